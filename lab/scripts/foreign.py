@@ -57,8 +57,8 @@ VIEWS = {"table": "on a table", "nothing": "nothing seen behind", "cloud": "clou
 WORST = 4  # of each view, in the last table
 
 
-@dataclass(frozen=True)
-class Options:
+@dataclass(frozen=True, kw_only=True)
+class Options(trainings.KeptOptions):
     """Train models, show them other organs, and count what they call good."""
 
     case: tuple[str, ...] = ()
@@ -80,9 +80,7 @@ class Options:
     seed: int = 0
     """Of trainings and scenes."""
     out: Path = Path("runs/foreign")
-    """Where models and rows are kept."""
     document: Path = Path("docs/results.md")
-    """Whose marked block is replaced."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,9 +106,7 @@ class Organ:
 
 def main(options: Options) -> None:
     """Every model, then the block."""
-    writer = ReportWriter(options.document, trainings.make_command(BLOCK))
-    writer.check([BLOCK])
-    options.out.mkdir(parents=True, exist_ok=True)
+    writer = options.begin(BLOCK, BLOCK)
     folders = {"phantom": phantom_case(options.out / "phantom", PhantomParameters())}
     folders |= named_folders(options.case, folders)
     opposite = named_folders(options.opposite, ())

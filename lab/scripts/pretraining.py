@@ -10,8 +10,6 @@ elastic states are of a library that no training has seen. Measurements are kept
 from __future__ import annotations
 
 import os
-import shlex
-import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache, partial
@@ -54,8 +52,8 @@ COLORS = {True: "#0072B2", False: "#D55E00"}
 KEYS = ["case", "steps", "pretrained"]
 
 
-@dataclass(frozen=True)
-class Options:
+@dataclass(frozen=True, kw_only=True)
+class Options(trainings.KeptOptions):
     """Train a new patient with and without pretrained weights, and measure."""
 
     start: Path
@@ -69,16 +67,13 @@ class Options:
     scenes: int = 64
     """To measure on."""
     out: Path = Path("runs/pretraining")
-    """Where measurements are kept."""
     document: Path = Path("docs/results.md")
-    """Whose marked block is replaced."""
 
 
 def main(options: Options) -> None:
     """Every case and seed, then the block."""
     torch.set_num_threads(1)
-    start = load_start(options.start)
-    options.out.mkdir(parents=True, exist_ok=True)
+    start, writer = load_start(options.start), options.begin("headstart", BLOCK)
     cases = {"phantom": phantom_case(options.out / "phantom", PhantomParameters())}
     cases |= named_folders(options.case, cases)
     made, rows = {name: load_case(folder) for name, folder in cases.items()}, []
@@ -99,9 +94,8 @@ def main(options: Options) -> None:
         measure = partial(_curve, made[name], partial(scenes, name), start, seed, options.steps)
         curve = trainings.kept(options.out / f"{name}_{seed}.json", about, measure)
         rows += [{"case": name, "seed": seed, **row} for row in curve]
-    command = shlex.join(["make", "headstart", f"ARGS={shlex.join(sys.argv[1:])}"])
     about = store.read_manifest(options.start, "pretrained")["provenance"]
-    _write(pd.DataFrame(rows), about, ReportWriter(options.document, command))
+    _write(pd.DataFrame(rows), about, writer)
 
 
 def _curve(

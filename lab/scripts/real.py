@@ -32,7 +32,7 @@ from tumortrack.tracking.tracker import Tracker
 from tumortrack_lab.real import kidneys, lungs, silicone
 from tumortrack_lab.real.judging import by_tumor, judge, quantiles, scene_of
 from tumortrack_lab.study import trainings
-from tumortrack_lab.study.document import ReportWriter, table
+from tumortrack_lab.study.document import table
 from tumortrack_lab.study.methods import named_folders
 
 Part = Literal["kidneys", "lungs", "silicone"]
@@ -43,8 +43,8 @@ KINDS = (*kidneys.KINDS, "between")  # of tumors
 ERRORS = "median / 90 / 95 / worst, mm"
 
 
-@dataclass(frozen=True)
-class Options:
+@dataclass(frozen=True, kw_only=True)
+class Options(trainings.KeptOptions):
     """Real kidneys, real deformations, and silicone."""
 
     data: Annotated[Path, tyro.conf.Positional]
@@ -64,9 +64,7 @@ class Options:
     seed: int = 0
     """Of trainings, scenes and places in the lungs."""
     out: Path = Path("runs/real")
-    """Where cases, models and rows are kept."""
     document: Path = Path("docs/real.md")
-    """Whose marked blocks are replaced."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,9 +113,7 @@ class Organ:
 
 def main(options: Options) -> None:
     """The parts, and after each its block."""
-    writer = ReportWriter(options.document, trainings.make_command("real"))
-    writer.check([f"real-{part}" for part in options.parts])
-    options.out.mkdir(parents=True, exist_ok=True)
+    writer = options.begin("real", *(f"real-{part}" for part in options.parts))
     rows = kidneys.frozen()
     if unknown := set(options.kidneys) - {row["case"] for row in rows}:
         raise InputError(f"--kidneys {min(unknown)} is not in the list; see docs/real.md.")

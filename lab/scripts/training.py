@@ -50,8 +50,8 @@ COLORS = dict(zip(BATCHES, ("#D55E00", "#0072B2", "#009E73", "#CC79A7"), strict=
 SETTING = ["preset", "batch", "per_side", "learning_rate"]
 
 
-@dataclass(frozen=True)
-class Options:
+@dataclass(frozen=True, kw_only=True)
+class Options(trainings.KeptOptions):
     """Train every setting for the same time, and judge it."""
 
     seconds: float = 45.0
@@ -63,9 +63,7 @@ class Options:
     looks: int = 5
     """How often a training is judged."""
     out: Path = Path("runs/training")
-    """Where measurements are kept."""
     document: Path = Path("docs/training.md")
-    """Whose marked block is replaced."""
 
 
 @dataclass(frozen=True)
@@ -111,6 +109,7 @@ def main(options: Options) -> None:
     """Every setting, then the block."""
     torch.set_num_threads(1)
     keep_freed_memory()
+    writer = options.begin(BLOCK, BLOCK)
     folder = phantom_case(options.out / "phantom", PhantomParameters())
     case, rows = load_case(folder), []
     judge = cache(partial(judge_of, case, count=options.scenes))
@@ -126,7 +125,7 @@ def main(options: Options) -> None:
         say(f"{setting.name}: " + " ".join(f"{k}={round(v, 3)}" for k, v in curve[-1].items()))
     frame = pd.DataFrame(rows)
     frame["both"] = (frame.miou + frame.other_miou) / 2
-    _write(frame, options, ReportWriter(options.document, trainings.make_command(BLOCK)))
+    _write(frame, options, writer)
 
 
 def _curve(case: Case, setting: Setting, judges: Callable, options: Options) -> list[dict]:

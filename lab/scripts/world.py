@@ -30,14 +30,15 @@ from tumortrack.report.metrics import box_center_distance
 from tumortrack.simulate.scene_folder import Scene, read_scene
 from tumortrack.tracking.tracker import Tracker
 from tumortrack_lab.peers.base import kabsch
+from tumortrack_lab.real.judging import quantiles
 from tumortrack_lab.study import trainings
 from tumortrack_lab.study.document import table
 from tumortrack_lab.tets import TetMesh
+from tumortrack_lab.twin.dataset import claim
 from tumortrack_lab.world.families import FAMILIES
 from tumortrack_lab.world.scenes import DISTURBANCES, World, WorldConfig
 
 _SAVE_EVERY = 20
-_PERCENTILES = (50, 90, 95, 100)
 
 
 @dataclass(frozen=True)
@@ -109,19 +110,14 @@ def _open(options: Options, config: WorldConfig) -> World:
         "case_sha256": store.sha256_of(options.case / store.MANIFEST),
         "config": to_builtins(config),
     }
-    path, tets = out / "world.json", out / "tets.safetensors"
-    if path.exists():
-        if store.read_json(path) != identity:
-            raise InputError(f"{out} is a world of another case or configuration; choose another.")
+    claim(out, "world.json", identity)
+    tets = out / "tets.safetensors"
+    if tets.exists():
         kept = load_file(tets)
         return World.of(case, config, TetMesh(kept["nodes_mm"], kept["tets"]))
-    if out.exists() and any(out.iterdir()):
-        raise InputError(f"{out} holds other files. Choose a new or empty folder.")
     world = World.of(case, config)
-    out.mkdir(parents=True, exist_ok=True)
     mesh = world.organ.mesh
     store.write_atomically(tets, save({"nodes_mm": mesh.nodes_mm, "tets": mesh.tets}))
-    store.write_json(path, identity)
     return world
 
 
@@ -186,22 +182,17 @@ def _summary(rows: pd.DataFrame, failures: dict[str, str]) -> str:
         lost = sum(name in ("all", scene.split("-")[place]) for scene in failures)
         first = mine.drop_duplicates("scene")
         counts = [str((first["verdict"] == verdict).sum()) for verdict in ("none", "poor", "good")]
-        errors = (_spread(mine[mine["verdict"] == v], "center_mm") for v in ("good", "poor"))
+        errors = (
+            quantiles(mine[mine["verdict"] == v].get("center_mm", ())) for v in ("good", "poor")
+        )
         cells = [name, str(len(first)), str(lost), ", ".join(counts), *errors]
-        body.append([*cells, _spread(mine, "rigid_mm")])
+        body.append([*cells, quantiles(mine.get("rigid_mm", ()))])
     reasons = pd.Series([reason.partition(":")[0] for reason in failures.values()], dtype=str)
     why = ", ".join(f"{name} {count}" for name, count in reasons.value_counts().items())
     return (
         f"{table(head, body, 1)}\n\nErrors of tumor centres: median / 90th / 95th percentile / "
         f"worst. rigid: the best rigid pose. Failed: {why or 'none'}.\n"
     )
-
-
-def _spread(rows: pd.DataFrame, column: str) -> str:
-    values = rows[column].dropna() if column in rows else pd.Series(dtype=float)
-    if values.empty:
-        return ""
-    return " / ".join(f"{x:.1f}" for x in np.percentile(values, _PERCENTILES))
 
 
 if __name__ == "__main__":

@@ -412,7 +412,6 @@ def test_end_to_end_twice_gives_the_same_document(phantom, tmp_path):
         grid=24,
         configurations=(3,),
         configuration_variants=("D1",),
-        configuration_view="clean",
         peers=("rigid_bound",),
     )
     document = tmp_path / "results.md"

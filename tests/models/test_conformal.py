@@ -49,27 +49,25 @@ def test_the_bound_is_clopper_and_pearsons():
     assert risk_bound(0, 0) == risk_bound(7, 7) == 1.0
 
 
-def test_the_loosest_rule_that_holds_is_found():
-    rules = [[(0, 20)], [(0, 90), (1, 150)], [(2, 200)], [(0, 100), (9, 100)]]
-    assert loosest_rule(rules, 0.05) == 2
-    assert loosest_rule(rules, 0.1) == 2
-    assert loosest_rule(rules[:1], 0.05) is None
-    # 59 without a miss suffice for one rule, for two it takes 72.
-    assert loosest_rule([[(0, 59)]], 0.05) == 0
-    assert loosest_rule([[(0, 59)], [(0, 59)]], 0.05) is None
-    assert loosest_rule([[(0, 72)], [(0, 59)]], 0.05) == 0
+def test_the_loosest_rule_before_the_first_that_fails_is_found():
+    rules = [[(0, 70)], [(0, 60), (1, 150)], [(0, 100), (9, 100)], [(0, 900)]]
+    assert loosest_rule(rules, 0.05) == 1  # what comes after a failure is not asked
+    assert loosest_rule(rules, 0.2) == 3
+    assert loosest_rule([[(0, 58)], *rules], 0.05) is None
+    assert loosest_rule(rules, 0.05, 0.025) is None  # 72 without a miss
+    assert loosest_rule([[(0, 72)]], 0.05, 0.025) == 0
 
 
 def test_a_rule_with_too_large_a_risk_passes_as_seldom_as_stated():
-    """Three rules whose risk is just too large, in one of two groups: one of them passes with a
-    chance of at most 5 % (2.1 % here, as counts are whole numbers)."""
+    """Three rules whose risk is just too large, in one of two groups: one of them is returned with
+    a chance of at most 5 % (a little less, as counts are whole numbers)."""
     rng = np.random.default_rng(3)
     missed = rng.binomial(200, 0.101, (8000, 3))
     wrong = [
         loosest_rule([[(0, 200), (int(count), 200)] for count in counts], 0.1) is not None
         for counts in missed
     ]
-    assert 0.015 < np.mean(wrong) < 0.03
+    assert 0.02 < np.mean(wrong) < 0.05
 
 
 def test_small_groups_join_the_next_larger_one():
@@ -80,6 +78,6 @@ def test_small_groups_join_the_next_larger_one():
         ("a", "far", "x"): 5,
         ("a", "far"): 7,  # y's two, with x's five
         ("a",): 8,
-        ("b",): 1,  # however small: for the caller to refuse
+        (): 9,
     }
     np.testing.assert_array_equal(found["a", "far"], np.arange(7))

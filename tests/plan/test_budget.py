@@ -180,7 +180,7 @@ def test_a_tumor_is_as_unsure_as_along_its_least_sure_axis():
     assert live.now.tracking_mm == 6.0
     estimate = update(0, std_mm=2.0).estimate
     seen = placed(estimate.cloud, estimate.meshes, estimate.motion, np.eye(4))
-    assert {*seen.std_mm} == {"tumor_1"}
+    assert {*seen.std_mm} == {"tumor_1", "tumor_2"}
     assert (seen.std_mm["tumor_1"] == 2.0).all()
 
 

@@ -127,7 +127,7 @@ def test_groups_are_those_of_the_nearest_of_points_that_lie_far_apart():
 
 
 def fit(motion, cost):
-    return RegistrationResult(motion, cost, np.zeros(3), 1, np.zeros(6))
+    return RegistrationResult(motion, cost, 0.0, cost, np.zeros(3), 1, np.zeros(6))
 
 
 def test_two_minima_widen_the_covariance_by_their_distance():

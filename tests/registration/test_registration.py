@@ -23,7 +23,7 @@ from tumortrack.core.types import Mesh
 from tumortrack.models.config import GaussNewtonConfig
 from tumortrack.models.encoders.heightmap import HeightMapConfig, _spread, picture
 from tumortrack.occupancy.network import OccupancyNetwork
-from tumortrack.registration.gauss_newton import GaussNewton, _prior, refine
+from tumortrack.registration.gauss_newton import GaussNewton, _prior, refine, size_of
 from tumortrack.registration.motion import ElasticMotion
 from tumortrack.registration.network import PoseHypothesis, RegistrationNetwork
 from tumortrack.registration.registration import Registration, _beside
@@ -261,6 +261,31 @@ def test_a_fifth_of_strays_does_not_matter():
     apart = fit.motion.carry(target) - clean.motion.carry(target)
     assert np.linalg.norm(apart, axis=1).mean() < 0.4
     assert np.abs(fit.distances_mm[strays]).mean() > 10
+
+
+def test_an_end_of_the_organ_is_found_all_around_a_misleading_start(unchecked):
+    vertices = ORGAN.vertices_mm
+    seen = vertices[(vertices[:, 2] > CENTER[2]) & (placed().carry(vertices)[:, 2] < PLACE_MM[2])]
+    points = placed().carry(seen[np.random.default_rng(9).permutation(len(seen))[:800]])
+    across = Rotation.from_euler("z", 90, degrees=True).as_matrix()
+    middle = points.mean(0) + [0, 0, 15]
+    start = dataclasses.replace(placed(), rotation=across @ TURNED, centre_mm=middle)
+    method = Registration(None, shape(), GaussNewtonConfig())
+    alone, around = (method.best_fit(points, [start], usual) for usual in (np.inf, 0.0))
+    truth = refine(shape(), points, placed(), GaussNewtonConfig())
+    assert alone.cost > 2 * truth.cost
+    assert around.cost < 1.1 * truth.cost
+    assert method.best_fit(points, [placed()], 0.0).cost <= truth.cost
+
+
+@pytest.mark.parametrize("times", [0.93, 1.0, 1.07])
+def test_a_wrong_scale_of_the_camera_shows_in_the_fit(times):
+    config = GaussNewtonConfig()
+    points = times * surface(placed(), 1000)
+    start = dataclasses.replace(START, centre_mm=times * START.centre_mm)
+    found, gain = size_of(refine(shape(), points, start, config), points, config)
+    assert abs(found - times) < 0.6 * abs(times - 1) + 0.01  # the robust kernel reads too little
+    assert (gain > 9.2) == (times != 1)
 
 
 def test_every_step_lowers_the_cost_and_enough_steps_end(unchecked):

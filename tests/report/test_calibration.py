@@ -10,12 +10,13 @@ import pytest
 from msgspec.structs import replace
 
 from live_objects import CAMERA, ball, small_anatomy, small_estimate
+from tumortrack.cli.margins import generic
 from tumortrack.core import store
 from tumortrack.core.errors import ArtifactError, InputError
 from tumortrack.core.types import SensorCloud
 from tumortrack.models import margins as stored
-from tumortrack.models.margins import ModelMargins, exceeded, stated_margin, stated_radius
-from tumortrack.report.calibration import Listed, list_states, margins_of, row_of
+from tumortrack.models.margins import ModelMargins, stated_margin, stated_radius
+from tumortrack.report.calibration import Listed, answered, list_states, margins_of, row_of
 from tumortrack.report.calibration_table import Row, head_of, open_table
 from tumortrack.report.metrics import outward_miss
 from tumortrack.sense.cloud import CloudConfig, cloud_from_depth
@@ -49,8 +50,8 @@ def drawn(rng, per_group, liars=0.0, groups=GROUPS):
 def within(margins: ModelMargins, rows, confidence):
     """Of the accepted states, whether all tumors are within the radius."""
     radius = next(s for s in margins.shells if s.confidence == confidence).radii["tumor"]
-    taken = [row for row in rows if not exceeded(margins.limits, row.measured)]
-    return [all(miss <= radius.at(s) for miss, s in row.misses["tumor"]) for row in taken]
+    taken = [row for row in rows if answered(row, margins)]
+    return [row.within("tumor", radius) for row in taken]
 
 
 def test_every_group_is_covered_as_often_as_stated():
@@ -73,15 +74,15 @@ def test_the_form_with_the_smaller_mean_is_used():
     rng = np.random.default_rng(2)
     grows = margins_of(drawn(rng, 60), "", (0.8,), 20.0).shells[0].radii["tumor"]
     assert grows.used == "scaled"
-    assert grows.at(2.0) > 1.5 * grows.at(1.0)
-    assert grows.at(None) is None
+    assert grows.at(2.0, {}) > 1.5 * grows.at(1.0, {})
+    assert grows.at(None, {}) is None
     flat = [
         replace(row, misses={"tumor": ((float(rng.random()), row.measured["unsure_mm"]),)})
         for row in drawn(rng, 60)
     ]
     same = margins_of(flat, "", (0.8,), 20.0).shells[0].radii["tumor"]
     assert same.used == "constant"
-    assert same.at(None) == same.at(9.0) <= 1.0
+    assert same.at(None, {}) == same.at(9.0, {}) <= 1.0
     unknown = [
         replace(row, misses={"tumor": tuple((miss, None) for miss, _ in row.misses["tumor"])})
         for row in drawn(rng, 60)
@@ -91,11 +92,27 @@ def test_the_form_with_the_smaller_mean_is_used():
     assert list(radii) == ["tumor"]
 
 
+def test_organs_that_are_bent_far_have_wider_margins_where_they_miss_by_more():
+    rng = np.random.default_rng(5)
+    rows = []
+    for row in drawn(rng, 60):
+        rarity, s = float(rng.exponential(0.1)), row.measured["unsure_mm"]
+        size = s + 6 * rarity**0.5
+        tumors = tuple((float(size * rng.uniform()), s) for _ in range(2))
+        figures = {**row.measured, "rarity": rarity}
+        rows.append(replace(row, measured=figures, misses={"tumor": tumors}))
+    radius = margins_of(rows, "", (0.9,), 20.0).shells[0].radii["tumor"]
+    assert 3 <= radius.bend_mm <= 8
+    straight, bent = (radius.at(1.0, {"rarity": rarity}) for rarity in (0.0, 0.25))
+    assert bent - straight == pytest.approx(radius.scaled * radius.bend_mm * 0.5)
+    assert radius.at(1.0, {}) == np.inf  # a method that knows no states is told nothing
+
+
 def test_answers_that_lie_are_refused_by_limits_that_were_tested():
     rng = np.random.default_rng(4)
     margins = margins_of(drawn(rng, 200, liars=0.12), "", (0.9,), 10.0)
     assert margins.limits["fit_cost"] < 1.05  # liars begin at 1
-    assert margins.risk_bound < 0.2
+    assert margins.risk_bound < 0.21
     assert 0.6 < margins.accepted < 0.9
     assert 0 < margins.missed < 0.1
     assert sum(group.accepted for group in margins.groups) < 0.9 * 200 * len(GROUPS)
@@ -149,7 +166,7 @@ def test_too_few_states_are_refused_with_their_number_and_small_groups_join():
     rng = np.random.default_rng(3)
     with pytest.raises(
         InputError,
-        match=r"0 of 5 of plate miss by more than 8 mm. It takes 86 without such a one, 125 with",
+        match=r"of all states miss by more than 8 mm. It takes 72 without such a one, 110 with one",
     ):
         margins_of(drawn(rng, 20, groups=GROUPS[:1]), "", (0.9, 0.95))
     with pytest.raises(InputError, match="no good estimate among"):
@@ -158,11 +175,12 @@ def test_too_few_states_are_refused_with_their_number_and_small_groups_join():
     margins = margins_of(uneven, "", (0.9,))
     assert margins.joined == {"plate, near, z": "plate, near"}
     assert {group.label[2]: group.states for group in margins.groups}["z"] == 3
-    mute = [replace(row, doubt="poor") for row in drawn(rng, 50, groups=[("cut", "near", "z")])]
-    with pytest.raises(InputError, match=r"0 of 0 of cut miss"):  # nothing is known of its answers
-        margins_of(uneven + mute, "", (0.9,))
-    with pytest.raises(InputError, match=r"of 1 of poke"):
-        margins_of(uneven + drawn(rng, 3, groups=[("poke", "near", "z")]), "", (0.9,))
+    rare = drawn(rng, 10, groups=[("cut", "near", "z")])
+    margins = margins_of(uneven + rare, "", (0.9,))
+    assert margins.joined["cut, near, z"] == "all states"
+    wide = [replace(row, misses={"tumor": ((7.9, 1.0),)}) for row in rare]
+    wider = margins_of(uneven + wide, "", (0.9,)).shells[0].radii["tumor"].constant_mm
+    assert wider >= margins.shells[0].radii["tumor"].constant_mm
 
 
 @pytest.mark.parametrize(("shift", "radius", "expected"), [(3, 10, 3), (0, 12, 0), (1, 8, 3)])
@@ -220,15 +238,37 @@ def test_stored_margins_are_refused_where_anything_differs(tmp_path, monkeypatch
         stored.read_margins(tmp_path)
 
 
+def test_a_generic_calibration_speaks_only_for_models_as_good_as_its_own(tmp_path, monkeypatch):
+    monkeypatch.setattr(stored, "GENERIC", tmp_path / "generic.json")
+    trust = {"usual_cost": 60.0, "std_scale": 1.0}
+    manifest = {
+        "files": {"shape.safetensors": ""},
+        "trust": trust,
+        "provenance": {"validation_tre_mm": 1.2},
+    }
+    with pytest.raises(InputError, match="without a generic calibration"):
+        generic(manifest)
+    worst = {"usual_cost": 75.0, "std_scale": 1.05, "validation_tre_mm": 1.4}
+    margins = replace(margins_of(drawn(np.random.default_rng(2), 60), "", (0.8,)), models=worst)
+    stored.write_sealed(stored.GENERIC, margins)
+    assert generic(manifest) == margins
+    with pytest.raises(InputError, match=r"validation_tre_mm is 1.5, and at most 1.4"):
+        generic({**manifest, "provenance": {"validation_tre_mm": 1.5}})
+    with pytest.raises(InputError, match=r"std_scale is 1.3"):
+        generic({**manifest, "trust": {**trust, "std_scale": 1.3}})
+    with pytest.raises(InputError, match="is of models of the preset clinic"):
+        generic({**manifest, "files": {}})
+
+
 def test_an_estimate_states_its_margins_or_why_it_has_none():
     margins = margins_of(drawn(np.random.default_rng(2), 60), "", (0.8, 0.9), 20.0)
     parts = {"kidney": {"surface_std_mm": 2.0}, "tumor_1": {"surface_std_mm": 1.0}}
     said = stated_margin({"parts": parts}, margins, good=True)
     radius = margins.shells[1].radii["tumor"]
-    assert stated_radius(said, "tumor_1").mm == radius.at(1.0)
-    assert stated_radius(said, "tumor_1").words == f"90 % margin {radius.at(1.0):.1f} mm"
-    assert stated_radius(said, "kidney").mm == margins.shells[1].radii["kidney"].at(2.0)
-    assert stated_radius(said, "tumor_1", 0.8).mm < radius.at(1.0)
+    assert stated_radius(said, "tumor_1").mm == radius.at(1.0, {})
+    assert stated_radius(said, "tumor_1").words == f"90 % margin {radius.at(1.0, {}):.1f} mm"
+    assert stated_radius(said, "kidney").mm == margins.shells[1].radii["kidney"].at(2.0, {})
+    assert stated_radius(said, "tumor_1", 0.8).mm < radius.at(1.0, {})
     assert stated_radius(said, "tumor_1", 0.95) is None
     assert stated_radius(said, "map") is None  # no scene had targets
     assert stated_margin({"parts": parts}, None, good=True)["stated"] == []

@@ -23,6 +23,9 @@ from tumortrack.tracking.tracker import Follower, FollowerConfig, Tracker
 from tumortrack.training.model import load_model
 from warp_objects import ANATOMY, PLACE_MM, TURNED, slim_clinic
 
+COST = {"now": 1.0, "without_strays": 1.0, "usual": 2.0, "strays": 0.0}
+EXACT = {"times": 1.0, "gain": 0.0}
+
 
 @pytest.fixture(scope="module")
 def tracker(slim_model):
@@ -42,7 +45,7 @@ def doubted(estimate, seen, **report):
         name: {**part, "probability": 0.9, "center_std_mm": 1.0}
         for name, part in estimate.report["parts"].items()
     }
-    sure = {**estimate.report, "parts": parts, "fit_cost": {"now": 1.0, "usual": 2.0}, **report}
+    sure = {**estimate.report, "parts": parts, "fit_cost": COST, "size": EXACT, **report}
     found = judged(replace(estimate, report=sure), seen)
     assert found.report["quality"] == {"verdict": found.quality, "reason": found.reason}
     return found
@@ -63,17 +66,36 @@ def test_a_worse_fit_is_flagged(tracker, stages):
     estimate = tracker.follow(cloud)
     good = doubted(estimate, cloud)
     assert (good.quality, good.reason) == ("good", "")
-    worse = doubted(estimate, cloud, fit_cost={"now": 2.1, "usual": 2.0})
+    worse = doubted(estimate, cloud, fit_cost=COST | {"now": 2.1})
     assert worse.quality == "poor"
     assert "worse than in most" in worse.reason
     parts = json.loads(json.dumps(good.report["parts"]))
     parts["tumor_1"]["center_std_mm"] = 3.4
     assert "tumor_1 is unsure by 3.4 mm" in doubted(estimate, cloud, parts=parts).reason
+    for gain, verdict in ((9.1, "good"), (9.3, "poor")):
+        scaled = doubted(estimate, cloud, size={"times": 1.07, "gain": gain})
+        assert scaled.quality == verdict
+    assert "1.07 times as large" in scaled.reason
     for apart_mm, verdict in ((2.9, "good"), (5.2, "poor")):
         others = [{"more": 1.0, "apart_mm": {"kidney": 0.4, "tumor_1": apart_mm}}]
-        rival = doubted(estimate, cloud, fit_cost={"now": 1.0, "usual": 2.0, "others": others})
+        rival = doubted(estimate, cloud, fit_cost=COST | {"others": others})
         assert rival.quality == verdict
     assert "tumor_1 may as well lie 5.2 mm away" in rival.reason
+
+
+def test_strays_are_no_part_of_the_fit_that_is_judged(tracker, stages):
+    points, rng = stages[0].cloud.points_mm, np.random.default_rng(8)
+    clean = tracker.follow(stages[0].cloud)
+    low, high = points.min(0), points.max(0)
+    anywhere = low + (high - low) * rng.uniform(-0.1, 1.1, points.shape)
+    spoiled = SensorCloud(np.where(rng.random((len(points), 1)) < 0.35, anywhere, points))
+    found = tracker.follow(spoiled)
+    away = found.motion.centre_mm - clean.motion.centre_mm  # an ellipsoid may lie both ways round
+    assert np.linalg.norm(away) < 2
+    cost, before = (one.report["fit_cost"] for one in (found, clean))
+    assert 0.15 < cost["strays"] < 0.35  # the others lie near the surface
+    assert cost["now"] > before["now"] + 0.8 * 300 * cost["strays"]
+    assert cost["without_strays"] < before["without_strays"] + 0.5 * cost["usual"]
 
 
 @pytest.mark.parametrize("known", [True, False])
@@ -110,8 +132,14 @@ def test_an_organ_that_the_camera_sees_through_is_refused(tracker, stages):
     alone = render_depth(organ.vertices_mm, organ.faces, camera)
     behind_mm = np.float32(np.nanmax(alone.depth_mm) + 30)
     table = DepthFrame(np.fmin(alone.depth_mm, behind_mm), camera)
-    assert seen_through(organ, alone) == 0
-    assert seen_through(organ, table) == 0
+    assert seen_through(organ, alone) == (0, 0)
+    assert seen_through(organ, table) == (0, 1)
+    costly = COST | {"now": 99.0, "without_strays": 3.9, "strays": 0.49}
+    assert doubted(estimate, alone, fit_cost=costly).quality == "poor"
+    assert doubted(estimate, table, fit_cost=costly).quality == "good"  # a wrong place would show
+    assert doubted(estimate, table, fit_cost=costly | {"without_strays": 4.1}).quality == "poor"
+    many = doubted(estimate, table, fit_cost=costly | {"strays": 0.51})
+    assert "51 % of the points do not lie" in many.reason
     rows = np.flatnonzero(np.isfinite(alone.depth_mm).any(1))
     for share, expected in ((0.07, "poor"), (0.3, "none")):
         area = np.cumsum(np.isfinite(alone.depth_mm[rows]).sum(1))
@@ -119,7 +147,7 @@ def test_an_organ_that_the_camera_sees_through_is_refused(tracker, stages):
         depth_mm = table.depth_mm.copy()
         depth_mm[few] = behind_mm  # the table where the organ is said to be
         holed = DepthFrame(depth_mm, camera)
-        assert seen_through(organ, holed) == pytest.approx(share, abs=0.02)
+        assert seen_through(organ, holed)[0] == pytest.approx(share, abs=0.02)
         if expected == "poor":
             found = doubted(estimate, holed)
             assert found.quality == "poor"
@@ -129,7 +157,7 @@ def test_an_organ_that_the_camera_sees_through_is_refused(tracker, stages):
                 doubted(estimate, holed)
     hidden = table.depth_mm.copy()
     hidden[:, :200] = behind_mm - 90  # a hand before it hides it, and proves nothing
-    assert seen_through(organ, DepthFrame(hidden, camera)) == 0
+    assert seen_through(organ, DepthFrame(hidden, camera))[0] == 0
 
 
 @pytest.mark.parametrize("spacing", [1, 5, 40])

@@ -54,7 +54,7 @@ class Margins:
         if self.seed < 0:
             raise InputError(f"--seed {self.seed} must be 0 or more.")
         manifest = read_model_manifest(self.model)
-        margins = self._calibrated() if self.scenes else _generic(manifest)
+        margins = self._calibrated() if self.scenes else generic(manifest)
         path = keep_margins(self.model, margins)
         for line in described(margins):
             say(line)
@@ -105,9 +105,11 @@ class Margins:
         return [done[str(one.folder.resolve())] for one in listed]
 
 
-def _generic(manifest: dict[str, Any]) -> ModelMargins:
+def generic(manifest: dict[str, Any]) -> ModelMargins:
+    """The calibration that comes with this version, for a model with this manifest. InputError:
+    there is none, or it says nothing of such a model."""
     from tumortrack.models.folder import has_shape
-    from tumortrack.models.margins import GENERIC, read_sealed
+    from tumortrack.models.margins import GENERIC, judged_by, read_sealed
 
     if not GENERIC.is_file():
         raise InputError(
@@ -119,7 +121,16 @@ def _generic(manifest: dict[str, Any]) -> ModelMargins:
             "no margin is known: the generic calibration is of models of the preset clinic. Give "
             "folders of scenes: tumortrack margins MODEL SCENES."
         )
-    return read_sealed(GENERIC)
+    margins = read_sealed(GENERIC)
+    for name, figure in judged_by(manifest).items():
+        if figure > margins.models[name]:
+            raise InputError(
+                f"no margin is known: {name} is {figure:.3g}, and at most "
+                f"{margins.models[name]:.3g} in the models of the generic calibration, so this one "
+                "may err by more. Train it longer, or give folders of scenes: tumortrack margins "
+                "MODEL SCENES."
+            )
+    return margins
 
 
 def described(margins: ModelMargins) -> list[str]:
@@ -129,7 +140,10 @@ def described(margins: ModelMargins) -> list[str]:
         for kind, radius in shells.radii.items():
             size = f"{radius.constant_mm:.1f} mm"
             if radius.used == "scaled":
-                size = f"{radius.scaled:.2f} x ({radius.offset_mm:g} mm + largest deviation)"
+                size = f"{radius.offset_mm:g} mm + largest deviation"
+                if radius.bend_mm:
+                    size += f" + {radius.bend_mm:g} mm x root of rarity"
+                size = f"{radius.scaled:.2f} x ({size})"
             lines.append(f"{100 * shells.confidence:g} % margin of {_WHAT[kind]}: {size}")
     lines += ["family, visible share, organ: states, good, accepted, tested, calibrated"]
     for group in margins.groups:

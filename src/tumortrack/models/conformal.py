@@ -47,31 +47,30 @@ def least_tested(risk: float, error: float = ERROR, misses: int = 0) -> int:
 def loosest_rule(
     rules: Sequence[Sequence[tuple[int, int]]], risk: float, error: float = ERROR
 ) -> int | None:
-    """The number of the last rule that holds its risk in every group, None where none does.
+    """The number of the last rule before the first one that does not hold its risk in every group;
+    None where that is the first of all.
 
     Args:
-        rules: of each rule, the strictest first, (misses, accepted cases) of each group. Each is
-            tested with its share of ``error`` (Bonferroni), which is then the largest chance that
-            the one returned has a larger risk in any group.
+        rules: of each rule, in an order fixed beforehand, best the strictest first, (misses,
+            accepted cases) of each group. Each is tested with the whole ``error``, which, as
+            testing ends with the first failure, is the largest chance that the one returned has a
+            larger risk in any group (fixed-sequence testing).
     """
-    each = error / len(rules)
-    held = [
-        number
-        for number, groups in enumerate(rules)
-        if all(risk_bound(misses, cases, each) <= risk for misses, cases in groups)
-    ]
-    return max(held, default=None)
+    for number, groups in enumerate(rules):
+        if not all(risk_bound(misses, cases, error) <= risk for misses, cases in groups):
+            return number - 1 if number else None
+    return len(rules) - 1
 
 
 def groups_of(labels: Sequence[Label], least: int) -> dict[Label, Int64[np.ndarray, " m"]]:
     """The members of each group, by their numbers. A group with fewer than ``least`` gives way to
-    the one that its label without the last word names, with all who are in that; one that a single
-    word names stays, however small."""
+    the one that its label without the last word names, with all who are in that; the last is the
+    empty label's, with everyone, however few."""
     found: dict[Label, Int64[np.ndarray, " m"]] = {}
-    for label in sorted(set(labels)):
+    for label in sorted(set(labels)) or [()]:
         while True:
             mine = [n for n, other in enumerate(labels) if other[: len(label)] == label]
-            if len(mine) >= least or len(label) == 1:
+            if len(mine) >= least or not label:
                 break
             label = label[:-1]
         found[label] = np.array(mine, np.int64)

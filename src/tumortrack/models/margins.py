@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -16,36 +17,45 @@ from tumortrack.core.errors import ArtifactError, InputError
 
 # Raise it with every change by which the same cloud gives another estimate, or another figure of
 # those in ``measured``: margins that were found before are then refused.
-METHOD = 2
+METHOD = 3
 NAME = "margins.json"
-GENERIC = Path(__file__).with_name("generic_margins.json")  # from many organs; none is shipped yet
+GENERIC = Path(__file__).with_name("generic_margins.json")  # from several organs
 Kind = Literal["tumor", "kidney", "map"]
 UNKNOWN = "no margin is known for this model (tumortrack margins)"
 
 
 class Radius(Config, frozen=True):
-    """A radius: ``scaled`` times (``offset_mm`` + s), or ``constant_mm``, whatever s is; s (mm) is
-    the largest standard deviation over the surface as estimated. ``scaled`` is None where the
-    method knows no s; ``used`` is the one with the smaller mean where that was chosen."""
+    """A radius: ``scaled`` times a part's size, or ``constant_mm``, whatever that is; ``used`` is
+    the one with the smaller mean where that was chosen. The size is ``offset_mm`` + s + ``bend_mm``
+    times the root of the elastic state's rarity: s (mm) is the largest standard deviation over the
+    surface as estimated, and the farther an organ is bent the less a library of states knows of it.
+    ``scaled`` is None where the method knows no s."""
 
     used: Literal["scaled", "constant"]
     constant_mm: float
     scaled: float | None = None
     offset_mm: float = 0.0
+    bend_mm: float = 0.0
 
     def __post_init__(self) -> None:
-        self.check_between("margins:", constant_mm=(0, 1000), offset_mm=(0, 1000))
+        limits = (0, 1000)
+        self.check_between("margins:", constant_mm=limits, offset_mm=limits, bend_mm=limits)
         if self.scaled is not None:
             self.check_between("margins:", scaled=(0, 1e6))
         elif self.used == "scaled":
             raise InputError("margins: a scaled radius needs its factor.")
 
-    def at(self, std_mm: float | None) -> float | None:
+    def size_mm(self, std_mm: float, found: dict[str, float]) -> float:
+        """``found``: the estimate's figures (``measured``); one without rarity is unbounded."""
+        bent = math.sqrt(found.get("rarity", math.inf)) if self.bend_mm else 0.0
+        return self.offset_mm + std_mm + self.bend_mm * bent
+
+    def at(self, std_mm: float | None, found: dict[str, float]) -> float | None:
         """mm; None where it depends on a standard deviation that is not known."""
         if self.used == "constant":
             return self.constant_mm
         assert self.scaled is not None
-        return None if std_mm is None else self.scaled * (self.offset_mm + std_mm)
+        return None if std_mm is None else self.scaled * self.size_mm(std_mm, found)
 
 
 class Shells(Config, frozen=True):
@@ -82,6 +92,8 @@ class ModelMargins(Config, frozen=True):
         shells: by rising confidence.
         groups: what was calibrated on, as it was given; ``joined``: of those, the ones that were
             too small to stand alone, and the larger one that spoke for each.
+        models: the worst that the calibration's models are by their own validation: a generic
+            calibration says nothing of a model that is worse (``judged_by``).
         risk_bound: upper bound of the share of accepted answers outside the widest margin of a
             tumor, in the worst group of the tested states, with 95 % confidence.
         accepted, missed: shares of all tested states: accepted; accepted and outside the margin.
@@ -100,6 +112,7 @@ class ModelMargins(Config, frozen=True):
     risk_bound: float
     accepted: float
     missed: float
+    models: dict[str, float] = msgspec.field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if not self.shells or not all(map(math.isfinite, self.limits.values())):
@@ -148,6 +161,19 @@ def _digest(content: dict[str, Any]) -> str:
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
+def judged_by(manifest: dict[str, Any]) -> dict[str, float]:
+    """How good a model is, by its manifest, and so by its validation: all the larger the worse.
+    InputError for one of another preset than clinic."""
+    trust, about = manifest.get("trust"), manifest.get("provenance", {})
+    if trust is None or "validation_tre_mm" not in about:
+        raise InputError("only models of the preset clinic have figures that margins ask for.")
+    return {
+        "usual_cost": trust["usual_cost"],
+        "std_scale": trust["std_scale"],
+        "validation_tre_mm": about["validation_tre_mm"],
+    }
+
+
 def measured(report: dict[str, Any]) -> dict[str, float]:
     """What an estimate's report says of how far it can be trusted; all the larger the worse."""
     cost, tumors = report.get("fit_cost"), list(report["parts"].values())[1:]
@@ -160,6 +186,23 @@ def measured(report: dict[str, Any]) -> dict[str, float]:
         "unsure_mm": max(unsure) if unsure else None,
     }
     return {name: float(value) for name, value in found.items() if value is not None}
+
+
+def figures(report: dict[str, Any], margins: ModelMargins) -> dict[str, float]:
+    """What limits are on: ``measured``, and the largest size of a tumor."""
+    tumors = list(report["parts"].values())[1:]
+    form = margins.shells[-1].radii["tumor"]
+    return sized(measured(report), [part.get("surface_std_mm") for part in tumors], form)
+
+
+def sized(
+    found: dict[str, float], deviations: Sequence[float | None], form: Radius
+) -> dict[str, float]:
+    """The figures with ``size_mm``, the largest of a tumor; as they are where a form has none."""
+    known = [std_mm for std_mm in deviations if std_mm is not None]
+    if form.scaled is None or len(known) < len(deviations):
+        return found
+    return {**found, "size_mm": max(form.size_mm(std_mm, found) for std_mm in known)}
 
 
 def exceeded(limits: dict[str, float], found: dict[str, float]) -> str:
@@ -182,14 +225,14 @@ def stated_margin(
         return {"stated": [], "reason": "a poor estimate has no margin"}
     if report.get("smoothing", {}).get("time_s", 0.0) > 0:
         return {"stated": [], "reason": "margins are of single clouds, not of smoothed motions"}
-    parts, stated = report["parts"], []
+    parts, found, stated = report["parts"], measured(report), []
     kinds: dict[str, Kind] = {name: "tumor" for name in parts}
     kinds |= {next(iter(parts)): "kidney", "map": "map"}
     deviations = {name: part.get("surface_std_mm") for name, part in parts.items()}
     deviations["map"] = next(iter(deviations.values()))
     for shells in margins.shells:
         radii = {
-            name: shells.radii[kind].at(deviations[name])
+            name: shells.radii[kind].at(deviations[name], found)
             for name, kind in kinds.items()
             if kind in shells.radii
         }

@@ -33,7 +33,7 @@ _GROUPS = 64  # of neighbouring points, some 8 mm apart; 128 see discrepancy whe
 # several millimetres are those of points that do not belong to the organ.
 AMPLITUDES_MM = np.array([0.0, 0.15, 0.3, 0.6, 1.2, 2.4, 4.8])
 NOISES_MM = np.array([0.15, 0.3, 0.6, 1.2, 2.4])  # of one point
-_FARTHEST = 2.0  # widths of the robust kernel: what lies beyond weighs less than 1/25
+FARTHEST = 2.0  # widths of the robust kernel: what lies beyond weighs less than 1/25
 _ROUNDING_MM2 = 1e-4
 
 
@@ -97,7 +97,7 @@ def judge(
     distances = np.abs(rows[:, -1])
     least = min(_GROUPS, len(distances))
     nearest_mm = np.partition(distances, least - 1)[least - 1]
-    kept = distances <= max(_FARTHEST * width_mm, nearest_mm)
+    kept = distances <= max(FARTHEST * width_mm, nearest_mm)
     rows, rest_ct = rows[kept].astype(float), rest_ct[kept]
     weights = 1 / (1 + (rows[:, -1] / width_mm) ** 2) ** 2
     group = _grouped(rest_ct)

@@ -24,7 +24,7 @@ from jaxtyping import Float, Float64
 from tumortrack.core.geometry import Points
 from tumortrack.models.config import GaussNewtonConfig
 from tumortrack.registration import gauss_newton_kernels as kernels
-from tumortrack.registration.discrepancy import judge
+from tumortrack.registration.discrepancy import FARTHEST, judge
 from tumortrack.registration.kernels import POSE
 from tumortrack.registration.motion import ElasticMotion
 from tumortrack.registration.rest_shape import RestShape
@@ -34,11 +34,15 @@ from tumortrack.simulate.elastic.flow import LatticeField
 @dataclass(frozen=True, eq=False)
 class RegistrationResult:
     """A motion, its cost (robust data term and prior), and the residuals (signed distances, mm).
-    ``moved``: shift (mm) and turn (rad) from where the prior has the pose. ``rivals``: other minima
-    that explain the points nearly as well (see ``registration.best_of``)."""
+    ``strays``: share of the points that lie farther off than ``discrepancy.FARTHEST`` widths;
+    ``cost_without_strays``: if all lay as the others do. ``moved``: shift (mm) and turn (rad) from
+    where the prior has the pose. ``rivals``: other minima that explain the points nearly as well
+    (see ``registration.best_of``)."""
 
     motion: ElasticMotion
     cost: float
+    strays: float
+    cost_without_strays: float
     distances_mm: Float[np.ndarray, " n"]
     steps: int
     moved: Float64[np.ndarray, " 6"]
@@ -104,7 +108,32 @@ class GaussNewton:
         covariance = np.linalg.inv(state.curvature)
         placed = state.rotation, state.centre_mm, state.coefficients
         motion = ElasticMotion(self._rest, *placed, covariance)
-        return RegistrationResult(motion, self.cost, state.distances_mm, self.steps, state.moved)
+        squares = (state.distances_mm / self._problem.last_mm) ** 2
+        far = squares > FARTHEST**2
+        of_strays = (squares / (1 + squares))[far].sum()
+        of_strays *= self._problem.weight * self._problem.last_mm**2
+        strays = float(far.mean())
+        without = float(self.cost - of_strays) / max(1 - strays, 1 / len(far))
+        judged = self.cost, strays, without
+        return RegistrationResult(motion, *judged, state.distances_mm, self.steps, state.moved)
+
+
+def size_of(
+    fit: RegistrationResult, points_mm: Points, config: GaussNewtonConfig
+) -> tuple[float, float]:
+    """How large the points (camera frame, mm) show the organ, times its true size, and how much
+    less it would cost to fit them scaled about the camera by that; to second order, as in Rao's
+    score test."""
+    motion, last_mm = fit.motion, config.last_mm
+    assert motion.covariance is not None
+    rows = motion.residual_rows(points_mm).astype(float)
+    slopes, distances = rows[:, :-1], rows[:, -1]
+    outwards = -(slopes[:, :3] * (points_mm @ motion.rotation)).sum(1)  # of scaling the points
+    weight = min(config.n_effective / len(rows), 1.0) / config.sigma_mm**2
+    weighed = outwards * weight / (1 + (distances / last_mm) ** 2) ** 2
+    cross = slopes.T @ weighed
+    slope, curvature = weighed @ distances, weighed @ outwards - cross @ motion.covariance @ cross
+    return float(1 + slope / curvature), float(slope**2 / curvature)
 
 
 def posterior(motion: ElasticMotion, points_mm: Points, config: GaussNewtonConfig) -> ElasticMotion:

@@ -18,7 +18,7 @@ from tumortrack.imaging.raster import label_grid
 from tumortrack.models.in_distribution import check_in_distribution, check_likely
 from tumortrack.models.report import Frame, describe_parts, grid_over
 from tumortrack.registration import kernels
-from tumortrack.registration.gauss_newton import RegistrationResult, posterior, refine
+from tumortrack.registration.gauss_newton import RegistrationResult, posterior, refine, size_of
 from tumortrack.registration.model import RegistrationModel
 from tumortrack.registration.motion import ElasticMotion, blend
 from tumortrack.registration.registration import best_of
@@ -95,16 +95,16 @@ class RegistrationLocator:
     def locate(self, cloud: SensorCloud, grid: int, seed: int) -> Estimate:
         """See ``tracking.tracker.Tracker.locate``."""
         frame = Frame(self._model, cloud, seed, np.random.default_rng(seed))
-        usual = self._calibration.usual_cost
-        fit = self._registration.register(frame.points_mm, usual, frame.stage)
-        placed = self._checked(frame, fit)
+        fit = self._registration.register(frame.points_mm, 0.0, frame.stage)
+        size, placed = self._size(frame, fit), self._checked(frame, fit)
         organ = placed.meshes[self._model.parts[0]]
         with frame.stage("fine"):
             inside = self._drawn(placed, organ, cloud.stamp_ns, frame.rng)
         with frame.stage("volume"):
             camera_from_index, shape = grid_over(organ.vertices_mm, grid)
             labels = label_grid(Anatomy(tuple(placed.meshes.values())), camera_from_index, shape)
-        report = self._report(frame, placed, inside, voxel_mm=float(camera_from_index[0, 0]))
+        voxel_mm = float(camera_from_index[0, 0])
+        report = self._report(frame, placed, inside, size=size, voxel_mm=voxel_mm)
         volume = CameraLabels(labels, camera_from_index)
         return Estimate(inside, volume, placed.meshes, report, placed.motion)
 
@@ -119,10 +119,10 @@ class RegistrationLocator:
                 starts = [start, *(rival for rival, _ in start.rivals)]
                 fits += [refine(self._shape, points, one, self._near) for one in starts]
         if not fits or how.thorough or min(fit.cost for fit in fits) > usual:
-            enough = usual if how.thorough or not fits else np.inf
+            enough = 0.0 if not fits else usual if how.thorough else np.inf
             fits.append(self._registration.register(points, enough, frame.stage))
         fit = best_of(fits)
-        unsmoothed, lag_s = fit.motion, 0.0
+        size, unsmoothed, lag_s = self._size(frame, fit), fit.motion, 0.0
         if last is not None and isinstance(last.motion, ElasticMotion) and how.smoothing_s > 0:
             past_s = (cloud.stamp_ns - last.cloud.stamp_ns) * 1e-9
             share = -math.expm1(-past_s / how.smoothing_s)
@@ -135,7 +135,7 @@ class RegistrationLocator:
         with frame.stage("carry"):
             inside = self._carry(placed, cloud.stamp_ns)
         smoothing = {"time_s": how.smoothing_s, "lag_ms": 1000 * lag_s}
-        report = self._report(frame, placed, inside, smoothing=smoothing)
+        report = self._report(frame, placed, inside, size=size, smoothing=smoothing)
         return Estimate(inside, None, placed.meshes, report, placed.motion, unsmoothed)
 
     def warm(self) -> None:
@@ -147,6 +147,10 @@ class RegistrationLocator:
         self._registration.propose(points)
         fit = refine(self._shape, points, rest, self._near)
         self._carry(self._moved(points, fit), 0)
+
+    def _size(self, frame: Frame, fit: RegistrationResult) -> dict[str, float]:
+        times, gain = size_of(fit, frame.points_mm, self._registration.config)
+        return {"times": times, "gain": gain}
 
     def _checked(self, frame: Frame, fit: RegistrationResult) -> _Registered:
         """What a fit says, if it can be this organ's."""
@@ -191,7 +195,8 @@ class RegistrationLocator:
             for rival in fit.rivals
         ]
         usual = self._calibration.usual_cost
-        more["fit_cost"] = {"now": fit.cost, "usual": usual, "others": others}
+        costs = {"now": fit.cost, "without_strays": fit.cost_without_strays, "usual": usual}
+        more["fit_cost"] = {**costs, "strays": fit.strays, "others": others}
         more["motion"] = {
             "camera_from_ct": motion.camera_from_ct.tolist(),
             "coefficients": motion.coefficients.tolist(),

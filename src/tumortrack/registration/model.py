@@ -20,8 +20,8 @@ from tumortrack.registration.rest_shape import RestShape
 
 class UncertaintyCalibration(Config, frozen=True):
     """What validation scenes taught: standard deviations are multiplied by ``std_scale``; where a
-    fit costs more than ``usual_cost``, turned starts are tried. Both hold for one robust kernel;
-    folders that name none were made with the first."""
+    fit costs more than ``usual_cost``, a search made anew looks all around. Both hold for one
+    robust kernel; folders that name none were made with the first."""
 
     LATER = ("kernel",)
 

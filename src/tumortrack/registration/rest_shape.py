@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -60,6 +60,13 @@ class RestShape:
     def middles_ct(self) -> Float64[np.ndarray, "parts 3"]:
         """Of each part's box."""
         return np.array([part.box_mm.mean(0) for part in self.anatomy_ct.parts])
+
+    @cached_property
+    def stiff(self) -> RestShape:
+        """The same with the body's first mode alone."""
+        body = self.body
+        few = {"modes": body.modes[..., :1].copy(), "states": body.states[:, :1].copy()}
+        return replace(self, body=replace(body, **few))
 
     def labels_at(
         self, points_ct: Float32[np.ndarray, "n 3"]

@@ -5,8 +5,10 @@ The unit is the physical state: one scene of each counts. docs/trust.md says wha
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import product
+from operator import itemgetter
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -27,6 +29,7 @@ from tumortrack.models.margins import (
     Shells,
     exceeded,
     measured,
+    sized,
 )
 from tumortrack.report.calibration_table import Miss, Row
 from tumortrack.report.metrics import outward_miss
@@ -38,13 +41,22 @@ _Turn = Literal["choose", "test", "calibrate"]
 CONFIDENCES = (0.9, 0.95)
 WIDEST_MM = 8.0  # what plans assume of estimates that say nothing of their error
 SHARES = (1 / 3, 2 / 3)  # of visible surface, that part the groups
-# Limits are tried at these quantiles of the figures of the states that they are chosen on.
-_LEVELS = (0.8, 0.9, 0.95, 1.0)
-_OFFSETS_MM = (0.1, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
+# Limits are tried at these quantiles of the states that they are chosen on, in two sequences: of
+# all that is reported; and of the size, the largest values of all else. The first may keep out what
+# fits badly; the second keeps out much at little loss.
+_LEVELS = {
+    "all": ((0.8, 0.8), (0.9, 0.9), (0.95, 0.95), (1.0, 1.0)),
+    "size": ((0.8, 1.0), (0.9, 1.0), (0.95, 1.0)),
+}
+_ERROR = conformal.ERROR / len(_LEVELS)
+_OFFSETS_MM = (0.1, 0.5, 1.0, 2.0, 4.0, 8.0)
+_BENDS_MM = (0.0, 2.0, 4.0, 8.0, 16.0)
 # What a state is for: choosing form and limits, testing limits, finding radii. Of each group's
 # states, drawn by the seed, in turn.
 _TURNS: tuple[_Turn, ...] = ("test", "calibrate", "choose", "test", "calibrate")
+_SIZE = "size_mm"
 _GRID = 8  # voxels: the labelled volume is not looked at
+_ALONE = 2  # times the scores that a quantile needs: the largest of few says little of a group
 _WORTH = 0.95  # of the constant radius: nothing less pays for one that varies
 
 
@@ -131,38 +143,40 @@ def margins_of(
     ``widest_mm`` are to be kept out by limits.
 
     Raises:
-        InputError: a family with too few states, or limits that hold their risk nowhere; says how
-            many there are and how many it takes.
+        InputError: too few states, or no limits that hold their risk; says how many there are and
+            how many it takes.
     """
     highest = max(confidences)
     turns = _dealt([row.label for row in rows], seed)
-    some: dict[_Turn, list[Row]] = {turn: [] for turn in get_args(_Turn)}
-    for row, turn in zip(rows, turns, strict=True):
-        some[turn].append(row)
-    good = [row for row in some["choose"] if not row.doubt]
+    good = [
+        row for row, turn in zip(rows, turns, strict=True) if turn == "choose" and not row.doubt
+    ]
     if not good:
         raise InputError(
-            f"no good estimate among {len(some['choose'])} states to choose limits on."
+            f"no good estimate among {turns.count('choose')} states to choose limits on."
         )
     located = [row for row in rows if not row.doubt]
     kinds: list[Kind] = [kind for kind in get_args(Kind) if all(kind in r.misses for r in located)]
-    rules = _rules(good)
-    number = _tested(rules, some["test"], kinds[0], widest_mm, 1 - highest)
-    accepted = {turn: [row for row in some[turn] if _accepted(row, rules[number])] for turn in some}
-    forms = {kind: _form(accepted["choose"] or good, kind, highest) for kind in kinds}
-    families, theirs = {row.label[0] for row in rows}, accepted["calibrate"]
+    forms = {kind: _form(good, kind) for kind in kinds}
+    rows = [_sized(row, forms[kinds[0]]) for row in rows]
+    some: dict[_Turn, list[Row]] = {turn: [] for turn in get_args(_Turn)}
+    for row, turn in zip(rows, turns, strict=True):
+        some[turn].append(row)
+    rules = _rules([row for row in some["choose"] if not row.doubt])
+    limits = _tested(rules, some["test"], kinds[0], widest_mm, 1 - highest)
+    accepted = {turn: [row for row in some[turn] if _accepted(row, limits)] for turn in some}
+    least = conformal.least_scores(highest)  # fewer than the test of limits asks for
+    groups, joined = _grouped(accepted["calibrate"], _ALONE * least)
     shells: list[Shells] = []
-    joined: dict[str, str] = {}
     for confidence in sorted(confidences):
         radii = {}
         for kind in kinds:
-            radii[kind], small = _radius(theirs, kind, forms[kind], confidence, families)
-            joined |= small
+            radii[kind] = _radius(groups, kind, forms[kind], confidence)
         shells.append(Shells(confidence=confidence, radii=radii))
-    each, tested = conformal.ERROR / len(rules), accepted["test"]
-    last, least = shells[-1].radii[kinds[0]], conformal.least_tested(1 - highest, each, misses=1)
-    groups = _grouped(tested, least)[0].values()
-    bounds = [conformal.risk_bound(_misses(of, kinds[0], last), len(of), each) for of in groups]
+    tested, last = accepted["test"], shells[-1].radii[kinds[0]]
+    least = conformal.least_tested(1 - highest, _ERROR, misses=1)
+    parts = _grouped(tested, least)[0].values()
+    bounds = [conformal.risk_bound(_misses(of, kinds[0], last), len(of)) for of in parts]
     return ModelMargins(
         method=METHOD,
         tumortrack=tumortrack.__version__,
@@ -170,9 +184,9 @@ def margins_of(
         table_sha256=table_sha256,
         seed=seed,
         widest_mm=widest_mm,
-        limits=rules[number],
+        limits=limits,
         shells=tuple(shells),
-        groups=tuple(_counts(rows, turns, rules[number])),
+        groups=tuple(_counts(rows, turns, limits)),
         joined=joined,
         risk_bound=max(bounds),
         accepted=len(tested) / len(some["test"]),
@@ -190,122 +204,128 @@ def _dealt(labels: Sequence[conformal.Label], seed: int) -> list[_Turn]:
     return [turns[n] for n in range(len(labels))]
 
 
-def _rules(good: Sequence[Row]) -> list[dict[str, float]]:
-    """Limits, the strictest first; none that lets pass what is worse than all that was seen."""
+def _rules(good: Sequence[Row]) -> list[list[dict[str, float]]]:
+    """Sequences of limits, the strictest first; none that lets pass what is worse than all that was
+    seen."""
     names = [name for name in good[0].measured if all(name in row.measured for row in good)]
-    figures = {name: np.array([row.measured[name] for row in good]) for name in names}
+    some = {name: np.array([row.measured[name] for row in good]) for name in names}
     return [
-        {name: float(np.quantile(some, level, method="higher")) for name, some in figures.items()}
-        for level in _LEVELS
+        [
+            {
+                name: float(np.quantile(of, size if name == _SIZE else other, method="higher"))
+                for name, of in some.items()
+            }
+            for size, other in levels
+        ]
+        for levels in _LEVELS.values()
     ]
+
+
+def answered(row: Row, margins: ModelMargins) -> bool:
+    """Whether an estimate states margins, by checks and limits."""
+    return _accepted(_sized(row, margins.shells[-1].radii["tumor"]), margins.limits)
+
+
+def _sized(row: Row, form: Radius) -> Row:
+    """The row with the size of its tumors among its figures."""
+    if row.doubt:
+        return row
+    deviations = [s for _, s in row.misses["tumor"]]
+    return replace(row, measured=sized(row.measured, deviations, form))
 
 
 def _accepted(row: Row, limits: dict[str, float]) -> bool:
     return not row.doubt and not exceeded(limits, row.measured)
 
 
-def _form(rows: Sequence[Row], kind: Kind, confidence: float) -> Radius:
-    """The form with the smaller mean radius; constant where they are about equal. Its factors are
-    provisional."""
-
-    def factor(offset_mm: float | None) -> float:
-        return float(np.quantile(_scores(rows, kind, offset_mm), confidence, method="higher"))
-
-    constant = factor(None)
-    deviations = [s for row in rows for _, s in row.misses[kind]]
-    if None in deviations:
-        return Radius(used="constant", constant_mm=constant)
-    mean = float(np.mean([s for s in deviations if s is not None]))
-    width, offset = min((factor(a) * (a + mean), a) for a in _OFFSETS_MM)
-    used: Literal["scaled", "constant"] = "scaled" if width < _WORTH * constant else "constant"
-    return Radius(used=used, constant_mm=constant, scaled=factor(offset), offset_mm=offset)
+def _form(rows: Sequence[Row], kind: Kind) -> Radius:
+    """The form under which these misses are likeliest, if they are exponential in the size;
+    constant where they are about as likely without. Its factors are still to be found."""
+    constant = Radius(used="constant", constant_mm=1.0)
+    deviations = [(s, row.measured) for row in rows for _, s in row.misses[kind]]
+    if any(s is None for s, _ in deviations):
+        return constant
+    bends = _BENDS_MM if all("rarity" in row.measured for row in rows) else (0.0,)
+    forms = []
+    for offset_mm, bend_mm in product(_OFFSETS_MM, bends):
+        form = replace(constant, scaled=1.0, offset_mm=offset_mm, bend_mm=bend_mm)
+        sizes = [form.size_mm(s or 0.0, found) for s, found in deviations]
+        mean = float(_scores(rows, kind, form).mean() * np.exp(np.log(sizes).mean()))
+        forms.append((mean, form))
+    mean, form = min(forms, key=itemgetter(0))
+    worth = mean < _WORTH * float(_scores(rows, kind, None).mean())
+    return replace(form, used="scaled") if worth else form
 
 
 def _tested(
-    rules: list[dict[str, float]], rows: Sequence[Row], kind: Kind, widest_mm: float, risk: float
-) -> int:
-    """The number of the loosest limits under which no more of the answers than the risk miss by
+    sequences: list[list[dict[str, float]]],
+    rows: Sequence[Row],
+    kind: Kind,
+    widest_mm: float,
+    risk: float,
+) -> dict[str, float]:
+    """The limits that give most answers of those under which no more of these than the risk miss by
     more than ``widest_mm``, in any group."""
-    each, tables = conformal.ERROR / len(rules), []
-    least, families = conformal.least_tested(risk, each, misses=1), {row.label[0] for row in rows}
-    for limits in rules:
-        taken = [row for row in rows if _accepted(row, limits)]
-        groups = _grouped(taken, least, families)[0]
-        tables.append(
+    least, held = conformal.least_tested(risk, _ERROR, misses=1), []
+    for rules in sequences:
+        answers = [[row for row in rows if _accepted(row, limits)] for limits in rules]
+        tables = [
             {name: (_beyond(of, kind, widest_mm), len(of)) for name, of in groups.items()}
-        )
-    number = conformal.loosest_rule([list(table.values()) for table in tables], risk)
-    if number is None:
-        said = "; ".join(f"{m} of {n} of {name}" for name, (m, n) in tables[-1].items())
-        none = conformal.least_tested(risk, each)
+            for groups in (_grouped(taken, least)[0] for taken in answers)
+        ]
+        number = conformal.loosest_rule([[*one.values()] for one in tables], risk, _ERROR)
+        if number is not None:
+            held.append((len(answers[number]), rules[number]))
+    if not held:
+        said = "; ".join(f"{m} of {n} of {name}" for name, (m, n) in tables[0].items())
+        none = conformal.least_tested(risk, _ERROR)
         raise InputError(
             f"no limits hold {100 * risk:.3g} %: of the answers in each group, {said} "
             f"miss by more than {widest_mm:g} mm. It takes {none} without such a one, {least} with "
-            "one, and 2.5 times as many states in all. Give more scenes of each family, a wider "
-            "--widest, or a lower --confidence."
+            "one, and 2.5 times as many states in all. Give more scenes, a wider --widest, or a "
+            "lower --confidence."
         )
-    return number
+    return max(held, key=itemgetter(0))[1]
 
 
 def _beyond(rows: Sequence[Row], kind: Kind, widest_mm: float) -> int:
-    return sum(row.score(kind, None) > widest_mm for row in rows)
+    return sum(row.score(kind) > widest_mm for row in rows)
 
 
 def _misses(rows: Sequence[Row], kind: Kind, radius: Radius) -> int:
     """How many have a tumor that is not within its radius."""
-    radii = [[(miss, radius.at(s)) for miss, s in row.misses[kind]] for row in rows]
-    return sum(any(at is None or miss > at for miss, at in some) for some in radii)
+    return sum(not row.within(kind, radius) for row in rows)
 
 
-def _grouped(
-    rows: Sequence[Row], least: int, families: Collection[str] = ()
-) -> tuple[dict[str, list[Row]], dict[str, str]]:
-    """The members of each group; which were too small to stand alone, and who speaks for them. One
-    of the ``families`` without any member is a group of none."""
+def _grouped(rows: Sequence[Row], least: int) -> tuple[dict[str, list[Row]], dict[str, str]]:
+    """The members of each group; which were too small to stand alone, and who speaks for them."""
     labels = [row.label for row in rows]
-    found = {
-        ", ".join(label): [rows[n] for n in members]
-        for label, members in conformal.groups_of(labels, least).items()
-    }
-    found |= {family: [] for family in families if family not in {label[0] for label in labels}}
-    names = {", ".join(label): label for label in labels}
+    groups = conformal.groups_of(labels, least)
+    found = {_name(label): [rows[n] for n in members] for label, members in groups.items()}
     joined = {}
-    for name, label in names.items():
-        if name not in found:
-            whole = [", ".join(label[:n]) for n in (2, 1)]
-            joined[name] = next(one for one in whole if one in found)
+    for label in set(labels) - groups.keys():
+        larger = next(label[:n] for n in (2, 1, 0) if label[:n] in groups)
+        joined[_name(label)] = _name(larger)
     return found, joined
 
 
-def _radius(
-    rows: Sequence[Row], kind: Kind, form: Radius, confidence: float, families: Collection[str]
-) -> tuple[Radius, dict[str, str]]:
+def _name(label: conformal.Label) -> str:
+    return ", ".join(label) or "all states"
+
+
+def _radius(groups: dict[str, list[Row]], kind: Kind, form: Radius, confidence: float) -> Radius:
     """The form with the greatest of the groups' quantiles."""
-    least = conformal.least_scores(confidence)
-    groups, joined = _grouped(rows, least, families)
-    few = [f"{len(of)} of {name}" for name, of in groups.items() if len(of) < least]
-    if few:
-        raise InputError(
-            f"{100 * confidence:g} % needs {least} accepted states of each family to calibrate "
-            f"with (2.5 times as many in all); there are {', '.join(few)}. Give more "
-            "scenes, or a lower --confidence."
-        )
 
-    def greatest(offset_mm: float | None) -> float:
-        return max(
-            conformal.conformal_quantile(_scores(of, kind, offset_mm), confidence)
-            for of in groups.values()
-        )
+    def greatest(form: Radius | None) -> float:
+        scores = [_scores(of, kind, form) for of in groups.values()]
+        return max(conformal.conformal_quantile(some, confidence) for some in scores)
 
-    scaled = None if form.scaled is None else greatest(form.offset_mm)
-    radius = Radius(
-        used=form.used, constant_mm=greatest(None), scaled=scaled, offset_mm=form.offset_mm
-    )
-    return radius, joined
+    scaled = None if form.scaled is None else greatest(form)
+    return replace(form, constant_mm=greatest(None), scaled=scaled)
 
 
-def _scores(rows: Sequence[Row], kind: Kind, offset: float | None) -> Float[np.ndarray, " n"]:
-    return np.array([row.score(kind, offset) for row in rows])
+def _scores(rows: Sequence[Row], kind: Kind, form: Radius | None) -> Float[np.ndarray, " n"]:
+    return np.array([row.score(kind, form) for row in rows])
 
 
 def _counts(

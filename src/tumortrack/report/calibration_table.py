@@ -15,7 +15,7 @@ from msgspec import field
 from tumortrack.core import store
 from tumortrack.core.config import Config, from_builtins, to_builtins
 from tumortrack.core.errors import InputError, StorageError
-from tumortrack.models.margins import METHOD, Kind
+from tumortrack.models.margins import METHOD, Kind, Radius
 
 Miss = tuple[float, float | None]  # outward miss or distance (mm), and s (mm)
 
@@ -31,12 +31,17 @@ class Row(Config, frozen=True):
     measured: dict[str, float] = field(default_factory=dict)
     misses: dict[Kind, tuple[Miss, ...]] = field(default_factory=dict)
 
-    def score(self, kind: Kind, offset_mm: float | None) -> float:
-        """Largest miss, over (offset + s) where an offset is given."""
+    def score(self, kind: Kind, form: Radius | None = None) -> float:
+        """Largest miss, mm; with a ``form`` over the size that this gives it."""
         misses = self.misses[kind]
-        if offset_mm is None:
+        if form is None:
             return max(miss for miss, _ in misses)
-        return max(miss / (offset_mm + (s or 0.0)) for miss, s in misses)
+        return max(miss / form.size_mm(s or 0.0, self.measured) for miss, s in misses)
+
+    def within(self, kind: Kind, radius: Radius) -> bool:
+        """Whether all are within their radii."""
+        radii = [(miss, radius.at(s, self.measured)) for miss, s in self.misses[kind]]
+        return all(at is not None and miss <= at for miss, at in radii)
 
 
 @contextmanager

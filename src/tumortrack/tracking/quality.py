@@ -5,12 +5,14 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from scipy.ndimage import distance_transform_edt
+from scipy.ndimage import binary_dilation, distance_transform_edt
 
 from tumortrack.core.errors import NoEstimate
 from tumortrack.core.estimate import Estimate, Quality
 from tumortrack.core.types import DepthFrame, Intrinsics, Mesh, SensorCloud
-from tumortrack.models.margins import ModelMargins, exceeded, measured, stated_margin
+from tumortrack.models.in_distribution import FIT_FACTOR
+from tumortrack.models.margins import ModelMargins, exceeded, figures, stated_margin
+from tumortrack.registration.registration import RIVAL_COST
 from tumortrack.sense.render import render_depth
 
 # Standard deviation of a tumor's middle, and how far from it another fit, nearly as likely, may
@@ -24,6 +26,12 @@ _LIMITS = 0.05, 0.09  # doubtful, impossible
 _ROUGH_LIMITS = 0.1, 0.2
 _WIDTH = 212  # pixels: so coarse a picture tells
 _THROUGH_MM = 6.0  # behind the estimated surface: what is seen there lies behind, not beside
+# Where the camera sees something round the organ, in more than this share of a rim so many pixels
+# (some 3 mm) wide, a wrong place is mostly seen through. Strays are no part of the judged fit then,
+# and it may cost ``FIT_FACTOR`` times what is usual: in a wider world than training's (make world)
+# the cost alone, without strays up to 1.5 times the usual one, spoke against 18 answers, all right.
+_TOLD, _RIM = 0.5, 2
+_MOST_STRAYS = 0.5  # of the points: no robust estimate bears more (the breakdown point)
 _UNSURE = 0.6  # mean probability of a tumor's points
 _PIXEL_MM = 1.5  # of the picture that a cloud is compared in
 _MOST_PIXELS = 1024  # along a side
@@ -50,9 +58,9 @@ def judged(estimate: Estimate, seen: DepthFrame | SensorCloud) -> Estimate:
         NoEstimate: a depth image sees through so much of it that the organ cannot lie there. Clouds
             refuse nothing: they may be joined from several views.
     """
-    organ, unseen = next(iter(estimate.meshes.values())), 0.0
+    organ, unseen, told = next(iter(estimate.meshes.values())), 0.0, 0.0
     if isinstance(seen, DepthFrame):
-        through = seen_through(organ, seen)
+        through, told = seen_through(organ, seen)
     else:
         through, unseen = cloud_shares(organ, seen)
         estimate.report["unseen"] = unseen
@@ -64,7 +72,7 @@ def judged(estimate: Estimate, seen: DepthFrame | SensorCloud) -> Estimate:
             "was taken for it is something else, or lies as no organ in training did. Choose the "
             "organ (a click, a --box), or look from another side."
         )
-    reason = _doubt(estimate)
+    reason = _misfit(estimate, told > _TOLD) or _doubt(estimate)
     if through > doubtful:
         reason = f"the camera sees through {100 * through:.0f} % of where the organ lies"
     elif unseen > _UNSEEN and not reason:
@@ -85,7 +93,7 @@ def with_margin(estimate: Estimate, cloud: SensorCloud, margins: ModelMargins | 
     if margins is not None and estimate.quality == "good":
         if "unseen" not in report:
             report["unseen"] = cloud_shares(organ, cloud)[1]
-        if reason := exceeded(margins.limits, measured(report)):
+        if reason := exceeded(margins.limits, figures(report, margins)):
             estimate = doubted(estimate, reason)
     report["margin"] = stated_margin(report, margins, estimate.quality == "good")
     return estimate
@@ -97,12 +105,25 @@ def doubted(estimate: Estimate, reason: str) -> Estimate:
     return replace(estimate, quality="poor", reason=reason)
 
 
-def _doubt(estimate: Estimate) -> str:
-    """What the estimate itself says against it."""
+def _misfit(estimate: Estimate, told: bool) -> str:
+    """What the fit says against it; ``told``: a wrong place would be seen through."""
     cost = estimate.report.get("fit_cost")
-    if cost is not None and cost["now"] > cost["usual"]:
+    if cost is None:
+        return ""
+    if told and cost["strays"] > _MOST_STRAYS:
+        return f"{100 * cost['strays']:.0f} % of the points do not lie on the organ's surface"
+    now, most = (cost["without_strays"], FIT_FACTOR) if told else (cost["now"], 1.0)
+    if now > most * cost["usual"]:
         return "the organ's surface fits the points worse than in most validation scenes"
-    for other in () if cost is None else cost.get("others", ()):
+    return ""
+
+
+def _doubt(estimate: Estimate) -> str:
+    """What else the estimate itself says against it."""
+    size = estimate.report.get("size")
+    if size is not None and size["gain"] > RIVAL_COST:
+        return f"an organ {size['times']:.2f} times as large fits better: check the camera's scale"
+    for other in estimate.report.get("fit_cost", {}).get("others", ()):
         name, apart_mm = max(other["apart_mm"].items(), key=lambda item: item[1])
         if apart_mm > _UNSURE_MM:
             return f"{name} may as well lie {apart_mm:.1f} mm away: the points fit there too"
@@ -116,10 +137,12 @@ def _doubt(estimate: Estimate) -> str:
     return ""
 
 
-def seen_through(organ: Mesh, frame: DepthFrame) -> float:
+def seen_through(organ: Mesh, frame: DepthFrame) -> tuple[float, float]:
     """The share of the estimated organ's picture behind whose surface the camera sees something,
     a table, say, which it could not see if the organ lay there. Pixels without return, and those
-    where something lies before the organ, say nothing. 0 where no pixel says anything."""
+    where something lies before the organ, say nothing. 0 where no pixel says anything. And the
+    share of a rim round the picture where something lies behind the organ's nearest point: a wrong
+    organ reaches beyond the true one, and is seen through where there is something to be seen."""
     every = max(1, round(frame.intrinsics.width / _WIDTH))
     seen_mm = frame.depth_mm[::every, ::every]
     given = frame.intrinsics
@@ -128,8 +151,11 @@ def seen_through(organ: Mesh, frame: DepthFrame) -> float:
     organ_mm = render_depth(organ.vertices_mm, organ.faces, few).depth_mm
     both = np.isfinite(organ_mm) & np.isfinite(seen_mm)
     if not both.any():
-        return 0.0
-    return float((seen_mm[both] > organ_mm[both] + _THROUGH_MM).mean())
+        return 0.0, 0.0
+    picture = np.isfinite(organ_mm)
+    rim = binary_dilation(picture, iterations=_RIM) & ~picture
+    told = (seen_mm[rim] > organ_mm[picture].min()).sum() / max(rim.sum(), 1)
+    return float((seen_mm[both] > organ_mm[both] + _THROUGH_MM).mean()), float(told)
 
 
 def cloud_shares(organ: Mesh, cloud: SensorCloud) -> tuple[float, float]:

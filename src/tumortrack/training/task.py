@@ -179,7 +179,7 @@ class RegistrationTask(TrainingTask):
     def model(self, network: RegistrationNetwork, provenance: dict[str, Any]) -> RegistrationModel:
         scenes, drafts = self._scenes, self._fits(network)
         usual_cost = float(np.percentile([fit.cost for _, fit in drafts], _USUAL))
-        more = self._registration(network).try_turned_starts
+        more = self._registration(network).look_around
         fits = [  # as the model will make them, knowing the usual cost
             more(cloud, likeliest, fit) if fit.cost > usual_cost else fit
             for cloud, (likeliest, fit) in zip(scenes.clouds_mm, drafts, strict=True)

@@ -28,6 +28,7 @@ from tumortrack.simulate.scene import PoseConfig, sample_pose
 from tumortrack.tracking.tracker import Tracker
 from tumortrack_lab.peers.pose_search import PoseSearch, RigidConfig
 from tumortrack_lab.real.judging import CAMERA
+from tumortrack_lab.twin.apparatus import triangles
 
 REST = "psm_data/PLY/kidney_and_base_2mm_aligned.ply"
 BENT = {
@@ -75,8 +76,7 @@ def closed(top: Mesh, bottom_z_mm: float) -> Mesh:
 
 def facing_pose(scan: Mesh, rng: np.random.Generator) -> np.ndarray:
     """``camera_from_scan``, its outer side to the camera."""
-    a, b, c = (scan.vertices_mm[scan.faces[:, corner]] for corner in range(3))
-    x, y, z = np.cross(b - a, c - a).sum(0)
+    x, y, z = triangles(scan)[1].sum(0)
     return sample_pose(PoseConfig(), scan, (x, y, z), PoseConfig().nearest_mm, rng)
 
 

@@ -12,12 +12,9 @@ from tumortrack_lab.study.goals import RIGID
 from tumortrack_lab.study.measure import CLEAN_VIEW, Job
 from tumortrack_lab.study.methods import CLINIC, UNREFINED, Method, Network, StudyCase
 from tumortrack_lab.study.resection import Truth, cutting
+from tumortrack_lab.twin.faults import FAULTS
+from tumortrack_lab.twin.views import VARIANTS, VIEWS
 
-VARIANTS = ("D0", "D1", "D2", "D3", "Rot90", "Rot180", "Rot270", "G1", "P1")
-VIEWS = ("clean", "noise", "shaft", "clutter")
-FAULTS = (
-    "clean", "noise", "distortion", "offset", "occlusion", "outliers", "registration", "all"
-)  # fmt: skip
 SEVERITIES = (
     "noise=0.5", "noise=1", "noise=2", "noise=4",
     "visible=80", "visible=60", "visible=40",
@@ -54,12 +51,11 @@ class StudyPlan(Config, frozen=True):
     case_seeds: tuple[int, ...] | None = None  # Of training for --case (the same as the phantom's)
     # Of training in the deformation study (the same as the phantom's)
     configuration_seeds: tuple[int, ...] | None = None
-    variants: tuple[str, ...] = VARIANTS  # Of every table that names no others
+    variants: tuple[str, ...] = tuple(VARIANTS)  # Of every table that names no others
     view: str = "noise"  # Of every table but those of faults and views
     grid: int = 160  # Voxels along the longest side (the paper's: 400)
     configurations: tuple[int, ...] = (1, 2, 3, 4, 5, 6)  # Rows of the paper's deformation table
     configuration_variants: tuple[str, ...] = ("D0", "D1", "D2", "D3")  # In the deformation study
-    configuration_view: str = "noise"  # In the deformation study
     # Methods and bounds beside the models
     peers: tuple[str, ...] = (RIGID, *BOUNDS, "rigid", "cpd", "elastic")
     case_peers: tuple[str, ...] | None = None  # Peers for --case (as for the phantom)
@@ -202,7 +198,7 @@ def _blocks(plan: StudyPlan, section: Section, case: StudyCase) -> list[_Block]:
         "ablation": [ablation] * (case.name in plan.ablation_cases),
         "deformation": [
             _Block(trained(configurations, of), (), plan.configuration_variants,
-                   (plan.configuration_view,), grid)
+                   (plan.view,), grid)
         ],
         "faults": [
             _Block(trained(plan.fault_models, once), known(plan.fault_peers),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shlex
 import sys
 from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import NoReturn, TypeVar
 
@@ -23,9 +24,27 @@ from tumortrack.simulate.scene import SceneStream, Simulator, body_for
 from tumortrack.training.scenes import batches
 from tumortrack.training.state import TrainingRun
 from tumortrack.training.task import TrainingTask, ValidationScenes, mean_iou_of, validation_scenes
+from tumortrack_lab.study.document import ReportWriter
 
 Options = TypeVar("Options")
 _UNSEEN_SEED = 1_000_003  # of the judged scenes and their library of states
+
+
+@dataclass(frozen=True, kw_only=True)
+class KeptOptions:
+    """What the scripts' options have in common."""
+
+    out: Path
+    """Where cases, models and rows are kept."""
+    document: Path
+    """Whose marked blocks are replaced."""
+
+    def begin(self, target: str, *blocks: str) -> ReportWriter:
+        """Make the folder; what writes the document's blocks. Raises InputError: it lacks one."""
+        writer = ReportWriter(self.document, make_command(target))
+        writer.check(blocks)
+        self.out.mkdir(parents=True, exist_ok=True)
+        return writer
 
 
 def unseen_scenes(case: Case, config: TrainConfig, count: int) -> ValidationScenes:

@@ -90,11 +90,7 @@ class Apparatus:
         ratio = 1 + (config.tumor_ratio - 1) * tumor_share(self.mesh, self.anatomy)
         shear_kpa = config.youngs_kpa * ratio / (2 * (1 + config.poisson))
         self.solid = NeoHookeanSolid(self.mesh, shear_kpa, config.poisson)
-        # One point of the surface per cube of 1 mm that it passes, and the area there.
-        points_mm, areas_mm2, _ = surface_samples(self.anatomy.organ, 1.0)
-        cubes = np.floor(points_mm).astype(int)
-        _, first, cube = np.unique(cubes, axis=0, return_index=True, return_inverse=True)
-        points_mm, areas_mm2 = points_mm[first], np.bincount(cube.ravel(), areas_mm2)
+        points_mm, areas_mm2 = contact_points(self.anatomy.organ, 1.0, 1.0)
         self.contact = Contact(embed(self.mesh, points_mm), areas_mm2, config.contact_kpa_mm)
         volumes = self.solid.node_volumes_mm3
         self._weight_mn = config.density_kg_m3 * GRAVITY_KPA_PER_MM * volumes
@@ -135,6 +131,16 @@ def moved(anatomy: Anatomy, b_from_a: Float64[np.ndarray, "4 4"]) -> Anatomy:
     return Anatomy(
         tuple(part.moved(transform_points(b_from_a, part.vertices_mm)) for part in anatomy.parts)
     )
+
+
+def contact_points(
+    organ: Mesh, spacing_mm: float, cube_mm: float
+) -> tuple[Float64[np.ndarray, "m 3"], Float64[np.ndarray, " m"]]:
+    """One point of the surface per cube that it passes, and the area there."""
+    points_mm, areas_mm2, _ = surface_samples(organ, spacing_mm)
+    cubes = np.floor(points_mm / cube_mm)
+    _, first, cube = np.unique(cubes, axis=0, return_index=True, return_inverse=True)
+    return points_mm[first], np.bincount(cube.ravel(), areas_mm2)
 
 
 def triangles(mesh: Mesh) -> tuple[Float64[np.ndarray, "f 3"], Float64[np.ndarray, "f 3"]]:

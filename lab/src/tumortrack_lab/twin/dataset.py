@@ -20,11 +20,12 @@ import numpy as np
 
 from tumortrack.core import store
 from tumortrack.core.config import to_builtins
-from tumortrack.core.errors import ArtifactError, InputError, StorageError
+from tumortrack.core.errors import ArtifactError, InputError
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import Anatomy
 from tumortrack.imaging.case import Case, load_case
 from tumortrack.simulate.scene_folder import TARGETS, InnerPoints, draw_targets, write_scene_files
+from tumortrack_lab.study.document import make_folder
 from tumortrack_lab.twin import views as viewing
 from tumortrack_lab.twin.apparatus import Apparatus, ApparatusConfig, State, solve
 from tumortrack_lab.twin.pictures import twin_picture
@@ -73,7 +74,15 @@ def make_scenes(
     wanted = [(v, w) for v in _known(variants, VARIANTS) for w in _known(views, VIEWS)]
     case = load_case(run.case_folder)
     targets, rest_ct = draw_targets(case.anatomy, run.seed), case.anatomy.organ
-    identity = _claim(run, out)
+    identity = {
+        "case_sha256": store.sha256_of(run.case_folder / store.MANIFEST),
+        "seed": run.seed,
+        "targets": TARGETS,
+        "bench_config": to_builtins(run.bench),
+        "view_config": to_builtins(run.view),
+    }
+    claim(out, "twin.json", identity)
+    make_folder(out / _STATES)
     todo = [(v, w) for v, w in wanted if not (out / f"{v}-{w}").exists()]
     states = list(dict.fromkeys(VARIANTS[v].state for v, _ in todo))
     cache = StateCache(out / _STATES, run, case, targets)
@@ -116,32 +125,22 @@ def _known(names: Sequence[Any], allowed: Iterable[str]) -> list:
     return list(dict.fromkeys(names))
 
 
-def _claim(run: TwinRun, out: Path) -> dict:
-    """State what the folder is made from, or check that it is the same."""
-    identity = {
-        "case_sha256": store.sha256_of(run.case_folder / store.MANIFEST),
-        "seed": run.seed,
-        "targets": TARGETS,
-        "bench_config": to_builtins(run.bench),
-        "view_config": to_builtins(run.view),
-    }
-    path = out / "twin.json"
+def claim(out: Path, name: str, identity: dict) -> None:
+    """State what a folder of scenes is made from, in a file of it, or check that it is the same.
+    Raises InputError: it is not, or the folder holds other files; StorageError."""
+    path = out / name
     if path.exists():
         differ = [k for k, v in identity.items() if store.read_json(path).get(k) != v]
         if differ:
             raise InputError(
-                f"{out} holds scenes of another {' and '.join(differ)}. Choose another SCENES "
-                "folder, or remove this one."
+                f"{out} holds scenes of another {' and '.join(differ)}. Choose another folder, or "
+                "remove this one."
             )
-        return identity
+        return
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise InputError(f"{out} holds other files. Choose a new or empty folder for the scenes.")
-    try:
-        (out / _STATES).mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise StorageError(f"cannot write {out}: {error.strerror}.") from error
+    make_folder(out)
     store.write_json(path, identity)
-    return identity
 
 
 class StateCache:

@@ -10,9 +10,8 @@ from jaxtyping import Bool, Float64, Int
 
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import Anatomy
-from tumortrack.report.metrics import surface_samples
 from tumortrack_lab.tets import Embedding, TetMesh, find
-from tumortrack_lab.twin.apparatus import tumor_share
+from tumortrack_lab.twin.apparatus import contact_points, tumor_share
 from tumortrack_lab.twin.equilibrium import Points
 from tumortrack_lab.twin.solid import NeoHookeanSolid
 from tumortrack_lab.world.forces import FACES, Bed, Obstacle, Springs, Touch, rows_of
@@ -90,11 +89,7 @@ class Organ:
 
     @classmethod
     def of(cls, anatomy: Anatomy, mesh: TetMesh) -> Organ:
-        points, areas, _ = surface_samples(anatomy.organ, _SAMPLE_MM / 2)
-        _, first, cube = np.unique(
-            np.floor(points / _SAMPLE_MM), axis=0, return_index=True, return_inverse=True
-        )
-        points, areas = points[first], np.bincount(cube.ravel(), areas)
+        points, areas = contact_points(anatomy.organ, _SAMPLE_MM / 2, _SAMPLE_MM)
         share = tumor_share(mesh, anatomy) if anatomy.tumors else np.zeros(len(mesh.tets))
         held = find(mesh.nodes_mm[mesh.tets], points)
         return cls(anatomy, mesh, Bed.of(anatomy.organ), share, points, areas, *held)

@@ -15,6 +15,7 @@ from jaxtyping import Float64
 
 from tumortrack.core.types import Anatomy, Mesh
 from tumortrack.simulate.occupancy import contains
+from tumortrack_lab.twin.apparatus import triangles
 
 Kind = Literal["none", "voxel", "slices", "reader"]
 KINDS: tuple[Kind, ...] = get_args(Kind)
@@ -56,9 +57,7 @@ def perturbed(
 
 def normals(mesh: Mesh) -> Vertices:
     """Unit normals of the vertices, outward."""
-    a, b, c = (mesh.vertices_mm[mesh.faces[:, i]] for i in range(3))
-    area = np.cross(b - a, c - a)
-    out = np.zeros_like(mesh.vertices_mm)
+    out, area = np.zeros_like(mesh.vertices_mm), triangles(mesh)[1]
     for corner in mesh.faces.T:
         np.add.at(out, corner, area)
     return out / np.maximum(np.linalg.norm(out, axis=1, keepdims=True), 1e-12)

@@ -1,0 +1,244 @@
+"""How far margins can be trusted: what tables of `tumortrack margins` say of states, physics and
+organs that no radius rests on. docs/trust.md has the protocol."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from msgspec.structs import replace
+from scipy.stats import binomtest, spearmanr
+
+from tumortrack.core import store
+from tumortrack.core.errors import InputError
+from tumortrack.core.geometry import transform_points
+from tumortrack.models.margins import METHOD, ModelMargins
+from tumortrack.report.calibration import answered, margins_of
+from tumortrack.report.calibration_table import Row, read_table
+from tumortrack.report.drawing import new_figure, save
+from tumortrack.report.pictures import FROM_CAMERA, FROM_SIDE, draw_solid_view, scene_legend
+from tumortrack.simulate.scene_folder import Scene, read_scene
+from tumortrack.tracking.tracker import Tracker
+from tumortrack_lab.peers.base import kabsch
+from tumortrack_lab.study.document import table
+
+STATED = (0.9, 0.95)
+_CURVE = tuple(np.round(np.arange(0.5, 0.96, 0.05), 2).tolist())  # of the reliability plot
+_HIDDEN = (0.0, 0.4)  # shares of the surface: bounds between the bands
+_BANDS = ("nothing hidden", "up to 40 %", "over 40 %")
+_BEYOND_MM = {3.0: "#0072B2", 5.0: "#E69F00", 8.0: "#D55E00"}  # Okabe and Ito
+
+
+@dataclass(frozen=True)
+class Table:
+    """An organ's rows and the folder of the model that located them."""
+
+    organ: str
+    model: Path
+    rows: list[Row]
+
+
+def read_tables(paths: Sequence[Path]) -> list[Table]:
+    """Organs are called as their models' folders; `margins` writes into these by default. Raises
+    InputError: a table of another version of the method."""
+    tables = []
+    for path in paths:
+        head, rows = read_table(path)
+        if head.get("method") != METHOD:
+            raise InputError(f"{path} was made with another version of the method.")
+        organ = path.parent.name
+        rows = [replace(row, label=(*row.label[:2], organ)) for row in rows]
+        tables.append(Table(organ, path.parent, rows))
+    return tables
+
+
+def states_of(rows: Sequence[Row]) -> pd.DataFrame:
+    """A line a state: family, band of hidden surface, organ, whether its estimate is good, and of
+    the tumors the largest miss (mm) and the largest standard deviation (mm)."""
+    lines = []
+    for row in rows:
+        meta = store.read_json(Path(row.scene) / "meta.json")
+        line: dict[str, Any] = {"family": row.label[0], "organ": row.label[2]}
+        line["hidden"] = _BANDS[np.searchsorted(_HIDDEN, meta.get("hidden_share", 0.0))]
+        line |= {"good": not row.doubt, "row": row}
+        if not row.doubt:
+            line["miss"] = row.score("tumor", None)
+            line["s"] = max(s or 0.0 for _, s in row.misses["tumor"])
+        lines.append(line)
+    return pd.DataFrame(lines)
+
+
+def left_out(states: pd.DataFrame, parts: pd.Series, seed: int, **how: Any) -> pd.DataFrame:
+    """The states with what a calibration on the others says of them, part by part: ``accepted``;
+    of every good estimate by confidence ``mm`` (the largest radius of its tumors) and ``within``
+    (all of them); ``refused``: why there is no calibration without this part."""
+    found = states.assign(part=parts, accepted=False, refused="")
+    for part in sorted(parts.unique()):
+        mine = found.index[parts == part]
+        try:
+            rest = [*states.row[parts != part]]
+            margins = margins_of(rest, "", tuple(_CURVE), seed=seed, **how)
+        except InputError as error:
+            found.loc[mine, "refused"] = str(error)
+            continue
+        for n in mine:
+            for name, value in _judged(found.row[n], margins).items():
+                found.loc[n, name] = value
+    if found.refused.all():
+        raise InputError(found.refused.iloc[0])
+    return found
+
+
+def _judged(row: Row, margins: ModelMargins) -> dict[str, Any]:
+    if row.doubt:
+        return {}
+    said: dict[str, Any] = {"accepted": answered(row, margins)}
+    for shells in margins.shells:
+        radius = shells.radii["tumor"]
+        radii = [radius.at(s, row.measured) for _, s in row.misses["tumor"]]
+        said[f"mm {shells.confidence}"] = max(np.inf if at is None else at for at in radii)
+        said[f"within {shells.confidence}"] = row.within("tumor", radius)
+    return said
+
+
+def share_words(hits: int, cases: int) -> str:
+    """A share with Clopper and Pearson's interval of 95 %."""
+    if not cases:
+        return "-"
+    low, high = binomtest(hits, cases).proportion_ci(0.95, "exact")
+    return f"{100 * hits / cases:.1f} ({100 * low:.1f} to {100 * high:.1f})"
+
+
+def coverage_table(found: pd.DataFrame, what: str) -> str:
+    """A line a part: answers, and by stated confidence who lies within it and its sizes."""
+    head = [what, "states", "good", "answers, %"]
+    for stated in STATED:
+        head += [f"within {100 * stated:g} %, %", "mm: median / 90 %"]
+    lines = []
+    for name, mine in [*found.groupby("part", sort=True), ("all", found)]:
+        cells = [str(name), str(len(mine)), str(mine.good.sum())]
+        taken = mine[mine.accepted.astype(bool)]
+        if taken.empty:
+            said = mine.refused.iloc[0]
+            lines.append([*cells, f"none: {said.partition(':')[0]}", *["-"] * (2 * len(STATED))])
+            continue
+        cells.append(f"{100 * len(taken) / len(mine):.0f}")
+        for stated in STATED:
+            cells.append(share_words(int(taken[f"within {stated}"].sum()), len(taken)))
+            middle, most = np.percentile(taken[f"mm {stated}"].astype(float), (50, 90))
+            cells.append(f"{middle:.1f} / {most:.1f}")
+        lines.append(cells)
+    return table(head, lines)
+
+
+def ranks_table(found: pd.DataFrame) -> str:
+    """Rank correlation with the true miss, over good estimates, limits or not: of the standard
+    deviation, and of the 95 % radius by a calibration without the state's part."""
+    lines, good = [], found[found.good]
+    for name, mine in [*good.groupby("organ"), ("all", good)]:
+        known = mine[mine[f"mm {STATED[-1]}"].notna()]
+        cells = [spearmanr(one, known.miss)[0] for one in (known.s, known[f"mm {STATED[-1]}"])]
+        misses = np.percentile(mine.miss, (50, 90, 95, 100))
+        lines.append(
+            [str(name), str(len(mine)), " / ".join(f"{x:.1f}" for x in misses)]
+            + [f"{x:.2f}" for x in cells]
+        )
+    head = ["organ", "good", "miss, mm: median / 90 / 95 % / worst"]
+    return table([*head, "deviation and miss", "95 % radius and miss"], lines)
+
+
+def risk_picture(found: pd.DataFrame, path: Path) -> None:
+    """Share of answers that are farther off than some mm, as answers are given down to a limit on
+    the stated 95 % radius; a dot: with the limits that the calibrations found."""
+    drawing = new_figure(8.6, 4.4, left=0.09, right=0.98, top=0.9, bottom=0.13)
+    axes, good = drawing.add_subplot(), found[found.good]
+    order = good.sort_values(f"mm {STATED[-1]}")
+    share = 100 * np.arange(1, len(order) + 1) / len(found)
+    taken = found[found.accepted.astype(bool)]
+    for far_mm, color in _BEYOND_MM.items():
+        beyond = 100 * np.cumsum(order.miss > far_mm) / np.arange(1, len(order) + 1)
+        axes.plot(share, beyond, color=color, lw=2, label=f"over {far_mm:g} mm off")
+        axes.plot(100 * len(taken) / len(found), 100 * (taken.miss > far_mm).mean(), "o", c=color)
+    axes.set(xlabel="answered: share of all states, %", ylabel="of these farther off, %")
+    axes.set(xlim=(0, 100), ylim=(0, None))
+    _finish(axes, "Risk against coverage: the surest answers first; dots: with the limits")
+    save(drawing, path)
+
+
+def reliability_picture(kinds: dict[str, pd.DataFrame], path: Path) -> None:
+    """Stated confidence against the share found within the margin, a line a way of leaving out."""
+    drawing = new_figure(6.4, 5.4, left=0.12, right=0.97, top=0.91, bottom=0.11)
+    axes = drawing.add_subplot()
+    axes.plot([50, 95], [50, 95], color="0.5", lw=1, ls="--", label="as stated")
+    for (name, found), color in zip(kinds.items(), _BEYOND_MM.values(), strict=False):
+        taken = found[found.accepted.astype(bool)]
+        hits = [int(taken[f"within {stated}"].sum()) for stated in _CURVE]
+        bands = [binomtest(n, len(taken)).proportion_ci(0.95, "exact") for n in hits]
+        x, y = 100 * np.array(_CURVE), 100 * np.array(hits) / len(taken)
+        low, high = 100 * np.array([(band.low, band.high) for band in bands]).T
+        axes.fill_between(x, low, high, color=color, alpha=0.13, lw=0)
+        axes.plot(x, y, "o-", color=color, ms=4, label=name)
+        for _, mine in taken.groupby("part"):
+            shares = [100 * mine[f"within {stated}"].mean() for stated in _CURVE]
+            axes.plot(x, shares, color=color, lw=0.6, alpha=0.5)
+    axes.set(xlabel="stated, %", ylabel="found within the margin, %")
+    _finish(axes, "Stated and found (thin: each part left out; band: 95 %)")
+    save(drawing, path)
+
+
+def worst_picture(found: pd.DataFrame, tables: Sequence[Table], count: int, path: Path) -> str:
+    """The accepted answers that are farthest off, drawn over the truth, a row each; and in words
+    what happened: a Markdown table."""
+    from tumortrack.training.model import load_model
+
+    taken = found[found.accepted.astype(bool)].nlargest(count, "miss")
+    models, trackers = {table.organ: table.model for table in tables}, {}
+    height = 3.5 * len(taken) + 0.5
+    drawing = new_figure(11.0, height)
+    panels, lines = drawing.subplots(len(taken), 2, squeeze=False), []
+    drawing.subplots_adjust(
+        left=0.04, top=1 - 0.75 / height, bottom=0.1 / height, hspace=0.13, wspace=0.03
+    )
+    for number, (row, (_, state)) in enumerate(zip(panels, taken.iterrows(), strict=True), start=1):
+        if state.organ not in trackers:
+            model = load_model(models[state.organ], "cpu", with_margins=False)
+            trackers[state.organ] = Tracker(model)
+        scene = read_scene(Path(state["row"].scene))
+        estimate = trackers[state.organ].locate(scene.cloud, 8, 0, scene.depth)
+        for axes, view in zip(row, (FROM_CAMERA, FROM_SIDE), strict=True):
+            draw_solid_view(axes, scene, estimate, view)
+        row[0].set_ylabel(f"{number}", fontsize=14, fontweight="bold", rotation=0, labelpad=10)
+        lines.append([str(number), f"{state.organ}, {Path(state['row'].scene).name}",
+                      f"{state.miss:.1f}", f"{state[f'mm {STATED[-1]}']:.1f}", state.hidden,
+                      _moved_words(estimate.motion, scene)])  # fmt: skip
+    drawing.legend(handles=scene_legend(), ncols=4, loc="upper right", frameon=False)
+    save(drawing, path)
+    head = ["", "scene", "off, mm", "95 % radius, mm", "hidden", "what happened"]
+    return table(head, lines, left=2)
+
+
+def _moved_words(motion: Any, scene: Scene) -> str:
+    """How the true organ lies to the estimated one."""
+    assert scene.targets is not None
+    there = motion.carry(scene.targets.points_ct)
+    best = kabsch(there, scene.targets.points_mm, np.ones(len(there)))
+    degrees = np.rad2deg(np.arccos(np.clip((np.trace(best[:3, :3]) - 1) / 2, -1, 1)))
+    middle = there.mean(0)
+    shift = float(np.linalg.norm(transform_points(best, middle[None])[0] - middle))
+    left = np.linalg.norm(transform_points(best, there) - scene.targets.points_mm, axis=1).mean()
+    return (
+        f"the organ lies {shift:.1f} mm beside and {degrees:.0f} degrees turned; {left:.1f} mm "
+        "would be left in the mean had it been moved there as it was"
+    )
+
+
+def _finish(axes: Any, title: str) -> None:
+    axes.set_title(title, loc="left", fontsize=11)
+    axes.grid(color="0.9", lw=0.8)
+    axes.set_axisbelow(True)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.legend(frameon=False)
