@@ -7,11 +7,11 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 from tyro.conf import Positional
 
-from tumortrack.cli.console import Device, console, keep_loaded, say
+from tumortrack.cli.console import Device, console, keep_loaded, say, say_notes
 from tumortrack.core import store
 from tumortrack.core.errors import InputError
 from tumortrack.core.process import is_follower
@@ -67,7 +67,7 @@ class Train:
             raise InputError(f"--workers {self.workers} must be 0 or more.")
         case = load_case(self.case)  # report what is wrong so far before PyTorch's seconds
 
-        from tumortrack.models.folder import is_finished
+        from tumortrack.models.folder import is_finished, weakness_of
         from tumortrack.models.margins import GENERIC
         from tumortrack.training.model import load_model, load_start
         from tumortrack.training.presets import PRESETS
@@ -90,7 +90,7 @@ class Train:
                     "another MODEL folder."
                 )
             say(f"{self.model} is trained already ({done['steps']} steps).")
-            _warn(done)
+            say_notes(filter(None, [weakness_of(done)]))
             return
         with _training_screen() as show:
             about = train(run, self.model, show).provenance
@@ -98,16 +98,9 @@ class Train:
             f"model written to {self.model}: {about['steps']} steps in {about['training_s']:.0f} "
             f"s, validation mIoU {about['validation_miou']:.3f}."
         )
-        _warn(about)
+        say_notes(filter(None, [weakness_of(about)]))
         if GENERIC.is_file() and self.preset == "clinic":
             say(f"it states no margins yet: tumortrack margins {self.model}")
-
-
-def _warn(provenance: dict[str, Any]) -> None:
-    from tumortrack.models.folder import weakness_of
-
-    if weakness := weakness_of(provenance):
-        say(f"WARNING: {weakness}. Every estimate of this one is poor.")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -100,7 +100,10 @@ def prepare(input: Path, options: PrepareOptions | None = None) -> Case:
     origin = {"source": input.name, "source_sha256": source_sha256, "options": given}
     turns, notes = half_turns(case.anatomy), case.report["notes"]
     said = warning(alike(turns))
-    looks = {"warning": said, "turns": [one.figures() for one in turns]}
+    looks = {
+        "warning": said,
+        "turns": [{k: v for k, v in asdict(one).items() if k != "ct_from_ct"} for one in turns],
+    }
     origin |= {"half_turn": looks, "notes": [*notes, said] if said else notes}
     return replace(case, up_lps=up, report={**case.report, **origin})
 

@@ -16,7 +16,6 @@ from torch import Tensor, nn
 
 from tumortrack.core.patient import Patient, patient_in
 from tumortrack.models.config import TrainConfig
-from tumortrack.models.folder import weakness_of
 from tumortrack.models.in_distribution import InDistributionRange
 from tumortrack.models.margins import ModelMargins
 
@@ -64,11 +63,6 @@ class Model(ABC):
     def patient(self) -> Patient:
         """Whose organ it was trained for, as far as it is known."""
         return patient_in(self.provenance.get("patient"), "provenance")
-
-    @property
-    def weakness(self) -> str:
-        """Why no estimate of it should be relied on, and what to do; empty: no reason known."""
-        return weakness_of(self.provenance)
 
     def extra_files(self) -> dict[str, bytes]:
         """Files of a model folder besides the weights, by name."""

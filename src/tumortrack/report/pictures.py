@@ -144,19 +144,14 @@ def scene_legend() -> list[Any]:
 
 
 def qc_picture(
-    case_labels: LabelVolume,
-    ct: Volume | None,
-    anatomy: Anatomy,
-    path: Path,
-    whose: str = "",
-    warning: str = "",
+    case_labels: LabelVolume, ct: Volume | None, anatomy: Anatomy, path: Path, whose: str = ""
 ) -> None:
     """Orthogonal slices with outlines, a row through each tumor, and a 3-D view: is everything
     outlined, and on the right side?
 
     All in the patient's frame (LPS, mm). The labels are shown as grey where there is no CT. Of
-    more than six tumors the six largest have rows. ``whose``: stands in the title, and a
-    ``warning`` below it. The PNG is written atomically.
+    more than six tumors the six largest have rows. ``whose``: stands in the title. The PNG is
+    written atomically.
     """
     order = sorted(range(len(anatomy.tumors)), key=lambda n: -abs(anatomy.tumors[n].volume_mm3))
     rows = {anatomy.names[n + 1]: anatomy.tumors[n] for n in sorted(order[:_MOST_ROWS])}
@@ -187,8 +182,6 @@ def qc_picture(
     more = f" (slices through the {_MOST_ROWS} largest of {len(order)} tumors)" if dropped else ""
     title = f"Prepared case over its {what}{more}" + (f": {whose}" if whose else "")
     figure.suptitle(title, x=0.015, ha="left", fontweight="bold", parse_math=False)
-    below = 1 - 0.5 / (height + 1.0)
-    figure.text(0.015, below, warning, color="firebrick", fontsize=10, va="top")
     handles = [
         Patch(facecolor=color, label=f"{name.replace('_', ' ')} {part.volume_mm3 / 1000:.1f} ml")
         for color, name, part in zip(colors, anatomy.names, anatomy.parts, strict=True)

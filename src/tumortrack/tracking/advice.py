@@ -7,7 +7,7 @@ from jaxtyping import Float
 from scipy.spatial import cKDTree
 
 from tumortrack.core.estimate import Estimate
-from tumortrack.core.types import Mesh, SensorCloud
+from tumortrack.core.types import SensorCloud
 from tumortrack.registration.motion import ElasticMotion
 
 # Where another view alone would not help: words of the reason, and what does.
@@ -33,10 +33,15 @@ def what_to_do(estimate: Estimate, cloud: SensorCloud) -> str:
     Args:
         cloud: the organ's points, camera frame, in which it was located.
     """
+    import trimesh
+
     for words, advice in _INSTEAD.items():
         if words in estimate.reason:
             return advice
-    middles, normals = _faces(next(iter(estimate.meshes.values())))
+    mesh = next(iter(estimate.meshes.values()))
+    faces = mesh.faces[:: len(mesh.faces) // _FACES + 1]
+    organ = trimesh.Trimesh(mesh.vertices_mm, faces, process=False)
+    middles, normals = organ.triangles_center, organ.face_normals
     sight = middles / np.linalg.norm(middles, axis=1, keepdims=True)
     facing = middles[-(normals * sight).sum(1) > _FACING]
     centre = middles.mean(0)
@@ -76,10 +81,3 @@ def _side(direction: Float[np.ndarray, " 3"], centre: Float[np.ndarray, " 3"]) -
     names = " ".join(words[axis][int(value > 0)] for axis, value in told.items())
     axes = ", ".join(f"{'+' if value > 0 else '-'}{axis}" for axis, value in told.items())
     return f"the {names} (the camera's {axes})"
-
-
-def _faces(mesh: Mesh) -> tuple[Float[np.ndarray, "f 3"], Float[np.ndarray, "f 3"]]:
-    """Middles and unit normals of some triangles."""
-    a, b, c = mesh.vertices_mm[mesh.faces[:: len(mesh.faces) // _FACES + 1]].transpose(1, 0, 2)
-    normals = np.cross(b - a, c - a)
-    return (a + b + c) / 3, normals / np.maximum(np.linalg.norm(normals, axis=1), 1e-12)[:, None]

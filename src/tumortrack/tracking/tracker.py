@@ -15,6 +15,7 @@ from tumortrack.core.errors import InputError
 from tumortrack.core.estimate import Estimate, Following
 from tumortrack.core.process import keep_small_blocks
 from tumortrack.core.types import Anatomy, DepthFrame, SensorCloud
+from tumortrack.models.folder import weakness_of
 from tumortrack.models.model import Model
 from tumortrack.occupancy.locator import OccupancyLocator
 from tumortrack.occupancy.model import OccupancyModel
@@ -42,7 +43,8 @@ class Tracker:
 
     def __init__(self, model: Model) -> None:
         keep_small_blocks()
-        self.model, self._patient, self._weakness = model, model.patient, model.weakness
+        self.model, self._patient = model, model.patient
+        self._weakness = weakness_of(model.provenance)
         self._locator = _LOCATORS[type(model)](model)
 
     @property

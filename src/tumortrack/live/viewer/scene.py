@@ -22,7 +22,7 @@ from tumortrack.live.display import MOST_SEEN, seen_points, thinned, wxyz_of
 from tumortrack.live.values import TrackingResult, TransformedEstimate
 from tumortrack.live.viewer.look import Look
 from tumortrack.live.viewer.slices import SlicePlane
-from tumortrack.live.viewer.surfaces import bare_faces, unit_ball
+from tumortrack.live.viewer.surfaces import bare_faces
 from tumortrack.models.margins import stated_radius
 from tumortrack.tracking.shells import exact_margin, rough_margin
 
@@ -289,14 +289,16 @@ class ViewerScene:
         """Where the middle of a tumor lies with 95 % probability, if the fit's own covariance were
         all there is to know; published frame. Nothing without a motion."""
         assert result.estimate is not None
+        from trimesh.creation import icosphere
+
         motion, part = result.estimate.motion, result.estimate.report["parts"].get(name, {})
         if self._at_rest is None or motion is None or "center_axes" not in part:
             return _NOTHING
         at_rest = dict(zip(self._at_rest.names, self._at_rest.parts, strict=True))[name]
-        ball, middle_mm = unit_ball(), motion.carry(at_rest.box_mm.mean(0, keepdims=True))
+        ball, middle_mm = icosphere(3), motion.carry(at_rest.box_mm.mean(0, keepdims=True))
         radii_mm = _ELLIPSOID * np.array(part["center_axes_std_mm"])
-        places_mm = middle_mm + (ball.vertices_mm * radii_mm) @ np.array(part["center_axes"])
-        return ball.moved(transform_points(self._way, places_mm))
+        places_mm = middle_mm + (ball.vertices * radii_mm) @ np.array(part["center_axes"])
+        return Mesh(transform_points(self._way, places_mm), ball.faces)
 
     def _bare(self, organ: Mesh) -> Mesh:
         """The organ's surface where it is no tumor's, if its triangles are those of the CT."""

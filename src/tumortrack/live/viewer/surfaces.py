@@ -1,13 +1,11 @@
-"""Surfaces made for the eye: the organ without its tumors' own, and a ball."""
+"""A surface made for the eye: the organ without its tumors' own."""
 
 from __future__ import annotations
-
-from functools import cache
 
 import numpy as np
 from jaxtyping import Int32
 
-from tumortrack.core.types import Anatomy, Mesh
+from tumortrack.core.types import Anatomy
 from tumortrack.simulate.occupancy import surface_distance
 
 _SAME_MM = 0.4
@@ -21,12 +19,3 @@ def bare_faces(anatomy: Anatomy) -> Int32[np.ndarray, "f 3"]:
     for tumor in anatomy.tumors:
         shared |= surface_distance(tumor, organ.vertices_mm) < _SAME_MM
     return organ.faces[~shared[organ.faces].all(1)]
-
-
-@cache
-def unit_ball() -> Mesh:
-    """About the origin, of radius 1."""
-    import trimesh
-
-    ball = trimesh.creation.icosphere(subdivisions=3)
-    return Mesh(ball.vertices, ball.faces)
