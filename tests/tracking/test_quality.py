@@ -95,7 +95,7 @@ def test_strays_are_no_part_of_the_fit_that_is_judged(tracker, stages):
     cost, before = (one.report["fit_cost"] for one in (found, clean))
     assert 0.15 < cost["strays"] < 0.35  # the others lie near the surface
     assert cost["now"] > before["now"] + 0.8 * 300 * cost["strays"]
-    assert cost["without_strays"] < before["without_strays"] + 0.5 * cost["usual"]
+    assert cost["without_strays"] < 0.3 * cost["now"]  # what lies within 2 mm still counts
 
 
 @pytest.mark.parametrize("known", [True, False])

@@ -17,7 +17,7 @@ with its uncertainty. `locator` reads surfaces, labels and numbers off it.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 
@@ -174,7 +174,7 @@ class Registration:
     def _race(
         self,
         points_mm: Points,
-        starts: list[tuple[ElasticMotion, Float64[np.ndarray, " 6"] | None]],
+        starts: Sequence[tuple[ElasticMotion, Float64[np.ndarray, " 6"] | None]],
         least: float = math.inf,
     ) -> list[RegistrationResult]:
         """All starts are refined by a few steps; those that may still win, against each other and

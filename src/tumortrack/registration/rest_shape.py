@@ -65,8 +65,8 @@ class RestShape:
     def stiff(self) -> RestShape:
         """The same with the body's first mode alone."""
         body = self.body
-        few = {"modes": body.modes[..., :1].copy(), "states": body.states[:, :1].copy()}
-        return replace(self, body=replace(body, **few))
+        modes, states = body.modes[..., :1].copy(), body.states[:, :1].copy()
+        return replace(self, body=replace(body, modes=modes, states=states))
 
     def labels_at(
         self, points_ct: Float32[np.ndarray, "n 3"]
