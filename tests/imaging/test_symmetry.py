@@ -26,7 +26,7 @@ def bent(anatomy: Anatomy, share: float) -> Anatomy:
     def moved(mesh):
         off = mesh.vertices_mm - middle
         end = off[:, 2:] / half
-        wider = off * np.where([True, True, False], 1 + 0.3 * share * end, 1)
+        wider = off * np.where([True, True, False], 1 + 0.5 * share * end, 1)
         return mesh.moved(middle + wider + share * np.array([14.0, 0, 0]) * end**2)
 
     return Anatomy(tuple(moved(part) for part in anatomy.parts))
@@ -52,12 +52,12 @@ def test_figures_do_not_depend_on_where_the_organ_lies():
     moved = tuple(part.moved(part.vertices_mm @ turn.T + shift) for part in anatomy.parts)
     here, there = half_turns(anatomy), half_turns(Anatomy(moved))
     for one, other in zip(here, there, strict=True):
-        assert other.mean_mm == pytest.approx(one.mean_mm, abs=0.1)
-        assert other.tumors_mm["tumor_1"] == pytest.approx(one.tumors_mm["tumor_1"], abs=0.5)
+        assert other.mean_mm == pytest.approx(one.mean_mm, abs=0.02)
+        assert other.tumors_mm["tumor_1"] == pytest.approx(one.tumors_mm["tumor_1"], abs=1)
 
 
 def test_the_less_it_is_alike_the_farther_apart_the_surfaces():
-    means = [half_turns(bent(organ(), share))[0].mean_mm for share in (0, 0.3, 0.6, 1.3)]
+    means = [half_turns(bent(organ(), share))[0].mean_mm for share in (0, 0.3, 0.6, 1.0)]
     assert means == sorted(means)
     assert means[0] < 0.1
     assert means[-1] > ALIKE_MM
@@ -69,7 +69,7 @@ def test_the_less_it_is_alike_the_farther_apart_the_surfaces():
 def test_prepare_says_it_and_inspect_repeats_it(tmp_path):
     meshes = tmp_path / "meshes"
     meshes.mkdir()
-    for share, says in ((0.0, True), (1.3, False)):
+    for share, says in ((0.0, True), (1.0, False)):
         write_anatomy(meshes, bent(organ(), share))
         case = tmp_path / f"case-{says}"
         said = succeeded(tumortrack("prepare", meshes, case))
