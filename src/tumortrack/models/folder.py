@@ -15,7 +15,7 @@ KIND = "model"
 SHAPE = "shape.safetensors"
 WEIGHTS = "weights.safetensors"
 # Of validation scenes. Networks of the demo's phantom and of an ellipsoid after 1 to 20 steps had
-# 0.05 to 0.08, and of 120 answers the 22 that were over 5 mm off were all called poor for other
+# 0.02 to 0.08, and of 120 answers the 17 that were over 5 mm off were all called poor for other
 # reasons. Beyond nothing was measured.
 _MOST_FAR = 0.1
 
