@@ -38,7 +38,7 @@ _TEXT_COLOURS = {"good": GOOD, "poor": POOR, "none": NONE}
 _STATE_COLOUR: Colour = (235, 238, 242)
 _KIDNEY_OPACITY = 0.35
 _TEXT_HEIGHT_M, _STATE_HEIGHT_M = 0.008, 0.04
-_TEXT_COLUMNS, _PITCH = 44, 3.1  # of a line; from line to line in RViz, by height
+_TEXT_COLUMNS, _STATE_COLUMNS, _PITCH = 44, 60, 3.1  # lines in RViz are so many heights apart
 _STATE_ABOVE_MM = 60.0
 _ORIGIN = np.zeros(3)
 
@@ -219,9 +219,9 @@ def _quality_text(result: TrackingResult) -> dict[str, Any]:
 
 def _state_text(result: TrackingResult, cell: Workcell) -> dict[str, Any]:
     """Above everything: where arms are, z is up."""
-    said = _lines(_describe(cell))
+    said = _lines(_describe(cell), _STATE_COLUMNS)
     if result.estimate is None:
-        said += f"\n{_lines(result.describe())}"
+        said += f"\n{_lines(result.describe(), _STATE_COLUMNS)}"
     box_mm, lines_mm = cell.box_mm, [line.points_mm for line in cell.drawn_lines]
     spots = lines_mm if box_mm is None else [box_mm, *lines_mm]
     corners = np.concatenate(spots) if spots else np.zeros((1, 3))
@@ -231,9 +231,9 @@ def _state_text(result: TrackingResult, cell: Workcell) -> dict[str, Any]:
     return _drawn(_STATE, _TEXT, colour, place_mm, text=said, scale=scale)
 
 
-def _lines(said: str) -> str:
+def _lines(said: str, columns: int = _TEXT_COLUMNS) -> str:
     """RViz breaks no line: a long one leaves the screen on both sides."""
-    return textwrap.fill(said, _TEXT_COLUMNS)
+    return textwrap.fill(said, columns)
 
 
 def _describe(cell: Workcell) -> str:
