@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import asdict
 from pathlib import Path
+from textwrap import fill
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -92,6 +93,8 @@ def prepare(
 
         with store.new_folder(Path(folder), overwrite) as aside:
             whose = str(case.patient)
+            if said := case.report["half_turn"]["warning"]:
+                whose += f"\nWARNING: {fill(said, 150)}"
             qc_picture(case.labels, case.ct, case.anatomy, aside / "qc.png", whose)
             save_case(case, aside)
     return case

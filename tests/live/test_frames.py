@@ -162,7 +162,7 @@ def test_after_doubt_good_is_what_stays_good():
     assert [one.quality for one in told] == [
         *("good", "good", "none", "poor", "poor", "poor", "poor", "good", "good"),
     ]
-    assert told[5].warning == "good again for 1 of 3 frames"
+    assert told[5].warning == "good again for 1 of 3 frames; wait"
 
 
 def test_silence_is_said_before_what_is_shown_is_stale(monkeypatch):

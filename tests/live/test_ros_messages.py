@@ -359,10 +359,17 @@ def test_an_estimate_is_sent_in_metres_in_the_published_frame():
         assert meshes[name].type == meshes[name].TRIANGLE_LIST
     assert meshes["kidney"].color.a < 0.5 < meshes["tumor_1"].color.a
     assert all(marker.lifetime.sec > 0 for marker in meshes.values())
-    assert meshes["quality"].text == (
+    lines = meshes["quality"].text.splitlines()
+    assert max(map(len, lines)) <= 44  # RViz breaks none
+    assert " ".join(lines) == (
         "fit: no check failed; its place is not verified; no margin is stated: no margin is known "
         "for this model (tumortrack margins)"
     )
+    spot = meshes["quality"].pose.position
+    here_mm = [1000 * spot.x, 1000 * spot.y, 1000 * spot.z, 1]
+    camera_mm = np.linalg.inv(TURNED.published_from_camera) @ here_mm
+    highest_mm = small_anatomy().organ.box_mm[0, 1]
+    assert camera_mm[1] + 12.0 * (len(lines) - 1) < highest_mm  # its middle: all lies above
 
     point = out["tumor_1/center"].point
     middle = small_anatomy().parts[1].box_mm.mean(0)

@@ -11,6 +11,7 @@ import pytest
 import trimesh
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
 
 from clock import Clock, until
 from live_objects import PARTS, ball, empty_update, small_anatomy, small_setting, small_update
@@ -275,6 +276,39 @@ def test_the_shell_is_the_stated_margin_and_without_one_there_is_none(sinks, clo
     assert not drawn(sink, "margin_tumor_2")  # of which none is stated
     assert "95 % margin 3.0 mm" in sink._panel.stage.content
     assert "±" not in sink._panel.stage.content
+
+
+def test_an_ellipsoid_is_the_covariances_and_shown_when_asked_for(sinks, clock):
+    case = sloped_case()
+    setting = SinkContext(parts=PARTS[:2], published_frame=ROBOT, anatomy_ct=case.anatomy)
+    update = replace(carried_update(case), published_frame=ROBOT)
+    axes = Rotation.from_rotvec([0.3, -0.5, 0.9]).as_matrix()
+    std_mm = np.array([2.5, 0.8, 0.3])
+    told = {"center_axes": axes.tolist(), "center_axes_std_mm": std_mm.tolist()}
+    tumor = {**update.estimate.report["parts"]["tumor_1"], **told}
+    parts = {**update.estimate.report["parts"], "tumor_1": tumor}
+    report = {**update.estimate.report, "parts": parts}
+    sink = sinks(setting, hz=60)
+    sink.publish(replace(update, estimate=replace(update.estimate, report=report)))
+    assert not drawn(sink, "ellipsoid_tumor_1")
+    switch = sink._panel._shown["ellipsoids"]
+    assert "not the margin" in switch.hint
+    sink._scene.change(replace(sink._panel.options, ellipsoids=True))
+    assert drawn(sink, "ellipsoid_tumor_1")
+    places = sink._server.scene.get_handle_by_name("/estimate/ellipsoid_tumor_1").vertices
+    way = ROBOT.published_from_camera
+    middle = transform_points(way, MOTION.carry(case.anatomy.tumors[0].box_mm.mean(0)[None]))
+    turned = way[:3, :3] @ axes.T
+    precision = np.linalg.inv(turned @ np.diag(std_mm**2) @ turned.T)
+    off = places - middle
+    squares = np.einsum("ij,jk,ik->i", off, precision, off)
+    assert squares == pytest.approx(chi2.ppf(0.95, 3), rel=2e-3)
+    assert np.linalg.norm(off, axis=1).max() == pytest.approx(2.7955 * 2.5, rel=0.01)
+    clock.sleep(1 / 60)
+    sink.publish(replace(update, sequence=1))  # a method that knows no covariance
+    assert not drawn(sink, "ellipsoid_tumor_1")
+    sink.publish(empty_update(2))
+    assert not drawn(sink, "ellipsoid_tumor_1")
 
 
 def test_part_that_was_not_found_is_not_shown(sinks, clock):

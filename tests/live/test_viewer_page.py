@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import socket
 import subprocess
@@ -200,11 +201,15 @@ def test_picture_of_a_resection_for_the_documentation(tmp_path):
     demo, plan = (Path(str(one)).resolve() for one in (DEMO, PLAN))
     port = free_port()
     command = live_resection(demo, plan, f"viewer:{port}")
-    process = subprocess.Popen(command, env=environment(), cwd=tmp_path)
+    said = tmp_path / "said.txt"
+    with said.open("w") as told:
+        process = subprocess.Popen(command, env=environment(), cwd=tmp_path, stdout=told)
     try:
         with Browser(1280, 800) as browser:
-            until(lambda: answers(port), "the viewer")
-            browser.open(f"http://127.0.0.1:{port}")
+            until(lambda: f":{port}/" in said.read_text(), "the viewer's address")
+            address = re.search(rf"http://\S+:{port}/[\w-]+", said.read_text())
+            assert address  # with the token: without it a page may change nothing
+            browser.open(address[0])
             until(lambda: "ARMS: sweep 2" in browser.text(), "the second sweep", 200)
             close = "document.querySelector('.mantine-Notification-closeButton')?.click()"
             browser.call("Runtime.evaluate", expression=close)

@@ -13,6 +13,7 @@ from stories import refusal, succeeded, tumortrack
 from tumortrack.core import store
 from tumortrack.core.errors import NoEstimate
 from tumortrack.core.types import DepthFrame, Mesh, SensorCloud
+from tumortrack.models.folder import weakness_of
 from tumortrack.registration.motion import ElasticMotion
 from tumortrack.sense.camera import d405
 from tumortrack.sense.render import render_depth
@@ -94,7 +95,7 @@ def test_strays_are_no_part_of_the_fit_that_is_judged(tracker, stages):
     cost, before = (one.report["fit_cost"] for one in (found, clean))
     assert 0.15 < cost["strays"] < 0.35  # the others lie near the surface
     assert cost["now"] > before["now"] + 0.8 * 300 * cost["strays"]
-    assert cost["without_strays"] < before["without_strays"] + 0.5 * cost["usual"]
+    assert cost["without_strays"] < 0.3 * cost["now"]  # what lies within 2 mm still counts
 
 
 @pytest.mark.parametrize("known", [True, False])
@@ -190,6 +191,42 @@ def test_an_organ_round_the_camera_is_not_seen(tracker, stages):
     organ = tracker.follow(stages[0].cloud).meshes["kidney"]
     close = organ.moved(organ.vertices_mm - [0, 0, organ.vertices_mm[:, 2].mean()])
     assert cloud_shares(close, stages[0].cloud) == (0.0, 1.0)
+
+
+def test_an_organ_that_looks_the_same_after_half_a_turn_is_in_doubt(slim_model, stages):
+    """The ellipsoid: whichever way round it is found, the other one is found too."""
+    model = load_model(slim_model, "cpu")
+    trained = replace(model, provenance={**model.provenance, "validation_far": 0.0})
+    for stage in stages:
+        estimate = Tracker(trained).follow(stage.cloud)
+        assert estimate.quality == "poor"
+        doubt, _, advice = estimate.reason.partition("; ")
+        assert estimate.report["quality"]["reason"] == estimate.reason
+        if "may as well" in doubt:
+            assert "tumor_1 may as well lie" in doubt
+            assert "look" in advice
+        away_mm = max(one["apart_mm"]["tumor_1"] for one in estimate.report["fit_cost"]["others"])
+        assert away_mm > 10  # of 16, 40 and 43 mm that the half-turns move it
+
+
+def test_a_badly_trained_model_says_so_in_every_estimate(slim_model, stages):
+    model = load_model(slim_model, "cpu")
+    bad = replace(model, provenance={**model.provenance, "validation_far": 0.4})
+    found = Tracker(bad).follow(stages[0].cloud)
+    assert found.quality == "poor"
+    assert "badly trained: 40 % of its validation scenes" in found.reason
+    assert found.reason.endswith("train longer (tumortrack train --steps)")
+    assert found.report["quality"]["reason"] == found.reason
+    assert found.report["margin"]["stated"] == []
+    assert weakness_of({"validation_far": 0.1}) == weakness_of({}) == ""
+    assert "--preset clinic" in weakness_of({"half_turn_mm": 0.4})
+
+
+def test_train_and_inspect_say_what_speaks_against_a_model(phantom_case, clinic_model):
+    weakness = weakness_of(store.read_json(clinic_model / store.MANIFEST)["provenance"])
+    assert "validation_far" in store.read_json(clinic_model / store.MANIFEST)["provenance"]
+    said = succeeded(tumortrack("inspect", clinic_model))
+    assert ("WARNING: the model is badly trained" in said) == bool(weakness)
 
 
 def test_locate_says_its_verdict_and_plan_heeds_it(tmp_path, phantom_case, clinic_model):

@@ -160,6 +160,7 @@ def _artifact(folder: Path) -> list[str]:
         return [*lines, f"  {len(scenes)} scenes: {', '.join(scenes)}", f"  {verdict}"]
     if kind == "model":
         from tumortrack.cli.margins import described
+        from tumortrack.models.folder import weakness_of
         from tumortrack.models.margins import UNKNOWN, read_margins
         from tumortrack.occupancy import model  # PyTorch takes a second
 
@@ -170,8 +171,13 @@ def _artifact(folder: Path) -> list[str]:
             does = "places the organ of the CT; `locate --map` says where points of the CT are"
         lines.append(f"  {encoder} + {decoder}: {does}")
         lines += [f"  {line}" for line in model.describe(folder)]
+        weakness = weakness_of(manifest.get("provenance", {}))
+        lines += [f"  WARNING: {weakness}"] if weakness else []
         margins = read_margins(folder)
         lines += [f"  {line}" for line in (described(margins) if margins else [UNKNOWN])]
+    if kind == "case":
+        said = manifest.get("report", {}).get("half_turn", {}).get("warning")
+        lines += [f"  WARNING: {said}"] if said else []
     skip = {"kind", "schema", "tumortrack", "units", "frame", "files", "config"}
     lines += [f"  {key}: {value}" for key, value in manifest.items() if key not in skip]
     return [*lines, f"  files: {', '.join(manifest['files'])}"]

@@ -187,8 +187,8 @@ class Plan(StatedPatient):
 
         written = {} if self.cell is None else store.read_json(self.cell)
         config = from_builtins(written, CellConfig, str(self.cell))
-        given = self.cell is not None and written.keys() >= {*_BASES}
-        source = store.sha256_of(self.cell) if given else INVENTED
+        given = written.keys() >= {*_BASES}
+        source = store.sha256_of(self.cell) if self.cell and given else INVENTED
         return config if self.stand is None else replace(config, stand_mm=self.stand), source
 
     def _frame(self, run: LocatedRun, stand_mm: float) -> PublishedFrame:

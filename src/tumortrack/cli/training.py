@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Literal
 
 from tyro.conf import Positional
 
-from tumortrack.cli.console import Device, console, keep_loaded, say
+from tumortrack.cli.console import Device, console, keep_loaded, say, say_notes
 from tumortrack.core import store
 from tumortrack.core.errors import InputError
 from tumortrack.core.process import is_follower
@@ -67,7 +67,7 @@ class Train:
             raise InputError(f"--workers {self.workers} must be 0 or more.")
         case = load_case(self.case)  # report what is wrong so far before PyTorch's seconds
 
-        from tumortrack.models.folder import is_finished
+        from tumortrack.models.folder import is_finished, weakness_of
         from tumortrack.training.model import load_model, load_start
         from tumortrack.training.presets import PRESETS
         from tumortrack.training.train import TrainingRun, train
@@ -89,6 +89,7 @@ class Train:
                     "another MODEL folder."
                 )
             say(f"{self.model} is trained already ({done['steps']} steps).")
+            say_notes(filter(None, [weakness_of(done)]))
             return
         with _training_screen() as show:
             about = train(run, self.model, show).provenance
@@ -96,6 +97,7 @@ class Train:
             f"model written to {self.model}: {about['steps']} steps in {about['training_s']:.0f} "
             f"s, validation mIoU {about['validation_miou']:.3f}."
         )
+        say_notes(filter(None, [weakness_of(about)]))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -20,6 +20,7 @@ from tumortrack.imaging.meshes import label_meshes, read_mesh_folder
 from tumortrack.imaging.segment import KIDNEY_HU, TUMOR_HU, segment_ct
 from tumortrack.imaging.select import MIN_TUMOR_ML, select_labels
 from tumortrack.imaging.surface import surfaces
+from tumortrack.imaging.symmetry import alike, half_turns, warning
 from tumortrack.imaging.volume import is_label_map, labels_of, read_raw, volume_of
 
 # Options that only one kind of input uses.
@@ -97,6 +98,13 @@ def prepare(input: Path, options: PrepareOptions | None = None) -> Case:
         raise InputError(f"{input} cannot be read: {error.strerror or error}.") from error
     given = {k: list(v) if isinstance(v, tuple) else v for k, v in asdict(options).items()}
     origin = {"source": input.name, "source_sha256": source_sha256, "options": given}
+    turns, notes = half_turns(case.anatomy), case.report["notes"]
+    said = warning(alike(turns))
+    looks = {
+        "warning": said,
+        "turns": [{k: v for k, v in asdict(one).items() if k != "ct_from_ct"} for one in turns],
+    }
+    origin |= {"half_turn": looks, "notes": [*notes, said] if said else notes}
     return replace(case, up_lps=up, report={**case.report, **origin})
 
 

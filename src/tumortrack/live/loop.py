@@ -218,7 +218,7 @@ class Loop:
             quality, warning = "poor", doubt
         self._in_a_row = self._in_a_row + 1 if quality == "good" else 0
         if 0 < self._in_a_row < _SURE_AFTER:
-            return "poor", f"good again for {self._in_a_row} of {_SURE_AFTER} frames"
+            return "poor", f"good again for {self._in_a_row} of {_SURE_AFTER} frames; wait"
         return quality, warning
 
     def _without_frame(self, reason: str) -> TrackingResult:

@@ -145,7 +145,7 @@ class RegistrationLocator:
         cloud = SensorCloud(rest.carry(organ.vertices_mm))
         points = Frame(self._model, cloud, 0, np.random.default_rng(0)).points_mm
         self._registration.propose(points)
-        fit = refine(self._shape, points, rest, self._near)
+        fit = self._registration.best_fit(points, [rest])
         self._carry(self._moved(points, fit), 0)
 
     def _size(self, frame: Frame, fit: RegistrationResult) -> dict[str, float]:

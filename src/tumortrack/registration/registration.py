@@ -8,6 +8,7 @@
 4. Other minima that explain the points nearly as well, and put a tumor elsewhere, are kept.
 5. In a first look, and where even that fits badly, the organ is looked for all around: what hides a
    part of it moves the middle and the longest direction of what is seen, and misleads the network.
+6. An organ that looks much the same after half a turn is tried that way round, too.
 
 The result is a motion (`motion`): any point of the CT, carried to the camera's frame and back,
 with its uncertainty. `locator` reads surfaces, labels and numbers off it.
@@ -16,7 +17,7 @@ with its uncertainty. `locator` reads surfaces, labels and numbers off it.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 
@@ -118,8 +119,12 @@ class Registration:
         """The hypothesis that fits best, refined; give the likeliest one first. Above
         ``usual_cost`` the organ is looked for all around."""
         fit = self._settle(points_mm, self._race(points_mm, [(one, None) for one in hypotheses]))
-        costly = fit.cost > usual_cost
-        return self.look_around(points_mm, hypotheses[0], fit) if costly else fit
+        if fit.cost > usual_cost:
+            fit = self.look_around(points_mm, hypotheses[0], fit)
+        turned = [(self._half_turned(fit.motion, turn), None) for turn in self.rest.half_turns]
+        if not turned:
+            return fit
+        return best_of([fit, self._settle(points_mm, self._race(points_mm, turned))])
 
     def look_around(
         self, points_mm: Points, likeliest: ElasticMotion, fit: RegistrationResult
@@ -152,6 +157,15 @@ class Registration:
         elsewhere = _elsewhere(best.motion, fit.motion)
         return self._settle(points_mm, [fit, *others]) if elsewhere else best
 
+    def _half_turned(
+        self, motion: ElasticMotion, turn: Float64[np.ndarray, "4 4"]
+    ) -> ElasticMotion:
+        """The undeformed organ in the same place, turned by this motion of the CT."""
+        middle_ct = self.rest.body.center_ct
+        off = motion.rotation @ (turn[:3, :3] @ middle_ct + turn[:3, 3] - middle_ct)
+        rotation, place = motion.rotation @ turn[:3, :3], motion.centre_mm + off
+        return ElasticMotion(self.rest, rotation, place, self.rest.body.mean)
+
     def _settle(self, points_mm: Points, fits: list[RegistrationResult]) -> RegistrationResult:
         """The best of some fits and of those from starts beside the best."""
         beside = _beside(min(fits, key=_cost))
@@ -160,7 +174,7 @@ class Registration:
     def _race(
         self,
         points_mm: Points,
-        starts: list[tuple[ElasticMotion, Float64[np.ndarray, " 6"] | None]],
+        starts: Sequence[tuple[ElasticMotion, Float64[np.ndarray, " 6"] | None]],
         least: float = math.inf,
     ) -> list[RegistrationResult]:
         """All starts are refined by a few steps; those that may still win, against each other and

@@ -11,6 +11,7 @@ from jaxtyping import Float32, Float64, UInt8
 from tumortrack.core.errors import InputError
 from tumortrack.core.process import parallel_for
 from tumortrack.core.types import Anatomy, Mesh
+from tumortrack.imaging.symmetry import alike, half_turns
 from tumortrack.registration.kernels import DistanceField, mark
 from tumortrack.simulate.elastic.body import ElasticBody
 from tumortrack.simulate.occupancy import contains, surface_distance
@@ -51,6 +52,11 @@ class RestShape:
         return long_axis_of(self.anatomy_ct.organ)
 
     @cached_property
+    def half_turns(self) -> list[Float64[np.ndarray, "4 4"]]:
+        """Motions of the CT after which the organ looks much the same; mostly none."""
+        return [one.ct_from_ct for one in alike(half_turns(self.anatomy_ct))]
+
+    @cached_property
     def middles_ct(self) -> Float64[np.ndarray, "parts 3"]:
         """Of each part's box."""
         return np.array([part.box_mm.mean(0) for part in self.anatomy_ct.parts])
@@ -59,8 +65,8 @@ class RestShape:
     def stiff(self) -> RestShape:
         """The same with the body's first mode alone."""
         body = self.body
-        few = {"modes": body.modes[..., :1].copy(), "states": body.states[:, :1].copy()}
-        return replace(self, body=replace(body, **few))
+        modes, states = body.modes[..., :1].copy(), body.states[:, :1].copy()
+        return replace(self, body=replace(body, modes=modes, states=states))
 
     def labels_at(
         self, points_ct: Float32[np.ndarray, "n 3"]

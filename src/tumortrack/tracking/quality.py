@@ -69,7 +69,8 @@ def judged(estimate: Estimate, seen: DepthFrame | SensorCloud) -> Estimate:
     if through > impossible and isinstance(seen, DepthFrame):
         raise NoEstimate(
             f"the camera sees through {100 * through:.0f} % of where the organ would lie: what "
-            "was taken for it is something else, or lies as no organ in training did."
+            "was taken for it is something else, or lies as no organ in training did. Choose the "
+            "organ (a click, a --box), or look from another side."
         )
     reason = _misfit(estimate, told > _TOLD) or _doubt(estimate)
     if through > doubtful:
@@ -93,10 +94,15 @@ def with_margin(estimate: Estimate, cloud: SensorCloud, margins: ModelMargins | 
         if "unseen" not in report:
             report["unseen"] = cloud_shares(organ, cloud)[1]
         if reason := exceeded(margins.limits, figures(report, margins)):
-            report["quality"] = {"verdict": "poor", "reason": reason}
-            estimate = replace(estimate, quality="poor", reason=reason)
+            estimate = doubted(estimate, reason)
     report["margin"] = stated_margin(report, margins, estimate.quality == "good")
     return estimate
+
+
+def doubted(estimate: Estimate, reason: str) -> Estimate:
+    """The same estimate, poor for this reason."""
+    estimate.report["quality"] = {"verdict": "poor", "reason": reason}
+    return replace(estimate, quality="poor", reason=reason)
 
 
 def _misfit(estimate: Estimate, told: bool) -> str:

@@ -15,6 +15,7 @@ from tumortrack.core.errors import InputError
 from tumortrack.core.estimate import Estimate, Following
 from tumortrack.core.process import keep_small_blocks
 from tumortrack.core.types import Anatomy, DepthFrame, SensorCloud
+from tumortrack.models.folder import weakness_of
 from tumortrack.models.model import Model
 from tumortrack.occupancy.locator import OccupancyLocator
 from tumortrack.occupancy.model import OccupancyModel
@@ -22,7 +23,8 @@ from tumortrack.registration.locator import RegistrationLocator
 from tumortrack.registration.model import RegistrationModel
 from tumortrack.sense.cloud import CloudConfig
 from tumortrack.sense.region import RegionConfig
-from tumortrack.tracking.quality import judged, with_margin
+from tumortrack.tracking.advice import what_to_do
+from tumortrack.tracking.quality import doubted, judged, with_margin
 
 _ALONE = Following()
 
@@ -42,6 +44,7 @@ class Tracker:
     def __init__(self, model: Model) -> None:
         keep_small_blocks()
         self.model, self._patient = model, model.patient
+        self._weakness = weakness_of(model.provenance)
         self._locator = _LOCATORS[type(model)](model)
 
     @property
@@ -91,7 +94,12 @@ class Tracker:
         self, estimate: Estimate, cloud: SensorCloud, seen: DepthFrame | SensorCloud
     ) -> Estimate:
         start = time.perf_counter()
-        estimate = with_margin(judged(estimate, seen), cloud, self.model.margins)
+        estimate = judged(estimate, seen)
+        if self._weakness:
+            estimate = doubted(estimate, self._weakness)
+        estimate = with_margin(estimate, cloud, self.model.margins)
+        if estimate.quality == "poor" and not self._weakness:
+            estimate = doubted(estimate, f"{estimate.reason}; {what_to_do(estimate, cloud)}")
         estimate = replace(estimate, patient=self._patient)
         estimate.report["patient"] = to_builtins(self._patient)
         seconds = estimate.report["timings"]

@@ -14,6 +14,8 @@ import torch
 from jaxtyping import Float32, Float64, UInt8
 
 from tumortrack.core.errors import InputError, NoEstimate
+from tumortrack.core.estimate import FAR_MM
+from tumortrack.imaging.symmetry import alike, half_turns
 from tumortrack.models.config import RegistrationHeadConfig, TrainConfig
 from tumortrack.models.in_distribution import InDistributionRange, fit_mm, spread_mm
 from tumortrack.models.model import Model
@@ -131,6 +133,8 @@ class OccupancyTask(TrainingTask):
                 lattice = lattice_over(partial(self._logits, network, latent), around, FIT_STEPS)
                 fit = fit_mm(surface_distances(lattice, points_mm))
             ranges.append((spread, fit))
+        if same := alike(half_turns(self._run.anatomy_ct)):
+            provenance = {**provenance, "half_turn_mm": same[0].mean_mm}
         return OccupancyModel(**self._fields(network, provenance, ranges))
 
     def _logits(
@@ -180,7 +184,7 @@ class RegistrationTask(TrainingTask):
             more(cloud, likeliest, fit) if fit.cost > usual_cost else fit
             for cloud, (likeliest, fit) in zip(scenes.clouds_mm, drafts, strict=True)
         ]
-        errors, ratios = [], []
+        errors, nearest, ratios = [], [], []
         for cloud, fit, points_mm, points_ct, labels in zip(
             scenes.clouds_mm,
             fits,
@@ -198,10 +202,16 @@ class RegistrationTask(TrainingTask):
             assert known_mm2 is not None
             away = motion.carry(inside_ct) - inside_mm
             errors.append(np.linalg.norm(away, axis=1).mean())
+            others = [rival.motion.carry(inside_ct) - inside_mm for rival in fit.rivals]
+            nearest.append(min(np.linalg.norm(off, axis=1).mean() for off in (away, *others)))
             solved = np.linalg.solve(known_mm2, away[..., None])[..., 0]
             ratios.append(np.sqrt((solved * away).sum(1)))
         std_scale = float(np.quantile(np.concatenate(ratios), _COVERED)) / _RADIUS
-        about = {**provenance, "validation_tre_mm": round(float(np.median(errors)), 3)}
+        about = {
+            **provenance,
+            "validation_tre_mm": round(float(np.median(errors)), 3),
+            "validation_far": float(np.mean(np.array(nearest) > FAR_MM)),  # no rival is right
+        }
         pairs = zip(scenes.clouds_mm, fits, strict=True)
         ranges = [(spread_mm(cloud), fit_mm(np.abs(fit.distances_mm))) for cloud, fit in pairs]
         return RegistrationModel(

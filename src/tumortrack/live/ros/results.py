@@ -6,6 +6,7 @@ cloud, deleted markers, places that are NaN, a diagnostic with the reason.
 
 from __future__ import annotations
 
+import textwrap
 from typing import Any
 
 import numpy as np
@@ -37,6 +38,7 @@ _TEXT_COLOURS = {"good": GOOD, "poor": POOR, "none": NONE}
 _STATE_COLOUR: Colour = (235, 238, 242)
 _KIDNEY_OPACITY = 0.35
 _TEXT_HEIGHT_M, _STATE_HEIGHT_M = 0.008, 0.04
+_TEXT_COLUMNS, _STATE_COLUMNS, _PITCH = 44, 60, 3.1  # lines in RViz are so many heights apart
 _STATE_ABOVE_MM = 60.0
 _ORIGIN = np.zeros(3)
 
@@ -205,20 +207,21 @@ def _labelled_cloud(estimate: TransformedEstimate | None, header: Any, messages:
 
 def _quality_text(result: TrackingResult) -> dict[str, Any]:
     """Above the organ, as the camera sees it; without one, in front of the camera."""
-    above_mm = np.array([[0.0, 0.0, 150.0]])
+    said, above_mm = _lines(result.describe()), np.array([[0.0, 0.0, 150.0]])
     if result.estimate is not None and (organ := result.estimate.meshes.get("kidney")):
         low, high = organ.box_mm
-        above_mm = np.array([[(low + high)[0] / 2, low[1] - 8.0, (low + high)[2] / 2]])
+        up_mm = 1000 * _TEXT_HEIGHT_M * (1 + _PITCH / 2 * said.count("\n"))  # to its middle
+        above_mm = np.array([[(low + high)[0] / 2, low[1] - up_mm, (low + high)[2] / 2]])
     place_mm = transform_points(result.published_frame.published_from_camera, above_mm)[0]
-    look = {"text": result.describe(), "scale": {"z": _TEXT_HEIGHT_M}}
+    look = {"text": said, "scale": {"z": _TEXT_HEIGHT_M}}
     return _drawn("quality", _TEXT, _TEXT_COLOURS[result.quality], place_mm, **look)
 
 
 def _state_text(result: TrackingResult, cell: Workcell) -> dict[str, Any]:
     """Above everything: where arms are, z is up."""
-    said = _describe(cell)
+    said = _lines(_describe(cell), _STATE_COLUMNS)
     if result.estimate is None:
-        said += f"\n{result.describe()}"
+        said += f"\n{_lines(result.describe(), _STATE_COLUMNS)}"
     box_mm, lines_mm = cell.box_mm, [line.points_mm for line in cell.drawn_lines]
     spots = lines_mm if box_mm is None else [box_mm, *lines_mm]
     corners = np.concatenate(spots) if spots else np.zeros((1, 3))
@@ -226,6 +229,11 @@ def _state_text(result: TrackingResult, cell: Workcell) -> dict[str, Any]:
     place_mm[2] = corners[:, 2].max() + _STATE_ABOVE_MM
     colour, scale = NONE if cell.halted else _STATE_COLOUR, {"z": _STATE_HEIGHT_M}
     return _drawn(_STATE, _TEXT, colour, place_mm, text=said, scale=scale)
+
+
+def _lines(said: str, columns: int = _TEXT_COLUMNS) -> str:
+    """RViz breaks no line: a long one leaves the screen on both sides."""
+    return textwrap.fill(said, columns)
 
 
 def _describe(cell: Workcell) -> str:

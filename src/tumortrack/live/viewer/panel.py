@@ -238,6 +238,12 @@ class Panel:
             shown |= {
                 "kidney": gui.add_slider("Kidney", 0.0, 1.0, 0.05, default.kidney),
                 "margin": gui.add_checkbox("Margins", default.margin),
+                "ellipsoids": gui.add_checkbox(
+                    "95 % ellipsoids (diagnostic)",
+                    default.ellipsoids,
+                    hint="95 % ellipsoid of each tumor's centre by the fit's own covariance, 2.80 "
+                    "standard deviations: a diagnostic, not the margin",
+                ),
                 "observed": gui.add_checkbox("Observed points", default.observed),
                 "points": gui.add_dropdown("Labelled points", ("none", "tumors", "all")),
                 "coloured_by": gui.add_dropdown("Coloured by", ("label", "probability")),

@@ -30,6 +30,10 @@ if TYPE_CHECKING:
     from viser import MeshHandle, PointCloudHandle, ViserServer
 
 _MOST_LABELLED = 15_000  # points shown
+# Standard deviations of the ellipsoid that holds 95 % of a normal distribution in three dimensions:
+# the root of the 95 % quantile of chi squared with three degrees of freedom.
+_ELLIPSOID = 2.7955
+_ELLIPSOID_COLOUR = 255, 255, 255  # stands out from every part
 _TUMOR_WITH_POINTS = 0.3  # opacity
 _NO_POINTS = np.zeros((0, 3), np.float32)
 _NOTHING = Mesh(np.zeros((3, 3)), np.array([[0, 1, 2]]))
@@ -46,6 +50,7 @@ class DisplayOptions:
     observed: bool = True
     kidney: float = 0.35  # opacity
     margin: bool = True
+    ellipsoids: bool = False
     points: str = "none"  # none | tumors | all
     coloured_by: str = "label"  # label | probability
     slice_plane: bool = False
@@ -86,7 +91,7 @@ class ViewerScene:
             "/picked", radius=1.5, color=colours.PICKED, visible=False, cast_shadow=False
         )
         nodes.add_frame("/estimate", show_axes=False)
-        self._shells, self._parts = {}, {}
+        self._shells, self._parts, self._ellipsoids = {}, {}, {}
         for label, name in enumerate(context.parts, start=1):
             look = {"color": colours.part_colour(label), "visible": False}
             if label > 1 and self._margin_mm != 0:
@@ -96,6 +101,10 @@ class ViewerScene:
             opacity = 0.35 if label == 1 else None
             path = f"/estimate/{name}"
             self._parts[name] = self._mesh(path, _NOTHING, opacity=opacity, **look)
+            if label > 1:
+                path = f"/estimate/ellipsoid_{name}"
+                look |= {"color": _ELLIPSOID_COLOUR, "opacity": 0.8}
+                self._ellipsoids[name] = self._mesh(path, _NOTHING, **look)
         self._points = self._cloud("/estimate/points", 0.3, colours.KIDNEY)
         clear = np.zeros((2, 2, 4), np.uint8)
         self._slice = nodes.add_image("/estimate/slice", clear, 1, 1, format="png", **_FLAT)
@@ -143,13 +152,15 @@ class ViewerScene:
             _put_mesh(node, shown)
         for name, node in self._shells.items():
             _put_mesh(node, self.margins.get(name, _NOTHING))
+        for name, node in self._ellipsoids.items():
+            _put_mesh(node, self._ellipsoid(result, name))
         self._placed = placed
         self.apply()
 
     def hide(self) -> None:
         """Nothing of any estimate stays. Surfaces are emptied, not made invisible: browsers show
         the one a frame later than the other, and old surfaces could not come back."""
-        for node in (*self._parts.values(), *self._shells.values()):
+        for node in (*self._parts.values(), *self._shells.values(), *self._ellipsoids.values()):
             _put_mesh(node, _NOTHING)
         self._points.points, self._points.colors = _NO_POINTS, _NO_POINTS.astype(np.uint8)
         self._placed = None
@@ -166,10 +177,13 @@ class ViewerScene:
             return
         for name, node in self._parts.items():
             node.visible = name != "kidney" or options.kidney > 0
-            if name != "kidney":  # solid, unless points are to be seen in it
-                node.opacity = None if options.points == "none" else _TUMOR_WITH_POINTS
+            if name != "kidney":  # solid, unless something is to be seen in it
+                looked_into = options.points != "none" or options.ellipsoids
+                node.opacity = _TUMOR_WITH_POINTS if looked_into else None
         for node in self._shells.values():
             node.visible = options.margin
+        for node in self._ellipsoids.values():
+            node.visible = options.ellipsoids
         self._parts["kidney"].opacity = options.kidney
         self._points.visible = options.points != "none"
         self._slice.visible = options.slice_plane and self._has_slice
@@ -270,6 +284,21 @@ class ViewerScene:
             for name, margin in zip(self._shells, self._margins_ct, strict=True)
             if name in tumors
         }
+
+    def _ellipsoid(self, result: TrackingResult, name: str) -> Mesh:
+        """Where the middle of a tumor lies with 95 % probability, if the fit's own covariance were
+        all there is to know; published frame. Nothing without a motion."""
+        assert result.estimate is not None
+        from trimesh.creation import icosphere
+
+        motion, part = result.estimate.motion, result.estimate.report["parts"].get(name, {})
+        if self._at_rest is None or motion is None or "center_axes" not in part:
+            return _NOTHING
+        at_rest = dict(zip(self._at_rest.names, self._at_rest.parts, strict=True))[name]
+        ball, middle_mm = icosphere(3), motion.carry(at_rest.box_mm.mean(0, keepdims=True))
+        radii_mm = _ELLIPSOID * np.array(part["center_axes_std_mm"])
+        places_mm = middle_mm + (ball.vertices * radii_mm) @ np.array(part["center_axes"])
+        return Mesh(transform_points(self._way, places_mm), ball.faces)
 
     def _bare(self, organ: Mesh) -> Mesh:
         """The organ's surface where it is no tumor's, if its triangles are those of the CT."""

@@ -69,7 +69,7 @@ class TableWatch:
         if self._moved:
             raise NoEstimate(self._moved)
         if self._hidden > _HIDDEN_LOOKS:
-            return "the table is hidden, so nobody notices if the camera moves"
+            return "the table is hidden, so nobody notices if the camera moves; uncover it"
         if self._known is not None and self._table is None:
             return "the calibration's table is not found: does the camera still stand there?"
         return ""

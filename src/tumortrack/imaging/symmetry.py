@@ -1,0 +1,83 @@
+"""Does an organ look the same after half a turn? Then a view may not tell the two apart."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float64
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from tumortrack.core.geometry import rigid, transform_points
+from tumortrack.core.types import Anatomy
+
+# Mean distance below which a view may not tell. Of organs between an ellipsoid and a phantom, 40
+# clouds each, the half-turned organ was nearly as likely (a hundredth at least) for 95 % at 0.15
+# mm, 60 % at 0.7, 25 % at 0.9, 10 % at 1.2 mm. 74 real kidneys, as segmented, have 1.9 to 6 mm, the
+# built-in phantom 2.1.
+ALIKE_MM = 1.5
+_SPACING_MM = 2.0  # of the surface's points, about
+_MOVED = 3000  # points that are laid on it; other ones change the mean by 0.03 mm
+_STEPS, _ENOUGH_MM = 30, 0.01  # at most; one that moves less is the last
+
+
+@dataclass(frozen=True, eq=False)
+class HalfTurn:
+    """The organ, turned by 180 degrees about a principal axis, then laid on itself by
+    ``ct_from_ct`` (LPS, mm). ``mean_mm``, ``p90_mm``: distances of the turned surface to the
+    organ's, mean and what nine tenths do not exceed. ``tumors_mm``: how far the middles move."""
+
+    ct_from_ct: Float64[np.ndarray, "4 4"]
+    mean_mm: float
+    p90_mm: float
+    tumors_mm: dict[str, float]
+
+
+def half_turns(anatomy: Anatomy) -> list[HalfTurn]:
+    """About each principal axis of the organ's surface, the best match first; a second at most."""
+    import trimesh
+
+    organ = trimesh.Trimesh(anatomy.organ.vertices_mm, anatomy.organ.faces, process=False)
+    count = max(_MOVED, round(organ.area / _SPACING_MM**2))
+    points, face = trimesh.sample.sample_surface(organ, count, seed=0)
+    points, normals, tree = np.asarray(points), organ.face_normals[face], cKDTree(points)
+    middle, found = points.mean(0), []
+    tumors = np.array([tumor.box_mm.mean(0) for tumor in anatomy.tumors]).reshape(-1, 3)
+    for axis in np.linalg.svd(points - middle, full_matrices=False)[2]:
+        turn = Rotation.from_rotvec(np.pi * axis).as_matrix()
+        way = rigid(turn, middle - turn @ middle)
+        there = transform_points(way, points[:_MOVED])
+        for _ in range(_STEPS):  # iterated closest points, to the planes at the nearest ones
+            away, near = tree.query(there)
+            off = ((points[near] - there) * normals[near]).sum(1)
+            rows = np.hstack([np.cross(there - middle, normals[near]), normals[near]])
+            step = np.linalg.lstsq(rows, off, rcond=1e-3)[0]  # turns that stay free are left out
+            turn = Rotation.from_rotvec(step[:3]).as_matrix()
+            way = rigid(turn, middle - turn @ middle + step[3:]) @ way
+            before, there = there, transform_points(way, points[:_MOVED])
+            if np.abs(there - before).max() < _ENOUGH_MM:
+                break
+        away_mm = np.where(away < 2 * _SPACING_MM, np.abs(off), away)
+        moved_mm = np.linalg.norm(transform_points(way, tumors) - tumors, axis=1).tolist()
+        told = float(away_mm.mean()), float(np.quantile(away_mm, 0.9))
+        found.append(HalfTurn(way, *told, dict(zip(anatomy.names[1:], moved_mm, strict=True))))
+    return sorted(found, key=lambda one: one.mean_mm)
+
+
+def alike(turns: list[HalfTurn]) -> list[HalfTurn]:
+    """Those after which a view may not tell that the organ was turned."""
+    return [one for one in turns if one.mean_mm < ALIKE_MM]
+
+
+def warning(turns: list[HalfTurn]) -> str:
+    """What ``alike`` found, for people; empty: nothing."""
+    if not turns:
+        return ""
+    worst = max(turns, key=lambda one: max(one.tumors_mm.values(), default=0.0))
+    tumors = " and ".join(f"{name} {mm:.0f} mm" for name, mm in worst.tumors_mm.items())
+    return (
+        f"the organ looks much the same after half a turn (surfaces {worst.mean_mm:.1f} mm apart "
+        f"in the mean, {worst.p90_mm:.1f} mm at 90 %), which would put {tumors or 'inner points'} "
+        "elsewhere: estimates are poor wherever the view does not tell the two apart"
+    )

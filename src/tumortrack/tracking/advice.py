@@ -1,0 +1,83 @@
+"""What to do about a poor estimate: one clause, mostly where to look from."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial import cKDTree
+
+from tumortrack.core.estimate import Estimate
+from tumortrack.core.types import SensorCloud
+from tumortrack.registration.motion import ElasticMotion
+
+# Where another view alone would not help: words of the reason, and what does.
+_INSTEAD = {
+    "sees through": "make sure that this is the organ (a click, --box), or look from another side",
+    "the camera's scale": "calibrate it",
+    "do not lie on the organ": "free the organ of what lies on it and beside it",
+}
+_FACES = 2000  # of the organ, that tell enough
+_FACING = 0.3  # cosine to the line of sight: flatter surfaces return little
+_NEAR_MM = 8.0  # of an observed point: seen
+_HIDDEN = 0.1  # share of what faces the camera
+_ASIDE = 0.3  # sine to the line of sight: a direction that is no more aside is none
+
+
+def what_to_do(estimate: Estimate, cloud: SensorCloud) -> str:
+    """Towards which side of the organ the camera should look, and why there.
+
+    Where a tenth of what faces the camera is not among the points: there. Where another fit is
+    nearly as likely: where its surface lies farthest from this one's. Else along the axis in which
+    a tumor's centre is least certain: surfaces hold what lies along their normals.
+
+    Args:
+        cloud: the organ's points, camera frame, in which it was located.
+    """
+    import trimesh
+
+    for words, advice in _INSTEAD.items():
+        if words in estimate.reason:
+            return advice
+    mesh = next(iter(estimate.meshes.values()))
+    faces = mesh.faces[:: len(mesh.faces) // _FACES + 1]
+    organ = trimesh.Trimesh(mesh.vertices_mm, faces, process=False)
+    middles, normals = organ.triangles_center, organ.face_normals
+    sight = middles / np.linalg.norm(middles, axis=1, keepdims=True)
+    facing = middles[-(normals * sight).sum(1) > _FACING]
+    centre = middles.mean(0)
+    if len(facing) and len(cloud.points_mm):
+        hidden = cKDTree(cloud.points_mm).query(facing)[0] > _NEAR_MM
+        if hidden.mean() > _HIDDEN and (where := _side(facing[hidden].mean(0) - centre, centre)):
+            return f"free the view of the organ's side towards {where}, or look from there"
+    where = _side(_unsure(estimate, centre), centre)
+    return f"look more from {where or 'another side'}, by about 30 degrees"
+
+
+def _unsure(estimate: Estimate, centre: Float[np.ndarray, " 3"]) -> Float[np.ndarray, " 3"]:
+    """The direction, camera frame, from which more would be known."""
+    motion = estimate.motion
+    if isinstance(motion, ElasticMotion) and motion.rivals:
+        places_mm = next(iter(estimate.meshes.values())).vertices_mm
+        other_mm = motion.rivals[0][0].carry(motion.shape.anatomy_ct.organ.vertices_mm)
+        return places_mm[cKDTree(other_mm).query(places_mm)[0].argmax()] - centre
+    tumors = list(estimate.report["parts"].items())[1:]
+    known = [(name, part) for name, part in tumors if "center_axes" in part]
+    if not known:
+        return np.zeros(3)
+    name, part = max(known, key=lambda item: item[1]["center_axes_std_mm"][0])
+    axis = np.array(part["center_axes"][0])
+    return axis if (estimate.meshes[name].box_mm.mean(0) - centre) @ axis >= 0 else -axis
+
+
+def _side(direction: Float[np.ndarray, " 3"], centre: Float[np.ndarray, " 3"]) -> str:
+    """A direction in words, as the camera's picture shows it; empty: it lies along the view."""
+    sight, length = centre / np.linalg.norm(centre), float(np.linalg.norm(direction))
+    x, y, _ = direction - (direction @ sight) * sight
+    if np.hypot(x, y) <= _ASIDE * length:
+        return ""
+    words = {"x": ("left", "right"), "y": ("top", "bottom")}
+    long = max(abs(x), abs(y))
+    told = {axis: value for axis, value in (("y", y), ("x", x)) if abs(value) > long / 2}
+    names = " ".join(words[axis][int(value > 0)] for axis, value in told.items())
+    axes = ", ".join(f"{'+' if value > 0 else '-'}{axis}" for axis, value in told.items())
+    return f"the {names} (the camera's {axes})"

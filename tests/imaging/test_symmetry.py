@@ -1,0 +1,80 @@
+"""Organs that look the same after half a turn: recognised, said, and tried both ways round."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from elastic_objects import organ
+from stories import succeeded, tumortrack
+from tumortrack.core import store
+from tumortrack.core.mesh_files import write_anatomy
+from tumortrack.core.types import Anatomy
+from tumortrack.imaging.symmetry import ALIKE_MM, alike, half_turns, warning
+from tumortrack.phantom.kidneys import random_anatomy
+
+# Of the ellipsoid's tumor, 8 mm and 20 mm from the middle along two of its axes: half a turn about
+# the third moves it by twice its distance, about one of them by twice the other's.
+AWAY_MM = [16.0, 40.0, 2 * np.hypot(8, 20)]
+
+
+def bent(anatomy: Anatomy, share: float) -> Anatomy:
+    """Thicker towards one end, and bent."""
+    middle, half = anatomy.organ.box_mm.mean(0), np.ptp(anatomy.organ.box_mm, axis=0).max() / 2
+
+    def moved(mesh):
+        off = mesh.vertices_mm - middle
+        end = off[:, 2:] / half
+        wider = off * np.where([True, True, False], 1 + 0.5 * share * end, 1)
+        return mesh.moved(middle + wider + share * np.array([14.0, 0, 0]) * end**2)
+
+    return Anatomy(tuple(moved(part) for part in anatomy.parts))
+
+
+def test_an_ellipsoid_looks_the_same_after_each_half_turn():
+    found = half_turns(organ())
+    assert len(alike(found)) == 3
+    assert max(one.p90_mm for one in found) < 0.2  # facets
+    away_mm = sorted(one.tumors_mm["tumor_1"] for one in found)
+    assert away_mm == pytest.approx(AWAY_MM, abs=0.2)
+    for one in found:
+        turn = Rotation.from_matrix(one.ct_from_ct[:3, :3])
+        assert np.degrees(turn.magnitude()) == pytest.approx(180, abs=1)
+    said = warning(found)
+    assert "tumor_1 43 mm elsewhere" in said
+    assert "inner points elsewhere" in warning(half_turns(Anatomy((organ().organ,))))
+
+
+def test_figures_do_not_depend_on_where_the_organ_lies():
+    anatomy = bent(organ(), 0.5)
+    turn, shift = Rotation.from_rotvec([0.4, -1.1, 0.7]).as_matrix(), [30.0, -70.0, 400.0]
+    moved = tuple(part.moved(part.vertices_mm @ turn.T + shift) for part in anatomy.parts)
+    here, there = half_turns(anatomy), half_turns(Anatomy(moved))
+    for one, other in zip(here, there, strict=True):
+        assert other.mean_mm == pytest.approx(one.mean_mm, abs=0.02)
+        assert other.tumors_mm["tumor_1"] == pytest.approx(one.tumors_mm["tumor_1"], abs=1)
+
+
+def test_the_less_it_is_alike_the_farther_apart_the_surfaces():
+    means = [half_turns(bent(organ(), share))[0].mean_mm for share in (0, 0.3, 0.6, 1.0)]
+    assert means == sorted(means)
+    assert means[0] < 0.1
+    assert means[-1] > ALIKE_MM
+    kidney = half_turns(random_anatomy(0)[0])
+    assert kidney[0].mean_mm > ALIKE_MM
+    assert warning(alike(kidney)) == ""
+
+
+def test_prepare_says_it_and_inspect_repeats_it(tmp_path):
+    meshes = tmp_path / "meshes"
+    meshes.mkdir()
+    for share, says in ((0.0, True), (1.0, False)):
+        write_anatomy(meshes, bent(organ(), share))
+        case = tmp_path / f"case-{says}"
+        said = succeeded(tumortrack("prepare", meshes, case))
+        assert ("the same after half a turn" in said) == says
+        report = store.read_json(case / store.MANIFEST)["report"]
+        assert any("half a turn" in note for note in report["notes"]) == says
+        assert len(report["half_turn"]["turns"]) == 3
+        assert ("WARNING: the organ looks" in succeeded(tumortrack("inspect", case))) == says

@@ -1,0 +1,88 @@
+"""What a poor estimate advises: towards the side that is not seen, or in doubt."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial.transform import Rotation
+
+from tumortrack.core.estimate import Estimate
+from tumortrack.core.types import Mesh, OccupancyCloud, SensorCloud
+from tumortrack.registration.motion import ElasticMotion
+from tumortrack.tracking.advice import what_to_do
+from warp_objects import ANATOMY, shape
+
+CENTRE = np.array([20.0, -10.0, 180.0])
+SIDES = {
+    "the left (the camera's -x)": (-1, 0),
+    "the right (the camera's +x)": (1, 0),
+    "the top (the camera's -y)": (0, -1),
+    "the bottom right (the camera's +y, +x)": (0.7, 0.7),
+}
+
+
+def ball(radius_mm: float, centre_mm: np.ndarray) -> Mesh:
+    solid = trimesh.creation.icosphere(4, radius_mm)
+    return Mesh(solid.vertices + centre_mm, solid.faces)
+
+
+ORGAN = ball(40.0, CENTRE)
+
+
+def estimate(axis, tumor_mm=(0.0, 0.0, 0.0), motion=None) -> Estimate:
+    """Of a ball with a tumor that lies so far from its middle, least sure along this axis."""
+    axes = np.linalg.qr(np.column_stack([axis, [0.3, 0.2, 0.9], [0.5, -0.8, 0.1]]))[0].T
+    tumor = {"center_axes": axes.tolist(), "center_axes_std_mm": [4.0, 1.0, 1.0]}
+    inside = OccupancyCloud(CENTRE[None], np.ones(1), np.ones(1))
+    meshes = {"kidney": ORGAN, "tumor_1": ball(8.0, CENTRE + tumor_mm)}
+    return Estimate(inside, None, meshes, {"parts": {"kidney": {}, "tumor_1": tumor}}, motion)
+
+
+def seen(towards=None) -> SensorCloud:
+    """All points of the ball's near side, or all but those on one side of the picture."""
+    off = ORGAN.vertices_mm - CENTRE
+    near = (off * ORGAN.vertices_mm).sum(1) < 0
+    if towards is not None:
+        near &= off[:, :2] @ np.array(towards) < 10
+    return SensorCloud(ORGAN.vertices_mm[near])
+
+
+@pytest.mark.parametrize(("words", "side"), SIDES.items())
+def test_a_hidden_side_is_named(words, side):
+    said = what_to_do(estimate([0, 0, 1]), seen(towards=side))
+    assert said == f"free the view of the organ's side towards {words}, or look from there"
+
+
+@pytest.mark.parametrize(("words", "side"), SIDES.items())
+def test_what_is_least_sure_is_looked_at_along_its_axis_from_the_tumors_side(words, side):
+    for sign in (1.0, -1.0):  # an axis has two directions
+        unsure = estimate([sign * side[0], sign * side[1], 0.0], (12 * side[0], 12 * side[1], 0))
+        assert what_to_do(unsure, seen()) == f"look more from {words}, by about 30 degrees"
+    along = what_to_do(estimate(CENTRE), seen())
+    assert along == "look more from another side, by about 30 degrees"
+
+
+def test_a_view_of_something_else_and_a_wrong_scale_need_other_help():
+    found = estimate([1, 0, 0])
+    for reason, words in (
+        ("the camera sees through 7 % of where the organ lies", "make sure that this is the organ"),
+        ("an organ 1.10 times as large fits better: check the camera's scale", "calibrate"),
+    ):
+        assert words in what_to_do(replace(found, reason=reason), seen())
+
+
+def test_another_place_is_looked_at_where_it_differs():
+    """A long organ across the picture; the other fit has it turned about its right end."""
+    lying = np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])  # its long axis is the CT's z
+    mean, end_mm = shape().body.mean, CENTRE + [48.0, 0, 0]
+    turn = Rotation.from_euler("z", 25, degrees=True).as_matrix()
+    other = ElasticMotion(shape(), turn @ lying, end_mm + turn @ (CENTRE - end_mm), mean)
+    fit = ElasticMotion(shape(), lying, CENTRE, mean, rivals=((other, 0.4),))
+    vertices = fit.carry(ANATOMY.organ.vertices_mm)
+    found = estimate([0, 1, 0], motion=fit)
+    found.meshes["kidney"] = ANATOMY.organ.moved(vertices)
+    said = what_to_do(found, SensorCloud(vertices))
+    assert said == "look more from the left (the camera's -x), by about 30 degrees"
