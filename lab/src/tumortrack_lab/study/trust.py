@@ -199,11 +199,11 @@ def worst_picture(found: pd.DataFrame, tables: Sequence[Table], count: int, path
 
     taken = found[found.accepted.astype(bool)].nlargest(count, "miss")
     models, trackers = {table.organ: table.model for table in tables}, {}
-    height = 3.5 * len(taken) + 0.5
-    drawing = new_figure(11.0, height)
+    height = 2.75 * len(taken) + 0.5
+    drawing = new_figure(8.4, height)
     panels, lines = drawing.subplots(len(taken), 2, squeeze=False), []
     drawing.subplots_adjust(
-        left=0.04, top=1 - 0.75 / height, bottom=0.1 / height, hspace=0.13, wspace=0.03
+        left=0.045, top=1 - 0.7 / height, bottom=0.1 / height, hspace=0.16, wspace=0.03
     )
     for number, (row, (_, state)) in enumerate(zip(panels, taken.iterrows(), strict=True), start=1):
         if state.organ not in trackers:
