@@ -53,7 +53,9 @@ def main(options: Options) -> None:
         say(f"calibrated without each {what}")
     family = found["family"]
     coverage = [trust.coverage_table(one, f"{what} left out") for what, one in found.items()]
-    coverage.append(trust.coverage_table(family.assign(part=states.hidden), "hidden surface"))
+    tested = family[family.refused == ""]
+    hidden = tested.assign(part=tested.hidden)
+    coverage.append(trust.coverage_table(hidden, "hidden surface, families left out"))
     picture = writer.image("trust_reliability")
     trust.reliability_picture(
         {f"each {what} left out": one for what, one in found.items()}, picture

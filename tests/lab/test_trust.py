@@ -55,7 +55,7 @@ def test_a_family_unlike_the_others_is_found_out_by_leaving_it_out(tables, tmp_p
     assert (taken.groupby("part")["mm 0.9"].max() <= taken.groupby("part")["mm 0.95"].max()).all()
     lines = trust.coverage_table(found, "family").splitlines()
     assert [line.split(" | ")[0] for line in lines[2:]] == [
-        "| cut", "| plate", "| pull", "| rest", "| all",
+        "| cut", "| plate", "| pull", "| rest", "| all of these",
     ]  # fmt: skip
     organs = trust.left_out(states, states.organ, 0, widest_mm=20.0)
     within = organs[organs.accepted.astype(bool)]["within 0.95"]

@@ -68,7 +68,6 @@ class Train:
         case = load_case(self.case)  # report what is wrong so far before PyTorch's seconds
 
         from tumortrack.models.folder import is_finished, weakness_of
-        from tumortrack.models.margins import GENERIC
         from tumortrack.training.model import load_model, load_start
         from tumortrack.training.presets import PRESETS
         from tumortrack.training.train import TrainingRun, train
@@ -99,8 +98,6 @@ class Train:
             f"s, validation mIoU {about['validation_miou']:.3f}."
         )
         say_notes(filter(None, [weakness_of(about)]))
-        if GENERIC.is_file() and self.preset == "clinic":
-            say(f"it states no margins yet: tumortrack margins {self.model}")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -49,7 +49,7 @@ class GenericMargins:
                 raise InputError(f"{table} does not lie beside the model that it was made with.")
             for name, figure in judged_by(manifest).items():
                 worst[name] = max(figure, worst.get(name, figure))
-            rows += some
+            rows += [replace(row, label=(*row.label[:2], table.parent.name)) for row in some]
         digests = "".join(store.sha256_of(table) for table in self.tables)
         of = hashlib.sha256(digests.encode()).hexdigest()
         margins = margins_of(rows, of, self.confidence, self.widest, self.seed)

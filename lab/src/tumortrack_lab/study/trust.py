@@ -119,7 +119,8 @@ def coverage_table(found: pd.DataFrame, what: str) -> str:
     for stated in STATED:
         head += [f"within {100 * stated:g} %, %", "mm: median / 90 %"]
     lines = []
-    for name, mine in [*found.groupby("part", sort=True), ("all", found)]:
+    tested = found[found.refused == ""]
+    for name, mine in [*found.groupby("part", sort=True), ("all of these", tested)]:
         cells = [str(name), str(len(mine)), str(mine.good.sum())]
         taken = mine[mine.accepted.astype(bool)]
         if taken.empty:
@@ -155,6 +156,7 @@ def risk_picture(found: pd.DataFrame, path: Path) -> None:
     """Share of answers that are farther off than some mm, as answers are given down to a limit on
     the stated 95 % radius; a dot: with the limits that the calibrations found."""
     drawing = new_figure(8.6, 4.4, left=0.09, right=0.98, top=0.9, bottom=0.13)
+    found = found[found.refused == ""]
     axes, good = drawing.add_subplot(), found[found.good]
     order = good.sort_values(f"mm {STATED[-1]}")
     share = 100 * np.arange(1, len(order) + 1) / len(found)
@@ -197,11 +199,11 @@ def worst_picture(found: pd.DataFrame, tables: Sequence[Table], count: int, path
 
     taken = found[found.accepted.astype(bool)].nlargest(count, "miss")
     models, trackers = {table.organ: table.model for table in tables}, {}
-    height = 3.5 * len(taken) + 0.5
-    drawing = new_figure(11.0, height)
+    height = 2.75 * len(taken) + 0.5
+    drawing = new_figure(8.4, height)
     panels, lines = drawing.subplots(len(taken), 2, squeeze=False), []
     drawing.subplots_adjust(
-        left=0.04, top=1 - 0.75 / height, bottom=0.1 / height, hspace=0.13, wspace=0.03
+        left=0.045, top=1 - 0.7 / height, bottom=0.1 / height, hspace=0.16, wspace=0.03
     )
     for number, (row, (_, state)) in enumerate(zip(panels, taken.iterrows(), strict=True), start=1):
         if state.organ not in trackers:
@@ -218,7 +220,7 @@ def worst_picture(found: pd.DataFrame, tables: Sequence[Table], count: int, path
     drawing.legend(handles=scene_legend(), ncols=4, loc="upper right", frameon=False)
     save(drawing, path)
     head = ["", "scene", "off, mm", "95 % radius, mm", "hidden", "what happened"]
-    return table(head, lines, left=2)
+    return table(head, lines, left=len(head))
 
 
 def _moved_words(motion: Any, scene: Scene) -> str:
