@@ -11,10 +11,11 @@ from scipy.stats import multivariate_normal
 
 from elastic_objects import CENTER, RADII
 from tumortrack.models.config import GaussNewtonConfig
+from tumortrack.models.in_distribution import RIVAL_COST
 from tumortrack.registration import discrepancy_kernels as kernels
 from tumortrack.registration.discrepancy import AMPLITUDES_MM, LENGTH_MM, NOISES_MM, _grouped, judge
 from tumortrack.registration.gauss_newton import RegistrationResult, posterior, refine
-from tumortrack.registration.registration import RIVAL_COST, best_of
+from tumortrack.registration.registration import best_of
 from tumortrack.sense.noise import CalibrationConfig
 from warp_objects import ANATOMY, nudged, placed, shape
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from tumortrack.core.errors import InputError
 
@@ -12,6 +12,8 @@ Points = Float[np.ndarray, "n 3"]
 Affine = Float[np.ndarray, "4 4"]
 Matrix = Float[np.ndarray, "3 3"]
 Vector = Float[np.ndarray, " 3"]
+Faces = Int[np.ndarray, "f 3"]
+Values = Float[np.ndarray, " f"]
 
 # Patient frame, DICOM: +x Left, +y Posterior, +z Superior (LPS).
 DIRECTIONS_LPS: dict[str, Direction] = {
@@ -84,3 +86,13 @@ def unit(vector: Vector) -> Vector:
 def perpendicular(vector: Vector) -> Vector:
     """Some unit vector at right angles to a vector."""
     return unit(np.cross(vector, np.eye(3)[np.argmin(np.abs(vector))]))
+
+
+def triangles_of(
+    vertices_mm: Points, faces: Faces
+) -> tuple[Float[np.ndarray, "f 3"], Float[np.ndarray, "f 3"], Values]:
+    """Middles (mm), unit normals and areas (mm2) of a surface's triangles."""
+    corners = vertices_mm[faces]
+    doubled = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    length = np.linalg.norm(doubled, axis=1)
+    return corners.mean(1), doubled / np.maximum(length, 1e-12)[:, None], length / 2

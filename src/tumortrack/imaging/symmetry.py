@@ -9,7 +9,7 @@ from jaxtyping import Float64
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from tumortrack.core.geometry import rigid, transform_points
+from tumortrack.core.geometry import rigid, transform_points, triangles_of
 from tumortrack.core.types import Anatomy
 
 # Mean distance below which a view may not tell. Of organs between an ellipsoid and a phantom, 40
@@ -36,12 +36,10 @@ class HalfTurn:
 
 def half_turns(anatomy: Anatomy) -> list[HalfTurn]:
     """About each principal axis of the organ's surface, the best match first; a second at most."""
-    import trimesh
-
-    organ = trimesh.Trimesh(anatomy.organ.vertices_mm, anatomy.organ.faces, process=False)
-    count = max(_MOVED, round(organ.area / _SPACING_MM**2))
-    points, face = trimesh.sample.sample_surface(organ, count, seed=0)
-    points, normals, tree = np.asarray(points), organ.face_normals[face], cKDTree(points)
+    points, normals, area = triangles_of(anatomy.organ.vertices_mm, anatomy.organ.faces)
+    count = max(_MOVED, round(area.sum() / _SPACING_MM**2))
+    drawn = np.random.default_rng(0).choice(len(points), count, p=area / area.sum())
+    points, normals, tree = points[drawn], normals[drawn], cKDTree(points[drawn])
     middle, found = points.mean(0), []
     tumors = np.array([tumor.box_mm.mean(0) for tumor in anatomy.tumors]).reshape(-1, 3)
     for axis in np.linalg.svd(points - middle, full_matrices=False)[2]:

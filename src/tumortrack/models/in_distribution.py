@@ -1,13 +1,15 @@
 """Whether a cloud looks like the organ of the training scenes, and how well the answer fits it.
 
 A network gives an answer for any input. Two numbers tell the organ from something else: how far
-the points spread, and how far they lie from the estimated surface. The first is a percentile over
-four fifths of the points, so that background does not count; of an estimate the second is judged by
-its half that lies nearest, the most that strays can leave of anything (the median's breakdown
-point).
+the points spread, and how far they lie from the estimated surface. Both are percentiles over four
+fifths of the points, so that background and strays do not count. Of a registered surface, which
+strays do not draw aside, the second is judged by the half that lies nearest: all that strays can
+leave of anything (the median's breakdown point).
 """
 
 from __future__ import annotations
+
+import math
 
 import numpy as np
 from jaxtyping import Float
@@ -27,6 +29,10 @@ _PER_MEDIAN = 1.90  # of four fifths, the distance per that of half, if errors a
 FIT_FACTOR = 2.0
 _SMALLEST_LIMIT_MM = 4.0  # a depth camera's own errors may exceed those of clean training scenes
 _SPREAD_FACTOR = 1.5
+
+# A fit's cost is -2 log of its probability, up to a constant: what costs so much more has a
+# hundredth of the best one's.
+RIVAL_COST = -2 * math.log(0.01)
 
 # An elastic state's squared Mahalanobis distance is 1 on average over its library. Fits of the
 # digital twin's worst states have 0.4, of the paper's drags, which no library holds, up to 0.9;
@@ -57,11 +63,12 @@ def fit_mm(distances_mm: Distances) -> float:
 
 
 def check_in_distribution(
-    known: InDistributionRange, points_mm: Points, distances_mm: Distances
+    known: InDistributionRange, points_mm: Points, distances_mm: Distances, registered: bool = False
 ) -> None:
     """NoEstimate for a cloud that cannot be the organ's: its points spread over much more or less
-    than in any validation scene, or half of them lie much farther from the estimated surface."""
-    spread, half = spread_mm(points_mm), float(np.median(distances_mm))
+    than in any validation scene, or a fifth of them (half, where the surface was ``registered``)
+    lie much farther from the estimated surface."""
+    spread = spread_mm(points_mm)
     low, high = known.spread_mm[0] / _SPREAD_FACTOR, known.spread_mm[1] * _SPREAD_FACTOR
     if not low <= spread <= high:
         raise _refusal(
@@ -69,10 +76,13 @@ def check_in_distribution(
             f"model's scenes within {low:.0f} to {high:.0f} mm",
             "the unit",
         )
-    limit = max(known.fit_mm * FIT_FACTOR, _SMALLEST_LIMIT_MM) / _PER_MEDIAN
-    if half > limit:
+    limit = max(known.fit_mm * FIT_FACTOR, _SMALLEST_LIMIT_MM)
+    which, fit = "a fifth", fit_mm(distances_mm)
+    if registered:
+        which, fit, limit = "half", float(np.median(distances_mm)), limit / _PER_MEDIAN
+    if fit > limit:
         raise _refusal(
-            f"half of its points lie more than {half:.1f} mm from the estimated surface, where "
+            f"{which} of its points lie more than {fit:.1f} mm from the estimated surface, where "
             f"{limit:.1f} mm are the most to expect"
         )
 

@@ -155,7 +155,7 @@ class RegistrationLocator:
     def _checked(self, frame: Frame, fit: RegistrationResult) -> _Registered:
         """What a fit says, if it can be this organ's."""
         known, distances_mm = self._model.in_distribution, np.abs(fit.distances_mm)
-        check_in_distribution(known, frame.points_mm, distances_mm)
+        check_in_distribution(known, frame.points_mm, distances_mm, registered=True)
         check_likely(fit.motion.rarity)
         with frame.stage("surfaces"):
             return self._moved(frame.points_mm, fit)

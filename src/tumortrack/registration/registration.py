@@ -31,6 +31,7 @@ from tumortrack.core.errors import NoEstimate
 from tumortrack.core.geometry import Points
 from tumortrack.core.process import parallel_for
 from tumortrack.models.config import GaussNewtonConfig
+from tumortrack.models.in_distribution import RIVAL_COST
 from tumortrack.registration.gauss_newton import GaussNewton, RegistrationResult
 from tumortrack.registration.motion import ElasticMotion
 from tumortrack.registration.network import RegistrationNetwork
@@ -58,9 +59,6 @@ _TRIAL_STEPS = 6
 _MAX_COST_RATIO = 3.0  # to the least cost: hypotheses above are given up
 _TURNED_SHARE = 2 / 3  # of that, for turned starts, which a whole fit races
 
-# A cost is -2 log of the probability, up to a constant: what costs so much more has a hundredth of
-# the best one's.
-RIVAL_COST = -2 * math.log(0.01)
 _WITHIN = 7.81  # 95 % of chi squared with three degrees of freedom
 _SAME_MM = 0.2  # descents that end in one minimum end within some last steps (enough_mm, 0.02)
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from itertools import product
 from operator import itemgetter
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 from jaxtyping import Float
@@ -35,7 +35,9 @@ from tumortrack.report.calibration_table import Miss, Row
 from tumortrack.report.metrics import outward_miss
 from tumortrack.simulate.scene_folder import Scene, list_scenes
 from tumortrack.tracking.quality import cloud_shares
-from tumortrack.tracking.tracker import Tracker
+
+if TYPE_CHECKING:
+    from tumortrack.tracking.tracker import Tracker
 
 _Turn = Literal["choose", "test", "calibrate"]
 CONFIDENCES = (0.9, 0.95)

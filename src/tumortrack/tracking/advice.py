@@ -7,6 +7,7 @@ from jaxtyping import Float
 from scipy.spatial import cKDTree
 
 from tumortrack.core.estimate import Estimate
+from tumortrack.core.geometry import triangles_of
 from tumortrack.core.types import SensorCloud
 from tumortrack.registration.motion import ElasticMotion
 
@@ -33,15 +34,12 @@ def what_to_do(estimate: Estimate, cloud: SensorCloud) -> str:
     Args:
         cloud: the organ's points, camera frame, in which it was located.
     """
-    import trimesh
-
     for words, advice in _INSTEAD.items():
         if words in estimate.reason:
             return advice
     mesh = next(iter(estimate.meshes.values()))
     faces = mesh.faces[:: len(mesh.faces) // _FACES + 1]
-    organ = trimesh.Trimesh(mesh.vertices_mm, faces, process=False)
-    middles, normals = organ.triangles_center, organ.face_normals
+    middles, normals, _ = triangles_of(mesh.vertices_mm, faces)
     sight = middles / np.linalg.norm(middles, axis=1, keepdims=True)
     facing = middles[-(normals * sight).sum(1) > _FACING]
     centre = middles.mean(0)

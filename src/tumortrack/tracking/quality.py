@@ -10,9 +10,8 @@ from scipy.ndimage import binary_dilation, distance_transform_edt
 from tumortrack.core.errors import NoEstimate
 from tumortrack.core.estimate import Estimate, Quality
 from tumortrack.core.types import DepthFrame, Intrinsics, Mesh, SensorCloud
-from tumortrack.models.in_distribution import FIT_FACTOR
+from tumortrack.models.in_distribution import FIT_FACTOR, RIVAL_COST
 from tumortrack.models.margins import ModelMargins, exceeded, figures, stated_margin
-from tumortrack.registration.registration import RIVAL_COST
 from tumortrack.sense.render import render_depth
 
 # Standard deviation of a tumor's middle, and how far from it another fit, nearly as likely, may
