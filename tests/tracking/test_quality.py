@@ -98,6 +98,28 @@ def test_strays_are_no_part_of_the_fit_that_is_judged(tracker, stages):
     assert cost["without_strays"] < 0.3 * cost["now"]  # what lies within 2 mm still counts
 
 
+def test_what_fits_worse_all_of_a_sudden_is_poor(tracker, stages):
+    """It may be another organ, put there; from a first look on, the same fit may be good."""
+    points, rng = stages[0].cloud.points_mm, np.random.default_rng(8)
+    clean = tracker.follow(stages[0].cloud)
+    camera = d405(424, 240)
+    alone = render_depth(clean.meshes["kidney"].vertices_mm, clean.meshes["kidney"].faces, camera)
+    table = DepthFrame(np.fmin(alone.depth_mm, np.float32(np.nanmax(alone.depth_mm) + 30)), camera)
+    low, high = points.min(0), points.max(0)
+    anywhere = low + (high - low) * rng.uniform(-0.1, 1.1, points.shape)
+    spoiled = SensorCloud(np.where(rng.random((len(points), 1)) < 0.35, anywhere, points))
+    first = tracker.follow(spoiled, seen=table)
+    cost = first.report["fit_cost"]
+    assert cost["now"] > cost["usual"]
+    worse = "worse than in most"
+    assert worse not in first.reason  # the ellipsoid's half turn is another matter
+    first, clean = (replace(one, quality="good") for one in (first, clean))
+    assert worse not in tracker.follow(spoiled, first, seen=table).reason
+    sudden = tracker.follow(spoiled, clean, seen=table)
+    assert worse in sudden.reason
+    assert worse in tracker.follow(spoiled, sudden, seen=table).reason
+
+
 @pytest.mark.parametrize("known", [True, False])
 def test_following_goes_on_to_say_that_another_place_fits_as_well(tracker, known, monkeypatch):
     """The organ is an ellipsoid: turned by half a turn it fits as well, its tumor 16 mm away."""

@@ -42,7 +42,7 @@ _UNSEEN = 0.1
 _NEAR_MM = 6.0  # of a point, or twice the points' usual distance: seen
 
 
-def judged(estimate: Estimate, seen: DepthFrame | SensorCloud) -> Estimate:
+def judged(estimate: Estimate, seen: DepthFrame | SensorCloud, strictly: bool = False) -> Estimate:
     """The estimate with its ``quality``, ``good`` or ``poor``, and the ``reason`` in words; also in
     its report, with the shares of the organ that are seen through and, of a cloud, not seen.
 
@@ -52,6 +52,7 @@ def judged(estimate: Estimate, seen: DepthFrame | SensorCloud) -> Estimate:
 
     Args:
         seen: all that the camera saw, not the organ's points alone, where it is known.
+        strictly: the fit must be no worse than usual, whatever the camera sees round the organ.
 
     Raises:
         NoEstimate: a depth image sees through so much of it that the organ cannot lie there. Clouds
@@ -71,7 +72,7 @@ def judged(estimate: Estimate, seen: DepthFrame | SensorCloud) -> Estimate:
             "was taken for it is something else, or lies as no organ in training did. Choose the "
             "organ (a click, a --box), or look from another side."
         )
-    reason = _misfit(estimate, told > _TOLD) or _doubt(estimate)
+    reason = _misfit(estimate, told > _TOLD and not strictly) or _doubt(estimate)
     if through > doubtful:
         reason = f"the camera sees through {100 * through:.0f} % of where the organ lies"
     elif unseen > _UNSEEN and not reason:

@@ -72,7 +72,7 @@ class Tracker:
         """
         if seed < 0:
             raise InputError(f"the seed is {seed}; it must be 0 or more.")
-        return self._judged(self._locator.locate(cloud, grid, seed), cloud, seen or cloud)
+        return self._judged(self._locator.locate(cloud, grid, seed), cloud, seen or cloud, False)
 
     def follow(
         self,
@@ -88,13 +88,20 @@ class Tracker:
             NoEstimate: as ``locate``.
             InputError: the cloud is in metres.
         """
-        return self._judged(self._locator.follow(cloud, last, how), cloud, seen or cloud)
+        # What fits worse all of a sudden may be something else that was put there.
+        strictly = last is not None and (last.quality != "good" or not _unusual(last))
+        estimate = self._locator.follow(cloud, last, how)
+        return self._judged(estimate, cloud, seen or cloud, strictly)
 
     def _judged(
-        self, estimate: Estimate, cloud: SensorCloud, seen: DepthFrame | SensorCloud
+        self,
+        estimate: Estimate,
+        cloud: SensorCloud,
+        seen: DepthFrame | SensorCloud,
+        strictly: bool,
     ) -> Estimate:
         start = time.perf_counter()
-        estimate = judged(estimate, seen)
+        estimate = judged(estimate, seen, strictly)
         if self._weakness:
             estimate = doubted(estimate, self._weakness)
         estimate = with_margin(estimate, cloud, self.model.margins)
@@ -110,6 +117,12 @@ class Tracker:
     def warm(self) -> None:
         """Load and compile what ``follow`` needs, which its first call would otherwise wait for."""
         self._locator.warm()
+
+
+def _unusual(estimate: Estimate) -> bool:
+    """Whether it fits worse than usual."""
+    cost = estimate.report.get("fit_cost")
+    return cost is not None and cost["now"] > cost["usual"]
 
 
 class FollowerConfig(Config, frozen=True, kw_only=True):
