@@ -72,7 +72,7 @@ bench: setup  ## speed of every part beside its naive form; fills docs/performan
 soak: setup  ## an hour of tracking with faults of eleven kinds (ARGS="MODEL CASE --minutes 5"; after make demo)
 	$(BIN)/python lab/scripts/soak.py $(ARGS)
 
-results: setup  ## the tables and plots of docs/results.md (hours; ARGS=--quick: minutes)
+results: setup  ## the tables and plots of docs/results.md (hours; ARGS="--case NAME=FOLDER": more organs)
 	$(BIN)/python lab/scripts/results.py $(ARGS)
 
 foreign: setup  ## how often another kidney, or a mirrored one, is called good (an hour)
