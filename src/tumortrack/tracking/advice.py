@@ -39,9 +39,9 @@ def what_to_do(estimate: Estimate, cloud: SensorCloud) -> str:
             return advice
     mesh = next(iter(estimate.meshes.values()))
     faces = mesh.faces[:: len(mesh.faces) // _MOST + 1]
-    middles, normals, _ = triangles_of(mesh.vertices_mm, faces)
+    middles, normals = triangles_of(mesh.vertices_mm, faces)
     sight = middles / np.linalg.norm(middles, axis=1, keepdims=True)
-    facing = middles[-(normals * sight).sum(1) > _FACING]
+    facing = middles[-(normals * sight).sum(1) > _FACING * np.linalg.norm(normals, axis=1)]
     centre = middles.mean(0)
     if len(facing) and len(cloud.points_mm):
         hidden = cKDTree(cloud.points_mm).query(facing)[0] > _NEAR_MM

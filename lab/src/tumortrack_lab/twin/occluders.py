@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from tumortrack.core.errors import InputError
-from tumortrack.core.geometry import rotation_onto
+from tumortrack.core.geometry import rotation_onto, triangles_of
 from tumortrack.core.types import DepthFrame, Mesh
 from tumortrack.sense.camera import deproject
 from tumortrack.sense.render import render_depth
@@ -253,8 +253,7 @@ def _drape(frame: DepthFrame, rng: Generator) -> Occluder:
         creases = 1.0 + np.sin(0.15 * along + phases[0]) * np.sin(0.2 * side + phases[1])
         depth = nearest_mm - _DRAPE_ABOVE_MM - creases
         vertices = np.concatenate([flat, depth[..., None]], axis=-1).reshape(-1, 3)
-        a, b, c = (vertices[faces[:, i]] for i in range(3))
-        towards_camera = np.cross(b - a, c - a)[:, 2].sum() < 0
+        towards_camera = triangles_of(vertices, faces)[1][:, 2].sum() < 0
         return Mesh(vertices, faces if towards_camera else faces[:, ::-1])
 
     return solid
