@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from tumortrack.core.errors import InputError
-from tumortrack.core.geometry import rotation_onto, triangles_of
+from tumortrack.core.geometry import rotation_onto
 from tumortrack.core.types import DepthFrame, Mesh
 from tumortrack.sense.camera import deproject
 from tumortrack.sense.render import render_depth
