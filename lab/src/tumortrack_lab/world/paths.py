@@ -56,9 +56,10 @@ def _no_tools(time_s: float) -> list[Mesh]:
 
 
 @dataclass(frozen=True, eq=False)
-class Path:
+class LoadPath:
     """Key frames (bench frame, mm) and what goes on besides.
 
+    ``phases_s``: when it begins, the load comes, is all there, goes, has gone, and when it ends;
     ``way``: how bench, bed and organ move as one (breathing, a hand that turns the organ over);
     ``bed_too``: the ground goes along; ``tools``: what else is in the picture; both by time.
     """
@@ -67,6 +68,7 @@ class Path:
     times_s: Times
     keys_mm: Sequence[Nodes]
     rim_mm: float
+    phases_s: list[float]
     about: dict[str, Any]
     way: Callable[[float], Transform] = _still
     bed_too: bool = False
@@ -156,6 +158,7 @@ class _Course(NamedTuple):
     shares: list[float]
     times_s: Times
     which: list[int]
+    phases_s: list[float]
 
     def share(self, time_s: float) -> float:
         return float(np.interp(time_s, self.times_s, np.array(self.shares)[self.which]))
@@ -172,13 +175,14 @@ def _there_and_back(reach_mm: float, rng: Generator) -> _Course:
     times = [0.0, *rising, *falling, falling[-1] + AFTER_S]
     last = 2 * steps
     which = [0, *range(steps + 1), *range(steps, last + 1), last]
-    return _Course([*up, *up[-2::-1]], np.array(times), which)
+    phases = [0.0, BEFORE_S, rising[-1], held_s, times[-2], times[-1]]
+    return _Course([*up, *up[-2::-1]], np.array(times), which, np.array(phases).tolist())
 
 
 def _loaded(
     bench: _Bench, course: _Course, at: Callable[[float], list[Force]], about: dict[str, Any],
     **besides: Any,
-) -> Path:  # fmt: skip
+) -> LoadPath:  # fmt: skip
     """The path of one load that comes and goes."""
     loads = (bench.forces + tuple(at(share) if share > 0 else ()) for share in course.shares)
     keys, iterations = equilibria(bench.stage.solid, loads)
@@ -187,14 +191,16 @@ def _loaded(
 
 def _path(
     bench: _Bench, course: _Course, keys: list[Nodes], about: dict[str, Any], **besides: Any
-) -> Path:
+) -> LoadPath:
     change = max((volume_change(bench.stage.solid, nodes) for nodes in keys), key=abs)
     told = {"material": bench.about, "rim_mm": bench.rim_mm, "volume_change": change, **about}
     shown = [keys[n] for n in course.which]
-    return Path(bench.stage.organ, course.times_s, shown, bench.rim_mm, told, **besides)
+    return LoadPath(
+        bench.stage.organ, course.times_s, shown, bench.rim_mm, course.phases_s, told, **besides
+    )
 
 
-def _press(organ: Organ, rng: Generator) -> Path:
+def _press(organ: Organ, rng: Generator) -> LoadPath:
     """A plate from above on the midsection, up to 25 degrees oblique, on which the organ does not
     slip freely; it is not in the picture (as the twin's is not)."""
     bench = _bench(organ, rng, (0.3, 0.5), _some_friction(rng))
@@ -214,7 +220,7 @@ def _press(organ: Organ, rng: Generator) -> Path:
     return _loaded(bench, _there_and_back(deep, rng), at, about)
 
 
-def _push(organ: Organ, rng: Generator) -> Path:
+def _push(organ: Organ, rng: Generator) -> LoadPath:
     """A rod, which is seen, pushes a flank aside."""
     bench = _bench(organ, rng, (0.05, 0.25), _some_friction(rng))
     out = unit(np.array([rng.normal(0, 0.3), rng.choice([-1.0, 1.0]), rng.uniform(0.0, 0.7)]))
@@ -237,14 +243,14 @@ def _push(organ: Organ, rng: Generator) -> Path:
     return _loaded(bench, course, at, {"mm": far, "rod_radius_mm": radius}, tools=tools)
 
 
-def _roll(organ: Organ, rng: Generator) -> Path:
+def _roll(organ: Organ, rng: Generator) -> LoadPath:
     """A flank is drawn round over a slippery bed by something that is not seen."""
     bench = _bench(organ, rng, (0.25, 0.5), 0.0)
     load = FAMILIES["roll"](bench.stage, rng)  # type: ignore[misc]  # only rest has none
     return _loaded(bench, _there_and_back(load.reach_mm, rng), load.at, load.about)
 
 
-def _breathe(organ: Organ, rng: Generator) -> Path:
+def _breathe(organ: Organ, rng: Generator) -> LoadPath:
     """A diaphragm presses on one pole and moves organ and bed along; two to three breaths."""
     bench = _bench(organ, rng, (0.2, 0.45), _some_friction(rng))
     out = unit(np.array([rng.choice([-1.0, 1.0]), *rng.normal(0, 0.2, 2)]))
@@ -259,7 +265,8 @@ def _breathe(organ: Organ, rng: Generator) -> Path:
     times = [BEFORE_S + period_s * (n + phase) for n in range(breaths) for phase in eased]
     end_s = BEFORE_S + breaths * period_s
     which = [0, *(np.arange(8 * breaths) % 8), 0, 0]
-    course = _Course(shares, np.array([0.0, *times, end_s, end_s + AFTER_S]), which)
+    phases = [0.0, BEFORE_S, BEFORE_S + period_s / 2, end_s - period_s / 2, end_s, end_s + AFTER_S]
+    course = _Course(shares, np.array([0.0, *times, end_s, end_s + AFTER_S]), which, phases)
 
     def at(share: float) -> list[Force]:
         return [bench.stage.touch(plate_over(bench.stage, axes, target, 100.0, share * deep))]
@@ -273,7 +280,7 @@ def _breathe(organ: Organ, rng: Generator) -> Path:
     return _loaded(bench, course, at, about, way=way, bed_too=True)
 
 
-def _turn(organ: Organ, rng: Generator) -> Path:
+def _turn(organ: Organ, rng: Generator) -> LoadPath:
     """A hand, which is seen, grips the organ, turns it about its length and lays it down."""
     bench = _bench(organ, rng, (0.1, 0.3), 0.0)
     stage, solid = bench.stage, bench.stage.solid
@@ -300,7 +307,9 @@ def _turn(organ: Organ, rng: Generator) -> Path:
     end_s = start_s + turn_s
     times = [0, BEFORE_S, start_s - 0.4, start_s, start_s + 0.3, end_s, end_s + 0.4, end_s + 0.8]
     which = [0, 0, 1, 2, 3, 4, 5, 6]
-    course = _Course([], np.array([*times, end_s + 0.8 + 2 * AFTER_S]), [*which, 6])
+    laid_s = end_s + 0.8
+    phases = [0.0, BEFORE_S, start_s, end_s, laid_s, laid_s + 2 * AFTER_S]
+    course = _Course([], np.array([*times, phases[-1]]), [*which, 6], phases)
 
     def way(time_s: float) -> Transform:
         share = np.clip((time_s - start_s) / turn_s, 0, 1)
@@ -308,7 +317,7 @@ def _turn(organ: Organ, rng: Generator) -> Path:
         up = _LIFT_MM * np.sin(np.pi * share) - share * (lowest + middle[2])
         return _turned(middle, [share * degrees, 0.0, 0.0], np.array([0.0, 0.0, up]))
 
-    angle = rng.uniform(0, 2 * np.pi)
+    angle = rng.choice([0.0, np.pi]) + rng.uniform(-0.4, 0.4)  # past cameras at the sides
     back, side = (np.array([np.cos(a), np.sin(a), 0.0]) for a in (angle, angle + np.pi / 2))
     shape = hand_mesh(back, side, rng)
     down = np.array([1.0, -1.0, -1.0])  # hands are made before a camera that looks straight down
@@ -333,12 +342,12 @@ def _turned(middle_mm: np.ndarray, degrees: Sequence[float], shift_mm: np.ndarra
     return rigid(rotation, middle_mm - rotation @ middle_mm + shift_mm)
 
 
-KINDS: dict[str, Callable[[Organ, Generator], Path]] = {
+KINDS: dict[str, Callable[[Organ, Generator], LoadPath]] = {
     "press": _press, "breathe": _breathe, "push": _push, "roll": _roll, "turn": _turn,
 }  # fmt: skip
 
 
-def random_path(organ: Organ, kind: str, seed: int) -> Path:
+def random_path(organ: Organ, kind: str, seed: Sequence[int]) -> LoadPath:
     """All of it drawn from the seed. Raises TumortrackError: a key frame has no equilibrium, or the
     organ's volume changed by more than tissue's does."""
-    return KINDS[kind](organ, np.random.default_rng([seed, list(KINDS).index(kind), 18]))
+    return KINDS[kind](organ, np.random.default_rng(seed))

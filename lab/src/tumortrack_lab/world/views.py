@@ -21,8 +21,8 @@ from tumortrack_lab.twin.occluders import rod_mesh
 from tumortrack_lab.world.families import Deformed, log_uniform
 from tumortrack_lab.world.noise import StereoCamera, StereoConfig
 
-_SIZE_PX = (424, 240)
-_NEAR_MM, _FAR_MM = (85.0, 230.0), 420.0  # of the organ's nearest point; nothing is seen beyond
+SIZE_PX = (424, 240)
+_NEAR_MM, FAR_MM = (85.0, 230.0), 420.0  # of the organ's nearest point; nothing is seen beyond
 _MOST_TILT = 60.0  # degrees from straight above
 _DEEPER_MM = 15.0  # behind a slit's film: seen through a gap between coarse walls
 
@@ -46,7 +46,7 @@ def look(
 ) -> View:
     """One random view of the state's true surface (bench frame), and of what else lies there.
     ``hidden``: the share of the organ's picture that a hand or instruments hide."""
-    camera = d405(*_SIZE_PX)
+    camera = d405(*SIZE_PX)
     to_camera, about = _camera_pose(organ, rng)
     alone = _organ_depth(state, organ, to_camera, camera)
     below = render(ground_mesh(state.rim_mm, rng), to_camera, camera)
@@ -57,12 +57,12 @@ def look(
         cover, about["occluder"] = _covering(alone, own, camera, hidden, rng)
         scene = np.fmin(scene, cover)
     seen = own & (alone <= scene)
-    scene[scene > _FAR_MM] = np.nan
+    scene[scene > FAR_MM] = np.nan
     sensor = StereoConfig(subpixel_px=rng.uniform(0.03, 0.12), gloss_degrees=rng.uniform(2.0, 7.0))
     frame = StereoCamera(camera, sensor, rng).see(scene.astype(np.float32))
     wide = Intrinsics(
-        *(2 * _SIZE_PX[0], 2 * _SIZE_PX[1]), camera.fx, camera.fy,
-        camera.cx + _SIZE_PX[0] / 2, camera.cy + _SIZE_PX[1] / 2,
+        *(2 * SIZE_PX[0], 2 * SIZE_PX[1]), camera.fx, camera.fy,
+        camera.cx + SIZE_PX[0] / 2, camera.cy + SIZE_PX[1] / 2,
     )  # fmt: skip
     every = max(int(np.isfinite(render(organ, to_camera, wide)).sum()), 1)
     about |= {
