@@ -95,7 +95,8 @@ def _follow(options: Options, names: list[str]) -> None:
         for method in options.methods:
             called = f"{method} {options.version}".strip()
             path = film.folder / f"{called.replace(' ', '-')}.json"
-            rows = trainings.kept(path, about, partial(following.judge, tracker, film, method))
+            locate = following.METHODS[method](tracker)
+            rows = trainings.kept(path, about, partial(following.judge, locate, film))
             errors = pd.DataFrame(rows)["center_mm"]
             say(f"{done}/{len(made)} {name}, {called}: centre {errors.median():.1f} mm off")
     rows = [row for out in (options.out, *options.others) for row in following.rows_in(out)]

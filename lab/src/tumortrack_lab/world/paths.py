@@ -11,7 +11,7 @@ leaves. Between them the first goes along by slerp, displacement and place by mo
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -80,45 +80,37 @@ class LoadPath:
 
     def of(self, points_mm: Points) -> Moving:
         """Points in or on the organ at rest on their way."""
-        mesh = self.organ.mesh
+        from scipy.interpolate import PchipInterpolator
+        from scipy.spatial.transform import Rotation, Slerp
+
+        mesh, rest = self.organ.mesh, self.organ.mesh.nodes_mm
         share = mesh.lump(mesh.volumes_mm3)
-        owner, weights = find(mesh.nodes_mm[mesh.tets], points_mm)
-        poses, left = [], []
-        for nodes in self.keys_mm:
-            pose = kabsch(mesh.nodes_mm, nodes, share)
-            moved = (nodes - mesh.nodes_mm)[mesh.tets[owner]]
-            there = points_mm + np.einsum("mi,mij->mj", weights, moved)
-            poses.append(pose)
-            left.append(transform_points(np.linalg.inv(pose), there) - points_mm)
-        middle = share @ mesh.nodes_mm / share.sum()
-        return Moving.through(self.times_s, points_mm, middle, np.array(poses), np.array(left))
+        owner, weights = find(rest[mesh.tets], points_mm)
+        poses = np.array([kabsch(rest, nodes, share) for nodes in self.keys_mm])
+        left = []
+        for nodes, pose in zip(self.keys_mm, poses, strict=True):
+            moved = np.einsum("mi,mij->mj", weights, (nodes - rest)[mesh.tets[owner]])
+            left.append(transform_points(np.linalg.inv(pose), points_mm + moved) - points_mm)
+        middle = share @ rest / share.sum()
+        places = poses[:, :3, :3] @ middle + poses[:, :3, 3]
+        turn = Slerp(self.times_s, Rotation.from_matrix(poses[:, :3, :3]))
+        place = PchipInterpolator(self.times_s, places)
+
+        def pose_at(time_s: float) -> Transform:
+            rotation = turn(time_s).as_matrix()
+            return rigid(rotation, place(time_s) - rotation @ middle)
+
+        return Moving(points_mm, pose_at, PchipInterpolator(self.times_s, np.array(left)))
 
 
 @dataclass(frozen=True, eq=False)
 class Moving:
-    """Points between key frames: ``pose(t)`` of what they are at rest plus ``bend(t)``."""
+    """Points between key frames: what ``bend(t)`` adds to their places at rest, moved by the rigid
+    ``pose(t)``."""
 
     points_mm: Points
     pose: Callable[[float], Transform]
     bend: Callable[[float], Points]
-
-    @classmethod
-    def through(
-        cls, times_s: Times, points_mm: Points, middle_mm: np.ndarray,
-        poses: Float64[np.ndarray, "k 4 4"], left_mm: Float64[np.ndarray, "k n 3"],
-    ) -> Moving:  # fmt: skip
-        from scipy.interpolate import PchipInterpolator
-        from scipy.spatial.transform import Rotation, Slerp
-
-        turn = Slerp(times_s, Rotation.from_matrix(poses[:, :3, :3]))
-        place = PchipInterpolator(times_s, poses[:, :3, :3] @ middle_mm + poses[:, :3, 3])
-        bend = PchipInterpolator(times_s, left_mm)
-
-        def pose(time_s: float) -> Transform:
-            rotation = turn(time_s).as_matrix()
-            return rigid(rotation, place(time_s) - rotation @ middle_mm)
-
-        return cls(points_mm, pose, bend)
 
     def at(self, time_s: float) -> Points:
         return transform_points(self.pose(time_s), self.points_mm + self.bend(time_s))
@@ -130,8 +122,6 @@ class _Bench(NamedTuple):
     stage: Stage
     forces: tuple[Force, ...]
     rim_mm: float
-    bed_kpa: float
-    down: Float64[np.ndarray, " 3"]
     about: dict[str, float]
 
 
@@ -139,12 +129,13 @@ def _bench(organ: Organ, rng: Generator, rim: tuple[float, float], friction: flo
     tissue, solid = random_tissue(organ, organ.mesh, rng)
     stage, rim_mm = Stage(organ, solid), rng.uniform(*rim) * organ.size_mm[2]
     bed_kpa, weight = log_uniform(rng, 3.0, 40.0), log_uniform(rng, 0.1, 1.0)
-    down = weight * np.array([0.0, 0.0, -1.0])
-    forces: list[Force] = [*bedded(stage, rim_mm, bed_kpa, friction, down)]
+    forces: list[Force] = [
+        *bedded(stage, rim_mm, bed_kpa, friction, weight * np.array([0.0, 0.0, -1.0]))
+    ]
     if tissue["capsule_mn_mm"] > 0:
         forces.append(Capsule.of(organ.mesh, tissue["capsule_mn_mm"]))
     about = {**tissue, "bed_kpa": bed_kpa, "friction": friction, "weights_added": weight}
-    return _Bench(stage, tuple(forces), rim_mm, bed_kpa, down, about)
+    return _Bench(stage, tuple(forces), rim_mm, about)
 
 
 def _some_friction(rng: Generator) -> float:
@@ -185,15 +176,17 @@ def _loaded(
 ) -> LoadPath:  # fmt: skip
     """The path of one load that comes and goes."""
     loads = (bench.forces + tuple(at(share) if share > 0 else ()) for share in course.shares)
-    keys, iterations = equilibria(bench.stage.solid, loads)
-    return _path(bench, course, keys, {"load": about, "iterations": iterations}, **besides)
+    return _path(bench, course, loads, about, **besides)
 
 
 def _path(
-    bench: _Bench, course: _Course, keys: list[Nodes], about: dict[str, Any], **besides: Any
-) -> LoadPath:
+    bench: _Bench, course: _Course, loads: Iterable[tuple[Force, ...]], about: dict[str, Any],
+    **besides: Any,
+) -> LoadPath:  # fmt: skip
+    keys, iterations = equilibria(bench.stage.solid, loads)
     change = max((volume_change(bench.stage.solid, nodes) for nodes in keys), key=abs)
-    told = {"material": bench.about, "rim_mm": bench.rim_mm, "volume_change": change, **about}
+    told = {"material": bench.about, "rim_mm": bench.rim_mm, "load": about}
+    told |= {"volume_change": change, "iterations": iterations}
     shown = [keys[n] for n in course.which]
     return LoadPath(
         bench.stage.organ, course.times_s, shown, bench.rim_mm, course.phases_s, told, **besides
@@ -302,7 +295,6 @@ def _turn(organ: Organ, rng: Generator) -> LoadPath:
         *((flat, pulled, *held, *grip.at(share * hard)) for share in (1.0, 0.5)),
         (flat, pulled, *held),
     ]
-    keys, iterations = equilibria(solid, loads)
     turn_s, start_s = rng.uniform(1.2, 3.0), BEFORE_S + 1.2
     end_s = start_s + turn_s
     times = [0, BEFORE_S, start_s - 0.4, start_s, start_s + 0.3, end_s, end_s + 0.4, end_s + 0.8]
@@ -331,8 +323,7 @@ def _turn(organ: Organ, rng: Generator) -> LoadPath:
         return [Mesh(hand.vertices_mm + top + out_mm * back * down, hand.faces)]
 
     about = {"degrees": degrees, "grip_mm": hard * grip.reach_mm, "turn_s": turn_s}
-    told = {"load": about, "iterations": iterations}
-    return _path(bench, course, keys, told, way=way, tools=tools)
+    return _path(bench, course, loads, about, way=way, tools=tools)
 
 
 def _turned(middle_mm: np.ndarray, degrees: Sequence[float], shift_mm: np.ndarray) -> Transform:
