@@ -97,7 +97,7 @@ METHODS: dict[str, Callable[[Tracker], Locate]] = {
 
 def judge(locate: Locate, film: Film) -> list[dict[str, Any]]:
     """A row a frame and tumor: quality, errors of its centre and surface (Hausdorff), stated
-    deviations, and the errors of the best rigid pose; mm. Without an estimate they are absent."""
+    deviations, and the best rigid pose's error of the centre; mm. Without an estimate they are absent."""
     poses, sites, rows = film.first_from_camera(), tumor_sites_of(film.rest), []
     for number, time_s in enumerate(film.seconds.tolist()):
         about: dict[str, Any] = {
@@ -120,22 +120,19 @@ def judge(locate: Locate, film: Film) -> list[dict[str, Any]]:
         for name, rest, true in zip(
             film.rest.names[1:], film.rest.tumors, truth.tumors, strict=True
         ):
-            rigid = transform_points(pose, rest.vertices_mm)
             row = {**about, "tumor": name, "site": sites[name].kind}
-            row |= _errors(rest.moved(rigid), true, "rigid_")
+            row["rigid_center_mm"] = _center_mm(transform_points(pose, rest.vertices_mm), true)
             if motion is not None:
-                row |= _errors(rest.moved(motion.carry(rest.vertices_mm)), true, "")
+                found = rest.moved(motion.carry(rest.vertices_mm))
+                row["center_mm"] = _center_mm(found.vertices_mm, true)
+                row["hausdorff_mm"] = surface_distances(found, true, 2.0).hausdorff_mm
                 row |= {key: parts[name].get(key) for key in ("center_std_mm", "surface_std_mm")}
             rows.append(row)
     return rows
 
 
-def _errors(found: Mesh, true: Mesh, prefix: str) -> dict[str, float]:
-    off_mm = found.vertices_mm.mean(0) - true.vertices_mm.mean(0)  # the same vertices
-    return {
-        f"{prefix}center_mm": float(np.linalg.norm(off_mm)),
-        f"{prefix}hausdorff_mm": surface_distances(found, true, 2.0).hausdorff_mm,
-    }
+def _center_mm(found_mm: np.ndarray, true: Mesh) -> float:
+    return float(np.linalg.norm(found_mm.mean(0) - true.vertices_mm.mean(0)))  # the same vertices
 
 
 def rows_in(out: Path) -> list[dict[str, Any]]:
