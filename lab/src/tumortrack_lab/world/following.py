@@ -97,7 +97,8 @@ METHODS: dict[str, Callable[[Tracker], Locate]] = {
 
 def judge(locate: Locate, film: Film) -> list[dict[str, Any]]:
     """A row a frame and tumor: quality, errors of its centre and surface (Hausdorff), stated
-    deviations, and the best rigid pose's error of the centre; mm. Without an estimate they are absent."""
+    deviations, and the error of the centre that the best rigid pose has; mm. Without an estimate
+    they are absent."""
     poses, sites, rows = film.first_from_camera(), tumor_sites_of(film.rest), []
     for number, time_s in enumerate(film.seconds.tolist()):
         about: dict[str, Any] = {
