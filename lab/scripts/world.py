@@ -22,10 +22,8 @@ import tyro
 from tumortrack import api
 from tumortrack.cli.console import say
 from tumortrack.core import store
-from tumortrack.core.config import to_builtins
 from tumortrack.core.errors import InputError, NoEstimate, TumortrackError
 from tumortrack.core.geometry import transform_points
-from tumortrack.imaging.case import load_case
 from tumortrack.report.metrics import box_center_distance
 from tumortrack.simulate.scene_folder import Scene, read_scene
 from tumortrack.tracking.tracker import Tracker
@@ -33,8 +31,6 @@ from tumortrack_lab.peers.base import kabsch
 from tumortrack_lab.real.judging import quantiles
 from tumortrack_lab.study import trainings
 from tumortrack_lab.study.document import table
-from tumortrack_lab.tets import TetMesh
-from tumortrack_lab.twin.dataset import claim
 from tumortrack_lab.world.families import FAMILIES
 from tumortrack_lab.world.scenes import DISTURBANCES, World, WorldConfig
 
@@ -74,7 +70,7 @@ def main(options: Options) -> None:
         disturbances=options.disturb,
         segmentation=options.segmentation,
     )
-    world = _open(options, config)
+    world = World.kept(options.case, options.out, "world.json", config)
     failures_path = options.out / "failures.json"
     failures = store.read_json(failures_path) if failures_path.exists() else {}
     names = {n: "-".join((f"{n:05d}", *world.recipe(n))) for n in range(options.count)}
@@ -99,26 +95,6 @@ def main(options: Options) -> None:
         text = _summary(rows, {k: v for k, v in failures.items() if k in names.values()})
         store.write_atomically(options.out / "table.md", text.encode())
         print(text)
-
-
-def _open(options: Options, config: WorldConfig) -> World:
-    """The world of the folder; stated there, with its tetrahedra, when it is new."""
-    from safetensors.numpy import load_file, save
-
-    case, out = load_case(options.case), options.out
-    identity = {
-        "case_sha256": store.sha256_of(options.case / store.MANIFEST),
-        "config": to_builtins(config),
-    }
-    claim(out, "world.json", identity)
-    tets = out / "tets.safetensors"
-    if tets.exists():
-        kept = load_file(tets)
-        return World.of(case, config, TetMesh(kept["nodes_mm"], kept["tets"]))
-    world = World.of(case, config)
-    mesh = world.organ.mesh
-    store.write_atomically(tets, save({"nodes_mm": mesh.nodes_mm, "tets": mesh.tets}))
-    return world
 
 
 def _measured(model: Path, world: World, out: Path, names: list[str]) -> pd.DataFrame:

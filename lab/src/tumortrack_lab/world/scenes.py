@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, Literal, get_args
 
 import numpy as np
 from jaxtyping import Float64
 
-from tumortrack.core.config import Config
+from tumortrack.core import store
+from tumortrack.core.config import Config, to_builtins
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import Anatomy, Mesh, SensorCloud
-from tumortrack.imaging.case import Case
+from tumortrack.imaging.case import Case, load_case
 from tumortrack.imaging.meshes import mesh_of, solid_of
 from tumortrack.phantom.kidneys import random_anatomy
 from tumortrack.simulate.scene_folder import InnerPoints, Scene, draw_targets
 from tumortrack_lab.tets import TetMesh, tetrahedralise
 from tumortrack_lab.twin.apparatus import bench_from_ct, moved
+from tumortrack_lab.twin.dataset import claim
 from tumortrack_lab.world import segmentation
 from tumortrack_lab.world.families import FAMILIES, Deformed, solve
 from tumortrack_lab.world.organ import Organ
@@ -77,6 +80,25 @@ class World:
             config, few, to_bench, Organ.of(there, mesh), draw_targets(few, config.seed),
             to_bench[:3, :3] @ thick,
         )  # fmt: skip
+
+    @classmethod
+    def kept(cls, case: Path, out: Path, about: str, config: Config) -> World:
+        """The world of a folder, stated in its file ``about``, with its tetrahedra; new, if there
+        is none. Raises InputError: the folder holds something else, or another case's or
+        configuration's."""
+        from safetensors.numpy import load_file, save
+
+        loaded, tets = load_case(case), out / "tets.safetensors"
+        sha256 = store.sha256_of(case / store.MANIFEST)
+        claim(out, about, {"case_sha256": sha256, "config": to_builtins(config)})
+        worlds = config if isinstance(config, WorldConfig) else WorldConfig()
+        if tets.exists():
+            kept = load_file(tets)
+            return cls.of(loaded, worlds, TetMesh(kept["nodes_mm"], kept["tets"]))
+        world = cls.of(loaded, worlds)
+        mesh = world.organ.mesh
+        store.write_atomically(tets, save({"nodes_mm": mesh.nodes_mm, "tets": mesh.tets}))
+        return world
 
     def recipe(self, number: int) -> tuple[str, Disturbance]:
         """Family and disturbance of a scene: all pairs in turn."""
