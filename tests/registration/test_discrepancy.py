@@ -15,6 +15,7 @@ from tumortrack.models.in_distribution import RIVAL_COST
 from tumortrack.registration import discrepancy_kernels as kernels
 from tumortrack.registration.discrepancy import AMPLITUDES_MM, LENGTH_MM, NOISES_MM, _grouped, judge
 from tumortrack.registration.gauss_newton import RegistrationResult, posterior, refine
+from tumortrack.registration.looks import Looks
 from tumortrack.registration.registration import best_of
 from tumortrack.sense.noise import CalibrationConfig
 from warp_objects import ANATOMY, nudged, placed, shape
@@ -38,7 +39,7 @@ def seen(bump_mm=0.0, width_mm=12.0):
 
 
 def judged(points):
-    return posterior(refine(shape(), points, START, CONFIG).motion, points, CONFIG)
+    return posterior(refine(shape(), points, START, CONFIG).motion, Looks.of([points]), CONFIG)
 
 
 @pytest.fixture(scope="module")

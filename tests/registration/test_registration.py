@@ -24,6 +24,7 @@ from tumortrack.models.config import GaussNewtonConfig
 from tumortrack.models.encoders.heightmap import HeightMapConfig, _spread, picture
 from tumortrack.occupancy.network import OccupancyNetwork
 from tumortrack.registration.gauss_newton import GaussNewton, _prior, refine, size_of
+from tumortrack.registration.looks import Looks
 from tumortrack.registration.motion import ElasticMotion
 from tumortrack.registration.network import PoseHypothesis, RegistrationNetwork
 from tumortrack.registration.registration import Registration, _beside
@@ -287,7 +288,7 @@ def test_a_wrong_scale_of_the_camera_shows_in_the_fit(times):
     config = GaussNewtonConfig()
     points = times * surface(placed(), 1000)
     start = dataclasses.replace(START, centre_mm=times * START.centre_mm)
-    found, gain = size_of(refine(shape(), points, start, config), points, config)
+    found, gain = size_of(refine(shape(), points, start, config), Looks.of([points]), config)
     assert abs(found - times) < 0.6 * abs(times - 1) + 0.01  # the robust kernel reads too little
     assert (gain > 9.2) == (times != 1)
 

@@ -16,6 +16,7 @@ from tumortrack.core.config import to_builtins
 from tumortrack.core.errors import InputError
 
 if TYPE_CHECKING:
+    from tumortrack.core.geometry import Affine
     from tumortrack.core.types import DepthFrame, SensorCloud
     from tumortrack.models.model import Model
     from tumortrack.sense.cloud import CloudConfig
@@ -24,12 +25,16 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class Locate(StatedPatient):
-    """Locate kidney and tumors in one cloud or depth image.
+    """Locate kidney and tumors in one cloud or depth image, or in several of the organ at rest.
 
     Attributes:
         model: folder that `train` wrote.
-        cloud: .ply, .pcd or .npz in the camera frame, or a depth .png (with --intrinsics).
+        cloud: .ply, .pcd or .npz in the camera frame, or a depth .png (with --intrinsics). Several
+            views of one organ that does not move in between need --poses; the answer is in the
+            first one's frame.
         out: folder to write.
+        poses: JSON with fixed_from_camera (4 x 4 rows for each view, in their order), unit (mm or
+            m) and frame_id: where the cameras were, in a robot's base, say.
         grid: voxels along the longest side of the labelled volume, up to 400.
         seed: of the random points and queries.
         range: keep depths between NEAR and FAR mm. By default a cloud is used as it is, and a depth
@@ -43,8 +48,9 @@ class Locate(StatedPatient):
     """
 
     model: Positional[Path]
-    cloud: Positional[Path]
+    cloud: Positional[tuple[Path, ...]]
     out: Positional[Path]
+    poses: Path | None = None
     grid: int = 160
     seed: int = 0
     range: tuple[float, float] | None = None
@@ -58,9 +64,13 @@ class Locate(StatedPatient):
         _check_grid(self.grid)
         store.check_place(self.out, "run", self.overwrite)
         points = self._points()
-        seen, notes = self._read()  # report what is wrong so far before PyTorch's seconds
+        # Report what is wrong so far before PyTorch's seconds.
+        poses = self._camera_from_look()
+        views = [self._read(path) for path in self.cloud]
+        notes = tuple(note for _, mine in views for note in mine)
 
         from tumortrack.core.estimate import NO_CHECK_FAILED, UNVERIFIED
+        from tumortrack.core.types import Look
         from tumortrack.models.margins import margin_words, stated_radius
         from tumortrack.tracking.files import write_estimate
         from tumortrack.tracking.points import check_near_organ
@@ -76,8 +86,10 @@ class Locate(StatedPatient):
             box_mm = tracker.anatomy_ct.organ.box_mm
             far = check_near_organ(points.points_ct, box_mm, str(self.map))
             notes = (*notes, *points.notes, *far)
-        cloud = self._cropped(seen, model.config.scene.cloud)
-        estimate = tracker.locate(cloud, self.grid, self.seed, seen)
+        crop = model.config.scene.cloud
+        first, *others = [(self._cropped(seen, crop), seen) for seen, _ in views]
+        looks = [Look(*one, pose) for one, pose in zip(others, poses, strict=True)]
+        estimate = tracker.locate(first[0], self.grid, self.seed, first[1], looks)
         if points is not None and self.map is not None:
             estimate.report["map"] = {
                 "points": len(points.points_ct),
@@ -89,7 +101,7 @@ class Locate(StatedPatient):
             notes=list(notes),
             model=model.provenance,
             model_sha256=store.sha256_of(self.model / store.MANIFEST),
-            cloud_sha256=store.sha256_of(self.cloud),
+            cloud_sha256=store.sha256_of(self.cloud[0]),
         )
         write_estimate(self.out, estimate, self.overwrite, points)
         say_notes(notes)
@@ -134,25 +146,41 @@ class Locate(StatedPatient):
             )
         return read_points(self.map)
 
-    def _read(self) -> tuple[SensorCloud | DepthFrame, tuple[str, ...]]:
-        """What the file holds, and notes."""
+    def _camera_from_look(self) -> list[Affine]:
+        """Where the further views' cameras were, seen from the first one's."""
+        import numpy as np
+
+        from tumortrack.sense.files import read_poses
+
+        if not self.cloud:
+            raise InputError("locate needs a cloud or a depth image: locate MODEL CLOUD OUT.")
+        if (self.poses is None) != (len(self.cloud) == 1):
+            raise InputError(
+                f"{len(self.cloud)} views and {'no ' if self.poses is None else ''}--poses do not "
+                "fit: several views need --poses FILE, and one takes none."
+            )
+        if self.poses is None:
+            return []
+        first, *others = read_poses(self.poses, len(self.cloud))
+        return [np.linalg.inv(first) @ pose for pose in others]
+
+    def _read(self, path: Path) -> tuple[SensorCloud | DepthFrame, tuple[str, ...]]:
+        """What a file holds, and notes."""
         from tumortrack.sense.cloud import check_cloud
         from tumortrack.sense.files import read_cloud, read_depth_png
 
-        if self.cloud.suffix.lower() == ".png":
+        if path.suffix.lower() == ".png":
             if self.intrinsics is None:
-                raise InputError(
-                    f"{self.cloud} is a depth image: give --intrinsics FILE.json with it."
-                )
+                raise InputError(f"{path} is a depth image: give --intrinsics FILE.json with it.")
             if self.unit != "mm":
                 raise InputError(
                     "--unit is for clouds; a depth image's unit stands in its intrinsics file as "
                     "depth_unit_mm (mm per step)."
                 )
-            return read_depth_png(self.cloud, self.intrinsics), ()
+            return read_depth_png(path, self.intrinsics), ()
         if self.intrinsics is not None:
-            raise InputError(f"--intrinsics is for depth images (.png); {self.cloud} is a cloud.")
-        cloud, notes = read_cloud(self.cloud, self.unit)
+            raise InputError(f"--intrinsics is for depth images (.png); {path} is a cloud.")
+        cloud, notes = read_cloud(path, self.unit)
         check_cloud(cloud)  # before the crop, which would only say that nothing lies in range
         return cloud, notes
 

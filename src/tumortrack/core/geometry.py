@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import Literal
+
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -24,6 +27,8 @@ DIRECTIONS_LPS: dict[str, Direction] = {
     "inferior": (0.0, 0.0, -1.0),
 }
 
+_NOT_RIGID = 1e-3  # largest deviation of a rotation from orthonormal: files have few digits
+
 # NIfTI is RAS+, DICOM is LPS: the first two axes change sign, and nothing else.
 RAS_FROM_LPS = np.diag([-1.0, -1.0, 1.0, 1.0])
 
@@ -39,6 +44,29 @@ def rigid(rotation: Matrix, translation_mm: Vector) -> Affine:
     b_from_a = np.eye(4)
     b_from_a[:3, :3] = rotation
     b_from_a[:3, 3] = translation_mm
+    return b_from_a
+
+
+def read_rigid(rows: Sequence[Sequence[float]], unit: Literal["mm", "m"], where: str) -> Affine:
+    """4 x 4 rows of a file as a transform in mm. Raises InputError, which names ``where``: they are
+    no rigid transform."""
+    b_from_a = np.array(rows, float) if {len(row) for row in rows} == {4} else np.zeros((0, 4))
+    if len(b_from_a) != 4:
+        raise InputError(f"{where} has {len(rows)} rows; it must have 4 of 4 numbers.")
+    turn = b_from_a[:3, :3]
+    good = (
+        np.isfinite(b_from_a).all()
+        and np.abs(turn @ turn.T - np.eye(3)).max() < _NOT_RIGID
+        and np.linalg.det(turn) > 0
+        and np.array_equal(b_from_a[3], [0, 0, 0, 1])
+    )
+    if not good:
+        raise InputError(
+            f"{where} is no rigid transform: its rotation must be orthonormal and right-handed, "
+            "its last row 0 0 0 1."
+        )
+    if unit == "m":
+        b_from_a[:3, 3] *= 1000
     return b_from_a
 
 

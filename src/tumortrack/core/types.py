@@ -199,6 +199,19 @@ class SensorCloud:
 
 
 @dataclass(frozen=True, eq=False)
+class Look:
+    """The organ's points from one more camera, or from another place: ``cloud`` and all that it saw
+    in its own frame, and ``camera_from_look`` from there to the first camera's."""
+
+    cloud: SensorCloud
+    seen: DepthFrame | SensorCloud
+    camera_from_look: Float64[np.ndarray, "4 4"]
+
+    def __post_init__(self) -> None:
+        _freeze(self, "camera_from_look", np.float64, (4, 4))
+
+
+@dataclass(frozen=True, eq=False)
 class OccupancyCloud:
     """The estimate as points inside the organ: label >= 1 and its probability, camera frame."""
 

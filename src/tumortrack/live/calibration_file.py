@@ -6,15 +6,15 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float64
 
 from tumortrack.core.config import Config, from_builtins
 from tumortrack.core.errors import InputError
+from tumortrack.core.geometry import read_rigid
 from tumortrack.core.store import read_json
 from tumortrack.live.values import PublishedFrame
 
 _LARGEST_MM, _LARGEST_DEG = 100.0, 10.0  # with more, it is no calibration
-_NOT_RIGID = 1e-3  # largest deviation of a rotation from orthonormal: files have few digits
+_NOT_UNIT = 1e-3  # of a normal's length: files have few digits
 
 _MATRICES = ("camera_from_robot", "robot_from_camera", "camera_from_marker", "robot_from_marker")
 
@@ -57,7 +57,7 @@ def read_frames(path: Path) -> PublishedFrame:
     exactly one of the three ways."""
     file = from_builtins(read_json(path), CalibrationFile, str(path))
     matrices = {
-        name: _rigid(rows, file.unit, f"{path}: {name}")
+        name: read_rigid(rows, file.unit, f"{path}: {name}")
         for name in _MATRICES
         if (rows := getattr(file, name)) is not None
     }
@@ -77,7 +77,7 @@ def read_frames(path: Path) -> PublishedFrame:
         raise InputError(f"{path}: frame_id is empty; give the robot's frame, base_link say.")
     table, camera = file.table_in_camera, file.camera_frame_id.strip().removeprefix("/")
     if table is not None:
-        if not abs(np.linalg.norm(table[:3]) - 1) < _NOT_RIGID or not np.isfinite(table[3]):
+        if not abs(np.linalg.norm(table[:3]) - 1) < _NOT_UNIT or not np.isfinite(table[3]):
             raise InputError(
                 f"{path}: table_in_camera must be a unit normal (3 numbers) and the plane's offset "
                 f"in {file.unit}, camera frame, as a run's report says it."
@@ -87,24 +87,3 @@ def read_frames(path: Path) -> PublishedFrame:
         table = x, y, z, offset * (1000 if file.unit == "m" else 1)
     error = file.error_mm, file.error_deg
     return PublishedFrame(file.frame_id, robot_from_camera, True, camera, table, *error)
-
-
-def _rigid(rows: Rows, unit: str, where: str) -> Float64[np.ndarray, "4 4"]:
-    if len(rows) != 4:
-        raise InputError(f"{where} has {len(rows)} rows; it must have 4 of 4 numbers.")
-    b_from_a = np.array(rows, float)
-    turn = b_from_a[:3, :3]
-    good = (
-        np.isfinite(b_from_a).all()
-        and np.abs(turn @ turn.T - np.eye(3)).max() < _NOT_RIGID
-        and np.linalg.det(turn) > 0
-        and np.array_equal(b_from_a[3], [0, 0, 0, 1])
-    )
-    if not good:
-        raise InputError(
-            f"{where} is no rigid transform: its rotation must be orthonormal and right-handed, "
-            "its last row 0 0 0 1."
-        )
-    if unit == "m":
-        b_from_a[:3, 3] *= 1000
-    return b_from_a

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
 
@@ -10,9 +11,9 @@ import numpy as np
 import torch
 from jaxtyping import Float32
 
-from tumortrack.core.errors import NoEstimate
+from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.estimate import Estimate, Following
-from tumortrack.core.types import Anatomy, CameraLabels, OccupancyCloud, SensorCloud
+from tumortrack.core.types import Anatomy, CameraLabels, Look, OccupancyCloud, SensorCloud
 from tumortrack.models.in_distribution import check_in_distribution
 from tumortrack.models.report import Frame, Rng, describe_parts, grid_over
 from tumortrack.occupancy import volume
@@ -37,10 +38,17 @@ class OccupancyLocator:
         self.model = model
         self.inference = Inference(model.network, model.arithmetic)
 
-    def locate(self, cloud: SensorCloud, grid: int, seed: int) -> Estimate:
+    def locate(
+        self, cloud: SensorCloud, grid: int, seed: int, others: Sequence[Look] = ()
+    ) -> Estimate:
         """See ``tracking.tracker.Tracker.locate``. The two passes of queries are those of the
         follow-up (LUDO): 10,000 coarse ones where the organ can be, then labels of 40,000 points
         in the enlarged box of those inside."""
+        if others:
+            raise InputError(
+                "several looks need a model that knows a motion: preset clinic; quick and paper "
+                "take one cloud."
+            )
         frame = _Frame(self, cloud, seed, np.random.default_rng(seed))
         lattice = frame.lattice(frame.coarse_box())
         distances_mm = frame.checked(lattice)

@@ -20,12 +20,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float, Float64
+from scipy.linalg import block_diag
 
 from tumortrack.core.geometry import Points
 from tumortrack.models.config import GaussNewtonConfig
 from tumortrack.registration import gauss_newton_kernels as kernels
 from tumortrack.registration.discrepancy import FARTHEST, judge
 from tumortrack.registration.kernels import POSE
+from tumortrack.registration.looks import CAMERA_STD, Looks
 from tumortrack.registration.motion import ElasticMotion
 from tumortrack.registration.rest_shape import RestShape
 from tumortrack.simulate.elastic.flow import LatticeField
@@ -119,16 +121,16 @@ class GaussNewton:
 
 
 def size_of(
-    fit: RegistrationResult, points_mm: Points, config: GaussNewtonConfig
+    fit: RegistrationResult, looks: Looks, config: GaussNewtonConfig
 ) -> tuple[float, float]:
-    """How large the points (camera frame, mm) show the organ, times its true size, and how much
-    less it would cost to fit them scaled about the camera by that; to second order, as in Rao's
-    score test."""
+    """How large the points show the organ, times its true size, and how much less it would cost to
+    fit them scaled about their cameras by that; to second order, as in Rao's score test."""
     motion, last_mm = fit.motion, config.last_mm
     assert motion.covariance is not None
-    rows = motion.residual_rows(points_mm).astype(float)
+    rows = motion.residual_rows(looks.points_mm).astype(float)
     slopes, distances = rows[:, :-1], rows[:, -1]
-    outwards = -(slopes[:, :3] * (points_mm @ motion.rotation)).sum(1)  # of scaling the points
+    outwards = -(slopes[:, :3] * (looks.rays_mm @ motion.rotation)).sum(1)  # of scaling the points
+    config = looks.weighed(config)
     weight = min(config.n_effective / len(rows), 1.0) / config.sigma_mm**2
     weighed = outwards * weight / (1 + (distances / last_mm) ** 2) ** 2
     cross = slopes.T @ weighed
@@ -136,16 +138,20 @@ def size_of(
     return float(1 + slope / curvature), float(slope**2 / curvature)
 
 
-def posterior(motion: ElasticMotion, points_mm: Points, config: GaussNewtonConfig) -> ElasticMotion:
-    """A fitted motion with what its residuals (points: camera frame, mm) leave unsure: see
-    ``discrepancy``."""
-    body = motion.shape.body
-    off = np.concatenate([np.zeros(POSE), body.mean - motion.coefficients])
-    prior = np.diag([config.shift_mm**2] * 3 + [config.turn_rad**2] * 3 + [0.0] * len(body.mean))
-    prior[POSE:, POSE:] = body.covariance
-    rows, rest_ct = motion.residual_rows(points_mm), motion.back(points_mm)
-    covariance, process = judge(rows, rest_ct, prior, off, config.last_mm)
-    return replace(motion, covariance=covariance, discrepancy=process)
+def posterior(motion: ElasticMotion, looks: Looks, config: GaussNewtonConfig) -> ElasticMotion:
+    """A fitted motion with what its residuals leave unsure: see ``discrepancy``."""
+    body, unknowns = motion.shape.body, POSE + len(motion.coefficients)
+    from_mean = np.zeros(POSE), motion.coefficients - body.mean, looks.shifts[1:].ravel()
+    pose_std = np.repeat([config.shift_mm, config.turn_rad], 3)
+    cameras = np.tile(CAMERA_STD**2, looks.count - 1)
+    prior = block_diag(np.diag(pose_std**2), body.covariance, np.diag(cameras))
+    rows = motion.residual_rows(looks.points_mm)
+    slopes, distances = rows[:, :-1], rows[:, -1:]
+    rows = np.concatenate([slopes, looks.unknown(slopes), distances], axis=1)
+    rest_ct = motion.back(looks.points_mm)
+    covariance, process = judge(rows, rest_ct, prior, -np.concatenate(from_mean), config.last_mm)
+    process = replace(process, cross=process.cross[:unknowns])
+    return replace(motion, covariance=covariance[:unknowns, :unknowns], discrepancy=process)
 
 
 def _prior(rest: RestShape, config: GaussNewtonConfig) -> Float64[np.ndarray, "p p"]:

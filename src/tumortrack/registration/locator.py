@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -12,13 +13,13 @@ from jaxtyping import Float, Float32, Int32, Int64, UInt8
 from scipy.spatial import cKDTree
 
 from tumortrack.core.estimate import Estimate, Following
-from tumortrack.core.geometry import Points
-from tumortrack.core.types import Anatomy, CameraLabels, Mesh, OccupancyCloud, SensorCloud
+from tumortrack.core.types import Anatomy, CameraLabels, Look, Mesh, OccupancyCloud, SensorCloud
 from tumortrack.imaging.raster import label_grid
 from tumortrack.models.in_distribution import check_in_distribution, check_likely
 from tumortrack.models.report import Frame, describe_parts, grid_over
 from tumortrack.registration import kernels
 from tumortrack.registration.gauss_newton import RegistrationResult, posterior, refine, size_of
+from tumortrack.registration.looks import Looks
 from tumortrack.registration.model import RegistrationModel
 from tumortrack.registration.motion import ElasticMotion, blend
 from tumortrack.registration.registration import best_of
@@ -92,11 +93,17 @@ class RegistrationLocator:
         self._nearest_sample = nearest_lookup(self._samples_ct)
         self._carried: _OrganPoints | None = None
 
-    def locate(self, cloud: SensorCloud, grid: int, seed: int) -> Estimate:
+    def locate(
+        self, cloud: SensorCloud, grid: int, seed: int, others: Sequence[Look] = ()
+    ) -> Estimate:
         """See ``tracking.tracker.Tracker.locate``."""
         frame = Frame(self._model, cloud, seed, np.random.default_rng(seed))
-        fit = self._registration.register(frame.points_mm, 0.0, frame.stage)
-        size, placed = self._size(frame, fit), self._checked(frame, fit)
+        more = [Frame(self._model, one.cloud, seed, frame.rng) for one in others]
+        looks = Looks.of(
+            [one.points_mm for one in (frame, *more)], [one.camera_from_look for one in others]
+        )
+        fit, looks = self._registration.register_all(looks, 0.0, frame.stage)
+        size, placed = self._size(looks, fit), self._checked(looks, fit, frame)
         organ = placed.meshes[self._model.parts[0]]
         with frame.stage("fine"):
             inside = self._drawn(placed, organ, cloud.stamp_ns, frame.rng)
@@ -105,6 +112,9 @@ class RegistrationLocator:
             labels = label_grid(Anatomy(tuple(placed.meshes.values())), camera_from_index, shape)
         voxel_mm = float(camera_from_index[0, 0])
         report = self._report(frame, placed, inside, size=size, voxel_mm=voxel_mm)
+        if others:
+            report["looks"] = looks.described()
+            report["fit_cost"]["usual"] *= looks.count
         volume = CameraLabels(labels, camera_from_index)
         return Estimate(inside, volume, placed.meshes, report, placed.motion)
 
@@ -121,8 +131,8 @@ class RegistrationLocator:
         if not fits or how.thorough or min(fit.cost for fit in fits) > usual:
             enough = 0.0 if not fits else usual if how.thorough else np.inf
             fits.append(self._registration.register(points, enough, frame.stage))
-        fit = best_of(fits)
-        size, unsmoothed, lag_s = self._size(frame, fit), fit.motion, 0.0
+        fit, looks = best_of(fits), Looks.of([points])
+        size, unsmoothed, lag_s = self._size(looks, fit), fit.motion, 0.0
         if last is not None and isinstance(last.motion, ElasticMotion) and how.smoothing_s > 0:
             past_s = (cloud.stamp_ns - last.cloud.stamp_ns) * 1e-9
             share = -math.expm1(-past_s / how.smoothing_s)
@@ -131,7 +141,7 @@ class RegistrationLocator:
             if np.linalg.norm(behind, axis=1).max() < _BEHIND_MM:
                 fit = replace(fit, motion=smooth)
                 lag_s = past_s * (1 - share) / share  # of what moves steadily
-        placed = self._checked(frame, fit)
+        placed = self._checked(looks, fit, frame)
         with frame.stage("carry"):
             inside = self._carry(placed, cloud.stamp_ns)
         smoothing = {"time_s": how.smoothing_s, "lag_ms": 1000 * lag_s}
@@ -146,23 +156,26 @@ class RegistrationLocator:
         points = Frame(self._model, cloud, 0, np.random.default_rng(0)).points_mm
         self._registration.propose(points)
         fit = self._registration.best_fit(points, [rest])
-        self._carry(self._moved(points, fit), 0)
+        self._carry(self._moved(Looks.of([points]), fit), 0)
 
-    def _size(self, frame: Frame, fit: RegistrationResult) -> dict[str, float]:
-        times, gain = size_of(fit, frame.points_mm, self._registration.config)
+    def _size(self, looks: Looks, fit: RegistrationResult) -> dict[str, float]:
+        times, gain = size_of(fit, looks, self._registration.config)
         return {"times": times, "gain": gain}
 
-    def _checked(self, frame: Frame, fit: RegistrationResult) -> _Registered:
+    def _checked(self, looks: Looks, fit: RegistrationResult, frame: Frame) -> _Registered:
         """What a fit says, if it can be this organ's."""
         known, distances_mm = self._model.in_distribution, np.abs(fit.distances_mm)
-        check_in_distribution(known, frame.points_mm, distances_mm, registered=True)
+        for n in range(looks.count):
+            mine = looks.look == n
+            points, off_mm = looks.points_mm[mine], distances_mm[mine]
+            check_in_distribution(known, points, off_mm, registered=True)
         check_likely(fit.motion.rarity)
         with frame.stage("surfaces"):
-            return self._moved(frame.points_mm, fit)
+            return self._moved(looks, fit)
 
-    def _moved(self, points_mm: Points, fit: RegistrationResult) -> _Registered:
+    def _moved(self, looks: Looks, fit: RegistrationResult) -> _Registered:
         motion = replace(
-            posterior(fit.motion, points_mm, self._registration.config),
+            posterior(fit.motion, looks, self._registration.config),
             calibration=self._model.config.scene.calibration,
             std_scale=self._calibration.std_scale,
         )

@@ -28,11 +28,12 @@ from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
 from tumortrack.core.errors import NoEstimate
-from tumortrack.core.geometry import Points
+from tumortrack.core.geometry import Points, transform_points
 from tumortrack.core.process import parallel_for
 from tumortrack.models.config import GaussNewtonConfig
 from tumortrack.models.in_distribution import RIVAL_COST
-from tumortrack.registration.gauss_newton import GaussNewton, RegistrationResult
+from tumortrack.registration.gauss_newton import GaussNewton, RegistrationResult, refine
+from tumortrack.registration.looks import Looks, seen_from_first
 from tumortrack.registration.motion import ElasticMotion
 from tumortrack.registration.network import RegistrationNetwork
 from tumortrack.registration.rest_shape import RestShape
@@ -59,6 +60,8 @@ _TRIAL_STEPS = 6
 _MAX_COST_RATIO = 3.0  # to the least cost: hypotheses above are given up
 _TURNED_SHARE = 2 / 3  # of that, for turned starts, which a whole fit races
 
+_CORRECTIONS = 3  # of cameras and motion in turns: more move nothing by a tenth of a millimetre
+
 _WITHIN = 7.81  # 95 % of chi squared with three degrees of freedom
 _SAME_MM = 0.2  # descents that end in one minimum end within some last steps (enough_mm, 0.02)
 
@@ -79,6 +82,32 @@ class Registration:
             hypotheses = self.propose(points_mm)
         with timed("refine"):
             return self.best_fit(points_mm, hypotheses, usual_cost)
+
+    def register_all(
+        self, looks: Looks, usual_cost: float = math.inf, timed: Timer = nullcontext
+    ) -> tuple[RegistrationResult, Looks]:
+        """The whole method for several looks at one still organ, each of which proposes; and the
+        looks as the further cameras are corrected then."""
+        if looks.count == 1:
+            return self.register(looks.points_mm, usual_cost, timed), looks
+        with timed("encode"):
+            hypotheses = []
+            for n, pose in enumerate(looks.camera_from_look):
+                seen = transform_points(np.linalg.inv(pose), looks.points_mm[looks.look == n])
+                hypotheses += [seen_from_first(one, pose) for one in self.propose(seen)]
+        config = looks.weighed(self.config)
+        with timed("refine"):
+            whole = replace(self, config=config)
+            fit = whole.best_fit(looks.points_mm, hypotheses, usual_cost)
+            near = msgspec.structs.replace(config, first_mm=config.last_mm)
+            for _ in range(_CORRECTIONS):
+                looks = looks.corrected(fit.motion, self.config)
+                every = (
+                    refine(self.rest, looks.points_mm, one.motion, near)
+                    for one in (fit, *fit.rivals)
+                )
+                fit = best_of(list(every))
+        return fit, looks
 
     @torch.no_grad()
     def propose(self, points_mm: Points) -> list[ElasticMotion]:

@@ -16,7 +16,9 @@ from typing import Any, Literal
 
 import numpy as np
 
+from tumortrack.core.config import Config, from_builtins
 from tumortrack.core.errors import InputError
+from tumortrack.core.geometry import Affine, read_rigid
 from tumortrack.core.store import read_file, read_json
 from tumortrack.core.types import DepthFrame, Intrinsics, SensorCloud
 from tumortrack.sense.camera import plausible
@@ -32,6 +34,31 @@ _DISTORTION_KEYS = (
     *("coeffs", "distortion", "distortion_coefficients", "dist_coeffs", "D"),
     *("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2"),
 )
+
+
+class PosesFile(Config, frozen=True, kw_only=True):
+    """Where a camera was for each of several views, in their order: 4 x 4 rows each, which carry
+    points of the camera's optical frame into one fixed frame; ``unit``: of the translations;
+    ``frame_id``: the fixed frame's name, ``base_link`` say."""
+
+    fixed_from_camera: tuple[tuple[tuple[float, float, float, float], ...], ...]
+    unit: Literal["mm", "m"]
+    frame_id: str
+
+
+def read_poses(path: Path, count: int) -> tuple[Affine, ...]:
+    """``fixed_from_camera`` of ``count`` views, mm, from JSON (``PosesFile``). Raises InputError:
+    missing, an unknown key, another number of views, or a matrix that is no rigid transform."""
+    file = from_builtins(read_json(path), PosesFile, str(path))
+    if len(file.fixed_from_camera) != count:
+        raise InputError(
+            f"{path} has {len(file.fixed_from_camera)} poses for {count} views; it must have one "
+            "for each, in their order."
+        )
+    return tuple(
+        read_rigid(rows, file.unit, f"{path}: fixed_from_camera, view {n}")
+        for n, rows in enumerate(file.fixed_from_camera, start=1)
+    )
 
 
 def read_cloud(path: Path, unit: Literal["mm", "m"] = "mm") -> tuple[SensorCloud, tuple[str, ...]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -9,7 +10,8 @@ from scipy.ndimage import binary_dilation, distance_transform_edt
 
 from tumortrack.core.errors import NoEstimate
 from tumortrack.core.estimate import Estimate, Quality
-from tumortrack.core.types import DepthFrame, Intrinsics, Mesh, SensorCloud
+from tumortrack.core.geometry import transform_points
+from tumortrack.core.types import DepthFrame, Intrinsics, Look, Mesh, SensorCloud
 from tumortrack.models.in_distribution import FIT_FACTOR, RIVAL_COST
 from tumortrack.models.margins import ModelMargins, exceeded, figures, stated_margin
 from tumortrack.sense.render import render_depth
@@ -42,7 +44,12 @@ _UNSEEN = 0.1
 _NEAR_MM = 6.0  # of a point, or twice the points' usual distance: seen
 
 
-def judged(estimate: Estimate, seen: DepthFrame | SensorCloud, strictly: bool = False) -> Estimate:
+def judged(
+    estimate: Estimate,
+    seen: DepthFrame | SensorCloud,
+    strictly: bool = False,
+    others: Sequence[Look] = (),
+) -> Estimate:
     """The estimate with its ``quality``, ``good`` or ``poor``, and the ``reason`` in words; also in
     its report, with the shares of the organ that are seen through and, of a cloud, not seen.
 
@@ -53,22 +60,27 @@ def judged(estimate: Estimate, seen: DepthFrame | SensorCloud, strictly: bool = 
     Args:
         seen: all that the camera saw, not the organ's points alone, where it is known.
         strictly: the fit must be no worse than usual, whatever the camera sees round the organ.
+        others: more looks at it; the one that says most against the estimate counts.
 
     Raises:
         NoEstimate: a depth image sees through so much of it that the organ cannot lie there. Clouds
             refuse nothing: they may be joined from several views.
     """
-    organ, unseen, told = next(iter(estimate.meshes.values())), 0.0, 0.0
-    if isinstance(seen, DepthFrame):
-        through, told = seen_through(organ, seen)
-    else:
-        through, unseen = cloud_shares(organ, seen)
+    organ = next(iter(estimate.meshes.values()))
+    views = [(organ, seen)] + [(_before(organ, one), one.seen) for one in others]
+    by_image = [seen_through(there, view) for there, view in views if isinstance(view, DepthFrame)]
+    clouds = [cloud_shares(there, view) for there, view in views if isinstance(view, SensorCloud)]
+    unseen = max((share for _, share in clouds), default=0.0)
+    if clouds:
         estimate.report["unseen"] = unseen
+    told = min((share for _, share in by_image), default=0.0) if not clouds else 0.0
+    by_depth = max((share for share, _ in by_image), default=0.0)
+    through = max(by_depth, *(share for share, _ in clouds), 0.0)
     estimate.report["seen_through"] = through
     doubtful, impossible = _LIMITS if estimate.motion is not None else _ROUGH_LIMITS
-    if through > impossible and isinstance(seen, DepthFrame):
+    if by_depth > impossible:
         raise NoEstimate(
-            f"the camera sees through {100 * through:.0f} % of where the organ would lie: what "
+            f"the camera sees through {100 * by_depth:.0f} % of where the organ would lie: what "
             "was taken for it is something else, or lies as no organ in training did. Choose the "
             "organ (a click, a --box), or look from another side."
         )
@@ -80,6 +92,11 @@ def judged(estimate: Estimate, seen: DepthFrame | SensorCloud, strictly: bool = 
     quality: Quality = "poor" if reason else "good"
     estimate.report["quality"] = {"verdict": quality, "reason": reason}
     return replace(estimate, quality=quality, reason=reason)
+
+
+def _before(organ: Mesh, look: Look) -> Mesh:
+    """The organ's surface in a further look's frame."""
+    return organ.moved(transform_points(np.linalg.inv(look.camera_from_look), organ.vertices_mm))
 
 
 def with_margin(estimate: Estimate, cloud: SensorCloud, margins: ModelMargins | None) -> Estimate:

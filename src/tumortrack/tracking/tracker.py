@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -14,7 +14,7 @@ from tumortrack.core.config import Config, to_builtins
 from tumortrack.core.errors import InputError
 from tumortrack.core.estimate import Estimate, Following
 from tumortrack.core.process import keep_small_blocks
-from tumortrack.core.types import Anatomy, DepthFrame, SensorCloud
+from tumortrack.core.types import Anatomy, DepthFrame, Look, SensorCloud
 from tumortrack.models.folder import weakness_of
 from tumortrack.models.model import Model
 from tumortrack.occupancy.locator import OccupancyLocator
@@ -58,21 +58,25 @@ class Tracker:
         grid: int = 160,
         seed: int = 0,
         seen: DepthFrame | SensorCloud | None = None,
+        others: Sequence[Look] = (),
     ) -> Estimate:
         """Everything about one cloud; the same cloud and seed give the same answer.
 
         Args:
             grid: voxels along the longest side of the dense volume.
             seen: all that the camera saw, by which the estimate is judged; None: the cloud.
+            others: more looks at the same organ, still in between, from other places.
 
         Raises:
             NoEstimate: too few points, no organ found in them, they do not show this model's, or
                 the camera sees through where it would lie.
-            InputError: the cloud is in metres; the seed is negative.
+            InputError: the cloud is in metres; the seed is negative; more than one look, where
+                the model knows no motion.
         """
         if seed < 0:
             raise InputError(f"the seed is {seed}; it must be 0 or more.")
-        return self._judged(self._locator.locate(cloud, grid, seed), cloud, seen or cloud, False)
+        estimate = self._locator.locate(cloud, grid, seed, others)
+        return self._judged(estimate, cloud, seen or cloud, False, others)
 
     def follow(
         self,
@@ -99,12 +103,14 @@ class Tracker:
         cloud: SensorCloud,
         seen: DepthFrame | SensorCloud,
         strictly: bool,
+        others: Sequence[Look] = (),
     ) -> Estimate:
         start = time.perf_counter()
-        estimate = judged(estimate, seen, strictly)
+        estimate = judged(estimate, seen, strictly, others)
         if self._weakness:
             estimate = doubted(estimate, self._weakness)
-        estimate = with_margin(estimate, cloud, self.model.margins)
+        # Margins are calibrated on single looks.
+        estimate = with_margin(estimate, cloud, None if others else self.model.margins)
         if estimate.quality == "poor" and not self._weakness:
             estimate = doubted(estimate, f"{estimate.reason}; {what_to_do(estimate, cloud)}")
         estimate = replace(estimate, patient=self._patient)

@@ -25,6 +25,7 @@ from tumortrack.occupancy.volume import FIT_STEPS, lattice_over, surface_distanc
 from tumortrack.registration.canonical_frame import carry_over, upright_of
 from tumortrack.registration.gauss_newton import RegistrationResult, posterior
 from tumortrack.registration.gauss_newton_kernels import KERNEL
+from tumortrack.registration.looks import Looks
 from tumortrack.registration.model import RegistrationModel, UncertaintyCalibration
 from tumortrack.registration.motion import ElasticMotion
 from tumortrack.registration.network import RegistrationNetwork
@@ -195,7 +196,7 @@ class RegistrationTask(TrainingTask):
         ):
             inside_ct, inside_mm = points_ct[labels > 0], points_mm[labels > 0]
             motion = replace(
-                posterior(fit.motion, cloud, self._run.config.refine),
+                posterior(fit.motion, Looks.of([cloud]), self._run.config.refine),
                 calibration=self._run.config.scene.calibration,
             )
             known_mm2 = motion.covariance_mm2(inside_ct)

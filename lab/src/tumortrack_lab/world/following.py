@@ -18,7 +18,7 @@ from tumortrack.core import store
 from tumortrack.core.errors import NoEstimate
 from tumortrack.core.estimate import Estimate
 from tumortrack.core.geometry import transform_points
-from tumortrack.core.types import DepthFrame, Mesh, SensorCloud
+from tumortrack.core.types import DepthFrame, Look, Mesh, SensorCloud
 from tumortrack.report.drawing import new_figure, save
 from tumortrack.report.metrics import surface_distances
 from tumortrack.sense.region import Hints, RegionConfig, organ_points
@@ -32,11 +32,12 @@ from tumortrack_lab.world.paths import KINDS
 # organs; largest displacement of the surface). Bounds lie half way.
 STATES = {"at rest": 1.5, "D1": 5.8, "D2": 8.8, "D3": np.inf}
 WRONG_MM = 3.0  # a centre farther off must not be called good
+_COARSE = 16  # of the volume, which is not looked at
 _NOTHING_KNOWN = Hints()
 _PHASES = ("at rest", "loaded", "held", "released", "at rest")
 
 
-class Look(NamedTuple):
+class Moment(NamedTuple):
     """One moment: a depth image a camera, and the cameras' poses; the first one's is the frame in
     which answers are given."""
 
@@ -44,14 +45,14 @@ class Look(NamedTuple):
     first_from_camera: Float64[np.ndarray, "views 4 4"]
 
 
-Locate = Callable[[Look], Estimate]
+Locate = Callable[[Moment], Estimate]
 
 
 def track(tracker: Tracker) -> Locate:
     """The first camera's images as `tumortrack track` follows them."""
     region, follower = region_for(tracker.model), Follower(tracker, FollowerConfig())
 
-    def locate(look: Look) -> Estimate:
+    def locate(look: Moment) -> Estimate:
         frame = look.frames[0]
         try:
             cloud = _organ(frame, region, Hints(last_box_mm=follower.last_box_mm(frame.stamp_ns)))
@@ -73,7 +74,7 @@ def laid_together(tracker: Tracker) -> Locate:
     """The organ's points of all cameras in one cloud, each time without memory."""
     region = region_for(tracker.model)
 
-    def locate(look: Look) -> Estimate:
+    def locate(look: Moment) -> Estimate:
         pairs = zip(look.frames, look.first_from_camera, strict=True)
         clouds = [(pose, _organ(frame, region).points_mm) for frame, pose in pairs]
         points = np.concatenate([transform_points(pose, mm.astype(float)) for pose, mm in clouds])
@@ -85,6 +86,18 @@ def laid_together(tracker: Tracker) -> Locate:
     return locate
 
 
+def several_looks(tracker: Tracker) -> Locate:
+    """All cameras, each with a place of its own: `tumortrack locate` with several views."""
+    region = region_for(tracker.model)
+
+    def locate(look: Moment) -> Estimate:
+        clouds = [_organ(frame, region) for frame in look.frames]
+        seen = zip(clouds[1:], look.frames[1:], look.first_from_camera[1:], strict=True)
+        return tracker.locate(clouds[0], _COARSE, 0, look.frames[0], [Look(*one) for one in seen])
+
+    return locate
+
+
 def _organ(frame: DepthFrame, region: RegionConfig, hints: Hints = _NOTHING_KNOWN) -> SensorCloud:
     rng = np.random.default_rng((0, frame.stamp_ns))  # as the live loop's
     return organ_points(frame, region, hints, rng).cloud
@@ -92,6 +105,7 @@ def _organ(frame: DepthFrame, region: RegionConfig, hints: Hints = _NOTHING_KNOW
 
 METHODS: dict[str, Callable[[Tracker], Locate]] = {
     "track": track, "first look": first_look, "laid together": laid_together,
+    "several looks": several_looks,
 }  # fmt: skip
 
 
@@ -108,7 +122,7 @@ def judge(locate: Locate, film: Film) -> list[dict[str, Any]]:
         }
         motion, parts = None, {}
         try:
-            estimate = locate(Look(film.looks(number), poses))
+            estimate = locate(Moment(film.looks(number), poses))
             about |= {"quality": estimate.quality, "reason": estimate.reason}
             motion, parts = estimate.motion, estimate.report["parts"]
             about["margin"] = estimate.report.get("margin")

@@ -1,0 +1,116 @@
+"""What one or several cameras see of a still organ, laid together.
+
+A camera's place relative to the first is known by a calibration, which errs. So each further one
+has six unknowns of its own, with that error as their prior; a correction of the points is found in
+turns with the organ's motion, and what is left unsure widens the motion's covariance.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import msgspec
+import numpy as np
+from jaxtyping import Float, Float64, Int64
+from scipy.spatial.transform import Rotation
+
+from tumortrack.core.geometry import Affine, Points, rigid, transform_points
+from tumortrack.models.config import GaussNewtonConfig
+from tumortrack.registration.kernels import POSE
+from tumortrack.registration.motion import ElasticMotion
+
+# Standard deviations of a camera's place relative to another's, along and about each axis: an
+# assumption, as wide as the errors to which `calibrate` holds a hand-eye calibration.
+CAMERA_STD = np.array([1.0] * 3 + [0.01] * 3)  # mm at the organ, rad
+
+
+@dataclass(frozen=True, eq=False)
+class Looks:
+    """Points of the organ in the first camera's frame, mm.
+
+    Attributes:
+        points_mm: of all looks, one after the other; ``look``: the number of each point's.
+        camera_from_look: where each look's camera is, the first one's being the identity.
+        shifts: by how much the organ was found to lie elsewhere before each camera (mm, rad; its
+            axes, about its centre): the camera's error. Zero for the first.
+    """
+
+    points_mm: Points
+    look: Int64[np.ndarray, " n"]
+    camera_from_look: tuple[Affine, ...]
+    shifts: Float64[np.ndarray, "k 6"]
+
+    @classmethod
+    def of(cls, points_mm: Sequence[Points], camera_from_look: Sequence[Affine] = ()) -> Looks:
+        """Points of each look in its own camera's frame; further ones with where it is."""
+        poses = (np.eye(4), *camera_from_look)
+        pairs = list(zip(points_mm, poses, strict=True))
+        moved = [
+            points if n == 0 else _moved(pose, points) for n, (points, pose) in enumerate(pairs)
+        ]
+        numbers = np.repeat(np.arange(len(moved)), [len(points) for points in moved])
+        every = moved[0] if len(moved) == 1 else np.concatenate(moved)
+        return cls(every, numbers, poses, np.zeros((len(moved), POSE)))
+
+    @property
+    def count(self) -> int:
+        """Of looks."""
+        return len(self.camera_from_look)
+
+    @property
+    def rays_mm(self) -> Points:
+        """From each point's camera to it."""
+        origins = np.array([pose[:3, 3] for pose in self.camera_from_look], np.float32)
+        return self.points_mm - origins[self.look]
+
+    def described(self) -> dict[str, Any]:
+        """For a report: where the cameras were, and by how much each was corrected."""
+        return {
+            "camera_from_look": [pose.tolist() for pose in self.camera_from_look],
+            "shift_mm": np.linalg.norm(self.shifts[:, :3], axis=1).tolist(),
+            "turn_degrees": np.rad2deg(np.linalg.norm(self.shifts[:, 3:], axis=1)).tolist(),
+        }
+
+    def weighed(self, config: GaussNewtonConfig) -> GaussNewtonConfig:
+        """As much is known of the organ by each look as by one."""
+        return msgspec.structs.replace(config, n_effective=self.count * config.n_effective)
+
+    def unknown(self, rows: Float[np.ndarray, "n p"]) -> Float[np.ndarray, "n q"]:
+        """What the organ's motion before one further camera alone does to distances, which is what
+        that camera's error does: the pose's columns, first in ``rows``, for its points."""
+        flat = [rows[:, :POSE] * (self.look == n)[:, None] for n in range(1, self.count)]
+        return np.concatenate([rows[:, :0], *flat], axis=1)
+
+    def corrected(self, motion: ElasticMotion, config: GaussNewtonConfig) -> Looks:
+        """The further cameras moved to where the organ in this motion fits their points best."""
+        points, shifts = self.points_mm.copy(), self.shifts.copy()
+        rows = motion.residual_rows(self.points_mm).astype(float)
+        weights = 1 / (1 + (rows[:, -1] / config.last_mm) ** 2) ** 2
+        for n in range(1, self.count):
+            mine = self.look == n
+            each = min(config.n_effective / mine.sum(), 1.0) / config.sigma_mm**2
+            slopes, pull = rows[mine, :POSE], each * weights[mine, None] * rows[mine, :POSE]
+            curvature = pull.T @ slopes + np.diag(CAMERA_STD**-2)
+            # As if the organ moved before this camera alone: then the points move back by it.
+            gradient = pull.T @ rows[mine, -1] + shifts[n] / CAMERA_STD**2
+            change = -np.linalg.solve(curvature, gradient)
+            shifts[n] += change
+            turned = motion.rotation @ Rotation.from_rotvec(change[3:]).as_matrix()
+            centre_mm = motion.centre_mm + motion.rotation @ change[:3]
+            back = motion.rotation @ turned.T
+            pose = rigid(back, motion.centre_mm - back @ centre_mm)
+            points[mine] = transform_points(pose, self.points_mm[mine])
+        return replace(self, points_mm=points, shifts=shifts)
+
+
+def seen_from_first(motion: ElasticMotion, camera_from_look: Affine) -> ElasticMotion:
+    """A motion before another camera, as the first one sees it."""
+    turn = camera_from_look[:3, :3]
+    centre_mm = turn @ motion.centre_mm + camera_from_look[:3, 3]
+    return replace(motion, rotation=turn @ motion.rotation, centre_mm=centre_mm)
+
+
+def _moved(pose: Affine, points: Points) -> Points:
+    return transform_points(pose, points).astype(np.float32)
