@@ -44,7 +44,7 @@ def _agreement(share: float) -> str:
 
 def _cells(row: BenchRow) -> dict[str, str]:
     """All that tables say of a row."""
-    took, naive_s, share = row.ours.median_s, row.naive and row.naive.median_s, row.agreement
+    took, share = row.ours.median_s, row.agreement
     return {
         "part": row.name,
         "of": row.what,
@@ -54,7 +54,7 @@ def _cells(row: BenchRow) -> dict[str, str]:
         "quartiles": f"± {50 * (row.ours.high_s - row.ours.low_s) / took:.0f} %",
         "items a second": _text(row.per_s, _COUNTS).strip(),
         "each": f"{row.per_s:,.0f}/s",
-        "naive": _EMPTY if naive_s is None else _text(naive_s),
+        "naive": _EMPTY if row.naive is None else _text(row.naive.median_s),
         "ratio": _EMPTY if row.ratio is None else f"{_digits(row.ratio)} x",
         "labels equal": _EMPTY if share is None else _agreement(share),
         "before torch": _text(row.others.get(rows.BEFORE_TORCH, 0.0)),
