@@ -8,7 +8,7 @@ INSTALL := pip install --quiet --disable-pip-version-check --no-compile --no-dep
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help setup debian demo test test-hard check attack fuzz crash replay bench soak wheel lock licences audit results foreign real world trust clean
+.PHONY: help setup debian demo test test-hard check attack fuzz crash replay bench soak wheel lock licences audit results real world trust clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 10
@@ -74,9 +74,6 @@ soak: setup  ## an hour of tracking with faults of eleven kinds (ARGS="MODEL CAS
 
 results: setup  ## the tables and plots of docs/results.md (hours; ARGS="--case NAME=FOLDER": more organs)
 	$(BIN)/python lab/scripts/results.py $(ARGS)
-
-foreign: setup  ## how often another kidney, or a mirrored one, is called good (an hour)
-	$(BIN)/python lab/scripts/foreign.py $(ARGS)
 
 real: setup  ## real kidneys, breathing lungs, silicone: ARGS='DATA', a folder of your copies (hours)
 	$(BIN)/python lab/scripts/real.py $(ARGS)

@@ -117,9 +117,7 @@ SMALL = ViewConfig(width=424, height=240, n_points=2000)
 @pytest.fixture
 def no_pictures(monkeypatch):
     """Pictures take most of a scene's time, and are looked at elsewhere."""
-    monkeypatch.setattr(
-        dataset, "twin_picture", lambda scene, settled, rest, path: path.write_bytes(b"picture")
-    )
+    monkeypatch.setattr(dataset, "twin_picture", lambda scene, path: path.write_bytes(b"picture"))
 
 
 @pytest.fixture(scope="module")
@@ -129,7 +127,7 @@ def made(case_folder, tmp_path_factory):
     run = TwinRun(case_folder, view=SMALL, build=StandIn, solve=StandIn.solve)
     make_scenes(run, out, ("Rot90",), ("clean",))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(dataset, "twin_picture", lambda *given: given[3].write_bytes(b"picture"))
+        patch.setattr(dataset, "twin_picture", lambda scene, path: path.write_bytes(b"picture"))
         make_scenes(run, out, ("Rot90", "P1"), ("clean", "clutter"))
     return out
 
