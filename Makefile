@@ -72,7 +72,7 @@ bench: setup  ## speed of every part; fills docs/performance.md (less than 10 mi
 soak: setup  ## an hour of tracking with faults of eleven kinds (ARGS="MODEL CASE --minutes 5"; after make demo)
 	$(BIN)/python lab/scripts/soak.py $(ARGS)
 
-results: setup  ## the tables and plots of docs/results.md (hours; ARGS="--case NAME=FOLDER": more organs)
+results: setup  ## the tables of docs/results.md (hours; ARGS="--case NAME=FOLDER": more organs)
 	$(BIN)/python lab/scripts/results.py $(ARGS)
 
 real: setup  ## real kidneys, breathing lungs, silicone: ARGS='DATA', a folder of your copies (hours)
