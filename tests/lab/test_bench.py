@@ -1,7 +1,8 @@
 """The bench: figures that follow from their definitions, naive forms that give the same answers."""
 
 import json
-import sys
+import os
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -9,7 +10,7 @@ import torch
 
 from clock import Clock
 from stories import tumortrack
-from tumortrack.core.errors import InputError, TumortrackError
+from tumortrack.core.errors import InputError
 from tumortrack.core.types import Anatomy, Mesh
 from tumortrack.models.config import MlpDecoderConfig, NetworkConfig
 from tumortrack.models.encoders.pointnet2 import PointNet2Config, SetAbstraction
@@ -17,8 +18,8 @@ from tumortrack.models.normalisation import CloudBox
 from tumortrack.occupancy.network import OccupancyNetwork
 from tumortrack.training.presets import quick_network
 from tumortrack_lab.bench import rows as interleaving
-from tumortrack_lab.bench import run as running
 from tumortrack_lab.bench import training
+from tumortrack_lab.bench.groups import GROUPS
 from tumortrack_lab.bench.machine import describe_machine
 from tumortrack_lab.bench.naive import NaiveOccupancy
 from tumortrack_lab.bench.report import BLOCKS, GOALS, goals_table, write_bench
@@ -26,10 +27,10 @@ from tumortrack_lab.bench.rows import (
     BenchResult,
     BenchRow,
     InterleavedTiming,
+    Workload,
     interleaved,
     timing_of,
 )
-from tumortrack_lab.bench.run import GROUPS, tasks_of
 from tumortrack_lab.bench.subject import BenchSubject
 from tumortrack_lab.cli.bench import Bench
 from tumortrack_lab.study.document import closing, opening
@@ -161,50 +162,26 @@ def test_a_workload_becomes_a_row(tmp_path) -> None:
     assert int(describe_machine()["cores"]) >= 1
 
 
-WORKER = """
-import json, os, sys
-task = json.loads(sys.argv[-1])
-assert os.environ["OMP_NUM_THREADS"] == str(task["threads"])
-print("a library's chatter")
-print(json.dumps({"under_way": "something"}))
-for group in task.get("groups", ()):
-    time = dict(best_s=1.0, median_s=2.0, low_s=1.5, high_s=3.0, turns=3)
-    row = dict(name=group, what="", threads=1, item="pair", ours=time)
-    if group == "planning":
-        row["naive"] = {**time, "median_s": 4.0}
-    print(json.dumps({"row": row}))
-if "command" in task.get("groups", ()):
-    sys.exit("the command is broken")
-"""
+def test_the_command_says_and_writes_what_it_found(tmp_path, monkeypatch, capfd) -> None:
+    def two(subject: BenchSubject, seconds: float) -> Iterator[Workload]:
+        for name, naive in (("one", None), ("two", lambda: None)):
+            yield Workload(name, "", "pair", lambda: None, naive)
 
-
-def test_the_command_gathers_what_processes_find(tmp_path, monkeypatch, capfd) -> None:
-    monkeypatch.setattr(running, "WORKER", [sys.executable, "-c", WORKER])
+    monkeypatch.setattr(training, "drags", two)
+    monkeypatch.setattr(os, "sched_setaffinity", lambda *_: None, raising=False)
+    for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS"):
+        monkeypatch.setenv(name, "1")
     out = tmp_path / "new" / "found.json"
-    Bench(only=("generator", "planning"), quick=True, out=out).run()
+    Bench(only=("generator",), quick=True, out=out).run()
     found = json.loads(out.read_text())
-    assert [row["name"] for row in found["rows"]] == ["generator", "planning"]
+    assert [row["name"] for row in found["rows"]] == ["one", "two"]
     assert found["machine"]["processor"]
-    assert found["command"] == "tumortrack bench --only generator planning --quick"
+    assert found["command"] == "tumortrack bench --only generator --quick"
     shown = capfd.readouterr().out
-    assert "something" in shown
-    assert shown.index("  generator") < shown.index("  planning") < shown.index("written to")
-    first, second = (line for line in shown.splitlines() if ", threads 1: 2.00 s a pair" in line)
-    assert "naive" not in first  # each as soon as it was measured
-    assert second.endswith("; naive 4.00 s, 2.00 x")
-    with pytest.raises(TumortrackError, match="the command is broken"):
-        Bench(only=("command",), out=tmp_path / "none.json").run()
-    assert not (tmp_path / "none.json").exists()
-
-
-def test_each_process_has_its_own_threads_and_only_needed_models_are_trained(tmp_path) -> None:
-    names = ("generator", "frame", "tracking")
-    first, one, two = tasks_of(names, tmp_path, True, cores=4)
-    assert (first.threads, first.presets, first.groups) == (2, ("clinic", "paper", "quick"), ())
-    assert (one.threads, one.presets, one.groups) == (1, (), names)
-    assert (two.threads, two.presets, two.groups) == (2, (), names[1:])
-    (alone,) = tasks_of(("generator",), tmp_path, True, cores=1)
-    assert (alone.threads, alone.groups, alone.quick) == (1, ("generator",), True)
+    assert shown.index("  one") < shown.index("  two") < shown.index("written to")
+    first, second = (line for line in shown.splitlines() if " a pair" in line)
+    assert "naive" not in first
+    assert second.endswith(" x")
 
 
 def test_what_cannot_be_measured_is_refused(tmp_path) -> None:

@@ -91,7 +91,7 @@ class Shifted:
             raise NoEstimate("no organ was found")
         shifted = CAMERA_FROM_CT.copy()
         shifted[0, 3] += self.shift_mm
-        fit = Fit(rigid_carry(shifted), 0.25)
+        fit = Fit(rigid_carry(shifted))
         estimate = estimate_of(fit, anatomy(), grid=grid)
         for part in self.without:
             del estimate.meshes[part]

@@ -11,12 +11,12 @@ from pathlib import Path
 
 from tumortrack.core.errors import TumortrackError
 from tumortrack.sense.ply import write_cloud_ply
+from tumortrack_lab.bench.groups import PRESETS
 from tumortrack_lab.bench.rows import (
     BEFORE_TORCH,
     COMMAND,
     LARGE,
     PEAK,
-    PRESETS,
     Workload,
     timing_of,
 )

@@ -19,7 +19,6 @@ _FEWEST, _MOST = 3, 25  # rounds
 _LEAST_S = 0.01  # that a turn lasts: shorter calls are repeated within it
 _LONG_S = 0.5  # a first call that takes longer is warm enough
 _LONGER_S = 1.0  # and one that takes longer still is a turn: what it loaded is little beside it
-PRESETS = ("clinic", "quick", "paper")
 # What rows are called.
 GENERATOR, FRAME, TRACKING = "generator", "frame", "tracking frame"
 VOLUME, COMMAND, LARGE = "400^3 labels", "`locate` command", "`locate --grid 400` command"

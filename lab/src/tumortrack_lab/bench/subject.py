@@ -41,9 +41,10 @@ from tumortrack.simulate.scene import RenderedScene, SceneConfig, SceneRecipe, S
 from tumortrack.training.model import load_model, save_model
 from tumortrack.training.state import TrainingRun
 from tumortrack.training.train import train
+from tumortrack_lab.bench.groups import PRESETS
 from tumortrack_lab.bench.occupancy import OccupancyForms
 from tumortrack_lab.bench.registration import RegistrationForms
-from tumortrack_lab.bench.rows import PRESETS, Workload
+from tumortrack_lab.bench.rows import Workload
 
 _PER_SIDE = 600  # points in and outside of each part in a step
 _RATE = 1.5e-3

@@ -37,7 +37,8 @@ class Twin:
         from tumortrack_lab.twin.dataset import TwinRun, make_scenes
         from tumortrack_lab.twin.views import VARIANTS, VIEWS
 
-        run, states = TwinRun(self.case, seed=self.seed), self.states or tuple(VARIANTS)
+        run = TwinRun(self.case, seed=self.seed)
+        states: tuple[str, ...] = self.states or tuple(VARIANTS)
         with console.status("twin ...") as line:
             report = line.update if console.is_terminal else say
             made = make_scenes(
