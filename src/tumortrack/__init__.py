@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from tumortrack.core.estimate import Estimate as Estimate
     from tumortrack.core.types import DepthFrame as DepthFrame
     from tumortrack.core.types import Intrinsics as Intrinsics
+    from tumortrack.core.types import Look as Look
     from tumortrack.core.types import SensorCloud as SensorCloud
     from tumortrack.imaging.case import Case as Case
     from tumortrack.tracking.tracker import Tracker as Tracker
@@ -29,7 +30,7 @@ _NAMES = {  # by the module that has them
     "read_cloud save_estimate scan_phantom simulate_scenes track train",
     "core": "errors",
     "core.estimate": "Estimate",
-    "core.types": "DepthFrame Intrinsics SensorCloud",
+    "core.types": "DepthFrame Intrinsics Look SensorCloud",
     "imaging.case": "Case",
     "tracking.tracker": "Tracker",
     "training": "presets",

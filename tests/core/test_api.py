@@ -28,7 +28,7 @@ SIGNATURES = {
     "train": "case folder preset='clinic' config=None minutes=None steps=None seed=0 "
     "device='auto' workers=None report=None",
 }
-VALUES = {"Case", "DepthFrame", "Estimate", "Intrinsics", "SensorCloud", "Tracker"}
+VALUES = {"Case", "DepthFrame", "Estimate", "Intrinsics", "Look", "SensorCloud", "Tracker"}
 MODULES = {"errors", "presets"}
 
 

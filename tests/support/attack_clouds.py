@@ -244,6 +244,36 @@ def _map_is_a_fifo(folder: Path, base: Path) -> Made:
     return ["locate", base / "model", cloud, folder / "out", "--map", folder / "map.csv"]
 
 
+def views(folder: Path, base: Path, *poses: object, **changed: object) -> Made:
+    """Two views of a right cloud, from such places."""
+    cloud = base / "scenes" / "0000" / "cloud.ply"
+    given = {"fixed_from_camera": poses, "unit": "mm", "frame_id": "base_link"} | changed
+    (folder / "poses.json").write_text(json.dumps(given))
+    options = ["--poses", folder / "poses.json", "--device", "cpu"]
+    return ["locate", base / "model", cloud, cloud, folder / "out", *options]
+
+
+HERE = np.eye(4).tolist()
+for name, poses in (
+    ("poses_of_one_view", [HERE]),
+    ("poses_nested", [[[HERE]]] * 2),
+    ("poses_mirrored", [HERE, np.diag([1.0, 1, -1, 1]).tolist()]),
+    ("poses_at_1e300", [HERE, [*HERE[:2], [0, 0, 1, 1e300], [0, 0, 0, 1]]]),
+    ("poses_100_m_away", [HERE, [[1, 0, 0, 1e5], *HERE[1:]]]),
+    ("poses_nan", [HERE, [[float("nan")] * 4] * 4]),
+    ("poses_from_behind", [HERE, np.diag([1.0, -1, -1, 1]).tolist()]),
+):
+    ATTACKS[name] = lambda folder, base, p=poses: views(folder, base, *p)
+
+
+@attack
+def _poses_are_a_fifo(folder: Path, base: Path) -> Made:
+    made = views(folder, base, HERE, HERE)
+    (folder / "poses.json").unlink()
+    os.mkfifo(folder / "poses.json")
+    return made
+
+
 def png_of(width: int, height: int, bits: int, data: bytes) -> bytes:
     def chunk(kind: bytes, body: bytes) -> bytes:
         return (

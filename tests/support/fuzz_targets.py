@@ -229,6 +229,7 @@ def _configurations() -> dict[str, Target]:
     from tumortrack.live.calibration_file import read_frames
     from tumortrack.plan.arms.config import CellConfig
     from tumortrack.plan.values import ResectionConfig
+    from tumortrack.sense.files import read_poses
     from tumortrack.training.presets import PRESETS
     from warp_objects import ANATOMY
 
@@ -243,7 +244,9 @@ def _configurations() -> dict[str, Target]:
     marker = {**frame, "camera_from_marker": turn, "robot_from_marker": turn}
     del marker["robot_from_camera"]
     clinic = PRESETS["clinic"](ANATOMY)
+    poses = {"fixed_from_camera": [turn, turn], "unit": "m", "frame_id": "base_link"}
     return {
+        "poses": ([json.dumps(poses).encode()], of_file(".json", lambda path: read_poses(path, 2))),
         "calibration": (
             [json.dumps(frame).encode(), json.dumps(marker).encode()],
             of_file(".json", read_frames),

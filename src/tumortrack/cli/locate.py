@@ -30,17 +30,18 @@ class Locate(StatedPatient):
     Attributes:
         model: folder that `train` wrote.
         cloud: .ply, .pcd or .npz in the camera frame, or a depth .png (with --intrinsics). Several
-            views of one organ that does not move in between need --poses; the answer is in the
-            first one's frame.
+            views of an organ that does not move in between (CLOUD CLOUD ... OUT) need --poses; the
+            answer is in the first one's frame.
         out: folder to write.
+        more: with several views: the paths that follow; the last one is OUT.
         poses: JSON with fixed_from_camera (4 x 4 rows for each view, in their order), unit (mm or
-            m) and frame_id: where the cameras were, in a robot's base, say.
+            m) and frame_id: where the camera was, in a robot's base, say.
         grid: voxels along the longest side of the labelled volume, up to 400.
         seed: of the random points and queries.
         range: keep depths between NEAR and FAR mm. By default a cloud is used as it is, and a depth
             image is cropped to the range that the model was trained for.
         unit: of the cloud's numbers.
-        intrinsics: JSON with width, height, fx, fy, cx, cy in pixels.
+        intrinsics: JSON with width, height, fx, fy, cx, cy in pixels, of all views.
         map: points of the CT whose present places to write (OUT/points.csv): a .csv with columns
             x,y,z (LPS, mm), or 3D Slicer's .mrk.json or .fcsv. Needs a model of preset clinic.
         device: auto takes CUDA if there is a GPU.
@@ -48,8 +49,9 @@ class Locate(StatedPatient):
     """
 
     model: Positional[Path]
-    cloud: Positional[tuple[Path, ...]]
+    cloud: Positional[Path]
     out: Positional[Path]
+    more: Positional[tuple[Path, ...]] = ()
     poses: Path | None = None
     grid: int = 160
     seed: int = 0
@@ -62,12 +64,15 @@ class Locate(StatedPatient):
 
     def run(self) -> None:
         _check_grid(self.grid)
-        store.check_place(self.out, "run", self.overwrite)
+        *clouds, out = self.cloud, self.out, *self.more
+        store.check_place(out, "run", self.overwrite)
         points = self._points()
-        # Report what is wrong so far before PyTorch's seconds.
-        poses = self._camera_from_look()
-        views = [self._read(path) for path in self.cloud]
+        frame_id, fixed_from_camera = self._poses(len(clouds))
+        views = [self._read(path) for path in clouds]
+        # What is wrong so far was reported before PyTorch's seconds.
         notes = tuple(note for _, mine in views for note in mine)
+
+        import numpy as np
 
         from tumortrack.core.estimate import NO_CHECK_FAILED, UNVERIFIED
         from tumortrack.core.types import Look
@@ -88,8 +93,18 @@ class Locate(StatedPatient):
             notes = (*notes, *points.notes, *far)
         crop = model.config.scene.cloud
         first, *others = [(self._cropped(seen, crop), seen) for seen, _ in views]
-        looks = [Look(*one, pose) for one, pose in zip(others, poses, strict=True)]
+        looks = [
+            Look(*one, np.linalg.inv(fixed_from_camera[0]) @ pose)
+            for one, pose in zip(others, fixed_from_camera[1:], strict=True)
+        ]
         estimate = tracker.locate(first[0], self.grid, self.seed, first[1], looks)
+        if self.poses is not None:
+            estimate.report["looks"] |= {
+                "frame_id": frame_id,
+                "fixed_from_camera": fixed_from_camera[0].tolist(),
+                "poses_sha256": store.sha256_of(self.poses),
+                "clouds_sha256": [store.sha256_of(path) for path in clouds],
+            }
         if points is not None and self.map is not None:
             estimate.report["map"] = {
                 "points": len(points.points_ct),
@@ -101,9 +116,9 @@ class Locate(StatedPatient):
             notes=list(notes),
             model=model.provenance,
             model_sha256=store.sha256_of(self.model / store.MANIFEST),
-            cloud_sha256=store.sha256_of(self.cloud[0]),
+            cloud_sha256=store.sha256_of(self.cloud),
         )
-        write_estimate(self.out, estimate, self.overwrite, points)
+        write_estimate(out, estimate, self.overwrite, points)
         say_notes(notes)
         margin = estimate.report.get("margin", {})
         for name, part in estimate.report["parts"].items():
@@ -117,7 +132,7 @@ class Locate(StatedPatient):
             else:
                 say(f"{name}: not found")
         if points is not None:
-            file = self.out / "points.csv"
+            file = out / "points.csv"
             radius = stated_radius(margin, "map")
             said = f"; {radius.words} for all of them" if radius else ""
             say(f"{len(points.points_ct)} points of the CT: their places are in {file}{said}")
@@ -127,7 +142,7 @@ class Locate(StatedPatient):
         say(f"{NO_CHECK_FAILED}; {UNVERIFIED}." if good
             else f"POOR: {estimate.reason}. Do not rely on it.")  # fmt: skip
         seconds = estimate.report["timings"]["total"]
-        say(f"written to {self.out} (camera frame, mm) in {seconds:.2f} s.")
+        say(f"written to {out} (camera frame, mm) in {seconds:.2f} s.")
 
     def _points(self) -> PointTable | None:
         """The points of --map; what is wrong with them or the model is said before a wait."""
@@ -146,23 +161,18 @@ class Locate(StatedPatient):
             )
         return read_points(self.map)
 
-    def _camera_from_look(self) -> list[Affine]:
-        """Where the further views' cameras were, seen from the first one's."""
-        import numpy as np
-
+    def _poses(self, views: int) -> tuple[str, tuple[Affine, ...]]:
+        """The fixed frame's name, and where the views' cameras were in it."""
         from tumortrack.sense.files import read_poses
 
-        if not self.cloud:
-            raise InputError("locate needs a cloud or a depth image: locate MODEL CLOUD OUT.")
-        if (self.poses is None) != (len(self.cloud) == 1):
+        if self.poses is None and views == 1:
+            return "", ()
+        if self.poses is None or views == 1:
             raise InputError(
-                f"{len(self.cloud)} views and {'no ' if self.poses is None else ''}--poses do not "
-                "fit: several views need --poses FILE, and one takes none."
+                f"{views} view{'s' * (views > 1)} with{'out' * (self.poses is None)} --poses: give "
+                "--poses FILE with several views (locate MODEL CLOUD CLOUD ... OUT), and only then."
             )
-        if self.poses is None:
-            return []
-        first, *others = read_poses(self.poses, len(self.cloud))
-        return [np.linalg.inv(first) @ pose for pose in others]
+        return read_poses(self.poses, views)
 
     def _read(self, path: Path) -> tuple[SensorCloud | DepthFrame, tuple[str, ...]]:
         """What a file holds, and notes."""

@@ -28,6 +28,7 @@ DIRECTIONS_LPS: dict[str, Direction] = {
 }
 
 _NOT_RIGID = 1e-3  # largest deviation of a rotation from orthonormal: files have few digits
+_FARTHEST_MM = 1e6
 
 # NIfTI is RAS+, DICOM is LPS: the first two axes change sign, and nothing else.
 RAS_FROM_LPS = np.diag([-1.0, -1.0, 1.0, 1.0])
@@ -53,9 +54,11 @@ def read_rigid(rows: Sequence[Sequence[float]], unit: Literal["mm", "m"], where:
     b_from_a = np.array(rows, float) if {len(row) for row in rows} == {4} else np.zeros((0, 4))
     if len(b_from_a) != 4:
         raise InputError(f"{where} has {len(rows)} rows; it must have 4 of 4 numbers.")
+    if unit == "m":
+        b_from_a[:3, 3] *= 1000
     turn = b_from_a[:3, :3]
     good = (
-        np.isfinite(b_from_a).all()
+        np.abs(b_from_a).max() < _FARTHEST_MM
         and np.abs(turn @ turn.T - np.eye(3)).max() < _NOT_RIGID
         and np.linalg.det(turn) > 0
         and np.array_equal(b_from_a[3], [0, 0, 0, 1])
@@ -63,10 +66,8 @@ def read_rigid(rows: Sequence[Sequence[float]], unit: Literal["mm", "m"], where:
     if not good:
         raise InputError(
             f"{where} is no rigid transform: its rotation must be orthonormal and right-handed, "
-            "its last row 0 0 0 1."
+            "its last row 0 0 0 1, its shift less than a kilometre."
         )
-    if unit == "m":
-        b_from_a[:3, 3] *= 1000
     return b_from_a
 
 

@@ -219,6 +219,8 @@ def stated_margin(
     """The entry ``margin`` of a report: ``stated``, by rising confidence, each with the radii in
     ``mm`` by part, and ``map`` for any mapped point; or none, and the ``reason``. ``good``: no
     check failed, and none of the ``limits`` is exceeded."""
+    if "looks" in report:
+        return {"stated": [], "reason": "margins are of single views, not of several"}
     if margins is None:
         return {"stated": [], "reason": UNKNOWN}
     if not good:

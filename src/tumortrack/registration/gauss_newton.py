@@ -125,16 +125,18 @@ def size_of(
 ) -> tuple[float, float]:
     """How large the points show the organ, times its true size, and how much less it would cost to
     fit them scaled about their cameras by that; to second order, as in Rao's score test."""
-    motion, last_mm = fit.motion, config.last_mm
+    motion = fit.motion
     assert motion.covariance is not None
     rows = motion.residual_rows(looks.points_mm).astype(float)
     slopes, distances = rows[:, :-1], rows[:, -1]
     outwards = -(slopes[:, :3] * (looks.rays_mm @ motion.rotation)).sum(1)  # of scaling the points
-    config = looks.weighed(config)
-    weight = min(config.n_effective / len(rows), 1.0) / config.sigma_mm**2
-    weighed = outwards * weight / (1 + (distances / last_mm) ** 2) ** 2
+    weights = looks.weights(distances, config)
+    weighed = outwards * weights
     cross = slopes.T @ weighed
     slope, curvature = weighed @ distances, weighed @ outwards - cross @ motion.covariance @ cross
+    known, across = looks.precision(slopes, weights, motion.covariance)
+    cross = looks.unknown(slopes).T @ weighed - across.T @ motion.covariance @ cross
+    curvature -= cross @ np.linalg.solve(known, cross)  # taken up by the cameras' errors
     return float(1 + slope / curvature), float(slope**2 / curvature)
 
 

@@ -18,6 +18,7 @@ from tumortrack.imaging.raster import label_grid
 from tumortrack.models.in_distribution import check_in_distribution, check_likely
 from tumortrack.models.report import Frame, describe_parts, grid_over
 from tumortrack.registration import kernels
+from tumortrack.registration.discrepancy import FARTHEST
 from tumortrack.registration.gauss_newton import RegistrationResult, posterior, refine, size_of
 from tumortrack.registration.looks import Looks
 from tumortrack.registration.model import RegistrationModel
@@ -114,7 +115,11 @@ class RegistrationLocator:
         report = self._report(frame, placed, inside, size=size, voxel_mm=voxel_mm)
         if others:
             report["looks"] = looks.described()
-            report["fit_cost"]["usual"] *= looks.count
+            report["points"] += sum(len(one.cloud.points_mm) for one in others)
+            costs, far_mm = report["fit_cost"], FARTHEST * self._registration.config.last_mm
+            costs["usual"] *= looks.count
+            far = np.abs(fit.distances_mm) > far_mm
+            costs["strays"] = max(float(far[looks.look == n].mean()) for n in range(looks.count))
         volume = CameraLabels(labels, camera_from_index)
         return Estimate(inside, volume, placed.meshes, report, placed.motion)
 

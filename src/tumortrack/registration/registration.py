@@ -95,19 +95,21 @@ class Registration:
             for n, pose in enumerate(looks.camera_from_look):
                 seen = transform_points(np.linalg.inv(pose), looks.points_mm[looks.look == n])
                 hypotheses += [seen_from_first(one, pose) for one in self.propose(seen)]
-        config = looks.weighed(self.config)
+        whole = replace(self, config=looks.weighed(self.config))
+        near = msgspec.structs.replace(whole.config, first_mm=self.config.last_mm)
         with timed("refine"):
-            whole = replace(self, config=config)
             fit = whole.best_fit(looks.points_mm, hypotheses, usual_cost)
-            near = msgspec.structs.replace(config, first_mm=config.last_mm)
-            for _ in range(_CORRECTIONS):
-                looks = looks.corrected(fit.motion, self.config)
-                every = (
-                    refine(self.rest, looks.points_mm, one.motion, near)
-                    for one in (fit, *fit.rivals)
-                )
-                fit = best_of(list(every))
-        return fit, looks
+            found: list[tuple[RegistrationResult, Looks]] = []
+            for each in (fit, *fit.rivals):  # with its own places of the cameras
+                one, mine = each, looks
+                for _ in range(_CORRECTIONS):
+                    mine = mine.corrected(one.motion, self.config)
+                    one = refine(self.rest, mine.points_mm, one.motion, near)
+                costs = one.cost + mine.cost, one.cost_without_strays + mine.cost
+                one = replace(one, cost=costs[0], cost_without_strays=costs[1])
+                found.append((one, mine))
+        best = best_of([one for one, _ in found])
+        return best, min(found, key=lambda pair: pair[0].cost)[1]
 
     @torch.no_grad()
     def propose(self, points_mm: Points) -> list[ElasticMotion]:

@@ -46,19 +46,21 @@ class PosesFile(Config, frozen=True, kw_only=True):
     frame_id: str
 
 
-def read_poses(path: Path, count: int) -> tuple[Affine, ...]:
-    """``fixed_from_camera`` of ``count`` views, mm, from JSON (``PosesFile``). Raises InputError:
-    missing, an unknown key, another number of views, or a matrix that is no rigid transform."""
+def read_poses(path: Path, count: int) -> tuple[str, tuple[Affine, ...]]:
+    """``frame_id`` and ``fixed_from_camera`` of ``count`` views, mm, from JSON (``PosesFile``).
+    Raises InputError: missing, an unknown key, another number of views, or a matrix that is no
+    rigid transform."""
     file = from_builtins(read_json(path), PosesFile, str(path))
     if len(file.fixed_from_camera) != count:
         raise InputError(
             f"{path} has {len(file.fixed_from_camera)} poses for {count} views; it must have one "
             "for each, in their order."
         )
-    return tuple(
+    poses = [
         read_rigid(rows, file.unit, f"{path}: fixed_from_camera, view {n}")
         for n, rows in enumerate(file.fixed_from_camera, start=1)
-    )
+    ]
+    return file.frame_id, tuple(poses)
 
 
 def read_cloud(path: Path, unit: Literal["mm", "m"] = "mm") -> tuple[SensorCloud, tuple[str, ...]]:

@@ -17,6 +17,9 @@ _INSTEAD = {
     "the camera's scale": "calibrate it",
     "do not lie on the organ": "free the organ of what lies on it and beside it",
 }
+# The same of several views.
+_AMONG_VIEWS = "its pose", "sees through", "do not lie on the organ", "fits the points worse"
+CHECK_POSES = "check the poses, or the organ moved between the views"
 _MOST = 2000  # of the organ's faces, or vertices: they tell enough
 _FACING = 0.3  # cosine to the line of sight: flatter surfaces return little
 _NEAR_MM = 8.0  # of an observed point: seen
@@ -34,6 +37,8 @@ def what_to_do(estimate: Estimate, cloud: SensorCloud) -> str:
     Args:
         cloud: the organ's points, camera frame, in which it was located.
     """
+    if "looks" in estimate.report and any(one in estimate.reason for one in _AMONG_VIEWS):
+        return CHECK_POSES
     for words, advice in _INSTEAD.items():
         if words in estimate.reason:
             return advice

@@ -14,6 +14,7 @@ from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import DepthFrame, Intrinsics, Look, Mesh, SensorCloud
 from tumortrack.models.in_distribution import FIT_FACTOR, RIVAL_COST
 from tumortrack.models.margins import ModelMargins, exceeded, figures, stated_margin
+from tumortrack.registration.looks import CAMERA_STD
 from tumortrack.sense.render import render_depth
 
 # Standard deviation of a tumor's middle, and how far from it another fit, nearly as likely, may
@@ -33,6 +34,7 @@ _THROUGH_MM = 6.0  # behind the estimated surface: what is seen there lies behin
 # the cost alone, without strays up to 1.5 times the usual one, spoke against 18 answers, all right.
 _TOLD, _RIM = 0.5, 2
 _MOST_STRAYS = 0.5  # of the points: no robust estimate bears more (the breakdown point)
+_FARTHEST = 3.0  # standard deviations of where cameras are
 _UNSURE = 0.6  # mean probability of a tumor's points
 _PIXEL_MM = 1.5  # of the picture that a cloud is compared in
 _MOST_PIXELS = 1024  # along a side
@@ -67,7 +69,10 @@ def judged(
             refuse nothing: they may be joined from several views.
     """
     organ = next(iter(estimate.meshes.values()))
-    views = [(organ, seen)] + [(_before(organ, one), one.seen) for one in others]
+    views, looks = [(organ, seen)], estimate.report.get("looks")
+    if looks is not None:
+        before = zip(others, looks["camera_from_look"][1:], strict=True)
+        views += [(_before(organ, pose), one.seen) for one, pose in before]
     by_image = [seen_through(there, view) for there, view in views if isinstance(view, DepthFrame)]
     clouds = [cloud_shares(there, view) for there, view in views if isinstance(view, SensorCloud)]
     unseen = max((share for _, share in clouds), default=0.0)
@@ -84,7 +89,8 @@ def judged(
             "was taken for it is something else, or lies as no organ in training did. Choose the "
             "organ (a click, a --box), or look from another side."
         )
-    reason = _misfit(estimate, told > _TOLD and not strictly) or _doubt(estimate)
+    reason = _misplaced(estimate) or _misfit(estimate, told > _TOLD and not strictly)
+    reason = reason or _doubt(estimate)
     if through > doubtful:
         reason = f"the camera sees through {100 * through:.0f} % of where the organ lies"
     elif unseen > _UNSEEN and not reason:
@@ -94,9 +100,10 @@ def judged(
     return replace(estimate, quality=quality, reason=reason)
 
 
-def _before(organ: Mesh, look: Look) -> Mesh:
+def _before(organ: Mesh, camera_from_look: Sequence[Sequence[float]]) -> Mesh:
     """The organ's surface in a further look's frame."""
-    return organ.moved(transform_points(np.linalg.inv(look.camera_from_look), organ.vertices_mm))
+    look_from_camera = np.linalg.inv(np.array(camera_from_look))
+    return organ.moved(transform_points(look_from_camera, organ.vertices_mm))
 
 
 def with_margin(estimate: Estimate, cloud: SensorCloud, margins: ModelMargins | None) -> Estimate:
@@ -120,6 +127,20 @@ def doubted(estimate: Estimate, reason: str) -> Estimate:
     """The same estimate, poor for this reason."""
     estimate.report["quality"] = {"verdict": "poor", "reason": reason}
     return replace(estimate, quality="poor", reason=reason)
+
+
+def _misplaced(estimate: Estimate) -> str:
+    """Whether a camera was found too far from where its pose says."""
+    looks = estimate.report.get("looks", {"shift_mm": (), "turn_degrees": ()})
+    most_mm, most_degrees = _FARTHEST * CAMERA_STD[0], np.rad2deg(_FARTHEST * CAMERA_STD[-1])
+    errors = zip(looks["shift_mm"], looks["turn_degrees"], strict=True)
+    for number, (shift_mm, degrees) in enumerate(errors, start=1):
+        if shift_mm > most_mm or degrees > most_degrees:
+            return (
+                f"view {number} shows the organ {shift_mm:.1f} mm and {degrees:.1f} degrees from "
+                "where its pose has it"
+            )
+    return ""
 
 
 def _misfit(estimate: Estimate, told: bool) -> str:

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from tumortrack.core.config import Config, to_builtins
-from tumortrack.core.errors import InputError
+from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.estimate import Estimate, Following
 from tumortrack.core.process import keep_small_blocks
 from tumortrack.core.types import Anatomy, DepthFrame, Look, SensorCloud
@@ -23,7 +23,7 @@ from tumortrack.registration.locator import RegistrationLocator
 from tumortrack.registration.model import RegistrationModel
 from tumortrack.sense.cloud import CloudConfig
 from tumortrack.sense.region import RegionConfig
-from tumortrack.tracking.advice import what_to_do
+from tumortrack.tracking.advice import CHECK_POSES, what_to_do
 from tumortrack.tracking.quality import doubted, judged, with_margin
 
 _ALONE = Following()
@@ -75,8 +75,13 @@ class Tracker:
         """
         if seed < 0:
             raise InputError(f"the seed is {seed}; it must be 0 or more.")
-        estimate = self._locator.locate(cloud, grid, seed, others)
-        return self._judged(estimate, cloud, seen or cloud, False, others)
+        try:
+            estimate = self._locator.locate(cloud, grid, seed, others)
+            return self._judged(estimate, cloud, seen or cloud, False, others)
+        except NoEstimate as error:
+            if not others:
+                raise
+            raise NoEstimate(f"{error} Of several views: {CHECK_POSES}.") from error
 
     def follow(
         self,

@@ -1,0 +1,275 @@
+"""Several views of a still organ as one: places of cameras, contradictions, the command."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from stories import refusal, succeeded, tumortrack
+from tumortrack.core import store
+from tumortrack.core.errors import InputError, NoEstimate
+from tumortrack.core.geometry import rigid, transform_points
+from tumortrack.core.types import DepthFrame, Look, SensorCloud
+from tumortrack.models.config import GaussNewtonConfig
+from tumortrack.registration import looks as module
+from tumortrack.registration.discrepancy import judge
+from tumortrack.registration.gauss_newton import posterior, refine
+from tumortrack.registration.looks import CAMERA_STD, Looks
+from tumortrack.sense.camera import d405
+from tumortrack.sense.files import depth_png, intrinsics_json, read_poses
+from tumortrack.sense.render import render_depth
+from tumortrack.tracking.advice import CHECK_POSES
+from tumortrack.tracking.tracker import Tracker
+from tumortrack.training.model import load_model
+from warp_objects import ANATOMY, PLACE_MM, nudged, placed, shape
+
+CAMERA = d405(424, 240)
+ORGAN = ANATOMY.organ
+INNER = (ORGAN.vertices_mm + ORGAN.vertices_mm.mean(0))[::5] / 2
+STATES = 73, 12, 40, 5
+SHIFT_MM, TURN_RAD = [1.2, -0.8, 0.9], [0.01, -0.015, 0.008]
+
+
+def around(degrees, shift_mm=(0.0, 0, 0), turn_rad=(0.0, 0, 0)):
+    """camera_from_look of a camera that was led round the organ, and stands elsewhere by this (its
+    axes, about the organ's centre)."""
+    turn = Rotation.from_rotvec([0, np.deg2rad(degrees), 0]).as_matrix()
+    small = Rotation.from_rotvec(turn_rad).as_matrix()
+    there = rigid(turn, PLACE_MM - turn @ PLACE_MM)
+    return there @ rigid(small, PLACE_MM - small @ PLACE_MM + shift_mm)
+
+
+def image(motion, camera_from_look, seed=0):
+    """What a camera sees there of the organ alone, 0.2 mm of noise."""
+    places = transform_points(np.linalg.inv(camera_from_look), motion.carry(ORGAN.vertices_mm))
+    depth_mm = render_depth(places, ORGAN.faces, CAMERA).depth_mm
+    noise = np.random.default_rng(seed).normal(0, 0.2, depth_mm.shape)
+    return DepthFrame((depth_mm + noise).astype(np.float32), CAMERA)
+
+
+def points_of(frame):
+    row, column = np.nonzero(np.isfinite(frame.depth_mm))
+    z = frame.depth_mm[row, column]
+    x, y = (column - CAMERA.cx) / CAMERA.fx, (row - CAMERA.cy) / CAMERA.fy
+    return SensorCloud(np.column_stack([x * z, y * z, z]).astype(np.float32))
+
+
+def view(motion, camera_from_look, stated=None, seed=0):
+    frame = image(motion, camera_from_look, seed)
+    return Look(points_of(frame), frame, camera_from_look if stated is None else stated)
+
+
+@pytest.fixture(scope="module")
+def tracker(slim_model):
+    return Tracker(load_model(slim_model, "cpu"))
+
+
+def located(tracker, first, *others):
+    return tracker.locate(first.cloud, 16, 0, first.seen, others)
+
+
+def off_mm(estimate, truth):
+    return np.linalg.norm(estimate.motion.carry(INNER) - truth.carry(INNER), axis=1).mean()
+
+
+def test_two_looks_see_more_than_one(tracker):
+    errors = []
+    for seed, state in enumerate(STATES):
+        truth = placed(state)
+        first, second = (view(truth, around(degrees), seed=seed) for degrees in (0, 60))
+        one, two = located(tracker, first), located(tracker, first, second)
+        errors.append([off_mm(one, truth), off_mm(two, truth)])
+        assert two.motion.largest_std_mm(INNER).mean() < one.motion.largest_std_mm(INNER).mean()
+        assert two.quality == "good"
+        assert "not of several" in two.report["margin"]["reason"]
+        assert two.report["points"] == len(first.cloud.points_mm) + len(second.cloud.points_mm)
+    one, two = np.median(errors, axis=0)
+    assert two < 0.8 * one
+
+
+def test_a_camera_that_stands_elsewhere_is_corrected(tracker, monkeypatch):
+    truth = placed()
+    first, real = view(truth, around(0)), around(60, SHIFT_MM, TURN_RAD)
+    exact = located(tracker, first, view(truth, real))
+    wrong = view(truth, real, around(60))
+    found = located(tracker, first, wrong)
+    apart = exact.motion.carry(INNER) - found.motion.carry(INNER)
+    assert np.linalg.norm(apart, axis=1).max() < 0.5
+    looks = found.report["looks"]
+    assert looks["shift_mm"][0] == looks["turn_degrees"][0] == 0
+    assert looks["shift_mm"][1] == pytest.approx(np.linalg.norm(SHIFT_MM), abs=0.6)
+    near, stated = np.linalg.inv(real), around(60)
+    for pose, least, most in ((looks["camera_from_look"][1], 0, 0.7), (stated, 1, 3)):
+        there = transform_points(near @ pose, PLACE_MM[None])[0]
+        assert least < np.linalg.norm(there - PLACE_MM) < most
+    assert found.quality == "good"
+    monkeypatch.setattr(module, "CAMERA_STD", CAMERA_STD * 1e-4)
+    trusting = located(tracker, first, wrong)
+    assert trusting.report["looks"]["shift_mm"][1] < 0.01
+    assert trusting.report["fit_cost"]["now"] > 1.5 * found.report["fit_cost"]["now"]
+    moved = np.linalg.norm(exact.motion.carry(INNER) - trusting.motion.carry(INNER), axis=1)
+    assert moved.mean() > 2 * np.linalg.norm(apart, axis=1).mean()
+
+
+def test_the_order_of_looks_does_not_matter(tracker):
+    truth, poses = placed(40), [around(degrees) for degrees in (0, 50, -50)]
+    frames = [image(truth, pose, seed) for seed, pose in enumerate(poses)]
+    found = []
+    for order in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        into = np.linalg.inv(poses[order[0]])
+        views = [Look(points_of(frames[n]), frames[n], into @ poses[n]) for n in order]
+        estimate = located(tracker, *views)
+        assert np.allclose(estimate.report["looks"]["camera_from_look"][0], np.eye(4))
+        found.append(transform_points(poses[order[0]], estimate.motion.carry(INNER)))
+    for other in found[1:]:
+        assert np.linalg.norm(other - found[0], axis=1).max() < 0.8
+
+
+def test_one_look_is_what_it_was(tracker):
+    points = points_of(image(placed(), np.eye(4))).points_mm[::20]
+    looks, registration = Looks.of([points]), tracker.model.registration()
+    assert looks.points_mm is points
+    fit, same = registration.register_all(looks)
+    assert same is looks
+    alone = registration.register(points)
+    np.testing.assert_array_equal(fit.motion.carry(INNER), alone.motion.carry(INNER))
+    assert fit.cost == alone.cost
+    config, motion, body = registration.config, alone.motion, alone.motion.shape.body
+    prior = np.diag([config.shift_mm**2] * 3 + [config.turn_rad**2] * 3 + [0.0] * len(body.mean))
+    prior[6:, 6:] = body.covariance
+    off = np.concatenate([np.zeros(6), body.mean - motion.coefficients])
+    rows, rest_ct = motion.residual_rows(points), motion.back(points)
+    covariance, process = judge(rows, rest_ct, prior, off, config.last_mm)
+    judged = posterior(motion, looks, config)
+    np.testing.assert_array_equal(judged.covariance, covariance)
+    np.testing.assert_array_equal(judged.discrepancy.cross, process.cross)
+
+
+def test_a_correction_undoes_a_cameras_error_and_leaves_the_rest():
+    """On exact points, with the true motion: a step finds an error to second order."""
+    truth, config = placed(), GaussNewtonConfig()
+    real = around(60, SHIFT_MM, TURN_RAD)
+    seen = [points_of(image(truth, pose)).points_mm[::25] for pose in (np.eye(4), real)]
+    looks = Looks.of(seen, [around(60)])
+    for _ in range(4):
+        fit = refine(shape(), looks.points_mm, truth, looks.weighed(config))
+        looks = looks.corrected(fit.motion, config)
+    np.testing.assert_array_equal(looks.points_mm[looks.look == 0], seen[0])
+    np.testing.assert_allclose(
+        looks.points_mm[looks.look == 1],
+        transform_points(looks.camera_from_look[1], seen[1]), atol=1e-3,
+    )  # fmt: skip
+    gone = looks.camera_from_look[1] @ np.linalg.inv(real)
+    middle = transform_points(gone, PLACE_MM[None])[0] - PLACE_MM
+    assert np.linalg.norm(middle) < 0.5
+    assert looks.cost == pytest.approx(((looks.shifts / CAMERA_STD) ** 2).sum())
+
+
+def test_a_pose_far_off_or_an_organ_that_moved_is_no_good_estimate(tracker):
+    truth, first = placed(), view(placed(), around(0))
+    wrong = around(60, [4.0, 3.0, -3.0])
+    found = located(tracker, first, view(truth, wrong, around(60)))
+    assert found.quality == "poor"
+    assert "view 2 shows the organ" in found.reason
+    assert found.reason.endswith(CHECK_POSES)
+    turned = replace(nudged(truth, [0, 0, 0], [0, 0.5, 0.4]), coefficients=truth.coefficients)
+    with pytest.raises(NoEstimate, match=CHECK_POSES):
+        located(tracker, first, view(turned, around(60)))
+
+
+def test_a_view_that_sees_through_refuses(tracker):
+    truth = placed()
+    first, second = (view(truth, around(degrees)) for degrees in (0, 60))
+    half = second.seen.depth_mm.copy()
+    half[:, half.shape[1] // 2 :] = np.nanmax(half) + 60  # a wall where half of it should be
+    with pytest.raises(NoEstimate, match=rf"sees through \d+ %.* Of several views: {CHECK_POSES}"):
+        located(tracker, first, replace(second, seen=DepthFrame(half, CAMERA)))
+
+
+def test_a_model_that_knows_no_motion_takes_one_look(learnt_model):
+    tracker, one = Tracker(load_model(learnt_model, "cpu")), view(placed(), around(0))
+    with pytest.raises(InputError, match="preset clinic"):
+        located(tracker, one, one)
+
+
+# --- files ---
+
+
+def poses_json(**changed):
+    poses = [around(degrees).tolist() for degrees in (0, 60)]
+    return {"fixed_from_camera": poses, "unit": "mm", "frame_id": "base_link"} | changed
+
+
+BAD_POSES = {
+    "another number": ({"fixed_from_camera": [np.eye(4).tolist()]}, "1 poses for 2 views"),
+    "mirrored": (
+        {"fixed_from_camera": [np.eye(4).tolist(), np.diag([1.0, 1, -1, 1]).tolist()]},
+        "view 2 is no rigid transform",
+    ),
+    "three rows": ({"fixed_from_camera": [np.eye(4)[:3].tolist()] * 2}, "view 1 has 3 rows"),
+    "not a number": ({"fixed_from_camera": [[[float("nan")] * 4] * 4] * 2}, "view 1"),
+    "far beyond": (
+        {"fixed_from_camera": [rigid(np.eye(3), np.full(3, 1e306)).tolist()] * 2, "unit": "m"},
+        "view 1",
+    ),
+    "inches": ({"unit": "inch"}, "unit"),
+    "an unknown key": ({"robot": 1}, "robot"),
+}
+
+
+@pytest.mark.parametrize("name", BAD_POSES)
+def test_bad_poses_are_refused(tmp_path, name):
+    changed, words = BAD_POSES[name]
+    (tmp_path / "poses.json").write_text(json.dumps(poses_json(**changed)))
+    with pytest.raises(InputError, match=words) as refused:
+        read_poses(tmp_path / "poses.json", 2)
+    assert "\n" not in str(refused.value)
+    assert "poses.json" in str(refused.value)
+
+
+def test_metres_are_millimetres(tmp_path):
+    poses = np.array(poses_json()["fixed_from_camera"])
+    poses[:, :3, 3] /= 1000
+    (tmp_path / "poses.json").write_text(
+        json.dumps(poses_json(fixed_from_camera=poses.tolist(), unit="m"))
+    )
+    frame_id, (_, second) = read_poses(tmp_path / "poses.json", 2)
+    assert frame_id == "base_link"
+    np.testing.assert_allclose(second, around(60), atol=1e-9)
+
+
+def test_the_command_takes_several_views(slim_model, tmp_path):
+    truth = placed()
+    names = "left.png", "right.png"
+    for name, degrees in zip(names, (0, 60), strict=True):
+        (tmp_path / name).write_bytes(depth_png(image(truth, around(degrees), degrees)))
+    (tmp_path / "camera.json").write_text(json.dumps(intrinsics_json(CAMERA)))
+    (tmp_path / "poses.json").write_text(json.dumps(poses_json()))
+    left, right = (tmp_path / name for name in names)
+    options = ["--intrinsics", tmp_path / "camera.json", "--range", 50, 400, "--device", "cpu"]
+    options += ["--grid", 32]
+    poses = ["--poses", tmp_path / "poses.json"]
+    out = tmp_path / "out"
+    command = "locate", slim_model, left
+    assert "--poses FILE with several views" in refusal(tumortrack(*command, right, out, *options))
+    assert "and only then" in refusal(tumortrack(*command, out, *options, *poses))
+    three = refusal(tumortrack(*command, right, left, out, *options, *poses))
+    assert "2 poses for 3 views" in three
+    assert not out.exists()
+    said = succeeded(tumortrack(*command, right, out, *options, *poses))
+    assert f"written to {out}" in said
+    report = json.loads((out / "report.json").read_text())
+    looks = report["looks"]
+    assert looks["clouds_sha256"] == [store.sha256_of(path) for path in (left, right)]
+    assert looks["poses_sha256"] == store.sha256_of(poses[1])
+    assert looks["frame_id"] == "base_link"
+    assert max(looks["shift_mm"]) < 1
+    places = truth.carry(ANATOMY.tumors[0].vertices_mm)
+    centre = np.array(report["parts"]["tumor_1"]["center_mm"])
+    assert np.linalg.norm(centre - (places.min(0) + places.max(0)) / 2) < 4
+    planned = tumortrack("plan", out, tmp_path / "plan", "--no-arms", "--confidence", 95)
+    assert "margin" in refusal(planned)  # none is stated for several views
