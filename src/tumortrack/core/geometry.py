@@ -54,11 +54,9 @@ def read_rigid(rows: Sequence[Sequence[float]], unit: Literal["mm", "m"], where:
     b_from_a = np.array(rows, float) if {len(row) for row in rows} == {4} else np.zeros((0, 4))
     if len(b_from_a) != 4:
         raise InputError(f"{where} has {len(rows)} rows; it must have 4 of 4 numbers.")
-    if unit == "m":
-        b_from_a[:3, 3] *= 1000
-    turn = b_from_a[:3, :3]
+    turn, per_unit = b_from_a[:3, :3], 1000.0 if unit == "m" else 1.0
     good = (
-        np.abs(b_from_a).max() < _FARTHEST_MM
+        np.abs(b_from_a).max() < _FARTHEST_MM / per_unit
         and np.abs(turn @ turn.T - np.eye(3)).max() < _NOT_RIGID
         and np.linalg.det(turn) > 0
         and np.array_equal(b_from_a[3], [0, 0, 0, 1])
@@ -68,6 +66,7 @@ def read_rigid(rows: Sequence[Sequence[float]], unit: Literal["mm", "m"], where:
             f"{where} is no rigid transform: its rotation must be orthonormal and right-handed, "
             "its last row 0 0 0 1, its shift less than a kilometre."
         )
+    b_from_a[:3, 3] *= per_unit
     return b_from_a
 
 

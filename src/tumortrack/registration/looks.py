@@ -43,7 +43,9 @@ class Looks:
     shifts: Float64[np.ndarray, "k 6"]
 
     @classmethod
-    def of(cls, points_mm: Sequence[Points], camera_from_look: Sequence[Affine] = ()) -> Looks:
+    def of(
+        cls, points_mm: Sequence[Float[np.ndarray, "_ 3"]], camera_from_look: Sequence[Affine] = ()
+    ) -> Looks:
         """Points of each look in its own camera's frame; further ones with where it is."""
         moved = [*points_mm[:1], *map(_moved, camera_from_look, points_mm[1:])]
         numbers = np.repeat(np.arange(len(moved)), [len(points) for points in moved])
