@@ -20,7 +20,13 @@ from tumortrack.core.geometry import rigid, transform_points
 from tumortrack.core.types import Anatomy, Mesh
 from tumortrack.models.report import estimate_of as of_surfaces
 from tumortrack.simulate.scene_folder import Scene
-from tumortrack_lab.peers.pose_search import Direction, Points, PoseSearch, Transform
+from tumortrack_lab.peers.pose_search import (
+    Direction,
+    Points,
+    PoseSearch,
+    RigidConfig,
+    Transform,
+)
 
 # Barycentric points of a tetrahedron that integrate quadratics exactly (Keast 1986, 4 points).
 _NEAR, _FAR = 0.1381966011250105, 0.5854101966249685
