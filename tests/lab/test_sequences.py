@@ -181,7 +181,8 @@ def test_a_followers_errors_are_judged_as_large_as_they_are(film) -> None:
     found = rows[rows["quality"] != "none"]
     np.testing.assert_allclose(found["center_mm"], 4.0, atol=1e-3)
     np.testing.assert_allclose(found["targets_mm"], 4.0, atol=1e-3)
-    assert (found["hausdorff_mm"] > 3.0).all()
+    assert (found["hausdorff_mm"].dropna() > 3.0).all()
+    assert found["hausdorff_mm"].notna().sum() > 1
     assert rows["center_mm"].isna().tolist() == (rows["quality"] == "none").tolist()
     assert (rows["rigid_center_mm"] < rows["bend_mm"] + 0.1).all()
     about = {"method": "track", "organ": "a", "sequence": "push-000", "kind": "push"}
