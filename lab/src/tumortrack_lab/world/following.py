@@ -97,9 +97,9 @@ METHODS: dict[str, Callable[[Tracker], Locate]] = {
 
 
 def judge(locate: Locate, film: Film) -> list[dict[str, Any]]:
-    """A row a frame and tumor: quality, errors of its centre and, in every third frame, its surface
-    (Hausdorff), stated deviations, and the error of the centre that the best rigid pose has; mm. Without an estimate
-    they are absent."""
+    """A row a frame and tumor: quality, error of its centre and, in every third frame, its surface
+    (Hausdorff), stated deviations, and how far the best rigid pose has the centre off; mm. What
+    needs an estimate is absent where there is none."""
     poses, sites, rows = film.first_from_camera(), tumor_sites_of(film.rest), []
     for number, time_s in enumerate(film.seconds.tolist()):
         about: dict[str, Any] = {
