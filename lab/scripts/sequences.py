@@ -51,7 +51,7 @@ class Options:
     """Also pictures of a colour camera in each one's place (0.2 s a frame and camera)."""
     model: Path | None = None
     """Follow with it (folder that `tumortrack train` wrote)."""
-    methods: tuple[str, ...] = ("track", "first look")
+    methods: tuple[str, ...] = ("track", "first-look")
     """How; see tumortrack_lab.world.following."""
     version: str = ""
     """Of the program, if several are to be compared: kept apart, and named in the table."""
@@ -95,7 +95,7 @@ def _follow(options: Options, model: Path, films: list[Film]) -> None:
     about = {"model_sha256": sha256, "version": options.version}
     for done, film in enumerate(films, start=1):
         for method in options.methods:
-            called = f"{method} {options.version}".strip().replace(" ", "-")
+            called = "-".join(filter(None, (method, options.version)))
             judge = partial(following.judge, following.METHODS[method](tracker), film)
             rows = trainings.kept(film.folder / f"{called}.json", about, judge)
             errors = pd.DataFrame(rows).reindex(columns=["center_mm"])["center_mm"]

@@ -92,7 +92,7 @@ def _organ(frame: DepthFrame, region: RegionConfig, hints: Hints = _NOTHING_KNOW
 
 
 METHODS: dict[str, Callable[[Tracker], Locate]] = {
-    "track": track, "first look": first_look, "laid together": laid_together,
+    "track": track, "first-look": first_look, "laid-together": laid_together,
 }  # fmt: skip
 
 
