@@ -292,15 +292,14 @@ def test_estimates_are_held_against_truth_and_rigid_pose_once_and_wrong_ones_nam
     scenes = [made.scene(number) for number in range(2)]
     for name, scene in zip(names, scenes, strict=True):
         scene.write(out / name)
-    off = np.array([6.0, 8.0, 0.0])  # 10 mm beside
-    targets, tumor = scenes[0].targets, scenes[0].reference.tumors[0]
-    answer = SimpleNamespace(
-        quality="good",
-        reason="",
-        meshes={"tumor_1": tumor.moved(tumor.vertices_mm + off)},
-        motion=SimpleNamespace(carry=lambda points: targets.points_mm + off),
+    back = np.linalg.inv(np.array(scenes[0].meta["camera_from_bench"]))
+    shift = np.linalg.inv(back)  # before the camera, and 10 mm beside where it lies
+    shift[:3, 3] += [6.0, 8.0, 0.0]
+    motion = SimpleNamespace(
+        carry=lambda points: transform_points(shift @ made.bench_from_ct, points),
+        std_mm=lambda points: np.ones(len(points)),
     )
-    asked = []
+    answer, asked = SimpleNamespace(quality="good", reason="", motion=motion), []
     monkeypatch.setattr(Tracker, "follow", lambda _, cloud, seen: asked.append(cloud) or answer)
     monkeypatch.setattr(estimates, "load_model", lambda *args, **how: None)
     monkeypatch.setattr(estimates, "Tracker", lambda model: Tracker.__new__(Tracker))
@@ -308,14 +307,17 @@ def test_estimates_are_held_against_truth_and_rigid_pose_once_and_wrong_ones_nam
         estimates.measure(tmp_path / "model", made.anatomy_ct, out, names[:upto])
     assert len(asked) == 2
     rows = estimates.read_rows([out])
-    assert rows.center_mm[0] == pytest.approx(10.0, abs=0.01)
-    assert rows.shape_mm[0] == pytest.approx(0.0, abs=0.01)
-    assert rows.rigid_mm[0] < 1.5  # as segmentation errs
+    assert rows.off[0] == pytest.approx(10.0, abs=1.5)  # as segmentation errs
+    assert rows["shape"][0] < 1.5
+    assert rows.rigid[0] < 1.5
     assert list(rows.wrong) == [True, True]
-    text = estimates.summary(rows, {"organ 2-rest-none": "NoEstimate: nothing"})
-    assert "| rest | 1 | 0, 0, 1 | 10.0 / 10.0 / 10.0 / 10.0 |" in text
+    text, off = (
+        estimates.summary(rows, {"2-rest-none": "NoEstimate: nothing"}),
+        f"{rows.off[0]:.1f}",
+    )
+    assert f"| rest | 1 | 0, 0, 1 | {off} / {off} / {off} / {off} |" in text
     assert "| nothing | 1 | 0, 0, 1 | – | – | 1 |" in text
-    assert "| none | laid elsewhere | 1 | organ 0-rest 10.0 (" in text
+    assert f"| none | laid elsewhere | 1 | organ 0-rest {off} (" in text
     assert "| nothing | another organ taken for it | 1 | organ 1-rest |" in text
     assert "Not made: NoEstimate 1." in text
     monkeypatch.setattr(estimates, "METHOD", -1)
