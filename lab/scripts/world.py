@@ -13,7 +13,7 @@ each, and the last with `--beside` the others.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
@@ -75,12 +75,8 @@ def main(options: Options) -> None:
         if unknown := sorted(set(names) - set(known)):
             raise InputError(f"{unknown[0]!r} is not known; allowed: {', '.join(known)}.")
     block = "world" if set(options.disturb) == {"none"} else "world-disturbed"
-    writer = (
-        ReportWriter(options.document, trainings.make_command("world"))
-        if options.document
-        else None
-    )
-    if writer is not None:
+    writer = ReportWriter(options.document or Path(), trainings.make_command("world"))
+    if options.document is not None:
         writer.check([block])
     config = WorldConfig(
         seed=options.seed,
@@ -110,17 +106,12 @@ def main(options: Options) -> None:
         made = [name for name in scenes if (options.out / name).exists()]
         estimates.measure(options.model, world.anatomy_ct, options.out, made)
         folders = [options.out, *options.beside]
-        text = estimates.summary(estimates.read_rows(folders), _failures(folders))
+        paths = [path for folder in folders if (path := folder / _FAILURES).exists()]
+        lost = [why for path in paths for why in store.read_json(path).values()]
+        text = estimates.summary(estimates.read_rows(folders), lost)
         print(text)
-        if writer is not None:
+        if options.document is not None:
             writer.write({block: f"`{writer.command}`\n\n{text}"})
-
-
-def _failures(folders: Iterable[Path]) -> dict[str, str]:
-    """Why scenes could not be made, by organ and scene."""
-    paths = [folder / _FAILURES for folder in folders]
-    kept = {path.parent.name: store.read_json(path) for path in paths if path.exists()}
-    return {f"{organ} {scene}": why for organ, some in kept.items() for scene, why in some.items()}
 
 
 def _scenes(options: Options, world: World) -> dict[str, Callable[[], Scene]]:
@@ -135,12 +126,10 @@ def _scenes(options: Options, world: World) -> dict[str, Callable[[], Scene]]:
         if kind != "none" or int(state) >= options.count or family not in options.families:
             continue
         for draw in range(options.draws):
-            n, kind = (
-                int(state) * options.draws + draw,
-                world.recipe(int(state), options.draws, draw)[1],
-            )
-            name = f"{n:05d}-{family}-{kind}"
-            scenes[name] = lambda f=folder, n=n, kind=kind: world.again(shown(f), n, kind)
+            _, other = world.recipe(int(state), options.draws, draw)
+            n = int(state) * options.draws + draw
+            make = partial(lambda f, n, kind: world.again(shown(f), n, kind), folder, n, other)
+            scenes[f"{n:05d}-{family}-{other}"] = make
     return scenes
 
 

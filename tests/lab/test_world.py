@@ -312,7 +312,7 @@ def test_estimates_are_held_against_truth_and_rigid_pose_once_and_wrong_ones_nam
     assert rows.rigid[0] < 1.5
     assert list(rows.wrong) == [True, True]
     text, off = (
-        estimates.summary(rows, {"2-rest-none": "NoEstimate: nothing"}),
+        estimates.summary(rows, ["NoEstimate: nothing"]),
         f"{rows.off[0]:.1f}",
     )
     assert f"| rest | 1 | 0, 0, 1 | {off} / {off} / {off} / {off} |" in text

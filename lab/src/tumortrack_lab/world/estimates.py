@@ -44,7 +44,7 @@ def measure(model: Path, anatomy_ct: Anatomy, out: Path, names: Sequence[str]) -
 
 def read_rows(folders: Sequence[Path]) -> pd.DataFrame:
     """A line a tumor of all scenes; organs are called as the folders. Raises InputError: measured
-    with another version of the method."""
+    with another version of the method, or none at all."""
     rows = []
     for folder in folders:
         kept = store.read_json(folder / _ROWS)
@@ -52,6 +52,8 @@ def read_rows(folders: Sequence[Path]) -> pd.DataFrame:
             raise InputError(f"{folder} was measured with another version of the method.")
         some = kept["rows"].items()
         rows += [{"organ": folder.name, "scene": name, **row} for name, row in some]
+    if not rows:
+        raise InputError("there are no scenes; give a larger --count, --draws.")
     lines = by_tumor(rows).reindex(columns=[*rows[0], *_ERRORS]).rename(columns=_ERRORS)
     lines["hidden"] = pd.Categorical(lines.hidden_share.map(band_of), BANDS)
     right = lines.off <= FAR_MM  # False where there is no such tumor
@@ -65,14 +67,14 @@ def _judged(tracker: Tracker, anatomy_ct: Anatomy, scene: Scene) -> dict[str, An
     return about | judge(tracker, anatomy_ct, scene, scene.depth, surfaces=False)
 
 
-def summary(rows: pd.DataFrame, failures: dict[str, str]) -> str:
+def summary(rows: pd.DataFrame, failures: Sequence[str]) -> str:
     """The tables in Markdown: undisturbed scenes by family, hidden surface and organ; disturbed
     ones by disturbance and organ; and every good answer that is wrong."""
     calm = rows.disturbance == "none"
     parts = [_verdicts(rows[calm], key) for key in ("family", "hidden", "organ") if calm.any()]
     if not calm.all():
         parts += [_verdicts(rows[~calm], key) for key in ("disturbance", "organ")]
-    reasons = pd.Series([why.partition(":")[0] for why in failures.values()], dtype=str)
+    reasons = pd.Series([why.partition(":")[0] for why in failures], dtype=str)
     lost = ", ".join(f"{name} {count}" for name, count in reasons.value_counts().items())
     parts.append(
         "Errors of the tumors' middles, mm: median / 90 % / 95 % / worst, of good answers and of "

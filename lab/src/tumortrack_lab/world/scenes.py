@@ -220,16 +220,11 @@ def _disturbed_frame(
     """The view through a sensor out of order, and by how much."""
     depth = view.frame.depth_mm
     if kind == "scale":
-        how = {
-            "scale": 1 + rng.choice([-1, 1]) * rng.uniform(0.02, 0.1),
-            "offset_mm": rng.uniform(-8.0, 8.0),
-        }
-        depth = depth * how["scale"] + how["offset_mm"]
+        scale, by_mm = 1 + rng.choice([-1, 1]) * rng.uniform(0.02, 0.1), rng.uniform(-8.0, 8.0)
+        how, depth = {"scale": scale, "offset_mm": by_mm}, depth * scale + by_mm
     elif kind == "side":
-        there, camera = (
-            transform_points(view.camera_from_bench, organ.vertices_mm),
-            view.frame.intrinsics,
-        )
+        there = transform_points(view.camera_from_bench, organ.vertices_mm)
+        camera = view.frame.intrinsics
         pixels = there[:, :2] / there[:, 2:] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
         angle, share = rng.uniform(0, 2 * np.pi), rng.uniform(0.35, 0.65)
         way = np.array([np.cos(angle), np.sin(angle)])
