@@ -8,7 +8,7 @@ INSTALL := pip install --quiet --disable-pip-version-check --no-compile --no-dep
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help setup debian demo test test-hard check attack fuzz crash replay bench soak wheel lock licences audit results headstart training-speed foreign real world trust clean
+.PHONY: help setup debian demo test test-hard check attack fuzz crash replay bench soak wheel lock licences audit results foreign real world trust clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 10
@@ -72,14 +72,8 @@ bench: setup  ## speed of every part beside its naive form; fills docs/performan
 soak: setup  ## an hour of tracking with faults of eleven kinds (ARGS="MODEL CASE --minutes 5"; after make demo)
 	$(BIN)/python lab/scripts/soak.py $(ARGS)
 
-results: setup  ## the tables and plots of docs/results.md (hours; ARGS=--quick: minutes)
+results: setup  ## the tables and plots of docs/results.md (hours; ARGS="--case NAME=FOLDER": more organs)
 	$(BIN)/python lab/scripts/results.py $(ARGS)
-
-headstart: setup  ## accuracy against training steps from pretrained weights (ARGS=--start OUT)
-	$(BIN)/python lab/scripts/pretraining.py $(ARGS)
-
-training-speed: setup  ## accuracy reached per second, by batch, learning rate and queries (half an hour)
-	$(BIN)/python lab/scripts/training.py $(ARGS)
 
 foreign: setup  ## how often another kidney, or a mirrored one, is called good (an hour)
 	$(BIN)/python lab/scripts/foreign.py $(ARGS)

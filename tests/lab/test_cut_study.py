@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import msgspec
 import numpy as np
@@ -19,20 +19,17 @@ from tumortrack.plan.resection import plan_resection
 from tumortrack.simulate.scene_folder import Scene
 from tumortrack_lab.cut import cut
 from tumortrack_lab.peers.base import Fit, estimate_of, rigid_carry
-from tumortrack_lab.study.document import ReportWriter
-from tumortrack_lab.study.measure import Job, MeasurementStore, measure, spec_of
-from tumortrack_lab.study.methods import Answer, Method, StudyCase
-from tumortrack_lab.study.report import section_blocks
+from tumortrack_lab.study.measure import measured
+from tumortrack_lab.study.methods import Method, StudyCase
 from tumortrack_lab.study.resection import (
     PLANNERS,
     Planner,
-    Truth,
     cut_one,
     cutting,
-    exophytic_tumors,
     scattered,
     tables_of,
     tidy_plans,
+    truth,
 )
 from tumortrack_lab.study.tables import groups
 
@@ -83,34 +80,19 @@ def test_the_papers_plan_on_the_truth_passes_right_below_the_tumor():
     assert result.margin_mm == pytest.approx(0.0, abs=0.6)
 
 
-@dataclass
-class Shifted(Method):
+def shifted(shift_mm=0.0, std_mm=None, nothing=False, name="clinic", calls=None):
     """Answers the truth, shifted along the table's x, and says how sure it is if it is told."""
 
-    shift_mm: float = 0.0
-    std_mm: float | None = None
-    nothing: bool = False
-    calls: list[str] = field(default_factory=list)
-    name: str = "clinic"
-    device: str = "cpu"
-    prepare_s: float | None = 60.0
-
-    @property
-    def identity(self):
-        return {"kind": "stub", "name": self.name, "shift_mm": self.shift_mm}
-
-    @property
-    def about(self):
-        return {"prepare_s": self.prepare_s}
-
-    def locate(self, scene, grid):
-        self.calls.append("asked")
-        if self.nothing:
+    def locate(scene, grid):
+        if calls is not None:
+            calls.append("asked")
+        if nothing:
             raise NoEstimate("the cloud shows no organ")
-        carry = rigid_carry(rigid(np.eye(3), np.array([self.shift_mm, 0.0, 0.0])))
+        carry = rigid_carry(rigid(np.eye(3), np.array([shift_mm, 0.0, 0.0])))
         estimate = scattered(estimate_of(Fit(carry, 0.2), scene.reference, grid=grid))
-        motion = None if self.std_mm is None else Sure(self.std_mm)
-        return Answer(replace(estimate, motion=motion), 0.2)
+        return replace(estimate, motion=None if std_mm is None else Sure(std_mm))
+
+    return Method(name, {"shift_mm": shift_mm}, locate)
 
 
 @dataclass(frozen=True)
@@ -146,29 +128,27 @@ def case(tmp_path_factory):
     return StudyCase("balls", root / "case", root / "scenes", kidney(), (0.0, 0.0, 1.0))
 
 
-def jobs(case, *methods, variants=("D0",)):
-    also = cutting()
-    return [Job(case, m, v, "noise", 64, also=also) for m in methods for v in variants]
-
-
-def test_only_exophytic_tumors_are_cut(case):
-    assert exophytic_tumors(case) == ("tumor_1",)
+def cuts(case, method, variant="D0"):
+    """What each planner's plan did, for the one exophytic tumor."""
+    rows = cut_one(case, method, variant, "noise", 64)
+    assert {row["tumor"] for row in rows} == {"tumor_1"}
+    return {row["planner"]: row for row in rows}
 
 
 def test_an_estimate_that_is_off_costs_as_much_margin(case):
-    here = cut_one(jobs(case, Shifted())[0])["plans"]["tumor_1"]
-    off = cut_one(jobs(case, Shifted(shift_mm=3.0))[0])["plans"]["tumor_1"]
+    here = cuts(case, shifted())
+    off = cuts(case, shifted(shift_mm=3.0))
     assert here[OURS.name]["removed_share"] == off[OURS.name]["removed_share"] == 1.0
     assert here[OURS.name]["margin_mm"] == pytest.approx(5.0, abs=0.4)
     assert off[OURS.name]["margin_mm"] == pytest.approx(5.0 - 3.0, abs=0.5)
-    far = cut_one(jobs(case, Shifted(shift_mm=8.0))[0])["plans"]["tumor_1"]
+    far = cuts(case, shifted(shift_mm=8.0))
     assert far[OURS.name]["margin_mm"] == pytest.approx(5.0 - 8.0, abs=0.6)
     assert far[OURS.name]["removed_share"] < 0.97
     assert far[OURS.name]["left_ml"] > 0.1
 
 
 def test_the_margin_grows_by_what_the_estimate_is_unsure_of(case):
-    plans = cut_one(jobs(case, Shifted(std_mm=0.5))[0])["plans"]["tumor_1"]
+    plans = cuts(case, shifted(std_mm=0.5))
     assert list(plans) == [planner.name for planner in PLANNERS]
     wider = Planner(method="margin", sigmas=2.0)
     gained = plans[wider.name]["margin_mm"] - plans[OURS.name]["margin_mm"]
@@ -176,29 +156,33 @@ def test_the_margin_grows_by_what_the_estimate_is_unsure_of(case):
     assert plans[wider.name]["healthy_ml"] > plans[OURS.name]["healthy_ml"] + 0.2
     paper = Planner(method="published", sigmas=2.0)
     assert plans[paper.name]["healthy_ml"] > plans[PUBLISHED.name]["healthy_ml"] + 0.2
-    without = cut_one(jobs(case, Shifted())[0])["plans"]["tumor_1"]
+    without = cuts(case, shifted())
     assert list(without) == [PUBLISHED.name, OURS.name]
 
 
 def test_plans_are_measured_once_and_apart_from_accuracy(case, tmp_path):
-    method, kept = Shifted(), MeasurementStore(tmp_path)
-    todo = jobs(case, method, variants=("D0", "D1"))
-    first = measure(todo, kept, one=cut_one)
-    assert len(method.calls) == 2
-    assert measure(todo, kept, one=cut_one) == first
-    assert len(method.calls) == 2
-    plain = replace(todo[0], also={})
-    assert spec_of(plain).digest != spec_of(todo[0]).digest
+    calls = []
+    about = case, shifted(calls=calls), ("D0", "D1"), "noise", 64, tmp_path
+    first = measured(*about, cut_one, **cutting())
+    assert len(calls) == 2
+    assert measured(*about, cut_one, **cutting()) == first
+    assert len(calls) == 2
+    measured(*about, cut_one, cutting="by other rules")
+    assert len(calls) == 4
 
 
 def test_a_scene_without_a_table_is_refused(case):
     with pytest.raises(InputError, match="where its table is"):
-        cut_one(*jobs(case, Truth(), variants=("G1",)))
+        cut_one(case, truth(), "G1", "noise", 64)
 
 
 def test_tables_say_what_was_removed_and_why_not(case, tmp_path):
-    methods = (Truth(), Shifted(shift_mm=8.0), Shifted(nothing=True, name="M_lim"))
-    found = measure(jobs(case, *methods), MeasurementStore(tmp_path / "cells"), one=cut_one)
+    methods = (truth(), shifted(shift_mm=8.0), shifted(nothing=True, name="M_lim"))
+    found = [
+        row
+        for method in methods
+        for row in measured(case, method, ("D0",), "noise", 64, tmp_path, cut_one, **cutting())
+    ]
     assert [group for group, _ in groups(tidy_plans(found), "method", "planner")] == [
         (name, planner.name)
         for name in ("clinic", "M_lim", "truth")
@@ -208,20 +192,15 @@ def test_tables_say_what_was_removed_and_why_not(case, tmp_path):
     lines = {
         tuple(cell.strip() for cell in line.split("|")[1:3]): line for line in text.split("\n")
     }
+    assert text.startswith("All cases:")
     best = lines["truth", "ours, 5 mm"]
     assert "| 1 of 1 | 1 of 1 | 1 of 1 | 100.0 | 100.0 | 0.00 |" in best
     assert "| 1 of 1 | 1 of 1 | 0 of 1 |" in lines["clinic", "ours, 5 mm"]
     assert "| 0 of 1 | 0 of 0 | 0 of 0 | – |" in lines["slim network, limited turns", "ours, 5 mm"]
     assert "1 x slim network, limited turns, the paper's, 5 mm: the cloud shows no organ" in text
-    block = section_blocks(
-        "resection", found, (case,), ReportWriter(tmp_path / "x.md", "make results")
-    )
-    assert block["resection"].startswith("All cases:")
-    assert "`make results`: 3 measurements" in block["resection"]
 
 
-def test_shares_are_never_rounded_up_to_all(case, tmp_path):
-    found = measure(jobs(case, Truth()), MeasurementStore(tmp_path), one=cut_one)
-    entry = {**found[0]["plans"]["tumor_1"][OURS.name], "removed_share": 0.99996}
-    found[0]["plans"]["tumor_1"][OURS.name] = entry
-    assert "| 99.9 | 99.9 |" in tables_of(found)
+def test_shares_are_never_rounded_up_to_all(case):
+    known = {"case": "balls", "method": "truth"}
+    (row,) = [r for r in cut_one(case, truth(), "D0", "noise", 64) if r["planner"] == OURS.name]
+    assert "| 99.9 | 99.9 |" in tables_of([{**known, **row, "removed_share": 0.99996}])

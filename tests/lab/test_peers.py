@@ -29,10 +29,8 @@ from tumortrack_lab.peers.elastic import (
     stiffness_matrix,
 )
 from tumortrack_lab.peers.kinds import peer_kinds
-from tumortrack_lab.peers.point_drift import Bcpd, BcpdConfig, Cpd, CpdConfig
 from tumortrack_lab.peers.pose_search import RigidConfig, seen_from, surface_points
-from tumortrack_lab.study.measure import StudyCase
-from tumortrack_lab.study.methods import peer_method
+from tumortrack_lab.study.methods import StudyCase, peer
 from tumortrack_lab.tets import tetrahedralise
 
 UP = (0.0, -1.0, 0.0)
@@ -145,19 +143,6 @@ def test_rigid_motion_is_recovered(anatomy, elastic, spin_deg):
     assert max(errors(anatomy, scene, elastic.fit(scene))) < 0.3
 
 
-def test_rigid_motion_is_recovered_from_any_side(anatomy):
-    upside_down = pose(anatomy) @ rigid(
-        rotation_onto(np.array([0.0, 1, 0]), np.array([0.3, -1, 0.2])), np.zeros(3)
-    )
-    upside_down[:3, 3] += [6, -4, 140] - transform_points(
-        upside_down, anatomy.organ.box_mm.mean(0)[None]
-    )[0]
-    scene = scene_of(anatomy, still, upside_down)
-    peer = Rigid(anatomy, UP, RigidConfig(orientation="unknown", turns=8, sides=24))
-    assert peer.name == "rigid_any_rotation"
-    assert max(errors(anatomy, scene, peer.fit(scene))) < 0.3
-
-
 def test_outliers_do_not_break_registration(anatomy, elastic):
     scene = scene_of(anatomy, still, pose(anatomy), outliers=45)
     assert max(errors(anatomy, scene, Rigid(anatomy, UP, FEW).fit(scene))) < 1.0
@@ -174,17 +159,11 @@ def test_too_few_points_are_refused(anatomy):
 # Deformation -------------------------------------------------------------------------------
 
 
-def test_deformable_peers_beat_rigid_registration(anatomy, elastic):
+def test_the_elastic_peer_beats_rigid_registration(anatomy, elastic):
     scene = scene_of(anatomy, squeeze, pose(anatomy), outliers=20)
     rigid_mm = errors(anatomy, scene, Rigid(anatomy, UP, FEW).fit(scene))
-    drift_mm = errors(
-        anatomy,
-        scene,
-        Cpd(anatomy, UP, CpdConfig(rigid=FEW, starts=1, points=300, iterations=30)).fit(scene),
-    )
     elastic_mm = errors(anatomy, scene, elastic.fit(scene))
     assert rigid_mm[0] > 2.0  # the deformation matters
-    assert drift_mm[0] < rigid_mm[0]
     assert elastic_mm[0] < 0.7 * rigid_mm[0]
     assert elastic_mm[1] < rigid_mm[1]
 
@@ -300,51 +279,15 @@ def acme(tmp_path, monkeypatch):
 
 def test_another_package_adds_a_peer_by_an_entry_point(anatomy, acme, tmp_path):
     assert list(peer_kinds())[:2] == ["rigid_bound", "rigid"]
-    method = peer_method("shifted", StudyCase("x", tmp_path, tmp_path, anatomy, UP))
+    method = peer("shifted", StudyCase("x", tmp_path, tmp_path, anatomy, UP))
     assert method.identity["versions"] == {"acme-peers": "1.2"}
     scene = scene_of(anatomy, still, pose(anatomy))
-    answer = method.locate(scene, 40)
-    kidney = answer.estimate.meshes["kidney"].vertices_mm
+    kidney = method.locate(scene, 40).meshes["kidney"].vertices_mm
     shift = scene.cloud.points_mm.mean(0) - anatomy.organ.box_mm.mean(0)
     np.testing.assert_allclose(kidney, anatomy.organ.vertices_mm + shift)
-    assert answer.frame_s == 0.25
     (acme / "entry_points.txt").write_text("[tumortrack.peers]\nrigid = acme_peers:PEER\n")
     with pytest.raises(InputError, match="'rigid' of acme-peers has the name of one of ours"):
         peer_kinds()
     (acme / "entry_points.txt").write_text("[tumortrack.peers]\nbare = acme_peers:Shifted\n")
     with pytest.raises(InputError, match=r"acme_peers:Shifted of acme-peers is no PeerKind"):
         peer_kinds()
-
-
-# BCPD by its program -----------------------------------------------------------------------
-
-
-def test_bcpd_says_how_to_get_its_program(anatomy):
-    with pytest.raises(InputError, match=r"github.com/ohirose/bcpd"):
-        Bcpd(anatomy, UP, BcpdConfig(program="/nowhere/bcpd"))
-
-
-def test_bcpd_reads_its_program_and_interpolates(anatomy, tmp_path):
-    """A stand-in with the program's interface that answers with a known map."""
-    program = tmp_path / "bcpd"
-    program.write_text(
-        f"#!{sys.executable}\n"
-        "import numpy as np\n"
-        "y = np.loadtxt('y.txt')\n"
-        "v = np.zeros_like(y) + [0.5, 0, -1]\n"
-        "np.savetxt('out_v.txt', v)\n"
-        "np.savetxt('out_y.txt', 1.01 * (y + v) + [2, 0, 0])\n"
-        "open('out_info.txt', 'w').write('loops\\t12\\n')\n"
-    )
-    program.chmod(0o755)
-    scene = scene_of(anatomy, still, pose(anatomy))
-    fit = Bcpd(anatomy, UP, BcpdConfig(program=str(program), rigid=FEW, starts=1)).fit(scene)
-    placed = scene.reference.organ.vertices_mm
-    near_cloud = placed[placed[:, 2] < np.median(scene.cloud.points_mm[:, 2])]
-    index = np.flatnonzero(placed[:, 2] < np.median(scene.cloud.points_mm[:, 2]))
-    carried = fit.carry(anatomy.organ.vertices_mm)[index]
-    np.testing.assert_allclose(carried, 1.01 * (near_cloud + [0.5, 0, -1]) + [2, 0, 0], atol=0.5)
-    assert fit.report["iterations"] == 12
-    program.write_text("#!/bin/sh\nexit 3\n")
-    with pytest.raises(NoEstimate, match="BCPD"):
-        Bcpd(anatomy, UP, BcpdConfig(program=str(program), rigid=FEW, starts=1)).fit(scene)

@@ -1,4 +1,4 @@
-"""Scenes of the digital twin: views, faults, the folder and its resumption.
+"""Scenes of the digital twin: views, the folder and its resumption.
 
 A stand-in takes the bench's place: a smooth squeeze with the same interface, solved at once.
 """
@@ -33,7 +33,6 @@ from tumortrack_lab.twin import dataset
 from tumortrack_lab.twin.apparatus import State
 from tumortrack_lab.twin.dataset import TwinRun, make_scenes
 from tumortrack_lab.twin.equilibrium import Rod
-from tumortrack_lab.twin.faults import FAULTS, disturbed
 from tumortrack_lab.twin.occluders import rod_mesh, shaft_over
 from tumortrack_lab.twin.views import (
     VARIANTS,
@@ -288,102 +287,6 @@ def test_scenes_replay_bit_for_bit(view):
     assert one.meta == again.meta
     other, _ = scene("D1", view, 4)
     assert not np.array_equal(one.cloud.points_mm, other.cloud.points_mm)
-
-
-# --- faults ---
-
-
-def test_clean_is_the_scene_itself():
-    clean, _ = scene()
-    assert disturbed(clean, "clean", 0) is clean
-
-
-def test_an_offset_moves_points_towards_the_camera_along_their_rays():
-    clean, _ = scene()
-    moved = disturbed(clean, "offset", 0)
-    before, after = deproject(clean.depth).astype(float), deproject(moved.depth).astype(float)
-    assert np.allclose(before[:, 2] - after[:, 2], 2, atol=1e-4)
-    assert np.allclose(after[:, :2] / after[:, 2:], before[:, :2] / before[:, 2:], atol=1e-6)
-    assert set(map(tuple, moved.cloud.points_mm.tolist())) <= set(
-        map(tuple, deproject(moved.depth).tolist())
-    )
-
-
-def test_a_registration_fault_moves_the_truth_by_one_millimetre_and_one_degree():
-    clean, _ = scene()
-    moved = disturbed(clean, "registration", 7)
-    assert moved.cloud is clean.cloud
-    motion = np.array(moved.meta["registration"])
-    for before, after in zip(clean.reference.parts, moved.reference.parts, strict=True):
-        assert np.allclose(transform_points(motion, before.vertices_mm), after.vertices_mm)
-    centre = clean.reference.organ.box_mm.mean(0)
-    assert np.linalg.norm(transform_points(motion, centre[None])[0] - centre) == pytest.approx(1)
-    angle = np.degrees(np.arccos((np.trace(motion[:3, :3]) - 1) / 2))
-    assert angle == pytest.approx(1, abs=1e-6)
-    assert not np.allclose(
-        motion, np.array(disturbed(clean, "registration", 8).meta["registration"])
-    )
-
-
-def test_noise_and_distortion_have_their_size():
-    clean, _ = scene()
-    z = clean.depth.depth_mm
-    seen = np.isfinite(z)
-    noisy = disturbed(clean, "noise", 0).depth.depth_mm
-    assert np.array_equal(np.isfinite(noisy), seen)
-    expected = 0.2 * (z[seen] / 150) ** 2
-    assert np.std((noisy - z)[seen] / expected) == pytest.approx(1, abs=0.06)  # with 0.1 mm steps
-    slow = (disturbed(clean, "distortion", 0).depth.depth_mm - z)[seen]
-    assert 0.1 < np.abs(slow).max() <= 1.0001
-    rough = np.diff(disturbed(clean, "distortion", 0).depth.depth_mm - z, axis=1)
-    assert np.nanmax(np.abs(rough)) < 0.03  # no step between neighbours
-
-
-def test_occlusion_and_outliers_are_as_in_the_views():
-    clean, _ = scene()
-    seen = np.isfinite(clean.depth.depth_mm)
-    hidden = np.isfinite(disturbed(clean, "occlusion", 0).depth.depth_mm)
-    assert (hidden <= seen).all()
-    assert 0.02 < 1 - hidden.sum() / seen.sum() < 0.3
-    more = np.isfinite(disturbed(clean, "outliers", 0).depth.depth_mm)
-    assert (more >= seen).all()
-    assert 1 - seen.sum() / more.sum() == pytest.approx(0.03, abs=1e-4)
-
-
-def test_all_has_every_fault_and_faults_replay():
-    clean, _ = scene()
-    alone = {fault: disturbed(clean, fault, 5) for fault in FAULTS}
-    together = alone["all"]
-    assert together.meta["registration"] == alone["registration"].meta["registration"]
-    assert np.array_equal(
-        together.reference.organ.vertices_mm, alone["registration"].reference.organ.vertices_mm
-    )
-    z, clean_z = together.depth.depth_mm, clean.depth.depth_mm
-    both = np.isfinite(z) & np.isfinite(clean_z)
-    assert np.median((clean_z - z)[both]) == pytest.approx(2, abs=1.05)
-    assert (np.isfinite(clean_z) & np.isnan(z)).sum() > 0.02 * np.isfinite(clean_z).sum()
-    assert (np.isnan(clean_z) & np.isfinite(z)).sum() > 0.02 * np.isfinite(clean_z).sum()
-    steps = z[np.isfinite(z)] / 0.1
-    assert np.abs(steps - np.rint(steps)).max() < 1e-2
-    for fault in FAULTS:
-        again = disturbed(clean, fault, 5)
-        assert np.array_equal(again.cloud.points_mm, alone[fault].cloud.points_mm)
-    clouds = [s.cloud.points_mm for s in alone.values()]
-    different = [not np.array_equal(clouds[0], c) for c in clouds]
-    assert different == [f not in ("clean", "registration") for f in FAULTS]
-
-
-def test_faults_want_a_clean_scene_and_a_known_name():
-    clean, _ = scene()
-    with pytest.raises(InputError, match=r"'none' is not known; allowed: clean, noise"):
-        disturbed(clean, "none", 0)
-    for wrong in (
-        scene("D0", "shaft")[0],
-        disturbed(clean, "noise", 0),
-        replace(clean, depth=None),
-    ):
-        with pytest.raises(InputError, match="clean scenes of the twin"):
-            disturbed(wrong, "offset", 0)
 
 
 # --- targets ---

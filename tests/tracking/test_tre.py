@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,14 +10,12 @@ import trimesh
 
 from motions import Wave
 from stories import succeeded, tumortrack, write_phantom_case
-from tumortrack.core.config import to_builtins
 from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.estimate import Estimate, OneWay
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import (
     Anatomy,
     CameraLabels,
-    DepthFrame,
     Mesh,
     OccupancyCloud,
     SensorCloud,
@@ -27,7 +24,6 @@ from tumortrack.imaging.case import load_case
 from tumortrack.report.metrics import label_grid, target_errors
 from tumortrack.report.page import target_text
 from tumortrack.report.protocol import evaluate_scene, evaluate_scenes, summarise, summary_table
-from tumortrack.sense.camera import d405
 from tumortrack.simulate.occupancy import labels_of
 from tumortrack.simulate.scene_folder import (
     Scene,
@@ -36,8 +32,6 @@ from tumortrack.simulate.scene_folder import (
     read_scene,
     read_targets,
 )
-from tumortrack_lab.twin.faults import disturbed
-from tumortrack_lab.twin.views import ViewConfig
 
 
 def ball(radius_mm, center_mm=(0.0, 0.0, 0.0)):
@@ -177,20 +171,6 @@ def test_simulate_writes_targets_that_follow_the_organ(tmp_path):
     folder = tmp_path / "again"
     succeeded(tumortrack(*command[:2], folder, *command[3:]))
     assert (folder / "0001" / "targets.csv").read_bytes() == before
-
-
-def test_a_registration_fault_moves_the_targets_with_the_truth():
-    camera = d405(424, 240)
-    depth = DepthFrame(np.full((240, 424), 130.0, np.float32), camera)
-    meta = {"view": "clean", "view_config": to_builtins(ViewConfig())}
-    clean = replace(scene(), depth=depth, meta=meta)
-    moved = disturbed(clean, "registration", 3)
-    camera_from_camera = np.array(moved.meta["registration"])
-    expected = transform_points(camera_from_camera, clean.targets.points_mm)
-    np.testing.assert_allclose(moved.targets.points_mm, expected, atol=1e-12)
-    assert np.linalg.norm(moved.targets.points_mm - clean.targets.points_mm, axis=1).min() > 0.1
-    np.testing.assert_array_equal(disturbed(clean, "noise", 3).targets.points_mm,
-                                  clean.targets.points_mm)  # fmt: skip
 
 
 # --- the protocol ---

@@ -132,31 +132,12 @@ def stopwatch() -> Iterator[SimpleNamespace]:
     watch.seconds = time.perf_counter() - start
 
 
-class DeformablePeer(TimedPeer):
-    """A peer that fits from each of the best rigid poses and keeps the fit of least error. Its
-    configuration has ``rigid`` (of the pose search) and ``starts`` (how many poses)."""
-
-    def _prepare(self, anatomy_ct: Anatomy, up_lps: Direction) -> None:
-        self._search = PoseSearch(anatomy_ct, up_lps, self.config.rigid)
-
-    def _fit(self, scene: Scene) -> tuple[Carry, dict]:
-        cloud = scene.cloud.points_mm.astype(float)
-        poses = self._search.poses(scene.cloud)[: self.config.starts]
-        fits = [(pose.start, *self._fit_from(pose.camera_from_ct, cloud)) for pose in poses]
-        start, _, carry, report = min(fits, key=lambda fit: fit[1])
-        return carry, {"start": start, **report}
-
-    @abstractmethod
-    def _fit_from(self, camera_from_ct: Transform, cloud: Points) -> tuple[float, Carry, dict]:
-        """The fit from one pose to the cloud (camera frame, mm): the error by which fits are
-        compared (any unit), the map, its report."""
-
-
 class Rigid(TimedPeer):
     """The pose of least error as a peer."""
 
+    name = "rigid"
+
     def _prepare(self, anatomy_ct: Anatomy, up_lps: Direction) -> None:
-        self.name = "rigid" if self.config.orientation == "facing" else "rigid_any_rotation"
         self._search = PoseSearch(anatomy_ct, up_lps, self.config)
 
     def _fit(self, scene: Scene) -> tuple[Carry, dict]:

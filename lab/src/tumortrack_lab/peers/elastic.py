@@ -22,7 +22,8 @@ from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import Anatomy
-from tumortrack_lab.peers.base import Carry, DeformablePeer
+from tumortrack.simulate.scene_folder import Scene
+from tumortrack_lab.peers.base import Carry, TimedPeer
 from tumortrack_lab.peers.pose_search import (
     CROP_PERCENT,
     Direction,
@@ -177,20 +178,30 @@ class _Pairs(NamedTuple):
     share: Float64[np.ndarray, " n"]  # a constant weight
 
 
-class ElasticPeer(DeformablePeer):
+class ElasticPeer(TimedPeer):
+    """Fits from each of the best rigid poses and keeps the fit of least error."""
+
     name = "elastic"
     config: ElasticPeerConfig
 
     def _prepare(self, anatomy_ct: Anatomy, up_lps: Direction) -> None:
-        super()._prepare(anatomy_ct, up_lps)
+        self._search = PoseSearch(anatomy_ct, up_lps, self.config.rigid)
         mesh = tetrahedralise(anatomy_ct.organ, self.config.edge_mm, _ENVELOPE)
         self.body = elastic_body(mesh, self.config.poisson, self.config.modes)
         self._surface = EmbeddedSurface(self.body, self._search)
         variance = self.config.displacement_mm**2 * self.body.area_mm2
         self._precision = self.body.stiffness * (1 / self.body.stiffness).sum() / variance
 
+    def _fit(self, scene: Scene) -> tuple[Carry, dict]:
+        cloud = scene.cloud.points_mm.astype(float)
+        poses = self._search.poses(scene.cloud)[: self.config.starts]
+        fits = [(pose.start, *self._fit_from(pose.camera_from_ct, cloud)) for pose in poses]
+        start, _, carry, report = min(fits, key=lambda fit: fit[1])
+        return carry, {"start": start, **report}
+
     def _fit_from(self, camera_from_ct: Transform, cloud: Points) -> tuple[float, Carry, dict]:
-        """The limit beyond which points are outliers shrinks during the iteration."""
+        """The cost of the fit from one pose, the map, its report. The limit beyond which points are
+        outliers shrinks during the iteration."""
         config = self.config
         state = _State(camera_from_ct, np.zeros(len(self._precision)))
         reach = np.geomspace(config.first_outlier_mm, config.outlier_mm, config.iterations // 2)

@@ -6,16 +6,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from importlib.metadata import entry_points, version
-from pathlib import Path
 from typing import Any
 
-from tumortrack.core import store
 from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import Anatomy
 from tumortrack_lab.peers.base import Peer, Rigid, RigidBound
 from tumortrack_lab.peers.elastic import ElasticPeer, ElasticPeerConfig
-from tumortrack_lab.peers.point_drift import Bcpd, BcpdConfig, Cpd, CpdConfig
 from tumortrack_lab.peers.pose_search import Direction, RigidConfig
 
 GROUP = "tumortrack.peers"
@@ -29,7 +26,6 @@ class PeerKind:
     make: Callable[..., Any]
     config: Config | None = None
     packages: tuple[str, ...] = ()  # distributions; an entry point's own is added to them
-    program_sha256: str | None = None
 
     @property
     def versions(self) -> dict[str, str]:
@@ -41,22 +37,15 @@ class PeerKind:
         return self.make(anatomy_ct, up_lps, *settings)
 
 
-def peer_kinds(bcpd: Path | None = None) -> dict[str, PeerKind]:
-    """Every peer there is; ``bcpd`` only with its program. Raises InputError: the program does not
-    exist, an entry point that names no ``PeerKind``, or takes the name of a peer of ours."""
+def peer_kinds() -> dict[str, PeerKind]:
+    """Every peer there is. Raises InputError: an entry point that names no ``PeerKind``, or takes
+    the name of a peer of ours."""
     kinds = {
         "rigid_bound": PeerKind(RigidBound),
         "rigid": PeerKind(Rigid, RigidConfig(), ("small_gicp",)),
-        "rigid_any_rotation": PeerKind(Rigid, RigidConfig(orientation="unknown"), ("small_gicp",)),
-        "cpd": PeerKind(Cpd, CpdConfig(), ("pycpd", "small_gicp")),
         "elastic": PeerKind(ElasticPeer, ElasticPeerConfig(), ("pytetwild", "scipy", "small_gicp")),
     }
-    if bcpd is not None:
-        if not bcpd.is_file():
-            raise InputError(f"{bcpd} does not exist; give the built program of BCPD, or none.")
-        config = BcpdConfig(program=str(bcpd))
-        kinds["bcpd"] = PeerKind(Bcpd, config, ("small_gicp",), store.sha256_of(bcpd))
-    ours = {*kinds, "bcpd"}
+    ours = {*kinds}
     for point in entry_points(group=GROUP):
         kind, origin = point.load(), point.dist.name if point.dist else point.value
         if point.name in ours:

@@ -7,7 +7,7 @@ nearest minimum only, so the starts cover the rotations that the surgeon's knowl
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Float64
@@ -25,7 +25,6 @@ CROP_PERCENT = 98.0  # of the cloud's depths: beyond, nothing was kept (or it is
 _POLISH = 20  # iterations
 _ALIKE_DEG, _ALIKE_MM = 8.0, 5.0
 _FEWEST_POINTS = 20
-_GOLDEN_ANGLE = np.pi * (3 - np.sqrt(5))
 
 Transform = Float64[np.ndarray, "4 4"]
 Points = Float64[np.ndarray, "_ 3"]
@@ -35,14 +34,11 @@ Direction = tuple[float, float, float]
 
 
 class RigidConfig(Config, frozen=True):
-    """How a rigid pose is searched."""
+    """How a rigid pose is searched: the side that faces the camera is known, the turn about the
+    camera's axis is not (the paper's M_lim)."""
 
-    # facing: the side that faces the camera is known, the turn about the camera's axis is not (the
-    # paper's M_lim); unknown: any rotation (its M_full)
-    orientation: Literal["facing", "unknown"] = "facing"
     turns: int = 24  # about the camera's axis
-    tilt_deg: float = 12.0  # four more starts of each turn, tilted by this (facing)
-    sides: int = 40  # directions that may face the camera (unknown)
+    tilt_deg: float = 12.0  # four more starts of each turn, tilted by this
     spacing_mm: float = 2.0  # of the model's surface points
     distance_mm: float = 120.0  # from the camera to the organ's nearest point, in the starts
     coarse_points: int = 250  # of the cloud, for the first pass over all starts
@@ -242,17 +238,7 @@ def _rotations(config: RigidConfig, up_lps: Point) -> list[Rotation3]:
     """Rotations ``camera_from_ct`` to start from."""
     spins = np.arange(config.turns) * 2 * np.pi / config.turns
     turns = Rotation.from_rotvec(spins[:, None] * [0.0, 0.0, 1.0])
-    if config.orientation == "unknown":
-        sides = [rotation_onto(side, _TOWARDS_CAMERA) for side in _directions(config.sides)]
-    else:
-        facing = rotation_onto(up_lps, _TOWARDS_CAMERA)
-        tilts = config.tilt_deg * np.array([(0, 0), (1, 0), (-1, 0), (0, 1), (0, -1)])
-        sides = [Rotation.from_euler("xy", t, degrees=True).as_matrix() @ facing for t in tilts]
+    facing = rotation_onto(up_lps, _TOWARDS_CAMERA)
+    tilts = config.tilt_deg * np.array([(0, 0), (1, 0), (-1, 0), (0, 1), (0, -1)])
+    sides = [Rotation.from_euler("xy", t, degrees=True).as_matrix() @ facing for t in tilts]
     return [turn @ side for side in sides for turn in turns.as_matrix()]
-
-
-def _directions(count: int) -> Points:
-    """Unit vectors spread evenly over the sphere (Fibonacci lattice)."""
-    z = 1 - (2 * np.arange(count) + 1) / count
-    angle, ring = _GOLDEN_ANGLE * np.arange(count), np.sqrt(1 - z**2)
-    return np.stack([ring * np.cos(angle), ring * np.sin(angle), z], 1)

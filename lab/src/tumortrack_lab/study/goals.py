@@ -19,20 +19,20 @@ from tumortrack_lab.study.tables import (
     EMPTY,
     NOT_FOUND,
     NOTHING,
+    Sites,
     is_deformed,
     names,
     scenes,
     tumors,
 )
-from tumortrack_lab.study.tumor_sites import Kind, TumorSite
+from tumortrack_lab.study.tumor_sites import Kind
 
 RULE = (
     "Distances in mm; of the seeds, and of a case's tumors of a kind, the worst counts in every "
     "scene, then the median over the variants. A part that was not found counts as infinitely far. "
     "Deformed variants are those that are neither turned only nor at rest. HD is the symmetric "
     "distance. Beside each: that of the best rigid pose, an oracle. Numbers are rounded up (mIoU: "
-    "down), and goals judged by the unrounded ones. Hidden surface: median error "
-    "with 40 % of the visible surface hidden over that without, of the first seed on clean depth."
+    "down), and goals judged by the unrounded ones."
 )
 RIGID = "rigid_bound"
 _GOALS_MM = {"exophytic": (1.5, 2.0, 3.0), "endophytic": (2.0, 3.0, 4.0)}
@@ -62,7 +62,7 @@ class StudyGoal:
         return shown, "yes" if met and finite else "no"
 
 
-def goal_table(frame: pd.DataFrame, sites: dict[str, dict[str, TumorSite]]) -> str:
+def goal_table(frame: pd.DataFrame, sites: dict[str, Sites]) -> str:
     """Every goal beside clinic and the best rigid pose on each case, never pooled: organs differ.
     ``sites``: by case and tumor."""
     kinds = [sites[case][part].kind if part in sites[case] else EMPTY
@@ -80,22 +80,18 @@ def goal_table(frame: pd.DataFrame, sites: dict[str, dict[str, TumorSite]]) -> s
     return table(["figure", "goal", *(f"{case}: clinic / rigid" for case in cases)], rows)
 
 
-def _noisy(frame: pd.DataFrame, deformed: bool = False) -> pd.DataFrame:
-    """The scenes without further faults; ``deformed``: neither at rest nor turned only."""
-    here = frame[frame.fault == "none"]
-    return here[is_deformed(here)] if deformed else here
+def _deformed(frame: pd.DataFrame) -> pd.DataFrame:
+    return frame[is_deformed(frame)]
 
 
 def _per_scene(frame: pd.DataFrame, column: str, worst: Literal["min", "max"] = "max") -> pd.Series:
     """For each scene and part the worst of the seeds; infinite where a seed has none."""
-    keys = ["case", "scene", "fault", "fault_seed", "part"]
-    return frame.groupby(keys, observed=True)[column].agg(worst)
+    return frame.groupby(["case", "variant", "part"], observed=True)[column].agg(worst)
 
 
 def _distance(frame: pd.DataFrame, variant: str, kind: str) -> float:
     """Of a case's tumors of a kind in a variant: the worst."""
-    here = _noisy(frame)
-    of_kind = here[(here.variant == variant) & (here.site == kind)]
+    of_kind = frame[(frame.variant == variant) & (frame.site == kind)]
     return _per_scene(of_kind, "hausdorff_mm").max()
 
 
@@ -103,37 +99,21 @@ def _targets(frame: pd.DataFrame) -> pd.Series:
     return _per_scene(scenes(frame if frame.carries.any() else frame[:0]), "target_mm")
 
 
-def _ratio(frame: pd.DataFrame, of: Callable[[pd.DataFrame], pd.Series]) -> float:
-    above = of(frame[frame.fault.astype(str).str.contains("=")]).median()
-    below = of(frame[frame.fault == "clean"]).median()
-    if math.isnan(above + below):
-        return math.nan
-    return above / below if 0 < below < math.inf else math.inf
-
-
-def _distances() -> list[StudyGoal]:
-    return [
+GOALS = (
+    *(
         StudyGoal(f"tumor HD, {variant}, {kind}",
                   partial(_distance, variant=variant, kind=kind), limit)
         for kind in get_args(Kind)
         for variant, limit in zip(("D1", "D2", "D3"), _GOALS_MM[kind], strict=True)
-    ]  # fmt: skip
-
-
-_deformed = partial(_noisy, deformed=True)
-GOALS = (
-    *_distances(),
+    ),
     StudyGoal("tumor centre, worst variant",
-              lambda f: _per_scene(tumors(_noisy(f)), "center_mm").max(), 2.5),
+              lambda f: _per_scene(tumors(f), "center_mm").max(), 2.5),
     StudyGoal("mIoU, deformed variants",
               lambda f: _per_scene(scenes(_deformed(f)), "miou", "min").median(), 0.90, True),
     StudyGoal("mIoU, all variants",
-              lambda f: _per_scene(scenes(_noisy(f)), "miou", "min").median(), 0.90, True),
+              lambda f: _per_scene(scenes(f), "miou", "min").median(), 0.90, True),
     StudyGoal("target error, deformed variants", lambda f: _targets(_deformed(f)).median(), 2.0),
-    StudyGoal("target error, all variants", lambda f: _targets(_noisy(f)).median(), 2.0),
-    StudyGoal("target error, worst variant", lambda f: _targets(_noisy(f)).max()),
-    StudyGoal("hidden surface: tumor HD, times",
-              partial(_ratio, of=lambda f: _per_scene(tumors(f), "hausdorff_mm")), 1.3),
-    StudyGoal("hidden surface: target error, times", partial(_ratio, of=_targets), 1.3),
-    StudyGoal("scenes with a part not found, %", lambda f: 100 * scenes(_noisy(f)).failed.mean()),
+    StudyGoal("target error, all variants", lambda f: _targets(f).median(), 2.0),
+    StudyGoal("target error, worst variant", lambda f: _targets(f).max()),
+    StudyGoal("scenes with a part not found, %", lambda f: 100 * scenes(f).failed.mean()),
 )  # fmt: skip

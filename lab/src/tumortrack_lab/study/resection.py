@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from dataclasses import asdict, dataclass, replace
-from functools import cache
+from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -27,8 +27,7 @@ from tumortrack.simulate.scene_folder import Scene, read_scene
 from tumortrack_lab.cut import VOXEL_MM, cut
 from tumortrack_lab.peers.base import Fit, estimate_of
 from tumortrack_lab.study.document import table
-from tumortrack_lab.study.measure import Job, about_answer
-from tumortrack_lab.study.methods import Answer, Method, StudyCase, code_sha256
+from tumortrack_lab.study.methods import Method, StudyCase, code_sha256
 from tumortrack_lab.study.tables import EMPTY, NOTHING, groups, label_of, names, ordered
 from tumortrack_lab.study.tumor_sites import tumor_sites_of
 from tumortrack_lab.twin.apparatus import moved
@@ -88,20 +87,16 @@ class Planner(Config, frozen=True):
 PLANNERS = tuple(Planner(method=m, sigmas=s) for m in ("published", "margin") for s in (0, SIGMAS))
 
 
-@dataclass(frozen=True, eq=False)
-class Truth(Method):
+def truth() -> Method:
     """Answers what is so: the bound of every planner."""
 
-    prepare_s: float | None = None
-
-    @property
-    def identity(self) -> dict:
-        return {"kind": "bound", "name": TRUTH, "tumortrack": tumortrack.__version__}
-
-    def locate(self, scene: Scene, grid: int) -> Answer:
+    def locate(scene: Scene, grid: int) -> Estimate:
         still = Fit(lambda points: points, 0.0)
-        estimate = estimate_of(still, scene.reference, scene.cloud.stamp_ns, max(grid, _FINE))
-        return Answer(scattered(estimate), 0.0)
+        return scattered(
+            estimate_of(still, scene.reference, scene.cloud.stamp_ns, max(grid, _FINE))
+        )
+
+    return Method(TRUTH, {"tumortrack": tumortrack.__version__}, locate)
 
 
 def scattered(estimate: Estimate) -> Estimate:
@@ -119,8 +114,7 @@ def scattered(estimate: Estimate) -> Estimate:
     return replace(estimate, cloud=cloud)
 
 
-@cache
-def cutting() -> dict:
+def cutting() -> dict[str, Any]:
     """What else decides a measurement whose estimate is planned on and cut."""
     planning = (Path(tumortrack.__file__).parent / "plan").glob("*.py")
     code = code_sha256([*planning, Path(tumortrack_lab.cut.__file__)])
@@ -128,63 +122,47 @@ def cutting() -> dict:
     return {"cutting": {"planners": planners, "voxel_mm": VOXEL_MM, "code_sha256": code}}
 
 
-def cut_one(job: Job) -> dict:
-    """One measurement: ``plans`` by tumor and planner. Raises InputError: a scene that does not say
-    where the table is."""
-    scene = read_scene(job.scene)
+def cut_one(
+    case: StudyCase, method: Method, variant: str, view: str, grid: int
+) -> list[dict[str, Any]]:
+    """One scene: a row for each exophytic tumor and planner: ``refused`` and why, or what the cut
+    did (``CutResult``). Raises InputError: a scene that does not say where the table is."""
+    scene = read_scene(case.scene(variant, view))
     if "camera_from_bench" not in scene.meta:
         raise InputError(
-            f"{job.scene.name} does not say where its table is; make it with tumortrack twin."
+            f"{variant}-{view} does not say where its table is; make it with tumortrack twin."
         )
     table_from_camera = np.linalg.inv(np.array(scene.meta["camera_from_bench"], float))
-    truth = moved(scene.reference, table_from_camera)
-    failed, answer, found = None, None, None
+    true = moved(scene.reference, table_from_camera)
+    tumors = [
+        name for name, site in tumor_sites_of(case.anatomy_ct).items() if site.kind == "exophytic"
+    ]
     try:
-        answer = job.method.locate(scene, job.grid)
+        estimate = method.locate(scene, grid)
     except (NoEstimate, InputError) as error:
-        failed = str(error)
-    else:
-        estimate = answer.estimate
-        found = located(estimate.cloud, estimate.meshes, estimate.motion, table_from_camera)
-    plans = {
-        tumor: {
-            planner.name: _planned_and_cut(truth, found, planner, tumor)
-            if found
-            else {"refused": failed}
-            for planner in PLANNERS
-            if not found or not planner.sigmas or found.std_mm  # others know no uncertainty
-        }
-        for tumor in exophytic_tumors(job.case)
-    }
-    return {"plans": plans, "failed": failed, **about_answer(job, answer)}
+        refused = {"refused": str(error)}
+        return [{"tumor": name, "planner": p.name, **refused} for name in tumors for p in PLANNERS]
+    found = located(estimate.cloud, estimate.meshes, estimate.motion, table_from_camera)
+    return [
+        {"tumor": name, "planner": planner.name, **_planned_and_cut(true, found, planner, name)}
+        for name in tumors
+        for planner in PLANNERS
+        if not planner.sigmas or found.std_mm  # others know no uncertainty
+    ]
 
 
-def _planned_and_cut(truth: Anatomy, found: Located, planner: Planner, tumor: str) -> dict:
-    """Plain JSON: ``refused`` and why, or what the cut did (``CutResult``)."""
+def _planned_and_cut(true: Anatomy, found: Located, planner: Planner, tumor: str) -> dict[str, Any]:
     try:
         plan = plan_resection(found, planner.config(found, tumor))
     except (NoPlan, InputError) as error:
         return {"refused": str(error)}
-    result = cut(truth, plan)
+    result = cut(true, plan)
     more = {"hurt": list(result.hurt), "left_ml": result.left_ml, "promised_ml": plan.volumes_ml}
     return {**asdict(result), **more}
 
 
-@cache
-def exophytic_tumors(case: StudyCase) -> tuple[str, ...]:
-    sites = tumor_sites_of(case.anatomy_ct)
-    return tuple(name for name, site in sites.items() if site.kind == "exophytic")
-
-
-def tidy_plans(measurements: list[dict]) -> pd.DataFrame:
+def tidy_plans(rows: list[dict[str, Any]]) -> pd.DataFrame:
     """One row for each plan, made or ``refused``: the truth's last, planners in their order."""
-    rows = [
-        {"case": one["spec"]["case"], "method": one["spec"]["method"]["name"], "planner": name}
-        | entry
-        for one in measurements
-        for plans in one["plans"].values()
-        for name, entry in plans.items()
-    ]
     frame = pd.DataFrame(rows).reindex(columns=["case", "method", "planner", "refused", *_RESULTS])
     frame = frame.astype(dict.fromkeys(_RESULTS[1:5], float))
     planners = pd.Categorical(frame.planner, [planner.name for planner in PLANNERS])
@@ -193,9 +171,9 @@ def tidy_plans(measurements: list[dict]) -> pd.DataFrame:
     return ordered(frame, ["case"])
 
 
-def tables_of(measurements: list[dict]) -> str:
+def tables_of(rows: list[dict[str, Any]]) -> str:
     """Pooled over the cases; each case; and why there was no plan, where there was none."""
-    frame = tidy_plans(measurements)
+    frame = tidy_plans(rows)
     texts = ["All cases:", table(_HEAD, _rows(frame), left=2)]
     if len(names(frame, "case")) > 1:
         each = [

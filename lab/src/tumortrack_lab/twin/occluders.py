@@ -1,4 +1,4 @@
-"""What else lies before the camera: instruments, fat, a drape's edge, background.
+"""What else lies before the camera: instruments, fat, background.
 
 All of it acts on the depth image of the organ (camera frame, mm), so that the cloud still comes
 from ``sense.cloud`` alone. Occluders are taken to be segmented out: where they hide the organ there
@@ -7,7 +7,7 @@ is no return, and they give none of their own. Background is what a segmentation
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -22,19 +22,11 @@ from tumortrack_lab.twin.equilibrium import Rod
 
 SHAFT_CLEARANCE_MM = 3.0  # between a shaft's tip and the organ, towards the camera
 SHAFT_RISE_DEGREES = 30.0  # of a shaft above the image plane
-LARGEST_SHARE = 0.9  # that can be hidden
 _TOUCH_MM = 1.0  # a shaft keeps this far from all of the organ that is seen
 _RING_MM = 4.0  # a rod is cut into rings: a triangle that reaches behind the camera is not drawn
 _LAST_DEPTH_MM = 5.0  # a rod that comes straight at the camera ends here
 _LUMP_SHARE = 2 / 3  # of the background; the rest is an instrument's tip
-_PARTS = (1 / 3, 2 / 3, 1.0)  # of the share: up to which the shaft, the lump, the drape hide
-_PULLED_BACK_MM = 140.0  # a shaft that hides nothing yet
-_LUMP_MM = (1.0, 100.0)  # longest half axis
-_DRAPE_MM = (-160.0, 160.0)  # place of its edge along its way, from the organ's middle
-_DRAPE_ABOVE_MM = 3.0  # before the organ's nearest point
-_HALVINGS = 14
 
-Occluder = Callable[[float], Mesh]  # a mesh (camera frame) that hides more the higher its number
 Flat = Float64[np.ndarray, " 2"]
 Generator = np.random.Generator
 
@@ -166,98 +158,6 @@ def _beside(frame: DepthFrame, angle: float, depth_mm: float, gap_mm: float) -> 
     pixel = middle + edge_px * direction - np.array([camera.cx, camera.cy])
     focal = np.array([camera.fx, camera.fy])
     return pixel * depth_mm / focal + gap_mm * direction
-
-
-def hide_share(
-    frame: DepthFrame, share: float, shaft_radius_mm: float, rng: Generator
-) -> DepthFrame:
-    """The frame with that share of its returns hidden by a shaft, a lump of fat and the edge of a
-    drape, one after another. With the same generator they keep their places and directions from
-    one share to another; only how far they reach differs. Raises InputError: a share outside
-    0..0.9, or a frame without returns."""
-    if not 0 <= share <= LARGEST_SHARE:
-        raise InputError(f"a share of {share:g} cannot be hidden; allowed: 0 to {LARGEST_SHARE:g}.")
-    total, out = _returns(frame), frame
-    if not total:
-        raise InputError("the depth image has no return, so nothing of it can be hidden.")
-    occluders = (_shaft(frame, shaft_radius_mm, rng), _lump(frame, rng), _drape(frame, rng))
-    for occluder, part in zip(occluders, _PARTS, strict=True):
-        out = _reached(out, occluder, total - round(part * share * total))
-    return out
-
-
-def _reached(frame: DepthFrame, occluder: Occluder, fewest: int) -> DepthFrame:
-    """The frame with as much hidden as leaves ``fewest`` returns or more, by bisection."""
-    farthest = _without(frame, occluder(1.0))
-    if _returns(farthest) >= fewest:
-        return farthest
-    best, low, high = frame, 0.0, 1.0
-    for _ in range(_HALVINGS):
-        middle = (low + high) / 2
-        tried = _without(frame, occluder(middle))
-        if _returns(tried) >= fewest:
-            best, low = tried, middle
-        else:
-            high = middle
-    return best
-
-
-def _shaft(frame: DepthFrame, radius_mm: float, rng: Generator) -> Occluder:
-    """The shaft of the views, drawn back along itself."""
-    rod = shaft_over(frame, radius_mm, rng)
-
-    back = _PULLED_BACK_MM
-    return lambda number: rod_mesh(replace(rod, tip_mm=rod.tip_mm + (1 - number) * back * rod.axis))
-
-
-def _lump(frame: DepthFrame, rng: Generator) -> Occluder:
-    """A lump of fat with hills that grows over the organ from a place on its outline."""
-    import trimesh
-
-    ball = trimesh.creation.icosphere(4, 1.0)
-    directions, phases = rng.standard_normal((5, 3)), rng.uniform(0, 2 * np.pi, 5)
-    hills = 0.09 * np.sin(2.5 * ball.vertices @ directions.T + phases).sum(1)
-    unit = ball.vertices * (1 + hills)[:, None]
-    x, y = _unit(rng.uniform(0, 2 * np.pi))
-    spin = np.array([[x, -y], [y, x]])
-    points = deproject(frame).astype(float)
-    outwards = points[:, :2] @ _unit(rng.uniform(0, 2 * np.pi))
-    place = points[int(np.argmax(outwards))]
-
-    def solid(number: float) -> Mesh:
-        size = _LUMP_MM[0] + number * (_LUMP_MM[1] - _LUMP_MM[0])
-        vertices = unit * np.array([size, 0.7 * size, 0.4 * size])
-        vertices[:, :2] = vertices[:, :2] @ spin.T
-        middle = np.array([place[0], place[1], place[2] - 0.25 * size])
-        return Mesh(vertices + middle, ball.faces)
-
-    return solid
-
-
-def _drape(frame: DepthFrame, rng: Generator) -> Occluder:
-    """A creased sheet before the organ whose wavy edge comes in from any side."""
-    points = deproject(frame).astype(float)
-    middle, nearest_mm = points.mean(0), float(points[:, 2].min())
-    way = _unit(rng.uniform(0, 2 * np.pi))
-    across = np.array([-way[1], way[0]])
-    waves, phases = rng.uniform(0.02, 0.12, 4), rng.uniform(0, 2 * np.pi, 4)
-    steps = np.linspace(0, 1, 41)
-    side, back = np.meshgrid(400 * (steps - 0.5), 500 * steps**2, indexing="ij")
-    corner = (np.arange(40)[:, None] * 41 + np.arange(40)).reshape(-1, 1)
-    faces = np.concatenate([corner + [0, 41, 1], corner + [1, 41, 42]])
-    edge = 4.0 * np.sin(side[..., None] * waves + phases).sum(-1)
-
-    def solid(number: float) -> Mesh:
-        along = _DRAPE_MM[0] + number * (_DRAPE_MM[1] - _DRAPE_MM[0]) + edge - back
-        flat = middle[:2] + along[..., None] * way + side[..., None] * across
-        creases = 1.0 + np.sin(0.15 * along + phases[0]) * np.sin(0.2 * side + phases[1])
-        depth = nearest_mm - _DRAPE_ABOVE_MM - creases
-        vertices = np.concatenate([flat, depth[..., None]], axis=-1).reshape(-1, 3)
-        a, b, c = (vertices[faces[:, i]] for i in range(3))
-        towards_camera = np.cross(b - a, c - a)[:, 2].sum() < 0
-        return Mesh(vertices, faces if towards_camera else faces[:, ::-1])
-
-    return solid
 
 
 def _unit(angle: float) -> Flat:
