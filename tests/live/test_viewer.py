@@ -291,11 +291,13 @@ def test_an_ellipsoid_is_the_covariances_and_shown_when_asked_for(sinks, clock):
     sink = sinks(setting, hz=60)
     sink.publish(replace(update, estimate=replace(update.estimate, report=report)))
     assert not drawn(sink, "ellipsoid_tumor_1")
+    node = sink._server.scene.get_handle_by_name("/estimate/ellipsoid_tumor_1")
+    assert len(node.vertices) == 3  # nothing is computed, nor sent, until it is asked for
     switch = sink._panel._shown["ellipsoids"]
     assert "not the margin" in switch.hint
     sink._scene.change(replace(sink._panel.options, ellipsoids=True))
     assert drawn(sink, "ellipsoid_tumor_1")
-    places = sink._server.scene.get_handle_by_name("/estimate/ellipsoid_tumor_1").vertices
+    places = node.vertices
     way = ROBOT.published_from_camera
     middle = transform_points(way, MOTION.carry(case.anatomy.tumors[0].box_mm.mean(0)[None]))
     turned = way[:3, :3] @ axes.T

@@ -84,7 +84,7 @@ def test_joints_and_markers_say_where_everything_stands():
     np.testing.assert_allclose(cell.box_mm, [everything.min(0), everything.max(0)], atol=1e-9)
     place, middle = text.pose.position, everything.min(0) / 2 + everything.max(0) / 2
     assert [place.x * 1000, place.y * 1000] == pytest.approx(middle[:2])
-    assert place.z * 1000 == pytest.approx(everything[:, 2].max() + 60)
+    assert place.z * 1000 == pytest.approx(everything[:, 2].max())
 
 
 def test_arms_are_told_of_without_an_estimate_and_why_they_stand():
@@ -93,6 +93,9 @@ def test_arms_are_told_of_without_an_estimate_and_why_they_stand():
     assert len(out["workcell"].markers) == len(NAMES) + 3
     assert [m.action for m in out["meshes"].markers] == [3]  # DELETEALL: no estimate
     first, *more = out["workcell"].markers[-1].text.splitlines()
+    below = sent(working())["workcell"].markers[-1].pose.position.z
+    below -= out["workcell"].markers[-1].pose.position.z  # its first line is at the same height
+    assert below == pytest.approx((0.025 + 0.012) / 2 * len(more))
     assert (first, " ".join(more)) == (
         "sweep 1, halted: the tumor moved by 6 mm", f"no estimate: {REASON}"
     )  # fmt: skip

@@ -29,7 +29,8 @@ class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         for name, (low, high) in allowed.items():
             value = getattr(self, name)
             if not all(low <= one <= high for one in (value if type(value) is tuple else (value,))):
-                raise InputError(f"{what} {name} is {value}; allowed: {low:g} to {high:g}.")
+                said = f"{value:g}" if isinstance(value, float) else value
+                raise InputError(f"{what} {name} is {said}; allowed: {low:g} to {high:g}.")
 
 
 C = TypeVar("C", bound=msgspec.Struct)

@@ -13,7 +13,6 @@ Affine = Float[np.ndarray, "4 4"]
 Matrix = Float[np.ndarray, "3 3"]
 Vector = Float[np.ndarray, " 3"]
 Faces = Int[np.ndarray, "f 3"]
-Values = Float[np.ndarray, " f"]
 
 # Patient frame, DICOM: +x Left, +y Posterior, +z Superior (LPS).
 DIRECTIONS_LPS: dict[str, Direction] = {
@@ -90,9 +89,8 @@ def perpendicular(vector: Vector) -> Vector:
 
 def triangles_of(
     vertices_mm: Points, faces: Faces
-) -> tuple[Float[np.ndarray, "f 3"], Float[np.ndarray, "f 3"], Values]:
-    """Middles (mm), unit normals and areas (mm2) of a surface's triangles."""
+) -> tuple[Float[np.ndarray, "f 3"], Float[np.ndarray, "f 3"]]:
+    """Each triangle's middle (mm) and outward normal, twice its area long (mm2)."""
     corners = vertices_mm[faces]
     doubled = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    length = np.linalg.norm(doubled, axis=1)
-    return corners.mean(1), doubled / np.maximum(length, 1e-12)[:, None], length / 2
+    return corners.mean(1), doubled

@@ -36,10 +36,12 @@ class HalfTurn:
 
 def half_turns(anatomy: Anatomy) -> list[HalfTurn]:
     """About each principal axis of the organ's surface, the best match first; a second at most."""
-    points, normals, area = triangles_of(anatomy.organ.vertices_mm, anatomy.organ.faces)
+    points, normals = triangles_of(anatomy.organ.vertices_mm, anatomy.organ.faces)
+    area = np.linalg.norm(normals, axis=1) / 2
     count = max(_MOVED, round(area.sum() / _SPACING_MM**2))
     drawn = np.random.default_rng(0).choice(len(points), count, p=area / area.sum())
-    points, normals, tree = points[drawn], normals[drawn], cKDTree(points[drawn])
+    normals = normals[drawn] / (2 * area[drawn])[:, None]
+    points, tree = points[drawn], cKDTree(points[drawn])
     middle, found = points.mean(0), []
     tumors = np.array([tumor.box_mm.mean(0) for tumor in anatomy.tumors]).reshape(-1, 3)
     for axis in np.linalg.svd(points - middle, full_matrices=False)[2]:

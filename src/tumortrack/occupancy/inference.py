@@ -18,7 +18,6 @@ from jaxtyping import Float32
 from torch import Tensor, nn
 
 from tumortrack.core.config import Config
-from tumortrack.core.errors import InputError
 from tumortrack.models.hardware import has_fast_bfloat16
 from tumortrack.models.layers import Layer
 from tumortrack.occupancy.network import Latent, MlpDecoder, OccupancyNetwork, octave_features
@@ -40,8 +39,7 @@ class Arithmetic(Config, frozen=True):
     chunk: int
 
     def __post_init__(self) -> None:
-        if not _CHUNKS[0] <= self.chunk <= _CHUNKS[1]:
-            raise InputError(f"chunk is {self.chunk}; {_CHUNKS[0]} to {_CHUNKS[1]} are allowed.")
+        self.check_between("arithmetic:", chunk=_CHUNKS)
 
 
 def can_pack(device: torch.device) -> bool:

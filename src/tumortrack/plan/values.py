@@ -22,17 +22,6 @@ Direction = Literal["shortest", "clockwise", "anticlockwise"]
 StrokeKind = Literal["wall", "floor"]
 Rings = tuple[Float64[np.ndarray, "_ 2"], ...]
 MARGIN_MM = (1.0, 20.0)  # allowed
-_ALLOWED = {
-    "margin_mm": MARGIN_MM,
-    "sigmas": (0.0, 10.0),
-    "spacing_mm": (0.2, 10.0),
-    "layer_mm": (1.0, 20.0),
-    "stroke_mm": (1.0, 30.0),
-    "lead_mm": (0.0, 30.0),
-    "least_exophytic": (0.0, 1.0),
-    "most_healthy": (0.0, 1.0),
-    "most_margin_mm": (20.0, 60.0),
-}
 
 
 class ResectionConfig(Config, frozen=True, kw_only=True):
@@ -71,10 +60,9 @@ class ResectionConfig(Config, frozen=True, kw_only=True):
     most_margin_mm: float = 20.0
 
     def __post_init__(self) -> None:
-        for name, (low, high) in _ALLOWED.items():
-            value = getattr(self, name)
-            if not low <= value <= high:
-                raise InputError(f"{name} is {value:g}; allowed: {low:g} to {high:g}.")
+        self.check_between("plan:", margin_mm=MARGIN_MM, most_margin_mm=(20, 60), sigmas=(0, 10))
+        self.check_between("plan:", spacing_mm=(0.2, 10), layer_mm=(1, 20), stroke_mm=(1, 30))
+        self.check_between("plan:", lead_mm=(0, 30), least_exophytic=(0, 1), most_healthy=(0, 1))
 
 
 def name_of(label: int) -> str:

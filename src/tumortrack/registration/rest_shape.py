@@ -40,21 +40,18 @@ def distance_of(mesh: Mesh) -> DistanceField:
 
 @dataclass(frozen=True, eq=False)
 class RestShape:
-    """The organ at rest (CT frame, LPS mm): ``distances`` has one field per part."""
+    """The organ at rest (CT frame, LPS mm): ``distances`` has one field per part; ``half_turns``
+    are motions of the CT after which the organ looks much the same, mostly none."""
 
     anatomy_ct: Anatomy
     body: ElasticBody
     distances: tuple[DistanceField, ...]
+    half_turns: Float64[np.ndarray, "t 4 4"]
 
     @cached_property
     def long_axis(self) -> Float64[np.ndarray, " 3"]:
         """The organ's longest principal direction, towards its slimmer, farther reaching end."""
         return long_axis_of(self.anatomy_ct.organ)
-
-    @cached_property
-    def half_turns(self) -> list[Float64[np.ndarray, "4 4"]]:
-        """Motions of the CT after which the organ looks much the same; mostly none."""
-        return [one.ct_from_ct for one in alike(half_turns(self.anatomy_ct))]
 
     @cached_property
     def middles_ct(self) -> Float64[np.ndarray, "parts 3"]:
@@ -89,7 +86,7 @@ class RestShape:
         for n, (part, field) in enumerate(zip(self.anatomy_ct.parts, self.distances, strict=True)):
             named = {"vertices_mm": part.vertices_mm, "faces": part.faces, **field._asdict()}
             arrays |= {f"{n}.{name}": np.asarray(value) for name, value in named.items()}
-        return arrays
+        return {**arrays, "half_turns": self.half_turns}
 
     @classmethod
     def from_arrays(cls, arrays: dict[str, np.ndarray], n_parts: int) -> RestShape:
@@ -108,7 +105,10 @@ class RestShape:
                 fields.append(DistanceField(values, np.asarray(origin, np.float32), float(spacing)))
         except KeyError as error:
             raise InputError(f"the organ's shape lacks {error}; train the model again.") from error
-        return cls(Anatomy(tuple(parts)), ElasticBody.from_arrays(body), tuple(fields))
+        anatomy_ct = Anatomy(tuple(parts))
+        turns = arrays.get("half_turns")  # which older folders lack
+        turns = _half_turns(anatomy_ct) if turns is None else turns
+        return cls(anatomy_ct, ElasticBody.from_arrays(body), tuple(fields), turns)
 
 
 def long_axis_of(organ: Mesh) -> Float64[np.ndarray, " 3"]:
@@ -121,4 +121,9 @@ def long_axis_of(organ: Mesh) -> Float64[np.ndarray, " 3"]:
 
 def shape_of(anatomy_ct: Anatomy, body: ElasticBody) -> RestShape:
     """The shape of an anatomy with its body; seconds."""
-    return RestShape(anatomy_ct, body, tuple(distance_of(part) for part in anatomy_ct.parts))
+    distances = tuple(distance_of(part) for part in anatomy_ct.parts)
+    return RestShape(anatomy_ct, body, distances, _half_turns(anatomy_ct))
+
+
+def _half_turns(anatomy_ct: Anatomy) -> Float64[np.ndarray, "t 4 4"]:
+    return np.array([one.ct_from_ct for one in alike(half_turns(anatomy_ct))]).reshape(-1, 4, 4)

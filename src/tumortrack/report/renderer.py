@@ -15,7 +15,7 @@ from jaxtyping import Float, Float32, UInt8
 from PIL import Image
 
 from tumortrack.core.colours import Colour
-from tumortrack.core.geometry import transform_points
+from tumortrack.core.geometry import transform_points, triangles_of
 from tumortrack.core.types import Mesh
 from tumortrack.imaging.raster import expand
 from tumortrack.report.renderer_kernels import Light, Triangles, nearest, shade
@@ -239,8 +239,7 @@ def corner_normals(mesh: Mesh) -> Float32[np.ndarray, "f 3 3"]:
     crease with this one, weighted by their areas."""
     if (known := _NORMALS.get(mesh)) is not None:
         return known
-    a, b, c = (mesh.vertices_mm[mesh.faces[:, k]] for k in range(3))
-    area = np.cross(b - a, c - a)
+    area = triangles_of(mesh.vertices_mm, mesh.faces)[1]
     unit = area / np.maximum(np.linalg.norm(area, axis=1, keepdims=True), 1e-12)
     _, place = np.unique(mesh.vertices_mm, axis=0, return_inverse=True)
     corner = place.reshape(-1)[mesh.faces].reshape(-1)

@@ -73,8 +73,7 @@ class ScenePlayerConfig(Config, frozen=True, kw_only=True):
     body: BodyConfig = BodyConfig()
 
     def __post_init__(self) -> None:
-        if not 60 <= self.distance_mm <= 400:
-            raise InputError(f"distance_mm is {self.distance_mm:g}; it must lie in 60..400.")
+        self.check_between("the virtual room:", distance_mm=(60, 400))
         d405(self.width, self.height)
 
 

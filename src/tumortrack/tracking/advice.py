@@ -17,7 +17,7 @@ _INSTEAD = {
     "the camera's scale": "calibrate it",
     "do not lie on the organ": "free the organ of what lies on it and beside it",
 }
-_FACES = 2000  # of the organ, that tell enough
+_MOST = 2000  # of the organ's faces, or vertices: they tell enough
 _FACING = 0.3  # cosine to the line of sight: flatter surfaces return little
 _NEAR_MM = 8.0  # of an observed point: seen
 _HIDDEN = 0.1  # share of what faces the camera
@@ -38,10 +38,10 @@ def what_to_do(estimate: Estimate, cloud: SensorCloud) -> str:
         if words in estimate.reason:
             return advice
     mesh = next(iter(estimate.meshes.values()))
-    faces = mesh.faces[:: len(mesh.faces) // _FACES + 1]
-    middles, normals, _ = triangles_of(mesh.vertices_mm, faces)
+    faces = mesh.faces[:: len(mesh.faces) // _MOST + 1]
+    middles, normals = triangles_of(mesh.vertices_mm, faces)
     sight = middles / np.linalg.norm(middles, axis=1, keepdims=True)
-    facing = middles[-(normals * sight).sum(1) > _FACING]
+    facing = middles[-(normals * sight).sum(1) > _FACING * np.linalg.norm(normals, axis=1)]
     centre = middles.mean(0)
     if len(facing) and len(cloud.points_mm):
         hidden = cKDTree(cloud.points_mm).query(facing)[0] > _NEAR_MM
@@ -56,6 +56,7 @@ def _unsure(estimate: Estimate, centre: Float[np.ndarray, " 3"]) -> Float[np.nda
     motion = estimate.motion
     if isinstance(motion, ElasticMotion) and motion.rivals:
         places_mm = next(iter(estimate.meshes.values())).vertices_mm
+        places_mm = places_mm[:: len(places_mm) // _MOST + 1]
         other_mm = motion.rivals[0][0].carry(motion.shape.anatomy_ct.organ.vertices_mm)
         return places_mm[cKDTree(other_mm).query(places_mm)[0].argmax()] - centre
     tumors = list(estimate.report["parts"].items())[1:]

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from tumortrack.core.errors import InputError, NoEstimate
-from tumortrack.core.geometry import Points, transform_points
+from tumortrack.core.geometry import Points, transform_points, triangles_of
 from tumortrack.core.mesh_files import read_mesh
 from tumortrack.core.types import Anatomy, Mesh, SensorCloud
 from tumortrack.models.report import Frame
@@ -28,7 +28,6 @@ from tumortrack.simulate.scene import PoseConfig, sample_pose
 from tumortrack.tracking.tracker import Tracker
 from tumortrack_lab.peers.pose_search import PoseSearch, RigidConfig
 from tumortrack_lab.real.judging import CAMERA
-from tumortrack_lab.twin.apparatus import triangles
 
 REST = "psm_data/PLY/kidney_and_base_2mm_aligned.ply"
 BENT = {
@@ -76,7 +75,7 @@ def closed(top: Mesh, bottom_z_mm: float) -> Mesh:
 
 def facing_pose(scan: Mesh, rng: np.random.Generator) -> np.ndarray:
     """``camera_from_scan``, its outer side to the camera."""
-    x, y, z = triangles(scan)[1].sum(0)
+    x, y, z = triangles_of(scan.vertices_mm, scan.faces)[1].sum(0)
     return sample_pose(PoseConfig(), scan, (x, y, z), PoseConfig().nearest_mm, rng)
 
 

@@ -26,7 +26,7 @@ from jaxtyping import Bool, Float, Float64
 
 from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError, TumortrackError
-from tumortrack.core.geometry import rigid, rotation_onto, transform_points
+from tumortrack.core.geometry import rigid, rotation_onto, transform_points, triangles_of
 from tumortrack.core.types import Anatomy, Mesh
 from tumortrack.imaging.raster import label_grid
 from tumortrack.report.metrics import surface_samples
@@ -143,12 +143,6 @@ def contact_points(
     return points_mm[first], np.bincount(cube.ravel(), areas_mm2)
 
 
-def triangles(mesh: Mesh) -> tuple[Float64[np.ndarray, "f 3"], Float64[np.ndarray, "f 3"]]:
-    """Each triangle's middle and outward normal, twice its area long."""
-    a, b, c = (mesh.vertices_mm[mesh.faces[:, i]] for i in range(3))
-    return (a + b + c) / 3, np.cross(b - a, c - a)
-
-
 def bench_from_ct(organ_ct: Mesh, up_lps: tuple[float, float, float]) -> np.ndarray:
     upright = rotation_onto(np.array(up_lps), np.array([0.0, 0.0, 1.0]))
     flat = (organ_ct.vertices_mm - organ_ct.vertices_mm.mean(0)) @ upright.T
@@ -165,7 +159,7 @@ def _faces_down(
     """Which points of the surface lie on its underside, where the slope is at most so much."""
     from scipy.spatial import cKDTree
 
-    middle, normal = triangles(organ)
+    middle, normal = triangles_of(organ.vertices_mm, organ.faces)
     down = -normal[:, 2] > np.linalg.norm(normal, axis=1) / np.hypot(1, steepest)
     return np.asarray(down[cKDTree(middle).query(points_mm)[1]])
 
@@ -304,7 +298,8 @@ def _poke_point(bench: Apparatus) -> Float64[np.ndarray, " 3"]:
     """Where the surface faces up, farthest from every tumor and from the organ's rim."""
     from scipy.spatial import cKDTree
 
-    middle, normal = triangles(bench.anatomy.organ)
+    organ = bench.anatomy.organ
+    middle, normal = triangles_of(organ.vertices_mm, organ.faces)
     facing = normal[:, 2] / np.maximum(np.linalg.norm(normal, axis=1), 1e-12)
     top = (facing > min(0.85, float(facing.max()))) & (middle[:, 2] > middle[:, 2].mean())
     away = [middle[facing < 0.5], *(tumor.vertices_mm for tumor in bench.anatomy.tumors)]

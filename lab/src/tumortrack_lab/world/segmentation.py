@@ -13,9 +13,9 @@ from typing import Literal, get_args
 import numpy as np
 from jaxtyping import Float64
 
+from tumortrack.core.geometry import rotation_onto, triangles_of
 from tumortrack.core.types import Anatomy, Mesh
 from tumortrack.simulate.occupancy import contains
-from tumortrack_lab.twin.apparatus import triangles
 
 Kind = Literal["none", "voxel", "slices", "reader"]
 KINDS: tuple[Kind, ...] = get_args(Kind)
@@ -57,7 +57,7 @@ def perturbed(
 
 def normals(mesh: Mesh) -> Vertices:
     """Unit normals of the vertices, outward."""
-    out, area = np.zeros_like(mesh.vertices_mm), triangles(mesh)[1]
+    out, area = np.zeros_like(mesh.vertices_mm), triangles_of(mesh.vertices_mm, mesh.faces)[1]
     for corner in mesh.faces.T:
         np.add.at(out, corner, area)
     return out / np.maximum(np.linalg.norm(out, axis=1, keepdims=True), 1e-12)
@@ -75,8 +75,6 @@ def _sliced(mesh: Mesh, thick_mm: float, phase: float, axis: np.ndarray) -> np.n
     """How far each vertex moves if the shape is known in slices alone: each shows the mean over its
     thickness, the steps between them are smoothed along the slices' normal."""
     from scipy.ndimage import gaussian_filter1d, map_coordinates
-
-    from tumortrack.core.geometry import rotation_onto
 
     turn = rotation_onto(axis, np.array([0.0, 0.0, 1.0]))
     there = mesh.vertices_mm @ turn.T

@@ -37,9 +37,9 @@ _LEVELS = {"good": _OK, "poor": _WARN, "none": _ERROR}
 _TEXT_COLOURS = {"good": GOOD, "poor": POOR, "none": NONE}
 _STATE_COLOUR: Colour = (235, 238, 242)
 _KIDNEY_OPACITY = 0.35
-_TEXT_HEIGHT_M, _STATE_HEIGHT_M = 0.008, 0.04
-_TEXT_COLUMNS, _STATE_COLUMNS, _PITCH = 44, 60, 3.1  # lines in RViz are so many heights apart
-_STATE_ABOVE_MM = 60.0
+_TEXT_HEIGHT_M, _STATE_HEIGHT_M = 0.008, 0.025
+_TEXT_COLUMNS, _STATE_COLUMNS = 44, 70
+_GAP_M = 0.012  # between lines, besides their height: measured in RViz of ROS 1; ROS 2's has 0.005
 _ORIGIN = np.zeros(3)
 
 _POINT = np.dtype(
@@ -210,7 +210,7 @@ def _quality_text(result: TrackingResult) -> dict[str, Any]:
     said, above_mm = _lines(result.describe()), np.array([[0.0, 0.0, 150.0]])
     if result.estimate is not None and (organ := result.estimate.meshes.get("kidney")):
         low, high = organ.box_mm
-        up_mm = 1000 * _TEXT_HEIGHT_M * (1 + _PITCH / 2 * said.count("\n"))  # to its middle
+        up_mm = 1000 * _TEXT_HEIGHT_M + _half_height_mm(said, _TEXT_HEIGHT_M)  # to its middle
         above_mm = np.array([[(low + high)[0] / 2, low[1] - up_mm, (low + high)[2] / 2]])
     place_mm = transform_points(result.published_frame.published_from_camera, above_mm)[0]
     look = {"text": said, "scale": {"z": _TEXT_HEIGHT_M}}
@@ -218,7 +218,7 @@ def _quality_text(result: TrackingResult) -> dict[str, Any]:
 
 
 def _state_text(result: TrackingResult, cell: Workcell) -> dict[str, Any]:
-    """Above everything: where arms are, z is up."""
+    """Hung from the height of what is highest (where arms are, z is up): a view of all has room."""
     said = _lines(_describe(cell), _STATE_COLUMNS)
     if result.estimate is None:
         said += f"\n{_lines(result.describe(), _STATE_COLUMNS)}"
@@ -226,7 +226,7 @@ def _state_text(result: TrackingResult, cell: Workcell) -> dict[str, Any]:
     spots = lines_mm if box_mm is None else [box_mm, *lines_mm]
     corners = np.concatenate(spots) if spots else np.zeros((1, 3))
     place_mm = (corners.min(0) + corners.max(0)) / 2
-    place_mm[2] = corners[:, 2].max() + _STATE_ABOVE_MM
+    place_mm[2] = corners[:, 2].max() - _half_height_mm(said, _STATE_HEIGHT_M)
     colour, scale = NONE if cell.halted else _STATE_COLOUR, {"z": _STATE_HEIGHT_M}
     return _drawn(_STATE, _TEXT, colour, place_mm, text=said, scale=scale)
 
@@ -234,6 +234,11 @@ def _state_text(result: TrackingResult, cell: Workcell) -> dict[str, Any]:
 def _lines(said: str, columns: int = _TEXT_COLUMNS) -> str:
     """RViz breaks no line: a long one leaves the screen on both sides."""
     return textwrap.fill(said, columns)
+
+
+def _half_height_mm(said: str, height_m: float) -> float:
+    """From the middle of a text, which RViz puts in its place, to the middle of its first line."""
+    return MM_PER_M * (height_m + _GAP_M) / 2 * said.count("\n")
 
 
 def _describe(cell: Workcell) -> str:

@@ -52,8 +52,7 @@ class RecordingSinkConfig(SinkConfig, frozen=True, kw_only=True, tag="recording"
     overwrite: bool = False
 
     def __post_init__(self) -> None:
-        if not 0 <= self.meshes_hz <= 1000:
-            raise InputError(f"recording: meshes_hz is {self.meshes_hz:g}; allowed: 0..1000.")
+        self.check_between("recording:", meshes_hz=(0, 1000))
 
     def open(self, context: SinkContext) -> McapFile | FrameFolders:
         """Raises InputError if the folder exists, and is no recording or ``overwrite`` was not

@@ -29,8 +29,7 @@ class RosSinkConfig(SinkConfig, frozen=True, kw_only=True):
     def __post_init__(self) -> None:
         kind = str(self.__struct_config__.tag)
         check_topic(kind, "namespace", self.namespace)
-        if not 0 <= self.mesh_hz <= 1000:
-            raise InputError(f"{kind}: mesh_hz {self.mesh_hz:g} must lie in 0..1000.")
+        self.check_between(f"{kind}:", mesh_hz=(0, 1000))
 
 
 class Ros2SinkConfig(RosSinkConfig, frozen=True, kw_only=True, tag="ros2"):

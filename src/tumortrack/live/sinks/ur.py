@@ -80,12 +80,8 @@ class UrSinkConfig(SinkConfig, frozen=True, kw_only=True, tag="ur"):
     gain: float = 300.0
 
     def __post_init__(self) -> None:
-        servo = (("lookahead_s", 0.03, 0.2), ("gain", 100.0, 2000.0))  # servoJ's own limits
-        ours = (("jump_deg", 0.1, 20.0), ("force_n", 5.0, 150.0))
-        for name, low, high in (*ours, *servo):
-            value = getattr(self, name)
-            if not low <= value <= high:
-                raise InputError(f"ur: {name} {value:g} must lie in {low:g}..{high:g}.")
+        self.check_between("ur:", jump_deg=(0.1, 20.0), force_n=(5.0, 150.0))
+        self.check_between("ur:", lookahead_s=(0.03, 0.2), gain=(100.0, 2000.0))  # servoJ's own
 
     def open(self, context: SinkContext) -> UrSink:
         """Nothing, or with ``execute`` the connection to the arm, which does not move yet.

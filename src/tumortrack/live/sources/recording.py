@@ -56,8 +56,7 @@ class RecordingSourceConfig(SourceConfig, frozen=True, kw_only=True, tag="record
                 f"recording: rate is {self.rate:g}; it must lie in 0.01..100, or be 0 for as fast "
                 "as it goes."
             )
-        if not 0.01 <= self.fps <= 1000:
-            raise InputError(f"recording: fps is {self.fps:g}; it must lie in 0.01..1000.")
+        self.check_between("recording:", fps=(0.01, 1000))
         if not 0 < self.unit_mm <= 100:
             raise InputError(f"recording: unit_mm is {self.unit_mm:g}; it must lie in 0..100 mm.")
 

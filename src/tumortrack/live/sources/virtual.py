@@ -43,8 +43,7 @@ class VirtualSourceConfig(SourceConfig, frozen=True, kw_only=True, tag="virtual"
     noise: bool = True
 
     def __post_init__(self) -> None:
-        if not 0.1 <= self.fps <= 1000:
-            raise InputError(f"virtual: fps is {self.fps:g}; it must lie in 0.1..1000.")
+        self.check_between("virtual:", fps=(0.1, 1000))
         if self.seed < 0:
             raise InputError(f"virtual: seed is {self.seed}; it must be 0 or more.")
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -72,7 +72,7 @@ class ViewerScene:
                 self._margins_ct = [exact_margin(part, margin_mm) for part in self._at_rest.tumors]
         self.options = DisplayOptions()
         self.margins: dict[str, Mesh] = {}  # of the shown estimate, published frame
-        self._placed: TransformedEstimate | None = None
+        self._shown: tuple[TrackingResult, TransformedEstimate] | None = None
         self._has_organ = self._has_slice = False
         self.look = Look(server, self._way)
         self._make_nodes(context)
@@ -144,7 +144,7 @@ class ViewerScene:
         """Show this result's estimate, which it must have."""
         placed = result.transformed
         assert placed is not None
-        self._put_labelled(placed)
+        self._put_asked_for(result, placed)
         self.margins = self._margins_of(result, placed)
         for name, node in self._parts.items():
             mesh = placed.meshes.get(name, _NOTHING)
@@ -152,9 +152,7 @@ class ViewerScene:
             _put_mesh(node, shown)
         for name, node in self._shells.items():
             _put_mesh(node, self.margins.get(name, _NOTHING))
-        for name, node in self._ellipsoids.items():
-            _put_mesh(node, self._ellipsoid(result, name))
-        self._placed = placed
+        self._shown = result, placed
         self.apply()
 
     def hide(self) -> None:
@@ -163,17 +161,17 @@ class ViewerScene:
         for node in (*self._parts.values(), *self._shells.values(), *self._ellipsoids.values()):
             _put_mesh(node, _NOTHING)
         self._points.points, self._points.colors = _NO_POINTS, _NO_POINTS.astype(np.uint8)
-        self._placed = None
+        self._shown = None
         self._has_slice = self._slice.visible = False
         self.margins = {}
 
     def apply(self) -> None:
         """Show and hide nodes by the options and by what there is."""
-        options, placed = self.options, self._placed
+        options = self.options
         self._seen.visible = self._organ.visible = options.observed
         self._axes.visible = options.helpers
         self._region.visible = options.helpers and self._has_organ
-        if placed is None:
+        if self._shown is None:
             return
         for name, node in self._parts.items():
             node.visible = name != "kidney" or options.kidney > 0
@@ -191,8 +189,8 @@ class ViewerScene:
     def change(self, options: DisplayOptions) -> None:
         """What the user wants to see is another."""
         self.options = options
-        if self._placed is not None:
-            self._put_labelled(self._placed)
+        if self._shown is not None:
+            self._put_asked_for(*self._shown)
         self.apply()
 
     def put_slice(self, picture: UInt8[np.ndarray, "h w 3"], plane: SlicePlane) -> None:
@@ -258,7 +256,11 @@ class ViewerScene:
         solid = opacity if opacity < 1 else None
         return self._mesh(name, opacity=solid, flat_shading=True, **look)
 
-    def _put_labelled(self, placed: TransformedEstimate) -> None:
+    def _put_asked_for(self, result: TrackingResult, placed: TransformedEstimate) -> None:
+        """What is computed and sent only if the user wants to see it."""
+        if self.options.ellipsoids:
+            for name, node in self._ellipsoids.items():
+                _put_mesh(node, self._ellipsoid(result, name))
         if self.options.points == "none":
             return
         least = 2 if self.options.points == "tumors" else 1
@@ -285,20 +287,25 @@ class ViewerScene:
             if name in tumors
         }
 
+    @cached_property
+    def _ball(self) -> Mesh:
+        from trimesh.creation import icosphere
+
+        ball = icosphere(3)
+        return Mesh(ball.vertices, ball.faces)
+
     def _ellipsoid(self, result: TrackingResult, name: str) -> Mesh:
         """Where the middle of a tumor lies with 95 % probability, if the fit's own covariance were
         all there is to know; published frame. Nothing without a motion."""
         assert result.estimate is not None
-        from trimesh.creation import icosphere
-
         motion, part = result.estimate.motion, result.estimate.report["parts"].get(name, {})
         if self._at_rest is None or motion is None or "center_axes" not in part:
             return _NOTHING
         at_rest = dict(zip(self._at_rest.names, self._at_rest.parts, strict=True))[name]
-        ball, middle_mm = icosphere(3), motion.carry(at_rest.box_mm.mean(0, keepdims=True))
+        middle_mm = motion.carry(at_rest.box_mm.mean(0, keepdims=True))
         radii_mm = _ELLIPSOID * np.array(part["center_axes_std_mm"])
-        places_mm = middle_mm + (ball.vertices * radii_mm) @ np.array(part["center_axes"])
-        return Mesh(transform_points(self._way, places_mm), ball.faces)
+        places_mm = middle_mm + (self._ball.vertices_mm * radii_mm) @ np.array(part["center_axes"])
+        return self._ball.moved(transform_points(self._way, places_mm))
 
     def _bare(self, organ: Mesh) -> Mesh:
         """The organ's surface where it is no tumor's, if its triangles are those of the CT."""

@@ -102,8 +102,7 @@ class CellConfig(Config, frozen=True, kw_only=True):
             if value is not None and not (0 < value < 1000 and low <= value <= high):
                 allowed = f"{low or 'over 0'} to {high}"
                 raise InputError(f"cell: {name} is {value:g}; allowed: {allowed}.")
-        if not all(100 <= side <= 10_000 for side in self.table_mm):
-            raise InputError(f"cell: table_mm is {self.table_mm}; allowed: 100 to 10000 each.")
+        self.check_between("cell:", table_mm=(100, 10_000))
         places = (*self.middle_mm, *self.camera_mm, *self.home_rad)
         for base in (self.cutter_base, self.holder_base):
             places += (*base.position_mm, base.yaw_deg)

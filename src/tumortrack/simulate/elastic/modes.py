@@ -16,7 +16,7 @@ from jaxtyping import Float64
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from tumortrack.core.geometry import unit
+from tumortrack.core.geometry import triangles_of, unit
 from tumortrack.core.types import Mesh
 from tumortrack.simulate.elastic.finite import LatticeSolid
 
@@ -43,9 +43,8 @@ class Patches:
 
 def patches_of(mesh: Mesh, count: int, rng: np.random.Generator) -> Patches:
     """At most ``count`` patches: faces go to the nearest of random ones, drawn by area."""
-    corners = mesh.vertices_mm[mesh.faces]
-    doubled = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    areas, middles = np.linalg.norm(doubled, axis=1) / 2, corners.mean(1)
+    middles, doubled = triangles_of(mesh.vertices_mm, mesh.faces)
+    areas = np.linalg.norm(doubled, axis=1) / 2
     drawn = rng.choice(len(areas), min(count, len(areas)), replace=False, p=areas / areas.sum())
     patch = cKDTree(middles[drawn]).query(middles)[1]
 
