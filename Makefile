@@ -8,7 +8,7 @@ INSTALL := pip install --quiet --disable-pip-version-check --no-compile --no-dep
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help setup debian demo test test-hard check attack fuzz crash replay bench soak wheel lock licences audit results foreign real world trust clean
+.PHONY: help setup debian demo test test-hard check attack fuzz crash replay bench soak wheel lock licences audit results real world trust clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 10
@@ -66,17 +66,14 @@ test-hard: setup  ## tests on narrow vector units beside two busy processes (ARG
 	trap "kill $$one $$two" EXIT; ONEDNN_MAX_CPU_ISA=AVX2 ATEN_CPU_CAPABILITY=avx2 \
 	NUMBA_CPU_NAME=haswell OMP_NUM_THREADS=1 $(BIN)/pytest $(ARGS)
 
-bench: setup  ## speed of every part beside its naive form; fills docs/performance.md (10 to 13 minutes; ARGS=--quick)
-	$(BIN)/tumortrack bench --curves --document docs/performance.md $(ARGS)
+bench: setup  ## speed of every part; fills docs/performance.md (less than 10 minutes; ARGS=--quick)
+	$(BIN)/tumortrack bench --document docs/performance.md $(ARGS)
 
 soak: setup  ## an hour of tracking with faults of eleven kinds (ARGS="MODEL CASE --minutes 5"; after make demo)
 	$(BIN)/python lab/scripts/soak.py $(ARGS)
 
-results: setup  ## the tables and plots of docs/results.md (hours; ARGS="--case NAME=FOLDER": more organs)
+results: setup  ## the tables of docs/results.md (hours; ARGS="--case NAME=FOLDER": more organs)
 	$(BIN)/python lab/scripts/results.py $(ARGS)
-
-foreign: setup  ## how often another kidney, or a mirrored one, is called good (an hour)
-	$(BIN)/python lab/scripts/foreign.py $(ARGS)
 
 real: setup  ## real kidneys, breathing lungs, silicone: ARGS='DATA', a folder of your copies (hours)
 	$(BIN)/python lab/scripts/real.py $(ARGS)

@@ -55,8 +55,6 @@ class Options(trainings.KeptOptions):
     """Which of the frozen list get a model, by case number; all are prepared and checked."""
     trained: tuple[str, ...] = ()
     """More organs for the lungs' deformations, each NAME=FOLDER with case/ and model/ in it."""
-    choose: bool = False
-    """First apply the rule to all your label maps: it must give the frozen list again."""
     steps: int = 500
     """Of each training."""
     scenes: int = 10
@@ -117,8 +115,6 @@ def main(options: Options) -> None:
     rows = kidneys.frozen()
     if unknown := set(options.kidneys) - {row["case"] for row in rows}:
         raise InputError(f"--kidneys {min(unknown)} is not in the list; see docs/real.md.")
-    if options.choose and kidneys.choose(options.data, options.out / "cases") != rows:
-        raise InputError(f"the rule gives other kidneys than {kidneys.FROZEN} lists.")
     folders = {}
     if {"kidneys", "lungs"} & {*options.parts}:
         folders = kidneys.check(options.data, options.out / "cases", rows)

@@ -23,9 +23,8 @@ from tumortrack.cli.console import say
 from tumortrack.core.errors import TumortrackError
 from tumortrack.phantom.digital import PhantomParameters, second_phantom
 from tumortrack.training.train import TrainingStatus
-from tumortrack_lab.study import goals, plots, resection, tables, trainings
-from tumortrack_lab.study.document import ReportWriter
-from tumortrack_lab.study.measure import CLEAN_VIEW, measured
+from tumortrack_lab.study import goals, resection, tables, trainings
+from tumortrack_lab.study.measure import measured
 from tumortrack_lab.study.methods import (
     CLINIC,
     Method,
@@ -57,7 +56,7 @@ RULES: dict[Section, str] = {
 
 @dataclass(frozen=True, kw_only=True)
 class Options(trainings.KeptOptions):
-    """Regenerate the tables and plots of docs/results.md."""
+    """Regenerate the tables of docs/results.md."""
 
     case: tuple[str, ...] = ()
     """More organs than the two phantoms, each NAME=FOLDER (of `tumortrack prepare`)."""
@@ -103,7 +102,7 @@ def main(options: Options) -> None:
                     rows += measured(*about, resection.cut_one, **resection.cutting())
                 else:
                     rows += measured(*about)
-        texts = [*texts_of(section, rows, cases, writer), tables.caption(rows, writer.command)]
+        texts = [*texts_of(section, rows, cases), tables.caption(rows, writer.command)]
         writer.write({section: "\n\n".join(texts) + f" {RULES[section]}"})
         say(f"{section}: block written to {options.document}")
 
@@ -116,9 +115,9 @@ def cases_of(options: Options) -> Iterator[StudyCase]:
 
 
 def make_scenes(case: StudyCase, variants: tuple[str, ...]) -> None:
-    """The twin's scenes; those that are there stay. The clean ones say what is visible."""
+    """The twin's scenes; those that are there stay."""
     command = [sys.executable, "-m", "tumortrack.cli.main", "twin", str(case.folder)]
-    command += [str(case.scenes), "--states", *variants, "--views", CLEAN_VIEW, VIEW]
+    command += [str(case.scenes), "--states", *variants, "--views", VIEW]
     if subprocess.run(command, check=False).returncode != 0:
         raise TumortrackError(f"the scenes of {case.name} could not be made (see above).")
 
@@ -139,10 +138,8 @@ def methods_of(
         yield peer(name, case)
 
 
-def texts_of(
-    section: Section, rows: Rows, cases: list[StudyCase], writer: ReportWriter
-) -> list[str]:
-    """The tables of a section, its pictures drawn."""
+def texts_of(section: Section, rows: Rows, cases: list[StudyCase]) -> list[str]:
+    """The tables of a section."""
     if section == "resection":
         return [resection.tables_of(rows)]
     frame = tables.tidy(rows)
@@ -153,10 +150,6 @@ def texts_of(
     for name, own in sites.items():
         mine = frame[frame.case == name]
         texts += [f"#### {name}", tables.sites_text(name, own), tables.accuracy(mine, own)]
-        for key in ("depth", "displacement"):
-            image = writer.image(f"results_{key}_{name}")
-            if plots.error_against(mine[tables.is_deformed(mine)], f"{key}_mm", image):
-                texts.append(writer.link(image, f"{name}: tumor error against {key}"))
     return texts
 
 

@@ -55,7 +55,7 @@ def moved(anatomy, b_from_a):
 
 
 def located_as_it_is(anatomy):
-    estimate = scattered(estimate_of(Fit(lambda points: points, 0.0), anatomy))
+    estimate = scattered(estimate_of(Fit(lambda points: points), anatomy))
     return located(estimate.cloud, estimate.meshes, None, np.eye(4))
 
 
@@ -89,7 +89,7 @@ def shifted(shift_mm=0.0, std_mm=None, nothing=False, name="clinic", calls=None)
         if nothing:
             raise NoEstimate("the cloud shows no organ")
         carry = rigid_carry(rigid(np.eye(3), np.array([shift_mm, 0.0, 0.0])))
-        estimate = scattered(estimate_of(Fit(carry, 0.2), scene.reference, grid=grid))
+        estimate = scattered(estimate_of(Fit(carry), scene.reference, grid=grid))
         return replace(estimate, motion=None if std_mm is None else Sure(std_mm))
 
     return Method(name, {"shift_mm": shift_mm}, locate)

@@ -29,7 +29,7 @@ from tumortrack_lab.peers.base import Fit, estimate_of, rigid_carry
 from tumortrack_lab.study import tables, tumor_sites
 from tumortrack_lab.study.document import ReportWriter, closing, fill, opening, table
 from tumortrack_lab.study.goals import goal_table
-from tumortrack_lab.study.measure import displacements, measured, point_errors
+from tumortrack_lab.study.measure import measured
 from tumortrack_lab.study.methods import Method, StudyCase, Trainer, peer, study_case
 from tumortrack_lab.study.tables import tidy
 
@@ -49,12 +49,9 @@ def anatomy():
     return Anatomy((ball(30), ball(8), ball(6, (15, 0, 0))))
 
 
-def moved(parts, camera_from_ct, shifts=()):
+def moved(parts, camera_from_ct):
     carry = rigid_carry(camera_from_ct)
-    out = [part.moved(carry(part.vertices_mm)) for part in parts.parts]
-    for number, shift in shifts:
-        out[number] = out[number].moved(out[number].vertices_mm + np.array(shift))
-    return Anatomy(tuple(out))
+    return Anatomy(tuple(part.moved(carry(part.vertices_mm)) for part in parts.parts))
 
 
 @pytest.fixture
@@ -94,7 +91,7 @@ class Shifted:
             raise NoEstimate("no organ was found")
         shifted = CAMERA_FROM_CT.copy()
         shifted[0, 3] += self.shift_mm
-        fit = Fit(rigid_carry(shifted), 0.25)
+        fit = Fit(rigid_carry(shifted))
         estimate = estimate_of(fit, anatomy(), grid=grid)
         for part in self.without:
             del estimate.meshes[part]
@@ -185,25 +182,6 @@ def test_parts_that_were_not_found_follow_the_rule(case, tmp_path):
     assert "0.00 / 0.00 / 0.00 |" in written  # mIoU of what was not found
 
 
-def test_point_errors_know_depth_displacement_and_distance():
-    rest = anatomy()
-    truth = moved(rest, CAMERA_FROM_CT, shifts=[(2, (0, 0, 4.0))])
-    moves = displacements(truth, rest)
-    assert np.abs(moves["tumor_1"]).max() < 1e-9
-    np.testing.assert_allclose(moves["tumor_2"], 4.0)
-    estimate = moved(rest, CAMERA_FROM_CT)
-    meshes = {"tumor_1": estimate.parts[1]}
-    seen = np.array([[3.0, -2.0, 100.0]])  # straight above the middle, on the organ's surface
-    points = point_errors(truth, rest, seen, meshes)
-    assert set(points) == {"tumor_1"}
-    assert max(points["tumor_1"]["error_mm"]) == 0
-    depth = points["tumor_1"]["depth_mm"]
-    assert 22 <= min(depth) < 26
-    assert 34 < max(depth) <= 38
-    other = Anatomy((ball(30), ball(8)))
-    assert displacements(moved(other, CAMERA_FROM_CT), rest) == {}
-
-
 def test_how_a_tumor_lies():
     deep = tumor_sites.tumor_sites_of(anatomy())
     assert {site.kind for site in deep.values()} == {"endophytic"}
@@ -239,7 +217,7 @@ def test_the_document_has_a_place_for_every_section():
     assert fill(document, {name: "x" for name in names}).count("\nx\n<!-- /results:") == len(names)
 
 
-@pytest.mark.parametrize("name", ["results", "soak", "foreign", "real", "world", "trust"])
+@pytest.mark.parametrize("name", ["results", "soak", "real", "world", "trust"])
 def test_scripts_are_imported_and_say_what_they_do(name, monkeypatch, capsys):
     monkeypatch.setattr("sys.argv", [f"{name}.py", "--help"])
     with pytest.raises(SystemExit) as stopped:
@@ -271,8 +249,7 @@ def phantom(tmp_path_factory):
     for number, variant in enumerate(("D0", "D1")):
         stage = simulator.render(SceneRecipe(3, "test", number))
         scene = Scene(stage.cloud, simulator.reference(stage), stage.frame)
-        for view in ("clean", "noise"):
-            scene.write(root / "scenes" / f"{variant}-{view}")
+        scene.write(root / "scenes" / f"{variant}-noise")
     return study_case("phantom", root / "case", root / "scenes")
 
 
@@ -294,7 +271,7 @@ def test_end_to_end_twice_gives_the_same_document(phantom, tmp_path, monkeypatch
         for method in script["methods_of"]("accuracy", phantom, options, trainer):
             about = method, options.variants, "noise", options.grid, tmp_path / "rows"
             rows += measured(phantom, *about)
-        texts = script["texts_of"]("accuracy", rows, [phantom], writer)
+        texts = script["texts_of"]("accuracy", rows, [phantom])
         writer.write({"accuracy": "\n\n".join([*texts, tables.caption(rows, writer.command)])})
         return document.read_text()
 
@@ -302,9 +279,8 @@ def test_end_to_end_twice_gives_the_same_document(phantom, tmp_path, monkeypatch
     assert set(trained) == {"phantom M_lim seed 0"}
     assert first.startswith("mine\n")
     assert first.endswith("yours\n")
-    for words in ("Models: 1 of 2 steps", "(oracle)", "](images/results_depth_phantom.png)"):
+    for words in ("Models: 1 of 2 steps", "(oracle)"):
         assert words in first
-    assert (tmp_path / "images" / "results_depth_phantom.png").stat().st_size > 5000
     trained.clear()
     assert run() == first
     assert not trained

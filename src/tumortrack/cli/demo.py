@@ -13,7 +13,7 @@ from tumortrack.cli.console import say
 from tumortrack.cli.locate import Evaluate
 from tumortrack.cli.training import Train
 from tumortrack.core import store
-from tumortrack.core.errors import InputError, StorageError
+from tumortrack.core.errors import InputError
 
 _CT_SEED, _SCENE_SEED = 1, 2
 _MARKER = "demo.json"  # says that what lies beside it is a demo's and may be replaced
@@ -80,11 +80,9 @@ def _clear(out: Path) -> None:
     """Make ``out``, or empty it of an earlier demo, known by its marker."""
     if out.exists() and not out.is_dir():
         raise InputError(f"{out} is a file; --out must be a folder.")
-    try:
+    with store.writing(out):
         out.mkdir(parents=True, exist_ok=True)
         names = sorted(p.name for p in out.iterdir())
-    except OSError as error:
-        raise StorageError(f"cannot write {out}: {error.strerror}.") from error
     foreign = [name for name in names if name not in (*_MINE, _MARKER)]
     if names and (foreign or _MARKER not in names):
         raise InputError(

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from tumortrack.core.errors import InputError, StorageError
-from tumortrack.core.store import read_file
+from tumortrack.core.errors import InputError
+from tumortrack.core.store import read_file, writing
 from tumortrack.core.types import Anatomy, Mesh
 
 SUFFIXES = (".ply", ".stl", ".obj")
@@ -50,10 +50,8 @@ def write_mesh(path: Path, mesh: Mesh) -> None:
     shows all files of a run as if their frame were the patient's. StorageError where the disk
     refuses."""
     kind = path.suffix.lower().removeprefix(".")
-    try:
+    with writing(path):
         path.write_bytes(_ply(mesh) if kind == "ply" else _exported(mesh, kind))
-    except OSError as error:
-        raise StorageError(f"cannot write {path}: {error.strerror}.") from error
 
 
 def _ply(mesh: Mesh) -> bytes:

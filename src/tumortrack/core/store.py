@@ -55,6 +55,15 @@ def read_file(path: Path, most_bytes: int, advice: str = "This is no file of our
         raise InputError(f"{path} cannot be read: {error.strerror}.") from error
 
 
+@contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """Round what writes there: StorageError where the disk refuses."""
+    try:
+        yield
+    except OSError as error:
+        raise StorageError(f"cannot write {path}: {error.strerror or error}.") from error
+
+
 def write_atomically(path: Path, content: bytes) -> None:
     """Write a file so that a reader sees the old or the new content, never a part. StorageError
     where the disk is full or not writable; the old file is then untouched."""

@@ -112,6 +112,11 @@ class Mesh:
         axes = np.ascontiguousarray(self.vertices_mm.T)  # ten times as fast as along the short axis
         return np.stack([axes.min(1), axes.max(1)])
 
+    @property
+    def longest_mm(self) -> float:
+        """The longest side of the box."""
+        return float(np.ptp(self.box_mm, axis=0).max())
+
     def moved(self, vertices_mm: Float[np.ndarray, "v 3"]) -> Mesh:
         """The same triangles over other vertices (a deformation or a change of frame)."""
         return Mesh(vertices_mm, self.faces)

@@ -8,7 +8,7 @@ from typing import Any
 
 from tumortrack.core import store
 from tumortrack.core.config import to_builtins
-from tumortrack.core.errors import ArtifactError, InputError, StorageError
+from tumortrack.core.errors import ArtifactError, InputError
 from tumortrack.core.mesh_files import read_anatomy, write_anatomy
 from tumortrack.core.patient import NOBODY, Patient, patient_in
 from tumortrack.core.types import Anatomy, LabelVolume, Volume
@@ -47,10 +47,7 @@ def save_case(case: Case, folder: Path) -> None:
     Raises:
         StorageError: the disk refused.
     """
-    try:
-        write_anatomy(folder, case.anatomy)
-    except OSError as error:
-        raise StorageError(f"cannot write into {folder}: {error.strerror}.") from error
+    write_anatomy(folder, case.anatomy)
     labels = case.labels
     write_nifti(folder / "labels.nii.gz", labels.labels, labels.lps_from_index, lps=True)
     if case.ct is not None:

@@ -128,7 +128,7 @@ def _stated_space(path: Path) -> str | None:
 
 
 def _check_unit(path: Path, organ: Mesh, unit: str | None) -> None:
-    extent = float(np.ptp(organ.box_mm, axis=0).max())
+    extent = organ.longest_mm
     low, high = _ORGAN_MM
     if low <= extent <= high:
         return
@@ -166,7 +166,7 @@ def closed_mesh(mesh: Mesh, name: str, notes: list[str]) -> Mesh:
     """
     import trimesh
 
-    size = float(np.ptp(mesh.box_mm, axis=0).max())
+    size = mesh.longest_mm
     if not size > 0:
         raise InputError(f"{name} has no extent; it is damaged.")
     _, first = np.unique(np.sort(mesh.faces, axis=1), axis=0, return_index=True)

@@ -20,10 +20,10 @@ from jaxtyping import Float, UInt8
 
 import tumortrack
 from tumortrack.core.colours import part_colour
-from tumortrack.core.errors import InputError, StorageError
+from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.patient import NOBODY, UNKNOWN, Patient, Side
-from tumortrack.core.store import write_atomically
+from tumortrack.core.store import write_atomically, writing
 from tumortrack.core.types import FIRST_TUMOR, ORGAN, LabelVolume
 from tumortrack.imaging.dicom import Series, find_series
 from tumortrack.imaging.grid import tight_box
@@ -183,10 +183,8 @@ def write_dicom_seg(
     pixels = _labels_on(found, labels, str(folder))
     slices = [pydicom.dcmread(file, stop_before_pixels=True) for file in found.files]
     dataset = _segmentation(slices, pixels, parts)
-    try:
+    with writing(path):
         dataset.save_as(path)
-    except OSError as error:
-        raise StorageError(f"cannot write {path}: {error.strerror}.") from error
     return found.notes
 
 

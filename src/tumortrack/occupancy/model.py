@@ -23,7 +23,7 @@ from jaxtyping import Float32, Float64
 
 from tumortrack.core import store
 from tumortrack.core.config import Config, from_builtins, to_builtins
-from tumortrack.core.errors import ArtifactError, InputError, StorageError
+from tumortrack.core.errors import ArtifactError, InputError
 from tumortrack.models.folder import WEIGHTS
 from tumortrack.models.model import Model
 from tumortrack.occupancy.inference import CHUNK, Arithmetic, Inference, possible
@@ -104,10 +104,8 @@ def save(folder: Path, compiled: Compiled) -> Path:
     """Write it into a model folder, over an older one of the same machine and threads; StorageError
     where the disk refuses."""
     path = place_of(folder, compiled.machine, compiled.threads)
-    try:
+    with store.writing(path.parent):
         path.parent.mkdir(exist_ok=True)
-    except OSError as error:
-        raise StorageError(f"cannot write {path.parent}: {error.strerror}.") from error
     store.write_json(path, to_builtins(compiled))
     return path
 

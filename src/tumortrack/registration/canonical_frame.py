@@ -55,8 +55,8 @@ def upright_of(
     organ_ct: Mesh, up_lps: Direction, center_ct: Vector, long_axis: Vector
 ) -> CanonicalFrame:
     """The upright frame of an organ."""
-    half_mm = float(np.ptp(organ_ct.box_mm, axis=0).max()) / 2
-    return CanonicalFrame(facing_rotation(up_lps, long_axis), center_ct, UPRIGHT_MM / half_mm)
+    scale = UPRIGHT_MM / (organ_ct.longest_mm / 2)
+    return CanonicalFrame(facing_rotation(up_lps, long_axis), center_ct, scale)
 
 
 def generic_points(count: int) -> Float[np.ndarray, "p 3"]:

@@ -14,7 +14,7 @@ from msgspec import field
 
 from tumortrack.core import store
 from tumortrack.core.config import Config, from_builtins, to_builtins
-from tumortrack.core.errors import InputError, StorageError
+from tumortrack.core.errors import InputError
 from tumortrack.models.margins import METHOD, Kind, Radius
 
 Miss = tuple[float, float | None]  # outward miss or distance (mm), and s (mm)
@@ -55,10 +55,8 @@ def open_table(
         InputError: it was begun with another ``head``, or another process fills it.
         StorageError: the disk refused.
     """
-    try:
+    with store.writing(path):
         stream = path.open("a+b")
-    except OSError as error:
-        raise StorageError(f"cannot write {path}: {error.strerror}.") from error
     with stream:
         try:
             fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -70,12 +68,10 @@ def open_table(
         stream.truncate(len(whole))
 
         def add(data: object) -> None:
-            try:
+            with store.writing(path):
                 stream.write(json.dumps(data, allow_nan=False).encode() + b"\n")
                 stream.flush()
                 os.fsync(stream.fileno())
-            except OSError as error:
-                raise StorageError(f"cannot write {path}: {error.strerror}.") from error
 
         if not whole:
             add(head)

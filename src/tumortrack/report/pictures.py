@@ -198,7 +198,7 @@ def _draw_plane(
     through_mm: Float[np.ndarray, " 3"],
 ) -> None:
     """A slice, equally large in all planes, so that lengths compare."""
-    half = float(np.ptp(anatomy.organ.box_mm, axis=0).max()) / 2 + _MARGIN_MM
+    half = anatomy.organ.longest_mm / 2 + _MARGIN_MM
     right, down, _ = view.project(anatomy.organ.box_mm.mean(0)[None])[0].tolist()
     frame = Frame(right - _ASPECT * half, right + _ASPECT * half, down - half, down + half)
     shown, (low, high) = background

@@ -12,9 +12,9 @@ import numpy as np
 from rich.table import Table
 
 import tumortrack
-from tumortrack.core.errors import InputError, NoEstimate, StorageError
+from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.estimate import FAR_MM, Estimate
-from tumortrack.core.store import write_json
+from tumortrack.core.store import write_json, writing
 from tumortrack.core.types import SensorCloud
 from tumortrack.report import metrics
 from tumortrack.report.page import counts, number, page_scene, part_rows, write_page
@@ -58,11 +58,9 @@ def evaluate_scenes(
         StorageError: the disk refused.
     """
     folders = list_scenes(scenes_dir)
-    try:
+    with writing(out):
         (out / "scenes").mkdir(parents=True, exist_ok=True)
         (out / "report.json").unlink(missing_ok=True)  # never an old table beside new pictures
-    except OSError as error:
-        raise StorageError(f"cannot write {out}: {error.strerror}.") from error
     entries, shown = [], []
     for folder in folders:
         scene = read_scene(folder)

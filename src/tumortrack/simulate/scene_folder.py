@@ -158,7 +158,7 @@ def _check_parts(folder: Path, anatomy: Anatomy) -> None:
             "1, 2, 3, ... without a gap."
         )
     low, high = _ORGAN_SIZE_MM
-    size_mm = float(np.ptp(anatomy.organ.box_mm, axis=0).max())
+    size_mm = anatomy.organ.longest_mm
     if not low <= size_mm <= high:
         raise InputError(
             f"{folder / 'kidney.ply'} is {size_mm:.3g} wide; an organ has {low:g} to {high:g} mm. "

@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Literal
 
-import numpy as np
-
 from tumortrack.core.types import Anatomy
 from tumortrack.models.config import (
     MlpDecoderConfig,
@@ -54,9 +52,7 @@ def quick(anatomy: Anatomy, rotations: Rotations = "limited") -> TrainConfig:
     local = tuple(DragConfig(steps=CONFIGURATIONS[n]) for n in (3, 6))
     squeezed = tuple(ChainConfig(links=(drag, StretchConfig())) for drag in local)
     return TrainConfig(
-        network=quick_network(
-            len(anatomy.parts) + 1, float(np.ptp(anatomy.organ.box_mm, axis=0).max()) / 2
-        ),
+        network=quick_network(len(anatomy.parts) + 1, anatomy.organ.longest_mm / 2),
         scene=SceneConfig(
             pose=PoseConfig(rotations=rotations),
             deform=(*local, *squeezed),
@@ -76,12 +72,7 @@ def clinic(anatomy: Anatomy, rotations: Rotations = "limited") -> TrainConfig:
     """The default: registration of the organ's elastic body, learnt in minutes from scenes with
     sensor errors, occlusion and background."""
     elastic = ElasticConfig()
-    return _clinic(
-        elastic,
-        elastic.body.modes,
-        float(np.ptp(anatomy.organ.box_mm, axis=0).max()) / 2,
-        rotations,
-    )
+    return _clinic(elastic, elastic.body.modes, anatomy.organ.longest_mm / 2, rotations)
 
 
 def pretraining(rotations: Rotations = "limited") -> TrainConfig:

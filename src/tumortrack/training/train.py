@@ -22,7 +22,7 @@ import torch
 
 from tumortrack.core.errors import InputError, StorageError, TumortrackError
 from tumortrack.core.process import available_cores, keep_freed_memory
-from tumortrack.core.store import write_atomically
+from tumortrack.core.store import write_atomically, writing
 from tumortrack.models.model import Model, Network
 from tumortrack.simulate.scene import SceneStream
 from tumortrack.training.distributed import ProcessGroup, process_group
@@ -180,11 +180,9 @@ def work_folder(folder: Path, writes: bool = True) -> Iterator[Path]:
     if not writes:
         yield work
         return
-    try:
+    with writing(work):
         work.mkdir(parents=True, exist_ok=True)
         lock = (work / _LOCK).open("w")
-    except OSError as error:
-        raise StorageError(f"cannot write into {folder}: {error.strerror}.") from error
     with lock:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)

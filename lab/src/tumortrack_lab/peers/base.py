@@ -7,30 +7,29 @@ follow; so peers and network are compared by the same ``report.protocol.compare`
 
 from __future__ import annotations
 
-import time
-from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from types import SimpleNamespace
-from typing import Any, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float, Float64
 
-import tumortrack
 from tumortrack.core.errors import InputError
 from tumortrack.core.estimate import Estimate
 from tumortrack.core.geometry import rigid, transform_points
-from tumortrack.core.types import Anatomy, CameraLabels, Mesh, OccupancyCloud
-from tumortrack.imaging.raster import label_grid
-from tumortrack.models.report import describe_parts, grid_over
+from tumortrack.core.types import Anatomy, Mesh
+from tumortrack.models.report import estimate_of as of_surfaces
 from tumortrack.simulate.scene_folder import Scene
-from tumortrack_lab.peers.pose_search import Direction, Points, PoseSearch, Transform
+from tumortrack_lab.peers.pose_search import (
+    Direction,
+    Points,
+    PoseSearch,
+    RigidConfig,
+    Transform,
+)
 
 # Barycentric points of a tetrahedron that integrate quadratics exactly (Keast 1986, 4 points).
 _NEAR, _FAR = 0.1381966011250105, 0.5854101966249685
-CLOUD_POINTS = 40_000  # of an estimate, as many as the tracker asks for
 
 Carry = Callable[[Float[np.ndarray, "n 3"]], Float[np.ndarray, "n 3"]]
 
@@ -39,13 +38,11 @@ Carry = Callable[[Float[np.ndarray, "n 3"]], Float[np.ndarray, "n 3"]]
 class Fit:
     """A peer's answer for one scene.
 
-    ``carry``: points of the undeformed CT frame (LPS, mm) -> the camera frame (mm); ``seconds``:
-    what a frame costs, preparation excluded; ``report`` (JSON): ``start`` used, ``iterations``,
-    ``residual_mm``, whatever explains it.
+    ``carry``: points of the undeformed CT frame (LPS, mm) -> the camera frame (mm); ``report``
+    (JSON): whatever explains it.
     """
 
     carry: Carry
-    seconds: float
     report: dict = field(default_factory=dict)
 
 
@@ -53,40 +50,10 @@ class Fit:
 class Peer(Protocol):
     """A method made ready for one patient."""
 
-    name: str
-    prepare_s: float  # spent before the first frame
-
     def fit(self, scene: Scene) -> Fit:
         """Locate the anatomy in a scene. All but the bound use ``scene.cloud`` alone. Raises
         NoEstimate: the cloud has too little information, such as fewer than 20 points; InputError:
         the cloud or the peer's settings cannot be used."""
-
-
-class TimedPeer(ABC):
-    """What our own peers share: their preparation and each fit are timed."""
-
-    name: str
-    config: Any
-
-    def __init__(self, anatomy_ct: Anatomy, up_lps: Direction, config: Any = None) -> None:
-        self.config = config
-        with stopwatch() as watch:
-            self._prepare(anatomy_ct, up_lps)
-        self.prepare_s = watch.seconds
-
-    def fit(self, scene: Scene) -> Fit:
-        """See ``Peer.fit``."""
-        with stopwatch() as watch:
-            carry, report = self._fit(scene)
-        return Fit(carry, watch.seconds, report)
-
-    @abstractmethod
-    def _prepare(self, anatomy_ct: Anatomy, up_lps: Direction) -> None:
-        """What can be done before a cloud is seen."""
-
-    @abstractmethod
-    def _fit(self, scene: Scene) -> tuple[Carry, dict]:
-        """The map of a fit, and its report."""
 
 
 def rigid_carry(camera_from_ct: Transform) -> Carry:
@@ -100,66 +67,34 @@ def estimate_of(fit: Fit, anatomy_ct: Anatomy, stamp_ns: int = 0, grid: int = 16
     carried = [np.asarray(fit.carry(part.vertices_mm)) for part in anatomy_ct.parts]
     if not all(np.isfinite(points_mm).all() for points_mm in carried):
         raise InputError("the fit diverged: it carries points to NaN or infinity.")
-    pairs = zip(anatomy_ct.parts, carried, strict=True)
-    moved = Anatomy(tuple(part.moved(points_mm) for part, points_mm in pairs))
-    camera_from_index, shape = grid_over(moved.organ.vertices_mm, grid)
-    labels = label_grid(moved, camera_from_index, shape)
-    inside = np.flatnonzero(labels)
-    inside = inside[:: max(1, len(inside) // CLOUD_POINTS)]  # spread evenly
-    index = np.stack(np.unravel_index(inside, labels.shape), 1).astype(float)
-    points_mm = transform_points(camera_from_index, index)
-    # A peer knows no probabilities but 1.
-    cloud = OccupancyCloud(points_mm, labels.reshape(-1)[inside], np.ones(len(inside)), stamp_ns)
-    meshes = dict(zip(moved.names, moved.parts, strict=True))
-    report = {
-        "tumortrack": tumortrack.__version__,
-        "units": "mm",
-        "frame": "camera",
-        "stamp_ns": stamp_ns,
-        "voxel_mm": float(camera_from_index[0, 0]),
-        "parts": describe_parts(moved.names, meshes, cloud),
-        "timings": {"total": fit.seconds},
-        "fit": fit.report,
-    }
-    return Estimate(cloud, CameraLabels(labels, camera_from_index), meshes, report)
+    pairs = zip(anatomy_ct.names, anatomy_ct.parts, carried, strict=True)
+    meshes = {name: part.moved(points_mm) for name, part, points_mm in pairs}
+    return of_surfaces(meshes, grid, stamp_ns, fit=fit.report)
 
 
-@contextmanager
-def stopwatch() -> Iterator[SimpleNamespace]:
-    """Its ``seconds`` are those spent in the ``with`` block."""
-    watch, start = SimpleNamespace(), time.perf_counter()
-    yield watch
-    watch.seconds = time.perf_counter() - start
-
-
-class Rigid(TimedPeer):
+class Rigid:
     """The pose of least error as a peer."""
 
-    name = "rigid"
+    def __init__(self, anatomy_ct: Anatomy, up_lps: Direction, config: RigidConfig) -> None:
+        self._search = PoseSearch(anatomy_ct, up_lps, config)
 
-    def _prepare(self, anatomy_ct: Anatomy, up_lps: Direction) -> None:
-        self._search = PoseSearch(anatomy_ct, up_lps, self.config)
-
-    def _fit(self, scene: Scene) -> tuple[Carry, dict]:
+    def fit(self, scene: Scene) -> Fit:
         best = self._search.poses(scene.cloud)[0]
-        report = {"start": best.start, "residual_mm": best.error_mm}
-        return rigid_carry(best.camera_from_ct), report
+        return Fit(rigid_carry(best.camera_from_ct), {"residual_mm": best.error_mm})
 
 
-class RigidBound(TimedPeer):
+class RigidBound:
     """The best rigid pose there is, found with the truth in hand: least squares over the organ's
     whole volume, from the truth's own correspondence. Not a method anyone could use; no rigid
     method can beat it in that norm. Errors as of ``matched_vertices``."""
 
-    name = "rigid_bound"
-
-    def _prepare(self, anatomy_ct: Anatomy, up_lps: Direction) -> None:
+    def __init__(self, anatomy_ct: Anatomy, up_lps: Direction) -> None:
         self._organ = anatomy_ct.organ
 
-    def _fit(self, scene: Scene) -> tuple[Carry, dict]:
+    def fit(self, scene: Scene) -> Fit:
         reference = self._organ.moved(matched_vertices(self._organ, scene.reference.organ))
         camera_from_ct, residual_mm = fit_over_volume(self._organ, reference)
-        return rigid_carry(camera_from_ct), {"residual_mm": residual_mm, "start": "truth"}
+        return Fit(rigid_carry(camera_from_ct), {"residual_mm": residual_mm})
 
 
 def matched_vertices(rest: Mesh, moved: Mesh) -> Points:

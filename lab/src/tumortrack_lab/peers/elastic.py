@@ -23,7 +23,7 @@ from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import Anatomy
 from tumortrack.simulate.scene_folder import Scene
-from tumortrack_lab.peers.base import Carry, TimedPeer
+from tumortrack_lab.peers.base import Fit
 from tumortrack_lab.peers.pose_search import (
     CROP_PERCENT,
     Direction,
@@ -178,30 +178,26 @@ class _Pairs(NamedTuple):
     share: Float64[np.ndarray, " n"]  # a constant weight
 
 
-class ElasticPeer(TimedPeer):
-    """Fits from each of the best rigid poses and keeps the fit of least error."""
+class ElasticPeer:
+    """Fits from each of the best rigid poses and keeps the fit of least cost."""
 
-    name = "elastic"
-    config: ElasticPeerConfig
-
-    def _prepare(self, anatomy_ct: Anatomy, up_lps: Direction) -> None:
-        self._search = PoseSearch(anatomy_ct, up_lps, self.config.rigid)
-        mesh = tetrahedralise(anatomy_ct.organ, self.config.edge_mm, _ENVELOPE)
-        self.body = elastic_body(mesh, self.config.poisson, self.config.modes)
+    def __init__(self, anatomy_ct: Anatomy, up_lps: Direction, config: ElasticPeerConfig) -> None:
+        self.config = config
+        self._search = PoseSearch(anatomy_ct, up_lps, config.rigid)
+        mesh = tetrahedralise(anatomy_ct.organ, config.edge_mm, _ENVELOPE)
+        self.body = elastic_body(mesh, config.poisson, config.modes)
         self._surface = EmbeddedSurface(self.body, self._search)
-        variance = self.config.displacement_mm**2 * self.body.area_mm2
+        variance = config.displacement_mm**2 * self.body.area_mm2
         self._precision = self.body.stiffness * (1 / self.body.stiffness).sum() / variance
 
-    def _fit(self, scene: Scene) -> tuple[Carry, dict]:
+    def fit(self, scene: Scene) -> Fit:
         cloud = scene.cloud.points_mm.astype(float)
         poses = self._search.poses(scene.cloud)[: self.config.starts]
-        fits = [(pose.start, *self._fit_from(pose.camera_from_ct, cloud)) for pose in poses]
-        start, _, carry, report = min(fits, key=lambda fit: fit[1])
-        return carry, {"start": start, **report}
+        fits = (self._fit_from(pose.camera_from_ct, cloud) for pose in poses)
+        return min(fits, key=lambda fit: fit.report["cost"])
 
-    def _fit_from(self, camera_from_ct: Transform, cloud: Points) -> tuple[float, Carry, dict]:
-        """The cost of the fit from one pose, the map, its report. The limit beyond which points are
-        outliers shrinks during the iteration."""
+    def _fit_from(self, camera_from_ct: Transform, cloud: Points) -> Fit:
+        """The limit beyond which points are outliers shrinks during the iteration."""
         config = self.config
         state = _State(camera_from_ct, np.zeros(len(self._precision)))
         reach = np.geomspace(config.first_outlier_mm, config.outlier_mm, config.iterations // 2)
@@ -215,9 +211,7 @@ class ElasticPeer(TimedPeer):
                 break
         return self._candidate(state, cloud, iteration + 1)
 
-    def _candidate(
-        self, state: _State, cloud: Points, iterations: int
-    ) -> tuple[float, Carry, dict]:
+    def _candidate(self, state: _State, cloud: Points, iterations: int) -> Fit:
         """Starts are compared by the cost (data, Tukey's, and strain energy); the residual is the
         root mean square distance of the points that count."""
 
@@ -237,7 +231,7 @@ class ElasticPeer(TimedPeer):
             "residual_mm": float(residual),
             "displacement_mm": self._surface_rms(state.amplitudes),
         }
-        return report["cost"], carry, report
+        return Fit(carry, report)
 
     def _pairs(self, state: _State, points: Points, outlier_mm: float) -> _Pairs:
         """Cloud points and the surface points nearest to them; then the other way round, for the

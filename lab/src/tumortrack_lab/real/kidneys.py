@@ -13,7 +13,7 @@ endophytic below 0.25, exophytic from 0.5 up; between them neither.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -29,8 +29,6 @@ from tumortrack.imaging.volume import read_labels
 from tumortrack.report.metrics import distance_to_surface, surface_samples
 
 SET_ASIDE = (91, 93, 96, 146, 155)
-IN_USE = (0, 2, 3)
-EACH = 6  # of a kind
 NEAR_MM = 2.0
 KINDS = {"endophytic": (0.0, 0.25), "exophytic": (0.5, 1.01)}  # of the share: from, below
 ORGAN_ML, TUMOR_ML = (100.0, 400.0), (1.0, 100.0)
@@ -98,37 +96,6 @@ def prepared(data: Path, number: int, folder: Path) -> Case:
     if case.report.get("source_sha256") != store.sha256_of(path):
         raise InputError(f"{folder} was made from another label map; remove it.")
     return case
-
-
-def choose(data: Path, cases: Path, last: int = 209) -> list[dict[str, Any]]:
-    """Apply the rule, from the first number on until there are enough of each kind.
-
-    Raises:
-        InputError: a label map on the way is missing, or there are not enough of a kind.
-    """
-    taken: list[dict[str, Any]] = []
-    for number in range(last + 1):
-        if number in (*SET_ASIDE, *IN_USE):
-            continue
-        try:
-            path = label_map(data, number)
-            case = prepared(data, number, cases / name_of(number))
-        except InputError as error:
-            if not (data / "kits19" / name_of(number)).is_dir():
-                raise
-            print(f"{name_of(number)}: not taken: {error}")
-            continue
-        row = described(case, path)
-        fails, kind = row.pop("fails"), row["kind"]
-        if kind in KINDS and not fails and _count(taken, kind) < EACH:
-            taken.append({"case": number, **row})
-        if all(_count(taken, kind) == EACH for kind in KINDS):
-            return in_turn(taken)
-    raise InputError(f"up to {name_of(last)} there are not {EACH} kidneys of each kind.")
-
-
-def _count(rows: Iterable[dict[str, Any]], kind: str) -> int:
-    return sum(row["kind"] == kind for row in rows)
 
 
 def in_turn(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:

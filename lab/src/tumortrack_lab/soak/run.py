@@ -12,6 +12,8 @@ from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
+from tyro.conf import Positional
+
 from tumortrack import api
 from tumortrack.cli.console import keep_loaded
 from tumortrack.core.errors import InputError
@@ -40,11 +42,20 @@ while peer.recv(1 << 20):
 
 @dataclass(frozen=True, kw_only=True)
 class SoakConfig:
-    """``stale_s``: as of `track`; faults last 3 to 6 times as long. ``wrong_mm``: a part so far off
-    is wrong. ``within_s``: how soon a fault must be named. ``kinds``: of faults, empty: all."""
+    """Track while everything round it goes wrong.
 
-    model: Path
-    case: Path
+    Attributes:
+        model: folder that `train` wrote.
+        case: folder that `prepare` wrote.
+        stale_s: older frames are refused, s; faults last 3 to 6 times as long.
+        wrong_mm: a part so far off is wrong.
+        within_s: how soon a fault must be named.
+        kinds: of faults; empty: all.
+        table: file for the Markdown tables, which are also printed.
+    """
+
+    model: Positional[Path] = Path("runs/demo/model")
+    case: Positional[Path] = Path("runs/demo/case")
     minutes: float = 60.0
     fps: float = 30.0
     seed: int = 0
@@ -52,6 +63,7 @@ class SoakConfig:
     wrong_mm: float = 5.0
     within_s: float = 0.5
     kinds: tuple[str, ...] = ()
+    table: Path | None = None
 
 
 def soak(config: SoakConfig, folder: Path) -> tuple[str, list[str]]:

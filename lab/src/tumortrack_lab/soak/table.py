@@ -8,11 +8,12 @@ import numpy as np
 
 from tumortrack_lab.soak.faults import FAULTS
 from tumortrack_lab.soak.judge import Answer, Judge
+from tumortrack_lab.study.document import table
 
 
 def document(judge: Judge, summary: dict[str, Any], about: str) -> str:
     """The run's figures, and a row per kind of fault."""
-    return "\n".join([about, "", *_figures(judge, summary), "", *_faults(judge), ""])
+    return "\n\n".join([about, _figures(judge, summary), _faults(judge)]) + "\n"
 
 
 def memory_marks(judge: Judge) -> dict[str, float]:
@@ -24,7 +25,7 @@ def memory_marks(judge: Judge) -> dict[str, float]:
     return {name: float(megabytes[int(np.abs(times - at).argmin())]) for name, at in marks.items()}
 
 
-def _figures(judge: Judge, summary: dict[str, Any]) -> list[str]:
+def _figures(judge: Judge, summary: dict[str, Any]) -> str:
     counts, latency, error = judge.counts, judge.latency.summary(), judge.error_mm.summary()
     results = sum(counts[quality] for quality in ("good", "poor", "none"))
     memory = ", ".join(f"{mb:.0f} ({name})" for name, mb in memory_marks(judge).items())
@@ -47,28 +48,22 @@ def _figures(judge: Judge, summary: dict[str, Any]) -> list[str]:
             f"{sink['delivered']:,} delivered, {sink['dropped']:,} missed, {sink['errors']:,} "
             "errors (of the faults)"
         )
-    return ["| | |", "|---|---|", *(f"| {name} | {row} |" for name, row in rows.items())]
+    return table(("", ""), [*rows.items()], left=2)
 
 
-def _faults(judge: Judge) -> list[str]:
-    head = [
-        "| fault | times | named after (median; longest), s | in these words | good again after "
-        "(longest), s |",
-        "|---|---|---|---|---|",
-    ]
-    return head + [
-        _row(kind, [one for one in judge.answers.values() if one.fault.kind == kind])
-        for kind in FAULTS
-    ]
+def _faults(judge: Judge) -> str:
+    head = (
+        "fault", "times", "named after (median; longest), s", "in these words",
+        "good again after (longest), s",
+    )  # fmt: skip
+    each = {kind: [a for a in judge.answers.values() if a.fault.kind == kind] for kind in FAULTS}
+    return table(head, [_row(kind, answers) for kind, answers in each.items()], left=4)
 
 
-def _row(kind: str, answers: list[Answer]) -> str:
+def _row(kind: str, answers: list[Answer]) -> list[str]:
     if not answers:
-        return f"| {kind} | 0 | | | |"
+        return [kind, "0", "", "", ""]
     named = [answer.named_s for answer in answers]
     back_s = max(answer.back_s for answer in answers)
-    words = answers[0].words[:90]
-    return (
-        f"| {kind} | {len(answers)} | {np.median(named):.2f}; {max(named):.2f} | {words} | "
-        f"{back_s:.2f} |"
-    )
+    late = f"{np.median(named):.2f}; {max(named):.2f}"
+    return [kind, f"{len(answers)}", late, answers[0].words[:90], f"{back_s:.2f}"]

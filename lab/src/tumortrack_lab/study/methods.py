@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import tumortrack
 import tumortrack_lab.peers
@@ -37,7 +37,7 @@ _UP_LPS = (0.0, -1.0, 0.0)
 _VOXEL_MM = 0.8  # of the phantoms' labels
 CLINIC = "clinic"
 # Preset and rotations of each model; `quick` stands for the paper's two, of which it is neither.
-MODELS = {
+MODELS: dict[str, tuple[str, Literal["limited", "full"]]] = {
     CLINIC: ("clinic", "limited"), "M_lim": ("quick", "limited"), "M_full": ("quick", "full"),
 }  # fmt: skip
 

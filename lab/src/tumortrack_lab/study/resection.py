@@ -91,7 +91,7 @@ def truth() -> Method:
     """Answers what is so: the bound of every planner."""
 
     def locate(scene: Scene, grid: int) -> Estimate:
-        still = Fit(lambda points: points, 0.0)
+        still = Fit(lambda points: points)
         return scattered(
             estimate_of(still, scene.reference, scene.cloud.stamp_ns, max(grid, _FINE))
         )

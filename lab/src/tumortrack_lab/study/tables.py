@@ -18,7 +18,6 @@ from tumortrack_lab.study.tumor_sites import TumorSite
 NOT_FOUND, NOTHING, EMPTY = "not found", "–", ""
 ORGAN = "kidney"  # its rows stand for their scenes
 _DISTANCES = ["hausdorff_mm", "center_mm", "target_mm"]
-_POINTS = ["depth_mm", "displacement_mm", "error_mm"]  # of points of a tumor's surface: lists
 _NAMES = ["case", "method", "variant", "part"]
 METHODS = {
     "M_lim": "slim network, limited turns",  # `quick`: not the paper's network, nor
@@ -33,7 +32,7 @@ Sites = dict[str, TumorSite]
 def tidy(rows: list[dict[str, Any]]) -> pd.DataFrame:
     """One row for each scene and part; ``carries``: whether the method carries points."""
     frame = pd.DataFrame(rows)
-    frame = frame.reindex(columns=[*dict.fromkeys([*frame.columns, *_DISTANCES, *_POINTS])])
+    frame = frame.reindex(columns=[*dict.fromkeys([*frame.columns, *_DISTANCES])])
     frame["carries"] = frame.target_mm.notna()
     frame[_DISTANCES] = frame[_DISTANCES].astype(float).fillna(np.inf)
     return ordered(frame, _NAMES)

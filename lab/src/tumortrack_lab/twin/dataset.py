@@ -21,7 +21,6 @@ import numpy as np
 from tumortrack.core import store
 from tumortrack.core.config import to_builtins
 from tumortrack.core.errors import ArtifactError, InputError
-from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import Anatomy
 from tumortrack.imaging.case import Case, load_case
 from tumortrack.simulate.scene_folder import TARGETS, InnerPoints, draw_targets, write_scene_files
@@ -104,10 +103,9 @@ def make_scenes(
                 scene, targets_mm = viewing.make_scene(state, variant, view, config, run.seed)
                 meta = {**identity, **scene.meta}
                 scene = replace(scene, meta=meta, targets=targets.at(targets_mm))
-                rest = rest_ct.moved(transform_points(state.bench_from_ct, rest_ct.vertices_mm))
                 with store.new_folder(out / f"{variant}-{view}") as aside:
                     write_scene_files(aside, scene)
-                    twin_picture(scene, state, rest, aside / "scene.png")
+                    twin_picture(scene, aside / "scene.png")
                 done += 1.0
                 say(f"{variant}-{view}")
     names = [f"{variant}-{view}" for variant in VARIANTS for view in VIEWS]

@@ -18,7 +18,7 @@ import numpy as np
 import tumortrack
 from tumortrack.core.config import to_builtins
 from tumortrack.core.errors import InputError, StorageError
-from tumortrack.core.store import read_json, write_json
+from tumortrack.core.store import read_json, write_json, writing
 from tumortrack.live.display import wxyz_of
 from tumortrack.live.recording.folders import ABOUT, FRAMES, INDEX, SHAPES, FrameFolders, report
 from tumortrack.live.ros.messages import MM_PER_M, Messages, Outgoing, xyz
@@ -58,15 +58,13 @@ class RecordingSinkConfig(SinkConfig, frozen=True, kw_only=True, tag="recording"
         """Raises InputError if the folder exists, and is no recording or ``overwrite`` was not
         given."""
         _make_room(self.path, self.overwrite)
-        try:
+        with writing(self.path):
             self.path.parent.mkdir(parents=True, exist_ok=True)
             sink: McapFile | FrameFolders
             if self.format == "mcap":
                 sink = McapFile(self.path, context, self.frames, self.meshes_hz)
             else:
                 sink = FrameFolders(self.path, self.frames)
-        except OSError as error:
-            raise StorageError(f"cannot write {self.path}: {error.strerror or error}.") from error
         frame = context.published_frame
         about = {
             "kind": _KIND,
