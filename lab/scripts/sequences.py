@@ -20,13 +20,15 @@ import tyro
 from tumortrack import api
 from tumortrack.cli.console import say
 from tumortrack.core import store
+from tumortrack.core.config import to_builtins
 from tumortrack.core.errors import InputError, TumortrackError
 from tumortrack.tracking.tracker import Tracker
 from tumortrack_lab.study import trainings
+from tumortrack_lab.twin.dataset import claim
 from tumortrack_lab.world import colour, following
 from tumortrack_lab.world.films import Film, FilmConfig, read_film, write_film
 from tumortrack_lab.world.paths import KINDS
-from tumortrack_lab.world.scenes import World
+from tumortrack_lab.world.scenes import TETS, World, WorldConfig
 
 
 @dataclass(frozen=True)
@@ -68,7 +70,12 @@ def main(options: Options) -> None:
     if options.views not in (1, 3):
         raise InputError(f"--views is {options.views}; allowed: 1, 3.")
     config = FilmConfig(seed=options.seed, fps=options.fps, views=options.views)
-    world = World.kept(options.case, options.out, "sequences.json", config)
+    identity = {
+        "case_sha256": store.sha256_of(options.case / store.MANIFEST),
+        "config": to_builtins(config),
+    }
+    claim(options.out, "sequences.json", identity)
+    world = World.opened(options.case, WorldConfig(), options.out / TETS)
     wanted = [(kind, number) for number in range(options.count) for kind in options.kinds]
     todo = [(k, n) for k, n in wanted if not (options.out / f"{k}-{n:03d}").exists()]
     start = time.monotonic()

@@ -46,7 +46,7 @@ _VIEWS_DEGREES = (0.0, 45.0, -45.0)  # about the organ's length
 _NEAREST_MM = (110.0, 190.0)  # so that an organ that is pushed stays in the picture
 _MOST_TILT = 25.0  # of the first camera, degrees
 _BEGIN_NS = 1_700_000_000_000_000_000
-_ATTEMPTS = 8  # loads, until one has equilibria all along
+_ATTEMPTS = 4  # loads, until one has equilibria all along
 # Of a calibration between cameras, one standard deviation each: an assumption.
 _POSE_MM, _POSE_DEGREES = 0.5, 0.2
 
