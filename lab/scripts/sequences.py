@@ -20,13 +20,15 @@ import tyro
 from tumortrack import api
 from tumortrack.cli.console import say
 from tumortrack.core import store
+from tumortrack.core.config import to_builtins
 from tumortrack.core.errors import InputError, TumortrackError
 from tumortrack.tracking.tracker import Tracker
 from tumortrack_lab.study import trainings
-from tumortrack_lab.world import following
-from tumortrack_lab.world.films import FilmConfig, read_film, write_film
+from tumortrack_lab.twin.dataset import claim
+from tumortrack_lab.world import colour, following
+from tumortrack_lab.world.films import Film, FilmConfig, read_film, write_film
 from tumortrack_lab.world.paths import KINDS
-from tumortrack_lab.world.scenes import World
+from tumortrack_lab.world.scenes import TETS, World, WorldConfig
 
 
 @dataclass(frozen=True)
@@ -47,9 +49,11 @@ class Options:
     """Frames a second."""
     seed: int = 0
     """Of everything."""
+    colour: bool = False
+    """Also pictures of a colour camera in each one's place (0.2 s a frame and camera)."""
     model: Path | None = None
     """Follow with it (folder that `tumortrack train` wrote)."""
-    methods: tuple[str, ...] = ("track", "first look")
+    methods: tuple[str, ...] = ("track", "first-look")
     """How; see tumortrack_lab.world.following."""
     version: str = ""
     """Of the program, if several are to be compared: kept apart, and named in the table."""
@@ -66,7 +70,12 @@ def main(options: Options) -> None:
     if options.views not in (1, 3):
         raise InputError(f"--views is {options.views}; allowed: 1, 3.")
     config = FilmConfig(seed=options.seed, fps=options.fps, views=options.views)
-    world = World.kept(options.case, options.out, "sequences.json", config)
+    identity = {
+        "case_sha256": store.sha256_of(options.case / store.MANIFEST),
+        "config": to_builtins(config),
+    }
+    claim(options.out, "sequences.json", identity)
+    world = World.opened(options.case, WorldConfig(), options.out / TETS)
     wanted = [(kind, number) for number in range(options.count) for kind in options.kinds]
     todo = [(k, n) for k, n in wanted if not (options.out / f"{k}-{n:03d}").exists()]
     start = time.monotonic()
@@ -78,27 +87,26 @@ def main(options: Options) -> None:
             what = f"failed: {error}"
         left_min = (time.monotonic() - start) / done * (len(todo) - done) / 60
         say(f"{done}/{len(todo)} {kind}-{number:03d} {what}; {left_min:.0f} min left")
+    folders = [options.out / f"{kind}-{number:03d}" for kind, number in wanted]
+    films = [read_film(folder) for folder in folders if folder.exists()]
+    for done, film in enumerate(films if options.colour else (), start=1):
+        if not (film.folder / "colour.json").exists():
+            colour.paint(film)
+            say(f"{done}/{len(films)} {film.folder.name} painted")
     if options.model is not None:
-        _follow(options, [f"{kind}-{number:03d}" for kind, number in wanted])
+        _follow(options, options.model, films)
 
 
-def _follow(options: Options, names: list[str]) -> None:
-    assert options.model is not None
-    tracker = Tracker(api.load_model(options.model, "cpu"))
-    about = {
-        "model_sha256": store.sha256_of(options.model / store.MANIFEST),
-        "version": options.version,
-    }
-    made = [name for name in names if (options.out / name).exists()]
-    for done, name in enumerate(made, start=1):
-        film = read_film(options.out / name)
+def _follow(options: Options, model: Path, films: list[Film]) -> None:
+    tracker, sha256 = Tracker(api.load_model(model, "cpu")), store.sha256_of(model / store.MANIFEST)
+    about = {"model_sha256": sha256, "version": options.version}
+    for done, film in enumerate(films, start=1):
         for method in options.methods:
-            called = f"{method} {options.version}".strip()
-            path = film.folder / f"{called.replace(' ', '-')}.json"
-            locate = following.METHODS[method](tracker)
-            rows = trainings.kept(path, about, partial(following.judge, locate, film))
-            errors = pd.DataFrame(rows)["center_mm"]
-            say(f"{done}/{len(made)} {name}, {called}: centre {errors.median():.1f} mm off")
+            called = "-".join(filter(None, (method, options.version)))
+            judge = partial(following.judge, following.METHODS[method](tracker), film)
+            rows = trainings.kept(film.folder / f"{called}.json", about, judge)
+            errors = pd.DataFrame(rows).reindex(columns=["center_mm"])["center_mm"]
+            say(f"{done}/{len(films)} {film.folder.name}, {called}: {errors.median():.1f} mm off")
     rows = [row for out in (options.out, *options.others) for row in following.rows_in(out)]
     found = pd.DataFrame(rows)
     text = following.summary(found)

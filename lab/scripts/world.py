@@ -4,37 +4,36 @@
 
 Writes scene folders into OUT, which `tumortrack evaluate` reads. The same command goes on where it
 was stopped. OUT/world.json states case, seed and configuration, OUT/failures.json the states that
-found no equilibrium and the views in which no organ was found, OUT/measured.json and table.md what
-a model makes of them. `--disturb strays fat ...` makes scenes that should be met with silence.
+found no equilibrium and the views in which no organ was found, OUT/measured.json what a model makes
+of them. `--disturb strays fat ...` makes scenes that should be met with silence, and with `--states
+FOLDER` in states that are solved already (0.3 s a scene). Tables of several organs: the same for
+each, and the last with `--beside` the others.
 """
 
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Annotated
 
-import numpy as np
-import pandas as pd
 import tyro
 
-from tumortrack import api
 from tumortrack.cli.console import say
 from tumortrack.core import store
-from tumortrack.core.errors import InputError, NoEstimate, TumortrackError
-from tumortrack.core.geometry import transform_points
-from tumortrack.report.metrics import box_center_distance
-from tumortrack.simulate.scene_folder import Scene, read_scene
-from tumortrack.tracking.tracker import Tracker
-from tumortrack_lab.peers.base import kabsch
-from tumortrack_lab.real.judging import quantiles
+from tumortrack.core.config import to_builtins
+from tumortrack.core.errors import InputError, TumortrackError
+from tumortrack.simulate.scene_folder import Scene, list_scenes, read_scene
 from tumortrack_lab.study import trainings
-from tumortrack_lab.study.document import table
+from tumortrack_lab.study.document import ReportWriter
+from tumortrack_lab.twin.dataset import claim
+from tumortrack_lab.world import estimates
 from tumortrack_lab.world.families import FAMILIES
-from tumortrack_lab.world.scenes import DISTURBANCES, World, WorldConfig
+from tumortrack_lab.world.scenes import DISTURBANCES, TETS, World, WorldConfig
 
-_SAVE_EVERY = 20
+_ABOUT, _FAILURES = "world.json", "failures.json"
 
 
 @dataclass(frozen=True)
@@ -46,7 +45,7 @@ class Options:
     out: tyro.conf.Positional[Path]
     """Folder of the scenes."""
     count: int = 320
-    """Scenes that are tried; families take turns."""
+    """States that are tried; families take turns."""
     seed: int = 0
     """Of everything."""
     families: tuple[str, ...] = tuple(FAMILIES)
@@ -55,8 +54,17 @@ class Options:
     """Which disturbances take turns; none: undisturbed scenes."""
     segmentation: float = 0.6
     """Share of scenes whose true organ differs from the case as segmentations err."""
+    states: Path | None = None
+    """Undisturbed scenes of this case that this command made: their states are seen again, instead
+    of new ones being solved."""
+    draws: int = 1
+    """How often each of these."""
     model: Path | None = None
     """Measure it (folder that `tumortrack train` wrote)."""
+    beside: tuple[Path, ...] = ()
+    """Other organs' scenes that are measured already: they join the tables."""
+    document: Path | None = None
+    """Its block of undisturbed or of disturbed scenes is replaced."""
 
 
 def main(options: Options) -> None:
@@ -64,111 +72,78 @@ def main(options: Options) -> None:
     for names, known in ((options.families, FAMILIES), (options.disturb, DISTURBANCES)):
         if unknown := sorted(set(names) - set(known)):
             raise InputError(f"{unknown[0]!r} is not known; allowed: {', '.join(known)}.")
+    block = "world" if set(options.disturb) == {"none"} else "world-disturbed"
+    writer = ReportWriter(options.document or Path(), trainings.make_command("world"))
+    if options.document is not None:
+        writer.check([block])
     config = WorldConfig(
         seed=options.seed,
         families=options.families,
         disturbances=options.disturb,
         segmentation=options.segmentation,
     )
-    world = World.kept(options.case, options.out, "world.json", config)
-    failures_path = options.out / "failures.json"
+    world = _open(options, config)
+    scenes = _scenes(options, world)
+    failures_path = options.out / _FAILURES
     failures = store.read_json(failures_path) if failures_path.exists() else {}
-    names = {n: "-".join((f"{n:05d}", *world.recipe(n))) for n in range(options.count)}
-    todo = [n for n, name in names.items() if name not in failures]
-    todo = [n for n in todo if not (options.out / names[n]).exists()]
+    todo = [n for n in scenes if n not in failures and not (options.out / n).exists()]
     start, used = time.monotonic(), time.process_time()
-    for done, number in enumerate(todo, start=1):
+    for done, name in enumerate(todo, start=1):
         try:
-            world.scene(number).write(options.out / names[number])
+            scenes[name]().write(options.out / name)
         except TumortrackError as error:
-            failures[names[number]] = f"{type(error).__name__}: {error}"
+            failures[name] = f"{type(error).__name__}: {error}"
             store.write_json(failures_path, failures)
         left_min = (time.monotonic() - start) / done * (len(todo) - done) / 60
         each_s = (time.process_time() - used) / done
         say(
-            f"{done}/{len(todo)} {names[number]}: {left_min:.0f} min left, {each_s:.1f} s of one "
-            f"core a scene, {len(failures)} failed"
+            f"{done}/{len(todo)} {name}: {left_min:.0f} min left, {each_s:.1f} s of one core a "
+            f"scene, {len(failures)} failed"
         )
     if options.model is not None:
-        made = [name for name in names.values() if (options.out / name).exists()]
-        rows = _measured(options.model, world, options.out, made)
-        text = _summary(rows, {k: v for k, v in failures.items() if k in names.values()})
-        store.write_atomically(options.out / "table.md", text.encode())
+        made = [name for name in scenes if (options.out / name).exists()]
+        estimates.measure(options.model, world.anatomy_ct, options.out, made)
+        folders = [options.out, *options.beside]
+        paths = [path for folder in folders if (path := folder / _FAILURES).exists()]
+        lost = [why for path in paths for why in store.read_json(path).values()]
+        text = estimates.summary(estimates.read_rows(folders), lost)
         print(text)
+        if options.document is not None:
+            writer.write({block: f"`{writer.command}`\n\n{text}"})
 
 
-def _measured(model: Path, world: World, out: Path, names: list[str]) -> pd.DataFrame:
-    """A row a tumor and scene, kept by model."""
-    path, about = out / "measured.json", store.sha256_of(model / store.MANIFEST)
-    kept = store.read_json(path) if path.exists() else {}
-    rows = kept.get("rows", {}) if kept.get("model_sha256") == about else {}
-    tracker = Tracker(api.load_model(model, "cpu"))
-    todo = [name for name in names if name not in rows]
-    for done, name in enumerate(todo, start=1):
-        rows[name] = _judge(tracker, world, read_scene(out / name))
-        if done % _SAVE_EVERY == 0 or done == len(todo):
-            store.write_json(path, {"model_sha256": about, "rows": rows})
-            say(f"measured {done}/{len(todo)}")
-    return pd.DataFrame([{"scene": name, **row} for name in names for row in rows[name]])
+def _scenes(options: Options, world: World) -> dict[str, Callable[[], Scene]]:
+    """What makes each scene, by its name."""
+    if options.states is None:
+        numbers = {"-".join((f"{n:05d}", *world.recipe(n))): n for n in range(options.count)}
+        return {name: partial(world.scene, n) for name, n in numbers.items()}
+    shown = lru_cache(1)(lambda folder: world.kept(read_scene(folder)))  # its draws in turn
+    scenes: dict[str, Callable[[], Scene]] = {}
+    for folder in list_scenes(options.states):
+        state, family, kind = folder.name.split("-")
+        if kind != "none" or int(state) >= options.count or family not in options.families:
+            continue
+        for draw in range(options.draws):
+            _, other = world.recipe(int(state), options.draws, draw)
+            n = int(state) * options.draws + draw
+            make = partial(lambda f, n, kind: world.again(shown(f), n, kind), folder, n, other)
+            scenes[f"{n:05d}-{family}-{other}"] = make
+    return scenes
 
 
-def _judge(tracker: Tracker, world: World, scene: Scene) -> list[dict]:
-    """Errors of each tumor's centre, of the estimate and of the best rigid pose there is."""
-    meta = scene.meta
-    about = {
-        "family": meta["family"],
-        "disturbance": meta["disturbance"]["kind"],
-        "segmentation": meta["segmentation"]["kind"],
-        "hidden_share": meta["hidden_share"],
-        "visible_share": meta["visible_share"],
-    }
-    try:
-        estimate = tracker.follow(scene.cloud, seen=scene.depth)
-        about |= {"verdict": estimate.quality, "reason": estimate.reason}
-        found = estimate.meshes
-    except NoEstimate as error:
-        about |= {"verdict": "none", "reason": str(error)}
-        found = {}
-    if scene.targets is None:  # not the model's organ: there is no right answer
-        return [about]
-    weights = np.array([part.volume_mm3 for part in world.anatomy_ct.parts])
-    weights /= np.maximum(np.bincount(scene.targets.labels, minlength=len(weights) + 1)[1:], 1)
-    best = kabsch(
-        scene.targets.points_ct, scene.targets.points_mm, weights[scene.targets.labels - 1]
-    )
-    rows = []
-    for number, truth in enumerate(scene.reference.tumors, start=1):
-        rest = world.anatomy_ct.tumors[number - 1]
-        rigid = rest.moved(transform_points(best, rest.vertices_mm))
-        row = {**about, "tumor": number, "rigid_mm": box_center_distance(rigid, truth)}
-        if f"tumor_{number}" in found:
-            row["center_mm"] = box_center_distance(found[f"tumor_{number}"], truth)
-        rows.append(row)
-    return rows
-
-
-def _summary(rows: pd.DataFrame, failures: dict[str, str]) -> str:
-    """A Markdown table: a line a family, or a disturbance where there are any."""
-    key = "family" if set(rows["disturbance"]) == {"none"} else "disturbance"
-    place = 1 if key == "family" else 2
-    head = [key, "scenes", "failed", "none, poor, good", "good: mm", "poor: mm", "rigid: mm"]
-    body = []
-    for name in [*rows[key].unique(), "all"]:
-        mine = rows if name == "all" else rows[rows[key] == name]
-        lost = sum(name in ("all", scene.split("-")[place]) for scene in failures)
-        first = mine.drop_duplicates("scene")
-        counts = [str((first["verdict"] == verdict).sum()) for verdict in ("none", "poor", "good")]
-        errors = (
-            quantiles(mine[mine["verdict"] == v].get("center_mm", ())) for v in ("good", "poor")
-        )
-        cells = [name, str(len(first)), str(lost), ", ".join(counts), *errors]
-        body.append([*cells, quantiles(mine.get("rigid_mm", ()))])
-    reasons = pd.Series([reason.partition(":")[0] for reason in failures.values()], dtype=str)
-    why = ", ".join(f"{name} {count}" for name, count in reasons.value_counts().items())
-    return (
-        f"{table(head, body, 1)}\n\nErrors of tumor centres: median / 90th / 95th percentile / "
-        f"worst. rigid: the best rigid pose. Failed: {why or 'none'}.\n"
-    )
+def _open(options: Options, config: WorldConfig) -> World:
+    """The world of the folder; stated there, with its tetrahedra, when it is new."""
+    out = options.out
+    sha256 = store.sha256_of(options.case / store.MANIFEST)
+    identity = {"case_sha256": sha256, "config": to_builtins(config)}
+    source = options.states or out
+    if options.states is not None:
+        kept = store.read_json(source / _ABOUT)
+        if kept["case_sha256"] != sha256:
+            raise InputError(f"{source} shows another case than {options.case}.")
+        identity |= {"states": kept, "draws": options.draws}
+    claim(out, _ABOUT, identity)
+    return World.opened(options.case, config, source / TETS)
 
 
 if __name__ == "__main__":

@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pandas as pd
 import pytest
+from PIL import Image
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
@@ -17,9 +18,9 @@ from tumortrack.core.estimate import OneWay
 from tumortrack.core.geometry import transform_points
 from tumortrack.live.sources.recording import RecordingSourceConfig
 from tumortrack.report.metrics import surface_samples
-from tumortrack.sense.camera import deproject
+from tumortrack.sense.camera import deproject, project
 from tumortrack_lab.peers.base import kabsch
-from tumortrack_lab.world import following
+from tumortrack_lab.world import colour, following
 from tumortrack_lab.world.films import FilmConfig, read_film, write_film
 from tumortrack_lab.world.paths import BEFORE_S, LoadPath, random_path
 from world_objects import organ, world
@@ -118,12 +119,10 @@ def test_all_cameras_see_the_true_surface_where_their_poses_say(film) -> None:
     for frame, pose in zip(film.looks(0), poses, strict=True):
         seen = transform_points(pose, deproject(frame).astype(float))
         near = seen[((seen > low) & (seen < high)).all(1)]
+        assert np.median(surface.query(near)[0]) < 1.5  # the bed is in the box as well
         assert len(near) > 500
-        distance = surface.query(near)[0]
-        assert np.median(distance) < 1.5
-    sides = poses[1:, :3, :3]  # 45 degrees to either side
-    angles = [np.rad2deg(Rotation.from_matrix(r).magnitude()) for r in sides]
-    assert all(20.0 < angle < 70.0 for angle in angles)
+    sides = Rotation.from_matrix(poses[1:, :3, :3]).magnitude()  # from the first one
+    np.testing.assert_allclose(np.rad2deg(sides), 45.0)
 
 
 def test_the_product_plays_what_a_camera_saw(film) -> None:
@@ -132,6 +131,27 @@ def test_the_product_plays_what_a_camera_saw(film) -> None:
     source.close()
     assert second.stamp_ns - first.stamp_ns == 1_000_000_000
     np.testing.assert_array_equal(first.content.depth_mm, film.looks(0)[1].depth_mm)
+
+
+def test_what_is_painted_moves_with_the_tissue(film) -> None:
+    colour.paint(film)
+    before, after = 0, int(np.argmax(film.bend_mm))
+    shades = []
+    for number in (before, after):
+        picture = film.folder / "colour_0" / f"{film.stamps_ns[number]}.jpg"
+        pixels = np.asarray(Image.open(picture)).astype(float) + 1
+        frame, points = film.looks(number)[0], film.truth(number).organ.vertices_mm
+        pixel, depth = project(points, frame.intrinsics)
+        column, row = np.rint(pixel).astype(int).T
+        seen = np.abs(frame.depth_mm[row, column] - depth) < 2.0
+        shades.append(np.where(seen, np.log(pixels[row, column, 1]), np.nan))
+    both = np.isfinite(shades).all(0)
+    assert both.sum() > 100
+    near = cKDTree(points[both]).query(points[both], 15)[1]  # lamps light what is near alike
+    veins = [green[both] - green[both][near].mean(1) for green in shades]
+    assert np.corrcoef(veins)[0, 1] > 0.2  # 240 places: by chance 0.06
+    moved = np.linalg.norm(film.vertices_mm[after] - film.vertices_mm[before], axis=1)
+    assert moved.max() > 5.0
 
 
 def off_by(film, shift_mm: float, lost: set[int], doubted: set[int]):
@@ -161,7 +181,8 @@ def test_a_followers_errors_are_judged_as_large_as_they_are(film) -> None:
     found = rows[rows["quality"] != "none"]
     np.testing.assert_allclose(found["center_mm"], 4.0, atol=1e-3)
     np.testing.assert_allclose(found["targets_mm"], 4.0, atol=1e-3)
-    assert (found["hausdorff_mm"] > 3.0).all()
+    assert (found["hausdorff_mm"].dropna() > 3.0).all()
+    assert found["hausdorff_mm"].notna().sum() > 1
     assert rows["center_mm"].isna().tolist() == (rows["quality"] == "none").tolist()
     assert (rows["rigid_center_mm"] < rows["bend_mm"] + 0.1).all()
     about = {"method": "track", "organ": "a", "sequence": "push-000", "kind": "push"}

@@ -3,7 +3,9 @@ camera's noise against its own law, and scenes that replay."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,14 +14,17 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial.transform import Rotation
 
 from tumortrack.core import store
+from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import Anatomy, Mesh
 from tumortrack.sense.camera import d405
+from tumortrack.simulate.scene_folder import read_scene
+from tumortrack.tracking.tracker import Tracker
 from tumortrack_lab.peers.base import kabsch
 from tumortrack_lab.tets import TetMesh, tetrahedralise
 from tumortrack_lab.twin.equilibrium import Rod, settle
 from tumortrack_lab.twin.solid import NeoHookeanSolid
-from tumortrack_lab.world import segmentation
+from tumortrack_lab.world import estimates, segmentation
 from tumortrack_lab.world.families import FAMILIES, Deformed, solve
 from tumortrack_lab.world.forces import Bed, Capsule, LoadedBody, Springs, Touch, Weight
 from tumortrack_lab.world.noise import StereoCamera, StereoConfig
@@ -223,6 +228,80 @@ def test_the_same_number_is_the_same_scene_to_the_byte(tmp_path) -> None:
     assert digests[0] == digests[1]
     made.scene(5).write(tmp_path / "c")
     assert store.sha256_of(tmp_path / "c") != digests[0]
+
+
+def test_a_kept_state_is_seen_again_from_elsewhere(tmp_path) -> None:
+    first = world(families=("rest", "plate", "cut"), hidden=0.0)
+    other = world(seed=9, disturbances=("hidden",))
+    for number in range(3):
+        first.scene(number).write(tmp_path / str(number))
+        kept = read_scene(tmp_path / str(number))
+        again = other.again(other.kept(kept), 5, "hidden")
+        there = []
+        for scene in (kept, again):
+            assert scene.meta["case_sha256"] == first.case_sha256
+            assert scene.meta["state"] == f"0-{number}"
+            assert scene.targets is not None
+            back = np.linalg.inv(np.array(scene.meta["camera_from_bench"]))
+            points = [scene.targets.points_mm, scene.reference.tumors[0].vertices_mm]
+            there.append(transform_points(back, np.concatenate(points)))
+        np.testing.assert_array_equal(again.targets.points_ct, kept.targets.points_ct)
+        np.testing.assert_allclose(there[0], there[1], atol=1e-3)
+        views = [np.array(scene.meta["camera_from_bench"]) for scene in (kept, again)]
+        assert np.abs(views[0] - views[1]).max() > 0.1
+        assert 0.26 < again.meta["hidden_share"] < 0.74
+        assert again.meta["cloud_on_organ"] > 0.9
+    with pytest.raises(InputError, match="another organ"):
+        replace(other, case_sha256="ffff").kept(kept)
+
+
+def test_states_and_disturbances_meet_in_all_pairs() -> None:
+    made = world(families=("rest", "plate"), disturbances=("hidden", "strays", "fat", "side"))
+    pairs = [made.recipe(number, 2, draw) for number in range(4) for draw in range(2)]
+    assert len(set(pairs)) == len(pairs) == 8
+
+
+def test_estimates_are_held_against_truth_and_rigid_pose_once_and_wrong_ones_named(
+    tmp_path, monkeypatch
+) -> None:
+    (tmp_path / "model").mkdir()
+    (tmp_path / "model" / store.MANIFEST).write_text("{}")
+    out, made = tmp_path / "organ", world(disturbances=("none", "nothing"), hidden=0.0)
+    names = ["0-rest-none", "1-rest-nothing"]
+    scenes = [made.scene(number) for number in range(2)]
+    for name, scene in zip(names, scenes, strict=True):
+        scene.write(out / name)
+    back = np.linalg.inv(np.array(scenes[0].meta["camera_from_bench"]))
+    shift = np.linalg.inv(back)  # before the camera, and 10 mm beside where it lies
+    shift[:3, 3] += [6.0, 8.0, 0.0]
+    motion = SimpleNamespace(
+        carry=lambda points: transform_points(shift @ made.bench_from_ct, points),
+        std_mm=lambda points: np.ones(len(points)),
+    )
+    answer, asked = SimpleNamespace(quality="good", reason="", motion=motion), []
+    monkeypatch.setattr(Tracker, "follow", lambda _, cloud, seen: asked.append(cloud) or answer)
+    monkeypatch.setattr(estimates, "load_model", lambda *args, **how: None)
+    monkeypatch.setattr(estimates, "Tracker", lambda model: Tracker.__new__(Tracker))
+    for upto in (1, 2, 2):
+        estimates.measure(tmp_path / "model", made.anatomy_ct, out, names[:upto])
+    assert len(asked) == 2
+    rows = estimates.read_rows([out])
+    assert rows.off[0] == pytest.approx(10.0, abs=1.5)  # as segmentation errs
+    assert rows["shape"][0] < 1.5
+    assert rows.rigid[0] < 1.5
+    assert list(rows.wrong) == [True, True]
+    text, off = (
+        estimates.summary(rows, ["NoEstimate: nothing"]),
+        f"{rows.off[0]:.1f}",
+    )
+    assert f"| rest | 1 | 0, 0, 1 | {off} / {off} / {off} / {off} |" in text
+    assert "| nothing | 1 | 0, 0, 1 | – | – | 1 |" in text
+    assert f"| none | laid elsewhere | 1 | organ 0-rest {off} (" in text
+    assert "| nothing | another organ taken for it | 1 | organ 1-rest |" in text
+    assert "Not made: NoEstimate 1." in text
+    monkeypatch.setattr(estimates, "METHOD", -1)
+    with pytest.raises(InputError, match="another version"):
+        estimates.read_rows([out])
 
 
 def test_a_hand_or_instruments_hide_the_share_that_was_asked_for() -> None:

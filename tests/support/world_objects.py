@@ -31,4 +31,4 @@ def world(**options) -> World:
     turned = Anatomy(tuple(p.moved(p.vertices_mm + [30.0, -40.0, 100.0]) for p in ANATOMY.parts))
     labels = LabelVolume(np.ones((2, 2, 2), np.uint8), np.diag([1.0, 1.0, 3.0, 1.0]))
     config = WorldConfig(**{"families": ("rest",), **options})
-    return World.of(Case(turned, labels, (0.0, 0.0, 1.0)), config, organ().mesh)
+    return World.of(Case(turned, labels, (0.0, 0.0, 1.0)), "0123abcd", config, organ().mesh)

@@ -14,7 +14,7 @@ import pandas as pd
 
 from tumortrack.core.errors import NoEstimate
 from tumortrack.core.geometry import transform_points
-from tumortrack.core.types import Anatomy, Mesh
+from tumortrack.core.types import Anatomy, DepthFrame, Mesh
 from tumortrack.report.metrics import surface_distances
 from tumortrack.sense.camera import d405
 from tumortrack.sense.cloud import CloudConfig, cloud_from_depth
@@ -48,47 +48,67 @@ def scene_of(
     return Scene(cloud_from_depth(frame, CloudConfig(), rng), there, frame)
 
 
-def judge(tracker: Tracker, anatomy_ct: Anatomy, scene: Scene) -> dict[str, Any]:
-    """What is said of a scene whose surfaces have the CT's vertices in their order.
+def judge(
+    tracker: Tracker,
+    anatomy_ct: Anatomy,
+    scene: Scene,
+    seen: DepthFrame | None = None,
+    surfaces: bool = True,
+) -> dict[str, Any]:
+    """What is said of a scene whose surfaces have the CT's triangles in their order; ``seen``: the
+    image that the estimate is judged by.
 
     Returns:
         ``verdict`` (refused, poor, good), ``reason``, and ``tumors``: of each the error of its
-        middle and the Hausdorff distance, of the estimate and of the best rigid pose, and the
-        deviation that the estimate states of its middle; mm.
+        middle and, with ``surfaces``, the Hausdorff distance, of the estimate and of the best rigid
+        pose; the middle's error were the estimate moved rigidly onto the truth (``shape_``), and
+        the deviation that is stated of it; mm. No tumors where the scene shows another organ.
     """
-    pose = fit_over_volume(anatomy_ct.organ, scene.reference.organ)[0]
-    pairs = list(zip(anatomy_ct.tumors, scene.reference.tumors, strict=True))
-    tumors = [_errors(_laid(rest, pose), true, "rigid_") for rest, true in pairs]
-    row: dict[str, Any] = {"tumors": tumors}
+    row: dict[str, Any] = {"tumors": [], "verdict": "refused", "reason": ""}
+    motion = None
     try:
-        estimate = tracker.follow(scene.cloud)
+        estimate = tracker.follow(scene.cloud, seen=seen)
+        row |= {"verdict": estimate.quality, "reason": estimate.reason}
+        motion = estimate.motion
+        assert motion is not None
     except NoEstimate as error:
-        return {**row, "verdict": "refused", "reason": str(error)}
-    motion = estimate.motion
-    assert motion is not None
-    for tumor, (rest, true) in zip(tumors, pairs, strict=True):
-        tumor |= _errors(rest.moved(motion.carry(rest.vertices_mm)), true)
-        std_mm = motion.std_mm(rest.vertices_mm.mean(0, keepdims=True))
-        assert std_mm is not None
-        tumor["std_mm"] = float(std_mm[0])
-    return {**row, "verdict": estimate.quality, "reason": estimate.reason}
+        row["reason"] = str(error)
+    if scene.meta.get("model_organ") is False:
+        return row
+    pose = fit_over_volume(anatomy_ct.organ, scene.reference.organ)[0]
+    onto = np.eye(4)
+    if motion is not None:
+        found = anatomy_ct.organ.moved(motion.carry(anatomy_ct.organ.vertices_mm))
+        onto = fit_over_volume(found, scene.reference.organ)[0]
+    for rest, true in zip(anatomy_ct.tumors, scene.reference.tumors, strict=True):
+        tumor = _errors(_laid(rest, pose), true, "rigid_", surfaces)
+        if motion is not None:
+            found = rest.moved(motion.carry(rest.vertices_mm))
+            tumor |= _errors(found, true, "", surfaces)
+            tumor |= _errors(_laid(found, onto), true, "shape_", False)
+            std_mm = motion.std_mm(rest.vertices_mm.mean(0, keepdims=True))
+            assert std_mm is not None
+            tumor["std_mm"] = float(std_mm[0])
+        row["tumors"].append(tumor)
+    return row
 
 
 def _laid(mesh: Mesh, pose: np.ndarray) -> Mesh:
     return mesh.moved(transform_points(pose, mesh.vertices_mm))
 
 
-def _errors(found: Mesh, true: Mesh, prefix: str = "") -> dict[str, float]:
+def _errors(found: Mesh, true: Mesh, prefix: str, surfaces: bool) -> dict[str, float]:
     off_mm = found.vertices_mm.mean(0) - true.vertices_mm.mean(0)  # the same vertices
-    return {
-        f"{prefix}middle_mm": float(np.linalg.norm(off_mm)),
-        f"{prefix}hausdorff_mm": surface_distances(found, true, spacing_mm=2.0).hausdorff_mm,
-    }
+    errors = {f"{prefix}middle_mm": float(np.linalg.norm(off_mm))}
+    if surfaces:
+        far_mm = surface_distances(found, true, spacing_mm=2.0).hausdorff_mm
+        errors[f"{prefix}hausdorff_mm"] = far_mm
+    return errors
 
 
 def by_tumor(rows: Iterable[dict[str, Any]]) -> pd.DataFrame:
-    """A line a tumor, with what holds for its scene."""
-    lines = [{**row, **tumor} for row in rows for tumor in row["tumors"]]
+    """A line a tumor, with what holds for its scene; one where there is none."""
+    lines = [{**row, **tumor} for row in rows for tumor in row["tumors"] or [{}]]
     found = pd.DataFrame(lines)
     return found.reindex(columns=[*dict.fromkeys([*_FIRST, *found.columns])])
 

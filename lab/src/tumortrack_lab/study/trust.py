@@ -17,7 +17,7 @@ from tumortrack.core import store
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import transform_points
 from tumortrack.models.margins import METHOD, ModelMargins
-from tumortrack.report.calibration import answered, margins_of
+from tumortrack.report.calibration import WIDEST_MM, answered, margins_of
 from tumortrack.report.calibration_table import Row, read_table
 from tumortrack.report.drawing import new_figure, save
 from tumortrack.report.pictures import FROM_CAMERA, FROM_SIDE, draw_solid_view, scene_legend
@@ -29,7 +29,7 @@ from tumortrack_lab.study.document import table
 STATED = (0.9, 0.95)
 _CURVE = tuple(np.round(np.arange(0.5, 0.96, 0.05), 2).tolist())  # of the reliability plot
 _HIDDEN = (0.0, 0.4)  # shares of the surface: bounds between the bands
-_BANDS = ("nothing hidden", "up to 40 %", "over 40 %")
+BANDS = ("nothing hidden", "up to 40 %", "over 40 %")
 _BEYOND_MM = {3.0: "#0072B2", 5.0: "#E69F00", 8.0: "#D55E00"}  # Okabe and Ito
 
 
@@ -58,18 +58,24 @@ def read_tables(paths: Sequence[Path]) -> list[Table]:
 
 def states_of(rows: Sequence[Row]) -> pd.DataFrame:
     """A line a state: family, band of hidden surface, organ, whether its estimate is good, and of
-    the tumors the largest miss (mm) and the largest standard deviation (mm)."""
+    the tumors the largest miss (mm), the largest standard deviation (mm) and whether all lie within
+    ``two`` of their own."""
     lines = []
     for row in rows:
         meta = store.read_json(Path(row.scene) / "meta.json")
         line: dict[str, Any] = {"family": row.label[0], "organ": row.label[2]}
-        line["hidden"] = _BANDS[np.searchsorted(_HIDDEN, meta.get("hidden_share", 0.0))]
+        line["hidden"] = band_of(meta.get("hidden_share", 0.0))
         line |= {"good": not row.doubt, "row": row}
         if not row.doubt:
             line["miss"] = row.score("tumor", None)
             line["s"] = max(s or 0.0 for _, s in row.misses["tumor"])
+            line["two"] = all(miss <= 2 * (s or 0.0) for miss, s in row.misses["tumor"])
         lines.append(line)
     return pd.DataFrame(lines)
+
+
+def band_of(hidden_share: float) -> str:
+    return BANDS[int(np.searchsorted(_HIDDEN, hidden_share))]
 
 
 def left_out(states: pd.DataFrame, parts: pd.Series, seed: int, **how: Any) -> pd.DataFrame:
@@ -140,15 +146,17 @@ def ranks_table(found: pd.DataFrame) -> str:
     """Rank correlation with the true miss, over good estimates, limits or not: of the standard
     deviation, and of the 95 % radius by a calibration without the state's part."""
     lines, good = [], found[found.good]
-    for name, mine in [*good.groupby("organ"), ("all", good)]:
+    for name, mine in [*good.groupby("family"), *good.groupby("organ"), ("all", good)]:
         known = mine[mine[f"mm {STATED[-1]}"].notna()]
         cells = [spearmanr(one, known.miss)[0] for one in (known.s, known[f"mm {STATED[-1]}"])]
         misses = np.percentile(mine.miss, (50, 90, 95, 100))
         lines.append(
             [str(name), str(len(mine)), " / ".join(f"{x:.1f}" for x in misses)]
+            + [str((mine.miss > WIDEST_MM).sum()), f"{100 * mine.two.mean():.0f}"]
             + [f"{x:.2f}" for x in cells]
         )
-    head = ["organ", "good", "miss, mm: median / 90 / 95 % / worst"]
+    head = ["family, organ", "good", "miss, mm: median / 90 / 95 % / worst"]
+    head += [f"over {WIDEST_MM:g} mm", "within two deviations, %"]
     return table([*head, "deviation and miss", "95 % radius and miss"], lines)
 
 

@@ -32,13 +32,21 @@ from tumortrack_lab.peers.base import fit_over_volume
 from tumortrack_lab.world.noise import StereoCamera, StereoConfig
 from tumortrack_lab.world.paths import KINDS, LoadPath, random_path
 from tumortrack_lab.world.scenes import World
-from tumortrack_lab.world.views import FAR_MM, SIZE_PX, direction, ground_mesh, pose_before, render
+from tumortrack_lab.world.views import (
+    FAR_MM,
+    SIZE_PX,
+    direction,
+    facing,
+    ground_mesh,
+    pose_before,
+    render,
+)
 
 _VIEWS_DEGREES = (0.0, 45.0, -45.0)  # about the organ's length
 _NEAREST_MM = (110.0, 190.0)  # so that an organ that is pushed stays in the picture
 _MOST_TILT = 25.0  # of the first camera, degrees
 _BEGIN_NS = 1_700_000_000_000_000_000
-_ATTEMPTS = 8  # loads, until one has equilibria all along
+_ATTEMPTS = 4  # loads, until one has equilibria all along
 # Of a calibration between cameras, one standard deviation each: an assumption.
 _POSE_MM, _POSE_DEGREES = 0.5, 0.2
 
@@ -107,6 +115,8 @@ def _parted(rest: Anatomy, vertices: Float[np.ndarray, "v 3"]) -> Anatomy:
 def write_film(world: World, config: FilmConfig, kind: str, number: int, folder: Path) -> None:
     """Solve, look and write one sequence, all or nothing. Raises TumortrackError: none of several
     loads has equilibria all along its path; StorageError."""
+    from scipy.spatial.transform import Rotation
+
     seed = [config.seed, list(KINDS).index(kind), number]
     path, failed = _some_path(world, kind, seed)
     rng = np.random.default_rng([*seed, 1])
@@ -118,10 +128,10 @@ def write_film(world: World, config: FilmConfig, kind: str, number: int, folder:
     there = [transform_points(path.way(t), moving.at(t)) for t in times_s]
     organ = [Mesh(places[: len(rest.organ.vertices_mm)], rest.organ.faces) for places in there]
     tilt, turn, roll = rng.uniform(0, _MOST_TILT), *rng.uniform(0, 2 * np.pi, 2)
-    nearest, back = rng.uniform(*_NEAREST_MM), direction(tilt, turn)
+    nearest, first = rng.uniform(*_NEAREST_MM), facing(direction(tilt, turn), roll)
+    turns = [Rotation.from_euler("x", angle, degrees=True) for angle in _VIEWS_DEGREES]
     poses = [
-        pose_before(organ[0], _about_x(degrees) @ back, roll, nearest)
-        for degrees in _VIEWS_DEGREES[: config.views]
+        pose_before(organ[0], first @ turn.as_matrix().T, nearest) for turn in turns[: config.views]
     ]
     stamps_ns = _BEGIN_NS + np.rint(times_s * 1e9).astype(np.int64)
     with store.new_folder(folder) as aside:
@@ -227,11 +237,6 @@ def read_film(folder: Path) -> Film:
     pairs = zip(np.split(vertices, ends[0]), np.split(faces, ends[1]), strict=True)
     rest = Anatomy(tuple(Mesh(*pair) for pair in pairs))
     return Film(folder, rest, store.read_json(folder / "meta.json"), **kept)
-
-
-def _about_x(degrees: float) -> np.ndarray:
-    cosine, sine = np.cos(np.deg2rad(degrees)), np.sin(np.deg2rad(degrees))
-    return np.array([[1, 0, 0], [0, cosine, -sine], [0, sine, cosine]])
 
 
 def _small_error(rng: np.random.Generator) -> Float64[np.ndarray, "4 4"]:

@@ -32,6 +32,7 @@ from tumortrack_lab.world.paths import KINDS
 # organs; largest displacement of the surface). Bounds lie half way.
 STATES = {"at rest": 1.5, "D1": 5.8, "D2": 8.8, "D3": np.inf}
 WRONG_MM = 3.0  # a centre farther off must not be called good
+_SURFACES_EVERY = 3  # frames: a Hausdorff distance takes as long as locating
 _COARSE = 16  # of the volume, which is not looked at
 _NOTHING_KNOWN = Hints()
 _PHASES = ("at rest", "loaded", "held", "released", "at rest")
@@ -104,15 +105,15 @@ def _organ(frame: DepthFrame, region: RegionConfig, hints: Hints = _NOTHING_KNOW
 
 
 METHODS: dict[str, Callable[[Tracker], Locate]] = {
-    "track": track, "first look": first_look, "laid together": laid_together,
-    "several looks": several_looks,
+    "track": track, "first-look": first_look, "laid-together": laid_together,
+    "several-looks": several_looks,
 }  # fmt: skip
 
 
 def judge(locate: Locate, film: Film) -> list[dict[str, Any]]:
-    """A row a frame and tumor: quality, errors of its centre and surface (Hausdorff), stated
-    deviations, and the error of the centre that the best rigid pose has; mm. Without an estimate
-    they are absent."""
+    """A row a frame and tumor: quality, error of its centre and, in every third frame, its surface
+    (Hausdorff), stated deviations, and how far the best rigid pose has the centre off; mm. What
+    needs an estimate is absent where there is none."""
     poses, sites, rows = film.first_from_camera(), tumor_sites_of(film.rest), []
     for number, time_s in enumerate(film.seconds.tolist()):
         about: dict[str, Any] = {
@@ -140,7 +141,8 @@ def judge(locate: Locate, film: Film) -> list[dict[str, Any]]:
             if motion is not None:
                 found = rest.moved(motion.carry(rest.vertices_mm))
                 row["center_mm"] = _center_mm(found.vertices_mm, true)
-                row["hausdorff_mm"] = surface_distances(found, true, 2.0).hausdorff_mm
+                if number % _SURFACES_EVERY == 0:
+                    row["hausdorff_mm"] = surface_distances(found, true, 2.0).hausdorff_mm
                 row |= {key: parts[name].get(key) for key in ("center_std_mm", "surface_std_mm")}
             rows.append(row)
     return rows

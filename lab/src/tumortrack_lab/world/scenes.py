@@ -3,37 +3,38 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 from jaxtyping import Float64
 
 from tumortrack.core import store
-from tumortrack.core.config import Config, to_builtins
+from tumortrack.core.config import Config
+from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import Anatomy, Mesh, SensorCloud
 from tumortrack.imaging.case import Case, load_case
 from tumortrack.imaging.meshes import mesh_of, solid_of
 from tumortrack.phantom.kidneys import random_anatomy
-from tumortrack.simulate.scene_folder import InnerPoints, Scene, draw_targets
+from tumortrack.simulate.scene_folder import InnerPoints, Scene, Targets, draw_targets
 from tumortrack_lab.tets import TetMesh, tetrahedralise
 from tumortrack_lab.twin.apparatus import bench_from_ct, moved
-from tumortrack_lab.twin.dataset import claim
 from tumortrack_lab.world import segmentation
 from tumortrack_lab.world.families import FAMILIES, Deformed, solve
 from tumortrack_lab.world.organ import Organ
 from tumortrack_lab.world.views import View, look, lump, organ_cloud
 
 Disturbance = Literal[
-    "none", "strays", "fat", "white", "scale", "side", "mirrored", "foreign", "nothing"
+    "none", "hidden", "strays", "fat", "white", "scale", "side", "mirrored", "foreign", "nothing"
 ]
 DISTURBANCES: tuple[Disturbance, ...] = get_args(Disturbance)
 OTHERS = ("mirrored", "foreign", "nothing")  # not the model's organ: nothing true can be said
-_FINE_MM, _EDGE_MM = (
-    0.1,
-    7.0,
-)  # surfaces are simplified by this, edges halved beyond: scenes are many
+TETS = "tets.safetensors"  # of a folder's world: filling an organ is not reproducible
+_FINE_MM, _EDGE_MM = 0.1, 7.0  # surfaces are simplified by this, edges halved beyond
+_HIDDEN = (0.3, 0.7)  # share of what is seen of the organ, where hiding is the disturbance
+_SAME_MM = 0.05  # between a state that was kept and the same, solved again
 
 Generator = np.random.Generator
 
@@ -53,11 +54,23 @@ class WorldConfig(Config, frozen=True, kw_only=True):
     disturbances: tuple[Disturbance, ...] = ("none",)
 
 
+class Shown(NamedTuple):
+    """A state, the true anatomy in it and inner points (bench frame, mm); ``name``: of
+    the state; ``about``: its recipe, as scenes state it."""
+
+    state: Deformed
+    truth: Anatomy
+    targets: Targets
+    name: str
+    about: dict[str, Any]
+
+
 @dataclass(frozen=True, eq=False)
 class World:
     """A case on the bench. ``anatomy_ct``: the case's, simplified by 0.1 mm."""
 
     config: WorldConfig
+    case_sha256: str
     anatomy_ct: Anatomy
     bench_from_ct: Float64[np.ndarray, "4 4"]
     organ: Organ
@@ -65,7 +78,9 @@ class World:
     slices_axis: Float64[np.ndarray, " 3"]  # of the CT, bench frame
 
     @classmethod
-    def of(cls, case: Case, config: WorldConfig, mesh: TetMesh | None = None) -> World:
+    def of(
+        cls, case: Case, case_sha256: str, config: WorldConfig, mesh: TetMesh | None = None
+    ) -> World:
         """``mesh``: the tetrahedra (bench frame) of a world that goes on: filling an organ is not
         reproducible."""
         to_bench = bench_from_ct(case.anatomy.organ, case.up_lps)
@@ -77,33 +92,29 @@ class World:
             mesh = tetrahedralise(there.organ, config.edge_mm, config.envelope)
         thick = axes[:, spacing.argmax()] / spacing.max()
         return cls(
-            config, few, to_bench, Organ.of(there, mesh), draw_targets(few, config.seed),
-            to_bench[:3, :3] @ thick,
+            config, case_sha256, few, to_bench, Organ.of(there, mesh),
+            draw_targets(few, config.seed), to_bench[:3, :3] @ thick,
         )  # fmt: skip
 
     @classmethod
-    def kept(cls, case: Path, out: Path, about: str, config: Config) -> World:
-        """The world of a folder, stated in its file ``about``, with its tetrahedra; new, if there
-        is none. Raises InputError: the folder holds something else, or another case's or
-        configuration's."""
+    def opened(cls, case: Path, config: WorldConfig, tets: Path) -> World:
+        """The world of a case's folder, with the tetrahedra in a file, which is written if there is
+        none."""
         from safetensors.numpy import load_file, save
 
-        loaded, tets = load_case(case), out / "tets.safetensors"
-        sha256 = store.sha256_of(case / store.MANIFEST)
-        claim(out, about, {"case_sha256": sha256, "config": to_builtins(config)})
-        worlds = config if isinstance(config, WorldConfig) else WorldConfig()
+        of = partial(cls.of, load_case(case), store.sha256_of(case / store.MANIFEST), config)
         if tets.exists():
             kept = load_file(tets)
-            return cls.of(loaded, worlds, TetMesh(kept["nodes_mm"], kept["tets"]))
-        world = cls.of(loaded, worlds)
+            return of(TetMesh(kept["nodes_mm"], kept["tets"]))
+        world = of()
         mesh = world.organ.mesh
         store.write_atomically(tets, save({"nodes_mm": mesh.nodes_mm, "tets": mesh.tets}))
         return world
 
-    def recipe(self, number: int) -> tuple[str, Disturbance]:
-        """Family and disturbance of a scene: all pairs in turn."""
+    def recipe(self, number: int, draws: int = 1, draw: int = 0) -> tuple[str, Disturbance]:
+        """Family and disturbance of a state's scene, of so many: all pairs in turn."""
         family = self.config.families[number % len(self.config.families)]
-        turn = number // len(self.config.families)
+        turn = number // len(self.config.families) * draws + draw
         return family, self.config.disturbances[turn % len(self.config.disturbances)]
 
     def scene(self, number: int) -> Scene:
@@ -118,8 +129,44 @@ class World:
         true, segmented = segmentation.perturbed(self.organ.anatomy, kind, self.slices_axis, rng)
         truth = Anatomy(tuple(part.moved(state.carry(part.vertices_mm)) for part in true.parts))
         points = state.carry(transform_points(self.bench_from_ct, self.targets.points_ct))
-        state, truth, beside = _replaced(disturbance, state, truth, rng)
+        about = {"family": family, "segmentation": segmented, **state.about}
+        shown = Shown(state, truth, self.targets.at(points), f"{config.seed}-{number}", about)
+        return self._seen(shown, number, disturbance, rng)
+
+    def kept(self, scene: Scene) -> Shown:
+        """What an undisturbed scene of this case and these tetrahedra shows, without solving it
+        again; all but slits, whose walls are not kept. Raises InputError: it is another's."""
+        meta, parts = scene.meta, ("material", "load", "volume_change", "least_stretch")
+        if meta.get("case_sha256", self.case_sha256) != self.case_sha256 or scene.targets is None:
+            raise InputError("the scene to be seen again shows another organ than the case.")
+        to_bench = np.linalg.inv(np.array(meta["camera_from_bench"]))
+        truth = moved(scene.reference, to_bench)
+        points = transform_points(to_bench, scene.targets.points_mm)
+        targets = replace(scene.targets, points_mm=points)
+        family, number, seed = meta["family"], meta["world"]["number"], meta["world"]["seed"]
+        about = {name: meta[name] for name in ("family", "segmentation", *parts) if name in meta}
+        if family in ("rest", "cut"):
+            state = solve(self.organ, family, seed * 1_000_003 + number)
+            there = state.carry(transform_points(self.bench_from_ct, scene.targets.points_ct))
+            if (off_mm := float(np.abs(there - points).max())) > _SAME_MM:
+                raise InputError(f"the state, solved again, is another by {off_mm:.2f} mm.")
+        else:  # nodes at rest: nobody looks inside
+            mesh, rim_mm = self.organ.mesh, meta["material"]["rim_mm"]
+            state = Deformed(self.organ, mesh.nodes_mm, mesh.tets, rim_mm, None, {})
+        return Shown(state, truth, targets, f"{seed}-{number}", about)
+
+    def again(self, shown: Shown, number: int, disturbance: Disturbance) -> Scene:
+        """Another view of a state, with another noise and this disturbance. Raises NoEstimate: the
+        organ is not found in its image."""
+        rng = np.random.default_rng([self.config.seed, number, 2])
+        return self._seen(shown, number, disturbance, rng)
+
+    def _seen(self, shown: Shown, number: int, disturbance: Disturbance, rng: Generator) -> Scene:
+        config = self.config
+        state, truth, beside = _replaced(disturbance, shown.state, shown.truth, rng)
         hidden = rng.uniform(0.05, config.most_hidden) * (rng.uniform() < config.hidden)
+        if disturbance == "hidden":
+            hidden = rng.uniform(*_HIDDEN)
         view = look(state, truth.organ, hidden, rng, beside)
         view, how = _disturbed_frame(disturbance, view, truth.organ, rng)
         cloud, on_organ = organ_cloud(view, truth.organ, rng)
@@ -134,20 +181,22 @@ class World:
             for part in reference.tumors
         ]
         meta = {
+            "case_sha256": self.case_sha256,
             "world": {"number": number, "seed": config.seed},
-            "family": family,
+            "state": shown.name,
+            **shown.about,
             "disturbance": {"kind": disturbance, **how},
             "model_organ": disturbance not in OTHERS,
-            "segmentation": segmented,
-            **state.about,
             **view.about,
             "cloud_on_organ": on_organ,
             "tumor_centre_to_cloud_mm": tumor_mm,
             "camera_from_bench": view.camera_from_bench.tolist(),
             "bench_from_ct": self.bench_from_ct.tolist(),
         }
-        targets = self.targets.at(transform_points(view.camera_from_bench, points))
-        known = targets if disturbance not in OTHERS else None
+        known = None
+        if disturbance not in OTHERS:
+            seen_mm = transform_points(view.camera_from_bench, shown.targets.points_mm)
+            known = replace(shown.targets, points_mm=seen_mm)
         return Scene(cloud, reference, view.frame, meta, known)
 
 
@@ -190,16 +239,11 @@ def _disturbed_frame(
     """The view through a sensor out of order, and by how much."""
     depth = view.frame.depth_mm
     if kind == "scale":
-        how = {
-            "scale": 1 + rng.choice([-1, 1]) * rng.uniform(0.02, 0.1),
-            "offset_mm": rng.uniform(-8.0, 8.0),
-        }
-        depth = depth * how["scale"] + how["offset_mm"]
+        scale, by_mm = 1 + rng.choice([-1, 1]) * rng.uniform(0.02, 0.1), rng.uniform(-8.0, 8.0)
+        how, depth = {"scale": scale, "offset_mm": by_mm}, depth * scale + by_mm
     elif kind == "side":
-        there, camera = (
-            transform_points(view.camera_from_bench, organ.vertices_mm),
-            view.frame.intrinsics,
-        )
+        there = transform_points(view.camera_from_bench, organ.vertices_mm)
+        camera = view.frame.intrinsics
         pixels = there[:, :2] / there[:, 2:] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
         angle, share = rng.uniform(0, 2 * np.pi), rng.uniform(0.35, 0.65)
         way = np.array([np.cos(angle), np.sin(angle)])

@@ -96,7 +96,7 @@ def _camera_pose(organ: Mesh, rng: Generator) -> tuple[Transform, dict[str, Any]
     tilt = min(abs(rng.normal(0, 25.0)), _MOST_TILT)
     turn, roll = rng.uniform(0, 2 * np.pi, 2)
     near = log_uniform(rng, *_NEAR_MM)
-    pose = pose_before(organ, direction(tilt, turn), roll, near)
+    pose = pose_before(organ, facing(direction(tilt, turn), roll), near)
     pose[:2, 3] += rng.uniform(-0.08, 0.08, 2) * near
     about = {"tilt_degrees": tilt, "nearest_mm": near, "roll_degrees": float(np.rad2deg(roll))}
     return pose, about
@@ -108,14 +108,17 @@ def direction(tilt_degrees: float, turn: float) -> np.ndarray:
     return np.array([np.sin(lean) * np.cos(turn), np.sin(lean) * np.sin(turn), np.cos(lean)])
 
 
-def pose_before(organ: Mesh, back: np.ndarray, roll: float, nearest_mm: float) -> Transform:
-    """Of a camera (camera_from_bench) that sees the organ from the direction ``back`` in the middle
-    of its picture, turned by ``roll`` (radians) about its axis."""
-    rotation = rotation_onto(-back, np.array([0.0, 0.0, 1.0]))
+def facing(back: np.ndarray, roll: float) -> np.ndarray:
+    """The rotation of a camera (camera_from_bench) that looks from the direction ``back``, turned
+    by ``roll`` (radians) about its axis."""
     spin = np.array([[np.cos(roll), -np.sin(roll), 0], [np.sin(roll), np.cos(roll), 0], [0, 0, 1]])
-    there = organ.vertices_mm @ (spin @ rotation).T
-    shift = np.array([*-there[:, :2].mean(0), nearest_mm - there[:, 2].min()])
-    return rigid(spin @ rotation, shift)
+    return spin @ rotation_onto(-back, np.array([0.0, 0.0, 1.0]))
+
+
+def pose_before(organ: Mesh, rotation: np.ndarray, nearest_mm: float) -> Transform:
+    """The pose of a camera so turned, with the organ in the middle of its picture."""
+    there = organ.vertices_mm @ rotation.T
+    return rigid(rotation, np.array([*-there[:, :2].mean(0), nearest_mm - there[:, 2].min()]))
 
 
 def render(mesh: Mesh, to_camera: Transform, camera: Intrinsics) -> np.ndarray:
