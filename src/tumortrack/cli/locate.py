@@ -64,7 +64,8 @@ class Locate(StatedPatient):
 
     def run(self) -> None:
         _check_grid(self.grid)
-        *clouds, out = self.cloud, self.out, *self.more
+        paths = [self.cloud, self.out, *self.more]
+        clouds, out = paths[:-1], paths[-1]
         store.check_place(out, "run", self.overwrite)
         points = self._points()
         frame_id, fixed_from_camera = self._poses(len(clouds))
