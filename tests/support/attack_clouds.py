@@ -264,6 +264,7 @@ for name, poses in (
     ("poses_from_behind", [HERE, np.diag([1.0, -1, -1, 1]).tolist()]),
 ):
     ATTACKS[name] = lambda folder, base, p=poses: views(folder, base, *p)
+FINISH.add("poses_from_behind")
 
 
 @attack
