@@ -96,24 +96,25 @@ def _verdicts(rows: pd.DataFrame, key: str) -> str:
 
 
 def _wrong(rows: pd.DataFrame) -> str:
-    """Every wrong good answer by name, and what is wrong with it."""
+    """Every wrong good answer by name, and what is wrong with it: ``laid elsewhere`` if its tumor
+    would be within half of its error, were the estimate moved rigidly onto the truth; else bent
+    ``too little`` or ``wrongly``, as the best rigid pose is farther off or nearer."""
     wrong = rows[rows.wrong].sort_values("off", ascending=False)
     wrong = wrong.drop_duplicates(["organ", "scene"])
     causes = {
         "another organ taken for it": wrong.off.isna(),
         "camera out of scale or depth": wrong.disturbance == "scale",
         "laid elsewhere": wrong["shape"] < wrong.off / 2,
-        "bent, and given another bend": wrong.rigid > FAR_MM,
+        "bent too little": wrong.off <= wrong.rigid,
     }
-    wrong["why"] = np.select([*causes.values()], [*causes], "given a bend it lacks")
-    wrong["place"] = [f"{row.organ} {row.scene.rpartition('-')[0]}" for row in wrong.itertuples()]
-    wrong["place"] += [
+    wrong["why"] = np.select([*causes.values()], [*causes], "bent wrongly")
+    wrong["name"] = wrong.scene.str.rpartition("-")[0] + [
         "" if np.isnan(row.off) else f" {row.off:.1f} ({row.rigid:.1f}, {row.hidden_share:.0%})"
         for row in wrong.itertuples()
     ]
-    body = [
-        [str(kind), str(why), str(len(mine)), ", ".join(mine.place)]
-        for (kind, why), mine in wrong.groupby(["disturbance", "why"])
-    ]
+    body = []
+    for (kind, why), mine in wrong.groupby(["disturbance", "why"]):
+        named = [f"{organ} {', '.join(some['name'])}" for organ, some in mine.groupby("organ")]
+        body.append([str(kind), str(why), str(len(mine)), "; ".join(named)])
     head = ["disturbance", "wrong", "scenes", "organ, scene, mm off (best rigid pose, hidden)"]
     return table(head, body, 4)
