@@ -74,6 +74,8 @@ def summary(rows: pd.DataFrame, failures: Sequence[str]) -> str:
     parts = [_verdicts(rows[calm], key) for key in ("family", "hidden", "organ") if calm.any()]
     if not calm.all():
         parts += [_verdicts(rows[~calm], key) for key in ("disturbance", "organ")]
+        bare = rows[~calm & (rows.hidden_share == 0)]
+        parts.append(_verdicts(bare, "disturbance", ", nothing hidden"))
     reasons = pd.Series([why.partition(":")[0] for why in failures], dtype=str)
     lost = ", ".join(f"{name} {count}" for name, count in reasons.value_counts().items())
     parts.append(
@@ -84,7 +86,7 @@ def summary(rows: pd.DataFrame, failures: Sequence[str]) -> str:
     return "\n\n".join([*parts, _wrong(rows)])
 
 
-def _verdicts(rows: pd.DataFrame, key: str) -> str:
+def _verdicts(rows: pd.DataFrame, key: str, of: str = "") -> str:
     body = []
     for name, mine in [*rows.groupby(key, sort=key == "hidden", observed=True), ("all", rows)]:
         scenes, good = mine.drop_duplicates(["organ", "scene"]), mine[mine.verdict == "good"]
@@ -92,7 +94,8 @@ def _verdicts(rows: pd.DataFrame, key: str) -> str:
         errors = quantiles(good.off), quantiles(good.rigid)
         wrong = mine[mine.wrong].groupby(["organ", "scene"]).ngroups
         body.append([str(name), str(len(scenes)), ", ".join(counts), *errors, str(wrong)])
-    return table([key, "scenes", "refused, poor, good", "good", "best rigid pose", "wrong"], body)
+    head = [key + of, "scenes", "refused, poor, good", "good", "best rigid pose", "wrong"]
+    return table(head, body)
 
 
 def _wrong(rows: pd.DataFrame) -> str:
@@ -109,8 +112,11 @@ def _wrong(rows: pd.DataFrame) -> str:
     }
     wrong["why"] = np.select([*causes.values()], [*causes], "bent wrongly")
     wrong["name"] = wrong.scene.str.rpartition("-")[0] + [
-        "" if np.isnan(row.off) else f" {row.off:.1f} ({row.rigid:.1f}, {row.hidden_share:.0%})"
-        for row in wrong.itertuples()
+        "" if np.isnan(row.off) else f" {row.off:.1f}" for row in wrong.itertuples()
+    ]
+    told = wrong.off.notna() & (wrong.disturbance != "scale")
+    wrong.loc[told, "name"] += [
+        f" ({row.rigid:.1f}, {row.hidden_share:.0%})" for row in wrong[told].itertuples()
     ]
     body = []
     for (kind, why), mine in wrong.groupby(["disturbance", "why"]):
