@@ -386,7 +386,7 @@ class Knowing:
     def __init__(self, model):
         pass
 
-    def locate(self, cloud, grid, seed, seen):
+    def locate(self, cloud, grid, seed, seen, others):
         Knowing.asked += 1
         return located(Wave(sure=True))
 
