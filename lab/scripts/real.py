@@ -22,7 +22,6 @@ from tumortrack import api
 from tumortrack.cli.console import say
 from tumortrack.core import store
 from tumortrack.core.errors import InputError
-from tumortrack.core.geometry import Points
 from tumortrack.core.mesh_files import read_mesh, write_mesh
 from tumortrack.core.types import Mesh
 from tumortrack.imaging.case import Case, load_case
@@ -323,7 +322,7 @@ def slab_block(options: Options) -> str:
 def _bent(
     name: str, rest: tuple[Mesh, float], files: dict[str, Path],
     scans: dict[str, Callable[[], Mesh]], options: Options,
-    curves: tuple[Points, Points] | None = None,
+    curves: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> list[dict]:  # fmt: skip
     """Rows of every scan, by a model of the top surface at rest over its underside's z, mm."""
     folder = options.out / name

