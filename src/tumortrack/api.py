@@ -449,9 +449,10 @@ def plan_resection(
         InputError: a poor estimate; no such tumor, or an option that is not allowed.
     """
     from dataclasses import replace
+    from functools import partial
 
     from tumortrack.core.config import from_builtins
-    from tumortrack.plan import budget, resection
+    from tumortrack.plan import budget
     from tumortrack.plan import located as places
     from tumortrack.plan.values import ResectionConfig
 
@@ -466,13 +467,9 @@ def plan_resection(
     else:
         doubt, seen = run.doubt, run.located(table_from_camera)
     notes = places.notes_of_doubt(doubt, accept_poor)
-    plan = resection.plan_resection(seen, config)
-    if confidence is not None:
-        errors = budget.planned_budget(plan, seen, confidence=confidence)
-        notes = (*notes, budget.beyond_errors(config.margin_mm, errors))
-        plan = resection.plan_resection(seen, budget.widened(config, errors))
+    budget_of = partial(budget.planned_budget, located=seen, confidence=confidence)
+    plan, _, errors = budget.plan_within(seen, config, budget_of, confidence is not None)
     plan = replace(plan, notes=(*notes, *plan.notes))
-    errors = budget.planned_budget(plan, seen, confidence=confidence)
     plan = budget.heeded(plan, errors, accept_budget)
     if picture is not None:
         from tumortrack.report.plan_pictures import draw_plan

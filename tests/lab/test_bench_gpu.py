@@ -7,10 +7,13 @@ import pytest
 
 from clock import Clock
 from tumortrack.training.presets import PRESETS, quick
-from tumortrack_lab.bench import occupancy, rows, training
+from tumortrack_lab.bench import curves, occupancy, rows, training
 from tumortrack_lab.bench import subject as subjects
 from tumortrack_lab.bench.report import goals_table
 from tumortrack_lab.bench.rows import (
+    DECODER,
+    ENCODER,
+    EVERY,
     FRAME,
     GENERATOR,
     STEP,
@@ -74,16 +77,17 @@ def test_rows_of_a_gpu_are_measured_on_any_device(quick_model, tmp_path, monkeyp
     subject = BenchSubject(presets, tmp_path)
     shutil.copytree(quick_model, tmp_path / "quick")
     every = training.on_device(subject, "cpu", 0.5)
-    found = {workload.name: workload.row(1, 0.5) for workload in every}
-    assert set(found) == {FRAME, VOLUME, TRAINING}
+    found = {row.name: row for workload in every for row in workload.rows(1, 0.5)}
+    assert set(found) == {FRAME, EVERY, VOLUME, TRAINING}
     assert all(row.device == "cpu" and row.what == "quick" for row in found.values())
     assert found[TRAINING].per_s > 0
 
 
 @pytest.mark.slow
 def test_every_workload_becomes_a_row(quick_model, clinic_model, tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr(subjects, "LABELLING", ("quick",))
     monkeypatch.setattr(subjects, "PRESETS", ("clinic", "quick"))
-    small = {"GRID": 24, "SLAB": 99, "QUERIES": 999}
+    small = {"GRID": 24, "SLAB": 99, "QUERIES": 999, "DECODED": (100, 200), "IN_ONE_PIECE": 100}
     for name, value in small.items():
         monkeypatch.setattr(occupancy, name, value)
     monkeypatch.setattr(training, "_SAMPLES", {"clinic": 2, "quick": 2})
@@ -92,8 +96,10 @@ def test_every_workload_becomes_a_row(quick_model, clinic_model, tmp_path, monke
         shutil.copytree(folder, tmp_path / name)
     subject = BenchSubject(presets, tmp_path)
     rows = [
-        workload.row(1, 0.01)
+        row
         for source in (
+            subjects.encoders,
+            subjects.decoders,
             subjects.frames,
             subjects.tracking,
             subjects.volumes,
@@ -101,19 +107,36 @@ def test_every_workload_becomes_a_row(quick_model, clinic_model, tmp_path, monke
             training.steps,
         )
         for workload in source(subject, 0.01)
+        for row in workload.rows(1, 0.01)
     ]
     found = [(row.name, row.what) for row in rows]
     both = [(name, what) for name in (TRACKING, VOLUME) for what in ("clinic", "quick")]
     assert found == [
+        (ENCODER, "quick"),
+        (ENCODER, "clinic"),
+        (DECODER, "quick, 100 queries"),
+        (DECODER, "quick, 200 queries"),
         (FRAME, "clinic"),
         (FRAME, "quick"),
+        (EVERY, "quick"),
         *both,
         (GENERATOR, "elastic"),
         (STEP, "clinic"),
         (STEP, "quick"),
     ]
     by_name = dict(zip(found, rows, strict=True))
-    for name in (FRAME, VOLUME):
-        assert by_name[name, "quick"].agreement > 0.95
-        assert by_name[name, "quick"].ratio is not None
-    assert all(row.ours.median_s > 0 for row in rows)
+    one, two = (by_name[DECODER, f"quick, {count} queries"] for count in (100, 200))
+    assert one.naive is not None
+    assert two.naive == one.naive.times(2.0)  # timed once, scaled
+    assert by_name[TRACKING, "quick"].naive == by_name[FRAME, "quick"].naive
+    assert by_name[VOLUME, "clinic"].agreement > 0.95
+    assert by_name[FRAME, "clinic"].agreement > 0.95
+    assert all(row.work is not None for row in rows if row.name != TRACKING)
+    assert all(row.naive is not None for row in rows if row != by_name[ENCODER, "clinic"])
+    for name in ("_QUERIES", "_POINTS", "_GRIDS", "_BATCHES"):
+        monkeypatch.setattr(curves, name, (20, 40))
+    for curve in ("queries", "points", "grid", "batch"):
+        for preset in presets:
+            points = list(curves.points_of(subject, curve, preset))
+            assert [point.size for point in points] == [20, 40]
+            assert all(point.seconds > 0 for point in points)

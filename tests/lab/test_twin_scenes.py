@@ -26,13 +26,14 @@ from tumortrack.core.types import CameraLabels, LabelVolume
 from tumortrack.imaging.case import Case, save_case
 from tumortrack.report.metrics import label_grid
 from tumortrack.report.protocol import evaluate_scenes
+from tumortrack.sense.camera import deproject
 from tumortrack.simulate.occupancy import contains, labels_of
 from tumortrack.simulate.scene_folder import draw_targets, list_scenes, read_scene
 from tumortrack_lab.twin import dataset
 from tumortrack_lab.twin.apparatus import State
 from tumortrack_lab.twin.dataset import TwinRun, make_scenes
 from tumortrack_lab.twin.equilibrium import Rod
-from tumortrack_lab.twin.occluders import rod_mesh
+from tumortrack_lab.twin.occluders import rod_mesh, shaft_over
 from tumortrack_lab.twin.views import (
     VARIANTS,
     VIEWS,
@@ -127,7 +128,7 @@ def made(case_folder, tmp_path_factory):
     make_scenes(run, out, ("Rot90",), ("clean",))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(dataset, "twin_picture", lambda scene, path: path.write_bytes(b"picture"))
-        make_scenes(run, out, ("Rot90", "P1"), ("clean", "noise"))
+        make_scenes(run, out, ("Rot90", "P1"), ("clean", "clutter"))
     return out
 
 
@@ -196,6 +197,29 @@ def test_the_camera_rises_over_tall_organs():
     assert np.allclose(targets - lower_targets, [0, 0, 25])
 
 
+def test_a_shaft_only_takes_points_away():
+    clean, _ = scene("D1")
+    covered, _ = scene("D1", "shaft")
+    before, after = clean.depth.depth_mm, covered.depth.depth_mm
+    kept = np.isfinite(after)
+    assert np.array_equal(after[kept], before[kept])
+    lost = np.isfinite(before) & ~kept
+    share = lost.sum() / np.isfinite(before).sum()
+    assert share == pytest.approx(covered.meta["seen"]["shaft_covers_share"])
+    assert 0.02 < share < 0.3
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_shaft_never_touches_the_organ(seed):
+    made, _ = scene("D0")
+    rod = shaft_over(made.depth, 4.0, np.random.default_rng(seed))
+    inside = contains(rod_mesh(rod), made.reference.organ.vertices_mm)
+    assert not inside.any()
+    # And its tip is near: over the organ's middle, a few mm above it.
+    nearest = np.linalg.norm(made.cloud.points_mm - np.array(rod.tip_mm), axis=1).min()
+    assert 0.9 < nearest < 15
+
+
 def test_what_a_rod_hides_lies_behind_it():
     """Lost pixels are those whose line of sight passes the rod's axis within its radius."""
     covered, _ = scene("P1")
@@ -233,6 +257,23 @@ def test_a_rod_has_its_size():
     assert along.max() == pytest.approx(60)
     whole = np.pi * 16 * 56 + 2 / 3 * np.pi * 64
     assert solid.volume_mm3 == pytest.approx(whole, rel=0.01)
+
+
+def test_background_is_three_percent_and_only_adds():
+    clean, _ = scene("D2")
+    cluttered, _ = scene("D2", "clutter")
+    before, after = clean.depth.depth_mm, cluttered.depth.depth_mm
+    organ = np.isfinite(before)
+    assert np.array_equal(after[organ], before[organ])
+    added = np.isfinite(after) & ~organ
+    assert abs(added.sum() - 0.03 * np.isfinite(after).sum()) <= 1
+    assert (after[added] < 150).all()
+    assert (after[added] > 50).all()
+    # So the cloud has about as many: 150 of 5000, a binomial draw.
+    organ_points = deproject(clean.depth)
+    kept = {tuple(p) for p in organ_points.tolist()}
+    strays = sum(tuple(p) not in kept for p in cluttered.cloud.points_mm.tolist())
+    assert 100 <= strays <= 200
 
 
 @pytest.mark.parametrize("view", VIEWS)
@@ -280,7 +321,7 @@ def test_a_tumor_that_others_cover_is_refused():
 
 def test_the_folder_holds_scenes_with_truth_targets_and_picture(made, case_folder):
     names = [p.name for p in list_scenes(made)]
-    assert names == ["P1-clean", "P1-noise", "Rot90-clean", "Rot90-noise"]
+    assert names == ["P1-clean", "P1-clutter", "Rot90-clean", "Rot90-clutter"]
     for name in names:
         folder = made / name
         back = read_scene(folder)
@@ -312,8 +353,8 @@ def test_vertices_keep_the_cases_order(made, case_folder):
 def test_the_protocol_reads_the_scenes(made, tmp_path):
     """A perfect answer from the kept truth scores as one."""
     scenes = tmp_path / "scenes"
-    shutil.copytree(made / "P1-noise", scenes / "P1-noise")
-    truth = read_scene(scenes / "P1-noise").reference
+    shutil.copytree(made / "P1-clutter", scenes / "P1-clutter")
+    truth = read_scene(scenes / "P1-clutter").reference
 
     def locate(cloud):
         low = truth.organ.box_mm[0] - 2
@@ -340,7 +381,7 @@ def test_a_finished_folder_is_left_alone_and_can_be_extended(
     run = TwinRun(case_folder, view=SMALL, build=StandIn, solve=StandIn.solve)
     before = {p: p.stat().st_mtime_ns for p in out.rglob("*") if p.is_file()}
     StandIn.solved = ()
-    assert len(make_scenes(run, out, ("Rot90", "P1"), ("clean", "noise"))) == 4
+    assert len(make_scenes(run, out, ("Rot90", "P1"), ("clean", "clutter"))) == 4
     assert StandIn.solved == ()
     changed = [p.name for p, t in before.items() if p.stat().st_mtime_ns != t]
     assert changed == ["manifest.json"]
@@ -418,10 +459,10 @@ def test_the_command_passes_its_options_on(no_pictures, case_folder, tmp_path, m
 
     out = tmp_path / "scenes"
     monkeypatch.setattr(dataset, "TwinRun", run)
-    options = ["--states", "D1", "P1", "--views", "noise", "--seed", "3"]
+    options = ["--states", "D1", "P1", "--views", "shaft", "--seed", "3"]
     monkeypatch.setattr("sys.argv", ["tumortrack", "twin", str(case_folder), str(out), *options])
     cli.main()
-    assert [p.name for p in list_scenes(out)] == ["D1-noise", "P1-noise"]
+    assert [p.name for p in list_scenes(out)] == ["D1-shaft", "P1-shaft"]
     assert store.read_json(out / "twin.json")["seed"] == 3
     assert "2 scenes in" in capsys.readouterr().out
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -25,9 +26,9 @@ from tumortrack.plan.budget import (
     TOOL_MM,
     UNKNOWN_TRACKING_MM,
     ErrorBudget,
-    beyond_errors,
     heeded,
     kept_mm,
+    plan_within,
     planned_budget,
     widened,
 )
@@ -230,14 +231,22 @@ def test_a_calibrated_margin_is_the_tracking_term():
 
 def test_healthy_tissue_is_kept_beyond_all_errors():
     seen, config = stating(tumor_1=2.0), ResectionConfig(margin_mm=3.0, most_healthy=1.0)
-    first = planned_budget(plan_resection(seen, config), seen, 0.5, 0.0, 1.0, confidence=0.95)
-    wide = widened(config, first)
+    budget_of = partial(
+        planned_budget,
+        located=seen,
+        hand_eye_mm=0.5,
+        tool_error_mm=0.0,
+        moved_mm=1.0,
+        confidence=0.95,
+    )
+    as_asked, same, first = plan_within(seen, config, budget_of)
+    assert (as_asked.margin_mm, same) == (3.0, config)
+    plan, wide, budget = plan_within(seen, config, budget_of, beyond_errors=True)
     assert wide.margin_mm == pytest.approx(3 + 1 + math.hypot(2.0, 0.5, OFF_MM))
-    plan = plan_resection(seen, wide)
-    budget = planned_budget(plan, seen, 0.5, 0.0, 1.0, confidence=0.95)
+    assert plan.margin_mm == wide.margin_mm
     assert budget.left_mm == pytest.approx(3.0, abs=0.3)
-    assert "3 mm of healthy tissue" in beyond_errors(3.0, budget)
-    assert "within 2.0 mm of its estimate in 95 of 100" in beyond_errors(3.0, budget)
+    assert "3 mm of healthy tissue" in plan.notes[0]
+    assert "within 2.0 mm of its estimate in 95 of 100" in plan.notes[0]
     with pytest.raises(NoPlan, match=r"allowed are 20"):
         widened(ResectionConfig(margin_mm=18.0), first)
     for twice in (ResectionConfig(method="published"), ResectionConfig(sigmas=1.0)):

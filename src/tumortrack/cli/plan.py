@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, replace
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -75,11 +76,10 @@ class Plan(StatedPatient):
 
     def run(self) -> None:
         from tumortrack.core.config import to_builtins
-        from tumortrack.plan.budget import beyond_errors, heeded, widened
+        from tumortrack.plan.budget import heeded, plan_within
         from tumortrack.plan.files import INVENTED, KIND, PlanFolder, write_plan
         from tumortrack.plan.located import notes_of_doubt, read_run
         from tumortrack.plan.operation import OperationConfig
-        from tumortrack.plan.resection import plan_resection
         from tumortrack.report.plan_pictures import draw_plan
 
         config = self._resection_config()
@@ -99,13 +99,10 @@ class Plan(StatedPatient):
             raise NoPlan(
                 "the run has no kidney.ply, so arms can't keep clear of it; give --no-arms."
             )
-        resection = plan_resection(located, config)
-        budget = self._budget(resection, located, frames, cell_config)
-        if self.confidence is not None:
-            healthy_mm, config = config.margin_mm, widened(config, budget)
-            resection = plan_resection(located, config)
-            budget = self._budget(resection, located, frames, cell_config)
-            doubts = (*doubts, beyond_errors(healthy_mm, budget))
+        budget_of = partial(self._budget, located=located, frames=frames, cell=cell_config)
+        resection, config, budget = plan_within(
+            located, config, budget_of, self.confidence is not None
+        )
         resection = replace(resection, notes=(*doubts, *resection.notes))
         for line in budget.table():
             say(line)

@@ -8,6 +8,7 @@ whose directions have nothing to do with each other: they add in quadrature.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 
 import msgspec
@@ -21,7 +22,7 @@ from tumortrack.core.errors import InputError, NoPlan
 from tumortrack.live.sinks.ur import OFF_MM
 from tumortrack.models.margins import StatedRadius, margin_words, stated_radius
 from tumortrack.plan.outline import evenly_round, polygon_of
-from tumortrack.plan.resection import inside
+from tumortrack.plan.resection import inside, plan_resection
 from tumortrack.plan.values import MARGIN_MM, CutLayer, Located, ResectionConfig, ResectionPlan
 
 # So many standard deviations, but no less than the largest Hausdorff distance of a tumor of any
@@ -187,13 +188,31 @@ def heeded(plan: ResectionPlan, budget: ErrorBudget, accept: bool) -> ResectionP
     return replace(plan, notes=(*plan.notes, f"{words}."))
 
 
-def beyond_errors(healthy_mm: float, budget: ErrorBudget) -> str:
-    """A note on what a widened margin is made of."""
-    return (
+def plan_within(
+    located: Located,
+    config: ResectionConfig,
+    budget_of: Callable[[ResectionPlan], ErrorBudget],
+    beyond_errors: bool = False,
+) -> tuple[ResectionPlan, ResectionConfig, ErrorBudget]:
+    """A plan, as it was asked for in the end, and its budget.
+
+    Args:
+        beyond_errors: the margin is of healthy tissue, and all errors are added to it; a note says
+            what it is made of. Raises as ``widened``.
+    """
+    plan = plan_resection(located, config)
+    budget = budget_of(plan)
+    if not beyond_errors:
+        return plan, config, budget
+    healthy_mm, config = config.margin_mm, widened(config, budget)
+    plan = plan_resection(located, config)
+    budget = budget_of(plan)
+    note = (
         f"the margin is {healthy_mm:g} mm of healthy tissue and {budget.sum_mm:.1f} mm of error, "
         f"with the tumor within {budget.tracking_mm:.1f} mm of its estimate in "
         f"{100 * budget.confidence:g} of 100 such cases."
     )
+    return replace(plan, notes=(note, *plan.notes)), config, budget
 
 
 def kept_mm(layers: tuple[CutLayer, ...], points_mm: Float[np.ndarray, "n 3"]) -> float:

@@ -11,12 +11,12 @@ from pathlib import Path
 
 from tumortrack.core.errors import TumortrackError
 from tumortrack.sense.ply import write_cloud_ply
-from tumortrack_lab.bench.groups import PRESETS
 from tumortrack_lab.bench.rows import (
     BEFORE_TORCH,
     COMMAND,
     LARGE,
     PEAK,
+    PRESETS,
     Workload,
     timing_of,
 )
@@ -52,7 +52,7 @@ def workloads(subject: BenchSubject, budget_s: float) -> Iterator[Workload]:
     with tempfile.TemporaryDirectory() as folder:
         for preset in PRESETS:
             cloud, out = Path(folder) / f"{preset}.ply", Path(folder) / "out"
-            write_cloud_ply(cloud, subject.cloud.points_mm)
+            write_cloud_ply(cloud, subject.cloud(preset).points_mm)
             words = ["locate", subject.model_folder(preset), cloud, out, "--overwrite"]
             arguments = [*map(str, words), "--device", "cpu"]
             run_command(arguments)  # into the disk's cache

@@ -1,14 +1,14 @@
-"""Workloads, timed in turns, and the rows that become of them: what was done and how long it took.
-Versions take turns, so that what else the machine does meets all.
+"""Workloads, timed in turns, and the rows that become of them: what was done, how long it took,
+what it has to take at least. Versions take turns, so that what else the machine does meets all.
 """
 
 from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import msgspec
 import numpy as np
@@ -19,11 +19,23 @@ _FEWEST, _MOST = 3, 25  # rounds
 _LEAST_S = 0.01  # that a turn lasts: shorter calls are repeated within it
 _LONG_S = 0.5  # a first call that takes longer is warm enough
 _LONGER_S = 1.0  # and one that takes longer still is a turn: what it loaded is little beside it
+PRESETS = ("clinic", "quick", "paper")
 # What rows are called.
-GENERATOR, FRAME, TRACKING = "generator", "frame", "tracking frame"
+GENERATOR, ENCODER, DECODER = "generator", "encoder", "decoder"
+FRAME, EVERY, TRACKING = "frame", "frame, every query asked", "tracking frame"
 VOLUME, COMMAND, LARGE = "400^3 labels", "`locate` command", "`locate --grid 400` command"
 PLAN, MOTIONS, STEP, TRAINING = "plan", "motions", "training step", "training, generator included"
 BEFORE_TORCH, PEAK = "seconds before torch is imported", "peak bytes"  # among ``others``
+
+Precision = Literal["fp32", "bf16", "int8"]
+
+
+@dataclass(frozen=True)
+class Uncounted:
+    """What a timed call returns if some of its seconds belong to something else."""
+
+    seconds: float
+
 
 Call = Callable[[], object]
 
@@ -43,34 +55,37 @@ class InterleavedTiming(Config, frozen=True):
         return InterleavedTiming(**seconds, turns=self.turns)
 
 
-def interleaved(*versions: Call, budget_s: float) -> list[InterleavedTiming]:
+def interleaved(*versions: Call, budget_s: float, fewest: int = _FEWEST) -> list[InterleavedTiming]:
     """Seconds a call of each version. Every version is called before (compiled, cached, warm);
-    then all take turns until ``budget_s`` is spent, between 3 and 25 times each. A first call that
-    took more than a second counts as a turn: a median of three bears a cold one. Where time is up,
-    those that have had the fewest turns leave the last to the others."""
+    then all take turns until ``budget_s`` is spent, between ``fewest`` and 25 times each. A first
+    call that took more than a second counts as a turn: a median of three bears a cold one. Where
+    time is up, those that have had the fewest turns leave the last to the others."""
     begun = time.perf_counter()
     warmed = []
     for version in versions:
-        first_s = _turn_s(version, 1)
-        warmed.append(first_s if first_s > _LONG_S else _turn_s(version, 1))
-    repeats = [max(1, math.ceil(_LEAST_S / max(took_s, 1e-7))) for took_s in warmed]
-    seconds = [[took_s] if took_s > _LONGER_S else [] for took_s in warmed]
+        first = _turn(version, 1)
+        warmed.append(first if first[0] > _LONG_S else _turn(version, 1))
+    repeats = [max(1, math.ceil(_LEAST_S / max(took_s, 1e-7))) for took_s, _ in warmed]
+    seconds = [[counted_s] if took_s > _LONGER_S else [] for took_s, counted_s in warmed]
     for done in range(_MOST):
         past_s = time.perf_counter() - begun
         up = past_s * (done + 1) / max(done, 1) > budget_s
-        if up and min(map(len, seconds)) >= _FEWEST:
+        if up and min(map(len, seconds)) >= fewest:
             break
         for times, version, repeat in zip(seconds, versions, repeats, strict=True):
-            if not (up and len(times) >= _FEWEST):
-                times.append(_turn_s(version, repeat) / repeat)
+            if not (up and len(times) >= fewest):
+                times.append(_turn(version, repeat)[1] / repeat)
     return [timing_of(times) for times in seconds]
 
 
-def _turn_s(version: Call, repeat: int) -> float:
-    start = time.perf_counter()
+def _turn(version: Call, repeat: int) -> tuple[float, float]:
+    """Seconds of so many calls: in all, and those that count."""
+    start, uncounted = time.perf_counter(), 0.0
     for _ in range(repeat):
-        version()
-    return time.perf_counter() - start
+        result = version()
+        uncounted += result.seconds if isinstance(result, Uncounted) else 0.0
+    took_s = time.perf_counter() - start
+    return took_s, took_s - uncounted
 
 
 def timing_of(seconds: list[float]) -> InterleavedTiming:
@@ -78,6 +93,14 @@ def timing_of(seconds: list[float]) -> InterleavedTiming:
     return InterleavedTiming(
         best_s=min(seconds), median_s=middle, low_s=low, high_s=high, turns=len(seconds)
     )
+
+
+class Work(Config, frozen=True):
+    """What cannot be left out of one call: arithmetic, and bytes that have to be moved once."""
+
+    flops: float
+    bytes: float
+    precision: Precision = "fp32"
 
 
 class BenchRow(Config, frozen=True):
@@ -95,6 +118,7 @@ class BenchRow(Config, frozen=True):
     ours: InterleavedTiming
     naive: InterleavedTiming | None = None
     naive_is: str = ""
+    work: Work | None = None
     per_call: int = 1
     agreement: float | None = None
     others: dict[str, float] = msgspec.field(default_factory=dict)
@@ -112,35 +136,67 @@ class BenchRow(Config, frozen=True):
         return self.per_call / self.ours.median_s
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class Workload:
-    """What becomes a row: our form, a call or what it took, and perhaps a naive one.
+    """What becomes a row: our form and the naive one, each a call or what it took.
 
     ``calls``: how many items one call of ours makes; ``naive_share``: how many times the naive
-    form's part the whole work is; ``facts``: the row's other fields, asked for once it is timed.
+    form's part the whole work is; ``facts``: the row's other fields, asked for once it is timed;
+    ``beside``: other forms of ours, timed in the same turns and beside the same naive form.
+    ``naive`` holds the seconds once they are known.
     """
 
     name: str
     what: str
     item: str
     ours: Call | InterleavedTiming
-    naive: Call | None = None
+    naive: Call | InterleavedTiming | None = None
     naive_is: str = ""
     calls: int = 1
     naive_share: float = 1.0
     facts: Callable[[], dict[str, Any]] = dict
+    beside: tuple[Workload, ...] = ()
 
-    def row(self, threads: int, budget_s: float) -> BenchRow:
-        """Time both forms in turns."""
-        ours, naive = self.ours, None
-        if not isinstance(ours, InterleavedTiming):
-            forms = [ours, *([self.naive] if self.naive else [])]
-            ours, *others = interleaved(*forms, budget_s=budget_s)
-            naive = others[0].times(self.naive_share) if others else None
-        return BenchRow(
-            name=self.name, what=self.what, threads=threads, item=self.item,
-            ours=ours.times(1 / self.calls), naive=naive, naive_is=self.naive_is, **self.facts(),
-        )  # fmt: skip
+    def rows(self, threads: int, budget_s: float) -> Iterator[BenchRow]:
+        """Time all forms in turns."""
+        forms = (self, *self.beside)
+        calls = [call for call in (*(f.ours for f in forms), self.naive) if callable(call)]
+        seconds = interleaved(*calls, budget_s=budget_s)
+        timed: dict[object, Any] = dict(zip(calls, seconds, strict=True))
+        self.naive = known = timed.get(self.naive, self.naive)
+        naive = None if known is None else known.times(self.naive_share)
+        for form in forms:
+            ours = timed.get(form.ours, form.ours).times(1 / form.calls)
+            yield BenchRow(
+                name=form.name, what=form.what, threads=threads, item=form.item, ours=ours,
+                naive=naive, naive_is=self.naive_is, **form.facts(),
+            )  # fmt: skip
+
+
+class Peaks(Config, frozen=True):
+    """What the machine reaches with so many threads: matrix products by precision (FLOP/s; absent:
+    not offered) and memory (bytes/s)."""
+
+    threads: int
+    gemm: dict[str, float]
+    triad: float
+
+    def least_s(self, work: Work) -> tuple[float, float]:
+        """The arithmetic at the measured rate (single precision's where the other is not offered)
+        and the bytes at the measured bandwidth; whichever takes longer is the floor."""
+        rate = self.gemm.get(work.precision, self.gemm["fp32"])
+        return work.flops / rate, work.bytes / self.triad
+
+
+class Point(Config, frozen=True):
+    """A point of a curve: time of one call and the process's peak memory meanwhile."""
+
+    curve: str  # against what: queries, points, ...
+    what: str
+    size: int
+    seconds: float
+    peak_bytes: int | None
+    working_bytes: int | None = None  # of the peak, what was not held before the call
 
 
 class BenchResult(Config, frozen=True):
@@ -148,4 +204,11 @@ class BenchResult(Config, frozen=True):
 
     machine: dict[str, str]
     command: str
+    peaks: tuple[Peaks, ...] = ()
     rows: tuple[BenchRow, ...] = ()
+    points: tuple[Point, ...] = ()
+
+    def peaks_for(self, row: BenchRow) -> Peaks | None:
+        """Of as many threads as the row was measured with; none for other devices."""
+        fitting = (peaks for peaks in self.peaks if peaks.threads == row.threads)
+        return next(fitting, None) if row.device == "cpu" else None

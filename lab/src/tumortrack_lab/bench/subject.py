@@ -1,10 +1,10 @@
 """The test subject: the built-in phantom, scenes of it, and models trained for it here.
 
 Labels of untrained networks mean nothing and their volumes have no surface, so whatever runs a
-network runs one that has learnt, from a fixed seed, kept in a folder. `clinic` and `quick` learn
-for a minute. The paper's network learns for hours: where its labels are compared, or the surface of
-its volume decides the time, one that is as sure of a single scene serves. Its encoder stays as it
-was drawn, and so do the weights on the latent; the rest of the decoder learns.
+network runs one that has learnt, from a fixed seed, kept in a folder; or a user's own. `clinic`
+and `quick` learn for a minute. The paper's network learns for hours: where its labels are compared,
+or the surface of its volume decides the time, one that is as sure of a single scene serves. Its
+encoder stays as it was drawn, and so do the weights on the latent; the rest of the decoder learns.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ import torch
 from msgspec.structs import replace
 from torch.nn.functional import cross_entropy
 
-from tumortrack.core.errors import ArtifactError
+from tumortrack.core.errors import ArtifactError, InputError
 from tumortrack.core.types import Anatomy, SensorCloud
 from tumortrack.imaging.surface import surfaces
 from tumortrack.models.config import TrainConfig
@@ -34,17 +34,17 @@ from tumortrack.occupancy.network import OccupancyNetwork
 from tumortrack.phantom.digital import PhantomParameters, phantom_labels
 from tumortrack.registration.model import RegistrationModel
 from tumortrack.sense.cloud import thin_cloud
+from tumortrack.sense.files import read_cloud
 from tumortrack.simulate.deform import DragConfig
 from tumortrack.simulate.elastic.body import ElasticBody
 from tumortrack.simulate.occupancy import OccupancyConfig, OccupancyPool
 from tumortrack.simulate.scene import RenderedScene, SceneConfig, SceneRecipe, Simulator
 from tumortrack.training.model import load_model, save_model
 from tumortrack.training.state import TrainingRun
-from tumortrack.training.train import train
-from tumortrack_lab.bench.groups import PRESETS
+from tumortrack.training.train import TrainingStatus, train
 from tumortrack_lab.bench.occupancy import OccupancyForms
 from tumortrack_lab.bench.registration import RegistrationForms
-from tumortrack_lab.bench.rows import Workload
+from tumortrack_lab.bench.rows import PRESETS, Workload
 
 _PER_SIDE = 600  # points in and outside of each part in a step
 _RATE = 1.5e-3
@@ -60,10 +60,12 @@ _VOXEL_MM = 1.5  # of the phantom
 
 @dataclass(eq=False)
 class BenchSubject:
-    """``presets``: configurations by name; ``folder``: where trained models are kept."""
+    """``presets``: configurations by name; ``folder``: where trained models are kept; ``given``: a
+    user's own model and a cloud that shows its organ, which take the place of its preset's."""
 
     presets: Mapping[str, Callable[..., TrainConfig]]  # of an anatomy
     folder: Path
+    given: tuple[Path, Path] | None = None
 
     @cached_property
     def anatomy(self) -> Anatomy:
@@ -84,26 +86,43 @@ class BenchSubject:
         return Simulator(self.anatomy, UP, config).render(SceneRecipe(SEED, "test", 0))
 
     def model(self, preset: str) -> Model:
-        """The trained model of a preset, on the CPU. Raises ArtifactError: there is no whole model
-        of this version."""
+        """The trained or given model of a preset, on the CPU. Raises ArtifactError: there is no
+        whole model of this version."""
         return _loaded(self.model_folder(preset))
 
-    @cached_property
-    def cloud(self) -> SensorCloud:
-        """1,000 points that models are asked about: of a view of ``scene``."""
-        return thin_cloud(self.scene.cloud, 1000, np.random.default_rng(SEED))
+    def cloud(self, preset: str) -> SensorCloud:
+        """1,000 points that the preset's model is asked about: of the given cloud, or of a view of
+        ``scene``."""
+        given = self.given is not None and preset == self._given_preset
+        seen = read_cloud(self.given[1])[0] if self.given and given else self.scene.cloud
+        return thin_cloud(seen, 1000, np.random.default_rng(SEED))
 
     @cache  # noqa: B019 (a subject lives as long as its process)
     def forms(self, preset: str) -> OccupancyForms | RegistrationForms:
         """One for all groups of rows, whose naive form then labels its queries once."""
-        model, cloud = self.model(preset), self.cloud
+        model, cloud = self.model(preset), self.cloud(preset)
         if isinstance(model, RegistrationModel):
             return RegistrationForms(model, cloud)
         assert isinstance(model, OccupancyModel)
         return OccupancyForms(preset, model, cloud.points_mm)
 
     def model_folder(self, preset: str) -> Path:
+        if self.given is not None and preset == self._given_preset:
+            return self.given[0]
         return self.folder / preset
+
+    @cached_property
+    def _given_preset(self) -> str | None:
+        """Of the given model: by its kind of network, and the size of what it encodes to. Raises
+        InputError: its network is that of no preset."""
+        if self.given is None:
+            return None
+        encoder = _loaded(self.given[0]).config.network.encoder
+        for preset in PRESETS:
+            like = self.presets[preset](self.anatomy).network.encoder
+            if type(like) is type(encoder) and like.latent_size == encoder.latent_size:
+                return preset
+        raise InputError(f"{self.given[0]}: its network is none of {', '.join(PRESETS)}.")
 
     def trained(self, preset: str) -> bool:
         """Whether there is a whole model of this version."""
@@ -113,8 +132,9 @@ class BenchSubject:
             return False
         return True
 
-    def train(self, preset: str) -> None:
-        """Train the preset's model into its folder, on the CPU."""
+    def train(self, preset: str, report: Callable[[TrainingStatus], None]) -> None:
+        """Train the preset's model into its folder, on the CPU; ``report`` is called with how far
+        it is."""
         folder, config = self.model_folder(preset), self.presets[preset](self.anatomy)
         shutil.rmtree(folder, ignore_errors=True)
         if preset == "paper":
@@ -123,25 +143,26 @@ class BenchSubject:
         name = hashlib.sha256(b"the bench's phantom").hexdigest()
         short = replace(config, validation_pairs=_VALIDATED)
         run = TrainingRun(self.anatomy, UP, name, short, SEED, steps=_STEPS[preset], device="cpu")
-        train(run, folder, lambda status: None)
+        train(run, folder, report)
 
 
 _loaded = cache(partial(load_model, device="cpu"))
 
 
 def _workloads(kind: str, subject: BenchSubject, _: float) -> Iterator[Workload]:
-    for preset in PRESETS:
+    presets = {"encoders": (*LABELLING, "clinic"), "decoders": LABELLING}
+    for preset in presets.get(kind, PRESETS):
         yield from getattr(subject.forms(preset), kind)()
 
 
-frames, tracking, volumes = (
-    partial(_workloads, kind) for kind in ("frames", "tracking", "volumes")
+encoders, decoders, frames, tracking, volumes = (
+    partial(_workloads, kind) for kind in ("encoders", "decoders", "frames", "tracking", "volumes")
 )
 
 
 def _overfit(subject: BenchSubject, config: TrainConfig, folder: Path) -> None:
     """Write a model folder whose network labels points of the subject's scene."""
-    anatomy, scene, cloud = subject.anatomy, subject.scene, subject.cloud
+    anatomy, scene, cloud = subject.anatomy, subject.scene, subject.cloud("paper")
     steps, pool = _STEPS["paper"], OccupancyPool(anatomy, OccupancyConfig(per_side=_PER_SIDE), 0)
     rng = np.random.default_rng(0)
     torch.manual_seed(0)

@@ -1,74 +1,74 @@
-"""`tumortrack bench`: speed; lines, JSON, blocks of a document."""
+"""`tumortrack bench`: speed beside naive forms; a table, JSON, blocks of a document."""
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from tumortrack_lab.bench.groups import GROUPS
+from rich.console import Console
+
+from tumortrack.core.errors import InputError
 
 TRAINED = Path("runs/bench")  # models trained to be measured
-_THREADS = 2  # at most
+_WIDE = 150  # characters of a table that goes to a file
 
 
 @dataclass(frozen=True, kw_only=True)
 class Bench:
-    """Measure the speed of every part on two cores of this machine, networks beside a naive form.
+    """Measure the speed of every part on this machine, each beside its naive form, in turns.
 
     Attributes:
         only: which parts; default: all.
         quick: shorter measurements, about a minute in all once there are models.
-        out: JSON file to write.
+        curves: also how time and memory grow with queries, points, tumors, voxels and batch.
+        model: folder that `train` wrote, to be measured instead of the one that the bench trains
+            (kept in runs/bench).
+        cloud: of that model's organ, freed of its background; .ply, .pcd or .npz in mm.
+        out: JSON file to write; curves lie beside it.
         document: Markdown file whose marked blocks are to be filled, such as docs/performance.md.
     """
 
     only: tuple[
         Literal[
-            "generator", "elastic-generator", "frame", "tracking", "volume", "command", "planning",
-            "gpu", "training", "whole-training",
+            "generator", "elastic-generator", "encoder", "decoder", "frame", "tracking", "volume",
+            "command", "planning", "gpu", "training", "whole-training",
         ],
         ...,
     ] = ()  # fmt: skip
     quick: bool = False
+    curves: bool = False
+    model: Path | None = None
+    cloud: Path | None = None
     out: Path = Path("runs/bench.json")
     document: Path | None = None
 
     def run(self) -> None:
-        """Measure, show, write. Raises InputError: a document without its markers."""
+        """Measure, show, write. Raises InputError: a model without a cloud or the other way, a
+        document without its markers."""
+        from tumortrack.cli.console import console, say
         from tumortrack.core.process import available_cores
-
-        threads = min(available_cores(), _THREADS)
-        for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS"):
-            os.environ[name] = f"{threads}"  # settled when PyTorch is loaded
-        if hasattr(os, "sched_setaffinity"):  # Linux alone has it
-            os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:threads])
-
-        from tumortrack.cli.console import say
-        from tumortrack.training.presets import PRESETS
-        from tumortrack_lab.bench.machine import describe_machine
-        from tumortrack_lab.bench.report import BLOCKS, line, write_bench
-        from tumortrack_lab.bench.rows import BenchResult
-        from tumortrack_lab.bench.subject import BenchSubject
+        from tumortrack_lab.bench.report import BLOCKS, line, rich_table, write_bench
+        from tumortrack_lab.bench.run import CURVES, GROUPS, Task, measure, tasks_of
         from tumortrack_lab.study.document import ReportWriter
 
+        if (self.model is None) != (self.cloud is None):
+            raise InputError(
+                "--model and --cloud belong together: a model, and a cloud of its organ."
+            )
         words = ["tumortrack bench", *(["--only", *self.only] if self.only else [])]
-        command = " ".join([*words, *(["--quick"] if self.quick else [])])
+        words += [f"--{name}" for name in ("quick", "curves") if getattr(self, name)]
+        command = " ".join(words)
         if self.document is not None:
             ReportWriter(self.document, command).check(BLOCKS)
-        machine, subject = describe_machine(), BenchSubject(PRESETS, TRAINED)
-        groups = [GROUPS[name] for name in self.only or GROUPS]
-        for preset in sorted({preset for group in groups for preset in group.needs}):
-            if not subject.trained(preset):
-                say(f"training a `{preset}` network to measure")
-                subject.train(preset)
-        rows = []
-        for group in groups:
-            seconds = group.quick_s if self.quick else group.seconds
-            for workload in group.workloads(subject, seconds):
-                rows.append(workload.row(threads, seconds))
-                say(line(rows[-1]))
-        found = BenchResult(machine=machine, command=command, rows=tuple(rows))
+        given = (str(self.model), str(self.cloud)) if self.model else None
+        common = Task(threads=1, folder=str(TRAINED), given=given, quick=self.quick)
+        curves = tuple(CURVES) if self.curves else ()
+        tasks = tasks_of(common, self.only or tuple(GROUPS), curves, available_cores())
+        with console.status("starting ...") as status:
+            report = status.update if console.is_terminal else say
+            found = measure(tasks, command, report, lambda row, left: say(line(row, left)))
+        shown = console if console.is_terminal else Console(width=_WIDE)
+        shown.print(rich_table(found))
         for path in write_bench(found, self.out, self.document):
             say(f"written to {path}")

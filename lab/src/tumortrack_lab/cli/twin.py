@@ -18,7 +18,7 @@ class Twin:
     Attributes:
         case: folder that `prepare` wrote.
         scenes: folder to write: what `evaluate` reads. The same command resumes.
-        seed: of noise and target points.
+        seed: of noise, instruments, background and target points.
         states: which of them; default: all.
         views: which of them; default: all.
     """
@@ -29,7 +29,7 @@ class Twin:
     states: tuple[
         Literal["D0", "D1", "D2", "D3", "Rot90", "Rot180", "Rot270", "G1", "P1"], ...
     ] = ()
-    views: tuple[Literal["clean", "noise"], ...] = ()
+    views: tuple[Literal["clean", "noise", "shaft", "clutter"], ...] = ()
 
     def run(self) -> None:
         """Make what is missing of these states and views; empty means all. Raises InputError: no

@@ -1,20 +1,34 @@
-"""The rod before the camera. It is taken to be segmented out: where it hides the organ there is no
-return, and it gives none of its own.
+"""What else lies before the camera: instruments, fat, background.
+
+All of it acts on the depth image of the organ (camera frame, mm), so that the cloud still comes
+from ``sense.cloud`` alone. Occluders are taken to be segmented out: where they hide the organ there
+is no return, and they give none of their own. Background is what a segmentation has left.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
+from jaxtyping import Float64
 
+from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import rotation_onto
 from tumortrack.core.types import DepthFrame, Mesh
+from tumortrack.sense.camera import deproject
 from tumortrack.sense.render import render_depth
 from tumortrack_lab.twin.equilibrium import Rod
 
+SHAFT_CLEARANCE_MM = 3.0  # between a shaft's tip and the organ, towards the camera
+SHAFT_RISE_DEGREES = 30.0  # of a shaft above the image plane
+_TOUCH_MM = 1.0  # a shaft keeps this far from all of the organ that is seen
 _RING_MM = 4.0  # a rod is cut into rings: a triangle that reaches behind the camera is not drawn
 _LAST_DEPTH_MM = 5.0  # a rod that comes straight at the camera ends here
+_LUMP_SHARE = 2 / 3  # of the background; the rest is an instrument's tip
+
+Flat = Float64[np.ndarray, " 2"]
+Generator = np.random.Generator
 
 
 def rod_mesh(rod: Rod) -> Mesh:
@@ -37,9 +51,114 @@ def rod_mesh(rod: Rod) -> Mesh:
 
 def occlude(frame: DepthFrame, rod: Rod) -> tuple[DepthFrame, float]:
     """The frame without what the rod hides, and the share of its returns that were lost."""
-    mesh, seen = rod_mesh(rod), np.isfinite(frame.depth_mm)
+    out, before = _without(frame, rod_mesh(rod)), _returns(frame)
+    return out, (before - _returns(out)) / max(before, 1)
+
+
+def _without(frame: DepthFrame, mesh: Mesh) -> DepthFrame:
+    """The frame without what a solid hides."""
     with np.errstate(invalid="ignore"):
         solid = render_depth(mesh.vertices_mm, mesh.faces, frame.intrinsics)
         hidden = solid.depth_mm < frame.depth_mm
-    depth_mm = np.where(hidden, np.float32(np.nan), frame.depth_mm)
-    return replace(frame, depth_mm=depth_mm), float(hidden.sum() / max(seen.sum(), 1))
+    return replace(frame, depth_mm=np.where(hidden, np.float32(np.nan), frame.depth_mm))
+
+
+def _returns(frame: DepthFrame) -> int:
+    return int(np.isfinite(frame.depth_mm).sum())
+
+
+def shaft_over(frame: DepthFrame, radius_mm: float, rng: Generator) -> Rod:
+    """A shaft that comes from any side, 30 degrees above the image plane, and ends 3 mm above a
+    random place in the middle tenth of what is seen; higher where it would else touch the organ
+    on its way."""
+    row, column = np.nonzero(np.isfinite(frame.depth_mm))
+    offset = row - np.median(row), column - np.median(column)
+    inner = np.argsort(np.hypot(*offset), kind="stable")
+    points = deproject(frame).astype(np.float64)
+    target = points[inner[rng.integers(max(len(points) // 10, 1))]]
+    angle, rise = rng.uniform(0, 2 * np.pi), np.deg2rad(SHAFT_RISE_DEGREES)
+    axis = np.array([np.cos(angle) * np.cos(rise), np.sin(angle) * np.cos(rise), -np.sin(rise)])
+    tip = target - [0, 0, SHAFT_CLEARANCE_MM]
+    while Rod(tip, axis, radius_mm).distance(points[::7])[0].min() < _TOUCH_MM:
+        tip[2] -= 1.0
+    return Rod(tip, axis, radius_mm)
+
+
+def add_background(
+    frame: DepthFrame, share: float, support_mm: float, rng: Generator
+) -> tuple[DepthFrame, float]:
+    """The frame with background in pixels without return: ``share`` of all returns, to the nearest
+    pixel; and what share that is. ``support_mm``: depth of the support plane. Two thirds are the
+    top of a lump of fat that lies on the support beside the organ, one third is the end of an
+    instrument there; a crop by depth keeps both. Raises InputError: no room beside the organ."""
+    organ = _returns(frame)
+    count = round(share / (1 - share) * organ)
+    lump = round(_LUMP_SHARE * count)
+    out = _filled(frame, _lumps(frame, support_mm, rng), lump, support_mm, nearest=True)
+    out = _filled(out, _tips(out, support_mm, rng), count - lump, support_mm, nearest=False)
+    got = _returns(out) - organ
+    return out, got / (got + organ)
+
+
+def _lumps(frame: DepthFrame, support_mm: float, rng: Generator) -> Iterator[Mesh]:
+    """Half ellipsoids on the support beside the organ, ever larger."""
+    import trimesh
+
+    ball = trimesh.creation.icosphere(3, 1.0)
+    for size_mm in (14.0, 18.0, 24.0, 32.0):
+        for angle in rng.uniform(0, 2 * np.pi, 8):
+            beside = _beside(frame, angle, support_mm, 0.5 * size_mm)
+            half = size_mm * np.array([1.0, 1.0, 0.6])
+            yield Mesh(ball.vertices * half + np.array([*beside, support_mm]), ball.faces)
+
+
+def _tips(frame: DepthFrame, support_mm: float, rng: Generator) -> Iterator[Mesh]:
+    """Rods that stand beside the organ and lean outwards, ever thicker."""
+    height_mm = support_mm - float(np.nanmedian(frame.depth_mm))
+    for radius_mm in (4.0, 6.0, 9.0, 13.0):
+        for angle in rng.uniform(0, 2 * np.pi, 8):
+            depth = support_mm - rng.uniform(0.3, 0.9) * max(height_mm, 5.0)
+            tip = np.array([*_beside(frame, angle, depth, radius_mm), depth])
+            lean = np.array([0.7 * np.cos(angle), 0.7 * np.sin(angle), -1.0])
+            yield rod_mesh(Rod(tip, lean / np.linalg.norm(lean), radius_mm))
+
+
+def _filled(
+    frame: DepthFrame, solids: Iterator[Mesh], count: int, support_mm: float, nearest: bool
+) -> DepthFrame:
+    """The frame with the nearest or the farthest ``count`` pixels of the first solid that shows so
+    many where nothing else is seen, and nearer than the support."""
+    for solid in solids:
+        seen = render_depth(solid.vertices_mm, solid.faces, frame.intrinsics).depth_mm
+        with np.errstate(invalid="ignore"):
+            free = np.flatnonzero((seen < support_mm) & np.isnan(frame.depth_mm))
+        if len(free) >= count:
+            depths = seen.ravel()[free]
+            order = np.argsort(depths if nearest else -depths, kind="stable")
+            chosen = free[order[:count]]
+            depth_mm = frame.depth_mm.copy()
+            depth_mm.flat[chosen] = seen.flat[chosen]
+            return replace(frame, depth_mm=depth_mm)
+    raise InputError(
+        "the image has no room for background beside the organ; the organ must be wholly in "
+        "view. Raise the camera or choose a wider one."
+    )
+
+
+def _beside(frame: DepthFrame, angle: float, depth_mm: float, gap_mm: float) -> Flat:
+    """(x, y) at a depth, in a direction of the image, ``gap_mm`` beyond the organ's edge there."""
+    camera = frame.intrinsics
+    row, column = np.nonzero(np.isfinite(frame.depth_mm))
+    middle = np.array([np.median(column), np.median(row)])
+    offset = np.stack([column, row], axis=1) - middle
+    direction = _unit(angle)
+    along = offset @ direction
+    across = np.abs(offset @ np.array([-direction[1], direction[0]]))
+    edge_px = along[across < 10].max(initial=0.0)
+    pixel = middle + edge_px * direction - np.array([camera.cx, camera.cy])
+    focal = np.array([camera.fx, camera.fy])
+    return pixel * depth_mm / focal + gap_mm * direction
+
+
+def _unit(angle: float) -> Flat:
+    return np.array([np.cos(angle), np.sin(angle)])

@@ -20,9 +20,9 @@ from tumortrack.sense.render import render_depth
 from tumortrack.simulate.scene_folder import Scene
 from tumortrack_lab.twin.apparatus import moved
 from tumortrack_lab.twin.equilibrium import Rod
-from tumortrack_lab.twin.occluders import occlude
+from tumortrack_lab.twin.occluders import add_background, occlude, shaft_over
 
-View = Literal["clean", "noise"]
+View = Literal["clean", "noise", "shaft", "clutter"]
 VIEWS: tuple[View, ...] = get_args(View)
 
 
@@ -53,6 +53,8 @@ class ViewConfig(Config, frozen=True, kw_only=True):
     width: int = 848
     height: int = 480
     n_points: int = 5000  # of the cloud; every method thins it by itself
+    shaft_radius_mm: float = 4.0  # of the instrument in the view ``shaft``
+    clutter_share: float = 0.03  # background points among all, in the view ``clutter``
     noise: NoiseConfig = D405_NOISE  # of the view ``noise``
 
     @property
@@ -95,7 +97,7 @@ def make_scene(
     """One variant's scene in one view, and the targets before its camera, mm.
 
     Random numbers depend on seed, variant and view alone. Raises NoEstimate: fewer than 200 points
-    of the organ are seen.
+    of the organ are seen; InputError: no room for background beside the organ.
     """
     variant = VARIANTS[name]
     to_camera = camera_from_bench(config, variant.turn_degrees)
@@ -113,6 +115,12 @@ def make_scene(
     rng = np.random.default_rng([seed, list(VARIANTS).index(name), VIEWS.index(view)])
     if view == "noise":
         frame = add_noise(frame, config.noise, rng)
+    elif view == "shaft":
+        shaft = shaft_over(frame, config.shaft_radius_mm, rng)
+        frame, seen["shaft_covers_share"] = occlude(frame, shaft)
+    elif view == "clutter":
+        frame, share = add_background(frame, config.clutter_share, config.far_mm, rng)
+        seen["background_share"] = share
     cloud = cloud_from_depth(frame, config.crop, rng)
     meta = {
         "variant": name,
