@@ -26,19 +26,17 @@ from tumortrack.cli.console import say
 from tumortrack.core import store
 from tumortrack.core.config import to_builtins
 from tumortrack.core.errors import InputError, TumortrackError
-from tumortrack.imaging.case import load_case
 from tumortrack.simulate.scene_folder import Scene, list_scenes, read_scene
 from tumortrack_lab.study import resection, trainings
 from tumortrack_lab.study.document import ReportWriter
 from tumortrack_lab.study.measure import measured
 from tumortrack_lab.study.methods import study_case
-from tumortrack_lab.tets import TetMesh
 from tumortrack_lab.twin.dataset import claim
 from tumortrack_lab.world import estimates
 from tumortrack_lab.world.families import FAMILIES
-from tumortrack_lab.world.scenes import DISTURBANCES, World, WorldConfig
+from tumortrack_lab.world.scenes import DISTURBANCES, TETS, World, WorldConfig
 
-_ABOUT, _TETS, _FAILURES = "world.json", "tets.safetensors", "failures.json"
+_ABOUT, _FAILURES = "world.json", "failures.json"
 
 
 @dataclass(frozen=True)
@@ -160,9 +158,7 @@ def _scenes(options: Options, world: World) -> dict[str, Callable[[], Scene]]:
 
 def _open(options: Options, config: WorldConfig) -> World:
     """The world of the folder; stated there, with its tetrahedra, when it is new."""
-    from safetensors.numpy import load_file, save
-
-    case, out = load_case(options.case), options.out
+    out = options.out
     sha256 = store.sha256_of(options.case / store.MANIFEST)
     identity = {"case_sha256": sha256, "config": to_builtins(config)}
     source = options.states or out
@@ -172,13 +168,7 @@ def _open(options: Options, config: WorldConfig) -> World:
             raise InputError(f"{source} shows another case than {options.case}.")
         identity |= {"states": kept, "draws": options.draws}
     claim(out, _ABOUT, identity)
-    if (source / _TETS).exists():
-        kept = load_file(source / _TETS)
-        return World.of(case, sha256, config, TetMesh(kept["nodes_mm"], kept["tets"]))
-    world = World.of(case, sha256, config)
-    mesh = world.organ.mesh
-    store.write_atomically(out / _TETS, save({"nodes_mm": mesh.nodes_mm, "tets": mesh.tets}))
-    return world
+    return World.opened(options.case, config, source / TETS)
 
 
 if __name__ == "__main__":

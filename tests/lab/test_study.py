@@ -217,7 +217,7 @@ def test_the_document_has_a_place_for_every_section():
     assert fill(document, {name: "x" for name in names}).count("\nx\n<!-- /results:") == len(names)
 
 
-@pytest.mark.parametrize("name", ["results", "soak", "real", "world", "trust"])
+@pytest.mark.parametrize("name", ["results", "soak", "real", "world", "sequences", "trust"])
 def test_scripts_are_imported_and_say_what_they_do(name, monkeypatch, capsys):
     monkeypatch.setattr("sys.argv", [f"{name}.py", "--help"])
     with pytest.raises(SystemExit) as stopped:

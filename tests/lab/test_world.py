@@ -16,8 +16,7 @@ from scipy.spatial.transform import Rotation
 from tumortrack.core import store
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import transform_points
-from tumortrack.core.types import Anatomy, LabelVolume, Mesh
-from tumortrack.imaging.case import Case
+from tumortrack.core.types import Anatomy, Mesh
 from tumortrack.sense.camera import d405
 from tumortrack.simulate.scene_folder import read_scene
 from tumortrack.tracking.tracker import Tracker
@@ -29,24 +28,11 @@ from tumortrack_lab.world import estimates, segmentation
 from tumortrack_lab.world.families import FAMILIES, Deformed, solve
 from tumortrack_lab.world.forces import Bed, Capsule, LoadedBody, Springs, Touch, Weight
 from tumortrack_lab.world.noise import StereoCamera, StereoConfig
-from tumortrack_lab.world.organ import Organ, Slit, Stage, cut_open
-from tumortrack_lab.world.scenes import World, WorldConfig
+from tumortrack_lab.world.organ import Slit, Stage, cut_open
+from world_objects import ellipsoid, organ, world
 
 CAMERA = d405(424, 240)
 SILENT = {"bias_px": 0.0, "lens_px": 0.0, "slant_px": 0.0, "gloss_degrees": 0.0, "quantum_mm": 0.0}
-
-
-def ellipsoid(half_mm: tuple[float, float, float], centre_mm=(0.0, 0.0, 0.0)) -> Mesh:
-    sphere = trimesh.creation.icosphere(subdivisions=3)
-    return Mesh(sphere.vertices * half_mm + centre_mm, sphere.faces)
-
-
-ANATOMY = Anatomy((ellipsoid((42.0, 24.0, 20.0), (0, 0, 20)), ellipsoid((7, 7, 7), (22, 0, 24))))
-
-
-@cache
-def organ() -> Organ:
-    return Organ.of(ANATOMY, tetrahedralise(ANATOMY.organ, 9.0, 0.01))
 
 
 @cache
@@ -231,13 +217,6 @@ def test_segmentation_errors_are_as_large_as_they_say() -> None:
         for n in range(30)
     ]
     assert np.sqrt(np.mean(np.square(spread))) == pytest.approx(segmentation.READER_MM, rel=0.2)
-
-
-def world(**options) -> World:
-    turned = Anatomy(tuple(p.moved(p.vertices_mm + [30.0, -40.0, 100.0]) for p in ANATOMY.parts))
-    labels = LabelVolume(np.ones((2, 2, 2), np.uint8), np.diag([1.0, 1.0, 3.0, 1.0]))
-    config = WorldConfig(**{"families": ("rest",), **options})
-    return World.of(Case(turned, labels, (0.0, 0.0, 1.0)), "0123abcd", config, organ().mesh)
 
 
 def test_the_same_number_is_the_same_scene_to_the_byte(tmp_path) -> None:

@@ -8,7 +8,7 @@ and has a capsule. Ranges are assumptions, wide on purpose, where no source stan
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -28,6 +28,7 @@ from tumortrack_lab.world.forces import (
     LoadedBody,
     Springs,
     Steady,
+    Touch,
     Turned,
     Weight,
     rows_of,
@@ -65,10 +66,10 @@ def _plate(stage: Stage, rng: Generator) -> Load:
     out = np.array([np.sin(tilt) * np.cos(turn), np.sin(tilt) * np.sin(turn), np.cos(tilt)])
     width, deep = rng.uniform(12, 60), rng.uniform(3, 0.3 * stage.organ.size_mm[2])
     target = stage.organ.place(rng, 0.0)
-    axes = _axes(out, rng)
+    axes = frame_along(out, rng)
 
     def at(share: float) -> list[Force]:
-        return [stage.touch(_pressed(stage, axes, target, width, share * deep))]
+        return [stage.touch(plate_over(stage, axes, target, width, share * deep))]
 
     return Load(at, deep, {"plate_tilt_degrees": np.rad2deg(tilt), "width_mm": width, "mm": deep})
 
@@ -79,12 +80,12 @@ def _clamp(stage: Stage, rng: Generator) -> Load:
     out = unit(np.array([np.cos(turn), np.sin(turn), rng.uniform(-0.2, 0.2)]))
     thick = float(np.ptp(stage.organ.points_mm @ out))
     deep = rng.uniform(2.0, 0.14 * min(thick, 80.0), 2)
-    target, axes = stage.organ.place(rng), _axes(out, rng)
+    target, axes = stage.organ.place(rng), frame_along(out, rng)
     back = axes * [-1.0, 1.0, -1.0]
 
     def at(share: float) -> list[Force]:
         sides = zip((axes, back), deep, strict=True)
-        plates = [_pressed(stage, way, target, width, share * mm) for way, mm in sides]
+        plates = [plate_over(stage, way, target, width, share * mm) for way, mm in sides]
         return [stage.touch(plate) for plate in plates]
 
     return Load(at, float(deep.sum()), {"width_mm": width, "mm": deep.tolist()})
@@ -181,7 +182,7 @@ def _cut(stage: Stage, rng: Generator) -> Load:
     return Load(at, open_mm, {"open_mm": open_mm, "slit_radius_mm": radius})
 
 
-def _axes(out: Vector, rng: Generator) -> Float64[np.ndarray, "3 3"]:
+def frame_along(out: Vector, rng: Generator) -> Float64[np.ndarray, "3 3"]:
     """A frame whose z is that direction, turned about it at random."""
     side = perpendicular(out)
     angle = rng.uniform(0, 2 * np.pi)
@@ -189,7 +190,7 @@ def _axes(out: Vector, rng: Generator) -> Float64[np.ndarray, "3 3"]:
     return np.stack([x, np.cross(out, x), out], axis=1)
 
 
-def _pressed(
+def plate_over(
     stage: Stage, axes: np.ndarray, target_mm: Vector, width_mm: float, deep_mm: float
 ) -> Turned:
     """A plate across the z of ``axes`` over a target, so deep from where it first touches."""
@@ -251,48 +252,75 @@ def solve(organ: Organ, family: str, seed: int) -> Deformed:
         return Deformed(organ, organ.mesh.nodes_mm, organ.mesh.tets, rim, None, {})
     wound = cut_open(organ.mesh, _random_slit(organ, rng)) if family == "cut" else None
     mesh = wound.mesh if wound else organ.mesh
-    material, solid = _random_tissue(organ, mesh, rng)
+    material, solid = random_tissue(organ, mesh, rng)
     stage = Stage(organ, solid, wound)
     load = loading(stage, rng)
     rim = rng.uniform(*load.rim) * height
     bed_kpa, friction = log_uniform(rng, 0.3, 40.0), rng.choice([0.0, rng.uniform(0.1, 0.8)])
     friction = 0.0 if load.smooth else friction
-    bed = stage.touch(organ.bed.under(organ.points_mm, rim), bed_kpa / _BED_DEPTH_MM, friction)
     down = np.array([*rng.normal(0, 0.3, 2), -1.0]) * log_uniform(rng, 0.2, 3.0)
-    steady: list[Force] = [bed, Weight(_GRAVITY * solid.node_volumes_mm3[:, None] * down)]
+    bed, weight = bedded(stage, rim, bed_kpa, friction, down)
+    steady: list[Force] = [bed, weight]
     if not load.free:
-        share = solid.node_volumes_mm3 / solid.node_volumes_mm3.sum()
-        steady.append(Steady(mesh.nodes_mm, share))
+        steady.append(Steady.of(solid))
         if rng.uniform() < 0.5:
             patch = stage.patch(organ.hilum_mm, 15.0)
             material["vessels_mn_mm"] = log_uniform(rng, 30.0, 600.0)
             steady.append(stage.grip(patch, np.zeros(3), material["vessels_mn_mm"]))
     if material["capsule_mn_mm"] > 0:
         steady.append(Capsule.of(mesh, material["capsule_mn_mm"]))
-    nodes, iterations = mesh.nodes_mm, 0
     steps = max(1, int(np.ceil(load.reach_mm / _STEP_MM)))
-    for step in range(1, steps + 1):
-        bed.remember(nodes)
-        problem = LoadedBody(solid, (*steady, *load.at(step / steps)))
-        nodes, convergence = equilibrium.settle(problem, nodes, _ITERATIONS)
-        iterations += convergence.iterations
-    stretch = solid.stretch(nodes)
-    change = float(np.average(stretch, weights=mesh.volumes_mm3) - 1)
-    limit = LARGEST_CHANGE if solid.poisson < 0.49 else NEARLY_NONE
-    if abs(change) > limit:
-        raise TumortrackError(f"the organ's volume changed by {change:.1%}, over {limit:.0%}.")
+    loads = ((*steady, *load.at(step / steps)) for step in range(1, steps + 1))
+    keys, iterations = equilibria(solid, loads)
+    nodes, change = keys[-1], volume_change(solid, keys[-1])
     about = {
         "material": {**material, "bed_kpa": bed_kpa, "friction": friction, "rim_mm": rim},
         "load": load.about,
         "volume_change": change,
-        "least_stretch": float(stretch.min()),
+        "least_stretch": float(solid.stretch(nodes).min()),
         "iterations": iterations,
         "steps": steps,
     }
     return Deformed(organ, nodes, mesh.tets, rim, wound, about)
 
 
-def _random_tissue(
+def bedded(
+    stage: Stage, rim_mm: float, bed_kpa: float, friction: float, down: Vector
+) -> tuple[Touch, Weight]:
+    """The organ's bed, and weight beyond what it bears in the CT (``down``: in weights)."""
+    under = stage.organ.bed.under(stage.organ.points_mm, rim_mm)
+    bed = stage.touch(under, bed_kpa / _BED_DEPTH_MM, friction)
+    return bed, Weight(_GRAVITY * stage.solid.node_volumes_mm3[:, None] * down)
+
+
+def equilibria(
+    solid: NeoHookeanSolid, loads: Iterable[tuple[Force, ...]]
+) -> tuple[list[Nodes], int]:
+    """Where the solid comes to rest under one set of forces after the other, each found from the
+    one before, against which it rubs; and how many iterations that took. Raises TumortrackError:
+    no equilibrium was found."""
+    nodes, iterations, keys = solid.mesh.nodes_mm, 0, []
+    for forces in loads:
+        for force in forces:
+            if isinstance(force, Touch):
+                force.remember(nodes)
+        nodes, convergence = equilibrium.settle(LoadedBody(solid, forces), nodes, _ITERATIONS)
+        iterations += convergence.iterations
+        keys.append(nodes)
+    return keys, iterations
+
+
+def volume_change(solid: NeoHookeanSolid, nodes_mm: Nodes) -> float:
+    """Share by which the volume is larger than at rest. Raises TumortrackError: by more than
+    tissue's is."""
+    change = float(np.average(solid.stretch(nodes_mm), weights=solid.mesh.volumes_mm3) - 1)
+    limit = LARGEST_CHANGE if solid.poisson < 0.49 else NEARLY_NONE
+    if abs(change) > limit:
+        raise TumortrackError(f"the organ's volume changed by {change:.1%}, over {limit:.0%}.")
+    return change
+
+
+def random_tissue(
     organ: Organ, mesh: TetMesh, rng: Generator
 ) -> tuple[dict[str, float], NeoHookeanSolid]:
     """Kidneys: 3 to 40 kPa; tumors one to ten times as stiff; up to a factor of two either way in

@@ -193,6 +193,10 @@ class Weight(_Soft):
 class Steady(_Soft, equilibrium.Hold):
     """Holds the mean sideways displacement and the mean rotation; see the twin's ``Hold``."""
 
+    @classmethod
+    def of(cls, solid: NeoHookeanSolid) -> Steady:
+        return cls(solid.mesh.nodes_mm, solid.node_volumes_mm3 / solid.node_volumes_mm3.sum())
+
 
 @dataclass(frozen=True, eq=False)
 class LoadedBody:

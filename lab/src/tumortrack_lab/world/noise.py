@@ -138,7 +138,7 @@ class StereoCamera:
         """Where the surface mirrors the lamp into the camera."""
         if self._config.gloss_degrees == 0:
             return np.zeros(true.shape, bool)
-        to_lamp = self._lamp - _points(true, self._camera)
+        to_lamp = self._lamp - points_of(true, self._camera)
         to_lamp /= np.linalg.norm(to_lamp, axis=-1, keepdims=True)
         half = to_camera + to_lamp
         half /= np.linalg.norm(half, axis=-1, keepdims=True)
@@ -170,7 +170,7 @@ def _fattened(true: Image) -> Image:
     return np.where(wins, near, true)
 
 
-def _points(depth_mm: Image, camera: Intrinsics) -> Float64[np.ndarray, "h w 3"]:
+def points_of(depth_mm: Image, camera: Intrinsics) -> Float64[np.ndarray, "h w 3"]:
     v, u = np.indices(depth_mm.shape)
     x, y = (u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy
     return np.stack([x * depth_mm, y * depth_mm, depth_mm], axis=-1)
@@ -178,7 +178,7 @@ def _points(depth_mm: Image, camera: Intrinsics) -> Float64[np.ndarray, "h w 3"]
 
 def _normals(depth_mm: Image, camera: Intrinsics) -> tuple[np.ndarray, np.ndarray]:
     """Unit normals towards the camera, and unit vectors to it; a plane's where nothing is seen."""
-    points = _points(depth_mm, camera)
+    points = points_of(depth_mm, camera)
     to_camera = -points / np.linalg.norm(points, axis=-1, keepdims=True)
     normal = np.cross(_slope(points, 0), _slope(points, 1))
     normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
 from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 from jaxtyping import Float64
 
+from tumortrack.core import store
 from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import Anatomy, Mesh, SensorCloud
-from tumortrack.imaging.case import Case
+from tumortrack.imaging.case import Case, load_case
 from tumortrack.imaging.meshes import mesh_of, solid_of
 from tumortrack.phantom.kidneys import random_anatomy
 from tumortrack.simulate.scene_folder import InnerPoints, Scene, Targets, draw_targets
@@ -28,6 +31,7 @@ Disturbance = Literal[
 ]
 DISTURBANCES: tuple[Disturbance, ...] = get_args(Disturbance)
 OTHERS = ("mirrored", "foreign", "nothing")  # not the model's organ: nothing true can be said
+TETS = "tets.safetensors"  # of a folder's world: filling an organ is not reproducible
 _FINE_MM, _EDGE_MM = 0.1, 7.0  # surfaces are simplified by this, edges halved beyond
 _HIDDEN = (0.3, 0.7)  # share of what is seen of the organ, where hiding is the disturbance
 _SAME_MM = 0.05  # between a state that was kept and the same, solved again
@@ -91,6 +95,21 @@ class World:
             config, case_sha256, few, to_bench, Organ.of(there, mesh),
             draw_targets(few, config.seed), to_bench[:3, :3] @ thick,
         )  # fmt: skip
+
+    @classmethod
+    def opened(cls, case: Path, config: WorldConfig, tets: Path) -> World:
+        """The world of a case's folder, with the tetrahedra in a file, which is written if there is
+        none."""
+        from safetensors.numpy import load_file, save
+
+        of = partial(cls.of, load_case(case), store.sha256_of(case / store.MANIFEST), config)
+        if tets.exists():
+            kept = load_file(tets)
+            return of(TetMesh(kept["nodes_mm"], kept["tets"]))
+        world = of()
+        mesh = world.organ.mesh
+        store.write_atomically(tets, save({"nodes_mm": mesh.nodes_mm, "tets": mesh.tets}))
+        return world
 
     def recipe(self, number: int, draws: int = 1, draw: int = 0) -> tuple[str, Disturbance]:
         """Family and disturbance of a state's scene, of so many: all pairs in turn."""

@@ -21,8 +21,8 @@ from tumortrack_lab.twin.occluders import rod_mesh
 from tumortrack_lab.world.families import Deformed, log_uniform
 from tumortrack_lab.world.noise import StereoCamera, StereoConfig
 
-_SIZE_PX = (424, 240)
-_NEAR_MM, _FAR_MM = (85.0, 230.0), 420.0  # of the organ's nearest point; nothing is seen beyond
+SIZE_PX = (424, 240)
+_NEAR_MM, FAR_MM = (85.0, 230.0), 420.0  # of the organ's nearest point; nothing is seen beyond
 _MOST_TILT = 60.0  # degrees from straight above
 _DEEPER_MM = 15.0  # behind a slit's film: seen through a gap between coarse walls
 
@@ -46,25 +46,25 @@ def look(
 ) -> View:
     """One random view of the state's true surface (bench frame), and of what else lies there.
     ``hidden``: the share of the organ's picture that a hand or instruments hide."""
-    camera = d405(*_SIZE_PX)
+    camera = d405(*SIZE_PX)
     to_camera, about = _camera_pose(organ, rng)
     alone = _organ_depth(state, organ, to_camera, camera)
-    ground = _render(_fat(state.rim_mm, rng), to_camera, camera)
-    others = [_render(mesh, to_camera, camera) for mesh in (*beside, *_beside(organ, rng))]
-    scene = np.fmin.reduce([alone, ground, *others])
+    below = render(ground_mesh(state.rim_mm, rng), to_camera, camera)
+    others = [render(mesh, to_camera, camera) for mesh in (*beside, *_beside(organ, rng))]
+    scene = np.fmin.reduce([alone, below, *others])
     own = np.isfinite(alone) & (alone <= scene)
     if hidden > 0 and own.any():
         cover, about["occluder"] = _covering(alone, own, camera, hidden, rng)
         scene = np.fmin(scene, cover)
     seen = own & (alone <= scene)
-    scene[scene > _FAR_MM] = np.nan
+    scene[scene > FAR_MM] = np.nan
     sensor = StereoConfig(subpixel_px=rng.uniform(0.03, 0.12), gloss_degrees=rng.uniform(2.0, 7.0))
     frame = StereoCamera(camera, sensor, rng).see(scene.astype(np.float32))
     wide = Intrinsics(
-        *(2 * _SIZE_PX[0], 2 * _SIZE_PX[1]), camera.fx, camera.fy,
-        camera.cx + _SIZE_PX[0] / 2, camera.cy + _SIZE_PX[1] / 2,
+        *(2 * SIZE_PX[0], 2 * SIZE_PX[1]), camera.fx, camera.fy,
+        camera.cx + SIZE_PX[0] / 2, camera.cy + SIZE_PX[1] / 2,
     )  # fmt: skip
-    every = max(int(np.isfinite(_render(organ, to_camera, wide)).sum()), 1)
+    every = max(int(np.isfinite(render(organ, to_camera, wide)).sum()), 1)
     about |= {
         "hidden_wanted": hidden,
         "hidden_share": 1 - float(seen.sum() / max(own.sum(), 1)),
@@ -95,20 +95,34 @@ def _camera_pose(organ: Mesh, rng: Generator) -> tuple[Transform, dict[str, Any]
     picture's middle."""
     tilt = min(abs(rng.normal(0, 25.0)), _MOST_TILT)
     turn, roll = rng.uniform(0, 2 * np.pi, 2)
-    lean = np.deg2rad(tilt)
-    back = np.array([np.sin(lean) * np.cos(turn), np.sin(lean) * np.sin(turn), np.cos(lean)])
     near = log_uniform(rng, *_NEAR_MM)
-    rotation = rotation_onto(-back, np.array([0.0, 0.0, 1.0]))
-    spin = np.array([[np.cos(roll), -np.sin(roll), 0], [np.sin(roll), np.cos(roll), 0], [0, 0, 1]])
-    rotation = spin @ rotation
-    there = organ.vertices_mm @ rotation.T
-    shift = np.array([*-there[:, :2].mean(0), near - there[:, 2].min()])
-    shift[:2] += rng.uniform(-0.08, 0.08, 2) * near
+    pose = pose_before(organ, facing(direction(tilt, turn), roll), near)
+    pose[:2, 3] += rng.uniform(-0.08, 0.08, 2) * near
     about = {"tilt_degrees": tilt, "nearest_mm": near, "roll_degrees": float(np.rad2deg(roll))}
-    return rigid(rotation, shift), about
+    return pose, about
 
 
-def _render(mesh: Mesh, to_camera: Transform, camera: Intrinsics) -> np.ndarray:
+def direction(tilt_degrees: float, turn: float) -> np.ndarray:
+    """A unit vector so far from straight up."""
+    lean = np.deg2rad(tilt_degrees)
+    return np.array([np.sin(lean) * np.cos(turn), np.sin(lean) * np.sin(turn), np.cos(lean)])
+
+
+def facing(back: np.ndarray, roll: float) -> np.ndarray:
+    """The rotation of a camera (camera_from_bench) that looks from the direction ``back``, turned
+    by ``roll`` (radians) about its axis."""
+    spin = np.array([[np.cos(roll), -np.sin(roll), 0], [np.sin(roll), np.cos(roll), 0], [0, 0, 1]])
+    return spin @ rotation_onto(-back, np.array([0.0, 0.0, 1.0]))
+
+
+def pose_before(organ: Mesh, rotation: np.ndarray, nearest_mm: float) -> Transform:
+    """The pose of a camera so turned, with the organ in the middle of its picture."""
+    there = organ.vertices_mm @ rotation.T
+    return rigid(rotation, np.array([*-there[:, :2].mean(0), nearest_mm - there[:, 2].min()]))
+
+
+def render(mesh: Mesh, to_camera: Transform, camera: Intrinsics) -> np.ndarray:
+    """True depths of a mesh (bench frame), NaN where it is not seen."""
     there = transform_points(to_camera, mesh.vertices_mm)
     return render_depth(there, mesh.faces, camera).depth_mm.astype(float)
 
@@ -117,14 +131,14 @@ def _organ_depth(
     state: Deformed, organ: Mesh, to_camera: Transform, camera: Intrinsics
 ) -> np.ndarray:
     """Of a slit organ: with the slit's walls, instead of the film that triangles span over it."""
-    film = _render(organ, to_camera, camera)
+    film = render(organ, to_camera, camera)
     if state.wound is None:
         return film
     rest = state.organ.anatomy.organ.vertices_mm
     before, now = (_edges(points[organ.faces]) for points in (rest, organ.vertices_mm))
     skin = Mesh(organ.vertices_mm, organ.faces[(now < 1.8 * before + 1.0).all(1)])
     walls = Mesh(state.nodes_mm, state.wound.walls)
-    depth = np.fmin(_render(skin, to_camera, camera), _render(walls, to_camera, camera))
+    depth = np.fmin(render(skin, to_camera, camera), render(walls, to_camera, camera))
     depth = np.maximum(depth, film)  # the walls of a coarse mesh may stand out of the skin
     depth[~(depth < film + _DEEPER_MM)] = np.nan
     return depth
@@ -134,7 +148,7 @@ def _edges(corners: np.ndarray) -> np.ndarray:
     return np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)
 
 
-def _fat(rim_mm: float, rng: Generator) -> Mesh:
+def ground_mesh(rim_mm: float, rng: Generator) -> Mesh:
     """The uneven ground round the organ, as high as its bed's rim."""
     ticks = np.arange(-320.0, 321.0, 8.0)
     x, y = np.meshgrid(ticks, ticks, indexing="ij")
@@ -182,7 +196,7 @@ def _covering(
     kind, angle = str(rng.choice(["hand", "instruments"])), rng.uniform(0, 2 * np.pi)
     back = np.array([np.cos(angle), np.sin(angle), 0.0])  # where they come from
     side = np.array([-back[1], back[0], 0.0])
-    shape = (_hand if kind == "hand" else _instruments)(back, side, rng)
+    shape = (hand_mesh if kind == "hand" else _instruments)(back, side, rng)
     row, column = np.nonzero(own)
     middle = float(organ[own].min()) - rng.uniform(5.0, 25.0)
     aim = np.array([column.mean() - camera.cx, row.mean() - camera.cy]) / camera.fx * middle
@@ -190,7 +204,7 @@ def _covering(
 
     def at(share: float) -> np.ndarray:
         place = np.array([*aim, middle]) + (1.2 - 3.0 * share) * size * back
-        return _render(Mesh(shape.vertices_mm + place, shape.faces), np.eye(4), camera)
+        return render(Mesh(shape.vertices_mm + place, shape.faces), np.eye(4), camera)
 
     low, high = 0.0, 1.0
     for _ in range(12):
@@ -201,7 +215,7 @@ def _covering(
     return at(high), kind
 
 
-def _hand(back: np.ndarray, side: np.ndarray, rng: Generator) -> Mesh:
+def hand_mesh(back: np.ndarray, side: np.ndarray, rng: Generator) -> Mesh:
     """Four fingers, a palm and the arm behind them."""
     rods, rise = [], np.array([0.0, 0.0, -0.25])
     for n, length in enumerate((66.0, 76.0, 72.0, 55.0)):

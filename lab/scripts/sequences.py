@@ -1,0 +1,119 @@
+"""Sequences of an organ on the move, with truth at every frame; and how followers do in them.
+
+    make sequences ARGS='CASE OUT --count 3 --views 3 --model MODEL'
+
+Writes a folder a sequence into OUT (``tumortrack_lab.world.films``; about 30 s each, and 0.1 s a
+frame and camera). The same command goes on where it was stopped, and --count may grow. With --model
+every method judges every frame; OUT/table.md and press.png also count what --others hold.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import pandas as pd
+import tyro
+
+from tumortrack import api
+from tumortrack.cli.console import say
+from tumortrack.core import store
+from tumortrack.core.config import to_builtins
+from tumortrack.core.errors import InputError, TumortrackError
+from tumortrack.tracking.tracker import Tracker
+from tumortrack_lab.study import trainings
+from tumortrack_lab.twin.dataset import claim
+from tumortrack_lab.world import colour, following
+from tumortrack_lab.world.films import Film, FilmConfig, read_film, write_film
+from tumortrack_lab.world.paths import KINDS
+from tumortrack_lab.world.scenes import TETS, World, WorldConfig
+
+
+@dataclass(frozen=True)
+class Options:
+    """Make sequences and follow them with a model."""
+
+    case: tyro.conf.Positional[Path]
+    """Folder that `tumortrack prepare` wrote."""
+    out: tyro.conf.Positional[Path]
+    """Folder of the sequences."""
+    count: int = 3
+    """Sequences of each kind."""
+    kinds: tuple[str, ...] = tuple(KINDS)
+    """Which kinds."""
+    views: int = 1
+    """Cameras: 1, or 3 (above the organ, and 45 degrees to either side)."""
+    fps: float = 10.0
+    """Frames a second."""
+    seed: int = 0
+    """Of everything."""
+    colour: bool = False
+    """Also pictures of a colour camera in each one's place (0.2 s a frame and camera)."""
+    model: Path | None = None
+    """Follow with it (folder that `tumortrack train` wrote)."""
+    methods: tuple[str, ...] = ("track", "first-look")
+    """How; see tumortrack_lab.world.following."""
+    version: str = ""
+    """Of the program, if several are to be compared: kept apart, and named in the table."""
+    others: tuple[Path, ...] = ()
+    """Folders of other organs, followed before, that the table counts in."""
+
+
+def main(options: Options) -> None:
+    """Make what is missing, then follow what there is."""
+    chosen = (options.kinds, KINDS), (options.methods, following.METHODS)
+    for names, known in chosen:
+        if unknown := sorted(set(names) - set(known)):
+            raise InputError(f"{unknown[0]!r} is not known; allowed: {', '.join(known)}.")
+    if options.views not in (1, 3):
+        raise InputError(f"--views is {options.views}; allowed: 1, 3.")
+    config = FilmConfig(seed=options.seed, fps=options.fps, views=options.views)
+    identity = {
+        "case_sha256": store.sha256_of(options.case / store.MANIFEST),
+        "config": to_builtins(config),
+    }
+    claim(options.out, "sequences.json", identity)
+    world = World.opened(options.case, WorldConfig(), options.out / TETS)
+    wanted = [(kind, number) for number in range(options.count) for kind in options.kinds]
+    todo = [(k, n) for k, n in wanted if not (options.out / f"{k}-{n:03d}").exists()]
+    start = time.monotonic()
+    for done, (kind, number) in enumerate(todo, start=1):
+        try:
+            write_film(world, config, kind, number, options.out / f"{kind}-{number:03d}")
+            what = "made"
+        except TumortrackError as error:
+            what = f"failed: {error}"
+        left_min = (time.monotonic() - start) / done * (len(todo) - done) / 60
+        say(f"{done}/{len(todo)} {kind}-{number:03d} {what}; {left_min:.0f} min left")
+    folders = [options.out / f"{kind}-{number:03d}" for kind, number in wanted]
+    films = [read_film(folder) for folder in folders if folder.exists()]
+    for done, film in enumerate(films if options.colour else (), start=1):
+        if not (film.folder / "colour.json").exists():
+            colour.paint(film)
+            say(f"{done}/{len(films)} {film.folder.name} painted")
+    if options.model is not None:
+        _follow(options, options.model, films)
+
+
+def _follow(options: Options, model: Path, films: list[Film]) -> None:
+    tracker, sha256 = Tracker(api.load_model(model, "cpu")), store.sha256_of(model / store.MANIFEST)
+    about = {"model_sha256": sha256, "version": options.version}
+    for done, film in enumerate(films, start=1):
+        for method in options.methods:
+            called = "-".join(filter(None, (method, options.version)))
+            judge = partial(following.judge, following.METHODS[method](tracker), film)
+            rows = trainings.kept(film.folder / f"{called}.json", about, judge)
+            errors = pd.DataFrame(rows).reindex(columns=["center_mm"])["center_mm"]
+            say(f"{done}/{len(films)} {film.folder.name}, {called}: {errors.median():.1f} mm off")
+    rows = [row for out in (options.out, *options.others) for row in following.rows_in(out)]
+    found = pd.DataFrame(rows)
+    text = following.summary(found)
+    store.write_atomically(options.out / "table.md", text.encode())
+    following.draw(found, options.out / "press.png")
+    print(text)
+
+
+if __name__ == "__main__":
+    trainings.run(main, Options)

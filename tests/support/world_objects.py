@@ -1,0 +1,34 @@
+"""A small organ of the wider world: an ellipsoid with a tumor inside."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import trimesh
+
+from tumortrack.core.types import Anatomy, LabelVolume, Mesh
+from tumortrack.imaging.case import Case
+from tumortrack_lab.tets import tetrahedralise
+from tumortrack_lab.world.organ import Organ
+from tumortrack_lab.world.scenes import World, WorldConfig
+
+
+def ellipsoid(half_mm: tuple[float, float, float], centre_mm=(0.0, 0.0, 0.0)) -> Mesh:
+    sphere = trimesh.creation.icosphere(subdivisions=3)
+    return Mesh(sphere.vertices * half_mm + centre_mm, sphere.faces)
+
+
+ANATOMY = Anatomy((ellipsoid((42.0, 24.0, 20.0), (0, 0, 20)), ellipsoid((7, 7, 7), (22, 0, 24))))
+
+
+@cache
+def organ() -> Organ:
+    return Organ.of(ANATOMY, tetrahedralise(ANATOMY.organ, 9.0, 0.01))
+
+
+def world(**options) -> World:
+    turned = Anatomy(tuple(p.moved(p.vertices_mm + [30.0, -40.0, 100.0]) for p in ANATOMY.parts))
+    labels = LabelVolume(np.ones((2, 2, 2), np.uint8), np.diag([1.0, 1.0, 3.0, 1.0]))
+    config = WorldConfig(**{"families": ("rest",), **options})
+    return World.of(Case(turned, labels, (0.0, 0.0, 1.0)), "0123abcd", config, organ().mesh)
