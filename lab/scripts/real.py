@@ -8,9 +8,9 @@ and silicone/ (docs/real.md says where they come from). Cases, models and rows a
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Annotated, Literal, get_args
 
@@ -22,7 +22,8 @@ from tumortrack import api
 from tumortrack.cli.console import say
 from tumortrack.core import store
 from tumortrack.core.errors import InputError
-from tumortrack.core.mesh_files import write_mesh
+from tumortrack.core.mesh_files import read_mesh, write_mesh
+from tumortrack.core.types import Mesh
 from tumortrack.imaging.case import Case, load_case
 from tumortrack.models.folder import is_finished
 from tumortrack.sense.noise import D405_NOISE
@@ -35,7 +36,7 @@ from tumortrack_lab.study import trainings
 from tumortrack_lab.study.document import table
 from tumortrack_lab.study.methods import named_folders
 
-Part = Literal["kidneys", "lungs", "silicone"]
+Part = Literal["kidneys", "lungs", "silicone", "slab"]
 DRAGGED = SceneConfig(
     deform=(ChainConfig(links=(DragConfig(), StretchConfig())),), noise=D405_NOISE
 )
@@ -131,6 +132,7 @@ def main(options: Options) -> None:
         "kidneys": lambda: kidneys_block(rows, chosen),
         "lungs": lambda: lungs_block([*more, *chosen], options),
         "silicone": lambda: silicone_block(options),
+        "slab": lambda: slab_block(options),
     }
     for part in options.parts:
         text = made[part]()
@@ -294,42 +296,74 @@ def _table(what: str, groups: dict[str, list[dict]]) -> str:
 
 def silicone_block(options: Options) -> str:
     """The bent casts: how far the scan lies from the estimated surface, seen and unseen."""
-    data, folder = options.data, options.out / "silicone"
+    data = options.data
     top = silicone.read_surface(data, silicone.REST)
+    files = {cast: silicone.file(data, name) for cast, name in silicone.BENT.items()}
+    scans = {cast: partial(read_mesh, path) for cast, path in files.items()}
+    rows = _bent("silicone", (top, silicone.UNDERSIDE_MM), files, scans, options)
+    return _bent_table("cast", rows)
+
+
+def slab_block(options: Options) -> str:
+    """The bent slab: the same, and how far the curve on it lies from its trace."""
+    data = options.data
+    files = {what: silicone.file(data, name) for what, name in silicone.SLAB.items()}
+    given = {what: silicone.read_slab(data, what) for what in files}
+    top = silicone.surface_over(given["flat scan"], np.inf)
+    under_mm = float(np.median(top.vertices_mm[:, 2])) + silicone.THICK_MM
+    scan = silicone.surface_over(given["bent scan"], silicone.HOLE_MM)
+    views = dict.fromkeys(("1", "2", "3"), lambda: scan)
+    curves = given["flat curve"], given["bent curve"]
+    rows = _bent("slab", (top, under_mm), files, views, options, curves)
+    more = {f"error / stated, {where}": f"ratio_{where}_mm" for where in ("seen", "unseen")}
+    return "\n\n".join([_bent_table("view", rows), _bent_table("view", rows, "curve_", more)])
+
+
+def _bent(
+    name: str, rest: tuple[Mesh, float], files: dict[str, Path],
+    scans: dict[str, Callable[[], Mesh]], options: Options,
+    curves: tuple[np.ndarray, np.ndarray] | None = None,
+) -> list[dict]:  # fmt: skip
+    """Rows of every scan, by a model of the top surface at rest over its underside's z, mm."""
+    folder = options.out / name
     if not (folder / "case").exists():
         (folder / "meshes").mkdir(parents=True, exist_ok=True)
-        write_mesh(folder / "meshes" / "kidney.ply", silicone.closed(top, silicone.UNDERSIDE_MM))
+        write_mesh(folder / "meshes" / "kidney.ply", silicone.closed(*rest))
         up = ",".join(map(str, silicone.UP))
-        api.prepare(folder / "meshes", folder / "case", up=up, patient="silicone")
-    organ = Organ("silicone", folder / "case", folder / "model", options)
-    scans = {cast: silicone.file(data, name) for cast, name in silicone.BENT.items()}
-    about = organ.about() | {cast: store.sha256_of(path) for cast, path in scans.items()}
+        api.prepare(folder / "meshes", folder / "case", up=up, patient=name)
+    organ = Organ(name, folder / "case", folder / "model", options)
+    about = organ.about() | {what: store.sha256_of(path) for what, path in files.items()}
 
     def measure() -> list[dict]:
         tracker, anatomy = organ.tracker(), organ.case.anatomy
         rows = []
-        for number, (cast, name) in enumerate(silicone.BENT.items()):
+        for number, (which, read) in enumerate(scans.items()):
             rng = np.random.default_rng([options.seed, number])
-            scan = silicone.read_surface(data, name)
-            found = silicone.measured(tracker, anatomy, top, scan, rng)
-            rows += [{"cast": cast, **row} for row in found]
-            say(f"cast {cast}: {rows[-1]}")
+            found = silicone.measured(tracker, anatomy, rest[0], read(), rng, curves)
+            rows += [{"cast": which, **row} for row in found]
+            say(f"{name} {which}: {rows[-1]}")
         return rows
 
-    rows = trainings.kept(folder / "rows.json", about, measure)
-    head = ["cast", "scan seen", "verdict", "cost / usual", "stated deviation, mm"]
-    head += [
-        f"{which}{where}, mm" for where in ("seen", "unseen") for which in ("", "best rigid, ")
-    ]
+    return trainings.kept(folder / "rows.json", about, measure)
+
+
+def _bent_table(
+    first: str, rows: list[dict], of: str = "", more: dict[str, str] | None = None
+) -> str:
+    """A line a view: what was said of it, and how far the surfaces (or what ``of`` says) lie off;
+    ``more``: columns, and what they show."""
+    columns = {
+        f"{which}{where}, mm": f"{key}{of}{where}_mm"
+        for where in ("seen", "unseen")
+        for which, key in {"": "", "best rigid, ": "rigid_"}.items()
+    } | (more or {})
+    head = [first, "scan seen", "verdict", "cost / usual", "stated deviation, mm", *columns]
     body = [
         [
             row["cast"], f"{row['share']:.0%}", row["verdict"], f"{row['cost']:.1f}",
             f"{row['std_mm']:.1f}",
-            *(
-                " / ".join(f"{mm:.1f}" for mm in row.get(f"{which}{where}_mm", ())) or "–"
-                for where in ("seen", "unseen")
-                for which in ("", "rigid_")
-            ),
+            *(" / ".join(f"{mm:.1f}" for mm in row.get(key, ())) or "–"
+              for key in columns.values()),
         ]
         for row in rows
     ]  # fmt: skip

@@ -14,8 +14,9 @@ from scipy.spatial.transform import Rotation
 
 from live_objects import small_anatomy
 from tumortrack.core.errors import InputError
-from tumortrack.core.geometry import transform_points
-from tumortrack.core.types import Mesh
+from tumortrack.core.geometry import transform_points, triangles_of
+from tumortrack.core.types import Anatomy, Mesh
+from tumortrack.tracking.tracker import Tracker
 from tumortrack_lab.real import kidneys, lungs, silicone
 
 SCRIPT = Path(__file__).parents[2] / "lab" / "scripts" / "real.py"
@@ -169,6 +170,68 @@ def test_a_slab_is_closed_by_its_walls_and_its_underside():
         silicone.read_surface(Path("nowhere"), silicone.REST)
     pose = silicone.facing_pose(top, np.random.default_rng(0))
     assert pose[2, :3] @ [0, 0, -1] < -0.9  # the outer side looks back at the camera
+
+
+def height_mm(points: np.ndarray) -> np.ndarray:
+    """Of a slab with one bump beside its middle, out of it: -z."""
+    return -8.0 * np.exp(-(((points - [30, 20]) / 9) ** 2).sum(1))
+
+
+def test_a_scanned_cloud_becomes_a_surface_whose_holes_stay_open_when_told():
+    flat = np.random.default_rng(0).uniform(0, 60, (60_000, 2))
+    cloud = np.column_stack([flat, height_mm(flat)])
+    holed = cloud[np.linalg.norm(flat - [40, 45], axis=1) > 6]
+    filled, open_ = (silicone.surface_over(holed, hole) for hole in (np.inf, silicone.HOLE_MM))
+    areas = []
+    for mesh in (filled, open_):
+        _, normals = triangles_of(mesh.vertices_mm, mesh.faces)
+        assert (normals[:, 2] < 0).all()
+        areas.append(-normals[:, 2].sum() / 2)  # in the plane
+        assert np.abs(mesh.vertices_mm[:, 2] - height_mm(mesh.vertices_mm[:, :2])).max() < 0.3
+    assert areas[0] == pytest.approx(59**2, rel=0.03)
+    assert np.pi * 6**2 < areas[0] - areas[1] < np.pi * 7**2
+
+
+class Told(Tracker):
+    """Says what it was told to."""
+
+    def __init__(self, estimate):
+        self.estimate = estimate
+
+    def follow(self, cloud):
+        return self.estimate
+
+
+def test_the_carried_curve_is_held_against_the_traced_one(monkeypatch):
+    flat = np.random.default_rng(0).uniform(0, 60, (40_000, 2))
+    top = silicone.surface_over(np.column_stack([flat, height_mm(flat)]), np.inf)
+    case = Anatomy((silicone.closed(top, 10.0),))
+    there = silicone.facing_pose(top, np.random.default_rng(3))  # the first thing that is drawn
+    beside = there @ np.array([[1, 0, 0, 0], [0, 1, 0, 5], [0, 0, 1, 0], [0, 0, 0, 1.0]])
+    found = SimpleNamespace(camera_from_ct=beside)
+    monkeypatch.setattr(silicone, "PoseSearch", lambda *_: SimpleNamespace(poses=lambda _: [found]))
+    motion = SimpleNamespace(
+        carry=lambda points: transform_points(there, points),
+        std_mm=lambda points: np.full(len(points), 0.5),
+    )
+    report = {"fit_cost": {"now": 3.0, "usual": 2.0}}
+    estimate = SimpleNamespace(motion=motion, quality="good", reason="", report=report)
+    at = np.linspace(5, 55, 500)
+    rest = np.column_stack([at, np.full(500, 45.0), np.zeros(500)])
+    curves = rest, rest[100:400] + [0, -2, 0]
+    told = Told(estimate)
+    rows = silicone.measured(told, case, top, top, np.random.default_rng(3), curves)
+    assert [row["share"] for row in rows] == list(silicone.SHARES)
+    for row in rows:
+        assert (row["verdict"], row["cost"], row["std_mm"]) == ("good", 1.5, 0.5)
+        parts = [part for part in ("seen", "unseen") if f"curve_{part}_mm" in row]
+        for part in parts:  # beside by 2 mm across; the rigid one is 5 the other way
+            assert row[f"curve_{part}_mm"] == pytest.approx([2] * 3, abs=0.01)
+            assert row[f"ratio_{part}_mm"] == pytest.approx([4] * 3, abs=0.02)
+            assert row[f"rigid_curve_{part}_mm"] == pytest.approx([7] * 3, abs=0.01)
+        assert parts[:1] == ["seen"]
+        assert row["share"] < 1 or len(parts) == 1
+        assert max(row["seen_mm"]) < 0.1
 
 
 def test_a_table_counts_verdicts_and_gives_errors_of_answers_and_of_what_was_called_good():

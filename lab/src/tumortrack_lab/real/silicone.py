@@ -1,18 +1,25 @@
-"""A silicone kidney on its plate, bent over a stand and scanned by CT: one side in, the rest out.
+"""Bent silicone, scanned: one side in, the rest out.
 
+A kidney on its plate, bent over a stand and scanned by CT, and a slab, bent and laser-scanned.
 vu-arma-dev/cpd-registration states no licence: the files stay with the user, who looks and
 measures. Of six casts of one mould there is the bent top surface (STL, mm), cut out of a CT; of the
 mould the flat top surface (PLY, mm; flat down to z = -7, the kidney up to z = -19). How thick the
 plate is is not said; ``kidney_and_base.stl`` has 10 mm. Spheres and arteries inside some casts have
 no known place in the flat state, and the fiducials are the stand's: no point is known twice.
+
+The slab has four shapes on it. There are point clouds (mm) of its top, flat and bent, and the
+points of a curve on it that was traced in both states.
 """
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.io import loadmat
+from scipy.spatial import Delaunay, cKDTree
 
 from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.geometry import Points, transform_points, triangles_of
@@ -38,6 +45,14 @@ BENT = {
         "D": "D_TopOnly_reduced",
     }.items()
 }
+SLAB = {
+    f"{state} {what}": f"cartesian_data/PointCloudData/{file}{name}.mat"
+    for state, file in {"flat": "NonDeformed", "bent": "Deformed"}.items()
+    for what, name in {"scan": "PointCloud", "curve": "TargetCurve"}.items()
+}
+THICK_MM = 10.0  # the slab under its shapes; not said, so that of kidney_and_base.stl
+GRID_MM = 1.0  # of the slab's surfaces; its scans have 15 points a mm2
+HOLE_MM = 3.0  # wider ones in the bent scan stay open
 UNDERSIDE_MM = 3.0  # z, of kidney_and_base.stl
 UP = (0.0, 0.0, -1.0)  # out of the plate, where the kidney sticks out
 SHARES = (1.0, 0.7, 0.5)  # of the scanned surface that the camera is given
@@ -55,6 +70,25 @@ def file(data: Path, name: str) -> Path:
 
 def read_surface(data: Path, name: str) -> Mesh:
     return read_mesh(file(data, name))
+
+
+def read_slab(data: Path, what: str) -> Points:
+    """One of ``SLAB``, turned so that ``UP`` holds (the scanner's z points up)."""
+    (points,) = (v for k, v in loadmat(file(data, SLAB[what])).items() if k.endswith("Data"))
+    return points * [1.0, -1.0, -1.0]
+
+
+def surface_over(points_mm: Points, hole_mm: float) -> Mesh:
+    """The surface through a cloud that was scanned along ``UP``: the mean in each square of the
+    grid, and triangles between them with sides of at most ``hole_mm`` in the plane."""
+    squares = np.floor(points_mm[:, :2] / GRID_MM).astype(int)
+    _, where, count = np.unique(squares, axis=0, return_inverse=True, return_counts=True)
+    sums = [np.bincount(where.reshape(-1), column) for column in points_mm.T]
+    vertices = np.stack(sums, 1) / count[:, None]
+    faces = Delaunay(vertices[:, :2]).simplices[:, ::-1]  # SciPy turns them to +z
+    corners = vertices[faces][:, :, :2]
+    sides_mm = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)
+    return Mesh(vertices, faces[sides_mm.max(1) <= hole_mm])
 
 
 def closed(top: Mesh, bottom_z_mm: float) -> Mesh:
@@ -80,16 +114,25 @@ def facing_pose(scan: Mesh, rng: np.random.Generator) -> np.ndarray:
 
 
 def measured(
-    tracker: Tracker, case: Anatomy, top: Mesh, scan: Mesh, rng: np.random.Generator
+    tracker: Tracker,
+    case: Anatomy,
+    top: Mesh,
+    scan: Mesh,
+    rng: np.random.Generator,
+    curves: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> list[dict[str, Any]]:
     """A row a share of the scan that the camera is given (one side of a line through the picture):
     what is said, and how far the estimated and the best rigid top surface lie from the scan, where
     the camera saw and where not (median, 95 %, worst; mm).
 
-    The rigid pose is the best for the whole scan. Where the tracker refuses, the errors are those
-    of the fit that it refused. Not from the scan to the surface: the casts' rims reach farther.
+    ``curves``: the points of one, at rest (the longer) and in a scan that lacks parts of the
+    surface. Distances are then from the scan, and from its curve to the other carried there, and
+    the latter's ratio to the stated deviation is given. Else they are to the scan: the casts' rims
+    reach farther than the mould. The rigid pose is the best for the whole scan. Where the tracker
+    refuses, the errors are those of the fit that it refused.
     """
-    there = scan.moved(transform_points(facing_pose(scan, rng), scan.vertices_mm))
+    camera_from_scan = facing_pose(scan, rng)
+    there = scan.moved(transform_points(camera_from_scan, scan.vertices_mm))
     frame = add_noise(render_depth(there.vertices_mm, there.faces, CAMERA), D405_NOISE, rng)
     angle = rng.uniform(0, 2 * np.pi)
     along = np.array([np.cos(angle), np.sin(angle)])
@@ -98,7 +141,6 @@ def measured(
     whole = surface_samples(there, 3.0)[0]
     whole = whole[:: len(whole) // POINTS + 1]
     pose = PoseSearch(case, UP, RigidConfig()).poses(SensorCloud(whole))[0].camera_from_ct
-    rigid = top.moved(transform_points(pose, top.vertices_mm))
     rows = []
     for share in SHARES:
         limit = np.quantile(_places(whole, along), share)
@@ -107,13 +149,24 @@ def measured(
         said, motion = located(tracker, cloud)
         std_mm = float(np.median(motion.std_mm(top.vertices_mm)))
         found = {"share": share, **said, "std_mm": std_mm}
-        for name, mesh in {"": top.moved(motion.carry(top.vertices_mm)), "rigid_": rigid}.items():
-            points_mm = surface_samples(mesh, 3.0)[0]
-            off_mm = distance_to_surface(points_mm, there)
-            hidden = _places(points_mm, along) > limit if share < 1 else np.zeros(len(off_mm), bool)
-            for part, which in {"seen": ~hidden, "unseen": hidden}.items():
-                if which.any():
-                    found[f"{name}{part}_mm"] = np.percentile(off_mm[which], [50, 95, 100]).tolist()
+        for name, carry in {"": motion.carry, "rigid_": partial(transform_points, pose)}.items():
+            mesh = top.moved(carry(top.vertices_mm))
+            points_mm, onto = surface_samples(mesh, 3.0)[0], there
+            if curves is not None:
+                points_mm, onto = whole, mesh
+            off = {name: (points_mm, distance_to_surface(points_mm, onto))}
+            if curves is not None:
+                true = transform_points(camera_from_scan, curves[1])
+                off_mm, nearest = cKDTree(carry(curves[0])).query(true)
+                off[f"{name}curve_"] = true, off_mm
+                if not name:
+                    off["ratio_"] = true, off_mm / motion.std_mm(curves[0])[nearest]
+            for what, (places_mm, size) in off.items():
+                hidden = (share < 1) & (_places(places_mm, along) > limit)
+                for part, which in {"seen": ~hidden, "unseen": hidden}.items():
+                    if which.any():
+                        spread = np.percentile(size[which], [50, 95, 100])
+                        found[f"{what}{part}_mm"] = spread.tolist()
         rows.append(found)
     return rows
 

@@ -153,7 +153,7 @@ def ranks_table(found: pd.DataFrame) -> str:
         lines.append(
             [str(name), str(len(mine)), " / ".join(f"{x:.1f}" for x in misses)]
             + [str((mine.miss > WIDEST_MM).sum()), f"{100 * mine.two.mean():.0f}"]
-            + [f"{x:.2f}" for x in cells]
+            + ["-" if np.isnan(x) else f"{x:.2f}" for x in cells]
         )
     head = ["family, organ", "good", "miss, mm: median / 90 / 95 % / worst"]
     head += [f"over {WIDEST_MM:g} mm", "within two deviations, %"]

@@ -74,6 +74,8 @@ def summary(rows: pd.DataFrame, failures: Sequence[str]) -> str:
     parts = [_verdicts(rows[calm], key) for key in ("family", "hidden", "organ") if calm.any()]
     if not calm.all():
         parts += [_verdicts(rows[~calm], key) for key in ("disturbance", "organ")]
+        bare = rows[~calm & (rows.hidden_share == 0)]
+        parts.append(_verdicts(bare, "disturbance", ", nothing hidden"))
     reasons = pd.Series([why.partition(":")[0] for why in failures], dtype=str)
     lost = ", ".join(f"{name} {count}" for name, count in reasons.value_counts().items())
     parts.append(
@@ -84,7 +86,7 @@ def summary(rows: pd.DataFrame, failures: Sequence[str]) -> str:
     return "\n\n".join([*parts, _wrong(rows)])
 
 
-def _verdicts(rows: pd.DataFrame, key: str) -> str:
+def _verdicts(rows: pd.DataFrame, key: str, of: str = "") -> str:
     body = []
     for name, mine in [*rows.groupby(key, sort=key == "hidden", observed=True), ("all", rows)]:
         scenes, good = mine.drop_duplicates(["organ", "scene"]), mine[mine.verdict == "good"]
@@ -92,28 +94,33 @@ def _verdicts(rows: pd.DataFrame, key: str) -> str:
         errors = quantiles(good.off), quantiles(good.rigid)
         wrong = mine[mine.wrong].groupby(["organ", "scene"]).ngroups
         body.append([str(name), str(len(scenes)), ", ".join(counts), *errors, str(wrong)])
-    return table([key, "scenes", "refused, poor, good", "good", "best rigid pose", "wrong"], body)
+    head = [key + of, "scenes", "refused, poor, good", "good", "best rigid pose", "wrong"]
+    return table(head, body)
 
 
 def _wrong(rows: pd.DataFrame) -> str:
-    """Every wrong good answer by name, and what is wrong with it."""
+    """Every wrong good answer by name, and what is wrong with it: ``laid elsewhere`` if its tumor
+    would be within half of its error, were the estimate moved rigidly onto the truth; else bent
+    ``too little`` or ``wrongly``, as the best rigid pose is farther off or nearer."""
     wrong = rows[rows.wrong].sort_values("off", ascending=False)
     wrong = wrong.drop_duplicates(["organ", "scene"])
     causes = {
         "another organ taken for it": wrong.off.isna(),
         "camera out of scale or depth": wrong.disturbance == "scale",
         "laid elsewhere": wrong["shape"] < wrong.off / 2,
-        "bent, and given another bend": wrong.rigid > FAR_MM,
+        "bent too little": wrong.off <= wrong.rigid,
     }
-    wrong["why"] = np.select([*causes.values()], [*causes], "given a bend it lacks")
-    wrong["place"] = [f"{row.organ} {row.scene.rpartition('-')[0]}" for row in wrong.itertuples()]
-    wrong["place"] += [
-        "" if np.isnan(row.off) else f" {row.off:.1f} ({row.rigid:.1f}, {row.hidden_share:.0%})"
-        for row in wrong.itertuples()
+    wrong["why"] = np.select([*causes.values()], [*causes], "bent wrongly")
+    wrong["name"] = wrong.scene.str.rpartition("-")[0] + [
+        "" if np.isnan(row.off) else f" {row.off:.1f}" for row in wrong.itertuples()
     ]
-    body = [
-        [str(kind), str(why), str(len(mine)), ", ".join(mine.place)]
-        for (kind, why), mine in wrong.groupby(["disturbance", "why"])
+    told = wrong.off.notna() & (wrong.disturbance != "scale")
+    wrong.loc[told, "name"] += [
+        f" ({row.rigid:.1f}, {row.hidden_share:.0%})" for row in wrong[told].itertuples()
     ]
+    body = []
+    for (kind, why), mine in wrong.groupby(["disturbance", "why"]):
+        named = [f"{organ} {', '.join(some['name'])}" for organ, some in mine.groupby("organ")]
+        body.append([str(kind), str(why), str(len(mine)), "; ".join(named)])
     head = ["disturbance", "wrong", "scenes", "organ, scene, mm off (best rigid pose, hidden)"]
     return table(head, body, 4)

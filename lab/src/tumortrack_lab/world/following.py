@@ -212,7 +212,7 @@ def draw(rows: pd.DataFrame, path: Path) -> None:
     """Error of centres against time under a press: medians over sequences, phases made equally
     long; and how far the organ is bent."""
     rows = rows[rows["kind"] == "press"]
-    step = np.round(rows["phase"] * 5) / 5
+    step = np.floor(rows["phase"] * 4) / 4 + 0.125
     figure = new_figure(9.4, 4.2)
     axes = figure.add_axes((0.07, 0.12, 0.68, 0.83))
     for number, (method, mine) in enumerate(rows.groupby("method")):
