@@ -7,7 +7,7 @@ was stopped. OUT/world.json states case, seed and configuration, OUT/failures.js
 found no equilibrium and the views in which no organ was found, OUT/measured.json what a model makes
 of them. `--disturb strays fat ...` makes scenes that should be met with silence, and with `--states
 FOLDER` in states that are solved already (0.3 s a scene). Tables of several organs: the same for
-each, and the last with `--beside` the others.
+each, and the last with `--beside` the others. `--plans MODEL` cuts tumors out (4 s a scene).
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache, partial
+from itertools import product
 from pathlib import Path
 from typing import Annotated
 
@@ -26,8 +27,10 @@ from tumortrack.core import store
 from tumortrack.core.config import to_builtins
 from tumortrack.core.errors import InputError, TumortrackError
 from tumortrack.simulate.scene_folder import Scene, list_scenes, read_scene
-from tumortrack_lab.study import trainings
+from tumortrack_lab.study import resection, trainings
 from tumortrack_lab.study.document import ReportWriter
+from tumortrack_lab.study.measure import measured
+from tumortrack_lab.study.methods import study_case
 from tumortrack_lab.twin.dataset import claim
 from tumortrack_lab.world import estimates
 from tumortrack_lab.world.families import FAMILIES
@@ -61,6 +64,8 @@ class Options:
     """How often each of these."""
     model: Path | None = None
     """Measure it (folder that `tumortrack train` wrote)."""
+    plans: Path | None = None
+    """Instead: plan on the estimates of this one, which was calibrated on other states, and cut."""
     beside: tuple[Path, ...] = ()
     """Other organs' scenes that are measured already: they join the tables."""
     document: Path | None = None
@@ -73,6 +78,7 @@ def main(options: Options) -> None:
         if unknown := sorted(set(names) - set(known)):
             raise InputError(f"{unknown[0]!r} is not known; allowed: {', '.join(known)}.")
     block = "world" if set(options.disturb) == {"none"} else "world-disturbed"
+    block = "world-plans" if options.plans else block
     writer = ReportWriter(options.document or Path(), trainings.make_command("world"))
     if options.document is not None:
         writer.check([block])
@@ -100,16 +106,35 @@ def main(options: Options) -> None:
             f"{done}/{len(todo)} {name}: {left_min:.0f} min left, {each_s:.1f} s of one core a "
             f"scene, {len(failures)} failed"
         )
-    if options.model is not None:
+    if (model := options.plans or options.model) is not None:
         made = [name for name in scenes if (options.out / name).exists()]
-        estimates.measure(options.model, world.anatomy_ct, options.out, made)
-        folders = [options.out, *options.beside]
-        paths = [path for folder in folders if (path := folder / _FAILURES).exists()]
-        lost = [why for path in paths for why in store.read_json(path).values()]
-        text = estimates.summary(estimates.read_rows(folders), lost)
+        text = (_plans if options.plans else _estimates)(options, world, model, made)
         print(text)
         if options.document is not None:
             writer.write({block: f"`{writer.command}`\n\n{text}"})
+
+
+def _estimates(options: Options, world: World, model: Path, made: list[str]) -> str:
+    estimates.measure(model, world.anatomy_ct, options.out, made)
+    folders = [options.out, *options.beside]
+    paths = [path for folder in folders if (path := folder / _FAILURES).exists()]
+    lost = [why for path in paths for why in store.read_json(path).values()]
+    return estimates.summary(estimates.read_rows(folders), lost)
+
+
+def _plans(options: Options, world: World, model: Path, made: list[str]) -> str:
+    """Plans are kept in the scenes' folder, a file a scene and method."""
+    case, rows = study_case(options.out.name, options.case, options.out), []
+    for name, method in product(made, (resection.calibrated(model), resection.truth())):
+        variant, _, view = name.rpartition("-")
+        about = case, method, [variant], view, 160, options.out / "plans" / name
+        rows += measured(*about, resection.cut_in_world, **resection.cutting())
+        say(f"planned {name} ({method.name})")
+    good = {row["variant"] for row in rows if row.get("good")}
+    for row in rows:
+        row["case"] = "an answer" if row["variant"] in good else "no answer"
+    said = f"Scenes: {len(made)}, with an answer: {len(good)}."
+    return "\n\n".join([said, resection.tables_of(rows), resection.RULE])
 
 
 def _scenes(options: Options, world: World) -> dict[str, Callable[[], Scene]]:

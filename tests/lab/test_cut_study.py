@@ -22,8 +22,10 @@ from tumortrack_lab.peers.base import Fit, estimate_of, rigid_carry
 from tumortrack_lab.study.measure import measured
 from tumortrack_lab.study.methods import Method, StudyCase
 from tumortrack_lab.study.resection import (
+    CALIBRATED,
     PLANNERS,
     Planner,
+    cut_in_world,
     cut_one,
     cutting,
     scattered,
@@ -158,6 +160,35 @@ def test_the_margin_grows_by_what_the_estimate_is_unsure_of(case):
     assert plans[paper.name]["healthy_ml"] > plans[PUBLISHED.name]["healthy_ml"] + 0.2
     without = cuts(case, shifted())
     assert list(without) == [PUBLISHED.name, OURS.name]
+
+
+def test_a_stated_margin_pays_for_an_estimate_that_is_as_far_off(case):
+    """3 mm of it, with 2 mm of hand-eye, 3 of tool and 2 of motion as nobody states them."""
+    off, radius_mm = shifted(shift_mm=3.0, std_mm=0.5), 3.0
+    stated = {"stated": [{"confidence": 0.95, "mm": {"tumor_1": radius_mm}}], "reason": ""}
+
+    def locate(scene, grid):
+        estimate = off.locate(scene, grid)
+        return replace(estimate, quality="good", report={**estimate.report, "margin": stated})
+
+    rows = cut_in_world(case, replace(off, locate=locate), "D0", "noise", 64)
+    assert all(row["good"] for row in rows)
+    plain_mm, _, radius, everything, thin = (row["margin_mm"] for row in rows)
+    assert [row["planner"] for row in rows] == [planner.name for planner in CALIBRATED]
+    assert plain_mm == pytest.approx(5.0 - 3.0, abs=0.5)
+    assert radius - plain_mm == pytest.approx(radius_mm, abs=0.3)
+    assert everything - plain_mm == pytest.approx(
+        2.0 + np.hypot(radius_mm, np.hypot(2, 3)), abs=0.3
+    )
+    assert everything - thin == pytest.approx(4.0, abs=0.3)
+    text = tables_of([{"case": "balls", "method": "calibrated", **row} for row in rows])
+    kept = {line.split("|")[2].strip(): line for line in text.splitlines() if "| ours," in line}
+    assert "| 0.0 (0.0 to 97.5) | 0 | 0 |" in kept["ours, 5 mm"]
+    assert "| 100.0 (2.5 to 100.0) | 0 | 0 |" in kept["ours, 5 mm + 95 % radius"]
+    silent = cut_in_world(case, off, "D0", "noise", 64)
+    assert [row.get("refused", "").partition(":")[0] for row in silent[2:]] == [
+        "the estimate states no 95 % margin of tumor_1"
+    ] * 3
 
 
 def test_plans_are_measured_once_and_apart_from_accuracy(case, tmp_path):

@@ -3,32 +3,42 @@
 from __future__ import annotations
 
 import math
+import re
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import asdict, replace
+from functools import cache
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import pandas as pd
 
 import tumortrack
 import tumortrack_lab.cut
+from tumortrack.core import store
 from tumortrack.core.config import Config, to_builtins
 from tumortrack.core.errors import InputError, NoEstimate, NoPlan
 from tumortrack.core.estimate import Estimate
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import Anatomy, OccupancyCloud
+from tumortrack.models.margins import NAME, read_margins
+from tumortrack.plan.budget import ErrorBudget, plan_within, planned_budget
 from tumortrack.plan.located import located
-from tumortrack.plan.resection import plan_resection
-from tumortrack.plan.values import Located, ResectionConfig
+from tumortrack.plan.values import Located, ResectionConfig, ResectionPlan
 from tumortrack.plan.values import Method as PlanMethod
 from tumortrack.registration.locator import QUERIES
 from tumortrack.simulate.scene_folder import Scene, read_scene
+from tumortrack.tracking.tracker import Tracker
+from tumortrack.training.model import load_model
 from tumortrack_lab.cut import VOXEL_MM, cut
 from tumortrack_lab.peers.base import Fit, estimate_of
 from tumortrack_lab.study.document import table
 from tumortrack_lab.study.methods import Method, StudyCase, code_sha256
 from tumortrack_lab.study.tables import EMPTY, NOTHING, groups, label_of, names, ordered
+from tumortrack_lab.study.trust import share_words
 from tumortrack_lab.study.tumor_sites import tumor_sites_of
 from tumortrack_lab.twin.apparatus import moved
 
@@ -40,9 +50,11 @@ _WHOLE = 0.999  # of a tumor: what is missing is a voxel's rounding
 _HEAD = (
     "located by", "planner", "plans", "piece comes free", "tumor whole in the piece",
     "tumor removed, %: median", "worst", "tumor left, ml: worst",
-    "margin kept, mm: median", "worst", "healthy tissue, ml: mean",
+    "margin kept, mm: median", "worst", "as asked, %", "cuts into it", "into another tumor",
+    "healthy tissue, ml: mean (of the parenchyma)",
 )  # fmt: skip
 _RESULTS = ["detached", "removed_share", "left_ml", "margin_mm", "healthy_ml", "hurt"]
+_NUMBER = re.compile(r"\d+(\.\d+)?")
 RULE = (
     "Each exophytic tumor (one whose own surface is the organ's over 5 % or more, in the CT) of "
     "each scene is planned on the estimate, and the plan is carried out on the true organ of that "
@@ -53,27 +65,46 @@ RULE = (
     "Margin kept: least distance from the cut's surface within tissue to the true tumor; negative: "
     "so deep did the cut go into it. Healthy tissue: with the pieces that came free. Numbers are "
     "of the plans that were made, tumors' shares rounded down. Truth: planned on the true organ, "
-    f"the bound. Margins are {MARGIN_MM:g} mm; “+ {SIGMAS:g} sd”: and {SIGMAS:g} standard "
+    f"the bound. As asked: the mm before a plus are kept, less the cut's voxels of {VOXEL_MM:g} mm;"
+    f" with Clopper and Pearson's interval of 95 %. “+ {SIGMAS:g} sd”: and {SIGMAS:g} standard "
     "deviations of the estimate more, at each place of the tumor's surface; with the paper's "
-    "planner, which has one margin, as many as the least certain place needs. Left out: tissue "
-    "does not move or give way while it is cut, nobody pulls at the piece, the instrument takes "
-    "no tissue with it, and it reaches all of a level sheet below the piece, of which the paper's "
-    "planner gives the outline alone."
+    "planner, which has one margin, as many as the least certain place needs. “+ 95 % radius”: and "
+    "the tumor's calibrated margin more; “and other errors”: and those of hand-eye, tool and "
+    "motion, none of which is simulated, together as `plan --confidence` adds them. Left out: "
+    "tissue does not move or give way while it is cut, nobody pulls at the piece, the instrument "
+    "takes no tissue with it, and it reaches all of a level sheet below the piece, of which the "
+    "paper's planner gives the outline alone."
 )
 
 
 class Planner(Config, frozen=True):
     """One way to plan: by whose rules, and how many standard deviations of the estimate are added
-    to the margin."""
+    to the margin; or with which ``confidence`` all errors are, as `plan --confidence` does it.
+    ``still``: of these the tumor's radius alone, for nothing else is off in a simulated cut."""
 
     method: PlanMethod
     sigmas: float = 0.0
     margin_mm: float = MARGIN_MM
+    confidence: float = 0.0
+    still: bool = False
 
     @property
     def name(self) -> str:
         more = f" + {self.sigmas:g} sd" if self.sigmas else ""
+        if self.confidence:
+            what = "radius" if self.still else "radius and other errors"
+            more = f" + {100 * self.confidence:g} % {what}"
         return f"{self.method}, {self.margin_mm:g} mm{more}"
+
+    def plan(self, found: Located, tumor: str) -> ResectionPlan:
+        """Raises InputError and NoPlan as ``plan_within``."""
+
+        def budget_of(plan: ResectionPlan) -> ErrorBudget:
+            budget = planned_budget(plan, found, confidence=self.confidence or None)
+            others = {"hand_eye_mm": 0.0, "tool_mm": 0.0, "motion_mm": 0.0, "assumed": ()}
+            return msgspec.structs.replace(budget, **(others if self.still else {}))
+
+        return plan_within(found, self.config(found, tumor), budget_of, self.confidence > 0)[0]
 
     def config(self, found: Located, tumor: str) -> ResectionConfig:
         """The paper's planner has one margin for all of the tumor: it is given what the least
@@ -85,6 +116,24 @@ class Planner(Config, frozen=True):
 
 
 PLANNERS = tuple(Planner(method=m, sigmas=s) for m in ("published", "margin") for s in (0, SIGMAS))
+# In the wider world, with a calibrated model; all but the last keep the same healthy tissue.
+CALIBRATED = (
+    *PLANNERS[2:],
+    Planner(method="margin", confidence=0.95, still=True),
+    Planner(method="margin", confidence=0.95),
+    Planner(method="margin", confidence=0.95, margin_mm=1.0),
+)
+_ALL = tuple(dict.fromkeys((*PLANNERS, *CALIBRATED)))
+
+
+def calibrated(folder: Path) -> Method:
+    """A model with its margins, judged by all that the camera saw, as `locate` does it. Raises
+    InputError: it has none."""
+    if read_margins(folder) is None:
+        raise InputError(f"{folder} has no margins; calibrate it first (tumortrack margins).")
+    tracker = cache(lambda: Tracker(load_model(folder, "cpu")))
+    identity = {name: store.sha256_of(folder / name) for name in (store.MANIFEST, NAME)}
+    return Method("calibrated", identity, lambda s, n: tracker().locate(s.cloud, n, 0, s.depth))
 
 
 def truth() -> Method:
@@ -118,15 +167,24 @@ def cutting() -> dict[str, Any]:
     """What else decides a measurement whose estimate is planned on and cut."""
     planning = (Path(tumortrack.__file__).parent / "plan").glob("*.py")
     code = code_sha256([*planning, Path(tumortrack_lab.cut.__file__)])
-    planners = [to_builtins(planner) for planner in PLANNERS]
+    planners = [to_builtins(planner) for planner in _ALL]
     return {"cutting": {"planners": planners, "voxel_mm": VOXEL_MM, "code_sha256": code}}
 
 
-def cut_one(
+def cut_in_world(
     case: StudyCase, method: Method, variant: str, view: str, grid: int
 ) -> list[dict[str, Any]]:
+    """``cut_one`` by the planners of a calibrated model."""
+    return cut_one(case, method, variant, view, grid, CALIBRATED)
+
+
+def cut_one(
+    case: StudyCase, method: Method, variant: str, view: str, grid: int,
+    planners: Sequence[Planner] = PLANNERS,
+) -> list[dict[str, Any]]:  # fmt: skip
     """One scene: a row for each exophytic tumor and planner: ``refused`` and why, or what the cut
-    did (``CutResult``). Raises InputError: a scene that does not say where the table is."""
+    did (``CutResult``); ``good``: the estimate, if there is one. Raises InputError: a scene that
+    does not say where the table is."""
     scene = read_scene(case.scene(variant, view))
     if "camera_from_bench" not in scene.meta:
         raise InputError(
@@ -141,19 +199,21 @@ def cut_one(
         estimate = method.locate(scene, grid)
     except (NoEstimate, InputError) as error:
         refused = {"refused": str(error)}
-        return [{"tumor": name, "planner": p.name, **refused} for name in tumors for p in PLANNERS]
+        return [{"tumor": name, "planner": p.name, **refused} for name in tumors for p in planners]
     found = located(estimate.cloud, estimate.meshes, estimate.motion, table_from_camera)
+    found = replace(found, margin=estimate.report.get("margin"))
+    about = {"good": estimate.quality == "good"}
     return [
-        {"tumor": name, "planner": planner.name, **_planned_and_cut(true, found, planner, name)}
+        {"tumor": name, "planner": p.name, **about, **_planned_and_cut(true, found, p, name)}
         for name in tumors
-        for planner in PLANNERS
-        if not planner.sigmas or found.std_mm  # others know no uncertainty
+        for p in planners
+        if not (p.sigmas or p.confidence) or found.std_mm  # others know no uncertainty
     ]
 
 
 def _planned_and_cut(true: Anatomy, found: Located, planner: Planner, tumor: str) -> dict[str, Any]:
     try:
-        plan = plan_resection(found, planner.config(found, tumor))
+        plan = planner.plan(found, tumor)
     except (NoPlan, InputError) as error:
         return {"refused": str(error)}
     result = cut(true, plan)
@@ -163,9 +223,10 @@ def _planned_and_cut(true: Anatomy, found: Located, planner: Planner, tumor: str
 
 def tidy_plans(rows: list[dict[str, Any]]) -> pd.DataFrame:
     """One row for each plan, made or ``refused``: the truth's last, planners in their order."""
-    frame = pd.DataFrame(rows).reindex(columns=["case", "method", "planner", "refused", *_RESULTS])
+    columns = ["case", "method", "planner", "refused", "promised_ml", *_RESULTS]
+    frame = pd.DataFrame(rows).reindex(columns=columns)
     frame = frame.astype(dict.fromkeys(_RESULTS[1:5], float))
-    planners = pd.Categorical(frame.planner, [planner.name for planner in PLANNERS])
+    planners = pd.Categorical(frame.planner, [planner.name for planner in _ALL])
     methods = sorted(frame.method.unique(), key=lambda name: name == TRUTH)
     frame = frame.assign(planner=planners, method=pd.Categorical(frame.method, methods))
     return ordered(frame, ["case"])
@@ -183,14 +244,12 @@ def tables_of(rows: list[dict[str, Any]]) -> str:
         ]
         texts += ["Each case:", table(("case", *_HEAD), each, left=3)]
     refused = Counter(
-        f"{label_of(method)}, {_label(planner)}: {reason}"
+        f"{label_of(method)}, {_label(planner)}: {_NUMBER.sub('N', reason.partition(': ')[0])}"
         for (method, planner), plans in groups(frame, "method", "planner")
         for reason in plans.refused.dropna()
     )
     reasons = " ".join(f"{count} x {why}" for why, count in refused.items())
     texts.append(f"Refused: {reasons}" if refused else "No plan was refused.")
-    made = frame[frame.refused.isna()]
-    texts.append(f"Cuts into another tumor: {made.hurt.map(bool).sum()} of {len(made)}.")
     return "\n\n".join(texts)
 
 
@@ -203,8 +262,13 @@ def _rows(frame: pd.DataFrame) -> list[list[str]]:
         row += [f"{n} of {len(made)}" for n in (len(free), (made.removed_share >= _WHOLE).sum())]
         row += [_text(share, down=True) for share in (removed.median(), removed.min())]
         row.append(_text(made.left_ml.max(), digits=2))
-        margins = made.margin_mm.median(), made.margin_mm.min()
-        rows.append([*row, *map(_text, (*margins, free.healthy_ml.mean()))])
+        row += map(_text, (made.margin_mm.median(), made.margin_mm.min()))
+        least_mm = {p.name: p.margin_mm for p in _ALL}[planner] - VOXEL_MM
+        row.append(share_words((made.margin_mm >= least_mm).sum(), len(made)))
+        row += [str((made.margin_mm < 0).sum()), str(made.hurt.map(bool).sum())]
+        parenchyma_ml = free.promised_ml.map(itemgetter("parenchyma")).astype(float)
+        part = 100 * (free.healthy_ml / parenchyma_ml).mean()
+        rows.append([*row, f"{_text(free.healthy_ml.mean())} ({_text(part, 0)} %)"])
     return rows
 
 
