@@ -1,7 +1,7 @@
 """Where to cut a tumor out of an organ that lies on the table.
 
 Run after 01: python examples/07_plan_a_resection.py [FOLDER]
-From the command line, with the motions of two arms: tumortrack plan RUN PLAN --margin 10
+From the command line, with the motions of two arms: tumortrack plan RUN PLAN --margin 9
 """
 
 import sys

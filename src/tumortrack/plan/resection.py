@@ -27,7 +27,7 @@ from tumortrack.plan.values import (
 _DIRECTIONS, _MOST = 192, 12_000  # of the hull, points it is made of: a kidney's is off by 0.5 mm
 _FEWEST = 30  # points that define a tumor's shape
 _A_COLUMN = 30  # points in a column, about
-_WHOLE, _TOUCHED = 0.99, 0.02  # of another tumor's points
+_WHOLE = 0.99  # of another tumor's points
 
 
 def plan_resection(located: Located, config: ResectionConfig) -> ResectionPlan:
@@ -42,7 +42,7 @@ def plan_resection(located: Located, config: ResectionConfig) -> ResectionPlan:
     layers, cuts, grasp_mm = method(located, label, config)
     taken = inside(layers, located.points_mm)
     volumes_ml = _volumes_ml(located, label, taken)
-    notes = _others(located, label, taken)
+    notes = _others(located, label, taken, layers)
     healthy_share = volumes_ml["healthy"] / volumes_ml["parenchyma"]
     if healthy_share > config.most_healthy:
         raise NoPlan(
@@ -180,17 +180,22 @@ def _cloud_volume_mm3(points_mm: np.ndarray) -> float:
     return float((span * area).sum() * side_mm**2)
 
 
-def _others(located: Located, label: int, taken: np.ndarray) -> tuple[str, ...]:
-    """What becomes of other tumors; a cut through one is no plan."""
+def _others(
+    located: Located, label: int, taken: np.ndarray, piece: tuple[CutLayer, ...]
+) -> tuple[str, ...]:
+    """What becomes of other tumors; a cut through one is no plan, however little it takes."""
     notes = []
     for other in located.tumors:
-        share = float(taken[located.labels == other].mean())
-        if other == label or share < _TOUCHED:
+        share, name = float(taken[located.labels == other].mean()), name_of(other)
+        surface = located.meshes.get(name)
+        touched = share > 0 or (surface is not None and inside(piece, surface.vertices_mm).any())
+        if other == label or not touched:
             continue
         if share < _WHOLE:
+            much = f"{share:.0%} of it" if share >= 0.01 else "an edge of it"
             raise NoPlan(
-                f"the cut would go through {name_of(other)} ({share:.0%} of it would come away). "
-                "Ask for another margin, or plan that tumor."
+                f"the cut would go through {name} ({much} would come away). Ask for another "
+                "margin, or plan that tumor."
             )
-        notes.append(f"{name_of(other)} comes away with {name_of(label)}.")
+        notes.append(f"{name} comes away with {name_of(label)}.")
     return tuple(notes)

@@ -102,6 +102,8 @@ def _wrong(rows: pd.DataFrame) -> str:
     """Every wrong good answer by name, and what is wrong with it: ``laid elsewhere`` if its tumor
     would be within half of its error, were the estimate moved rigidly onto the truth; else bent
     ``too little`` or ``wrongly``, as the best rigid pose is farther off or nearer."""
+    if not rows.wrong.any():
+        return "Wrong: none."
     wrong = rows[rows.wrong].sort_values("off", ascending=False)
     wrong = wrong.drop_duplicates(["organ", "scene"])
     causes = {
