@@ -27,9 +27,10 @@ from tumortrack.models.config import GaussNewtonConfig
 from tumortrack.registration import gauss_newton_kernels as kernels
 from tumortrack.registration.discrepancy import FARTHEST, judge
 from tumortrack.registration.kernels import POSE
-from tumortrack.registration.looks import CAMERA_STD, Looks
+from tumortrack.registration.looks import Looks
 from tumortrack.registration.motion import ElasticMotion
 from tumortrack.registration.rest_shape import RestShape
+from tumortrack.sense.noise import CAMERA_STD
 from tumortrack.simulate.elastic.flow import LatticeField
 
 

@@ -20,10 +20,7 @@ from tumortrack.core.geometry import Affine, Points, rigid, transform_points
 from tumortrack.models.config import GaussNewtonConfig
 from tumortrack.registration.kernels import POSE
 from tumortrack.registration.motion import ElasticMotion
-
-# Standard deviations of a camera's place relative to another's, along and about each axis:
-# calibrations with 3D cameras err by about 0.9 mm and 0.27 degrees (arXiv 2311.01335).
-CAMERA_STD = np.array([1.0] * 3 + [0.01] * 3)  # mm at the organ, rad
+from tumortrack.sense.noise import CAMERA_STD
 
 
 @dataclass(frozen=True, eq=False)
