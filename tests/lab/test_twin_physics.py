@@ -266,7 +266,7 @@ def test_a_load_that_finds_no_rest_is_an_error(bench: Apparatus) -> None:
 
 def test_the_twin_shares_no_code_with_the_training_deformations() -> None:
     code = (
-        "import sys, tumortrack_lab.twin.dataset, tumortrack_lab.twin.faults\n"
+        "import sys, tumortrack_lab.twin.dataset, tumortrack_lab.twin.occluders\n"
         "training = ('tumortrack.simulate.deform', 'tumortrack.simulate.elastic')\n"
         "print([m for m in sys.modules if m.startswith(training)])"
     )
