@@ -16,9 +16,10 @@ from tumortrack.models.config import MlpDecoderConfig, NetworkConfig
 from tumortrack.models.encoders.pointnet2 import PointNet2Config, SetAbstraction
 from tumortrack.models.normalisation import CloudBox
 from tumortrack.occupancy.network import MlpDecoder, OccupancyNetwork
-from tumortrack.training.presets import quick_network
+from tumortrack.training.presets import PRESETS, quick_network
 from tumortrack_lab.bench import rows as interleaving
 from tumortrack_lab.bench import run as running
+from tumortrack_lab.bench import subject as subject_module
 from tumortrack_lab.bench.machine import forget_peak, peak_bytes
 from tumortrack_lab.bench.naive import NaiveOccupancy, flowed
 from tumortrack_lab.bench.occupancy import module_flops
@@ -219,6 +220,16 @@ def small_subject(folder: Path) -> BenchSubject:
     subject = BenchSubject({}, folder)
     subject.__dict__["anatomy"] = Anatomy((ball(30.0, 0.0), ball(8.0, 10.0)))
     return subject
+
+
+def test_a_large_network_to_measure_is_saved_and_read_again(tmp_path, monkeypatch):
+    for name in ("_SETTLED", "_PER_SIDE"):
+        monkeypatch.setattr(subject_module, name, 1 if name == "_SETTLED" else 8)
+    monkeypatch.setitem(subject_module._STEPS, "paper", 1)
+    subject = BenchSubject({"paper": PRESETS["paper"]}, tmp_path)
+    subject.train("paper", lambda _: None)
+    assert subject.trained("paper")
+    assert subject.model("paper").provenance["steps"] == 1
 
 
 def test_a_process_measures_a_part(tmp_path) -> None:

@@ -204,7 +204,7 @@ def _overfit(subject: BenchSubject, config: TrainConfig, folder: Path) -> None:
     model = OccupancyModel(
         network=network.eval(), config=config, parts=anatomy.names,
         query_box_mm=np.array([organ.min(0), organ.max(0)], float),
-        in_distribution=InDistributionRange(spread_mm=(0.0, 1e3), fit_mm=1e3),  # all is accepted
+        in_distribution=InDistributionRange(spread_mm=(0.1, 1e3), fit_mm=100),  # widest allowed
         provenance={"steps": steps, "loss": round(float(loss.detach()), 4), "scenes": 1},
     )  # fmt: skip
     save_model(model, folder)
