@@ -28,7 +28,7 @@ _SAME_MM = 2.0  # points this near the ray are all under the pointer: the foremo
 _MISSED_MM = 10.0
 
 
-class Look:
+class Viewpoint:
     """New visitors look from the depth camera's place along its axis, its y axis down."""
 
     def __init__(self, server: ViserServer, way: Float[np.ndarray, "4 4"]) -> None:

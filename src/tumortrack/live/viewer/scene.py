@@ -20,7 +20,7 @@ from tumortrack.core.types import Mesh
 from tumortrack.live import values as live
 from tumortrack.live.display import MOST_SEEN, seen_points, thinned, wxyz_of
 from tumortrack.live.values import TrackingResult, TransformedEstimate
-from tumortrack.live.viewer.look import Look
+from tumortrack.live.viewer.look import Viewpoint
 from tumortrack.live.viewer.slices import SlicePlane
 from tumortrack.live.viewer.surfaces import bare_faces
 from tumortrack.models.margins import stated_radius
@@ -74,7 +74,7 @@ class ViewerScene:
         self.margins: dict[str, Mesh] = {}  # of the shown estimate, published frame
         self._shown: tuple[TrackingResult, TransformedEstimate] | None = None
         self._has_organ = self._has_slice = False
-        self.look = Look(server, self._way)
+        self.look = Viewpoint(server, self._way)
         self._make_nodes(context)
 
     def _make_nodes(self, context: live.SinkContext) -> None:
