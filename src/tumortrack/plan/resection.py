@@ -186,10 +186,11 @@ def _others(
     """What becomes of other tumors; a cut through one is no plan, however little it takes."""
     notes = []
     for other in located.tumors:
+        if other == label:
+            continue
         share, name = float(taken[located.labels == other].mean()), name_of(other)
         surface = located.meshes.get(name)
-        touched = share > 0 or (surface is not None and inside(piece, surface.vertices_mm).any())
-        if other == label or not touched:
+        if share == 0 and (surface is None or not inside(piece, surface.vertices_mm).any()):
             continue
         if share < _WHOLE:
             much = f"{share:.0%} of it" if share >= 0.01 else "an edge of it"
