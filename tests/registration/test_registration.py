@@ -133,6 +133,9 @@ def test_a_shape_survives_its_arrays():
     assert len(again.half_turns)
     older = RestShape.from_arrays({k: v for k, v in arrays.items() if k != "half_turns"}, 2)
     np.testing.assert_array_equal(older.half_turns, again.half_turns)
+    for damaged in (np.full((1, 4, 4), np.nan), np.eye(4)):
+        with pytest.raises(InputError, match="half turns are damaged"):
+            RestShape.from_arrays({**arrays, "half_turns": damaged}, 2)
     with pytest.raises(InputError, match=r"1\.values_mm"):
         RestShape.from_arrays({k: v for k, v in arrays.items() if k != "1.values_mm"}, 2)
 

@@ -108,6 +108,8 @@ class RestShape:
         anatomy_ct = Anatomy(tuple(parts))
         turns = arrays.get("half_turns")  # which older folders lack
         turns = _half_turns(anatomy_ct) if turns is None else turns
+        if turns.shape[1:] != (4, 4) or not np.isfinite(turns).all():
+            raise InputError("the organ's half turns are damaged; train the model again.")
         return cls(anatomy_ct, ElasticBody.from_arrays(body), tuple(fields), turns)
 
 
