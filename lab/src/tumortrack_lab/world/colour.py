@@ -14,7 +14,7 @@ from collections.abc import Callable
 import numpy as np
 from jaxtyping import Float64
 
-from tumortrack.core.geometry import transform_points
+from tumortrack.core.geometry import transform_points, triangles_of
 from tumortrack.core.store import write_atomically, write_json
 from tumortrack.core.types import DepthFrame
 from tumortrack_lab.world.films import Film
@@ -37,10 +37,8 @@ def paint(film: Film) -> None:
     from PIL import Image
 
     rng = np.random.default_rng(list(film.folder.name.encode()))
-    texture, strength = (
-        _texture(rng),
-        float(rng.choice([0.0, rng.uniform(0.4, 1.0)], p=[_BARE, 1 - _BARE])),
-    )
+    texture = _texture(rng)
+    strength = float(rng.choice([0.0, rng.uniform(0.4, 1.0)], p=[_BARE, 1 - _BARE]))
     way, period_s = rng.normal(0, 60.0, (2, 3)) * [1, 1, 0.3], rng.uniform(3.0, 9.0)
     poses = np.linalg.inv(film.first_from_camera(as_it_is=True))
     for n in range(len(poses)):
@@ -72,7 +70,7 @@ def _picture(
 
     rays = points_of(np.ones(frame.depth_mm.shape), frame.intrinsics).reshape(-1, 3)
     scene = EmbreeScene()
-    keep = TriangleMesh(scene, there_mm[faces].astype(np.float32))  # noqa: F841  the scene's own
+    _mesh = TriangleMesh(scene, there_mm[faces].astype(np.float32))  # the scene needs it alive
     start, way = np.zeros_like(rays, np.float32), rays.astype(np.float32)
     hit = scene.run(start, way, output=1)
     depth = np.nan_to_num(frame.depth_mm, nan=np.inf).ravel().astype(float)
@@ -82,11 +80,7 @@ def _picture(
     corners = faces[hit["primID"][own]]
     rest, place = ((weights * points[corners]).sum(1) for points in (rest_mm, there_mm))
     normals = np.zeros_like(there_mm)
-    ends = there_mm[faces]
-    for corner in range(3):
-        np.add.at(
-            normals, faces[:, corner], np.cross(ends[:, 1] - ends[:, 0], ends[:, 2] - ends[:, 0])
-        )
+    np.add.at(normals, faces, triangles_of(there_mm, faces)[1][:, None])
     mottle, veins, *slopes = texture
     normal = _unit((weights * _unit(normals)[corners]).sum(1))
     to_lamp, to_camera = _unit(lamp_mm - place), _unit(-place)
@@ -113,14 +107,8 @@ def _texture(rng: np.random.Generator) -> Texture:
 
 def _waves(length_mm: float, rng: np.random.Generator) -> Field:
     """A smooth random field of variance 1."""
-    ways = rng.normal(size=(24, 3))
-    ways *= (
-        2
-        * np.pi
-        / length_mm
-        * rng.uniform(0.7, 1.3, (24, 1))
-        / np.linalg.norm(ways, axis=1)[:, None]
-    )
+    ways = _unit(rng.normal(size=(24, 3)))
+    ways *= 2 * np.pi / length_mm * rng.uniform(0.7, 1.3, (24, 1))
     phases = rng.uniform(0, 2 * np.pi, 24)
     return lambda x: np.cos(x @ ways.T + phases).sum(1) / np.sqrt(12)
 

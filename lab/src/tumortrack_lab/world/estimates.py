@@ -12,6 +12,7 @@ import pandas as pd
 from tumortrack.cli.console import say
 from tumortrack.core import store
 from tumortrack.core.errors import InputError
+from tumortrack.core.estimate import FAR_MM
 from tumortrack.core.types import Anatomy
 from tumortrack.models.margins import METHOD
 from tumortrack.simulate.scene_folder import Scene, read_scene
@@ -23,7 +24,6 @@ from tumortrack_lab.study.trust import BANDS, band_of
 
 _ERRORS = {"middle_mm": "off", "rigid_middle_mm": "rigid", "shape_middle_mm": "shape"}
 _ROWS, _SAVE_EVERY = "measured.json", 20
-FAR_MM = 5.0  # off: a good answer that is wrong
 
 
 def measure(model: Path, anatomy_ct: Anatomy, out: Path, names: Sequence[str]) -> None:

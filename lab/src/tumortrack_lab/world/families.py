@@ -74,7 +74,7 @@ def _plate(stage: Stage, rng: Generator) -> Load:
     return Load(at, deep, {"plate_tilt_degrees": np.rad2deg(tilt), "width_mm": width, "mm": deep})
 
 
-def _clamp(stage: Stage, rng: Generator) -> Load:
+def clamp(stage: Stage, rng: Generator) -> Load:
     """Two plates from opposite sides, about level."""
     turn, width = rng.uniform(0, 2 * np.pi), rng.uniform(15, 60)
     out = unit(np.array([np.cos(turn), np.sin(turn), rng.uniform(-0.2, 0.2)]))
@@ -152,7 +152,7 @@ def _tether(stage: Stage, rng: Generator) -> Load:
     return Load(at, max(pull, deep), about, free=True)
 
 
-def _roll(stage: Stage, rng: Generator) -> Load:
+def roll(stage: Stage, rng: Generator) -> Load:
     """A flank is drawn sideways over a slippery bed: the organ is free to roll about its length."""
     organ, far_mm = stage.organ, rng.uniform(5.0, 18.0)
     out = unit(np.array([rng.normal(0, 0.2), rng.choice([-1.0, 1.0]), rng.uniform(0.3, 1.0)]))
@@ -216,8 +216,8 @@ def _random_slit(organ: Organ, rng: Generator) -> Slit:
 
 
 FAMILIES: dict[str, Callable[[Stage, Generator], Load] | None] = {
-    "rest": None, "plate": _plate, "clamp": _clamp, "twist": _twist, "pull": _pull,
-    "tether": _tether, "roll": _roll, "cut": _cut,
+    "rest": None, "plate": _plate, "clamp": clamp, "twist": _twist, "pull": _pull,
+    "tether": _tether, "roll": roll, "cut": _cut,
 }  # fmt: skip
 
 

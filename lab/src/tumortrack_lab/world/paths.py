@@ -25,16 +25,17 @@ from tumortrack_lab.tets import find
 from tumortrack_lab.twin.equilibrium import Nodes, Points, Rod, Support
 from tumortrack_lab.twin.occluders import rod_mesh
 from tumortrack_lab.world.families import (
-    FAMILIES,
     bedded,
+    clamp,
     equilibria,
     frame_along,
     log_uniform,
     plate_over,
     random_tissue,
+    roll,
     volume_change,
 )
-from tumortrack_lab.world.forces import Capsule, Force, Steady, Touch, Turned
+from tumortrack_lab.world.forces import Capsule, Force, Steady, Touch, Turned, Weight
 from tumortrack_lab.world.organ import Generator, Organ, Stage
 from tumortrack_lab.world.views import direction, hand_mesh
 
@@ -239,7 +240,7 @@ def _push(organ: Organ, rng: Generator) -> LoadPath:
 def _roll(organ: Organ, rng: Generator) -> LoadPath:
     """A flank is drawn round over a slippery bed by something that is not seen."""
     bench = _bench(organ, rng, (0.25, 0.5), 0.0)
-    load = FAMILIES["roll"](bench.stage, rng)  # type: ignore[misc]  # only rest has none
+    load = roll(bench.stage, rng)
     return _loaded(bench, _there_and_back(load.reach_mm, rng), load.at, load.about)
 
 
@@ -277,23 +278,29 @@ def _turn(organ: Organ, rng: Generator) -> LoadPath:
     """A hand, which is seen, grips the organ, turns it about its length and lays it down."""
     bench = _bench(organ, rng, (0.1, 0.3), 0.0)
     stage, solid = bench.stage, bench.stage.solid
-    grip = FAMILIES["clamp"](stage, rng)  # type: ignore[misc]  # only rest has none
+    grip = clamp(stage, rng)
     hard = min(1.0, rng.uniform(2.0, 8.0) / grip.reach_mm)
     degrees = rng.uniform(60.0, 180.0) * rng.choice([-1.0, 1.0])
     rotation = _turned(np.zeros(3), [degrees, 0.0, 0.0], np.zeros(3))[:3, :3]
     middle, lowest = organ.middle_mm, ((organ.points_mm - organ.middle_mm) @ rotation[2]).min()
     floor = Turned(Support(lowest), rotation.T, middle)
-    held = (Steady.of(solid), *(f for f in bench.forces if isinstance(f, Capsule)))
+    held: tuple[Force, ...] = (
+        Steady.of(solid),
+        *(f for f in bench.forces if isinstance(f, Capsule)),
+    )
     bed, weight = bench.forces[:2]
     assert isinstance(bed, Touch)
+    assert isinstance(weight, Weight)
     flat = stage.touch(floor, bed.stiffness_kpa_mm)
-    pulled = type(weight)(weight.force_mn @ rotation)  # type: ignore[attr-defined, call-arg]
+    pulled = Weight(weight.force_mn @ rotation)
+    before: tuple[Force, ...] = (bed, weight, *held)
+    after: tuple[Force, ...] = (flat, pulled, *held)
     loads = [
-        (bed, weight, *held),
-        *((bed, weight, *held, *grip.at(share * hard)) for share in (0.5, 1.0)),
+        before,
+        *((*before, *grip.at(share * hard)) for share in (0.5, 1.0)),
         (*held, *grip.at(hard)),
-        *((flat, pulled, *held, *grip.at(share * hard)) for share in (1.0, 0.5)),
-        (flat, pulled, *held),
+        *((*after, *grip.at(share * hard)) for share in (1.0, 0.5)),
+        after,
     ]
     turn_s, start_s = rng.uniform(1.2, 3.0), BEFORE_S + 1.2
     end_s = start_s + turn_s
