@@ -25,7 +25,7 @@ from tumortrack.sense.camera import d405
 from tumortrack.sense.files import depth_png, intrinsics_json, read_poses
 from tumortrack.sense.render import render_depth
 from tumortrack.tracking.advice import CHECK_POSES
-from tumortrack.tracking.tracker import Tracker
+from tumortrack.tracking.tracker import Follower, FollowerConfig, Tracker
 from tumortrack.training.model import load_model
 from warp_objects import ANATOMY, PLACE_MM, nudged, placed, shape
 
@@ -302,3 +302,24 @@ def test_the_command_takes_several_views(slim_model, tmp_path):
     middle = truth.carry(ORGAN.vertices_mm).mean(0)  # which way round it lies nobody can tell
     assert np.linalg.norm(report["parts"]["kidney"]["center_mm"] - middle) < 5
     assert "not of several" in report["margin"]["reason"]
+
+
+def test_an_organ_is_followed_by_several_cameras_and_by_one_that_goes_round(tracker):
+    """Where the last frame's camera stood elsewhere, the search starts where it put the organ."""
+    follower, second_ns = Follower(tracker, FollowerConfig(rescan_s=100.0)), 10**9
+    found = []
+    for n, degrees in enumerate(((0, 60), (0, 60), (50,), (-50, 0))):
+        lead = around(degrees[0])
+        views = [view(REST, around(one), np.linalg.inv(lead) @ around(one), n) for one in degrees]
+        before = around((0, 0, 0, 50)[n])
+        here = replace(views[0].cloud, stamp_ns=1 + n * second_ns // 10)
+        way = np.linalg.inv(lead) @ before
+        estimate = follower.locate(here, views[0].seen, views[1:], way)
+        found.append(transform_points(lead, estimate.motion.carry(INNER)))
+        assert ("follow" in estimate.report["timings"]) == (n > 0)
+        assert ("refine" in estimate.report["timings"]) == (n == 0)
+        box_mm = follower.last_box_mm(here.stamp_ns, lead)
+        assert np.allclose(box_mm.mean(0), found[-1].mean(0), atol=6)
+        assert len(estimate.report["looks"]["shift_mm"]) == 2 if len(degrees) == 2 else True
+    for other in found:
+        assert np.linalg.norm(other - REST.carry(INNER), axis=1).mean() < 1.0

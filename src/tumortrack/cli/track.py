@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any
 
 from tyro.conf import Positional
 
-from tumortrack.cli.cameras import CameraSetup, camera_setup
 from tumortrack.cli.console import Device, console, keep_loaded, say, say_notes
 from tumortrack.cli.stated import StatedPatient
 from tumortrack.core import store
@@ -68,7 +67,11 @@ class Track(StatedPatient):
         views: further cameras that stand still; what all see at about one moment is laid together.
         poses: JSON that says where all cameras stand, as for `locate`, SOURCE's first; results are
             in its frame, unless --frame gives another.
-        moving: SOURCE's camera moves; where it is in each frame comes from file:POSES.csv.
+        moving: SOURCE's camera moves; where it is in each frame comes from file:POSES.csv, tf
+            (ros2:FIXED_FRAME, ros1:FIXED_FRAME) or a robot (ur:HOST). Where that gives poses of a
+            tool, --frame has tool_from_camera.
+        scan: with --moving: begin with three looks at the organ at rest, from 30 degrees apart,
+            within 5 s; what they show together is what the following starts from.
         intrinsics: JSON with the camera's width, height, fx, fy, cx, cy in pixels, instead of what
             the source says.
         smoothing: time constant in s of a mean over past estimates; the lag is in the report.
@@ -93,6 +96,7 @@ class Track(StatedPatient):
     views: tuple[str, ...] = ()
     poses: Path | None = None
     moving: str = ""
+    scan: bool = False
     intrinsics: Path | None = None
     smoothing: float = 0.0
     rescan: float = 1.0
@@ -108,7 +112,9 @@ class Track(StatedPatient):
         """Until the source ends, the time is up, the arms have ended, or Ctrl-C."""
         from tumortrack import api
         from tumortrack.core.config import to_builtins
+        from tumortrack.live.cameras import Cameras, CameraSetup
         from tumortrack.live.values import Controls, SinkContext
+        from tumortrack.live.workers import SourceWorker
         from tumortrack.models.folder import patient_of, read_model_manifest
 
         setup = self._cameras()
@@ -130,6 +136,8 @@ class Track(StatedPatient):
         model = api.load_model(self.model, self.device)
         say_notes(model.notes)
         tracker = Tracker(model)
+        if setup.still and tracker.anatomy_ct is None:
+            raise InputError("--views needs a model that knows a motion: preset clinic.")
         config = self._loop_config(model)
         tip_mm = None if arms is None else arms.tip_mm
         context = SinkContext(
@@ -165,14 +173,21 @@ class Track(StatedPatient):
                 "frame_id": frames.frame_id,
                 "published_from_camera": None if frames.moves else way.tolist(),
             },
-            **setup.about,
+            "views": list(self.views),
+            "moving": self.moving,
+            "published_from_cameras": [place.tolist() for place in setup.still],
             **({} if arms is None else arms.about),
         }
+
+        def begin() -> Cameras:
+            workers = [SourceWorker(source.open) for source in setup.sources.values()]
+            return Cameras(workers, setup.poses or setup.still or (way,), config.stale_s)
+
         with (
             stopping(stop),
             ExitStack() as ending,
             api.open_sinks(named, context) as sinks,
-            closing(setup.open(config.stale_s)) as cameras,
+            closing(begin()) as cameras,
         ):
             say_opened(sinks)
             ur = arms is not None and arms.ur
@@ -183,11 +198,21 @@ class Track(StatedPatient):
             loop.run(cameras, sinks, screen.show)
 
     def _cameras(self) -> CameraSetup:
-        if self.box is not None and (self.views or self.moving):
-            raise InputError("--box lies before one camera that stands still; leave it out.")
-        if self.intrinsics is not None and self.views:
-            raise InputError("--intrinsics are of one camera; with --views each says its own.")
-        return camera_setup(self.source, self.views, self.poses, self.moving, self.frame)
+        from tumortrack.live.cameras import camera_setup
+
+        wrong = {
+            "--box lies before one camera that stands still": self.box
+            and (self.views or self.moving),
+            "--intrinsics is of one camera; with --views each says its own": (
+                self.intrinsics and self.views
+            ),
+            "--scan is of one camera that moves (--moving); several look all the time": (
+                self.scan and not self.moving
+            ),
+        }
+        if found := [what for what, there in wrong.items() if there]:
+            raise InputError(f"{found[0]}. Leave it out.")
+        return camera_setup((self.source, *self.views), self.poses, self.moving, self.frame)
 
     def _loop_config(self, model: Model) -> LoopConfig:
         from tumortrack.live.loop import LoopConfig
@@ -202,6 +227,7 @@ class Track(StatedPatient):
             intrinsics=None if self.intrinsics is None else read_intrinsics(self.intrinsics),
             stale_s=self.stale,
             frozen_s=self.frozen,
+            scan=self.scan,
             give_up_s=self.give_up,
             seconds=self.seconds,
         )

@@ -24,6 +24,7 @@ from tumortrack.core.types import DepthFrame, Intrinsics
 from tumortrack.live import values as live
 from tumortrack.live.cameras import Cameras
 from tumortrack.live.meter import RunStatistics
+from tumortrack.live.scan import Scan
 from tumortrack.live.stamps import check_age
 from tumortrack.live.values import Observation, SourceLost, TrackingResult, View
 from tumortrack.live.views import Found, ViewsLocator, camera_words, timed
@@ -40,7 +41,8 @@ class LoopConfig(Config, frozen=True, kw_only=True):
     """``stale_s``: no frame for so long, or one that old, gives 'no estimate'. ``give_up_s``: the
     loop ends where no frame came for so long. ``intrinsics``: of depth images, instead of what the
     source says. ``frozen_s``: an image that repeats bit for bit for so long is an old one; 0: it
-    may repeat. ``seconds``: the loop ends so long after the first frame; 0: never."""
+    may repeat. ``seconds``: the loop ends so long after the first frame; 0: never. ``scan``: the
+    first estimate is from several looks."""
 
     region: RegionConfig = RegionConfig()
     follower: FollowerConfig = FollowerConfig()
@@ -49,6 +51,7 @@ class LoopConfig(Config, frozen=True, kw_only=True):
     give_up_s: float = 60.0
     seconds: float = 0.0
     frozen_s: float = 0.25
+    scan: bool = False
 
     def __post_init__(self) -> None:
         if not 0 < self.stale_s < self.give_up_s:
@@ -81,6 +84,8 @@ class Loop:
         self._follower = Follower(tracker, config.follower)
         seed = config.follower.seed
         self.views = ViewsLocator(self._follower, context, config.region, config.frozen_s, seed)
+        if config.scan:
+            self.views.scan = Scan(tracker)
         self._stop = threading.Event()
         self._sequence = itertools.count()
         self._cameras: Cameras

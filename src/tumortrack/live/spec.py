@@ -129,6 +129,9 @@ POSES = Registry[PosesConfig](
     PosesConfig,
     {
         "file": f"{_LIVE}.poses:PosesFileConfig",
+        "ros2": f"{_LIVE}.ros.tf:Ros2PosesConfig",
+        "ros1": f"{_LIVE}.ros.tf:Ros1PosesConfig",
+        "ur": f"{_LIVE}.robot:UrPosesConfig",
     },
 )
 

@@ -15,6 +15,7 @@ from tumortrack.core.estimate import Estimate
 from tumortrack.core.geometry import HERE, Affine, transform_points
 from tumortrack.core.types import Look, SensorCloud
 from tumortrack.live.frames import FrameCheck
+from tumortrack.live.scan import Scan
 from tumortrack.live.values import PublishedFrame, SinkContext, View
 from tumortrack.sense.region import Hints, RegionConfig, organ_points
 from tumortrack.tracking.tracker import Follower
@@ -38,6 +39,7 @@ class ViewsLocator:
     ) -> None:
         self._follower, self._context = follower, context
         self._region, self._frozen_s, self._seed = region, frozen_s, seed
+        self.scan: Scan | None = None  # until it is done, by which the first estimate is made
         self._published_from_last = context.published_frame.published_from_camera
         self._picked: Float64[np.ndarray, " 3"] | None = None  # by the user, published frame
         self._place_mm: Float64[np.ndarray, " 3"] | None = None  # where that is by now
@@ -71,6 +73,12 @@ class ViewsLocator:
     def locate(self, found: list[Found]) -> Estimate:
         """In the frame of the first view's camera. Raises NoEstimate as ``Follower.locate``."""
         (lead, organ), *more = found
+        if self.scan is not None:
+            estimate = self.scan.look(lead, organ)
+            self._follower.begin(estimate)
+            self.frames.notes.append(self.scan.told)
+            self.scan, self._published_from_last = None, lead.published_from_camera
+            return estimate
         lead_from_published = np.linalg.inv(lead.published_from_camera)
         others = [
             Look(its, view.seen.content, lead_from_published @ view.published_from_camera)

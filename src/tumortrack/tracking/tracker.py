@@ -181,7 +181,7 @@ class Follower:
             )
         self._tracker, self._config = tracker, config
         self._last: Estimate | None = None
-        self._scanned_ns = 0
+        self._scanned_ns, self._rests = 0, False
 
     def warm(self) -> None:
         """See ``Tracker.warm``."""
@@ -190,6 +190,10 @@ class Follower:
     def forget(self) -> None:
         """Nothing is known of where the organ is: a new clock, a new pick."""
         self._last = None
+
+    def begin(self, estimate: Estimate) -> None:
+        """The organ rests there: the next search starts at it, however long it took."""
+        self._last, self._rests, self._scanned_ns = estimate, True, estimate.cloud.stamp_ns
 
     def last_box_mm(
         self, stamp_ns: int, camera_from_last: Affine = HERE
@@ -217,7 +221,7 @@ class Follower:
         Raises:
             NoEstimate: see ``Tracker.follow``; the last estimate is forgotten then.
         """
-        last, self._last = self._recent(cloud.stamp_ns), None
+        last, self._last, self._rests = self._recent(cloud.stamp_ns), None, False
         if last is not None and camera_from_last is not HERE:
             last = _seen_from(last, camera_from_last)
         thorough = (cloud.stamp_ns - self._scanned_ns) * 1e-9 >= self._config.rescan_s
@@ -232,7 +236,8 @@ class Follower:
         if self._last is None:
             return None
         age_s = (stamp_ns - self._last.cloud.stamp_ns) * 1e-9
-        return self._last if 0 <= age_s <= self._config.forget_s else None
+        recent = 0 <= age_s <= self._config.forget_s or self._rests
+        return self._last if recent else None
 
 
 def _seen_from(estimate: Estimate, camera_from_last: Affine) -> Estimate:

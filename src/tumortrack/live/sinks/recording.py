@@ -109,7 +109,7 @@ class WithPoses:
 
     def __init__(self, sink: McapFile | FrameFolders, path: Path) -> None:
         self._sink, self._file = sink, path.open("ab", buffering=0)
-        self._file.write((",".join(COLUMNS) + "\n").encode())
+        self._file.write(f"{COLUMNS}\n".encode())
 
     def publish(self, result: TrackingResult) -> None:
         self._sink.publish(result)
