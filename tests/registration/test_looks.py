@@ -14,6 +14,8 @@ from tumortrack.core import store
 from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.geometry import rigid, transform_points
 from tumortrack.core.types import DepthFrame, Look, SensorCloud
+from tumortrack.live.scan import Scan
+from tumortrack.live.values import CameraView, Observation
 from tumortrack.models.config import GaussNewtonConfig
 from tumortrack.occupancy.locator import OccupancyLocator
 from tumortrack.registration import looks as module
@@ -323,3 +325,48 @@ def test_an_organ_is_followed_by_several_cameras_and_by_one_that_goes_round(trac
         assert len(estimate.report["looks"]["shift_mm"]) == 2 if len(degrees) == 2 else True
     for other in found:
         assert np.linalg.norm(other - REST.carry(INNER), axis=1).mean() < 1.0
+
+
+def test_a_scan_takes_three_looks_from_apart_and_says_what_each_added(tracker):
+    scan, told, second_ns = Scan(tracker), [], 10**9
+
+    def seen(degrees, stamp_s, truth=REST):
+        one = view(truth, around(degrees), seed=round(10 * stamp_s))
+        cloud = replace(one.cloud, stamp_ns=round(stamp_s * second_ns))
+        frame = replace(one.seen, stamp_ns=cloud.stamp_ns)
+        return CameraView(1, Observation(frame, 0), around(degrees)), cloud
+
+    def ask(*looks):
+        try:
+            return scan.look(*seen(*looks))
+        except NoEstimate as error:
+            told.append(str(error))
+        return None
+
+    assert ask(0, 1.0) is None
+    assert ask(20, 1.5) is None  # too near the first
+    assert ask(50, 2.0) is None
+    assert [text.split(";")[0] for text in told] == [
+        *("scan: 1 of 3 looks", "scan: 1 of 3 looks", "scan: 2 of 3 looks")
+    ]
+    assert ask(-50, 7.5) is None  # the first two are over 5 s old
+    assert "1 of 3" in told[-1]
+    assert ask(0, 8.0) is None
+    found = ask(50, 9.0)
+    assert found is not None
+    there = transform_points(around(50), found.motion.carry(INNER))
+    assert np.linalg.norm(there - REST.carry(INNER), axis=1).mean() < 1.0
+    one, _, three = found.report["scan"]["center_std_mm"]
+    assert three < one
+    assert f"{one:.1f} mm" in scan.told
+    follower = Follower(tracker, FollowerConfig(rescan_s=100.0))
+    follower.begin(found)  # the answer took long: the organ rests
+    cloud = seen(50, 12.0)[1]
+    assert "follow" in follower.locate(cloud).report["timings"]
+    turned = nudged(REST, [12.0, 0, 0], [0, 0, 0.3])
+    scan = Scan(tracker)
+    told.clear()
+    for degrees, stamp_s, truth in ((0, 1.0, REST), (50, 2.0, turned), (-50, 3.0, REST)):
+        assert ask(degrees, stamp_s, truth) is None
+    assert "scan, begun anew" in told[-1]
+    assert "the organ moved between the views" in told[-1]

@@ -79,7 +79,12 @@ def tool_pose(stamp_ns: int) -> np.ndarray:
 def transforms(hz: float, seconds: float) -> None:
     """The camera on the tool, said once and kept; then the tool."""
     bus = open_bus("dds")
-    with mock.patch.object(Policy.Durability, "Volatile", Policy.Durability.TransientLocal):
+    endpoint, kept = bus._endpoint, Policy.Durability.TransientLocal
+
+    def keeping(topic: str, kind: str, reliability: object, _: object, most: int) -> object:
+        return endpoint(topic, kind, reliability, kept, most)
+
+    with mock.patch.object(bus, "_endpoint", keeping):
         static = bus.publisher("/tf_static", TRANSFORMS)
     moving, end_s = bus.publisher("/tf", TRANSFORMS), time.monotonic() + seconds
 

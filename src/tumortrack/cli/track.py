@@ -20,7 +20,7 @@ from tumortrack.core import store
 from tumortrack.core.errors import InputError, StorageError
 
 if TYPE_CHECKING:
-    from tumortrack.live.cameras import Cameras
+    from tumortrack.live.cameras import Cameras, CameraSetup
     from tumortrack.live.loop import Loop, LoopConfig
     from tumortrack.live.values import PublishedFrame, SourceConfig, TrackingResult
     from tumortrack.live.workers import SinkWorker

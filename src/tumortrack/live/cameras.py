@@ -16,7 +16,7 @@ from tumortrack.core.geometry import HERE, Affine
 from tumortrack.live.calibration_file import read_frames
 from tumortrack.live.poses import CameraPoses
 from tumortrack.live.spec import POSES, SOURCES
-from tumortrack.live.values import Observation, PublishedFrame, SourceConfig, View
+from tumortrack.live.values import CameraView, Observation, PublishedFrame, SourceConfig
 from tumortrack.live.workers import SourceWorker
 from tumortrack.sense.files import read_poses
 
@@ -145,18 +145,18 @@ class Cameras:
         if isinstance(self._places, CameraPoses):
             self._places.close()
 
-    def views(self, seen: Observation) -> tuple[list[View], dict[int, str]]:
+    def views(self, seen: Observation) -> tuple[list[CameraView], dict[int, str]]:
         """What all cameras saw together with a frame just taken, that one first; and by the
         others' numbers, why there is nothing. Raises NoEstimate: where the camera was is not
         known."""
         if isinstance(self._places, CameraPoses):
-            return [View(1, seen, self._places.at(seen))], {}
-        views, absent = [View(self._lead + 1, seen, self._places[self._lead])], {}
+            return [CameraView(1, seen, self._places.at(seen))], {}
+        views, absent = [CameraView(self._lead + 1, seen, self._places[self._lead])], {}
         for n, place in enumerate(self._places):
             if n != self._lead:
                 got = self._beside(n, seen.stamp_ns)
                 if isinstance(got, Observation):
-                    views.append(View(n + 1, got, place))
+                    views.append(CameraView(n + 1, got, place))
                 else:
                     absent[n + 1] = got
         return views, absent

@@ -26,7 +26,7 @@ from tumortrack.live.cameras import Cameras
 from tumortrack.live.meter import RunStatistics
 from tumortrack.live.scan import Scan
 from tumortrack.live.stamps import check_age
-from tumortrack.live.values import Observation, SourceLost, TrackingResult, View
+from tumortrack.live.values import CameraView, Observation, SourceLost, TrackingResult
 from tumortrack.live.views import Found, ViewsLocator, camera_words, timed
 from tumortrack.live.workers import SinkWorker, SourceWorker
 from tumortrack.sense.camera import d405
@@ -170,7 +170,7 @@ class Loop:
         organ, estimate, reason, warning = None, None, "", ""
         quality: Quality = "none"
         timely = False
-        views: list[View] = []
+        views: list[CameraView] = []
         absent: dict[int, str] = {}  # cameras that say nothing now, and why
         found: list[Found] = []
         try:

@@ -9,7 +9,7 @@ from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.estimate import Estimate
 from tumortrack.core.geometry import transform_points, unit
 from tumortrack.core.types import Look, SensorCloud
-from tumortrack.live.values import View
+from tumortrack.live.values import CameraView
 from tumortrack.tracking.tracker import Tracker
 
 LOOKS, WITHIN_S = 3, 5.0
@@ -25,9 +25,9 @@ class Scan:
         if tracker.anatomy_ct is None:
             raise InputError("a scan needs a model that knows a motion: preset clinic.")
         self._tracker, self.told = tracker, ""
-        self._looks: list[tuple[View, SensorCloud, Float64[np.ndarray, " 3"]]] = []
+        self._looks: list[tuple[CameraView, SensorCloud, Float64[np.ndarray, " 3"]]] = []
 
-    def look(self, view: View, organ: SensorCloud) -> Estimate:
+    def look(self, view: CameraView, organ: SensorCloud) -> Estimate:
         """The estimate from all looks, in the frame of the last one. Raises NoEstimate: there are
         too few yet, they are too much alike, or they do not show one organ at rest; then it begins
         anew."""

@@ -117,7 +117,7 @@ class PublishedFrame:
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class CameraView:
     """What one of the cameras saw, and where it was then. ``number``: the camera's, from 1."""
 
     number: int
@@ -227,7 +227,7 @@ class TrackingResult:
     seconds: Mapping[str, float] = field(default_factory=dict)
     latency_ms: float | None = None
     workcell: Workcell | None = None
-    views: tuple[View, ...] = ()
+    views: tuple[CameraView, ...] = ()
     cameras: str = ""
 
     @cached_property

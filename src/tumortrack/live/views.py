@@ -16,13 +16,13 @@ from tumortrack.core.geometry import HERE, Affine, transform_points
 from tumortrack.core.types import Look, SensorCloud
 from tumortrack.live.frames import FrameCheck
 from tumortrack.live.scan import Scan
-from tumortrack.live.values import PublishedFrame, SinkContext, View
+from tumortrack.live.values import CameraView, PublishedFrame, SinkContext
 from tumortrack.sense.region import Hints, RegionConfig, organ_points
 from tumortrack.tracking.tracker import Follower
 
 _PICK_S = 3.0  # without the organ: a pick is forgotten
 
-Found = tuple[View, SensorCloud]  # the organ's points in it
+Found = tuple[CameraView, SensorCloud]  # the organ's points in it
 
 
 class ViewsLocator:
@@ -49,7 +49,7 @@ class ViewsLocator:
         self._frames = {1: self.frames}
 
     def find(
-        self, views: list[View], absent: dict[int, str], seconds: dict[str, float]
+        self, views: list[CameraView], absent: dict[int, str], seconds: dict[str, float]
     ) -> tuple[list[Found], str]:
         """The organ in each view, and a doubt about the frames. Where several cameras are, those
         that do not see it become ``absent``, with the reason. Raises NoEstimate: none sees it."""
@@ -90,7 +90,7 @@ class ViewsLocator:
         self._follow_pick(lead, organ)
         return estimate
 
-    def _organ(self, view: View, seconds: dict[str, float]) -> tuple[SensorCloud, str]:
+    def _organ(self, view: CameraView, seconds: dict[str, float]) -> tuple[SensorCloud, str]:
         """The organ's points, and a doubt about the frame."""
         seen = view.seen
         if (frames := self._frames.get(view.number)) is None:  # where it stands is calibrated too
@@ -105,7 +105,7 @@ class ViewsLocator:
         frames.check_new(seen.content)  # that it shows nothing would be said before
         return organ, doubt
 
-    def _camera_from_last(self, view: View) -> Affine:
+    def _camera_from_last(self, view: CameraView) -> Affine:
         """From the frame of the last estimate."""
         if np.array_equal(view.published_from_camera, self._published_from_last):
             return HERE
@@ -121,7 +121,7 @@ class ViewsLocator:
             controls.picked_mm = None  # it is not there any more, nor where it was seen last
             self._picked = self._place_mm = None
 
-    def _hints(self, view: View) -> Hints:
+    def _hints(self, view: CameraView) -> Hints:
         way, place_mm = self._camera_from_last(view), None
         last_box_mm = self._follower.last_box_mm(view.seen.stamp_ns, way)
         # Once the organ is found its box is the better guide: pieces may cover the place.
@@ -130,7 +130,7 @@ class ViewsLocator:
             place_mm = transform_points(camera_from_published, self._place_mm[None])[0]
         return Hints(mask=view.seen.mask, picked_mm=place_mm, last_box_mm=last_box_mm)
 
-    def _follow_pick(self, view: View, organ: SensorCloud) -> None:
+    def _follow_pick(self, view: CameraView, organ: SensorCloud) -> None:
         """The organ was found: what the user picked moves along with it."""
         self._found_s = time.monotonic()
         if self._picked is not None:

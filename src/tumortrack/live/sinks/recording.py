@@ -34,11 +34,11 @@ from tumortrack.live.ros.messages import MM_PER_M, Messages, Outgoing, xyz
 from tumortrack.live.ros.results import ResultMessages
 from tumortrack.live.ros.sensors import CAMERA_FRAME, messages_seen
 from tumortrack.live.values import (
+    CameraView,
     Sink,
     SinkConfig,
     SinkContext,
     TrackingResult,
-    View,
 )
 
 _KIND = "recording"
@@ -209,11 +209,13 @@ class McapFile:
         out = [one._replace(suffix=f"/tumortrack/{one.suffix}") for one in out]
         if not self._frames or result.observation is None:
             return out
-        for view in result.views or (View(1, result.observation, frame.published_from_camera),):
+        for view in result.views or (
+            CameraView(1, result.observation, frame.published_from_camera),
+        ):
             out = [*self._seen(view, frame.frame_id, result.stamp_ns), *out]
         return out
 
-    def _seen(self, view: View, frame_id: str, stamp_ns: int) -> Iterator[Outgoing]:
+    def _seen(self, view: CameraView, frame_id: str, stamp_ns: int) -> Iterator[Outgoing]:
         """What one camera saw, and its pose in the published frame."""
         way, number = view.published_from_camera, f"_{view.number}" if view.number > 1 else ""
         same = np.array_equal(way, np.eye(4))
