@@ -356,9 +356,10 @@ def test_a_scan_takes_three_looks_from_apart_and_says_what_each_added(tracker):
     assert found is not None
     there = transform_points(around(50), found.motion.carry(INNER))
     assert np.linalg.norm(there - REST.carry(INNER), axis=1).mean() < 1.0
-    one, _, three = found.report["scan"]["center_std_mm"]
-    assert three < one
-    assert f"{one:.1f} mm" in scan.told
+    stated = [f"{mm:.1f} mm" for mm in found.report["scan"]["center_std_mm"]]
+    assert f"standard deviation of {', then '.join(stated)}, with one to 3 looks" in scan.told
+    parts = found.report["parts"]  # of all looks
+    assert stated[-1] == f"{max(parts[n]['center_std_mm'] for n in parts if n != 'kidney'):.1f} mm"
     follower = Follower(tracker, FollowerConfig(rescan_s=100.0))
     follower.begin(found)  # the answer took long: the organ rests
     cloud = seen(50, 12.0)[1]
