@@ -18,13 +18,8 @@ _LARGEST_MM, _LARGEST_DEG = 100.0, 10.0  # with more, it is no calibration
 _NOT_UNIT = 1e-3  # of a normal's length: files have few digits
 
 _TOOL = "tool_from_camera"
-_MATRICES = (
-    "camera_from_robot",
-    "robot_from_camera",
-    "camera_from_marker",
-    "robot_from_marker",
-    _TOOL,
-)
+_CAMERA = "camera_from_robot", "robot_from_camera"
+_MATRICES = *_CAMERA, "camera_from_marker", "robot_from_marker", _TOOL
 
 Rows = tuple[tuple[float, float, float, float], ...]
 

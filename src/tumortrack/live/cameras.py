@@ -94,7 +94,10 @@ class Cameras:
 
     @property
     def trouble(self) -> str:
-        return "; ".join(filter(None, (worker.trouble for worker in self.workers)))
+        if len(self.workers) == 1:
+            return self.workers[0].trouble
+        troubles = [(n, worker.trouble) for n, worker in enumerate(self.workers, start=1)]
+        return "; ".join(f"camera {n}: {trouble}" for n, trouble in troubles if trouble)
 
     @property
     def ended(self) -> bool:

@@ -55,11 +55,7 @@ class OccupancyLocator:
         return frame.estimate(distances_mm, inside, margins, labels, camera_from_index)
 
     def follow(
-        self,
-        cloud: SensorCloud,
-        last: Estimate | None,
-        how: Following,
-        others: Sequence[Look] = (),
+        self, cloud: SensorCloud, last: Estimate | None, how: Following, others: Sequence[Look] = ()
     ) -> Estimate:
         """See ``tracking.tracker.Tracker.follow``. The enlarged box of the last organ replaces the
         coarse queries, and its lattice is queried only where the organ is (``organ_lattice``).

@@ -115,11 +115,7 @@ class RegistrationLocator:
         return Estimate(inside, volume, placed.meshes, report, placed.motion)
 
     def follow(
-        self,
-        cloud: SensorCloud,
-        last: Estimate | None,
-        how: Following,
-        others: Sequence[Look] = (),
+        self, cloud: SensorCloud, last: Estimate | None, how: Following, others: Sequence[Look] = ()
     ) -> Estimate:
         """See ``tracking.tracker.Tracker.follow``."""
         rng = np.random.default_rng((how.seed, cloud.stamp_ns))

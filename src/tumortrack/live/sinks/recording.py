@@ -21,25 +21,12 @@ from tumortrack.core.errors import InputError, StorageError
 from tumortrack.core.store import read_json, write_json, writing
 from tumortrack.live.display import wxyz_of
 from tumortrack.live.poses import COLUMNS, pose_row
-from tumortrack.live.recording.folders import (
-    ABOUT,
-    FRAMES,
-    INDEX,
-    SHAPES,
-    VIEW,
-    FrameFolders,
-    report,
-)
+from tumortrack.live.recording import folders
+from tumortrack.live.recording.folders import ABOUT, FRAMES, INDEX, SHAPES, FrameFolders, report
 from tumortrack.live.ros.messages import MM_PER_M, Messages, Outgoing, xyz
 from tumortrack.live.ros.results import ResultMessages
 from tumortrack.live.ros.sensors import CAMERA_FRAME, messages_seen
-from tumortrack.live.values import (
-    CameraView,
-    Sink,
-    SinkConfig,
-    SinkContext,
-    TrackingResult,
-)
+from tumortrack.live.values import CameraView, Sink, SinkConfig, SinkContext, TrackingResult
 
 _KIND = "recording"
 POSES, STILL = "poses.csv", "poses.json"  # of a camera that moves; of several that stand still
@@ -135,7 +122,7 @@ def _make_room(path: Path, overwrite: bool) -> None:
         )
     inside = {p.name for p in path.iterdir()} if path.is_dir() else {path.name}
     ours = {ABOUT, INDEX, FRAMES, SHAPES, POSES, STILL, "metadata.yaml", f"{path.name}.mcap"}
-    inside = {name for name in inside if not name.startswith(VIEW)}
+    inside = {name for name in inside if not name.startswith(folders.VIEW)}
     is_ours = ABOUT in inside and read_json(path / ABOUT).get("kind") == _KIND
     if inside and (inside - ours or not is_ours or not path.is_dir()):
         raise InputError(
@@ -209,9 +196,8 @@ class McapFile:
         out = [one._replace(suffix=f"/tumortrack/{one.suffix}") for one in out]
         if not self._frames or result.observation is None:
             return out
-        for view in result.views or (
-            CameraView(1, result.observation, frame.published_from_camera),
-        ):
+        alone = CameraView(1, result.observation, frame.published_from_camera)
+        for view in result.views or (alone,):
             out = [*self._seen(view, frame.frame_id, result.stamp_ns), *out]
         return out
 
@@ -219,8 +205,7 @@ class McapFile:
         """What one camera saw, and its pose in the published frame."""
         way, number = view.published_from_camera, f"_{view.number}" if view.number > 1 else ""
         same = np.array_equal(way, np.eye(4))
-        other = CAMERA_FRAME if frame_id != CAMERA_FRAME else f"{CAMERA_FRAME}_optical"
-        other += number
+        other = CAMERA_FRAME + ("_optical" if frame_id == CAMERA_FRAME else "") + number
         # As the source calls it: a calibration may know the camera by that when this is played.
         camera = view.seen.frame_id or (frame_id if same else other)
         if camera == frame_id and not same:
