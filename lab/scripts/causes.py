@@ -126,7 +126,8 @@ def _measure(options: Options) -> None:
 def summary(rows: pd.DataFrame) -> str:
     """Markdown: the ladder by kind of tumor and size of state, and what exchanges change."""
     size = np.array(list(STATES))[np.searchsorted(list(STATES.values()), rows["bend_mm"])]
-    rows = rows.assign(size=size)[size != "at rest"]
+    kind = np.where(rows["family"] == "pull", "one is pulled", rows["site"])
+    rows = rows.assign(size=size, site=kind)[size != "at rest"]
     sites, head = sorted(set(rows["site"])), ["told"]
     cells = [(site, size) for site in sites for size in list(STATES)[1:]]
     head += [

@@ -62,7 +62,6 @@ _RATIO, _POISSON, _SHEAR_KPA = 3.0, 0.49, 5.0  # the twin's tissue
 _LIBRARY = 200  # of the library's states where others join them
 
 Carry = Callable[[Points], Points]
-Coefficients = Float64[np.ndarray, "s m"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,8 +80,8 @@ class Told:
         """What an undisturbed scene of the world shows, its segmentation being right."""
         pairs = zip(rest.parts, reference.parts, strict=True)
         true = Anatomy(tuple(a.moved(matched_vertices(a, b)) for a, b in pairs))
-        poses = (np.array(meta[name]) for name in ("camera_from_bench", "bench_from_ct"))
-        return cls(rest, true, *poses, meta["material"]["rim_mm"])
+        there, at_rest = np.array(meta["camera_from_bench"]), np.array(meta["bench_from_ct"])
+        return cls(rest, true, there, at_rest, meta["material"]["rim_mm"])
 
     def off_mm(self, carry: Carry) -> list[float]:
         """How far a map from the CT to the camera has the middle of each tumor's vertices off."""
@@ -162,9 +161,9 @@ def recognised(
         velocity = body.velocity(motion.coefficients)
         steps = steps_for(velocity, body.spacing_mm)
         flow = Flow(velocity, body.origin_mm, np.float32(body.spacing_mm), steps)
-        slopes = np.empty((len(points), 3, POSE + len(motion.coefficients)))
-        kernels.effects(flow, body.modes, body.center_ct, points, slopes)
-        slopes = slopes.reshape(-1, slopes.shape[-1])
+        effects = np.empty((len(points), 3, POSE + len(motion.coefficients)))
+        kernels.effects(flow, body.modes, body.center_ct, points, effects)
+        slopes = effects.reshape(-1, effects.shape[-1])
         off = ((pairs.points_mm - motion.carry(points)) @ motion.rotation).ravel()
         curvature, gradient = weight * slopes.T @ slopes, weight * slopes.T @ off
         curvature[POSE:, POSE:] += prior * body.precision
@@ -233,7 +232,10 @@ class Priors:
         self._ratios = {ratio: library(tissues[POISSONS[-1]], ratio) for ratio in RATIOS}
 
     def exchanged(
-        self, material: Mapping[str, float], others: Coefficients, alike: Coefficients
+        self,
+        material: Mapping[str, float],
+        others: Float64[np.ndarray, "s m"],
+        alike: Float64[np.ndarray, "t m"],
     ) -> dict[str, RestShape]:
         """Shapes by what their bodies assume. ``others``: the truths of other states; ``alike``: of
         those under the same kind of load."""
@@ -242,7 +244,7 @@ class Priors:
         states = self.shape.body.states
         mean, some = states.mean(0), states[:: max(1, len(states) // _LIBRARY)]
 
-        def among(these: Coefficients) -> ElasticBody:
+        def among(these: Float64[np.ndarray, "u m"]) -> ElasticBody:
             """The library keeps about a fifth of the weight."""
             times = max(1, round(4 * len(some) / len(these)))
             joined = np.concatenate([some, *[these.astype(np.float32)] * times])
