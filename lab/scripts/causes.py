@@ -26,7 +26,7 @@ from tumortrack.simulate.scene_folder import list_scenes, read_scene
 from tumortrack.tracking.tracker import Tracker
 from tumortrack.training.model import load_model
 from tumortrack_lab.study import trainings
-from tumortrack_lab.study.document import ReportWriter, table
+from tumortrack_lab.study.document import ReportWriter, make_folder, table
 from tumortrack_lab.world import causes
 from tumortrack_lab.world.following import STATES
 from tumortrack_lab.world.scenes import TETS, World, WorldConfig
@@ -76,7 +76,7 @@ def main(options: Options) -> None:
     writer = ReportWriter(options.document or Path(), trainings.make_command("causes"))
     if options.document is not None:
         writer.check([BLOCK])
-    options.out.mkdir(parents=True, exist_ok=True)
+    make_folder(options.out)
     _measure(options)
     files = [path for out in (options.out, *options.beside) for path in sorted(out.glob("*.json"))]
     text = summary(pd.DataFrame([row for path in files for row in store.read_json(path)["rows"]]))
