@@ -87,7 +87,7 @@ class Locate(StatedPatient):
         keep_loaded()
         model = load_model(self.model, self.device)
         say(str(model.patient))
-        tracker, notes = Tracker(model), (*notes, *model.notes)
+        tracker = Tracker(model)
         if points is not None:
             assert tracker.anatomy_ct is not None  # a model with a shape
             box_mm = tracker.anatomy_ct.organ.box_mm
@@ -270,7 +270,6 @@ class Evaluate:
             "seed": self.seed,
         }
         tracker = Tracker(model)
-        say_notes(model.notes)
         with progress_bar("evaluate", len(folders)) as advance:
             locate = partial(tracker.locate, grid=self.grid, seed=self.seed)
             result = evaluate_scenes(locate, self.variants, self.report, advance, about)
