@@ -127,11 +127,10 @@ class Plan(StatedPatient):
                 say(f"note: {moved}")
         model = store.read_json(self.run_folder / "report.json").get("model")
         content = PlanFolder(
-            resection, config, frames.published_from_camera, frames.frame_id, located.meshes,
-            cell_used, motions,
+            resection, config, frames, located.meshes, cell_used, motions,
             str(model.get("case_sha256") or "") if isinstance(model, dict) else "",
             store.sha256_of(self.frame) if self.frame else INVENTED, cell_source, run.patient,
-            budget, frames.camera_frame_id, frames.table_in_camera,
+            budget,
         )  # fmt: skip
 
         def pictures(aside: Path) -> None:
