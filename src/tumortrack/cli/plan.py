@@ -94,11 +94,6 @@ class Plan(StatedPatient):
         doubts = notes_of_doubt(run.doubt, self.accept_poor)
         frames = self._frame(run, cell_config.stand_mm)
         located = run.located(frames.published_from_camera)
-        organ = located.meshes.get("kidney")
-        if self.arms and organ is None:
-            raise NoPlan(
-                "the run has no kidney.ply, so arms can't keep clear of it; give --no-arms."
-            )
         budget_of = partial(self._budget, located=located, frames=frames, cell=cell_config)
         resection, config, budget = plan_within(
             located, config, budget_of, self.confidence is not None
@@ -109,11 +104,11 @@ class Plan(StatedPatient):
         resection = heeded(resection, budget, self.accept_budget)
         _say_plan(resection)
         motions, cell_used, cell_source = None, None, INVENTED
-        if self.arms and organ is not None:
+        if self.arms:
             from tumortrack.plan.arms.procedure import search_bases
             from tumortrack.plan.arms.trajectory import first_hit
 
-            start = time.perf_counter()
+            start, organ = time.perf_counter(), located.meshes["kidney"]
             placed, motions, moved = search_bases(resection, _below(organ, cell_config), organ)
             if hit := first_hit(motions, placed.config, organ):
                 raise NoPlan(f"the arms can't carry this out: {hit}. Place the organ otherwise.")
@@ -194,7 +189,7 @@ class Plan(StatedPatient):
         from tumortrack.plan.located import table_under
 
         if self.frame is None:
-            return PublishedFrame("table", table_under(run.cloud, run.meshes, stand_mm))
+            return PublishedFrame("table", table_under(run.meshes, stand_mm))
         frames = read_frames(self.frame)
         if frames.published_from_camera[2, 2] >= 0:  # cuts are planned from above
             raise InputError(
