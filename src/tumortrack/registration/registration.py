@@ -39,6 +39,7 @@ from tumortrack.registration.network import RegistrationNetwork
 from tumortrack.registration.rest_shape import RestShape
 
 Timer = Callable[[str], AbstractContextManager[object]]
+Laid = tuple[RegistrationResult, Looks]  # a fit, with the further cameras where it has them
 
 _FLIP_MARGIN = 6.0  # logits: beyond this lead the other way round is not tried
 _FARTHEST_MM = 1e5  # of the organ's middle
@@ -85,7 +86,7 @@ class Registration:
 
     def register_all(
         self, looks: Looks, usual_cost: float = math.inf, timed: Timer = nullcontext
-    ) -> tuple[RegistrationResult, Looks]:
+    ) -> Laid:
         """The whole method for several looks at one still organ, each of which proposes; and the
         looks as the further cameras are corrected then."""
         if looks.count == 1:
@@ -96,20 +97,26 @@ class Registration:
                 seen = transform_points(np.linalg.inv(pose), looks.points_mm[looks.look == n])
                 hypotheses += [seen_from_first(one, pose) for one in self.propose(seen)]
         whole = replace(self, config=looks.weighed(self.config))
-        near = msgspec.structs.replace(whole.config, first_mm=self.config.last_mm)
         with timed("refine"):
             fit = whole.best_fit(looks.points_mm, hypotheses, usual_cost)
-            found: list[tuple[RegistrationResult, Looks]] = []
-            for each in (fit, *fit.rivals):  # with its own places of the cameras
-                one, mine = each, looks
-                for _ in range(_CORRECTIONS):
-                    mine = mine.corrected(one.motion, self.config)
-                    one = refine(self.rest, mine.points_mm, one.motion, near)
-                costs = one.cost + mine.cost, one.cost_without_strays + mine.cost
-                one = replace(one, cost=costs[0], cost_without_strays=costs[1])
-                found.append((one, mine))
-        best = best_of([one for one, _ in found])
-        return best, min(found, key=lambda pair: pair[0].cost)[1]
+            # Each with its own places of the cameras.
+            return best_laid([self._laid(looks, one, _CORRECTIONS) for one in (fit, *fit.rivals)])
+
+    def follow(self, looks: Looks, start: ElasticMotion, config: GaussNewtonConfig) -> Laid:
+        """The fit near a motion, and the looks as the further cameras are corrected then."""
+        fit = refine(self.rest, looks.points_mm, start, looks.weighed(config))
+        return self._laid(looks, fit, _CORRECTIONS)
+
+    def _laid(self, looks: Looks, fit: RegistrationResult, times: int) -> Laid:
+        """Further cameras and the motion in turns, from a fit with the cameras as stated."""
+        if looks.count == 1:
+            return fit, looks
+        near = msgspec.structs.replace(looks.weighed(self.config), first_mm=self.config.last_mm)
+        for _ in range(times):
+            looks = looks.corrected(fit.motion, self.config)
+            fit = refine(self.rest, looks.points_mm, fit.motion, near)
+        costs = fit.cost + looks.cost, fit.cost_without_strays + looks.cost
+        return replace(fit, cost=costs[0], cost_without_strays=costs[1]), looks
 
     @torch.no_grad()
     def propose(self, points_mm: Points) -> list[ElasticMotion]:
@@ -217,6 +224,11 @@ class Registration:
         left = [descent for descent in descents if descent.cost <= most]
         parallel_for(lambda part: left[part.start].run(steps), len(left), 1)
         return [descent.result() for descent in left]
+
+
+def best_laid(found: list[Laid]) -> Laid:
+    """``best_of`` the fits, and its looks."""
+    return best_of([fit for fit, _ in found]), min(found, key=lambda laid: laid[0].cost)[1]
 
 
 def best_of(fits: list[RegistrationResult]) -> RegistrationResult:
