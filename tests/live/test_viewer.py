@@ -313,6 +313,24 @@ def test_an_ellipsoid_is_the_covariances_and_shown_when_asked_for(sinks, clock):
     assert not drawn(sink, "ellipsoid_tumor_1")
 
 
+def test_a_camera_that_moves_is_shown_where_it_was_and_who_took_part_is_said(sinks, clock):
+    sink = sinks(hz=60)
+    for n in (0, 1):
+        way = np.eye(4)
+        way[:3, 3] = 10 * n, 20, -300
+        frame = PublishedFrame("base", way, calibrated=True, moves=True)
+        sink.publish(replace(small_update(n, frames=frame), cameras="cameras 1, 3; camera 2: gone"))
+        nodes = sink._server.scene
+        organ = small_update().organ.points_mm + way[:3, 3]
+        np.testing.assert_allclose(nodes.get_handle_by_name("/organ").points, organ, atol=1e-3)
+        np.testing.assert_allclose(nodes.get_handle_by_name("/camera").position, way[:3, 3])
+        tumor = small_update().estimate.meshes["tumor_1"].vertices_mm + way[:3, 3]
+        shown = nodes.get_handle_by_name("/estimate/tumor_1").vertices
+        np.testing.assert_allclose(shown, tumor, atol=1e-3)
+        clock.sleep(1 / 60)
+    assert "cameras 1, 3; camera 2: gone" in sink._panel.stage.content
+
+
 def test_part_that_was_not_found_is_not_shown(sinks, clock):
     sink = sinks(hz=60, margin_mm=5.0)
     update = small_update(0)
