@@ -65,7 +65,7 @@ class Options:
     others: tuple[Path, ...] = ()
     """Folders of other organs, followed before, that the table counts in."""
     document: Path | None = None
-    """Its block is replaced by the tables, a plot and a film of this organ's first press."""
+    """Its block is replaced by the tables, a plot and a film of this organ's strongest press."""
 
 
 def main(options: Options) -> None:
@@ -128,7 +128,8 @@ def _follow(options: Options, model: Path, films: list[Film]) -> None:
         plot, moving = writer.image("sequences_press"), writer.image("sequences_film")
         moving = moving.with_suffix(".gif")
         pictures.draw(found, plot)
-        press = next(film for film in films if film.meta["kind"] == "press")
+        presses = (film for film in films if film.meta["kind"] == "press")
+        press = max(presses, key=lambda film: film.bend_mm.max())
         pictures.show(following.METHODS["track"](tracker), press, moving)
         links = writer.link(plot, "errors under a press"), writer.link(moving, "a press, followed")
         writer.write({"sequences": "\n\n".join([f"`{writer.command}`", text, *links])})
