@@ -51,3 +51,69 @@ def test_a_class_that_moved_and_a_damaged_file_cost_a_compilation_and_no_more(tm
     for path in kept:
         path.write_bytes(damage)
         run(tmp_path, "before")
+
+
+TOTAL = """
+from tumortrack.core.compiled import numba
+
+@numba.njit(cache=True)
+def total(values):
+    total = 0.0
+    for value in values:
+        total += FACTOR * value
+    return total
+"""
+
+
+def total_of(folder, kind):
+    """In a process of its own, which may find machine code: the sum of 1, 2, 3."""
+    code = f"import numpy, kernel; print(kernel.total(numpy.array([1, 2, 3], numpy.{kind})))"
+    environment = {**os.environ, "PYTHONPATH": f"{folder}:{os.environ.get('PYTHONPATH', '')}"}
+    environment.pop("NUMBA_CACHE_DIR", None)
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, cwd=folder
+    )
+    return done.stdout.strip() or done.stderr
+
+
+def test_machine_code_for_other_types_of_arguments_is_not_taken(tmp_path):
+    """As two processes leave it that compile the same function at once: each takes the name that
+    is free, the index is of the one and the code of the other."""
+    (tmp_path / "kernel.py").write_text(TOTAL.replace("FACTOR", "1"))
+    left = {}
+    for kind in ("float32", "float64"):
+        assert total_of(tmp_path, kind) == "6.0"
+        left[kind] = {path: path.read_bytes() for path in (tmp_path / "__pycache__").glob("*.nb?")}
+        for path in left[kind]:
+            path.unlink()
+    assert left["float32"].keys() == left["float64"].keys()
+    for path, content in left["float64"].items():
+        path.write_bytes(content if path.suffix == ".nbi" else left["float32"][path])
+    assert total_of(tmp_path, "float64") == "6.0"
+    assert total_of(tmp_path, "float32") == "6.0"
+
+
+def test_machine_code_of_older_source_is_not_taken(tmp_path):
+    """As a process leaves it that is killed after it has written the index."""
+    (tmp_path / "kernel.py").write_text(TOTAL.replace("FACTOR", "1"))
+    assert total_of(tmp_path, "float64") == "6.0"
+    (code,) = (tmp_path / "__pycache__").glob("*.nbc")
+    older = code.read_bytes()
+    (tmp_path / "kernel.py").write_text(TOTAL.replace("FACTOR", "2"))
+    assert total_of(tmp_path, "float64") == "12.0"
+    code.write_bytes(older)
+    assert total_of(tmp_path, "float64") == "12.0"
+
+
+def test_machine_code_is_outdated_when_a_function_that_it_calls_has_changed(tmp_path):
+    (tmp_path / "callee.py").write_text(
+        "from tumortrack.core.compiled import numba\n\n"
+        "@numba.njit(cache=True)\ndef factor():\n    return 1.0\n"
+    )
+    importing = "from callee import factor\n" + TOTAL.replace("FACTOR", "factor()")
+    (tmp_path / "kernel.py").write_text(importing)
+    assert total_of(tmp_path, "float64") == "6.0"
+    (tmp_path / "callee.py").write_text(
+        (tmp_path / "callee.py").read_text().replace("return 1.0", "return 2.0")
+    )
+    assert total_of(tmp_path, "float64") == "12.0"

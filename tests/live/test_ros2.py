@@ -105,6 +105,23 @@ def test_what_other_nodes_see_of_a_topic(bus: Bus) -> None:
     assert publisher  # it lives as long as whoever asked for it holds it
 
 
+def test_a_program_joins_once_and_what_it_left_is_gone(bus: Bus) -> None:
+    """One participant however often topics are opened; their types are never freed, for Cyclone
+    reads them without a lock. Writers and readers end with whoever opened them."""
+    from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsParticipant
+
+    for _ in range(3):
+        again = open_bus("dds")
+        publisher = again.publisher("/again/points", sensors.CLOUD)
+        until(lambda: bus.types_of("/again/points") == {sensors.CLOUD})
+        again.close()
+        until(lambda: not bus.types_of("/again/points"))
+        assert publisher  # held, and ended all the same
+    everyone = BuiltinDataReader(bus._published.participant, BuiltinTopicDcpsParticipant)
+    mine = [one for one in everyone.read(100) if one.key == bus._published.participant.guid]
+    assert len(mine) == len(everyone.read(100)) == 1
+
+
 # --- the source ----------------------------------------------------------------------------------
 
 

@@ -29,7 +29,7 @@ from tumortrack.tracking.tracker import Tracker
 from tumortrack.training.model import load_model
 from warp_objects import ANATOMY, PLACE_MM, nudged, placed, shape
 
-CAMERA = d405(424, 240)
+CAMERA, SMALL = d405(424, 240), d405(320, 180)
 ORGAN = ANATOMY.organ
 INNER = (ORGAN.vertices_mm + ORGAN.vertices_mm.mean(0))[::5] / 2
 REST = placed(share=0.0)  # one side of a bent ellipsoid leaves its state open
@@ -45,12 +45,12 @@ def around(degrees, shift_mm=(0.0, 0, 0), turn_rad=(0.0, 0, 0)):
     return there @ rigid(small, PLACE_MM - small @ PLACE_MM + shift_mm)
 
 
-def image(motion, camera_from_look, seed=0):
+def image(motion, camera_from_look, seed=0, camera=CAMERA):
     """What a camera sees there of the organ alone, 0.2 mm of noise."""
     places = transform_points(np.linalg.inv(camera_from_look), motion.carry(ORGAN.vertices_mm))
-    depth_mm = render_depth(places, ORGAN.faces, CAMERA).depth_mm
+    depth_mm = render_depth(places, ORGAN.faces, camera).depth_mm
     noise = np.random.default_rng(seed).normal(0, 0.2, depth_mm.shape)
-    return DepthFrame((depth_mm + noise).astype(np.float32), CAMERA)
+    return DepthFrame((depth_mm + noise).astype(np.float32), camera)
 
 
 def points_of(frame):
@@ -270,13 +270,14 @@ def test_metres_are_millimetres(tmp_path):
 def test_the_command_takes_several_views(slim_model, tmp_path):
     truth = REST
     names = "left.png", "right.png"
-    for name, degrees in zip(names, (0, 60), strict=True):
-        (tmp_path / name).write_bytes(depth_png(image(truth, around(degrees), degrees)))
-    (tmp_path / "camera.json").write_text(json.dumps(intrinsics_json(CAMERA)))
+    for name, degrees, camera in zip(names, (0, 60), (CAMERA, SMALL), strict=True):
+        frame = image(truth, around(degrees), degrees, camera)
+        (tmp_path / name).write_bytes(depth_png(frame))
+        (tmp_path / name).with_suffix(".json").write_text(json.dumps(intrinsics_json(camera)))
     (tmp_path / "poses.json").write_text(json.dumps(poses_json()))
     left, right = (tmp_path / name for name in names)
-    options = ["--intrinsics", tmp_path / "camera.json", "--range", 50, 400, "--device", "cpu"]
-    options += ["--grid", 32]
+    first, second = (["--intrinsics", path.with_suffix(".json")] for path in (left, right))
+    options = [*first, "--range", 50, 400, "--device", "cpu", "--grid", 32]
     poses = ["--poses", tmp_path / "poses.json"]
     out = tmp_path / "out"
     command = "locate", slim_model, left
@@ -285,7 +286,12 @@ def test_the_command_takes_several_views(slim_model, tmp_path):
     three = refusal(tumortrack(*command, right, left, out, *options, *poses))
     assert "2 poses for 3 views" in three
     assert not out.exists()
-    said = succeeded(tumortrack(*command, right, out, *options, *poses))
+    options += poses
+    other = refusal(tumortrack(*command, right, out, *options))
+    assert "320 x 180" in other
+    thrice = refusal(tumortrack(*command, right, out, *options, *second, *second))
+    assert "--intrinsics is given 3 times for 2 views" in thrice
+    said = succeeded(tumortrack(*command, right, out, *options, *second))
     assert f"written to {out}" in said
     report = json.loads((out / "report.json").read_text())
     looks = report["looks"]

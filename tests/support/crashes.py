@@ -3,8 +3,8 @@
 python tests/support/crashes.py FOLDER [--times 20] [--seed 0] [--only NAME]    (`make crash`)
 
 A killed training goes on to the weights of one that was never killed. A killed recording can be
-read to its last second. After a killed `locate` or `compile` there is the old artifact or the new
-one, never a part, and the same command works. Nothing else stays in the folder.
+read to its last second. After a killed `locate` there is the old run or the new one,
+never a part, and the same command works. Nothing else stays in the folder.
 """
 
 from __future__ import annotations
@@ -98,20 +98,6 @@ def locating(base: Path, folder: Path, times: int, rng: np.random.Generator) -> 
     return _writing(command, folder, "run", "run", times, rng)
 
 
-def compiling(base: Path, folder: Path, times: int, rng: np.random.Generator) -> str:
-    shutil.copytree(base / "quick", folder / "model")
-    command: list[object] = ["compile", folder / "model"]
-    takes_s, fault = whole(command)
-    for _ in range(times):
-        if fault:
-            return fault
-        shutil.rmtree(folder / "model" / "compiled", ignore_errors=True)
-        killed(command, rng.uniform(0.2, takes_s))
-        _, fault = whole(["inspect", folder / "model"])
-    _, fault = whole(command)
-    return fault or strays(folder, "model")
-
-
 def _writing(
     command: list[object], folder: Path, name: str, kind: str, times: int, rng: np.random.Generator
 ) -> str:
@@ -180,17 +166,15 @@ def stamps_of(tape: Path) -> list[int]:
     return stamps
 
 
-KINDS = {each.__name__: each for each in (training, locating, compiling, recording)}
+KINDS = {each.__name__: each for each in (training, locating, recording)}
 
 
 def make_bases(folder: Path) -> Path:
-    """A case, models of `clinic` and `quick`, a scene, a run and a plan, made once."""
+    """A case, a model, a scene, a run and a plan, made once."""
     base = folder.resolve() / "base"
     if not base.exists():
         base.mkdir(parents=True)
         make_base(base)
-        quick = ["--preset", "quick", "--steps", 20, "--workers", 0, "--device", "cpu"]
-        whole(["train", base / "case", base / "quick", *quick])
     return base
 
 

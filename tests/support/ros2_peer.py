@@ -87,7 +87,9 @@ def reliably(bus: DdsBus) -> object:
     from cyclonedds.sub import DataReader
 
     reliable, volatile = Policy.Reliability.Reliable(0), Policy.Durability.Volatile
-    return DataReader(*bus._endpoint("/tumortrack/cloud", CLOUD, reliable, volatile, 1))
+    return DataReader(
+        bus._readers, *bus._endpoint("/tumortrack/cloud", CLOUD, reliable, volatile, 1)
+    )
 
 
 def told(message: object, kind: str) -> dict:

@@ -10,7 +10,8 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from tumortrack.core.estimate import Estimate
-from tumortrack.core.types import Mesh, OccupancyCloud, SensorCloud
+from tumortrack.core.geometry import rigid, transform_points
+from tumortrack.core.types import Look, Mesh, OccupancyCloud, SensorCloud
 from tumortrack.registration.motion import ElasticMotion
 from tumortrack.tracking.advice import what_to_do
 from warp_objects import ANATOMY, shape
@@ -54,6 +55,17 @@ def seen(towards=None) -> SensorCloud:
 def test_a_hidden_side_is_named(words, side):
     said = what_to_do(estimate([0, 0, 1]), seen(towards=side))
     assert said == f"free the view of the organ's side towards {words}, or look from there"
+
+
+def test_what_another_camera_saw_is_not_hidden():
+    side = SIDES[towards := "the left (the camera's -x)"]
+    first, rest = seen(towards=side), SensorCloud(ORGAN.vertices_mm)
+    aside = rigid(np.diag([-1.0, 1, -1]), np.array([90.0, 0, 200]))
+    there = SensorCloud(transform_points(np.linalg.inv(aside), rest.points_mm.astype(float)))
+    unsure = estimate([side[0], side[1], 0], (12 * side[0], 12 * side[1], 0))
+    assert towards in what_to_do(unsure, first)
+    said = what_to_do(unsure, first, [Look(there, there, aside)])
+    assert said == "look more from the left (the first camera's -x), by about 30 degrees"
 
 
 @pytest.mark.parametrize(("words", "side"), SIDES.items())

@@ -162,7 +162,6 @@ def _artifact(folder: Path) -> list[str]:
         from tumortrack.cli.margins import described
         from tumortrack.models.folder import weakness_of
         from tumortrack.models.margins import UNKNOWN, read_margins
-        from tumortrack.occupancy import model  # PyTorch takes a second
 
         network = manifest.get("config", {}).get("network", {})
         encoder, decoder = (network.get(n, {}).get("type", "?") for n in ("encoder", "decoder"))
@@ -170,7 +169,6 @@ def _artifact(folder: Path) -> list[str]:
         if decoder == "warp":
             does = "places the organ of the CT; `locate --map` says where points of the CT are"
         lines.append(f"  {encoder} + {decoder}: {does}")
-        lines += [f"  {line}" for line in model.describe(folder)]
         weakness = weakness_of(manifest.get("provenance", {}))
         lines += [f"  WARNING: {weakness}"] if weakness else []
         margins = read_margins(folder)

@@ -7,7 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from tyro.conf import Positional
+from tyro.conf import Positional, UseAppendAction
 
 from tumortrack.cli.console import Device, console, keep_loaded, progress_bar, say, say_notes
 from tumortrack.cli.stated import StatedPatient
@@ -41,7 +41,8 @@ class Locate(StatedPatient):
         range: keep depths between NEAR and FAR mm. By default a cloud is used as it is, and a depth
             image is cropped to the range that the model was trained for.
         unit: of the cloud's numbers.
-        intrinsics: JSON with width, height, fx, fy, cx, cy in pixels, of all views.
+        intrinsics: JSON with width, height, fx, fy, cx, cy in pixels: once for all views, or again
+            and again, once for each in their order.
         map: points of the CT whose present places to write (OUT/points.csv): a .csv with columns
             x,y,z (LPS, mm), or 3D Slicer's .mrk.json or .fcsv. Needs a model of preset clinic.
         device: auto takes CUDA if there is a GPU.
@@ -57,7 +58,7 @@ class Locate(StatedPatient):
     seed: int = 0
     range: tuple[float, float] | None = None
     unit: Literal["mm", "m"] = "mm"
-    intrinsics: Path | None = None
+    intrinsics: UseAppendAction[tuple[Path, ...]] = ()
     map: Path | None = None
     device: Device = "auto"
     overwrite: bool = False
@@ -69,7 +70,7 @@ class Locate(StatedPatient):
         store.check_place(out, "run", self.overwrite)
         points = self._points()
         frame_id, fixed_from_camera = self._poses(len(clouds))
-        views = [self._read(path) for path in clouds]
+        views = list(map(self._read, clouds, self._cameras(len(clouds))))
         # What is wrong so far was reported before PyTorch's seconds.
         notes = tuple(note for _, mine in views for note in mine)
 
@@ -86,7 +87,7 @@ class Locate(StatedPatient):
         keep_loaded()
         model = load_model(self.model, self.device)
         say(str(model.patient))
-        tracker, notes = Tracker(model), (*notes, *model.notes)
+        tracker = Tracker(model)
         if points is not None:
             assert tracker.anatomy_ct is not None  # a model with a shape
             box_mm = tracker.anatomy_ct.organ.box_mm
@@ -175,21 +176,33 @@ class Locate(StatedPatient):
             )
         return read_poses(self.poses, views)
 
-    def _read(self, path: Path) -> tuple[SensorCloud | DepthFrame, tuple[str, ...]]:
+    def _cameras(self, views: int) -> tuple[Path | None, ...]:
+        """The file of each view's intrinsics."""
+        given = self.intrinsics or (None,)
+        if len(given) not in (1, views):
+            raise InputError(
+                f"--intrinsics is given {len(given)} times for {views} view{'s' * (views > 1)}: "
+                "give it once for all of them, or once for each, in their order."
+            )
+        return given if len(given) == views else given * views
+
+    def _read(
+        self, path: Path, intrinsics: Path | None
+    ) -> tuple[SensorCloud | DepthFrame, tuple[str, ...]]:
         """What a file holds, and notes."""
         from tumortrack.sense.cloud import check_cloud
         from tumortrack.sense.files import read_cloud, read_depth_png
 
         if path.suffix.lower() == ".png":
-            if self.intrinsics is None:
+            if intrinsics is None:
                 raise InputError(f"{path} is a depth image: give --intrinsics FILE.json with it.")
             if self.unit != "mm":
                 raise InputError(
                     "--unit is for clouds; a depth image's unit stands in its intrinsics file as "
                     "depth_unit_mm (mm per step)."
                 )
-            return read_depth_png(path, self.intrinsics), ()
-        if self.intrinsics is not None:
+            return read_depth_png(path, intrinsics), ()
+        if intrinsics is not None:
             raise InputError(f"--intrinsics is for depth images (.png); {path} is a cloud.")
         cloud, notes = read_cloud(path, self.unit)
         check_cloud(cloud)  # before the crop, which would only say that nothing lies in range
@@ -257,7 +270,6 @@ class Evaluate:
             "seed": self.seed,
         }
         tracker = Tracker(model)
-        say_notes(model.notes)
         with progress_bar("evaluate", len(folders)) as advance:
             locate = partial(tracker.locate, grid=self.grid, seed=self.seed)
             result = evaluate_scenes(locate, self.variants, self.report, advance, about)

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from tyro.conf import Positional
 
-from tumortrack.cli.console import Device, console, keep_loaded, say, say_notes
+from tumortrack.cli.console import Device, console, keep_loaded, say
 from tumortrack.cli.stated import StatedPatient
 from tumortrack.core import store
 from tumortrack.core.errors import InputError, StorageError
@@ -122,7 +122,6 @@ class Track(StatedPatient):
         if arms is None:
             keep_loaded()
         model = api.load_model(self.model, self.device)
-        say_notes(model.notes)
         tracker = Tracker(model)
         config = self._loop_config(model)
         tip_mm = None if arms is None else arms.tip_mm
@@ -149,7 +148,6 @@ class Track(StatedPatient):
         about = {
             "patient": to_builtins(model.patient),
             "model": model.provenance,
-            "notes": list(model.notes),
             "model_sha256": store.sha256_of(self.model / store.MANIFEST),
             "source": self.source,
             "sinks": list(self.sinks),

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Float64, Int
 
 from tumortrack.core.errors import InputError
 
@@ -122,3 +122,18 @@ def triangles_of(
     corners = vertices_mm[faces]
     doubled = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     return corners.mean(1), doubled
+
+
+def spread_over(
+    vertices: Float64[np.ndarray, "v k"], faces: Faces, longest_mm: float
+) -> Float64[np.ndarray, "n k"]:
+    """The vertices, and more until no triangle has an edge longer than ``longest_mm``: x, y, z in
+    mm come first, and what follows them is interpolated."""
+    corners = vertices[faces, :3]
+    edges_mm = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)
+    coarse = faces[(edges_mm > longest_mm).any(1)]
+    if not len(coarse):
+        return vertices
+    from trimesh.remesh import subdivide_to_size  # slow to import
+
+    return subdivide_to_size(vertices, coarse, longest_mm)[0]

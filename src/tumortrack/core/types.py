@@ -14,6 +14,7 @@ import numpy.typing as npt
 from jaxtyping import Float, Float32, Float64, Int32, UInt8
 
 from tumortrack.core.errors import InputError
+from tumortrack.core.geometry import spread_over
 
 OUTSIDE, ORGAN, FIRST_TUMOR = 0, 1, 2
 
@@ -116,6 +117,10 @@ class Mesh:
     def longest_mm(self) -> float:
         """The longest side of the box."""
         return float(np.ptp(self.box_mm, axis=0).max())
+
+    def spread_mm(self, longest_mm: float = 2.0) -> Float64[np.ndarray, "n 3"]:
+        """Points all over the surface, see ``spread_over``."""
+        return spread_over(self.vertices_mm, self.faces, longest_mm)
 
     def moved(self, vertices_mm: Float[np.ndarray, "v 3"]) -> Mesh:
         """The same triangles over other vertices (a deformation or a change of frame)."""

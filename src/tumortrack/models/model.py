@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import warnings
-from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar
@@ -41,11 +40,10 @@ class Network(nn.Module):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Model(ABC):
+class Model:
     """A network in evaluation mode and what it was trained for. ``query_box_mm``: where the organ
     can lie (lower and upper corner), relative to the median of the observed points, camera frame;
-    ``provenance``: seeds, steps, hashes; ``notes``: for the user, about this machine; ``margins``:
-    None where it was not calibrated."""
+    ``provenance``: seeds, steps, hashes; ``margins``: None where it was not calibrated."""
 
     # From a NetworkConfig, with weights from torch's global generator (``torch.manual_seed``).
     new_network: ClassVar[type[Network]]
@@ -56,7 +54,6 @@ class Model(ABC):
     query_box_mm: Float64[np.ndarray, "2 3"]
     in_distribution: InDistributionRange
     provenance: dict[str, Any] = field(default_factory=dict)
-    notes: tuple[str, ...] = ()
     margins: ModelMargins | None = None
 
     @property
@@ -73,10 +70,10 @@ class Model(ABC):
         return {"trust": None}
 
     @classmethod
-    @abstractmethod
     def from_folder(cls: type[M], folder: Path, manifest: dict[str, Any], **known: Any) -> M:
         """The model of a folder whose fields ``known`` are read already; InputError, KeyError,
         ValueError or OSError where the folder lacks something."""
+        return cls(**known)
 
 
 M = TypeVar("M", bound=Model)

@@ -17,29 +17,17 @@ import torch
 from jaxtyping import Float32
 from torch import Tensor, nn
 
-from tumortrack.core.config import Config
 from tumortrack.models.hardware import has_fast_bfloat16
 from tumortrack.models.layers import Layer
 from tumortrack.occupancy.network import Latent, MlpDecoder, OccupancyNetwork, octave_features
 
-CHUNK = 2048  # queries at once and core: their activations (2 MB at 512 channels) stay near it
-_CHUNK_GPU = 2**17
-_CHUNKS = (16, 2**14)  # fewest and most queries at once and core
+# Queries at once and core: their activations (2 MB at 512 channels) stay near it. With 1,024 or
+# 4,096 nothing was faster by more than one run differs from the next (AMX, quick and paper).
+_CHUNK, _CHUNK_GPU = 2048, 2**17
 _ENCODER_ROWS = 4096
 _ROUND = 512  # rows
 
 Numbers = Literal["network", "float32", "bfloat16"]
-
-
-class Arithmetic(Config, frozen=True):
-    """How queries are answered: ``network`` is the network as it is (``torch.autocast``), the
-    others are its packed form; ``chunk``: queries at once and core."""
-
-    numbers: Numbers
-    chunk: int
-
-    def __post_init__(self) -> None:
-        self.check_between("arithmetic:", chunk=_CHUNKS)
 
 
 def can_pack(device: torch.device) -> bool:
@@ -51,34 +39,27 @@ def can_pack(device: torch.device) -> bool:
     return all(hasattr(operators, name) for name in ("_reorder_linear_weight", "_linear_pointwise"))
 
 
-def possible(device: torch.device) -> tuple[Numbers, ...]:
-    """What the device has fast instructions for, the usually fastest last."""
+def fastest(device: torch.device) -> Numbers:
+    """What the device has fast instructions for."""
     if not can_pack(device):
-        return ("network",)
-    return ("network", "bfloat16" if has_fast_bfloat16(device) else "float32")
-
-
-def usual(device: torch.device) -> Arithmetic:
-    """What is fastest on most machines; `tumortrack compile` measures."""
-    if device.type == "cuda":
-        return Arithmetic(numbers="network", chunk=_CHUNK_GPU)
-    return Arithmetic(numbers=possible(device)[-1], chunk=CHUNK)
+        return "network"
+    return "bfloat16" if has_fast_bfloat16(device) else "float32"
 
 
 class Inference:
-    """A network in use, where it lies; ``arithmetic`` None: what is usually fastest."""
+    """A network in use, where it lies. ``numbers``: ``network`` is the network as it is
+    (``torch.autocast``), the others are its packed form; None: what is fastest."""
 
-    def __init__(self, network: OccupancyNetwork, arithmetic: Arithmetic | None = None) -> None:
+    def __init__(self, network: OccupancyNetwork, numbers: Numbers | None = None) -> None:
         self.network = network.folded()
         self.device = next(network.parameters()).device
-        self.arithmetic = arithmetic or usual(self.device)
-        self._rows = self.arithmetic.chunk
-        if self.device.type == "cpu":
-            self._rows *= torch.get_num_threads()
-        packed = self.arithmetic.numbers != "network"
+        self.numbers: Numbers = numbers or fastest(self.device)
+        on_cpu = self.device.type == "cpu"
+        self._rows = _CHUNK * torch.get_num_threads() if on_cpu else _CHUNK_GPU
+        packed = self.numbers != "network"
         self._bf16 = not packed and has_fast_bfloat16(self.device)
         if packed:
-            dtype = torch.bfloat16 if self.arithmetic.numbers == "bfloat16" else torch.float32
+            dtype = torch.bfloat16 if self.numbers == "bfloat16" else torch.float32
             self.network.decoder = PackedDecoder(self.network.decoder, dtype, self._rows)
             pack_stacks(self.network.encoder)
 

@@ -36,7 +36,7 @@ class OccupancyLocator:
 
     def __init__(self, model: OccupancyModel) -> None:
         self.model = model
-        self.inference = Inference(model.network, model.arithmetic)
+        self.inference = Inference(model.network)
 
     def locate(
         self, cloud: SensorCloud, grid: int, seed: int, others: Sequence[Look] = ()

@@ -18,6 +18,7 @@ from skimage.measure import find_contours
 
 from tumortrack.core.compiled import numba
 from tumortrack.core.errors import NoPlan
+from tumortrack.core.geometry import spread_over
 from tumortrack.plan.outline import arcs, evenly_round, first_in_cell, polygon_of, rings_of
 from tumortrack.plan.values import (
     Cut,
@@ -30,12 +31,16 @@ from tumortrack.plan.values import (
     name_of,
 )
 
+# Balls round the corners of a triangle whose edges are sqrt(6 gap margin) long leave so much of the
+# margin uncovered between them.
+_GAP_MM = 0.1
 # Of outlines, which are interpolated; and one surface point in each cube of that size. Both finer
 # where the margin is narrow, so that it is kept to a tenth of a millimetre.
 _CELL_MM, _CELL_SHARE = 1.0, 0.4
 _THIN_MM, _THIN_SHARE = 0.7, 0.2
 _SLACK_MM = 2.0  # the organ may reach so much higher, or lower, than was estimated
 _COLUMN_MM = 2.0  # of the organ's upper and lower surface
+_EDGE_MM = 3.0  # of triangles: so few columns between vertices take their neighbours' heights
 _SMOOTH_MM = 0.05  # outlines lose corners smaller than this
 _FAR_MM = 1e3
 _LEAST_MM2 = 1.0  # a smaller rest of a floor needs no stroke
@@ -85,6 +90,10 @@ def _grown_tumor(located: Located, label: int, config: ResectionConfig) -> _Grow
             f"{config.most_margin_mm:g} mm. Look from nearer, or uncover more of the organ."
         )
     size_mm = min(_THIN_MM, _THIN_SHARE * float(margins.min()))
+    if mesh is not None:
+        edge_mm = np.sqrt(6 * _GAP_MM * margins.min())
+        spread = spread_over(np.column_stack([points, margins]), mesh.faces, float(edge_mm))
+        points, margins = spread[:, :3], spread[:, 3]
     widest_first = np.argsort(-margins, kind="stable")
     points, margins = points[widest_first], margins[widest_first]  # of each cube, this one stays
     keep = first_in_cell(np.floor(points / size_mm).astype(np.int64))
@@ -104,7 +113,8 @@ class Columns:
     def of(cls, located: Located) -> Columns:
         """From the organ's surface, or from all points, where there is no surface."""
         mesh = located.meshes.get("kidney")
-        points = np.asarray(located.points_mm if mesh is None else mesh.vertices_mm, float)
+        points = located.points_mm if mesh is None else mesh.spread_mm(_EDGE_MM)
+        points = np.asarray(points, float)
         low = points[:, :2].min(0) - 2 * _COLUMN_MM
         cell = np.round((points[:, :2] - low) / _COLUMN_MM).astype(int)
         lowest, highest = column_extremes(cell, points[:, 2], tuple(cell.max(0) + 3))

@@ -75,7 +75,7 @@ class Planned:
     @cached_property
     def kept_mm(self) -> float:
         """The least distance between the cut and the tumor's surface: the margin as planned."""
-        return kept_mm(self.plan.layers, self.meshes[self.plan.tumor].vertices_mm)
+        return kept_mm(self.plan.layers, self.meshes[self.plan.tumor].spread_mm())
 
 
 @dataclass(frozen=True)

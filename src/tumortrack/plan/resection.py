@@ -190,7 +190,7 @@ def _others(
             continue
         share, name = float(taken[located.labels == other].mean()), name_of(other)
         surface = located.meshes.get(name)
-        if share == 0 and (surface is None or not inside(piece, surface.vertices_mm).any()):
+        if share == 0 and (surface is None or not inside(piece, surface.spread_mm()).any()):
             continue
         if share < _WHOLE:
             much = f"{share:.0%} of it" if share >= 0.01 else "an edge of it"

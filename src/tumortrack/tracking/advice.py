@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from jaxtyping import Float
 from scipy.spatial import cKDTree
 
 from tumortrack.core.estimate import Estimate
-from tumortrack.core.geometry import triangles_of
-from tumortrack.core.types import SensorCloud
+from tumortrack.core.geometry import transform_points, triangles_of
+from tumortrack.core.types import Look, SensorCloud
 from tumortrack.registration.motion import ElasticMotion
 
 # Where another view alone would not help: words of the reason, and what does.
@@ -27,15 +29,16 @@ _HIDDEN = 0.1  # share of what faces the camera
 _ASIDE = 0.3  # sine to the line of sight: a direction that is no more aside is none
 
 
-def what_to_do(estimate: Estimate, cloud: SensorCloud) -> str:
+def what_to_do(estimate: Estimate, cloud: SensorCloud, others: Sequence[Look] = ()) -> str:
     """Towards which side of the organ the camera should look, and why there.
 
-    Where a tenth of what faces the camera is not among the points: there. Where another fit is
+    Where a tenth of what faces the camera is among no view's points: there. Where another fit is
     nearly as likely: where its surface lies farthest from this one's. Else along the axis in which
     a tumor's centre is least certain: surfaces hold what lies along their normals.
 
     Args:
         cloud: the organ's points, camera frame, in which it was located.
+        others: more looks at it; the sides are those of the first camera's picture.
     """
     if "looks" in estimate.report and any(one in estimate.reason for one in _AMONG_VIEWS):
         return CHECK_POSES
@@ -48,11 +51,15 @@ def what_to_do(estimate: Estimate, cloud: SensorCloud) -> str:
     sight = middles / np.linalg.norm(middles, axis=1, keepdims=True)
     facing = middles[-(normals * sight).sum(1) > _FACING * np.linalg.norm(normals, axis=1)]
     centre = middles.mean(0)
-    if len(facing) and len(cloud.points_mm):
-        hidden = cKDTree(cloud.points_mm).query(facing)[0] > _NEAR_MM
-        if hidden.mean() > _HIDDEN and (where := _side(facing[hidden].mean(0) - centre, centre)):
+    more = [transform_points(one.camera_from_look, one.cloud.points_mm) for one in others]
+    points_mm = np.concatenate([cloud.points_mm, *more])
+    whose = "the first camera's" if more else "the camera's"
+    if len(facing) and len(points_mm):
+        hidden = cKDTree(points_mm).query(facing)[0] > _NEAR_MM
+        towards = facing[hidden].mean(0) - centre if hidden.mean() > _HIDDEN else np.zeros(3)
+        if where := _side(towards, centre, whose):
             return f"free the view of the organ's side towards {where}, or look from there"
-    where = _side(_unsure(estimate, centre), centre)
+    where = _side(_unsure(estimate, centre), centre, whose)
     return f"look more from {where or 'another side'}, by about 30 degrees"
 
 
@@ -73,7 +80,7 @@ def _unsure(estimate: Estimate, centre: Float[np.ndarray, " 3"]) -> Float[np.nda
     return axis if (estimate.meshes[name].box_mm.mean(0) - centre) @ axis >= 0 else -axis
 
 
-def _side(direction: Float[np.ndarray, " 3"], centre: Float[np.ndarray, " 3"]) -> str:
+def _side(direction: Float[np.ndarray, " 3"], centre: Float[np.ndarray, " 3"], whose: str) -> str:
     """A direction in words, as the camera's picture shows it; empty: it lies along the view."""
     sight, length = centre / np.linalg.norm(centre), float(np.linalg.norm(direction))
     x, y, _ = direction - (direction @ sight) * sight
@@ -84,4 +91,4 @@ def _side(direction: Float[np.ndarray, " 3"], centre: Float[np.ndarray, " 3"]) -
     told = {axis: value for axis, value in (("y", y), ("x", x)) if abs(value) > long / 2}
     names = " ".join(words[axis][int(value > 0)] for axis, value in told.items())
     axes = ", ".join(f"{'+' if value > 0 else '-'}{axis}" for axis, value in told.items())
-    return f"the {names} (the camera's {axes})"
+    return f"the {names} ({whose} {axes})"

@@ -117,7 +117,8 @@ class Tracker:
         # Margins are calibrated on single looks.
         estimate = with_margin(estimate, cloud, None if others else self.model.margins)
         if estimate.quality == "poor" and not self._weakness:
-            estimate = doubted(estimate, f"{estimate.reason}; {what_to_do(estimate, cloud)}")
+            advice = what_to_do(estimate, cloud, others)
+            estimate = doubted(estimate, f"{estimate.reason}; {advice}")
         estimate = replace(estimate, patient=self._patient)
         estimate.report["patient"] = to_builtins(self._patient)
         seconds = estimate.report["timings"]

@@ -99,7 +99,7 @@ class OccupancyForms:
         self, preset: str, model: OccupancyModel, points_mm: np.ndarray, device: str = "cpu"
     ) -> None:
         self.preset, self.points_mm, self._model, self._device = preset, points_mm, model, device
-        self._inference = Inference(model.network, model.arithmetic)
+        self._inference = Inference(model.network)
         self.encode = self._inference.encode
         self._plain = NaiveOccupancy(model.network)
         self._cloud = torch.tensor(points_mm)[None].to(device)
@@ -285,7 +285,7 @@ class OccupancyForms:
     def _decoder_work(self, queries: int, voxels: int = 0) -> Work:
         """The latent's share once a frame; queries in, logits out; a label to every voxel."""
         kinds: dict[str, Precision] = {"float32": "fp32", "bfloat16": "bf16"}
-        precision = kinds.get(self._inference.arithmetic.numbers, self._precision)
+        precision = kinds.get(self._inference.numbers, self._precision)
         folded = self._model.network.folded()
         some = torch.from_numpy(self.queries(100))[None].to(self._device)
         latent = folded.encode(self._cloud)

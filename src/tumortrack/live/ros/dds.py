@@ -24,8 +24,10 @@ from cyclonedds.domain import Domain, DomainParticipant
 from cyclonedds.idl import make_idl_struct, types
 from cyclonedds.internal import DDS, dds_c_t
 from cyclonedds.pub import DataWriter
+from cyclonedds.pub import Publisher as DdsPublisher
 from cyclonedds.qos import Policy, Qos
 from cyclonedds.sub import DataReader
+from cyclonedds.sub import Subscriber as DdsSubscription
 from cyclonedds.topic import Sample, Topic
 from rosbags.interfaces import Nodetype
 
@@ -60,14 +62,17 @@ _OTHER_TYPES: dict[str, Any] = {  # those that cyclonedds calls otherwise than R
     **dict.fromkeys(("char", "byte", "octet"), types.uint8),
 }
 
-# A domain is set up once per process and outlives its participants: made again, it would cut off
-# whoever else uses it.
-_domains: dict[int, Any] = {}
+# A domain is set up once per process, with one participant and one topic of each name and type. All
+# of it outlives whoever used it: a domain that is made again would cut off the others, and while
+# Cyclone (11.0.1) makes a topic, it looks through all types without the lock under which types that
+# nobody uses any more are freed. A program that left the graph and joined it again could crash.
+_domains: dict[int, tuple[Any, DomainParticipant]] = {}
+_topics: dict[tuple[int, str, str], Any] = {}
 _setting_up = threading.Lock()
 
 
 class DdsBus:
-    """One participant in the environment's domain; see ``bus.Bus``. ``CYCLONEDDS_URI``,
+    """Readers and writers in the environment's domain; see ``bus.Bus``. ``CYCLONEDDS_URI``,
     ``ROS_LOCALHOST_ONLY`` and ``ROS_AUTOMATIC_DISCOVERY_RANGE`` choose the network. Raises
     InputError if the environment or the network cannot be used.
     """
@@ -75,20 +80,20 @@ class DdsBus:
     def __init__(self, messages: Messages) -> None:
         self.messages = messages
         self._closing = threading.Lock()
-        domain = domain_id()
+        self._domain = domain = domain_id()
         try:
-            _set_up(domain)
-            member = DomainParticipant(domain, Qos(Policy.Userdata(b"enclave=/;")))
+            member = _member_of(domain)
             self._waitset, self._over = core.WaitSet(member), core.GuardCondition(member)
             self._waitset.attach(self._over)  # and without anything attached it would not wait
             self._published = BuiltinDataReader(member, BuiltinTopicDcpsPublication)
+            self._writers, self._readers = DdsPublisher(member), DdsSubscription(member)
         except core.DDSException as error:
             raise InputError(
                 f"DDS domain {domain} cannot be joined ({_error_text(error.code)}; Cyclone "
                 "DDS says more above). Check the network, CYCLONEDDS_URI, and that not too many "
                 "programs are in that domain."
             ) from error
-        self._member: Any = member
+        self._closed = False
         self.note = "on this machine alone"
         if not _stays_here():
             self.note = (
@@ -98,7 +103,7 @@ class DdsBus:
 
     def publisher(self, topic: str, kind: str) -> Publisher:
         reliable, volatile = Policy.Reliability.Reliable(_BLOCKED_NS), Policy.Durability.Volatile
-        writer: Any = DataWriter(*self._endpoint(topic, kind, reliable, volatile, 1))
+        writer: Any = DataWriter(self._writers, *self._endpoint(topic, kind, reliable, volatile, 1))
         # By ctypes, and not by the extension module: that one keeps Python's lock while it waits
         # for a slow subscriber.
         write = DDS._dll_handle.dds_write
@@ -126,7 +131,9 @@ class DdsBus:
         qos: tuple[Any, Any] = (Policy.Reliability.BestEffort, Policy.Durability.Volatile)
         if latched:
             qos = Policy.Reliability.Reliable(0), Policy.Durability.TransientLocal
-        subscriber = DdsSubscriber(*self._endpoint(topic, kind, *qos, most), most)
+        subscriber = DdsSubscriber(
+            DataReader(self._readers, *self._endpoint(topic, kind, *qos, most)), most
+        )
         self._waitset.attach(subscriber.condition)
         return subscriber
 
@@ -144,28 +151,29 @@ class DdsBus:
 
     def close(self) -> None:
         with self._closing:
-            member, self._member = self._member, None
-        if member is not None:
+            closed, self._closed = self._closed, True
+        if not closed:
             self._over.set(True)
-            member._delete(member._ref)  # and with it all that it made
+            for one in (self._writers, self._readers, self._published, self._waitset, self._over):
+                one._delete(one._ref)  # and with it all that it made
 
     def _endpoint(
         self, topic: str, kind: str, reliability: Any, durability: Any, most: int
-    ) -> tuple[Any, Any, Any]:
-        """Participant, topic and QoS of a reader or writer."""
+    ) -> tuple[Any, Any]:
+        """Topic and QoS of a reader or writer."""
         user_data = f"typehash={self.messages.type_hash(kind)};".encode()
         encoding = Policy.DataRepresentation(use_cdrv0_representation=True)
         kept = Policy.History.KeepLast(most)
         qos = Qos(reliability, durability, kept, encoding, Policy.Userdata(user_data))
-        return self._member, Topic(self._member, "rt" + topic, idl_type(kind)), qos
+        return _topic(self._domain, topic, kind), qos
 
 
 class DdsSubscriber(Subscriber):
     """It takes what came from Cyclone's own queue."""
 
-    def __init__(self, member: Any, topic: Any, qos: Any, most: int) -> None:
+    def __init__(self, reader: Any, most: int) -> None:
         super().__init__(most)
-        self._reader = DataReader(member, topic, qos)
+        self._reader = reader
         mask = core.ViewState.Any | core.InstanceState.Any | core.SampleState.NotRead
         self.condition = core.ReadCondition(self._reader, mask)
 
@@ -191,7 +199,8 @@ def domain_id() -> int:
     return int(text)
 
 
-def _set_up(domain: int) -> None:
+def _member_of(domain: int) -> DomainParticipant:
+    """This process's participant. Raises InputError where the environment forbids any."""
     reach = os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "").upper()
     if reach == "OFF":
         raise InputError(
@@ -202,7 +211,17 @@ def _set_up(domain: int) -> None:
         if domain not in _domains:
             local = _LOCAL if _stays_here() else ""
             parts = (_TUNING, local, os.environ.get("CYCLONEDDS_URI", ""))
-            _domains[domain] = Domain(domain, ",".join(filter(None, parts)))
+            made = Domain(domain, ",".join(filter(None, parts)))
+            _domains[domain] = made, DomainParticipant(domain, Qos(Policy.Userdata(b"enclave=/;")))
+        return _domains[domain][1]
+
+
+def _topic(domain: int, topic: str, kind: str) -> Any:
+    with _setting_up:
+        key = domain, topic, kind
+        if key not in _topics:
+            _topics[key] = Topic(_domains[domain][1], "rt" + topic, idl_type(kind))
+        return _topics[key]
 
 
 def _stays_here() -> bool:
