@@ -10,6 +10,7 @@ every method judges every frame; OUT/table.md and press.png also count what --ot
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
@@ -31,7 +32,7 @@ from tumortrack_lab.world import colour, following, pictures, tables
 from tumortrack_lab.world.films import ALL_KINDS, Film, FilmConfig, read_film, write_film
 from tumortrack_lab.world.paths import KINDS
 from tumortrack_lab.world.scenes import TETS, World, WorldConfig
-from tumortrack_lab.world.states import STATE_KINDS, read_states
+from tumortrack_lab.world.states import STATE_KINDS, State, read_states, world_of
 
 
 @dataclass(frozen=True)
@@ -79,13 +80,7 @@ def main(options: Options) -> None:
     if options.views not in (1, 3):
         raise InputError(f"--views is {options.views}; allowed: 1, 3.")
     config = FilmConfig(seed=options.seed, fps=options.fps, views=options.views)
-    identity = {
-        "case_sha256": store.sha256_of(options.case / store.MANIFEST),
-        "config": to_builtins(config),
-    }
-    claim(options.out, "sequences.json", identity)
-    world = World.opened(options.case, WorldConfig(), (options.states or options.out) / TETS)
-    states = cache(lambda: read_states(world, options.states or options.out))
+    world, states = _opened(options, config)
     wanted = [(kind, number) for number in range(options.count) for kind in options.kinds]
     todo = [(k, n) for k, n in wanted if not (options.out / f"{k}-{n:03d}").exists()]
     start = time.monotonic()
@@ -105,6 +100,20 @@ def main(options: Options) -> None:
             say(f"{done}/{len(films)} {film.folder.name} painted")
     if options.model is not None:
         _follow(options, options.model, films)
+
+
+def _opened(options: Options, config: FilmConfig) -> tuple[World, Callable[[], list[State]]]:
+    """The world of the folder, stated there, and the solved states to go through."""
+    identity = {
+        "case_sha256": store.sha256_of(options.case / store.MANIFEST),
+        "config": to_builtins(config),
+    }
+    claim(options.out, "sequences.json", identity)
+    source = options.states or options.out
+    world = World.opened(options.case, WorldConfig(), source / TETS)
+    if options.states is not None:
+        world = world_of(world, source)
+    return world, cache(lambda: read_states(world, source))
 
 
 def _follow(options: Options, model: Path, films: list[Film]) -> None:

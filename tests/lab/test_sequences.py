@@ -24,12 +24,12 @@ from tumortrack.live.sources.recording import RecordingSourceConfig
 from tumortrack.report.drawing import ESTIMATED, TRUE
 from tumortrack.report.metrics import surface_samples
 from tumortrack.sense.camera import deproject, project
-from tumortrack.simulate.scene_folder import read_scene
+from tumortrack.simulate.scene_folder import draw_targets, read_scene
 from tumortrack_lab.study.tumor_sites import tumor_sites_of
 from tumortrack_lab.world import colour, following, pictures, tables
 from tumortrack_lab.world.films import FilmConfig, read_film, write_film
 from tumortrack_lab.world.paths import BEFORE_S, LoadPath, random_path
-from tumortrack_lab.world.states import AWAY_S, FAR_MM, State, read_states, state_path
+from tumortrack_lab.world.states import AWAY_S, FAR_MM, State, read_states, state_path, world_of
 from world_objects import organ, world
 
 
@@ -200,7 +200,9 @@ def states(tmp_path_factory) -> tuple[Path, list[State]]:
     out = tmp_path_factory.mktemp("states")
     made = world(families=("plate",), segmentation=0.0, hidden=0.0)
     made.scene(0).write(out / "00000-plate-none")
-    return out, read_states(made, out)
+    with pytest.raises(InputError, match="other inner points"):
+        read_states(replace(made, targets=draw_targets(made.anatomy_ct, 7)), out)
+    return out, read_states(world_of(made, out), out)
 
 
 def test_a_state_is_gone_into_from_rest_and_what_lies_between_keeps_its_volume(states) -> None:
@@ -222,7 +224,7 @@ def test_a_state_is_gone_into_from_rest_and_what_lies_between_keeps_its_volume(s
 
 
 def test_states_of_another_organ_are_refused(states) -> None:
-    other = world(families=("plate",))
+    other = world_of(world(), states[0])
     faces = other.organ.anatomy.organ.faces[::-1]
     turned = Anatomy(
         (Mesh(other.organ.anatomy.organ.vertices_mm, faces), *other.organ.anatomy.tumors)

@@ -34,7 +34,7 @@ from tumortrack.tracking.tracker import Follower, FollowerConfig, Tracker
 
 _PICK_S = 3.0  # without the organ: a pick is forgotten
 _QUIET = 0.8  # of stale_s: silence is said while what is shown still holds
-_SURE_AFTER = 3  # good estimates in a row after doubt: single frames of something else may pass
+SURE_AFTER = 3  # good estimates in a row after doubt: single frames of something else may pass
 
 
 class LoopConfig(Config, frozen=True, kw_only=True):
@@ -86,7 +86,7 @@ class Loop:
         self._picked: Float64[np.ndarray, " 3"] | None = None  # by the user
         self._place_mm: Float64[np.ndarray, " 3"] | None = None  # where that is by now
         self._found_s = time.monotonic()
-        self._in_a_row = _SURE_AFTER  # good estimates since the last doubt
+        self._in_a_row = SURE_AFTER  # good estimates since the last doubt
         self._says: Intrinsics | None = None  # the source, where others are given
         self._stamp: tuple[int, int] | None = None  # of the last frame, and when that was here
         self.statistics = RunStatistics()
@@ -217,8 +217,8 @@ class Loop:
         if doubt and quality == "good":
             quality, warning = "poor", doubt
         self._in_a_row = self._in_a_row + 1 if quality == "good" else 0
-        if 0 < self._in_a_row < _SURE_AFTER:
-            return "poor", f"good again for {self._in_a_row} of {_SURE_AFTER} frames; wait"
+        if 0 < self._in_a_row < SURE_AFTER:
+            return "poor", f"good again for {self._in_a_row} of {SURE_AFTER} frames; wait"
         return quality, warning
 
     def _without_frame(self, reason: str) -> TrackingResult:

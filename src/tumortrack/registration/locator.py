@@ -135,7 +135,8 @@ class RegistrationLocator:
                 fits += [refine(self._shape, points, one, self._near) for one in starts]
         if not fits or how.thorough or min(fit.cost for fit in fits) > usual:
             enough = 0.0 if not fits else usual if how.thorough else np.inf
-            fits.append(self._registration.register(points, enough, frame.stage))
+            anew = self._registration.register(points, enough, frame.stage, how.either_side)
+            fits.append(anew)
         fit, looks = best_of(fits), Looks.of([points])
         size, unsmoothed, lag_s = self._size(looks, fit), fit.motion, 0.0
         if last is not None and isinstance(last.motion, ElasticMotion) and how.smoothing_s > 0:

@@ -8,6 +8,7 @@
 4. Other minima that explain the points nearly as well, and put a tumor elsewhere, are kept.
 5. In a first look, and where even that fits badly, the organ is looked for all around: what hides a
    part of it moves the middle and the longest direction of what is seen, and misleads the network.
+   An organ that was seen a moment ago may have been turned over, which no organ in training was.
 6. An organ that looks much the same after half a turn is tried that way round, too.
 
 The result is a motion (`motion`): any point of the CT, carried to the camera's frame and back,
@@ -75,13 +76,17 @@ class Registration:
     config: GaussNewtonConfig
 
     def register(
-        self, points_mm: Points, usual_cost: float = math.inf, timed: Timer = nullcontext
+        self,
+        points_mm: Points,
+        usual_cost: float = math.inf,
+        timed: Timer = nullcontext,
+        either_side: bool = False,
     ) -> RegistrationResult:
         """The whole method; ``timed("encode")`` and ``timed("refine")`` time its halves."""
         with timed("encode"):
             hypotheses = self.propose(points_mm)
         with timed("refine"):
-            return self.best_fit(points_mm, hypotheses, usual_cost)
+            return self.best_fit(points_mm, hypotheses, usual_cost, either_side)
 
     def register_all(
         self, looks: Looks, usual_cost: float = math.inf, timed: Timer = nullcontext
@@ -143,24 +148,32 @@ class Registration:
         ]
 
     def best_fit(
-        self, points_mm: Points, hypotheses: list[ElasticMotion], usual_cost: float = math.inf
+        self,
+        points_mm: Points,
+        hypotheses: list[ElasticMotion],
+        usual_cost: float = math.inf,
+        either_side: bool = False,
     ) -> RegistrationResult:
         """The hypothesis that fits best, refined; give the likeliest one first. Above
-        ``usual_cost`` the organ is looked for all around."""
+        ``usual_cost`` the organ is looked for all around, ``either_side`` up."""
         fit = self._settle(points_mm, self._race(points_mm, [(one, None) for one in hypotheses]))
         if fit.cost > usual_cost:
-            fit = self.look_around(points_mm, hypotheses[0], fit)
+            fit = self.look_around(points_mm, hypotheses[0], fit, either_side)
         turned = [(self._half_turned(fit.motion, turn), None) for turn in self.rest.half_turns]
         if not turned:
             return fit
         return best_of([fit, self._settle(points_mm, self._race(points_mm, turned))])
 
     def look_around(
-        self, points_mm: Points, likeliest: ElasticMotion, fit: RegistrationResult
+        self,
+        points_mm: Points,
+        likeliest: ElasticMotion,
+        fit: RegistrationResult,
+        either_side: bool = False,
     ) -> RegistrationResult:
         """The best of a fit and those from many more places: the likeliest hypothesis turned all
-        around the camera's axis and moved along the organ, first as a nearly stiff body that
-        follows few points."""
+        around the camera's axis and moved along the organ, ``either_side`` up, first as a nearly
+        stiff body that follows few points."""
         angles, stiff = np.arange(_TURNS) * 360 / _TURNS, self.rest.stiff
         turns = Rotation.from_euler("z", angles[:, None], degrees=True).as_matrix()
         across = self.rest.long_axis * np.ptp(
@@ -168,7 +181,9 @@ class Registration:
         )
         config = msgspec.structs.replace(self.config, first_mm=_FIRST_MM)
         descents = []
-        for rotation in turns @ likeliest.rotation:
+        over = Rotation.from_rotvec(np.pi * self.rest.long_axis).as_matrix()
+        sides = [np.eye(3), over] if either_side else [np.eye(3)]
+        for rotation in np.concatenate([turns @ likeliest.rotation @ side for side in sides]):
             for share in _ALONG:
                 place = likeliest.centre_mm + share * (rotation @ across) * [1, 1, 0]
                 start = ElasticMotion(stiff, rotation, place, stiff.body.mean)

@@ -27,6 +27,9 @@ from tumortrack.tracking.advice import CHECK_POSES, what_to_do
 from tumortrack.tracking.quality import doubted, judged, with_margin
 
 _ALONE = Following()
+# So long after it was found good the organ is also looked for with its other side up. In first
+# looks of strangers that called 18 of 46 kidneys of others, or mirrored, good; none without it.
+_TURNED_OVER_S = 30.0
 
 
 _LOCATORS: dict[type[Model], Callable[[Any], RegistrationLocator | OccupancyLocator]] = {
@@ -98,7 +101,7 @@ class Tracker:
             InputError: the cloud is in metres.
         """
         # What fits worse all of a sudden may be something else that was put there.
-        strictly = last is not None and (last.quality != "good" or not _unusual(last))
+        strictly = how.either_side if last is None else last.quality != "good" or not _unusual(last)
         estimate = self._locator.follow(cloud, last, how)
         return self._judged(estimate, cloud, seen or cloud, strictly)
 
@@ -170,6 +173,7 @@ class Follower:
         self._tracker, self._config = tracker, config
         self._last: Estimate | None = None
         self._scanned_ns = 0
+        self._good_ns: int | None = None
 
     def warm(self) -> None:
         """See ``Tracker.warm``."""
@@ -195,8 +199,12 @@ class Follower:
         if last is None or thorough:
             self._scanned_ns = cloud.stamp_ns
         smoothing_s, seed = self._config.smoothing_s, self._config.seed
-        how = Following(thorough=thorough, smoothing_s=smoothing_s, seed=seed)
+        since_ns = np.inf if self._good_ns is None else cloud.stamp_ns - self._good_ns
+        turned = bool(0 <= since_ns <= _TURNED_OVER_S * 1e9)
+        how = Following(thorough=thorough, either_side=turned, smoothing_s=smoothing_s, seed=seed)
         self._last = self._tracker.follow(cloud, last, how, seen)
+        if self._last.quality == "good":
+            self._good_ns = cloud.stamp_ns
         return self._last
 
     def _recent(self, stamp_ns: int) -> Estimate | None:

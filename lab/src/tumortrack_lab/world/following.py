@@ -16,8 +16,10 @@ from tumortrack.core.errors import NoEstimate
 from tumortrack.core.estimate import Estimate
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import DepthFrame, Look, Mesh, SensorCloud
+from tumortrack.live.loop import SURE_AFTER
 from tumortrack.report.metrics import surface_distances
 from tumortrack.sense.region import Hints, RegionConfig, organ_points
+from tumortrack.tracking.quality import doubted
 from tumortrack.tracking.tracker import Follower, FollowerConfig, Tracker, region_for
 from tumortrack_lab.study.tumor_sites import TumorSite
 from tumortrack_lab.world.films import Film
@@ -39,17 +41,24 @@ Locate = Callable[[Moment], Estimate]
 
 
 def track(tracker: Tracker) -> Locate:
-    """The first camera's images as `tumortrack track` follows them."""
+    """The first camera's images as `tumortrack track` follows them, its wait for the third good
+    estimate in a row included."""
     region, follower = region_for(tracker.model), Follower(tracker, FollowerConfig())
+    in_a_row = 0
 
     def locate(look: Moment) -> Estimate:
+        nonlocal in_a_row
         frame = look.frames[0]
         try:
             cloud = _organ(frame, region, Hints(last_box_mm=follower.last_box_mm(frame.stamp_ns)))
         except NoEstimate:
             follower.forget()
+            in_a_row = 0
             raise
-        return follower.locate(cloud, frame)
+        in_a_row, before = 0, in_a_row
+        estimate = follower.locate(cloud, frame)
+        in_a_row = before + 1 if estimate.quality == "good" else 0
+        return doubted(estimate, "wait") if 0 < in_a_row < SURE_AFTER else estimate
 
     return locate
 

@@ -10,7 +10,7 @@ state, and sinks into no bed.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -20,7 +20,7 @@ from tumortrack.core import store
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import rigid, transform_points, unit
 from tumortrack.core.mesh_files import read_anatomy
-from tumortrack.simulate.scene_folder import list_scenes, read_targets
+from tumortrack.simulate.scene_folder import InnerPoints, list_scenes, read_targets
 from tumortrack_lab.peers.base import kabsch, matched_vertices
 from tumortrack_lab.twin.equilibrium import Points
 from tumortrack_lab.world.organ import Generator, Organ
@@ -45,6 +45,12 @@ class State(NamedTuple):
     bend_mm: Points
 
 
+def world_of(world: World, folder: Path) -> World:
+    """With the inner points of a folder's scenes, which may have been drawn otherwise."""
+    inner = read_targets(list_scenes(folder)[0] / "targets.csv")
+    return replace(world, targets=InnerPoints(inner.points_ct, inner.labels))
+
+
 def read_states(world: World, folder: Path) -> list[State]:
     """Of scenes of this case that `make world` made, with its very anatomy and no slit. Raises
     InputError: there is none, or they are another organ's."""
@@ -55,7 +61,10 @@ def read_states(world: World, folder: Path) -> list[State]:
             continue
         pairs = zip(world.organ.anatomy.parts, read_anatomy(path).parts, strict=True)
         vertices = [matched_vertices(part, seen) for part, seen in pairs]
-        there = np.concatenate([*vertices, read_targets(path / "targets.csv").points_mm])
+        inner = read_targets(path / "targets.csv")
+        if not np.array_equal(inner.points_ct, world.targets.points_ct):
+            raise InputError(f"{path} has other inner points than the first scene of its folder.")
+        there = np.concatenate([*vertices, inner.points_mm])
         there = transform_points(np.linalg.inv(np.array(meta["camera_from_bench"])), there)
         pose = kabsch(rest, there, np.ones(len(rest)))
         bend = transform_points(np.linalg.inv(pose), there) - rest
