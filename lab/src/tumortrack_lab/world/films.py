@@ -128,10 +128,7 @@ def write_film(
     from scipy.spatial.transform import Rotation
 
     seed = [config.seed, ALL_KINDS.index(kind), number]
-    if kind in STATE_KINDS:
-        path, failed = state_path(world.organ, states(), kind, [*seed, 3]), 0
-    else:
-        path, failed = _some_path(world, kind, seed)
+    path, failed = _some_path(world, kind, seed, states)
     rng, rest = np.random.default_rng([*seed, 1]), world.organ.anatomy
     moving = path.of(world.points)
     times_s = np.arange(int(path.seconds * config.fps) + 1) / config.fps
@@ -172,7 +169,11 @@ def write_film(
         store.write_json(aside / "meta.json", meta)
 
 
-def _some_path(world: World, kind: str, seed: list[int]) -> tuple[LoadPath, int]:
+def _some_path(
+    world: World, kind: str, seed: list[int], states: Callable[[], list[State]]
+) -> tuple[LoadPath, int]:
+    if kind in STATE_KINDS:
+        return state_path(world.organ, states(), kind, [*seed, 3]), 0
     for attempt in range(_ATTEMPTS):
         try:
             return random_path(world.organ, kind, [*seed, 3, attempt]), attempt
@@ -188,7 +189,7 @@ def _tools(
     """What hides the organ by and by, as it lies in the middle of the stay (bench frame)."""
     camera, placed, back = d405(*SIZE_PX), [], np.linalg.inv(pose)
     for cover in path.covers:
-        middle = np.searchsorted(times_s, (cover.since_s + cover.until_s) / 2)
+        middle = int(np.searchsorted(times_s, (cover.since_s + cover.until_s) / 2))
         seen = render(organ[min(middle, len(organ) - 1)], pose, camera)
         if np.isfinite(seen).any():
             placed.append((cover, *covering(seen, np.isfinite(seen), camera, cover.share, rng)))

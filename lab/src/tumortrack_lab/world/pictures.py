@@ -96,7 +96,7 @@ def show(locate: Locate, film: Film, path: Path) -> None:
             left = figure.add_axes((0.01, 0.03, 0.56, 0.84))
             _section(left, view, middles[0], ((truth, TRUE), (found, ESTIMATED)))
             seen = view.project(deproject(film.looks(n)[0]).astype(float) - middles[0])
-            near = seen[np.abs(seen[:, 2]) < _NEAR_MM] + view.project(middles[:1])
+            near = seen[np.abs(seen[:, 2]) < _NEAR_MM] + view.project(middles[0][None])
             left.plot(near[:, 0], near[:, 1], ".", color="0.6", markersize=2, zorder=0)
             drawing.finish_view(left, Frame(low[0], high[0], low[1], high[1]))
             _curve(figure.add_axes((0.65, 0.16, 0.33, 0.71)), film, errors)
