@@ -24,7 +24,7 @@ from tumortrack.registration.model import RegistrationModel
 from tumortrack.sense.cloud import CloudConfig
 from tumortrack.sense.region import RegionConfig
 from tumortrack.tracking.advice import CHECK_POSES, what_to_do
-from tumortrack.tracking.quality import doubted, judged, with_margin
+from tumortrack.tracking.quality import doubted, judged, unless_hidden, with_margin
 
 _ALONE = Following()
 # So long after it was found good the organ is also looked for with its other side up. In first
@@ -103,7 +103,7 @@ class Tracker:
         # What fits worse all of a sudden may be something else that was put there.
         strictly = how.either_side if last is None else last.quality != "good" or not _unusual(last)
         estimate = self._locator.follow(cloud, last, how)
-        return self._judged(estimate, cloud, seen or cloud, strictly)
+        return self._judged(estimate, cloud, seen or cloud, strictly, last=last)
 
     def _judged(
         self,
@@ -112,9 +112,12 @@ class Tracker:
         seen: DepthFrame | SensorCloud,
         strictly: bool,
         others: Sequence[Look] = (),
+        last: Estimate | None = None,
     ) -> Estimate:
         start = time.perf_counter()
         estimate = judged(estimate, seen, strictly, others)
+        if last is not None:
+            estimate = unless_hidden(estimate, last)
         if self._weakness:
             estimate = doubted(estimate, self._weakness)
         # Margins are calibrated on single looks.
