@@ -8,7 +8,7 @@ INSTALL := pip install --quiet --disable-pip-version-check --no-compile --no-dep
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help setup debian demo test test-hard check attack fuzz crash replay bench soak wheel lock licences audit results real world sequences trust clean
+.PHONY: help setup debian demo test test-hard check attack fuzz crash replay bench soak wheel lock licences audit results real world sequences causes trust clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 10
@@ -83,6 +83,9 @@ world: setup  ## scenes of wider physics, noise and views, and how a model does 
 
 sequences: setup  ## an organ pressed, pushed, rolled, breathing, turned over, and how it is followed (ARGS="CASE OUT --model MODEL")
 	$(BIN)/python lab/scripts/sequences.py $(ARGS)
+
+causes: setup  ## shares of causes in the tumors' errors: fits told parts of the truth (ARGS="CASE WORLD MODEL OUT", after `make world`)
+	$(BIN)/python lab/scripts/causes.py $(ARGS)
 
 trust: setup  ## what margins are worth for physics and organs left out (ARGS="MODEL/margins.jsonl ...": an organ each)
 	$(BIN)/python lab/scripts/trust.py $(ARGS)

@@ -459,7 +459,7 @@ def plan_resection(
     config = from_builtins(options, ResectionConfig, "plan_resection")
     run = located if isinstance(located, Estimate) else places.read_run(Path(located))
     stand_mm = places.STAND_MM if stand_mm is None else stand_mm
-    table_from_camera = places.table_under(run.cloud, run.meshes, stand_mm)
+    table_from_camera = places.table_under(run.meshes, stand_mm)
     if isinstance(run, Estimate):
         doubt = "" if run.quality == "good" else run.reason
         seen = places.located(run.cloud, run.meshes, run.motion, table_from_camera)

@@ -79,12 +79,12 @@ def test_a_plan_is_written_in_the_tables_frame(story):
     assert "tumor_1 (7" in said
     assert "ml healthy tissue" in said
     stored = read_plan(folder / "plan")
-    assert stored.frame_id == "table"
+    assert stored.frames.frame_id == "table"
     # Straight above, 120 mm over the table by default, its middle over the origin.
     kidney = stored.meshes["kidney"]
     assert kidney.box_mm[0, 2] == pytest.approx(120, abs=0.01)
     assert kidney.box_mm.mean(0)[:2] == pytest.approx([0, 0], abs=0.01)
-    assert stored.table_from_camera[:3, :3] == pytest.approx(np.diag([1, -1, -1]))
+    assert stored.frames.published_from_camera[:3, :3] == pytest.approx(np.diag([1, -1, -1]))
     plan = stored.plan
     assert plan.volumes_ml["tumor"] == pytest.approx(4 / 3 * np.pi * 1.2**3, rel=0.06)
     data = json.loads((folder / "plan" / "plan.json").read_text())
@@ -231,7 +231,7 @@ def given(story, tmp_path_factory):
     """Plans in a robot's frame, with and without the arms' places; models of three cases."""
     folder, _ = story
     here, place = read_plan(folder / "plan"), tmp_path_factory.mktemp("given")
-    rows = here.table_from_camera.tolist()
+    rows = here.frames.published_from_camera.tolist()
     frame = {"frame_id": "base_link", "unit": "mm", "robot_from_camera": rows}
     (place / "unstated.json").write_text(json.dumps(frame))
     (place / "frame.json").write_text(json.dumps({**frame, "error_mm": 1.0, "error_deg": 0.2}))
@@ -520,7 +520,7 @@ def test_with_a_calibration_plan_and_arms_are_in_the_robots_frame(story, tmp_pat
     robot_from_table[:3, :3] = [[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]
     robot_from_table[:3, 3] = [430.0, -120.0, -60.0]
     frame, cell = tmp_path / "frame.json", tmp_path / "cell.json"
-    rows = (robot_from_table @ here.table_from_camera).tolist()
+    rows = (robot_from_table @ here.frames.published_from_camera).tolist()
     frame.write_text(json.dumps({"frame_id": "base_link", "unit": "mm", "robot_from_camera": rows}))
     done = tumortrack("plan", folder / "run", tmp_path / "plan", "--frame", frame)
     assert "where do the arms stand" in refusal(done)
@@ -535,7 +535,7 @@ def test_with_a_calibration_plan_and_arms_are_in_the_robots_frame(story, tmp_pat
     command = ("plan", folder / "run", tmp_path / "plan", "--frame", frame, "--cell", cell)
     succeeded(tumortrack(*command, *WIDE))
     there = read_plan(tmp_path / "plan")
-    assert there.frame_id == "base_link"
+    assert there.frames.frame_id == "base_link"
     expected = robot_from_table @ [*here.plan.grasp_mm, 1.0]
     assert there.plan.grasp_mm == pytest.approx(expected[:3], abs=1.6)
     assert there.cell["middle_mm"] == pytest.approx(robot_from_table[:3, 3].tolist(), abs=1.5)

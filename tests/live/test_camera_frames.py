@@ -101,6 +101,18 @@ def test_a_cloud_of_the_whole_scene_is_watched_too():
     assert "moved since the start" in text
 
 
+def test_a_camera_that_is_meant_to_move_may():
+    frames = [*still(), *(scene(n, off_mm=3.0) for n in range(40, 56))]
+    for moves in (False, True):
+        check = FrameCheck(PublishedFrame(calibrated=True, moves=moves), CONFIG, 0.0)
+        seen = [Observation(frame, 0) for frame in frames]
+        if moves:
+            assert [check.check(one) for one in seen] == [""] * len(seen)
+        else:
+            with pytest.raises(NoEstimate, match="moved since"):
+                [check.check(one) for one in seen]
+
+
 def test_what_a_plane_cannot_show_is_not_noticed_and_said():
     check = FrameCheck(PublishedFrame(calibrated=True, camera_frame_id="c"), CONFIG, 0.25)
     for n in range(80):

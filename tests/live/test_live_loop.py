@@ -47,7 +47,7 @@ def clock(monkeypatch):
     """The loop's, its reader's and the script's, which the test turns."""
     one = Clock()
     monkeypatch.setattr(sys.modules[__name__], "time", one)
-    for module in ("loop", "workers"):
+    for module in ("loop", "workers", "views", "cameras"):
         monkeypatch.setattr(f"tumortrack.live.{module}.time", one)
     return one
 
@@ -277,7 +277,7 @@ def test_garbage_and_defects_are_said_and_survived(tracker, stages, monkeypatch)
 
 def test_a_defect_is_kept_for_the_report(tracker, stages):
     class Broken(Tracker):
-        def follow(self, cloud, last=None, how=Following(), seen=None):  # noqa: B008
+        def follow(self, cloud, last=None, how=Following(), seen=None, others=()):  # noqa: B008
             if cloud.stamp_ns == clouds[1].stamp_ns:
                 raise ZeroDivisionError("a defect")
             return super().follow(cloud, last, how, seen)
@@ -320,7 +320,7 @@ def test_stale_frames_are_refused(tracker, stages, clock):
 
 def test_an_answer_that_comes_too_late_is_none_and_yet_a_start(tracker, stages, clock):
     class Slow(Tracker):
-        def follow(self, cloud, last=None, how=Following(), seen=None):  # noqa: B008
+        def follow(self, cloud, last=None, how=Following(), seen=None, others=()):  # noqa: B008
             helped.append(last is not None)
             clock.sleep(21 if len(helped) == 1 else 0)
             return super().follow(cloud, last, how, seen)
@@ -342,9 +342,10 @@ def test_an_answer_that_comes_too_late_is_none_and_yet_a_start(tracker, stages, 
 
 def test_only_an_organ_found_good_a_moment_ago_may_have_been_turned_over(tracker, stages):
     class Watched(Tracker):
-        def follow(self, cloud, last=None, how=Following(), seen=None):  # noqa: B008
+        def follow(self, cloud, last=None, how=Following(), seen=None, others=()):  # noqa: B008
             asked.append(how.either_side)
-            return replace(super().follow(cloud, last, how, seen), quality=verdicts.pop(0))
+            found = super().follow(cloud, last, how, seen, others)
+            return replace(found, quality=verdicts.pop(0))
 
     asked, verdicts = [], ["poor", "good", "poor", "poor", "poor", "poor"]
     follower = Follower(Watched(tracker.model), FollowerConfig())
@@ -382,7 +383,7 @@ def test_a_pick_moves_along_and_is_forgotten_when_lost(tracker, stages, clock):
         clock.sleep(3.1)
 
     reader = SourceWorker(lambda: Script([*clouds, few[0], later, few[1]]))
-    loop.run(reader, [], lambda _: places.append((loop._place_mm, controls.picked_mm)))
+    loop.run(reader, [], lambda _: places.append((loop.views._place_mm, controls.picked_mm)))
     reader.close()
     assert np.linalg.norm(places[2][0] - places[0][0]) == pytest.approx(12, abs=0.5)
     assert places[2][1] is not None

@@ -249,3 +249,48 @@ def _wait_for(process, words, seconds=300):
             return
         assert process.poll() is None, line
     raise AssertionError(f"{words!r} was never said")
+
+
+def test_several_cameras_and_one_that_moves_are_tracked_from_recordings(world, tmp_path):
+    tape, poses = tmp_path / "tape", tmp_path / "poses.json"
+    source = f"recording:{tape}?rate=0"
+    first = tumortrack(
+        *("track", world.model, virtual(world, fps=10, camera_motion="false")),
+        *(f"recording:{tape}?format=files", "--seconds", 3, *PATIENT),
+        *("--report", tmp_path / "live.json"),
+    )
+    succeeded(first)
+    rows = np.eye(4).tolist()
+    poses.write_text(
+        json.dumps({"unit": "mm", "frame_id": "base", "fixed_from_camera": [rows, rows]})
+    )
+    two = tumortrack(
+        *("track", world.model, source, f"recording:{tmp_path / 'two'}?format=files"),
+        *("--views", f"{source}&fps=30", "--poses", poses, "--report", tmp_path / "two.json"),
+        *PATIENT,
+    )
+    assert "cameras 1, 2" in succeeded(two)
+    found = told(tmp_path / "two.json")
+    assert found["cameras"]["1"] == found["cameras"]["2"] >= 2
+    assert found["frame"]["frame_id"] == "base"
+    assert (tmp_path / "two" / "view_2" / "frames").is_dir()
+    lines = [json.loads(line) for line in (tape / "index.jsonl").read_text().splitlines()]
+    stamps = [line["stamp_ns"] for line in lines if line["seen"]]
+    table = "stamp_ns,frame_id,x_mm,y_mm,z_mm,qw,qx,qy,qz\n" + "".join(
+        f"{stamp},base,{n},0,0,0,1,0,0\n" for n, stamp in enumerate(stamps[:-1])
+    )
+    (tmp_path / "poses.csv").write_text(table)
+    moved = tumortrack(
+        *("track", world.model, source, f"recording:{tmp_path / 'moved'}?format=files"),
+        *("--moving", f"file:{tmp_path / 'poses.csv'}", "--report", tmp_path / "moved.json"),
+        *PATIENT,
+    )
+    succeeded(moved)
+    found = told(tmp_path / "moved.json")
+    assert found["frame"] == {"frame_id": "base", "published_from_camera": None}
+    assert sum(found["estimates"].values()) >= 2
+    assert any("last pose is older than the frame" in reason for reason in found["reasons"])
+    kept = (tmp_path / "moved" / "poses.csv").read_text().splitlines()
+    assert [line.split(",")[0] for line in kept[1:]] == [str(one) for one in stamps[:-1]]
+    alone = tumortrack("track", world.model, source, "--views", f"{source}&fps=30")
+    assert "--views needs --poses" in refusal(alone)

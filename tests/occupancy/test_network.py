@@ -14,7 +14,6 @@ from tumortrack.models.layers import greatest_above_zero
 from tumortrack.models.normalisation import (
     Aligned,
     CloudBox,
-    FixedScale,
     alignment,
     turned,
     without_strays,
@@ -417,7 +416,7 @@ def test_impossible_configurations_are_refused() -> None:
     with pytest.raises(InputError, match=r"1\.\.5"):
         MlpDecoderConfig(n_classes=4, width=8, hidden_layers=5, skip_layer=6)
     with pytest.raises(InputError, match="scale_mm"):
-        FixedScale(scale_mm=0.0, reach=1.0)
+        Aligned(scale_mm=0.0, reach=1.0)
     with pytest.raises(InputError, match="reach"):
         Aligned(scale_mm=50.0, reach=-1.0)
     data = to_builtins(quick_network(4, 60.0))

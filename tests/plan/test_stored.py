@@ -17,6 +17,7 @@ from plan_objects import RADIUS_MM, TUMOR_MM, located, sphere
 from tumortrack.core import store
 from tumortrack.core.config import to_builtins
 from tumortrack.core.errors import ArtifactError, NoPlan
+from tumortrack.live.values import PublishedFrame
 from tumortrack.plan.arms import procedure
 from tumortrack.plan.arms.cell import ArmCell, PlanningGroup
 from tumortrack.plan.arms.config import CellConfig
@@ -36,7 +37,7 @@ def content():
     motions = plan_motions(plan(), ArmCell(CONFIG, organ()), organ())
     meshes = {"kidney": organ(), "tumor_1": sphere(TUMOR_MM, RADIUS_MM)}
     return PlanFolder(
-        plan(), ResectionConfig(), np.eye(4), "base", meshes, to_builtins(CONFIG), motions,
+        plan(), ResectionConfig(), PublishedFrame("base"), meshes, to_builtins(CONFIG), motions,
         "c" * 64, "f" * 64, "e" * 64,
     )  # fmt: skip
 

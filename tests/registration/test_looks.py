@@ -14,6 +14,8 @@ from tumortrack.core import store
 from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.geometry import rigid, transform_points
 from tumortrack.core.types import DepthFrame, Look, SensorCloud
+from tumortrack.live.scan import Scan
+from tumortrack.live.values import CameraView, Observation
 from tumortrack.models.config import GaussNewtonConfig
 from tumortrack.occupancy.locator import OccupancyLocator
 from tumortrack.registration import looks as module
@@ -25,7 +27,7 @@ from tumortrack.sense.camera import d405
 from tumortrack.sense.files import depth_png, intrinsics_json, read_poses
 from tumortrack.sense.render import render_depth
 from tumortrack.tracking.advice import CHECK_POSES
-from tumortrack.tracking.tracker import Tracker
+from tumortrack.tracking.tracker import Follower, FollowerConfig, Tracker
 from tumortrack.training.model import load_model
 from warp_objects import ANATOMY, PLACE_MM, nudged, placed, shape
 
@@ -77,7 +79,7 @@ def tracker(slim_model, monkeypatch):
         for degrees in (0, 50, -50, 60)
     ]
     monkeypatch.setattr(Registration, "propose", lambda self, points_mm: starts)
-    monkeypatch.setattr(Registration, "look_around", lambda *given: given[3])
+    monkeypatch.setattr(Registration, "look_around", lambda self, points_mm, likeliest, fit: fit)
     trained = {**model.provenance, "validation_far": 0.0}
     return Tracker(replace(model, shape=one_way, provenance=trained))
 
@@ -302,3 +304,70 @@ def test_the_command_takes_several_views(slim_model, tmp_path):
     middle = truth.carry(ORGAN.vertices_mm).mean(0)  # which way round it lies nobody can tell
     assert np.linalg.norm(report["parts"]["kidney"]["center_mm"] - middle) < 5
     assert "not of several" in report["margin"]["reason"]
+
+
+def test_an_organ_is_followed_by_several_cameras_and_by_one_that_goes_round(tracker):
+    """Where the last frame's camera stood elsewhere, the search starts where it put the organ."""
+    follower, second_ns = Follower(tracker, FollowerConfig(rescan_s=100.0)), 10**9
+    found = []
+    for n, degrees in enumerate(((0, 60), (0, 60), (50,), (-50, 0))):
+        lead = around(degrees[0])
+        views = [view(REST, around(one), np.linalg.inv(lead) @ around(one), n) for one in degrees]
+        before = around((0, 0, 0, 50)[n])
+        here = replace(views[0].cloud, stamp_ns=1 + n * second_ns // 10)
+        way = np.linalg.inv(lead) @ before
+        estimate = follower.locate(here, views[0].seen, views[1:], way)
+        found.append(transform_points(lead, estimate.motion.carry(INNER)))
+        assert ("follow" in estimate.report["timings"]) == (n > 0)
+        assert ("refine" in estimate.report["timings"]) == (n == 0)
+        box_mm = follower.last_box_mm(here.stamp_ns, lead)
+        assert np.allclose(box_mm.mean(0), found[-1].mean(0), atol=6)
+        assert len(estimate.report["looks"]["shift_mm"]) == 2 if len(degrees) == 2 else True
+    for other in found:
+        assert np.linalg.norm(other - REST.carry(INNER), axis=1).mean() < 1.0
+
+
+def test_a_scan_takes_three_looks_from_apart_and_says_what_each_added(tracker):
+    scan, told, second_ns = Scan(tracker), [], 10**9
+
+    def seen(degrees, stamp_s, truth=REST):
+        one = view(truth, around(degrees), seed=round(10 * stamp_s))
+        cloud = replace(one.cloud, stamp_ns=round(stamp_s * second_ns))
+        frame = replace(one.seen, stamp_ns=cloud.stamp_ns)
+        return CameraView(1, Observation(frame, 0), around(degrees)), cloud
+
+    def ask(*looks):
+        try:
+            return scan.look(*seen(*looks))
+        except NoEstimate as error:
+            told.append(str(error))
+        return None
+
+    assert ask(0, 1.0) is None
+    assert ask(20, 1.5) is None  # too near the first
+    assert ask(50, 2.0) is None
+    assert [text.split(";")[0] for text in told] == [
+        *("scan: 1 of 3 looks", "scan: 1 of 3 looks", "scan: 2 of 3 looks")
+    ]
+    assert ask(-50, 7.5) is None  # the first two are over 5 s old
+    assert "1 of 3" in told[-1]
+    assert ask(0, 8.0) is None
+    found = ask(50, 9.0)
+    assert found is not None
+    there = transform_points(around(50), found.motion.carry(INNER))
+    assert np.linalg.norm(there - REST.carry(INNER), axis=1).mean() < 1.0
+    stated = [f"{mm:.1f} mm" for mm in found.report["scan"]["center_std_mm"]]
+    assert f"standard deviation of {', then '.join(stated)}, with one to 3 looks" in scan.told
+    parts = found.report["parts"]  # of all looks
+    assert stated[-1] == f"{max(parts[n]['center_std_mm'] for n in parts if n != 'kidney'):.1f} mm"
+    follower = Follower(tracker, FollowerConfig(rescan_s=100.0))
+    follower.begin(found)  # the answer took long: the organ rests
+    cloud = seen(50, 12.0)[1]
+    assert "follow" in follower.locate(cloud).report["timings"]
+    turned = nudged(REST, [12.0, 0, 0], [0, 0, 0.3])
+    scan = Scan(tracker)
+    told.clear()
+    for degrees, stamp_s, truth in ((0, 1.0, REST), (50, 2.0, turned), (-50, 3.0, REST)):
+        assert ask(degrees, stamp_s, truth) is None
+    assert "scan, begun anew" in told[-1]
+    assert "the organ moved between the views" in told[-1]

@@ -301,10 +301,11 @@ def test_an_organ_that_was_turned_over_is_found_where_that_may_have_happened(unc
     points = seen[np.random.default_rng(9).permutation(len(seen))[:800]]
     over = Rotation.from_rotvec(np.pi * rest.long_axis).as_matrix()
     wrong = dataclasses.replace(truth, rotation=TURNED @ over)
-    method, target = Registration(None, rest, GaussNewtonConfig()), banana.tumors[0].vertices_mm
+    target, config = banana.tumors[0].vertices_mm, GaussNewtonConfig()
+    methods = [Registration(None, rest, config, either_side=side) for side in (False, True)]
     off_mm = [
         np.linalg.norm(fit.motion.carry(target) - truth.carry(target), axis=1).mean()
-        for fit in (method.best_fit(points, [wrong], 0.0, side) for side in (False, True))
+        for fit in (method.best_fit(points, [wrong], 0.0) for method in methods)
     ]
     assert off_mm[0] > 10 * off_mm[1]
     assert off_mm[1] < 1.5

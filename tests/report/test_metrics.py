@@ -20,7 +20,6 @@ from tumortrack.report.metrics import (
     surface_distances,
     surface_samples,
     triangle_distance,
-    weighted_percentile,
 )
 
 
@@ -172,13 +171,6 @@ def test_samples_carry_the_whole_area_evenly():
     size = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]),
                           axis=1) / 2  # fmt: skip
     np.testing.assert_allclose(area @ points, size @ corners.mean(1), rtol=1e-9, atol=1e-6)
-
-
-def test_weighted_percentile_counts_weight_not_samples():
-    values, weights = np.array([5.0, 1.0, 9.0]), np.array([90.0, 5.0, 5.0])
-    assert weighted_percentile(values, weights, 5.0) == 1.0
-    assert weighted_percentile(values, weights, 95.0) == 5.0
-    assert weighted_percentile(values, weights, 95.1) == 9.0
 
 
 def test_empty_surfaces_are_refused():

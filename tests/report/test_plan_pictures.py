@@ -24,7 +24,6 @@ from tumortrack.report.plan_pictures import (
     organ_surfaces,
     parted,
     plan_figure,
-    skin,
 )
 from tumortrack.report.renderer import Body, Viewpoint, corner_normals, render
 from tumortrack.simulate.occupancy import contains
@@ -125,9 +124,8 @@ def test_the_piece_and_the_rest_are_the_organ(located: Located) -> None:
 def test_the_same_plan_is_the_same_file(
     plan: ResectionPlan, located: Located, tmp_path: Path
 ) -> None:
-    bare = replace(located, meshes={})  # a cloud alone
     for name in ("one.png", "two.png"):
-        draw_plan(replace(plan, notes=("as it is",)), bare, tmp_path / name)
+        draw_plan(replace(plan, notes=("as it is",)), located, tmp_path / name)
     assert (tmp_path / "one.png").read_bytes() == (tmp_path / "two.png").read_bytes()
     assert Image.open(tmp_path / "one.png").size == (1200, 600)
     odd = replace(located, patient=Patient(r"$\frac$", "left"))  # no formula
@@ -138,27 +136,10 @@ def test_the_same_plan_is_the_same_file(
         draw_plan(replace(plan, label=3, tumor="tumor_2"), located, tmp_path / "none.png")
 
 
-@pytest.mark.parametrize("n", [400, 4000, 100_000])
-def test_the_skin_of_a_cloud_holds_its_volume(n: int) -> None:
-    rng = np.random.default_rng(1)
-    points = rng.normal(size=(n, 3))
-    points *= rng.uniform(size=(n, 1)) ** (1 / 3) / np.linalg.norm(points, axis=1, keepdims=True)
-    mesh = skin(CENTRE + RADII * points)
-    volume = 4 / 3 * np.pi * RADII.prod()
-    assert mesh.volume_mm3 == pytest.approx(volume, rel=0.25 if n < 1000 else 0.06)
-    assert trimesh.Trimesh(mesh.vertices_mm, mesh.faces).is_watertight
-    with pytest.raises(InputError, match="too few"):
-        skin(points[:4])
-
-
 def test_surfaces_are_by_label(located: Located) -> None:
     meshes = organ_surfaces(located)
     assert meshes[1] is located.meshes["kidney"]
     assert meshes[2] is located.meshes["tumor_1"]
-    from_cloud = organ_surfaces(replace(located, meshes={}))
-    assert from_cloud.keys() == meshes.keys()
-    for label, mesh in from_cloud.items():
-        assert mesh.volume_mm3 == pytest.approx(meshes[label].volume_mm3, rel=0.25)
 
 
 BLUE, RED = (0.16, 0.24, 0.86), (0.86, 0.2, 0.16)
@@ -288,9 +269,8 @@ def test_the_same_frames_are_the_same_film(
     workcells: list[Workcell], located: Located, tmp_path: Path
 ) -> None:
     halted = [replace(workcells[0], halted="no fresh estimate"), workcells[1]]
-    bare = replace(located, meshes={})
     for name in ("one.gif", "two.gif"):
-        film(halted, bare, tmp_path / name, size=(200, 160))
+        film(halted, located, tmp_path / name, size=(200, 160))
     assert (tmp_path / "one.gif").read_bytes() == (tmp_path / "two.gif").read_bytes()
     with Image.open(tmp_path / "one.gif") as gif:
         picture = np.asarray(gif.convert("RGB")).astype(int)

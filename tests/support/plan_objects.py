@@ -25,7 +25,7 @@ def organ_with(*tumors):
     return mesh_of(whole)
 
 
-def located(*tumors, n=40_000, seed=0, meshes=True, std_mm=None):
+def located(*tumors, n=40_000, seed=0, std_mm=None):
     """As an estimate in the table's frame: points evenly in the organ, labelled."""
     if not tumors:
         tumors = (sphere(TUMOR_MM, RADIUS_MM),)
@@ -43,8 +43,7 @@ def located(*tumors, n=40_000, seed=0, meshes=True, std_mm=None):
     deviations = {} if std_mm is None else {
         name: np.full(len(mesh.vertices_mm), std_mm) for name, mesh in named.items()
     }  # fmt: skip
-    surfaces = {"kidney": organ, **named} if meshes else {}
-    return Located(points[inside], labels[inside], surfaces, deviations)
+    return Located(points[inside], labels[inside], {"kidney": organ, **named}, deviations)
 
 
 class Deviating:

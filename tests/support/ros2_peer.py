@@ -2,6 +2,7 @@
 
 ros2_peer.py send image|cloud HZ SECONDS
 ros2_peer.py hear SECONDS
+ros2_peer.py tf HZ SECONDS
 """
 
 from __future__ import annotations
@@ -9,19 +10,26 @@ from __future__ import annotations
 import json
 import sys
 import time
+from unittest import mock
 
 import numpy as np
+from cyclonedds.qos import Policy
+from scipy.spatial.transform import Rotation
 
 from live_objects import empty_update, small_frame, small_setting
+from tumortrack.core.geometry import rigid
 from tumortrack.core.types import DepthFrame, SensorCloud
+from tumortrack.live.ros.bus import Publisher
 from tumortrack.live.ros.dds import DdsBus
 from tumortrack.live.ros.messages import stamp_of
 from tumortrack.live.ros.results import DIAGNOSTICS, MARKERS, ResultMessages
 from tumortrack.live.ros.ros2 import open_bus
 from tumortrack.live.ros.sensors import CLOUD, messages_seen, plain_cloud
+from tumortrack.live.ros.tf import TRANSFORMS
 from tumortrack.live.values import Observation
 
 N_POINTS = 40_000
+TOOL_FROM_CAMERA = rigid(np.diag([-1.0, -1, 1]), np.array([0.01, 0.02, 0.06]))  # m
 
 
 def points_mm() -> np.ndarray:
@@ -61,6 +69,47 @@ def send(kind: str, hz: float, seconds: float) -> None:
     bus.close()
 
 
+def tool_pose(stamp_ns: int) -> np.ndarray:
+    """base_link from a tool that shifts and turns at a constant rate, m."""
+    seconds = (stamp_ns % 10**11) * 1e-9
+    turn = Rotation.from_rotvec([0, 0.3 * seconds, 0]).as_matrix()
+    return rigid(turn, np.array([0.02 * seconds, 0.5, 0.1]))
+
+
+def transforms(hz: float, seconds: float) -> None:
+    """The camera on the tool, said once and kept; then the tool."""
+    bus = open_bus("dds")
+    endpoint, kept = bus._endpoint, Policy.Durability.TransientLocal
+
+    def keeping(topic: str, kind: str, reliability: object, _: object, most: int) -> object:
+        return endpoint(topic, kind, reliability, kept, most)
+
+    with mock.patch.object(bus, "_endpoint", keeping):
+        static = bus.publisher("/tf_static", TRANSFORMS)
+    moving, end_s = bus.publisher("/tf", TRANSFORMS), time.monotonic() + seconds
+
+    def send(publisher: Publisher, stamp_ns: int, parent: str, child: str, way: np.ndarray) -> None:
+        x, y, z, w = Rotation.from_matrix(way[:3, :3]).as_quat().tolist()
+        one = {
+            "header": bus.messages.header(stamp_ns, parent),
+            "child_frame_id": child,
+            "transform": {
+                "translation": dict(zip("xyz", way[:3, 3].tolist(), strict=True)),
+                "rotation": {"x": x, "y": y, "z": z, "w": w},
+            },
+        }
+        message = bus.messages.make(TRANSFORMS, transforms=[one])
+        publisher.publish(bus.messages.to_bytes(message))
+
+    send(static, 1, "tool0", "optical", TOOL_FROM_CAMERA)
+    print(json.dumps({"static": True}), flush=True)
+    while time.monotonic() < end_s:
+        now_ns = time.time_ns()
+        send(moving, now_ns, "base_link", "tool0", tool_pose(now_ns))
+        time.sleep(1 / hz)
+    bus.close()
+
+
 def hear(seconds: float) -> None:
     """Writes a line as soon as it listens, and one for every message."""
     bus = open_bus("dds")
@@ -83,7 +132,6 @@ def hear(seconds: float) -> None:
 
 def reliably(bus: DdsBus) -> object:
     """A second reader of the cloud, whose writer has to wait for its acknowledgements."""
-    from cyclonedds.qos import Policy
     from cyclonedds.sub import DataReader
 
     reliable, volatile = Policy.Reliability.Reliable(0), Policy.Durability.Volatile
@@ -107,5 +155,7 @@ def told(message: object, kind: str) -> dict:
 if __name__ == "__main__":
     if sys.argv[1] == "send":
         send(sys.argv[2], float(sys.argv[3]), float(sys.argv[4]))
+    elif sys.argv[1] == "tf":
+        transforms(float(sys.argv[2]), float(sys.argv[3]))
     else:
         hear(float(sys.argv[2]))

@@ -94,11 +94,6 @@ class Plan(StatedPatient):
         doubts = notes_of_doubt(run.doubt, self.accept_poor)
         frames = self._frame(run, cell_config.stand_mm)
         located = run.located(frames.published_from_camera)
-        organ = located.meshes.get("kidney")
-        if self.arms and organ is None:
-            raise NoPlan(
-                "the run has no kidney.ply, so arms can't keep clear of it; give --no-arms."
-            )
         budget_of = partial(self._budget, located=located, frames=frames, cell=cell_config)
         resection, config, budget = plan_within(
             located, config, budget_of, self.confidence is not None
@@ -109,11 +104,11 @@ class Plan(StatedPatient):
         resection = heeded(resection, budget, self.accept_budget)
         _say_plan(resection)
         motions, cell_used, cell_source = None, None, INVENTED
-        if self.arms and organ is not None:
+        if self.arms:
             from tumortrack.plan.arms.procedure import search_bases
             from tumortrack.plan.arms.trajectory import first_hit
 
-            start = time.perf_counter()
+            start, organ = time.perf_counter(), located.meshes["kidney"]
             placed, motions, moved = search_bases(resection, _below(organ, cell_config), organ)
             if hit := first_hit(motions, placed.config, organ):
                 raise NoPlan(f"the arms can't carry this out: {hit}. Place the organ otherwise.")
@@ -127,11 +122,10 @@ class Plan(StatedPatient):
                 say(f"note: {moved}")
         model = store.read_json(self.run_folder / "report.json").get("model")
         content = PlanFolder(
-            resection, config, frames.published_from_camera, frames.frame_id, located.meshes,
-            cell_used, motions,
+            resection, config, frames, located.meshes, cell_used, motions,
             str(model.get("case_sha256") or "") if isinstance(model, dict) else "",
             store.sha256_of(self.frame) if self.frame else INVENTED, cell_source, run.patient,
-            budget, frames.camera_frame_id, frames.table_in_camera,
+            budget,
         )  # fmt: skip
 
         def pictures(aside: Path) -> None:
@@ -195,7 +189,7 @@ class Plan(StatedPatient):
         from tumortrack.plan.located import table_under
 
         if self.frame is None:
-            return PublishedFrame("table", table_under(run.cloud, run.meshes, stand_mm))
+            return PublishedFrame("table", table_under(run.meshes, stand_mm))
         frames = read_frames(self.frame)
         if frames.published_from_camera[2, 2] >= 0:  # cuts are planned from above
             raise InputError(

@@ -160,7 +160,7 @@ class Resect(StatedPatient):
                 stored.frame_source != INVENTED
             ),
             "a plan made with --frame FILE that has camera_frame_id, as this source has": (
-                live is None or stored.camera_frame_id or live.kind not in ("ros1", "ros2")
+                live is None or stored.frames.camera_frame_id or live.kind not in ("ros1", "ros2")
             ),
             "a plan made with --cell FILE that gives both bases, and keeps to them": (
                 stored.cell_source != INVENTED
@@ -219,11 +219,13 @@ class Resect(StatedPatient):
         assert self.live is not None
         model, source = self.live
 
+        way = stored.frames.published_from_camera
+
         def locate(result: TrackingResult, unsure: bool = False) -> Located:
             estimate = result.estimate
             assert estimate is not None
             motion = estimate.motion if unsure else None
-            return located(estimate.cloud, estimate.meshes, motion, stored.table_from_camera)
+            return located(estimate.cloud, estimate.meshes, motion, way)
 
         again = msgspec.structs.replace(stored.config, tumor=stored.plan.tumor)
         # In a process of its own: planning for a second must not hold up a frame.
@@ -306,7 +308,7 @@ class Resect(StatedPatient):
         content = {
             "patient": to_builtins(stored.patient),
             "plan": {"tumor": stored.plan.tumor, "method": stored.plan.method},
-            "frame": stored.frame_id,
+            "frame": frames.frame_id,
             "resection": operation.summary(),
             "sinks": {sink.name: sink.summary() for sink in sinks},
         }

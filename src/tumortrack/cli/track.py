@@ -20,9 +20,10 @@ from tumortrack.core import store
 from tumortrack.core.errors import InputError, StorageError
 
 if TYPE_CHECKING:
+    from tumortrack.live.cameras import Cameras, CameraSetup
     from tumortrack.live.loop import Loop, LoopConfig
     from tumortrack.live.values import PublishedFrame, SourceConfig, TrackingResult
-    from tumortrack.live.workers import SinkWorker, SourceWorker
+    from tumortrack.live.workers import SinkWorker
     from tumortrack.models.model import Model
     from tumortrack.plan.operation import Operation
 
@@ -63,6 +64,14 @@ class Track(StatedPatient):
         box: keep what lies in a box: two opposite corners X Y Z X Y Z, camera frame, mm.
         whole: what is in range and box is the organ alone; do not look for it among other things.
         frame: JSON file that says where the camera is; results are then in the robot's frame.
+        views: further cameras that stand still; what all see at about one moment is laid together.
+        poses: JSON that says where all cameras stand, as for `locate`, SOURCE's first; results are
+            in its frame, unless --frame gives another.
+        moving: SOURCE's camera moves; where it is in each frame comes from file:POSES.csv, tf
+            (ros2:FIXED_FRAME, ros1:FIXED_FRAME) or a robot (ur:HOST). Where that gives poses of a
+            tool, --frame has tool_from_camera.
+        scan: with --moving: begin with three looks at the organ at rest, from 30 degrees apart,
+            within 5 s; what they show together is what the following starts from.
         intrinsics: JSON with the camera's width, height, fx, fy, cx, cy in pixels, instead of what
             the source says.
         smoothing: time constant in s of a mean over past estimates; the lag is in the report.
@@ -84,6 +93,10 @@ class Track(StatedPatient):
     box: tuple[float, float, float, float, float, float] | None = None
     whole: bool = False
     frame: Path | None = None
+    views: tuple[str, ...] = ()
+    poses: Path | None = None
+    moving: str = ""
+    scan: bool = False
     intrinsics: Path | None = None
     smoothing: float = 0.0
     rescan: float = 1.0
@@ -99,30 +112,31 @@ class Track(StatedPatient):
         """Until the source ends, the time is up, the arms have ended, or Ctrl-C."""
         from tumortrack import api
         from tumortrack.core.config import to_builtins
-        from tumortrack.live.calibration_file import read_frames
-        from tumortrack.live.spec import SOURCES
-        from tumortrack.live.values import Controls, PublishedFrame, SinkContext
+        from tumortrack.live.cameras import Cameras, CameraSetup
+        from tumortrack.live.values import Controls, SinkContext
+        from tumortrack.live.workers import SourceWorker
         from tumortrack.models.folder import patient_of, read_model_manifest
 
-        source_config = SOURCES.parse(self.source) if arms is None else arms.source
-        named = api.named_sinks(self.sinks)
-        frames = read_frames(self.frame) if self.frame else PublishedFrame()
+        setup = self._cameras()
         if arms is not None:
-            frames = arms.frames
+            setup = CameraSetup(arms.frames, {self.source: arms.source})
+        frames, named = setup.published, api.named_sinks(self.sinks)
         manifest = read_model_manifest(self.model)  # what is wrong, before PyTorch's seconds
         patient = patient_of(manifest, self.model)
         patient.check_is(self.stated, str(self.model))
-        source_config.patient().check_shown(patient, self.source)
+        for text, source_config in setup.sources.items():
+            source_config.patient().check_shown(patient, text)
         report = report_path(self.report, "track")
 
         from tumortrack.live.loop import Loop
-        from tumortrack.live.workers import SourceWorker
         from tumortrack.tracking.tracker import Tracker
 
         if arms is None:
             keep_loaded()
         model = api.load_model(self.model, self.device)
         tracker = Tracker(model)
+        if setup.still and tracker.anatomy_ct is None:
+            raise InputError("--views needs a model that knows a motion: preset clinic.")
         config = self._loop_config(model)
         tip_mm = None if arms is None else arms.tip_mm
         context = SinkContext(
@@ -132,6 +146,7 @@ class Track(StatedPatient):
             Controls(),
             arms is not None,
             model.patient,
+            setup.still,
             tip_mm,
         )
         companion = None if arms is None else arms.companion
@@ -152,22 +167,50 @@ class Track(StatedPatient):
             "source": self.source,
             "sinks": list(self.sinks),
             "config": to_builtins(config),
-            "frame": {"frame_id": frames.frame_id, "published_from_camera": way.tolist()},
+            "frame": {
+                "frame_id": frames.frame_id,
+                "published_from_camera": None if frames.moves else way.tolist(),
+            },
+            "views": list(self.views),
+            "moving": self.moving,
+            "published_from_cameras": [place.tolist() for place in setup.still],
             **({} if arms is None else arms.about),
         }
+
+        def begin() -> Cameras:
+            workers = [SourceWorker(source.open) for source in setup.sources.values()]
+            return Cameras(workers, setup.poses or setup.still or (way,), config.stale_s)
+
         with (
             stopping(stop),
             ExitStack() as ending,
             api.open_sinks(named, context) as sinks,
-            closing(SourceWorker(source_config.open)) as source,
+            closing(begin()) as cameras,
         ):
             say_opened(sinks)
             ur = arms is not None and arms.ur
-            screen = _Screen(loop, source, sinks, report, about, companion, ur)
+            screen = _Screen(loop, cameras, sinks, report, about, companion, ur)
             ending.callback(screen.end)  # once all workers have flushed
-            say(f"{model.patient}: tracking {self.source} in frame {frames.frame_id!r}; "
-                "Ctrl-C ends it.")  # fmt: skip
-            loop.run(source, sinks, screen.show)
+            say(f"{model.patient}: tracking {', '.join(setup.sources)} in frame "
+                f"{frames.frame_id!r}; Ctrl-C ends it.")  # fmt: skip
+            loop.run(cameras, sinks, screen.show)
+
+    def _cameras(self) -> CameraSetup:
+        from tumortrack.live.cameras import camera_setup
+
+        wrong = {
+            "--box lies before one camera that stands still": self.box
+            and (self.views or self.moving),
+            "--intrinsics is of one camera; with --views each says its own": (
+                self.intrinsics and self.views
+            ),
+            "--scan is of one camera that moves (--moving); several look all the time": (
+                self.scan and not self.moving
+            ),
+        }
+        if found := [what for what, there in wrong.items() if there]:
+            raise InputError(f"{found[0]}. Leave it out.")
+        return camera_setup((self.source, *self.views), self.poses, self.moving, self.frame)
 
     def _loop_config(self, model: Model) -> LoopConfig:
         from tumortrack.live.loop import LoopConfig
@@ -182,6 +225,7 @@ class Track(StatedPatient):
             intrinsics=None if self.intrinsics is None else read_intrinsics(self.intrinsics),
             stale_s=self.stale,
             frozen_s=self.frozen,
+            scan=self.scan,
             give_up_s=self.give_up,
             seconds=self.seconds,
         )
@@ -249,7 +293,7 @@ class _Screen:
     """One line of state now and then, every change of quality, and the report."""
 
     loop: Loop
-    source: SourceWorker
+    source: Cameras
     sinks: list[SinkWorker]
     report: Path
     about: dict[str, Any]
@@ -276,9 +320,9 @@ class _Screen:
         if kind != self._state and now - self._changed >= _SAY_S:
             self._state, self._changed = kind, now
             say(state)
-        for note in self.loop.frames.notes[self._notes :]:
+        for note in self.loop.views.frames.notes[self._notes :]:
             say(f"note: {note}.")
-        self._notes = len(self.loop.frames.notes)
+        self._notes = len(self.loop.views.frames.notes)
         say_failures(self.sinks, self._errors)
         if now - self._shown >= (_SAY_S if console.is_terminal else _SAY_PLAIN_S):
             self._line(now)
@@ -330,7 +374,7 @@ class _Screen:
         self._memory_mb["now"] = now_mb = round(_resident_mb(), 1)
         if self._stored - self._started > _SETTLED_S:
             self._memory_mb.setdefault("settled", now_mb)
-        frames, watch = self.loop.frames, self.loop.frames.watch
+        frames, watch = self.loop.views.frames, self.loop.views.frames.watch
         content = {
             **self.about,
             "seconds": round(self._stored - self._started, 2),

@@ -27,6 +27,8 @@ DIRECTIONS_LPS: dict[str, Direction] = {
     "inferior": (0.0, 0.0, -1.0),
 }
 
+HERE = np.eye(4)  # two frames are one
+HERE.flags.writeable = False
 _NOT_RIGID = 1e-3  # largest deviation of a rotation from orthonormal: files have few digits
 _FARTHEST_MM = 1e6
 

@@ -161,8 +161,14 @@ def _find_organ(solid: np.ndarray, dense: np.ndarray, lps_from_index: np.ndarray
     principal spread above 0.28). The largest such piece is the kidney; a deeper cut replaces it
     only where that frees it of a sheet. Attached sheets thinner than 6 mm are removed.
     """
+    from skimage.measure import block_reduce
+
     factors = np.maximum(1, np.rint(_STEP_MM / spacing_mm(lps_from_index)).astype(int))
-    filled, bright = (_block_mean(mask, factors) >= 0.5 for mask in (solid, dense))
+    # Blocks at the ends are padded with False.
+    single, blocks = {"dtype": np.float32}, tuple(factors.tolist())
+    filled, bright = (
+        block_reduce(mask, blocks, np.mean, func_kwargs=single) >= 0.5 for mask in (solid, dense)
+    )
     grid = _Grid(filled, bright, lps_from_index @ np.diag([*factors, 1.0]))
     region = _search(grid) if grid.solid.any() else None
     if region is None:
@@ -173,16 +179,6 @@ def _find_organ(solid: np.ndarray, dense: np.ndarray, lps_from_index: np.ndarray
             "the label map with --labels."
         )
     return _refine(region, grid.solid & ~region, solid, factors)
-
-
-def _block_mean(mask: np.ndarray, factors: np.ndarray) -> np.ndarray:
-    """Mean over blocks of ``factors`` voxels; the ends are padded with False."""
-    f = factors.tolist()
-    out = np.pad(mask, [(0, -n % k) for n, k in zip(mask.shape, f, strict=True)])
-    for axis in (2, 1, 0):
-        shape = (*out.shape[:axis], out.shape[axis] // f[axis], f[axis], *out.shape[axis + 1 :])
-        out = out.reshape(shape).mean(axis + 1, dtype=np.float32)
-    return out.astype(float)
 
 
 def _search(grid: _Grid) -> np.ndarray | None:

@@ -1,4 +1,5 @@
-"""Where results are published: the camera's frame, or a robot's by a calibration file."""
+"""Where results are published: the camera's frame, or a robot's by a calibration file; and where
+the cameras are."""
 
 from __future__ import annotations
 
@@ -16,7 +17,9 @@ from tumortrack.live.values import PublishedFrame
 _LARGEST_MM, _LARGEST_DEG = 100.0, 10.0  # with more, it is no calibration
 _NOT_UNIT = 1e-3  # of a normal's length: files have few digits
 
-_MATRICES = ("camera_from_robot", "robot_from_camera", "camera_from_marker", "robot_from_marker")
+_TOOL = "tool_from_camera"
+_CAMERA = "camera_from_robot", "robot_from_camera"
+_MATRICES = *_CAMERA, "camera_from_marker", "robot_from_marker", _TOOL
 
 Rows = tuple[tuple[float, float, float, float], ...]
 
@@ -24,7 +27,8 @@ Rows = tuple[tuple[float, float, float, float], ...]
 class CalibrationFile(Config, frozen=True, kw_only=True):
     """A file that says where the camera is, in one of three ways, each by 4 x 4 rows:
     ``camera_from_robot`` or ``robot_from_camera``, of a hand-eye calibration, or
-    ``camera_from_marker`` with ``robot_from_marker``: a marker that both know. ``unit``: of the
+    ``camera_from_marker`` with ``robot_from_marker``: a marker that both know. Of a camera that a
+    robot moves ``tool_from_camera``, its place on the tool. ``unit``: of the
     translations, and of a plane's offset. ``frame_id``: the robot's frame, as ROS calls it;
     ``camera_frame_id``: the camera's optical frame, as the source's messages call it;
     ``table_in_camera``: the table's plane in the camera's frame, unit normal (3) and offset.
@@ -37,6 +41,7 @@ class CalibrationFile(Config, frozen=True, kw_only=True):
     robot_from_camera: Rows | None = None
     camera_from_marker: Rows | None = None
     robot_from_marker: Rows | None = None
+    tool_from_camera: Rows | None = None
     camera_frame_id: str = ""
     table_in_camera: tuple[float, float, float, float] | None = None
     error_mm: float | None = None
@@ -51,18 +56,23 @@ class CalibrationFile(Config, frozen=True, kw_only=True):
             raise InputError(f"error_deg is {self.error_deg:g}; allowed: 0 to {_LARGEST_DEG:g}.")
 
 
-def read_frames(path: Path) -> PublishedFrame:
-    """The robot's frame of a calibration file (JSON; keys as in ``CalibrationFile``). Raises
-    InputError if it is missing, or has an unknown key, a matrix that is no rigid transform, or not
-    exactly one of the three ways."""
+def read_frames(path: Path, moves: bool = False) -> PublishedFrame:
+    """The robot's frame of a calibration file (JSON; keys as in ``CalibrationFile``). ``moves``: of
+    a camera on a tool, which it is placed by. Raises InputError if it is missing, or has an unknown
+    key, a matrix that is no rigid transform, or not exactly one of the ways."""
     file = from_builtins(read_json(path), CalibrationFile, str(path))
     matrices = {
         name: read_rigid(rows, file.unit, f"{path}: {name}")
         for name in _MATRICES
         if (rows := getattr(file, name)) is not None
     }
+    if moves != (_TOOL in matrices):
+        raise InputError(
+            f"{path}: {_TOOL} is of a camera that a robot moves; it goes with `track --moving` "
+            "alone, and nothing else does."
+        )
     match list(matrices.items()):
-        case [("robot_from_camera", robot_from_camera)]:
+        case [("robot_from_camera" | "tool_from_camera", robot_from_camera)]:
             pass
         case [("camera_from_robot", camera_from_robot)]:
             robot_from_camera = np.linalg.inv(camera_from_robot)
@@ -85,5 +95,7 @@ def read_frames(path: Path) -> PublishedFrame:
         unit = float(np.linalg.norm(table[:3]))  # but for the file's few digits
         x, y, z, offset = (number / unit for number in table)
         table = x, y, z, offset * (1000 if file.unit == "m" else 1)
+    if moves and table is not None:
+        raise InputError(f"{path}: table_in_camera is of a camera that stands still.")
     error = file.error_mm, file.error_deg
-    return PublishedFrame(file.frame_id, robot_from_camera, True, camera, table, *error)
+    return PublishedFrame(file.frame_id, robot_from_camera, True, camera, table, *error, moves)

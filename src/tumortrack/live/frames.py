@@ -25,7 +25,8 @@ _SLIDING = (
 
 class FrameCheck:
     """Of one run. ``notes``: what nobody can check, said once each, as it turns out. The table is
-    watched only where places depend on where the camera stands: in the frame of a calibration.
+    watched only where places depend on where the camera stands: in the frame of a calibration, and
+    not where it is meant to move.
 
     A sensor's noise never repeats bit for bit: an image that does is an old one, whatever its
     stamp says. A camera that is replaced, zoomed or set to another mode in between may stand
@@ -38,7 +39,8 @@ class FrameCheck:
         self._since_ns = self._last_ns = 0  # an image may have come since; the last frame
         self._camera: Intrinsics | None = None
         self._first: Observation | None = None
-        self.watch = TableWatch(config, published.table_in_camera) if published.calibrated else None
+        watched = published.calibrated and not published.moves
+        self.watch = TableWatch(config, published.table_in_camera) if watched else None
         self.notes: list[str] = []
         if published.calibrated and not published.camera_frame_id:
             self.notes.append(UNNAMED)

@@ -11,28 +11,28 @@ import math
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float64
 
 from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError, NoEstimate, TumortrackError
 from tumortrack.core.estimate import Estimate, Quality
-from tumortrack.core.types import DepthFrame, Intrinsics, SensorCloud
+from tumortrack.core.types import DepthFrame, Intrinsics
 from tumortrack.live import values as live
-from tumortrack.live.frames import FrameCheck
+from tumortrack.live.cameras import Cameras
 from tumortrack.live.meter import RunStatistics
+from tumortrack.live.scan import Scan
 from tumortrack.live.stamps import check_age
-from tumortrack.live.values import Observation, SourceLost, TrackingResult
+from tumortrack.live.values import CameraView, Observation, SourceLost, TrackingResult
+from tumortrack.live.views import Found, ViewsLocator, camera_words, timed
 from tumortrack.live.workers import SinkWorker, SourceWorker
 from tumortrack.sense.camera import d405
 from tumortrack.sense.region import Hints, RegionConfig, organ_points
 from tumortrack.tracking.tracker import Follower, FollowerConfig, Tracker
 
-_PICK_S = 3.0  # without the organ: a pick is forgotten
 _QUIET = 0.8  # of stale_s: silence is said while what is shown still holds
 SURE_AFTER = 3  # good estimates in a row after doubt: single frames of something else may pass
 
@@ -41,7 +41,8 @@ class LoopConfig(Config, frozen=True, kw_only=True):
     """``stale_s``: no frame for so long, or one that old, gives 'no estimate'. ``give_up_s``: the
     loop ends where no frame came for so long. ``intrinsics``: of depth images, instead of what the
     source says. ``frozen_s``: an image that repeats bit for bit for so long is an old one; 0: it
-    may repeat. ``seconds``: the loop ends so long after the first frame; 0: never."""
+    may repeat. ``seconds``: the loop ends so long after the first frame; 0: never. ``scan``: the
+    first estimate is from several looks."""
 
     region: RegionConfig = RegionConfig()
     follower: FollowerConfig = FollowerConfig()
@@ -50,6 +51,7 @@ class LoopConfig(Config, frozen=True, kw_only=True):
     give_up_s: float = 60.0
     seconds: float = 0.0
     frozen_s: float = 0.25
+    scan: bool = False
 
     def __post_init__(self) -> None:
         if not 0 < self.stale_s < self.give_up_s:
@@ -80,12 +82,13 @@ class Loop:
     ) -> None:
         self._config, self._context, self._arms = config, context, arms
         self._follower = Follower(tracker, config.follower)
-        self.frames = FrameCheck(context.published_frame, config.region, config.frozen_s)
+        seed = config.follower.seed
+        self.views = ViewsLocator(self._follower, context, config.region, config.frozen_s, seed)
+        if config.scan:
+            self.views.scan = Scan(tracker)
         self._stop = threading.Event()
         self._sequence = itertools.count()
-        self._picked: Float64[np.ndarray, " 3"] | None = None  # by the user
-        self._place_mm: Float64[np.ndarray, " 3"] | None = None  # where that is by now
-        self._found_s = time.monotonic()
+        self._cameras: Cameras
         self._in_a_row = SURE_AFTER  # good estimates since the last doubt
         self._says: Intrinsics | None = None  # the source, where others are given
         self._stamp: tuple[int, int] | None = None  # of the last frame, and when that was here
@@ -108,14 +111,17 @@ class Loop:
 
     def run(
         self,
-        source_worker: SourceWorker,
+        source: SourceWorker | Cameras,
         sink_workers: list[SinkWorker],
         on_result: Callable[[TrackingResult], None],
     ) -> None:
         """``on_result`` is called with every result, after the sink_workers have it. SourceLost: no
-        frame came for ``give_up_s``. Whatever keeps the source from ever working is raised too."""
+        frame came for ``give_up_s``. Whatever keeps a source from ever working is raised too."""
+        if not isinstance(source, Cameras):
+            source = Cameras([source], [self._context.published_frame.published_from_camera])
+        self._cameras = source
         try:
-            for result in self._results(source_worker):
+            for result in self._results(source):
                 on_result(self._publish(result, sink_workers))
                 if self._arms is not None and self._arms.ended:
                     return
@@ -124,7 +130,7 @@ class Loop:
                 self._arms.abort("tracking has ended")
                 self._publish(self._without_frame("tracking has ended"), sink_workers)
 
-    def _results(self, source_worker: SourceWorker) -> Iterator[TrackingResult]:
+    def _results(self, source_worker: Cameras) -> Iterator[TrackingResult]:
         fresh_s = time.monotonic()
         quiet_s = _QUIET * self._config.stale_s
         ends_s, told_s = math.inf, fresh_s  # by when what is shown came to be
@@ -164,6 +170,9 @@ class Loop:
         organ, estimate, reason, warning = None, None, "", ""
         quality: Quality = "none"
         timely = False
+        views: list[CameraView] = []
+        absent: dict[int, str] = {}  # cameras that say nothing now, and why
+        found: list[Found] = []
         try:
             # What is simulated has this computer's clock, and so has the moment of arrival.
             other_clock = born_ns == seen.stamp_ns and seen.truth is None
@@ -172,18 +181,16 @@ class Loop:
             if self._stamp is not None and seen.stamp_ns <= self._stamp[0]:  # set back: see workers
                 self.statistics.clock_jumps += 1
                 self._follower.forget()
-            with _timed(seconds, "frame"):
-                doubt = self.frames.check(seen)
-            with _timed(seconds, "organ"):
-                rng = np.random.default_rng((self._config.follower.seed, seen.stamp_ns))
-                hints = self._hints(seen)
-                organ = organ_points(seen.content, self._config.region, hints, rng).cloud
-            self.frames.check_new(seen.content)  # that it shows nothing would be said before
-            with _timed(seconds, "locate"):
-                estimate = self._follower.locate(organ, seen.content)
+            with timed(seconds, "frame"):
+                views, absent = self._cameras.views(seen)
+            found, doubt = self.views.find(views, absent, seconds)
+            organ = found[0][1]
+            with timed(seconds, "locate"):
+                estimate = self.views.locate(found)
             seconds |= {f"locate.{k}": v for k, v in estimate.report["timings"].items()}
+            if len(self._cameras.workers) > 1:
+                estimate.report["cameras"] = [view.number for view, _ in found]
             quality, warning = self._confirmed(estimate, doubt)
-            self._follow_pick(organ)
             if hurry and _age_s(born_ns) > self._config.stale_s:
                 raise _TooLate(f"the answer came too late: {_age_s(born_ns):.2f} s after the frame")
         except Exception as error:
@@ -196,6 +203,8 @@ class Loop:
                 self.statistics.add_defect(error)
                 reason = f"internal error, {type(error).__name__}: {error}"
         self._stamp = (seen.stamp_ns, time.monotonic_ns())
+        several, published = len(self._cameras.workers) > 1, self._context.published_frame
+        lead = found[0][0] if found else next(iter(views), None)
         return TrackingResult(
             next(self._sequence),
             seen.stamp_ns,
@@ -203,11 +212,13 @@ class Loop:
             reason,
             quality,
             warning,
-            seen,
+            lead.seen if lead is not None else None if published.moves else seen,
             organ,
-            self._context.published_frame,
+            published if lead is None else published.of_camera(lead.published_from_camera),
             seconds,
             latency_ms=1000 * _age_s(born_ns),
+            views=tuple(views) if several else (),
+            cameras=camera_words([view.number for view, _ in found], absent) if several else "",
         )
 
     def _confirmed(self, estimate: Estimate, doubt: str) -> tuple[Quality, str]:
@@ -249,28 +260,6 @@ class Loop:
             )
         return replace(seen, content=DepthFrame(content.depth_mm, given, content.stamp_ns))
 
-    def _hints(self, seen: Observation) -> Hints:
-        controls = self._context.controls
-        if controls.picked_mm is not self._picked:  # the user chose again
-            self._picked = self._place_mm = controls.picked_mm
-            self._found_s = time.monotonic()
-            self._follower.forget()
-        elif self._picked is not None and time.monotonic() - self._found_s > _PICK_S:
-            controls.picked_mm = None  # it is not there any more, nor where it was seen last
-            self._picked = self._place_mm = None
-        last_box_mm = self._follower.last_box_mm(seen.stamp_ns)
-        # Once the organ is found its box is the better guide: pieces may cover the place.
-        place_mm = self._place_mm if last_box_mm is None else None
-        return Hints(mask=seen.mask, picked_mm=place_mm, last_box_mm=last_box_mm)
-
-    def _follow_pick(self, organ: SensorCloud) -> None:
-        """The organ was found: what the user picked moves along with it."""
-        self._found_s = time.monotonic()
-        if self._picked is not None:
-            points_mm = organ.points_mm.astype(np.float64)
-            off_mm = np.linalg.norm(points_mm - np.median(points_mm, axis=0), axis=1)
-            self._place_mm = points_mm[int(off_mm.argmin())]
-
     def _publish(self, result: TrackingResult, sink_workers: list[SinkWorker]) -> TrackingResult:
         if self._arms is not None:
             result = self._act(self._arms, result)
@@ -290,28 +279,18 @@ class Loop:
             return result
 
 
-@contextmanager
-def _timed(seconds: dict[str, float], name: str) -> Iterator[None]:
-    """Notes how long a ``with`` block took, also where it raises."""
-    start = time.perf_counter()
-    try:
-        yield
-    finally:
-        seconds[name] = time.perf_counter() - start
-
-
 def _age_s(born_ns: int) -> float:
     return (time.time_ns() - born_ns) * 1e-9
 
 
 def summary(
-    loop: Loop, source_worker: SourceWorker, sink_workers: list[SinkWorker]
+    loop: Loop, source: SourceWorker | Cameras, sink_workers: list[SinkWorker]
 ) -> dict[str, Any]:
     """The report of a run (JSON types): counts, latencies and stage times in ms."""
     return loop.statistics.summary() | {
-        "dropped": source_worker.dropped,
-        "opened": source_worker.opened,
-        "latency_from": source_worker.latency_from,
+        "dropped": source.dropped,
+        "opened": source.opened,
+        "latency_from": source.latency_from,
         "sinks": {worker.name: worker.summary() for worker in sink_workers},
-        "defects": [*loop.statistics.defects, *source_worker.defects],
+        "defects": [*loop.statistics.defects, *source.defects],
     }

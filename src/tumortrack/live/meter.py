@@ -77,6 +77,7 @@ class RunStatistics:
         self.errors: dict[str, Histogram] = {}  # mm, of a source that knows the truth
         self.counts: Counter[str] = Counter()  # by quality
         self.reasons: Counter[str] = Counter()
+        self.cameras: Counter[str] = Counter()  # of several: estimates that each took part in
         self.clock_jumps = 0  # how often the source's clock was set back
         self.defects: list[str] = []
 
@@ -91,6 +92,7 @@ class RunStatistics:
             self.stages.setdefault(name, Histogram()).add(1000 * stage_s)
         if result.estimate is None:
             return
+        self.cameras.update(map(str, result.estimate.report.get("cameras", ())))
         if result.latency_ms is not None:
             self.latency.add(result.latency_ms)
         if result.observation is None or (truth := result.observation.truth) is None:
@@ -112,6 +114,7 @@ class RunStatistics:
             "estimates": {"good": self.counts["good"], "poor": self.counts["poor"]},
             "no_estimate": self.counts["none"],
             "reasons": dict(self.reasons.most_common()),
+            **({"cameras": dict(sorted(self.cameras.items()))} if self.cameras else {}),
             "clock_jumps": self.clock_jumps,
             "latency_ms": self.latency.summary(),
             "stages_ms": {name: times.summary() for name, times in self.stages.items()},

@@ -17,6 +17,7 @@ import msgspec
 
 from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError
+from tumortrack.live.poses import PosesConfig
 from tumortrack.live.values import SinkConfig, SourceConfig
 
 C = TypeVar("C", bound=Config)
@@ -118,6 +119,19 @@ SINKS = Registry[SinkConfig](
         "ros1": f"{_LIVE}.sinks.ros:Ros1SinkConfig",
         "openigtlink": f"{_LIVE}.sinks.openigtlink:OpenIgtLinkSinkConfig",
         "ur": f"{_LIVE}.sinks.ur:UrSinkConfig",
+    },
+)
+
+
+POSES = Registry[PosesConfig](
+    "camera's pose",
+    "tumortrack.poses",
+    PosesConfig,
+    {
+        "file": f"{_LIVE}.poses:PosesFileConfig",
+        "ros2": f"{_LIVE}.ros.tf:Ros2PosesConfig",
+        "ros1": f"{_LIVE}.ros.tf:Ros1PosesConfig",
+        "ur": f"{_LIVE}.robot:UrPosesConfig",
     },
 )
 

@@ -11,7 +11,7 @@ import math
 import threading
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import ClassVar, Protocol, runtime_checkable
 
@@ -92,7 +92,8 @@ class PublishedFrame:
     """Where results are published. Of a calibration also (``calibrated``), as far as its file
     says it: ``camera_frame_id``, what sources call the camera's frame; ``table_in_camera``: unit
     normal and offset (mm) of the table's plane, ``normal @ point = offset``, when it was made;
-    ``error_mm`` and ``error_deg``: bounds of its error, at the camera and of its direction."""
+    ``error_mm`` and ``error_deg``: bounds of its error, at the camera and of its direction.
+    ``moves``: the camera is meant to; then each result has where it was."""
 
     frame_id: str = "camera"
     published_from_camera: Float64[np.ndarray, "4 4"] = field(default_factory=lambda: np.eye(4))
@@ -101,11 +102,27 @@ class PublishedFrame:
     table_in_camera: tuple[float, float, float, float] | None = None
     error_mm: float | None = None
     error_deg: float = 0.0
+    moves: bool = False
+
+    def of_camera(self, published_from_camera: Float64[np.ndarray, "4 4"]) -> PublishedFrame:
+        """The same frame, for a camera that stands there."""
+        if np.array_equal(published_from_camera, self.published_from_camera):
+            return self
+        return replace(self, published_from_camera=published_from_camera, table_in_camera=None)
 
     def error_at(self, distance_mm: float) -> float | None:
         """The calibration's error so far from the camera, mm; None: it states none."""
         turned_mm = distance_mm * math.radians(self.error_deg)
         return None if self.error_mm is None else self.error_mm + turned_mm
+
+
+@dataclass(frozen=True, eq=False)
+class CameraView:
+    """What one of the cameras saw, and where it was then. ``number``: the camera's, from 1."""
+
+    number: int
+    seen: Observation
+    published_from_camera: Float64[np.ndarray, "4 4"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,13 +203,16 @@ class TrackingResult:
         estimate: camera frame, mm; None where nothing can be said. Never an older one.
         reason: why there is no estimate; empty with one.
         quality: ``poor``: it should not be relied on, and ``warning`` says why.
-        observation: what the source saw; None if no frame came.
+        observation: what the source saw, of several cameras the one in whose frame the estimate
+            is; None if no frame came, or where the camera was is unknown.
         organ: its points that belong to the organ; camera frame.
         seconds: duration of each stage.
         latency_ms: until the result was handed to the sinks, from the stamp (if the source does
             not have this machine's clock: from the arrival; if it waits for the loop: from the
             reading); None if no frame came.
         workcell: what the arms do with it; None without arms.
+        views: of several cameras: what each saw. ``cameras``: which of them the estimate is from,
+            and of the others why not, in words; empty for one camera.
     """
 
     sequence: int
@@ -207,6 +227,8 @@ class TrackingResult:
     seconds: Mapping[str, float] = field(default_factory=dict)
     latency_ms: float | None = None
     workcell: Workcell | None = None
+    views: tuple[CameraView, ...] = ()
+    cameras: str = ""
 
     @cached_property
     def transformed(self) -> TransformedEstimate | None:
@@ -233,10 +255,11 @@ class TrackingResult:
         """How good the estimate is, in words for people, or why there is none."""
         if self.estimate is None:
             return f"no estimate: {self.reason}"
+        by = self.cameras and f"; {self.cameras}"
         if self.quality == "good":
             margins = margin_words(self.estimate.report.get("margin"))
-            return f"{NO_CHECK_FAILED}; {UNVERIFIED}; {margins}"
-        return f"{self.quality} estimate: {self.warning}"
+            return f"{NO_CHECK_FAILED}; {UNVERIFIED}; {margins}{by}"
+        return f"{self.quality} estimate: {self.warning}{by}"
 
 
 @runtime_checkable
@@ -260,7 +283,7 @@ class ArmsController(Protocol):
 
 @dataclass(eq=False)
 class Controls:
-    """What the user asks of the running loop; from any thread. ``picked_mm``: this point (camera
+    """What the user asks of the running loop; from any thread. ``picked_mm``: this point (published
     frame) lies on the organ: track the piece that it is on. ``aborted``: the arms stop for good."""
 
     picked_mm: Float64[np.ndarray, " 3"] | None = None
@@ -272,8 +295,8 @@ class SinkContext:
     """What a sink knows when it is opened. ``parts``: the model's, the organ first. ``anatomy_ct``:
     the organ in the CT (LPS, mm), if the model has it: estimates then have a motion, and their
     meshes its triangles. ``arms``: results may have a workcell. ``patient``: whose organ the model
-    is of. ``tip_mm``: where the tool's tip of an arm (cutter, holder) is, by the arm's six joints;
-    published frame."""
+    is of. ``cameras``: where several stand still, published frame. ``tip_mm``: where the tool's tip
+    of an arm (cutter, holder) is, by the arm's six joints; published frame."""
 
     parts: tuple[str, ...]
     published_frame: PublishedFrame
@@ -281,6 +304,7 @@ class SinkContext:
     controls: Controls = field(default_factory=Controls)
     arms: bool = False
     patient: Patient = NOBODY
+    cameras: tuple[Float64[np.ndarray, "4 4"], ...] = ()
     tip_mm: Callable[[str, Float64[np.ndarray, " 6"]], Float64[np.ndarray, " 3"]] | None = None
 
 

@@ -7,7 +7,7 @@ from typing import Literal
 from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError
 from tumortrack.models.encoders import EncoderConfig
-from tumortrack.models.normalisation import Aligned, CloudBox, FixedScale
+from tumortrack.models.normalisation import Aligned, CloudBox
 from tumortrack.simulate.scene import SceneConfig
 
 _WIDEST = 4096  # of a layer: far beyond use, and a layer's weights still have room
@@ -55,7 +55,7 @@ class NetworkConfig(Config, frozen=True):
 
     encoder: EncoderConfig
     decoder: MlpDecoderConfig | RegistrationHeadConfig
-    normalisation: CloudBox | FixedScale | Aligned
+    normalisation: CloudBox | Aligned
 
 
 class GaussNewtonConfig(Config, frozen=True):

@@ -16,10 +16,13 @@ class CloudBox(Config, frozen=True, tag="cloud-box"):
     """Centre and half the longest side of the observed cloud's bounding box (the follow-up's)."""
 
 
-class FixedScale(Config, frozen=True, tag="fixed"):
+class Aligned(Config, frozen=True, tag="aligned"):
     """Scale: a constant, so that size is not lost. Centre: the mean of the points that lie
     within ``reach`` scales of it; the others are strays, and nothing sees them. The mean and not
-    the box's centre: one stray point moves it by 1 / N of its distance, the box by half."""
+    the box's centre: one stray point moves it by 1 / N of its distance, the box by half. Turned
+    about the camera's axis until the cloud's longest direction across it is x, its heavier tail at
+    +x: turning the organ or the camera about that axis then changes nothing, and most of what
+    varies between ``limited`` poses need not be learnt."""
 
     scale_mm: float
     reach: float
@@ -30,14 +33,8 @@ class FixedScale(Config, frozen=True, tag="fixed"):
                 raise InputError(f"{name} must be positive, not {getattr(self, name)}.")
 
 
-class Aligned(FixedScale, frozen=True, tag="aligned"):
-    """As ``FixedScale``, and turned about the camera's axis until the cloud's longest direction
-    across it is x, its heavier tail at +x. Turning the organ or the camera about that axis then
-    changes nothing: most of what varies between ``limited`` poses need not be learnt."""
-
-
 def normalised(
-    points_mm: Tensor, kind: CloudBox | FixedScale
+    points_mm: Tensor, kind: CloudBox | Aligned
 ) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
     """Clouds (B, N, 3), camera frame, mm, in a network's frame; their centre (B, 1, 3) and scale
     (B, 1, 1), mm, and cosine and sine (2, B, 1) of their turn about z, if they are turned."""
@@ -51,7 +48,7 @@ def normalised(
     return turned(points, turn), centre_mm, scale_mm, turn
 
 
-def normalisation(points_mm: Tensor, kind: CloudBox | FixedScale) -> tuple[Tensor, Tensor]:
+def normalisation(points_mm: Tensor, kind: CloudBox | Aligned) -> tuple[Tensor, Tensor]:
     """Centre (B, 1, 3) and scale (B, 1, 1), both mm, of clouds (B, N, 3)."""
     if not isinstance(kind, CloudBox):
         centre_mm = points_mm.mean(dim=1, keepdim=True)

@@ -44,11 +44,7 @@ class OccupancyLocator:
         """See ``tracking.tracker.Tracker.locate``. The two passes of queries are those of the
         follow-up (LUDO): 10,000 coarse ones where the organ can be, then labels of 40,000 points
         in the enlarged box of those inside."""
-        if others:
-            raise InputError(
-                "several looks need a model that knows a motion: preset clinic; quick and paper "
-                "take one cloud."
-            )
+        _check_one(others)
         frame = _Frame(self, cloud, seed, np.random.default_rng(seed))
         lattice = frame.lattice(frame.coarse_box())
         distances_mm = frame.checked(lattice)
@@ -58,13 +54,16 @@ class OccupancyLocator:
             margins, labels = sparse_margins(frame.logits_at, camera_from_index, shape)
         return frame.estimate(distances_mm, inside, margins, labels, camera_from_index)
 
-    def follow(self, cloud: SensorCloud, last: Estimate | None, how: Following) -> Estimate:
+    def follow(
+        self, cloud: SensorCloud, last: Estimate | None, how: Following, others: Sequence[Look] = ()
+    ) -> Estimate:
         """See ``tracking.tracker.Tracker.follow``. The enlarged box of the last organ replaces the
         coarse queries, and its lattice is queried only where the organ is (``organ_lattice``).
         Where this frame's organ reaches the box's border, without a last estimate, or with
         ``thorough``, the organ is searched for as in a first frame, and the lattice queried
         everywhere. The surfaces' grid is twice as fine as the lattice, and queried only about
         surfaces."""
+        _check_one(others)
         rng = np.random.default_rng((how.seed, cloud.stamp_ns))
         frame = _Frame(self, cloud, how.seed, rng)
         lattice = None
@@ -93,6 +92,14 @@ class OccupancyLocator:
         ball = np.linalg.norm(np.indices((16, 16, 16)).T - 7.5, axis=-1) < 5
         margins = np.where(ball, 1, -1).astype(np.float16)[None]
         volume.part_surfaces(margins, ball.astype(np.uint8), np.eye(4), ("kidney",))
+
+
+def _check_one(others: Sequence[Look]) -> None:
+    if others:
+        raise InputError(
+            "several looks need a model that knows a motion: preset clinic; quick and paper take "
+            "one cloud."
+        )
 
 
 def steps_over(box: volume.Box) -> int:

@@ -13,6 +13,7 @@ from scipy import ndimage
 from tumortrack.core.errors import NoEstimate
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import FIRST_TUMOR, ORGAN, OUTSIDE, Mesh, OccupancyCloud
+from tumortrack.imaging.grid import grown_box, tight_box
 from tumortrack.occupancy.kernels import between
 from tumortrack.simulate.occupancy import surface_distance
 
@@ -122,23 +123,15 @@ def drop_islands(
 
 
 def _largest_piece(mask: Mask) -> Mask:
-    box = _box_of(mask)
+    if not mask.any():
+        return mask
+    box = tight_box(mask)
     pieces, count = ndimage.label(mask[box])
     if count < 2:
         return mask
     largest = np.zeros_like(mask)
     largest[box] = pieces == 1 + int(np.argmax(np.bincount(pieces.ravel())[1:]))
     return largest
-
-
-def _box_of(mask: Mask, margin: int = 0) -> tuple[slice, ...]:
-    """Where a mask is true, and ``margin`` voxels more on each side."""
-    box = []
-    for others in ((1, 2), (0, 2), (0, 1)):
-        found = np.flatnonzero(mask.any(axis=others))
-        first, last = (int(found[0]), int(found[-1]) + 1) if len(found) else (0, 0)
-        box.append(slice(max(first - margin, 0), last + margin))
-    return tuple(box)
 
 
 def part_surfaces(
@@ -153,7 +146,7 @@ def part_surfaces(
         if not mask.any():
             continue
         # One voxel more on each side: the surface lies between voxels of either sign.
-        box = _box_of(mask, 1)
+        box = grown_box(tight_box(mask), mask.shape, np.ones(3, int))
         field = np.where(mask[box], margins[n][box], -np.abs(margins[n][box])).astype(np.float32)
         field = np.where(field > 0, 1, -1) * np.maximum(np.abs(field), _SMALLEST_MARGIN)
         # Padding closes what the grid's edge cuts.

@@ -38,13 +38,8 @@ class TumorParameters(Config, frozen=True):
     """Largest deviation from a ball, as a share of the radius."""
 
     def __post_init__(self) -> None:
-        if not (2 <= self.diameter_mm <= 120 and 0 <= self.lobulation <= 0.2):
-            raise InputError(
-                f"tumor of {self.diameter_mm} mm with lobulation {self.lobulation}: allowed are "
-                "2 to 120 mm and 0 to 0.2."
-            )
-        if not all(abs(coordinate) <= 200 for coordinate in self.center_mm):
-            raise InputError(f"tumor at {self.center_mm} mm: allowed are -200 to 200 mm.")
+        self.check_between("tumor:", diameter_mm=(2, 120), lobulation=(0, 0.2))
+        self.check_between("tumor:", center_mm=(-200, 200))
 
 
 class PhantomParameters(Config, frozen=True):
@@ -69,15 +64,8 @@ class PhantomParameters(Config, frozen=True):
     center_lps_mm: tuple[float, float, float] = (-62.0, 38.0, -45.0)
 
     def __post_init__(self) -> None:
-        if not all(20 <= length <= 250 for length in self.size_mm):
-            raise InputError(f"phantom size {self.size_mm} mm: allowed are 20 to 250 mm.")
-        shape = (self.bend_mm, self.hilum_depth_mm, self.lump_mm, 100 * self.taper)
-        bounds = (25, 25, 2, 30)
-        if not all(0 <= value <= bound for value, bound in zip(shape, bounds, strict=True)):
-            raise InputError(
-                f"phantom shape (bend, hilum depth, lumps in mm, taper in %) {shape}: allowed "
-                f"are 0 to {bounds}."
-            )
+        self.check_between("phantom:", size_mm=(20, 250), bend_mm=(0, 25), taper=(0, 0.3))
+        self.check_between("phantom:", hilum_depth_mm=(0, 25), lump_mm=(0, 2))
         for one, other in itertools.combinations(self.tumors, 2):
             if gap_mm(one, other) < SMALLEST_GAP_MM:
                 raise InputError(

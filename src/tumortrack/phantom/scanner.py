@@ -53,19 +53,18 @@ class ScannerParameters(Config, frozen=True):
     """Between the label map's box and the block, on the patient's right."""
 
     def __post_init__(self) -> None:
-        for name in ("organ_hu", "tumor_hu", "table_hu", "block_hu"):
-            if not AIR_HU <= getattr(self, name) <= 3000:
-                raise InputError(f"{name} = {getattr(self, name)}: allowed are -1000 to 3000.")
-        if not all(0.2 <= length <= 10 for length in self.spacing_mm):
-            raise InputError(f"scan spacing {self.spacing_mm} mm: allowed are 0.2 to 10 mm.")
-        if not all(0 <= length <= 200 for length in self.block_size_mm):
-            raise InputError(f"block_size_mm = {self.block_size_mm}: allowed are 0 to 200 mm.")
-        if not all(-180 <= angle <= 180 for angle in self.tilt_deg):
-            raise InputError(f"tilt_deg = {self.tilt_deg}: allowed are -180 to 180 degrees.")
-        lengths = ("margin_mm", "table_thickness_mm", "table_gap_mm", "block_gap_mm")
-        for name in (*lengths, "psf_sigma_mm", "noise_hu", "noise_correlation_voxels"):
-            if not 0 <= getattr(self, name) <= 200:
-                raise InputError(f"{name} = {getattr(self, name)}: allowed are 0 to 200.")
+        hu, extent = (AIR_HU, 3000), (0, 200)
+        self.check_between("scan:", organ_hu=hu, tumor_hu=hu, table_hu=hu, block_hu=hu)
+        self.check_between("scan:", spacing_mm=(0.2, 10), tilt_deg=(-180, 180), noise_hu=extent)
+        lengths = (
+            "margin_mm",
+            "table_thickness_mm",
+            "table_gap_mm",
+            "block_gap_mm",
+            "psf_sigma_mm",
+        )
+        others = ("block_size_mm", "psf_sigma_mm", "noise_correlation_voxels")
+        self.check_between("scan:", **dict.fromkeys((*lengths, *others), extent))
 
 
 def scan(labels: LabelVolume, parameters: ScannerParameters, seed: int) -> Volume:

@@ -237,9 +237,8 @@ def kept_mm(layers: tuple[CutLayer, ...], points_mm: Float[np.ndarray, "n 3"]) -
 
 
 def tumor_points(plan: ResectionPlan, located: Located) -> Float64[np.ndarray, "n 3"]:
-    """On the tumor's surface, or in it where there is no mesh; table frame, mm."""
-    mesh = located.meshes.get(plan.tumor)
-    return np.asarray(located.of(plan.label) if mesh is None else mesh.spread_mm(), float)
+    """On the tumor's surface; table frame, mm."""
+    return located.meshes[plan.tumor].spread_mm()
 
 
 def _remedy(plan: ResectionPlan, budget: ErrorBudget) -> str:

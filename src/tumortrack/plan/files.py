@@ -13,7 +13,6 @@ from typing import Any
 
 import msgspec
 import numpy as np
-from jaxtyping import Float64
 
 from tumortrack.core import store
 from tumortrack.core.config import from_builtins, to_builtins
@@ -42,13 +41,12 @@ class PlanFolder:
     as JSON; motions and cell are None where no arms were planned. ``case_sha256``: of the case that
     the organ was located by; empty where unknown. ``frame_source``, ``cell_source``: the sha256 of
     the user's file that gave the frame, and the places of the arms; or ``INVENTED``. ``patient``:
-    whose organ, as far as it is known. ``budget``: None in plans of older versions.
-    ``camera_frame_id``, ``table_in_camera``: as ``PublishedFrame`` has them."""
+    whose organ, as far as it is known. ``budget``: None in plans of older versions. ``frames``:
+    where a live run publishes that carries the plan out."""
 
     plan: ResectionPlan
     config: ResectionConfig
-    table_from_camera: Float64[np.ndarray, "4 4"]
-    frame_id: str
+    frames: PublishedFrame
     meshes: dict[str, Mesh]
     cell: dict[str, Any] | None = None
     motions: Motions | None = None
@@ -57,19 +55,6 @@ class PlanFolder:
     cell_source: str = INVENTED
     patient: Patient = NOBODY
     budget: ErrorBudget | None = None
-    camera_frame_id: str = ""
-    table_in_camera: tuple[float, float, float, float] | None = None
-
-    @property
-    def frames(self) -> PublishedFrame:
-        """Where a live run publishes that carries the plan out."""
-        return PublishedFrame(
-            self.frame_id,
-            self.table_from_camera,
-            self.frame_source != INVENTED,
-            self.camera_frame_id,
-            self.table_in_camera,
-        )
 
 
 def write_plan(
@@ -87,21 +72,21 @@ def write_plan(
         NoPlan: motions that would be refused when read.
         StorageError: the disk refused.
     """
-    plan, motions = content.plan, content.motions
+    plan, motions, frames = content.plan, content.motions, content.frames
     if motions is not None:
         cell = from_builtins(content.cell, CellConfig, "cell")
         for fault in _faults(motions, cell, plan.sweeps):
             raise NoPlan(f"the arms can't carry this out: {fault}.")
     data = {
-        "frame_id": content.frame_id,
-        "table_from_camera": content.table_from_camera.tolist(),
+        "frame_id": frames.frame_id,
+        "table_from_camera": frames.published_from_camera.tolist(),
         "config": to_builtins(content.config),
         "case_sha256": content.case_sha256,
         "patient": to_builtins(content.patient),
         "frame_source": content.frame_source,
         "cell_source": content.cell_source,
-        "camera_frame_id": content.camera_frame_id,
-        "table_in_camera": content.table_in_camera,
+        "camera_frame_id": frames.camera_frame_id,
+        "table_in_camera": frames.table_in_camera,
         "plan": as_builtins(plan),
         "budget": content.budget and to_builtins(content.budget),
         "cell": content.cell,
@@ -115,7 +100,7 @@ def write_plan(
         if motions is not None:
             _write_motions(aside / _MOTIONS, motions)
         more(aside)
-        store.seal(aside, KIND, {"inputs": inputs}, frame=content.frame_id)
+        store.seal(aside, KIND, {"inputs": inputs}, frame=frames.frame_id)
 
 
 def as_located(content: PlanFolder) -> Located:
@@ -143,23 +128,26 @@ def read_plan(folder: Path) -> PlanFolder:
             for fault in _faults(motions, cell, plan.sweeps):
                 raise ArtifactError(f"{path} can't be carried out: {fault}. Plan again.")
         budget, where = data.get("budget"), str(folder / _NAME)
+        frame_source = str(data.get("frame_source", INVENTED))
+        frames = PublishedFrame(
+            str(data["frame_id"]),
+            np.array(data["table_from_camera"], float),
+            frame_source != INVENTED,
+            str(data.get("camera_frame_id", "")),
+            msgspec.convert(data.get("table_in_camera"), tuple[float, float, float, float] | None),
+        )
         return PlanFolder(
             plan=plan,
             config=from_builtins(data["config"], ResectionConfig, where),
-            table_from_camera=np.array(data["table_from_camera"], float),
-            frame_id=str(data["frame_id"]),
+            frames=frames,
             meshes=meshes,
             cell=data["cell"],
             motions=motions,
             case_sha256=str(data["case_sha256"] or ""),
-            frame_source=str(data.get("frame_source", INVENTED)),
+            frame_source=frame_source,
             cell_source=str(data.get("cell_source", INVENTED)),
             patient=patient_in(data.get("patient"), where),
             budget=None if budget is None else from_builtins(budget, ErrorBudget, where),
-            camera_frame_id=str(data.get("camera_frame_id", "")),
-            table_in_camera=msgspec.convert(
-                data.get("table_in_camera"), tuple[float, float, float, float] | None
-            ),
         )
     except ArtifactError:
         raise
@@ -169,36 +157,16 @@ def read_plan(folder: Path) -> PlanFolder:
 
 def as_builtins(plan: ResectionPlan) -> dict[str, Any]:
     """The plan as JSON holds it; an infinite height is null."""
-    return {
-        "method": plan.method,
-        "tumor": plan.tumor,
-        "label": plan.label,
-        "grasp_mm": plan.grasp_mm.tolist(),
-        "approach": [0.0, 0.0, -1.0],
-        "margin_mm": plan.margin_mm,
-        "exophytic": plan.exophytic,
-        "volumes_ml": plan.volumes_ml,
-        "stamp_ns": plan.stamp_ns,
-        "notes": list(plan.notes),
-        "cuts": [
-            {
-                "sweep": cut.sweep,
-                "kind": cut.kind,
-                "closed": cut.closed,
-                "length_mm": round(cut.length_mm, 1),
-                "path_mm": cut.path_mm.round(4).tolist(),
-            }
-            for cut in plan.cuts
-        ],
-        "layers": [
-            {
-                "bottom_mm": layer.bottom_mm,
-                "top_mm": layer.top_mm if np.isfinite(layer.top_mm) else None,
-                "rings_mm": [ring.round(4).tolist() for ring in layer.rings_mm],
-            }
-            for layer in plan.layers
-        ],
-    }
+
+    def plain(array: np.ndarray | np.floating[Any]) -> Any:
+        return (array.round(4) if array.ndim == 2 else array).tolist()  # of lines: 0.1 micrometres
+
+    data: dict[str, Any] = msgspec.to_builtins(plan, enc_hook=plain)
+    for cut, its in zip(plan.cuts, data["cuts"], strict=True):
+        its |= {"closed": cut.closed, "length_mm": round(cut.length_mm, 1)}
+    for layer in data["layers"]:
+        layer["top_mm"] = layer["top_mm"] if np.isfinite(layer["top_mm"]) else None
+    return {**data, "approach": [0.0, 0.0, -1.0]}
 
 
 def from_plain(data: dict[str, Any]) -> ResectionPlan:

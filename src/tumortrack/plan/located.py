@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float, Float64
 from scipy.spatial import cKDTree
 
-from tumortrack.core.errors import ArtifactError, InputError
+from tumortrack.core.errors import ArtifactError, InputError, NoPlan
 from tumortrack.core.estimate import Motion
 from tumortrack.core.geometry import rigid, transform_points
 from tumortrack.core.mesh_files import read_mesh
@@ -26,24 +26,18 @@ STAND_MM = 120.0  # the organ's lowest point over the table, where it is not kno
 POOR_ESTIMATE = "PLANNED ON A POOR ESTIMATE"
 
 
-def table_below(points_mm: Float[np.ndarray, "n 3"], stand_mm: float) -> Float64[np.ndarray, "4 4"]:
-    """``table_from_camera`` of a camera that looks straight down on the organ (camera frame), whose
-    lowest point stands ``stand_mm`` over the table.
+def table_under(meshes: Mapping[str, Mesh], stand_mm: float) -> Float64[np.ndarray, "4 4"]:
+    """``table_from_camera`` of a camera that looks straight down on the organ (its surface in the
+    camera's frame), whose lowest point stands ``stand_mm`` over the table.
 
     x goes to the right in the picture, y to its top, z towards the camera; the origin lies on the
-    table below the organ's middle.
+    table below the organ's middle. NoPlan: there is no organ.
     """
-    low, high = points_mm.min(0), points_mm.max(0)
+    if "kidney" not in meshes:
+        raise NoPlan("no organ was located, so nothing can be planned. Locate it first.")
+    low, high = meshes["kidney"].box_mm
     x, y, _ = (low + high) / 2
     return rigid(np.diag([1.0, -1.0, -1.0]), np.array([-x, y, high[2] + stand_mm]))
-
-
-def table_under(
-    cloud: OccupancyCloud, meshes: Mapping[str, Mesh], stand_mm: float
-) -> Float64[np.ndarray, "4 4"]:
-    """``table_below`` the organ's surface or, without one, its points."""
-    kidney = meshes.get("kidney")
-    return table_below(cloud.points_mm if kidney is None else kidney.vertices_mm, stand_mm)
 
 
 def located(
@@ -133,7 +127,7 @@ def read_run(folder: Path) -> LocatedRun:
     meshes = {name: read_mesh(folder / f"{name}.ply") for name in sorted(surfaces - {path.stem})}
     found = [name_of(label) for label in np.unique(cloud.labels) if label]
     lacking = [name for name in found if name not in meshes]
-    if meshes and lacking:
+    if lacking:
         raise ArtifactError(
             f"{folder} has points of {', '.join(lacking)} and no {lacking[0]}.ply; locate again."
         )

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import shapely
-from jaxtyping import Float, Float64, Int
+from jaxtyping import Float, Float64
 from numpy.linalg import norm
 from scipy.ndimage import binary_closing, minimum_filter
 from skimage.measure import find_contours
@@ -19,6 +19,7 @@ from skimage.measure import find_contours
 from tumortrack.core.compiled import numba
 from tumortrack.core.errors import NoPlan
 from tumortrack.core.geometry import spread_over
+from tumortrack.core.types import Mesh
 from tumortrack.plan.outline import arcs, evenly_round, first_in_cell, polygon_of, rings_of
 from tumortrack.plan.values import (
     Cut,
@@ -55,7 +56,7 @@ def margin_plan(located: Located, label: int, config: ResectionConfig) -> Method
     Raises:
         NoPlan: the margin with its uncertainty is wider than allowed; there is nothing to cut.
     """
-    columns, tumor = Columns.of(located), located.of(label)
+    columns, tumor = Columns.of(located.meshes["kidney"]), located.of(label)
     layers = _layers(_grown_tumor(located, label, config), columns, config.layer_mm)
     slabs = list(zip(layers, (*layers[1:], None), strict=True))
     cuts: list[Cut] = []
@@ -72,13 +73,12 @@ def margin_plan(located: Located, label: int, config: ResectionConfig) -> Method
 
 
 def _grown_tumor(located: Located, label: int, config: ResectionConfig) -> _Grown:
-    """Of the tumor's surface, or of points in it where there is no mesh."""
+    """Of the tumor's surface."""
     name = name_of(label)
-    mesh = located.meshes.get(name)
-    points = np.asarray(located.of(label) if mesh is None else mesh.vertices_mm, float)
-    margins = np.full(len(points), config.margin_mm)
+    mesh = located.meshes[name]
+    margins = np.full(len(mesh.vertices_mm), config.margin_mm)
     if config.sigmas > 0:
-        if mesh is None or name not in located.std_mm:
+        if name not in located.std_mm:
             raise NoPlan(
                 "the estimate does not say how unsure it is, so its uncertainty can't be added to "
                 "the margin. Use a model of preset clinic, or sigmas 0."
@@ -90,14 +90,11 @@ def _grown_tumor(located: Located, label: int, config: ResectionConfig) -> _Grow
             f"{config.most_margin_mm:g} mm. Look from nearer, or uncover more of the organ."
         )
     size_mm = min(_THIN_MM, _THIN_SHARE * float(margins.min()))
-    if mesh is not None:
-        edge_mm = np.sqrt(6 * _GAP_MM * margins.min())
-        spread = spread_over(np.column_stack([points, margins]), mesh.faces, float(edge_mm))
-        points, margins = spread[:, :3], spread[:, 3]
-    widest_first = np.argsort(-margins, kind="stable")
-    points, margins = points[widest_first], margins[widest_first]  # of each cube, this one stays
-    keep = first_in_cell(np.floor(points / size_mm).astype(np.int64))
-    return points[keep], margins[keep]
+    edge_mm = float(np.sqrt(6 * _GAP_MM * margins.min()))
+    spread = spread_over(np.column_stack([mesh.vertices_mm, margins]), mesh.faces, edge_mm)
+    spread = spread[np.argsort(-spread[:, 3], kind="stable")]  # of each cube, the widest stays
+    keep = first_in_cell(np.floor(spread[:, :3] / size_mm).astype(np.int64))
+    return spread[keep, :3], spread[keep, 3]
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,14 +107,15 @@ class Columns:
     highest_mm: Float64[np.ndarray, "i j"]
 
     @classmethod
-    def of(cls, located: Located) -> Columns:
-        """From the organ's surface, or from all points, where there is no surface."""
-        mesh = located.meshes.get("kidney")
-        points = located.points_mm if mesh is None else mesh.spread_mm(_EDGE_MM)
-        points = np.asarray(points, float)
+    def of(cls, organ: Mesh) -> Columns:
+        """From the organ's surface."""
+        points = organ.spread_mm(_EDGE_MM)
         low = points[:, :2].min(0) - 2 * _COLUMN_MM
         cell = np.round((points[:, :2] - low) / _COLUMN_MM).astype(int)
-        lowest, highest = column_extremes(cell, points[:, 2], tuple(cell.max(0) + 3))
+        lowest = np.full(tuple(cell.max(0) + 3), np.inf)
+        highest = -lowest
+        np.minimum.at(lowest, tuple(cell.T), points[:, 2])
+        np.maximum.at(highest, tuple(cell.T), points[:, 2])
         return cls(low, _spread(lowest), -_spread(-highest))
 
     def at(self, points_mm: Float[np.ndarray, "n 2"]) -> Heights:
@@ -133,17 +131,6 @@ class Columns:
         and a thin bridge would hold the piece."""
         low, high = self.at(points_mm)
         return (high + _SLACK_MM > bottom_mm) & (low - _SLACK_MM < top_mm)  # False at NaN
-
-
-def column_extremes(
-    cells: Int[np.ndarray, "m 2"], heights: Float[np.ndarray, " m"], shape: tuple[int, ...]
-) -> Heights:
-    """The lowest and the highest point in each cell of a grid; inf and -inf where none is."""
-    flat = np.ravel_multi_index(tuple(cells.T), shape)
-    lowest, highest = np.full(shape, np.inf), np.full(shape, -np.inf)
-    np.minimum.at(lowest.ravel(), flat, heights)
-    np.maximum.at(highest.ravel(), flat, heights)
-    return lowest, highest
 
 
 def _spread(values: np.ndarray) -> np.ndarray:

@@ -64,12 +64,9 @@ def common(a: Polygon, b: Polygon) -> Polygon:
 
 def evenly(ring_mm: Float[np.ndarray, "n 2"], spacing_mm: float) -> Float64[np.ndarray, "m 2"]:
     """Points at equal distances along a line, ends included; at most ``spacing_mm`` apart."""
-    steps = np.linalg.norm(np.diff(ring_mm, axis=0), axis=1)
-    moves = steps > 1e-9
-    line = np.asarray(ring_mm, float)[np.r_[True, moves]]
-    along = np.r_[0.0, np.cumsum(steps[moves])]
-    at = np.linspace(0.0, along[-1], max(2, int(np.ceil(along[-1] / spacing_mm)) + 1))
-    return np.stack([np.interp(at, along, axis) for axis in line.T], axis=1)
+    line = shapely.LineString(ring_mm)
+    shares = np.linspace(0, 1, max(2, int(np.ceil(line.length / spacing_mm)) + 1))
+    return shapely.get_coordinates(shapely.line_interpolate_point(line, shares, normalized=True))
 
 
 def evenly_round(ring: Float[np.ndarray, "n 2"], spacing: float) -> Float64[np.ndarray, "m 2"]:

@@ -12,7 +12,7 @@ from scipy.spatial import ConvexHull, QhullError
 
 from tumortrack.core.errors import InputError, NoPlan
 from tumortrack.core.types import FIRST_TUMOR, ORGAN
-from tumortrack.plan.margin import column_extremes, margin_plan
+from tumortrack.plan.margin import margin_plan
 from tumortrack.plan.outline import common, concave_hull, evenly, grown, polygon_of, rings_of
 from tumortrack.plan.values import (
     Cut,
@@ -26,7 +26,6 @@ from tumortrack.plan.values import (
 
 _DIRECTIONS, _MOST = 192, 12_000  # of the hull, points it is made of: a kidney's is off by 0.5 mm
 _FEWEST = 30  # points that define a tumor's shape
-_A_COLUMN = 30  # points in a column, about
 _WHOLE = 0.99  # of another tumor's points
 
 
@@ -103,6 +102,9 @@ def _chosen_tumor(located: Located, config: ResectionConfig) -> tuple[int, float
             f"{inside} wholly inside the organ ({shares[label]:.0%} outside its hull, "
             f"{config.least_exophytic:.0%} are needed): there is no contour to cut along."
         )
+    needed = ("kidney", *names)
+    if lacking := [part for part in needed if part not in located.meshes]:
+        raise NoPlan(f"{lacking[0]} has no surface to keep a margin from. Locate it again.")
     return label, shares[label]
 
 
@@ -148,9 +150,7 @@ def inside(layers: tuple[CutLayer, ...], points_mm: Float[np.ndarray, "n 3"]) ->
 
 def _volumes_ml(located: Located, label: int, taken: np.ndarray) -> dict[str, float]:
     """By counting points, which lie evenly in the organ."""
-    kidney = located.meshes.get("kidney")
-    organ_mm3 = _cloud_volume_mm3(located.points_mm) if kidney is None else kidney.volume_mm3
-    organ_ml = organ_mm3 / 1000
+    organ_ml = located.meshes["kidney"].volume_mm3 / 1000
     each_ml = organ_ml / len(located.points_mm)
     tumor, healthy = located.labels == label, located.labels < FIRST_TUMOR
     masks = {
@@ -162,24 +162,6 @@ def _volumes_ml(located: Located, label: int, taken: np.ndarray) -> dict[str, fl
     return {"organ": organ_ml, **{k: each_ml * float(mask.sum()) for k, mask in masks.items()}}
 
 
-def _cloud_volume_mm3(points_mm: np.ndarray) -> float:
-    """Of a body evenly filled with points, without overhangs: the sum over columns of their area
-    times the height that k points' span stands for, (k + 1) / (k - 1) of it."""
-    flat = points_mm[:, :2] - points_mm[:, :2].min(0)
-    side_mm = float(np.sqrt(_A_COLUMN * np.ptp(flat, axis=0).prod() / len(flat)))
-    cell = (flat / side_mm).astype(int)
-    shape = tuple(cell.max(0) + 1)
-    low, high = column_extremes(cell, points_mm[:, 2], shape)
-    count = np.bincount(np.ravel_multi_index(tuple(cell.T), shape), minlength=low.size)
-    count = count.reshape(shape)
-    some = count >= 2
-    span = (high - low)[some] * (count[some] + 1) / (count[some] - 1)
-    # A column at the edge is not full: it counts by how dense its points are.
-    dense = np.median(count[some] / span)
-    area = np.minimum(1.0, count[some] / span / dense)
-    return float((span * area).sum() * side_mm**2)
-
-
 def _others(
     located: Located, label: int, taken: np.ndarray, piece: tuple[CutLayer, ...]
 ) -> tuple[str, ...]:
@@ -189,8 +171,7 @@ def _others(
         if other == label:
             continue
         share, name = float(taken[located.labels == other].mean()), name_of(other)
-        surface = located.meshes.get(name)
-        if share == 0 and (surface is None or not inside(piece, surface.spread_mm()).any()):
+        if share == 0 and not inside(piece, located.meshes[name].spread_mm()).any():
             continue
         if share < _WHOLE:
             much = f"{share:.0%} of it" if share >= 0.01 else "an edge of it"

@@ -76,7 +76,7 @@ class Located:
 
     Attributes:
         points_mm, labels: the labelled cloud: label 1 organ without tumors, 2, 3, ... tumors.
-        meshes: closed surfaces, as far as known: kidney (tumors included), tumor_1, ...
+        meshes: closed surfaces: kidney (tumors included), tumor_1, ...
         std_mm: per tumor, the standard deviation of each of its mesh's vertices along the axis that
             is least sure; left out where the estimate has none.
         margin: what margins the estimate states (``models.margins``).

@@ -19,11 +19,11 @@ from tumortrack.models.in_distribution import check_in_distribution, check_likel
 from tumortrack.models.report import Frame, describe_parts, grid_over
 from tumortrack.registration import kernels
 from tumortrack.registration.discrepancy import FARTHEST
-from tumortrack.registration.gauss_newton import RegistrationResult, posterior, refine, size_of
+from tumortrack.registration.gauss_newton import RegistrationResult, posterior, size_of
 from tumortrack.registration.looks import Looks
 from tumortrack.registration.model import RegistrationModel
 from tumortrack.registration.motion import ElasticMotion, blend
-from tumortrack.registration.registration import best_of
+from tumortrack.registration.registration import best_laid
 
 QUERIES = 40_000  # as many as the paper asks
 CARRIED = 20_000  # points of the undeformed organ that live estimates carry along
@@ -99,10 +99,7 @@ class RegistrationLocator:
     ) -> Estimate:
         """See ``tracking.tracker.Tracker.locate``."""
         frame = Frame(self._model, cloud, seed, np.random.default_rng(seed))
-        more = [Frame(self._model, one.cloud, seed, frame.rng) for one in others]
-        looks = Looks.of(
-            [one.points_mm for one in (frame, *more)], [one.camera_from_look for one in others]
-        )
+        looks = self._looks(frame, others)
         fit, looks = self._registration.register_all(looks, 0.0, frame.stage)
         size, placed = self._size(looks, fit), self._checked(looks, fit, frame)
         organ = placed.meshes[self._model.parts[0]]
@@ -113,31 +110,27 @@ class RegistrationLocator:
             labels = label_grid(Anatomy(tuple(placed.meshes.values())), camera_from_index, shape)
         voxel_mm = float(camera_from_index[0, 0])
         report = self._report(frame, placed, inside, size=size, voxel_mm=voxel_mm)
-        if others:
-            report["looks"] = looks.described()
-            report["points"] += sum(len(one.cloud.points_mm) for one in others)
-            costs, far_mm = report["fit_cost"], FARTHEST * self._registration.config.last_mm
-            costs["usual"] *= looks.count
-            far = np.abs(fit.distances_mm) > far_mm
-            costs["strays"] = max(float(far[looks.look == n].mean()) for n in range(looks.count))
+        self._add_looks(report, looks, fit, others)
         volume = CameraLabels(labels, camera_from_index)
         return Estimate(inside, volume, placed.meshes, report, placed.motion)
 
-    def follow(self, cloud: SensorCloud, last: Estimate | None, how: Following) -> Estimate:
+    def follow(
+        self, cloud: SensorCloud, last: Estimate | None, how: Following, others: Sequence[Look] = ()
+    ) -> Estimate:
         """See ``tracking.tracker.Tracker.follow``."""
         rng = np.random.default_rng((how.seed, cloud.stamp_ns))
         frame = Frame(self._model, cloud, how.seed, rng)
-        points, start = frame.points_mm, last.unsmoothed if last is not None else None
-        usual, fits = self._calibration.usual_cost, []
+        looks, start = self._looks(frame, others), last.unsmoothed if last is not None else None
+        usual, found = self._calibration.usual_cost * looks.count, []
         if isinstance(start, ElasticMotion):
             with frame.stage("follow"):
                 starts = [start, *(rival for rival, _ in start.rivals)]
-                fits += [refine(self._shape, points, one, self._near) for one in starts]
-        if not fits or how.thorough or min(fit.cost for fit in fits) > usual:
-            enough = 0.0 if not fits else usual if how.thorough else np.inf
-            anew = self._registration.register(points, enough, frame.stage, how.either_side)
-            fits.append(anew)
-        fit, looks = best_of(fits), Looks.of([points])
+                found += [self._registration.follow(looks, one, self._near) for one in starts]
+        if not found or how.thorough or min(fit.cost for fit, _ in found) > usual:
+            enough = 0.0 if not found else usual if how.thorough else np.inf
+            method = replace(self._registration, either_side=how.either_side)
+            found.append(method.register_all(looks, enough, frame.stage))
+        fit, looks = best_laid(found)
         size, unsmoothed, lag_s = self._size(looks, fit), fit.motion, 0.0
         if last is not None and isinstance(last.motion, ElasticMotion) and how.smoothing_s > 0:
             past_s = (cloud.stamp_ns - last.cloud.stamp_ns) * 1e-9
@@ -152,7 +145,27 @@ class RegistrationLocator:
             inside = self._carry(placed, cloud.stamp_ns)
         smoothing = {"time_s": how.smoothing_s, "lag_ms": 1000 * lag_s}
         report = self._report(frame, placed, inside, size=size, smoothing=smoothing)
+        self._add_looks(report, looks, fit, others)
         return Estimate(inside, None, placed.meshes, report, placed.motion, unsmoothed)
+
+    def _looks(self, frame: Frame, others: Sequence[Look]) -> Looks:
+        """The first camera's points, and those of further looks."""
+        more = [Frame(self._model, one.cloud, frame.seed, frame.rng) for one in others]
+        points_mm = [one.points_mm for one in (frame, *more)]
+        return Looks.of(points_mm, [one.camera_from_look for one in others])
+
+    def _add_looks(
+        self, report: dict[str, Any], looks: Looks, fit: RegistrationResult, others: Sequence[Look]
+    ) -> None:
+        """What several looks change in a report."""
+        if not others:
+            return
+        report["looks"] = looks.described()
+        report["points"] += sum(len(one.cloud.points_mm) for one in others)
+        costs, far_mm = report["fit_cost"], FARTHEST * self._registration.config.last_mm
+        costs["usual"] *= looks.count
+        far = np.abs(fit.distances_mm) > far_mm
+        costs["strays"] = max(float(far[looks.look == n].mean()) for n in range(looks.count))
 
     def warm(self) -> None:
         """See ``tracking.tracker.Tracker.warm``."""

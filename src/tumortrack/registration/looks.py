@@ -132,7 +132,8 @@ def seen_from_first(motion: ElasticMotion, camera_from_look: Affine) -> ElasticM
     """A motion before another camera, as the first one sees it."""
     turn = camera_from_look[:3, :3]
     centre_mm = turn @ motion.centre_mm + camera_from_look[:3, 3]
-    return replace(motion, rotation=turn @ motion.rotation, centre_mm=centre_mm)
+    rivals = tuple((seen_from_first(one, camera_from_look), share) for one, share in motion.rivals)
+    return replace(motion, rotation=turn @ motion.rotation, centre_mm=centre_mm, rivals=rivals)
 
 
 def _moved(pose: Affine, points: Points) -> Points:

@@ -40,6 +40,7 @@ from tumortrack.registration.network import RegistrationNetwork
 from tumortrack.registration.rest_shape import RestShape
 
 Timer = Callable[[str], AbstractContextManager[object]]
+Laid = tuple[RegistrationResult, Looks]  # a fit, with the further cameras where it has them
 
 _FLIP_MARGIN = 6.0  # logits: beyond this lead the other way round is not tried
 _FARTHEST_MM = 1e5  # of the organ's middle
@@ -69,28 +70,26 @@ _SAME_MM = 0.2  # descents that end in one minimum end within some last steps (e
 
 @dataclass(frozen=True, eq=False)
 class Registration:
-    """The organ at rest, laid on clouds (camera frame, mm) that show one side of it."""
+    """The organ at rest, laid on clouds (camera frame, mm) that show one side of it.
+    ``either_side``: looking around, it is also turned over."""
 
     network: RegistrationNetwork
     rest: RestShape
     config: GaussNewtonConfig
+    either_side: bool = False
 
     def register(
-        self,
-        points_mm: Points,
-        usual_cost: float = math.inf,
-        timed: Timer = nullcontext,
-        either_side: bool = False,
+        self, points_mm: Points, usual_cost: float = math.inf, timed: Timer = nullcontext
     ) -> RegistrationResult:
         """The whole method; ``timed("encode")`` and ``timed("refine")`` time its halves."""
         with timed("encode"):
             hypotheses = self.propose(points_mm)
         with timed("refine"):
-            return self.best_fit(points_mm, hypotheses, usual_cost, either_side)
+            return self.best_fit(points_mm, hypotheses, usual_cost)
 
     def register_all(
         self, looks: Looks, usual_cost: float = math.inf, timed: Timer = nullcontext
-    ) -> tuple[RegistrationResult, Looks]:
+    ) -> Laid:
         """The whole method for several looks at one still organ, each of which proposes; and the
         looks as the further cameras are corrected then."""
         if looks.count == 1:
@@ -101,20 +100,26 @@ class Registration:
                 seen = transform_points(np.linalg.inv(pose), looks.points_mm[looks.look == n])
                 hypotheses += [seen_from_first(one, pose) for one in self.propose(seen)]
         whole = replace(self, config=looks.weighed(self.config))
-        near = msgspec.structs.replace(whole.config, first_mm=self.config.last_mm)
         with timed("refine"):
             fit = whole.best_fit(looks.points_mm, hypotheses, usual_cost)
-            found: list[tuple[RegistrationResult, Looks]] = []
-            for each in (fit, *fit.rivals):  # with its own places of the cameras
-                one, mine = each, looks
-                for _ in range(_CORRECTIONS):
-                    mine = mine.corrected(one.motion, self.config)
-                    one = refine(self.rest, mine.points_mm, one.motion, near)
-                costs = one.cost + mine.cost, one.cost_without_strays + mine.cost
-                one = replace(one, cost=costs[0], cost_without_strays=costs[1])
-                found.append((one, mine))
-        best = best_of([one for one, _ in found])
-        return best, min(found, key=lambda pair: pair[0].cost)[1]
+            # Each with its own places of the cameras.
+            return best_laid([self._laid(looks, one, _CORRECTIONS) for one in (fit, *fit.rivals)])
+
+    def follow(self, looks: Looks, start: ElasticMotion, config: GaussNewtonConfig) -> Laid:
+        """The fit near a motion, and the looks as the further cameras are corrected then."""
+        fit = refine(self.rest, looks.points_mm, start, looks.weighed(config))
+        return self._laid(looks, fit, _CORRECTIONS)
+
+    def _laid(self, looks: Looks, fit: RegistrationResult, times: int) -> Laid:
+        """Further cameras and the motion in turns, from a fit with the cameras as stated."""
+        if looks.count == 1:
+            return fit, looks
+        near = msgspec.structs.replace(looks.weighed(self.config), first_mm=self.config.last_mm)
+        for _ in range(times):
+            looks = looks.corrected(fit.motion, self.config)
+            fit = refine(self.rest, looks.points_mm, fit.motion, near)
+        costs = fit.cost + looks.cost, fit.cost_without_strays + looks.cost
+        return replace(fit, cost=costs[0], cost_without_strays=costs[1]), looks
 
     @torch.no_grad()
     def propose(self, points_mm: Points) -> list[ElasticMotion]:
@@ -148,41 +153,33 @@ class Registration:
         ]
 
     def best_fit(
-        self,
-        points_mm: Points,
-        hypotheses: list[ElasticMotion],
-        usual_cost: float = math.inf,
-        either_side: bool = False,
+        self, points_mm: Points, hypotheses: list[ElasticMotion], usual_cost: float = math.inf
     ) -> RegistrationResult:
         """The hypothesis that fits best, refined; give the likeliest one first. Above
-        ``usual_cost`` the organ is looked for all around, ``either_side`` up."""
+        ``usual_cost`` the organ is looked for all around."""
         fit = self._settle(points_mm, self._race(points_mm, [(one, None) for one in hypotheses]))
         if fit.cost > usual_cost:
-            fit = self.look_around(points_mm, hypotheses[0], fit, either_side)
+            fit = self.look_around(points_mm, hypotheses[0], fit)
         turned = [(self._half_turned(fit.motion, turn), None) for turn in self.rest.half_turns]
         if not turned:
             return fit
         return best_of([fit, self._settle(points_mm, self._race(points_mm, turned))])
 
     def look_around(
-        self,
-        points_mm: Points,
-        likeliest: ElasticMotion,
-        fit: RegistrationResult,
-        either_side: bool = False,
+        self, points_mm: Points, likeliest: ElasticMotion, fit: RegistrationResult
     ) -> RegistrationResult:
         """The best of a fit and those from many more places: the likeliest hypothesis turned all
-        around the camera's axis and moved along the organ, ``either_side`` up, first as a nearly
-        stiff body that follows few points."""
+        around the camera's axis and moved along the organ, first as a nearly stiff body that
+        follows few points."""
         angles, stiff = np.arange(_TURNS) * 360 / _TURNS, self.rest.stiff
         turns = Rotation.from_euler("z", angles[:, None], degrees=True).as_matrix()
         across = self.rest.long_axis * np.ptp(
             self.rest.anatomy_ct.organ.vertices_mm @ self.rest.long_axis
         )
         config = msgspec.structs.replace(self.config, first_mm=_FIRST_MM)
-        descents = []
         over = Rotation.from_rotvec(np.pi * self.rest.long_axis).as_matrix()
-        sides = [np.eye(3), over] if either_side else [np.eye(3)]
+        sides = [np.eye(3), over] if self.either_side else [np.eye(3)]
+        descents = []
         for rotation in np.concatenate([turns @ likeliest.rotation @ side for side in sides]):
             for share in _ALONG:
                 place = likeliest.centre_mm + share * (rotation @ across) * [1, 1, 0]
@@ -232,6 +229,11 @@ class Registration:
         left = [descent for descent in descents if descent.cost <= most]
         parallel_for(lambda part: left[part.start].run(steps), len(left), 1)
         return [descent.result() for descent in left]
+
+
+def best_laid(found: list[Laid]) -> Laid:
+    """``best_of`` the fits, and its looks."""
+    return best_of([fit for fit, _ in found]), min(found, key=lambda laid: laid[0].cost)[1]
 
 
 def best_of(fits: list[RegistrationResult]) -> RegistrationResult:

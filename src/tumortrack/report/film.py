@@ -7,13 +7,15 @@ from __future__ import annotations
 
 import io
 from collections.abc import Callable, Iterable, Iterator
-from itertools import groupby, pairwise
+from itertools import groupby
 from pathlib import Path
 
 import matplotlib
 import numpy as np
+import shapely
 from jaxtyping import Float, Float64, UInt8
 from PIL import Image, ImageDraw, ImageFont
+from trimesh.creation import sweep_polygon
 
 from tumortrack.core.colours import BACKGROUND, NONE, part_colour
 from tumortrack.core.errors import InputError
@@ -228,24 +230,7 @@ def _viewpoint_of(
 
 def tube(points_mm: Float[np.ndarray, "n 3"], radius_mm: float, sides: int = 6) -> Mesh:
     """A polyline as a thin closed tube; its joints are mitred."""
-    step = np.diff(points_mm, axis=0)
-    step /= np.maximum(np.linalg.norm(step, axis=1, keepdims=True), 1e-9)
-    along = np.concatenate([step[:1], step[:-1] + step[1:], step[-1:]])
-    along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-9)
-    least = np.eye(3)[np.abs(along).argmin(1)]  # the axis most across
-    a = np.cross(along, least)
-    for one, two in pairwise(range(len(a))):  # carried along, so that the tube does not twist
-        a[two] = a[one] - along[two] * (a[one] @ along[two])
-        a[two] /= max(float(np.linalg.norm(a[two])), 1e-9)
-    a[0] /= np.linalg.norm(a[0])
-    b = np.cross(along, a)
     turn = 2 * np.pi * np.arange(sides) / sides
-    ring = np.cos(turn)[None, :, None] * a[:, None] + np.sin(turn)[None, :, None] * b[:, None]
-    vertices = (points_mm[:, None] + radius_mm * ring).reshape(-1, 3)
-    start, corner = sides * np.arange(len(points_mm) - 1)[:, None], np.arange(sides)
-    first, next_ = start + corner, start + (corner + 1) % sides
-    low = np.stack([first, next_, next_ + sides], -1).reshape(-1, 3)
-    high = np.stack([first, next_ + sides, first + sides], -1).reshape(-1, 3)
-    fan = np.stack([np.zeros(sides - 2), corner[1:-1], corner[2:]], -1)
-    ends = [fan[:, ::-1], fan + sides * (len(points_mm) - 1)]
-    return Mesh(vertices, np.concatenate([low, high, *ends]).astype(np.int32))
+    ring = shapely.Polygon(radius_mm * np.stack([np.cos(turn), np.sin(turn)], axis=1))
+    solid = sweep_polygon(ring, points_mm)
+    return Mesh(solid.vertices, solid.faces)

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
+from trimesh.triangles import closest_point
 
 from tumortrack.core.errors import InputError
 from tumortrack.core.estimate import Motion
@@ -82,21 +83,7 @@ def triangle_distance(
     points_mm: Float[np.ndarray, "n 3"], triangles_mm: Float[np.ndarray, "n 3 3"]
 ) -> Float[np.ndarray, " n"]:
     """Exact distance of each point to its triangle (interior, edges and corners), mm."""
-    a, b, c = triangles_mm[:, 0], triangles_mm[:, 1], triangles_mm[:, 2]
-    normal = np.cross(b - a, c - a)
-    length2 = np.einsum("ij,ij->i", normal, normal)
-    inside = length2 > 0
-    nearest2 = np.full(len(points_mm), np.inf)
-    for start, end in ((a, b), (b, c), (c, a)):
-        edge, to = end - start, points_mm - start
-        along = np.einsum("ij,ij->i", to, edge)
-        t = along / np.maximum(np.einsum("ij,ij->i", edge, edge), 1e-300)
-        off = to - np.clip(t, 0, 1)[:, None] * edge
-        nearest2 = np.minimum(nearest2, np.einsum("ij,ij->i", off, off))
-        inside &= np.einsum("ij,ij->i", np.cross(edge, to), normal) >= 0
-    height = np.einsum("ij,ij->i", points_mm - a, normal)
-    plane2 = height**2 / np.maximum(length2, 1e-300)
-    return np.sqrt(np.where(inside, np.minimum(plane2, nearest2), nearest2))
+    return np.linalg.norm(points_mm - closest_point(triangles_mm, points_mm), axis=1)
 
 
 def surface_distances(
@@ -113,15 +100,13 @@ def surface_distances(
     points_back, weights_back, _ = surface_samples(reference, spacing_mm)
     out = distance_to_surface(points_out, reference)
     back = distance_to_surface(points_back, estimate)
+    pairs = (out, weights_out), (back, weights_back)
+    by_area = [np.percentile(d, 95, weights=w, method="inverted_cdf") for d, w in pairs]
     return SurfaceDistances(
         hausdorff_mm=float(max(out.max(), back.max())),
         hausdorff_one_sided_mm=float(out.max()),
-        hausdorff_95_mm=max(
-            weighted_percentile(out, weights_out, 95.0),
-            weighted_percentile(back, weights_back, 95.0),
-        ),
-        surface_mm=float(np.average(out, weights=weights_out) / 2)
-        + float(np.average(back, weights=weights_back) / 2),
+        hausdorff_95_mm=float(max(by_area)),
+        surface_mm=sum(float(np.average(d, weights=w)) for d, w in pairs) / 2,
     )
 
 
@@ -154,16 +139,6 @@ def outward_miss(estimate: Mesh, reference: Mesh) -> float:
     points_mm = surface_samples(reference)[0]
     outside = points_mm[~contains(estimate, points_mm)]
     return float(distance_to_surface(outside, estimate).max()) if len(outside) else 0.0
-
-
-def weighted_percentile(
-    values: Float[np.ndarray, " n"], weights: Float[np.ndarray, " n"], percent: float
-) -> float:
-    """The smallest value that at least ``percent`` of the weight does not exceed."""
-    order = np.argsort(values)
-    total = np.cumsum(weights[order])
-    place = np.searchsorted(total, total[-1] * percent / 100 * (1 - 1e-12))
-    return float(values[order[min(place, len(order) - 1)]])
 
 
 def target_errors(motion: Motion, targets: Targets) -> dict[str, float]:

@@ -14,7 +14,6 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.patheffects import Normal, Stroke
-from scipy.ndimage import gaussian_filter
 
 from tumortrack.core.colours import part_colour, sweep_colour
 from tumortrack.core.errors import InputError
@@ -43,9 +42,6 @@ _ORGAN_OPACITY, _PIECE_OPACITY = 0.36, 0.3
 _BADGE_MM = 4.4  # numbers closer than this would cover each other
 _ARROW_EVERY_MM, _HEAD_MM = 45.0, 2.6
 _MOST_ARROWED = 8  # sweeps with arrows
-_BLUR = 1.2  # cells: bridges the gaps between points strewn at random
-_INSIDE = 0.75  # quantile of the density at the points: those near the surface have less
-_FEWEST, _MOST_CELLS = 8, 60  # points of a part; cells along its longest side
 
 
 def draw_plan(plan: ResectionPlan, located: Located, path: Path) -> None:
@@ -57,7 +53,7 @@ def plan_figure(plan: ResectionPlan, located: Located) -> Figure:
     """Organ, tumors, what comes away, strokes with their directions, and where it is held.
 
     Two axes in mm, down pointing down: from above x and -y, from the side x and -z. Strokes are
-    bold where they pass through the organ. Of a cloud without meshes the skin is drawn.
+    bold where they pass through the organ.
 
     Raises:
         InputError: what was located has no surface, or one that is not closed.
@@ -217,44 +213,9 @@ def _words(figure: Figure, plan: ResectionPlan, patient: Patient) -> None:
 
 
 def organ_surfaces(located: Located) -> dict[int, Mesh]:
-    """By label 1 (the whole organ, tumors included), 2, ...: closed surfaces, table frame, mm.
-    Of a bare cloud they are the skin of its points.
-
-    Raises:
-        InputError: neither meshes nor enough points.
-    """
-    if "kidney" in located.meshes:
-        labels = {name: label for label, name in enumerate(part_names(255), start=1)}
-        return {labels[name]: mesh for name, mesh in located.meshes.items() if name in labels}
-    clouds = {ORGAN: located.points_mm} | {n: located.of(n) for n in located.tumors}
-    return {label: skin(np.asarray(points, float)) for label, points in clouds.items()}
-
-
-def skin(points_mm: Float[np.ndarray, "n 3"]) -> Mesh:
-    """The closed surface around points strewn evenly through a body: a level of their blurred
-    density, the one that holds all of them at the density that there is inside.
-
-    Raises:
-        InputError: too few points.
-    """
-    from skimage.measure import marching_cubes
-
-    if len(points_mm) < _FEWEST:
-        raise InputError(f"{len(points_mm)} points are too few to draw a part of the organ.")
-    low, size = points_mm.min(0), np.ptp(points_mm, axis=0)
-    # About two points a cell, if they fill an ellipsoid.
-    cell = (2 * np.pi / 6 * np.prod(np.maximum(size, 1.0)) / len(points_mm)) ** (1 / 3)
-    cell = max(cell, size.max() / _MOST_CELLS)
-    low = low - 4 * cell
-    edges = [low[d] + cell * np.arange(np.ceil(size[d] / cell) + 9) for d in range(3)]
-    counts, _ = np.histogramdd(points_mm, edges)
-    density = gaussian_filter(counts, _BLUR, mode="constant")
-    inside = np.quantile(density[tuple(((points_mm - low) / cell).astype(int).T)], _INSIDE)
-    ranked, cells = np.sort(density, axis=None), round(len(points_mm) / inside)
-    level = float(ranked[-cells - 1 : -cells + 1].mean())  # of no cell: corners would coincide
-    vertices, faces, _, _ = marching_cubes(density, level, gradient_direction="ascent")
-    mesh = Mesh(low + cell * (vertices + 0.5), faces)
-    return mesh if mesh.volume_mm3 > 0 else Mesh(mesh.vertices_mm, mesh.faces[:, ::-1])
+    """By label 1 (the whole organ, tumors included), 2, ...: closed surfaces, table frame, mm."""
+    labels = {name: label for label, name in enumerate(part_names(255), start=1)}
+    return {labels[name]: mesh for name, mesh in located.meshes.items() if name in labels}
 
 
 def parted(organ: Mesh, layers: tuple[CutLayer, ...]) -> tuple[Mesh, Mesh]:

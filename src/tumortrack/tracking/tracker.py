@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
 
@@ -13,6 +14,7 @@ from jaxtyping import Float64
 from tumortrack.core.config import Config, to_builtins
 from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.estimate import Estimate, Following
+from tumortrack.core.geometry import HERE, Affine, transform_points
 from tumortrack.core.process import keep_small_blocks
 from tumortrack.core.types import Anatomy, DepthFrame, Look, SensorCloud
 from tumortrack.models.folder import weakness_of
@@ -20,7 +22,9 @@ from tumortrack.models.model import Model
 from tumortrack.occupancy.locator import OccupancyLocator
 from tumortrack.occupancy.model import OccupancyModel
 from tumortrack.registration.locator import RegistrationLocator
+from tumortrack.registration.looks import seen_from_first
 from tumortrack.registration.model import RegistrationModel
+from tumortrack.registration.motion import ElasticMotion
 from tumortrack.sense.cloud import CloudConfig
 from tumortrack.sense.region import RegionConfig
 from tumortrack.tracking.advice import CHECK_POSES, what_to_do
@@ -78,13 +82,9 @@ class Tracker:
         """
         if seed < 0:
             raise InputError(f"the seed is {seed}; it must be 0 or more.")
-        try:
+        with _of_several(others):
             estimate = self._locator.locate(cloud, grid, seed, others)
             return self._judged(estimate, cloud, seen or cloud, False, others)
-        except NoEstimate as error:
-            if not others:
-                raise
-            raise NoEstimate(f"{error} Of several views: {CHECK_POSES}.") from error
 
     def follow(
         self,
@@ -92,18 +92,20 @@ class Tracker:
         last: Estimate | None = None,
         how: Following = _ALONE,
         seen: DepthFrame | SensorCloud | None = None,
+        others: Sequence[Look] = (),
     ) -> Estimate:
         """The same, fast, for one frame of many: no volume, and a search that starts at the
         ``last`` estimate, if there is one a moment old. Models that know no motion smooth nothing.
 
         Raises:
             NoEstimate: as ``locate``.
-            InputError: the cloud is in metres.
+            InputError: the cloud is in metres; more than one look, as ``locate``.
         """
         # What fits worse all of a sudden may be something else that was put there.
         strictly = how.either_side if last is None else last.quality != "good" or not _unusual(last)
-        estimate = self._locator.follow(cloud, last, how)
-        return self._judged(estimate, cloud, seen or cloud, strictly, last=last)
+        with _of_several(others):
+            estimate = self._locator.follow(cloud, last, how, others)
+            return self._judged(estimate, cloud, seen or cloud, strictly, others, last)
 
     def _judged(
         self,
@@ -135,6 +137,16 @@ class Tracker:
     def warm(self) -> None:
         """Load and compile what ``follow`` needs, which its first call would otherwise wait for."""
         self._locator.warm()
+
+
+@contextmanager
+def _of_several(others: Sequence[Look]) -> Iterator[None]:
+    try:
+        yield
+    except NoEstimate as error:
+        if not others:
+            raise
+        raise NoEstimate(f"{error} Of several views: {CHECK_POSES}.") from error
 
 
 def _unusual(estimate: Estimate) -> bool:
@@ -175,7 +187,7 @@ class Follower:
             )
         self._tracker, self._config = tracker, config
         self._last: Estimate | None = None
-        self._scanned_ns = 0
+        self._scanned_ns, self._rests = 0, False
         self._good_ns: int | None = None
 
     def warm(self) -> None:
@@ -186,18 +198,39 @@ class Follower:
         """Nothing is known of where the organ is: a new clock, a new pick."""
         self._last = None
 
-    def last_box_mm(self, stamp_ns: int) -> Float64[np.ndarray, "2 3"] | None:
-        """The organ's box in the last estimate (camera frame), if that is recent enough."""
-        last = self._recent(stamp_ns)
-        return None if last is None else next(iter(last.meshes.values())).box_mm
+    def begin(self, estimate: Estimate) -> None:
+        """The organ rests there: the next search starts at it, however long it took."""
+        self._last, self._rests, self._scanned_ns = estimate, True, estimate.cloud.stamp_ns
 
-    def locate(self, cloud: SensorCloud, seen: DepthFrame | SensorCloud | None = None) -> Estimate:
-        """The estimate of this frame.
+    def last_box_mm(
+        self, stamp_ns: int, camera_from_last: Affine = HERE
+    ) -> Float64[np.ndarray, "2 3"] | None:
+        """The organ's box in the last estimate, if that is recent enough; camera frame.
+        ``camera_from_last``: from the frame of the camera that it was made by."""
+        last = self._recent(stamp_ns)
+        if last is None:
+            return None
+        organ = next(iter(last.meshes.values()))
+        if camera_from_last is not HERE:
+            organ = organ.moved(transform_points(camera_from_last, organ.vertices_mm))
+        return organ.box_mm
+
+    def locate(
+        self,
+        cloud: SensorCloud,
+        seen: DepthFrame | SensorCloud | None = None,
+        others: Sequence[Look] = (),
+        camera_from_last: Affine = HERE,
+    ) -> Estimate:
+        """The estimate of this frame. ``others``: further looks at the same moment;
+        ``camera_from_last``: as in ``last_box_mm``.
 
         Raises:
             NoEstimate: see ``Tracker.follow``; the last estimate is forgotten then.
         """
-        last, self._last = self._recent(cloud.stamp_ns), None
+        last, self._last, self._rests = self._recent(cloud.stamp_ns), None, False
+        if last is not None and camera_from_last is not HERE:
+            last = _seen_from(last, camera_from_last)
         thorough = (cloud.stamp_ns - self._scanned_ns) * 1e-9 >= self._config.rescan_s
         if last is None or thorough:
             self._scanned_ns = cloud.stamp_ns
@@ -205,7 +238,7 @@ class Follower:
         since_ns = np.inf if self._good_ns is None else cloud.stamp_ns - self._good_ns
         turned = bool(0 <= since_ns <= _TURNED_OVER_S * 1e9)
         how = Following(thorough=thorough, either_side=turned, smoothing_s=smoothing_s, seed=seed)
-        self._last = self._tracker.follow(cloud, last, how, seen)
+        self._last = self._tracker.follow(cloud, last, how, seen, others)
         if self._last.quality == "good":
             self._good_ns = cloud.stamp_ns
         return self._last
@@ -214,7 +247,19 @@ class Follower:
         if self._last is None:
             return None
         age_s = (stamp_ns - self._last.cloud.stamp_ns) * 1e-9
-        return self._last if 0 <= age_s <= self._config.forget_s else None
+        recent = 0 <= age_s <= self._config.forget_s or self._rests
+        return self._last if recent else None
+
+
+def _seen_from(estimate: Estimate, camera_from_last: Affine) -> Estimate:
+    """What the next search needs of it, before a camera that stands elsewhere."""
+    points_mm = transform_points(camera_from_last, estimate.cloud.points_mm)
+    motion, unsmoothed = (
+        seen_from_first(one, camera_from_last) if isinstance(one, ElasticMotion) else one
+        for one in (estimate.motion, estimate.unsmoothed)
+    )
+    cloud = replace(estimate.cloud, points_mm=points_mm)
+    return replace(estimate, cloud=cloud, motion=motion, unsmoothed=unsmoothed)
 
 
 def region_for(

@@ -13,10 +13,9 @@ from pathlib import Path
 import numpy as np
 
 from tumortrack.core.types import DepthFrame
-from tumortrack.live.recording.folders import FrameFolders
 from tumortrack.live.ros.messages import Messages
 from tumortrack.live.ros.sensors import depth_of, messages_seen
-from tumortrack.live.sinks.recording import McapFile, RecordingSinkConfig
+from tumortrack.live.sinks.recording import RecordingSinkConfig
 from tumortrack.live.sources.virtual import VirtualSource
 from tumortrack.live.values import Observation, Sink, SinkContext, SourceLost, TrackingResult
 from tumortrack.simulate.player import ScenePlayer
@@ -252,7 +251,7 @@ class Tapes:
         resource.setrlimit(resource.RLIMIT_FSIZE, (_hard(), _hard()))
         self._tape.close()
 
-    def _open(self) -> McapFile | FrameFolders:
+    def _open(self) -> Sink:
         self._number, self._opened_s = self._number + 1, time.monotonic()
         self._place = self._folder / f"tape{self._number}"
         return RecordingSinkConfig(path=self._place).open(self._context)

@@ -24,6 +24,7 @@ from tumortrack.sense import files
 from tumortrack.sense.ply import cloud_ply
 
 TIMES, INTRINSICS = "times.csv", "intrinsics.json"
+VIEW = "view_"  # a folder of frames by each further camera
 FRAMES, DEPTH, CLOUD, MASK = "frames", "depth.png", "cloud.ply", "mask.png"
 REPORT, META = "report.json", "meta.json"
 ABOUT = "recording.json"  # of what the sink wrote, frames or bag
@@ -147,7 +148,8 @@ class FrameFolders:
     """``frames/00000012/``: depth.png and intrinsics.json (and mask.png), or cloud.ply;
     report.json; ``estimate/``: occupancy.ply, kidney.ply, tumor_1.ply, ...; with arms
     workcell.json: state, halted, joints (radians), lines and the places of shapes, in the
-    published frame; each surface stands once in ``shapes/``, in the shape's own frame.
+    published frame; each surface stands once in ``shapes/``, in the shape's own frame. What
+    further cameras saw lies in ``view_2/frames/00000012/``, with its stamp in meta.json.
 
     Depths are rounded to 0.1 mm; those that 16 bits of it cannot hold (from 6553.5 mm) are left
     out. Files are not forced to the disk one by one, as that would take longer than a frame.
@@ -167,7 +169,8 @@ class FrameFolders:
         try:
             folder.mkdir()
             if self._frames and result.observation is not None:
-                _write_seen(folder, result.observation)
+                views = {view.number: view.seen for view in result.views}
+                self._write_views(folder, views or {1: result.observation})
             if result.estimate is not None:
                 _write_estimate(folder / _ESTIMATE, result.estimate)
             if result.workcell is not None:
@@ -183,6 +186,15 @@ class FrameFolders:
 
     def close(self) -> None:
         self._index.close()
+
+    def _write_views(self, folder: Path, views: dict[int, Observation]) -> None:
+        for number, seen in views.items():
+            there = folder
+            if number > 1:
+                there = self._root.parent / f"{VIEW}{number}" / FRAMES / folder.name
+                there.mkdir(parents=True)
+                _write_json(there / META, {"stamp_ns": seen.stamp_ns})
+            _write_seen(there, seen)
 
     def _workcell(self, cell: Workcell) -> dict[str, Any]:
         return {
@@ -253,7 +265,7 @@ def facts(result: TrackingResult) -> dict[str, Any]:
     """One line about a result (JSON types)."""
     seen = result.observation
     kind = None if seen is None else "cloud" if isinstance(seen.content, SensorCloud) else "depth"
-    same = ("quality", "reason", "warning", "latency_ms")
+    same = ("quality", "reason", "warning", "latency_ms", "cameras")
     return {
         "sequence": result.sequence,
         "stamp_ns": result.stamp_ns,

@@ -20,13 +20,16 @@ from tumortrack.core.config import to_builtins
 from tumortrack.core.errors import InputError, StorageError
 from tumortrack.core.store import read_json, write_json, writing
 from tumortrack.live.display import wxyz_of
+from tumortrack.live.poses import COLUMNS, pose_row
+from tumortrack.live.recording import folders
 from tumortrack.live.recording.folders import ABOUT, FRAMES, INDEX, SHAPES, FrameFolders, report
 from tumortrack.live.ros.messages import MM_PER_M, Messages, Outgoing, xyz
 from tumortrack.live.ros.results import ResultMessages
 from tumortrack.live.ros.sensors import CAMERA_FRAME, messages_seen
-from tumortrack.live.values import SinkConfig, SinkContext, TrackingResult
+from tumortrack.live.values import CameraView, Sink, SinkConfig, SinkContext, TrackingResult
 
 _KIND = "recording"
+POSES, STILL = "poses.csv", "poses.json"  # of a camera that moves; of several that stand still
 _CHUNK_S = 0.25  # a killed program loses what is in no chunk yet
 _STRING, _TRANSFORMS = "std_msgs/msg/String", "tf2_msgs/msg/TFMessage"
 
@@ -54,17 +57,19 @@ class RecordingSinkConfig(SinkConfig, frozen=True, kw_only=True, tag="recording"
     def __post_init__(self) -> None:
         self.check_between("recording:", meshes_hz=(0, 1000))
 
-    def open(self, context: SinkContext) -> McapFile | FrameFolders:
+    def open(self, context: SinkContext) -> Sink:
         """Raises InputError if the folder exists, and is no recording or ``overwrite`` was not
         given."""
         _make_room(self.path, self.overwrite)
         with writing(self.path):
             self.path.parent.mkdir(parents=True, exist_ok=True)
-            sink: McapFile | FrameFolders
+            sink: McapFile | FrameFolders | WithPoses
             if self.format == "mcap":
                 sink = McapFile(self.path, context, self.frames, self.meshes_hz)
             else:
                 sink = FrameFolders(self.path, self.frames)
+            if context.published_frame.moves:
+                sink = WithPoses(sink, self.path / POSES)
         frame = context.published_frame
         about = {
             "kind": _KIND,
@@ -78,7 +83,32 @@ class RecordingSinkConfig(SinkConfig, frozen=True, kw_only=True, tag="recording"
             "estimate_frame": "camera" if self.format == "files" else frame.frame_id,
         }
         write_json(self.path / ABOUT, about)
+        if context.cameras:
+            rows = [pose.tolist() for pose in context.cameras]
+            fixed = {"unit": "mm", "frame_id": frame.frame_id, "fixed_from_camera": rows}
+            write_json(self.path / STILL, fixed)
         return sink
+
+
+class WithPoses:
+    """Beside a recording, where the camera was in each frame: a table as `track --moving` reads it.
+    Whatever the disk refuses raises, and the next result is tried."""
+
+    def __init__(self, sink: McapFile | FrameFolders, path: Path) -> None:
+        self._sink, self._file = sink, path.open("ab", buffering=0)
+        self._file.write(f"{COLUMNS}\n".encode())
+
+    def publish(self, result: TrackingResult) -> None:
+        self._sink.publish(result)
+        if result.observation is not None:
+            frame, stamp_ns = result.published_frame, result.stamp_ns
+            row = pose_row(stamp_ns, frame.frame_id, frame.published_from_camera)
+            with writing(Path(self._file.name)):
+                self._file.write(row.encode())
+
+    def close(self) -> None:
+        self._file.close()
+        self._sink.close()
 
 
 def _make_room(path: Path, overwrite: bool) -> None:
@@ -91,7 +121,8 @@ def _make_room(path: Path, overwrite: bool) -> None:
             "recording."
         )
     inside = {p.name for p in path.iterdir()} if path.is_dir() else {path.name}
-    ours = {ABOUT, INDEX, FRAMES, SHAPES, "metadata.yaml", f"{path.name}.mcap"}
+    ours = {ABOUT, INDEX, FRAMES, SHAPES, POSES, STILL, "metadata.yaml", f"{path.name}.mcap"}
+    inside = {name for name in inside if not name.startswith(folders.VIEW)}
     is_ours = ABOUT in inside and read_json(path / ABOUT).get("kind") == _KIND
     if inside and (inside - ours or not is_ours or not path.is_dir()):
         raise InputError(
@@ -102,8 +133,9 @@ def _make_room(path: Path, overwrite: bool) -> None:
 
 
 class McapFile:
-    """Topics: ``/camera/...`` what the source saw, in the camera's frame; ``/tumortrack/...`` the
-    results as in ROS, and ``report`` (JSON); ``/tf`` where the two frames differ.
+    """Topics: ``/camera/...`` what the source saw, in the camera's frame, of further cameras
+    ``/camera_2/...``; ``/tumortrack/...`` the results as in ROS, and ``report`` (JSON); ``/tf``
+    where the frames differ.
 
     Messages are filed under their time of arrival, which never goes back; headers have the stamps.
     Where the disk refuses, whole chunks stay, in a file without an end, and each later result
@@ -164,26 +196,33 @@ class McapFile:
         out = [one._replace(suffix=f"/tumortrack/{one.suffix}") for one in out]
         if not self._frames or result.observation is None:
             return out
-        same = np.array_equal(frame.published_from_camera, np.eye(4))
-        other = CAMERA_FRAME if frame.frame_id != CAMERA_FRAME else f"{CAMERA_FRAME}_optical"
+        alone = CameraView(1, result.observation, frame.published_from_camera)
+        for view in result.views or (alone,):
+            out = [*self._seen(view, frame.frame_id, result.stamp_ns), *out]
+        return out
+
+    def _seen(self, view: CameraView, frame_id: str, stamp_ns: int) -> Iterator[Outgoing]:
+        """What one camera saw, and its pose in the published frame."""
+        way, number = view.published_from_camera, f"_{view.number}" if view.number > 1 else ""
+        same = np.array_equal(way, np.eye(4))
+        other = CAMERA_FRAME + ("_optical" if frame_id == CAMERA_FRAME else "") + number
         # As the source calls it: a calibration may know the camera by that when this is played.
-        camera = result.observation.frame_id or (frame.frame_id if same else other)
-        if camera == frame.frame_id and not same:
+        camera = view.seen.frame_id or (frame_id if same else other)
+        if camera == frame_id and not same:
             camera = other
-        seen = messages_seen(result.observation, self._messages, camera)
-        out = [*(one._replace(suffix=f"/camera/{one.suffix}") for one in seen), *out]
-        if camera != frame.frame_id:  # the camera's pose in the published frame
-            way = frame.published_from_camera
+        for one in messages_seen(view.seen, self._messages, camera):
+            yield one._replace(suffix=f"/camera{number}/{one.suffix}")
+        if camera != frame_id:
             stamped = {
-                "header": self._messages.header(result.stamp_ns, frame.frame_id),
+                "header": self._messages.header(stamp_ns, frame_id),
                 "child_frame_id": camera,
                 "transform": {
                     "translation": xyz(way[:3, 3] / MM_PER_M),
                     "rotation": dict(zip("wxyz", wxyz_of(way[:3, :3]).tolist(), strict=True)),
                 },
             }
-            out.append(Outgoing("/tf", _TRANSFORMS, make(_TRANSFORMS, transforms=[stamped])))
-        return out
+            message = self._messages.make(_TRANSFORMS, transforms=[stamped])
+            yield Outgoing("/tf", _TRANSFORMS, message)
 
     def _flush(self) -> None:
         with self._on_disk():

@@ -91,7 +91,6 @@ class ViewerSink:
         self._server, self._guard = _opened(config.host, config.port)
         self.port: int = self._server.get_port()
         self.url = f"{self._page_url()}/{self._guard.token}"
-        self._back = np.linalg.inv(context.published_frame.published_from_camera)
         self._lock = threading.RLock()  # round every change of the page
         self._result: TrackingResult | None = None  # the last that came
         self._told: TrackingResult | None = None  # the page is of this one, all of it
@@ -281,18 +280,20 @@ class ViewerSink:
             if hidden_count == self._hidden_count:
                 self._panel.put_slice(picture)
                 if picture is not None and plane is not None:
-                    self._scene.put_slice(picture, plane)
+                    way = result.published_frame.published_from_camera
+                    self._scene.put_slice(picture, plane, way)
 
     def _outlines(
         self, result: TrackingResult, margins: dict[str, Mesh]
     ) -> Iterator[tuple[Mesh, colours.Colour, int]]:
         assert result.estimate is not None
+        back = np.linalg.inv(result.published_frame.published_from_camera)
         for label, name in enumerate(self._context.parts, start=1):
             colour = colours.part_colour(label)
             if (mesh := result.estimate.meshes.get(name)) is not None:
                 yield mesh, colour, 2 if label > 1 else 1
             if (margin := margins.get(name)) is not None:
-                yield margin.moved(transform_points(self._back, margin.vertices_mm)), colour, 1
+                yield margin.moved(transform_points(back, margin.vertices_mm)), colour, 1
 
     def _toggle_picking(self) -> None:
         """The next click in the scene chooses the organ; asked twice: it does not."""
@@ -314,16 +315,16 @@ class ViewerSink:
             if result is None or result.observation is None:
                 event.client.add_notification("Nothing is seen at present", "Click again later.")
                 return
-            origin = transform_points(self._back, np.array([event.ray_origin]))[0]
-            direction = self._back[:3, :3] @ np.array(event.ray_direction)
-            point = point_under(seen_points(result.observation).astype(float), origin, direction)
+            way = result.published_frame.published_from_camera
+            seen = transform_points(way, seen_points(result.observation).astype(float))
+            point = point_under(seen, np.array(event.ray_origin), np.array(event.ray_direction))
             if point is None:
                 event.client.add_notification("No observed point there", "Click on the points.")
             else:
                 self._mark(point)
 
     def _mark(self, point_mm: np.ndarray | None) -> None:
-        """The user clicked here (camera frame), or on 'Choose again'."""
+        """The user clicked here (published frame), or on 'Choose again'."""
         with self._lock:
             self._context.controls.picked_mm = point_mm
             self._scene.mark(point_mm)

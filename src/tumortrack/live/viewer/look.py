@@ -50,15 +50,18 @@ class Viewpoint:
             server.scene.add_light_directional(name, intensity=intensity, position=(x, y, z))
         server.on_client_connect(self._follow)
 
-    def aim(self, depth_mm: float) -> None:
-        """Turn about the organ from now on, once its distance is known."""
+    def aim(self, depth_mm: float, way: Float[np.ndarray, "4 4"]) -> None:
+        """Turn about the organ from now on, once its distance is known, and the camera's place."""
         if self._aimed:
             return
-        self._aimed = True
-        self._organ_mm = self._way[:3, 3] + depth_mm * self._way[:3, 2]
+        self._aimed, moved = True, not np.array_equal(way, self._way)
+        self._way, self._organ_mm = way, way[:3, 3] + depth_mm * way[:3, 2]
         if self._cell is None:  # else they look at the whole workcell
-            self._server.initial_camera.look_at = self._organ_mm
+            camera = self._server.initial_camera
+            camera.position, camera.look_at, camera.up = self._view("organ")
             for client in self._server.get_clients().values():
+                if moved:
+                    self.turn(client, "organ")
                 client.camera.look_at = self._organ_mm
 
     def oversee(self, cell: Workcell) -> None:

@@ -151,6 +151,7 @@ class StatusPanel:
             "<div style='display:flex;justify-content:space-between;margin-top:6px'>"
             f"<span>latency <b>{latency}</b></span><span>last frame <b>{self.age_s:.1f} s</b> ago"
             "</span></div>"
+            f"<div>{escape(result.cameras)}</div>"
             "<div style='opacity:0.65;font-size:12px;min-height:36px'>"
             f"{times and 'stages, ms: '}{times}</div></div>"
         )

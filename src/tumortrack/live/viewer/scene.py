@@ -130,6 +130,9 @@ class ViewerScene:
         """Show what this result saw; nothing, if it saw nothing."""
         seen = _NO_POINTS if result.observation is None else seen_points(result.observation)
         organ = _NO_POINTS if result.organ is None else result.organ.points_mm
+        if not np.array_equal(way := result.published_frame.published_from_camera, self._way):
+            self._way, self._axes.position = way, way[:3, 3]
+            self._axes.wxyz = wxyz_of(way[:3, :3])
         for node, points in ((self._seen, seen), (self._organ, organ)):
             there = transform_points(self._way, thinned(points, MOST_SEEN))
             node.points = there.astype(np.float32)
@@ -137,7 +140,7 @@ class ViewerScene:
             lower, upper = organ.min(0), organ.max(0)
             corners = transform_points(self._way, lower + _CORNERS * (upper - lower))
             self._region.points = corners[_EDGES].astype(np.float32)
-            self.look.aim(float(np.median(organ[:, 2])))
+            self.look.aim(float(np.median(organ[:, 2])), self._way)
         self._has_organ = len(organ) > 0
 
     def show(self, result: TrackingResult) -> None:
@@ -193,25 +196,30 @@ class ViewerScene:
             self._put_asked_for(*self._shown)
         self.apply()
 
-    def put_slice(self, picture: UInt8[np.ndarray, "h w 3"], plane: SlicePlane) -> None:
+    def put_slice(
+        self,
+        picture: UInt8[np.ndarray, "h w 3"],
+        plane: SlicePlane,
+        published_from_camera: Float[np.ndarray, "4 4"],
+    ) -> None:
         """The slice as a plane of the scene, at its true place."""
         self._has_slice = self.options.slice_plane
         if not self._has_slice:
             return  # what was there is old by the time it is asked for
         # viser lays a picture's columns along x and its rows along y.
         axes = np.stack([plane.across, plane.down, np.cross(plane.across, plane.down)], axis=1)
-        self._slice.position = transform_points(self._way, plane.centre_mm[None])[0]
-        self._slice.wxyz = wxyz_of(self._way[:3, :3] @ axes)
+        self._slice.position = transform_points(published_from_camera, plane.centre_mm[None])[0]
+        self._slice.wxyz = wxyz_of(published_from_camera[:3, :3] @ axes)
         self._slice.render_width = self._slice.render_height = plane.side_mm
         solid = (picture > 8).any(2, keepdims=True)
         self._slice.image = np.concatenate([picture, solid.astype(np.uint8) * 255], axis=2)
         self.apply()
 
     def mark(self, point_mm: Float[np.ndarray, " 3"] | None) -> None:
-        """Where the user clicked (camera frame); None: nowhere."""
+        """Where the user clicked (published frame); None: nowhere."""
         self._picked.visible = point_mm is not None
         if point_mm is not None:
-            self._picked.position = transform_points(self._way, point_mm[None])[0]
+            self._picked.position = point_mm
 
     def show_cell(self, cell: live.Workcell | None) -> None:
         """Show what arms do, and nothing of what was shown before; None: nothing. A shape's surface

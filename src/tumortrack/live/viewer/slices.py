@@ -49,17 +49,12 @@ class SlicePlane:
 
     def section(self, mesh: Mesh) -> Float64[np.ndarray, "m 2 2"]:
         """Where a surface crosses the plane, as segments; (column, row) in mm from the centre."""
-        offset = mesh.vertices_mm - self.centre_mm
-        height = offset @ np.cross(self.across, self.down)
-        flat = offset @ np.stack([self.across, self.down], axis=1)
-        above = height[mesh.faces] > 0
-        cut = mesh.faces[above.any(1) & ~above.all(1)]
-        first, second = cut, np.roll(cut, -1, axis=1)  # the three edges' ends
-        with np.errstate(divide="ignore", invalid="ignore"):
-            share = (height[first] / (height[first] - height[second]))[..., None]
-            points = flat[first] + share * (flat[second] - flat[first])
-        crosses = (height[first] > 0) != (height[second] > 0)  # exactly two of the three do
-        return points[crosses].reshape(-1, 2, 2)
+        from trimesh import Trimesh
+        from trimesh.intersections import mesh_plane
+
+        solid = Trimesh(mesh.vertices_mm, mesh.faces, process=False)
+        lines = mesh_plane(solid, np.cross(self.across, self.down), self.centre_mm)
+        return (lines - self.centre_mm) @ np.stack([self.across, self.down], axis=1)
 
 
 class CarriedCt:

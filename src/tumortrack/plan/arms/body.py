@@ -261,13 +261,9 @@ def _add_mount(robot: ET.Element, parent: str, child: str, place: np.ndarray) ->
 
 def _add_place(element: ET.Element, place: Pose) -> None:
     """A rigid transform (mm) as the origin of an element."""
-    turn = place[:3, :3]
-    level = np.hypot(turn[0, 0], turn[1, 0])
-    if level > 1e-9:
-        roll, yaw = np.arctan2(turn[2, 1], turn[2, 2]), np.arctan2(turn[1, 0], turn[0, 0])
-    else:  # the x-axis stands upright: one of the two angles is free
-        roll, yaw = np.arctan2(-turn[1, 2], turn[1, 1]), 0.0
-    _add_origin(element, place[:3, 3], [roll, np.arctan2(-turn[2, 0], level), yaw])
+    from pinocchio.rpy import matrixToRpy
+
+    _add_origin(element, place[:3, 3], matrixToRpy(place[:3, :3]))
 
 
 def _add_origin(element: ET.Element, xyz_mm: np.ndarray, rpy_rad: Iterable[float]) -> None:

@@ -303,9 +303,7 @@ def replan(located: Located, joints_rad: Joints, progress: ResectionProgress) ->
     """
     config, cell = _setting[0]
     plan = plan_resection(located, config)
-    organ = located.meshes.get("kidney")
-    if organ is None:
-        raise NoPlan("the organ's surface was not found")
+    organ = located.meshes["kidney"]
     from_sweep = progress.first_sweep(plan, located.meshes[plan.tumor])
     motions = plan_motions(plan, cell, organ, start_rad=joints_rad, from_sweep=from_sweep)
     if hit := first_hit(motions, cell.config, organ, begun=True):

@@ -1,0 +1,156 @@
+"""Where a camera that moves is at a frame's stamp: stamped poses, interpolated; from a file."""
+
+from __future__ import annotations
+
+import threading
+from abc import abstractmethod
+from bisect import bisect_left
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+from scipy.spatial.transform import Rotation, Slerp
+
+from tumortrack.core.config import Config
+from tumortrack.core.errors import InputError, NoEstimate
+from tumortrack.core.geometry import HERE, Affine, rigid
+from tumortrack.core.store import read_file
+from tumortrack.live.display import wxyz_of
+from tumortrack.live.values import Observation
+
+# Between two poses an arm that speeds up by 1 m/s2 is off the straight way by at most a t^2 / 8 =
+# 1.3 mm, about what is allowed for a camera's place (``sense.noise.CAMERA_STD``).
+_GAP_NS = 100_000_000
+_BACK_NS = 1_000_000_000
+_KEPT = 2000  # poses of a live source: 4 s at 500 Hz
+_NOT_UNIT = 1e-3  # of a quaternion's length: files have few digits
+_LARGEST_TABLE = 256 * 2**20  # bytes
+_UNKNOWN = "where the camera was is unknown"
+COLUMNS = "stamp_ns,frame_id,x_mm,y_mm,z_mm,qw,qx,qy,qz"
+
+
+class CameraPoses:
+    """Where a camera is, or the tool that holds it so (``tool_from_camera``); one thread asks.
+    ``frame_id`` names the fixed frame; empty: nobody says how it is called."""
+
+    frame_id = ""
+    tool_from_camera = HERE
+
+    def at(self, seen: Observation) -> Affine:
+        """Fixed frame from the camera at the observation's stamp. Raises NoEstimate: no pose is
+        known then."""
+        return self.pose(seen) @ self.tool_from_camera
+
+    @abstractmethod
+    def pose(self, seen: Observation) -> Affine:
+        """The same without the tool."""
+
+    def close(self) -> None:
+        """Release everything."""
+
+
+class PosesConfig(Config, frozen=True, kw_only=True, tag_field="kind"):
+    """Base of what says where a moving camera is; as ``live.values.SourceConfig``."""
+
+    target: ClassVar[str] = ""
+
+    @abstractmethod
+    def open(self) -> CameraPoses:
+        """Raises InputError if it can never work."""
+
+
+class PoseBuffer:
+    """The last stamped poses of one thing. One thread may add while another asks."""
+
+    def __init__(self) -> None:
+        self._stamps_ns: list[int] = []
+        self._poses: list[Affine] = []
+        self._lock = threading.Condition()
+
+    def add(self, stamp_ns: int, pose: Affine, kept: int = _KEPT) -> None:
+        """One that is out of order is left out; after one whose stamp goes back by more than a
+        second it begins anew: the clock was set back."""
+        with self._lock:
+            if self._stamps_ns and stamp_ns <= self._stamps_ns[-1]:
+                if stamp_ns > self._stamps_ns[-1] - _BACK_NS:
+                    return
+                self._stamps_ns, self._poses = [], []
+            self._stamps_ns.append(stamp_ns)
+            self._poses.append(pose)
+            del self._stamps_ns[:-kept], self._poses[:-kept]
+            self._lock.notify_all()
+
+    def at(self, stamp_ns: int, wait_s: float = 0.0) -> Affine:
+        """The pose then: between its neighbours, shifted linearly and turned at a constant rate
+        (slerp). ``wait_s``: for the later one. Raises NoEstimate: one is missing, or they are too
+        far apart."""
+        with self._lock:
+            self._lock.wait_for(lambda: max(self._stamps_ns, default=-1) >= stamp_ns, wait_s)
+            place, stamps_ns = bisect_left(self._stamps_ns, stamp_ns), self._stamps_ns
+            if stamp_ns in stamps_ns[place : place + 1]:
+                return self._poses[place]
+            if not stamps_ns:
+                raise NoEstimate(f"{_UNKNOWN}: no pose has come")
+            if place in (0, len(stamps_ns)):
+                off_s = abs(stamp_ns - stamps_ns[place and -1]) * 1e-9
+                which = "last pose is older" if place else "first pose is newer"
+                raise NoEstimate(f"{_UNKNOWN}: its {which} than the frame by {off_s:.2f} s")
+            before_ns, after_ns = stamps_ns[place - 1 : place + 1]
+            a, b = self._poses[place - 1 : place + 1]
+        if (gap_ns := after_ns - before_ns) > _GAP_NS:
+            raise NoEstimate(
+                f"{_UNKNOWN}: its poses before and after the frame are {gap_ns * 1e-9:.2f} s "
+                f"apart; allowed: {_GAP_NS * 1e-9:g} s"
+            )
+        share = (stamp_ns - before_ns) / gap_ns
+        turns = Slerp([0, 1], Rotation.from_matrix([a[:3, :3], b[:3, :3]]))([share])
+        return rigid(turns.as_matrix()[0], (1 - share) * a[:3, 3] + share * b[:3, 3])
+
+
+class PosesFileConfig(PosesConfig, frozen=True, kw_only=True, tag="file"):
+    """A table of stamped poses (CSV; docs/conventions.md), as the sink ``recording`` writes it."""
+
+    target: ClassVar[str] = "path"
+
+    path: Path
+
+    def open(self) -> FilePoses:
+        return FilePoses(self.path)
+
+
+class FilePoses(CameraPoses):
+    """Raises InputError: no such table, or one that is damaged."""
+
+    def __init__(self, path: Path) -> None:
+        head, *lines = read_file(path, _LARGEST_TABLE).decode(errors="replace").split("\n")
+        rows = [line.strip().split(",") for line in lines if line.strip()]
+        try:
+            stamps_ns = np.array([int(row[0]) for row in rows])
+            numbers = np.array([row[2:] for row in rows], float).reshape(len(rows), 7)
+        except (ValueError, OverflowError) as error:
+            raise InputError(f"{path} is no table of poses ({COLUMNS}): {error}.") from error
+        names = {row[1].strip() for row in rows}
+        lengths = np.linalg.norm(numbers[:, 3:], axis=1)
+        faults = {
+            f"its first line must be {COLUMNS}": head.strip() == COLUMNS,
+            "it has no poses": len(rows) > 0,
+            "stamps must rise": (np.diff(stamps_ns) > 0).all(),
+            "frame_id must be one name, in every row": len(names) == 1 and "" not in names,
+            "places must be finite": np.isfinite(numbers).all(),
+            "qw, qx, qy, qz must have length 1": (np.abs(lengths - 1) < _NOT_UNIT).all(),
+        }
+        if wrong := [what for what, met in faults.items() if not met]:
+            raise InputError(f"{path} is no table of poses: {wrong[0]}.")
+        (self.frame_id,), self._poses = names, PoseBuffer()
+        turns = Rotation.from_quat(numbers[:, 3:], scalar_first=True).as_matrix()
+        for stamp_ns, turn, shift in zip(stamps_ns.tolist(), turns, numbers[:, :3], strict=True):
+            self._poses.add(stamp_ns, rigid(turn, shift), len(rows))
+
+    def pose(self, seen: Observation) -> Affine:
+        return self._poses.at(seen.stamp_ns)
+
+
+def pose_row(stamp_ns: int, frame_id: str, pose: Affine) -> str:
+    """A line of such a table."""
+    numbers = [*pose[:3, 3].tolist(), *wxyz_of(pose[:3, :3]).tolist()]
+    return ",".join([str(stamp_ns), frame_id, *(f"{number:.9f}" for number in numbers)]) + "\n"

@@ -1,0 +1,116 @@
+"""Where a camera is by tf, as ROS 1 and ROS 2 publish it: /tf between stamps, /tf_static always."""
+
+from __future__ import annotations
+
+import time
+from typing import Any, ClassVar
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from tumortrack.core.errors import NoEstimate
+from tumortrack.core.geometry import Affine, rigid
+from tumortrack.live.poses import CameraPoses, PoseBuffer, PosesConfig
+from tumortrack.live.ros.bus import Bus
+from tumortrack.live.ros.messages import MM_PER_M, stamp_of
+from tumortrack.live.ros.ros2 import Via, open_bus
+from tumortrack.live.ros.rospy_node import RospyBus
+from tumortrack.live.values import Observation
+
+TRANSFORMS = "tf2_msgs/msg/TFMessage"
+_WAIT_S = 0.1  # for a transform of after the frame's stamp: publishers of 10 Hz and faster
+_MOST = 1000  # messages between two frames: 30 publishers of 1 kHz at 30 Hz
+_NOT_UNIT = 1e-3  # of a quaternion's length
+
+
+class TfPosesConfig(PosesConfig, frozen=True, kw_only=True):
+    """``frame``: the fixed one, base_link say. ``camera``: the camera's, or its tool's where the
+    calibration has tool_from_camera; empty: as the source's messages call it."""
+
+    target: ClassVar[str] = "frame"
+
+    frame: str
+    camera: str = ""
+
+
+class Ros2PosesConfig(TfPosesConfig, frozen=True, kw_only=True, tag="ros2"):
+    """tf of ROS 2."""
+
+    via: Via = "auto"
+
+    def open(self) -> TfPoses:
+        return TfPoses(open_bus(self.via), self.frame, self.camera)
+
+
+class Ros1PosesConfig(TfPosesConfig, frozen=True, kw_only=True, tag="ros1"):
+    """tf of ROS 1."""
+
+    def open(self) -> TfPoses:
+        return TfPoses(RospyBus(), self.frame, self.camera)
+
+
+class TfPoses(CameraPoses):
+    """Of a frame that ``camera`` names, or else the observation."""
+
+    def __init__(self, bus: Bus, frame: str, camera: str) -> None:
+        self.frame_id, self._camera, self._bus = frame.removeprefix("/"), camera, bus
+        self._heard = [bus.subscriber("/tf", TRANSFORMS, _MOST)]
+        self._heard.append(bus.subscriber("/tf_static", TRANSFORMS, _MOST, latched=True))
+        # Each frame's parent, and its poses there, or the one that it always has.
+        self._known: dict[str, tuple[str, PoseBuffer | Affine]] = {}
+
+    def pose(self, seen: Observation) -> Affine:
+        """Waits for what may still be on its way."""
+        until_s = time.monotonic() + _WAIT_S
+        while True:
+            for static, subscriber in enumerate(self._heard):
+                for raw in subscriber.take():
+                    for one in self._bus.messages.from_bytes(raw, TRANSFORMS).transforms:
+                        self._keep(one, bool(static))
+            try:
+                return self._way(self._camera or seen.frame_id or "", seen.stamp_ns)
+            except NoEstimate:
+                if time.monotonic() >= until_s:
+                    raise
+            self._bus.wait(max(until_s - time.monotonic(), 0.0))
+
+    def close(self) -> None:
+        self._bus.close()
+
+    def _keep(self, message: Any, static: bool) -> None:
+        shift, turn = message.transform.translation, message.transform.rotation
+        numbers = np.array([turn.x, turn.y, turn.z, turn.w, shift.x, shift.y, shift.z])
+        if not abs(np.linalg.norm(numbers[:4]) - 1) < _NOT_UNIT or not np.isfinite(numbers).all():
+            return  # no transform: without another one nothing is known
+        pose = rigid(Rotation.from_quat(numbers[:4]).as_matrix(), numbers[4:] * MM_PER_M)
+        parent = message.header.frame_id.removeprefix("/")
+        child = message.child_frame_id.removeprefix("/")
+        before, poses = self._known.get(child, ("", None))
+        if static:
+            self._known[child] = parent, pose
+            return
+        if before != parent or not isinstance(poses, PoseBuffer):
+            self._known[child] = parent, (poses := PoseBuffer())
+        poses.add(stamp_of(message.header), pose)
+
+    def _way(self, camera: str, stamp_ns: int) -> Affine:
+        """From the camera to the fixed frame, over the first frame above both."""
+        above, mine = self._above(self.frame_id), self._above(camera)
+        common = next((name for name in mine if name in above), None)
+        if common is None:
+            raise NoEstimate(f"tf does not connect the camera, {camera!r}, with {self.frame_id!r}")
+        ways = []
+        for names in (above, mine):
+            ways.append(np.eye(4))
+            for name in names[: names.index(common)]:
+                pose = self._known[name][1]
+                now = pose.at(stamp_ns) if isinstance(pose, PoseBuffer) else pose
+                ways[-1] = now @ ways[-1]
+        return np.linalg.inv(ways[0]) @ ways[1]
+
+    def _above(self, name: str) -> list[str]:
+        """A frame and those that it hangs on, upwards."""
+        names = [name]
+        while (parent := self._known.get(names[-1], ("",))[0]) and parent not in names:
+            names.append(parent)
+        return names

@@ -1,0 +1,155 @@
+"""From what the cameras saw together to an estimate: the organ in each view, and all of them laid
+together."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import numpy as np
+from jaxtyping import Float64
+
+from tumortrack.core.errors import NoEstimate
+from tumortrack.core.estimate import Estimate
+from tumortrack.core.geometry import HERE, Affine, transform_points
+from tumortrack.core.types import Look, SensorCloud
+from tumortrack.live.frames import FrameCheck
+from tumortrack.live.scan import Scan
+from tumortrack.live.values import CameraView, PublishedFrame, SinkContext
+from tumortrack.sense.region import Hints, RegionConfig, organ_points
+from tumortrack.tracking.tracker import Follower
+
+_PICK_S = 3.0  # without the organ: a pick is forgotten
+
+Found = tuple[CameraView, SensorCloud]  # the organ's points in it
+
+
+class ViewsLocator:
+    """Of one run; ``seed``: of the random points. Estimates are in the frame of a camera that may
+    be elsewhere, or another one, in the next frame."""
+
+    def __init__(
+        self,
+        follower: Follower,
+        context: SinkContext,
+        region: RegionConfig,
+        frozen_s: float,
+        seed: int,
+    ) -> None:
+        self._follower, self._context = follower, context
+        self._region, self._frozen_s, self._seed = region, frozen_s, seed
+        self.scan: Scan | None = None  # until it is done, by which the first estimate is made
+        self._published_from_last = context.published_frame.published_from_camera
+        self._picked: Float64[np.ndarray, " 3"] | None = None  # by the user, published frame
+        self._place_mm: Float64[np.ndarray, " 3"] | None = None  # where that is by now
+        self._found_s = time.monotonic()
+        # Of the first camera by its calibration, of others as they come.
+        self.frames = FrameCheck(context.published_frame, region, frozen_s)
+        self._frames = {1: self.frames}
+
+    def find(
+        self, views: list[CameraView], absent: dict[int, str], seconds: dict[str, float]
+    ) -> tuple[list[Found], str]:
+        """The organ in each view, and a doubt about the frames. Where several cameras are, those
+        that do not see it become ``absent``, with the reason. Raises NoEstimate: none sees it."""
+        self._heed_pick()
+        found, doubts = [], []
+        for view in views:
+            try:
+                organ, doubt = self._organ(view, seconds)
+            except NoEstimate as error:
+                if len(views) + len(absent) == 1:
+                    raise
+                absent[view.number] = str(error)
+                continue
+            found.append((view, organ))
+            several = len(views) + len(absent) > 1
+            doubts += [f"camera {view.number}: {doubt}" if several else doubt] if doubt else []
+        if not found:
+            raise NoEstimate(camera_words([], absent))
+        return found, "; ".join(doubts)
+
+    def locate(self, found: list[Found]) -> Estimate:
+        """In the frame of the first view's camera. Raises NoEstimate as ``Follower.locate``."""
+        (lead, organ), *more = found
+        if self.scan is not None:
+            estimate = self.scan.look(lead, organ)
+            self._follower.begin(estimate)
+            self.frames.notes.append(self.scan.told)
+            self.scan, self._published_from_last = None, lead.published_from_camera
+            return estimate
+        lead_from_published = np.linalg.inv(lead.published_from_camera)
+        others = [
+            Look(its, view.seen.content, lead_from_published @ view.published_from_camera)
+            for view, its in more
+        ]
+        way = self._camera_from_last(lead)
+        estimate = self._follower.locate(organ, lead.seen.content, others, way)
+        self._published_from_last = lead.published_from_camera
+        self._follow_pick(lead, organ)
+        return estimate
+
+    def _organ(self, view: CameraView, seconds: dict[str, float]) -> tuple[SensorCloud, str]:
+        """The organ's points, and a doubt about the frame."""
+        seen = view.seen
+        if (frames := self._frames.get(view.number)) is None:  # where it stands is calibrated too
+            place = PublishedFrame(self._context.published_frame.frame_id, calibrated=True)
+            frames = FrameCheck(place, self._region, self._frozen_s)
+            frames.notes, self._frames[view.number] = self.frames.notes, frames
+        with timed(seconds, "frame"):
+            doubt = frames.check(seen)
+        with timed(seconds, "organ"):
+            rng = np.random.default_rng((self._seed, seen.stamp_ns))
+            organ = organ_points(seen.content, self._region, self._hints(view), rng).cloud
+        frames.check_new(seen.content)  # that it shows nothing would be said before
+        return organ, doubt
+
+    def _camera_from_last(self, view: CameraView) -> Affine:
+        """From the frame of the last estimate."""
+        if np.array_equal(view.published_from_camera, self._published_from_last):
+            return HERE
+        return np.linalg.inv(view.published_from_camera) @ self._published_from_last
+
+    def _heed_pick(self) -> None:
+        controls = self._context.controls
+        if controls.picked_mm is not self._picked:  # the user chose again
+            self._picked = self._place_mm = controls.picked_mm
+            self._found_s = time.monotonic()
+            self._follower.forget()
+        elif self._picked is not None and time.monotonic() - self._found_s > _PICK_S:
+            controls.picked_mm = None  # it is not there any more, nor where it was seen last
+            self._picked = self._place_mm = None
+
+    def _hints(self, view: CameraView) -> Hints:
+        way, place_mm = self._camera_from_last(view), None
+        last_box_mm = self._follower.last_box_mm(view.seen.stamp_ns, way)
+        # Once the organ is found its box is the better guide: pieces may cover the place.
+        if last_box_mm is None and self._place_mm is not None:
+            camera_from_published = np.linalg.inv(view.published_from_camera)
+            place_mm = transform_points(camera_from_published, self._place_mm[None])[0]
+        return Hints(mask=view.seen.mask, picked_mm=place_mm, last_box_mm=last_box_mm)
+
+    def _follow_pick(self, view: CameraView, organ: SensorCloud) -> None:
+        """The organ was found: what the user picked moves along with it."""
+        self._found_s = time.monotonic()
+        if self._picked is not None:
+            points_mm = transform_points(view.published_from_camera, organ.points_mm.astype(float))
+            off_mm = np.linalg.norm(points_mm - np.median(points_mm, axis=0), axis=1)
+            self._place_mm = points_mm[int(off_mm.argmin())]
+
+
+def camera_words(numbers: list[int], absent: dict[int, str]) -> str:
+    """Which cameras an estimate is from, and why the others say nothing."""
+    by = [f"camera{'s' * (len(numbers) > 1)} {', '.join(map(str, sorted(numbers)))}"]
+    return "; ".join(by * bool(numbers) + [f"camera {n}: {absent[n]}" for n in sorted(absent)])
+
+
+@contextmanager
+def timed(seconds: dict[str, float], name: str) -> Iterator[None]:
+    """Adds how long a ``with`` block took, also where it raises."""
+    start = time.perf_counter()
+    try:
+        yield
+    finally:
+        seconds[name] = seconds.get(name, 0.0) + time.perf_counter() - start
