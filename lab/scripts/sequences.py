@@ -10,8 +10,9 @@ every method judges every frame; OUT/table.md and press.png also count what --ot
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 
 import pandas as pd
@@ -24,11 +25,14 @@ from tumortrack.core.config import to_builtins
 from tumortrack.core.errors import InputError, TumortrackError
 from tumortrack.tracking.tracker import Tracker
 from tumortrack_lab.study import trainings
+from tumortrack_lab.study.document import ReportWriter
+from tumortrack_lab.study.tumor_sites import tumor_sites_of
 from tumortrack_lab.twin.dataset import claim
-from tumortrack_lab.world import colour, following
-from tumortrack_lab.world.films import Film, FilmConfig, read_film, write_film
+from tumortrack_lab.world import colour, following, pictures, tables
+from tumortrack_lab.world.films import ALL_KINDS, Film, FilmConfig, read_film, write_film
 from tumortrack_lab.world.paths import KINDS
 from tumortrack_lab.world.scenes import TETS, World, WorldConfig
+from tumortrack_lab.world.states import STATE_KINDS, State, read_states, world_of
 
 
 @dataclass(frozen=True)
@@ -42,7 +46,9 @@ class Options:
     count: int = 3
     """Sequences of each kind."""
     kinds: tuple[str, ...] = tuple(KINDS)
-    """Which kinds."""
+    """Which kinds; jump, hidden and random need --states."""
+    states: Path | None = None
+    """Undisturbed scenes of this case that `make world` made: their states are gone through."""
     views: int = 1
     """Cameras: 1, or 3 (above the organ, and 45 degrees to either side)."""
     fps: float = 10.0
@@ -59,29 +65,28 @@ class Options:
     """Of the program, if several are to be compared: kept apart, and named in the table."""
     others: tuple[Path, ...] = ()
     """Folders of other organs, followed before, that the table counts in."""
+    document: Path | None = None
+    """Its block is replaced by the tables, a plot and a film of this organ's strongest press."""
 
 
 def main(options: Options) -> None:
     """Make what is missing, then follow what there is."""
-    chosen = (options.kinds, KINDS), (options.methods, following.METHODS)
+    chosen = (options.kinds, ALL_KINDS), (options.methods, following.METHODS)
     for names, known in chosen:
         if unknown := sorted(set(names) - set(known)):
             raise InputError(f"{unknown[0]!r} is not known; allowed: {', '.join(known)}.")
+    if options.states is None and set(options.kinds) & set(STATE_KINDS):
+        raise InputError("jump, hidden and random go through solved states; name some: --states.")
     if options.views not in (1, 3):
         raise InputError(f"--views is {options.views}; allowed: 1, 3.")
     config = FilmConfig(seed=options.seed, fps=options.fps, views=options.views)
-    identity = {
-        "case_sha256": store.sha256_of(options.case / store.MANIFEST),
-        "config": to_builtins(config),
-    }
-    claim(options.out, "sequences.json", identity)
-    world = World.opened(options.case, WorldConfig(), options.out / TETS)
+    world, states = _opened(options, config)
     wanted = [(kind, number) for number in range(options.count) for kind in options.kinds]
     todo = [(k, n) for k, n in wanted if not (options.out / f"{k}-{n:03d}").exists()]
     start = time.monotonic()
     for done, (kind, number) in enumerate(todo, start=1):
         try:
-            write_film(world, config, kind, number, options.out / f"{kind}-{number:03d}")
+            write_film(world, config, kind, number, options.out / f"{kind}-{number:03d}", states)
             what = "made"
         except TumortrackError as error:
             what = f"failed: {error}"
@@ -97,22 +102,46 @@ def main(options: Options) -> None:
         _follow(options, options.model, films)
 
 
+def _opened(options: Options, config: FilmConfig) -> tuple[World, Callable[[], list[State]]]:
+    """The world of the folder, stated there, and the solved states to go through."""
+    identity = {
+        "case_sha256": store.sha256_of(options.case / store.MANIFEST),
+        "config": to_builtins(config),
+    }
+    claim(options.out, "sequences.json", identity)
+    source = options.states or options.out
+    world = World.opened(options.case, WorldConfig(), source / TETS)
+    if options.states is not None:
+        world = world_of(world, source)
+    return world, cache(lambda: read_states(world, source))
+
+
 def _follow(options: Options, model: Path, films: list[Film]) -> None:
     tracker, sha256 = Tracker(api.load_model(model, "cpu")), store.sha256_of(model / store.MANIFEST)
     about = {"model_sha256": sha256, "version": options.version}
+    sites = tumor_sites_of(films[0].rest)
     for done, film in enumerate(films, start=1):
         for method in options.methods:
             called = "-".join(filter(None, (method, options.version)))
-            judge = partial(following.judge, following.METHODS[method](tracker), film)
+            judge = partial(following.judge, following.METHODS[method](tracker), film, sites)
             rows = trainings.kept(film.folder / f"{called}.json", about, judge)
             errors = pd.DataFrame(rows).reindex(columns=["center_mm"])["center_mm"]
             say(f"{done}/{len(films)} {film.folder.name}, {called}: {errors.median():.1f} mm off")
-    rows = [row for out in (options.out, *options.others) for row in following.rows_in(out)]
+    rows = [row for out in (options.out, *options.others) for row in tables.rows_in(out)]
     found = pd.DataFrame(rows)
-    text = following.summary(found)
+    text = tables.summary(found)
     store.write_atomically(options.out / "table.md", text.encode())
-    following.draw(found, options.out / "press.png")
     print(text)
+    if options.document is not None:
+        writer = ReportWriter(options.document, trainings.make_command("sequences"))
+        plot, moving = writer.image("sequences_press"), writer.image("sequences_film")
+        moving = moving.with_suffix(".gif")
+        pictures.draw(found, plot)
+        presses = (film for film in films if film.meta["kind"] == "press")
+        press = max(presses, key=lambda film: film.bend_mm.max())
+        pictures.show(following.METHODS["track"](tracker), press, moving)
+        links = writer.link(plot, "errors under a press"), writer.link(moving, "a press, followed")
+        writer.write({"sequences": "\n\n".join([f"`{writer.command}`", text, *links])})
 
 
 if __name__ == "__main__":

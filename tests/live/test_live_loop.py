@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 import threading
 import time
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -337,6 +338,22 @@ def test_an_answer_that_comes_too_late_is_none_and_yet_a_start(tracker, stages, 
     assert updates[0].estimate is None
     assert updates[-1].estimate is not None
     assert helped == [False, True]
+
+
+def test_only_an_organ_found_good_a_moment_ago_may_have_been_turned_over(tracker, stages):
+    class Watched(Tracker):
+        def follow(self, cloud, last=None, how=Following(), seen=None, others=()):  # noqa: B008
+            asked.append(how.either_side)
+            found = super().follow(cloud, last, how, seen, others)
+            return replace(found, quality=verdicts.pop(0))
+
+    asked, verdicts = [], ["poor", "good", "poor", "poor", "poor", "poor"]
+    follower = Follower(Watched(tracker.model), FollowerConfig())
+    for seconds in (0, 1, 2, 30, 32, -5):
+        stamp_ns = 10**15 + seconds * 10**9
+        follower.locate(SensorCloud(stages[0].cloud.points_mm, stamp_ns))
+        follower.forget()  # it was out of sight
+    assert asked == [False, False, True, True, False, False]
 
 
 def test_smoothing_never_lags_by_much(tracker, stages):

@@ -16,10 +16,10 @@ import trimesh
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from elastic_objects import CENTER, RADII, UP
+from elastic_objects import CENTER, RADII, SMALL, UP
 from tumortrack.core.errors import InputError
 from tumortrack.core.estimate import Motion
-from tumortrack.core.types import Mesh
+from tumortrack.core.types import Anatomy, Mesh
 from tumortrack.models.config import GaussNewtonConfig
 from tumortrack.models.encoders.heightmap import HeightMapConfig, _spread, picture
 from tumortrack.occupancy.network import OccupancyNetwork
@@ -28,7 +28,8 @@ from tumortrack.registration.looks import Looks
 from tumortrack.registration.motion import ElasticMotion
 from tumortrack.registration.network import PoseHypothesis, RegistrationNetwork
 from tumortrack.registration.registration import Registration, _beside
-from tumortrack.registration.rest_shape import RestShape, distance_of
+from tumortrack.registration.rest_shape import RestShape, distance_of, shape_of
+from tumortrack.simulate.elastic.body import build_body
 from tumortrack.simulate.occupancy import labels_of, surface_distance
 from tumortrack.training.presets import quick_network
 from warp_objects import (
@@ -284,6 +285,30 @@ def test_an_end_of_the_organ_is_found_all_around_a_misleading_start(unchecked):
     assert alone.cost > 2 * truth.cost
     assert around.cost < 1.1 * truth.cost
     assert method.best_fit(points, [placed()], 0.0).cost <= truth.cost
+
+
+def test_an_organ_that_was_turned_over_is_found_where_that_may_have_happened(unchecked):
+    def bent(mesh):
+        bend = 16 * ((mesh.vertices_mm[:, 2] - CENTER[2]) / RADII[2]) ** 2
+        return mesh.moved(mesh.vertices_mm + np.outer(bend, [0.0, 1.0, 0.0]))
+
+    banana = Anatomy(tuple(bent(part) for part in ANATOMY.parts))
+    rest = shape_of(banana, build_body(banana, UP, SMALL, 3))
+    rest = dataclasses.replace(rest, half_turns=np.zeros((0, 4, 4)))
+    truth = ElasticMotion(rest, TURNED, PLACE_MM, rest.body.mean)
+    places = truth.carry(banana.organ.vertices_mm)
+    seen = places[places[:, 2] < PLACE_MM[2] - 4]
+    points = seen[np.random.default_rng(9).permutation(len(seen))[:800]]
+    over = Rotation.from_rotvec(np.pi * rest.long_axis).as_matrix()
+    wrong = dataclasses.replace(truth, rotation=TURNED @ over)
+    target, config = banana.tumors[0].vertices_mm, GaussNewtonConfig()
+    methods = [Registration(None, rest, config, either_side=side) for side in (False, True)]
+    off_mm = [
+        np.linalg.norm(fit.motion.carry(target) - truth.carry(target), axis=1).mean()
+        for fit in (method.best_fit(points, [wrong], 0.0) for method in methods)
+    ]
+    assert off_mm[0] > 10 * off_mm[1]
+    assert off_mm[1] < 1.5
 
 
 @pytest.mark.parametrize("times", [0.93, 1.0, 1.07])

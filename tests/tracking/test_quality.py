@@ -18,7 +18,7 @@ from tumortrack.registration.motion import ElasticMotion
 from tumortrack.sense.camera import d405
 from tumortrack.sense.render import render_depth
 from tumortrack.simulate.scene import SceneRecipe, Simulator, body_for
-from tumortrack.tracking.quality import cloud_shares, judged, seen_through
+from tumortrack.tracking.quality import cloud_shares, judged, seen_through, unless_hidden
 from tumortrack.tracking.tracker import Follower, FollowerConfig, Tracker
 from tumortrack.training.model import load_model
 from warp_objects import ANATOMY, PLACE_MM, TURNED, slim_clinic
@@ -154,8 +154,8 @@ def test_an_organ_that_the_camera_sees_through_is_refused(tracker, stages):
     alone = render_depth(organ.vertices_mm, organ.faces, camera)
     behind_mm = np.float32(np.nanmax(alone.depth_mm) + 30)
     table = DepthFrame(np.fmin(alone.depth_mm, behind_mm), camera)
-    assert seen_through(organ, alone) == (0, 0)
-    assert seen_through(organ, table) == (0, 1)
+    assert seen_through(organ, alone) == (0, 0, 1)
+    assert seen_through(organ, table) == (0, 1, 1)
     costly = COST | {"now": 99.0, "without_strays": 3.9, "strays": 0.49}
     assert doubted(estimate, alone, fit_cost=costly).quality == "poor"
     assert doubted(estimate, table, fit_cost=costly).quality == "good"  # a wrong place would show
@@ -179,7 +179,23 @@ def test_an_organ_that_the_camera_sees_through_is_refused(tracker, stages):
                 doubted(estimate, holed)
     hidden = table.depth_mm.copy()
     hidden[:, :200] = behind_mm - 90  # a hand before it hides it, and proves nothing
-    assert seen_through(organ, DepthFrame(hidden, camera))[0] == 0
+    by_hand = DepthFrame(hidden, camera)
+    hides = np.isfinite(alone.depth_mm[:, :200]).sum() / np.isfinite(alone.depth_mm).sum()
+    assert 0.1 < hides < 0.9
+    assert seen_through(organ, by_hand)[::2] == (0, pytest.approx(1 - hides, abs=0.02))
+    depth_mm = table.depth_mm.copy()
+    depth_mm[rows[: len(rows) // 8]] = behind_mm
+    before = doubted(estimate, DepthFrame(depth_mm, camera))
+    covered, free = doubted(estimate, by_hand), doubted(estimate, table)
+    assert (before.quality, covered.quality) == ("poor", "good")
+    still = unless_hidden(covered, before)
+    assert still.quality == "poor"
+    assert "what showed that is hidden" in still.reason
+    assert unless_hidden(doubted(estimate, by_hand), still).quality == "poor"
+    assert unless_hidden(free, still).quality == "good"
+    aside = {name: mesh.moved(mesh.vertices_mm + 12.0) for name, mesh in estimate.meshes.items()}
+    elsewhere = replace(before, meshes=aside)
+    assert unless_hidden(doubted(estimate, by_hand), elsewhere).quality == "good"
 
 
 @pytest.mark.parametrize("spacing", [1, 5, 40])

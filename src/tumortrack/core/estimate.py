@@ -62,10 +62,12 @@ class OneWay:
 
 class Following(Config, frozen=True, kw_only=True):
     """How one frame of many is located. ``thorough``: also search without the last estimate, and
-    keep the better fit: a search near the last answer alone would keep its error. ``smoothing_s``:
-    time constant of the mean over past estimates; 0: none."""
+    keep the better fit: a search near the last answer alone would keep its error. ``either_side``:
+    somebody may have turned the organ over. ``smoothing_s``: time constant of the mean over past
+    estimates; 0: none."""
 
     thorough: bool = False
+    either_side: bool = False
     smoothing_s: float = 0.0
     seed: int = 0
 

@@ -34,7 +34,7 @@ from tumortrack.sense.region import Hints, RegionConfig, organ_points
 from tumortrack.tracking.tracker import Follower, FollowerConfig, Tracker
 
 _QUIET = 0.8  # of stale_s: silence is said while what is shown still holds
-_SURE_AFTER = 3  # good estimates in a row after doubt: single frames of something else may pass
+SURE_AFTER = 3  # good estimates in a row after doubt: single frames of something else may pass
 
 
 class LoopConfig(Config, frozen=True, kw_only=True):
@@ -89,7 +89,7 @@ class Loop:
         self._stop = threading.Event()
         self._sequence = itertools.count()
         self._cameras: Cameras
-        self._in_a_row = _SURE_AFTER  # good estimates since the last doubt
+        self._in_a_row = SURE_AFTER  # good estimates since the last doubt
         self._says: Intrinsics | None = None  # the source, where others are given
         self._stamp: tuple[int, int] | None = None  # of the last frame, and when that was here
         self.statistics = RunStatistics()
@@ -228,8 +228,8 @@ class Loop:
         if doubt and quality == "good":
             quality, warning = "poor", doubt
         self._in_a_row = self._in_a_row + 1 if quality == "good" else 0
-        if 0 < self._in_a_row < _SURE_AFTER:
-            return "poor", f"good again for {self._in_a_row} of {_SURE_AFTER} frames; wait"
+        if 0 < self._in_a_row < SURE_AFTER:
+            return "poor", f"good again for {self._in_a_row} of {SURE_AFTER} frames; wait"
         return quality, warning
 
     def _without_frame(self, reason: str) -> TrackingResult:

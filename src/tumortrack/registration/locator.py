@@ -130,7 +130,8 @@ class RegistrationLocator:
                 found += [self._registration.follow(looks, one, self._near) for one in starts]
         if not found or how.thorough or min(fit.cost for fit, _ in found) > usual:
             enough = 0.0 if not found else usual if how.thorough else np.inf
-            found.append(self._registration.register_all(looks, enough, frame.stage))
+            method = replace(self._registration, either_side=how.either_side)
+            found.append(method.register_all(looks, enough, frame.stage))
         fit, looks = best_laid(found)
         size, unsmoothed, lag_s = self._size(looks, fit), fit.motion, 0.0
         if last is not None and isinstance(last.motion, ElasticMotion) and how.smoothing_s > 0:

@@ -8,6 +8,7 @@
 4. Other minima that explain the points nearly as well, and put a tumor elsewhere, are kept.
 5. In a first look, and where even that fits badly, the organ is looked for all around: what hides a
    part of it moves the middle and the longest direction of what is seen, and misleads the network.
+   An organ that was seen a moment ago may have been turned over, which no organ in training was.
 6. An organ that looks much the same after half a turn is tried that way round, too.
 
 The result is a motion (`motion`): any point of the CT, carried to the camera's frame and back,
@@ -69,11 +70,13 @@ _SAME_MM = 0.2  # descents that end in one minimum end within some last steps (e
 
 @dataclass(frozen=True, eq=False)
 class Registration:
-    """The organ at rest, laid on clouds (camera frame, mm) that show one side of it."""
+    """The organ at rest, laid on clouds (camera frame, mm) that show one side of it.
+    ``either_side``: looking around, it is also turned over."""
 
     network: RegistrationNetwork
     rest: RestShape
     config: GaussNewtonConfig
+    either_side: bool = False
 
     def register(
         self, points_mm: Points, usual_cost: float = math.inf, timed: Timer = nullcontext
@@ -174,8 +177,10 @@ class Registration:
             self.rest.anatomy_ct.organ.vertices_mm @ self.rest.long_axis
         )
         config = msgspec.structs.replace(self.config, first_mm=_FIRST_MM)
+        over = Rotation.from_rotvec(np.pi * self.rest.long_axis).as_matrix()
+        sides = [np.eye(3), over] if self.either_side else [np.eye(3)]
         descents = []
-        for rotation in turns @ likeliest.rotation:
+        for rotation in np.concatenate([turns @ likeliest.rotation @ side for side in sides]):
             for share in _ALONG:
                 place = likeliest.centre_mm + share * (rotation @ across) * [1, 1, 0]
                 start = ElasticMotion(stiff, rotation, place, stiff.body.mean)

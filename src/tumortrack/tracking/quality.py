@@ -27,6 +27,9 @@ _LIMITS = 0.05, 0.09  # doubtful, impossible
 # Without a motion surfaces are rougher: where centres are 2 to 8 mm off, 0.09 to 0.15 are usual.
 _ROUGH_LIMITS = 0.1, 0.2
 _WIDTH = 212  # pixels: so coarse a picture tells
+# Of a state that was doubted: less of what was in sight then may hide the doubt; moved by more from
+# one frame to the next, it is another state.
+_AS_MUCH, _ELSEWHERE_MM = 0.9, 10.0
 _THROUGH_MM = 6.0  # behind the estimated surface: what is seen there lies behind, not beside
 # Where the camera sees something round the organ, in more than this share of a rim so many pixels
 # (some 3 mm) wide, a wrong place is mostly seen through. Strays are no part of the judged fit then,
@@ -78,8 +81,8 @@ def judged(
     unseen = max((share for _, share in clouds), default=0.0)
     if clouds:
         estimate.report["unseen"] = unseen
-    told = min((share for _, share in by_image), default=0.0) if not clouds else 0.0
-    by_depth = max((share for share, _ in by_image), default=0.0)
+    told = min((share for _, share, _ in by_image), default=0.0) if not clouds else 0.0
+    by_depth = max((share for share, _, _ in by_image), default=0.0)
     through = max(by_depth, *(share for share, _ in clouds), 0.0)
     estimate.report["seen_through"] = through
     doubtful, impossible = _LIMITS if estimate.motion is not None else _ROUGH_LIMITS
@@ -91,7 +94,10 @@ def judged(
         )
     reason = _misplaced(estimate) or _misfit(estimate, told > _TOLD and not strictly)
     reason = reason or _doubt(estimate)
+    if by_image:
+        estimate.report["in_sight"] = by_image[0][2]
     if through > doubtful:
+        estimate.report["doubted_in_sight"] = estimate.report.get("in_sight", 0.0)
         reason = f"the camera sees through {100 * through:.0f} % of where the organ lies"
     elif unseen > _UNSEEN and not reason:
         reason = f"over {100 * unseen:.0f} % of where the organ lies the cloud has no points"
@@ -104,6 +110,20 @@ def _before(organ: Mesh, camera_from_look: Sequence[Sequence[float]]) -> Mesh:
     """The organ's surface in a further look's frame."""
     look_from_camera = np.linalg.inv(np.array(camera_from_look))
     return organ.moved(transform_points(look_from_camera, organ.vertices_mm))
+
+
+def unless_hidden(estimate: Estimate, last: Estimate) -> Estimate:
+    """The estimate, poor where the camera saw through the ``last`` one, which lay there too, and
+    sees less of it now: whatever came before it is no evidence that the organ lies there."""
+    doubted_at = last.report.get("doubted_in_sight", 0.0)
+    report, (now, then) = estimate.report, (next(iter(e.meshes.values())) for e in (estimate, last))
+    if "doubted_in_sight" in report or report.get("in_sight", 1.0) >= _AS_MUCH * doubted_at:
+        return estimate
+    if np.abs(now.box_mm - then.box_mm).max() > _ELSEWHERE_MM:
+        return estimate
+    report["doubted_in_sight"] = doubted_at
+    reason = "a moment ago the camera saw through where the organ lies; what showed that is hidden"
+    return estimate if estimate.quality == "poor" else doubted(estimate, reason)
 
 
 def with_margin(estimate: Estimate, cloud: SensorCloud, margins: ModelMargins | None) -> Estimate:
@@ -175,12 +195,13 @@ def _doubt(estimate: Estimate) -> str:
     return ""
 
 
-def seen_through(organ: Mesh, frame: DepthFrame) -> tuple[float, float]:
+def seen_through(organ: Mesh, frame: DepthFrame) -> tuple[float, float, float]:
     """The share of the estimated organ's picture behind whose surface the camera sees something,
     a table, say, which it could not see if the organ lay there. Pixels without return, and those
     where something lies before the organ, say nothing. 0 where no pixel says anything. And the
     share of a rim round the picture where something lies behind the organ's nearest point: a wrong
-    organ reaches beyond the true one, and is seen through where there is something to be seen."""
+    organ reaches beyond the true one, and is seen through where there is something to be seen. And
+    the share of its picture that nothing hides."""
     every = max(1, round(frame.intrinsics.width / _WIDTH))
     seen_mm = frame.depth_mm[::every, ::every]
     given = frame.intrinsics
@@ -189,11 +210,13 @@ def seen_through(organ: Mesh, frame: DepthFrame) -> tuple[float, float]:
     organ_mm = render_depth(organ.vertices_mm, organ.faces, few).depth_mm
     both = np.isfinite(organ_mm) & np.isfinite(seen_mm)
     if not both.any():
-        return 0.0, 0.0
+        return 0.0, 0.0, 0.0
     picture = np.isfinite(organ_mm)
+    in_sight = (seen_mm[both] > organ_mm[both] - _THROUGH_MM).sum() / picture.sum()
     rim = binary_dilation(picture, iterations=_RIM) & ~picture
     told = (seen_mm[rim] > organ_mm[picture].min()).sum() / max(rim.sum(), 1)
-    return float((seen_mm[both] > organ_mm[both] + _THROUGH_MM).mean()), float(told)
+    through = (seen_mm[both] > organ_mm[both] + _THROUGH_MM).mean()
+    return float(through), float(told), float(in_sight)
 
 
 def cloud_shares(organ: Mesh, cloud: SensorCloud) -> tuple[float, float]:

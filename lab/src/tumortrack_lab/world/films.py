@@ -12,6 +12,7 @@ SEQUENCES/
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -32,9 +33,11 @@ from tumortrack_lab.peers.base import fit_over_volume
 from tumortrack_lab.world.noise import StereoCamera, StereoConfig
 from tumortrack_lab.world.paths import KINDS, LoadPath, random_path
 from tumortrack_lab.world.scenes import World
+from tumortrack_lab.world.states import STATE_KINDS, State, state_path
 from tumortrack_lab.world.views import (
     FAR_MM,
     SIZE_PX,
+    covering,
     direction,
     facing,
     ground_mesh,
@@ -46,6 +49,9 @@ _VIEWS_DEGREES = (0.0, 45.0, -45.0)  # about the organ's length
 _NEAREST_MM = (110.0, 190.0)  # so that an organ that is pushed stays in the picture
 _MOST_TILT = 25.0  # of the first camera, degrees
 _BEGIN_NS = 1_700_000_000_000_000_000
+ALL_KINDS = (*KINDS, *STATE_KINDS)
+COVERED_S = 0.3  # until what hides the organ has come, or gone
+_BESIDE = 0.8  # where it comes from: as ``views.covering`` counts
 _ATTEMPTS = 4  # loads, until one has equilibria all along
 # Of a calibration between cameras, one standard deviation each: an assumption.
 _POSE_MM, _POSE_DEGREES = 0.5, 0.2
@@ -112,18 +118,19 @@ def _parted(rest: Anatomy, vertices: Float[np.ndarray, "v 3"]) -> Anatomy:
     return Anatomy(tuple(part.moved(places) for part, places in pairs))
 
 
-def write_film(world: World, config: FilmConfig, kind: str, number: int, folder: Path) -> None:
-    """Solve, look and write one sequence, all or nothing. Raises TumortrackError: none of several
-    loads has equilibria all along its path; StorageError."""
+def write_film(
+    world: World, config: FilmConfig, kind: str, number: int, folder: Path,
+    states: Callable[[], list[State]] = list,
+) -> None:  # fmt: skip
+    """Solve, look and write one sequence, all or nothing; ``states``: for the kinds that go through
+    solved ones. Raises TumortrackError: none of several loads has equilibria all along its path;
+    StorageError."""
     from scipy.spatial.transform import Rotation
 
-    seed = [config.seed, list(KINDS).index(kind), number]
-    path, failed = _some_path(world, kind, seed)
-    rng = np.random.default_rng([*seed, 1])
-    rest = world.organ.anatomy
-    points = np.concatenate([part.vertices_mm for part in rest.parts])
-    inner = transform_points(world.bench_from_ct, world.targets.points_ct)
-    moving = path.of(np.concatenate([points, inner]))
+    seed = [config.seed, ALL_KINDS.index(kind), number]
+    path, failed = _some_path(world, kind, seed, states)
+    rng, rest = np.random.default_rng([*seed, 1]), world.organ.anatomy
+    moving = path.of(world.points)
     times_s = np.arange(int(path.seconds * config.fps) + 1) / config.fps
     there = [transform_points(path.way(t), moving.at(t)) for t in times_s]
     organ = [Mesh(places[: len(rest.organ.vertices_mm)], rest.organ.faces) for places in there]
@@ -134,9 +141,10 @@ def write_film(world: World, config: FilmConfig, kind: str, number: int, folder:
         pose_before(organ[0], first @ turn.as_matrix().T, nearest) for turn in turns[: config.views]
     ]
     stamps_ns = _BEGIN_NS + np.rint(times_s * 1e9).astype(np.int64)
+    tools = _tools(path, organ, times_s, poses[0], rng) if path.covers else path.tools
     with store.new_folder(folder) as aside:
         views = [
-            _filmed(path, organ, pose, times_s, stamps_ns, aside / f"view_{n}", [*seed, 2 + n])
+            _filmed(path, organ, pose, stamps_ns, aside / f"view_{n}", [*seed, 2 + n], tools)
             for n, pose in enumerate(poses)
         ]
         exact = np.array([poses[0] @ np.linalg.inv(pose) for pose in poses])
@@ -161,7 +169,11 @@ def write_film(world: World, config: FilmConfig, kind: str, number: int, folder:
         store.write_json(aside / "meta.json", meta)
 
 
-def _some_path(world: World, kind: str, seed: list[int]) -> tuple[LoadPath, int]:
+def _some_path(
+    world: World, kind: str, seed: list[int], states: Callable[[], list[State]]
+) -> tuple[LoadPath, int]:
+    if kind in STATE_KINDS:
+        return state_path(world.organ, states(), kind, [*seed, 3]), 0
     for attempt in range(_ATTEMPTS):
         try:
             return random_path(world.organ, kind, [*seed, 3, attempt]), attempt
@@ -170,9 +182,34 @@ def _some_path(world: World, kind: str, seed: list[int]) -> tuple[LoadPath, int]
     raise last
 
 
+def _tools(
+    path: LoadPath, organ: list[Mesh], times_s: np.ndarray, pose: np.ndarray,
+    rng: np.random.Generator,
+) -> Callable[[float], list[Mesh]]:  # fmt: skip
+    """What hides the organ by and by, as it lies in the middle of the stay (bench frame)."""
+    camera, placed, back = d405(*SIZE_PX), [], np.linalg.inv(pose)
+    for cover in path.covers:
+        middle = int(np.searchsorted(times_s, (cover.since_s + cover.until_s) / 2))
+        seen = render(organ[min(middle, len(organ) - 1)], pose, camera)
+        if np.isfinite(seen).any():
+            placed.append((cover, *covering(seen, np.isfinite(seen), camera, cover.share, rng)))
+
+    def tools(time_s: float) -> list[Mesh]:
+        shown = []
+        for (since_s, until_s, _), at, share, _ in placed:
+            ramp = [since_s - COVERED_S, since_s, until_s, until_s + COVERED_S]
+            there = float(np.interp(time_s, ramp, [0.0, 1.0, 1.0, 0.0]))
+            if there > 0:
+                mesh = at(share - _BESIDE * (1 - there))
+                shown.append(mesh.moved(transform_points(back, mesh.vertices_mm)))
+        return shown
+
+    return tools
+
+
 def _filmed(
-    path: LoadPath, organ: list[Mesh], pose: np.ndarray, times_s: np.ndarray,
-    stamps_ns: np.ndarray, folder: Path, seed: list[int],
+    path: LoadPath, organ: list[Mesh], pose: np.ndarray, stamps_ns: np.ndarray, folder: Path,
+    seed: list[int], tools: Callable[[float], list[Mesh]],
 ) -> Float64[np.ndarray, " f"]:  # fmt: skip
     """One camera's frames, written; the share of the organ that is hidden in each."""
     folder.mkdir()
@@ -180,12 +217,14 @@ def _filmed(
     sensor = StereoConfig(subpixel_px=rng.uniform(0.03, 0.12), gloss_degrees=rng.uniform(2.0, 7.0))
     sees = StereoCamera(camera, sensor, rng)
     bed = ground_mesh(path.rim_mm, np.random.default_rng(seed[:-1]))
-    below, hidden = render(bed, pose, camera), []
-    for mesh, time_s, stamp_ns in zip(organ, times_s.tolist(), stamps_ns.tolist(), strict=True):
-        if path.bed_too:
-            below = render(bed, pose @ path.way(time_s), camera)
+    below, hidden, there = np.empty(0), [], np.zeros((4, 4))
+    for mesh, stamp_ns in zip(organ, stamps_ns.tolist(), strict=True):
+        time_s = (stamp_ns - _BEGIN_NS) * 1e-9
+        if not np.array_equal(path.bed(time_s), there):
+            there = path.bed(time_s)
+            below = render(bed, pose @ there, camera)
         own = render(mesh, pose, camera)
-        others = [below, *(render(tool, pose, camera) for tool in path.tools(time_s))]
+        others = [below, *(render(tool, pose, camera) for tool in tools(time_s))]
         scene = np.fmin.reduce([own, *others])
         with np.errstate(invalid="ignore"):
             shown = np.isfinite(own) & (own <= scene)

@@ -2,8 +2,7 @@
 
 Quasi-static: every key frame is found from the one before, against which the bed rubs, so where the
 organ comes to lie depends on its way. Nothing but bed and weight holds it while it is pressed,
-pushed, rolled or breathes: it is free to roll. A hand that turns it over holds it. Ranges are
-assumptions, wide on purpose.
+pushed, rolled or breathes: it is free to roll. Ranges are assumptions, wide on purpose.
 
 Key frames are parted into their best rigid motion over the volume and the displacement that it
 leaves. Between them the first goes along by slerp, displacement and place by monotone cubics.
@@ -22,11 +21,10 @@ from tumortrack.core.geometry import rigid, transform_points, unit
 from tumortrack.core.types import Mesh
 from tumortrack_lab.peers.base import kabsch
 from tumortrack_lab.tets import find
-from tumortrack_lab.twin.equilibrium import Nodes, Points, Rod, Support
+from tumortrack_lab.twin.equilibrium import Nodes, Points, Rod
 from tumortrack_lab.twin.occluders import rod_mesh
 from tumortrack_lab.world.families import (
     bedded,
-    clamp,
     equilibria,
     frame_along,
     log_uniform,
@@ -35,14 +33,13 @@ from tumortrack_lab.world.families import (
     roll,
     volume_change,
 )
-from tumortrack_lab.world.forces import Capsule, Force, Steady, Touch, Turned, Weight
+from tumortrack_lab.world.forces import Capsule, Force
 from tumortrack_lab.world.organ import Generator, Organ, Stage
-from tumortrack_lab.world.views import direction, hand_mesh
+from tumortrack_lab.world.views import direction
 
 KEY_MM = 2.5  # of a load, between key frames
 BEFORE_S, AFTER_S = 1.0, 1.5  # at rest, before the load comes and when it has gone
 _AWAY_MM = 60.0  # where a tool waits
-_LIFT_MM = 25.0  # of an organ that is turned over
 
 Transform = Float64[np.ndarray, "4 4"]
 Times = Float64[np.ndarray, " k"]
@@ -56,13 +53,21 @@ def _no_tools(time_s: float) -> list[Mesh]:
     return []
 
 
+class Cover(NamedTuple):
+    """A hand or instruments hide this share of the organ's picture (first camera) meanwhile."""
+
+    since_s: float
+    until_s: float
+    share: float
+
+
 @dataclass(frozen=True, eq=False)
 class LoadPath:
     """Key frames (bench frame, mm) and what goes on besides.
 
     ``phases_s``: when it begins, the load comes, is all there, goes, has gone, and when it ends;
-    ``way``: how bench, bed and organ move as one (breathing, a hand that turns the organ over);
-    ``bed_too``: the ground goes along; ``tools``: what else is in the picture; both by time.
+    ``way``, ``bed``: how the organ and the ground move as one (breathing); ``tools``: what else is
+    in the picture; all by time. ``covers``: what comes before the organ.
     """
 
     organ: Organ
@@ -72,18 +77,16 @@ class LoadPath:
     phases_s: list[float]
     about: dict[str, Any]
     way: Callable[[float], Transform] = _still
-    bed_too: bool = False
+    bed: Callable[[float], Transform] = _still
     tools: Callable[[float], list[Mesh]] = _no_tools
+    covers: tuple[Cover, ...] = ()
 
     @property
     def seconds(self) -> float:
         return float(self.times_s[-1])
 
-    def of(self, points_mm: Points) -> Moving:
-        """Points in or on the organ at rest on their way."""
-        from scipy.interpolate import PchipInterpolator
-        from scipy.spatial.transform import Rotation, Slerp
-
+    def parted(self, points_mm: Points) -> tuple[np.ndarray, np.ndarray]:
+        """Of each key frame the rigid motion, and what it leaves at these points."""
         mesh, rest = self.organ.mesh, self.organ.mesh.nodes_mm
         share = mesh.lump(mesh.volumes_mm3)
         owner, weights = find(rest[mesh.tets], points_mm)
@@ -92,7 +95,15 @@ class LoadPath:
         for nodes, pose in zip(self.keys_mm, poses, strict=True):
             moved = np.einsum("mi,mij->mj", weights, (nodes - rest)[mesh.tets[owner]])
             left.append(transform_points(np.linalg.inv(pose), points_mm + moved) - points_mm)
-        middle = share @ rest / share.sum()
+        return poses, np.array(left)
+
+    def of(self, points_mm: Points) -> Moving:
+        """Points in or on the organ at rest on their way."""
+        from scipy.interpolate import PchipInterpolator
+        from scipy.spatial.transform import Rotation, Slerp
+
+        mesh, (poses, left) = self.organ.mesh, self.parted(points_mm)
+        middle = np.average(mesh.nodes_mm, axis=0, weights=mesh.lump(mesh.volumes_mm3))
         places = poses[:, :3, :3] @ middle + poses[:, :3, 3]
         turn = Slerp(self.times_s, Rotation.from_matrix(poses[:, :3, :3]))
         place = PchipInterpolator(self.times_s, places)
@@ -101,7 +112,7 @@ class LoadPath:
             rotation = turn(time_s).as_matrix()
             return rigid(rotation, place(time_s) - rotation @ middle)
 
-        return Moving(points_mm, pose_at, PchipInterpolator(self.times_s, np.array(left)))
+        return Moving(points_mm, pose_at, PchipInterpolator(self.times_s, left))
 
 
 @dataclass(frozen=True, eq=False)
@@ -268,72 +279,14 @@ def _breathe(organ: Organ, rng: Generator) -> LoadPath:
     def way(time_s: float) -> Transform:
         phase = np.clip((time_s - BEFORE_S) / period_s, 0, breaths)
         share = np.sin(np.pi * phase) ** 2
-        return _turned(middle, [0.0, share * tilt, 0.0], share * (far * -out + [0, 0, lift]))
+        return turned(middle, [0.0, share * tilt, 0.0], share * (far * -out + [0, 0, lift]))
 
     about = {"mm": deep, "moved_mm": far, "period_s": period_s}
-    return _loaded(bench, course, at, about, way=way, bed_too=True)
+    return _loaded(bench, course, at, about, way=way, bed=way)
 
 
-def _turn(organ: Organ, rng: Generator) -> LoadPath:
-    """A hand, which is seen, grips the organ, turns it about its length and lays it down."""
-    bench = _bench(organ, rng, (0.1, 0.3), 0.0)
-    stage, solid = bench.stage, bench.stage.solid
-    grip = clamp(stage, rng)
-    hard = min(1.0, rng.uniform(2.0, 8.0) / grip.reach_mm)
-    degrees = rng.uniform(60.0, 180.0) * rng.choice([-1.0, 1.0])
-    rotation = _turned(np.zeros(3), [degrees, 0.0, 0.0], np.zeros(3))[:3, :3]
-    middle, lowest = organ.middle_mm, ((organ.points_mm - organ.middle_mm) @ rotation[2]).min()
-    floor = Turned(Support(lowest), rotation.T, middle)
-    held: tuple[Force, ...] = (
-        Steady.of(solid),
-        *(f for f in bench.forces if isinstance(f, Capsule)),
-    )
-    bed, weight = bench.forces[:2]
-    assert isinstance(bed, Touch)
-    assert isinstance(weight, Weight)
-    flat = stage.touch(floor, bed.stiffness_kpa_mm)
-    pulled = Weight(weight.force_mn @ rotation)
-    before: tuple[Force, ...] = (bed, weight, *held)
-    after: tuple[Force, ...] = (flat, pulled, *held)
-    loads = [
-        before,
-        *((*before, *grip.at(share * hard)) for share in (0.5, 1.0)),
-        (*held, *grip.at(hard)),
-        *((*after, *grip.at(share * hard)) for share in (1.0, 0.5)),
-        after,
-    ]
-    turn_s, start_s = rng.uniform(1.2, 3.0), BEFORE_S + 1.2
-    end_s = start_s + turn_s
-    times = [0, BEFORE_S, start_s - 0.4, start_s, start_s + 0.3, end_s, end_s + 0.4, end_s + 0.8]
-    which = [0, 0, 1, 2, 3, 4, 5, 6]
-    laid_s = end_s + 0.8
-    phases = [0.0, BEFORE_S, start_s, end_s, laid_s, laid_s + 2 * AFTER_S]
-    course = _Course([], np.array([*times, phases[-1]]), [*which, 6], phases)
-
-    def way(time_s: float) -> Transform:
-        share = np.clip((time_s - start_s) / turn_s, 0, 1)
-        share = (1 - np.cos(np.pi * share)) / 2
-        up = _LIFT_MM * np.sin(np.pi * share) - share * (lowest + middle[2])
-        return _turned(middle, [share * degrees, 0.0, 0.0], np.array([0.0, 0.0, up]))
-
-    angle = rng.choice([0.0, np.pi]) + rng.uniform(-0.4, 0.4)  # past cameras at the sides
-    back, side = (np.array([np.cos(a), np.sin(a), 0.0]) for a in (angle, angle + np.pi / 2))
-    shape = hand_mesh(back, side, rng)
-    down = np.array([1.0, -1.0, -1.0])  # hands are made before a camera that looks straight down
-    hand = Mesh(shape.vertices_mm * down, shape.faces)
-
-    def tools(time_s: float) -> list[Mesh]:
-        away = [0.0, BEFORE_S, start_s, end_s, end_s + 1.0]
-        out_mm = np.interp(time_s, away, [250.0, 60.0, -15.0, -15.0, 250.0])
-        above = _LIFT_MM * np.sin(np.pi * np.clip((time_s - start_s) / turn_s, 0, 1))
-        top = middle + [0, 0, organ.size_mm[2] / 2 + 14.0 + above]
-        return [Mesh(hand.vertices_mm + top + out_mm * back * down, hand.faces)]
-
-    about = {"degrees": degrees, "grip_mm": hard * grip.reach_mm, "turn_s": turn_s}
-    return _path(bench, course, loads, about, way=way, tools=tools)
-
-
-def _turned(middle_mm: np.ndarray, degrees: Sequence[float], shift_mm: np.ndarray) -> Transform:
+def turned(middle_mm: np.ndarray, degrees: Sequence[float], shift_mm: np.ndarray) -> Transform:
+    """A motion that turns about a point (a rotation vector), and moves it."""
     from scipy.spatial.transform import Rotation
 
     rotation = Rotation.from_rotvec(degrees, degrees=True).as_matrix()
@@ -341,7 +294,7 @@ def _turned(middle_mm: np.ndarray, degrees: Sequence[float], shift_mm: np.ndarra
 
 
 KINDS: dict[str, Callable[[Organ, Generator], LoadPath]] = {
-    "press": _press, "breathe": _breathe, "push": _push, "roll": _roll, "turn": _turn,
+    "press": _press, "breathe": _breathe, "push": _push, "roll": _roll,
 }  # fmt: skip
 
 

@@ -111,6 +111,13 @@ class World:
         store.write_atomically(tets, save({"nodes_mm": mesh.nodes_mm, "tets": mesh.tets}))
         return world
 
+    @property
+    def points(self) -> Float64[np.ndarray, "n 3"]:
+        """The vertices of all parts at rest, one part after the other, and the inner points (bench
+        frame, mm)."""
+        inner = transform_points(self.bench_from_ct, self.targets.points_ct)
+        return np.concatenate([*(p.vertices_mm for p in self.organ.anatomy.parts), inner])
+
     def recipe(self, number: int, draws: int = 1, draw: int = 0) -> tuple[str, Disturbance]:
         """Family and disturbance of a state's scene, of so many: all pairs in turn."""
         family = self.config.families[number % len(self.config.families)]

@@ -4,6 +4,7 @@ noise of ``noise``; the organ's points as the live path finds them; and what dis
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -54,8 +55,8 @@ def look(
     scene = np.fmin.reduce([alone, below, *others])
     own = np.isfinite(alone) & (alone <= scene)
     if hidden > 0 and own.any():
-        cover, about["occluder"] = _covering(alone, own, camera, hidden, rng)
-        scene = np.fmin(scene, cover)
+        at, share, about["occluder"] = covering(alone, own, camera, hidden, rng)
+        scene = np.fmin(scene, render(at(share), np.eye(4), camera))
     seen = own & (alone <= scene)
     scene[scene > FAR_MM] = np.nan
     sensor = StereoConfig(subpixel_px=rng.uniform(0.03, 0.12), gloss_degrees=rng.uniform(2.0, 7.0))
@@ -188,11 +189,11 @@ def lump(middle_mm: np.ndarray, half_mm: np.ndarray) -> Mesh:
     return Mesh(ball.vertices * half_mm + middle_mm, ball.faces)
 
 
-def _covering(
+def covering(
     organ: np.ndarray, own: np.ndarray, camera: Intrinsics, hidden: float, rng: Generator
-) -> tuple[np.ndarray, str]:
-    """The depth of a hand or of instruments that come in from a side, so far that they hide this
-    share of what is seen of the organ; and which of them."""
+) -> tuple[Callable[[float], Mesh], float, str]:
+    """A hand or instruments that come in from a side (camera frame), by how far; where they hide
+    this share of what is seen of the organ; and which of them."""
     kind, angle = str(rng.choice(["hand", "instruments"])), rng.uniform(0, 2 * np.pi)
     back = np.array([np.cos(angle), np.sin(angle), 0.0])  # where they come from
     side = np.array([-back[1], back[0], 0.0])
@@ -202,17 +203,17 @@ def _covering(
     aim = np.array([column.mean() - camera.cx, row.mean() - camera.cy]) / camera.fx * middle
     size = float(np.hypot(np.ptp(column), np.ptp(row))) / camera.fx * middle
 
-    def at(share: float) -> np.ndarray:
+    def at(share: float) -> Mesh:
         place = np.array([*aim, middle]) + (1.2 - 3.0 * share) * size * back
-        return render(Mesh(shape.vertices_mm + place, shape.faces), np.eye(4), camera)
+        return Mesh(shape.vertices_mm + place, shape.faces)
 
     low, high = 0.0, 1.0
     for _ in range(12):
         share = (low + high) / 2
         with np.errstate(invalid="ignore"):
-            covered = float((at(share)[own] < organ[own]).mean())
+            covered = float((render(at(share), np.eye(4), camera)[own] < organ[own]).mean())
         low, high = (share, high) if covered < hidden else (low, share)
-    return at(high), kind
+    return at, high, kind
 
 
 def hand_mesh(back: np.ndarray, side: np.ndarray, rng: Generator) -> Mesh:
