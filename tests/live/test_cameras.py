@@ -213,6 +213,8 @@ def test_results_of_a_camera_that_moves_are_in_the_fixed_frame_and_missing_poses
     np.testing.assert_allclose(
         last.cloud.points_mm[:, 0], small_estimate().cloud.points_mm[:, 0] - 3.3, atol=1e-4
     )
+    box_mm = small_estimate().meshes["kidney"].box_mm - [3.3, 0, 0]
+    np.testing.assert_allclose(last.meshes["kidney"].box_mm, box_mm, atol=1e-6)
 
 
 def test_poses_between_stamps_turn_at_a_constant_rate():

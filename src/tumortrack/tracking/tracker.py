@@ -258,8 +258,9 @@ def _seen_from(estimate: Estimate, camera_from_last: Affine) -> Estimate:
         seen_from_first(one, camera_from_last) if isinstance(one, ElasticMotion) else one
         for one in (estimate.motion, estimate.unsmoothed)
     )
-    cloud = replace(estimate.cloud, points_mm=points_mm)
-    return replace(estimate, cloud=cloud, motion=motion, unsmoothed=unsmoothed)
+    cloud, meshes = replace(estimate.cloud, points_mm=points_mm), estimate.meshes.items()
+    moved = {n: m.moved(transform_points(camera_from_last, m.vertices_mm)) for n, m in meshes}
+    return replace(estimate, cloud=cloud, meshes=moved, motion=motion, unsmoothed=unsmoothed)
 
 
 def region_for(
