@@ -12,7 +12,6 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
-from trimesh.triangles import closest_point
 
 from tumortrack.core.errors import InputError
 from tumortrack.core.estimate import Motion
@@ -83,6 +82,8 @@ def triangle_distance(
     points_mm: Float[np.ndarray, "n 3"], triangles_mm: Float[np.ndarray, "n 3 3"]
 ) -> Float[np.ndarray, " n"]:
     """Exact distance of each point to its triangle (interior, edges and corners), mm."""
+    from trimesh.triangles import closest_point  # slow to import
+
     return np.linalg.norm(points_mm - closest_point(triangles_mm, points_mm), axis=1)
 
 
