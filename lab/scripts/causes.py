@@ -28,8 +28,8 @@ from tumortrack.training.model import load_model
 from tumortrack_lab.study import trainings
 from tumortrack_lab.study.document import ReportWriter, make_folder, table
 from tumortrack_lab.world import causes
-from tumortrack_lab.world.following import STATES
 from tumortrack_lab.world.scenes import TETS, World, WorldConfig
+from tumortrack_lab.world.tables import STATES
 
 BLOCK = "causes"
 LADDER = {  # what is told of the surface, what else is known

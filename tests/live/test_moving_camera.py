@@ -56,8 +56,8 @@ def test_tf_of_another_process_places_the_camera_at_the_frames_stamp():
         try:
             stamps = []
 
-            def now():
-                stamps.append(time.time_ns() - 10**8)
+            def now(ago_ns=10**8):
+                stamps.append(time.time_ns() - ago_ns)
                 return seen(stamps[-1])
 
             pose = known(poses, now)
@@ -65,8 +65,10 @@ def test_tf_of_another_process_places_the_camera_at_the_frames_stamp():
             np.testing.assert_allclose(pose, expected, atol=0.01)
             np.testing.assert_allclose(known(tool, now), in_mm(tool_pose(stamps[-1])), atol=0.01)
             # A frame just taken waits for what was said after it.
-            fresh = known(poses, lambda: now() and seen(time.time_ns()))
-            assert np.linalg.norm(fresh[:3, 3] - pose[:3, 3]) > 0.5
+            fresh = known(poses, lambda: now(0))
+            np.testing.assert_allclose(
+                fresh, in_mm(tool_pose(stamps[-1]) @ TOOL_FROM_CAMERA), atol=0.01
+            )
             with pytest.raises(NoEstimate, match="older than the frame"):
                 poses.at(seen(time.time_ns() + 10**9))
             with pytest.raises(NoEstimate, match="the camera, 'optical', with 'world'"):

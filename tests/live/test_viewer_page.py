@@ -22,7 +22,7 @@ from browser import Browser
 from clock import until
 from live_objects import empty_update, small_setting, small_update
 from stories import COMMAND, environment, live_resection
-from tumortrack.core.geometry import rigid
+from tumortrack.core.geometry import rigid, transform_points
 from tumortrack.live.sinks.viewer import ViewerSink, ViewerSinkConfig
 from tumortrack.live.values import PublishedFrame, SinkContext, TrackingResult
 from workcell_objects import REASON, virtual, workcell
@@ -144,15 +144,16 @@ def check_arms(browser: Browser, feed: Feed, shown: TrackingResult, setting: Sin
 
 
 def check_click(browser: Browser, setting: SinkContext) -> None:
-    """A click on the scene gives the seen point under it, in the camera's frame."""
+    """A click on the scene gives the seen point under it, in the published frame."""
     rect = browser.box("canvas")
     browser.click_text("Click the organ")
     until(lambda: "Now click" in browser.text(), "being asked to click")
     column, row = 40, -25  # pixels from the middle of the view
     browser.click(rect[0] + rect[2] / 2 + column, rect[1] + rect[3] / 2 + row)
     until(lambda: setting.controls.picked_mm is not None, "the click")
-    picked = setting.controls.picked_mm
-    assert picked is not None
+    assert setting.controls.picked_mm is not None
+    camera_from_published = np.linalg.inv(setting.published_frame.published_from_camera)
+    (picked,) = transform_points(camera_from_published, setting.controls.picked_mm[None])
     focal = rect[3] / 2 / np.tan(0.45)  # the view starts where the camera is, 0.9 rad high
     assert picked[2] > 100
     assert picked[:2] == pytest.approx(np.array([column, row]) * picked[2] / focal, abs=3)
