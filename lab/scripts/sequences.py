@@ -61,8 +61,6 @@ class Options:
     """Follow with it (folder that `tumortrack train` wrote)."""
     methods: tuple[str, ...] = ("track", "first-look")
     """How; see tumortrack_lab.world.following."""
-    version: str = ""
-    """Of the program, if several are to be compared: kept apart, and named in the table."""
     others: tuple[Path, ...] = ()
     """Folders of other organs, followed before, that the table counts in."""
     document: Path | None = None
@@ -118,15 +116,14 @@ def _opened(options: Options, config: FilmConfig) -> tuple[World, Callable[[], l
 
 def _follow(options: Options, model: Path, films: list[Film]) -> None:
     tracker, sha256 = Tracker(api.load_model(model, "cpu")), store.sha256_of(model / store.MANIFEST)
-    about = {"model_sha256": sha256, "version": options.version}
+    about = {"model_sha256": sha256, "version": ""}
     sites = tumor_sites_of(films[0].rest)
     for done, film in enumerate(films, start=1):
         for method in options.methods:
-            called = "-".join(filter(None, (method, options.version)))
             judge = partial(following.judge, following.METHODS[method](tracker), film, sites)
-            rows = trainings.kept(film.folder / f"{called}.json", about, judge)
+            rows = trainings.kept(film.folder / f"{method}.json", about, judge)
             errors = pd.DataFrame(rows).reindex(columns=["center_mm"])["center_mm"]
-            say(f"{done}/{len(films)} {film.folder.name}, {called}: {errors.median():.1f} mm off")
+            say(f"{done}/{len(films)} {film.folder.name}, {method}: {errors.median():.1f} mm off")
     rows = [row for out in (options.out, *options.others) for row in tables.rows_in(out)]
     found = pd.DataFrame(rows)
     text = tables.summary(found)

@@ -46,7 +46,7 @@ def summary(rows: pd.DataFrame) -> str:
     one = rows["method"].isin(["track", "first-look"])
     also = rows.merge(rows.loc[~one, ["organ", "sequence"]].drop_duplicates())
     frames = _frames(rows)
-    parts = [_errors(rows[one]), _errors(also), _verdicts(frames), _kept(frames)]
+    parts = [_errors(rows[one]), _errors(also), _verdicts(frames)]
     parts += [_jumps(frames[frames["kind"] == "jump"]), _hiding(frames[frames["kind"] == "hidden"])]
     return "\n\n".join(filter(None, parts)) + "\n"
 
@@ -90,50 +90,33 @@ def _frames(rows: pd.DataFrame) -> pd.DataFrame:
     return frames.assign(wrong=wrong, failed=failed)
 
 
-def _sequences(frames: pd.DataFrame) -> pd.DataFrame:
-    """A line a sequence: for how long without a break it was wrong and called good."""
-    body = []
-    for (organ, name), mine in frames.groupby(["organ", "sequence"]):
-        times = mine["time_s"].tolist()
-        spans = [longest_s(times, mine[key].tolist()) for key in ("wrong", "failed")]
-        body.append((organ, name, *spans))
-    return pd.DataFrame(body, columns=["organ", "sequence", "wrong_s", "failed_s"])
-
-
 def _verdicts(frames: pd.DataFrame) -> str:
-    body = []
+    """By method and kind; and by name where a wrong state was called good for over a second."""
+    body, named = [], []
     for (method, kind), mine in frames.groupby(["method", "kind"]):
-        shares = [(mine["quality"] == "good").mean(), (mine["quality"] == "poor").mean()]
-        each = _sequences(mine)
-        cells = [method, kind, str(len(each)), str(len(mine))]
-        cells += [f"{100 * share:.0f}" for share in shares] + [f"{100 * mine['wrong'].mean():.1f}"]
-        kept = [str((each[key] > KEPT_S).sum()) for key in ("wrong_s", "failed_s")]
-        body.append([*cells, f"{each['wrong_s'].max():.1f}", *kept])
+        spans = []
+        for (organ, name), one in mine.groupby(["organ", "sequence"]):
+            times, its = one["time_s"].tolist(), one[one["wrong"]]
+            spans.append([longest_s(times, one[key].tolist()) for key in ("wrong", "failed")])
+            if spans[-1][0] > KEPT_S:
+                off, rigid = (its[key].median() for key in ("center_mm", "rigid_center_mm"))
+                named.append(
+                    f"{method} in {organ} {name}, {spans[-1][0]:.1f} s ({spans[-1][1]:.1f} s over "
+                    f"5 mm), {off:.1f} mm off (best rigid pose {rigid:.1f}), "
+                    f"{100 * its['hidden_share'].median():.0f} % hidden"
+                )
+        shares = [f"{100 * (mine['quality'] == q).mean():.0f}" for q in ("good", "poor")]
+        kept = [str(int((np.array(spans)[:, n] > KEPT_S).sum())) for n in (0, 1)]
+        cells = [method, kind, str(len(spans)), str(len(mine)), *shares]
+        wrong = f"{100 * mine['wrong'].mean():.1f}", f"{np.max(spans, axis=0)[0]:.1f}"
+        body.append([*cells, *wrong, *kept])
     head = ["method", "kind", "sequences", "frames", "good, %", "poor, %", "good and over 3 mm, %"]
     head += ["longest, s", "kept over 1 s", "over 5 mm kept over 1 s"]
     return (
         f"{table(head, body, 2)}\n\nOver 3 mm: the centre of any tumor. Longest, kept: good and "
-        "over 3 mm (5 mm) off without a break; sequences."
+        "over 3 mm (5 mm) off without a break; sequences. Kept over a second: "
+        f"{'; '.join(named) or 'none'}."
     )
-
-
-def _kept(frames: pd.DataFrame) -> str:
-    """Sequences in which the follower was wrong and called good for over a second."""
-    by = {method: mine.set_index(_FRAME) for method, mine in frames.groupby("method")}
-    each, body = _sequences(frames[frames["method"] == "track"]), []
-    for organ, name, *spans in each[each["wrong_s"] > KEPT_S].itertuples(index=False):
-        mine = by["track"].loc[(organ, name)]
-        mine, also = mine[mine["wrong"]], "–"
-        if "first-look" in by and (organ, name) in by["first-look"].index:
-            also = (
-                f"{100 * by['first-look'].loc[(organ, name)]['wrong'].loc[mine.index].mean():.0f}"
-            )
-        off = (f"{mine[key].median():.1f}" for key in ("center_mm", "rigid_center_mm"))
-        hidden = f"{100 * mine['hidden_share'].median():.0f}"
-        body.append([f"{organ} {name}", *(f"{span:.1f}" for span in spans), *off, hidden, also])
-    head = ["wrong state kept over 1 s", "over 3 mm, s", "over 5 mm, s", "off, mm"]
-    head += ["best rigid pose, mm", "hidden, %", "a first look wrong, too, %"]
-    return table(head, body) if body else ""
 
 
 def _jumps(frames: pd.DataFrame) -> str:
