@@ -430,12 +430,14 @@ def test_a_source_that_stays_away_ends_the_loop(tracker):
         play(tracker, [threading.Event().wait], config)
 
 
-def test_a_lost_source_comes_back(tracker, stages):
+def test_a_lost_source_comes_back(tracker, stages, monkeypatch):
+    # Silent for longer than it is stale after, and that longer than a loaded machine takes.
+    monkeypatch.setattr("tumortrack.live.workers._AGAIN_S", 1.5)
     clouds = moving(stages[0], 4)
     scripts = [Script([*clouds[:2], SourceLost("the camera was unplugged")]), Script(clouds[2:])]
     sink = Notes()
     setting = SinkContext(tracker.model.parts, PublishedFrame(), tracker.anatomy_ct, Controls())
-    loop = Loop(tracker, setting, LoopConfig(region=WHOLE, stale_s=0.3, give_up_s=PATIENCE_S))
+    loop = Loop(tracker, setting, LoopConfig(region=WHOLE, stale_s=0.9, give_up_s=PATIENCE_S))
     outlets = [SinkWorker("notes", sink, 1000)]
     reader = SourceWorker(lambda: scripts.pop(0))
     loop.run(reader, outlets, lambda _: None)
