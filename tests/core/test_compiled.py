@@ -26,14 +26,19 @@ class Pair(NamedTuple):
 """
 
 
-def run(folder, home):
-    code = f"from kernel import total; from {home} import Pair; print(total(Pair(1.0, 2.0)))"
+def printed(folder, code):
+    """What it prints in a process of its own, which may find machine code; or the error."""
     environment = {**os.environ, "PYTHONPATH": f"{folder}:{os.environ.get('PYTHONPATH', '')}"}
     environment.pop("NUMBA_CACHE_DIR", None)
     done = subprocess.run(
         [sys.executable, "-c", code], env=environment, capture_output=True, text=True, cwd=folder
     )
-    assert done.stdout.strip() == "3.0", done.stderr
+    return done.stdout.strip() or done.stderr
+
+
+def run(folder, home):
+    code = f"from kernel import total; from {home} import Pair; print(total(Pair(1.0, 2.0)))"
+    assert printed(folder, code) == "3.0"
 
 
 @pytest.mark.parametrize("damage", [None, b"", b"\x80\x05garbage"])
@@ -66,14 +71,9 @@ def total(values):
 
 
 def total_of(folder, kind):
-    """In a process of its own, which may find machine code: the sum of 1, 2, 3."""
+    """The sum of 1, 2, 3."""
     code = f"import numpy, kernel; print(kernel.total(numpy.array([1, 2, 3], numpy.{kind})))"
-    environment = {**os.environ, "PYTHONPATH": f"{folder}:{os.environ.get('PYTHONPATH', '')}"}
-    environment.pop("NUMBA_CACHE_DIR", None)
-    done = subprocess.run(
-        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, cwd=folder
-    )
-    return done.stdout.strip() or done.stderr
+    return printed(folder, code)
 
 
 def test_machine_code_for_other_types_of_arguments_is_not_taken(tmp_path):
@@ -106,15 +106,15 @@ def test_machine_code_of_older_source_is_not_taken(tmp_path):
     assert total_of(tmp_path, "float64") == "12.0"
 
 
-def test_machine_code_is_outdated_when_a_function_that_it_calls_has_changed(tmp_path):
-    (tmp_path / "callee.py").write_text(
-        "from tumortrack.core.compiled import numba\n\n"
-        "@numba.njit(cache=True)\ndef factor():\n    return 1.0\n"
-    )
-    importing = "from callee import factor\n" + TOTAL.replace("FACTOR", "factor()")
+@pytest.mark.parametrize(
+    ("part", "asked"),
+    [("@numba.njit(cache=True)\ndef part(): return 1.0", "part()"), ("part = 1.0", "part")],
+)
+def test_machine_code_is_outdated_when_a_part_of_another_module_has_changed(tmp_path, part, asked):
+    before = f"from tumortrack.core.compiled import numba\n\n{part}\n"
+    (tmp_path / "other.py").write_text(before)
+    importing = "from other import part\n" + TOTAL.replace("FACTOR", asked)
     (tmp_path / "kernel.py").write_text(importing)
     assert total_of(tmp_path, "float64") == "6.0"
-    (tmp_path / "callee.py").write_text(
-        (tmp_path / "callee.py").read_text().replace("return 1.0", "return 2.00")
-    )
+    (tmp_path / "other.py").write_text(before.replace("1.0", "2.00"))
     assert total_of(tmp_path, "float64") == "12.0"

@@ -117,8 +117,9 @@ class Track(StatedPatient):
         from tumortrack.live.workers import SourceWorker
         from tumortrack.models.folder import patient_of, read_model_manifest
 
-        setup = self._cameras()
-        if arms is not None:
+        if arms is None:
+            setup = self._cameras()
+        else:  # read once: what executes is what was checked
             setup = CameraSetup(arms.frames, {self.source: arms.source})
         frames, named = setup.published, api.named_sinks(self.sinks)
         manifest = read_model_manifest(self.model)  # what is wrong, before PyTorch's seconds

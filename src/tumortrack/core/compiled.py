@@ -11,13 +11,14 @@ arguments. Three things about it are mended here, each of which costs a compilat
   gives wrong numbers or crashes. So each file says for which source and types it is, and what is
   for others is not taken.
 - Code is outdated when its own module has changed, but not when a function of another module has
-  that is part of it. Here those modules count as well.
+  that is part of it, or a number that it takes from one. Here those count as well.
 """
 
 from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 from types import FunctionType
 from typing import Any
@@ -34,20 +35,29 @@ _load_index, _load, _save = (
 )
 
 
-def _begin_with_callees(self: Any, function: FunctionType) -> None:
+def _begin_with_parts(self: Any, function: FunctionType) -> None:
     _begin(self, function)
-    files = sorted(set(_files(function)) - {function.__code__.co_filename})
-    stamps = [hashlib.sha256(Path(file).read_bytes()).hexdigest() for file in files]
-    self._cache_file._source_stamp = (self._cache_file._source_stamp, *stamps)
+    self._cache_file._source_stamp = (
+        self._cache_file._source_stamp,
+        *sorted(set(_parts(function))),
+    )
 
 
-def _files(function: FunctionType) -> Iterator[str]:
-    """Where a function and the compiled ones that it calls are written."""
-    yield function.__code__.co_filename
+def _parts(function: FunctionType) -> Iterator[str]:
+    """What becomes part of a function's machine code: the sources of compiled ones that it calls,
+    theirs in turn, and constants."""
     for name in function.__code__.co_names:
-        callee = function.__globals__.get(name)
-        if isinstance(callee, Dispatcher) and callee.py_func is not function:
-            yield from _files(callee.py_func)
+        value = function.__globals__.get(name)
+        if isinstance(value, Dispatcher) and value.py_func is not function:
+            yield _sha256(value.py_func.__code__.co_filename)
+            yield from _parts(value.py_func)
+        elif isinstance(value, int | float | str | tuple):
+            yield f"{name} = {value!r}"
+
+
+@cache
+def _sha256(file: str) -> str:
+    return hashlib.sha256(Path(file).read_bytes()).hexdigest()
 
 
 def _index_or_none(self: Any) -> Any:
@@ -69,7 +79,7 @@ def _save_with_key(self: Any, key: Any, code: Any) -> None:
     _save(self, key, (self._source_stamp, key, code))
 
 
-setattr(Cache, "__init__", _begin_with_callees)  # noqa: B010
+setattr(Cache, "__init__", _begin_with_parts)  # noqa: B010
 setattr(IndexDataCacheFile, "_load_index", _index_or_none)  # noqa: B010  as mypy wants it
 setattr(IndexDataCacheFile, "load", _code_or_none)  # noqa: B010
 setattr(IndexDataCacheFile, "save", _save_with_key)  # noqa: B010

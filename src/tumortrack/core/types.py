@@ -119,7 +119,8 @@ class Mesh:
         return float(np.ptp(self.box_mm, axis=0).max())
 
     def spread_mm(self, longest_mm: float = 2.0) -> Float64[np.ndarray, "n 3"]:
-        """Points all over the surface, see ``spread_over``."""
+        """Points all over the surface, see ``spread_over``. With the default one of them is at most
+        1.2 mm away, which makes a distance of 5 mm to the surface too long by 0.1 mm at most."""
         return spread_over(self.vertices_mm, self.faces, longest_mm)
 
     def moved(self, vertices_mm: Float[np.ndarray, "v 3"]) -> Mesh:

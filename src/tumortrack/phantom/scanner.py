@@ -56,13 +56,7 @@ class ScannerParameters(Config, frozen=True):
         hu, extent = (AIR_HU, 3000), (0, 200)
         self.check_between("scan:", organ_hu=hu, tumor_hu=hu, table_hu=hu, block_hu=hu)
         self.check_between("scan:", spacing_mm=(0.2, 10), tilt_deg=(-180, 180), noise_hu=extent)
-        lengths = (
-            "margin_mm",
-            "table_thickness_mm",
-            "table_gap_mm",
-            "block_gap_mm",
-            "psf_sigma_mm",
-        )
+        lengths = ("margin_mm", "table_thickness_mm", "table_gap_mm", "block_gap_mm")
         others = ("block_size_mm", "psf_sigma_mm", "noise_correlation_voxels")
         self.check_between("scan:", **dict.fromkeys((*lengths, *others), extent))
 

@@ -103,19 +103,19 @@ class Registration:
         with timed("refine"):
             fit = whole.best_fit(looks.points_mm, hypotheses, usual_cost)
             # Each with its own places of the cameras.
-            return best_laid([self._laid(looks, one, _CORRECTIONS) for one in (fit, *fit.rivals)])
+            return best_laid([self._laid(looks, one) for one in (fit, *fit.rivals)])
 
     def follow(self, looks: Looks, start: ElasticMotion, config: GaussNewtonConfig) -> Laid:
         """The fit near a motion, and the looks as the further cameras are corrected then."""
         fit = refine(self.rest, looks.points_mm, start, looks.weighed(config))
-        return self._laid(looks, fit, _CORRECTIONS)
+        return self._laid(looks, fit)
 
-    def _laid(self, looks: Looks, fit: RegistrationResult, times: int) -> Laid:
+    def _laid(self, looks: Looks, fit: RegistrationResult) -> Laid:
         """Further cameras and the motion in turns, from a fit with the cameras as stated."""
         if looks.count == 1:
             return fit, looks
         near = msgspec.structs.replace(looks.weighed(self.config), first_mm=self.config.last_mm)
-        for _ in range(times):
+        for _ in range(_CORRECTIONS):
             looks = looks.corrected(fit.motion, self.config)
             fit = refine(self.rest, looks.points_mm, fit.motion, near)
         costs = fit.cost + looks.cost, fit.cost_without_strays + looks.cost
