@@ -16,14 +16,14 @@ help:  ## list the targets
 setup: $(SETUP)  ## install everything into .venv
 
 # PyTorch's CPU build is taken where pip knows of it, else PyPI's, which on Linux needs CUDA's packages.
-$(SETUP): pyproject.toml lab/pyproject.toml requirements/lock.txt requirements/cuda.txt requirements/torch-cpu.txt
+$(SETUP): pyproject.toml lab/pyproject.toml experiment/pyproject.toml requirements/lock.txt requirements/cuda.txt requirements/torch-cpu.txt
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "tumortrack needs Python 3.11 or newer; give make PYTHON=python3.11")'
 	$(PYTHON) -m venv .venv
 	$(BIN)/$(INSTALL) --require-hashes -r requirements/torch-cpu.txt 2>/dev/null || echo "PyTorch: PyPI's build"
 	$(BIN)/$(INSTALL) --require-hashes -r requirements/lock.txt
 	if $(BIN)/python -c 'from importlib.metadata import requires; print(requires("torch"))' | grep -q nvidia; then \
 	$(BIN)/$(INSTALL) --require-hashes -r requirements/cuda.txt; fi
-	$(BIN)/$(INSTALL) --no-build-isolation -e . -e lab
+	$(BIN)/$(INSTALL) --no-build-isolation -e . -e experiment -e lab
 	$(BIN)/python -I -m pip check  # -I: what PYTHONPATH names, as ROS sets it, is none of ours
 	touch $@
 
@@ -36,8 +36,8 @@ demo: setup  ## CT -> tumors located in unseen deformed scenes (about 4 minutes 
 	$(BIN)/tumortrack demo
 
 check: setup  ## lint, types, import order, licences
-	$(BIN)/ruff check src lab tests examples tools
-	$(BIN)/ruff format --check src lab tests examples tools
+	$(BIN)/ruff check src lab experiment tests examples tools
+	$(BIN)/ruff format --check src lab experiment tests examples tools
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 	$(BIN)/python tools/dependencies.py licences
@@ -90,9 +90,9 @@ causes: setup  ## shares of causes in the tumors' errors: fits told parts of the
 trust: setup  ## what margins are worth for physics and organs left out (ARGS="MODEL/margins.jsonl ...": an organ each)
 	$(BIN)/python lab/scripts/trust.py $(ARGS)
 
-wheel: setup  ## build the wheels of product and laboratory into dist/, with their dependencies (SBOM)
-	$(BIN)/pip wheel --quiet --no-deps --no-build-isolation --wheel-dir dist . ./lab
-	$(BIN)/python tools/dependencies.py sbom dist/tumortrack-*.whl dist/tumortrack_lab-*.whl
+wheel: setup  ## build the wheels of product, experiment and laboratory into dist/, with their dependencies (SBOM)
+	$(BIN)/pip wheel --quiet --no-deps --no-build-isolation --wheel-dir dist . ./experiment ./lab
+	$(BIN)/python tools/dependencies.py sbom dist/tumortrack-*.whl dist/tumortrack_experiment-*.whl dist/tumortrack_lab-*.whl
 
 lock: setup $(TOOLS)  ## pin the dependencies by hash (ARGS=--upgrade: newest; ARGS="--upgrade-package NAME")
 	PATH="$(CURDIR)/.tools/bin:$$PATH" $(BIN)/python tools/dependencies.py lock $(ARGS)

@@ -10,7 +10,11 @@ import jaxtyping
 import pytest
 
 ROOT = Path(__file__).parents[1]
-PACKAGES = (ROOT / "src" / "tumortrack", ROOT / "lab" / "src" / "tumortrack_lab")
+PACKAGES = (
+    ROOT / "src" / "tumortrack",
+    ROOT / "lab" / "src" / "tumortrack_lab",
+    ROOT / "experiment" / "src" / "tumortrack_experiment",
+)
 
 # Left out: modules with numba kernels (numba compiles the plain function); core.types, whose
 # constructors convert and check shapes themselves, always; and packages' __init__.py, with whom

@@ -24,7 +24,7 @@ from packaging.utils import canonicalize_name
 ROOT = Path(__file__).parents[1]
 LOCKS = ROOT / "requirements"
 TABLE = ROOT / "docs" / "dependencies.md"
-OWN = ("tumortrack", "tumortrack-lab")
+OWN = ("tumortrack", "tumortrack-lab", "tumortrack-experiment")
 _APART = {"ur-rtde": "ur"}  # in a file of its own: `make setup` leaves it out
 
 # Licences that ask for no more than to be named, and those that bind only changes of the package
@@ -56,7 +56,7 @@ def lock(upgrade: list[str]) -> None:
     """Resolve everything for every platform, and keep what is pinned unless told to upgrade."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
     extras = ",".join(project["optional-dependencies"])
-    everything = f"-e {ROOT}[{extras}]\n-e {ROOT / 'lab'}\n"
+    everything = f"-e {ROOT}[{extras}]\n-e {ROOT / 'lab'}\n-e {ROOT / 'experiment'}\n"
     pins = pinned(_resolved(everything, "".join(_locks().values()), upgrade))
     files: dict[str, list[str]] = {name: [] for name in _ABOUT}
     for name, text in pins.items():

@@ -39,6 +39,7 @@ _COMMANDS: tuple[type[Command], ...] = (
 _ORDER = (
     *("demo", "prepare", "export", "train", "pretrain", "locate", "track", "plan", "resect"),
     *("simulate", "twin", "evaluate", "margins", "generic-margins", "bench"),
+    *("phantom-kit", "calibrate", "record", "reference"),
     *("compile", "onnx", "inspect", "doctor"),
 )
 _OBJECTS_A_COLLECTION = 20_000

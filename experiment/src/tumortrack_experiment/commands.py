@@ -1,0 +1,1 @@
+"""The experiment's commands: `tumortrack` finds them by its entry points' names."""
