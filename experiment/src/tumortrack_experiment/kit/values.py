@@ -15,8 +15,8 @@ from tumortrack.core.types import Mesh
 class PrintedPart:
     """A closed solid, mm, where it is in use: molds round the organ in the ``ct`` frame (LPS), what
     stands on the bench in the ``base`` frame. ``print_from_frame``: how it lies on the printer's
-    bed, z up from 0. ``state``: the state that it imposes, if any. ``checks``: numbers by name, with
-    their unit, as the table of checks has them."""
+    bed, z up from 0. ``state``: the state that it imposes, if any. ``checks``: numbers by name,
+    with their unit, as the table of checks has them."""
 
     name: str
     purpose: str
