@@ -1,44 +1,35 @@
-"""Molds for casting the organ and its tumors: two halves along each one's own parting surface."""
+"""Molds for casting an organ and its tumors: two halves along each one's own parting surface."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float64
 
 from tumortrack.core.config import Config
-from tumortrack.core.geometry import transform_points
+from tumortrack.core.geometry import transform_points, triangles_of
 from tumortrack.core.types import Anatomy, Mesh
 from tumortrack.imaging.meshes import mesh_of, solid_of
 from tumortrack.sense.render import Visibility
-from tumortrack_experiment.kit.casting import Halves, Layout, cut_halves, lay_out
-from tumortrack_experiment.kit.mold_checks import (
-    area_mm2,
-    behind_mm,
-    cast_solid,
-    demould,
-    distance_mm,
-    open_edges,
-    thin_share,
-)
+from tumortrack_experiment.kit.casting import Layout, cut_halves, lay_out
+from tumortrack_experiment.kit.mold_checks import cast_error, demould, open_edges, walls
 from tumortrack_experiment.kit.parting import undercut
 from tumortrack_experiment.kit.pins import Pin, firmness, place_pins
-from tumortrack_experiment.kit.split import fits, split_to_bed, to_bed
+from tumortrack_experiment.kit.split import fits, laid_mesh, split_to_bed, to_bed
 from tumortrack_experiment.kit.values import PrintedPart
 
-_EDGE_MM = 3.0  # from the parting line and from holes a wall is as thin as its edge
+Checks = tuple[tuple[str, float], ...]
 
 
 class MoldConfig(Config):
     """Sizes of the molds, mm. ``clearance_mm``: between a key and its hole, on the radius.
-    ``largest_undercut_mm``: how far the cast may have to yield when a part is pulled off; soft
-    casts yield, and 4 mm is our choice. ``bed_mm``: the printer's; larger parts are split."""
+    ``largest_undercut_mm``: how far a cast may have to yield when a half is pulled off; our choice:
+    hydrogel and silicone stretch by more. ``bed_mm``: the printer's; larger parts are split."""
 
     wall_mm: float = 5.0
     clearance_mm: float = 0.25
-    largest_undercut_mm: float = 4.0
+    largest_undercut_mm: float = 5.0
     sprue_mm: float = 10.0
     vent_mm: float = 1.5
     pin_mm: float = 1.5
@@ -53,12 +44,12 @@ class MoldConfig(Config):
 
 @dataclass(frozen=True, eq=False)
 class OrganMold:
-    """The printed parts, how they come off, and what was measured on them.
+    """A mold's printed parts (of an organ or a tumor), how they come off, and their checks.
 
-    The mold stands on its lower half when it is filled: ``pull_ct``, the way in which the upper
-    half comes off, is up. ``parting_ct``: the loop where the parting surface meets the organ.
-    ``undercut_mm2``, its share of the organ's surface: what neither pull lays open.
-    ``undercut_depth_mm``: how far the cast must yield. ``checks``: numbers by name with their unit.
+    It stands on its lower half when it is filled: ``pull_ct``, in which the upper half comes off,
+    is up. ``parting_ct``: the loop where the parting surface meets the organ. ``undercut_mm2`` and
+    its share of the surface: what no pull lays open. ``undercut_depth_mm``: how far the cast must
+    yield. ``sprue_ct``: where it meets the organ. ``checks``: numbers by name with their unit.
     """
 
     parts: tuple[PrintedPart, ...]
@@ -68,10 +59,10 @@ class OrganMold:
     undercut_share: float
     undercut_depth_mm: float
     cast_ml: float
-    sprue_ct: Float64[np.ndarray, " 3"]  # where it meets the organ
+    sprue_ct: Float64[np.ndarray, " 3"]
     vents_ct: Float64[np.ndarray, "v 3"]
-    pins: tuple[Pin, ...]  # in the ct frame
-    checks: tuple[tuple[str, float], ...]
+    pins: tuple[Pin, ...]
+    checks: Checks
 
 
 def organ_mold(anatomy: Anatomy, config: MoldConfig) -> OrganMold:
@@ -80,14 +71,11 @@ def organ_mold(anatomy: Anatomy, config: MoldConfig) -> OrganMold:
     Raises:
         InputError: a surface that is not closed, or a tumor that no three pins reach.
     """
-    layout = lay_out(anatomy.organ, config.wall_mm, config.sprue_mm)
-    tumors = [
-        tumor.moved(transform_points(layout.mold_from_ct, tumor.vertices_mm))
-        for tumor in anatomy.tumors
-    ]
+    layout = lay_out(anatomy.organ, anatomy.tumors, config.wall_mm, config.sprue_mm)
+    way = layout.mold_from_ct
+    tumors = [t.moved(transform_points(way, t.vertices_mm)) for t in anatomy.tumors]
     pins = place_pins(layout, tumors, config.pin_mm)
-    ct_from_mold = np.linalg.inv(layout.mold_from_ct)
-    return _mold(layout, config, "organ", tuple(pin.moved(ct_from_mold) for pin in pins))
+    return _mold(layout, config, "organ", tuple(pin.moved(np.linalg.inv(way)) for pin in pins))
 
 
 def tumor_molds(
@@ -97,101 +85,76 @@ def tumor_molds(
     leave in the cast tumor the holes by which they hold it in the organ's mold."""
     molds = []
     for number, tumor in enumerate(anatomy.tumors, 1):
-        its = tuple(pin for pin in pins if pin.tumor == number)
-        ways = np.array([pin.way for pin in its]).reshape(-1, 3)
-        layout = lay_out(tumor, config.wall_mm, config.sprue_mm, ways if len(ways) else None)
-        molds.append(_mold(layout, config, f"tumor_{number}", its))
+        own = tuple(pin for pin in pins if pin.tumor == number)
+        ways = np.array([pin.way for pin in own])
+        layout = lay_out(tumor, (), config.wall_mm, config.sprue_mm, ways)
+        molds.append(_mold(layout, config, f"tumor_{number}", own))
     return tuple(molds)
 
 
 def _mold(layout: Layout, config: MoldConfig, name: str, pins: tuple[Pin, ...]) -> OrganMold:
     """Cut the halves, measure them, and turn them back to the ``ct`` frame."""
-    inside = [pin.moved(layout.mold_from_ct) for pin in pins]
-    reach = 20.0 + 2 * layout.mesh.longest_mm
-    ways = [(pin.tip_mm, pin.mouth_mm + reach * pin.way) for pin in inside]
+    far = 2 * layout.mesh.longest_mm + 50.0  # a tumor's pins go on through its own mold's wall
+    moved = [pin.moved(layout.mold_from_ct) for pin in pins]
+    ways = [(pin.tip_mm, pin.mouth_mm + far * pin.way) for pin in moved]
     halves = cut_halves(layout, config.vent_mm, config.pin_mm, config.clearance_mm, ways)
-    solid = solid_of(layout.mesh, name)
-    parts, checks, depth = [], [], 0.0
-    for side, part, way in (("upper", halves.upper, 1.0), ("lower", halves.lower, -1.0)):
-        pull = np.array([0.0, 0.0, way])
-        off = demould(part, solid, layout.mesh, pull)
-        depth = max(depth, off.depth_mm)
-        mesh = mesh_of(part)
-        own = (*_measured(mesh, layout), ("yields_mm", off.depth_mm))
-        own += (("yields_mm3", off.volume_mm3),)
-        parts += _printed(layout, mesh, f"{name}_{side}", config, own, way)
-    cast, other = cast_solid(halves.block, [halves.upper, halves.lower], halves.channels, solid)
-    area = area_mm2(layout.mesh)
-    hidden = area[undercut(layout.mesh, np.array([0, 0, 1.0]), Visibility(layout.mesh))].sum()
-    checks = _summary(layout, halves, solid, cast, other)
-    back = np.linalg.inv(layout.mold_from_ct)
+    organ, up = solid_of(layout.mesh, name), np.array([0.0, 0.0, 1.0])
+    sides = ("upper", halves.upper, up), ("lower", halves.lower, -up)
+    depths = {side: demould(part, organ, layout.mesh, pull) for side, part, pull in sides}
+    parts = [
+        piece
+        for side, solid, pull in sides
+        for piece in _printed(
+            layout, mesh_of(solid), f"{name}_{side}", pull[2], config, depths[side]
+        )
+    ]
+    cast_mm3, differs_mm3 = cast_error(halves, organ)
+    area = np.linalg.norm(triangles_of(layout.mesh.vertices_mm, layout.mesh.faces)[1], axis=1) / 2
+    hidden = float(area[undercut(layout.mesh, up, Visibility(layout.mesh))].sum())
+    deepest = max(depths.values())
+    slope = np.hypot(*np.gradient(layout.field.heights_mm, layout.field.step_mm))
+    beside = (layout.beyond(layout.field.nodes()) < 0) & ~layout.cells.inside.any(2)
+    checks = {
+        "cast_error_percent": 100 * (cast_mm3 / layout.mesh.volume_mm3 - 1),
+        "cast_differs_mm": differs_mm3 / area.sum(),
+        "halves_overlap_mm3": (halves.upper ^ halves.lower).volume(),
+        "undercut_percent": 100 * hidden / area.sum(),
+        "undercut_depth_mm": deepest,
+        "undercut_within_limit": deepest <= config.largest_undercut_mm,
+        "steep_parting_deg": np.degrees(np.arctan(np.percentile(slope[beside], 95))),
+        "keys": halves.keys, "bolts": halves.bolts, "vents": len(layout.vents_mm),
+    }  # fmt: skip
+    for number in sorted({pin.tumor for pin in pins}):
+        held = np.array([pin.way for pin in pins if pin.tumor == number])
+        checks[f"tumor_{number}_firmness"] = firmness(held)
+    ct_from_mold = np.linalg.inv(layout.mold_from_ct)
+    sprue, *vents = transform_points(ct_from_mold, np.vstack([layout.sprue_mm, layout.vents_mm]))
     return OrganMold(
-        tuple(parts), back[:3, 2].copy(), transform_points(back, layout.parting_mm),
-        float(hidden), float(hidden / area.sum()), depth, cast / 1000,
-        transform_points(back, layout.sprue_mm[None])[0],
-        transform_points(back, layout.vents_mm), pins, (*checks, *_held(pins)),
+        tuple(parts), ct_from_mold[:3, 2], transform_points(ct_from_mold, layout.parting_mm),
+        hidden, float(hidden / area.sum()), deepest, cast_mm3 / 1000, sprue,
+        np.array(vents).reshape(-1, 3), pins, tuple((k, float(v)) for k, v in checks.items()),
     )  # fmt: skip
-
-
-def _measured(mesh: Mesh, layout: Layout) -> tuple[tuple[str, float], ...]:
-    """Closed, walls, plastic."""
-    points, deep = behind_mm(mesh)
-    at_cavity = distance_mm(points, layout.mesh) < 0.05
-    holes = [layout.sprue_mm, *layout.vents_mm]
-    edge = layout.field.at(points[:, :2])
-    clear = np.abs(points[:, 2] - edge) > _EDGE_MM
-    for hole in holes:
-        clear &= np.linalg.norm(points[:, :2] - hole[:2], axis=1) > 3 * layout.sprue_radius_mm
-    return (
-        ("open_edges", float(open_edges(mesh))),
-        ("least_wall_mm", float(deep[at_cavity & clear].min(initial=np.inf))),
-        ("thin_share", thin_share(deep)),
-        ("plastic_ml", mesh.volume_mm3 / 1000),
-    )
 
 
 def _printed(
-    layout: Layout, mesh: Mesh, name: str, config: MoldConfig, checks: Any, way: float
+    layout: Layout, mesh: Mesh, name: str, up: float, config: MoldConfig, depth_mm: float
 ) -> list[PrintedPart]:
     """As it is printed: on its flat outside, the parting surface up, in pieces if need be."""
-    back = np.linalg.inv(layout.mold_from_ct)
-    turn = np.diag([1.0, -way, -way])
-    on_bed = to_bed(mesh.vertices_mm, turn)
-    purpose = f"{name.replace('_', ' ')} half of the mold"
-    part = PrintedPart(
-        name, purpose, mesh.moved(transform_points(back, mesh.vertices_mm)), "ct",
-        on_bed @ layout.mold_from_ct, "", tuple(checks),
+    wall_mm, thin = walls(mesh, layout)
+    whole: Checks = (
+        ("least_wall_mm", wall_mm), ("thin_percent", 100 * thin), ("yields_mm", depth_mm),
     )  # fmt: skip
-    pieces = split_to_bed(part, config.bed_mm, config.clearance_mm)
-    return [replace(p, checks=(*p.checks, ("fits_bed", float(_fits(p, config))))) for p in pieces]
-
-
-def _fits(part: PrintedPart, config: MoldConfig) -> bool:
-    laid = part.mesh.moved(transform_points(part.print_from_frame, part.mesh.vertices_mm))
-    return fits(laid, config.bed_mm)
-
-
-def _summary(
-    layout: Layout, halves: Halves, organ: Any, cast: float, other: float
-) -> tuple[tuple[str, float], ...]:
-    field = layout.field
-    near = layout.beyond_wall(field.nodes()) < 0
-    steps = np.hypot(*np.gradient(field.heights_mm, field.step_mm))
-    volume = float(organ.volume())
-    return (
-        ("cast_error_percent", 100 * (cast / volume - 1)),
-        ("cast_differs_mm", other / area_mm2(layout.mesh).sum()),
-        ("halves_overlap_mm3", float((halves.upper ^ halves.lower).volume())),
-        ("steepest_parting_deg", float(np.degrees(np.arctan(np.percentile(steps[near], 99))))),
-        ("keys", float(halves.keys)),
-        ("bolts", float(halves.bolts)),
-        ("vents", float(len(layout.vents_mm))),
+    on_bed = to_bed(mesh.vertices_mm, np.diag([1.0, -up, -up])) @ layout.mold_from_ct
+    own = mesh.moved(transform_points(np.linalg.inv(layout.mold_from_ct), mesh.vertices_mm))
+    purpose = f"{name.replace('_', ' ')} half of the mold"
+    pieces = split_to_bed(
+        PrintedPart(name, purpose, own, "ct", on_bed), config.bed_mm, config.clearance_mm
     )
-
-
-def _held(pins: tuple[Pin, ...]) -> tuple[tuple[str, float], ...]:
-    """How firmly each tumor's pins hold it."""
-    return tuple(
-        (f"firmness_{number}", firmness(np.array([p.way for p in pins if p.tumor == number])))
-        for number in sorted({pin.tumor for pin in pins})
-    )
+    return [
+        replace(piece, checks=(
+            ("open_edges", float(open_edges(laid_mesh(piece)))), *whole,
+            ("plastic_ml", piece.mesh.volume_mm3 / 1000),
+            ("fits_bed", float(fits(piece, config.bed_mm))),
+        ))
+        for piece in pieces
+    ]  # fmt: skip
