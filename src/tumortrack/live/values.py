@@ -212,7 +212,7 @@ class TrackingResult:
             reading); None if no frame came.
         workcell: what the arms do with it; None without arms.
         views: of several cameras: what each saw. ``cameras``: which of them the estimate is from,
-            and of the others why not, in words; empty for one camera.
+            and of the others why not; of a scan what each look added. In words; else empty.
     """
 
     sequence: int
