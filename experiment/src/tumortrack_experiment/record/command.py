@@ -16,7 +16,6 @@ from tumortrack.core.errors import InputError
 
 if TYPE_CHECKING:
     from tumortrack.live.cameras import CameraSetup
-    from tumortrack_experiment.kit_file import Kit
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,6 +35,8 @@ class Record:
             a robot (ur:HOST), as for `track`. Without --frame, poses are those of the tool.
         intrinsics: JSON with the camera's width, height, fx, fy, cx, cy in pixels, instead of what
             the source says.
+        only: record these states of the checklist now, and leave the others for later; one that is
+            finished is recorded anew.
         seconds: how long each state is recorded.
         range: depths between NEAR and FAR mm are good (default: a D405's).
         yes: ask nothing: count down before each state, keep it as it is, and go on.
@@ -49,8 +50,9 @@ class Record:
     frame: Path | None = None
     moving: str = ""
     intrinsics: Path | None = None
+    only: tuple[str, ...] = ()
     seconds: float = 3.0
-    range: tuple[float, float] = (70.0, 500.0)
+    range: tuple[float, float] = (70.0, 500.0)  # of its data sheet, at 848 x 480
     yes: bool = False
     countdown: float = 3.0
 
@@ -58,58 +60,35 @@ class Record:
         """Until all states are recorded, or the user ends it."""
         from tumortrack.live.workers import SourceWorker
         from tumortrack.sense.files import read_intrinsics
-        from tumortrack.tracking.tracker import region_for
+        from tumortrack_experiment.kit_file import KIT_FILE, read_kit
         from tumortrack_experiment.record.folder import RecordingFolder
         from tumortrack_experiment.record.guide import Guide
 
-        self._check()
-        kit, files = self._files()
-        setup = self._setup()
-        states = self.states or (kit.states if kit else ())
-        folder = RecordingFolder(self.folder, states, setup.published.frame_id, files)
-        (config,) = setup.sources.values()
-        if folder.missing:
-            with closing(SourceWorker(config.open)) as worker:
-                guide = Guide(
-                    folder=folder,
-                    worker=worker,
-                    setup=setup,
-                    region=region_for(range_mm=self.range),
-                    seconds=self.seconds,
-                    range_mm=self.range,
-                    parts=_parts(kit),
-                    countdown_s=self.countdown if self.yes else None,
-                    intrinsics=read_intrinsics(self.intrinsics) if self.intrinsics else None,
-                )
-                guide.record()
-        if folder.missing:
-            say(f"missing: {', '.join(folder.missing)}. The same command goes on.")
-        else:
-            say(f"{len(states)} states: {folder.finish()}")
-
-    def _check(self) -> None:
         near_mm, far_mm = self.range
-        if not (0.1 <= self.seconds <= 3600 and 0 <= self.countdown <= 3600):
-            raise InputError("--seconds must lie in 0.1 to 3600, --countdown in 0 to 3600.")
-        if not 0 < near_mm < far_mm < math.inf:
-            raise InputError(f"--range {near_mm:g} {far_mm:g}: give NEAR and FAR in mm, NEAR less.")
+        if not (0.1 <= self.seconds <= 3600 and 0 < near_mm < far_mm < math.inf):
+            raise InputError("--seconds must lie in 0.1 to 3600; --range is NEAR FAR, mm.")
         if not self.yes and not sys.stdin.isatty():
             raise InputError("this is no terminal, so nobody can be asked. Give --yes.")
-
-    def _files(self) -> tuple[Kit | None, dict[str, bytes]]:
-        """The kit, and what is stored with the recording."""
-        from tumortrack_experiment.kit_file import KIT_FILE, read_kit
-
-        files, kit = {}, None
-        if self.kit is not None:
-            kit = read_kit(self.kit)
-            path = self.kit / KIT_FILE if self.kit.is_dir() else self.kit
-            files[KIT_FILE] = path.read_bytes()
-            if strange := [name for name in self.states if name not in kit.states]:
-                raise InputError(f"the kit has no state {strange[0]!r}, only {kit.states}.")
-        if self.frame is not None and self.frame.is_file():
-            files["calibration.json"] = self.frame.read_bytes()
-        return kit, files
+        kit = read_kit(self.kit) if self.kit else None
+        states = self.states or (kit.states if kit else ())
+        if strange := [name for name in states if kit and name not in kit.states]:
+            raise InputError(
+                f"the kit has no state {strange[0]!r}; it has {', '.join(kit.states)}."
+            )
+        setup = self._setup()
+        kit_path = self.kit / KIT_FILE if self.kit and self.kit.is_dir() else self.kit
+        beside = {KIT_FILE: kit_path, "calibration.json": self.frame}
+        files = {name: path.read_bytes() for name, path in beside.items() if path}
+        intrinsics = read_intrinsics(self.intrinsics) if self.intrinsics else None
+        folder = RecordingFolder(self.folder, states, setup.published.frame_id, files)
+        if now := folder.to_record(self.only):
+            (config,) = setup.sources.values()
+            with closing(SourceWorker(config.open)) as worker:
+                Guide(self, folder, worker, setup, kit, intrinsics).record(now)
+        if missing := folder.to_record():
+            say(f"missing: {', '.join(missing)}. The same command goes on.")
+        else:
+            say(f"{len(states)} states: {folder.finish()}")
 
     def _setup(self) -> CameraSetup:
         from tumortrack.live.cameras import CameraSetup, camera_setup
@@ -119,15 +98,5 @@ class Record:
         if not self.moving or self.frame is not None:
             return camera_setup((self.source,), None, self.moving, self.frame)
         poses = POSES.parse(self.moving).open()
-        published = PublishedFrame(poses.frame_id or "fixed", moves=True)
+        published = PublishedFrame(poses.frame_id or "fixed", calibrated=True, moves=True)
         return CameraSetup(published, {self.source: SOURCES.parse(self.source)}, poses=poses)
-
-
-def _parts(kit: Kit | None) -> dict[str, str]:
-    """By state, what is set up for it."""
-    parts = kit.parts if kit else ()
-    states = {part.state for part in parts if part.state}
-    return {
-        state: ", ".join(f"{part.name} ({part.purpose})" for part in parts if part.state == state)
-        for state in states
-    }

@@ -71,10 +71,15 @@ class RecordingFolder:
             path.mkdir(parents=True, exist_ok=True)
         self._note()
 
-    @property
-    def missing(self) -> list[str]:
-        """States that are not finished, in their order."""
-        return [state for state in self.about["states"] if state not in self.about["done"]]
+    def to_record(self, only: tuple[str, ...] = ()) -> list[str]:
+        """The states that are missing; or those that are asked for. Raises InputError: there is no
+        such state in the checklist, or all are in one MCAP already."""
+        states, done = self.about["states"], self.about["done"]
+        if strange := [name for name in only if name not in states]:
+            raise InputError(f"the checklist has no state {strange[0]!r}, but {', '.join(states)}.")
+        if only and (self.path / WHOLE).is_file():
+            raise InputError(f"{self.path} is finished. Choose another folder.")
+        return [state for state in states if (state in only if only else state not in done)]
 
     def begin(self, state: str) -> None:
         """Record this state, from its beginning."""
@@ -94,7 +99,7 @@ class RecordingFolder:
         self._bag.write(seen.arrived_ns, sorted(out, key=lambda one: one.suffix == IMAGE))
 
     def keep(self, said: dict[str, Any], **facts: Any) -> None:
-        """What was added since ``begin`` is the state. ``said``: of it; ``facts``: of everything."""
+        """What was added since ``begin`` is the state. ``said``: of it; ``facts``: of all."""
         self._bag.close()
         with writing(self.path):
             file = self.path / _ASIDE / f"{_ASIDE}.mcap"

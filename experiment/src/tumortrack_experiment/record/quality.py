@@ -12,7 +12,6 @@ from tumortrack.core.errors import InputError
 from tumortrack.core.types import DepthFrame
 from tumortrack.live.values import Observation
 
-D405_RANGE_MM = (70.0, 500.0)  # its data sheet: from 7 cm (848 x 480) to 50 cm
 _PIXELS = 20_000  # that are looked at, evenly spread
 _WINDOW = 16  # frames: half a second at 30 Hz
 # A matcher that errs by 0.08 px, as RealSense's engineers advise, is 0.22 mm off at 150 mm
@@ -61,23 +60,18 @@ class DepthQuality(Config, frozen=True, kw_only=True):
         noise_mm, middle_mm = self.noise_mm or 0.0, self.depth_mm[1]
         most_mm = _NOISE_MM * max(middle_mm / _REFERENCE_MM, 1.0) ** 2
         mean, white = self.light or (_LIT[0], 0.0)
-        found = {
-            f"{self.near:.0%} is nearer than {range_mm[0]:g} mm: move the camera away": (
-                self.near > _MOST_NEAR
-            ),
-            f"half is farther than {range_mm[1]:g} mm: move nearer": middle_mm > range_mm[1],
-            f"only {self.seen:.0%} has a depth in range: aim at the organ": self.seen < _LEAST_SEEN,
-            f"{self.holes:.0%} has no depth: matt surfaces, or more light": (
-                self.holes > _MOST_HOLES
-            ),
-            f"the noise is over {most_mm:.2f} mm: matt surfaces, or more light": noise_mm > most_mm,
-            f"{self.moving:.1%} moved: wait until all is still": self.moving > _LEAST_MOVING,
-            f"{white:.0%} of the picture is white: less light": white > _MOST_WHITE,
-            f"the picture's mean is {mean:.0f} of 255: other light": not (
-                _LIT[0] <= mean <= _LIT[1]
-            ),
-        }
-        return [text for text, bad in found.items() if bad]
+        near_mm, far_mm = range_mm
+        found = (
+            (self.near > _MOST_NEAR, f"{self.near:.0%} is nearer than {near_mm:g} mm: move away"),
+            (middle_mm > far_mm, f"half is farther than {far_mm:g} mm: move nearer"),
+            (self.seen < _LEAST_SEEN, f"only {self.seen:.0%} is in range: aim at the organ"),
+            (self.holes > _MOST_HOLES, f"{self.holes:.0%} has no depth: matt surfaces, more light"),
+            (noise_mm > most_mm, f"noise is over {most_mm:.2f} mm: matt surfaces, more light"),
+            (self.moving > _LEAST_MOVING, f"{self.moving:.1%} moved: wait until all is still"),
+            (white > _MOST_WHITE, f"{white:.0%} of the picture is white: less light"),
+            (not _LIT[0] <= mean <= _LIT[1], f"the picture's mean is {mean:.0f} of 255"),
+        )
+        return [text for bad, text in found if bad]
 
 
 class DepthMeter:
@@ -115,7 +109,7 @@ class DepthMeter:
         depths_mm, (near_mm, far_mm) = np.array(self._window), self._range_mm
         last_mm = depths_mm[-1]
         there_mm, every = last_mm[np.isfinite(last_mm)], len(last_mm)
-        inside = np.count_nonzero((there_mm >= near_mm) & (there_mm <= far_mm))
+        inside = int(np.count_nonzero((there_mm >= near_mm) & (there_mm <= far_mm)))
         low, middle, high = np.percentile(there_mm, [5, 50, 95]) if len(there_mm) else (0, 0, 0)
         seconds = (self._stamps_ns[-1] - self._stamps_ns[0]) * 1e-9
         noise_mm, moving = self._changes(depths_mm)
@@ -125,7 +119,7 @@ class DepthMeter:
             dropped=dropped,
             seen=inside / every,
             holes=1 - len(there_mm) / every,
-            near=np.count_nonzero(there_mm < near_mm) / every,
+            near=int(np.count_nonzero(there_mm < near_mm)) / every,
             depth_mm=(float(low), float(middle), float(high)),
             noise_mm=noise_mm,
             moving=moving,
@@ -152,5 +146,5 @@ class DepthMeter:
             before_mm.append(self._first_mm[steady])
         # Of 8 frames' medians: 4 standard deviations of a difference are 2.5 of a frame.
         least_mm = _MOVED_MM + 2.5 * np.sqrt(variance)
-        moved = [np.count_nonzero(np.abs(end_mm - one) > least_mm) for one in before_mm]
+        moved = [int(np.count_nonzero(np.abs(end_mm - one) > least_mm)) for one in before_mm]
         return float(np.sqrt(np.median(variance))), max(moved) / depths_mm.shape[1]
