@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
-from contextlib import closing
+from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -83,7 +83,8 @@ class Record:
         folder = RecordingFolder(self.folder, states, setup.published.frame_id, files)
         if now := folder.to_record(self.only):
             (config,) = setup.sources.values()
-            with closing(SourceWorker(config.open)) as worker:
+            with closing(SourceWorker(config.open)) as worker, ExitStack() as ending:
+                ending.callback(folder.drop)
                 Guide(self, folder, worker, setup, kit, intrinsics).record(now)
         if missing := folder.to_record():
             say(f"missing: {', '.join(missing)}. The same command goes on.")

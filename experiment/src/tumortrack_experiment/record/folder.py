@@ -83,7 +83,7 @@ class RecordingFolder:
 
     def begin(self, state: str) -> None:
         """Record this state, from its beginning."""
-        self._clear()
+        self.drop()
         self._bag = McapBag(self.path / _ASIDE, self._messages, _AGAIN)
         self._state, self._begins = state, True
 
@@ -108,13 +108,13 @@ class RecordingFolder:
         self.about["done"][self._state] = said
         self.about |= facts
         self._note()
-        self._clear()
+        self.drop()
 
     def finish(self) -> Path:
         """All states in one MCAP, as a rosbag2 folder."""
         parts = [self._part(state) for state in self.about["states"]]
         if not (self.path / WHOLE).is_file():
-            self._clear()
+            self.drop()
             inside = self.path / _ASIDE / Path(WHOLE).stem
             bag, end_ns = McapBag(inside, self._messages, _AGAIN), 0
             for part in parts:
@@ -131,7 +131,7 @@ class RecordingFolder:
                     os.replace(inside / name, self.path / name)
         for part in parts:
             part.unlink(missing_ok=True)
-        self._clear()
+        self.drop()
         return self.path / WHOLE
 
     def _part(self, state: str) -> Path:
@@ -140,5 +140,6 @@ class RecordingFolder:
     def _note(self) -> None:
         write_json(self.path / ABOUT, self.about)
 
-    def _clear(self) -> None:
+    def drop(self) -> None:
+        """Take away a state that was begun, and not kept."""
         shutil.rmtree(self.path / _ASIDE, ignore_errors=True)

@@ -18,8 +18,9 @@ from tumortrack.core.types import DepthFrame, Intrinsics
 from tumortrack.live.cameras import CameraSetup
 from tumortrack.live.values import Observation, SourceLost
 from tumortrack.live.workers import SourceWorker
+from tumortrack.sense.cloud import CloudConfig
+from tumortrack.sense.region.picture import RegionConfig
 from tumortrack.sense.region.watch import TableWatch
-from tumortrack.tracking.tracker import region_for
 from tumortrack_experiment.kit_file import Kit
 from tumortrack_experiment.record.folder import RecordingFolder
 from tumortrack_experiment.record.quality import DepthMeter
@@ -48,7 +49,8 @@ class Guide:
     def __post_init__(self) -> None:
         known = self.setup.published.table_in_camera or self.folder.about.get("table_in_camera")
         self._known = known and tuple(known)
-        self._region = region_for(range_mm=self.options.range)
+        near_mm, far_mm = self.options.range
+        self._region = RegionConfig(crop=CloudConfig(near_mm=near_mm, far_mm=far_mm))
         self._watch = TableWatch(self._region, self._known)
         self._before = self._unusable = 0  # frames dropped before this state; and refused in it
         self._shown_s, self._trouble = 0.0, ""
@@ -113,8 +115,8 @@ class Guide:
         say(f"  {state}: {quality.frames} frames, {quality.line()}")
         for text in wrong:
             say(f"  warning: {text}")
-        if self._watch.table_in_camera is None and self.setup.poses is None:
-            say("  note: no table is seen: nobody notices if the camera moves between states")
+        if not (moved or self._watch.table_in_camera or self.setup.poses):
+            say("  note: no table was found in this, so nobody notices if the camera moves")
         answer = self._answer()
         if answer not in (_AGAIN, _QUIT):
             self._known = self._known or self._watch.table_in_camera
@@ -138,7 +140,8 @@ class Guide:
                 self._watch.check(seen.content)
         except NoEstimate as error:
             self._watch = TableWatch(self._region, self._known)
-            return str(error).split(". ")[0].replace("the start", "the first state")
+            lies = str(error).partition(": ")[2].split(". ")[0]
+            return f"the camera or the table has moved since the first state: {lies}"
         return ""
 
     def _frames(self, patient: bool = False) -> Iterator[tuple[Observation | None, Affine | None]]:
