@@ -70,11 +70,10 @@ class Record:
         if not self.yes and not sys.stdin.isatty():
             raise InputError("this is no terminal, so nobody can be asked. Give --yes.")
         kit = read_kit(self.kit) if self.kit else None
-        states = self.states or (kit.states if kit else ())
-        if strange := [name for name in states if kit and name not in kit.states]:
-            raise InputError(
-                f"the kit has no state {strange[0]!r}; it has {', '.join(kit.states)}."
-            )
+        known = kit.states if kit else self.states
+        states = self.states or known
+        if strange := [name for name in states if name not in known]:
+            raise InputError(f"the kit has no state {strange[0]!r}; it has {', '.join(known)}.")
         setup = self._setup()
         kit_path = self.kit / KIT_FILE if self.kit and self.kit.is_dir() else self.kit
         beside = {KIT_FILE: kit_path, "calibration.json": self.frame}

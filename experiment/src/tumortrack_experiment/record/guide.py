@@ -115,6 +115,8 @@ class Guide:
         say(f"  {state}: {quality.frames} frames, {quality.line()}")
         for text in wrong:
             say(f"  warning: {text}")
+        if quality.light is None and state == self.folder.about["states"][0]:
+            say("  note: no picture comes with the depth images (realsense?picture=true)")
         if not (moved or self._watch.table_in_camera or self.setup.poses):
             say("  note: no table was found in this, so nobody notices if the camera moves")
         answer = self._answer()

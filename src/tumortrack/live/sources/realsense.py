@@ -104,8 +104,7 @@ class RealSenseSource:
         self._room = threading.Condition()
         # The SDK's depth image (True) and picture (False) of one moment, and when they came.
         self._newest: tuple[dict[bool, Any], int] | None = None
-        self._pair: dict[bool, Any] = {}  # that may become one
-        self._wanted = {True, not config.picture}
+        self._wanted, self._pair = {True, not config.picture}, dict[bool, Any]()
         self._closed = False
         self._untimed = 0
         self._sensor, profile = _depth_stream(rs, device, None if self._playback else config)
