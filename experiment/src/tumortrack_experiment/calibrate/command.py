@@ -168,7 +168,7 @@ class CalibrateHandEye(WithBoard):
 
         from tumortrack.core.config import to_builtins
         from tumortrack.live.calibration_file import CalibrationFile
-        from tumortrack_experiment.calibrate.hand_eye import solve
+        from tumortrack_experiment.calibrate.hand_eye import HandEyeData, solve
         from tumortrack_experiment.calibrate.lens import read_lens
         from tumortrack_experiment.calibrate.pictures import read_robot_poses
 
@@ -180,9 +180,12 @@ class CalibrateHandEye(WithBoard):
             )
         frame_id, base_from_tool = read_robot_poses(self.poses, shots)
         poses = base_from_tool[list(seen)]
-        poses = np.linalg.inv(poses) if self.eye_to_hand else poses
+        data = HandEyeData(
+            np.linalg.inv(poses) if self.eye_to_hand else poses,
+            np.array([lens.place(one)[0] for one in seen.values()]),
+        )
         names = [shots[n].name for n in seen]
-        found, said, warnings = solve(poses, list(seen.values()), names, lens, self.distance)
+        found, said, warnings = solve(data, names, self.distance, lens.focal_std)
         key = "robot_from_camera" if self.eye_to_hand else "tool_from_camera"
         file = CalibrationFile(
             frame_id=frame_id,
@@ -197,14 +200,14 @@ class CalibrateHandEye(WithBoard):
             store.write_json(aside / "calibration.json", content)
             store.write_json(aside / "report.json", {**said, "warnings": warnings})
             store.seal(aside, "hand-eye calibration", {"report": "report.json"}, frame_id)
-        for name, one in said["methods"].items():
+        for name, rms_mm in said["left_out_rms_mm"].items():
             say(
-                f"{name}: {one['leave_one_out_rms_mm']:.2f} mm off where it was left out (root "
-                f"mean square), {one['from_chosen_mm']:.2f} mm from the chosen one"
+                f"{name}: {rms_mm:.2f} mm off where it was left out (root mean square), "
+                f"{said['from_chosen_mm'][name]:.2f} mm from the chosen one"
             )
         say(
-            f"{said['method']}, {said['used']} of {len(shots)} pictures: with 95 % confidence "
-            f"within {said['error_at_organ_mm']:.2f} mm at {self.distance:g} mm."
+            f"{said['method']}, {len(names) - len(said['left_out'])} of {len(shots)} pictures: "
+            f"with 95 % confidence within {said['bound_mm']:.2f} mm at {self.distance:g} mm."
         )
         for one in warnings:
             say(f"warning: {one}.")
