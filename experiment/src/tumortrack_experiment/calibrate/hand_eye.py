@@ -71,7 +71,8 @@ def solve(
     data: HandEyeData, names: list[str], at_mm: float, focal_std: float = 0.0
 ) -> tuple[Affine, dict[str, Any], list[str]]:
     """``moving_from_camera``, a report with bounds of its error so far before the camera, and
-    warnings. ``focal_std``: of the focal length, as a share; 0: unknown. Raises InputError: the poses do not determine it, or don't fit."""
+    warnings. ``focal_std``: of the focal length, as a share; 0: unknown. Raises InputError: the
+    poses do not determine it, or don't fit."""
     _check_unit(data)
     turned(data.moving)
     good = _agreeing(data, at_mm)
@@ -101,6 +102,7 @@ def solve(
     points_mm = _points(at_mm)
     said = {
         "pictures": len(names),
+        "used": int(good.sum()),
         "left_out": [names[n] for n in np.flatnonzero(~good)],
         "turned_degrees": about.tolist(),
         "at_mm": at_mm,
@@ -115,6 +117,21 @@ def solve(
         **_bounds(answer, each, at_mm, focal_std or _UNKNOWN_FOCAL),
     }
     return answer.camera, said, warnings
+
+
+def described(said: dict[str, Any]) -> list[str]:
+    """Lines of a report."""
+    lines = [
+        f"{name}: {rms_mm:.2f} mm off where it was left out (root mean square), "
+        f"{said['from_chosen_mm'][name]:.2f} mm from the chosen one"
+        for name, rms_mm in said["left_out_rms_mm"].items()
+    ]
+    return [
+        *lines,
+        f"{said['method']}, {said['used']} of {said['pictures']} poses: with "
+        f"{100 * said['confidence']:g} % confidence within {said['bound_mm']:.2f} mm at "
+        f"{said['at_mm']:g} mm",
+    ]
 
 
 def _check_unit(data: HandEyeData) -> None:
@@ -272,14 +289,14 @@ def _apart_mm(one: Affine, other: Affine, points_mm: np.ndarray) -> np.ndarray:
 
 def _bounds(answer: _Answer, each: list[_Answer], at_mm: float, focal_std: float) -> dict[str, Any]:
     """By the jackknife: the answers without one picture scatter as the answer does about the truth,
-    after Student's t; the lens's own error comes on top. ``error_mm`` and ``error_deg`` are the line, least at the stated distance,
-    that is above the bound from 2 / 3 to 4 / 3 of it."""
+    after Student's t; the lens's own error comes on top. ``error_mm`` and ``error_deg`` are the
+    line, least at the stated distance, that is above the bound from 2 / 3 to 4 / 3 of it."""
     count = len(each)
     apart = [np.linalg.inv(answer.camera) @ one.camera for one in each]
     turns = Rotation.from_matrix([one[:3, :3] for one in apart]).as_rotvec()
     steps = np.column_stack([turns, [one[:3, 3] for one in apart]])
     steps = (steps - steps.mean(0)) * np.sqrt((count - 1) / count)
-    rng, free = np.random.default_rng(0), count - 6
+    rng, free = np.random.default_rng(0), count - 2
     draws = rng.normal(size=(_DRAWS, count)) @ steps
     draws *= np.sqrt(free / rng.chisquare(free, (_DRAWS, 1)))
 
