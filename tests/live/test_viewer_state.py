@@ -17,7 +17,7 @@ from tumortrack.core.estimate import Quality
 from tumortrack.live.sinks.viewer import ViewerSinkConfig
 from tumortrack.live.values import TrackingResult
 
-_SHOTS = 40
+_SHOTS = 20
 
 
 def _seen(number: int, aside_mm: float, quality: Quality) -> TrackingResult:

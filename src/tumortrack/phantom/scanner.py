@@ -6,6 +6,9 @@ correlated Gaussian noise is added. Beam hardening, scatter and streaks are left
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from types import MappingProxyType
+
 import numpy as np
 from jaxtyping import Float, Float32
 
@@ -17,6 +20,7 @@ from tumortrack.core.types import FIRST_TUMOR, ORGAN, LabelVolume, Volume
 AIR_HU = -1000.0
 _LOWEST_HU, _HIGHEST_HU = -1024, 3071  # the 12 bits of a clinical scanner
 _LARGEST_SCAN = 400_000_000  # voxels
+_NOTHING_ELSE: Mapping[int, float] = MappingProxyType({})
 
 _Object = tuple[np.ndarray, np.ndarray, float]  # lower and upper corner, HU
 
@@ -61,8 +65,14 @@ class ScannerParameters(Config, frozen=True):
         self.check_between("scan:", **dict.fromkeys((*lengths, *others), extent))
 
 
-def scan(labels: LabelVolume, parameters: ScannerParameters, seed: int) -> Volume:
-    """Scan a label map: 1 becomes hydrogel, 2 and above contrast-loaded tumor, 0 air.
+def scan(
+    labels: LabelVolume,
+    parameters: ScannerParameters,
+    seed: int,
+    material_hu: Mapping[int, float] = _NOTHING_ELSE,
+) -> Volume:
+    """Scan a label map: 1 becomes hydrogel, 2 and above contrast-loaded tumor, 0 air, and what
+    ``material_hu`` names by its label, that.
 
     Only the box round the labels is scanned. HU are whole numbers in -1024..3071; the same seed
     gives the same volume.
@@ -78,7 +88,7 @@ def scan(labels: LabelVolume, parameters: ScannerParameters, seed: int) -> Volum
     objects = _objects(box_mm, parameters)
     lps_from_index, shape = _field_of_view(box_mm, objects, parameters)
     sigma_mm = _blur_mm(np.eye(3), lps_from_index, parameters)
-    hu = _scan_labels(body, lps_from_index, shape, parameters)
+    hu = _scan_labels(body, lps_from_index, shape, parameters, material_hu)
     for lower_mm, upper_mm, object_hu in objects:
         _add_box(hu, lps_from_index, (lower_mm, upper_mm), object_hu - AIR_HU, sigma_mm)
     hu += _noise(shape, parameters, seed)
@@ -152,6 +162,7 @@ def _scan_labels(
     lps_from_index: np.ndarray,
     shape: tuple[int, int, int],
     parameters: ScannerParameters,
+    material_hu: Mapping[int, float],
 ) -> Float32[np.ndarray, "i j k"]:
     """The label map's HU, blurred on its own grid and read at the scanner's voxels."""
     from scipy import ndimage
@@ -159,6 +170,8 @@ def _scan_labels(
     hu_of_label = np.full(256, AIR_HU, np.float32)
     hu_of_label[ORGAN] = parameters.organ_hu
     hu_of_label[FIRST_TUMOR:] = parameters.tumor_hu
+    for label, hu in material_hu.items():
+        hu_of_label[label] = hu
     spacing = spacing_mm(body.lps_from_index)
     directions = body.lps_from_index[:3, :3] / spacing
     sigma = _blur_mm(directions, lps_from_index, parameters) / spacing
