@@ -11,6 +11,9 @@ from tumortrack_experiment.calibrate.command import (
     CalibrateCamera,
     CalibrateHandEye,
 )
+from tumortrack_experiment.kit.command import PhantomKit
+
+phantom_kit = PhantomKit
 
 Calibration = (
     Annotated[CalibrateBoard, subcommand("board")]
