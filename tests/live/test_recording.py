@@ -34,7 +34,7 @@ from tumortrack.core.errors import InputError, StorageError
 from tumortrack.core.geometry import rigid
 from tumortrack.core.mesh_files import write_anatomy
 from tumortrack.core.types import DepthFrame, SensorCloud
-from tumortrack.live.sinks.recording import _CHUNK_S
+from tumortrack.live.recording.mcap import CHUNK_S
 from tumortrack.live.sinks.recording import RecordingSinkConfig as RecordTo
 from tumortrack.live.sources.recording import RecordingSourceConfig
 from tumortrack.live.values import Observation, PublishedFrame, SourceEnded, SourceLost
@@ -194,8 +194,8 @@ def test_a_file_cut_anywhere_gives_the_frames_before(tmp_path):
     ends = []
     for n in range(6):
         sink.publish(update_number(n))
-        sink._flush()  # as time does
-        ends.append(sink._whole)
+        sink._bag.flush()  # as time does
+        ends.append(sink._bag._whole)
     sink.close()
     raw = (tmp_path / "r" / "r.mcap").read_bytes()
     found, cut_file = [], tmp_path / "cut.mcap"
@@ -246,8 +246,8 @@ def test_a_killed_recorder_loses_less_than_a_second(tmp_path):
     came_s = np.array([float(at_s) for _, at_s in lines])
     lost_s = came_s[-1] - came_s[min(len(got), len(came_s) - 1)]
     # A chunk ends with the first frame after its time; how far apart frames come is not its matter.
-    assert _CHUNK_S < 1
-    assert lost_s <= _CHUNK_S + np.diff(came_s).max()
+    assert CHUNK_S < 1
+    assert lost_s <= CHUNK_S + np.diff(came_s).max()
 
 
 @contextmanager
@@ -455,8 +455,8 @@ def test_a_bag_damaged_in_the_middle_is_said_and_ends(tmp_path):
     ends = []
     for n in range(4):
         sink.publish(update_number(n))
-        sink._flush()
-        ends.append(sink._whole)
+        sink._bag.flush()
+        ends.append(sink._bag._whole)
     sink.close()
     path = tmp_path / "r" / "r.mcap"
     raw = bytearray(path.read_bytes())

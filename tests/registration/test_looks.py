@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from live_objects import small_setting
 from stories import refusal, succeeded, tumortrack
 from tumortrack.core import store
 from tumortrack.core.errors import InputError, NoEstimate
@@ -16,6 +17,7 @@ from tumortrack.core.geometry import rigid, transform_points
 from tumortrack.core.types import DepthFrame, Look, SensorCloud
 from tumortrack.live.scan import Scan
 from tumortrack.live.values import CameraView, Observation
+from tumortrack.live.views import ViewsLocator
 from tumortrack.models.config import GaussNewtonConfig
 from tumortrack.occupancy.locator import OccupancyLocator
 from tumortrack.registration import looks as module
@@ -25,6 +27,7 @@ from tumortrack.registration.looks import CAMERA_STD, Looks, seen_from_first
 from tumortrack.registration.registration import Registration
 from tumortrack.sense.camera import d405
 from tumortrack.sense.files import depth_png, intrinsics_json, read_poses
+from tumortrack.sense.region import RegionConfig
 from tumortrack.sense.render import render_depth
 from tumortrack.tracking.advice import CHECK_POSES
 from tumortrack.tracking.tracker import Follower, FollowerConfig, Tracker
@@ -364,6 +367,13 @@ def test_a_scan_takes_three_looks_from_apart_and_says_what_each_added(tracker):
     follower.begin(found)  # the answer took long: the organ rests
     cloud = seen(50, 12.0)[1]
     assert "follow" in follower.locate(cloud).report["timings"]
+    views = ViewsLocator(follower, small_setting(), RegionConfig(), 1.0, 0)
+    views.scan = Scan(tracker)
+    for degrees, stamp_s in ((-50, 7.5), (0, 8.0)):
+        with pytest.raises(NoEstimate):
+            views.locate([seen(degrees, stamp_s)])
+    views.locate([seen(50, 9.0)])
+    assert views.scanned == scan.told  # what the live page shows from then on
     turned = nudged(REST, [12.0, 0, 0], [0, 0, 0.3])
     scan = Scan(tracker)
     told.clear()

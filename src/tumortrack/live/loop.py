@@ -204,6 +204,7 @@ class Loop:
                 reason = f"internal error, {type(error).__name__}: {error}"
         self._stamp = (seen.stamp_ns, time.monotonic_ns())
         several, published = len(self._cameras.workers) > 1, self._context.published_frame
+        numbers = [view.number for view, _ in found]
         lead = found[0][0] if found else next(iter(views), None)
         return TrackingResult(
             next(self._sequence),
@@ -218,7 +219,7 @@ class Loop:
             seconds,
             latency_ms=1000 * _age_s(born_ns),
             views=tuple(views) if several else (),
-            cameras=camera_words([view.number for view, _ in found], absent) if several else "",
+            cameras=camera_words(numbers, absent) if several else self.views.scanned,
         )
 
     def _confirmed(self, estimate: Estimate, doubt: str) -> tuple[Quality, str]:

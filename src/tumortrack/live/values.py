@@ -46,7 +46,8 @@ class Observation:
     ``content`` has the ``stamp_ns`` of its exposure. ``arrived_ns``: when it reached this program,
     by ``time.time_ns``. ``mask``: of a depth image: True where the organ may be. ``truth``: the
     true surfaces, where the source simulates them. ``frame_id``: what the source calls the camera's
-    frame; None: it is of a kind that calls it nothing.
+    frame; None: it is of a kind that calls it nothing. ``picture``: what the camera saw in the
+    pixels of the depth image: grey, or red, green and blue.
     """
 
     content: DepthFrame | SensorCloud
@@ -54,6 +55,7 @@ class Observation:
     mask: Bool[np.ndarray, "h w"] | None = None
     truth: Anatomy | None = None
     frame_id: str | None = None
+    picture: UInt8[np.ndarray, "h w *rgb"] | None = None
 
     @property
     def stamp_ns(self) -> int:
@@ -212,7 +214,7 @@ class TrackingResult:
             reading); None if no frame came.
         workcell: what the arms do with it; None without arms.
         views: of several cameras: what each saw. ``cameras``: which of them the estimate is from,
-            and of the others why not, in words; empty for one camera.
+            and of the others why not; of a scan what each look added. In words; else empty.
     """
 
     sequence: int

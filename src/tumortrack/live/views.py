@@ -40,6 +40,7 @@ class ViewsLocator:
         self._follower, self._context = follower, context
         self._region, self._frozen_s, self._seed = region, frozen_s, seed
         self.scan: Scan | None = None  # until it is done, by which the first estimate is made
+        self.scanned = ""  # what each of its looks added
         self._published_from_last = context.published_frame.published_from_camera
         self._picked: Float64[np.ndarray, " 3"] | None = None  # by the user, published frame
         self._place_mm: Float64[np.ndarray, " 3"] | None = None  # where that is by now
@@ -76,7 +77,8 @@ class ViewsLocator:
         if self.scan is not None:
             estimate = self.scan.look(lead, organ)
             self._follower.begin(estimate)
-            self.frames.notes.append(self.scan.told)
+            self.scanned = self.scan.told
+            self.frames.notes.append(self.scanned)
             self.scan, self._published_from_last = None, lead.published_from_camera
             return estimate
         lead_from_published = np.linalg.inv(lead.published_from_camera)

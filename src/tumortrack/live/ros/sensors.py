@@ -10,7 +10,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, UInt8
 
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import DepthFrame, Intrinsics, SensorCloud
@@ -28,6 +28,7 @@ _FLOATS = {_FLOAT32: "f4", _FLOAT64: "f8"}
 _POINT_FIELDS = {"|u1": _UINT8, "<f4": _FLOAT32, "<u4": _FLOAT32}  # four bytes of colour, by PCL
 DEPTHS = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
 _MASKS = {"mono8": "u1", "8UC1": "u1"}
+_COLOURS = {"rgb8": 1, "bgr8": -1}  # and the order in which their channels are red, green, blue
 _LONGEST_SIDE = 8192  # as of Intrinsics
 
 
@@ -122,6 +123,14 @@ def mask_of(image: Any) -> Bool[np.ndarray, "h w"]:
     return _pixels(image, _MASKS, "a mask") != 0
 
 
+def picture_of(image: Any) -> UInt8[np.ndarray, "h w *rgb"]:
+    """A mono8, 8UC1, rgb8 or bgr8 image: grey, or red, green and blue."""
+    order = _COLOURS.get(image.encoding)
+    allowed = _MASKS | dict.fromkeys(_COLOURS, "u1")
+    values = _pixels(image, allowed, "a picture", 3 if order else 1)
+    return values if order is None else values[..., ::order]
+
+
 def _intrinsics_of(info: Any, rectified: bool) -> Intrinsics:
     width, height = int(info.width), int(info.height)
     roi = info.roi
@@ -150,8 +159,9 @@ def _intrinsics_of(info: Any, rectified: bool) -> Intrinsics:
     return plausible(camera, "a camera_info came")
 
 
-def _pixels(image: Any, allowed: dict[str, str], what: str) -> np.ndarray:
-    """The values of a single-channel image (height, width), in this machine's byte order."""
+def _pixels(image: Any, allowed: dict[str, str], what: str, channels: int = 1) -> np.ndarray:
+    """An image's values (height, width), or with a third axis where there are several channels, in
+    this machine's byte order."""
     code = allowed.get(image.encoding)
     if code is None:
         raise InputError(
@@ -161,13 +171,16 @@ def _pixels(image: Any, allowed: dict[str, str], what: str) -> np.ndarray:
     width, height, step = int(image.width), int(image.height), int(image.step)
     data = np.frombuffer(image.data, np.uint8)
     fits = 0 < width <= _LONGEST_SIDE and 0 < height <= _LONGEST_SIDE
-    if not fits or step < width * int(code[1]) or step * height > data.nbytes:
+    size = int(code[1])
+    if not fits or step < width * size * channels or step * height > data.nbytes:
         raise InputError(
             f"{what} came that claims {width} x {height} pixels in rows of {step} bytes, and holds "
             f"{data.nbytes} bytes; it is damaged (allowed: up to {_LONGEST_SIDE} a side)."
         )
     order = ">" if image.is_bigendian else "<"
-    values = np.ndarray((height, width), order + code, data, 0, (step, int(code[1])))
+    shape, strides = (height, width, channels), (step, size * channels, size)
+    values = np.ndarray(shape, order + code, data, 0, strides)
+    values = values if channels > 1 else values[..., 0]
     return values.astype(values.dtype.newbyteorder("="))
 
 
@@ -176,8 +189,9 @@ def messages_seen(
 ) -> list[Outgoing]:
     """An observation in the camera's frame: ``depth/image_rect`` (32FC1, metres, NaN without
     return (REP 118): float32 there and back is exact to one part in 10 million, 1e-5 mm at 150 mm)
-    and ``depth/camera_info`` (K and P, no distortion), or ``points``; and ``mask`` (mono8) where
-    there is one. Raises InputError for a stamp that ROS can't say.
+    and ``depth/camera_info`` (K and P, no distortion), or ``points``; and where there are such,
+    ``mask`` (mono8) and ``color/image_raw`` (mono8 or rgb8) with its camera_info. Raises
+    InputError for a stamp that ROS can't say.
     """
     header = messages.header(seen.stamp_ns, frame_id)
     frame = seen.content
@@ -204,11 +218,15 @@ def messages_seen(
     if seen.mask is not None:
         pixels = seen.mask.astype(np.uint8) * np.uint8(255)
         out.append(Outgoing("mask", IMAGE, _image(pixels, "mono8", header, messages)))
+    if (picture := seen.picture) is not None:
+        encoding = "mono8" if picture.ndim == 2 else "rgb8"
+        out.append(Outgoing("color/image_raw", IMAGE, _image(picture, encoding, header, messages)))
+        out.append(Outgoing("color/camera_info", CAMERA_INFO, info))
     return out
 
 
 def _image(pixels: np.ndarray, encoding: str, header: Any, messages: Messages) -> Any:
-    height, width = pixels.shape
+    height, width = pixels.shape[:2]
     return messages.make(
         IMAGE,
         header=header,
@@ -216,7 +234,7 @@ def _image(pixels: np.ndarray, encoding: str, header: Any, messages: Messages) -
         width=width,
         encoding=encoding,
         is_bigendian=0,
-        step=width * pixels.itemsize,
+        step=pixels.nbytes // height,
         data=_octets(pixels.astype(pixels.dtype.newbyteorder("<"), copy=False)),
     )
 

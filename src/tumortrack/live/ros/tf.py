@@ -78,11 +78,8 @@ class TfPoses(CameraPoses):
         self._bus.close()
 
     def _keep(self, message: Any, static: bool) -> None:
-        shift, turn = message.transform.translation, message.transform.rotation
-        numbers = np.array([turn.x, turn.y, turn.z, turn.w, shift.x, shift.y, shift.z])
-        if not abs(np.linalg.norm(numbers[:4]) - 1) < _NOT_UNIT or not np.isfinite(numbers).all():
-            return  # no transform: without another one nothing is known
-        pose = rigid(Rotation.from_quat(numbers[:4]).as_matrix(), numbers[4:] * MM_PER_M)
+        if (pose := pose_of(message)) is None:
+            return  # without another one nothing is known
         parent = message.header.frame_id.removeprefix("/")
         child = message.child_frame_id.removeprefix("/")
         before, poses = self._known.get(child, ("", None))
@@ -114,3 +111,12 @@ class TfPoses(CameraPoses):
         while (parent := self._known.get(names[-1], ("",))[0]) and parent not in names:
             names.append(parent)
         return names
+
+
+def pose_of(message: Any) -> Affine | None:
+    """Parent from child, mm, of a TransformStamped; None: its numbers are no transform."""
+    shift, turn = message.transform.translation, message.transform.rotation
+    numbers = np.array([turn.x, turn.y, turn.z, turn.w, shift.x, shift.y, shift.z])
+    if not abs(np.linalg.norm(numbers[:4]) - 1) < _NOT_UNIT or not np.isfinite(numbers).all():
+        return None
+    return rigid(Rotation.from_quat(numbers[:4]).as_matrix(), numbers[4:] * MM_PER_M)

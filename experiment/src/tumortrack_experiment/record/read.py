@@ -1,0 +1,138 @@
+"""What `tumortrack record` wrote, by state: depth images, pictures, where the camera was.
+
+A recording is a folder with one MCAP (https://mcap.dev/spec) of ROS 2's messages, or as long as
+states are missing with one for each that is finished. Topics: ``/state`` (std_msgs/String: its
+name, as it begins), ``/tf``, ``/camera/depth/image_rect`` (32FC1, metres),
+``/camera/depth/camera_info``, ``/camera/color/image_raw`` (mono8 or rgb8, of the depth image's
+pixels) with its camera_info. Attachments: recording.json, kit.json, calibration.json.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import UInt8
+
+from tumortrack.core.errors import InputError
+from tumortrack.core.geometry import Affine
+from tumortrack.core.types import DepthFrame
+
+STATE, TF, CAMERA = "/state", "/tf", "/camera/"
+IMAGE, INFO = f"{CAMERA}depth/image_rect", f"{CAMERA}depth/camera_info"
+PICTURE = f"{CAMERA}color/image_raw"
+WHOLE = "recording.mcap"
+_STEADY = 30  # depth images, of which the median has a fifth of one's noise
+
+
+@dataclass(frozen=True, eq=False)
+class Moment:
+    """What the camera saw at one instant. ``depth``: camera frame, mm, with its camera and stamp;
+    ``picture``: grey (h, w) or red, green and blue (h, w, 3) in the same pixels, None without
+    colour; ``fixed_from_camera``: where the camera was (of one on a tool, without a calibration
+    yet: where the tool was), None where nobody says it."""
+
+    depth: DepthFrame
+    picture: UInt8[np.ndarray, "h w *rgb"] | None = None
+    fixed_from_camera: Affine | None = None
+
+
+class _Take(NamedTuple):
+    """Where a state's messages lie."""
+
+    file: Path
+    start_ns: int
+    stop_ns: int
+
+
+@dataclass(frozen=True, eq=False)
+class Recorded:
+    """A recording on disk. ``states``: the finished ones, as they were recorded; ``attachments``:
+    files that came with it, by name."""
+
+    folder: Path
+    takes: dict[str, _Take]
+    attachments: dict[str, bytes]
+
+    @property
+    def states(self) -> tuple[str, ...]:
+        return tuple(self.takes)
+
+    def moments(self, state: str) -> Iterator[Moment]:
+        """All of a state, one after the other; none is read before its turn. Raises InputError:
+        there is no such state, or it is damaged."""
+        from tumortrack.live.ros import sensors
+        from tumortrack.live.ros.messages import stamp_of
+        from tumortrack.live.ros.tf import pose_of
+
+        if state not in self.takes:
+            known = ", ".join(self.states) or "none"
+            raise InputError(f"{self.folder} has no finished state {state!r}. It has: {known}.")
+        beside: dict[str, Any] = {}
+        for topic, _, message in _messages(*self.takes[state]):
+            beside[topic] = message
+            if topic == IMAGE:  # it comes last of what belongs to it
+                stamp_ns = stamp_of(message.header)
+                picture, tf = beside.get(PICTURE), beside.get(TF)
+                same = picture is not None and stamp_of(picture.header) == stamp_ns
+                yield Moment(
+                    sensors.depth_of(message, beside[INFO]),
+                    sensors.picture_of(picture) if same else None,
+                    None if tf is None else pose_of(tf.transforms[0]),
+                )
+
+    def steady_depth(self, state: str, most: int = _STEADY) -> DepthFrame:
+        """The median of a state's first depth images, pixel by pixel; no return where fewer than
+        half have one. For what stands still. Raises InputError as ``moments``."""
+        frames = [moment.depth for moment in islice(self.moments(state), most)]
+        depths_mm = np.array([frame.depth_mm for frame in frames])
+        seen = np.isfinite(depths_mm).sum(0) * 2 >= len(frames)
+        steady_mm = np.full(depths_mm.shape[1:], np.nan, np.float32)
+        steady_mm[seen] = np.nanmedian(depths_mm[:, seen], axis=0)
+        return DepthFrame(steady_mm, frames[0].intrinsics, frames[0].stamp_ns)
+
+
+def read_recorded(folder: Path) -> Recorded:
+    """The recording in a folder that `tumortrack record` wrote, finished or not. Raises InputError:
+    there is none, or it is damaged."""
+    from tumortrack_experiment.record.attachments import attachments_of
+
+    files = [folder / WHOLE] if (folder / WHOLE).is_file() else sorted(folder.glob("*.mcap"))
+    if not files:
+        raise InputError(f"{folder} holds no recording with a finished state.")
+    takes: dict[str, _Take] = {}
+    for file in files:
+        began = [(at_ns, message.data) for topic, at_ns, message in _messages(file, of=STATE)]
+        ends_ns = [at_ns for at_ns, _ in began[1:]]
+        for (at_ns, name), end_ns in zip(began, [*ends_ns, 2**63 - 1], strict=True):
+            takes[name] = _Take(file, at_ns, end_ns)
+    return Recorded(folder, takes, attachments_of(files[0]))
+
+
+def _messages(
+    file: Path, start_ns: int = 0, stop_ns: int = 2**63 - 1, of: str = ""
+) -> Iterator[tuple[str, int, Any]]:
+    """Topic, time of recording and message, of all topics or one."""
+    from tumortrack.live.ros.messages import Messages
+
+    messages = Messages()
+    with _opened(file) as reader:
+        wanted = [c for c in reader.connections if of in ("", c.topic)]
+        for connection, at_ns, raw in reader.messages(wanted, start_ns, stop_ns):
+            yield connection.topic, at_ns, messages.from_bytes(raw, connection.msgtype)
+
+
+@contextmanager
+def _opened(file: Path) -> Iterator[Any]:
+    from rosbags.rosbag2 import Reader, ReaderError
+
+    try:
+        with Reader(file) as reader:
+            yield reader
+    except (ReaderError, OSError) as error:
+        raise InputError(f"{file} cannot be read: {error}.") from error

@@ -1,0 +1,142 @@
+"""ROS 2's messages into an MCAP: whatever ends the writing leaves what came before."""
+
+from __future__ import annotations
+
+import io
+import os
+import time
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tumortrack.core.errors import InputError, StorageError
+from tumortrack.core.geometry import Affine
+from tumortrack.live.display import wxyz_of
+from tumortrack.live.ros.messages import MM_PER_M, Messages, Outgoing, xyz
+from tumortrack.live.ros.sensors import CAMERA_FRAME, messages_seen
+from tumortrack.live.ros.tf import TRANSFORMS
+from tumortrack.live.values import Observation
+
+CHUNK_S = 0.25  # a killed program loses what is in no chunk yet
+STRING = "std_msgs/msg/String"
+
+
+class McapBag:
+    """A new rosbag2 folder with one MCAP.
+
+    Messages are filed under their time of arrival, which never goes back; headers have the stamps.
+    Where the disk refuses, whole chunks stay, in a file without an end, and each later writing
+    raises the same StorageError, which ends with ``advice``: it is not in the recording.
+    """
+
+    def __init__(self, folder: Path, messages: Messages, advice: str) -> None:
+        from rosbags.rosbag2 import StoragePlugin, Writer, WriterError
+
+        self._messages, self._advice = messages, advice
+        self._connections: dict[str, Any] = {}
+        self._last_ns, self._chunk_s = 0, time.monotonic()
+        self._refused = ""
+        try:
+            # Version 8 is Humble's.
+            writer: Any = Writer(folder, version=8, storage_plugin=StoragePlugin.MCAP)
+            writer.open()
+        except WriterError as error:  # another process began to record into it a moment ago
+            raise InputError(f"{folder} exists already. Choose another folder.") from error
+        self._writer, self._storage = writer, writer.storage
+        self._storage.bio.close()  # what is buffered could not be taken back on a full disk
+        self._storage.bio = self._file = _WholeWrites(self._storage.path)
+        self._whole = self._file.tell()  # behind the last whole chunk
+
+    def write(self, arrived_ns: int, out: Iterable[Outgoing]) -> None:
+        """Messages with the full names of their topics; they are on the disk 0.25 s later."""
+        if self._refused:
+            raise StorageError(self._refused)
+        self._last_ns = max(self._last_ns, arrived_ns)
+        for topic, message_type, message in out:
+            if topic not in self._connections:
+                definition, _ = self._messages.definition(message_type)
+                type_hash = self._messages.type_hash(message_type)
+                self._connections[topic] = self._writer.add_connection(
+                    topic, message_type, msgdef=definition, rihs01=type_hash
+                )
+            data = self._messages.to_bytes(message)
+            with self._on_disk():
+                self._writer.write(self._connections[topic], self._last_ns, data)
+        if time.monotonic() - self._chunk_s >= CHUNK_S:
+            self.flush()
+
+    def close(self) -> None:
+        """Write the index and metadata.yaml."""
+        if not self._file.closed:
+            if self._storage.chunk.msgs:
+                self.flush()
+            with self._on_disk():
+                self._writer.close()
+
+    def flush(self) -> None:
+        """What was written is on the disk."""
+        with self._on_disk():
+            self._storage.close_chunk()
+
+    @contextmanager
+    def _on_disk(self) -> Iterator[None]:
+        """Around what may write a chunk: where it fails, whole chunks only are left."""
+        try:
+            yield
+        except OSError as error:
+            if not self._file.closed:
+                os.ftruncate(self._file.fileno(), self._whole)
+                self._file.close()
+            self._refused = f"cannot write {self._file.name}: {error.strerror}. {self._advice}"
+            raise StorageError(self._refused) from error
+        if not self._file.closed and (end := self._file.tell()) > self._whole:
+            self._whole, self._chunk_s = end, time.monotonic()
+
+
+def camera_messages(
+    seen: Observation, fixed_from_camera: Affine, frame_id: str, messages: Messages, number: int = 1
+) -> list[Outgoing]:
+    """What a camera saw, and its pose in the frame ``frame_id`` on ``/tf`` where the two differ,
+    with the full names of their topics. ``number``: of the camera, from 1."""
+    suffix = f"_{number}" if number > 1 else ""
+    same = np.array_equal(fixed_from_camera, np.eye(4))
+    other = CAMERA_FRAME + ("_optical" if frame_id == CAMERA_FRAME else "") + suffix
+    # As the source calls it: a calibration may know the camera by that when this is played.
+    camera = seen.frame_id or (frame_id if same else other)
+    if camera == frame_id and not same:
+        camera = other
+    out = [
+        one._replace(suffix=f"/camera{suffix}/{one.suffix}")
+        for one in messages_seen(seen, messages, camera)
+    ]
+    if camera != frame_id:
+        stamped = {
+            "header": messages.header(seen.stamp_ns, frame_id),
+            "child_frame_id": camera,
+            "transform": {
+                "translation": xyz(fixed_from_camera[:3, 3] / MM_PER_M),
+                "rotation": dict(
+                    zip("wxyz", wxyz_of(fixed_from_camera[:3, :3]).tolist(), strict=True)
+                ),
+            },
+        }
+        out.append(Outgoing("/tf", TRANSFORMS, messages.make(TRANSFORMS, transforms=[stamped])))
+    return out
+
+
+class _WholeWrites(io.FileIO):
+    """Appends, without a buffer; each write is whole or raises."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path, "r+")
+        self.seek(0, io.SEEK_END)
+
+    def write(self, data: Any) -> int:
+        left = memoryview(data).cast("B")
+        size = len(left)
+        while left:
+            left = left[super().write(left) or 0 :]
+        return size
