@@ -1,5 +1,5 @@
-"""What a laboratory's hands do on the bench that does not exist: lay the organ down in a state, stand
-the camera there, show it the bench, and carry the phantom to the scanner."""
+"""What a laboratory's hands do on the bench that does not exist: lay the organ down in a state,
+stand the camera there, show it the bench, and carry the phantom to the scanner."""
 
 from __future__ import annotations
 
@@ -24,11 +24,12 @@ from tumortrack_lab.rehearsal.bench import Setup, scan_bench, see_bench
 class BenchErrors(Config, frozen=True, kw_only=True):
     """What is wrong with the apparatus, and known to nobody but the rehearsal: the camera's focal
     length and principal point against what the device says of itself; its depth, by a factor and an
-    offset. Within what D405 owners report at 70 to 200 mm (librealsense #12236, #14204)."""
+    offset. Within what D405 owners report at 70 to 200 mm (librealsense #12236, #14204).
+    ``distortion``: what rectification left, as OpenCV has it (k1, k2, p1, p2, k3)."""
 
     focal: float = 1.004
     centre_px: tuple[float, float] = (1.5, -1.0)
-    distortion: tuple[float, ...] = (0.02, -0.03, 0.0005, -0.0004, 0.0)
+    distortion: tuple[float, float, float, float, float] = (0.004, -0.006, 0.0003, -0.0002, 0.0)
     depth_scale: float = 1.004
     depth_offset_mm: float = 0.3
 
