@@ -1,0 +1,1 @@
+"""One frame to another by the beads of a kit's base."""
