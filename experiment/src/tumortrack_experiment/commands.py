@@ -11,14 +11,20 @@ from tumortrack_experiment.calibrate.command import (
     CalibrateCamera,
     CalibrateHandEye,
 )
+from tumortrack_experiment.reference.command import Reference
+from tumortrack_experiment.register.command import CalibrateRegister
 
 Calibration = (
     Annotated[CalibrateBoard, subcommand("board")]
     | Annotated[CalibrateCamera, subcommand("camera")]
     | Annotated[CalibrateHandEye, subcommand("hand-eye")]
+    | Annotated[CalibrateRegister, subcommand("register")]
 )
 
 
 def calibrate(kind: OmitSubcommandPrefixes[Calibration]) -> Calibration:
-    """Calibrate a camera, and its place on a robot, each with the error that is left."""
+    """Calibrate a camera, its place on a robot, and a CT's before it, each with its error."""
     return kind
+
+
+reference = Reference

@@ -167,12 +167,12 @@ def cut_halves(
     holes = [_key(place, clearance_mm) for place in keys]
     pegged = Manifold.batch_boolean([lower, *(_key(place, 0.0) for place in keys)], OpType.Add)
     drills.append(solid_of(layout.mesh, "the surface to be cast"))
-    halves = (
+    upper_half, lower_half = (
         Manifold.batch_boolean([solid, *cut], OpType.Subtract).as_original().simplify(_SMOOTH_MM)
         for solid, cut in ((upper, [*drills, *holes]), (pegged, drills))
     )
     channels = Manifold.batch_boolean([*drills[:-1], *holes], OpType.Add)
-    return Halves(*halves, upper + lower, channels, len(keys), len(bolts))
+    return Halves(upper_half, lower_half, upper + lower, channels, len(keys), len(bolts))
 
 
 def rod(start: np.ndarray, end: np.ndarray, radius_mm: float, end_mm: float | None = None) -> Any:

@@ -22,7 +22,7 @@ from tumortrack_experiment.kit.values import PrintedPart
 Checks = tuple[tuple[str, float], ...]
 
 
-class MoldConfig(Config):
+class MoldConfig(Config, frozen=True):
     """Sizes of the molds, mm. ``clearance_mm``: between a key and its hole, on the radius.
     ``largest_undercut_mm``: how far a cast may have to yield when a half is pulled off; our choice:
     hydrogel and silicone stretch by more. ``bed_mm``: the printer's; larger parts are split."""

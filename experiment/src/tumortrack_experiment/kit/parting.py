@@ -23,6 +23,7 @@ from tumortrack.imaging.raster import voxelise
 from tumortrack.sense.render import Visibility
 
 _FAR_MM = 50_000.0  # an eye from where the organ is seen as good as in parallel
+_GRAZED_MM = 0.05  # a wall along the pull is seen past itself
 _SEARCHED = 3000  # faces that stand for all in the search, drawn by their area
 _COARSE = 400  # pulls tried first, 7 degrees apart; then rings round the best:
 _RINGS = np.radians([5.0, 2.5, 1.2])
@@ -47,6 +48,8 @@ def undercut(
     middle, area = triangles_of(
         mesh.vertices_mm, mesh.faces if faces is None else mesh.faces[faces]
     )
+    outward = area / np.maximum(np.linalg.norm(area, axis=1, keepdims=True), 1e-12)
+    middle += _GRAZED_MM * outward
     hidden, up = np.zeros(len(middle), bool), area @ pull > 0
     for side, way in ((up, pull), (~up, -pull)):
         hidden[side] = ~sight(middle[side], mesh.box_mm.mean(0) + _FAR_MM * way)

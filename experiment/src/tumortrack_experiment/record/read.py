@@ -74,7 +74,7 @@ class Recorded:
             known = ", ".join(self.states) or "none"
             raise InputError(f"{self.folder} has no finished state {state!r}. It has: {known}.")
         beside: dict[str, Any] = {}
-        for topic, _, message in _messages(*self.takes[state]):
+        for topic, _, message in messages_in(*self.takes[state]):
             beside[topic] = message
             if topic == IMAGE:  # it comes last of what belongs to it
                 stamp_ns = stamp_of(message.header)
@@ -107,14 +107,14 @@ def read_recorded(folder: Path) -> Recorded:
         raise InputError(f"{folder} holds no recording with a finished state.")
     takes: dict[str, _Take] = {}
     for file in files:
-        began = [(at_ns, message.data) for topic, at_ns, message in _messages(file, of=STATE)]
+        began = [(at_ns, message.data) for topic, at_ns, message in messages_in(file, of=STATE)]
         ends_ns = [at_ns for at_ns, _ in began[1:]]
         for (at_ns, name), end_ns in zip(began, [*ends_ns, 2**63 - 1], strict=True):
             takes[name] = _Take(file, at_ns, end_ns)
     return Recorded(folder, takes, attachments_of(files[0]))
 
 
-def _messages(
+def messages_in(
     file: Path, start_ns: int = 0, stop_ns: int = 2**63 - 1, of: str = ""
 ) -> Iterator[tuple[str, int, Any]]:
     """Topic, time of recording and message, of all topics or one."""

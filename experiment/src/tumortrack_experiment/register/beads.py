@@ -61,6 +61,10 @@ class NamedBeads:
     def found(self) -> Bool[np.ndarray, " n"]:
         return np.isfinite(self.points_mm[:, 0])
 
+    def places_mm(self, kit: Kit) -> Float64[np.ndarray, "n 3"]:
+        """Where the drawing has them all."""
+        return transform_points(self.device_from_base, kit.beads_mm)
+
 
 def fit_rigid(from_mm: Points, to_mm: Points) -> tuple[Affine, Float[np.ndarray, " n"]]:
     """The rigid transform that lays points (n, 3) on others by least squares, and the distances
@@ -73,9 +77,9 @@ def fit_rigid(from_mm: Points, to_mm: Points) -> tuple[Affine, Float[np.ndarray,
     return to_from, np.linalg.norm(transform_points(to_from, from_mm) - to_mm, axis=1)
 
 
-def name_beads(kit: Kit, points_mm: Points, device: Device) -> NamedBeads:
+def name_beads(kit: Kit, points_mm: Points, device: Device, above_mm: float = 0.0) -> NamedBeads:
     """Which of the points are which of the kit's beads, by the largest arrangement that agrees with
-    the drawing; points may be missing, moved or too many.
+    the drawing; points may be missing, moved or too many, and all lie so far above the middles.
 
     Raises:
         InputError: fewer than 4 agree, they lie on a line, two arrangements fit as well, or the
@@ -84,15 +88,16 @@ def name_beads(kit: Kit, points_mm: Points, device: Device) -> NamedBeads:
     what = f"{device.name}: {len(points_mm)} places that may be beads"
     if len(points_mm) > _MOST_CANDIDATES:
         raise InputError(f"{what}; at most {_MOST_CANDIDATES} are allowed. Clear the base.")
-    best, other = _arrangements(kit.beads_mm, points_mm, device.tolerance_mm)
-    mirrored, _ = _arrangements(kit.beads_mm * [1, 1, -1], points_mm, device.tolerance_mm)
+    drawn_mm = kit.beads_mm + [0, 0, above_mm]
+    best, other = _arrangements(drawn_mm, points_mm, device.tolerance_mm)
+    mirrored, _ = _arrangements(drawn_mm * [1, 1, -1], points_mm, device.tolerance_mm)
     if mirrored.count >= LEAST_BEADS and mirrored.beats(best):
         raise InputError(
             f"{what}; {mirrored.count} of them are the kit's mirror image. Left and right are "
             "exchanged in these data, or it is another kit."
         )
     names = [bead.name for bead in kit.beads]
-    notes = _left_out(kit, points_mm, best, device)
+    notes = _left_out(kit, drawn_mm, points_mm, best, device)
     if best.count < LEAST_BEADS:
         agree = ", ".join(names[n] for n in np.flatnonzero(best.which >= 0)) or "none"
         raise InputError(
@@ -108,7 +113,7 @@ def name_beads(kit: Kit, points_mm: Points, device: Device) -> NamedBeads:
         )
     named = np.full((len(names), 3), np.nan)
     there = best.which >= 0
-    named[there] = points_mm[best.which[there]]
+    named[there] = points_mm[best.which[there]] - above_mm * best.device_from_base[:3, 2]
     _check_spread(named[there], device.name)
     return NamedBeads(device, named, best.device_from_base, best.rms_mm, tuple(notes))
 
@@ -197,10 +202,12 @@ def _grown(
     return _Arrangement(which, device_from_base, float(np.sqrt((left_mm**2).mean())))
 
 
-def _left_out(kit: Kit, points_mm: np.ndarray, best: _Arrangement, device: Device) -> list[str]:
+def _left_out(
+    kit: Kit, drawn_mm: np.ndarray, points_mm: np.ndarray, best: _Arrangement, device: Device
+) -> list[str]:
     """A line for each bead that is not where the drawing has it."""
     free = np.setdiff1d(np.arange(len(points_mm)), best.which)
-    places = transform_points(best.device_from_base, kit.beads_mm)
+    places = transform_points(best.device_from_base, drawn_mm)
     notes = []
     for n in np.flatnonzero(best.which < 0):
         away_mm = np.linalg.norm(points_mm[free] - places[n], axis=1)

@@ -11,6 +11,10 @@ from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import spacing_mm, transform_points
 from tumortrack.core.types import Volume
 from tumortrack.imaging.grid import Box, extent_mm, grown_box
+from tumortrack_experiment.kit_file import Kit
+from tumortrack_experiment.register.beads import CT, NamedBeads, name_beads
+
+Vector = np.ndarray
 
 # Glass beads have 1,500 HU and more, ceramics and steel reach the scanner's last number (3071);
 # whatever else is on the base, tumors (to 1000 HU) and prints (about 100), has less.
@@ -55,13 +59,21 @@ def find_balls(volume: Volume, diameter_mm: float, seed_hu: float = SEED_HU) -> 
     if len(seeds) > _MOST_SEEDS:
         raise InputError(
             f"the CT has {len(seeds)} spots of over {seed_hu:g} HU as small as a bead of "
-            f"{diameter_mm:g} mm; at most {_MOST_SEEDS} are allowed. Is it the phantom on its base, "
-            "reconstructed with a soft kernel?"
+            f"{diameter_mm:g} mm; at most {_MOST_SEEDS} are allowed. Is it the phantom on its base?"
         )
     tries = [_fitted(volume, seeds, _Model(diameter_mm / 2, spread, steps)) for spread in
              _POINT_SPREADS_MM]  # fmt: skip
     balls = max(tries, key=lambda found: (len(found), -sum(ball.misfit for ball in found)))
     return _different(balls, diameter_mm / 2)
+
+
+def beads_in_ct(kit: Kit, volume: Volume) -> NamedBeads:
+    """The kit's beads in a CT, LPS. Raises InputError: as ``find_balls`` and ``name_beads``."""
+    return name_beads(kit, middles_mm(find_balls(volume, kit.bead_diameter_mm)), CT)
+
+
+def middles_mm(balls: list[Ball]) -> Float64[np.ndarray, "n 3"]:
+    return np.array([ball.center_mm for ball in balls], np.float64).reshape(-1, 3)
 
 
 class _Model:

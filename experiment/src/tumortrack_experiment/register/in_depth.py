@@ -72,11 +72,11 @@ def _voted(frame: DepthFrame, radius_mm: float) -> Points:
     votes = np.bincount(np.ravel_multi_index(cells.T, shape), minlength=shape.prod())
     two = ndimage.uniform_filter(votes.reshape(shape).astype(np.float32), 2, mode="constant") * 8
     # Pixels that a ball at this distance covers.
-    covered = np.pi * radius_mm**2 * camera.fx * camera.fy / (low[2] + np.arange(shape[2]) + 0.5) ** 2
-    share = two / covered
-    peaks = np.argwhere(
-        (share == ndimage.maximum_filter(share, 5)) & (share > _LEAST_VOTES)
+    covered = (
+        np.pi * radius_mm**2 * camera.fx * camera.fy / (low[2] + np.arange(shape[2]) + 0.5) ** 2
     )
+    share = two / covered
+    peaks = np.argwhere((share == ndimage.maximum_filter(share, 5)) & (share > _LEAST_VOTES))
     best = peaks[np.argsort(-share[tuple(peaks.T)])[:_MOST_PLACES]]
     return low + best * _CELL_MM  # the corner that the two cells on each axis share
 
@@ -119,7 +119,11 @@ def fit_ball_seen(
             return None
         depth = z[rows, columns].astype(np.float64)
         rays = np.stack(
-            [(columns - camera.cx) / camera.fx, (rows - camera.cy) / camera.fy, np.ones(rows.shape)],
+            [
+                (columns - camera.cx) / camera.fx,
+                (rows - camera.cy) / camera.fy,
+                np.ones(rows.shape),
+            ],
             axis=-1,
         )
         lengths = np.linalg.norm(rays, axis=-1)

@@ -1,0 +1,185 @@
+"""Organ and tumors of a deformed phantom from its CT on the base, held against the case."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float64
+
+from tumortrack.core.errors import InputError
+from tumortrack.core.geometry import spacing_mm, transform_points
+from tumortrack.core.mesh_files import read_mesh
+from tumortrack.core.types import Anatomy, Mesh, Volume
+from tumortrack.imaging.case import Case
+from tumortrack.imaging.grid import grown_box, moved_origin, voxel_ml
+from tumortrack.imaging.raster import voxelise
+from tumortrack.imaging.segment import segment_ct
+from tumortrack.imaging.surface import surfaces
+from tumortrack_experiment.kit_file import Kit, KitPart
+from tumortrack_experiment.register.in_ct import Ball
+
+AIR_HU = -1000.0
+_ROUND_MM = 35.0  # that a pressed organ may come out of its box at rest, or beside the beads
+_BEAD_RIM_MM = 1.5
+_ORGAN_PERCENT = 5.0  # hydrogel keeps its volume; a second scan at 1 mm finds it to 1 %
+_TUMOR_PERCENT, _TUMOR_ML = 15.0, 0.3  # of small ones the rim is a larger share
+_STANDS_MM = (-2.0, 6.0)  # the organ's lowest point over the plate
+_USUAL_SHIFT_MM = 15.0  # of a tumor by the paper's plates
+_USUAL_CHANGE = 0.1  # of its volume
+
+
+@dataclass(frozen=True, eq=False)
+class Deformed:
+    """``anatomy``: LPS of the second CT, tumors numbered as the case's; ``report``: plain JSON."""
+
+    anatomy: Anatomy
+    report: dict[str, Any]
+
+
+def parts_in(kit: Kit, folder: Path, state: str) -> list[Mesh]:
+    """The kit's parts that stand on the base in a state, base frame. Raises InputError: a part's
+    file is missing or damaged."""
+    folder = folder if folder.is_dir() else folder.parent
+
+    def placed(part: KitPart) -> Mesh:
+        mesh = read_mesh(folder / part.file)
+        return mesh.moved(transform_points(np.array(part.base_from_part), mesh.vertices_mm))
+
+    return [
+        placed(part)
+        for part in kit.parts
+        if part.base_from_part is not None and part.state in ("", state)
+    ]
+
+
+def segment_deformed(
+    volume: Volume,
+    ct_from_base: Float64[np.ndarray, "4 4"],
+    kit: Kit,
+    case: Case,
+    others: tuple[list[Mesh], list[Ball]],
+    windows: tuple[tuple[float, float], tuple[float, float]],
+) -> Deformed:
+    """Take away what stands on the base and what lies under it, segment the rest by HU windows, and
+    compare. ``others``: the parts that stand there, base frame, and the bright balls of the CT.
+
+    Raises:
+        InputError: no organ, or organ and tumors are not those that the kit's molds cast.
+    """
+    rest_mm = transform_points(np.array(kit.base_from_ct), case.anatomy.organ.vertices_mm)
+    alone = _without_base(_cropped(volume, ct_from_base, kit, rest_mm), ct_from_base, kit, others)
+    labels, notes = segment_ct(alone, *windows)
+    anatomy, _ = surfaces(labels)
+    base_from_ct = np.linalg.inv(ct_from_base)
+    in_base = [transform_points(base_from_ct, part.vertices_mm) for part in anatomy.parts]
+    counts = np.bincount(labels.labels.ravel())[1:] * voxel_ml(labels.lps_from_index)
+    found_ml = [float(counts.sum()), *counts[1:].tolist()]
+    lowest_mm = float(in_base[0][:, 2].min())
+    _check(found_ml, kit, lowest_mm)
+    places = [
+        transform_points(np.array(kit.base_from_ct), part.vertices_mm.mean(0)[None])[0]
+        for part in case.anatomy.tumors
+    ]
+    order = _order(found_ml[1:], np.array([at.mean(0) for at in in_base[1:]]), kit, places)
+    tumors = [anatomy.tumors[n] for n in order]
+    report = {
+        "organ_ml": found_ml[0],
+        "tumors_ml": [found_ml[1 + n] for n in order],
+        "kit_ml": [kit.organ_ml, *kit.tumors_ml],
+        "lowest_mm": lowest_mm,
+        "tumor_shift_mm": [
+            float(np.linalg.norm(in_base[1 + n].mean(0) - at))
+            for n, at in zip(order, places, strict=True)
+        ],
+        "notes": notes,
+    }
+    return Deformed(Anatomy((anatomy.organ, *tumors)), report)
+
+
+def _cropped(volume: Volume, ct_from_base: np.ndarray, kit: Kit, rest_mm: np.ndarray) -> Volume:
+    """The voxels about the organ's place on the base."""
+    box = np.stack([rest_mm.min(0), rest_mm.max(0)]) + np.array([[-_ROUND_MM], [_ROUND_MM]])
+    box[0, 2] = -5.0
+    corners = np.stack(np.meshgrid(*box.T), -1).reshape(-1, 3)
+    index_from_base = np.linalg.inv(volume.lps_from_index) @ ct_from_base
+    index = transform_points(index_from_base, corners)
+    ends = zip(np.floor(index.min(0)).astype(int), np.ceil(index.max(0)).astype(int), strict=True)
+    sides = [slice(max(0, int(a)), max(0, int(b))) for a, b in ends]
+    inner = grown_box(sides, volume.hu.shape)
+    if min(side.stop - side.start for side in inner) < 2:
+        raise InputError("the organ's place on the base lies outside the CT. Scan the whole base.")
+    return Volume(volume.hu[inner], moved_origin(volume.lps_from_index, inner))
+
+
+def _without_base(
+    volume: Volume,
+    ct_from_base: np.ndarray,
+    kit: Kit,
+    others: tuple[list[Mesh], list[Ball]],
+) -> Volume:
+    """The CT with air for all that is under the organ and for the kit's parts, whose rims the
+    segmentation drops as sheets; balls inside something are filled with what is round them."""
+    hu, affine = volume.hu.copy(), volume.lps_from_index
+    parts, balls = others
+    base_from_index = np.linalg.inv(ct_from_base) @ affine
+    i, j, k = np.ogrid[tuple(slice(0, n) for n in hu.shape)]
+    x, y, z, shift = base_from_index[2]
+    hu[x * i + y * j + z * k + shift < 0] = AIR_HU
+    for part in parts:
+        there = part.moved(transform_points(ct_from_base, part.vertices_mm))
+        hu[voxelise(there, affine, hu.shape)] = AIR_HU
+    steps = spacing_mm(affine)
+    reach_mm = kit.bead_diameter_mm / 2 + _BEAD_RIM_MM + float(steps.max()) / 2
+    for ball in balls:
+        at = transform_points(np.linalg.inv(affine), ball.center_mm[None])[0]
+        away = sum(((axis - c) * s) ** 2 for axis, c, s in zip((i, j, k), at, steps, strict=True))
+        hu[away < reach_mm**2] = ball.hu_around
+    return Volume(hu, affine)
+
+
+def _check(found_ml: list[float], kit: Kit, lowest_mm: float) -> None:
+    """Raises InputError, with all numbers, where this is not what the molds cast."""
+    faults = []
+    change = 100 * (found_ml[0] / kit.organ_ml - 1)
+    if abs(change) > _ORGAN_PERCENT:
+        faults.append(
+            f"the organ has {found_ml[0]:.1f} ml, {change:+.0f} %, where {_ORGAN_PERCENT:g} % are "
+            "allowed (a plate taken for organ, or another phantom?)"
+        )
+    if len(found_ml) - 1 != len(kit.tumors_ml):
+        faults.append(f"it has {len(found_ml) - 1} tumors instead of {len(kit.tumors_ml)}")
+    if not _STANDS_MM[0] <= lowest_mm <= _STANDS_MM[1]:
+        faults.append(
+            f"its lowest point is {lowest_mm:.1f} mm over the base ({_STANDS_MM[0]:g} to "
+            f"{_STANDS_MM[1]:g} are allowed): it does not stand there"
+        )
+    if faults:
+        raise InputError(
+            f"the CT does not show the kit's organ of {kit.organ_ml:.1f} ml with tumors of "
+            f"{', '.join(f'{ml:.1f}' for ml in kit.tumors_ml)} ml: {'; '.join(faults)}. Check that "
+            "it is this phantom, in this state (--state), and the HU windows."
+        )
+
+
+def _order(
+    found_ml: list[float], found_mm: np.ndarray, kit: Kit, places: list[np.ndarray]
+) -> list[int]:
+    """Which of the tumors found is the case's first, second, ...: by volume and by place."""
+    from scipy.optimize import linear_sum_assignment
+
+    if not places:
+        return []
+    ratio = np.log(np.array(found_ml) / np.array(kit.tumors_ml)[:, None]) / _USUAL_CHANGE
+    away = np.linalg.norm(found_mm - np.array(places)[:, None], axis=2) / _USUAL_SHIFT_MM
+    order = [int(n) for n in linear_sum_assignment(ratio**2 + away**2)[1]]
+    for number, (n, ml) in enumerate(zip(order, kit.tumors_ml, strict=True), 1):
+        allowed_ml = max(_TUMOR_PERCENT / 100 * ml, _TUMOR_ML)
+        if abs(found_ml[n] - ml) > allowed_ml:
+            raise InputError(
+                f"the tumor in tumor_{number}'s place has {found_ml[n]:.1f} ml; the kit's has "
+                f"{ml:.1f} +- {allowed_ml:.1f} ml. Check that it is this phantom, and --tumor-hu."
+            )
+    return order
