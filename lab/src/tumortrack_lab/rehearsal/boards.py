@@ -12,7 +12,6 @@ from scipy.spatial.transform import Rotation
 from tumortrack.core import store
 from tumortrack.core.geometry import Affine, rigid
 from tumortrack.core.types import DepthFrame
-from tumortrack.live.poses import COLUMNS, pose_row
 from tumortrack.sense.files import depth_png, intrinsics_json
 from tumortrack.sense.noise import D405_NOISE, add_noise
 from tumortrack_experiment.calibrate.board import Board
@@ -39,25 +38,24 @@ def hold_board(hands: Hands, board: Board, folder: Path, count: int, seed: int) 
 
 def move_board(
     hands: Hands, board: Board, robot_from_camera: Affine, folder: Path, count: int, seed: int
-) -> Path:
-    """Pictures of a board on the tool of a robot, and the table of the robot's own poses, for
-    `calibrate hand-eye --eye-to-hand`. The robot is where it says, but for its accuracy."""
+) -> None:
+    """Pictures of a board on the tool of a robot, and the robot's own poses, for `calibrate
+    hand-eye --eye-to-hand`. The robot is where it says, but for its accuracy."""
     rng = np.random.default_rng(seed)
     tool_from_board = rigid(
         Rotation.from_euler("xyz", rng.uniform(-20, 20, 3), degrees=True).as_matrix(),
         rng.uniform(-40, 40, 3) + [0, 0, 60],
     )
-    rows = [COLUMNS + "\n"]
+    rows = []
     looks = looks_at_board(board, count, rng, (130.0, 230.0))
     for number, camera_from_board in enumerate(looks):
         _shoot(hands, board, camera_from_board, folder / f"{number:02d}", rng, depth=False)
         said = robot_from_camera @ camera_from_board @ np.linalg.inv(tool_from_board)
         wrong = Rotation.from_rotvec(np.radians(rng.normal(0, ROBOT_DEG, 3))).as_matrix()
         said = said @ rigid(wrong, rng.normal(0, ROBOT_MM, 3))
-        rows.append(pose_row(number + 1, "base_link", said))
-    table = folder.with_suffix(".csv")
-    store.write_atomically(table, "".join(rows).encode())
-    return table
+        rows.append(said.tolist())
+    poses = folder.with_suffix(".json")
+    store.write_json(poses, {"frame_id": "base_link", "unit": "mm", "base_from_tool": rows})
 
 
 def _shoot(

@@ -112,13 +112,12 @@ class Rehearsal:
             move_board(self.hands, Board(), self.robot_from_camera, folder, _POSES, 2)
         lens = self.out / "camera-calibration" / "lens.json"
         options = ("--lens", lens, "--eye-to-hand", "--distance", distance)
-        table = folder.with_suffix(".csv")
-        self._once(
-            out.name, lambda: self._do("calibrate", "hand-eye", folder, table, out, *options)
-        )
+        poses = ("--poses", folder.with_suffix(".json"))
+        words = "calibrate", "hand-eye", folder, out, *options, *poses
+        self._once(out.name, lambda: self._do(*words))
         found = np.array(store.read_json(out / "calibration.json")["robot_from_camera"])
         there = transform_points(found, point) - transform_points(self.robot_from_camera, point)
-        stated_mm = store.read_json(out / "report.json")["error_at_organ_mm"]
+        stated_mm = store.read_json(out / "report.json")["bound_mm"]
         return [Row("hand-eye, at the organ", stated_mm, float(np.linalg.norm(there)))]
 
     @cached_property
@@ -178,7 +177,7 @@ class Rehearsal:
             store.read_json(self.out / "ct" / f"{state}.json")["scanner_from_base"]
         )
         true = self.hands.camera_from_base @ np.linalg.inv(scanner_from_base)
-        found = np.array(registration["camera_from_ct"])
+        found = np.array(registration["rows"])
         rows = []
         names = zip(truth.names[1:], truth.tumors, scene.reference.tumors, strict=True)
         for name, tumor, seen in names:
