@@ -84,8 +84,6 @@ def test_an_experiment_from_its_kit_to_what_is_read_and_played_of_it(tmp_path, c
             np.testing.assert_array_equal(moment.picture, seen.picture)
             np.testing.assert_allclose(moment.fixed_from_camera, POSE, atol=1e-9)
             stamps.append(moment.depth.stamp_ns)
-        still = recorded.steady_depth(state).depth_mm
-        assert np.std(still - seen.content.depth_mm) == pytest.approx(0.2, abs=0.03)
     assert stamps == sorted(stamps)
     assert len(set(stamps)) == 51
 

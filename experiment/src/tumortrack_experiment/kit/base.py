@@ -219,7 +219,7 @@ def _arranged(anatomy: Anatomy, standing: list[PrintedPart], config: BaseConfig)
     if not good.any():
         raise InputError(
             f"base: of {_TRIES} arrangements of {config.beads} beads none has distances that all "
-            f"differ by {config.gap_mm:g} mm, with {LEAST_BEADS} beads in view in every state. Take "
+            f"differ by {config.gap_mm:g} mm, with {LEAST_BEADS} in view in every state. Take "
             "another number of beads, fewer states, or a smaller tilt."
         )
     drawn = drawn[good]

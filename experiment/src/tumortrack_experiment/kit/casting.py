@@ -191,7 +191,8 @@ def _channels(layout: Layout, vent_mm: float, pin_mm: float, pins: list[Segment]
 
     foot, radius = layout.sprue_mm, layout.sprue_radius_mm
     out = layout.top_mm - foot[2]
-    funnel = min(2 * radius, max(out - 3.0, 0.5))  # deep, of 45 degrees
+    room = min(2 * radius, out - 3.0, -float(layout.beyond(foot)) - radius - 2.0)
+    funnel = max(room, 0.1)  # deep, of 45 degrees
     rods = [rod(foot, raised(foot, out + 5), radius)]
     rods.append(rod(raised(foot, out - funnel), raised(foot, out), radius, radius + funnel))
     rods += [rod(raised(v, -1.0), raised(v, layout.top_mm - v[2] + 5), vent_mm / 2)

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from tumortrack.core.geometry import rotation_onto
 from tumortrack.core.types import Mesh
 from tumortrack.imaging.meshes import solid_of
 
@@ -34,6 +35,12 @@ def ball(center: tuple[float, float, float], radius: float) -> Any:
     from manifold3d import Manifold
 
     return Manifold.sphere(radius, _SIDES).translate(center)
+
+
+def rod(start: np.ndarray, end: np.ndarray, radius: float) -> Any:
+    """A cylinder between two points."""
+    way = np.column_stack([rotation_onto(np.array([0.0, 0.0, 1.0]), end - start), start])
+    return cone((0, 0, 0), float(np.linalg.norm(end - start)), radius).transform(way)
 
 
 def rounded_plate(half: tuple[float, float], low: float, high: float, radius: float) -> Any:

@@ -19,7 +19,8 @@ from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import rigid, transform_points, triangles_of
 from tumortrack.core.types import Anatomy, Mesh
 from tumortrack.imaging.meshes import mesh_of
-from tumortrack_experiment.kit.solids import ball, box, cone
+from tumortrack_experiment.kit.recipe import COUPON_MM, COUPONS
+from tumortrack_experiment.kit.solids import ball, box, cone, written
 from tumortrack_experiment.kit.values import PrintedPart
 
 COMPRESSION_MM = {"D1": 4.0, "D2": 8.0, "D3": 12.0}
@@ -182,3 +183,18 @@ def _part(name: str, purpose: str, solid: Any, state: str, upside_down: float) -
 def _block(sides: tuple[float, float, float, float], low: float, high: float) -> Any:
     x0, x1, y0, y1 = sides
     return box((x0, y0, low), (x1, y1, high))
+
+
+def coupon_mold() -> PrintedPart:
+    """A slab with a through-hole for each coupon: laid on a film, filled, covered by a film. K:
+    of the organ's batch; T: of the tumors'."""
+    across, high = COUPON_MM
+    step = across + 6.0
+    slab = box((0, 0, 0), (COUPONS * step + 16, 2 * step + 6, high))
+    for row, letter in enumerate("KT"):
+        y = 3 + step / 2 + row * step
+        for n in range(COUPONS):
+            slab -= cone((3 + step * (n + 0.5), y, -1), high + 2, across / 2)
+        slab -= written(letter, (COUPONS * step + 9, y, high - 0.6), 8.0, 1.0)
+    purpose = "molds the coupons that tell stiffness and HU of both batches"
+    return PrintedPart("coupons", purpose, mesh_of(slab), "ct", np.eye(4))

@@ -105,7 +105,7 @@ class Guide:
             if left_s <= 0:
                 break
         self._line("", None)
-        quality = meter.whole(self.worker.dropped - self._before)
+        quality = meter.quality(self.worker.dropped - self._before, whole=True)
         said = {
             moved: bool(moved),
             f"the source was silent for {longest_s:.1f} s": longest_s > _LONGEST_S,
@@ -187,7 +187,7 @@ class Guide:
             return
         self._shown_s, text = time.monotonic(), ""
         if meter is not None and meter.frames:
-            quality = meter.now(self.worker.dropped - self._before)
+            quality = meter.quality(self.worker.dropped - self._before)
             wrong = quality.warnings(self.options.range)[:1]
             text = "".join([f"  {what}", *(f"! {one} ! " for one in wrong), quality.line()])
         elif meter is not None:
