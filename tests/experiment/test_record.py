@@ -1,83 +1,282 @@
-"""Recordings of an experiment: states, pictures and poses come back, with the files beside them."""
+"""`record`: what was seen comes back by state, with what came with it, however it was stopped."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+import errno
+import hashlib
+import json
+import os
+import signal
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
-from rosbags.rosbag2 import Reader
+from rosbags.highlevel import AnyReader
 
-from live_objects import STAMP_NS, small_frame
+from record_objects import SPEC, SmallBenchConfig
+from tumortrack.cli.main import run
 from tumortrack.core.errors import InputError
-from tumortrack.core.geometry import rigid
-from tumortrack.live.recording.mcap import STRING, McapBag, camera_messages
-from tumortrack.live.ros.messages import Messages, Outgoing
-from tumortrack.live.values import Observation
-from tumortrack_experiment.record.attachments import attach, attachments_of
-from tumortrack_experiment.record.read import IMAGE, STATE, WHOLE, read_recorded
+from tumortrack.live.poses import COLUMNS
+from tumortrack.live.recording import mcap
+from tumortrack.live.spec import SOURCES
+from tumortrack.live.values import SourceEnded
+from tumortrack_experiment.record.attachments import attachments_of
+from tumortrack_experiment.record.folder import RecordingFolder
+from tumortrack_experiment.record.read import WHOLE, read_recorded
 
-FILES = {"kit.json": b'{"beads": 4}', "calibration.json": bytes(range(256)) * 300}
-
-
-def seen_number(n: int, colour: bool) -> Observation:
-    frame = small_frame(STAMP_NS + n * 10_000_000)
-    frame = replace(frame, depth_mm=frame.depth_mm + np.float32(n))
-    shape = (*frame.depth_mm.shape, 3) if colour else frame.depth_mm.shape
-    picture = np.random.default_rng(n).integers(0, 256, shape).astype(np.uint8)
-    return Observation(frame, STAMP_NS + n, picture=picture)
-
-
-def pose_number(n: int) -> np.ndarray:
-    return rigid(np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), np.array([10.0, -20, n]))
-
-
-def written(folder: Path, colour: bool = True) -> Path:
-    messages = Messages()
-    bag = McapBag(folder / "recording", messages, "")
-    for n in range(8):
-        seen = seen_number(n, colour)
-        out = camera_messages(seen, pose_number(n), "base", messages)
-        if n in (0, 5):
-            state = messages.make(STRING, data="D1" if n else "rest")
-            out.append(Outgoing(STATE, STRING, state))
-        bag.write(seen.arrived_ns, sorted(out, key=lambda one: one.suffix == IMAGE))
-    bag.close()
-    (folder / "recording" / WHOLE).rename(folder / WHOLE)
-    attach(folder / WHOLE, FILES)
-    return folder
+POSE = [[0.0, -1, 0, 10], [1, 0, 0, -20], [0, 0, 1, 300], [0, 0, 0, 1]]
+KIT = {
+    "case_sha256": "0",
+    "bead_diameter_mm": 6.0,
+    "beads": [{"name": f"b{n}", "center_mm": [n * 20, n % 2 * 30, 3]} for n in range(4)],
+    "base_from_ct": np.eye(4).tolist(),
+    "organ_ml": 100.0,
+    "tumors_ml": [3.0],
+    "states": ["rest", "D1", "D2"],
+    "parts": [
+        {"name": "plate", "file": "p.stl", "purpose": "squeezes", "volume_ml": 1, "state": "D1"}
+    ],
+}
 
 
-@pytest.mark.parametrize("colour", [True, False])
-def test_states_come_back_with_pictures_poses_and_files(tmp_path, colour):
-    recorded = read_recorded(written(tmp_path, colour))
-    assert recorded.states == ("rest", "D1")
-    assert recorded.attachments == FILES
-    for state, numbers in (("rest", range(5)), ("D1", range(5, 8))):
+@pytest.fixture(autouse=True)
+def bench(monkeypatch):
+    monkeypatch.setitem(SOURCES.built_in, "small", SPEC)
+    SmallBenchConfig.taken.clear()
+
+
+def record(folder: Path, *options: str, source: str = "small", seconds: str = "0.5") -> int:
+    default = () if "--kit" in options else ("--states", "rest", "D1")
+    always = ["--seconds", seconds, "--countdown", "0", "--yes"]
+    return run(["record", source, str(folder), *default, *always, *options])
+
+
+def said_of(folder: Path, state: str) -> str:
+    about = json.loads((folder / "recording.json").read_text())
+    return "; ".join(about["done"][state]["warnings"])
+
+
+def test_an_experiment_from_its_kit_to_what_is_read_and_played_of_it(tmp_path, capsys):
+    (tmp_path / "kit.json").write_text(json.dumps(KIT))
+    frame = {"frame_id": "base", "unit": "mm", "robot_from_camera": POSE}
+    (tmp_path / "frame.json").write_text(json.dumps(frame))
+    beside = ("--kit", str(tmp_path), "--frame", str(tmp_path / "frame.json"))
+    assert record(tmp_path / "r", *beside, source="small?grey=120") == 0
+    said = capsys.readouterr().out
+    assert "state 2 of 3: D1\n  set up plate: squeezes\n" in said
+    assert "17 frames, depth 100% in range" in said
+    assert ", still, light 119 of 255, 30 fps, 0 dropped" in said
+    inside = {path.name for path in (tmp_path / "r").iterdir()}
+    assert inside == {"recording.json", "recording.mcap", "metadata.yaml"}
+
+    recorded = read_recorded(tmp_path / "r")
+    assert recorded.states == ("rest", "D1", "D2")
+    sent = {seen.stamp_ns: seen for seen in SmallBenchConfig.taken}
+    stamps = []
+    for state in recorded.states:
         moments = list(recorded.moments(state))
-        assert len(moments) == len(numbers)
-        for moment, n in zip(moments, numbers, strict=True):
-            sent = seen_number(n, colour)
-            assert moment.depth.stamp_ns == sent.stamp_ns
-            np.testing.assert_allclose(moment.depth.depth_mm, sent.content.depth_mm, rtol=2e-7)
-            np.testing.assert_array_equal(moment.picture, sent.picture)
-            np.testing.assert_allclose(moment.fixed_from_camera, pose_number(n), atol=1e-12)
-    steady = recorded.steady_depth("D1").depth_mm
-    np.testing.assert_allclose(steady, seen_number(6, colour).content.depth_mm, rtol=2e-7)
-    with pytest.raises(InputError, match=r"no finished state 'D2'\. It has: rest, D1"):
-        next(recorded.moments("D2"))
+        assert len(moments) == 17
+        for moment in moments:
+            seen = sent[moment.depth.stamp_ns]
+            np.testing.assert_allclose(moment.depth.depth_mm, seen.content.depth_mm, rtol=2e-7)
+            assert moment.depth.intrinsics == seen.content.intrinsics
+            np.testing.assert_array_equal(moment.picture, seen.picture)
+            np.testing.assert_allclose(moment.fixed_from_camera, POSE, atol=1e-9)
+            stamps.append(moment.depth.stamp_ns)
+    assert stamps == sorted(stamps)
+    assert len(set(stamps)) == 51
+
+    files = {name: (tmp_path / name).read_bytes() for name in ("kit.json", "frame.json")}
+    files["calibration.json"] = files.pop("frame.json")
+    about = json.loads(recorded.attachments.pop("recording.json"))
+    assert recorded.attachments == files
+    assert about["files"] == {n: hashlib.sha256(data).hexdigest() for n, data in files.items()}
+    assert about == json.loads((tmp_path / "r" / "recording.json").read_text())
+
+    source = SOURCES.parse(f"recording:{tmp_path / 'r'}?rate=0").open()
+    assert [source.read(0.1).stamp_ns for _ in stamps] == stamps
+    with pytest.raises(SourceEnded):
+        source.read(0.1)
+    with AnyReader([tmp_path / "r"]) as reader:
+        messages = [(c.topic, reader.deserialize(m, c.msgtype)) for c, _, m in reader.messages()]
+    assert [m.data for topic, m in messages if topic == "/state"] == ["rest", "D1", "D2"]
+    colours = [m for topic, m in messages if topic == "/camera/color/image_raw"]
+    assert (len(colours), colours[0].encoding) == (51, "rgb8")
+    assert {m.transforms[0].header.frame_id for topic, m in messages if topic == "/tf"} == {"base"}
 
 
-def test_attachments_leave_the_messages_as_they_were(tmp_path):
-    with Reader(written(tmp_path) / WHOLE) as reader:
-        assert reader.message_count == 8 * 5 + 2
-        assert sum(1 for _ in reader.messages()) == reader.message_count
+def test_a_killed_recording_goes_on_with_what_is_missing(tmp_path, capsys):
+    with pytest.raises(InputError, match="no recording"):
+        read_recorded(tmp_path / "r")
+    if not (child := os.fork()):  # killed in the second state's middle
+        record(tmp_path / "r", source="small?kill_at=30")
+        os._exit(1)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == -signal.SIGKILL
+    before = read_recorded(tmp_path / "r")
+    assert before.states == ("rest",)
+    rest = [moment.depth for moment in before.moments("rest")]
+    assert len(rest) == 17
+    capsys.readouterr()
+    assert record(tmp_path / "r", "--states", "rest", "D2") == 2
+    assert 'begun with other states: ["rest", "D1"]' in capsys.readouterr().err
+    assert record(tmp_path / "r", "--frame", __file__) == 2
+    assert record(tmp_path / "r", "--only", "D7") == 2
+    assert "no state 'D7', but rest, D1" in capsys.readouterr().err
+    assert record(tmp_path / "r") == 0
+    assert capsys.readouterr().out.startswith("state 2 of 2: D1")
+    after = read_recorded(tmp_path / "r")
+    assert after.states == ("rest", "D1")
+    for moment, kept in zip(after.moments("rest"), rest, strict=True):
+        assert moment.depth.stamp_ns == kept.stamp_ns
+        np.testing.assert_array_equal(moment.depth.depth_mm, kept.depth_mm)
+    assert record(tmp_path / "r") == 0  # nothing is missing
+    assert record(tmp_path / "r", "--only", "D1") == 2
+    assert "is finished" in capsys.readouterr().err
+
+
+def test_a_state_alone_and_anew(tmp_path):
+    """In the checklist's order, whichever came first."""
+    assert record(tmp_path, "--only", "D1") == 0
+    first = next(read_recorded(tmp_path).moments("D1")).depth.stamp_ns
+    assert record(tmp_path, "--only", "D1") == 0
+    second = next(read_recorded(tmp_path).moments("D1")).depth.stamp_ns
+    assert second > first
+    assert record(tmp_path) == 0
+    recorded = read_recorded(tmp_path)
+    assert recorded.states == ("rest", "D1")
+    assert next(recorded.moments("D1")).depth.stamp_ns == second
+    assert next(recorded.moments("rest")).depth.stamp_ns > second
+
+
+@pytest.mark.parametrize(
+    ("source", "words"),
+    [
+        ("small", ""),
+        ("small:wobbles", "moved: wait until all is still"),
+        ("small:sinks", "moved: wait until all is still"),
+        ("small?lift_mm=-110", "nearer than 70 mm"),
+        ("small?lift_mm=400", "farther than 500 mm: move nearer; only 0% is in range"),
+        ("small?noise_mm=1.5", "noise is over 1."),
+        ("small?hole_share=0.4", "has no depth"),
+        ("small?grey=255", "of the picture is white"),
+        ("small?grey=3", "the picture's mean is"),
+        ("small?lost_at=2", "the source was silent for"),
+    ],
+)
+def test_what_is_wrong_with_a_state_is_said(tmp_path, source, words, monkeypatch):
+    monkeypatch.setattr("tumortrack.live.workers._AGAIN_S", 0.01)
+    if "lost" in source:  # 1.1 s by its stamps
+        monkeypatch.setattr("record_objects.PERIOD_NS", 600_000_000)
+    assert record(tmp_path, "--only", "rest", source=source, seconds="1.6") == 0
+    said = said_of(tmp_path, "rest")
+    assert words in said
+    assert bool(words) == bool(said)
+
+
+def test_a_camera_that_moved_between_states_is_noticed(tmp_path):
+    states = ("--states", "rest", "D1", "D2", "--only")
+    assert record(tmp_path, *states, "rest", seconds="2") == 0
+    assert record(tmp_path, *states, "D1", source="small?lift_mm=3", seconds="2") == 0
+    moved = "the camera or the table has moved since the first state: the table lies 3.0 mm off"
+    assert said_of(tmp_path, "rest") == ""
+    assert moved in said_of(tmp_path, "D1")
+    assert record(tmp_path, *states, "D1", seconds="2") == 0
+    assert said_of(tmp_path, "D1") == ""
+
+
+def test_poses_of_a_moving_camera_come_back(tmp_path):
+    from record_objects import BEGIN_NS, PERIOD_NS
+
+    now = SmallBenchConfig.number[0]
+    rows = [f"{BEGIN_NS + n * PERIOD_NS},base,{n},0,0,1,0,0,0" for n in range(now, now + 60)]
+    (tmp_path / "poses.csv").write_text("\n".join([COLUMNS, *rows, ""]))
+    assert record(tmp_path / "r", "--moving", f"file:{tmp_path / 'poses.csv'}") == 0
+    for state in ("rest", "D1"):
+        for moment in read_recorded(tmp_path / "r").moments(state):
+            n = (moment.depth.stamp_ns - BEGIN_NS) / PERIOD_NS
+            np.testing.assert_allclose(moment.fixed_from_camera[:3, 3], [n, 0, 0], atol=1e-9)
+
+
+def test_a_full_disk_is_one_error_and_costs_no_state(tmp_path, monkeypatch, capsys):
+    def refused() -> None:
+        with monkeypatch.context() as full:
+            full.setattr(mcap._WholeWrites, "write", no_room)
+            assert record(tmp_path) == 4
+        said = capsys.readouterr().err
+        assert "No space left on device. What is finished stays. Free some" in said
+        assert said.count("\n") == 1
+
+    def no_room(self, *data):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    assert record(tmp_path, "--only", "rest") == 0
+    refused()  # in the second state
+    assert read_recorded(tmp_path).states == ("rest",)
+    with monkeypatch.context() as full:  # where all are put together
+        full.setattr(RecordingFolder, "finish", lambda folder: folder.path)
+        assert record(tmp_path) == 0
+    refused()
+    assert read_recorded(tmp_path).states == ("rest", "D1")
+    assert not (tmp_path / WHOLE).exists()
+    assert record(tmp_path) == 0
+    assert read_recorded(tmp_path).states == ("rest", "D1")
+    assert (tmp_path / WHOLE).is_file()
+
+
+def test_the_user_is_asked_and_may_repeat_or_end(tmp_path, monkeypatch, capsys):
+    ours, theirs = os.openpty()
+    with os.fdopen(theirs) as terminal:
+        monkeypatch.setattr(sys, "stdin", terminal)
+        always = ["record", "small", str(tmp_path), "--states", "rest", "D1", "--seconds", "0.5"]
+        for answers, states in (("\nr\n\n\n\nq\n", ("rest",)), ("\n\n", ("rest", "D1"))):
+            os.write(ours, answers.encode())
+            assert run(always) == 0
+            assert read_recorded(tmp_path).states == states
+            assert not (tmp_path / ".part").exists()
+        os.close(ours)
+    said = capsys.readouterr().out
+    assert said.count("rest: 17 frames") == 2
+    assert "missing: D1. The same command goes on." in said
+
+
+@pytest.mark.parametrize(
+    ("source", "options", "words"),
+    [
+        ("nothing", (), "no kind 'nothing'"),
+        ("small?cloud=true", (), "gives clouds; a recording needs depth images"),
+        ("small?frames=20", (), "the source is at its end, and states are missing"),
+        ("small", ("--states", "a", "a"), "each once"),
+        ("small", ("--states", "../a"), "cannot be called '../a'"),
+        ("small", ("--seconds", "0"), "--seconds must lie in"),
+        ("small", ("--range", "200", "100"), "--range is NEAR FAR"),
+        ("small", ("--frame", "none.json"), "none.json does not exist"),
+        ("small", ("--kit", "none"), "none does not exist"),
+        ("small", ("--moving", "file:none.csv"), "none.csv does not exist"),
+    ],
+)
+def test_what_cannot_be_recorded_is_one_error(tmp_path, capsys, source, options, words):
+    assert record(tmp_path / "r", *options, source=source) == 2
+    said = capsys.readouterr().err
+    assert words in said
+    assert said.count("\n") == 1
+
+
+def test_other_folders_are_left_alone(tmp_path, capsys):
+    (tmp_path / "other.txt").write_text("mine")
+    assert record(tmp_path) == 2
+    assert "exists already, and is no recording" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["other.txt"]
+    assert run(["record", "small", str(tmp_path / "r"), "--states", "rest"]) == 2
+    assert "Give --yes" in capsys.readouterr().err
+
+
+def test_damage_is_said(tmp_path):
+    assert record(tmp_path) == 0
     whole = (tmp_path / WHOLE).read_bytes()
-    damaged = whole.replace(FILES["kit.json"], b'{"beads": 5}')
-    (tmp_path / WHOLE).write_bytes(damaged)
+    (tmp_path / WHOLE).write_bytes(whole.replace(b'"kind": "experiment"', b'"kind": "experimenT"'))
     with pytest.raises(InputError, match="checksum"):
         attachments_of(tmp_path / WHOLE)
     (tmp_path / WHOLE).write_bytes(whole[:-9])
-    with pytest.raises(InputError, match="no finished MCAP"):
-        attachments_of(tmp_path / WHOLE)
+    with pytest.raises(InputError, match="cannot be read"):
+        read_recorded(tmp_path)

@@ -27,6 +27,7 @@ from tumortrack.live.values import (
     SourceLost,
 )
 from tumortrack.live.workers import SinkWorker, SourceWorker
+from tumortrack.sense.files import DepthCorrection
 from tumortrack.sense.region import RegionConfig
 from tumortrack.simulate.scene import SceneRecipe, Simulator, body_for
 from tumortrack.tracking.tracker import Follower, FollowerConfig, Tracker
@@ -396,14 +397,18 @@ def test_other_intrinsics_replace_the_sources(tracker):
     setting = SinkContext(tracker.model.parts, PublishedFrame(), tracker.anatomy_ct, Controls())
     sink = Notes()
     for intrinsics, said in ((given, None), (Intrinsics(32, 48, 30, 30, 15, 23), "32 x 48")):
-        loop = Loop(tracker, setting, LoopConfig(intrinsics=intrinsics))
+        correction = DepthCorrection(scale=0.99, offset_mm=2.0)
+        loop = Loop(tracker, setting, LoopConfig(intrinsics=intrinsics, correction=correction))
         outlets = [SinkWorker("notes", sink, 10)]
         reader = SourceWorker(lambda: Script([frame]))
         loop.run(reader, outlets, lambda _: None)
         reader.close()
         outlets[0].close()
         if said is None:
-            assert sink.updates[-1].observation.content.intrinsics == given
+            content = sink.updates[-1].observation.content
+            assert content.intrinsics == given
+            corrected_mm = frame.content.depth_mm * 0.99 + 2
+            np.testing.assert_allclose(content.depth_mm, corrected_mm, rtol=1e-5)
         else:
             assert said in sink.updates[-1].reason
 

@@ -37,6 +37,31 @@ def test_a_cameras_frame_comes_out_bit_for_bit():
     source.close()
 
 
+@pytest.mark.parametrize("pictures", [("color",), ("infrared",), ("color", "infrared")])
+def test_the_picture_in_the_depth_images_pixels_comes_with_it(pictures: tuple[str, ...]):
+    """Of a colour image through another lens nobody knows that: the infrared one is taken."""
+    camera = Camera(pictures=pictures)
+    source = RealSenseSource(camera.device, RealSenseSourceConfig(picture=True))
+    shape = (HEIGHT, WIDTH) if "infrared" in pictures else (HEIGHT, WIDTH, 3)
+    for number in range(4):
+        stamp_ms = 1_790_000_000_123.0 + 33 * number
+        picture = np.random.default_rng(number).integers(0, 256, shape).astype(np.uint8)
+        shows = [
+            lambda n=number, t=stamp_ms: camera.show(n, t),
+            lambda n=number, t=stamp_ms, p=picture: camera.show_picture(pictures[-1], p, n, t),
+        ]
+        for show in shows[:: 1 if number % 2 else -1]:  # in either order
+            assert source.read(0.01) is None
+            show()
+        seen = source.read(PATIENCE_S)
+        np.testing.assert_array_equal(seen.picture, picture)
+        assert seen.stamp_ns == pytest.approx(stamp_ms * 1e6, abs=500)
+        assert np.nanmax(np.rint(seen.content.depth_mm * 10) - raw_depth(number)) == 0
+    source.close()
+    with pytest.raises(InputError, match=r"no picture"):
+        RealSenseSource(Camera().device, RealSenseSourceConfig(picture=True))
+
+
 @pytest.mark.parametrize("unit_m", [0.001, 0.0001, 0.00025])
 def test_the_devices_own_unit_counts(unit_m: float):
     camera = Camera(unit_m=unit_m)

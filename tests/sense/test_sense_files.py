@@ -17,7 +17,7 @@ from tumortrack.core.errors import InputError
 from tumortrack.core.types import Intrinsics
 from tumortrack.sense.camera import d405, deproject
 from tumortrack.sense.cloud import CloudConfig, check_cloud, cloud_from_depth
-from tumortrack.sense.files import read_cloud, read_depth_png, read_intrinsics
+from tumortrack.sense.files import intrinsics_json, read_cloud, read_depth_png, read_intrinsics
 from tumortrack.sense.noise import NoiseConfig, add_noise
 from tumortrack.sense.ply import write_cloud_ply
 
@@ -279,6 +279,21 @@ def test_depth_unit_comes_from_the_file_or_the_caller(tmp_path):
     assert (read_depth_png(png, camera, depth_unit_mm=1.0).depth_mm == 520).all()
     with pytest.raises(InputError, match="depth_unit_mm"):
         read_depth_png(png, camera, depth_unit_mm=0)
+
+
+def test_depths_are_corrected_as_the_intrinsics_file_says(tmp_path):
+    png, camera = tmp_path / "depth.png", tmp_path / "intrinsics.json"
+    write_depth_png(png, wall(130.0))
+    stated = intrinsics_json(SMALL)
+    camera.write_text(json.dumps(stated | {"depth_scale": 0.98, "depth_offset_mm": 1.5}))
+    assert read_depth_png(png, camera).depth_mm == pytest.approx(128.9, abs=1e-4)
+    camera.write_text(json.dumps(stated | {"depth_scale": 0.98, "depth_offset_mm": -19.0}))
+    write_depth_png(png, wall(19.0))  # would lie behind the camera
+    assert np.isnan(read_depth_png(png, camera).depth_mm).all()
+    for wrong in ({"depth_scale": 98.0}, {"depth_offset_mm": 21}, {"depth_offset_mm": "1 mm"}):
+        camera.write_text(json.dumps(stated | wrong))
+        with pytest.raises(InputError, match=next(iter(wrong)).removeprefix("depth_")):
+            read_depth_png(png, camera)
 
 
 def test_depths_that_16_bits_cannot_hold_are_refused(tmp_path):

@@ -25,7 +25,11 @@ class Camera:
     """A software device with a depth stream of 848 x 480; options as a D405's."""
 
     def __init__(
-        self, unit_m: float = UNIT_M, global_time: bool = True, distortion: float = 0.0
+        self,
+        unit_m: float = UNIT_M,
+        global_time: bool = True,
+        distortion: float = 0.0,
+        pictures: tuple[str, ...] = (),  # color, infrared
     ) -> None:
         self.device = rs.software_device()
         self.device.register_info(rs.camera_info.serial_number, "8128")
@@ -35,12 +39,33 @@ class Camera:
         stream.width, stream.height, stream.fps, stream.uid = WIDTH, HEIGHT, 30, 1
         stream.intrinsics = _intrinsics(distortion)
         self._profile = self._sensor.add_video_stream(stream).as_video_stream_profile()
+        self._wanted = pictures
+        self._pictures = {name: self._picture_profile(name) for name in pictures}
         self._sensor.add_read_only_option(rs.option.depth_units, unit_m)
         self._unit_m = unit_m
         if global_time:
             span = rs.option_range()
             span.min, span.max, span.step, span.default = 0, 1, 1, 1
             self._sensor.add_option(rs.option.global_time_enabled, span, True)
+
+    def _picture_profile(self, name: str) -> rs.video_stream_profile:
+        stream, colour = rs.video_stream(), name == "color"
+        stream.type, stream.bpp = getattr(rs.stream, name), 3 if colour else 1
+        stream.fmt = rs.format.rgb8 if colour else rs.format.y8
+        stream.width, stream.height, stream.fps = WIDTH, HEIGHT, 30
+        stream.index, stream.uid = (0, 2) if colour else (1, 3)
+        # A colour image with a lens of its own is not the depth image's.
+        stream.intrinsics = _intrinsics(0.1 if colour and "infrared" in self._wanted else 0.0)
+        return self._sensor.add_video_stream(stream).as_video_stream_profile()
+
+    def show_picture(self, name: str, pixels: np.ndarray, number: int, stamp_ms: float) -> None:
+        frame = rs.software_video_frame()
+        frame.pixels = pixels
+        frame.bpp = pixels.size // (WIDTH * HEIGHT)
+        frame.stride, frame.timestamp = WIDTH * frame.bpp, stamp_ms
+        frame.domain = rs.timestamp_domain.global_time
+        frame.frame_number, frame.profile = number, self._pictures[name]
+        self._sensor.on_video_frame(frame)
 
     def show(
         self, number: int, stamp_ms: float | None = None, hardware_clock: bool = False

@@ -73,7 +73,7 @@ class Track(StatedPatient):
         scan: with --moving: begin with three looks at the organ at rest, from 30 degrees apart,
             within 5 s; what they show together is what the following starts from.
         intrinsics: JSON with the camera's width, height, fx, fy, cx, cy in pixels, instead of what
-            the source says.
+            the source says, and perhaps a correction of depths, as `calibrate camera` writes it.
         smoothing: time constant in s of a mean over past estimates; the lag is in the report.
         rescan: every so many s, search for the organ as in a first frame.
         stale: frames older than so many s are refused; a pause is reported after four fifths of it.
@@ -215,7 +215,7 @@ class Track(StatedPatient):
 
     def _loop_config(self, model: Model) -> LoopConfig:
         from tumortrack.live.loop import LoopConfig
-        from tumortrack.sense.files import read_intrinsics
+        from tumortrack.sense.files import DepthCorrection, read_correction, read_intrinsics
         from tumortrack.tracking.tracker import FollowerConfig, region_for
 
         box = None if self.box is None else (self.box[:3], self.box[3:])
@@ -223,7 +223,8 @@ class Track(StatedPatient):
         return LoopConfig(
             region=region_for(model, range_mm=self.range, box_mm=box, whole=self.whole),
             follower=follower,
-            intrinsics=None if self.intrinsics is None else read_intrinsics(self.intrinsics),
+            intrinsics=self.intrinsics and read_intrinsics(self.intrinsics),
+            correction=read_correction(self.intrinsics) if self.intrinsics else DepthCorrection(),
             stale_s=self.stale,
             frozen_s=self.frozen,
             scan=self.scan,

@@ -30,6 +30,7 @@ from tumortrack.live.values import CameraView, Observation, SourceLost, Tracking
 from tumortrack.live.views import Found, ViewsLocator, camera_words, timed
 from tumortrack.live.workers import SinkWorker, SourceWorker
 from tumortrack.sense.camera import d405
+from tumortrack.sense.files import DepthCorrection
 from tumortrack.sense.region import Hints, RegionConfig, organ_points
 from tumortrack.tracking.tracker import Follower, FollowerConfig, Tracker
 
@@ -40,13 +41,14 @@ SURE_AFTER = 3  # good estimates in a row after doubt: single frames of somethin
 class LoopConfig(Config, frozen=True, kw_only=True):
     """``stale_s``: no frame for so long, or one that old, gives 'no estimate'. ``give_up_s``: the
     loop ends where no frame came for so long. ``intrinsics``: of depth images, instead of what the
-    source says. ``frozen_s``: an image that repeats bit for bit for so long is an old one; 0: it
+    source says, and ``correction`` of their depths with them. ``frozen_s``: an image that repeats bit for bit for so long is an old one; 0: it
     may repeat. ``seconds``: the loop ends so long after the first frame; 0: never. ``scan``: the
     first estimate is from several looks."""
 
     region: RegionConfig = RegionConfig()
     follower: FollowerConfig = FollowerConfig()
     intrinsics: Intrinsics | None = None
+    correction: DepthCorrection = DepthCorrection()
     stale_s: float = 0.5
     give_up_s: float = 60.0
     seconds: float = 0.0
@@ -259,7 +261,8 @@ class Loop:
                 f"the depth images are {has.width} x {has.height}, and --intrinsics is for "
                 f"{given.width} x {given.height}; calibrate for the size that is streamed."
             )
-        return replace(seen, content=DepthFrame(content.depth_mm, given, content.stamp_ns))
+        depth_mm = self._config.correction.corrected(content.depth_mm)
+        return replace(seen, content=DepthFrame(depth_mm, given, content.stamp_ns))
 
     def _publish(self, result: TrackingResult, sink_workers: list[SinkWorker]) -> TrackingResult:
         if self._arms is not None:

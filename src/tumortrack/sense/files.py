@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+from jaxtyping import Float32
 
 from tumortrack.core.config import Config, from_builtins
 from tumortrack.core.errors import InputError
@@ -44,6 +45,24 @@ class PosesFile(Config, frozen=True, kw_only=True):
     fixed_from_camera: tuple[tuple[tuple[float, float, float, float], ...], ...]
     unit: Literal["mm", "m"]
     frame_id: str
+
+
+class DepthCorrection(Config, frozen=True, kw_only=True):
+    """As `calibrate camera` finds it: the true depth is ``scale`` times the measured one, plus
+    ``offset_mm``."""
+
+    scale: float = 1.0
+    offset_mm: float = 0.0
+
+    def __post_init__(self) -> None:
+        self.check_between("depth correction:", scale=(0.8, 1.25), offset_mm=(-20.0, 20.0))
+
+    def corrected(self, depth_mm: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
+        """What lies behind the camera then has no return (NaN)."""
+        if self == DepthCorrection():
+            return depth_mm
+        true_mm = depth_mm * np.float32(self.scale) + np.float32(self.offset_mm)
+        return np.where(true_mm > 0, true_mm, np.float32(np.nan))
 
 
 def read_poses(path: Path, count: int) -> tuple[str, tuple[Affine, ...]]:
@@ -186,6 +205,19 @@ def read_intrinsics(path: Path) -> Intrinsics:
     return _camera(path)[0]
 
 
+def read_correction(path: Path) -> DepthCorrection:
+    """What the same file states as ``depth_scale`` and ``depth_offset_mm``; nothing: none."""
+    return _correction(_camera(path)[1], path)
+
+
+def _correction(data: dict[str, Any], path: Path) -> DepthCorrection:
+    (scale,), (offset_mm,) = (
+        _numbers(data.get(key, default), key, path)
+        for key, default in (("depth_scale", 1.0), ("depth_offset_mm", 0.0))
+    )
+    return DepthCorrection(scale=scale, offset_mm=offset_mm)
+
+
 def _camera(path: Path) -> tuple[Intrinsics, dict[str, Any]]:
     """The camera, and all that its file has."""
     try:
@@ -234,7 +266,8 @@ def read_depth_png(
 ) -> DepthFrame:
     """A 16-bit depth image; 0 is no return.
 
-    One step is ``depth_unit_mm``, else what the intrinsics file states, else 0.1 mm.
+    One step is ``depth_unit_mm``, else what the intrinsics file states, else 0.1 mm; then what that
+    file states as correction.
 
     Raises:
         InputError: not a single-channel 16-bit PNG, or of another size than the intrinsics.
@@ -260,7 +293,8 @@ def read_depth_png(
             f"{path} is {size[0]} x {size[1]}, mode {mode}; it must be 16-bit grey and "
             f"{intrinsics.width} x {intrinsics.height}, as {intrinsics_path} says."
         )
-    return DepthFrame(np.where(steps > 0, steps * np.float32(unit_mm), np.nan), intrinsics)
+    depth_mm = np.where(steps > 0, steps * np.float32(unit_mm), np.float32(np.nan))
+    return DepthFrame(_correction(data, intrinsics_path).corrected(depth_mm), intrinsics)
 
 
 def depth_png(

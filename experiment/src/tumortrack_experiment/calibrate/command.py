@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from tyro.conf import Positional
 
@@ -26,10 +26,12 @@ class WithBoard:
     Attributes:
         squares: of the board, across and down.
         square_mm: their size as it was printed: measure the board's whole length.
+        overwrite: replace OUT if it exists.
     """
 
     squares: tuple[int, int] = (15, 21)
     square_mm: float = 12.0
+    overwrite: bool = False
 
     @property
     def board(self) -> Board:
@@ -37,6 +39,17 @@ class WithBoard:
 
         columns, rows = self.squares
         return Board(columns=columns, rows=rows, square_mm=self.square_mm)
+
+    def shown_in(self, folder: Path) -> tuple[list[Shot], dict[int, Corners]]:
+        """The pictures, and by their numbers the board's corners where it shows."""
+        from tumortrack_experiment.calibrate.board import find_boards
+        from tumortrack_experiment.calibrate.pictures import read_shots
+
+        shots = read_shots(folder)
+        found = find_boards([shot.grey for shot in shots], self.board)
+        seen = {n: corners for n, corners in enumerate(found) if corners is not None}
+        say(f"the board is in {len(seen)} of {len(shots)} pictures.")
+        return shots, seen
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,8 +65,8 @@ class CalibrateBoard(WithBoard):
     def run(self) -> None:
         from tumortrack_experiment.calibrate.board import draw_board
 
-        if self.out.exists():
-            raise InputError(f"{self.out} exists already. Choose another file.")
+        if self.out.exists() and not self.overwrite:
+            raise InputError(f"{self.out} exists already. Choose another path, or --overwrite.")
         draw_board(self.board, self.out)
         say(f"written to {self.out}; print it at 100 %, and measure its rulers.")
 
@@ -63,74 +76,53 @@ class CalibrateCamera(WithBoard):
     """Intrinsics, lens distortion and depth errors, from pictures of the board.
 
     Attributes:
-        pictures: folder of pictures (.png, .jpg) by the lens that depth belongs to (a D405's left
-            infrared, or colour aligned to depth); or of a folder each with colour.png or
-            infrared.png, depth.png and intrinsics.json.
+        pictures: what `record` wrote, each state a pose of the board; or a folder of pictures
+            (.png, .jpg), or of folders with colour.png or infrared.png, depth.png and
+            intrinsics.json. Of the lens that depth belongs to: a D405's left infrared, or colour
+            in the depth image's pixels.
         out: folder to write: intrinsics.json, lens.json, report.json, camera.png.
-        overwrite: replace OUT if it exists.
     """
 
     pictures: Positional[Path]
     out: Positional[Path]
-    overwrite: bool = False
 
     def run(self) -> None:
         store.check_place(self.out, "camera", self.overwrite)
-        shots, seen = _with_board(self.pictures, self.board)
+        shots, seen = self.shown_in(self.pictures)
 
-        from tumortrack_experiment.calibrate import report
+        import numpy as np
+
+        from tumortrack.core.config import to_builtins
+        from tumortrack.sense.files import intrinsics_json
         from tumortrack_experiment.calibrate.depth import correction, depth_report
-        from tumortrack_experiment.calibrate.lens import LENS_FILE, fit_lens
+        from tumortrack_experiment.calibrate.lens import fit_lens, lens_of, rays_apart
+        from tumortrack_experiment.calibrate.report import camera_words, draw_camera
 
         height, width = shots[0].grey.shape
-        fit = fit_lens(seen, (width, height))
-        said, warnings = report.lens_report(fit, seen, [shot.name for shot in shots])
-        planes, device = self._planes(shots, seen, fit.lens)
-        said["device"] = report.beside(device, fit.lens) if device else None
-        if planes:
+        fit = fit_lens(seen, [shot.name for shot in shots], (width, height))
+        lens, warnings = to_builtins(fit.lens), fit.warnings
+        said = {"squares": self.squares, "square_mm": self.square_mm, "lens": lens, **fit.said}
+        said["depth"], pinhole = None, intrinsics_json(fit.pinhole.camera)
+        del pinhole["depth_unit_mm"]  # the depth images' own file says it
+        if planes := _planes(shots, seen, fit.lens):
+            device = next(shot.depth.intrinsics for shot in shots if shot.depth)
+            off_mm = 150 * rays_apart(lens_of(device), fit.lens)
+            rms_mm = float(np.sqrt(np.mean(off_mm**2)))
+            said["device_off_mm"] = {"rms": rms_mm, "largest": float(off_mm.max())}
             said["depth"], more = depth_report(planes, fit.lens)
             warnings += more
+            pinhole |= correction(said["depth"])
         else:
-            said["depth"] = None
             warnings.append("no depth images of the board: how far depth is off is unknown")
-        said = {"board": self._board(), **said, "warnings": warnings}
-        pinhole = report.pinhole_json(fit.pinhole) | correction(said["depth"] or {})
         with store.new_folder(self.out, self.overwrite) as aside:
             store.write_json(aside / "intrinsics.json", pinhole)
-            store.write_json(aside / LENS_FILE, report.lens_json(fit.lens))
-            store.write_json(aside / "report.json", said)
-            report.draw_camera(aside / "camera.png", fit.lens, [seen[n] for n in fit.used], said)
+            store.write_json(aside / "lens.json", lens)
+            store.write_json(aside / "report.json", {**said, "warnings": warnings})
+            draw_camera(aside / "camera.png", [seen[n] for n in fit.used], said)
             store.seal(aside, "camera", {"report": "report.json"}, "camera")
-        for line in [*report.camera_words(said), *(f"warning: {one}." for one in warnings)]:
-            say(line)
-        say(f"written to {self.out}; give `track` and `locate` its intrinsics.json (--intrinsics).")
-
-    def _board(self) -> dict[str, Any]:
-        return {"squares": list(self.squares), "square_mm": self.square_mm}
-
-    def _planes(
-        self, shots: list[Shot], seen: dict[int, Corners], lens: Lens
-    ) -> tuple[list[PlaneErrors], Lens | None]:
-        """Of the depth images, and the camera that their files state."""
-        from tumortrack_experiment.calibrate.depth import plane_errors, same_pose
-        from tumortrack_experiment.calibrate.lens import lens_of
-
-        found, device, pose, before = [], None, 0, None
-        for n, corners in seen.items():
-            if (read := shots[n].depth) is None:
-                continue
-            frame = read()
-            if frame.depth_mm.shape != shots[n].grey.shape:
-                raise InputError(
-                    f"{shots[n].name}: picture and depth image differ in size; align them, or take "
-                    "the infrared picture that the depth is of."
-                )
-            device = lens_of(frame.intrinsics, [0.0] * 5)
-            pose += before is None or not same_pose(before, corners)
-            before = corners
-            one = plane_errors(frame, lens, corners, lens.place(corners)[0], pose)
-            found += [one] if one is not None else []
-        return found, device
+        for line in [*camera_words(said), *(f"warning: {one}" for one in warnings)]:
+            say(f"{line}.")
+        say(f"written to {self.out}; `track`, `locate`: --intrinsics {self.out}/intrinsics.json.")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -138,26 +130,25 @@ class CalibrateHandEye(WithBoard):
     """Where a camera is on a robot's tool, or before its base, with a bound of the error.
 
     Attributes:
-        pictures: folder of pictures of the board, as for `calibrate camera`: 20 or more, the wrist
-            turned by 20 degrees or more about two axes.
-        poses: the tool's in the robot's base, for each picture: a table as for `track --moving`
-            (.csv), or JSON with base_from_tool (4 x 4 rows each), unit (mm or m) and frame_id.
+        pictures: as for `calibrate camera`: 20 or more, the wrist turned by 20 degrees or more
+            about two axes, each from where the camera will work.
         out: folder to write: calibration.json for `track --frame` and `plan --frame`, report.json.
-        lens: lens.json of these pictures' camera, that `calibrate camera` wrote, or its intrinsics.
+        lens: lens.json of these pictures' camera, that `calibrate camera` wrote, or intrinsics.
+        poses: the tool's in the robot's base: a table as for `track --moving file:` (.csv; pictures
+            then need stamps), or JSON with base_from_tool (4 x 4 rows for each picture), unit (mm
+            or m) and frame_id. Without: those of the recording.
         eye_to_hand: the camera stands still, and the board is on the tool.
         distance: of the organ from the camera, mm, where the error is stated.
         camera_frame_id: what the source's messages call the camera's frame.
-        overwrite: replace OUT if it exists.
     """
 
     pictures: Positional[Path]
-    poses: Positional[Path]
     out: Positional[Path]
     lens: Path
+    poses: Path | None = None
     eye_to_hand: bool = False
     distance: float = 150.0
     camera_frame_id: str = ""
-    overwrite: bool = False
 
     def run(self) -> None:
         store.check_place(self.out, "hand-eye calibration", self.overwrite)
@@ -166,59 +157,55 @@ class CalibrateHandEye(WithBoard):
 
         import numpy as np
 
-        from tumortrack.core.config import to_builtins
-        from tumortrack.live.calibration_file import CalibrationFile
-        from tumortrack_experiment.calibrate.hand_eye import solve
+        from tumortrack_experiment.calibrate.depth import same_pose
+        from tumortrack_experiment.calibrate.hand_eye import HandEyeData, described, solve
         from tumortrack_experiment.calibrate.lens import read_lens
-        from tumortrack_experiment.calibrate.pictures import read_robot_poses
+        from tumortrack_experiment.calibrate.pictures import with_poses
 
         lens = read_lens(self.lens)
-        shots, seen = _with_board(self.pictures, self.board)
+        shots, seen = self.shown_in(self.pictures)
         if shots[0].grey.shape != (lens.height, lens.width):
             raise InputError(
                 f"{self.lens} is of {lens.width} x {lens.height}; the pictures have another size."
             )
-        frame_id, base_from_tool = read_robot_poses(self.poses, shots)
-        poses = base_from_tool[list(seen)]
-        poses = np.linalg.inv(poses) if self.eye_to_hand else poses
-        names = [shots[n].name for n in seen]
-        found, said, warnings = solve(poses, list(seen.values()), names, lens, self.distance)
-        key = "robot_from_camera" if self.eye_to_hand else "tool_from_camera"
-        file = CalibrationFile(
-            frame_id=frame_id,
-            unit="mm",
-            camera_frame_id=self.camera_frame_id,
-            error_mm=said["error_mm"],
-            error_deg=said["error_deg"],
-            **{key: tuple(map(tuple, found.tolist()))},
-        )
-        content = {name: value for name, value in to_builtins(file).items() if value is not None}
+        frame_id, shots = with_poses(shots, self.poses or self.pictures)
+        once: list[int] = []  # a pose seen twice would vouch for itself
+        for n in seen:
+            if not once or not same_pose(seen[once[-1]], seen[n]):
+                once.append(n)
+        poses = np.array([shots[n].base_from_tool for n in once])
+        if self.eye_to_hand:
+            poses = np.linalg.inv(poses)
+        data = HandEyeData(poses, np.array([lens.place(seen[n])[0] for n in once]))
+        names = [shots[n].name for n in once]
+        found, said, warnings = solve(data, names, self.distance, lens.focal_std)
+        way = "robot_from_camera" if self.eye_to_hand else "tool_from_camera"
+        content = {
+            "frame_id": frame_id,
+            "unit": "mm",
+            way: found.tolist(),
+            "camera_frame_id": self.camera_frame_id,
+            "error_mm": said["error_mm"],
+            "error_deg": said["error_deg"],
+        }
         with store.new_folder(self.out, self.overwrite) as aside:
             store.write_json(aside / "calibration.json", content)
             store.write_json(aside / "report.json", {**said, "warnings": warnings})
             store.seal(aside, "hand-eye calibration", {"report": "report.json"}, frame_id)
-        for name, one in said["methods"].items():
-            say(
-                f"{name}: {one['leave_one_out_rms_mm']:.2f} mm off where it was left out (root "
-                f"mean square), {one['from_chosen_mm']:.2f} mm from the chosen one"
-            )
-        say(
-            f"{said['method']}, {said['used']} of {len(shots)} pictures: with 95 % confidence "
-            f"within {said['error_at_organ_mm']:.2f} mm at {self.distance:g} mm."
-        )
-        for one in warnings:
-            say(f"warning: {one}.")
-        how = "--moving with --frame" if key == "tool_from_camera" else "--frame"
-        say(f"written to {self.out}; calibration.json is for {how}.")
+        for line in [*described(said), *(f"warning: {one}" for one in warnings)]:
+            say(f"{line}.")
+        moving = "" if self.eye_to_hand else "--moving ... "
+        say(f"written to {self.out}; {moving}--frame {self.out}/calibration.json.")
 
 
-def _with_board(folder: Path, board: Board) -> tuple[list[Shot], dict[int, Corners]]:
-    """The pictures, and by their numbers the board's corners where it shows."""
-    from tumortrack_experiment.calibrate.board import find_boards
-    from tumortrack_experiment.calibrate.pictures import read_shots
+def _planes(shots: list[Shot], seen: dict[int, Corners], lens: Lens) -> list[PlaneErrors]:
+    """Of the depth images that show the board."""
+    from tumortrack_experiment.calibrate.depth import plane_errors, same_pose
 
-    shots = read_shots(folder)
-    found = find_boards([shot.grey for shot in shots], board)
-    seen = {n: corners for n, corners in enumerate(found) if corners is not None}
-    say(f"the board is in {len(seen)} of {len(shots)} pictures.")
-    return shots, seen
+    found, pose, before = [], 0, None
+    for n, corners in seen.items():
+        pose += before is None or not same_pose(before, corners)
+        before = corners
+        if (frame := shots[n].depth) is not None:
+            found.append(plane_errors(frame, lens, corners, pose))
+    return [one for one in found if one is not None]

@@ -1,82 +1,42 @@
-"""Pictures of a board from a folder, with depth images and stamps where there are; and the poses of
-the robot that belong to them."""
+"""Pictures of a board, with depth images and the robot's poses where there are: from a folder, or
+from what `tumortrack record` wrote."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import partial
+from itertools import islice
 from pathlib import Path
 from typing import Literal, NamedTuple
 
 import cv2
 import numpy as np
-from jaxtyping import Float64, UInt8
+from jaxtyping import UInt8
 
 from tumortrack.core.config import Config, from_builtins
 from tumortrack.core.errors import InputError, NoEstimate
-from tumortrack.core.geometry import read_rigid
+from tumortrack.core.geometry import Affine, read_rigid
 from tumortrack.core.store import read_file, read_json
 from tumortrack.core.types import DepthFrame, SensorCloud
-from tumortrack.live.poses import COLUMNS, FilePoses
-from tumortrack.live.recording.folders import DEPTH, FRAMES, INTRINSICS, META
+from tumortrack.live.poses import FilePoses
+from tumortrack.live.recording.folders import ABOUT, DEPTH, FRAMES, INTRINSICS, META
 from tumortrack.live.values import Observation
 from tumortrack.sense.files import read_depth_png
+from tumortrack_experiment.record.read import read_recorded
 
-PICTURES = ("colour", "color", "infrared", "picture")  # names, .png or .jpg, in a frame's folder
+_NAMES = ("colour", "color", "infrared")  # .png or .jpg, in a frame's folder
 _SUFFIXES = (".png", ".jpg", ".jpeg")
 _LARGEST = 64 * 2**20  # bytes
-_STAMP_DIGITS = 12  # a name with fewer digits is a number, no time in ns
+_OF_A_STATE = 2  # moments: two tell the noise
 
 
 class Shot(NamedTuple):
-    """A picture, and the depth image of the same moment, read when ``depth`` is called."""
+    """A picture, the depth image of the same moment and pixels, its stamp (0: unknown), and where
+    the tool was in the robot's base, as far as they are known."""
 
     name: str
     grey: UInt8[np.ndarray, "h w"]
-    depth: Callable[[], DepthFrame] | None
-    stamp_ns: int | None
-
-
-def read_shots(folder: Path) -> list[Shot]:
-    """The pictures in a folder, by name: loose ones, or folders of one each (colour.png or
-    infrared.png, perhaps with depth.png and intrinsics.json). Raises InputError: there are none,
-    one is damaged, or they differ in size."""
-    root = folder / FRAMES if (folder / FRAMES).is_dir() else folder
-    inside = sorted(p for p in root.iterdir() if p.name[0] != ".") if root.is_dir() else []
-    names = [name + suffix for name in PICTURES for suffix in _SUFFIXES]
-    files = [next((p / n for n in names if (p / n).is_file()), None) for p in inside if p.is_dir()]
-    found = [file for file in files if file is not None]
-    found = found or [p for p in inside if p.suffix.lower() in _SUFFIXES]
-    if not found:
-        raise InputError(
-            f"{folder} holds no pictures. Allowed: .png and .jpg, or a folder for each with "
-            f"{' or '.join(f'{name}.png' for name in PICTURES)} (and {DEPTH} with {INTRINSICS})."
-        )
-    shots = [_read_shot(file, "" if file.parent == root else file.parent.name) for file in found]
-    sizes = {shot.grey.shape[::-1]: shot.name for shot in shots}
-    if len(sizes) > 1:
-        said = ", ".join(f"{name} {w} x {h}" for (w, h), name in sizes.items())
-        raise InputError(f"{folder}: pictures differ in size ({said}); give those of one stream.")
-    return shots
-
-
-def _read_shot(file: Path, frame: str) -> Shot:
-    content = np.frombuffer(read_file(file, _LARGEST), np.uint8)
-    try:
-        grey = cv2.imdecode(content, cv2.IMREAD_GRAYSCALE) if len(content) else None
-    except cv2.error:  # of a header that claims too much
-        grey = None
-    if grey is None:
-        raise InputError(f"{file} cannot be read as a picture.")
-    folder, depth = file.parent, None
-    if frame and (folder / DEPTH).is_file():
-        depth = partial(read_depth_png, folder / DEPTH, folder / INTRINSICS)
-    name = frame or file.stem
-    meta = folder / META
-    stamp = read_json(meta).get("stamp_ns") if frame and meta.is_file() else None
-    if stamp is None and name.isdecimal() and name.isascii() and len(name) >= _STAMP_DIGITS:
-        stamp = int(name)
-    return Shot(name, grey, depth, stamp if isinstance(stamp, int) else None)
+    depth: DepthFrame | None = None
+    stamp_ns: int = 0
+    base_from_tool: Affine | None = None
 
 
 class RobotPoses(Config, frozen=True, kw_only=True):
@@ -88,39 +48,101 @@ class RobotPoses(Config, frozen=True, kw_only=True):
     frame_id: str
 
 
-def read_robot_poses(path: Path, shots: list[Shot]) -> tuple[str, Float64[np.ndarray, "n 4 4"]]:
-    """``frame_id`` and ``base_from_tool`` for each picture, mm, from JSON (``RobotPoses``) or a
-    table of stamped poses (CSV, as `track --moving` reads it: by stamps where all pictures have
-    one, else row by row). Raises InputError: damaged, or not one for each picture."""
-    if path.suffix.lower() != ".csv":
-        file = from_builtins(read_json(path), RobotPoses, str(path))
-        _check_count(path, len(file.base_from_tool), shots)
-        where = f"{path}: base_from_tool"
-        return file.frame_id, np.array(
-            [
-                read_rigid(rows, file.unit, f"{where} of {shot.name}")
-                for rows, shot in zip(file.base_from_tool, shots, strict=True)
-            ]
-        )
-    table = FilePoses(path)
-    stamps_ns = [shot.stamp_ns for shot in shots]
-    if None in stamps_ns:
-        lines = read_file(path, _LARGEST, f"Give a row for each picture ({COLUMNS}).").split(b"\n")
-        stamps_ns = [int(line.split(b",")[0]) for line in lines[1:] if line.strip()]
-        _check_count(path, len(stamps_ns), shots)
-    poses = []
-    for stamp_ns, shot in zip(stamps_ns, shots, strict=True):
-        at = Observation(SensorCloud(np.zeros((1, 3), np.float32), stamp_ns or 0), 0)
-        try:
-            poses.append(table.at(at))
-        except NoEstimate as error:
-            raise InputError(f"{path} has no pose for picture {shot.name}: {error}.") from error
-    return table.frame_id, np.array(poses)
-
-
-def _check_count(path: Path, count: int, shots: list[Shot]) -> None:
-    if count != len(shots):
+def read_shots(folder: Path) -> list[Shot]:
+    """The pictures in a folder, by name: loose ones; folders with colour.png or infrared.png each
+    (and depth.png, intrinsics.json, meta.json); or a recording, whose states are a pose each.
+    Raises InputError: there are none, one is damaged, or they differ in size."""
+    root = folder / FRAMES if (folder / FRAMES).is_dir() else folder
+    inside = sorted(p for p in root.iterdir() if p.name[0] != ".") if root.is_dir() else []
+    names = [name + suffix for name in _NAMES for suffix in _SUFFIXES]
+    files = [next((p / n for n in names if (p / n).is_file()), None) for p in inside if p.is_dir()]
+    if any(p.suffix == ".mcap" for p in inside):
+        shots = _recorded(folder)
+    elif framed := [file for file in files if file is not None]:
+        shots = [_framed(file) for file in framed]
+    else:
+        shots = [Shot(p.stem, _grey(p)) for p in inside if p.suffix.lower() in _SUFFIXES]
+    if not shots:
         raise InputError(
-            f"{path} has {count} poses for {len(shots)} pictures; it must have one for each, in "
-            "the order of their names."
+            f"{folder} holds no pictures. Allowed: .png and .jpg; a folder for each with "
+            f"colour.png or infrared.png (and {DEPTH}, {INTRINSICS}); a recording with pictures."
         )
+    sizes = {shot.grey.shape[::-1]: shot.name for shot in shots}
+    if len(sizes) > 1:
+        said = ", ".join(f"{name} {w} x {h}" for (w, h), name in sizes.items())
+        raise InputError(f"{folder}: pictures differ in size ({said}); give those of one stream.")
+    return shots
+
+
+def _recorded(folder: Path) -> list[Shot]:
+    recorded, shots = read_recorded(folder), []
+    for state in recorded.states:
+        for moment in islice(recorded.moments(state), _OF_A_STATE):
+            if (seen := moment.picture) is not None:
+                grey = cv2.cvtColor(seen, cv2.COLOR_RGB2GRAY) if seen.ndim == 3 else seen
+                stamp_ns = moment.depth.stamp_ns
+                shots.append(Shot(state, grey, moment.depth, stamp_ns, moment.fixed_from_camera))
+    return shots
+
+
+def _framed(file: Path) -> Shot:
+    folder, depth = file.parent, None
+    if (folder / DEPTH).is_file():
+        depth = read_depth_png(folder / DEPTH, folder / INTRINSICS)
+        if "depth_scale" in read_json(folder / INTRINSICS):
+            raise InputError(
+                f"{folder / INTRINSICS} corrects depth already; give the camera's own."
+            )
+    stamp_ns = read_json(folder / META).get("stamp_ns") if (folder / META).is_file() else 0
+    grey = _grey(file)
+    if depth is not None and depth.depth_mm.shape != grey.shape:
+        raise InputError(
+            f"{folder}: picture and depth image differ in size; align them, or take the infrared "
+            "picture that the depth is of."
+        )
+    return Shot(folder.name, grey, depth, stamp_ns if isinstance(stamp_ns, int) else 0)
+
+
+def _grey(file: Path) -> UInt8[np.ndarray, "h w"]:
+    content = np.frombuffer(read_file(file, _LARGEST), np.uint8)
+    try:
+        grey = cv2.imdecode(content, cv2.IMREAD_GRAYSCALE) if len(content) else None
+    except cv2.error:  # of a header that claims too much
+        grey = None
+    if grey is None:
+        raise InputError(f"{file} cannot be read as a picture.")
+    return grey
+
+
+def with_poses(shots: list[Shot], path: Path) -> tuple[str, list[Shot]]:
+    """``frame_id`` of the robot's base, and the pictures with their poses, from JSON
+    (``RobotPoses``), a table of stamped poses (.csv, as for `track --moving`), or a recording.
+    Raises InputError: damaged, or not one for each picture."""
+    if path.is_dir():
+        if lack := [shot.name for shot in shots if shot.base_from_tool is None]:
+            raise InputError(f"{path} does not say where the tool was in {lack[0]}: give --poses.")
+        return read_json(path / ABOUT)["frame_id"], shots
+    if path.suffix.lower() == ".csv":
+        table, poses = FilePoses(path), []
+        for shot in shots:
+            at = Observation(SensorCloud(np.zeros((1, 3), np.float32), shot.stamp_ns), 0)
+            try:
+                poses.append(table.at(at))
+            except NoEstimate as error:
+                raise InputError(f"{path}: of picture {shot.name}, {error}.") from error
+        frame_id = table.frame_id
+    else:
+        file = from_builtins(read_json(path), RobotPoses, str(path))
+        if len(file.base_from_tool) != len(shots):
+            raise InputError(
+                f"{path} has {len(file.base_from_tool)} poses for {len(shots)} pictures; it must "
+                "have one for each, in the order of their names."
+            )
+        where, frame_id = f"{path}: base_from_tool of", file.frame_id
+        poses = [
+            read_rigid(rows, file.unit, f"{where} {shot.name}")
+            for rows, shot in zip(file.base_from_tool, shots, strict=True)
+        ]
+    return frame_id, [
+        shot._replace(base_from_tool=pose) for shot, pose in zip(shots, poses, strict=True)
+    ]

@@ -167,12 +167,12 @@ def cut_halves(
     holes = [_key(place, clearance_mm) for place in keys]
     pegged = Manifold.batch_boolean([lower, *(_key(place, 0.0) for place in keys)], OpType.Add)
     drills.append(solid_of(layout.mesh, "the surface to be cast"))
-    halves = (
+    upper_half, lower_half = (
         Manifold.batch_boolean([solid, *cut], OpType.Subtract).as_original().simplify(_SMOOTH_MM)
         for solid, cut in ((upper, [*drills, *holes]), (pegged, drills))
     )
     channels = Manifold.batch_boolean([*drills[:-1], *holes], OpType.Add)
-    return Halves(*halves, upper + lower, channels, len(keys), len(bolts))
+    return Halves(upper_half, lower_half, upper + lower, channels, len(keys), len(bolts))
 
 
 def rod(start: np.ndarray, end: np.ndarray, radius_mm: float, end_mm: float | None = None) -> Any:
@@ -191,7 +191,8 @@ def _channels(layout: Layout, vent_mm: float, pin_mm: float, pins: list[Segment]
 
     foot, radius = layout.sprue_mm, layout.sprue_radius_mm
     out = layout.top_mm - foot[2]
-    funnel = min(2 * radius, max(out - 3.0, 0.5))  # deep, of 45 degrees
+    room = min(2 * radius, out - 3.0, -float(layout.beyond(foot)) - radius - 2.0)
+    funnel = max(room, 0.1)  # deep, of 45 degrees
     rods = [rod(foot, raised(foot, out + 5), radius)]
     rods.append(rod(raised(foot, out - funnel), raised(foot, out), radius, radius + funnel))
     rods += [rod(raised(v, -1.0), raised(v, layout.top_mm - v[2] + 5), vent_mm / 2)

@@ -22,7 +22,7 @@ from tumortrack_experiment.kit.values import PrintedPart
 Checks = tuple[tuple[str, float], ...]
 
 
-class MoldConfig(Config):
+class MoldConfig(Config, frozen=True):
     """Sizes of the molds, mm. ``clearance_mm``: between a key and its hole, on the radius.
     ``largest_undercut_mm``: how far a cast may have to yield when a half is pulled off; our choice:
     hydrogel and silicone stretch by more. ``bed_mm``: the printer's; larger parts are split."""
@@ -122,6 +122,7 @@ def _mold(layout: Layout, config: MoldConfig, name: str, pins: tuple[Pin, ...]) 
         "undercut_depth_mm": deepest,
         "undercut_within_limit": deepest <= config.largest_undercut_mm,
         "steep_parting_deg": np.degrees(np.arctan(np.percentile(slope[beside], 95))),
+        "sprue_below_top_mm": layout.mesh.box_mm[1, 2] - layout.sprue_mm[2],
         "keys": halves.keys, "bolts": halves.bolts, "vents": len(layout.vents_mm),
     }  # fmt: skip
     for number in sorted({pin.tumor for pin in pins}):

@@ -22,8 +22,9 @@ def open_edges(mesh: Mesh) -> int:
     """Edges without two faces once a part was written as STL (single precision, no shared corners)
     and read again; 0: closed."""
     import trimesh
+    from trimesh.exchange.stl import export_stl
 
-    data = trimesh.Trimesh(mesh.vertices_mm, mesh.faces, process=False).export(file_type="stl")
+    data = export_stl(trimesh.Trimesh(mesh.vertices_mm, mesh.faces, process=False))
     again = trimesh.load_mesh(io.BytesIO(data), file_type="stl")
     again.merge_vertices()
     _, counts = np.unique(again.edges_sorted, axis=0, return_counts=True)

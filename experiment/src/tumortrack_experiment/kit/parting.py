@@ -23,6 +23,7 @@ from tumortrack.imaging.raster import voxelise
 from tumortrack.sense.render import Visibility
 
 _FAR_MM = 50_000.0  # an eye from where the organ is seen as good as in parallel
+_GRAZED_MM = 0.05  # a wall along the pull is seen past itself
 _SEARCHED = 3000  # faces that stand for all in the search, drawn by their area
 _COARSE = 400  # pulls tried first, 7 degrees apart; then rings round the best:
 _RINGS = np.radians([5.0, 2.5, 1.2])
@@ -47,6 +48,8 @@ def undercut(
     middle, area = triangles_of(
         mesh.vertices_mm, mesh.faces if faces is None else mesh.faces[faces]
     )
+    outward = area / np.maximum(np.linalg.norm(area, axis=1, keepdims=True), 1e-12)
+    middle += _GRAZED_MM * outward
     hidden, up = np.zeros(len(middle), bool), area @ pull > 0
     for side, way in ((up, pull), (~up, -pull)):
         hidden[side] = ~sight(middle[side], mesh.box_mm.mean(0) + _FAR_MM * way)
@@ -161,12 +164,13 @@ def parting_surface(cells: Cells) -> HeightField:
 
 
 def _membrane(start: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """Least sum of squared steps between neighbours, free edges, each node between its bounds or
-    those of a neighbour: on a steep wall it may so leave the silhouette by a step at most, which
-    spares a rough organ a jagged loop."""
+    """Least sum of squared steps between neighbours, free edges, each node between bounds: half way
+    from its own to the widest of its neighbours'. On a steep wall it may so leave the silhouette by
+    some tenths of a step, which spares a rough organ a jagged loop."""
     keep, free = np.minimum(_INSIDE_MM, (high - low) / 4), np.isinf(high)
-    low = ndimage.grey_erosion(np.where(free, np.inf, low + keep), footprint=_CROSS)
-    high = ndimage.grey_dilation(np.where(free, -np.inf, high - keep), footprint=_CROSS)
+    low, high = np.where(free, np.inf, low + keep), np.where(free, -np.inf, high - keep)
+    low = (low + ndimage.grey_erosion(low, footprint=_CROSS)) / 2
+    high = (high + ndimage.grey_dilation(high, footprint=_CROSS)) / 2
     low, high = np.where(free, -np.inf, low), np.where(free, np.inf, high)
     heights = np.clip(start, low, high)
     _relax(heights, low, high, 2 / (1 + np.pi / max(heights.shape)), 3000)  # a square's best factor

@@ -57,7 +57,8 @@ def firmness(ways: Float64[np.ndarray, "*n p 3"]) -> Float64[np.ndarray, " *n"]:
     """How firmly pins hold against a shift in the direction in which they hold least: 0, all are
     parallel and let it slide; 1, as three that are square to each other. Each holds what it pierces
     across its axis and not along it: the least eigenvalue of the sum of 1 - way way^T, halved."""
-    return (ways.shape[-2] - np.linalg.eigvalsh(np.swapaxes(ways, -1, -2) @ ways)[..., -1]) / 2
+    along = np.linalg.eigvalsh(np.swapaxes(ways, -1, -2) @ ways)[..., -1]
+    return np.asarray((ways.shape[-2] - along) / 2)
 
 
 def place_pins(layout: Layout, tumors: list[Mesh], pin_mm: float) -> list[Pin]:

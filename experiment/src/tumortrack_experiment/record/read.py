@@ -12,11 +12,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
 from jaxtyping import UInt8
 
 from tumortrack.core.errors import InputError
@@ -27,7 +25,6 @@ STATE, TF, CAMERA = "/state", "/tf", "/camera/"
 IMAGE, INFO = f"{CAMERA}depth/image_rect", f"{CAMERA}depth/camera_info"
 PICTURE = f"{CAMERA}color/image_raw"
 WHOLE = "recording.mcap"
-_STEADY = 30  # depth images, of which the median has a fifth of one's noise
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +71,7 @@ class Recorded:
             known = ", ".join(self.states) or "none"
             raise InputError(f"{self.folder} has no finished state {state!r}. It has: {known}.")
         beside: dict[str, Any] = {}
-        for topic, _, message in _messages(*self.takes[state]):
+        for topic, _, message in messages_in(*self.takes[state]):
             beside[topic] = message
             if topic == IMAGE:  # it comes last of what belongs to it
                 stamp_ns = stamp_of(message.header)
@@ -85,16 +82,6 @@ class Recorded:
                     sensors.picture_of(picture) if same else None,
                     None if tf is None else pose_of(tf.transforms[0]),
                 )
-
-    def steady_depth(self, state: str, most: int = _STEADY) -> DepthFrame:
-        """The median of a state's first depth images, pixel by pixel; no return where fewer than
-        half have one. For what stands still. Raises InputError as ``moments``."""
-        frames = [moment.depth for moment in islice(self.moments(state), most)]
-        depths_mm = np.array([frame.depth_mm for frame in frames])
-        seen = np.isfinite(depths_mm).sum(0) * 2 >= len(frames)
-        steady_mm = np.full(depths_mm.shape[1:], np.nan, np.float32)
-        steady_mm[seen] = np.nanmedian(depths_mm[:, seen], axis=0)
-        return DepthFrame(steady_mm, frames[0].intrinsics, frames[0].stamp_ns)
 
 
 def read_recorded(folder: Path) -> Recorded:
@@ -107,14 +94,14 @@ def read_recorded(folder: Path) -> Recorded:
         raise InputError(f"{folder} holds no recording with a finished state.")
     takes: dict[str, _Take] = {}
     for file in files:
-        began = [(at_ns, message.data) for topic, at_ns, message in _messages(file, of=STATE)]
+        began = [(at_ns, message.data) for topic, at_ns, message in messages_in(file, of=STATE)]
         ends_ns = [at_ns for at_ns, _ in began[1:]]
         for (at_ns, name), end_ns in zip(began, [*ends_ns, 2**63 - 1], strict=True):
             takes[name] = _Take(file, at_ns, end_ns)
     return Recorded(folder, takes, attachments_of(files[0]))
 
 
-def _messages(
+def messages_in(
     file: Path, start_ns: int = 0, stop_ns: int = 2**63 - 1, of: str = ""
 ) -> Iterator[tuple[str, int, Any]]:
     """Topic, time of recording and message, of all topics or one."""

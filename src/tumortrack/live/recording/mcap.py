@@ -113,16 +113,13 @@ def camera_messages(
         for one in messages_seen(seen, messages, camera)
     ]
     if camera != frame_id:
-        stamped = {
-            "header": messages.header(seen.stamp_ns, frame_id),
-            "child_frame_id": camera,
-            "transform": {
-                "translation": xyz(fixed_from_camera[:3, 3] / MM_PER_M),
-                "rotation": dict(
-                    zip("wxyz", wxyz_of(fixed_from_camera[:3, :3]).tolist(), strict=True)
-                ),
-            },
+        turn = wxyz_of(fixed_from_camera[:3, :3]).tolist()
+        transform = {
+            "translation": xyz(fixed_from_camera[:3, 3] / MM_PER_M),
+            "rotation": dict(zip("wxyz", turn, strict=True)),
         }
+        header = messages.header(seen.stamp_ns, frame_id)
+        stamped = {"header": header, "child_frame_id": camera, "transform": transform}
         out.append(Outgoing("/tf", TRANSFORMS, messages.make(TRANSFORMS, transforms=[stamped])))
     return out
 

@@ -24,6 +24,7 @@ from tumortrack.sense.camera import plausible
 
 _RECORDINGS = (".db3", ".bag")
 _LAST_S = 0.2  # after a recording's end: its last frame may still be on its way
+_TOGETHER_MS = 5.0  # of one exposure: depth image and picture
 _MOST_UNTIMED = 150  # frames before the camera's clock is tied to this machine's
 
 
@@ -46,6 +47,8 @@ class RealSenseSourceConfig(SourceConfig, frozen=True, kw_only=True, tag="realse
         preset: of a camera's visual presets, as ``high_accuracy``; empty: as it is.
         global_time: stamps of a camera by this machine's clock, else by its own.
         realtime: a recording at its own speed, else every frame as it is asked for.
+        picture: also what the camera saw in the depth image's pixels: in colour where the depth
+            sensor has that, else the left infrared image.
     """
 
     target: ClassVar[str] = "device"
@@ -58,6 +61,7 @@ class RealSenseSourceConfig(SourceConfig, frozen=True, kw_only=True, tag="realse
     preset: str = ""
     global_time: bool = True
     realtime: bool = True
+    picture: bool = False
 
     def open(self) -> RealSenseSource:
         """Start the camera or the recording. Raises SourceLost if no such camera is connected or
@@ -98,7 +102,9 @@ class RealSenseSource:
         self._playback = device.as_playback() if device.is_playback() else None
         self.lossless = self._playback is not None and not config.realtime
         self._room = threading.Condition()
-        self._newest: tuple[Any, int] | None = None  # the SDK's frame, and when it came
+        # The SDK's depth image (True) and picture (False) of one moment, and when they came.
+        self._newest: tuple[dict[bool, Any], int] | None = None
+        self._wanted, self._pair = {True, not config.picture}, dict[bool, Any]()
         self._closed = False
         self._untimed = 0
         self._sensor, profile = _depth_stream(rs, device, None if self._playback else config)
@@ -117,7 +123,8 @@ class RealSenseSource:
         option = rs.option.global_time_enabled
         tied = self._sensor.supports(option) and self._sensor.get_option(option)
         self.host_clock = self._playback is None and bool(tied)
-        self._sensor.open(profile)
+        beside = [_picture_stream(rs, self._sensor, profile)] if config.picture else []
+        self._sensor.open([profile, *beside])
         self._sensor.start(self._take)
 
     @_while_connected()
@@ -133,7 +140,8 @@ class RealSenseSource:
             if not self._device.is_connected():
                 raise SourceLost("the RealSense is unplugged.")
             return None
-        frame, arrived_ns = came
+        pair, arrived_ns = came
+        frame = pair[True]
         hardware_clock = self._rs.timestamp_domain.hardware_clock
         if self.host_clock and frame.get_frame_timestamp_domain() == hardware_clock:
             # A camera's first frames come before its clock is tied to this machine's.
@@ -149,7 +157,9 @@ class RealSenseSource:
         depth_mm = raw * np.float32(self._unit_mm)
         depth_mm[raw == 0] = np.nan  # the sensor's way to say: no return
         stamp_ns = round(frame.get_timestamp() * 1e6)
-        return Observation(DepthFrame(depth_mm, self._intrinsics, stamp_ns), arrived_ns)
+        picture = np.array(pair[False].get_data()) if False in pair else None
+        depth = DepthFrame(depth_mm, self._intrinsics, stamp_ns)
+        return Observation(depth, arrived_ns, picture=picture)
 
     def close(self) -> None:
         """Stop the stream; may be called twice."""
@@ -164,18 +174,24 @@ class RealSenseSource:
     def _take(self, frame: Any) -> None:
         """Called by the SDK's thread."""
         arrived_ns = time.time_ns()
-        if not frame.is_depth_frame():
+        is_depth = frame.is_depth_frame()
+        if is_depth not in self._wanted:
             return
         with self._room:
+            self._pair[is_depth] = frame
+            times_ms = [one.get_timestamp() for one in self._pair.values()]
+            if self._pair.keys() != self._wanted or np.ptp(times_ms) > _TOGETHER_MS:
+                return
+            pair, self._pair = self._pair, {}
             if self.lossless:
                 self._room.wait_for(lambda: self._newest is None or self._closed)
             if self._closed:
                 return
             self.dropped += self._newest is not None
-            self._newest = (frame, arrived_ns)
+            self._newest = (pair, arrived_ns)
             self._room.notify_all()
 
-    def _next(self, timeout_s: float) -> tuple[Any, int] | None:
+    def _next(self, timeout_s: float) -> tuple[dict[bool, Any], int] | None:
         with self._room:
             self._room.wait_for(lambda: self._newest is not None or self._closed, timeout_s)
             if self._closed:
@@ -216,6 +232,23 @@ def _depth_stream(
         listed = ", ".join(f"{w}x{h}@{fps}" for w, h, fps in sorted(modes))
         raise InputError(f"the RealSense has no {size[0]}x{size[1]}@{size[2]}. Allowed: {listed}.")
     return modes[size]
+
+
+def _picture_stream(rs: ModuleType, sensor: Any, depth: Any) -> Any:
+    """The profile of a picture in the depth image's pixels."""
+    profiles = [profile.as_video_stream_profile() for profile in sensor.get_stream_profiles()]
+    for kind in ((rs.stream.color, rs.format.rgb8), (rs.stream.infrared, rs.format.y8)):
+        for one in profiles:
+            if (one.stream_type(), one.format()) == kind and _lens_of(one) == _lens_of(depth):
+                return one
+    raise InputError("the RealSense has no picture in the depth image's pixels; leave it out.")
+
+
+def _lens_of(profile: Any) -> tuple[Any, ...]:
+    """What two streams of the same pixels at the same moments share."""
+    lens = profile.get_intrinsics()
+    size = lens.width, lens.height, profile.fps(), max(profile.stream_index(), 1)
+    return *size, lens.fx, lens.fy, lens.ppx, lens.ppy, *lens.coeffs
 
 
 def _set_up(rs: ModuleType, sensor: Any, config: RealSenseSourceConfig) -> None:

@@ -1,0 +1,84 @@
+"""`phantom-kit`: everything to print and to mix for one case."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from tyro.conf import Positional
+
+from tumortrack.cli.console import say
+from tumortrack.core import store
+from tumortrack.core.errors import InputError, TumortrackError
+
+if TYPE_CHECKING:
+    from tumortrack_experiment.kit.design import Design
+
+
+@dataclass(frozen=True, kw_only=True)
+class PhantomKit:
+    """Make the parts that cast a case as a phantom and squeeze it on a bench.
+
+    Attributes:
+        case: folder that `prepare` wrote.
+        out: folder to write: kit.json, an STL a part, kit.3mf, checks.json and sheet.html.
+        states: to be imposed: D1, D2, D3 (midsection pressed by 4, 8, 12 mm), P1 (a rod pressed in
+            by 10 mm), T2 to T25 (base tilted by so many degrees).
+        bed: the printer's, X Y Z in mm; larger parts of molds are split.
+        bead_mm: diameter of the beads of glass, ceramic or steel.
+        beads: how many.
+        wall: of the molds, mm.
+        pva: percent by weight of polyvinyl alcohol in the hydrogel.
+        cycles: of freezing and thawing.
+        overwrite: replace OUT if it exists.
+    """
+
+    case: Positional[Path]
+    out: Positional[Path]
+    states: tuple[str, ...] = ("D1", "D2", "D3", "P1")
+    bed: tuple[float, float, float] = (220.0, 220.0, 250.0)
+    bead_mm: float = 6.0
+    beads: int = 7
+    wall: float = 5.0
+    pva: float = 10.0
+    cycles: int = 2
+    overwrite: bool = False
+
+    def run(self) -> None:
+        from tumortrack import api
+        from tumortrack_experiment.kit import design
+        from tumortrack_experiment.kit.base import BaseConfig
+        from tumortrack_experiment.kit.mold import MoldConfig
+        from tumortrack_experiment.kit.recipe import Mix
+
+        store.check_place(self.out, "kit", self.overwrite)
+        if not all(30 <= side <= 2000 for side in self.bed):
+            raise InputError(f"--bed {self.bed}: each side must be 30 to 2000 mm.")
+        base = BaseConfig(states=self.states, bead_mm=self.bead_mm, beads=self.beads)
+        mold = MoldConfig(wall_mm=self.wall, bed_mm=self.bed)
+        mix = Mix(pva_percent=self.pva, cycles=self.cycles)
+        case = api.load_case(self.case)
+        if not case.anatomy.tumors:
+            raise InputError(
+                f"{self.case} has no tumor, so its phantom would have nothing to locate. Prepare "
+                "it from a scan or labels with one."
+            )
+        digest = store.sha256_of(self.case / store.MANIFEST)
+        made = design.design_kit(case.anatomy, case.up_lps, base, mold, mix)
+        with store.new_folder(self.out, self.overwrite) as aside:
+            design.write_kit(made, aside, digest)
+        self._report(made)
+
+    def _report(self, made: Design) -> None:
+        for where in dict.fromkeys(check.where for check in made.checks):
+            rows = [check for check in made.checks if check.where == where]
+            verdict = max((row.verdict for row in rows), key=["good", "look", "FAILS"].index)
+            numbers = (f"{row.what} {row.value:g} {row.unit}".strip() for row in rows)
+            say(f"{verdict:5} {where}: {', '.join(numbers)}")
+            for row in (row for row in rows if not row.good):
+                say(f"      {row.what}: {row.value:g} {row.unit}; wanted: {row.limits}")
+        say(f"{len(made.parts)} parts, written to {self.out}; print {self.out / 'sheet.html'}.")
+        if failed := [check for check in made.checks if check.needed and not check.good]:
+            named = "; ".join(f"{check.where}: {check.what}" for check in failed)
+            raise TumortrackError(f"this kit cannot be used as it is: {named}.")
