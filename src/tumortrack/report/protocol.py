@@ -147,8 +147,9 @@ def summarise(entries: list[dict[str, Any]]) -> dict[str, Any]:
     off, called good in ``far_good``.
 
     ``tre_mm`` holds the medians of the scenes' target errors and how many ``scenes`` count, where
-    the method knows a motion. A part's ``registration_mm`` is the rms error that the registration
-    of its truth is expected to have there, where scenes state one. The rule for parts that were not found is ``RULE``.
+    the method knows a motion. A part's ``registration_mm`` is the rms error that its truth is
+    expected to have by its registration, where scenes state one. The rule for parts that were not
+    found is ``RULE``.
     """
     summary: dict[str, Any] = {}
     names = sorted({part for entry in entries for part in entry["parts"]}, key=_part_order)
