@@ -19,6 +19,7 @@ from tumortrack.live.cameras import CameraSetup
 from tumortrack.live.values import Observation, SourceLost
 from tumortrack.live.workers import SourceWorker
 from tumortrack.sense.cloud import CloudConfig
+from tumortrack.sense.files import DepthCorrection
 from tumortrack.sense.region.picture import RegionConfig
 from tumortrack.sense.region.watch import TableWatch
 from tumortrack_experiment.kit_file import Kit
@@ -45,6 +46,7 @@ class Guide:
     setup: CameraSetup
     kit: Kit | None
     intrinsics: Intrinsics | None
+    correction: DepthCorrection
 
     def __post_init__(self) -> None:
         known = self.setup.published.table_in_camera or self.folder.about.get("table_in_camera")
@@ -176,7 +178,9 @@ class Guide:
             has = content.depth_mm.shape
             if has != (given.height, given.width):
                 raise InputError(f"--intrinsics is of another size than the images, {has}.")
-            seen = replace(seen, content=replace(content, intrinsics=given))
+            depth_mm = self.correction.corrected(content.depth_mm)
+            true = DepthFrame(depth_mm, given, content.stamp_ns)
+            seen = replace(seen, content=true)
         if self.setup.poses is not None:
             return seen, self.setup.poses.at(seen)
         return seen, published.published_from_camera if published.calibrated else None

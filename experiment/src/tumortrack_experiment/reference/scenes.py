@@ -10,8 +10,7 @@ from tumortrack.core.geometry import Points, transform_points
 from tumortrack.core.types import DepthFrame, Mesh, SensorCloud
 from tumortrack.imaging.case import Case
 from tumortrack.sense.camera import deproject, project
-from tumortrack.sense.cloud import CloudConfig
-from tumortrack.sense.region import Hints, RegionConfig, organ_points
+from tumortrack.sense.cloud import CloudConfig, cloud_from_depth
 from tumortrack.sense.render import render_depth
 from tumortrack.simulate.occupancy import labels_of
 from tumortrack.simulate.scene_folder import Targets
@@ -52,10 +51,10 @@ def kit_pixels(
 
 
 def organ_cloud(frame: DepthFrame, others: Bool[np.ndarray, "h w"]) -> SensorCloud:
-    """The organ's points as ``sense.region`` finds it among what the kit has not. Raises
-    NoEstimate: none are left."""
-    config = RegionConfig(crop=_RANGE, plane=False)
-    return organ_points(frame, config, Hints(mask=~others), np.random.default_rng(0)).cloud
+    """All points that are not the kit's: a stand may part them, and an exophytic tumor stands out,
+    which a search for the organ's one piece would lose. Raises NoEstimate: none are left."""
+    left_mm = np.where(others, np.float32("nan"), frame.depth_mm)
+    return cloud_from_depth(frame.with_depth(left_mm), _RANGE, np.random.default_rng(0))
 
 
 def check_surface(
