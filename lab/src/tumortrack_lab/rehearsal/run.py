@@ -7,7 +7,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -80,8 +80,8 @@ class Rehearsal:
         rows = [*self.calibrate_camera(), *self.calibrate_hand_eye()]
         self._once("recording", self.record)
         for state in STATES:
-            self._once(f"ct/{state}", lambda state=state: self.scan(state))
-            self._once(f"scenes/{state}", lambda state=state: self.reference(state))
+            self._once(f"ct/{state}", partial(self.scan, state))
+            self._once(f"scenes/{state}", partial(self.reference, state))
         rows += [row for state in STATES for row in self.registered(state)]
         return rows, self.evaluated()
 
@@ -202,7 +202,7 @@ class Rehearsal:
     def evaluated(self) -> dict[str, Any]:
         """`evaluate` by the second CTs, and the same clouds by the truth: report by report."""
         for state in STATES:
-            self._once(f"true-scenes/{state}", lambda state=state: self._write_truth(state))
+            self._once(f"true-scenes/{state}", partial(self._write_truth, state))
         for scenes in ("scenes", "true-scenes"):
             self._do("evaluate", self.model, self.out / scenes, self.out / f"{scenes}-report")
         return {
