@@ -22,6 +22,7 @@ FLANGE_MM, THICK_MM = 14.0, 8.0  # beyond the wall, room for a washer; each half
 _CELL_MM = (1.0, 1.0, 0.25)
 _SPACING_MM = 32.0  # from a bolt to the next key and on to the next bolt
 _BOLT_MM, _SEAT_MM = 4.5, 11.0  # M4 with play (ISO 273, medium); its washer (9 mm) with play
+_NUT_MM = 7.0  # below its seat, where the mold stands
 _KEY_MM = (3.6, 2.4, 5.0)  # a cone's radius on the parting surface and at its end, and its height
 _POCKET_CELLS = 2  # of 1 mm: shallower trapped air gets no vent
 _PIN_PLAY_MM = 0.1  # on the radius: printed holes come out narrower
@@ -87,7 +88,7 @@ def lay_out(
     loop = max(shadow.simplify(0.05).to_polygons(), key=len)
     sprue, vents = _openings(cells, tumors, radius)
     (low, high), heights = mesh.box_mm[:, 2], field.at(rim.to_polygons()[0])
-    bottom = min(low - wall_mm, heights.min() - THICK_MM)
+    bottom = min(low - wall_mm, heights.min() - THICK_MM - _NUT_MM)
     top = max(high + wall_mm, heights.max() + THICK_MM)
     return Layout(
         mold_from_ct, mesh, cells, field, outline, rim, bottom, top, sprue, radius, vents,
