@@ -107,6 +107,19 @@ def test_report_has_the_promised_layout(evaluated):
     assert keys <= report["summary"]["kidney"].keys()
 
 
+def test_the_registrations_share_stands_beside_the_error(tmp_path):
+    """Of scenes whose truth is a second CT: rms over them, by part."""
+    stated = {"registration": {"tre_mm": {"kidney": 0.2, "tumor_1": 0.3}}}
+    replace(scene(), meta=stated).write(tmp_path / "scenes" / "one")
+    locate = Scripted(estimate_of(anatomy((3, 0, 0))))
+    report = evaluate_scenes(locate, tmp_path / "scenes", tmp_path / "out")
+    assert "<th>registration mm</th>" in (tmp_path / "out" / "index.html").read_text()
+    other = {**report["scenes"][0], "registration_mm": {"kidney": 0.2, "tumor_1": 0.4}}
+    report["summary"] = summarise([report["scenes"][0], other])
+    table = summary_table(report)
+    assert [str(cell) for cell in table.columns[-1].cells] == ["0.20", "0.35"]
+
+
 def test_known_shifts_give_known_distances(evaluated):
     first, second = evaluated[1]["scenes"][:2]
     for part in ("kidney", "tumor_1"):

@@ -148,12 +148,15 @@ def part_rows(summary: dict[str, Any]) -> dict[str, dict[str, Any]]:
 
 def _table(parts: dict[str, dict[str, Any]]) -> str:
     """Of a scene's parts, or the summary's."""
-    head = "".join(f"<th>{title}</th>" for title in ("part", "found", *_COLUMNS.values()))
+    columns = dict(_COLUMNS)
+    if any("registration_mm" in part for part in parts.values()):
+        columns["registration_mm"] = "registration mm"
+    head = "".join(f"<th>{title}</th>" for title in ("part", "found", *columns.values()))
     rows = []
     for name, part in parts.items():
         found = "yes" if part["found"] else "no"
         found = f"{part['found']}/{part['scenes']}" if "scenes" in part else found
-        cells = "".join(f"<td>{number(part.get(key))}</td>" for key in _COLUMNS)
+        cells = "".join(f"<td>{number(part.get(key))}</td>" for key in columns)
         label = html.escape(name.replace("_", " "))
         rows.append(f"<tr><th>{label}</th><td>{found}</td>{cells}</tr>")
     return f"<table><thead><tr>{head}</tr></thead><tbody>{''.join(rows)}</tbody></table>"

@@ -65,6 +65,8 @@ def evaluate_scenes(
     for folder in folders:
         scene = read_scene(folder)
         entry, estimate = evaluate_scene(locate, scene, folder.name)
+        if isinstance(stated := scene.meta.get("registration"), dict):  # of a second CT as truth
+            entry["registration_mm"] = stated.get("tre_mm", {})
         picture = out / "scenes" / f"{folder.name}.png"
         scene_picture(scene, estimate, entry, picture)
         entries.append(entry)
@@ -145,7 +147,9 @@ def summarise(entries: list[dict[str, Any]]) -> dict[str, Any]:
     off, called good in ``far_good``.
 
     ``tre_mm`` holds the medians of the scenes' target errors and how many ``scenes`` count, where
-    the method knows a motion. The rule for parts that were not found is ``RULE``.
+    the method knows a motion. A part's ``registration_mm`` is the rms error that its truth is
+    expected to have by its registration, where scenes state one. The rule for parts that were not
+    found is ``RULE``.
     """
     summary: dict[str, Any] = {}
     names = sorted({part for entry in entries for part in entry["parts"]}, key=_part_order)
@@ -158,6 +162,9 @@ def summarise(entries: list[dict[str, Any]]) -> dict[str, Any]:
             "found": sum(row["found"] for row in rows),
             "scenes": len(rows),
         }
+        shares = [e["registration_mm"].get(name) for e in entries if "registration_mm" in e]
+        if shares and None not in shares:
+            summary[name]["registration_mm"] = float(np.sqrt(np.mean(np.square(shares))))
     errors = [entry["tre_mm"] for entry in entries if "tre_mm" in entry]
     if any(errors):
         medians = {
@@ -185,10 +192,14 @@ def summary_table(report: dict[str, Any]) -> Table:
     table.add_column("part")
     for head in ("found", "HD mm", "one-sided", "HD95", "surface", "centre", "IoU"):
         table.add_column(head, justify="right")
-    for name, part in part_rows(summary).items():
+    rows = part_rows(summary)
+    if registered := any("registration_mm" in part for part in rows.values()):
+        table.add_column("registration", justify="right")
+    for name, part in rows.items():
         numbers = [number(part[key], 1 if key != "surface_mm" else 2) for key in DISTANCES]
         found = f"{part['found']}/{part['scenes']}"
-        table.add_row(name, found, *numbers, number(part["iou"]))
+        share = [number(part.get("registration_mm"))] if registered else []
+        table.add_row(name, found, *numbers, number(part["iou"]), *share)
     return table
 
 

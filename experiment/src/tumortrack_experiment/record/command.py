@@ -34,7 +34,8 @@ class Record:
         moving: the camera moves; where it is comes from file:POSES.csv, tf (ros2:FIXED_FRAME) or
             a robot (ur:HOST), as for `track`. Without --frame, poses are those of the tool.
         intrinsics: JSON with the camera's width, height, fx, fy, cx, cy in pixels, instead of what
-            the source says.
+            the source says; `calibrate camera` writes it, with a correction of depth that is
+            applied before anything is recorded.
         only: record these states of the checklist now, and leave the others for later; one that is
             finished is recorded anew.
         seconds: how long each state is recorded.
@@ -59,7 +60,7 @@ class Record:
     def run(self) -> None:
         """Until all states are recorded, or the user ends it."""
         from tumortrack.live.workers import SourceWorker
-        from tumortrack.sense.files import read_intrinsics
+        from tumortrack.sense.files import DepthCorrection, read_correction, read_intrinsics
         from tumortrack_experiment.kit_file import KIT_FILE, read_kit
         from tumortrack_experiment.record.folder import RecordingFolder
         from tumortrack_experiment.record.guide import Guide
@@ -79,12 +80,13 @@ class Record:
         beside = {KIT_FILE: kit_path, "calibration.json": self.frame}
         files = {name: path.read_bytes() for name, path in beside.items() if path}
         intrinsics = read_intrinsics(self.intrinsics) if self.intrinsics else None
+        correction = read_correction(self.intrinsics) if self.intrinsics else DepthCorrection()
         folder = RecordingFolder(self.folder, states, setup.published.frame_id, files)
         if now := folder.to_record(self.only):
             (config,) = setup.sources.values()
             with closing(SourceWorker(config.open)) as worker, ExitStack() as ending:
                 ending.callback(folder.drop)
-                Guide(self, folder, worker, setup, kit, intrinsics).record(now)
+                Guide(self, folder, worker, setup, kit, intrinsics, correction).record(now)
         if missing := folder.to_record():
             say(f"missing: {', '.join(missing)}. The same command goes on.")
         else:

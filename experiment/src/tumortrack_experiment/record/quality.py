@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import deque
 
-import msgspec
 import numpy as np
 
 from tumortrack.core.config import Config
@@ -39,28 +38,25 @@ class DepthQuality(Config, frozen=True, kw_only=True):
     depth_mm: tuple[float, float, float]
     noise_mm: float | None
     moving: float
-    light: tuple[float, float] | None = None
+    light: tuple[float, float] | None
 
     def line(self) -> str:
         """In one line."""
         low, middle, high = self.depth_mm
-        still = self.moving <= _LEAST_MOVING
-        words = [
-            f"depth {self.seen:.0%} in range, {self.holes:.0%} holes",
-            f"at {middle:.0f} mm ({low:.0f} to {high:.0f})",
-            "noise ?" if self.noise_mm is None else f"noise {self.noise_mm:.2f} mm",
-            "still" if still else f"{self.moving:.1%} moving",
-            f"light {self.light[0]:.0f} of 255" if self.light else "",
-            f"{self.fps:.0f} fps, {self.dropped} dropped",
-        ]
-        return ", ".join(filter(None, words))
+        noise = "?" if self.noise_mm is None else f"{self.noise_mm:.2f} mm"
+        still = "still" if self.moving <= _LEAST_MOVING else f"{self.moving:.1%} moving"
+        light = f"light {self.light[0]:.0f} of 255, " if self.light else ""
+        return (
+            f"depth {self.seen:.0%} in range, {self.holes:.0%} holes, at {middle:.0f} mm "
+            f"({low:.0f} to {high:.0f}), noise {noise}, {still}, {light}{self.fps:.0f} fps, "
+            f"{self.dropped} dropped"
+        )
 
     def warnings(self, range_mm: tuple[float, float]) -> list[str]:
         """What is bad about it, and what to do."""
-        noise_mm, middle_mm = self.noise_mm or 0.0, self.depth_mm[1]
+        noise_mm, middle_mm, (near_mm, far_mm) = self.noise_mm or 0.0, self.depth_mm[1], range_mm
         most_mm = _NOISE_MM * max(middle_mm / _REFERENCE_MM, 1.0) ** 2
         mean, white = self.light or (_LIT[0], 0.0)
-        near_mm, far_mm = range_mm
         found = (
             (self.near > _MOST_NEAR, f"{self.near:.0%} is nearer than {near_mm:g} mm: move away"),
             (middle_mm > far_mm, f"half is farther than {far_mm:g} mm: move nearer"),
@@ -79,11 +75,10 @@ class DepthMeter:
 
     def __init__(self, range_mm: tuple[float, float]) -> None:
         self._range_mm, self.frames = range_mm, 0
-        self._window: deque[np.ndarray] = deque(maxlen=_WINDOW)
-        self._stamps_ns: deque[int] = deque(maxlen=_WINDOW)
+        self._window: deque[tuple[int, np.ndarray]] = deque(maxlen=_WINDOW)  # stamps and depths
         self._light: tuple[float, float] | None = None
         self._first_mm: np.ndarray | None = None  # the first window's median
-        self._past: list[DepthQuality] = []  # at the end of each window
+        self._changes: list[tuple[float, float]] = []  # at the end of each window
 
     def add(self, seen: Observation) -> None:
         """A depth image, and its picture. Raises InputError: it is of another size than before."""
@@ -91,54 +86,46 @@ class DepthMeter:
         depth_mm = seen.content.depth_mm
         step = max(1, int(np.sqrt(depth_mm.size / _PIXELS)))
         some_mm = depth_mm[::step, ::step].ravel()
-        if self._window and len(self._window[0]) != len(some_mm):
+        if self._window and len(self._window[0][1]) != len(some_mm):
             raise InputError("the depth images changed their size; give the same command again.")
-        self._window.append(some_mm)
-        self._stamps_ns.append(seen.stamp_ns)
+        self._window.append((seen.stamp_ns, some_mm))
         if seen.picture is not None:
             some = seen.picture[::step, ::step]
             self._light = float(some.mean()), float(np.mean(some >= _WHITE))
         self.frames += 1
         if self.frames % _WINDOW == 0:
-            self._past.append(self.now(0))
+            self._changes += self._change()
             if self._first_mm is None:
-                self._first_mm = np.median(self._window, axis=0)
+                self._first_mm = np.median([depths_mm for _, depths_mm in self._window], axis=0)
 
-    def now(self, dropped: int) -> DepthQuality:
-        """How the last half second was; one frame at least was added."""
-        depths_mm, (near_mm, far_mm) = np.array(self._window), self._range_mm
-        last_mm = depths_mm[-1]
+    def quality(self, dropped: int, whole: bool = False) -> DepthQuality:
+        """How the last half second was; one frame at least was added. ``whole``: with the median
+        noise, and the most that moved, since the beginning."""
+        (first_ns, _), (last_ns, last_mm) = self._window[0], self._window[-1]
+        near_mm, far_mm = self._range_mm
         there_mm, every = last_mm[np.isfinite(last_mm)], len(last_mm)
         inside = int(np.count_nonzero((there_mm >= near_mm) & (there_mm <= far_mm)))
         low, middle, high = np.percentile(there_mm, [5, 50, 95]) if len(there_mm) else (0, 0, 0)
-        seconds = (self._stamps_ns[-1] - self._stamps_ns[0]) * 1e-9
-        noise_mm, moving = self._changes(depths_mm)
+        changes = [*(self._changes if whole else ()), *self._change()]
         return DepthQuality(
             frames=self.frames,
-            fps=(len(depths_mm) - 1) / seconds if seconds > 0 else 0.0,
+            fps=(len(self._window) - 1) * 1e9 / max(last_ns - first_ns, 1),
             dropped=dropped,
             seen=inside / every,
             holes=1 - len(there_mm) / every,
             near=int(np.count_nonzero(there_mm < near_mm)) / every,
             depth_mm=(float(low), float(middle), float(high)),
-            noise_mm=noise_mm,
-            moving=moving,
+            noise_mm=float(np.median([noise_mm for noise_mm, _ in changes])) if changes else None,
+            moving=max((moving for _, moving in changes), default=0.0),
             light=self._light,
         )
 
-    def whole(self, dropped: int) -> DepthQuality:
-        """The last half second, with the median noise and the most that moved of all frames."""
-        now = self.now(dropped)
-        noises_mm = [one.noise_mm for one in (*self._past, now) if one.noise_mm is not None]
-        noise_mm = float(np.median(noises_mm)) if noises_mm else None
-        moving = max(one.moving for one in (*self._past, now))
-        return msgspec.structs.replace(now, noise_mm=noise_mm, moving=moving)
-
-    def _changes(self, depths_mm: np.ndarray) -> tuple[float | None, float]:
-        """Noise, and the share of pixels that moved."""
+    def _change(self) -> list[tuple[float, float]]:
+        """Noise (mm), and the share of pixels that moved; nothing of too few frames."""
+        depths_mm = np.array([depths_mm for _, depths_mm in self._window])
         steady = np.isfinite(depths_mm).all(0)
         if len(depths_mm) < _WINDOW // 2 or not steady.any():
-            return None, 0.0
+            return []
         variance = np.mean(np.diff(depths_mm[:, steady], axis=0) ** 2, axis=0) / 2
         first, last = np.array_split(depths_mm[:, steady], 2)
         end_mm, before_mm = np.median(last, axis=0), [np.median(first, axis=0)]
@@ -147,4 +134,4 @@ class DepthMeter:
         # Of 8 frames' medians: 4 standard deviations of a difference are 2.5 of a frame.
         least_mm = _MOVED_MM + 2.5 * np.sqrt(variance)
         moved = [int(np.count_nonzero(np.abs(end_mm - one) > least_mm)) for one in before_mm]
-        return float(np.sqrt(np.median(variance))), max(moved) / depths_mm.shape[1]
+        return [(float(np.sqrt(np.median(variance))), max(moved) / depths_mm.shape[1])]

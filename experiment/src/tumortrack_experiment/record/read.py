@@ -12,7 +12,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -27,7 +26,6 @@ STATE, TF, CAMERA = "/state", "/tf", "/camera/"
 IMAGE, INFO = f"{CAMERA}depth/image_rect", f"{CAMERA}depth/camera_info"
 PICTURE = f"{CAMERA}color/image_raw"
 WHOLE = "recording.mcap"
-_STEADY = 30  # depth images, of which the median has a fifth of one's noise
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,16 +83,6 @@ class Recorded:
                     sensors.picture_of(picture) if same else None,
                     None if tf is None else pose_of(tf.transforms[0]),
                 )
-
-    def steady_depth(self, state: str, most: int = _STEADY) -> DepthFrame:
-        """The median of a state's first depth images, pixel by pixel; no return where fewer than
-        half have one. For what stands still. Raises InputError as ``moments``."""
-        frames = [moment.depth for moment in islice(self.moments(state), most)]
-        depths_mm = np.array([frame.depth_mm for frame in frames])
-        seen = np.isfinite(depths_mm).sum(0) * 2 >= len(frames)
-        steady_mm = np.full(depths_mm.shape[1:], np.nan, np.float32)
-        steady_mm[seen] = np.nanmedian(depths_mm[:, seen], axis=0)
-        return DepthFrame(steady_mm, frames[0].intrinsics, frames[0].stamp_ns)
 
 
 def read_recorded(folder: Path) -> Recorded:

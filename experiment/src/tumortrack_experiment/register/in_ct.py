@@ -22,7 +22,7 @@ SEED_HU = 1000.0
 _LONGEST = 1.6  # of a seed, in diameters: a screw is longer
 _MOST_SEEDS = 300
 _STEP_MM = 0.25  # of the blurred ball's table
-_POINT_SPREADS_MM = (0.4, 0.7, 1.0, 1.4)  # standard deviations of scanners, soft kernels last
+_POINT_SPREADS_MM = (0.4, 0.7, 1.1)  # standard deviations of scanners, soft kernels last
 _OUTSIDE = 0.04  # with less of the ball in it, a voxel shows what lies about it
 _SHELL_MM = 1.8
 _NEIGHBOURS = 6  # of the surroundings in a direction
@@ -61,8 +61,8 @@ def find_balls(volume: Volume, diameter_mm: float, seed_hu: float = SEED_HU) -> 
             f"the CT has {len(seeds)} spots of over {seed_hu:g} HU as small as a bead of "
             f"{diameter_mm:g} mm; at most {_MOST_SEEDS} are allowed. Is it the phantom on its base?"
         )
-    tries = [_fitted(volume, seeds, _Model(diameter_mm / 2, spread, steps)) for spread in
-             _POINT_SPREADS_MM]  # fmt: skip
+    models = (_Model(diameter_mm / 2, spread, steps) for spread in _POINT_SPREADS_MM)
+    tries = [[ball for seed in seeds if (ball := _fit(volume, seed, one))] for one in models]
     balls = max(tries, key=lambda found: (len(found), -sum(ball.misfit for ball in found)))
     return _different(balls, diameter_mm / 2)
 
@@ -99,11 +99,6 @@ class _Model:
         return ndimage.map_coordinates(self._table, cells.T, order=1, mode="nearest")
 
 
-def _fitted(volume: Volume, seeds: list[Box], model: _Model) -> list[Ball]:
-    found = (_fit(volume, box, model) for box in seeds)
-    return [ball for ball in found if ball is not None]
-
-
 def _fit(volume: Volume, seed: Box, model: _Model) -> Ball | None:
     from scipy.optimize import least_squares
 
@@ -117,12 +112,11 @@ def _fit(volume: Volume, seed: Box, model: _Model) -> Ball | None:
     hu = hu.ravel()
     weight = np.clip(hu - SEED_HU / 2, 0, None)
     middle_mm = (weight[:, None] * places_mm).sum(0) / weight.sum()
-    bright_hu = float(hu.max())
-    for _ in range(3):
+    bright_hu, about = float(hu.max()), np.zeros(0)
+    for _ in range(2):  # the second time round its middle
         near = np.linalg.norm((places_mm - middle_mm) / (model.reach_mm + _SHELL_MM), axis=1) <= 1
         at_mm, here = places_mm[near], hu[near]
-        about = _about(at_mm - middle_mm, here, model)
-        if about is None:
+        if len(about := _about(at_mm - middle_mm, here, model)) == 0:
             return None
 
         def misfit(
@@ -149,13 +143,14 @@ def _fit(volume: Volume, seed: Box, model: _Model) -> Ball | None:
     return Ball(center_mm, float(np.median(about)), error)
 
 
-def _about(at_mm: np.ndarray, hu: np.ndarray, model: _Model) -> np.ndarray | None:
-    """What would be in each voxel without the ball: what lies behind it, seen from its middle."""
+def _about(at_mm: np.ndarray, hu: np.ndarray, model: _Model) -> np.ndarray:
+    """What would be in each voxel without the ball: what lies behind it, seen from its middle.
+    Empty: nothing is seen about it."""
     from scipy.spatial import cKDTree
 
     shell = np.linalg.norm(at_mm / model.reach_mm, axis=1) > 1
     if shell.sum() < 4 * _NEIGHBOURS:
-        return None
+        return np.zeros(0)
     away = at_mm / np.maximum(np.linalg.norm(at_mm, axis=1, keepdims=True), 1e-6)
     _, nearest = cKDTree(away[shell]).query(away, _NEIGHBOURS)
     return np.asarray(hu[shell][nearest].mean(1))

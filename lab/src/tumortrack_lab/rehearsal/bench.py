@@ -27,6 +27,7 @@ from tumortrack_lab.twin.views import EquilibriumState
 
 PRINTED_HU, BEAD_HU = 130.0, 2200.0
 _PRINTED, _BEAD = 254, 255  # labels of the virtual CT
+_TABLE_MM = (600.0, 500.0)
 _CELL_MM = 0.5  # of what is scanned: finer than any scanner's voxel
 
 
@@ -74,6 +75,7 @@ def scan_bench(
     scanner_from_base: Float64[np.ndarray, "4 4"],
     parameters: ScannerParameters,
     seed: int,
+    printed_hu: float = PRINTED_HU,
 ) -> Volume:
     """A CT of the bench, which lies so in the scanner (LPS, mm)."""
     corners = np.concatenate([mesh.box_mm for mesh in setup.meshes])
@@ -84,7 +86,7 @@ def scan_bench(
     for meshes, label in ((setup.printed, _PRINTED), (setup.beads, _BEAD)):
         for mesh in meshes:
             labels[voxelise(mesh, base_from_index, shape) & (labels == 0)] = label
-    material_hu = {_PRINTED: PRINTED_HU, _BEAD: BEAD_HU}
+    material_hu = {_PRINTED: printed_hu, _BEAD: BEAD_HU}
     volume = LabelVolume(labels, scanner_from_base @ base_from_index)
     return scan(volume, parameters, seed, material_hu)
 
@@ -92,9 +94,11 @@ def scan_bench(
 def see_bench(
     setup: Setup, camera_from_base: Float64[np.ndarray, "4 4"], camera: Intrinsics
 ) -> DepthFrame:
-    """The depth image, without any error, of a camera that stands so."""
+    """The depth image, without any error, of a camera that stands so; the base is on a table."""
     nearest = np.full((camera.height, camera.width), np.nan, np.float32)
-    for mesh in setup.meshes:
+    lowest_mm = min(float(mesh.box_mm[0, 2]) for mesh in setup.meshes)
+    table = trimesh.creation.box((*_TABLE_MM, 10.0))
+    for mesh in (Mesh(table.vertices + [0, 0, lowest_mm - 5.0], table.faces), *setup.meshes):
         there = transform_points(camera_from_base, mesh.vertices_mm)
         nearest = np.fmin(nearest, render_depth(there, mesh.faces, camera).depth_mm)
     return DepthFrame(nearest, camera)

@@ -1,0 +1,242 @@
+"""The paper's experiment rehearsed: every command, as a laboratory gives it, on a bench that does
+not exist, and what each states of its own error beside what that error is."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from tumortrack.cli.console import say
+from tumortrack.core import store
+from tumortrack.core.errors import TumortrackError
+from tumortrack.core.geometry import Affine, transform_points
+from tumortrack.core.types import Anatomy
+from tumortrack.imaging.case import load_case
+from tumortrack.report.metrics import surface_distances
+from tumortrack.simulate.scene_folder import draw_targets, read_scene, write_scene_files
+from tumortrack_experiment.calibrate.board import Board
+from tumortrack_experiment.kit_file import Kit, read_kit
+from tumortrack_lab.rehearsal.bench import Setup, set_up
+from tumortrack_lab.rehearsal.boards import hold_board, move_board
+from tumortrack_lab.rehearsal.hands import BenchErrors, Hands, looking_down
+from tumortrack_lab.twin.apparatus import moved
+from tumortrack_lab.twin.dataset import StateCache, TwinRun
+from tumortrack_lab.twin.views import EquilibriumState
+
+STATES = {"rest": "D0", "D1": "D1", "D2": "D2", "D3": "D3"}  # the kit's and the twin's
+_ABOVE_MM, _TILT_DEG = 185.0, (8.0, -6.0)  # the camera over the base
+_SECONDS = 2.0  # of each state
+_BOARDS, _POSES = 24, 20
+
+
+class Row(NamedTuple):
+    """An error of the chain in mm, as a command states it and as it is; ``what`` in words."""
+
+    what: str
+    stated_mm: float
+    true_mm: float
+
+
+@dataclass(frozen=True)
+class Rehearsal:
+    """Of a case and its model, into ``out``; what lies there is not done again."""
+
+    case: Path
+    model: Path
+    out: Path
+    seed: int = 0
+
+    @cached_property
+    def kit(self) -> Kit:
+        return read_kit(self.out / "kit")
+
+    @cached_property
+    def hands(self) -> Hands:
+        camera_from_base = looking_down(_ABOVE_MM, _TILT_DEG)
+        return Hands(self.out / "camera", BenchErrors(), camera_from_base)
+
+    @cached_property
+    def states(self) -> dict[str, EquilibriumState]:
+        case = load_case(self.case)
+        (self.out / "states").mkdir(parents=True, exist_ok=True)
+        targets = draw_targets(case.anatomy, 0)
+        cache = StateCache(self.out / "states", TwinRun(self.case), case, targets)
+        return {name: cache.get(of, say) for name, of in STATES.items()}
+
+    def setup(self, state: str) -> Setup:
+        return set_up(self.kit, self.out / "kit", self.states[state], state)
+
+    def run(self) -> tuple[list[Row], dict[str, Any]]:
+        """All of it, in order: the errors, and what `evaluate` found by the second CTs and by the
+        truth."""
+        self._once("kit", lambda: self._do("phantom-kit", self.case, self.out / "kit"))
+        rows = [*self.calibrate_camera(), *self.calibrate_hand_eye()]
+        self._once("recording", self.record)
+        for state in STATES:
+            self._once(f"ct/{state}", partial(self.scan, state))
+            self._once(f"scenes/{state}", partial(self.reference, state))
+        rows += [row for state in STATES for row in self.registered(state)]
+        return rows, self.evaluated()
+
+    def calibrate_camera(self) -> list[Row]:
+        """The focal length and the depth, at 150 mm."""
+        out, board = self.out / "camera-calibration", Board()
+        self._once("held", lambda: hold_board(self.hands, board, self.out / "held", _BOARDS, 1))
+        self._once(out.name, lambda: self._do("calibrate", "camera", self.out / "held", out))
+        report, lens = (store.read_json(out / name) for name in ("report.json", "lens.json"))
+        depth, errors, true = report["depth"], self.hands.errors, self.hands.true
+        off_mm = (1 + depth["scale"]) * 150 + depth["offset_mm"]
+        off_mm -= errors.depth_scale * 150 + errors.depth_offset_mm
+        side_mm = 0.4 * 150  # a point beside the axis, seen by the wrong focal length
+        focal = lens["fx"] / true.fx - 1
+        return [
+            Row("depth of the camera at 150 mm, corrected", depth["left_mm"], abs(off_mm)),
+            Row("60 mm beside the axis, by the focal length",
+                1.96 * lens["focal_std"] * side_mm, abs(focal) * side_mm),
+        ]  # fmt: skip
+
+    def calibrate_hand_eye(self) -> list[Row]:
+        """The camera before a robot, at the organ."""
+        out, folder = self.out / "hand-eye", self.out / "tool"
+        middle = np.array([[0.0, 0.0, 20.0]])  # of the organ, base frame
+        point = transform_points(self.hands.camera_from_base, middle)
+        distance = f"{point[0, 2]:.0f}"
+        if not folder.exists():
+            move_board(self.hands, Board(), self.robot_from_camera, folder, _POSES, 2)
+        lens = self.out / "camera-calibration" / "lens.json"
+        options = ("--lens", lens, "--eye-to-hand", "--distance", distance)
+        poses = ("--poses", folder.with_suffix(".json"))
+        words = "calibrate", "hand-eye", folder, out, *options, *poses
+        self._once(out.name, lambda: self._do(*words))
+        found = np.array(store.read_json(out / "calibration.json")["robot_from_camera"])
+        there = transform_points(found, point) - transform_points(self.robot_from_camera, point)
+        stated_mm = store.read_json(out / "report.json")["bound_mm"]
+        return [Row("hand-eye, at the organ", stated_mm, float(np.linalg.norm(there)))]
+
+    @cached_property
+    def robot_from_camera(self) -> Affine:
+        """The robot's base beside the bench."""
+        robot_from_base = np.eye(4)
+        robot_from_base[:3, 3] = [420.0, -80.0, 15.0]
+        return robot_from_base @ np.linalg.inv(self.hands.camera_from_base)
+
+    def record(self) -> None:
+        """`record` asks for a state; the hands set it up meanwhile."""
+        self.record_into(self.out / "recording", {state: self.hands for state in STATES})
+
+    def record_into(self, folder: Path, hands: dict[str, Hands]) -> str:
+        """Record these states, the camera held by these hands in each; what `record` says."""
+        states, (first, *_) = list(hands), hands.values()
+        first.plug_in()
+        first.show(self.setup(states[0]))
+        command = self._command(
+            "record", f"bench:{first.folder}", folder, "--states", *states,
+            "--kit", self.out / "kit", "--seconds", _SECONDS, "--countdown", 3, "--yes",
+            "--intrinsics", self.out / "camera-calibration" / "intrinsics.json",
+        )  # fmt: skip
+        said = []
+        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+            assert process.stdout is not None
+            for line in process.stdout:
+                said.append(line.rstrip())
+                say(said[-1])
+                words = line.split()
+                if words[:1] == ["state"]:
+                    hands[words[4].rstrip(";")].show(self.setup(words[4].rstrip(";")))
+        if process.returncode:
+            raise TumortrackError(f"record ended with {process.returncode}.")
+        return "\n".join(said)
+
+    def scan(self, state: str) -> None:
+        """The phantom is carried to the scanner in this state."""
+        out = self.out / "ct" / state
+        out.parent.mkdir(exist_ok=True)
+        seed = 10 + list(STATES).index(state)
+        scanner_from_base = self.hands.scanned(self.setup(state), out, seed)
+        rows = scanner_from_base.tolist()
+        store.write_json(self.out / "ct" / f"{state}.json", {"scanner_from_base": rows})
+
+    def reference(self, state: str) -> None:
+        self.compare(self.out / "ct" / state, self.out / "recording", self.out / "scenes", state)
+
+    def compare(self, ct: Path, recording: Path, scenes: Path, state: str) -> str:
+        """`reference`; what it says. Raises TumortrackError: it refuses."""
+        return self._do(
+            "reference", ct, recording, scenes, "--kit", self.out / "kit", "--case", self.case,
+            "--state", state,
+        )  # fmt: skip
+
+    def truth(self, state: str) -> Anatomy:
+        """Where everything is; camera frame."""
+        return moved(self.setup(state).anatomy, self.hands.camera_from_base)
+
+    def registered(self, state: str) -> list[Row]:
+        """The reference against the truth: registration alone at each tumor, and with the
+        segmentation of the second CT."""
+        scene, truth = read_scene(self.out / "scenes" / state), self.truth(state)
+        registration = scene.meta["registration"]
+        scanner_from_base = np.array(
+            store.read_json(self.out / "ct" / f"{state}.json")["scanner_from_base"]
+        )
+        true = self.hands.camera_from_base @ np.linalg.inv(scanner_from_base)
+        found = np.array(registration["rows"])
+        rows = []
+        names = zip(truth.names[1:], truth.tumors, scene.reference.tumors, strict=True)
+        for name, tumor, seen in names:
+            middle = tumor.vertices_mm.mean(0, keepdims=True)
+            in_ct = transform_points(np.linalg.inv(true), middle)
+            off_mm = float(np.linalg.norm(transform_points(found, in_ct) - middle))
+            stated_mm = registration["tre_mm"][name]
+            rows.append(Row(f"{state}: registration at {name}", stated_mm, off_mm))
+            apart = surface_distances(seen, tumor)
+            rows.append(Row(f"{state}: surface of {name}, mean", stated_mm, apart.surface_mm))
+        return rows
+
+    def evaluated(self) -> dict[str, Any]:
+        """`evaluate` by the second CTs, and the same clouds by the truth: report by report."""
+        for state in STATES:
+            self._once(f"true-scenes/{state}", partial(self._write_truth, state))
+        for scenes in ("scenes", "true-scenes"):
+            self._do("evaluate", self.model, self.out / scenes, self.out / f"{scenes}-report")
+        return {
+            scenes: store.read_json(self.out / f"{scenes}-report" / "report.json")
+            for scenes in ("scenes", "true-scenes")
+        }
+
+    def _write_truth(self, state: str) -> None:
+        scene = read_scene(self.out / "scenes" / state)
+        with store.new_folder(self.out / "true-scenes" / state) as aside:
+            write_scene_files(aside, replace(scene, reference=self.truth(state), targets=None))
+
+    def _once(self, name: str, make: Callable[[], object]) -> None:
+        if not (self.out / name).exists():
+            make()
+
+    def _command(self, *words: object) -> list[str]:
+        return [sys.executable, "-m", "tumortrack", *map(str, words)]
+
+    def _do(self, *words: object) -> str:
+        """A command; what it says. Raises TumortrackError: it failed."""
+        say("$ tumortrack " + " ".join(map(str, words)))
+        done = subprocess.run(self._command(*words), capture_output=True, text=True, check=False)
+        say(done.stdout.rstrip())
+        if done.returncode:
+            raise TumortrackError(done.stderr.strip())
+        return done.stdout
+
+
+def errors_mm(report: dict[str, Any]) -> dict[str, dict[str, float]]:
+    """The tumors' errors in an evaluation: scene -> tumor -> mm between the boxes' centres."""
+    return {
+        scene["name"]: {
+            name: part["center_mm"] for name, part in scene["parts"].items() if name != "kidney"
+        }
+        for scene in report["scenes"]
+    }
