@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Bool, Float64
+from scipy import ndimage
+from scipy.optimize import linear_sum_assignment
+from scipy.spatial.distance import cdist
 
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import Points, transform_points
 from tumortrack.core.types import DepthFrame, Mesh, SensorCloud
 from tumortrack.imaging.case import Case
 from tumortrack.sense.camera import deproject, project
-from tumortrack.sense.cloud import CloudConfig, cloud_from_depth
+from tumortrack.sense.cloud import CloudConfig
+from tumortrack.sense.region import Hints, RegionConfig, organ_points
 from tumortrack.sense.render import render_depth
 from tumortrack.simulate.occupancy import labels_of
 from tumortrack.simulate.scene_folder import Targets
@@ -20,6 +24,7 @@ _PART_MM = 2.0  # a pixel so near to a part of the kit shows that
 _BEAD_RIM_MM = 2.0
 _OVER_PLATE_MM = 1.5
 _RANGE = CloudConfig(near_mm=60.0, far_mm=450.0)
+_PATCH_PX = 200
 _EDGE_PX = 4  # of the organ's outline: depth flies there
 _LEAST_PIXELS = 300
 _OFF_MM = 4.0  # 95 % of the surface seen; another state's is off by centimetres
@@ -51,10 +56,14 @@ def kit_pixels(
 
 
 def organ_cloud(frame: DepthFrame, others: Bool[np.ndarray, "h w"]) -> SensorCloud:
-    """All points that are not the kit's: a stand may part them, and an exophytic tumor stands out,
-    which a search for the organ's one piece would lose. Raises NoEstimate: none are left."""
-    left_mm = np.where(others, np.float32("nan"), frame.depth_mm)
-    return cloud_from_depth(frame.with_depth(left_mm), _RANGE, np.random.default_rng(0))
+    """All points that are not the kit's, without flying ones and small patches, as edges of beads
+    leave: a stand may part them, and an exophytic tumor stands out, which a search for the organ's
+    one piece would lose. Raises NoEstimate: none are left."""
+    patches, _ = ndimage.label(np.isfinite(frame.depth_mm) & ~others)
+    large = np.bincount(patches.ravel()) >= _PATCH_PX
+    large[0] = False
+    config = RegionConfig(crop=_RANGE, plane=False, pieces=False)
+    return organ_points(frame, config, Hints(mask=large[patches]), np.random.default_rng(0)).cloud
 
 
 def check_surface(
@@ -67,8 +76,6 @@ def check_surface(
     Raises:
         InputError: little of the organ is seen, or what is seen has another shape or place.
     """
-    from scipy import ndimage
-
     true_mm = render_depth(organ.vertices_mm, organ.faces, frame.intrinsics).depth_mm
     inner = ndimage.binary_erosion(np.isfinite(true_mm), iterations=_EDGE_PX)
     off_mm = (frame.depth_mm - true_mm)[inner & ~others]
@@ -92,7 +99,7 @@ def check_surface(
 
 def match_targets(
     rest_ct: Points, found_mm: Points, expected_mm: Points, case: Case
-) -> tuple[Targets, list[str]]:
+) -> tuple[Targets, str]:
     """Beads inside the organ, known at rest (CT of the case), to those found in the second CT;
     ``expected_mm``: where they would be had the organ not been deformed. All in one frame but the
     first.
@@ -100,9 +107,6 @@ def match_targets(
     Raises:
         InputError: other numbers of them, or a bead that could be two.
     """
-    from scipy.optimize import linear_sum_assignment
-    from scipy.spatial.distance import cdist
-
     if len(rest_ct) != len(found_mm):
         raise InputError(
             f"{len(rest_ct)} targets are known at rest, and {len(found_mm)} bright balls lie in "
@@ -122,4 +126,4 @@ def match_targets(
         )
     labels = np.maximum(labels_of(case.anatomy, rest_ct), 1).astype(np.uint8)
     note = f"{len(rest_ct)} targets, up to {stretch_mm.max():.1f} mm beside a rigid motion"
-    return Targets(rest_ct, found_mm[columns], labels), [note]
+    return Targets(rest_ct, found_mm[columns], labels), note
