@@ -8,7 +8,7 @@ INSTALL := pip install --quiet --disable-pip-version-check --no-compile --no-dep
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help setup debian demo test test-hard check attack fuzz crash replay bench soak wheel lock licences audit results real world sequences causes trust clean
+.PHONY: help setup debian demo test test-hard check attack fuzz crash replay bench soak wheel lock licences audit results real world sequences causes trust rehearsal clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 10
@@ -89,6 +89,9 @@ causes: setup  ## shares of causes in the tumors' errors: fits told parts of the
 
 trust: setup  ## what margins are worth for physics and organs left out (ARGS="MODEL/margins.jsonl ...": an organ each)
 	$(BIN)/python lab/scripts/trust.py $(ARGS)
+
+rehearsal: setup  ## the experiment on a bench that does not exist, by all its commands (ARGS="CASE MODEL OUT", after make demo)
+	$(BIN)/python lab/scripts/rehearsal.py $(ARGS)
 
 wheel: setup  ## build the wheels of product, experiment and laboratory into dist/, with their dependencies (SBOM)
 	$(BIN)/pip wheel --quiet --no-deps --no-build-isolation --wheel-dir dist . ./experiment ./lab

@@ -29,22 +29,22 @@ def ball(radius, *center):
 @pytest.fixture(scope="module")
 def cast():
     """A ball with a tumor inside and one that pokes out."""
-    tumors = ball(5.0, 4.0, 3.0, 2.0), ball(5.0, -12.0, 0.0, 9.0)
-    organ = ball(18.0) + tumors[1]
+    tumors = ball(4.0, 5.0, 3.0, 2.0), ball(4.0, -8.0, 0.0, 7.0)
+    organ = ball(13.0) + tumors[1]
     anatomy = Anatomy(tuple(mesh_of(solid) for solid in (organ, *tumors)))
     return anatomy, organ_mold(anatomy, MoldConfig())
 
 
 def test_a_ball_parts_along_a_great_circle_without_undercut():
-    layout = lay_out(mesh_of(ball(15.0)), (), 4.0, 8.0)
+    layout = lay_out(mesh_of(ball(12.0)), (), 4.0, 8.0)
     loop = layout.parting_mm
-    assert np.abs(np.linalg.norm(loop, axis=1) - 15.0).max() < 0.15
+    assert np.abs(np.linalg.norm(loop, axis=1) - 12.0).max() < 0.2
     assert np.abs(loop[:, 2]).max() < 0.1
     assert not undercut(layout.mesh, UP, Visibility(layout.mesh)).any()
     halves, organ = cut_halves(layout, 1.5, 1.5, 0.25, []), solid_of(layout.mesh, "ball")
     assert demould(halves.upper, organ, layout.mesh, UP) < 0.05
     assert demould(halves.lower, organ, layout.mesh, -UP) < 0.05
-    assert demould(halves.upper, organ, layout.mesh, UP[[2, 1, 0]]) > 3  # not sideways
+    assert demould(halves.upper, organ, layout.mesh, UP[[2, 1, 0]]) > 2  # not sideways
     # They fit, come apart, and fill the block but for the cast and the holes.
     assert (halves.upper ^ halves.lower).volume() < 0.05
     assert (halves.upper.translate([0, 0, 2]) ^ halves.lower).volume() < 0.05
@@ -52,7 +52,7 @@ def test_a_ball_parts_along_a_great_circle_without_undercut():
     pegs = halves.lower ^ halves.channels
     assert pegs.volume() > halves.keys * 80
     assert (halves.block - filled).volume() < 0.5
-    assert layout.sprue_mm[2] > 13.5
+    assert layout.sprue_mm[2] > 10.5
     assert not len(layout.vents_mm)
 
 
@@ -95,10 +95,15 @@ def test_the_organ_s_mold_casts_the_organ(cast):
         assert 4.9 < numbers["least_wall_mm"] < 8
         low, high = laid_mesh(part).box_mm
         assert low[2] == pytest.approx(0.0, abs=1e-6)
-        assert high[2] > 15
+        assert high[2] > 12
     highest = (anatomy.organ.vertices_mm @ mold.pull_ct).max()
     assert mold.sprue_ct @ mold.pull_ct > highest - 4.0
     assert anatomy.tumors[1].box_mm.mean(0) @ mold.pull_ct < 5  # the tumors lie low
+
+
+def test_a_tumor_that_takes_up_all_leaves_no_place_for_the_sprue():
+    with pytest.raises(InputError, match="no place for a sprue of 8 mm"):
+        lay_out(mesh_of(ball(13.0)), (mesh_of(ball(12.0)),), 4.0, 8.0)
 
 
 def test_pins_hold_each_tumor_and_reach_it_through_both_molds(cast):

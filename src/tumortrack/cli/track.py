@@ -223,7 +223,7 @@ class Track(StatedPatient):
         return LoopConfig(
             region=region_for(model, range_mm=self.range, box_mm=box, whole=self.whole),
             follower=follower,
-            intrinsics=self.intrinsics and read_intrinsics(self.intrinsics),
+            intrinsics=read_intrinsics(self.intrinsics) if self.intrinsics else None,
             correction=read_correction(self.intrinsics) if self.intrinsics else DepthCorrection(),
             stale_s=self.stale,
             frozen_s=self.frozen,

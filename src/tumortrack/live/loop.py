@@ -41,9 +41,9 @@ SURE_AFTER = 3  # good estimates in a row after doubt: single frames of somethin
 class LoopConfig(Config, frozen=True, kw_only=True):
     """``stale_s``: no frame for so long, or one that old, gives 'no estimate'. ``give_up_s``: the
     loop ends where no frame came for so long. ``intrinsics``: of depth images, instead of what the
-    source says, and ``correction`` of their depths with them. ``frozen_s``: an image that repeats bit for bit for so long is an old one; 0: it
-    may repeat. ``seconds``: the loop ends so long after the first frame; 0: never. ``scan``: the
-    first estimate is from several looks."""
+    source says, and ``correction`` of their depths with them. ``frozen_s``: an image that repeats
+    bit for bit for so long is an old one; 0: it may repeat. ``seconds``: the loop ends so long
+    after the first frame; 0: never. ``scan``: the first estimate is from several looks."""
 
     region: RegionConfig = RegionConfig()
     follower: FollowerConfig = FollowerConfig()

@@ -95,7 +95,7 @@ def find_boards(pictures: Sequence[UInt8[np.ndarray, "h w"]], board: Board) -> l
 
 
 def draw_board(board: Board, path: Path) -> None:
-    """A page to print at 100 %, with rulers that show if it was (.pdf, .svg; .png of 600 dpi).
+    """A page to print at 100 %, with rulers that show if it was (.pdf, .svg; .png of 300 dpi).
     Raises InputError: another suffix, or no page is large enough."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.collections import PolyCollection
@@ -133,7 +133,7 @@ def draw_board(board: Board, path: Path) -> None:
     )
     axes.text(left, top - 4, words, fontsize=7)
     long_mm = 10 * (wide // 10), 10 * (high // 10)
-    ruled = {"color": "black", "linewidth": 0.4}
+    ruled: dict[str, Any] = {"color": "black", "linewidth": 0.4}
     for mark in np.arange(0, long_mm[0] + 1, 10):
         axes.plot([left + mark] * 2, [top + high + 3, top + high + 6], **ruled)
     for mark in np.arange(0, long_mm[1] + 1, 10):
@@ -144,5 +144,5 @@ def draw_board(board: Board, path: Path) -> None:
         "where they differ, give --square-mm as it was printed.",
     )  # fmt: skip
     stream = io.BytesIO()
-    figure.savefig(stream, format=path.suffix[1:].lower(), dpi=600)
+    figure.savefig(stream, format=path.suffix[1:].lower(), dpi=300)
     write_atomically(path, stream.getvalue())

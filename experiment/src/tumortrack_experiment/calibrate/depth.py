@@ -40,8 +40,8 @@ def plane_errors(frame: DepthFrame, lens: Lens, seen: Corners, pose: int) -> Pla
     """None: too little of the board has depth, or it is too steep."""
     mask = np.zeros(frame.depth_mm.shape, np.uint8)
     cv2.fillConvexPoly(mask, cv2.convexHull(np.rint(seen.pixels).astype(np.int32)), 1)
-    mask = cv2.erode(mask, np.ones((2 * _INSET_PX + 1,) * 2, np.uint8))
-    pixels = np.flatnonzero((mask > 0) & np.isfinite(frame.depth_mm))
+    inner = cv2.erode(mask, np.ones((2 * _INSET_PX + 1,) * 2, np.uint8))
+    pixels = np.flatnonzero((inner > 0) & np.isfinite(frame.depth_mm))
     camera_from_board, _ = lens.place(seen)
     normal, shift = camera_from_board[:3, 2], camera_from_board[:3, 3]
     depth_mm = (normal @ shift) / (pixel_rays(lens).reshape(-1, 3)[pixels] @ normal)
@@ -98,7 +98,7 @@ def depth_report(found: list[PlaneErrors], lens: Lens) -> tuple[dict[str, Any], 
     if all(row["noise_mm"] is None for row in rows):
         warnings.append("no two images of one pose: temporal noise is unknown")
     if len(poses) >= _LEAST_POSES and np.ptp(at_mm) >= _LEAST_SPAN_MM:
-        return said | _scale(at_mm, off_mm, warnings), warnings
+        return said | _scale(at_mm, off_mm, lens.focal_std, warnings), warnings
     warnings.append(
         f"{len(poses)} poses of the board over {np.ptp(at_mm):.0f} mm of distance do not tell "
         "scale from offset, so no correction is written; "
@@ -108,8 +108,11 @@ def depth_report(found: list[PlaneErrors], lens: Lens) -> tuple[dict[str, Any], 
     return said | {"error_mm": worst_mm, "left_mm": worst_mm, "corrected": False}, warnings
 
 
-def _scale(at_mm: np.ndarray, off_mm: np.ndarray, warnings: list[str]) -> dict[str, Any]:
-    """The line through the poses' errors; what it leaves is asked of each pose without itself."""
+def _scale(
+    at_mm: np.ndarray, off_mm: np.ndarray, focal_std: float, warnings: list[str]
+) -> dict[str, Any]:
+    """The line through the poses' errors; what it leaves is asked of each pose without itself. The
+    board is as much farther away as the focal length is longer."""
     design = np.column_stack([at_mm, np.ones(len(at_mm))])
     inverse = np.linalg.inv(design.T @ design)
     scale, offset_mm = inverse @ design.T @ off_mm
@@ -117,6 +120,7 @@ def _scale(at_mm: np.ndarray, off_mm: np.ndarray, warnings: list[str]) -> dict[s
     std = np.sqrt(np.diag(inverse) * (rest_mm @ rest_mm) / (len(at_mm) - 2))
     alone_mm = rest_mm / (1 - np.einsum("ij,jk,ik->i", design, inverse, design))
     before_mm, left_mm = (float(np.quantile(np.abs(x), 0.95)) for x in (off_mm, alone_mm))
+    left_mm += 2 * focal_std * float(at_mm.max())
     inside = abs(offset_mm) <= _TRAINED.offset_mm and abs(scale) <= _TRAINED.scale
     if not inside:
         warnings.append(
@@ -126,7 +130,7 @@ def _scale(at_mm: np.ndarray, off_mm: np.ndarray, warnings: list[str]) -> dict[s
         )
     return {
         "scale": float(scale),
-        "scale_std": float(std[0]),
+        "scale_std": float(np.hypot(std[0], focal_std)),
         "offset_mm": float(offset_mm),
         "offset_std_mm": float(std[1]),
         "inside_training": bool(inside),

@@ -3,13 +3,12 @@
 One equation holds both: ``fixed_from_moving @ moving_from_camera @ camera_from_board`` is the same
 in all pictures. Eye in hand: fixed is the base, moving the tool. A board on the tool: fixed is the
 tool, moving the base. OpenCV's solvers answer it. Least squares follow on how far robot and board
-disagree, seen from what moves, where the robot errs: on the corners' pixels they were 1.5 to 2
+disagree, seen from the tool, where the robot errs: on the corners' pixels they were 1.5 to 2
 times worse than the solvers, here they are up to a third better (docs/bench.md).
 """
 
 from __future__ import annotations
 
-from functools import partial
 from typing import Any, NamedTuple
 
 import cv2
@@ -38,13 +37,15 @@ _SCALES = np.array([0.01, 0.01, 0.01, 1, 1, 1, 0.01, 0.01, 0.01, 1, 1, 1, 0.01])
 
 
 class HandEyeData(NamedTuple):
-    """By picture: ``fixed_from_moving`` and ``camera_from_board``, mm."""
+    """By picture: ``fixed_from_moving`` and ``camera_from_board``, mm. ``to_hand``: the tool is
+    what is fixed, with the board on it."""
 
     moving: Poses
     board: Poses
+    to_hand: bool = False
 
     def only(self, kept: np.ndarray) -> HandEyeData:
-        return HandEyeData(self.moving[kept], self.board[kept])
+        return HandEyeData(self.moving[kept], self.board[kept], self.to_hand)
 
 
 class _Answer(NamedTuple):
@@ -83,7 +84,8 @@ def solve(
             f"the wrist turned by {about[0]:.0f} degrees about one axis, and by {about[1]:.0f} "
             "about others (root mean square): turn it by 20 or more about two axes"
         )
-    tried = {name: one for name in _METHODS if (one := _left_out(name, data)) is not None}
+    methods = *_SOLVERS, *_LEAST_SQUARES
+    tried = {name: one for name in methods if (one := _left_out(name, data)) is not None}
     rms_mm = {name: _left_out_mm(data, each, at_mm) for name, (_, each) in tried.items()}
     best = min(rms_mm, key=lambda name: rms_mm[name])
     answer, each = tried[best]
@@ -172,14 +174,19 @@ def _agreeing(data: HandEyeData, at_mm: float) -> np.ndarray:
     """Which pictures fit together. Raises InputError: too few do."""
 
     def off_mm(data: HandEyeData) -> np.ndarray:
-        return _refined(data, loss="cauchy", f_scale=0.3).off_mm(data, at_mm)
+        start = _solved(data)
+        fitted = _fit(data, start, loss="cauchy", f_scale=0.3)
+        return _moved(start, fitted.x).off_mm(data, at_mm)
 
     each_mm = off_mm(data)
     middle_mm = float(np.median(each_mm))
     good = each_mm <= max(_OUTLIER_TIMES * middle_mm, _OUTLIER_MM)
     if middle_mm > _FAR_OFF_MM or np.mean(~good) > _MOST_DROPPED or good.sum() < LEAST_POSES:
         hint = "are they in the pictures' order, and of the same moments?"
-        if np.median(off_mm(HandEyeData(np.linalg.inv(data.moving), data.board))) < 0.2 * middle_mm:
+        if (
+            np.median(off_mm(HandEyeData(np.linalg.inv(data.moving), data.board, not data.to_hand)))
+            < 0.2 * middle_mm
+        ):
             hint = (
                 "inverted they do. Give base_from_tool, and --eye-to-hand only where the board is "
                 "on the tool."
@@ -227,20 +234,25 @@ def _moved(answer: _Answer, by: np.ndarray) -> _Answer:
     return _Answer(answer.camera @ camera, answer.board @ board, size)
 
 
-def _refined(data: HandEyeData, unknown: int = 12, **loss: Any) -> _Answer:
-    """Least squares from the solver's answer whose pictures agree best."""
+def _solved(data: HandEyeData) -> _Answer:
+    """The solver's answer whose pictures agree best."""
     found = [one for method in _SOLVERS.values() if (one := _opencv(method, data)) is not None]
     if not found:
         raise InputError("no solver finds where the camera is from these poses and pictures.")
-    start = min(found, key=lambda one: float(np.median(one.off_mm(data, _ARM_MM))))
+    return min(found, key=lambda one: float(np.median(one.off_mm(data, _ARM_MM))))
+
+
+def _fit(data: HandEyeData, start: _Answer, unknown: int = 12, **loss: Any) -> Any:
+    """SciPy's least squares: six residuals a picture."""
 
     def rest(by: np.ndarray) -> np.ndarray:
         off = _moved(start, by).off(data)
+        if data.to_hand:
+            off = data.moving @ np.linalg.inv(data.moving @ off)
         turns = Rotation.from_matrix(off[:, :3, :3]).as_rotvec()
-        return np.concatenate([off[:, :3, 3].ravel(), _ARM_MM * turns.ravel()])
+        return np.column_stack([off[:, :3, 3], _ARM_MM * turns]).ravel()
 
-    scale = _SCALES[:unknown]
-    return _moved(start, least_squares(rest, np.zeros(unknown), x_scale=scale, **loss).x)
+    return least_squares(rest, np.zeros(unknown), x_scale=_SCALES[:unknown], **loss)
 
 
 _APART = 100  # OpenCV numbers both kinds from 0
@@ -256,18 +268,28 @@ _SOLVERS: dict[str, int] = {
     **_WORLD,
 }
 _FREE = "least squares, board's size free"
-_METHODS: dict[str, Any] = {
-    **{name: partial(_opencv, method) for name, method in _SOLVERS.items()},
-    "least squares": _refined,
-    _FREE: partial(_refined, unknown=13),
-}
+_LEAST_SQUARES = {"least squares": 12, _FREE: 13}  # unknown numbers
 
 
 def _left_out(name: str, data: HandEyeData) -> tuple[_Answer, list[_Answer]] | None:
-    """A method's answer, and those without one picture each; None: one of them has none."""
+    """A method's answer, and those without one picture each, of least squares by one step; None:
+    one of them has none."""
+    if unknown := _LEAST_SQUARES.get(name):
+        start = _solved(data)
+        answer = _moved(start, _fit(data, start, unknown).x)
+        end = _fit(data, answer, unknown)
+        jacobians, rests = end.jac.reshape(-1, 6, unknown), end.fun.reshape(-1, 6)
+        whole = end.jac.T @ end.jac
+        each = [
+            _moved(answer, np.linalg.solve(whole - its.T @ its, its.T @ rest))
+            for its, rest in zip(jacobians, rests, strict=True)
+        ]
+        return answer, each
     every = np.arange(len(data.moving))
-    answers = [_METHODS[name](data.only(np.delete(every, n))) for n in (*every, [])]
-    return None if None in answers else (answers[-1], answers[:-1])
+    parts = [data.only(np.delete(every, n)) for n in every]
+    answers = [_opencv(_SOLVERS[name], part) for part in (data, *parts)]
+    found = [one for one in answers if one is not None]
+    return (found[0], found[1:]) if len(found) == len(answers) else None
 
 
 def _left_out_mm(data: HandEyeData, each: list[_Answer], at_mm: float) -> float:

@@ -62,7 +62,8 @@ class Lens(Config, frozen=True, kw_only=True):
         """Where pixels look, z = 1."""
         until = cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 30, 1e-7
         pixels = pixels.reshape(-1, 1, 2)
-        flat = cv2.undistortPointsIter(pixels, *self.opencv, None, None, until).reshape(-1, 2)
+        same, (matrix, bent) = np.eye(3), self.opencv
+        flat = cv2.undistortPointsIter(pixels, matrix, bent, same, same, until).reshape(-1, 2)
         return np.column_stack([flat, np.ones(len(flat))])
 
     def place(self, seen: Corners) -> tuple[Affine, float]:
@@ -193,7 +194,7 @@ def _fit(
     pixels = [one.pixels.astype(np.float32) for one in seen]
     try:
         _, matrix, bent, _, _, std, _, errors = cv2.calibrateCameraExtended(
-            points, pixels, size, None, None, flags=_MODELS[model]
+            points, pixels, size, np.zeros((3, 3)), np.zeros(5), flags=_MODELS[model]
         )
         camera = Intrinsics(*size, *map(float, matrix[[0, 1, 0, 1], [0, 1, 2, 2]]))
         plausible(camera, "these pictures")
@@ -204,5 +205,5 @@ def _fit(
         ) from error
     std = std.ravel()[:4]
     focal_std = float(np.max(std[:2] / [camera.fx, camera.fy]))
-    bent = tuple(map(float, np.ravel(bent)[:5]))
-    return lens_of(camera, distortion=bent, focal_std=focal_std), errors.ravel(), std
+    five = tuple(map(float, np.ravel(bent)[:5]))
+    return lens_of(camera, distortion=five, focal_std=focal_std), errors.ravel(), std

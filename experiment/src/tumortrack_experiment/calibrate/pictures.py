@@ -3,6 +3,7 @@ from what `tumortrack record` wrote."""
 
 from __future__ import annotations
 
+import re
 from itertools import islice
 from pathlib import Path
 from typing import Literal, NamedTuple
@@ -25,6 +26,9 @@ from tumortrack_experiment.record.read import read_recorded
 _NAMES = ("colour", "color", "infrared")  # .png or .jpg, in a frame's folder
 _SUFFIXES = (".png", ".jpg", ".jpeg")
 _LARGEST = 64 * 2**20  # bytes
+_IS_STAMP = re.compile(
+    r"[0-9]{12,19}"
+)  # of fewer digits it is a number of a picture, no time in ns
 _OF_A_STATE = 2  # moments: two tell the noise
 
 
@@ -61,7 +65,11 @@ def read_shots(folder: Path) -> list[Shot]:
     elif framed := [file for file in files if file is not None]:
         shots = [_framed(file) for file in framed]
     else:
-        shots = [Shot(p.stem, _grey(p)) for p in inside if p.suffix.lower() in _SUFFIXES]
+        shots = [
+            Shot(p.stem, _grey(p), stamp_ns=int(p.stem) if _IS_STAMP.fullmatch(p.stem) else 0)
+            for p in inside
+            if p.suffix.lower() in _SUFFIXES
+        ]
     if not shots:
         raise InputError(
             f"{folder} holds no pictures. Allowed: .png and .jpg; a folder for each with "

@@ -13,6 +13,7 @@ from jaxtyping import Float, Float64
 from scipy import ndimage
 from scipy.spatial import ConvexHull
 
+from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import perpendicular, rigid, transform_points, unit
 from tumortrack.core.types import Mesh
 from tumortrack.imaging.meshes import solid_of
@@ -22,6 +23,7 @@ FLANGE_MM, THICK_MM = 14.0, 8.0  # beyond the wall, room for a washer; each half
 _CELL_MM = (1.0, 1.0, 0.25)
 _SPACING_MM = 32.0  # from a bolt to the next key and on to the next bolt
 _BOLT_MM, _SEAT_MM = 4.5, 11.0  # M4 with play (ISO 273, medium); its washer (9 mm) with play
+_NUT_MM = 7.0  # below its seat, where the mold stands
 _KEY_MM = (3.6, 2.4, 5.0)  # a cone's radius on the parting surface and at its end, and its height
 _POCKET_CELLS = 2  # of 1 mm: shallower trapped air gets no vent
 _PIN_PLAY_MM = 0.1  # on the radius: printed holes come out narrower
@@ -65,6 +67,9 @@ def lay_out(
 
     The side where the ``tumors_ct`` are that will lie in it is down, so that they can be set on
     pins in the open lower half; sprue and vents keep off them. ``pins``: as in ``best_pull``.
+
+    Raises:
+        InputError: a surface that is not closed, or tumors that leave no place for the sprue.
     """
     from manifold3d import JoinType
 
@@ -87,7 +92,7 @@ def lay_out(
     loop = max(shadow.simplify(0.05).to_polygons(), key=len)
     sprue, vents = _openings(cells, tumors, radius)
     (low, high), heights = mesh.box_mm[:, 2], field.at(rim.to_polygons()[0])
-    bottom = min(low - wall_mm, heights.min() - THICK_MM)
+    bottom = min(low - wall_mm, heights.min() - THICK_MM - _NUT_MM)
     top = max(high + wall_mm, heights.max() + THICK_MM)
     return Layout(
         mold_from_ct, mesh, cells, field, outline, rim, bottom, top, sprue, radius, vents,
@@ -119,6 +124,11 @@ def _openings(cells: Cells, tumors: list[Mesh], radius_mm: float) -> tuple[np.nd
     roof, below = free.max(2), np.where(inside & tumor, height, 0).max(2)
     disc = disk(int(np.ceil(radius_mm / cells.step_mm[0])))
     under = ndimage.grey_erosion(np.where(roof > below, roof, 0), footprint=disc, mode="constant")
+    if not under.any():
+        raise InputError(
+            f"there is no place for a sprue of {2 * radius_mm:g} mm beside the tumors, which take "
+            "up all of the upper side. Take a narrower one."
+        )
     sprue = np.array(np.unravel_index(under.argmax(), under.shape))
     pockets, count = ndimage.label(h_maxima(free, _POCKET_CELLS), np.ones((3, 3, 3)))
     tops = np.array(ndimage.center_of_mass(pockets > 0, pockets, range(1, count + 1)))

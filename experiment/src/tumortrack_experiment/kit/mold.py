@@ -69,7 +69,7 @@ def organ_mold(anatomy: Anatomy, config: MoldConfig) -> OrganMold:
     """The organ's mold with a sprue, vents, keys, bolt holes and the holes for the tumors' pins.
 
     Raises:
-        InputError: a surface that is not closed, or a tumor that no three pins reach.
+        InputError: an open surface, no place for a sprue, or a tumor that no three pins reach.
     """
     layout = lay_out(anatomy.organ, anatomy.tumors, config.wall_mm, config.sprue_mm)
     way = layout.mold_from_ct
@@ -124,6 +124,7 @@ def _mold(layout: Layout, config: MoldConfig, name: str, pins: tuple[Pin, ...]) 
         "steep_parting_deg": np.degrees(np.arctan(np.percentile(slope[beside], 95))),
         "sprue_below_top_mm": layout.mesh.box_mm[1, 2] - layout.sprue_mm[2],
         "keys": halves.keys, "bolts": halves.bolts, "vents": len(layout.vents_mm),
+        "pins_through_bottom": sum(pin.mouth_mm[2] < layout.bottom_mm + 1 for pin in moved),
     }  # fmt: skip
     for number in sorted({pin.tumor for pin in pins}):
         held = np.array([pin.way for pin in pins if pin.tumor == number])

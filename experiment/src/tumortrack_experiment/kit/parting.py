@@ -25,8 +25,8 @@ from tumortrack.sense.render import Visibility
 _FAR_MM = 50_000.0  # an eye from where the organ is seen as good as in parallel
 _GRAZED_MM = 0.05  # a wall along the pull is seen past itself
 _SEARCHED = 3000  # faces that stand for all in the search, drawn by their area
-_COARSE = 400  # pulls tried first, 7 degrees apart; then rings round the best:
-_RINGS = np.radians([5.0, 2.5, 1.2])
+_COARSE = 200  # pulls tried first, 10 degrees apart; then rings round the best:
+_RINGS = np.radians([7.0, 3.5, 1.7])
 _FLATTER = 0.01  # share of the surface that a pull along the shortest side is worth
 _STEEP = np.sin(np.radians(25.0))  # between a pin and the parting surface
 _INSIDE_MM = 0.3  # that the membrane keeps from the organ's surface where it can
@@ -42,12 +42,11 @@ def directions(n: int) -> Float64[np.ndarray, "n 3"]:
 
 
 def undercut(
-    mesh: Mesh, pull: Float[np.ndarray, " 3"], sight: Visibility, faces: np.ndarray | None = None
+    mesh: Mesh, pull: Float[np.ndarray, " 3"], sight: Visibility
 ) -> Bool[np.ndarray, " f"]:
-    """Which faces (all, or those numbered) are laid open neither by ``pull`` nor against it."""
-    middle, area = triangles_of(
-        mesh.vertices_mm, mesh.faces if faces is None else mesh.faces[faces]
-    )
+    """Which faces of a surface (or a part of it) the ``sight`` of the whole finds laid open neither
+    by ``pull`` nor against it."""
+    middle, area = triangles_of(mesh.vertices_mm, mesh.faces)
     outward = area / np.maximum(np.linalg.norm(area, axis=1, keepdims=True), 1e-12)
     middle += _GRAZED_MM * outward
     hidden, up = np.zeros(len(middle), bool), area @ pull > 0
@@ -63,12 +62,13 @@ def best_pull(
     ``pins`` are unit vectors that should not lie in the plane across it."""
     sight, rng = Visibility(mesh), np.random.default_rng(0)
     area = np.linalg.norm(triangles_of(mesh.vertices_mm, mesh.faces)[1], axis=1)
-    some = rng.choice(len(area), min(_SEARCHED, 4 * len(area)), p=area / area.sum())
+    drawn = rng.choice(len(area), min(_SEARCHED, 4 * len(area)), p=area / area.sum())
+    some = Mesh(mesh.vertices_mm, mesh.faces[drawn])
 
     def cost(pull: np.ndarray) -> float:
         flat = 0.0 if pins is None else max(_STEEP - np.abs(pins @ pull).min(), 0)
         length = np.ptp(mesh.vertices_mm @ pull) / mesh.longest_mm
-        return float(undercut(mesh, pull, sight, some).mean() + _FLATTER * length + flat)
+        return float(undercut(some, pull, sight).mean() + _FLATTER * length + flat)
 
     best = min(directions(2 * _COARSE)[:_COARSE], key=cost)
     for ring in _RINGS:

@@ -21,7 +21,7 @@ _WAYS, _COMPARED = 600, 60  # directions tried, 8 degrees apart; of them, compar
 _DEEP_MM, _DEEP = 8.0, 0.6  # in the tumor, at most; at most this share of the way to its middle
 _OFF_MM = 3.0  # from other tumors and pins, and of a hole in the wall from the parting surface
 _STEP_MM = 0.5
-_UPPER, _UNDER, _LONG_MM = 0.4, 0.2, 300.0  # costs in units of ``firmness``; of a mm: 1/300
+_UPPER, _UNDER, _LONG_MM = 0.8, 0.3, 300.0  # costs in units of ``firmness``; of a mm: 1/300
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,6 +3,7 @@ reads. They go to the end of the data; the summary behind, of a few kilobytes, i
 
 from __future__ import annotations
 
+import os
 import struct
 import time
 import zlib
@@ -19,7 +20,8 @@ _COUNT_AT = 8 + 2 + 4  # of attachments, within the statistics
 
 
 def attach(path: Path, files: Mapping[str, bytes]) -> None:
-    """Add files to a finished MCAP that has none. Raises InputError: it is not finished."""
+    """Add files to a finished MCAP that has none; it is on the disk then, also for a power cut.
+    Raises InputError: it is not finished."""
     begin, records = _summary(path)
     indexes = b""
     with path.open("r+b") as stream:
@@ -41,6 +43,8 @@ def attach(path: Path, files: Mapping[str, bytes]) -> None:
                 stream.write(_record(opcode, content))
         stream.write(indexes + _record(_FOOTER, struct.pack("<QQI", begin, 0, 0)) + _MAGIC)
         stream.truncate()
+        stream.flush()
+        os.fsync(stream.fileno())
 
 
 def attachments_of(path: Path) -> dict[str, bytes]:

@@ -16,12 +16,12 @@ from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.geometry import Affine
 from tumortrack.core.types import DepthFrame, Intrinsics
 from tumortrack.live.cameras import CameraSetup
+from tumortrack.live.frames import FrameCheck
 from tumortrack.live.values import Observation, SourceLost
 from tumortrack.live.workers import SourceWorker
 from tumortrack.sense.cloud import CloudConfig
 from tumortrack.sense.files import DepthCorrection
 from tumortrack.sense.region.picture import RegionConfig
-from tumortrack.sense.region.watch import TableWatch
 from tumortrack_experiment.kit_file import Kit
 from tumortrack_experiment.record.folder import RecordingFolder
 from tumortrack_experiment.record.quality import DepthMeter
@@ -33,6 +33,7 @@ _TICK_S = 0.1  # a look at the keyboard at least so often
 _LINE_S = 0.2  # between two changes of the line
 _LONGEST_S = 1.0  # between two frames: a longer pause is no time of the recording
 _GIVE_UP_S = 60.0  # without a frame, where nobody is asked
+_FROZEN_S = 0.25  # the same image bit for bit, as `track` has it
 _AGAIN, _QUIT = "r", "q"
 
 
@@ -51,11 +52,10 @@ class Guide:
     def __post_init__(self) -> None:
         known = self.setup.published.table_in_camera or self.folder.about.get("table_in_camera")
         self._known = known and tuple(known)
-        near_mm, far_mm = self.options.range
-        self._region = RegionConfig(crop=CloudConfig(near_mm=near_mm, far_mm=far_mm))
-        self._watch = TableWatch(self._region, self._known)
-        self._before = self._unusable = 0  # frames dropped before this state; and refused in it
-        self._shown_s, self._trouble = 0.0, ""
+        self._check = self._new_check()
+        # Frames dropped before this state, frames refused in it; the last usable one, the line.
+        self._before = self._unusable = 0
+        self._heard_s, self._shown_s, self._trouble = time.monotonic(), 0.0, ""
 
     def record(self, states: list[str]) -> None:
         """One after the other. Raises SourceLost: no frame for a minute; InputError: the source is
@@ -93,13 +93,17 @@ class Guide:
     def _take(self, state: str) -> str:
         """Record a state; what the user says of it."""
         self.folder.begin(state)
-        meter, left_s, last_ns, longest_s, moved = DepthMeter(self.options.range), 0.0, 0, 0.0, ""
-        left_s, self._before, self._unusable = self.options.seconds, self.worker.dropped, 0
+        meter, left_s, doubts = (
+            DepthMeter(self.options.range),
+            self.options.seconds,
+            dict[str, bool](),
+        )
+        self._before, self._unusable, last_ns, longest_s = self.worker.dropped, 0, 0, 0.0
         for seen, where in self._frames():
             if seen is not None:
                 self.folder.add(seen, where)
                 meter.add(seen)
-                moved = moved or self._moved(seen)
+                doubts[self._doubt(seen)] = True
                 passed_s = max(seen.stamp_ns - (last_ns or seen.stamp_ns), 0) * 1e-9
                 last_ns, longest_s = seen.stamp_ns, max(longest_s, passed_s)
                 left_s -= min(passed_s, _LONGEST_S)
@@ -108,67 +112,73 @@ class Guide:
                 break
         self._line("", None)
         quality = meter.quality(self.worker.dropped - self._before, whole=True)
-        said = {
-            moved: bool(moved),
-            f"the source was silent for {longest_s:.1f} s": longest_s > _LONGEST_S,
-            f"{self._unusable} frames were refused: {self._trouble}": self._unusable > 0,
-        }
-        wrong = [*quality.warnings(self.options.range), *(text for text in said if said[text])]
+        doubts[f"the source was silent for {longest_s:.1f} s"] = longest_s > _LONGEST_S
+        doubts[f"{self._unusable} frames were refused: {self._trouble}"] = self._unusable > 0
+        wrong = [*quality.warnings(self.options.range), *(text for text in doubts if doubts[text])]
         say(f"  {state}: {quality.frames} frames, {quality.line()}")
-        for text in wrong:
+        for text in filter(None, wrong):
             say(f"  warning: {text}")
         if quality.light is None and state == self.folder.about["states"][0]:
             say("  note: no picture comes with the depth images (realsense?picture=true)")
-        if not (moved or self._watch.table_in_camera or self.setup.poses):
+        table = self._check.watch and self._check.watch.table_in_camera
+        if not table and not self._known and not self.setup.poses:
             say("  note: no table was found in this, so nobody notices if the camera moves")
-        answer = self._answer()
+        answer = "" if self.options.yes else self._ask()
         if answer not in (_AGAIN, _QUIT):
-            self._known = self._known or self._watch.table_in_camera
-            taken = {"quality": to_builtins(quality), "warnings": wrong}
+            self._known = self._known or table
+            taken = {"quality": to_builtins(quality), "warnings": list(filter(None, wrong))}
             self.folder.keep(taken, table_in_camera=self._known)
         return answer
 
-    def _answer(self) -> str:
-        if self.options.yes:
-            return ""
+    def _ask(self) -> str:
         try:
             ask = f"  Enter keeps it; {_AGAIN} records it again; {_QUIT} ends without it: "
             return input(ask).strip().lower()
         except EOFError:
             return _QUIT
 
-    def _moved(self, seen: Observation) -> str:
-        """That the camera has moved since the first state; or nothing."""
+    def _new_check(self) -> FrameCheck:
+        """The table is watched as one of a calibration: from the first state on."""
+        near_mm, far_mm = self.options.range
+        region = RegionConfig(crop=CloudConfig(near_mm=near_mm, far_mm=far_mm))
+        published = replace(self.setup.published, calibrated=True, table_in_camera=self._known)
+        return FrameCheck(published, region, _FROZEN_S)
+
+    def _doubt(self, seen: Observation) -> str:
+        """That camera or table moved, or the camera is frozen or another one; or nothing."""
         try:
-            if self.setup.poses is None:
-                self._watch.check(seen.content)
+            self._check.check_new(seen.content)
+            self._check.check(seen)
         except NoEstimate as error:
-            self._watch = TableWatch(self._region, self._known)
-            lies = str(error).partition(": ")[2].split(". ")[0]
-            return f"the camera or the table has moved since the first state: {lies}"
+            self._check = self._new_check()
+            said, _, lies = str(error).split(". ")[0].partition(": the table lies ")
+            return f"the camera or the table has moved: the table lies {lies}" if lies else said
         return ""
 
     def _frames(self, patient: bool = False) -> Iterator[tuple[Observation | None, Affine | None]]:
         """Frame after frame, and where the camera was; no frame where none came for a moment.
         ``patient``: however long none comes."""
-        heard_s = time.monotonic()
+        self._heard_s = time.monotonic()
         while True:
             got = self.worker.take(_TICK_S)
-            if isinstance(got, Observation):
-                heard_s = time.monotonic()
-                try:
-                    yield self._placed(got)
+            try:
+                if isinstance(got, Observation):
+                    placed = self._placed(got)
+                    self._heard_s = time.monotonic()
+                    yield placed
                     continue
-                except NoEstimate as error:  # where the camera was is unknown
-                    got = error
+            except NoEstimate as error:  # where the camera was is unknown
+                got = error
             if got is not None:
                 self._trouble, self._unusable = str(got), self._unusable + 1
             elif self.worker.ended:
                 raise InputError("the source is at its end, and states are missing.")
-            if not patient and time.monotonic() - heard_s > _GIVE_UP_S:
-                why = self._trouble or self.worker.trouble
-                raise SourceLost(f"no frame for {_GIVE_UP_S:g} s. {why}")
+            if not patient and time.monotonic() - self._heard_s > _GIVE_UP_S:
+                raise SourceLost(f"no frame for {_GIVE_UP_S:g} s. {self._why()}")
             yield None, None
+
+    def _why(self) -> str:
+        return self.worker.trouble or self._trouble or "no frame comes"
 
     def _placed(self, seen: Observation) -> tuple[Observation, Affine | None]:
         content, given, published = seen.content, self.intrinsics, self.setup.published
@@ -190,11 +200,12 @@ class Guide:
         if not sys.stdout.isatty() or (meter and time.monotonic() - self._shown_s < _LINE_S):
             return
         self._shown_s, text = time.monotonic(), ""
-        if meter is not None and meter.frames:
+        silent = time.monotonic() - self._heard_s > _LONGEST_S
+        if meter is not None and meter.frames and not silent:
             quality = meter.quality(self.worker.dropped - self._before)
             wrong = quality.warnings(self.options.range)[:1]
             text = "".join([f"  {what}", *(f"! {one} ! " for one in wrong), quality.line()])
         elif meter is not None:
-            text = f"  {what}{self.worker.trouble or self._trouble or 'waiting for a frame'}"
+            text = f"  {what}{self._why()}"
         sys.stdout.write(f"\r{text[: shutil.get_terminal_size().columns - 1]}\x1b[K")
         sys.stdout.flush()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -68,7 +69,7 @@ def write_reference(given: Reference) -> None:
     }
     kit_file = given.kit / KIT_FILE if given.kit.is_dir() else given.kit
     inputs = {"ct": given.ct, "recording": given.recording, "kit": kit_file}
-    meta = {
+    meta: dict[str, Any] = {
         "state": state,
         "depth": f"median of the first {len(moments)} frames",
         "case_sha256": kit.case_sha256,

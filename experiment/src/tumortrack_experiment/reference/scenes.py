@@ -13,8 +13,7 @@ from tumortrack.core.geometry import Points, transform_points
 from tumortrack.core.types import DepthFrame, Mesh, SensorCloud
 from tumortrack.imaging.case import Case
 from tumortrack.sense.camera import deproject, project
-from tumortrack.sense.cloud import CloudConfig
-from tumortrack.sense.region import Hints, RegionConfig, organ_points
+from tumortrack.sense.cloud import CloudConfig, cloud_from_depth
 from tumortrack.sense.render import render_depth
 from tumortrack.simulate.occupancy import labels_of
 from tumortrack.simulate.scene_folder import Targets
@@ -24,9 +23,9 @@ _PART_MM = 2.0  # a pixel so near to a part of the kit shows that
 _BEAD_RIM_MM = 2.0
 _OVER_PLATE_MM = 1.5
 _RANGE = CloudConfig(near_mm=60.0, far_mm=450.0)
-_PATCH_PX = 200
 _EDGE_PX = 4  # of the organ's outline: depth flies there
 _LEAST_PIXELS = 300
+_RIM_PX, _CRUMB = 2, 0.02  # of the pixels that are not the kit's: less is none of the organ
 _OFF_MM = 4.0  # 95 % of the surface seen; another state's is off by centimetres
 _BESIDE = 0.2
 _FAR_MM = 25.0  # something else before or behind the organ
@@ -56,14 +55,15 @@ def kit_pixels(
 
 
 def organ_cloud(frame: DepthFrame, others: Bool[np.ndarray, "h w"]) -> SensorCloud:
-    """All points that are not the kit's, without flying ones and small patches, as edges of beads
-    leave: a stand may part them, and an exophytic tumor stands out, which a search for the organ's
-    one piece would lose. Raises NoEstimate: none are left."""
-    patches, _ = ndimage.label(np.isfinite(frame.depth_mm) & ~others)
-    large = np.bincount(patches.ravel()) >= _PATCH_PX
-    large[0] = False
-    config = RegionConfig(crop=_RANGE, plane=False, pieces=False)
-    return organ_points(frame, config, Hints(mask=large[patches]), np.random.default_rng(0)).cloud
+    """All points that are not the kit's, but for crumbs and thin rims: a stand may part them, and
+    an exophytic tumor stands out, which a search for the organ's one piece would lose. Raises
+    NoEstimate: none are left."""
+    left = ndimage.binary_opening(np.isfinite(frame.depth_mm) & ~others, iterations=_RIM_PX)
+    pieces, _ = ndimage.label(left)
+    sizes = np.bincount(pieces.ravel())
+    organ = left & (sizes >= _CRUMB * left.sum())[pieces]
+    seen_mm = np.where(organ, frame.depth_mm, np.float32("nan"))
+    return cloud_from_depth(frame.with_depth(seen_mm), _RANGE, np.random.default_rng(0))
 
 
 def check_surface(

@@ -75,6 +75,7 @@ def scan_bench(
     scanner_from_base: Float64[np.ndarray, "4 4"],
     parameters: ScannerParameters,
     seed: int,
+    printed_hu: float = PRINTED_HU,
 ) -> Volume:
     """A CT of the bench, which lies so in the scanner (LPS, mm)."""
     corners = np.concatenate([mesh.box_mm for mesh in setup.meshes])
@@ -85,7 +86,7 @@ def scan_bench(
     for meshes, label in ((setup.printed, _PRINTED), (setup.beads, _BEAD)):
         for mesh in meshes:
             labels[voxelise(mesh, base_from_index, shape) & (labels == 0)] = label
-    material_hu = {_PRINTED: PRINTED_HU, _BEAD: BEAD_HU}
+    material_hu = {_PRINTED: printed_hu, _BEAD: BEAD_HU}
     volume = LabelVolume(labels, scanner_from_base @ base_from_index)
     return scan(volume, parameters, seed, material_hu)
 

@@ -18,7 +18,7 @@ from tumortrack.phantom.dicom import write_dicom_series
 from tumortrack.phantom.scanner import ScannerParameters
 from tumortrack.sense.camera import d405
 from tumortrack.sense.files import intrinsics_json
-from tumortrack_lab.rehearsal.bench import Setup, scan_bench, see_bench
+from tumortrack_lab.rehearsal.bench import PRINTED_HU, Setup, scan_bench, see_bench
 
 
 class BenchErrors(Config, frozen=True, kw_only=True):
@@ -73,12 +73,14 @@ class Hands:
         np.save(aside, depth_mm.astype(np.float32))
         aside.rename(self.folder / "now.npy")
 
-    def scanned(self, setup: Setup, out: Path, seed: int) -> Float64[np.ndarray, "4 4"]:
+    def scanned(
+        self, setup: Setup, out: Path, seed: int, printed_hu: float = PRINTED_HU
+    ) -> Float64[np.ndarray, "4 4"]:
         """A DICOM series of the bench, which was carried to the scanner: ``scanner_from_base``."""
         rng = np.random.default_rng(seed)
         turn = Rotation.from_euler("xyz", rng.uniform(-6, 6, 3) + [90, 0, 0], degrees=True)
         scanner_from_base = rigid(turn.as_matrix(), rng.uniform(-30, 30, 3))
-        volume = scan_bench(setup, scanner_from_base, ScannerParameters(), seed)
+        volume = scan_bench(setup, scanner_from_base, ScannerParameters(), seed, printed_hu)
         write_dicom_series(volume, out, seed, "Phantom on its base")
         return scanner_from_base
 

@@ -7,7 +7,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -80,8 +80,8 @@ class Rehearsal:
         rows = [*self.calibrate_camera(), *self.calibrate_hand_eye()]
         self._once("recording", self.record)
         for state in STATES:
-            self._once(f"ct/{state}", lambda state=state: self.scan(state))
-            self._once(f"scenes/{state}", lambda state=state: self.reference(state))
+            self._once(f"ct/{state}", partial(self.scan, state))
+            self._once(f"scenes/{state}", partial(self.reference, state))
         rows += [row for state in STATES for row in self.registered(state)]
         return rows, self.evaluated()
 
@@ -129,25 +129,30 @@ class Rehearsal:
 
     def record(self) -> None:
         """`record` asks for a state; the hands set it up meanwhile."""
-        hands = self.hands
-        hands.plug_in()
-        states = iter(STATES)
-        hands.show(self.setup(next(states)))
+        self.record_into(self.out / "recording", {state: self.hands for state in STATES})
+
+    def record_into(self, folder: Path, hands: dict[str, Hands]) -> str:
+        """Record these states, the camera held by these hands in each; what `record` says."""
+        states, (first, *_) = list(hands), hands.values()
+        first.plug_in()
+        first.show(self.setup(states[0]))
         command = self._command(
-            "record", f"bench:{hands.folder}", self.out / "recording", "--states", *STATES,
+            "record", f"bench:{first.folder}", folder, "--states", *states,
             "--kit", self.out / "kit", "--seconds", _SECONDS, "--countdown", 3, "--yes",
             "--intrinsics", self.out / "camera-calibration" / "intrinsics.json",
         )  # fmt: skip
+        said = []
         with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
             assert process.stdout is not None
             for line in process.stdout:
-                say(line.rstrip())
+                said.append(line.rstrip())
+                say(said[-1])
                 words = line.split()
                 if words[:1] == ["state"]:
-                    asked = words[4].rstrip(";")
-                    hands.show(self.setup(asked))
+                    hands[words[4].rstrip(";")].show(self.setup(words[4].rstrip(";")))
         if process.returncode:
             raise TumortrackError(f"record ended with {process.returncode}.")
+        return "\n".join(said)
 
     def scan(self, state: str) -> None:
         """The phantom is carried to the scanner in this state."""
@@ -159,9 +164,13 @@ class Rehearsal:
         store.write_json(self.out / "ct" / f"{state}.json", {"scanner_from_base": rows})
 
     def reference(self, state: str) -> None:
-        self._do(
-            "reference", self.out / "ct" / state, self.out / "recording", self.out / "scenes",
-            "--kit", self.out / "kit", "--case", self.case, "--state", state,
+        self.compare(self.out / "ct" / state, self.out / "recording", self.out / "scenes", state)
+
+    def compare(self, ct: Path, recording: Path, scenes: Path, state: str) -> str:
+        """`reference`; what it says. Raises TumortrackError: it refuses."""
+        return self._do(
+            "reference", ct, recording, scenes, "--kit", self.out / "kit", "--case", self.case,
+            "--state", state,
         )  # fmt: skip
 
     def truth(self, state: str) -> Anatomy:
@@ -193,7 +202,7 @@ class Rehearsal:
     def evaluated(self) -> dict[str, Any]:
         """`evaluate` by the second CTs, and the same clouds by the truth: report by report."""
         for state in STATES:
-            self._once(f"true-scenes/{state}", lambda state=state: self._write_truth(state))
+            self._once(f"true-scenes/{state}", partial(self._write_truth, state))
         for scenes in ("scenes", "true-scenes"):
             self._do("evaluate", self.model, self.out / scenes, self.out / f"{scenes}-report")
         return {
@@ -219,7 +228,7 @@ class Rehearsal:
         done = subprocess.run(self._command(*words), capture_output=True, text=True, check=False)
         say(done.stdout.rstrip())
         if done.returncode:
-            raise TumortrackError(f"tumortrack {words[0]} failed: {done.stderr.strip()}")
+            raise TumortrackError(done.stderr.strip())
         return done.stdout
 
 

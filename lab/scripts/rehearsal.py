@@ -1,0 +1,63 @@
+"""The experiment of docs/bench.md, rehearsed on a bench that does not exist.
+
+    make rehearsal ARGS='CASE MODEL OUT'      (five minutes; goes on where it was stopped)
+
+All commands run as a laboratory would give them; OUT keeps every file. --document fills its tables.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+
+from tumortrack.cli.console import say
+from tumortrack_lab.rehearsal import tables
+from tumortrack_lab.rehearsal.mishaps import Mishaps
+from tumortrack_lab.rehearsal.run import Rehearsal
+from tumortrack_lab.study import trainings
+from tumortrack_lab.study.document import ReportWriter
+
+BLOCK = "rehearsal"
+
+
+@dataclass(frozen=True)
+class Options:
+    """Rehearse the experiment with a case and its model."""
+
+    case: tyro.conf.Positional[Path]
+    """Folder that `tumortrack prepare` wrote."""
+    model: tyro.conf.Positional[Path]
+    """Folder that `tumortrack train` wrote."""
+    out: tyro.conf.Positional[Path]
+    """Everything goes here."""
+    mishaps: bool = True
+    """Also act what goes wrong on a bench."""
+    document: Path | None = None
+    """Its block `rehearsal` is replaced."""
+
+
+def main(options: Options) -> None:
+    """Rehearse, and say what was found."""
+    writer = None
+    if options.document is not None:
+        words = f"{options.case.name} MODEL OUT --document docs/bench.md"
+        writer = ReportWriter(options.document, f"make rehearsal ARGS='{words}'")
+        writer.check([BLOCK])
+    rehearsal = Rehearsal(options.case, options.model, options.out)
+    rows, reports = rehearsal.run()
+    blocks = [tables.error_table(rows), tables.evaluation_table(reports)]
+    if options.mishaps:
+        blocks.append(tables.mishap_table(Mishaps(rehearsal).run()))
+    for block in blocks:
+        say(block)
+    if writer is not None:
+        image = writer.image("bench_rehearsal")
+        tables.picture(rehearsal, image)
+        picture = writer.link(image, "a state before the camera, in the scanner, and compared")
+        writer.write({BLOCK: "\n\n".join([f"`{writer.command}`", *blocks, picture])})
+
+
+if __name__ == "__main__":
+    trainings.run(main, Options)

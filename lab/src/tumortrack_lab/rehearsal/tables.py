@@ -1,0 +1,75 @@
+"""A rehearsal's tables and picture for a document."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tumortrack.imaging.volume import read_volume
+from tumortrack.report.drawing import new_figure, save
+from tumortrack.simulate.scene_folder import read_scene
+from tumortrack_lab.rehearsal.mishaps import Mishap
+from tumortrack_lab.rehearsal.run import STATES, Rehearsal, Row, errors_mm
+from tumortrack_lab.study.document import table
+
+_SHOWN = "D2"
+
+
+def error_table(rows: list[Row]) -> str:
+    """What each step states of its own error, and what it is."""
+    head = ("step", "stated, mm", "true, mm")
+    return table(head, [(row.what, f"{row.stated_mm:.2f}", f"{row.true_mm:.2f}") for row in rows])
+
+
+def evaluation_table(reports: dict[str, dict[str, Any]]) -> str:
+    """Each state's tumors: how far off the estimates are by the second CT, and by the truth."""
+    by_ct, by_truth = (errors_mm(reports[name]) for name in ("scenes", "true-scenes"))
+    verdicts = {
+        scene["name"]: scene.get("quality", "none") for scene in reports["scenes"]["scenes"]
+    }
+    head = ("state", "verdict", "tumor", "by the second CT, mm", "by the truth, mm", "apart, mm")
+    rows = [
+        (state, verdicts[state], name, f"{off:.2f}", f"{true:.2f}", f"{off - true:+.2f}")
+        for state in STATES
+        for (name, off), true in zip(by_ct[state].items(), by_truth[state].values(), strict=True)
+    ]
+    return table(head, rows, left=3)
+
+
+def mishap_table(mishaps: list[Mishap]) -> str:
+    """What was done, and what the commands said."""
+    rows = [
+        (one.what, "refused" if one.refused else "named" if one.noticed else "**not noticed**",
+         one.said.removeprefix("tumortrack: "))
+        for one in mishaps
+    ]  # fmt: skip
+    return table(("mishap", "", "what is said"), rows, left=3)
+
+
+def picture(rehearsal: Rehearsal, path: Path) -> None:
+    """One state: the depth image, the second CT across base, beads and organ, and the estimate
+    over the second CT's surfaces."""
+    from matplotlib.image import imread
+
+    out = rehearsal.out
+    figure = new_figure(15, 4.2, wspace=0.04)
+    depth, ct, estimate = figure.subplots(1, 3, width_ratios=(1.5, 1.1, 1.3))
+    frame = read_scene(out / "scenes" / _SHOWN).depth
+    assert frame is not None
+    depth.imshow(frame.depth_mm, cmap="viridis_r")
+    depth.set_title(f"{_SHOWN}: the depth image that is recorded")
+    volume = read_volume(out / "ct" / _SHOWN)
+    most = np.unravel_index(int(volume.hu.argmax()), volume.hu.shape)  # through a bead
+    tumors = np.where((volume.hu > 450) & (volume.hu < 900))
+    cut = volume.hu[:, :, int(np.median(tumors[2]))]
+    ct.imshow(np.maximum(cut, 0.6 * volume.hu[:, :, most[2]]).T, cmap="gray", vmin=-900, vmax=1200)
+    ct.set_title("the second CT (a slice through a bead laid over)")
+    picture = imread(out / "scenes-report" / "scenes" / f"{_SHOWN}.png")
+    height, width = picture.shape[:2]
+    estimate.imshow(picture[height // 12 : height // 2, : width // 2])
+    estimate.set_title("estimate, and the second CT's surfaces")
+    for axes in (depth, ct, estimate):
+        axes.set_axis_off()
+    save(figure, path)
