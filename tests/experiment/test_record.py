@@ -8,6 +8,7 @@ import json
 import os
 import signal
 import sys
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -273,7 +274,7 @@ def test_other_folders_are_left_alone(tmp_path, capsys):
 
 
 def test_damage_is_said(tmp_path):
-    assert record(tmp_path) == 0
+    assert record(tmp_path, source="small?grey=99", seconds="0.1") == 0
     whole = (tmp_path / WHOLE).read_bytes()
     (tmp_path / WHOLE).write_bytes(whole.replace(b'"kind": "experiment"', b'"kind": "experimenT"'))
     with pytest.raises(InputError, match="checksum"):
@@ -281,3 +282,14 @@ def test_damage_is_said(tmp_path):
     (tmp_path / WHOLE).write_bytes(whole[:-9])
     with pytest.raises(InputError, match="cannot be read"):
         read_recorded(tmp_path)
+    rng, read = np.random.default_rng(0), 0
+    for at in (
+        rng.integers(len(whole), size=8).tolist() + (len(whole) - 2 ** np.arange(12)).tolist()
+    ):
+        changed = bytearray(whole)
+        changed[at] ^= 1 << rng.integers(8)
+        (tmp_path / WHOLE).write_bytes(changed)
+        with suppress(InputError):  # and nothing else
+            recorded = read_recorded(tmp_path)
+            read += sum(len(list(recorded.moments(state))) for state in recorded.states)
+    assert read > 17
