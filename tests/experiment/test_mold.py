@@ -101,6 +101,11 @@ def test_the_organ_s_mold_casts_the_organ(cast):
     assert anatomy.tumors[1].box_mm.mean(0) @ mold.pull_ct < 5  # the tumors lie low
 
 
+def test_a_tumor_that_takes_up_all_leaves_no_place_for_the_sprue():
+    with pytest.raises(InputError, match="no place for a sprue of 8 mm"):
+        lay_out(mesh_of(ball(13.0)), (mesh_of(ball(12.0)),), 4.0, 8.0)
+
+
 def test_pins_hold_each_tumor_and_reach_it_through_both_molds(cast):
     anatomy, mold = cast
     (its_mold,) = tumor_molds(Anatomy(anatomy.parts[:2]), MoldConfig(), mold.pins)

@@ -176,7 +176,8 @@ class CalibrateHandEye(WithBoard):
         poses = np.array([shots[n].base_from_tool for n in once])
         if self.eye_to_hand:
             poses = np.linalg.inv(poses)
-        data = HandEyeData(poses, np.array([lens.place(seen[n])[0] for n in once]))
+        places = np.array([lens.place(seen[n])[0] for n in once])
+        data = HandEyeData(poses, places, self.eye_to_hand)
         names = [shots[n].name for n in once]
         found, said, warnings = solve(data, names, self.distance, lens.focal_std)
         way = "robot_from_camera" if self.eye_to_hand else "tool_from_camera"

@@ -3,7 +3,7 @@
 One equation holds both: ``fixed_from_moving @ moving_from_camera @ camera_from_board`` is the same
 in all pictures. Eye in hand: fixed is the base, moving the tool. A board on the tool: fixed is the
 tool, moving the base. OpenCV's solvers answer it. Least squares follow on how far robot and board
-disagree, seen from what moves, where the robot errs: on the corners' pixels they were 1.5 to 2
+disagree, seen from the tool, where the robot errs: on the corners' pixels they were 1.5 to 2
 times worse than the solvers, here they are up to a third better (docs/bench.md).
 """
 
@@ -37,13 +37,15 @@ _SCALES = np.array([0.01, 0.01, 0.01, 1, 1, 1, 0.01, 0.01, 0.01, 1, 1, 1, 0.01])
 
 
 class HandEyeData(NamedTuple):
-    """By picture: ``fixed_from_moving`` and ``camera_from_board``, mm."""
+    """By picture: ``fixed_from_moving`` and ``camera_from_board``, mm. ``to_hand``: the tool is
+    what is fixed, with the board on it."""
 
     moving: Poses
     board: Poses
+    to_hand: bool = False
 
     def only(self, kept: np.ndarray) -> HandEyeData:
-        return HandEyeData(self.moving[kept], self.board[kept])
+        return HandEyeData(self.moving[kept], self.board[kept], self.to_hand)
 
 
 class _Answer(NamedTuple):
@@ -181,7 +183,10 @@ def _agreeing(data: HandEyeData, at_mm: float) -> np.ndarray:
     good = each_mm <= max(_OUTLIER_TIMES * middle_mm, _OUTLIER_MM)
     if middle_mm > _FAR_OFF_MM or np.mean(~good) > _MOST_DROPPED or good.sum() < LEAST_POSES:
         hint = "are they in the pictures' order, and of the same moments?"
-        if np.median(off_mm(HandEyeData(np.linalg.inv(data.moving), data.board))) < 0.2 * middle_mm:
+        if (
+            np.median(off_mm(HandEyeData(np.linalg.inv(data.moving), data.board, not data.to_hand)))
+            < 0.2 * middle_mm
+        ):
             hint = (
                 "inverted they do. Give base_from_tool, and --eye-to-hand only where the board is "
                 "on the tool."
@@ -242,6 +247,8 @@ def _fit(data: HandEyeData, start: _Answer, unknown: int = 12, **loss: Any) -> A
 
     def rest(by: np.ndarray) -> np.ndarray:
         off = _moved(start, by).off(data)
+        if data.to_hand:
+            off = data.moving @ np.linalg.inv(data.moving @ off)
         turns = Rotation.from_matrix(off[:, :3, :3]).as_rotvec()
         return np.column_stack([off[:, :3, 3], _ARM_MM * turns]).ravel()
 

@@ -13,6 +13,7 @@ from jaxtyping import Float, Float64
 from scipy import ndimage
 from scipy.spatial import ConvexHull
 
+from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import perpendicular, rigid, transform_points, unit
 from tumortrack.core.types import Mesh
 from tumortrack.imaging.meshes import solid_of
@@ -66,6 +67,9 @@ def lay_out(
 
     The side where the ``tumors_ct`` are that will lie in it is down, so that they can be set on
     pins in the open lower half; sprue and vents keep off them. ``pins``: as in ``best_pull``.
+
+    Raises:
+        InputError: a surface that is not closed, or tumors that leave no place for the sprue.
     """
     from manifold3d import JoinType
 
@@ -120,6 +124,11 @@ def _openings(cells: Cells, tumors: list[Mesh], radius_mm: float) -> tuple[np.nd
     roof, below = free.max(2), np.where(inside & tumor, height, 0).max(2)
     disc = disk(int(np.ceil(radius_mm / cells.step_mm[0])))
     under = ndimage.grey_erosion(np.where(roof > below, roof, 0), footprint=disc, mode="constant")
+    if not under.any():
+        raise InputError(
+            f"there is no place for a sprue of {2 * radius_mm:g} mm beside the tumors, which take "
+            "up all of the upper side. Take a narrower one."
+        )
     sprue = np.array(np.unravel_index(under.argmax(), under.shape))
     pockets, count = ndimage.label(h_maxima(free, _POCKET_CELLS), np.ones((3, 3, 3)))
     tops = np.array(ndimage.center_of_mass(pockets > 0, pockets, range(1, count + 1)))

@@ -69,7 +69,7 @@ def organ_mold(anatomy: Anatomy, config: MoldConfig) -> OrganMold:
     """The organ's mold with a sprue, vents, keys, bolt holes and the holes for the tumors' pins.
 
     Raises:
-        InputError: a surface that is not closed, or a tumor that no three pins reach.
+        InputError: an open surface, no place for a sprue, or a tumor that no three pins reach.
     """
     layout = lay_out(anatomy.organ, anatomy.tumors, config.wall_mm, config.sprue_mm)
     way = layout.mold_from_ct

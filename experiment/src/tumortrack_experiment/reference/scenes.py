@@ -22,6 +22,7 @@ _OVER_PLATE_MM = 1.5
 _RANGE = CloudConfig(near_mm=60.0, far_mm=450.0)
 _EDGE_PX = 4  # of the organ's outline: depth flies there
 _LEAST_PIXELS = 300
+_RIM_PX, _CRUMB = 2, 0.02  # of the pixels that are not the kit's: less is none of the organ
 _OFF_MM = 4.0  # 95 % of the surface seen; another state's is off by centimetres
 _BESIDE = 0.2
 _FAR_MM = 25.0  # something else before or behind the organ
@@ -51,10 +52,17 @@ def kit_pixels(
 
 
 def organ_cloud(frame: DepthFrame, others: Bool[np.ndarray, "h w"]) -> SensorCloud:
-    """All points that are not the kit's: a stand may part them, and an exophytic tumor stands out,
-    which a search for the organ's one piece would lose. Raises NoEstimate: none are left."""
-    left_mm = np.where(others, np.float32("nan"), frame.depth_mm)
-    return cloud_from_depth(frame.with_depth(left_mm), _RANGE, np.random.default_rng(0))
+    """All points that are not the kit's, but for crumbs and thin rims: a stand may part them, and
+    an exophytic tumor stands out, which a search for the organ's one piece would lose. Raises
+    NoEstimate: none are left."""
+    from scipy import ndimage
+
+    left = ndimage.binary_opening(np.isfinite(frame.depth_mm) & ~others, iterations=_RIM_PX)
+    pieces, _ = ndimage.label(left)
+    sizes = np.bincount(pieces.ravel())
+    organ = left & (sizes >= _CRUMB * left.sum())[pieces]
+    seen_mm = np.where(organ, frame.depth_mm, np.float32("nan"))
+    return cloud_from_depth(frame.with_depth(seen_mm), _RANGE, np.random.default_rng(0))
 
 
 def check_surface(
