@@ -187,6 +187,18 @@ def test_a_camera_that_moved_between_states_is_noticed(tmp_path):
     assert said_of(tmp_path, "D1") == ""
 
 
+def test_another_camera_than_the_calibrations_is_noticed(tmp_path):
+    frame = {"frame_id": "base", "unit": "mm", "robot_from_camera": POSE, "camera_frame_id": "lens"}
+    (tmp_path / "f.json").write_text(json.dumps(frame))
+    for name, words in (("lens", ""), ("other", "'other', and the calibration is for 'lens'")):
+        folder, beside = tmp_path / name, ("--frame", str(tmp_path / "f.json"))
+        assert record(folder, *beside, "--only", "D1", source=f"small?frame_id={name}") == 0
+        assert words in said_of(folder, "D1")
+        assert bool(words) == bool(said_of(folder, "D1"))
+        for moment in read_recorded(folder).moments("D1"):
+            np.testing.assert_allclose(moment.fixed_from_camera, POSE, atol=1e-9)
+
+
 def test_poses_of_a_moving_camera_come_back(tmp_path):
     from record_objects import BEGIN_NS, PERIOD_NS
 
