@@ -170,7 +170,7 @@ def test_what_is_wrong_with_a_state_is_said(tmp_path, source, words, monkeypatch
     monkeypatch.setattr("tumortrack.live.workers._AGAIN_S", 0.01)
     if "lost" in source:  # 1.1 s by its stamps
         monkeypatch.setattr("record_objects.PERIOD_NS", 600_000_000)
-    assert record(tmp_path, "--only", "rest", source=source, seconds="1.6") == 0
+    assert record(tmp_path, "--only", "rest", source=source, seconds="1.1") == 0
     said = said_of(tmp_path, "rest")
     assert words in said
     assert bool(words) == bool(said)
@@ -178,12 +178,12 @@ def test_what_is_wrong_with_a_state_is_said(tmp_path, source, words, monkeypatch
 
 def test_a_camera_that_moved_between_states_is_noticed(tmp_path):
     states = ("--states", "rest", "D1", "D2", "--only")
-    assert record(tmp_path, *states, "rest", seconds="2") == 0
-    assert record(tmp_path, *states, "D1", source="small?lift_mm=3", seconds="2") == 0
+    assert record(tmp_path, *states, "rest", seconds="1.4") == 0
+    assert record(tmp_path, *states, "D1", source="small?lift_mm=3", seconds="1.4") == 0
     moved = "the camera or the table has moved: the table lies 3.0 mm off"
     assert said_of(tmp_path, "rest") == ""
     assert moved in said_of(tmp_path, "D1")
-    assert record(tmp_path, *states, "D1", seconds="2") == 0
+    assert record(tmp_path, *states, "D1", seconds="1.4") == 0
     assert said_of(tmp_path, "D1") == ""
 
 
