@@ -94,8 +94,8 @@ def test_a_second_ct_becomes_the_truth_of_what_the_camera_saw(made, tmp_path, ca
     near = (np.linalg.norm(scene.cloud.points_mm[:, None] - pins_mm, axis=2) < 45).any(1)
     assert near.all()  # no point of base, plate or beads
     assert abs(scene.meta["surface"]["median_mm"]) < 0.6
-    assert set(scene.meta["inputs"]) == {"ct", "recording", "kit", "targets"}
-    assert "registration: 6 beads, FRE" in capsys.readouterr().out
+    assert set(scene.meta["inputs"]) == {"ct", "recording", "kit"}
+    assert "camera_from_ct: 6 beads, FRE" in capsys.readouterr().out
 
 
 def test_a_camera_that_moved_between_states_is_noticed(made, tmp_path, capsys):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -31,14 +30,6 @@ _USUAL_SHIFT_MM = 15.0  # of a tumor by the paper's plates
 _USUAL_CHANGE = 0.1  # of its volume
 
 
-@dataclass(frozen=True, eq=False)
-class Deformed:
-    """``anatomy``: LPS of the second CT, tumors numbered as the case's; ``report``: plain JSON."""
-
-    anatomy: Anatomy
-    report: dict[str, Any]
-
-
 def parts_in(kit: Kit, folder: Path, state: str) -> list[Mesh]:
     """The kit's parts that stand on the base in a state, base frame. Raises InputError: a part's
     file is missing or damaged."""
@@ -62,9 +53,10 @@ def segment_deformed(
     case: Case,
     others: tuple[list[Mesh], list[Ball]],
     windows: tuple[tuple[float, float], tuple[float, float]],
-) -> Deformed:
+) -> tuple[Anatomy, dict[str, Any]]:
     """Take away what stands on the base and what lies under it, segment the rest by HU windows, and
-    compare. ``others``: the parts that stand there, base frame, and the bright balls of the CT.
+    compare: surfaces (LPS of this CT), tumors numbered as the case's, and plain JSON. ``others``:
+    the parts that stand there, base frame, and the bright balls of the CT.
 
     Raises:
         InputError: no organ, or organ and tumors are not those that the kit's molds cast.
@@ -96,7 +88,7 @@ def segment_deformed(
         ],
         "notes": notes,
     }
-    return Deformed(Anatomy((anatomy.organ, *tumors)), report)
+    return Anatomy((anatomy.organ, *tumors)), report
 
 
 def _cropped(volume: Volume, ct_from_base: np.ndarray, kit: Kit, rest_mm: np.ndarray) -> Volume:
