@@ -187,7 +187,7 @@ def _arranged(anatomy: Anatomy, standing: list[PrintedPart], config: BaseConfig)
     sectors = np.array_split(np.arange(len(places)), config.beads)
     good = np.full(_TRIES, len(sectors[-1]) > 2)
     if good.any():
-        rng = np.random.default_rng(0)
+        rng, fewest = np.random.default_rng(0), np.full(_TRIES, config.beads)
         chosen = np.stack([sector[rng.integers(len(sector), size=_TRIES)] for sector in sectors], 1)
         gap, mirror = uniqueness_mm(places[chosen])
         good = (gap >= _LEAST_GAP_MM) & (mirror >= _MIRROR_MM)
@@ -198,13 +198,15 @@ def _arranged(anatomy: Anatomy, standing: list[PrintedPart], config: BaseConfig)
         for state in {part.state for part in standing}:
             there = [anatomy.organ, *(part.mesh for part in standing if part.state == state)]
             for seen in seen_beads(there, places, eyes, config.bead_mm):
-                good &= seen[chosen].sum(1) >= LEAST_BEADS
+                fewest = np.minimum(fewest, seen[chosen].sum(1))
+        good &= fewest >= LEAST_BEADS
     if not good.any():
         raise InputError(
             f"base: no arrangement of {config.beads} beads of {config.bead_mm:g} mm has distances "
             f"that all differ by {_LEAST_GAP_MM:g} mm, with {LEAST_BEADS} seen in every state. "
             "Take another number of beads, smaller ones, fewer states, or a larger --bed."
         )
+    good &= fewest >= min(LEAST_BEADS + 1, fewest[good].max())  # one to spare, if it can be had
     good &= gap >= min(_GAP_MM, 0.9 * gap[good].max())
     drawn = places[chosen[good]]
     tre = expected_tre_mm(drawn, _middles(anatomy.tumors or (anatomy.organ,))).max(1)
