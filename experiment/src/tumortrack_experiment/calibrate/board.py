@@ -24,7 +24,7 @@ CELLS, _MARKER_CELLS = 8, 6
 _DICTIONARY, _MARKERS = cv2.aruco.DICT_4X4_250, 250
 _LEAST_CORNERS = 10
 _PAGES_MM = (210.0, 297.0), (297.0, 420.0), (420.0, 594.0), (594.0, 841.0)  # A4 to A1
-_BORDER_MM = 10.0  # that printers leave white
+_BORDER_MM = 24.0  # for rulers, and what printers leave white, on both sides
 
 
 class Corners(NamedTuple):
@@ -97,52 +97,37 @@ def find_boards(pictures: Sequence[UInt8[np.ndarray, "h w"]], board: Board) -> l
 def draw_board(board: Board, path: Path) -> None:
     """A page to print at 100 %, with rulers that show if it was (.pdf, .svg; .png of 300 dpi).
     Raises InputError: another suffix, or no page is large enough."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.collections import PolyCollection
-    from matplotlib.figure import Figure
+    from tumortrack.report.drawing import new_figure
 
-    if path.suffix.lower() not in (".pdf", ".svg", ".png"):
+    kind = path.suffix.lower().removeprefix(".")
+    if kind not in ("pdf", "svg", "png"):
         raise InputError(f"{path}: a board is written as .pdf, .svg or .png.")
     wide, high = board.size_mm
-    need = wide + 2 * _BORDER_MM, high + 4 * _BORDER_MM  # above and below stand text and rulers
-    pages = [page for page in _PAGES_MM if need[0] <= page[0] and need[1] <= page[1]]
+    pages = [(w, h) for w, h in _PAGES_MM if wide + _BORDER_MM <= w and high + _BORDER_MM <= h]
     if not pages:
         raise InputError(
             f"a board of {wide:g} x {high:g} mm fits no page up to A1 (turned upright); take fewer "
             "or smaller squares."
         )
-    page_mm = np.array(pages[0])
-    figure = Figure(figsize=tuple(page_mm / 25.4), facecolor="white")
-    FigureCanvasAgg(figure)
-    axes = figure.add_axes((0, 0, 1, 1))
-    axes.set(xlim=(0, page_mm[0]), ylim=(page_mm[1], 0))
-    axes.axis("off")
-    left, top = (page_mm - board.size_mm) / 2
-    cell_mm, corner = board.square_mm / CELLS, np.array([[0, 0], [0, 1], [1, 1], [1, 0]])
-    black = [  # runs of black cells
-        corner * [end - begin, 1] + [begin, row]
-        for row, line in enumerate(~board.cells())
-        for begin, end in np.flatnonzero(np.diff(np.pad(line, 1).astype(int))).reshape(-1, 2)
-    ]
-    polygons = [run * cell_mm + [left, top] for run in black]
-    axes.add_collection(PolyCollection(polygons, facecolor="black", linewidth=0, antialiased=False))
+    (page_w, page_h), cell_mm = pages[0], board.square_mm / CELLS
+    left, top = (page_w - wide) / 2, (page_h - high) / 2
+    figure = new_figure(page_w / 25.4, page_h / 25.4)
+    axes = figure.add_axes((left / page_w, top / page_h, wide / page_w, high / page_h))
+    for row, black in enumerate(~board.cells()):
+        runs = np.flatnonzero(np.diff(np.pad(black, 1).astype(int))).reshape(-1, 2) * cell_mm
+        bars = [(begin, end - begin) for begin, end in runs]
+        axes.broken_barh(bars, (row * cell_mm, cell_mm), color="black", linewidth=0)
+    axes.set(xlim=(0, wide), ylim=(high, 0))
+    axes.set(xticks=np.arange(0, wide + 1, 10), yticks=np.arange(0, high + 1, 10))
+    axes.tick_params(labelsize=5)
+    for side in axes.spines.values():
+        side.set(position=("outward", 9), linewidth=0)
     words = (
-        f"ChArUco {board.columns} x {board.rows}, squares {board.square_mm:g} mm, markers "
-        f"{board.square_mm * _MARKER_CELLS / CELLS:g} mm, DICT_4X4_250. Print at 100 %, glue it on "
-        "glass or aluminium."
+        f"ChArUco {board.columns} x {board.rows}, squares {board.square_mm:g} mm, DICT_4X4_250. "
+        "Print at 100 %, glue on glass. Measure both rulers (mm): where they are off, so is "
+        "--square-mm."
     )
-    axes.text(left, top - 4, words, fontsize=7)
-    long_mm = 10 * (wide // 10), 10 * (high // 10)
-    ruled: dict[str, Any] = {"color": "black", "linewidth": 0.4}
-    for mark in np.arange(0, long_mm[0] + 1, 10):
-        axes.plot([left + mark] * 2, [top + high + 3, top + high + 6], **ruled)
-    for mark in np.arange(0, long_mm[1] + 1, 10):
-        axes.plot([left - 6, left - 3], [top + mark] * 2, **ruled)
-    axes.text(
-        left, top + high + 10, fontsize=7,
-        s=f"First to last mark: {long_mm[0]:g} mm across, {long_mm[1]:g} mm down. Measure both; "
-        "where they differ, give --square-mm as it was printed.",
-    )  # fmt: skip
+    figure.text(left / page_w, 1 - (top - 5) / page_h, words, fontsize=7)
     stream = io.BytesIO()
-    figure.savefig(stream, format=path.suffix[1:].lower(), dpi=300)
+    figure.savefig(stream, format=kind, dpi=300)
     write_atomically(path, stream.getvalue())

@@ -33,6 +33,13 @@ _CONFIDENCE, _DRAWS = 0.95, 4000
 # Of the distance: two deviations of the focal length, each of which moves the answer by 1.7 of it.
 _LENS, _UNKNOWN_FOCAL = 3.5, 1e-3  # a device states no deviation
 _BAND = 1 / 3  # of the stated distance, to either side, in which the written bound holds
+_HAND, _WORLD = "CALIB_HAND_EYE_", "CALIB_ROBOT_WORLD_HAND_EYE_"
+_SOLVERS: dict[str, int] = {
+    name: getattr(cv2, (_WORLD if name in ("Shah", "Li") else _HAND) + name.upper())
+    for name in ("Tsai", "Park", "Horaud", "Andreff", "Daniilidis", "Shah", "Li")
+}
+_FREE = "least squares, board's size free"
+_LEAST_SQUARES = {"least squares": 12, _FREE: 13}  # unknown numbers
 _SCALES = np.array([0.01, 0.01, 0.01, 1, 1, 1, 0.01, 0.01, 0.01, 1, 1, 1, 0.01])
 
 
@@ -198,23 +205,20 @@ def _agreeing(data: HandEyeData, at_mm: float) -> np.ndarray:
     return good
 
 
-def _opencv(method: int, data: HandEyeData) -> _Answer | None:
+def _opencv(name: str, data: HandEyeData) -> _Answer | None:
     """None: this solver has no answer."""
 
     def parts(poses: Poses) -> tuple[list[np.ndarray], list[np.ndarray]]:
         return list(poses[:, :3, :3]), list(poses[:, :3, 3])
 
     try:
-        if method in _WORLD.values():
-            back = parts(np.linalg.inv(data.moving))
-            *_, turn, shift = cv2.calibrateRobotWorldHandEye(
-                *parts(data.board), *back, method=method - _APART
-            )
+        if name in ("Shah", "Li"):
+            given = *parts(data.board), *parts(np.linalg.inv(data.moving))
+            *_, turn, shift = cv2.calibrateRobotWorldHandEye(*given, method=_SOLVERS[name])
             camera = np.linalg.inv(rigid(turn, shift.ravel()))
         else:
-            turn, shift = cv2.calibrateHandEye(
-                *parts(data.moving), *parts(data.board), method=method
-            )
+            given = *parts(data.moving), *parts(data.board)
+            turn, shift = cv2.calibrateHandEye(*given, method=_SOLVERS[name])
             camera = rigid(turn, shift.ravel())
     except (cv2.error, np.linalg.LinAlgError):
         return None
@@ -236,7 +240,7 @@ def _moved(answer: _Answer, by: np.ndarray) -> _Answer:
 
 def _solved(data: HandEyeData) -> _Answer:
     """The solver's answer whose pictures agree best."""
-    found = [one for method in _SOLVERS.values() if (one := _opencv(method, data)) is not None]
+    found = [one for name in _SOLVERS if (one := _opencv(name, data)) is not None]
     if not found:
         raise InputError("no solver finds where the camera is from these poses and pictures.")
     return min(found, key=lambda one: float(np.median(one.off_mm(data, _ARM_MM))))
@@ -255,22 +259,6 @@ def _fit(data: HandEyeData, start: _Answer, unknown: int = 12, **loss: Any) -> A
     return least_squares(rest, np.zeros(unknown), x_scale=_SCALES[:unknown], **loss)
 
 
-_APART = 100  # OpenCV numbers both kinds from 0
-_WORLD = {
-    "Shah": _APART + cv2.CALIB_ROBOT_WORLD_HAND_EYE_SHAH,
-    "Li": _APART + cv2.CALIB_ROBOT_WORLD_HAND_EYE_LI,
-}
-_SOLVERS: dict[str, int] = {
-    **{
-        name: getattr(cv2, f"CALIB_HAND_EYE_{name.upper()}")
-        for name in ("Tsai", "Park", "Horaud", "Andreff", "Daniilidis")
-    },
-    **_WORLD,
-}
-_FREE = "least squares, board's size free"
-_LEAST_SQUARES = {"least squares": 12, _FREE: 13}  # unknown numbers
-
-
 def _left_out(name: str, data: HandEyeData) -> tuple[_Answer, list[_Answer]] | None:
     """A method's answer, and those without one picture each, of least squares by one step; None:
     one of them has none."""
@@ -287,7 +275,7 @@ def _left_out(name: str, data: HandEyeData) -> tuple[_Answer, list[_Answer]] | N
         return answer, each
     every = np.arange(len(data.moving))
     parts = [data.only(np.delete(every, n)) for n in every]
-    answers = [_opencv(_SOLVERS[name], part) for part in (data, *parts)]
+    answers = [_opencv(name, part) for part in (data, *parts)]
     found = [one for one in answers if one is not None]
     return (found[0], found[1:]) if len(found) == len(answers) else None
 

@@ -84,12 +84,14 @@ def read_shots(folder: Path) -> list[Shot]:
 
 def _recorded(folder: Path) -> list[Shot]:
     recorded, shots = read_recorded(folder), []
+    tool = "calibration.json" not in recorded.attachments  # by which poses are the camera's
     for state in recorded.states:
         for moment in islice(recorded.moments(state), _OF_A_STATE):
             if (seen := moment.picture) is not None:
                 grey = cv2.cvtColor(seen, cv2.COLOR_RGB2GRAY) if seen.ndim == 3 else seen
                 stamp_ns = moment.depth.stamp_ns
-                shots.append(Shot(state, grey, moment.depth, stamp_ns, moment.fixed_from_camera))
+                pose = moment.fixed_from_camera if tool else None
+                shots.append(Shot(state, grey, moment.depth, stamp_ns, pose))
     return shots
 
 
@@ -128,7 +130,10 @@ def with_poses(shots: list[Shot], path: Path) -> tuple[str, list[Shot]]:
     Raises InputError: damaged, or not one for each picture."""
     if path.is_dir():
         if lack := [shot.name for shot in shots if shot.base_from_tool is None]:
-            raise InputError(f"{path} does not say where the tool was in {lack[0]}: give --poses.")
+            raise InputError(
+                f"{path} does not say where the tool was in {lack[0]}: give --poses, or record "
+                "with --moving and without --frame."
+            )
         return read_json(path / ABOUT)["frame_id"], shots
     if path.suffix.lower() == ".csv":
         table, poses = FilePoses(path), []
