@@ -145,10 +145,16 @@ def test_another_phantom_and_a_plate_taken_for_organ_are_refused(made):
         segmented(made, slab)
 
 
+def test_a_plate_that_the_ct_does_not_show_is_noticed(made):
+    alone = bench.a_scan(bench.State(np.ones(3), press=False), CT_FROM_BASE, 2.0)
+    with pytest.raises(InputError, match=r"the kit has the part D1-plate .* the CT has air"):
+        segmented(made, alone)
+
+
 def test_a_state_that_the_ct_does_not_show_is_noticed(made):
     root, case, _, view = made
     kit = read_kit(root / "kit")
-    parts = parts_in(kit, root / "kit", "D1")
+    parts = [*parts_in(kit, root / "kit", "D1").values()]
     beads = transform_points(POSE, bench.BEADS_MM), bench.BEAD_MM
     others = scenes.kit_pixels(view, POSE, parts, beads)
     cloud = scenes.organ_cloud(view, others)

@@ -61,7 +61,7 @@ def write_reference(given: Reference) -> None:
     moved = (p.moved(transform_points(one.to_from, p.vertices_mm)) for p in in_ct2.parts)
     anatomy = Anatomy(tuple(moved))
     beads = in_view.points_mm[in_view.found], kit.bead_diameter_mm
-    known = scenes.kit_pixels(frame, in_view.device_from_base, parts, beads)
+    known = scenes.kit_pixels(frame, in_view.device_from_base, [*parts.values()], beads)
     cloud = scenes.organ_cloud(frame, known)
     middles = {
         name: part.vertices_mm.mean(0)[None]

@@ -26,7 +26,7 @@ _RANGE = CloudConfig(near_mm=60.0, far_mm=450.0)
 _EDGE_PX = 4  # of the organ's outline: depth flies there
 _LEAST_PIXELS = 300
 _RIM_PX, _CRUMB = 2, 0.02  # of the pixels that are not the kit's: less is none of the organ
-_OFF_MM = 4.0  # 95 % of the surface seen; another state's is off by centimetres
+_OFF_MM = 1.5  # 95 % of the surface seen: of the right state 0.7, of its neighbours 2.0 and more
 _BESIDE = 0.2
 _FAR_MM = 25.0  # something else before or behind the organ
 _LARGEST_STRETCH_MM = 12.0  # of a bead in the organ beside the others' rigid motion
