@@ -8,6 +8,7 @@ import json
 import os
 import signal
 import sys
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -169,7 +170,7 @@ def test_what_is_wrong_with_a_state_is_said(tmp_path, source, words, monkeypatch
     monkeypatch.setattr("tumortrack.live.workers._AGAIN_S", 0.01)
     if "lost" in source:  # 1.1 s by its stamps
         monkeypatch.setattr("record_objects.PERIOD_NS", 600_000_000)
-    assert record(tmp_path, "--only", "rest", source=source, seconds="1.6") == 0
+    assert record(tmp_path, "--only", "rest", source=source, seconds="1.1") == 0
     said = said_of(tmp_path, "rest")
     assert words in said
     assert bool(words) == bool(said)
@@ -177,13 +178,25 @@ def test_what_is_wrong_with_a_state_is_said(tmp_path, source, words, monkeypatch
 
 def test_a_camera_that_moved_between_states_is_noticed(tmp_path):
     states = ("--states", "rest", "D1", "D2", "--only")
-    assert record(tmp_path, *states, "rest", seconds="2") == 0
-    assert record(tmp_path, *states, "D1", source="small?lift_mm=3", seconds="2") == 0
+    assert record(tmp_path, *states, "rest", seconds="1.4") == 0
+    assert record(tmp_path, *states, "D1", source="small?lift_mm=3", seconds="1.4") == 0
     moved = "the camera or the table has moved: the table lies 3.0 mm off"
     assert said_of(tmp_path, "rest") == ""
     assert moved in said_of(tmp_path, "D1")
-    assert record(tmp_path, *states, "D1", seconds="2") == 0
+    assert record(tmp_path, *states, "D1", seconds="1.4") == 0
     assert said_of(tmp_path, "D1") == ""
+
+
+def test_another_camera_than_the_calibrations_is_noticed(tmp_path):
+    frame = {"frame_id": "base", "unit": "mm", "robot_from_camera": POSE, "camera_frame_id": "lens"}
+    (tmp_path / "f.json").write_text(json.dumps(frame))
+    for name, words in (("lens", ""), ("other", "'other', and the calibration is for 'lens'")):
+        folder, beside = tmp_path / name, ("--frame", str(tmp_path / "f.json"))
+        assert record(folder, *beside, "--only", "D1", source=f"small?frame_id={name}") == 0
+        assert words in said_of(folder, "D1")
+        assert bool(words) == bool(said_of(folder, "D1"))
+        for moment in read_recorded(folder).moments("D1"):
+            np.testing.assert_allclose(moment.fixed_from_camera, POSE, atol=1e-9)
 
 
 def test_poses_of_a_moving_camera_come_back(tmp_path):
@@ -273,7 +286,7 @@ def test_other_folders_are_left_alone(tmp_path, capsys):
 
 
 def test_damage_is_said(tmp_path):
-    assert record(tmp_path) == 0
+    assert record(tmp_path, source="small?grey=99", seconds="0.1") == 0
     whole = (tmp_path / WHOLE).read_bytes()
     (tmp_path / WHOLE).write_bytes(whole.replace(b'"kind": "experiment"', b'"kind": "experimenT"'))
     with pytest.raises(InputError, match="checksum"):
@@ -281,3 +294,14 @@ def test_damage_is_said(tmp_path):
     (tmp_path / WHOLE).write_bytes(whole[:-9])
     with pytest.raises(InputError, match="cannot be read"):
         read_recorded(tmp_path)
+    rng, read = np.random.default_rng(0), 0
+    for at in (
+        rng.integers(len(whole), size=8).tolist() + (len(whole) - 2 ** np.arange(12)).tolist()
+    ):
+        changed = bytearray(whole)
+        changed[at] ^= 1 << rng.integers(8)
+        (tmp_path / WHOLE).write_bytes(changed)
+        with suppress(InputError):  # and nothing else
+            recorded = read_recorded(tmp_path)
+            read += sum(len(list(recorded.moments(state))) for state in recorded.states)
+    assert read > 17

@@ -94,8 +94,8 @@ def test_a_second_ct_becomes_the_truth_of_what_the_camera_saw(made, tmp_path, ca
     near = (np.linalg.norm(scene.cloud.points_mm[:, None] - pins_mm, axis=2) < 45).any(1)
     assert near.all()  # no point of base, plate or beads
     assert abs(scene.meta["surface"]["median_mm"]) < 0.6
-    assert set(scene.meta["inputs"]) == {"ct", "recording", "kit", "targets"}
-    assert "registration: 6 beads, FRE" in capsys.readouterr().out
+    assert set(scene.meta["inputs"]) == {"ct", "recording", "kit"}
+    assert "camera_from_ct: 6 beads, FRE" in capsys.readouterr().out
 
 
 def test_a_camera_that_moved_between_states_is_noticed(made, tmp_path, capsys):
@@ -145,10 +145,16 @@ def test_another_phantom_and_a_plate_taken_for_organ_are_refused(made):
         segmented(made, slab)
 
 
+def test_a_plate_that_the_ct_does_not_show_is_noticed(made):
+    alone = bench.a_scan(bench.State(np.ones(3), press=False), CT_FROM_BASE, 2.0)
+    with pytest.raises(InputError, match=r"the kit has the part D1-plate .* the CT has air"):
+        segmented(made, alone)
+
+
 def test_a_state_that_the_ct_does_not_show_is_noticed(made):
     root, case, _, view = made
     kit = read_kit(root / "kit")
-    parts = parts_in(kit, root / "kit", "D1")
+    parts = [*parts_in(kit, root / "kit", "D1").values()]
     beads = transform_points(POSE, bench.BEADS_MM), bench.BEAD_MM
     others = scenes.kit_pixels(view, POSE, parts, beads)
     cloud = scenes.organ_cloud(view, others)

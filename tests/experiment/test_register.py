@@ -103,7 +103,7 @@ def both(error_mm, seed, kit=None, moved=None):
         at = transform_points(pose, BEADS_MM) + rng.normal(0, error_mm / np.sqrt(6), (6, 3))
         if moved is not None and device is beads.CAMERA:
             at[moved[0]] += moved[1]
-        found.append(beads.NamedBeads(device, at, pose, 0.0))
+        found.append(beads.NamedBeads(device, at, pose))
     return beads.register(kit or a_kit(), *found), poses[1] @ np.linalg.inv(poses[0]), poses[0]
 
 

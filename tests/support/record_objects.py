@@ -19,7 +19,7 @@ SPEC = "record_objects:SmallBenchConfig"
 class SmallBenchConfig(SourceConfig, frozen=True, kw_only=True, tag="small"):
     """``organ``: wobbles | sinks | still; ``lift_mm``: of the camera; ``grey``: of its picture,
     0: none; ``noise_mm``; ``frames`` until it ends, ``lost_at`` and ``kill_at``: frames at which it
-    breaks, or the process is killed; ``cloud``: it gives clouds."""
+    breaks, or the process is killed; ``cloud``: it gives clouds; ``frame_id`` of the camera."""
 
     target: ClassVar[str] = "organ"
 
@@ -32,6 +32,7 @@ class SmallBenchConfig(SourceConfig, frozen=True, kw_only=True, tag="small"):
     lost_at: int = -1
     kill_at: int = -1
     cloud: bool = False
+    frame_id: str = ""
     taken: ClassVar[list[Observation]] = []
     number: ClassVar[list[int]] = [0]
 
@@ -66,7 +67,8 @@ class SmallBench:
         if config.grey:
             picture = np.full((CAMERA.height, CAMERA.width, 3), config.grey, np.uint8)
             picture[0] = config.number[0] % 200
-        seen = Observation(frame, stamp_ns + 1000, picture=picture)
+        name = config.frame_id or None
+        seen = Observation(frame, stamp_ns + 1000, frame_id=name, picture=picture)
         config.taken.append(seen)
         return seen
 

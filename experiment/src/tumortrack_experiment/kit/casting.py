@@ -178,7 +178,10 @@ def cut_halves(
     pegged = Manifold.batch_boolean([lower, *(_key(place, 0.0) for place in keys)], OpType.Add)
     drills.append(solid_of(layout.mesh, "the surface to be cast"))
     upper_half, lower_half = (
-        Manifold.batch_boolean([solid, *cut], OpType.Subtract).as_original().simplify(_SMOOTH_MM)
+        max(  # crumbs that hang on nothing are left out
+            Manifold.batch_boolean([solid, *cut], OpType.Subtract).decompose(),
+            key=lambda piece: piece.volume(),
+        ).simplify(_SMOOTH_MM)
         for solid, cut in ((upper, [*drills, *holes]), (pegged, drills))
     )
     channels = Manifold.batch_boolean([*drills[:-1], *holes], OpType.Add)

@@ -8,12 +8,14 @@ from typing import TYPE_CHECKING
 
 from tyro.conf import Positional
 
-from tumortrack.cli.console import say
+from tumortrack.cli.console import say, say_notes
 from tumortrack.core import store
 from tumortrack.core.errors import InputError, TumortrackError
 
 if TYPE_CHECKING:
     from tumortrack_experiment.kit.design import Design
+
+_WORSE = ("good", "look", "FAILS")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,7 +44,7 @@ class PhantomKit:
     beads: int = 7
     wall: float = 5.0
     pva: float = 10.0
-    cycles: int = 2
+    cycles: int = 1
     overwrite: bool = False
 
     def run(self) -> None:
@@ -55,7 +57,9 @@ class PhantomKit:
         store.check_place(self.out, "kit", self.overwrite)
         if not all(30 <= side <= 2000 for side in self.bed):
             raise InputError(f"--bed {self.bed}: each side must be 30 to 2000 mm.")
-        base = BaseConfig(states=self.states, bead_mm=self.bead_mm, beads=self.beads)
+        base = BaseConfig(
+            states=self.states, bead_mm=self.bead_mm, beads=self.beads, bed_mm=self.bed[:2]
+        )
         mold = MoldConfig(wall_mm=self.wall, bed_mm=self.bed)
         mix = Mix(pva_percent=self.pva, cycles=self.cycles)
         case = api.load_case(self.case)
@@ -73,12 +77,13 @@ class PhantomKit:
     def _report(self, made: Design) -> None:
         for where in dict.fromkeys(check.where for check in made.checks):
             rows = [check for check in made.checks if check.where == where]
-            verdict = max((row.verdict for row in rows), key=["good", "look", "FAILS"].index)
-            numbers = (f"{row.what} {row.value:g} {row.unit}".strip() for row in rows)
-            say(f"{verdict:5} {where}: {', '.join(numbers)}")
-            for row in (row for row in rows if not row.good):
-                say(f"      {row.what}: {row.value:g} {row.unit}; wanted: {row.limits}")
+            said = ", ".join(f"{row.what} {row.value:g} {row.unit}".strip() for row in rows)
+            say(f"{max((row.verdict for row in rows), key=_WORSE.index):5} {where}: {said}")
         say(f"{len(made.parts)} parts, written to {self.out}; print {self.out / 'sheet.html'}.")
-        if failed := [check for check in made.checks if check.needed and not check.good]:
-            named = "; ".join(f"{check.where}: {check.what}" for check in failed)
-            raise TumortrackError(f"this kit cannot be used as it is: {named}.")
+        texts: dict[str, list[str]] = {verdict: [] for verdict in _WORSE}
+        for row in made.checks:
+            number = f"{row.what} {row.value:g} {row.unit}".strip()
+            texts[row.verdict].append(f"{row.where}: {number}, {row.limits} is wanted")
+        say_notes(texts["look"])
+        if texts["FAILS"]:
+            raise TumortrackError(f"this kit cannot be used as it is. {'; '.join(texts['FAILS'])}.")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -16,7 +15,7 @@ from tumortrack.core.geometry import Direction
 from tumortrack.core.mesh_files import write_mesh
 from tumortrack.core.types import Anatomy
 from tumortrack_experiment.kit.base import Base, BaseConfig, base_design
-from tumortrack_experiment.kit.checks import Check, check_base, check_mold
+from tumortrack_experiment.kit.checks import Check, check_base, check_mold, check_print
 from tumortrack_experiment.kit.mold import MoldConfig, OrganMold, organ_mold, tumor_molds
 from tumortrack_experiment.kit.recipe import Mix
 from tumortrack_experiment.kit.split import fits, laid_mesh, split_to_bed
@@ -48,21 +47,22 @@ def design_kit(
     printer's bed in one piece, or what the parts' functions say."""
     bed = mold_config.bed_mm
     base = base_design(anatomy, up_lps, base_config)
-    plate = base.parts[0]
+    plate, *standing = base.parts
     if not fits(plate, bed):
         size = " x ".join(f"{side:.0f}" for side in np.ptp(plate.mesh.box_mm, axis=0))
         raise InputError(
             f"--bed {' '.join(f'{side:g}' for side in bed)}: the base is {size} mm and must be "
             "printed in one piece, or its beads' places are not known. Take a larger printer, "
-            "or smaller or fewer beads."
+            "or fewer or smaller beads."
         )
     organ = organ_mold(anatomy, mold_config)
     molds = (organ, *tumor_molds(anatomy, mold_config, organ.pins))
     names = ("organ", *(f"tumor {n}" for n in range(1, len(molds))))
-    standing = [piece for part in base.parts[1:] for piece in split_to_bed(part, bed)]
-    parts = (*(part for mold in molds for part in mold.parts), coupon_mold(), plate, *standing)
+    others = [p for part in (*standing, coupon_mold()) for p in split_to_bed(part, bed)]
     checks = [row for n, m in zip(names, molds, strict=True) for row in check_mold(n, m)]
-    checks += check_base(base, base_config, bed)
+    checks += check_base(base, base_config)
+    checks += [row for part in (plate, *others) for row in check_print(part, bed)]
+    parts = (*(part for mold in molds for part in mold.parts), plate, *others)
     return Design(anatomy, base, base_config, molds, mix, parts, tuple(checks))
 
 
@@ -75,7 +75,7 @@ def write_kit(design: Design, folder: Path, case_sha256: str) -> None:
     (folder / "kit.3mf").write_bytes(_three_mf(design.parts))
     kit = kit_of(design, case_sha256)
     store.write_json(folder / KIT_FILE, to_builtins(kit))
-    store.write_json(folder / "checks.json", {"checks": [_row(check) for check in design.checks]})
+    store.write_json(folder / "checks.json", {"checks": list(map(to_builtins, design.checks))})
     write_sheet(design, kit, folder / "sheet.html")
     content = {
         "case_sha256": case_sha256, "states": list(kit.states), "parts": len(kit.parts),
@@ -88,6 +88,15 @@ def write_kit(design: Design, folder: Path, case_sha256: str) -> None:
 def kit_of(design: Design, case_sha256: str) -> Kit:
     """What every later command knows a kit by."""
     beads = enumerate(design.base.beads_mm.round(4).tolist(), 1)
+    parts = [
+        KitPart(
+            name=part.name, file=f"{part.name}.stl", purpose=part.purpose, state=part.state,
+            volume_ml=round(part.mesh.volume_mm3 / 1000, 3),
+            base_from_part=_rows(np.linalg.inv(part.print_from_frame))
+            if part.frame == "base" else None,
+        )
+        for part in design.parts
+    ]  # fmt: skip
     return Kit(
         case_sha256=case_sha256,
         bead_diameter_mm=design.base_config.bead_mm,
@@ -96,25 +105,13 @@ def kit_of(design: Design, case_sha256: str) -> Kit:
         organ_ml=design.molds[0].cast_ml,
         tumors_ml=tuple(mold.cast_ml for mold in design.molds[1:]),
         states=("rest", *design.base_config.states),
-        parts=tuple(_known(part) for part in design.parts),
+        parts=tuple(parts),
     )
-
-
-def _known(part: PrintedPart) -> KitPart:
-    where = _rows(np.linalg.inv(part.print_from_frame)) if part.frame == "base" else None
-    return KitPart(
-        name=part.name, file=f"{part.name}.stl", purpose=part.purpose, state=part.state,
-        volume_ml=round(part.mesh.volume_mm3 / 1000, 3), base_from_part=where,
-    )  # fmt: skip
 
 
 def _rows(b_from_a: np.ndarray) -> Rows:
     a, b, c, d = (tuple(row) for row in b_from_a.tolist())
     return a, b, c, d
-
-
-def _row(check: Check) -> dict[str, Any]:
-    return {**to_builtins(check), "verdict": check.verdict}
 
 
 def _three_mf(parts: tuple[PrintedPart, ...]) -> bytes:

@@ -2,28 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
-from tumortrack.core.geometry import rotation_onto
 from tumortrack.core.types import Mesh
 from tumortrack.imaging.meshes import solid_of
 
-_SIDES = 48  # of a circle: a bead's seat is then out of round by 0.006 mm
+_SIDES = 48  # of a circle: a cone is then out of round by 0.006 mm where a bead touches it
+Corner = Sequence[float] | np.ndarray
 
 
-def box(low: tuple[float, float, float], high: tuple[float, float, float]) -> Any:
+def box(low: Corner, high: Corner) -> Any:
     """From its lower to its upper corner."""
     from manifold3d import Manifold
 
     return Manifold.cube(np.subtract(high, low)).translate(low)
 
 
-def cone(
-    foot: tuple[float, float, float], height: float, radius: float, top: float | None = None
-) -> Any:
+def cone(foot: Corner, height: float, radius: float, top: float | None = None) -> Any:
     """Upright, from its foot's middle; ``top``: its radius there (a cylinder without)."""
     from manifold3d import Manifold
 
@@ -31,16 +30,10 @@ def cone(
     return Manifold.cylinder(height, radius, above, _SIDES).translate(foot)
 
 
-def ball(center: tuple[float, float, float], radius: float) -> Any:
+def ball(center: Corner, radius: float) -> Any:
     from manifold3d import Manifold
 
     return Manifold.sphere(radius, _SIDES).translate(center)
-
-
-def rod(start: np.ndarray, end: np.ndarray, radius: float) -> Any:
-    """A cylinder between two points."""
-    way = np.column_stack([rotation_onto(np.array([0.0, 0.0, 1.0]), end - start), start])
-    return cone((0, 0, 0), float(np.linalg.norm(end - start)), radius).transform(way)
 
 
 def rounded_plate(half: tuple[float, float], low: float, high: float, radius: float) -> Any:
@@ -53,14 +46,14 @@ def rounded_plate(half: tuple[float, float], low: float, high: float, radius: fl
     )
 
 
-def written(text: str, at: tuple[float, float, float], size: float, height: float) -> Any:
-    """A line of text in the plane z, about its middle."""
+def written(text: str, at: Corner, size: float, height: float) -> Any:
+    """A line of text, upright from a plane, about its middle."""
     from manifold3d import CrossSection, FillRule
     from matplotlib.textpath import TextPath
 
     path = TextPath((0, 0), text, size=size)
     middle = path.get_extents().get_points().mean(0)
-    outlines = [ring[:-1] - middle for ring in path.to_polygons()]
+    outlines = [np.asarray(ring)[:-1] - middle for ring in path.to_polygons()]
     return CrossSection(outlines, FillRule.EvenOdd).extrude(height).translate(at)
 
 
@@ -71,19 +64,13 @@ def height_field(
     floor: float,
 ) -> Any:
     """What lies between a floor and heights over a grid."""
-    rows, columns = z.shape
-    across, down = np.meshgrid(x, y)
-    top = np.stack([across, down, z], -1).reshape(-1, 3)
-    n = rows * columns
-    at = np.arange(n).reshape(rows, columns)
+    top = np.stack([*np.meshgrid(x, y), z], -1).reshape(-1, 3)
+    n, at = len(top), np.arange(len(top)).reshape(z.shape)
     a, b, c, d = (side.ravel() for side in (at[:-1, :-1], at[:-1, 1:], at[1:, 1:], at[1:, :-1]))
     cover = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
     rim = np.concatenate([at[0], at[1:, -1], at[-1, -2::-1], at[-2:0:-1, 0]])
-    following = np.roll(rim, -1)
-    walls = [
-        np.stack([rim, rim + n, following], 1),
-        np.stack([following, rim + n, following + n], 1),
-    ]
+    ahead = np.roll(rim, -1)
+    walls = [np.stack([rim, rim + n, ahead], 1), np.stack([ahead, rim + n, ahead + n], 1)]
     vertices = np.concatenate([top, top * [1, 1, 0] + [0, 0, floor]])
     faces = np.concatenate([cover, cover[:, ::-1] + n, *walls]).astype(np.int32)
     return solid_of(Mesh(vertices, faces), "the cradle")

@@ -30,8 +30,7 @@ _TILTS_DEG = (2, 25)  # what lies farther over slides
 _GAP_MM = 10.0  # between organ and legs: at D3 a kidney's sides come out by some 5 mm
 _LEG_MM, _BEAM_MM = 5.0, 8.0
 _FIT_MM = 0.25  # on each side of what is put into something
-SOCKET_MM = 8.0  # high
-_SOCKET_WALL_MM = 4.0
+_SOCKET_WALL_MM, _HIGH_MM = 4.0, 8.0
 
 
 @dataclass(frozen=True)
@@ -53,14 +52,13 @@ class Sockets:
         sides = ((low - _LEG_MM, low), (high, high + _LEG_MM))
         return [(-x, x, start - grown, end + grown) for start, end in sides]
 
-    def solid(self) -> Any:
-        """The sockets on the base: walls round each leg, open above."""
-        out = None
+    def cut_into(self, base: Any) -> Any:
+        """A base with walls round each leg, and the room for it."""
         for leg in range(2):
-            outer, inner = self.legs(_SOCKET_WALL_MM)[leg], self.legs(_FIT_MM)[leg]
-            wall = _block(outer, -1, SOCKET_MM) - _block(inner, 0, SOCKET_MM + 1)
-            out = wall if out is None else out + wall
-        return out
+            base += _block(self.legs(_SOCKET_WALL_MM)[leg], -1, _HIGH_MM)
+        for leg in range(2):  # the cradle, too, makes room
+            base -= _block(self.legs(_FIT_MM)[leg], 0, 200)
+        return base
 
 
 def tilt_of(state: str) -> int | None:
@@ -126,7 +124,7 @@ def _poke(anatomy: Anatomy, sockets: Sockets) -> list[PrintedPart]:
     beam += arm.hull()
     for leg in sockets.legs():
         head = (-7, 7, *leg[2:])
-        beam += (_block(leg, 0, SOCKET_MM + 4) + _block(head, under, under + 1)).hull()
+        beam += (_block(leg, 0, _HIGH_MM + 4) + _block(head, under, under + 1)).hull()
     beam -= cone((x, y, under - 1), _BEAM_MM + 2, radius + 0.2)
     tip, top = z - POKE_MM, under + _BEAM_MM
     rod = ball((x, y, tip + radius), radius) + cone((x, y, tip + radius), top - tip, radius)

@@ -58,7 +58,7 @@ class RecordingFolder:
         same = {"kind": _KIND, "states": list(states), "frame_id": frame_id, "files": hashes}
         self.about: dict[str, Any] = same | {"tumortrack": tumortrack.__version__, "done": {}}
         if (path / ABOUT).is_file():
-            self.about = read_json(path / ABOUT)
+            self.about |= read_json(path / ABOUT)
             for key, new in same.items():
                 if (old := self.about.get(key)) != new:
                     raise InputError(

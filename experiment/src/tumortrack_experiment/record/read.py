@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import UInt8
 
-from tumortrack.core.errors import InputError
+from tumortrack.core.errors import InputError, TumortrackError
 from tumortrack.core.geometry import Affine
 from tumortrack.core.types import DepthFrame
 
@@ -74,14 +74,14 @@ class Recorded:
         beside: dict[str, Any] = {}
         for topic, _, message in messages_in(*self.takes[state]):
             beside[topic] = message
-            if topic == IMAGE:  # it comes last of what belongs to it
+            if topic == IMAGE and INFO in beside:  # it comes last of what belongs to it
                 stamp_ns = stamp_of(message.header)
                 picture, tf = beside.get(PICTURE), beside.get(TF)
                 same = picture is not None and stamp_of(picture.header) == stamp_ns
                 yield Moment(
                     sensors.depth_of(message, beside[INFO]),
-                    sensors.picture_of(picture) if same else None,
-                    None if tf is None else pose_of(tf.transforms[0]),
+                    _picture_of(picture) if same else None,
+                    pose_of(tf.transforms[0]) if tf is not None and tf.transforms else None,
                 )
 
 
@@ -91,14 +91,14 @@ def read_recorded(folder: Path) -> Recorded:
     from tumortrack_experiment.record.attachments import attachments_of
 
     files = [folder / WHOLE] if (folder / WHOLE).is_file() else sorted(folder.glob("*.mcap"))
-    if not files:
-        raise InputError(f"{folder} holds no recording with a finished state.")
     takes: dict[str, _Take] = {}
     for file in files:
         began = [(at_ns, message.data) for topic, at_ns, message in messages_in(file, of=STATE)]
         ends_ns = [at_ns for at_ns, _ in began[1:]]
         for (at_ns, name), end_ns in zip(began, [*ends_ns, 2**63 - 1], strict=True):
             takes[name] = _Take(file, at_ns, end_ns)
+    if not takes:
+        raise InputError(f"{folder} holds no recording with a finished state.")
     return Recorded(folder, takes, attachments_of(files[0]))
 
 
@@ -117,10 +117,19 @@ def messages_in(
 
 @contextmanager
 def _opened(file: Path) -> Iterator[Any]:
-    from rosbags.rosbag2 import Reader, ReaderError
+    from rosbags.rosbag2 import Reader
 
     try:
         with Reader(file) as reader:
             yield reader
-    except (ReaderError, OSError) as error:
+    except TumortrackError:
+        raise
+    except Exception as error:  # rosbags raises anything on a damaged file
         raise InputError(f"{file} cannot be read: {error}.") from error
+
+
+def _picture_of(image: Any) -> UInt8[np.ndarray, "h w *rgb"]:
+    shape = (image.height, image.width, 3)[: 3 if image.encoding == "rgb8" else 2]
+    if len(image.data) != np.prod(shape, dtype=np.int64):
+        raise InputError("a picture of the recording is damaged: its size is another.")
+    return np.asarray(image.data, np.uint8).reshape(shape)

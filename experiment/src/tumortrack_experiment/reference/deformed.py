@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,10 +17,11 @@ from tumortrack.imaging.grid import grown_box, moved_origin, voxel_ml
 from tumortrack.imaging.raster import voxelise
 from tumortrack.imaging.segment import segment_ct
 from tumortrack.imaging.surface import surfaces
-from tumortrack_experiment.kit_file import Kit, KitPart
+from tumortrack_experiment.kit_file import Kit
 from tumortrack_experiment.register.in_ct import Ball
 
 AIR_HU = -1000.0
+_LEAST_PRINT_HU = -900.0  # of a print that is mostly hollow
 _ROUND_MM = 35.0  # that a pressed organ may come out of its box at rest, or beside the beads
 _BEAD_RIM_MM = 1.5
 _ORGAN_PERCENT = 5.0  # hydrogel keeps its volume; a second scan at 1 mm finds it to 1 %
@@ -31,28 +31,17 @@ _USUAL_SHIFT_MM = 15.0  # of a tumor by the paper's plates
 _USUAL_CHANGE = 0.1  # of its volume
 
 
-@dataclass(frozen=True, eq=False)
-class Deformed:
-    """``anatomy``: LPS of the second CT, tumors numbered as the case's; ``report``: plain JSON."""
-
-    anatomy: Anatomy
-    report: dict[str, Any]
-
-
-def parts_in(kit: Kit, folder: Path, state: str) -> list[Mesh]:
-    """The kit's parts that stand on the base in a state, base frame. Raises InputError: a part's
-    file is missing or damaged."""
+def parts_in(kit: Kit, folder: Path, state: str) -> dict[str, Mesh]:
+    """The kit's parts that stand on the base in a state by name, base frame. Raises InputError: a
+    part's file is missing or damaged."""
     folder = folder if folder.is_dir() else folder.parent
-
-    def placed(part: KitPart) -> Mesh:
-        mesh = read_mesh(folder / part.file)
-        return mesh.moved(transform_points(np.array(part.base_from_part), mesh.vertices_mm))
-
-    return [
-        placed(part)
-        for part in kit.parts
-        if part.base_from_part is not None and part.state in ("", state)
-    ]
+    found = {}
+    for part in kit.parts:
+        if part.base_from_part is not None and part.state in ("", state):
+            mesh = read_mesh(folder / part.file)
+            base_from_part = np.array(part.base_from_part)
+            found[part.name] = mesh.moved(transform_points(base_from_part, mesh.vertices_mm))
+    return found
 
 
 def segment_deformed(
@@ -60,11 +49,12 @@ def segment_deformed(
     ct_from_base: Float64[np.ndarray, "4 4"],
     kit: Kit,
     case: Case,
-    others: tuple[list[Mesh], list[Ball]],
+    others: tuple[dict[str, Mesh], list[Ball]],
     windows: tuple[tuple[float, float], tuple[float, float]],
-) -> Deformed:
+) -> tuple[Anatomy, dict[str, Any]]:
     """Take away what stands on the base and what lies under it, segment the rest by HU windows, and
-    compare. ``others``: the parts that stand there, base frame, and the bright balls of the CT.
+    compare: surfaces (LPS of this CT), tumors numbered as the case's, and plain JSON. ``others``:
+    the parts that stand there, base frame, and the bright balls of the CT.
 
     Raises:
         InputError: no organ, or organ and tumors are not those that the kit's molds cast.
@@ -96,7 +86,7 @@ def segment_deformed(
         ],
         "notes": notes,
     }
-    return Deformed(Anatomy((anatomy.organ, *tumors)), report)
+    return Anatomy((anatomy.organ, *tumors)), report
 
 
 def _cropped(volume: Volume, ct_from_base: np.ndarray, kit: Kit, rest_mm: np.ndarray) -> Volume:
@@ -118,19 +108,26 @@ def _without_base(
     volume: Volume,
     ct_from_base: np.ndarray,
     kit: Kit,
-    others: tuple[list[Mesh], list[Ball]],
+    others: tuple[dict[str, Mesh], list[Ball]],
 ) -> Volume:
     """The CT with air for all that is under the organ and for the kit's parts, whose rims the
-    segmentation drops as sheets; balls inside something are filled with what is round them."""
+    segmentation drops as sheets; balls inside something are filled with what is round them.
+    Raises InputError: a part is not there."""
     hu, affine = volume.hu.copy(), volume.lps_from_index
     parts, balls = others
     base_from_index = np.linalg.inv(ct_from_base) @ affine
     i, j, k = np.ogrid[tuple(slice(0, n) for n in hu.shape)]
     x, y, z, shift = base_from_index[2]
     hu[x * i + y * j + z * k + shift < 0] = AIR_HU
-    for part in parts:
+    for name, part in parts.items():
         there = part.moved(transform_points(ct_from_base, part.vertices_mm))
-        hu[voxelise(there, affine, hu.shape)] = AIR_HU
+        inside = voxelise(there, affine, hu.shape)
+        if inside.any() and np.median(volume.hu[inside]) < _LEAST_PRINT_HU:
+            raise InputError(
+                f"where the kit has the part {name} in this state, the CT has air. It shows "
+                "another state (--state), or the part stands elsewhere."
+            )
+        hu[inside] = AIR_HU
     steps = spacing_mm(affine)
     reach_mm = kit.bead_diameter_mm / 2 + _BEAD_RIM_MM + float(steps.max()) / 2
     for ball in balls:

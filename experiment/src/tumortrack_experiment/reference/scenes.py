@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Bool, Float64
+from scipy import ndimage
+from scipy.optimize import linear_sum_assignment
+from scipy.spatial.distance import cdist
 
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import Points, transform_points
@@ -23,7 +26,7 @@ _RANGE = CloudConfig(near_mm=60.0, far_mm=450.0)
 _EDGE_PX = 4  # of the organ's outline: depth flies there
 _LEAST_PIXELS = 300
 _RIM_PX, _CRUMB = 2, 0.02  # of the pixels that are not the kit's: less is none of the organ
-_OFF_MM = 4.0  # 95 % of the surface seen; another state's is off by centimetres
+_OFF_MM = 1.5  # 95 % of the surface seen: of the right state 0.7, of its neighbours 2.0 and more
 _BESIDE = 0.2
 _FAR_MM = 25.0  # something else before or behind the organ
 _LARGEST_STRETCH_MM = 12.0  # of a bead in the organ beside the others' rigid motion
@@ -55,8 +58,6 @@ def organ_cloud(frame: DepthFrame, others: Bool[np.ndarray, "h w"]) -> SensorClo
     """All points that are not the kit's, but for crumbs and thin rims: a stand may part them, and
     an exophytic tumor stands out, which a search for the organ's one piece would lose. Raises
     NoEstimate: none are left."""
-    from scipy import ndimage
-
     left = ndimage.binary_opening(np.isfinite(frame.depth_mm) & ~others, iterations=_RIM_PX)
     pieces, _ = ndimage.label(left)
     sizes = np.bincount(pieces.ravel())
@@ -75,8 +76,6 @@ def check_surface(
     Raises:
         InputError: little of the organ is seen, or what is seen has another shape or place.
     """
-    from scipy import ndimage
-
     true_mm = render_depth(organ.vertices_mm, organ.faces, frame.intrinsics).depth_mm
     inner = ndimage.binary_erosion(np.isfinite(true_mm), iterations=_EDGE_PX)
     off_mm = (frame.depth_mm - true_mm)[inner & ~others]
@@ -100,7 +99,7 @@ def check_surface(
 
 def match_targets(
     rest_ct: Points, found_mm: Points, expected_mm: Points, case: Case
-) -> tuple[Targets, list[str]]:
+) -> tuple[Targets, str]:
     """Beads inside the organ, known at rest (CT of the case), to those found in the second CT;
     ``expected_mm``: where they would be had the organ not been deformed. All in one frame but the
     first.
@@ -108,9 +107,6 @@ def match_targets(
     Raises:
         InputError: other numbers of them, or a bead that could be two.
     """
-    from scipy.optimize import linear_sum_assignment
-    from scipy.spatial.distance import cdist
-
     if len(rest_ct) != len(found_mm):
         raise InputError(
             f"{len(rest_ct)} targets are known at rest, and {len(found_mm)} bright balls lie in "
@@ -130,4 +126,4 @@ def match_targets(
         )
     labels = np.maximum(labels_of(case.anatomy, rest_ct), 1).astype(np.uint8)
     note = f"{len(rest_ct)} targets, up to {stretch_mm.max():.1f} mm beside a rigid motion"
-    return Targets(rest_ct, found_mm[columns], labels), [note]
+    return Targets(rest_ct, found_mm[columns], labels), note

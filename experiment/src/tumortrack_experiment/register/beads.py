@@ -14,6 +14,9 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Float64
+from scipy.spatial.distance import cdist
+from scipy.spatial.transform import Rotation
+from scipy.stats import t
 
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import Affine, Points, rigid, transform_points
@@ -49,28 +52,21 @@ ROBOT = Device("robot", 0.4, 1.5)  # of a tip that is brought to a bead by hand;
 class NamedBeads:
     """A kit's beads where a device found them: ``points_mm``, its frame, a row for each of the kit,
     NaN where it has none; ``notes``: which are missing or moved. ``device_from_base``: the kit's
-    drawing laid on them, ``rms_mm`` what is left."""
+    drawing laid on them."""
 
     device: Device
     points_mm: Float64[np.ndarray, "n 3"]
     device_from_base: Float64[np.ndarray, "4 4"]
-    rms_mm: float
     notes: tuple[str, ...] = ()
 
     @property
     def found(self) -> Bool[np.ndarray, " n"]:
         return np.isfinite(self.points_mm[:, 0])
 
-    def places_mm(self, kit: Kit) -> Float64[np.ndarray, "n 3"]:
-        """Where the drawing has them all."""
-        return transform_points(self.device_from_base, kit.beads_mm)
-
 
 def fit_rigid(from_mm: Points, to_mm: Points) -> tuple[Affine, Float[np.ndarray, " n"]]:
     """The rigid transform that lays points (n, 3) on others by least squares, and the distances
     that are left."""
-    from scipy.spatial.transform import Rotation
-
     middles = from_mm.mean(0), to_mm.mean(0)
     turn = Rotation.align_vectors(to_mm - middles[1], from_mm - middles[0])[0].as_matrix()
     to_from = rigid(turn, middles[1] - turn @ middles[0])
@@ -91,7 +87,7 @@ def name_beads(kit: Kit, points_mm: Points, device: Device, above_mm: float = 0.
     drawn_mm = kit.beads_mm + [0, 0, above_mm]
     best, other = _arrangements(drawn_mm, points_mm, device.tolerance_mm)
     mirrored, _ = _arrangements(drawn_mm * [1, 1, -1], points_mm, device.tolerance_mm)
-    if mirrored.count >= LEAST_BEADS and mirrored.beats(best):
+    if mirrored.count >= LEAST_BEADS and mirrored.rank < (-best.count, best.rms_mm / _AS_GOOD):
         raise InputError(
             f"{what}; {mirrored.count} of them are the kit's mirror image. Left and right are "
             "exchanged in these data, or it is another kit."
@@ -114,8 +110,7 @@ def name_beads(kit: Kit, points_mm: Points, device: Device, above_mm: float = 0.
     named = np.full((len(names), 3), np.nan)
     there = best.which >= 0
     named[there] = points_mm[best.which[there]] - above_mm * best.device_from_base[:3, 2]
-    _check_spread(named[there], device.name)
-    return NamedBeads(device, named, best.device_from_base, best.rms_mm, tuple(notes))
+    return NamedBeads(device, named, best.device_from_base, tuple(notes))
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,10 +125,10 @@ class _Arrangement:
     def count(self) -> int:
         return int((self.which >= 0).sum())
 
-    def beats(self, other: _Arrangement) -> bool:
-        if self.count != other.count:
-            return self.count > other.count
-        return _AS_GOOD * self.rms_mm < other.rms_mm
+    @property
+    def rank(self) -> tuple[int, float]:
+        """The least is the best."""
+        return -self.count, self.rms_mm
 
 
 def _arrangements(
@@ -144,9 +139,8 @@ def _arrangements(
     found: dict[bytes, _Arrangement] = {}
     for triple, which in _triples(beads_mm, points_mm, 2 * tolerance_mm):
         one = _grown(beads_mm, points_mm, (triple, which), tolerance_mm)
-        if one is not None:
-            found[one.which.tobytes()] = one
-    ranked = sorted(found.values(), key=lambda one: (-one.count, one.rms_mm))
+        found |= {one.which.tobytes(): one} if one is not None else {}
+    ranked = sorted(found.values(), key=lambda one: one.rank)
     best = ranked[0] if ranked else none
 
     def differs(one: _Arrangement) -> bool:
@@ -160,8 +154,6 @@ def _triples(
     beads_mm: np.ndarray, points_mm: np.ndarray, tolerance_mm: float
 ) -> Iterator[tuple[list[int], np.ndarray]]:
     """Three beads and three points with the same distances between them."""
-    from scipy.spatial.distance import cdist
-
     bead_mm, point_mm = cdist(beads_mm, beads_mm), cdist(points_mm, points_mm)
     for i, j, k in combinations(range(len(beads_mm)), 3):
         like = {n: np.abs(point_mm - bead_mm[n]) < tolerance_mm for n in ((i, j), (i, k), (j, k))}
@@ -178,25 +170,21 @@ def _grown(
     tolerance_mm: float,
 ) -> _Arrangement | None:
     """Three pairs and whatever else then lies in its place; None: they were no arrangement."""
-    from scipy.spatial.distance import cdist
-
     triple, points = start
-    if len(set(points.tolist())) < 3 or _across_mm(beads_mm[triple]) < _LEAST_SPREAD_MM:
-        return None
     which = np.full(len(beads_mm), -1)
     which[triple] = points
     for reach in (2.0, 1.0, 1.0):  # three alone turn by more than all of them do
         there = which >= 0
-        device_from_base, _ = fit_rigid(beads_mm[there], points_mm[which[there]])
+        if there.sum() < 3 or _across_mm(beads_mm[there]) < _LEAST_SPREAD_MM:
+            return None
+        device_from_base, left_mm = fit_rigid(beads_mm[there], points_mm[which[there]])
         away_mm = cdist(transform_points(device_from_base, beads_mm), points_mm)
         nearest = away_mm.argmin(1)
         alone = away_mm.argmin(0)[nearest] == np.arange(len(beads_mm))
         near = away_mm[np.arange(len(beads_mm)), nearest] < reach * tolerance_mm
         which = np.where(alone & near, nearest, -1)
-        if (which >= 0).sum() < 3:
-            return None
     there = which >= 0
-    if _across_mm(beads_mm[there]) < _LEAST_SPREAD_MM:
+    if there.sum() < 3 or _across_mm(beads_mm[there]) < _LEAST_SPREAD_MM:
         return None
     device_from_base, left_mm = fit_rigid(beads_mm[there], points_mm[which[there]])
     return _Arrangement(which, device_from_base, float(np.sqrt((left_mm**2).mean())))
@@ -225,14 +213,6 @@ def _across_mm(points_mm: np.ndarray) -> float:
     return float(np.sqrt((spreads[1:] ** 2).sum() / len(points_mm)))
 
 
-def _check_spread(points_mm: np.ndarray, where: str) -> None:
-    if (across_mm := _across_mm(points_mm)) < _LEAST_SPREAD_MM:
-        raise InputError(
-            f"{where}: the {len(points_mm)} beads lie on a line, but for {across_mm:.1f} mm, about "
-            "which a turn stays unknown. Bring one beside it into view."
-        )
-
-
 @dataclass(frozen=True, eq=False)
 class Registration:
     """``to_from``: one device's frame to another's, mm. ``beads``: names of those that it rests on;
@@ -256,8 +236,6 @@ class Registration:
     def bound_mm(self, points_mm: Targets) -> float:
         """What the error at any of the points stays below with 95 %, all of it along one axis at
         worst; by Student's t, as few beads tell little of their own error."""
-        from scipy.stats import t
-
         free = 3 * len(self.beads) - 6
         return float(t.ppf(0.5 + _CERTAIN / 2, free) * self.tre_mm(points_mm).max())
 
@@ -270,12 +248,9 @@ class Registration:
             "fre_mm": self.fre_mm,
             "fle_mm": self.fle_mm,
             "tre_mm": {name: float(self.tre_mm(at).max()) for name, at in targets.items()},
-            "beads": {
-                name: {"left_mm": float(left), "without_it_mm": float(without)}
-                for name, left, without in zip(
-                    self.beads, self.left_mm, self.without_mm, strict=True
-                )
-            },
+            "beads": list(self.beads),
+            "left_mm": self.left_mm.tolist(),
+            "without_it_mm": self.without_mm.tolist(),
             "notes": list(self.notes),
         }
 
@@ -305,12 +280,16 @@ def register(kit: Kit, first: NamedBeads, second: NamedBeads) -> Registration:
     notes = list(dict.fromkeys((*first.notes, *second.notes)))
     while len(both) >= LEAST_BEADS:
         from_mm, to_mm = first.points_mm[both], second.points_mm[both]
-        _check_spread(from_mm, pair)
+        if (across_mm := _across_mm(from_mm)) < _LEAST_SPREAD_MM:
+            raise InputError(
+                f"{pair}: the {len(both)} beads lie on a line, but for {across_mm:.1f} mm, about "
+                "which a turn stays unknown. Bring one beside it into view."
+            )
         to_from, left_mm = fit_rigid(from_mm, to_mm)
-        without_mm = np.array([_without(from_mm, to_mm, n) for n in range(len(both))])
+        without_mm, growth = np.array([_without(from_mm, to_mm, n) for n in range(len(both))]).T
         fre2 = float((left_mm**2).mean())
         fle_mm = max(float(np.sqrt(fre2 / (1 - 2 / len(both)))), usual_mm)
-        limits_mm = _OUTLIER * usual_mm * np.array([_growth(from_mm, n) for n in range(len(both))])
+        limits_mm = _OUTLIER * usual_mm * growth
         worst = int((without_mm / limits_mm).argmax())
         if without_mm[worst] <= limits_mm[worst]:
             names = tuple(kit.beads[n].name for n in both)
@@ -330,14 +309,10 @@ def register(kit: Kit, first: NamedBeads, second: NamedBeads) -> Registration:
     )
 
 
-def _without(from_mm: np.ndarray, to_mm: np.ndarray, n: int) -> float:
-    """How far a bead is from where the others have it."""
+def _without(from_mm: np.ndarray, to_mm: np.ndarray, n: int) -> tuple[float, float]:
+    """How far a bead is from where the others have it, and how far it would be if each were off by
+    1 mm."""
     others = np.arange(len(from_mm)) != n
     to_from, _ = fit_rigid(from_mm[others], to_mm[others])
-    return float(np.linalg.norm(transform_points(to_from, from_mm[[n]])[0] - to_mm[n]))
-
-
-def _growth(from_mm: np.ndarray, n: int) -> float:
-    """The same for beads that are each off by 1 mm: its own error, and the others' there."""
-    others = np.arange(len(from_mm)) != n
-    return float(np.hypot(1.0, expected_tre(from_mm[others], from_mm[[n]], 1.0)[0]))
+    off_mm = np.linalg.norm(transform_points(to_from, from_mm[[n]])[0] - to_mm[n])
+    return float(off_mm), float(np.hypot(1, expected_tre(from_mm[others], from_mm[[n]], 1.0)[0]))

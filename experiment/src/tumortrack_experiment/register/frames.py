@@ -10,9 +10,12 @@ import numpy as np
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import DepthFrame
+from tumortrack.live.recording.folders import folder_frames
+from tumortrack.sense.files import read_depth_png
 from tumortrack_experiment.kit_file import Kit
 from tumortrack_experiment.record.read import Moment, Recorded, read_recorded
 from tumortrack_experiment.register.beads import CAMERA, NamedBeads, name_beads
+from tumortrack_experiment.register.in_depth import find_balls_seen
 
 _MOST_FRAMES = 30  # the median of so many has a fifth of one's noise
 _HALVES = 6  # with fewer frames nothing is said about movement while they were taken
@@ -37,16 +40,33 @@ def states_in(recording: Path) -> dict[str, Recorded | Path]:
     return dict(states)
 
 
-def moments_of(where: Recorded | Path, state: str) -> list[Moment]:
-    """The first 30 of a state. Raises InputError: no depth images, or damaged ones."""
-    from tumortrack.live.recording.folders import folder_frames
-    from tumortrack.sense.files import read_depth_png
+def one_of(states: dict[str, Recorded | Path], state: str | None, recording: Path) -> str:
+    """The state, or the only one. Raises InputError: there is no such state."""
+    if state is None and len(states) == 1:
+        return next(iter(states))
+    if state is None or state not in states:
+        raise InputError(
+            f"{recording}: choose one of its states with --state: {', '.join(states)}."
+        )
+    return state
 
+
+def moments_in(view: Path, state: str | None) -> list[Moment]:
+    """Of a recording's state, or a folder of depth images. Raises InputError as ``moments_of``."""
+    if state is None and not any(view.glob("*.mcap")):
+        return moments_of(view, "")
+    states = states_in(view)
+    name = one_of(states, state, view)
+    return moments_of(states[name], name)
+
+
+def moments_of(where: Recorded | Path, state: str, most: int = _MOST_FRAMES) -> list[Moment]:
+    """The first of a state. Raises InputError: no depth images, or damaged ones."""
     if isinstance(where, Recorded):
-        return list(islice(where.moments(state), _MOST_FRAMES))
+        return list(islice(where.moments(state), most))
     if (where / "depth.png").is_file():
         return [Moment(read_depth_png(where / "depth.png", where / "intrinsics.json"))]
-    found = [frame.load().content for frame in folder_frames(where, 30.0, "mm")[:_MOST_FRAMES]]
+    found = [frame.load().content for frame in folder_frames(where, 30.0, "mm")[:most]]
     images = [content for content in found if isinstance(content, DepthFrame)]
     if not images:
         raise InputError(f"{where} holds clouds; depth images are needed to see beads.")
@@ -68,8 +88,6 @@ def median_of(frames: list[DepthFrame]) -> DepthFrame:
 def beads_in_view(kit: Kit, frame: DepthFrame) -> NamedBeads:
     """The kit's beads in a depth image, camera frame. Raises InputError: as ``name_beads``, or the
     base is seen from below."""
-    from tumortrack_experiment.register.in_depth import find_balls_seen
-
     found = name_beads(kit, find_balls_seen(frame, kit.bead_diameter_mm), CAMERA)
     camera_from_base = found.device_from_base
     if camera_from_base[:3, 2] @ camera_from_base[:3, 3] > 0:

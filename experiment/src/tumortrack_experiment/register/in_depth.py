@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Float, Float64
+from scipy import ndimage
+from scipy.optimize import least_squares
 
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import Points
@@ -44,8 +46,6 @@ def find_balls_seen(frame: DepthFrame, diameter_mm: float) -> Float64[np.ndarray
 
 def _voted(frame: DepthFrame, radius_mm: float) -> Points:
     """Where balls may be, most voted first."""
-    from scipy import ndimage
-
     camera, z = frame.intrinsics, frame.depth_mm.astype(np.float64)
     z = np.where((z > _RANGE_MM[0]) & (z < _RANGE_MM[1]), z, np.nan)
     seen = np.isfinite(z)
@@ -83,8 +83,6 @@ def _voted(frame: DepthFrame, radius_mm: float) -> Points:
 
 def _slopes(z: np.ndarray, half: int) -> tuple[np.ndarray, np.ndarray]:
     """Depth per pixel down and across: the slope of a plane through a window, NaN at its gaps."""
-    from scipy import ndimage
-
     ramp = np.arange(-half, half + 1, dtype=float)
     flat = np.ones(2 * half + 1)
     per = (ramp**2).sum() * len(flat)
@@ -101,8 +99,6 @@ def fit_ball_seen(
 ) -> tuple[float, Float64[np.ndarray, " 3"]] | None:
     """A ball fitted to the depths about a place (camera frame, mm), along the pixels' rays, as
     that is how depths err: rms of what is left, and its middle. None: no ball is seen there."""
-    from scipy.optimize import least_squares
-
     radius_mm, camera = diameter_mm / 2, frame.intrinsics
     at = np.asarray(near_mm, np.float64)
     z = frame.depth_mm

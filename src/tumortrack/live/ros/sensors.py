@@ -10,7 +10,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, UInt8
+from jaxtyping import Bool
 
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import DepthFrame, Intrinsics, SensorCloud
@@ -28,7 +28,6 @@ _FLOATS = {_FLOAT32: "f4", _FLOAT64: "f8"}
 _POINT_FIELDS = {"|u1": _UINT8, "<f4": _FLOAT32, "<u4": _FLOAT32}  # four bytes of colour, by PCL
 DEPTHS = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
 _MASKS = {"mono8": "u1", "8UC1": "u1"}
-_COLOURS = {"rgb8": 1, "bgr8": -1}  # and the order in which their channels are red, green, blue
 _LONGEST_SIDE = 8192  # as of Intrinsics
 
 
@@ -123,14 +122,6 @@ def mask_of(image: Any) -> Bool[np.ndarray, "h w"]:
     return _pixels(image, _MASKS, "a mask") != 0
 
 
-def picture_of(image: Any) -> UInt8[np.ndarray, "h w *rgb"]:
-    """A mono8, 8UC1, rgb8 or bgr8 image: grey, or red, green and blue."""
-    order = _COLOURS.get(image.encoding)
-    allowed = _MASKS | dict.fromkeys(_COLOURS, "u1")
-    values = _pixels(image, allowed, "a picture", 3 if order else 1)
-    return values if order is None else values[..., ::order]
-
-
 def _intrinsics_of(info: Any, rectified: bool) -> Intrinsics:
     width, height = int(info.width), int(info.height)
     roi = info.roi
@@ -159,9 +150,8 @@ def _intrinsics_of(info: Any, rectified: bool) -> Intrinsics:
     return plausible(camera, "a camera_info came")
 
 
-def _pixels(image: Any, allowed: dict[str, str], what: str, channels: int = 1) -> np.ndarray:
-    """An image's values (height, width), or with a third axis where there are several channels, in
-    this machine's byte order."""
+def _pixels(image: Any, allowed: dict[str, str], what: str) -> np.ndarray:
+    """The values of a single-channel image (height, width), in this machine's byte order."""
     code = allowed.get(image.encoding)
     if code is None:
         raise InputError(
@@ -171,16 +161,13 @@ def _pixels(image: Any, allowed: dict[str, str], what: str, channels: int = 1) -
     width, height, step = int(image.width), int(image.height), int(image.step)
     data = np.frombuffer(image.data, np.uint8)
     fits = 0 < width <= _LONGEST_SIDE and 0 < height <= _LONGEST_SIDE
-    size = int(code[1])
-    if not fits or step < width * size * channels or step * height > data.nbytes:
+    if not fits or step < width * int(code[1]) or step * height > data.nbytes:
         raise InputError(
             f"{what} came that claims {width} x {height} pixels in rows of {step} bytes, and holds "
             f"{data.nbytes} bytes; it is damaged (allowed: up to {_LONGEST_SIDE} a side)."
         )
     order = ">" if image.is_bigendian else "<"
-    shape, strides = (height, width, channels), (step, size * channels, size)
-    values = np.ndarray(shape, order + code, data, 0, strides)
-    values = values if channels > 1 else values[..., 0]
+    values = np.ndarray((height, width), order + code, data, 0, (step, int(code[1])))
     return values.astype(values.dtype.newbyteorder("="))
 
 
