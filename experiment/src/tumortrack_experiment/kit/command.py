@@ -57,7 +57,9 @@ class PhantomKit:
         store.check_place(self.out, "kit", self.overwrite)
         if not all(30 <= side <= 2000 for side in self.bed):
             raise InputError(f"--bed {self.bed}: each side must be 30 to 2000 mm.")
-        base = BaseConfig(states=self.states, bead_mm=self.bead_mm, beads=self.beads)
+        base = BaseConfig(
+            states=self.states, bead_mm=self.bead_mm, beads=self.beads, bed_mm=self.bed[:2]
+        )
         mold = MoldConfig(wall_mm=self.wall, bed_mm=self.bed)
         mix = Mix(pva_percent=self.pva, cycles=self.cycles)
         case = api.load_case(self.case)

@@ -127,7 +127,7 @@ def _picture(bodies: list[Body], towards: np.ndarray) -> np.ndarray:
     place = middle + 1000 * unit(towards)
     axes = Viewpoint.towards(middle, place, 1.0).axes
     width = 2.04 * float(np.abs((points - middle) @ axes[:2].T).max())
-    image = render(bodies, Viewpoint.towards(middle, place, width, parallel=True), (900, 900))
+    image = render(bodies, Viewpoint.towards(middle, place, width, parallel=True), (720, 720))
     drawn = [np.flatnonzero((image < 255).any((2, axis))) for axis in (1, 0)]
     return image[drawn[0][0] : drawn[0][-1] + 1, drawn[1][0] : drawn[1][-1] + 1]
 

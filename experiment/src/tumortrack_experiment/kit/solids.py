@@ -53,7 +53,7 @@ def written(text: str, at: Corner, size: float, height: float) -> Any:
 
     path = TextPath((0, 0), text, size=size)
     middle = path.get_extents().get_points().mean(0)
-    outlines = [ring[:-1] - middle for ring in path.to_polygons()]
+    outlines = [np.asarray(ring)[:-1] - middle for ring in path.to_polygons()]
     return CrossSection(outlines, FillRule.EvenOdd).extrude(height).translate(at)
 
 
