@@ -182,7 +182,7 @@ def _agreeing(data: HandEyeData, at_mm: float) -> np.ndarray:
 
     def off_mm(data: HandEyeData) -> np.ndarray:
         start = _solved(data)
-        fitted = _fit(data, start, loss="cauchy", f_scale=0.3)
+        fitted = _fit(data, start, 13, loss="cauchy", f_scale=0.3)  # a wrong size is said later
         return _moved(start, fitted.x).off_mm(data, at_mm)
 
     each_mm = off_mm(data)
