@@ -63,7 +63,7 @@ class Record:
         from tumortrack.sense.files import DepthCorrection, read_correction, read_intrinsics
         from tumortrack_experiment.kit_file import KIT_FILE, read_kit
         from tumortrack_experiment.record.folder import RecordingFolder
-        from tumortrack_experiment.record.guide import Guide
+        from tumortrack_experiment.record.guide import Guide, GuideConfig
 
         near_mm, far_mm = self.range
         if not (0.1 <= self.seconds <= 3600 and 0 < near_mm < far_mm < math.inf):
@@ -81,12 +81,13 @@ class Record:
         files = {name: path.read_bytes() for name, path in beside.items() if path}
         intrinsics = read_intrinsics(self.intrinsics) if self.intrinsics else None
         correction = read_correction(self.intrinsics) if self.intrinsics else DepthCorrection()
+        how = GuideConfig(self.seconds, self.range, self.yes, self.countdown)
         folder = RecordingFolder(self.folder, states, setup.published.frame_id, files)
         if now := folder.to_record(self.only):
             (config,) = setup.sources.values()
             with closing(SourceWorker(config.open)) as worker, ExitStack() as ending:
                 ending.callback(folder.drop)
-                Guide(self, folder, worker, setup, kit, intrinsics, correction).record(now)
+                Guide(how, folder, worker, setup, kit, intrinsics, correction).record(now)
         if missing := folder.to_record():
             say(f"missing: {', '.join(missing)}. The same command goes on.")
         else:

@@ -8,7 +8,6 @@ import sys
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 from tumortrack.cli.console import say
 from tumortrack.core.config import to_builtins
@@ -26,9 +25,6 @@ from tumortrack_experiment.kit_file import Kit
 from tumortrack_experiment.record.folder import RecordingFolder
 from tumortrack_experiment.record.quality import DepthMeter
 
-if TYPE_CHECKING:
-    from tumortrack_experiment.record.command import Record
-
 _TICK_S = 0.1  # a look at the keyboard at least so often
 _LINE_S = 0.2  # between two changes of the line
 _LONGEST_S = 1.0  # between two frames: a longer pause is no time of the recording
@@ -37,11 +33,22 @@ _FROZEN_S = 0.25  # the same image bit for bit, as `track` has it
 _AGAIN, _QUIT = "r", "q"
 
 
+@dataclass(frozen=True)
+class GuideConfig:
+    """How long each state is recorded, s, and between which depths, mm, frames are good. ``yes``:
+    nobody is asked; each state begins after ``countdown`` seconds."""
+
+    seconds: float
+    range: tuple[float, float]
+    yes: bool
+    countdown: float
+
+
 @dataclass(eq=False)
 class Guide:
-    """Records from one open source, by the options of `record`."""
+    """Records from one open source."""
 
-    options: Record
+    options: GuideConfig
     folder: RecordingFolder
     worker: SourceWorker
     setup: CameraSetup
