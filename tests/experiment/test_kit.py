@@ -2,11 +2,13 @@
 
 import json
 import zipfile
+from itertools import combinations
 
 import numpy as np
 import pytest
 import trimesh
 from manifold3d import Manifold
+from scipy.spatial.transform import Rotation
 
 from tumortrack.cli.main import run
 from tumortrack.core.errors import InputError
@@ -17,16 +19,15 @@ from tumortrack.imaging.case import Case, save_case
 from tumortrack.imaging.meshes import label_meshes, mesh_of, solid_of
 from tumortrack_experiment.kit import recipe
 from tumortrack_experiment.kit.base import (
-    FLE_MM,
     BaseConfig,
     base_design,
-    expected_tre_mm,
     uniqueness_mm,
 )
 from tumortrack_experiment.kit.checks import checked, plate_height_mm
 from tumortrack_experiment.kit.split import laid_mesh
 from tumortrack_experiment.kit.stands import midsection_top_mm, poke_point
 from tumortrack_experiment.kit_file import read_kit
+from tumortrack_experiment.register.beads import CAMERA, name_beads
 
 ANTERIOR = (0.0, -1.0, 0.0)
 STATES = ("D1", "D2", "D3", "P1", "T10")
@@ -78,17 +79,15 @@ def test_the_organ_lies_as_in_its_ct_and_is_told_apart_from_its_mirror(base, ana
     assert mirror >= 10
 
 
-def test_the_expected_target_error_is_that_of_many_noisy_fits(base):
-    beads, target = base.beads_mm, np.array([[5.0, -8.0, 30.0]])
-    rng, errors = np.random.default_rng(1), []
-    middle = beads.mean(0)
-    for _ in range(2000):
-        found = beads + rng.normal(0, FLE_MM / np.sqrt(3), beads.shape)
-        u, _, vt = np.linalg.svd((beads - middle).T @ (found - found.mean(0)))
-        turn = u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt
-        errors.append((target - middle) @ turn + found.mean(0) - target)
-    measured = np.sqrt((np.array(errors) ** 2).sum(-1).mean())
-    assert expected_tre_mm(beads, target)[0] == pytest.approx(measured, rel=0.05)
+def test_any_four_beads_are_named_in_any_order(kit):
+    told, rng = read_kit(kit), np.random.default_rng(0)
+    for count in (4, 5, 6):
+        for some in combinations(range(6), count):
+            order = rng.permutation(some)
+            turn = Rotation.random(random_state=rng).as_matrix()
+            found = told.beads_mm[order] @ turn.T + rng.normal(0, 0.1, (count, 3))
+            named = name_beads(told, found, CAMERA)
+            assert np.array_equal(named.points_mm[order], found)
 
 
 def test_a_ball_in_its_cone_has_its_middle_where_the_kit_says(base):

@@ -255,15 +255,18 @@ class Registration:
         }
 
 
-def expected_tre(beads_mm: Points, points_mm: Targets, fle_mm: float) -> Float64[np.ndarray, " m"]:
+def expected_tre(
+    beads_mm: Float[np.ndarray, "*k n 3"], points_mm: Targets, fle_mm: float
+) -> Float64[np.ndarray, "*k m"]:
     """Rms error (m,) at points, in mm, of a registration by beads that are each off by ``fle_mm``
-    (rms, three axes together, the same in all directions): Fitzpatrick and others, equation 46."""
-    middle = beads_mm.mean(0)
-    axes = np.linalg.svd(beads_mm - middle)[2]
-    squares = [((some - middle) @ axes.T) ** 2 for some in (beads_mm, points_mm)]
-    beads2, points2 = (one.sum(1, keepdims=True) - one for one in squares)  # from each axis
-    share = (points2 / beads2.mean(0)).sum(1) / 3
-    return fle_mm * np.sqrt((1 + share) / len(beads_mm))
+    (rms, three axes together, the same in all directions): Fitzpatrick and others, equation 46; of
+    several arrangements of beads at once."""
+    middle = beads_mm.mean(-2, keepdims=True)
+    axes = np.swapaxes(np.linalg.svd(beads_mm - middle, full_matrices=False)[2], -1, -2)
+    squares = [((some - middle) @ axes) ** 2 for some in (beads_mm, points_mm)]
+    beads2, points2 = (one.sum(-1, keepdims=True) - one for one in squares)  # from each axis
+    share = (points2 / beads2.mean(-2, keepdims=True)).sum(-1) / 3
+    return np.asarray(fle_mm * np.sqrt((1 + share) / beads_mm.shape[-2]))
 
 
 def register(kit: Kit, first: NamedBeads, second: NamedBeads) -> Registration:
