@@ -17,8 +17,10 @@ from tumortrack.core.geometry import rigid, transform_points
 from tumortrack.live.calibration_file import read_frames
 from tumortrack.simulate.scene_folder import read_scene
 from tumortrack_experiment.kit_file import read_kit
+from tumortrack_experiment.record.read import Moment
 from tumortrack_experiment.reference import scenes
 from tumortrack_experiment.reference.deformed import parts_in, segment_deformed
+from tumortrack_experiment.register.frames import still_beads
 from tumortrack_experiment.register.in_ct import find_balls, middles_mm
 from tumortrack_experiment.register.in_depth import find_balls_seen
 
@@ -38,7 +40,7 @@ def made(tmp_path_factory):
     root = tmp_path_factory.mktemp("bench")
     case = bench.a_case(root / "case")
     bench.a_kit(root / "kit", root / "case", case)
-    scan = bench.a_scan(D1, CT_FROM_BASE)
+    scan = bench.a_scan(D1, CT_FROM_BASE, 1.5)
     bench.write_scan(root / "ct2.nii.gz", scan)
     view = bench.a_view(D1, POSE, case)
     bench.write_view(root / "recording" / "D1", view)
@@ -107,6 +109,14 @@ def test_a_camera_that_moved_between_states_is_noticed(made, tmp_path, capsys):
     assert reference(root, tmp_path / "s", "--state", "D1", recording=recording) == 2
     assert re.search(r"moved by 2\.[3-7] mm between D1 and rest", capsys.readouterr().err)
     assert not (tmp_path / "s").exists()
+
+
+def test_a_base_that_is_knocked_during_a_state_is_noticed(made):
+    root, case, _, view = made
+    knocked = bench.a_view(D1, bench.camera_from_base(shift_mm=(0, 2, 0)), case, seed=2)
+    moments = [Moment(frame) for frame in [view] * 3 + [knocked] * 3]
+    with pytest.raises(InputError, match=r"D1: the camera or the base moved by [12]\.\d mm while"):
+        still_beads(read_kit(root / "kit"), moments, "D1")
 
 
 def test_an_unreadable_ct_is_one_line(made, tmp_path, capsys):

@@ -46,11 +46,11 @@ def write_reference(given: Reference) -> None:
     state = one_of(states, given.state, given.recording)
     if (folder := given.scenes / state).exists():
         raise InputError(f"{folder} exists already. Choose another SCENES folder.")
+    volume = read_volume(given.ct, given.series)
     parts = parts_in(kit, given.kit, state)
     moments = moments_of(states[state], state)
     frame, in_view = still_beads(kit, moments, state)
     moved_mm = {} if given.moves else _moved(kit, states, state, (moments[0], in_view))
-    volume = read_volume(given.ct, given.series)
     balls = find_balls(volume, kit.bead_diameter_mm)
     in_ct = name_beads(kit, middles_mm(balls), CT)
     one = register(kit, in_ct, in_view)

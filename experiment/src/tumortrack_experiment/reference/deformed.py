@@ -25,7 +25,7 @@ _LEAST_PRINT_HU = -900.0  # of a print that is mostly hollow
 _ROUND_MM = 35.0  # that a pressed organ may come out of its box at rest, or beside the beads
 _BEAD_RIM_MM = 1.5
 _ORGAN_PERCENT = 5.0  # hydrogel keeps its volume; a second scan at 1 mm finds it to 1 %
-_TUMOR_PERCENT, _TUMOR_ML = 15.0, 0.3  # of small ones the rim is a larger share
+_TUMOR_PERCENT, _TUMOR_VOXELS = 15.0, 0.5  # of its volume, or all round, whichever is more
 _STANDS_MM = (-2.0, 6.0)  # the organ's lowest point over the plate
 _USUAL_SHIFT_MM = 15.0  # of a tumor by the paper's plates
 _USUAL_CHANGE = 0.1  # of its volume
@@ -69,21 +69,18 @@ def segment_deformed(
     found_ml = [float(counts.sum()), *counts[1:].tolist()]
     lowest_mm = float(in_base[0][:, 2].min())
     _check(found_ml, kit, lowest_mm)
-    places = [
-        transform_points(np.array(kit.base_from_ct), part.vertices_mm.mean(0)[None])[0]
-        for part in case.anatomy.tumors
-    ]
-    order = _order(found_ml[1:], np.array([at.mean(0) for at in in_base[1:]]), kit, places)
+    middles = np.array([at.mean(0) for at in in_base[1:]]).reshape(-1, 3)
+    at_rest = np.array([tumor.vertices_mm.mean(0) for tumor in case.anatomy.tumors]).reshape(-1, 3)
+    places = transform_points(np.array(kit.base_from_ct), at_rest)
+    step_mm = float(spacing_mm(volume.lps_from_index).mean())
+    order = _order(found_ml[1:], middles, kit, places, step_mm)
     tumors = [anatomy.tumors[n] for n in order]
     report = {
         "organ_ml": found_ml[0],
         "tumors_ml": [found_ml[1 + n] for n in order],
         "kit_ml": [kit.organ_ml, *kit.tumors_ml],
         "lowest_mm": lowest_mm,
-        "tumor_shift_mm": [
-            float(np.linalg.norm(in_base[1 + n].mean(0) - at))
-            for n, at in zip(order, places, strict=True)
-        ],
+        "tumor_shift_mm": np.linalg.norm(middles[order] - places, axis=1).tolist(),
         "notes": notes,
     }
     return Anatomy((anatomy.organ, *tumors)), report
@@ -162,18 +159,20 @@ def _check(found_ml: list[float], kit: Kit, lowest_mm: float) -> None:
 
 
 def _order(
-    found_ml: list[float], found_mm: np.ndarray, kit: Kit, places: list[np.ndarray]
+    found_ml: list[float], found_mm: np.ndarray, kit: Kit, places: np.ndarray, step_mm: float
 ) -> list[int]:
-    """Which of the tumors found is the case's first, second, ...: by volume and by place."""
+    """Which of the tumors found is the case's first, second, ...: by volume and by place. Raises
+    InputError: one has another volume."""
     from scipy.optimize import linear_sum_assignment
 
-    if not places:
+    if not len(places):
         return []
     ratio = np.log(np.array(found_ml) / np.array(kit.tumors_ml)[:, None]) / _USUAL_CHANGE
-    away = np.linalg.norm(found_mm - np.array(places)[:, None], axis=2) / _USUAL_SHIFT_MM
+    away = np.linalg.norm(found_mm - places[:, None], axis=2) / _USUAL_SHIFT_MM
     order = [int(n) for n in linear_sum_assignment(ratio**2 + away**2)[1]]
     for number, (n, ml) in enumerate(zip(order, kit.tumors_ml, strict=True), 1):
-        allowed_ml = max(_TUMOR_PERCENT / 100 * ml, _TUMOR_ML)
+        rim_ml = _TUMOR_VOXELS * step_mm * (36 * np.pi) ** (1 / 3) * (1000 * ml) ** (2 / 3) / 1000
+        allowed_ml = max(_TUMOR_PERCENT / 100 * ml, rim_ml)  # of a ball's surface
         if abs(found_ml[n] - ml) > allowed_ml:
             raise InputError(
                 f"the tumor in tumor_{number}'s place has {found_ml[n]:.1f} ml; the kit's has "

@@ -101,20 +101,16 @@ def still_beads(kit: Kit, moments: list[Moment], state: str) -> tuple[DepthFrame
     """The median depth image of a state and the beads in it. Raises InputError: as
     ``beads_in_view``, or camera or base moved while it was recorded."""
     frames = [moment.depth for moment in moments]
-    median = median_of(frames)
-    found = beads_in_view(kit, median)
     if len(frames) >= _HALVES:
-        middle = len(frames) // 2
-        first, last = (
-            beads_in_view(kit, median_of(part)) for part in (frames[:middle], frames[middle:])
-        )
-        moved_mm = apart_mm(kit, first.device_from_base, last.device_from_base)
-        if moved_mm > _STILL_MM:
+        halves = frames[: len(frames) // 2], frames[len(frames) // 2 :]
+        poses = [beads_in_view(kit, median_of(half)).device_from_base for half in halves]
+        if (moved_mm := apart_mm(kit, *poses)) > _STILL_MM:
             raise InputError(
                 f"{state}: the camera or the base moved by {moved_mm:.1f} mm while it was recorded "
                 f"(at most {_STILL_MM:g} mm is noise). Record it again."
             )
-    return median, found
+    median = median_of(frames)
+    return median, beads_in_view(kit, median)
 
 
 def apart_mm(kit: Kit, first_from_base: np.ndarray, second_from_base: np.ndarray) -> float:
