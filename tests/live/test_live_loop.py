@@ -407,7 +407,7 @@ def test_other_intrinsics_replace_the_sources(tracker):
         if said is None:
             content = sink.updates[-1].observation.content
             assert content.intrinsics == given
-            corrected_mm = frame.content.depth_mm * 0.99 + 2
+            corrected_mm = frame.depth_mm * 0.99 + 2
             np.testing.assert_allclose(content.depth_mm, corrected_mm, rtol=1e-5)
         else:
             assert said in sink.updates[-1].reason
