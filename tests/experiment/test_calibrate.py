@@ -138,20 +138,21 @@ def test_distortion_is_fitted_only_where_there_is_any(lens, model):
 
 def test_the_stated_bound_holds():
     rng, within = np.random.default_rng(2), []
-    for _ in range(6):
+    for _ in range(3):
         poses, looks = robot_looks(10, rng)
         places = [LENS.place(corners_of(look, LENS, rng))[0] for look in looks]
         data = HandEyeData(poses, np.array(places))
         found, said, _ = solve(data, list(map(str, range(10))), 150.0, 1e-4)
         within.append(off_mm(found) <= said["bound_mm"] < 1.5)
-    assert sum(within) >= 5  # of 6, where 95 % are promised
+    assert all(within)  # 95 % are promised
 
 
-@pytest.fixture
-def hand(tmp_path):
+@pytest.fixture(scope="module")
+def hand(tmp_path_factory):
     """Pictures of the board by a camera on a tool, and the tool's poses."""
     rng = np.random.default_rng(3)
     poses, looks = robot_looks(9, rng)
+    tmp_path = tmp_path_factory.mktemp("hand")
     (tmp_path / "seen").mkdir()
     for n, look in enumerate(looks):
         picture = board_picture(BOARD, LENS, look, rng)
@@ -201,9 +202,9 @@ def test_poses_come_by_stamps_from_a_table_and_in_order_from_json(hand):
     (folder / "poses.csv").write_text(COLUMNS + "\n" + "".join(rows[:-1]))
     with pytest.raises(InputError, match=r"of picture 1000000000008, .*last pose is older"):
         with_poses(shots, folder / "poses.csv")
-    write_poses(folder / "poses.json", poses[:-1])
+    write_poses(folder / "fewer.json", poses[:-1])
     with pytest.raises(InputError, match="8 poses for 9 pictures"):
-        with_poses(shots, folder / "poses.json")
+        with_poses(shots, folder / "fewer.json")
     with pytest.raises(InputError, match="does not say where the tool was"):
         with_poses(shots, folder / "seen")
 

@@ -348,6 +348,48 @@ def _margins() -> dict[str, Target]:
     }
 
 
+def _experiment() -> dict[str, Target]:
+    """Kits, lenses, robots' poses, pictures of boards, and MCAPs with attachments."""
+    import cv2
+
+    from tumortrack_experiment.calibrate.lens import read_lens
+    from tumortrack_experiment.calibrate.pictures import Shot, read_shots, with_poses
+    from tumortrack_experiment.kit_file import read_kit
+
+    rows = np.eye(4).tolist()
+    beads = [{"name": str(n), "center_mm": [n, n * n, 3.0]} for n in range(4)]
+    parts = [
+        {"name": "base", "file": "a.stl", "purpose": "", "volume_ml": 1, "base_from_part": rows}
+    ]
+    kit = {"case_sha256": "0", "bead_diameter_mm": 6, "beads": beads, "base_from_ct": rows}
+    kit |= {"organ_ml": 100, "tumors_ml": [3], "states": ["rest"], "parts": parts}
+    lens = {"width": 16, "height": 12, "fx": 10, "fy": 10, "cx": 8, "cy": 6}
+    poses = {"base_from_tool": [rows, rows], "unit": "mm", "frame_id": "base"}
+    shots = [Shot(str(n), np.zeros((2, 2), np.uint8)) for n in range(2)]
+    pictures = scratch()
+    grey = np.arange(192, dtype=np.uint8).reshape(12, 16)
+
+    def read_picture(content: bytes) -> object:
+        (pictures / "a.png").write_bytes(content)
+        return read_shots(pictures)
+
+    return {
+        "kit": ([json.dumps(kit).encode()], of_file(".json", read_kit)),
+        "lens": (
+            [json.dumps(lens | {"distortion": [0.0] * 5}).encode()],
+            of_file(".json", read_lens),
+        ),
+        "robot poses": (
+            [json.dumps(poses).encode()],
+            of_file(".json", lambda path: with_poses(shots, path)),
+        ),
+        "picture": (
+            [cv2.imencode(kind, grey)[1].tobytes() for kind in (".png", ".jpg")],
+            read_picture,
+        ),
+    }
+
+
 def of_base(base: Path) -> dict[str, Target]:
     """Case, scene, model, run and plan, as ``attacks.make_base`` makes them."""
     from tumortrack.imaging.case import load_case
@@ -382,7 +424,7 @@ def targets(base: Path | None = None) -> dict[str, Target]:
     found: dict[str, Target] = {}
     for make in (
         *(_cloud_files, _images, _volumes, _dicom, _meshes, _artifacts, _texts, _wire),
-        *(_configurations, _recordings, _margins),
+        *(_configurations, _recordings, _margins, _experiment),
     ):
         found |= make()
     return found | (of_base(base) if base is not None else {})

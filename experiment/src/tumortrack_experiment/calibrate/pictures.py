@@ -3,6 +3,7 @@ from what `tumortrack record` wrote."""
 
 from __future__ import annotations
 
+import io
 import re
 from itertools import islice
 from pathlib import Path
@@ -25,6 +26,7 @@ from tumortrack_experiment.record.read import read_recorded
 
 _NAMES = ("colour", "color", "infrared")  # .png or .jpg, in a frame's folder
 _SUFFIXES = (".png", ".jpg", ".jpeg")
+_MOST_PIXELS = 50_000_000
 _LARGEST = 64 * 2**20  # bytes
 _IS_STAMP = re.compile(
     r"[0-9]{12,19}"
@@ -114,13 +116,17 @@ def _framed(file: Path) -> Shot:
 
 
 def _grey(file: Path) -> UInt8[np.ndarray, "h w"]:
-    content = np.frombuffer(read_file(file, _LARGEST), np.uint8)
+    from PIL import Image
+
+    content = io.BytesIO(read_file(file, _LARGEST))
     try:
-        grey = cv2.imdecode(content, cv2.IMREAD_GRAYSCALE) if len(content) else None
-    except cv2.error:  # of a header that claims too much
-        grey = None
+        picture = Image.open(content, formats=["PNG", "JPEG"])
+        width, height = picture.size  # from the header: nothing is decoded yet
+        grey = np.asarray(picture.convert("L")) if width * height <= _MOST_PIXELS else None
+    except Exception as error:  # Pillow raises anything on a damaged file
+        raise InputError(f"{file} cannot be read as a picture: {error}.") from error
     if grey is None:
-        raise InputError(f"{file} cannot be read as a picture.")
+        raise InputError(f"{file} is {width} x {height}; at most 50 million pixels are read.")
     return grey
 
 

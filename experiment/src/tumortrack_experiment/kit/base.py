@@ -136,7 +136,7 @@ def expected_tre_mm(
     beads_mm: Float[np.ndarray, "*k n 3"], targets_mm: Float[np.ndarray, "m 3"]
 ) -> Float64[np.ndarray, "*k m"]:
     """The rms error expected at targets after a rigid fit to beads that are found with ``FLE_MM``,
-    equal in all directions (Fitzpatrick, West, Maurer 1998, doi 10.1109/42.736021, equation 46); of
+    equal in all directions (Fitzpatrick, West, Maurer 1998, doi 10.1109/42.736021); of
     several arrangements at once."""
     middle, n = beads_mm.mean(-2, keepdims=True), beads_mm.shape[-2]
     _, spread, axes = np.linalg.svd(beads_mm - middle, full_matrices=False)

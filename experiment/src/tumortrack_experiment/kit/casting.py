@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Float64
+from jaxtyping import Bool, Float, Float64
 from scipy import ndimage
 from scipy.spatial import ConvexHull
 
@@ -57,6 +57,13 @@ class Layout:
         for x, y, offset in ConvexHull(self.outline.to_polygons()[0]).equations:
             np.maximum(out, points_mm[..., 0] * x + points_mm[..., 1] * y + offset, out=out)
         return out
+
+    def in_block(self, points_mm: Float[np.ndarray, "*n 3"]) -> Bool[np.ndarray, " *n"]:
+        """Whether points lie in the block or its flange."""
+        z, beyond = points_mm[..., 2], self.beyond(points_mm)
+        thick = THICK_MM + FLANGE_MM - np.maximum(beyond, 0)
+        flange = (beyond < FLANGE_MM) & (np.abs(z - self.field.at(points_mm)) < thick)
+        return (flange | (beyond < 0)) & (z > self.bottom_mm) & (z < self.top_mm)
 
 
 def lay_out(

@@ -15,7 +15,7 @@ from tumortrack.sense.render import Visibility
 from tumortrack_experiment.kit.casting import Layout, cut_halves, lay_out
 from tumortrack_experiment.kit.mold_checks import cast_error, demould, open_edges, walls
 from tumortrack_experiment.kit.parting import undercut
-from tumortrack_experiment.kit.pins import Pin, firmness, place_pins
+from tumortrack_experiment.kit.pins import HANDLE_MM, Pin, firmness, in_own_mold, place_pins
 from tumortrack_experiment.kit.split import fits, laid_mesh, split_to_bed, to_bed
 from tumortrack_experiment.kit.values import PrintedPart
 
@@ -82,21 +82,23 @@ def tumor_molds(
     anatomy: Anatomy, config: MoldConfig, pins: tuple[Pin, ...]
 ) -> tuple[OrganMold, ...]:
     """A mold of two halves for each tumor, with holes for the same pins (``OrganMold.pins``), which
-    leave in the cast tumor the holes by which they hold it in the organ's mold."""
+    leave in the cast tumor the holes by which they hold it in the organ's mold. The pins of these
+    molds are those again, each with its mouth on the outside of the tumor's mold."""
     molds = []
     for number, tumor in enumerate(anatomy.tumors, 1):
         own = tuple(pin for pin in pins if pin.tumor == number)
         ways = np.array([pin.way for pin in own])
         layout = lay_out(tumor, (), config.wall_mm, config.sprue_mm, ways)
+        there, back = layout.mold_from_ct, np.linalg.inv(layout.mold_from_ct)
+        own = tuple(in_own_mold(pin.moved(there), layout).moved(back) for pin in own)
         molds.append(_mold(layout, config, f"tumor_{number}", own))
     return tuple(molds)
 
 
 def _mold(layout: Layout, config: MoldConfig, name: str, pins: tuple[Pin, ...]) -> OrganMold:
     """Cut the halves, measure them, and turn them back to the ``ct`` frame."""
-    far = 2 * layout.mesh.longest_mm + 50.0  # a tumor's pins go on through its own mold's wall
     moved = [pin.moved(layout.mold_from_ct) for pin in pins]
-    ways = [(pin.tip_mm, pin.mouth_mm + far * pin.way) for pin in moved]
+    ways = [(pin.tip_mm, pin.mouth_mm + HANDLE_MM * pin.way) for pin in moved]
     halves = cut_halves(layout, config.vent_mm, config.pin_mm, config.clearance_mm, ways)
     organ, up = solid_of(layout.mesh, name), np.array([0.0, 0.0, 1.0])
     sides = ("upper", halves.upper, up), ("lower", halves.lower, -up)

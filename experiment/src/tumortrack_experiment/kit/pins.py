@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import transform_points, unit
 from tumortrack.core.types import Mesh
-from tumortrack_experiment.kit.casting import FLANGE_MM, THICK_MM, Layout
+from tumortrack_experiment.kit.casting import Layout
 from tumortrack_experiment.kit.parting import Cells, directions
 
 HANDLE_MM = 10.0  # of a pin outside the mold
@@ -26,9 +26,10 @@ _UPPER, _UNDER, _LONG_MM = 0.8, 0.3, 300.0  # costs in units of ``firmness``; of
 
 @dataclass(frozen=True, eq=False)
 class Pin:
-    """A straight rod that holds a tumor (its number, from 1) in the organ's mold; in one frame.
+    """A straight rod that holds a tumor (its number, from 1) in the organ's mold, or leaves its
+    hole in the tumor while that is cast; in one frame.
 
-    ``tip_mm`` lies in the tumor, ``entry_mm`` on its surface, ``mouth_mm`` on the mold's outside.
+    ``tip_mm`` lies in the tumor, ``entry_mm`` on its surface, ``mouth_mm`` on that mold's outside.
     """
 
     tumor: int
@@ -38,9 +39,14 @@ class Pin:
     mouth_mm: Float64[np.ndarray, " 3"]
 
     @property
+    def depth_mm(self) -> float:
+        """From its tip to the mold's outside: where it has a mark."""
+        return float(np.linalg.norm(self.mouth_mm - self.tip_mm))
+
+    @property
     def length_mm(self) -> float:
         """From its tip to 10 mm outside."""
-        return float(np.linalg.norm(self.mouth_mm - self.tip_mm)) + HANDLE_MM
+        return self.depth_mm + HANDLE_MM
 
     @property
     def way(self) -> Float64[np.ndarray, " 3"]:
@@ -93,6 +99,13 @@ def place_pins(layout: Layout, tumors: list[Mesh], pin_mm: float) -> list[Pin]:
     return pins
 
 
+def in_own_mold(pin: Pin, layout: Layout) -> Pin:
+    """A pin of the organ's mold as it goes through its tumor's own; both in that mold's frame."""
+    run = np.arange(0, 2 * layout.mesh.longest_mm + 100.0, 0.1)[:, None]
+    points = pin.tip_mm + run * pin.way
+    return replace(pin, mouth_mm=points[np.flatnonzero(layout.in_block(points))[-1]])
+
+
 def _reaching(layout: Layout, tumor: Mesh, taken: cKDTree) -> Float64[np.ndarray, "n 3 3"]:
     """Tip, entry and mouth of every straight way to a tumor's middle that is free."""
     cells, ways = Cells(tumor, (_STEP_MM,) * 3, 0.0), directions(_WAYS)
@@ -100,20 +113,13 @@ def _reaching(layout: Layout, tumor: Mesh, taken: cKDTree) -> Float64[np.ndarray
     middle = cells.place_mm(np.array(np.unravel_index(depth.argmax(), depth.shape)))
     run = np.arange(0, np.linalg.norm(np.ptp(layout.mesh.box_mm, axis=0)) + 80.0, _STEP_MM)
     points = middle + run[:, None] * ways[:, None]
-    z, above, beyond = (
-        points[..., 2],
-        points[..., 2] - layout.field.at(points),
-        layout.beyond(points),
-    )
-    block = (beyond < 0) & (z > layout.bottom_mm) & (z < layout.top_mm)
-    block |= (beyond < FLANGE_MM) & (np.abs(above) < THICK_MM + FLANGE_MM - np.maximum(beyond, 0))
+    z, above = points[..., 2], points[..., 2] - layout.field.at(points)
+    block = layout.in_block(points)
     entry, mouth = (len(run) - 1 - held[:, ::-1].argmax(1) for held in (cells.at(points), block))
     wall = block & (np.arange(len(run)) > entry[:, None]) & ~layout.cells.at(points)
     bad = np.abs(above) < _OFF_MM
-    for hole, wide in (
-        (layout.sprue_mm, 3 * layout.sprue_radius_mm),
-        *((v, 0.0) for v in layout.vents_mm),
-    ):
+    for hole in (layout.sprue_mm, *layout.vents_mm):
+        wide = 3 * layout.sprue_radius_mm if hole is layout.sprue_mm else 0.0
         off = np.linalg.norm(points[..., :2] - hole[:2], axis=-1) < wide + _OFF_MM
         bad |= off & (z > hole[2])
     split = (wall & (above > 0)).any(1) & (wall & (above < 0)).any(1)

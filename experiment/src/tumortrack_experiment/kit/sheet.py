@@ -95,8 +95,12 @@ def write_sheet(design: Design, kit: Kit, path: Path) -> None:
             _figure(mold_picture(mold, cast), f"Mold of {name}")
             for mold, cast, name in zip(design.molds, casts, names, strict=True)),
         "CYCLES": str(mix.cycles), "DAYS": str(mix.cycles),
-        "PINS": _table("pin for, diameter mm, cut to mm", (
-            (f"tumor {p.tumor}", f"{p.diameter_mm:g}", f"{p.length_mm:.0f}") for p in pins)),
+        "PINS": _table(
+            "pin for, diameter mm, cut to mm, mark for the tumor's mold mm, for the organ's mm", (
+                (f"tumor {p.tumor}", f"{p.diameter_mm:g}", f"{max(p.length_mm, own.length_mm):.0f}",
+                 f"{own.depth_mm:.1f}", f"{p.depth_mm:.1f}")
+                for p, own in zip(pins, (o for m in design.molds[1:] for o in m.pins), strict=True)
+            )),
         "SHOWN": "".join(
             _figure(bench_picture(design, s, 25.0), f"State {s}; what stands in sockets is lifted")
             for s in shown),

@@ -45,9 +45,11 @@ class Mishaps:
         self._out.mkdir()
         names = [bead.name for bead in self._of.kit.beads]
         acts: dict[str, tuple[Callable[[], str], str]] = {
-            "a bead is missing in the CT": (lambda: self._beads({names[1]: _GONE}), names[1]),
+            "a bead is missing in the CT": (
+                lambda: self._beads({names[1]: _GONE}), f"bead {names[1]} ",
+            ),
             "a bead lies 4 mm beside its dimple in the CT": (
-                lambda: self._beads({names[2]: (4.0, 0.0, 0.0)}), names[2],
+                lambda: self._beads({names[2]: (4.0, 0.0, 0.0)}), f"bead {names[2]} ",
             ),
             "three beads are left in the CT": (
                 lambda: self._beads(dict.fromkeys(names[3:], _GONE)), "",
