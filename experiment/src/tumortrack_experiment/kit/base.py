@@ -25,6 +25,7 @@ from tumortrack_experiment.kit import stands
 from tumortrack_experiment.kit.solids import box, cone, height_field, rounded_plate, written
 from tumortrack_experiment.kit.values import PrintedPart
 from tumortrack_experiment.kit_file import LEAST_BEADS
+from tumortrack_experiment.register.beads import expected_tre_mm
 
 FLE_MM = 0.2  # rms error of a bead's middle in 3-D, for the expected target errors
 _THICK_MM = 5.0
@@ -114,7 +115,7 @@ def base_design(anatomy_ct: Anatomy, up_lps: Direction, config: BaseConfig) -> B
     purpose = "carries the organ, the beads and the stands"
     plate = PrintedPart("base", purpose, mesh_of(solid), "base", lifted)
     tilts = [stands.wedge(s, (x, y), -_THICK_MM) for s in config.states if stands.tilt_of(s)]
-    tre = expected_tre_mm(beads, _middles(anatomy.tumors))
+    tre = expected_tre_mm(beads, _middles(anatomy.tumors), FLE_MM)
     parts = (plate, *standing, *tilts)
     gap, mirror = map(float, uniqueness_mm(beads))
     return Base(parts, beads, base_from_ct, anatomy, tuple(tre.tolist()), gap, mirror, steady_mm)
@@ -130,20 +131,6 @@ def laid_down(organ_ct: Mesh, up_lps: Direction) -> Float64[np.ndarray, "4 4"]:
     turned = organ_ct.vertices_mm @ rotation.T
     low, high = turned.min(0), turned.max(0)
     return rigid(rotation, -np.array([*(low + high)[:2] / 2, low[2]]))
-
-
-def expected_tre_mm(
-    beads_mm: Float[np.ndarray, "*k n 3"], targets_mm: Float[np.ndarray, "m 3"]
-) -> Float64[np.ndarray, "*k m"]:
-    """The rms error expected at targets after a rigid fit to beads that are found with ``FLE_MM``,
-    equal in all directions (Fitzpatrick, West, Maurer 1998, doi 10.1109/42.736021); of
-    several arrangements at once."""
-    middle, n = beads_mm.mean(-2, keepdims=True), beads_mm.shape[-2]
-    _, spread, axes = np.linalg.svd(beads_mm - middle, full_matrices=False)
-    squares = ((targets_mm - middle) @ np.swapaxes(axes, -1, -2)) ** 2  # along principal axes
-    off_axis = squares.sum(-1, keepdims=True) - squares
-    from_axis = ((spread**2).sum(-1, keepdims=True) - spread**2) / n  # of the beads, mean square
-    return np.asarray(FLE_MM * np.sqrt((1 + (off_axis / from_axis[..., None, :]).sum(-1) / 3) / n))
 
 
 def uniqueness_mm(
@@ -209,7 +196,7 @@ def _arranged(anatomy: Anatomy, standing: list[PrintedPart], config: BaseConfig)
     good &= fewest >= min(LEAST_BEADS + 1, fewest[good].max())  # one to spare, if it can be had
     good &= gap >= min(_GAP_MM, 0.9 * gap[good].max())
     drawn = places[chosen[good]]
-    tre = expected_tre_mm(drawn, _middles(anatomy.tumors or (anatomy.organ,))).max(1)
+    tre = expected_tre_mm(drawn, _middles(anatomy.tumors or (anatomy.organ,)), FLE_MM).max(1)
     area = np.abs(drawn[..., :2]).max(1).prod(1)
     return np.asarray(drawn[(tre * area).argmin()])
 
