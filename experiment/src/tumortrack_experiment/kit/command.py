@@ -49,8 +49,9 @@ class PhantomKit:
 
     def run(self) -> None:
         from tumortrack import api
-        from tumortrack_experiment.kit import design
         from tumortrack_experiment.kit.base import BaseConfig
+        from tumortrack_experiment.kit.design import design_kit
+        from tumortrack_experiment.kit.folder import write_kit
         from tumortrack_experiment.kit.mold import MoldConfig
         from tumortrack_experiment.kit.recipe import Mix
 
@@ -69,9 +70,9 @@ class PhantomKit:
                 "it from a scan or labels with one."
             )
         digest = store.sha256_of(self.case / store.MANIFEST)
-        made = design.design_kit(case.anatomy, case.up_lps, base, mold, mix)
+        made = design_kit(case.anatomy, case.up_lps, base, mold, mix)
         with store.new_folder(self.out, self.overwrite) as aside:
-            design.write_kit(made, aside, digest)
+            write_kit(made, aside, digest)
         self._report(made)
 
     def _report(self, made: Design) -> None:

@@ -126,7 +126,7 @@ def _reaching(layout: Layout, tumor: Mesh, taken: cKDTree) -> Float64[np.ndarray
     ends = []
     for n in np.flatnonzero(~(bad & wall).any(1) & ~split):
         way = points[n, entry[n] : mouth[n] + 1]
-        if taken.query(way[::3])[0].min() > _OFF_MM:
-            deep = min(_DEEP_MM, _DEEP * run[entry[n]])
-            ends.append([way[0] - deep * ways[n], way[0], way[-1]])
+        tip = way[0] - min(_DEEP_MM, _DEEP * run[entry[n]]) * ways[n]
+        if taken.query(way[::3])[0].min() > _OFF_MM and cells.at(tip):
+            ends.append([tip, way[0], way[-1]])
     return np.array(ends).reshape(-1, 3, 3)
