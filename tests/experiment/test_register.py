@@ -127,7 +127,7 @@ def test_the_expected_error_is_the_one_that_occurs():
         errors.append(transform_points(to_from, TUMORS_MM) - TUMORS_MM)
         left.append(left_mm)
     true_mm = np.sqrt((np.array(errors) ** 2).sum(2).mean(0))
-    expected_mm = beads.expected_tre(BEADS_MM, TUMORS_MM, fle_mm)
+    expected_mm = beads.expected_tre_mm(BEADS_MM, TUMORS_MM, fle_mm)
     assert true_mm == pytest.approx(expected_mm, rel=0.05)
     assert np.sqrt((np.array(left) ** 2).mean()) == pytest.approx(fle_mm * np.sqrt(1 - 2 / 6), 0.03)
 

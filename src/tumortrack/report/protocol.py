@@ -194,7 +194,8 @@ def summary_table(report: dict[str, Any]) -> Table:
         table.add_column(head, justify="right")
     rows = part_rows(summary)
     if registered := any("registration_mm" in part for part in rows.values()):
-        table.add_column("registration", justify="right")
+        table.add_column("± mm", justify="right")
+        table.caption = "± mm: the expected error of the truth, by its registration"
     for name, part in rows.items():
         numbers = [number(part[key], 1 if key != "surface_mm" else 2) for key in DISTANCES]
         found = f"{part['found']}/{part['scenes']}"

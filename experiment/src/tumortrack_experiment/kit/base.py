@@ -25,7 +25,7 @@ from tumortrack_experiment.kit import stands
 from tumortrack_experiment.kit.solids import box, cone, height_field, rounded_plate, written
 from tumortrack_experiment.kit.values import PrintedPart
 from tumortrack_experiment.kit_file import LEAST_BEADS
-from tumortrack_experiment.register.beads import expected_tre
+from tumortrack_experiment.register.beads import expected_tre_mm
 
 FLE_MM = 0.2  # rms error of a bead's middle in 3-D, for the expected target errors
 _THICK_MM = 5.0
@@ -115,7 +115,7 @@ def base_design(anatomy_ct: Anatomy, up_lps: Direction, config: BaseConfig) -> B
     purpose = "carries the organ, the beads and the stands"
     plate = PrintedPart("base", purpose, mesh_of(solid), "base", lifted)
     tilts = [stands.wedge(s, (x, y), -_THICK_MM) for s in config.states if stands.tilt_of(s)]
-    tre = expected_tre(beads, _middles(anatomy.tumors), FLE_MM)
+    tre = expected_tre_mm(beads, _middles(anatomy.tumors), FLE_MM)
     parts = (plate, *standing, *tilts)
     gap, mirror = map(float, uniqueness_mm(beads))
     return Base(parts, beads, base_from_ct, anatomy, tuple(tre.tolist()), gap, mirror, steady_mm)
@@ -196,7 +196,7 @@ def _arranged(anatomy: Anatomy, standing: list[PrintedPart], config: BaseConfig)
     good &= fewest >= min(LEAST_BEADS + 1, fewest[good].max())  # one to spare, if it can be had
     good &= gap >= min(_GAP_MM, 0.9 * gap[good].max())
     drawn = places[chosen[good]]
-    tre = expected_tre(drawn, _middles(anatomy.tumors or (anatomy.organ,)), FLE_MM).max(1)
+    tre = expected_tre_mm(drawn, _middles(anatomy.tumors or (anatomy.organ,)), FLE_MM).max(1)
     area = np.abs(drawn[..., :2]).max(1).prod(1)
     return np.asarray(drawn[(tre * area).argmin()])
 

@@ -231,7 +231,7 @@ class Registration:
 
     def tre_mm(self, points_mm: Targets) -> Float64[np.ndarray, " m"]:
         """The rms error to expect at points (m, 3) of the first frame."""
-        return expected_tre(self.from_mm, points_mm, self.fle_mm)
+        return expected_tre_mm(self.from_mm, points_mm, self.fle_mm)
 
     def bound_mm(self, points_mm: Targets) -> float:
         """What the error at any of the points stays below with 95 %, all of it along one axis at
@@ -255,18 +255,18 @@ class Registration:
         }
 
 
-def expected_tre(
+def expected_tre_mm(
     beads_mm: Float[np.ndarray, "*k n 3"], points_mm: Targets, fle_mm: float
 ) -> Float64[np.ndarray, "*k m"]:
-    """Rms error (m,) at points, in mm, of a registration by beads that are each off by ``fle_mm``
+    """The rms error expected at points of a registration by beads that are each off by ``fle_mm``
     (rms, three axes together, the same in all directions): Fitzpatrick and others, equation 46; of
-    several arrangements of beads at once."""
-    middle = beads_mm.mean(-2, keepdims=True)
-    axes = np.swapaxes(np.linalg.svd(beads_mm - middle, full_matrices=False)[2], -1, -2)
-    squares = [((some - middle) @ axes) ** 2 for some in (beads_mm, points_mm)]
-    beads2, points2 = (one.sum(-1, keepdims=True) - one for one in squares)  # from each axis
-    share = (points2 / beads2.mean(-2, keepdims=True)).sum(-1) / 3
-    return np.asarray(fle_mm * np.sqrt((1 + share) / beads_mm.shape[-2]))
+    several arrangements at once."""
+    middle, n = beads_mm.mean(-2, keepdims=True), beads_mm.shape[-2]
+    _, spread, axes = np.linalg.svd(beads_mm - middle, full_matrices=False)
+    squares = ((points_mm - middle) @ np.swapaxes(axes, -1, -2)) ** 2  # along principal axes
+    off_axis = squares.sum(-1, keepdims=True) - squares
+    from_axis = ((spread**2).sum(-1, keepdims=True) - spread**2) / n  # of the beads, mean square
+    return np.asarray(fle_mm * np.sqrt((1 + (off_axis / from_axis[..., None, :]).sum(-1) / 3) / n))
 
 
 def register(kit: Kit, first: NamedBeads, second: NamedBeads) -> Registration:
@@ -318,4 +318,4 @@ def _without(from_mm: np.ndarray, to_mm: np.ndarray, n: int) -> tuple[float, flo
     others = np.arange(len(from_mm)) != n
     to_from, _ = fit_rigid(from_mm[others], to_mm[others])
     off_mm = np.linalg.norm(transform_points(to_from, from_mm[[n]])[0] - to_mm[n])
-    return float(off_mm), float(np.hypot(1, expected_tre(from_mm[others], from_mm[[n]], 1.0)[0]))
+    return float(off_mm), float(np.hypot(1, expected_tre_mm(from_mm[others], from_mm[[n]], 1.0)[0]))

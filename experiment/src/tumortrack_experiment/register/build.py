@@ -27,14 +27,14 @@ from tumortrack_experiment.register.beads import (
     name_beads,
     register,
 )
-from tumortrack_experiment.register.command import CalibrateRegister
 from tumortrack_experiment.register.frames import moments_in, still_beads
 from tumortrack_experiment.register.in_ct import find_balls, middles_mm
+from tumortrack_experiment.register.options import RegisterOptions
 
 _ORGAN_MM = [[0.0, 0.0, 25.0]]  # without a case: half an organ's height above the plate
 
 
-def write_registration(given: CalibrateRegister) -> None:
+def write_registration(given: RegisterOptions) -> None:
     """Raises InputError: see what finds and registers beads."""
     kit = read_kit(given.kit)
     base_mm = targets_mm(given.case, kit)
@@ -91,7 +91,7 @@ def targets_mm(case: Path | None, kit: Kit) -> dict[str, Points]:
     }
 
 
-def _moments(view: Path, given: CalibrateRegister) -> list[Moment]:
+def _moments(view: Path, given: RegisterOptions) -> list[Moment]:
     if view.suffix.lower() == ".png":
         beside = given.intrinsics or view.parent / "intrinsics.json"
         return [Moment(read_depth_png(view, beside))]
@@ -100,7 +100,7 @@ def _moments(view: Path, given: CalibrateRegister) -> list[Moment]:
     return moments_in(view, given.state)
 
 
-def _pointed(kit: Kit, path: Path, given: CalibrateRegister) -> NamedBeads:
+def _pointed(kit: Kit, path: Path, given: RegisterOptions) -> NamedBeads:
     """Raises InputError: as ``name_beads``, or a place is not that of the bead it is named for."""
     table = read_points(path)
     points_mm = table.points_ct * (1000.0 if given.unit == "m" else 1.0)
@@ -119,7 +119,7 @@ def _pointed(kit: Kit, path: Path, given: CalibrateRegister) -> NamedBeads:
     return found
 
 
-def _calibration(given: CalibrateRegister, one: Registration, at_mm: Points) -> dict[str, Any]:
+def _calibration(given: RegisterOptions, one: Registration, at_mm: Points) -> dict[str, Any]:
     bound_mm = one.bound_mm(at_mm)
     file = CalibrationFile(
         frame_id=given.frame_id,
