@@ -49,7 +49,7 @@ def mishap_table(mishaps: list[Mishap]) -> str:
 
 
 def picture(rehearsal: Rehearsal, path: Path) -> None:
-    """One state: the depth image, the second CT across base, beads and organ, and the estimate
+    """One state: the depth image, the second CT across base and organ, and the estimate
     over the second CT's surfaces."""
     from matplotlib.image import imread
 
@@ -61,14 +61,13 @@ def picture(rehearsal: Rehearsal, path: Path) -> None:
     depth.imshow(frame.depth_mm, cmap="viridis_r")
     depth.set_title(f"{_SHOWN}: the depth image that is recorded")
     volume = read_volume(out / "ct" / _SHOWN)
-    most = np.unravel_index(int(volume.hu.argmax()), volume.hu.shape)  # through a bead
     tumors = np.where((volume.hu > 450) & (volume.hu < 900))
     cut = volume.hu[:, :, int(np.median(tumors[2]))]
-    ct.imshow(np.maximum(cut, 0.6 * volume.hu[:, :, most[2]]).T, cmap="gray", vmin=-900, vmax=1200)
-    ct.set_title("the second CT (a slice through a bead laid over)")
+    ct.imshow(cut.T, cmap="gray", vmin=-900, vmax=1200)
+    ct.set_title("the second CT")
     picture = imread(out / "scenes-report" / "scenes" / f"{_SHOWN}.png")
     height, width = picture.shape[:2]
-    estimate.imshow(picture[height // 12 : height // 2, : width // 2])
+    estimate.imshow(picture[height // 11 : height // 2, : width // 2])
     estimate.set_title("estimate, and the second CT's surfaces")
     for axes in (depth, ct, estimate):
         axes.set_axis_off()
