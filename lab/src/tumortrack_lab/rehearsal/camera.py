@@ -1,4 +1,4 @@
-"""The rehearsal's depth camera as a source for commands: ``bench:FOLDER``.
+"""The rehearsal's depth camera as a source for commands: ``rehearsal:FOLDER``.
 
 FOLDER has ``camera.json``, what the device believes of itself, and ``now.npy``, the depth image
 that it would measure without noise, mm. Whoever plays the laboratory's hands replaces that file.
@@ -20,7 +20,7 @@ from tumortrack.sense.files import read_intrinsics
 from tumortrack.sense.noise import D405_NOISE, add_noise
 
 
-class BenchSourceConfig(SourceConfig, frozen=True, kw_only=True, tag="bench"):
+class BenchSourceConfig(SourceConfig, frozen=True, kw_only=True, tag="rehearsal"):
     """A rehearsal's camera.
 
     Attributes:

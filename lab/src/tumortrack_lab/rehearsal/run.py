@@ -137,7 +137,7 @@ class Rehearsal:
         first.plug_in()
         first.show(self.setup(states[0]))
         command = self._command(
-            "record", f"bench:{first.folder}", folder, "--states", *states,
+            "record", f"rehearsal:{first.folder}", folder, "--states", *states,
             "--kit", self.out / "kit", "--seconds", _SECONDS, "--countdown", 3, "--yes",
             "--intrinsics", self.out / "camera-calibration" / "intrinsics.json",
         )  # fmt: skip
