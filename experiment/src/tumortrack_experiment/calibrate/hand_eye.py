@@ -195,12 +195,15 @@ def _agreeing(data: HandEyeData, at_mm: float) -> np.ndarray:
             < 0.2 * middle_mm
         ):
             hint = (
-                "inverted they do. Give base_from_tool, and --eye-to-hand only where the board is "
-                "on the tool."
+                "inverted they do. Where the board is on the tool and the camera stands, add "
+                "--eye-to-hand; where the camera is on the tool, leave that out. Only if that is "
+                "right already the file holds tool_from_base: give base_from_tool."
             )
+        far = int((~good).sum())
+        others = f", {far} of {len(good)} much farther" if far else ""
         raise InputError(
-            f"poses and pictures do not fit together: {middle_mm:.1f} mm at the organ (median), "
-            f"{int((~good).sum())} of {len(good)} pictures far off; {hint}"
+            f"poses and pictures do not fit together: they are {middle_mm:.1f} mm off at the organ "
+            f"(median){others}; {hint}"
         )
     return good
 

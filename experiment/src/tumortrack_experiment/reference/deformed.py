@@ -140,8 +140,8 @@ def _check(found_ml: list[float], kit: Kit, lowest_mm: float) -> None:
     change = 100 * (found_ml[0] / kit.organ_ml - 1)
     if abs(change) > _ORGAN_PERCENT:
         faults.append(
-            f"the organ has {found_ml[0]:.1f} ml, {change:+.0f} %, where {_ORGAN_PERCENT:g} % are "
-            "allowed (a plate taken for organ, or another phantom?)"
+            f"the organ has {found_ml[0]:.1f} ml, {change:+.2g} %, where {_ORGAN_PERCENT:g} % are "
+            "allowed (another state or phantom, or a plate taken for organ?)"
         )
     if len(found_ml) - 1 != len(kit.tumors_ml):
         faults.append(f"it has {len(found_ml) - 1} tumors instead of {len(kit.tumors_ml)}")
