@@ -215,16 +215,17 @@ class Track(StatedPatient):
 
     def _loop_config(self, model: Model) -> LoopConfig:
         from tumortrack.live.loop import LoopConfig
-        from tumortrack.sense.files import DepthCorrection, read_correction, read_intrinsics
+        from tumortrack.sense.files import read_camera
         from tumortrack.tracking.tracker import FollowerConfig, region_for
 
         box = None if self.box is None else (self.box[:3], self.box[3:])
         follower = FollowerConfig(rescan_s=self.rescan, smoothing_s=self.smoothing, seed=self.seed)
+        intrinsics, correction = read_camera(self.intrinsics)
         return LoopConfig(
             region=region_for(model, range_mm=self.range, box_mm=box, whole=self.whole),
             follower=follower,
-            intrinsics=read_intrinsics(self.intrinsics) if self.intrinsics else None,
-            correction=read_correction(self.intrinsics) if self.intrinsics else DepthCorrection(),
+            intrinsics=intrinsics,
+            correction=correction,
             stale_s=self.stale,
             frozen_s=self.frozen,
             scan=self.scan,

@@ -7,7 +7,6 @@ correlated Gaussian noise is added. Beam hardening, scatter and streaks are left
 from __future__ import annotations
 
 from collections.abc import Mapping
-from types import MappingProxyType
 
 import numpy as np
 from jaxtyping import Float, Float32
@@ -20,7 +19,6 @@ from tumortrack.core.types import FIRST_TUMOR, ORGAN, LabelVolume, Volume
 AIR_HU = -1000.0
 _LOWEST_HU, _HIGHEST_HU = -1024, 3071  # the 12 bits of a clinical scanner
 _LARGEST_SCAN = 400_000_000  # voxels
-_NOTHING_ELSE: Mapping[int, float] = MappingProxyType({})
 
 _Object = tuple[np.ndarray, np.ndarray, float]  # lower and upper corner, HU
 
@@ -69,7 +67,7 @@ def scan(
     labels: LabelVolume,
     parameters: ScannerParameters,
     seed: int,
-    material_hu: Mapping[int, float] = _NOTHING_ELSE,
+    material_hu: Mapping[int, float] | None = None,
 ) -> Volume:
     """Scan a label map: 1 becomes hydrogel, 2 and above contrast-loaded tumor, 0 air, and what
     ``material_hu`` names by its label, that.
@@ -88,7 +86,7 @@ def scan(
     objects = _objects(box_mm, parameters)
     lps_from_index, shape = _field_of_view(box_mm, objects, parameters)
     sigma_mm = _blur_mm(np.eye(3), lps_from_index, parameters)
-    hu = _scan_labels(body, lps_from_index, shape, parameters, material_hu)
+    hu = _scan_labels(body, lps_from_index, shape, parameters, material_hu or {})
     for lower_mm, upper_mm, object_hu in objects:
         _add_box(hu, lps_from_index, (lower_mm, upper_mm), object_hu - AIR_HU, sigma_mm)
     hu += _noise(shape, parameters, seed)

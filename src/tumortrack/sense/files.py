@@ -205,9 +205,12 @@ def read_intrinsics(path: Path) -> Intrinsics:
     return _camera(path)[0]
 
 
-def read_correction(path: Path) -> DepthCorrection:
-    """What the same file states as ``depth_scale`` and ``depth_offset_mm``; nothing: none."""
-    return _correction(_camera(path)[1], path)
+def read_camera(path: Path | None) -> tuple[Intrinsics | None, DepthCorrection]:
+    """The same, and the correction that the file may have; without a file neither."""
+    if path is None:
+        return None, DepthCorrection()
+    camera, data = _camera(path)
+    return camera, _correction(data, path)
 
 
 def _correction(data: dict[str, Any], path: Path) -> DepthCorrection:

@@ -60,8 +60,8 @@ class Record:
     def run(self) -> None:
         """Until all states are recorded, or the user ends it."""
         from tumortrack.live.workers import SourceWorker
-        from tumortrack.sense.files import DepthCorrection, read_correction, read_intrinsics
-        from tumortrack_experiment.kit_file import KIT_FILE, read_kit
+        from tumortrack.sense.files import read_camera
+        from tumortrack_experiment.kit_file import KIT_FILE, kit_path, read_kit
         from tumortrack_experiment.record.folder import RecordingFolder
         from tumortrack_experiment.record.guide import Guide, GuideConfig
 
@@ -76,11 +76,10 @@ class Record:
         if strange := [name for name in states if name not in known]:
             raise InputError(f"the kit has no state {strange[0]!r}; it has {', '.join(known)}.")
         setup = self._setup()
-        kit_path = self.kit / KIT_FILE if self.kit and self.kit.is_dir() else self.kit
-        beside = {KIT_FILE: kit_path, "calibration.json": self.frame}
+        beside = {"calibration.json": self.frame, "intrinsics.json": self.intrinsics}
+        beside |= {KIT_FILE: kit_path(self.kit)} if self.kit else {}
         files = {name: path.read_bytes() for name, path in beside.items() if path}
-        intrinsics = read_intrinsics(self.intrinsics) if self.intrinsics else None
-        correction = read_correction(self.intrinsics) if self.intrinsics else DepthCorrection()
+        intrinsics, correction = read_camera(self.intrinsics)
         how = GuideConfig(self.seconds, self.range, self.yes, self.countdown)
         folder = RecordingFolder(self.folder, states, setup.published.frame_id, files)
         if now := folder.to_record(self.only):
