@@ -16,11 +16,11 @@ from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import rigid, transform_points
 from tumortrack.live.calibration_file import read_frames
 from tumortrack.simulate.scene_folder import read_scene
-from tumortrack_experiment.kit_file import read_kit
-from tumortrack_experiment.record.read import Moment
+from tumortrack_experiment.kit_file import KIT_FILE, read_kit
+from tumortrack_experiment.record.read import Moment, Recorded
 from tumortrack_experiment.reference import scenes
 from tumortrack_experiment.reference.deformed import parts_in, segment_deformed
-from tumortrack_experiment.register.frames import still_beads
+from tumortrack_experiment.register.frames import check_kit, still_beads
 from tumortrack_experiment.register.in_ct import find_balls, middles_mm
 from tumortrack_experiment.register.in_depth import find_balls_seen
 
@@ -137,6 +137,20 @@ def test_another_case_than_the_kits_is_refused(made, tmp_path, capsys):
     (tmp_path / "kit" / "kit.json").write_text(json.dumps(kit))
     assert reference(root, tmp_path / "s", "--kit", str(tmp_path / "kit")) == 2
     assert "is not the case that this kit was made of" in capsys.readouterr().err
+
+
+def test_a_recording_that_was_made_with_another_kit_is_told(made):
+    path = made[0] / "kit" / KIT_FILE
+    kit, content = read_kit(path), path.read_bytes()
+    check_kit(Recorded(path.parent, {}, {}), kit)  # it does not say which
+    check_kit(Recorded(path.parent, {}, {KIT_FILE: content}), kit)
+    other = json.loads(content)
+    other["beads"][2]["center_mm"][0] += 5.0
+    recorded = Recorded(path.parent, {}, {KIT_FILE: json.dumps(other).encode()})
+    with pytest.raises(InputError, match="recorded with another kit, whose beads lie elsewhere"):
+        check_kit(recorded, kit)
+    with pytest.raises(InputError, match="cannot be read as JSON"):
+        check_kit(Recorded(path.parent, {}, {KIT_FILE: b"{"}), kit)
 
 
 def segmented(made, scan, **changed):

@@ -68,10 +68,15 @@ class Kit(Config, frozen=True, kw_only=True):
         return np.array([bead.center_mm for bead in self.beads], np.float64)
 
 
+def kit_path(folder: Path) -> Path:
+    """``kit.json`` of a kit's folder, or that file itself."""
+    return folder / KIT_FILE if folder.is_dir() else folder
+
+
 def read_kit(folder: Path) -> Kit:
     """The kit of a folder that `tumortrack phantom-kit` wrote, or of its ``kit.json``. Raises
     ArtifactError or InputError: there is none, or it is damaged."""
-    path = folder / KIT_FILE if folder.is_dir() else folder
+    path = kit_path(folder)
     kit = from_builtins(read_json(path), Kit, str(path))
     read_rigid(kit.base_from_ct, "mm", f"{path}: base_from_ct")
     return kit

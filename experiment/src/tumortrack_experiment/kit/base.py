@@ -34,6 +34,7 @@ _STEADY_MM = 8.0  # the organ's centre of mass lies so far inside of what bears 
 _LIP_MM, _SLOPE = 0.6, np.sqrt(0.5)  # of a cone beyond the circle of touch; 45 degrees
 _FOOT = 1.4  # radii of a post
 _CLEAR_MM = 7.0  # between a post and the organ, whose sides come out when it is pressed
+_APART_MM = 18.0  # of two beads: of two 11 mm apart a CT showed neither
 _LEAN = 0.9  # of a look from the farthest side, by its height
 _TRIES = 60_000
 _GAP_MM, _LEAST_GAP_MM = 2.0, 1.0  # no two pairs of beads are equally far apart to within it
@@ -182,6 +183,7 @@ def _arranged(anatomy: Anatomy, standing: list[PrintedPart], config: BaseConfig)
         apart = np.abs(places[chosen[:, first]] - places[chosen[:, second]])
         level = np.hypot(apart[..., 0], apart[..., 1])  # no post stands before another's bead
         good &= (level > _LEAN * apart[..., 2] + 2 * _FOOT * config.post_mm).all(1)
+        good &= (np.hypot(level, apart[..., 2]) >= _APART_MM).all(1)
         for state in {part.state for part in standing}:
             there = [anatomy.organ, *(part.mesh for part in standing if part.state == state)]
             for seen in seen_beads(there, places, eyes, config.bead_mm):

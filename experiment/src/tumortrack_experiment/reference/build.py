@@ -17,7 +17,7 @@ from tumortrack.imaging.volume import read_volume
 from tumortrack.simulate.occupancy import contains
 from tumortrack.simulate.scene_folder import Scene, Targets
 from tumortrack.tracking.points import read_points
-from tumortrack_experiment.kit_file import KIT_FILE, Kit, read_kit
+from tumortrack_experiment.kit_file import Kit, kit_path, read_kit
 from tumortrack_experiment.record.read import Moment, Recorded
 from tumortrack_experiment.reference import scenes
 from tumortrack_experiment.reference.case import case_of_kit
@@ -42,7 +42,7 @@ def write_reference(given: ReferenceOptions) -> None:
     """Raises InputError: CT, recording, kit and case do not belong together, or cannot be read."""
     kit = read_kit(given.kit)
     case = case_of_kit(given.case, kit)
-    states = states_in(given.recording)
+    states = states_in(given.recording, kit)
     state = one_of(states, given.state, given.recording)
     if (folder := given.scenes / state).exists():
         raise InputError(f"{folder} exists already. Choose another SCENES folder.")
@@ -67,8 +67,7 @@ def write_reference(given: ReferenceOptions) -> None:
         name: part.vertices_mm.mean(0)[None]
         for name, part in zip(in_ct2.names, in_ct2.parts, strict=True)
     }
-    kit_file = given.kit / KIT_FILE if given.kit.is_dir() else given.kit
-    inputs = {"ct": given.ct, "recording": given.recording, "kit": kit_file}
+    inputs = {"ct": given.ct, "recording": given.recording, "kit": kit_path(given.kit)}
     meta: dict[str, Any] = {
         "state": state,
         "depth": f"median of the first {len(moments)} frames",

@@ -16,7 +16,7 @@ from tumortrack.imaging.volume import read_volume
 from tumortrack.live.calibration_file import CalibrationFile
 from tumortrack.sense.files import read_depth_png
 from tumortrack.tracking.points import read_points
-from tumortrack_experiment.kit_file import Kit, read_kit
+from tumortrack_experiment.kit_file import Kit, kit_path, read_kit
 from tumortrack_experiment.record.read import Moment
 from tumortrack_experiment.reference.case import case_of_kit
 from tumortrack_experiment.register.beads import (
@@ -38,13 +38,13 @@ def write_registration(given: RegisterOptions) -> None:
     """Raises InputError: see what finds and registers beads."""
     kit = read_kit(given.kit)
     base_mm = targets_mm(given.case, kit)
-    found, inputs = {}, {"kit": given.kit}
+    found, inputs = {}, {"kit": kit_path(given.kit)}
     if given.robot_points is not None:
         inputs["robot"] = given.robot_points
         found["robot"] = _pointed(kit, given.robot_points, given)
     if given.view is not None:
         inputs["camera"] = given.view
-        moments = _moments(given.view, given)
+        moments = _moments(given.view, given, kit)
         found["camera"] = still_beads(kit, moments, given.state or str(given.view))[1]
     if given.ct is not None:
         inputs["ct"] = given.ct
@@ -91,13 +91,13 @@ def targets_mm(case: Path | None, kit: Kit) -> dict[str, Points]:
     }
 
 
-def _moments(view: Path, given: RegisterOptions) -> list[Moment]:
+def _moments(view: Path, given: RegisterOptions, kit: Kit) -> list[Moment]:
     if view.suffix.lower() == ".png":
         beside = given.intrinsics or view.parent / "intrinsics.json"
         return [Moment(read_depth_png(view, beside))]
     if given.intrinsics is not None:
         raise InputError(f"--intrinsics is for a depth image (.png); {view} has its own.")
-    return moments_in(view, given.state)
+    return moments_in(view, given.state, kit)
 
 
 def _pointed(kit: Kit, path: Path, given: RegisterOptions) -> NamedBeads:

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import json
 from itertools import islice
 from pathlib import Path
 
 import numpy as np
 
+from tumortrack.core.config import from_builtins
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import DepthFrame
 from tumortrack.live.recording.folders import folder_frames
 from tumortrack.sense.files import read_depth_png
-from tumortrack_experiment.kit_file import Kit
+from tumortrack_experiment.kit_file import KIT_FILE, Kit
 from tumortrack_experiment.record.read import Moment, Recorded, read_recorded
 from tumortrack_experiment.register.beads import CAMERA, NamedBeads, name_beads
 from tumortrack_experiment.register.in_depth import find_balls_seen
@@ -22,13 +24,15 @@ _HALVES = 6  # with fewer frames nothing is said about movement while they were 
 _STILL_MM = 1.0  # beads of two halves of a state's frames differ by less where nothing moved
 
 
-def states_in(recording: Path) -> dict[str, Recorded | Path]:
+def states_in(recording: Path, kit: Kit) -> dict[str, Recorded | Path]:
     """The states of a recording, and where their frames are: what `tumortrack record` wrote, or a
-    folder with one for each state, of depth images or scene folders. Raises InputError: none."""
+    folder with one for each state, of depth images or scene folders. Raises InputError: none, or
+    it says itself that it is of another kit."""
     if not recording.is_dir():
         raise InputError(f"{recording} is no folder. Give one that `tumortrack record` wrote.")
     if any(recording.glob("*.mcap")):
         recorded = read_recorded(recording)
+        check_kit(recorded, kit)
         return dict.fromkeys(recorded.states, recorded)
     inside = sorted(path for path in recording.iterdir() if path.is_dir())
     states = {path.name: path for path in inside if any(path.rglob("*.png"))}
@@ -38,6 +42,23 @@ def states_in(recording: Path) -> dict[str, Recorded | Path]:
             "with: tumortrack record."
         )
     return dict(states)
+
+
+def check_kit(recorded: Recorded, kit: Kit) -> None:
+    """InputError: the beads of the kit that the recording was made with lie elsewhere."""
+    data = recorded.attachments.get(KIT_FILE)
+    if data is None:
+        return
+    where = f"{recorded.folder}: {KIT_FILE}"
+    try:
+        content = json.loads(data)
+    except ValueError as error:
+        raise InputError(f"{where} cannot be read as JSON: {error}.") from error
+    if from_builtins(content, Kit, where).beads != kit.beads:
+        raise InputError(
+            f"{recorded.folder} was recorded with another kit, whose beads lie elsewhere (another "
+            "case, --bed or --states makes another kit). Give that one."
+        )
 
 
 def one_of(states: dict[str, Recorded | Path], state: str | None, recording: Path) -> str:
@@ -51,11 +72,12 @@ def one_of(states: dict[str, Recorded | Path], state: str | None, recording: Pat
     return state
 
 
-def moments_in(view: Path, state: str | None) -> list[Moment]:
-    """Of a recording's state, or a folder of depth images. Raises InputError as ``moments_of``."""
+def moments_in(view: Path, state: str | None, kit: Kit) -> list[Moment]:
+    """Of a recording's state, or a folder of depth images. Raises InputError as ``moments_of``
+    and ``states_in``."""
     if state is None and not any(view.glob("*.mcap")):
         return moments_of(view, "")
-    states = states_in(view)
+    states = states_in(view, kit)
     name = one_of(states, state, view)
     return moments_of(states[name], name)
 
