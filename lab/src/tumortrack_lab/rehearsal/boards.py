@@ -15,7 +15,7 @@ from tumortrack.core.types import DepthFrame
 from tumortrack.sense.files import depth_png, intrinsics_json
 from tumortrack.sense.noise import D405_NOISE, add_noise
 from tumortrack_experiment.calibrate.board import Board
-from tumortrack_experiment.calibrate.lens import Lens
+from tumortrack_experiment.calibrate.lens import lens_of
 from tumortrack_experiment.calibrate.virtual_board import (
     board_depth_mm,
     board_picture,
@@ -66,23 +66,13 @@ def _shoot(
     rng: np.random.Generator,
     depth: bool = True,
 ) -> None:
-    true, errors = hands.true, hands.errors
-    lens = Lens(
-        width=true.width,
-        height=true.height,
-        fx=true.fx,
-        fy=true.fy,
-        cx=true.cx,
-        cy=true.cy,
-        distortion=errors.distortion,
-    )
+    errors = hands.errors
+    lens = lens_of(hands.true, distortion=errors.distortion)
     folder.mkdir(parents=True)
     picture = board_picture(board, lens, camera_from_board, rng)
     store.write_atomically(folder / "infrared.png", cv2.imencode(".png", picture)[1].tobytes())
     if depth:
-        straight = Lens(**{name: getattr(true, name) for name in ("width", "height")},
-                        fx=true.fx, fy=true.fy, cx=true.cx, cy=true.cy)  # fmt: skip
-        depth_mm = board_depth_mm(board, straight, camera_from_board)
+        depth_mm = board_depth_mm(board, lens_of(hands.true), camera_from_board)
         measured_mm = depth_mm * errors.depth_scale + errors.depth_offset_mm
         frame = add_noise(DepthFrame(measured_mm, hands.believed), D405_NOISE, rng)
         store.write_atomically(folder / "depth.png", depth_png(frame))

@@ -26,10 +26,12 @@ from jaxtyping import Bool, Float, Float64
 
 from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError, TumortrackError
-from tumortrack.core.geometry import rigid, rotation_onto, transform_points, triangles_of
+from tumortrack.core.geometry import rigid, transform_points, triangles_of
 from tumortrack.core.types import Anatomy, Mesh
 from tumortrack.imaging.raster import label_grid
 from tumortrack.report.metrics import surface_samples
+from tumortrack_experiment.kit.base import laid_down as bench_from_ct
+from tumortrack_experiment.kit.stands import COMPRESSION_MM, poke_point
 from tumortrack_lab.tets import TetMesh, embed, tetrahedralise
 from tumortrack_lab.twin import equilibrium
 from tumortrack_lab.twin.equilibrium import Contact, ContactPlate, Nodes, Obstacles, Rod, Support
@@ -37,7 +39,6 @@ from tumortrack_lab.twin.solid import NeoHookeanSolid
 
 GRAVITY_KPA_PER_MM = 9.81e-6  # of 1 kg/m^3
 STATES = ("D0", "D1", "D2", "D3", "G1", "P1")
-COMPRESSION_MM = {"D1": 4.0, "D2": 8.0, "D3": 12.0}
 _LARGEST_VOLUME_CHANGE = 0.02
 _SINK_STEPS = 15
 _SINK_TOLERANCE_MM = 0.4
@@ -141,16 +142,6 @@ def contact_points(
     cubes = np.floor(points_mm / cube_mm)
     _, first, cube = np.unique(cubes, axis=0, return_index=True, return_inverse=True)
     return points_mm[first], np.bincount(cube.ravel(), areas_mm2)
-
-
-def bench_from_ct(organ_ct: Mesh, up_lps: tuple[float, float, float]) -> np.ndarray:
-    upright = rotation_onto(np.array(up_lps), np.array([0.0, 0.0, 1.0]))
-    flat = (organ_ct.vertices_mm - organ_ct.vertices_mm.mean(0)) @ upright.T
-    x, y = np.linalg.eigh(np.cov(flat[:, :2].T))[1][:, 1]
-    rotation = np.array([[x, y, 0], [-y, x, 0], [0, 0, 1]]) @ upright
-    turned = organ_ct.vertices_mm @ rotation.T
-    box = np.stack([turned.min(0), turned.max(0)])
-    return rigid(rotation, -np.array([*box.mean(0)[:2], box[0, 2]]))
 
 
 def _faces_down(
@@ -280,7 +271,7 @@ def _sink(bench: Apparatus, step: Step) -> tuple[Nodes, dict]:
 def _poke(bench: Apparatus, step: Step) -> tuple[Nodes, dict]:
     config, nodes = bench.config, bench.mesh.nodes_mm
     radius = config.poke_diameter_mm / 2
-    point, up = _poke_point(bench), np.array([0.0, 0.0, 1.0])
+    point, up = poke_point(bench.anatomy), np.array([0.0, 0.0, 1.0])
     for depth in _increments(0.0, config.poke_mm, config.load_step_mm / 2):
         rod = Rod(point - depth * up, up, radius)
         nodes = step(nodes, (rod,), f"rod pressed in by {depth:.1f} mm")
@@ -292,16 +283,3 @@ def _poke(bench: Apparatus, step: Step) -> tuple[Nodes, dict]:
         "poke_load_n": load_n,
         "sunk_in_mm": bench.contact.depth_mm(nodes, (Support(), rod)),
     }
-
-
-def _poke_point(bench: Apparatus) -> Float64[np.ndarray, " 3"]:
-    """Where the surface faces up, farthest from every tumor and from the organ's rim."""
-    from scipy.spatial import cKDTree
-
-    organ = bench.anatomy.organ
-    middle, normal = triangles_of(organ.vertices_mm, organ.faces)
-    facing = normal[:, 2] / np.maximum(np.linalg.norm(normal, axis=1), 1e-12)
-    top = (facing > min(0.85, float(facing.max()))) & (middle[:, 2] > middle[:, 2].mean())
-    away = [middle[facing < 0.5], *(tumor.vertices_mm for tumor in bench.anatomy.tumors)]
-    room = np.min([cKDTree(points).query(middle[top])[0] for points in away], axis=0)
-    return middle[top][int(room.argmax())]
