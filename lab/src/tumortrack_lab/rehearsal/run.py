@@ -1,5 +1,5 @@
-"""The paper's experiment rehearsed: the commands from kit to table, as a laboratory gives them, on a
-bench that does not exist, and what each states of its own error beside what that error is."""
+"""The paper's experiment rehearsed: the commands from kit to table, as a laboratory gives them, on
+a bench that does not exist, and what each states of its own error beside what that error is."""
 
 from __future__ import annotations
 
