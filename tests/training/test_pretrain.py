@@ -33,7 +33,7 @@ from tumortrack.simulate.deform import ElasticConfig
 from tumortrack.simulate.occupancy import OccupancyConfig
 from tumortrack.training.model import PretrainedWeights, load_start
 from tumortrack.training.presets import clinic, pretraining, quick
-from tumortrack.training.pretrain import KidneyStream, kidney_stream, pretrain
+from tumortrack.training.pretrain import KidneyStream, pretrain
 from tumortrack.training.state import Pretraining, TrainingProgress, TrainingRun, provenance
 from tumortrack.training.task import TrainingTask, task_of
 from tumortrack.training.train import train
@@ -79,7 +79,7 @@ def start(pretrained: Path) -> PretrainedWeights:
 
 @pytest.fixture(scope="module")
 def stream() -> KidneyStream:
-    return kidney_stream(a_pretraining())
+    return KidneyStream(a_pretraining())
 
 
 @pytest.fixture(scope="module")
@@ -224,7 +224,7 @@ def test_a_crashed_pretraining_ends_with_the_weights_of_one_that_was_not(
 
     run = replace(a_pretraining(), checkpoint_every_s=0.0)
     broken = tmp_path / "broken"
-    monkeypatch.setattr("tumortrack.training.pretrain.kidney_stream", lambda _: stream)
+    monkeypatch.setattr("tumortrack.training.pretrain.KidneyStream", lambda _: stream)
     with monkeypatch.context() as patch:
         patch.setattr("tumortrack.training.train.REPORT_EVERY_S", 0.0)  # after the first step
         with pytest.raises(RuntimeError, match="power cut"):

@@ -115,8 +115,8 @@ class Pretrain:
     """
 
     out: Positional[Path]
-    anatomies: int = 40
-    steps: int = 6000
+    anatomies: int = 400
+    steps: int = 16_000
     seed: int = 0
     device: Device = "auto"
     workers: int | None = None

@@ -8,6 +8,7 @@ from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError
 from tumortrack.models.encoders import EncoderConfig
 from tumortrack.models.normalisation import Aligned, CloudBox
+from tumortrack.simulate.coarse import CoarseConfig
 from tumortrack.simulate.scene import SceneConfig
 
 _WIDEST = 4096  # of a layer: far beyond use, and a layer's weights still have room
@@ -106,7 +107,7 @@ class TrainConfig(Config, frozen=True):
     """Everything that decides the weights, apart from case, seed and number of steps; ``refine``
     is how an elastic body is fitted to the cloud, in validation and in use."""
 
-    LATER = ("refine",)
+    LATER = ("refine", "coarse")
 
     network: NetworkConfig
     scene: SceneConfig
@@ -121,3 +122,4 @@ class TrainConfig(Config, frozen=True):
     validation_points: int = 2048
     validate_every: int = 250  # steps
     refine: GaussNewtonConfig = GaussNewtonConfig()
+    coarse: CoarseConfig | None = None  # training scenes; those of validation stay as they are

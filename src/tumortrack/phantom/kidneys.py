@@ -21,9 +21,14 @@ _ATTEMPTS = 100
 _FIELD_LIMIT_MM = 2 * _STEP_MM  # vertices lie where neighbouring nodes differ in sign
 
 
-def random_anatomy(seed: int) -> tuple[Anatomy, tuple[float, float, float]]:
-    """A kidney of 90 to 130 mm with one to three tumors of 10 to 45 mm, deep or bulging, and the
-    direction that faces the camera: CT frame (LPS), mm; closed surfaces, tumors in label order.
+def random_anatomy(
+    seed: int,
+    lengths_mm: tuple[float, float] = (90.0, 130.0),
+    tumors_mm: tuple[float, float] = (10.0, 45.0),
+) -> tuple[Anatomy, tuple[float, float, float]]:
+    """A kidney of a length in this range with one to three tumors of such diameters, deep or
+    bulging, and the direction that faces the camera: CT frame (LPS), mm; closed surfaces, tumors in
+    label order.
 
     The same seed gives the same kidney.
 
@@ -31,7 +36,7 @@ def random_anatomy(seed: int) -> tuple[Anatomy, tuple[float, float, float]]:
         InputError: a negative seed.
     """
     rng = np.random.default_rng([seed, 0x81D])
-    parameters = _random_parameters(rng)
+    parameters = _random_parameters(rng, lengths_mm, tumors_mm)
     turn = Rotation.random(rng=rng).as_matrix()
     if rng.uniform() < 0.5:  # a left kidney: the mirror image
         turn = turn @ np.diag([-1.0, 1.0, 1.0])
@@ -47,9 +52,11 @@ def random_anatomy(seed: int) -> tuple[Anatomy, tuple[float, float, float]]:
     return Anatomy(tuple(parts)), (float(x), float(y), float(z))
 
 
-def _random_parameters(rng: np.random.Generator) -> digital.PhantomParameters:
+def _random_parameters(
+    rng: np.random.Generator, lengths_mm: tuple[float, float], tumors_mm: tuple[float, float]
+) -> digital.PhantomParameters:
     """The shape of a random kidney and its tumors."""
-    length = rng.uniform(90, 130)
+    length = rng.uniform(*lengths_mm)
     size = (length * rng.uniform(0.45, 0.62), length * rng.uniform(0.38, 0.52), length)
     return digital.PhantomParameters(
         size_mm=size,
@@ -58,12 +65,14 @@ def _random_parameters(rng: np.random.Generator) -> digital.PhantomParameters:
         hilum_depth_mm=rng.uniform(6, 24),
         lump_mm=rng.uniform(0.3, 2.0),
         shape_seed=int(rng.integers(1 << 31)),
-        tumors=_random_tumors(size, rng),
+        tumors=_random_tumors(size, tumors_mm, rng),
     )
 
 
 def _random_tumors(
-    size_mm: tuple[float, float, float], rng: np.random.Generator
+    size_mm: tuple[float, float, float],
+    diameters_mm: tuple[float, float],
+    rng: np.random.Generator,
 ) -> tuple[digital.TumorParameters, ...]:
     """Tumors that keep apart: centres anywhere from the middle out to the organ's surface."""
     wanted = int(rng.integers(1, _MOST_TUMORS + 1))
@@ -72,7 +81,7 @@ def _random_tumors(
         direction = rng.normal(size=3)
         depth = rng.uniform(0.1, 0.95) * np.array(size_mm) / 2
         x, y, z = direction / np.linalg.norm(direction) * depth
-        diameter = float(np.exp(rng.uniform(np.log(10), np.log(45))))
+        diameter = float(np.exp(rng.uniform(*np.log(diameters_mm))))
         tumor = digital.TumorParameters(diameter_mm=diameter, center_mm=(x, y, z))
         if all(digital.gap_mm(tumor, other) >= digital.SMALLEST_GAP_MM for other in tumors):
             tumors.append(tumor)

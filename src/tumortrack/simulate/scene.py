@@ -8,7 +8,7 @@ and evaluate the exponential of a drag differently.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 from typing import Any, Literal, NamedTuple
 
@@ -28,13 +28,21 @@ from tumortrack.sense.clutter import ClutterConfig, add_clutter
 from tumortrack.sense.noise import CalibrationConfig, NoiseConfig, add_noise, miscalibrate
 from tumortrack.sense.occlusion import OcclusionConfig, occlude
 from tumortrack.sense.render import Visibility, render_depth
-from tumortrack.simulate.deform import ChainConfig, DragConfig, RestConfig, installed, links_of
+from tumortrack.simulate.deform import (
+    ChainConfig,
+    DragConfig,
+    ElasticConfig,
+    RestConfig,
+    installed,
+    links_of,
+)
 from tumortrack.simulate.deform.base import Deformation, Points, View
 from tumortrack.simulate.elastic.body import BodyConfig, ElasticBody, build_body
 from tumortrack.simulate.occupancy import OccupancyConfig, PointSource
 
 STREAMS = ("train", "validation", "test")
 ATTEMPTS = 20  # draws of a recipe until one shows enough of the organ
+_STATE = 0x57A7E
 
 
 class PoseConfig(Config, frozen=True):
@@ -60,7 +68,7 @@ class SceneConfig(Config, frozen=True):
     from that range, log-uniformly, instead of ``cloud.n_points``.
     """
 
-    LATER = ("occlusion", "calibration", "cloud_points")
+    LATER = ("occlusion", "calibration", "cloud_points", "views")
 
     width: int = 424
     height: int = 240
@@ -76,8 +84,14 @@ class SceneConfig(Config, frozen=True):
     occlusion: OcclusionConfig = OcclusionConfig()
     calibration: CalibrationConfig = CalibrationConfig()
     cloud_points: tuple[int, int] | None = None
+    views: int = 1  # recipes in a row that show the same state, where all deformations are elastic
 
     def __post_init__(self) -> None:
+        if self.views > 1 and not all(isinstance(one, ElasticConfig) for one in self.deform):
+            raise InputError(
+                f"views is {self.views}, but only elastic states can be seen from several sides; "
+                "the configuration has other deformations."
+            )
         fewest, most = self.cloud_points or (FEWEST_POINTS, FEWEST_POINTS)
         if not FEWEST_POINTS <= fewest <= most:
             raise InputError(
@@ -103,6 +117,11 @@ class SceneRecipe:
     def generator(self, attempt: int) -> np.random.Generator:
         return np.random.default_rng([self.seed, STREAMS.index(self.stream), self.index, attempt])
 
+    def state(self, views: int) -> np.random.Generator:
+        """The generator of the state that so many recipes in a row share."""
+        number = self.index // views
+        return np.random.default_rng([self.seed, STREAMS.index(self.stream), number, 0, _STATE])
+
 
 @dataclass(frozen=True, eq=False)
 class RenderedScene:
@@ -119,6 +138,27 @@ class RenderedScene:
 
 
 @dataclass(eq=False)
+class _SharedState:
+    """A deformation that several scenes show, and where it took the points that it was given: the
+    organ's vertices and the labelled points are the same arrays in all of them."""
+
+    number: tuple[str, int, int]  # stream, seed, number of the state
+    deformation: Deformation
+    moved: list[tuple[Points, Points]] = field(default_factory=list)
+
+    def apply(self, points_ct: Points) -> Points:
+        for given, there in self.moved:
+            if given is points_ct:
+                return there
+        there = self.deformation.apply(points_ct)
+        self.moved.append((points_ct, there))
+        return there
+
+    def record(self) -> dict[str, Any]:
+        return self.deformation.record()
+
+
+@dataclass(eq=False)
 class Simulator:
     """Makes the scenes of one anatomy (CT frame, LPS mm); ``body`` where the configuration has
     elastic deformations (``body_for`` builds it)."""
@@ -129,6 +169,7 @@ class Simulator:
     body: ElasticBody | None = None
 
     def __post_init__(self) -> None:
+        self._shared: _SharedState | None = None
         self._intrinsics = d405(self.config.width, self.config.height)
         self._visibility = Visibility(self.anatomy_ct.organ)
         vertices = self.anatomy_ct.organ.vertices_mm
@@ -157,18 +198,38 @@ class Simulator:
     ) -> tuple[Float64[np.ndarray, "4 4"], Deformation, bool]:
         """Of the next scene of this generator: ``camera_from_ct``, deformation, and whether it is
         seen from any distance and not cropped."""
+        camera_from_ct, free = self._pose(rng)
+        return camera_from_ct, self._deformation(camera_from_ct, rng), free
+
+    def _pose(self, rng: np.random.Generator) -> tuple[Float64[np.ndarray, "4 4"], bool]:
         config = self.config
         free = bool(rng.uniform() < config.free_range)
         nearest = config.free_nearest_mm if free else config.pose.nearest_mm
-        camera_from_ct = sample_pose(config.pose, self._hull_ct, self.up_lps, nearest, rng)
-        model = config.deform[rng.integers(len(config.deform))]
-        return camera_from_ct, model.sample(self._view(camera_from_ct), rng), free
+        return sample_pose(config.pose, self._hull_ct, self.up_lps, nearest, rng), free
+
+    def _deformation(
+        self, camera_from_ct: Float64[np.ndarray, "4 4"], rng: np.random.Generator
+    ) -> Deformation:
+        model = self.config.deform[rng.integers(len(self.config.deform))]
+        return model.sample(self._view(camera_from_ct), rng)
+
+    def _draw_shared(
+        self, recipe: SceneRecipe, rng: np.random.Generator
+    ) -> tuple[Float64[np.ndarray, "4 4"], Deformation, bool]:
+        """As ``draw``, with the state that the recipes beside this one show as well."""
+        camera_from_ct, free = self._pose(rng)
+        number = recipe.stream, recipe.seed, recipe.index // self.config.views
+        if self._shared is None or self._shared.number != number:
+            drawn = self._deformation(camera_from_ct, recipe.state(self.config.views))
+            self._shared = _SharedState(number, drawn)
+        return camera_from_ct, self._shared, free
 
     def _render(self, recipe: SceneRecipe) -> tuple[RenderedScene, np.random.Generator]:
         config, organ = self.config, self.anatomy_ct.organ
         for attempt in range(ATTEMPTS):
             rng = recipe.generator(attempt)
-            camera_from_ct, deformation, free = self.draw(rng)
+            drawn = self.draw(rng) if config.views == 1 else self._draw_shared(recipe, rng)
+            camera_from_ct, deformation, free = drawn
             vertices = transform_points(camera_from_ct, deformation.apply(organ.vertices_mm))
             frame = render_depth(vertices, organ.faces, self._intrinsics)
             frame = add_clutter(frame, config.clutter, rng)

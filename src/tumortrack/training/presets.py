@@ -20,6 +20,7 @@ from tumortrack.registration.canonical_frame import FIELDS, UPRIGHT_MM
 from tumortrack.sense.clutter import ClutterConfig
 from tumortrack.sense.noise import D405_NOISE, CalibrationConfig
 from tumortrack.sense.occlusion import OcclusionConfig
+from tumortrack.simulate.coarse import CoarseConfig
 from tumortrack.simulate.deform import ChainConfig, DragConfig, ElasticConfig, StretchConfig
 from tumortrack.simulate.deform.drag import CONFIGURATIONS
 from tumortrack.simulate.elastic.body import BodyConfig
@@ -105,6 +106,7 @@ def _clinic(
         steps=6_000,
         drop_points=0.6,
         validate_every=500,
+        coarse=CoarseConfig(),
     )
 
 

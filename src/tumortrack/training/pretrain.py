@@ -8,6 +8,7 @@ where any organ lies and how it is bent.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from tumortrack.models.hardware import choose_device
 from tumortrack.phantom.kidneys import random_anatomy
 from tumortrack.registration import canonical_frame
 from tumortrack.registration.rest_shape import long_axis_of
+from tumortrack.simulate.coarse import coarsened
 from tumortrack.simulate.occupancy import FixedPoints
 from tumortrack.simulate.scene import Batch, SceneStream, body_for
 from tumortrack.training.model import save_start
@@ -26,40 +28,52 @@ from tumortrack.training.scenes import Scenes, batches
 from tumortrack.training.state import Pretraining, TrainingState
 from tumortrack.training.train import Report, divide_cores, run_steps, work_folder
 
+# Kidneys and tumors of those who are operated on (KiTS19's tumors: arXiv:1904.00445), and beyond.
+LENGTHS_MM, TUMORS_MM = (80.0, 150.0), (8.0, 80.0)
+
 
 @dataclass(frozen=True, eq=False)
 class KidneyStream:
-    """Batches of many organs in turn, each in its upright frame: batch ``i`` shows organ ``i``
-    modulo their number."""
+    """Batches of a run's random kidneys in turn, each in its upright frame: batch ``i`` shows
+    kidney ``i`` modulo their number. A kidney is made with its body, in about a second, where it is
+    first shown. Picklable."""
 
-    organs: tuple[tuple[SceneStream, canonical_frame.CanonicalFrame], ...]
+    run: Pretraining
 
     def batch(self, index: int) -> Batch:
         """The batch with this number, its lengths scaled with the organ's."""
-        turn, which = divmod(index, len(self.organs))
-        stream, upright = self.organs[which]
+        turn, which = divmod(index, self.run.anatomies)
+        if which not in self._organs:
+            self._organs[which] = _organ(self.run, which)
+        stream, upright = self._organs[which]
         clouds_mm, points_mm, labels, camera_from_ct = stream.batch(turn)
         poses, scale = upright.camera_from_upright(camera_from_ct), np.float32(upright.scale)
         return Batch(clouds_mm * scale, points_mm * scale, labels, poses.astype(np.float32))
 
+    @cached_property
+    def _organs(self) -> dict[int, tuple[SceneStream, canonical_frame.CanonicalFrame]]:
+        return {}
 
-def kidney_stream(run: Pretraining) -> KidneyStream:
-    """The random kidneys of a run with their bodies; about a second each."""
-    seeds = np.random.default_rng([run.seed, 0x517E]).integers(1 << 31, size=run.anatomies)
-    config, organs = run.config, []
+    def __getstate__(self) -> dict[str, Any]:
+        return {"run": self.run}
+
+
+def _organ(run: Pretraining, number: int) -> tuple[SceneStream, canonical_frame.CanonicalFrame]:
+    """The scenes and the upright frame of a run's random kidney with this number."""
+    seed = int(np.random.default_rng([run.seed, 0x517E, number]).integers(1 << 31))
+    config = run.config
     assert isinstance(config.network.decoder, RegistrationHeadConfig)
+    anatomy_ct, up_lps = random_anatomy(seed, LENGTHS_MM, TUMORS_MM)
+    body = body_for(anatomy_ct, up_lps, config.scene, seed)
+    if body is None:
+        raise InputError("pretraining needs elastic deformations; the configuration has none.")
+    organ = anatomy_ct.organ
+    upright = canonical_frame.upright_of(organ, up_lps, body.center_ct, long_axis_of(organ))
     generic = canonical_frame.generic_points(config.network.decoder.points)
-    for seed in seeds.tolist():
-        anatomy_ct, up_lps = random_anatomy(seed)
-        body = body_for(anatomy_ct, up_lps, config.scene, seed)
-        if body is None:
-            raise InputError("pretraining needs elastic deformations; the configuration has none.")
-        organ = anatomy_ct.organ
-        upright = canonical_frame.upright_of(organ, up_lps, body.center_ct, long_axis_of(organ))
-        fixed = FixedPoints(upright.in_ct(generic).astype(np.float32))
-        scenes = (anatomy_ct, up_lps, config.scene, fixed, run.seed)
-        organs.append((SceneStream(*scenes, "train", config.batch_size, body), upright))
-    return KidneyStream(tuple(organs))
+    fixed = FixedPoints(upright.in_ct(generic).astype(np.float32))
+    seen_ct, scene = coarsened(anatomy_ct, config.scene, config.coarse)
+    about = seen_ct, up_lps, scene, fixed, run.seed
+    return SceneStream(*about, "train", config.batch_size, body), upright
 
 
 def pretrain(run: Pretraining, folder: Path, report: Report) -> dict[str, Any]:
@@ -72,7 +86,7 @@ def pretrain(run: Pretraining, folder: Path, report: Report) -> dict[str, Any]:
         state.initialize(canonical_frame.initialize_canonical)
         state.resume(work)
         steps = range(state.progress.step, run.steps)
-        made = batches(kidney_stream(run).batch, steps, 0, workers, device)
+        made = batches(KidneyStream(run).batch, steps, 0, workers, device)
         run_steps(state, Scenes(made, f"{workers} processes"), work, report)
         about = {
             "seed": run.seed,

@@ -24,6 +24,7 @@ from tumortrack.core.errors import InputError, StorageError, TumortrackError
 from tumortrack.core.process import available_cores, keep_freed_memory
 from tumortrack.core.store import write_atomically, writing
 from tumortrack.models.model import Model, Network
+from tumortrack.simulate.coarse import coarsened
 from tumortrack.simulate.scene import SceneStream
 from tumortrack.training.distributed import ProcessGroup, process_group
 from tumortrack.training.model import load_model, save_model
@@ -108,7 +109,8 @@ def _train(run: TrainingRun, work: Path, group: ProcessGroup, report: Report) ->
     state = TrainingState(run, device, group)
     state.initialize(task.initialize)
     state.resume(work)
-    about = run.anatomy_ct, run.up_lps, config.scene, task.points, run.seed
+    anatomy_ct, scene = coarsened(run.anatomy_ct, config.scene, config.coarse)
+    about = anatomy_ct, run.up_lps, scene, task.points, run.seed
     stream = SceneStream(*about, "train", group.local_size(config.batch_size), task.body)
     steps = group.local_batches(range(state.progress.step, state.progress.end or config.steps))
     period = config.training_pairs // config.batch_size * group.size
