@@ -11,6 +11,7 @@ from itertools import count, cycle, pairwise
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
 import torch
 from msgspec.structs import replace
 from torch.nn import functional
@@ -19,6 +20,7 @@ from tumortrack.core.process import keep_freed_memory
 from tumortrack.models.hardware import has_fast_bfloat16
 from tumortrack.occupancy.model import OccupancyModel
 from tumortrack.occupancy.network import OccupancyNetwork
+from tumortrack.simulate.coarse import CoarseConfig, coarsened
 from tumortrack.simulate.deform import DragConfig, ElasticConfig
 from tumortrack.simulate.elastic.body import ElasticBody
 from tumortrack.simulate.occupancy import FixedPoints, OccupancyConfig, OccupancyPool, PointSource
@@ -51,8 +53,29 @@ def drags(subject: BenchSubject, _: float) -> Iterator[Workload]:
 
 
 def elastic(subject: BenchSubject, _: float) -> Iterator[Workload]:
-    """States of the organ's elastic body."""
-    return _generator(subject, "elastic", ElasticConfig(), subject.body)
+    """States of the organ's elastic body; and the scenes that `clinic` learns from."""
+    yield from _generator(subject, "elastic", ElasticConfig(), subject.body)
+    ours, full = _learnt_scenes(subject, CoarseConfig(), _PAIRS), _learnt_scenes(subject, None, 1)
+    naive_is = "the same with its whole image and surface, each state seen once"
+    note = "one thread whatever there is: workers are processes; sensor errors and occlusion too"
+    facts = {"note": note}
+    yield Workload(GENERATOR, "clinic", "scene", ours, full, naive_is, _PAIRS, facts=lambda: facts)
+
+
+def _learnt_scenes(
+    subject: BenchSubject, coarse: CoarseConfig | None, scenes: int
+) -> Callable[[], None]:
+    """So many scenes as `clinic` has them, with points to be placed; one after the other."""
+    config = subject.presets["clinic"](subject.anatomy)
+    anatomy, scene = coarsened(subject.anatomy, config.scene, coarse)
+    simulator, index = Simulator(anatomy, UP, scene, subject.body), count()
+    points = FixedPoints(subject.anatomy.organ.vertices_mm[:200].astype(np.float32))
+
+    def make() -> None:
+        for _ in range(scenes):
+            simulator.pair(SceneRecipe(SEED, "train", next(index)), points)
+
+    return make
 
 
 def _generator(
@@ -139,7 +162,8 @@ def training_state(
         points = FixedPoints(places)
     else:
         points = OccupancyPool(anatomy, config.scene.occupancy, SEED)
-    stream = SceneStream(anatomy, UP, config.scene, points, SEED, "train", size, body)
+    seen, scene = coarsened(anatomy, config.scene, config.coarse)
+    stream = SceneStream(seen, UP, scene, points, SEED, "train", size, body)
     run = TrainingRun(anatomy, UP, "", config, SEED, steps=_STEPS, device="cpu")
     made = []
     for one in map(stream.batch, range(batches)):
