@@ -8,7 +8,7 @@ INSTALL := pip install --quiet --disable-pip-version-check --no-compile --no-dep
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help setup debian demo test test-hard check attack fuzz crash replay bench soak wheel lock licences audit results real world sequences causes trust rehearsal clean
+.PHONY: help setup debian demo test test-hard check pretrained attack fuzz crash replay bench soak wheel lock licences audit results real minutes world sequences causes trust rehearsal clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 10
@@ -48,6 +48,10 @@ debian:  ## install what tests need from Debian (ROS, RViz, Chromium)
 test: check  ## check, then all tests (those of ROS, RViz and Chromium after `make debian`)
 	OMP_NUM_THREADS=1 $(BIN)/pytest -n 3 --dist loadfile --no-loadscope-reorder
 
+pretrained: setup  ## the weights of random kidneys that the package ships (ARGS="--anatomies N --steps N")
+	$(BIN)/tumortrack pretrain runs/kidneys $(ARGS)
+	cp runs/kidneys/manifest.json runs/kidneys/weights.safetensors src/tumortrack/models/kidneys/
+
 attack: setup  ## hostile files and calls: each must end in one clear line (3 minutes; ARGS=NAME ...: these)
 	$(BIN)/python tests/support/attacks.py runs/attacks $(ARGS)
 
@@ -77,6 +81,9 @@ results: setup  ## the tables of docs/results.md (hours; ARGS="--case NAME=FOLDE
 
 real: setup  ## real kidneys, breathing lungs, silicone: ARGS='DATA', a folder of your copies (hours)
 	$(BIN)/python lab/scripts/real.py $(ARGS)
+
+minutes: setup  ## a model after 0, 100 and 400 steps and a whole training (ARGS="NAME=CASE ...")
+	$(BIN)/python lab/scripts/minutes.py $(ARGS)
 
 world: setup  ## scenes of wider physics, noise and views, and how a model does in them (ARGS="CASE OUT --model MODEL")
 	$(BIN)/python lab/scripts/world.py $(ARGS)

@@ -166,6 +166,7 @@ def train(
     seed: int = 0,
     device: Device = "auto",
     workers: int | None = None,
+    start: StrPath | None = None,
     report: Callable[[TrainingStatus], None] | None = None,
 ) -> Model:
     """Train a model for a case; the same call resumes after Ctrl-C or a crash.
@@ -175,8 +176,10 @@ def train(
         folder: the model's, to write.
         preset: ``clinic`` registers the organ of the CT, ``quick`` and ``paper`` label points.
         config: a changed preset instead: ``msgspec.structs.replace(presets.clinic(anatomy), ...)``.
-        minutes, steps: where to stop; at most one of them (default: the preset's end).
+        minutes, steps: where to stop; at most one of them (default: the preset's end); 0: learn
+            nothing, take what training starts from.
         workers: processes that make scenes (default: as the machine allows).
+        start: folder that `pretrain` wrote, or ``none`` (default: the package's, for ``clinic``).
         report: called every few seconds.
 
     Raises:
@@ -185,6 +188,7 @@ def train(
         StorageError: the disk is full; the last checkpoint is whole.
     """
     from tumortrack.training import train as training
+    from tumortrack.training.model import start_of
     from tumortrack.training.presets import PRESETS
 
     if minutes is not None and steps is not None:
@@ -192,11 +196,13 @@ def train(
     if preset not in PRESETS:
         raise InputError(f"there is no preset {preset!r}; allowed: {', '.join(PRESETS)}.")
     of = load_case(case)
+    config = config or PRESETS[preset](of.anatomy, "limited")
     run = training.TrainingRun(
         anatomy_ct=of.anatomy, up_lps=of.up_lps,
         case_sha256=store.sha256_of(Path(case) / store.MANIFEST),
-        config=config or PRESETS[preset](of.anatomy, "limited"), patient=of.patient,
-        seed=seed, steps=steps, minutes=minutes, device=device, workers=workers,
+        config=config, patient=of.patient, seed=seed, steps=steps, minutes=minutes,
+        device=device, workers=workers,
+        start=start_of(config.network, None if start is None else Path(start)),
     )  # fmt: skip
     return training.train(run, Path(folder), report or (lambda status: None))
 

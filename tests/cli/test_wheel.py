@@ -69,4 +69,5 @@ def test_the_wheel_holds_the_package_alone(wheel):
     tops = {name.split("/")[0] for name in names}
     assert {top.split("-")[0] for top in tops} == {"tumortrack"}
     assert "tumortrack/py.typed" in names
+    assert "tumortrack/models/kidneys/weights.safetensors" in names
     assert any(name.endswith("LICENSE") for name in names)

@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from elastic_objects import SMALL, UP, organ
 from stories import refusal, tumortrack, write_phantom_case
 from tumortrack.cli.training import Train
+from tumortrack.core import store
 from tumortrack.core.errors import ArtifactError, InputError
 from tumortrack.core.types import Mesh
 from tumortrack.phantom.kidneys import random_anatomy
@@ -31,7 +32,7 @@ from tumortrack.registration.network import RegistrationNetwork, facing_rotation
 from tumortrack.registration.rest_shape import long_axis_of
 from tumortrack.simulate.deform import ElasticConfig
 from tumortrack.simulate.occupancy import OccupancyConfig
-from tumortrack.training.model import PretrainedWeights, load_start
+from tumortrack.training.model import SHIPPED, PretrainedWeights, load_start, start_of
 from tumortrack.training.presets import clinic, pretraining, quick
 from tumortrack.training.pretrain import KidneyStream, pretrain
 from tumortrack.training.state import Pretraining, TrainingProgress, TrainingRun, provenance
@@ -243,6 +244,35 @@ def test_a_model_says_what_it_started_from(patient, start, tmp_path):
     plain = replace(patient, start=None)
     assert plain.identity != patient.identity
     assert "start_sha256" not in provenance(plain, TrainingProgress(step=1), CPU)
+
+
+@pytest.mark.parametrize("end", [{"steps": 0}, {"steps": None, "minutes": 0.0}])
+def test_without_a_step_a_model_is_its_start(patient, task, start, end, tmp_path):
+    run, expected = replace(patient, **end), RegistrationNetwork(patient.config.network)
+    made = train(run, tmp_path / "model", silent)
+    task.initialize(expected)
+    for name, value in expected.state_dict().items():
+        assert torch.equal(made.network.state_dict()[name], value), name
+    assert made.provenance["steps"] == 0
+    assert made.provenance["start_sha256"] == start.sha256
+    assert made.calibration.std_scale > 0.1
+    assert sorted(p.suffix for p in (tmp_path / "model").iterdir()) == [
+        *(".json", ".safetensors", ".safetensors")
+    ]
+    with pytest.raises(InputError, match="starts from nothing"):
+        replace(run, start=None)
+
+
+def test_the_package_has_a_start_for_every_patient():
+    network = clinic(organ()).network
+    shipped = start_of(network, None)
+    shipped.check(network)
+    assert max(float(v.std()) for k, v in shipped.weights.items() if "output" in k) > 0.01
+    assert start_of(network, Path("none")) is None
+    assert start_of(quick(organ()).network, None) is None
+    about = store.read_manifest(SHIPPED, "pretrained")["provenance"]
+    assert about["command"].startswith("tumortrack pretrain OUT --anatomies ")
+    assert about["steps"] > 0
 
 
 def test_what_does_not_fit_is_refused(patient, start):

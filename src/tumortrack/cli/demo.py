@@ -37,8 +37,8 @@ class Demo:
     def run(self) -> None:
         from tumortrack.phantom import dicom, digital, scanner
 
-        if not 0 < self.minutes < float("inf"):
-            raise InputError(f"--minutes {self.minutes:g} must be more than 0.")
+        if not 0 <= self.minutes < float("inf"):
+            raise InputError(f"--minutes {self.minutes:g} must be 0 or more.")
         if self.scenes < 1:
             raise InputError(f"--scenes {self.scenes} must be at least 1.")
         out = self.out

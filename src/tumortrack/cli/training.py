@@ -33,13 +33,15 @@ class Train:
             and paper label points.
         rotations: poses to learn: any turn about the camera's axis and tilts up to 15 degrees
             (clinic: 30), or every rotation.
-        minutes: stop after about so long (default: the preset's end).
+        minutes: stop after about so long (default: the preset's end). 0: learn nothing, take what
+            training starts from.
         steps: stop after exactly so many steps.
         seed: of weights and scenes.
         device: auto takes CUDA if there is a GPU.
         workers: processes that make scenes (default: as the machine allows).
         checkpoint_every: seconds; a crash loses at most the steps since.
-        start: folder that `pretrain` wrote: learn the patient from there (preset clinic).
+        start: folder that `pretrain` wrote: learn the patient from there (preset clinic; default:
+            what the package has learnt from random kidneys). none: from nothing.
     """
 
     case: Positional[Path]
@@ -57,10 +59,10 @@ class Train:
     def run(self) -> None:
         from tumortrack.imaging.case import load_case
 
-        if self.minutes is not None and not self.minutes > 0:
-            raise InputError(f"--minutes {self.minutes} must be more than 0.")
-        if self.steps is not None and self.steps < 1:
-            raise InputError(f"--steps {self.steps} must be at least 1.")
+        if self.minutes is not None and not self.minutes >= 0:
+            raise InputError(f"--minutes {self.minutes} must be 0 or more.")
+        if self.steps is not None and self.steps < 0:
+            raise InputError(f"--steps {self.steps} must be 0 or more.")
         if self.minutes is not None and self.steps is not None:
             raise InputError("--minutes and --steps both say when to stop; give one of them.")
         if self.workers is not None and self.workers < 0:
@@ -68,18 +70,18 @@ class Train:
         case = load_case(self.case)  # report what is wrong so far before PyTorch's seconds
 
         from tumortrack.models.folder import is_finished, weakness_of
-        from tumortrack.training.model import load_model, load_start
+        from tumortrack.training.model import load_model, start_of
         from tumortrack.training.presets import PRESETS
         from tumortrack.training.train import TrainingRun, train
 
         keep_loaded()
+        config = PRESETS[self.preset](case.anatomy, self.rotations)
         run = TrainingRun(
             anatomy_ct=case.anatomy, up_lps=case.up_lps,
             case_sha256=store.sha256_of(self.case / store.MANIFEST),
-            config=PRESETS[self.preset](case.anatomy, self.rotations), seed=self.seed,
-            steps=self.steps, minutes=self.minutes, device=self.device, workers=self.workers,
-            checkpoint_every_s=self.checkpoint_every,
-            start=None if self.start is None else load_start(self.start), patient=case.patient,
+            config=config, seed=self.seed, steps=self.steps, minutes=self.minutes,
+            device=self.device, workers=self.workers, checkpoint_every_s=self.checkpoint_every,
+            start=start_of(config.network, self.start), patient=case.patient,
         )  # fmt: skip
         if is_finished(self.model):
             done = load_model(self.model).provenance

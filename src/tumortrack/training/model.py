@@ -26,6 +26,7 @@ from tumortrack.occupancy.model import OccupancyModel
 from tumortrack.registration.model import RegistrationModel
 
 PRETRAINED = "pretrained"  # kind of a folder
+SHIPPED = Path(__file__).parents[1] / "models" / "kidneys"  # weights that are the package's own
 _LARGEST_BOX_MM = 1000.0
 
 
@@ -146,9 +147,12 @@ def _shared(config: NetworkConfig) -> tuple[Any, ...]:
 def save_start(
     network: nn.Module, config: NetworkConfig, provenance: dict[str, Any], folder: Path
 ) -> None:
-    """Write weights and manifest into an existing folder, the manifest last."""
-    store.write_atomically(folder / WEIGHTS, _weights(network))
-    content = {"provenance": provenance, "config": to_builtins(config)}
+    """Write weights, in half precision, and manifest into an existing folder, the manifest last."""
+    halves = {k: v.detach().cpu().half().contiguous() for k, v in network.state_dict().items()}
+    store.write_atomically(folder / WEIGHTS, save(halves))
+    options = " ".join(f"--{k} {provenance[k]}" for k in ("anatomies", "steps", "seed"))
+    about = {**provenance, "command": f"tumortrack pretrain OUT {options}"}
+    content = {"provenance": about, "config": to_builtins(config)}
     store.seal(folder, PRETRAINED, content, frame="camera")
 
 
@@ -158,7 +162,7 @@ def load_start(folder: Path) -> PretrainedWeights:
     manifest = store.read_manifest(folder, PRETRAINED)
     try:
         config = from_builtins(manifest["config"], NetworkConfig, f"{folder}: config")
-        weights = read_tensors(folder / WEIGHTS, load)
+        weights = {k: v.float() for k, v in read_tensors(folder / WEIGHTS, load).items()}
         _filled(model_class(config), config, weights)
     except (InputError, KeyError, ValueError, RuntimeError, OSError) as error:
         raise ArtifactError(
@@ -166,3 +170,11 @@ def load_start(folder: Path) -> PretrainedWeights:
             "again: tumortrack pretrain OUT."
         ) from error
     return PretrainedWeights(store.sha256_of(folder / WEIGHTS), config, weights)
+
+
+def start_of(network: NetworkConfig, folder: Path | None) -> PretrainedWeights | None:
+    """The weights that a training starts from: those of ``folder``, which may be ``none``; of None
+    the package's own where the network places an organ."""
+    if folder is None and model_class(network) is not RegistrationModel:
+        return None
+    return None if str(folder) == "none" else load_start(folder or SHIPPED)

@@ -55,11 +55,16 @@ class TrainingRun:
     patient: Patient = NOBODY  # whose organ it is
 
     def __post_init__(self) -> None:
-        _check(self, seed=0, steps=1, workers=0)
-        if self.minutes is not None and not 0 < self.minutes < float("inf"):
-            raise InputError(f"minutes is {self.minutes}; it must be positive.")
+        _check(self, seed=0, steps=0, workers=0)
+        if self.minutes is not None and not 0 <= self.minutes < float("inf"):
+            raise InputError(f"minutes is {self.minutes}; it must be 0 or more.")
         if self.start is not None:
             self.start.check(self.config.network)
+        elif 0 in (self.steps, self.minutes):
+            raise InputError(
+                "without a step of training a model is what it starts from, and this one starts "
+                "from nothing: give it minutes or steps, or the preset clinic and its head start."
+            )
 
     @property
     def identity(self) -> str:
@@ -198,7 +203,9 @@ class TrainingState:
             weight_decay=config.weight_decay,
             fused=True,  # a twentieth of the quick step on a CPU
         )
-        end = run.steps or (config.steps if run.minutes is None else None)
+        # With other minutes the end is settled on the way.
+        whole: dict[float | None, int] = {None: config.steps, 0: 0}
+        end = whole.get(run.minutes) if run.steps is None else run.steps
         self.progress = TrainingProgress(end=end)
         self._best: dict[str, Tensor] = {}
         self.learning_rate = 0.0  # of the last step

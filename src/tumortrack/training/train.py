@@ -112,10 +112,14 @@ def _train(run: TrainingRun, work: Path, group: ProcessGroup, report: Report) ->
     anatomy_ct, scene = coarsened(run.anatomy_ct, config.scene, config.coarse)
     about = anatomy_ct, run.up_lps, scene, task.points, run.seed
     stream = SceneStream(*about, "train", group.local_size(config.batch_size), task.body)
-    steps = group.local_batches(range(state.progress.step, state.progress.end or config.steps))
+    end = config.steps if state.progress.end is None else state.progress.end
+    steps = group.local_batches(range(state.progress.step, end))
     period = config.training_pairs // config.batch_size * group.size
     scenes = scenes_for(stream, steps, period, workers, device, run.scenes)
-    run_steps(state, scenes, work, report, task.miou)
+    if end == 0:
+        state.keep_if_best(task.miou(state.average))
+    else:
+        run_steps(state, scenes, work, report, task.miou)
     if not group.is_main:
         return None
     origin = {**provenance(run, state.progress, device), "scenes": scenes.maker}

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import islice
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -143,13 +142,12 @@ def build_body(
     Raises:
         InputError: a surface that turns inside, or numbers that make no body.
     """
-    from tumortrack.simulate.elastic.loads import random_state
+    from tumortrack.simulate.elastic.loads import random_states
 
     rng = np.random.default_rng([seed, 0xE1A57])
     up = unit(np.asarray(up_lps, float))
     reduced = reduced_organ(anatomy_ct, up, config, rng)
-    drawn = (random_state(reduced, up, config.bed_anywhere, rng) for _ in range(2 * config.states))
-    states = list(islice((state for state in drawn if state is not None), config.states))
+    states = random_states(reduced, up, config.bed_anywhere, rng, config.states)
     if len(states) < config.states:
         raise InputError(
             f"only {len(states)} of {2 * config.states} loads leave this organ at rest; its "

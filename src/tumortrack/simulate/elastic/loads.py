@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from tumortrack.core.compiled import numba
 from tumortrack.core.geometry import perpendicular, unit
+from tumortrack.core.process import parallel_for
 from tumortrack.simulate.elastic.modes import ReducedModel
 
 KPA = 1e-3  # N/mm2
@@ -30,6 +31,7 @@ _WEIGHT = 1.05e-6 * 9.81  # N/mm3
 _EDGE_MM = 4.0  # over which an obstacle's edge fades
 _DEEPEST = 0.28  # of the organ's thickness, that a plate goes
 _FARTHEST_MM = 16.0  # that a place of the surface moves
+_TOGETHER = 64  # problems that are solved together: some 0.3 MB each
 _SWELLING = 0.025  # largest change of volume: leaves room below 3 % for what modes do to it
 
 
@@ -232,18 +234,54 @@ def in_bed(organ: ReducedModel, up: Vector, rng: np.random.Generator) -> Reduced
 def random_state(
     organ: ReducedModel, up: Vector, anywhere: float, rng: np.random.Generator
 ) -> Float64[np.ndarray, " k"] | None:
-    """Coefficients of the modes after one or two random loads; None for states that find no
-    equilibrium or move a place by more than 24 mm. Motions of 16 to 24 mm are scaled to 16.
+    """Coefficients of the modes after one or two random loads, as ``random_problem`` has them and
+    ``state_of`` finds them."""
+    return state_of(random_problem(organ, up, anywhere, rng))
 
-    ``anywhere``: fraction of states with the bed on any side, instead of opposite to ``up``.
-    """
+
+def random_states(
+    organ: ReducedModel, up: Vector, anywhere: float, rng: np.random.Generator, count: int
+) -> list[Float64[np.ndarray, " k"]]:
+    """The first ``count`` states of twice as many loads at most; fewer where few are at rest. They
+    are drawn in turn and solved on two threads: the same as by ``random_state``."""
+    states: list[Float64[np.ndarray, " k"]] = []
+    for first in range(0, 2 * count, _TOGETHER):
+        some = range(first, min(first + _TOGETHER, 2 * count))
+        problems = [random_problem(organ, up, anywhere, rng) for _ in some]
+        states += [state for state in _solved(problems) if state is not None]
+        if len(states) >= count:
+            break
+    return states[:count]
+
+
+def _solved(problems: list[ReducedProblem]) -> list[Float64[np.ndarray, " k"] | None]:
+    found: dict[int, Float64[np.ndarray, " k"] | None] = {}
+
+    def solve(part: slice) -> None:
+        found[part.start] = state_of(problems[part.start])
+
+    parallel_for(solve, len(problems), 1)
+    return [found[n] for n in range(len(problems))]
+
+
+def random_problem(
+    organ: ReducedModel, up: Vector, anywhere: float, rng: np.random.Generator
+) -> ReducedProblem:
+    """An organ in a random bed under one or two random loads. ``anywhere``: fraction of problems
+    with the bed on any side, instead of opposite to ``up``."""
     if rng.uniform() < anywhere:
         up = unit(rng.normal(size=3))
     problem = in_bed(organ, _turned(up, 0.12, rng), rng)
     shares = np.array([share for _, share in LOADS])
     for n in rng.choice(len(LOADS), 1 + (rng.uniform() < 0.35), p=shares / shares.sum()):
         LOADS[n][0](problem, rng)
-    found = problem.equilibrium()
+    return problem
+
+
+def state_of(problem: ReducedProblem) -> Float64[np.ndarray, " k"] | None:
+    """Coefficients of the modes at rest; None for states that find no equilibrium or move a place
+    by more than 24 mm. Motions of 16 to 24 mm are scaled to 16."""
+    found, organ = problem.equilibrium(), problem.organ
     if found is None:
         return None
     state = found[: organ.n_modes]

@@ -1,0 +1,168 @@
+"""How good a model is after no training, a quarter of a minute, a minute, and a whole training.
+
+    make minutes ARGS='NAME=CASE ...'     (0.3 s a scene and length, and the trainings)
+
+Every length sees the same clouds: ``states`` are scenes of the kind that training shows, hidden
+parts and background among them, of a library of elastic states that no training has seen;
+``dragged`` ones are dragged, squeezed and bent as no training scene is; ``world`` ones lie in
+folders that `make world` or `tumortrack twin` wrote. Cases, models and rows are kept under --out.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Annotated
+
+import pandas as pd
+import tyro
+
+from tumortrack import api
+from tumortrack.cli.console import say
+from tumortrack.core import store
+from tumortrack.core.errors import InputError
+from tumortrack.imaging.case import Case
+from tumortrack.models.folder import is_finished
+from tumortrack.sense.noise import D405_NOISE
+from tumortrack.simulate.deform import ChainConfig, DragConfig, StretchConfig
+from tumortrack.simulate.scene import SceneConfig
+from tumortrack.simulate.scene_folder import Scene, list_scenes, read_scene
+from tumortrack.tracking.tracker import Tracker
+from tumortrack.training.presets import clinic
+from tumortrack_lab.real import kidneys
+from tumortrack_lab.real.judging import by_tumor, judge, quantiles
+from tumortrack_lab.study import trainings
+from tumortrack_lab.study.document import table
+from tumortrack_lab.study.methods import named_folders
+
+BLOCK = "minutes"
+FAR_MM = (3.0, 5.0)
+DRAGGED = SceneConfig(
+    deform=(ChainConfig(links=(DragConfig(), StretchConfig())),), noise=D405_NOISE
+)
+Made = list[tuple[str, Callable[[], Scene]]]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options(trainings.KeptOptions):
+    """Short trainings beside a whole one, on organs that no training has seen."""
+
+    organs: Annotated[tuple[str, ...], tyro.conf.Positional]
+    """NAME=FOLDER of each case that `tumortrack prepare` wrote."""
+    lengths: tuple[str, ...] = ("0", "100", "400", "6000", "none:6000")
+    """Steps of each training; with none: in front from nothing, else from the head start."""
+    start: Path | None = None
+    """Head start (default: the package's)."""
+    scenes: int = 60
+    """Of states, of each organ; half as many are dragged."""
+    worlds: tuple[str, ...] = ()
+    """NAME=FOLDER of further scenes of an organ."""
+    seed: int = 0
+    """Of trainings and scenes."""
+    device: api.Device = "auto"
+    out: Path = Path("runs/minutes")
+    document: Path = Path("docs/training.md")
+
+
+def main(options: Options) -> None:
+    """Train what is not trained, locate what is not located, write the tables."""
+    writer = options.begin("minutes", BLOCK)
+    cases, worlds = named_folders(options.organs, ()), named_folders(options.worlds, ())
+    if foreign := sorted(set(worlds) - set(cases)):
+        raise InputError(f"--worlds {foreign[0]}=... has no case of that name.")
+    rows = []
+    for name, folder in cases.items():
+        for length in options.lengths:
+            rows += list(_of_length(name, folder, worlds.get(name), length, options))
+    lines = by_tumor(rows)
+    looks = pd.DataFrame(rows).drop(columns="tumors")
+    blocks = [
+        _table("training, scenes", lines, looks, ["length", "source"]),
+        _table("training, organ", lines, looks, ["length", "organ"]),
+        _table("training, tumors", lines, looks, ["length", "kind"]),
+    ]
+    writer.write({BLOCK: "\n\n".join([*blocks, f"`{writer.command}`"])})
+    say(f"written to {options.document}")
+
+
+def _of_length(
+    name: str, folder: Path, world: Path | None, length: str, options: Options
+) -> Iterator[dict]:
+    """The rows of one model, a scene each."""
+    from_nothing, _, steps = length.rpartition(":")
+    if from_nothing not in ("", "none") or not steps.isdigit():
+        raise InputError(f"--lengths {length!r} must be steps, or none:steps.")
+    model = options.out / name / f"{length.replace(':', '-')}-steps"
+    if not is_finished(model):
+        say(f"{name}: training for {length} steps")
+        start = from_nothing or options.start
+        api.train(
+            folder, model, steps=int(steps), seed=options.seed, device=options.device, start=start
+        )
+    about = {
+        "case": store.sha256_of(folder / store.MANIFEST), "scenes": options.scenes,
+        "model": store.sha256_of(model / store.MANIFEST), "seed": options.seed,
+        "world": None if world is None else store.sha256_of(world),
+    }  # fmt: skip
+    known = {"organ": name, "length": length}
+
+    def measure() -> list[dict]:
+        case = api.load_case(folder)
+        tracker = Tracker(api.load_model(model, options.device))
+        tracker.warm()
+        organ, *tumors = case.anatomy.parts
+        kinds = [kidneys.kind_of(kidneys.outer_share(tumor, organ)) for tumor in tumors]
+        found = []
+        for source, make in _scenes(case, world, options):
+            scene, began = make(), time.perf_counter()
+            row = {"source": source, **judge(tracker, case.anatomy, scene, surfaces=False)}
+            row["seconds"] = time.perf_counter() - began
+            for tumor, kind in zip(row["tumors"], kinds, strict=False):
+                tumor["kind"] = kind
+            found.append(row)
+        return found
+
+    rows = trainings.kept(model.with_suffix(".json"), about, measure)
+    say(f"{name}, {length} steps: {quantiles(by_tumor(rows).middle_mm)} mm")
+    for row in rows:
+        yield {**known, **row}
+
+
+def _scenes(case: Case, world: Path | None, options: Options) -> Made:
+    """What every length sees, and of what source."""
+    made: Made = []
+    states = clinic(case.anatomy).scene
+    for source, config, count in (
+        ("states", states, options.scenes),
+        ("dragged", DRAGGED, options.scenes // 2),
+    ):
+        make = api.scene_maker(case, config, options.seed)
+        made += [(source, partial(make, number)) for number in range(count)]
+    folders = [] if world is None else list_scenes(world)
+    return made + [("world", partial(read_scene, folder)) for folder in folders]
+
+
+def _table(what: str, lines: pd.DataFrame, looks: pd.DataFrame, by: list[str]) -> str:
+    """Verdicts of scenes and errors of tumors' middles, mm, by group."""
+    head = [what, "scenes", "good", "poor", "refused"]
+    head += [f"good, over {far:g} mm" for far in FAR_MM]
+    head += ["middle of tumors, median / 90 / 95 / worst", "called good", "best rigid pose"]
+    body = []
+    for key, some in lines.groupby(by, sort=False):
+        mine = looks if by[1] not in looks else looks[looks[by[1]] == key[1]]
+        verdicts = mine[mine.length == key[0]].verdict
+        good = some[some.verdict == "good"]
+        body.append([
+            ", ".join(map(str, key)), str(len(verdicts)),
+            *(str((verdicts == one).sum()) for one in ("good", "poor", "refused")),
+            *(f"{(good.middle_mm > far).mean():.1%}" if len(good) else "–" for far in FAR_MM),
+            *map(quantiles, (some.middle_mm, good.middle_mm, some.rigid_middle_mm)),
+        ])  # fmt: skip
+    return table(head, body)
+
+
+if __name__ == "__main__":
+    trainings.run(main, Options)
