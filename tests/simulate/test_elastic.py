@@ -33,6 +33,7 @@ from tumortrack.simulate.elastic.loads import (
     ReducedProblem,
     in_bed,
     random_state,
+    random_states,
 )
 from tumortrack.simulate.elastic.modes import ReducedModel, modes_of, patches_of, random_loads
 from tumortrack.simulate.occupancy import OccupancyConfig, OccupancyPool
@@ -359,6 +360,9 @@ def test_a_state_that_moves_far_is_scaled_back(reduced):
     ]
     assert len(farthest) > 140
     assert 10 < max(farthest) <= 16 + 1e-9
+    found = [s for s in states if s is not None][:140]  # one after the other; now on two threads
+    together = random_states(reduced, np.array(UP), 0.2, np.random.default_rng(0), 140)
+    np.testing.assert_array_equal(together, found)
 
 
 def test_a_body_survives_a_file(body, unchecked):

@@ -6,6 +6,8 @@ from contextlib import suppress
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING
 
 from tyro.conf import Positional
 
@@ -13,19 +15,23 @@ from tumortrack.cli.console import Device, say
 from tumortrack.core import store
 from tumortrack.core.errors import InputError, NoEstimate
 
+if TYPE_CHECKING:
+    from tumortrack.models.model import Model
+
 _GRID = 32
 
 
 @dataclass(frozen=True, kw_only=True)
 class Compile:
-    """Compile what frames need for this machine, before the first one would wait for it.
+    """Compile what this machine needs, before the first patient or frame would wait for it.
 
     Attributes:
-        model: folder that `train` wrote; nothing is written into it.
+        model: folder that `train` wrote; nothing is written into it. Without one, what a new
+            patient's model needs is compiled as well, on a random kidney.
         device: auto takes CUDA if there is a GPU.
     """
 
-    model: Positional[Path]
+    model: Positional[Path | None] = None
     device: Device = "auto"
 
     def run(self) -> None:
@@ -44,7 +50,8 @@ class Compile:
             inside = 5.0 - np.linalg.norm(points_mm - _GRID / 4, axis=1)
             return torch.from_numpy(np.column_stack([-inside, inside]).astype(np.float32))
 
-        tracker = Tracker(load_model(self.model, self.device))
+        model = load_model(self.model, self.device) if self.model else _random_model(self.device)
+        tracker = Tracker(model)
         tracker.warm()
         grid = np.diag([0.5, 0.5, 0.5, 1.0])
         sparse_margins(ball, grid, (_GRID, _GRID, _GRID), start_mm=2.0)
@@ -54,6 +61,21 @@ class Compile:
             with suppress(NoEstimate):  # seen from all sides at once it may fit nothing
                 tracker.locate(cloud, _GRID)
         say("kernels: compiled and kept for every model of this machine.")
+
+
+def _random_model(device: Device) -> Model:
+    """Of a random kidney, made as `train --minutes 0` makes one; none of it stays."""
+    from tumortrack.phantom.kidneys import random_anatomy
+    from tumortrack.training.model import start_of
+    from tumortrack.training.presets import clinic
+    from tumortrack.training.train import TrainingRun, train
+
+    anatomy, up = random_anatomy(0)
+    config = clinic(anatomy)
+    start = start_of(config.network, None)
+    run = TrainingRun(anatomy, up, "none", config, steps=0, device=device, start=start)
+    with TemporaryDirectory() as folder:
+        return train(run, Path(folder), lambda _: None)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -121,10 +121,18 @@ def long_axis_of(organ: Mesh) -> Float64[np.ndarray, " 3"]:
     return axis if ((spread @ axis) ** 3).sum() >= 0 else -axis
 
 
-def shape_of(anatomy_ct: Anatomy, body: ElasticBody) -> RestShape:
-    """The shape of an anatomy with its body; seconds."""
-    distances = tuple(distance_of(part) for part in anatomy_ct.parts)
+def shape_of(
+    anatomy_ct: Anatomy, body: ElasticBody, distances: tuple[DistanceField, ...] | None = None
+) -> RestShape:
+    """The shape of an anatomy with its body; a second or two, unless its parts' distances are
+    known."""
+    distances = distances or distances_of(anatomy_ct)
     return RestShape(anatomy_ct, body, distances, _half_turns(anatomy_ct))
+
+
+def distances_of(anatomy_ct: Anatomy) -> tuple[DistanceField, ...]:
+    """One field per part."""
+    return tuple(map(distance_of, anatomy_ct.parts))
 
 
 def _half_turns(anatomy_ct: Anatomy) -> Float64[np.ndarray, "t 4 4"]:

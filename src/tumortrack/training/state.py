@@ -11,6 +11,7 @@ import json
 import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
@@ -197,18 +198,23 @@ class TrainingState:
         self.network = new_network(config.network).to(device)
         self.average = new_network(config.network).to(device).eval().requires_grad_(False)
         self.average.load_state_dict(self.network.state_dict())
-        self.optimizer = torch.optim.Adam(
-            self.network.parameters(),
-            config.schedule.learning_rate,
-            weight_decay=config.weight_decay,
-            fused=True,  # a twentieth of the quick step on a CPU
-        )
         # With other minutes the end is settled on the way.
         whole: dict[float | None, int] = {None: config.steps, 0: 0}
         end = whole.get(run.minutes) if run.steps is None else run.steps
         self.progress = TrainingProgress(end=end)
         self._best: dict[str, Tensor] = {}
         self.learning_rate = 0.0  # of the last step
+
+    @cached_property
+    def optimizer(self) -> torch.optim.Optimizer:
+        """Made for the first step: PyTorch loads its compiler for it, which takes 2 s."""
+        config = self.run.config
+        return torch.optim.Adam(
+            self.network.parameters(),
+            config.schedule.learning_rate,
+            weight_decay=config.weight_decay,
+            fused=True,  # a twentieth of the quick step on a CPU
+        )
 
     def initialize(self, initialize: Callable[[Any], None]) -> None:
         """Give both networks what does not have to be learnt."""

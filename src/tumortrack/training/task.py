@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
@@ -30,7 +31,7 @@ from tumortrack.registration.model import RegistrationModel, UncertaintyCalibrat
 from tumortrack.registration.motion import ElasticMotion
 from tumortrack.registration.network import RegistrationNetwork
 from tumortrack.registration.registration import Registration
-from tumortrack.registration.rest_shape import shape_of
+from tumortrack.registration.rest_shape import distances_of, shape_of
 from tumortrack.simulate.elastic.body import ElasticBody
 from tumortrack.simulate.occupancy import FixedPoints, OccupancyPool, PartPool, organ_pool
 from tumortrack.simulate.scene import SceneRecipe, Simulator, body_for, refill
@@ -83,9 +84,9 @@ class TrainingTask(ABC):
         simulator = Simulator(run.anatomy_ct, run.up_lps, run.config.scene, self.body)
         return validation_scenes(simulator, self._pool(), run.config, run.seed)
 
+    @abstractmethod
     def _pool(self) -> PartPool:
         """Points about the organ, to validate on."""
-        return organ_pool(self._run.anatomy_ct, self._run.config.scene.occupancy, self._run.seed)
 
     def _fields(
         self, network: Any, provenance: dict[str, Any], clouds_mm: Sequence[tuple[float, float]]
@@ -152,15 +153,22 @@ class RegistrationTask(TrainingTask):
     body: ElasticBody
 
     def __init__(self, run: TrainingRun, device: torch.device) -> None:
-        super().__init__(run, device)
+        about = run.anatomy_ct, run.config.scene.occupancy, run.seed
+        with ThreadPoolExecutor(1) as beside:  # the body takes as long, and needs neither
+            distances = beside.submit(distances_of, run.anatomy_ct)
+            self._labelled = beside.submit(organ_pool, *about)
+            super().__init__(run, device)
         if self.body is None:
             raise InputError(
                 "a registration network learns from elastic deformations; the scene configuration "
                 "has none."
             )
-        self._shape = shape_of(run.anatomy_ct, self.body)
+        self._shape = shape_of(run.anatomy_ct, self.body, distances.result())
         self.points = _learnt_points(run)
         self._last: tuple[bytes, list[tuple[ElasticMotion, RegistrationResult]]] | None = None
+
+    def _pool(self) -> PartPool:
+        return self._labelled.result()
 
     def initialize(self, network: RegistrationNetwork) -> None:
         run, shape = self._run, self._shape

@@ -10,11 +10,14 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from tumortrack.core.errors import TumortrackError
+from tumortrack.imaging.nifti import write_nifti
+from tumortrack.phantom.digital import PhantomParameters, phantom_labels
 from tumortrack.sense.ply import write_cloud_ply
 from tumortrack_lab.bench.rows import (
     BEFORE_TORCH,
     COMMAND,
     LARGE,
+    PATIENT,
     PEAK,
     PRESETS,
     Workload,
@@ -58,6 +61,31 @@ def workloads(subject: BenchSubject, budget_s: float) -> Iterator[Workload]:
             run_command(arguments)  # into the disk's cache
             for name, grid in _GRIDS.items():
                 yield _workload(name, preset, [*arguments, "--grid", str(grid)], budget_s)
+
+
+def patient(subject: BenchSubject, budget_s: float) -> Iterator[Workload]:
+    """A new patient's labels to the first estimate: `prepare`, `train --minutes 0` and `locate`, a
+    process each."""
+    with tempfile.TemporaryDirectory() as folder:
+        labels, cloud = Path(folder) / "labels.nii.gz", Path(folder) / "cloud.ply"
+        made = phantom_labels(PhantomParameters(), voxel_mm=1.0)
+        write_nifti(labels, made.labels, made.lps_from_index, lps=True)
+        write_cloud_ply(cloud, subject.cloud("clinic").points_mm)
+        runs: list[list[float]] = []
+        begun = time.perf_counter()
+        while len(runs) <= _FEWEST or time.perf_counter() - begun < budget_s:
+            aside = Path(folder) / str(len(runs))
+            case, model, out = aside / "case", aside / "model", aside / "out"
+            steps = (
+                ("prepare", labels, case),
+                ("train", case, model, "--minutes", 0, "--device", "cpu"),
+                ("locate", model, cloud, out, "--device", "cpu"),
+            )
+            runs.append([run_command([*map(str, step)])[0] for step in steps])
+        each = [timing_of([*seconds]).median_s for seconds in zip(*runs[1:], strict=True)]
+        note = " s, ".join(f"{what[0]} {s:.1f}" for what, s in zip(steps, each, strict=True))
+        took = timing_of([sum(run) for run in runs[1:]])  # the first one compiled
+        yield Workload(PATIENT, "clinic", "patient", took, facts=lambda: {"note": f"{note} s"})
 
 
 def _workload(name: str, preset: str, arguments: list[str], budget_s: float) -> Workload:

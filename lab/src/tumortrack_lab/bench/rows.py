@@ -23,6 +23,7 @@ PRESETS = ("clinic", "quick", "paper")
 # What rows are called.
 GENERATOR, ENCODER, DECODER = "generator", "encoder", "decoder"
 FRAME, EVERY, TRACKING = "frame", "frame, every query asked", "tracking frame"
+PATIENT = "labels to first estimate"
 VOLUME, COMMAND, LARGE = "400^3 labels", "`locate` command", "`locate --grid 400` command"
 PLAN, MOTIONS, STEP, TRAINING = "plan", "motions", "training step", "training, generator included"
 BEFORE_TORCH, PEAK = "seconds before torch is imported", "peak bytes"  # among ``others``

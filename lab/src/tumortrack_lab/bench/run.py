@@ -53,6 +53,7 @@ GROUPS: dict[str, Group] = {
     "tracking": Group("subject:tracking", (1, 2), 9, 3.0, 0.7, PRESETS),
     "volume": Group("subject:volumes", (1, 2), 9, 6.0, 2.0, PRESETS),
     "command": Group("command:workloads", (2,), 18, 4.2, 1.0, PRESETS),
+    "patient": Group("command:patient", (2,), 1, 40.0, 20.0),
     "planning": Group("planning:workloads", (1,), 3, 3.0, 0.7),
     "training": Group("training:steps", (1,), 3, 5.0, 1.0, ("clinic",)),
     "whole-training": Group("training:whole", (2,), 1, 20.0, 12.0),

@@ -32,7 +32,7 @@ class Bench:
     only: tuple[
         Literal[
             "generator", "elastic-generator", "encoder", "decoder", "frame", "tracking", "volume",
-            "command", "planning", "gpu", "training", "whole-training",
+            "command", "patient", "planning", "gpu", "training", "whole-training",
         ],
         ...,
     ] = ()  # fmt: skip

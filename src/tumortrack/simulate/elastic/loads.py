@@ -31,7 +31,7 @@ _WEIGHT = 1.05e-6 * 9.81  # N/mm3
 _EDGE_MM = 4.0  # over which an obstacle's edge fades
 _DEEPEST = 0.28  # of the organ's thickness, that a plate goes
 _FARTHEST_MM = 16.0  # that a place of the surface moves
-_TOGETHER = 64  # problems that are solved together: some 0.3 MB each
+_TOGETHER = 32  # problems that are solved together: some 2 MB each
 _SWELLING = 0.025  # largest change of volume: leaves room below 3 % for what modes do to it
 
 
@@ -46,6 +46,7 @@ class ReducedProblem:
     forces: Float64[np.ndarray, " m"]  # g
     # (rows, depth_mm, springs): they push where depth_mm + rows @ z is above zero
     contacts: list[tuple[np.ndarray, ...]] = field(default_factory=list)
+    later: list[Callable[[], object]] = field(default_factory=list)  # adds to H and g
 
     def touch(self, rows: np.ndarray, depth_mm: np.ndarray, springs: np.ndarray) -> None:
         """Add contacts with springs in N/mm."""
@@ -54,7 +55,8 @@ class ReducedProblem:
 
     def tie(self, rows: np.ndarray, target_mm: np.ndarray | float, springs: np.ndarray) -> None:
         """Springs (N/mm) that hold ``rows @ z`` at a target, both ways."""
-        _add_springs(self.stiffness, self.forces, rows, springs * target_mm, springs)
+        whole = self.stiffness, self.forces, rows, springs * target_mm, springs
+        self.later.append(lambda: _add_springs(*whole))
 
     def press(self, outward: Vector, height_mm: float, foot: Float64[np.ndarray, " p"]) -> None:
         """Something hard comes from a unit vector and stops at ``height_mm`` along it, felt by a
@@ -80,14 +82,18 @@ class ReducedProblem:
 
     def weigh(self, down: Vector, fraction: float) -> None:
         """A fraction of the weight that the tissue bore in the CT is no longer borne."""
-        self.forces += fraction * _WEIGHT * (down @ self.organ.volume_moves)
+        added = fraction * _WEIGHT * (down @ self.organ.volume_moves)
+        self.later.append(lambda: np.add(self.forces, added, out=self.forces))
 
     def expand(self, strain: float) -> None:
         """The organ takes up or loses fluid: a strain of its volume, if nothing hinders it."""
-        self.forces += self.modulus * strain * self.organ.swelling
+        added = self.modulus * strain * self.organ.swelling
+        self.later.append(lambda: np.add(self.forces, added, out=self.forces))
 
     def equilibrium(self) -> Float64[np.ndarray, " m"] | None:
         """The unknowns at rest; None where the contacts do not converge."""
+        while self.later:
+            self.later.pop(0)()
         none = np.zeros((0, len(self.forces))), np.zeros(0), np.zeros(0)
         contacts = map(np.concatenate, zip(none, *self.contacts, strict=True))
         z, converged = _equilibrium(self.stiffness, self.forces, *contacts)
@@ -123,14 +129,15 @@ def _equilibrium(stiffness, forces, rows, depth, springs):  # type: ignore[no-un
 
 @numba.njit(cache=True, nogil=True)
 def _add_springs(matrix, right, rows, loads, springs):  # type: ignore[no-untyped-def]
-    """matrix += rows' diag(springs) rows and right += rows' loads, in place."""
+    """matrix += rows' diag(springs) rows, of which the lower triangle is all that ``_solve`` asks
+    for, and right += rows' loads, in place."""
     for p in range(len(rows)):
         if springs[p] == 0.0:
             continue
         for a in range(len(right)):
             force = springs[p] * rows[p, a]
             right[a] += rows[p, a] * loads[p]
-            for b in range(len(right)):
+            for b in range(a + 1):
                 matrix[a, b] += force * rows[p, b]
 
 
