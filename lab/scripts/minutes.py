@@ -25,24 +25,19 @@ from tumortrack.cli.console import say
 from tumortrack.core import store
 from tumortrack.core.errors import InputError
 from tumortrack.imaging.case import Case
-from tumortrack.models.folder import is_finished
-from tumortrack.sense.noise import D405_NOISE
-from tumortrack.simulate.deform import ChainConfig, DragConfig, StretchConfig
-from tumortrack.simulate.scene import SceneConfig
+from tumortrack.models.folder import WEIGHTS, is_finished
 from tumortrack.simulate.scene_folder import Scene, list_scenes, read_scene
 from tumortrack.tracking.tracker import Tracker
+from tumortrack.training.model import SHIPPED
 from tumortrack.training.presets import clinic
 from tumortrack_lab.real import kidneys
-from tumortrack_lab.real.judging import by_tumor, judge, quantiles
+from tumortrack_lab.real.judging import DRAGGED, by_tumor, judge, quantiles
 from tumortrack_lab.study import trainings
 from tumortrack_lab.study.document import table
 from tumortrack_lab.study.methods import named_folders
 
 BLOCK = "minutes"
 FAR_MM = (3.0, 5.0)
-DRAGGED = SceneConfig(
-    deform=(ChainConfig(links=(DragConfig(), StretchConfig())),), noise=D405_NOISE
-)
 Made = list[tuple[str, Callable[[], Scene]]]
 
 
@@ -77,14 +72,7 @@ def main(options: Options) -> None:
     for name, folder in cases.items():
         for length in options.lengths:
             rows += list(_of_length(name, folder, worlds.get(name), length, options))
-    lines = by_tumor(rows)
-    looks = pd.DataFrame(rows).drop(columns="tumors")
-    blocks = [
-        _table("training, scenes", lines, looks, ["length", "source"]),
-        _table("training, organ", lines, looks, ["length", "organ"]),
-        _table("training, tumors", lines, looks, ["length", "kind"]),
-    ]
-    writer.write({BLOCK: "\n\n".join([*blocks, f"`{writer.command}`"])})
+    writer.write({BLOCK: f"{tables(rows)}\n\n`{writer.command}`"})
     say(f"written to {options.document}")
 
 
@@ -95,15 +83,17 @@ def _of_length(
     from_nothing, _, steps = length.rpartition(":")
     if from_nothing not in ("", "none") or not steps.isdigit():
         raise InputError(f"--lengths {length!r} must be steps, or none:steps.")
-    model = options.out / name / f"{length.replace(':', '-')}-steps"
+    case_sha256 = store.sha256_of(folder / store.MANIFEST)
+    start = Path("none") if from_nothing else options.start or SHIPPED
+    of = from_nothing or store.sha256_of(start / WEIGHTS)[:8]
+    model = options.out / name / f"{case_sha256[:8]}-{of}-{options.seed}-{steps}"
     if not is_finished(model):
         say(f"{name}: training for {length} steps")
-        start = from_nothing or options.start
         api.train(
             folder, model, steps=int(steps), seed=options.seed, device=options.device, start=start
         )
     about = {
-        "case": store.sha256_of(folder / store.MANIFEST), "scenes": options.scenes,
+        "case": case_sha256, "scenes": options.scenes,
         "model": store.sha256_of(model / store.MANIFEST), "seed": options.seed,
         "world": None if world is None else store.sha256_of(world),
     }  # fmt: skip
@@ -145,15 +135,21 @@ def _scenes(case: Case, world: Path | None, options: Options) -> Made:
     return made + [("world", partial(read_scene, folder)) for folder in folders]
 
 
-def _table(what: str, lines: pd.DataFrame, looks: pd.DataFrame, by: list[str]) -> str:
-    """Verdicts of scenes and errors of tumors' middles, mm, by group."""
+def tables(rows: list[dict]) -> str:
+    """By source of scenes, by organ, and by how the tumors lie."""
+    lines = by_tumor({**row, "scene": number} for number, row in enumerate(rows))
+    by = {"scenes": "source", "organ": "organ", "tumors": "kind"}
+    return "\n\n".join(_table(f"steps, {what}", lines, column) for what, column in by.items())
+
+
+def _table(what: str, lines: pd.DataFrame, column: str) -> str:
+    """Verdicts of scenes and errors of tumors' middles, mm, by length and group."""
     head = [what, "scenes", "good", "poor", "refused"]
     head += [f"good, over {far:g} mm" for far in FAR_MM]
     head += ["middle of tumors, median / 90 / 95 / worst", "called good", "best rigid pose"]
     body = []
-    for key, some in lines.groupby(by, sort=False):
-        mine = looks if by[1] not in looks else looks[looks[by[1]] == key[1]]
-        verdicts = mine[mine.length == key[0]].verdict
+    for key, some in lines.groupby(["length", column], sort=False):
+        verdicts = some.drop_duplicates("scene").verdict
         good = some[some.verdict == "good"]
         body.append([
             ", ".join(map(str, key)), str(len(verdicts)),

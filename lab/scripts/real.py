@@ -26,20 +26,14 @@ from tumortrack.core.mesh_files import read_mesh, write_mesh
 from tumortrack.core.types import Mesh
 from tumortrack.imaging.case import Case, load_case
 from tumortrack.models.folder import is_finished
-from tumortrack.sense.noise import D405_NOISE
-from tumortrack.simulate.deform import ChainConfig, DragConfig, StretchConfig
-from tumortrack.simulate.scene import SceneConfig
 from tumortrack.tracking.tracker import Tracker
 from tumortrack_lab.real import kidneys, lungs, silicone
-from tumortrack_lab.real.judging import by_tumor, judge, quantiles, scene_of
+from tumortrack_lab.real.judging import DRAGGED, by_tumor, judge, quantiles, scene_of
 from tumortrack_lab.study import trainings
 from tumortrack_lab.study.document import table
 from tumortrack_lab.study.methods import named_folders
 
 Part = Literal["kidneys", "lungs", "silicone", "slab"]
-DRAGGED = SceneConfig(
-    deform=(ChainConfig(links=(DragConfig(), StretchConfig())),), noise=D405_NOISE
-)
 KINDS = (*kidneys.KINDS, "between")  # of tumors
 ERRORS = "median / 90 / 95 / worst, mm"
 

@@ -36,7 +36,7 @@ from tumortrack.training.state import (
     provenance,
     settle_end,
 )
-from tumortrack.training.task import task_of
+from tumortrack.training.task import TrainingTask, task_of
 
 __all__ = ["Interrupted", "TrainingRun", "TrainingStatus", "train"]
 
@@ -109,23 +109,31 @@ def _train(run: TrainingRun, work: Path, group: ProcessGroup, report: Report) ->
     state = TrainingState(run, device, group)
     state.initialize(task.initialize)
     state.resume(work)
-    anatomy_ct, scene = coarsened(run.anatomy_ct, config.scene, config.coarse)
-    about = anatomy_ct, run.up_lps, scene, task.points, run.seed
-    stream = SceneStream(*about, "train", group.local_size(config.batch_size), task.body)
     end = config.steps if state.progress.end is None else state.progress.end
-    steps = group.local_batches(range(state.progress.step, end))
-    period = config.training_pairs // config.batch_size * group.size
-    scenes = scenes_for(stream, steps, period, workers, device, run.scenes)
     if end == 0:
         state.keep_if_best(task.miou(state.average))
     else:
+        steps = range(state.progress.step, end)
+        scenes = _scenes(run, task, group.local_batches(steps), group, workers)
         run_steps(state, scenes, work, report, task.miou)
     if not group.is_main:
         return None
-    origin = {**provenance(run, state.progress, device), "scenes": scenes.maker}
+    origin = {**provenance(run, state.progress, device), "scenes": scenes.maker if end else "none"}
     model = task.model(state.best_network(), origin)
     save_model(model, work.parent)
     return model
+
+
+def _scenes(
+    run: TrainingRun, task: TrainingTask, steps: range, group: ProcessGroup, workers: int
+) -> Scenes:
+    """Of these steps, this process's share."""
+    config = run.config
+    anatomy_ct, scene = coarsened(run.anatomy_ct, config.scene, config.coarse)
+    about = anatomy_ct, run.up_lps, scene, task.points, run.seed
+    stream = SceneStream(*about, "train", group.local_size(config.batch_size), task.body)
+    period = config.training_pairs // config.batch_size * group.size
+    return scenes_for(stream, steps, period, workers, group.device, run.scenes)
 
 
 def run_steps(

@@ -20,13 +20,18 @@ from tumortrack.sense.camera import d405
 from tumortrack.sense.cloud import CloudConfig, cloud_from_depth
 from tumortrack.sense.noise import D405_NOISE, add_noise
 from tumortrack.sense.render import render_depth
+from tumortrack.simulate.deform import ChainConfig, DragConfig, StretchConfig
 from tumortrack.simulate.deform.base import Deformation
-from tumortrack.simulate.scene import PoseConfig, sample_pose
+from tumortrack.simulate.scene import PoseConfig, SceneConfig, sample_pose
 from tumortrack.simulate.scene_folder import Scene
 from tumortrack.tracking.tracker import Tracker
 from tumortrack_lab.peers.base import fit_over_volume
 
 CAMERA = d405(424, 240)  # as training's
+# As no training scene of `clinic` is.
+DRAGGED = SceneConfig(
+    deform=(ChainConfig(links=(DragConfig(), StretchConfig())),), noise=D405_NOISE
+)
 _FIRST = ["name", "verdict", "middle_mm", "hausdorff_mm", "std_mm"]
 
 
