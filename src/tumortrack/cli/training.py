@@ -118,7 +118,7 @@ class Pretrain:
 
     out: Positional[Path]
     anatomies: int = 400
-    steps: int = 16_000
+    steps: int = 10_000
     seed: int = 0
     device: Device = "auto"
     workers: int | None = None

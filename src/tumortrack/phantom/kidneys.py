@@ -25,10 +25,11 @@ def random_anatomy(
     seed: int,
     lengths_mm: tuple[float, float] = (90.0, 130.0),
     tumors_mm: tuple[float, float] = (10.0, 45.0),
+    rises_deg: float = 0.0,
 ) -> tuple[Anatomy, tuple[float, float, float]]:
     """A kidney of a length in this range with one to three tumors of such diameters, deep or
-    bulging, and the direction that faces the camera: CT frame (LPS), mm; closed surfaces, tumors in
-    label order.
+    bulging, and the direction that faces the camera, to which the long axis rises or falls by up to
+    ``rises_deg``: CT frame (LPS), mm; closed surfaces, tumors in label order.
 
     The same seed gives the same kidney.
 
@@ -48,7 +49,8 @@ def random_anatomy(
         faces = mesh.faces if np.linalg.det(turn) > 0 else mesh.faces[:, ::-1]  # outward again
         parts.append(Mesh(mesh.vertices_mm @ turn.T + centre, faces))
     aside = Rotation.from_euler("z", rng.uniform(-_SIDEWAYS_DEG, _SIDEWAYS_DEG), degrees=True)
-    x, y, z = turn @ aside.apply([0.0, -1.0, 0.0])
+    rise = np.radians(rng.uniform(-rises_deg, rises_deg))
+    x, y, z = turn @ aside.apply([0.0, -np.cos(rise), np.sin(rise)])
     return Anatomy(tuple(parts)), (float(x), float(y), float(z))
 
 

@@ -1,8 +1,8 @@
 """What the organs of all patients have in common: one frame, one size, one set of displacements.
 
-The upright frame: origin at the organ's centre, upper side towards -z, long axis along +x as far
-as it lies across (``network.facing_rotation``), lengths scaled so that the organ's box has the
-half length ``UPRIGHT_MM``. There a displacement is a sum of smooth fields, polynomials of second
+The upright frame: origin at the organ's centre, long axis along +x, upper side towards -z as far as
+that allows (``network.facing_rotation``), lengths scaled so that half the organ's length along its
+axis is ``UPRIGHT_MM``. There a displacement is a sum of smooth fields, polynomials of second
 degree less rigid motion: stretches, shears, bends. They are the same for every organ, while each
 organ's elastic modes are its own.
 """
@@ -51,11 +51,16 @@ class CanonicalFrame:
         return poses
 
 
+def half_length_mm(organ_ct: Mesh, long_axis: Vector) -> float:
+    """Half of the organ's length along its axis, however it is turned."""
+    return float(np.ptp(organ_ct.vertices_mm @ long_axis)) / 2
+
+
 def upright_of(
     organ_ct: Mesh, up_lps: Direction, center_ct: Vector, long_axis: Vector
 ) -> CanonicalFrame:
     """The upright frame of an organ."""
-    scale = UPRIGHT_MM / (organ_ct.longest_mm / 2)
+    scale = UPRIGHT_MM / half_length_mm(organ_ct, long_axis)
     return CanonicalFrame(facing_rotation(up_lps, long_axis), center_ct, scale)
 
 

@@ -13,12 +13,11 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from scipy.spatial.transform import Rotation
 from torch import Tensor, nn
 from torch.nn import functional
 
 from tumortrack.core.errors import InputError
-from tumortrack.core.geometry import Direction, Matrix, Points, Vector, rotation_onto
+from tumortrack.core.geometry import Direction, Matrix, Points, Vector, perpendicular, unit
 from tumortrack.models.config import NetworkConfig, RegistrationHeadConfig
 from tumortrack.models.layers import Layer
 from tumortrack.models.model import Network, OnnxParts
@@ -192,11 +191,14 @@ class _Exported(nn.Module):
 
 
 def facing_rotation(up_lps: Direction, long_axis: Vector) -> Matrix:
-    """The rotation that an organ of any patient has where nothing is tilted: its upper side
-    towards the camera, its long axis along +x as far as it lies across the view."""
-    facing = rotation_onto(np.asarray(up_lps, float), np.array([0.0, 0.0, -1.0]))
-    x, y, _ = facing @ long_axis
-    return Rotation.from_euler("z", -np.arctan2(y, x)).as_matrix() @ facing
+    """The rotation that an organ of any patient has where it lies flat before the camera: its long
+    axis along +x, its upper side towards the camera as far as the axis allows. How far the axis
+    rises towards the upper side, 20 degrees or so in most patients, is seen, and so is no part of
+    the frame."""
+    x = unit(np.asarray(long_axis, float))
+    across = np.asarray(up_lps, float) - (np.asarray(up_lps, float) @ x) * x
+    z = -unit(across) if np.linalg.norm(across) > 1e-6 else perpendicular(x)
+    return np.stack([x, np.cross(z, x), z])
 
 
 def _placed(points: Tensor, rotation: Tensor, centre_mm: Tensor) -> Tensor:

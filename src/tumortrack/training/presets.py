@@ -16,7 +16,8 @@ from tumortrack.models.config import (
 from tumortrack.models.encoders.heightmap import HeightMapConfig
 from tumortrack.models.encoders.pointnet2 import PointNet2Config, SetAbstraction
 from tumortrack.models.normalisation import Aligned, CloudBox
-from tumortrack.registration.canonical_frame import FIELDS, UPRIGHT_MM
+from tumortrack.registration.canonical_frame import FIELDS, UPRIGHT_MM, half_length_mm
+from tumortrack.registration.rest_shape import long_axis_of
 from tumortrack.sense.clutter import ClutterConfig
 from tumortrack.sense.noise import D405_NOISE, CalibrationConfig
 from tumortrack.sense.occlusion import OcclusionConfig
@@ -73,7 +74,8 @@ def clinic(anatomy: Anatomy, rotations: Rotations = "limited") -> TrainConfig:
     """The default: registration of the organ's elastic body, learnt in minutes from scenes with
     sensor errors, occlusion and background."""
     elastic = ElasticConfig()
-    return _clinic(elastic, elastic.body.modes, anatomy.organ.longest_mm / 2, rotations)
+    half_mm = half_length_mm(anatomy.organ, long_axis_of(anatomy.organ))
+    return _clinic(elastic, elastic.body.modes, half_mm, rotations)
 
 
 def pretraining(rotations: Rotations = "limited") -> TrainConfig:
