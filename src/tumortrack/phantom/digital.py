@@ -94,13 +94,9 @@ def second_phantom() -> PhantomParameters:
 def phantom_labels(parameters: PhantomParameters, voxel_mm: float = 0.8) -> LabelVolume:
     """The phantom on an isotropic voxel grid along the LPS axes.
 
-    Labels: 0 outside, 1 organ, 2 the tumor of largest diameter, 3 the next, ...; a tumor wins
-    over the organ.
-
-    Raises:
-        InputError: ``voxel_mm`` outside 0.2..4, more than 50 million voxels, or a tumor wholly
-            outside the organ.
-    """
+    Labels: 0 outside, 1 organ, 2 the tumor of largest diameter, 3 the next, ...; a tumor wins over
+    the organ. Raises InputError: ``voxel_mm`` outside 0.2..4, more than 50 million voxels, or a
+    tumor wholly outside the organ."""
     if not 0.2 <= voxel_mm <= 4:
         raise InputError(f"voxel size {voxel_mm} mm: allowed are 0.2 to 4 mm.")
     reach_mm = np.array(parameters.size_mm) / 2

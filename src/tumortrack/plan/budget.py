@@ -156,12 +156,9 @@ def planned_budget(
 
 
 def widened(config: ResectionConfig, budget: ErrorBudget) -> ResectionConfig:
-    """With the margin of healthy tissue that ``config`` asks for beyond all errors.
-
-    Raises:
-        InputError: the method keeps no margin below the tumor, or ``sigmas`` count errors twice.
-        NoPlan: it is wider than any that is planned.
-    """
+    """With the margin of healthy tissue that ``config`` asks for beyond all errors. Raises
+    InputError: the method keeps no margin below the tumor, or ``sigmas`` count errors twice;
+    NoPlan: it is wider than any that is planned."""
     if config.method != "margin" or config.sigmas > 0:
         raise InputError("--confidence needs the method margin, and no --sigmas.")
     wide_mm = config.margin_mm + budget.sum_mm

@@ -28,11 +28,8 @@ def concave_hull(points_mm: Float[np.ndarray, "n 2"]) -> Polygon:
     """The outline of a cloud's largest cluster.
 
     Edges may be as long as 5 sqrt(A / n), A being the convex hull's area: a fixed ratio, which GEOS
-    takes, would mean another length at every density.
-
-    Raises:
-        NoPlan: fewer than three points, or all on a line.
-    """
+    takes, would mean another length at every density. Raises NoPlan: fewer than three points, or
+    all on a line."""
     points = np.asarray(points_mm, float)
     if len(points) > _MOST:
         points = points[np.linspace(0, len(points) - 1, _MOST).astype(int)]
