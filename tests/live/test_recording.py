@@ -127,8 +127,8 @@ def test_an_mcap_is_read_by_rosbags_with_its_estimates(tmp_path):
     np.testing.assert_allclose(np.abs([turn.x, turn.y, turn.z, turn.w]), [0, 0, 1, 0], atol=1e-12)
 
 
-def test_without_frames_there_are_estimates_only(tmp_path):
-    path = record(tmp_path / "r", [update_number(0)], frames=False)
+def test_without_a_picture_there_are_estimates_only(tmp_path):
+    path = record(tmp_path / "r", [empty_update(0)])
     with AnyReader([path]) as reader:
         assert all(topic.startswith("/tumortrack/") for topic in reader.topics)
     with pytest.raises(InputError, match="no depth images"):

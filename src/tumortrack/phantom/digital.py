@@ -75,22 +75,6 @@ class PhantomParameters(Config, frozen=True):
                 )
 
 
-def second_phantom() -> PhantomParameters:
-    """Another kidney: three tumors, the deep one in the lower pole, one on the lateral rim."""
-    return PhantomParameters(
-        size_mm=(56.0, 47.0, 104.0),
-        bend_mm=9.0,
-        taper=0.04,
-        hilum_depth_mm=16.0,
-        shape_seed=7,
-        tumors=(
-            TumorParameters(diameter_mm=30.0, center_mm=(-3.0, 1.0, -20.0)),
-            TumorParameters(diameter_mm=26.0, center_mm=(-20.0, -12.0, 17.0)),
-            TumorParameters(diameter_mm=12.0, center_mm=(4.0, 2.0, 25.0)),
-        ),
-    )
-
-
 def phantom_labels(parameters: PhantomParameters, voxel_mm: float = 0.8) -> LabelVolume:
     """The phantom on an isotropic voxel grid along the LPS axes.
 

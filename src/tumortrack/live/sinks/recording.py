@@ -30,11 +30,10 @@ _ON_FULL_DISK = (
 
 
 class RecordingSinkConfig(SinkConfig, frozen=True, kw_only=True, tag="recording"):
-    """A new folder with every result.
+    """A new folder with every result and what the source saw: depth images as 32FC1 in metres
+    (float32 to 1e-5 mm), stamps exact.
 
     Attributes:
-        frames: also what the source saw (depth images as 32FC1 in metres: float32 to 1e-5 mm;
-            stamps exact); otherwise the recording cannot be played.
         meshes_hz: surfaces at most so often; 0: with every result.
         overwrite: replace a recording of this kind.
     """
@@ -43,7 +42,6 @@ class RecordingSinkConfig(SinkConfig, frozen=True, kw_only=True, tag="recording"
     queue_size: ClassVar[int] = 30
 
     path: Path
-    frames: bool = True
     meshes_hz: float = 2.0
     overwrite: bool = False
 
@@ -56,7 +54,7 @@ class RecordingSinkConfig(SinkConfig, frozen=True, kw_only=True, tag="recording"
         _make_room(self.path, self.overwrite)
         with writing(self.path):
             self.path.parent.mkdir(parents=True, exist_ok=True)
-            sink = McapFile(self.path, context, self.frames, self.meshes_hz)
+            sink = McapFile(self.path, context, self.meshes_hz)
             moves = context.published_frame.moves
             poses = WithPoses(sink, self.path / POSES) if moves else None
         frame = context.published_frame
@@ -122,8 +120,8 @@ class McapFile:
     ``/camera_2/...``; ``/tumortrack/...`` the results as in ROS, and ``report`` (JSON); ``/tf``
     where the frames differ."""
 
-    def __init__(self, folder: Path, context: SinkContext, frames: bool, meshes_hz: float) -> None:
-        self._messages, self._frames = Messages(), frames
+    def __init__(self, folder: Path, context: SinkContext, meshes_hz: float) -> None:
+        self._messages = Messages()
         self._results = ResultMessages(self._messages, context, meshes_hz, observed=False)
         self._bag = McapBag(folder, self._messages, _ON_FULL_DISK)
 
@@ -142,7 +140,7 @@ class McapFile:
         said = Outgoing("report", STRING, make(STRING, data=text))
         out = [*self._results.of(result), said]
         out = [one._replace(suffix=f"/tumortrack/{one.suffix}") for one in out]
-        if not self._frames or result.observation is None:
+        if result.observation is None:
             return out
         alone = CameraView(1, result.observation, frame.published_from_camera)
         for view in result.views or (alone,):
