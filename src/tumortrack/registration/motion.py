@@ -110,7 +110,7 @@ class ElasticMotion:
     def residual_rows(self, points_camera: Points) -> Float32[np.ndarray, "n q"]:
         """What shift, turn and coefficients each do to the signed distance (mm) of points, carried
         back, to the organ's surface at rest; that distance last."""
-        body, points = self.shape.body, np.ascontiguousarray(points_camera, np.float32)
+        body, points = self.shape.body, np.array(points_camera, np.float32, order="C")
         pose = Pose(body.center_ct, self.rotation, self.centre_mm)
         out = np.empty((len(points), kernels.POSE + len(self.coefficients) + 1), np.float32)
         known = body.modes, self.shape.distances[0], self._opposite, pose
