@@ -191,12 +191,9 @@ def plan_within(
     budget_of: Callable[[ResectionPlan], ErrorBudget],
     beyond_errors: bool = False,
 ) -> tuple[ResectionPlan, ResectionConfig, ErrorBudget]:
-    """A plan, as it was asked for in the end, and its budget.
-
-    Args:
-        beyond_errors: the margin is of healthy tissue, and all errors are added to it; a note says
-            what it is made of. Raises as ``widened``.
-    """
+    """A plan, as it was asked for in the end, and its budget. ``beyond_errors``: the margin is of
+    healthy tissue, and all errors are added to it; a note says what it is made of. Raises as
+    ``widened``."""
     plan = plan_resection(located, config)
     budget = budget_of(plan)
     if not beyond_errors:

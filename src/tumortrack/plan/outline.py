@@ -75,11 +75,8 @@ def arcs(
     ring_mm: Float[np.ndarray, "n 2"], wanted: Bool[np.ndarray, " n"], lead: int
 ) -> list[Float64[np.ndarray, "m 2"]]:
     """The runs of a closed ring's wanted points, each longer by ``lead`` points at both ends; the
-    whole ring, closed, where that leaves no gap.
-
-    Args:
-        ring_mm: evenly spaced, the first point not repeated.
-    """
+    whole ring, closed, where that leaves no gap. ``ring_mm``: evenly spaced, the first point not
+    repeated."""
     n = len(ring_mm)
     if not wanted.any():
         return []
