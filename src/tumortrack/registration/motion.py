@@ -118,8 +118,10 @@ class ElasticMotion:
         return out
 
     def _moved(self, kernel: Callable[..., None], flow: Flow, points_mm: Points) -> Moved:
-        points, out = np.ascontiguousarray(points_mm, np.float32), np.empty((len(points_mm), 3))
-        pose = Pose(self.shape.body.center_ct, self.rotation, self.centre_mm)
+        # Copies, in C's order: for other arrays the kernels would be compiled once more.
+        points, out = np.array(points_mm, np.float32, order="C"), np.empty((len(points_mm), 3))
+        rotation = np.ascontiguousarray(self.rotation)
+        pose = Pose(self.shape.body.center_ct, rotation, self.centre_mm)
         parallel_for(lambda part: kernel(flow, pose, points[part], out[part]), len(out), _AT_ONCE)
         return out
 
