@@ -33,17 +33,23 @@ jaxtyping.install_import_hook(CHECKED, "checking.check_annotations")
 # What needs a model is slow: it may be the one that trains it.
 TRAINED = {"clinic_model", "quick_model", "learnt_model", "slim_model"}
 
-# The longest files first: with few workers none is left alone with one at the end.
+# The longest files first: with few workers none is left alone with one at the end. Two of the
+# first three train no `clinic` model: else each worker would compile its kernels for itself.
 SLOWEST = (
     "test_soak.py",
+    "test_locate.py",
+    "test_attacks.py",
     "test_training.py",
     "test_real_patients.py",
-    "test_track.py",
-    "test_locate.py",
     "test_examples.py",
-    "test_demo.py",
-    "test_twin_physics.py",
     "test_resect.py",
+    "test_gauss_newton.py",
+    "test_registration.py",
+    "test_track.py",
+    "test_demo.py",
+    "test_bench_gpu.py",
+    "test_margins.py",
+    "test_twin_physics.py",
 )
 
 

@@ -21,7 +21,7 @@ os.environ.setdefault("GOMP_SPINCOUNT", "1000")
 
 from tumortrack.cli.console import say
 from tumortrack.core.errors import TumortrackError
-from tumortrack.phantom.digital import PhantomParameters, second_phantom
+from tumortrack.phantom.digital import PhantomParameters
 from tumortrack.training.train import TrainingStatus
 from tumortrack_lab.study import goals, resection, tables, trainings
 from tumortrack_lab.study.measure import measured
@@ -33,6 +33,7 @@ from tumortrack_lab.study.methods import (
     named_folders,
     peer,
     phantom_case,
+    second_phantom,
     study_case,
 )
 from tumortrack_lab.study.tumor_sites import tumor_sites_of

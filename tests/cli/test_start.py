@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from importlib.metadata import EntryPoint
 
 import numpy as np
 import pytest
 
 from stories import COMMAND, cloud_by_rays, environment, looking_down
+from tumortrack.cli import main
 from tumortrack.imaging.case import load_case
 from tumortrack.sense.ply import write_cloud_ply
 
@@ -88,3 +90,12 @@ def test_a_command_ends_well_where_nobody_reads_its_errors():
     closed = f"exec {sys.executable} -c '{words}' 2>&-"
     done = subprocess.run(["sh", "-c", closed], stdout=subprocess.PIPE, timeout=300, check=True)
     assert done.stdout == b"1\n"
+
+
+def test_a_broken_command_of_another_package_stops_no_other(monkeypatch, tmp_path, capsys):
+    broken = EntryPoint("broken", "nowhere.at_all:Command", "tumortrack.commands")
+    monkeypatch.setattr(main, "entry_points", lambda group: (broken,))
+    assert main.run(["inspect", str(tmp_path)]) == 2
+    assert "is no case" in capsys.readouterr().err
+    with pytest.raises(ModuleNotFoundError):
+        main.run(["broken"])

@@ -26,7 +26,7 @@ def run(*command, **options):
 def wheel(tmp_path_factory):
     folder = tmp_path_factory.mktemp("wheel")
     build = [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--wheel-dir", folder]
-    run(*build, ROOT)
+    run(*build, "--no-build-isolation", ROOT)
     return next(folder.glob("tumortrack-*.whl"))
 
 

@@ -17,7 +17,6 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from tumortrack.core.errors import InputError, NoEstimate
-from tumortrack.core.estimate import OneWay
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import Anatomy, Mesh
 from tumortrack.live.sources.recording import RecordingSourceConfig
@@ -25,6 +24,7 @@ from tumortrack.report.drawing import ESTIMATED, TRUE
 from tumortrack.report.metrics import surface_samples
 from tumortrack.sense.camera import deproject, project
 from tumortrack.simulate.scene_folder import draw_targets, read_scene
+from tumortrack_lab.peers.base import OneWay
 from tumortrack_lab.study.tumor_sites import tumor_sites_of
 from tumortrack_lab.world import colour, following, pictures, tables
 from tumortrack_lab.world.films import FilmConfig, read_film, write_film

@@ -17,7 +17,6 @@ import trimesh
 from stories import write_phantom_case
 from tumortrack.core import store
 from tumortrack.core.errors import InputError, NoEstimate
-from tumortrack.core.estimate import OneWay
 from tumortrack.core.geometry import rigid
 from tumortrack.core.types import Anatomy, Mesh, SensorCloud
 from tumortrack.simulate.deform import RestConfig
@@ -25,7 +24,7 @@ from tumortrack.simulate.occupancy import OccupancyConfig
 from tumortrack.simulate.scene import SceneConfig, SceneRecipe, Simulator
 from tumortrack.simulate.scene_folder import Scene
 from tumortrack.training.presets import PRESETS, quick
-from tumortrack_lab.peers.base import Fit, estimate_of, rigid_carry
+from tumortrack_lab.peers.base import Fit, OneWay, estimate_of, rigid_carry
 from tumortrack_lab.study import tables, tumor_sites
 from tumortrack_lab.study.document import ReportWriter, closing, fill, opening, table
 from tumortrack_lab.study.goals import goal_table

@@ -159,10 +159,6 @@ def test_what_a_camera_cannot_do_is_said():
         RealSenseSource(Camera(distortion=0.1).device, RealSenseSourceConfig())
     with pytest.raises(InputError, match=r"no 640x480@30. Allowed: 848x480@30"):
         RealSenseSource(Camera().device, RealSenseSourceConfig(width=640))
-    with pytest.raises(InputError, match=r"no emitter"):
-        RealSenseSource(Camera().device, RealSenseSourceConfig(emitter=True))
-    with pytest.raises(InputError, match=r"Allowed: .*high_accuracy"):
-        RealSenseSource(Camera().device, RealSenseSourceConfig(preset="best"))
 
 
 def test_what_is_not_there_is_said(tmp_path, monkeypatch):
@@ -179,6 +175,6 @@ def test_what_is_not_there_is_said(tmp_path, monkeypatch):
 
 
 def test_the_command_lines_text():
-    config = SOURCES.parse("realsense:0123?fps=60&emitter=true&preset=default")
-    assert config == RealSenseSourceConfig(device="0123", fps=60, emitter=True, preset="default")
+    config = SOURCES.parse("realsense:0123?fps=60&global_time=false")
+    assert config == RealSenseSourceConfig(device="0123", fps=60, global_time=False)
     assert SOURCES.parse("realsense") == RealSenseSourceConfig()

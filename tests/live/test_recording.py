@@ -16,10 +16,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 from rosbags.highlevel import AnyReader
 
 from clock import PATIENCE_S, Clock
-from depth_files import write_depth_png, write_intrinsics
+from depth_files import write_depth_png, write_frame_folder, write_intrinsics
 from live_objects import (
     CAMERA,
     PARTS,
@@ -66,12 +67,11 @@ def stamps(got: list) -> list[int]:
     return [seen.stamp_ns for seen in got]
 
 
-@pytest.mark.parametrize("form", ["mcap", "files"])
-def test_depth_images_come_back(tmp_path, form):
+def test_depth_images_come_back(tmp_path):
     mask = np.zeros((CAMERA.height, CAMERA.width), bool)
     mask[3:9, 4:40] = True
     updates = [update_number(0), update_number(1, mask=mask), empty_update(2), update_number(3)]
-    got = play(record(tmp_path / "r", updates, format=form))
+    got = play(record(tmp_path / "r", updates))
     assert stamps(got) == [updates[n].stamp_ns for n in (0, 1, 3)]
     for seen, n in zip(got, (0, 1, 3), strict=True):
         sent, back = frame_number(n), seen.content
@@ -84,11 +84,10 @@ def test_depth_images_come_back(tmp_path, form):
     assert all(seen.truth is None for seen in got)
 
 
-@pytest.mark.parametrize("form", ["mcap", "files"])
-def test_clouds_come_back(tmp_path, form):
+def test_clouds_come_back(tmp_path):
     points_mm = small_estimate().cloud.points_mm
     cloud = SensorCloud(points_mm, STAMP_NS)
-    (seen,) = play(record(tmp_path / "r", [update_number(0, cloud)], format=form))
+    (seen,) = play(record(tmp_path / "r", [update_number(0, cloud)]))
     assert seen.stamp_ns == STAMP_NS
     np.testing.assert_allclose(seen.content.points_mm, points_mm, rtol=2e-7)
     assert abs(seen.arrived_ns - time.time_ns()) < 600e9
@@ -128,42 +127,8 @@ def test_an_mcap_is_read_by_rosbags_with_its_estimates(tmp_path):
     np.testing.assert_allclose(np.abs([turn.x, turn.y, turn.z, turn.w]), [0, 0, 1, 0], atol=1e-12)
 
 
-def test_plain_files_hold_what_was_seen_and_said(tmp_path):
-    updates = [update_number(0), empty_update(1, "the drape hides it")]
-    path = record(tmp_path / "r", updates, format="files")
-    lines = [json.loads(line) for line in (path / "index.jsonl").read_text().splitlines()]
-    assert [(line["folder"], line["seen"], line["quality"]) for line in lines] == [
-        ("00000000", "depth", "good"),
-        ("00000001", None, "none"),
-    ]
-    one, two = (path / "frames" / line["folder"] for line in lines)
-    assert {p.name for p in one.iterdir()} == {
-        *("depth.png", "intrinsics.json", "report.json", "estimate")
-    }
-    assert {p.name for p in (one / "estimate").iterdir()} == {
-        *("occupancy.ply", "kidney.ply", "tumor_1.ply", "tumor_2.ply")
-    }
-    assert [p.name for p in two.iterdir()] == ["report.json"]
-    report = json.loads((two / "report.json").read_text())
-    assert (report["estimate"], report["reason"]) == (None, "the drape hides it")
-    about = json.loads((path / "recording.json").read_text())
-    assert (about["kind"], about["parts"]) == ("recording", list(PARTS))
-    assert about["patient"] == {"id": "P1", "side": "left"}
-
-
-def test_depths_beyond_sixteen_bits_are_left_out_of_files(tmp_path):
-    frame = frame_number(0)
-    depth_mm = frame.depth_mm.copy()
-    depth_mm[0, :3] = [6553.5, 6554, 0.04]
-    frame = replace(frame, depth_mm=depth_mm)
-    (seen,) = play(record(tmp_path / "r", [update_number(0, frame)], format="files"))
-    np.testing.assert_array_equal(
-        np.isnan(seen.content.depth_mm[0, :4]), [False, True, True, False]
-    )
-
-
-def test_without_frames_there_are_estimates_only(tmp_path):
-    path = record(tmp_path / "r", [update_number(0)], frames=False)
+def test_without_a_picture_there_are_estimates_only(tmp_path):
+    path = record(tmp_path / "r", [empty_update(0)])
     with AnyReader([path]) as reader:
         assert all(topic.startswith("/tumortrack/") for topic in reader.topics)
     with pytest.raises(InputError, match="no depth images"):
@@ -171,15 +136,17 @@ def test_without_frames_there_are_estimates_only(tmp_path):
 
 
 def test_an_existing_folder_is_replaced_only_if_it_is_a_recording(tmp_path):
-    for form in ("mcap", "files"):
-        path = record(tmp_path / form, [update_number(0)], format=form)
-        with pytest.raises(InputError, match="exists"):
-            record(path, [])
-        record(path, [update_number(n) for n in range(2)], format=form, overwrite=True)
-        assert len(play(path)) == 2
-        (path / "thesis.tex").write_text("years of work")
-        with pytest.raises(InputError, match="not replaced"):
-            record(path, [], overwrite=True)
+    path = record(tmp_path / "mcap", [update_number(0)])
+    about = json.loads((path / "recording.json").read_text())
+    assert (about["kind"], about["parts"]) == ("recording", list(PARTS))
+    assert about["patient"] == {"id": "P1", "side": "left"}
+    with pytest.raises(InputError, match="exists"):
+        record(path, [])
+    record(path, [update_number(n) for n in range(2)], overwrite=True)
+    assert len(play(path)) == 2
+    (path / "thesis.tex").write_text("years of work")
+    with pytest.raises(InputError, match="not replaced"):
+        record(path, [], overwrite=True)
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "recording.json").write_text('{"kind": "song"}')
     for path in (tmp_path / "other", tmp_path / "mcap" / "recording.json"):
@@ -282,16 +249,6 @@ def test_a_full_disk_is_said_and_leaves_what_was_whole(tmp_path):
     assert "File too large" in said[0]
 
 
-def test_plain_files_go_on_when_there_is_room_again(tmp_path):
-    sink = RecordTo(path=tmp_path / "r", format="files").open(small_setting())
-    sink.publish(update_number(0))
-    with full_disk_at(3000), pytest.raises(StorageError):
-        sink.publish(update_number(1))
-    sink.publish(update_number(2))
-    sink.close()
-    assert stamps(play(tmp_path / "r")) == [STAMP_NS, STAMP_NS + 2 * PERIOD_NS]
-
-
 def cloud_files(folder: Path, names: list[str]) -> Path:
     folder.mkdir()
     for n, name in enumerate(names):
@@ -344,6 +301,19 @@ def test_depth_images_beside_one_camera(tmp_path):
     (tmp_path / "intrinsics.json").unlink()
     with pytest.raises(InputError, match=r"intrinsics\.json"):
         RecordingSourceConfig(path=tmp_path).open()
+
+
+def test_masks_lie_beside_depth_images(tmp_path):
+    mask = np.zeros((CAMERA.height, CAMERA.width), np.uint8)
+    mask[3:9, 4:40] = 255
+    for n in range(3):
+        write_frame_folder(tmp_path / "frames" / f"{n}", frame_number(n))
+    Image.fromarray(mask).save(tmp_path / "frames" / "1" / "mask.png")
+    Image.fromarray(mask[1:]).save(tmp_path / "frames" / "2" / "mask.png")
+    one, two, wrong = play(tmp_path)
+    assert one.mask is None
+    np.testing.assert_array_equal(two.mask, mask > 0)
+    assert "as large as depth.png" in str(wrong)
 
 
 def test_scenes_bring_their_truth(tmp_path):
@@ -539,15 +509,6 @@ def test_a_long_pause_is_cut_short_of_a_frozen_source(tmp_path, clock):
     assert clock.monotonic() - start == pytest.approx(2.0, abs=1e-6)
 
 
-def test_a_loop_goes_on_with_rising_stamps(tmp_path):
-    folder = cloud_files(tmp_path / "c", ["1.ply", "2.ply"])
-    source = RecordingSourceConfig(path=folder, rate=0, loop=True, fps=20).open()
-    got = [source.read(0.1) for _ in range(6)]
-    assert first_x(got) == [1, 2, 1, 2, 1, 2]
-    assert set(np.diff(stamps(got))) == {50_000_000}
-    source.close()
-
-
 def test_close_ends_a_read_that_waits(tmp_path, monkeypatch):
     monkeypatch.setattr("tumortrack.live.sources.recording._LONGEST_WAIT_S", 10 * PATIENCE_S)
     folder = cloud_files(tmp_path / "c", ["1000000000000.ply", "9000000000000.ply"])
@@ -560,15 +521,12 @@ def test_close_ends_a_read_that_waits(tmp_path, monkeypatch):
     assert time.monotonic() - start < PATIENCE_S
 
 
-@pytest.mark.parametrize("form", ["mcap", "files"])
-def test_the_second_of_two_that_begin_to_record_into_one_folder_is_refused(
-    tmp_path, monkeypatch, form
-):
+def test_the_second_of_two_that_begin_to_record_into_one_folder_is_refused(tmp_path, monkeypatch):
     """Both looked before either had made it."""
     monkeypatch.setattr("tumortrack.live.sinks.recording._make_room", lambda *_: None)
-    first = RecordTo(path=tmp_path / "tape", format=form).open(small_setting())
-    with pytest.raises((InputError, StorageError), match="exists"):
-        RecordTo(path=tmp_path / "tape", format=form).open(small_setting())
+    first = RecordTo(path=tmp_path / "tape").open(small_setting())
+    with pytest.raises(InputError, match="exists"):
+        RecordTo(path=tmp_path / "tape").open(small_setting())
     first.publish(update_number(0))
     first.close()
     assert stamps(play(tmp_path / "tape")) == [frame_number(0).stamp_ns]

@@ -17,7 +17,8 @@ import numpy as np
 import pytest
 
 from clock import PATIENCE_S, until
-from recording_objects import record, update_number
+from depth_files import write_frame_folder
+from recording_objects import frame_number, record, update_number
 from theatre_objects import small_theatre
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import DepthFrame, SensorCloud
@@ -113,8 +114,9 @@ def recorded_mcap(folder: Path) -> Iterator[Source]:
 
 @contextmanager
 def recorded_files(folder: Path) -> Iterator[Source]:
-    path = record(folder / "r", [update_number(n) for n in range(8)], format="files")
-    yield RecordingSourceConfig(path=path).open()
+    for n in range(8):
+        write_frame_folder(folder / "frames" / f"{n}", frame_number(n))
+    yield RecordingSourceConfig(path=folder).open()
 
 
 def _recording(folder: Path) -> str:

@@ -1,8 +1,7 @@
-"""What arms do, on every sink: messages, files, OpenIGTLink."""
+"""What arms do, on every sink: messages, recordings, OpenIGTLink."""
 
 from __future__ import annotations
 
-import json
 import socket
 from collections.abc import Iterator
 from dataclasses import replace
@@ -19,7 +18,6 @@ from igtl_reader import IgtlStatus, unpack_status, unpack_transform
 from live_objects import small_setting, small_update
 from recording_objects import frame_number
 from tumortrack.core.geometry import rigid, transform_points
-from tumortrack.core.mesh_files import read_mesh
 from tumortrack.live.ros.messages import Messages, stamp_of
 from tumortrack.live.ros.results import ResultMessages
 from tumortrack.live.ros.sensors import cloud_of
@@ -195,31 +193,6 @@ def test_an_mcap_holds_the_arms_and_plays_again(tmp_path):
     assert said["/tumortrack/workcell"][2].markers[0].action == 2
     assert "/tumortrack/observed" not in said  # the picture itself is there
     assert [seen.stamp_ns for seen in played(path)] == [u.stamp_ns for u in three()[:2]]
-
-
-def test_files_hold_the_arms_each_surface_once_and_play_again(tmp_path):
-    path = record(tmp_path / "r", three(), format="files")
-    frames = sorted((path / "frames").iterdir())
-    cells = [json.loads((frame / "workcell.json").read_text()) for frame in frames]
-    assert [(c["state"], c["halted"]) for c in cells] == [
-        ("sweep 1", ""), ("sweep 1", "stale"), ("sweep 1", ""),
-    ]  # fmt: skip
-    for cell, update in zip(cells, three(), strict=True):
-        true = update.workcell
-        assert true is not None
-        assert cell["joints_rad"] == true.joints_rad
-        assert list(cell["shapes"]) == [shape.name for shape in true.shapes]
-        for shape in true.shapes:
-            kept = cell["shapes"][shape.name]
-            np.testing.assert_array_equal(kept["published_from_shape"], shape.published_from_shape)
-            mesh = read_mesh(path / kept["surface"])
-            np.testing.assert_allclose(mesh.vertices_mm, shape.mesh.vertices_mm, atol=1e-4)
-            np.testing.assert_array_equal(mesh.faces, shape.mesh.faces)
-        np.testing.assert_array_equal(cell["lines"]["cut/1"]["points_mm"], true.lines[0].points_mm)
-    lengths = {shape.name: shape.mesh for update in three() for shape in update.workcell.shapes}
-    assert len(lengths) <= len(list((path / "shapes").iterdir())) <= len(lengths) + 4
-    assert [seen.stamp_ns for seen in played(path)] == [u.stamp_ns for u in three()[:2]]
-    record(path, three()[:1], format="files", overwrite=True)  # with its shapes, it is replaced
 
 
 # OpenIGTLink

@@ -15,9 +15,9 @@ from tumortrack.phantom.digital import (
     TumorParameters,
     organ_field,
     phantom_labels,
-    second_phantom,
 )
 from tumortrack.phantom.scanner import ScannerParameters
+from tumortrack_lab.study.methods import second_phantom
 from volume_points import lps_of, read_at
 
 VOXEL = 1.0

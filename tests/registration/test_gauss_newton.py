@@ -382,7 +382,7 @@ def test_open_and_nested_surfaces_wind_as_in_the_plain_form():
 # --- frames ---
 
 
-def test_frames_leave_no_memory_behind(slim_model):
+def test_frames_leave_no_memory_behind(slim_model, unchecked):
     locator = RegistrationLocator(load_model(slim_model, "cpu"))
     vertices = placed().carry(ANATOMY.organ.vertices_mm)
     seen = vertices[vertices[:, 2] < np.median(vertices[:, 2])]

@@ -10,7 +10,6 @@ import pytest
 from msgspec.structs import replace
 
 from live_objects import CAMERA, ball, small_anatomy, small_estimate
-from tumortrack.cli.margins import generic
 from tumortrack.core import store
 from tumortrack.core.errors import ArtifactError, InputError
 from tumortrack.core.types import SensorCloud
@@ -236,28 +235,6 @@ def test_stored_margins_are_refused_where_anything_differs(tmp_path, monkeypatch
     said = f"version {now} of the method; this is version {now + 1}"
     with pytest.raises(ArtifactError, match=said):
         stored.read_margins(tmp_path)
-
-
-def test_a_generic_calibration_speaks_only_for_models_as_good_as_its_own(tmp_path, monkeypatch):
-    monkeypatch.setattr(stored, "GENERIC", tmp_path / "generic.json")
-    trust = {"usual_cost": 60.0, "std_scale": 1.0}
-    manifest = {
-        "files": {"shape.safetensors": ""},
-        "trust": trust,
-        "provenance": {"validation_tre_mm": 1.2},
-    }
-    with pytest.raises(InputError, match="without a generic calibration"):
-        generic(manifest)
-    worst = {"usual_cost": 75.0, "std_scale": 1.05, "validation_tre_mm": 1.4}
-    margins = replace(margins_of(drawn(np.random.default_rng(2), 60), "", (0.8,)), models=worst)
-    stored.write_sealed(stored.GENERIC, margins)
-    assert generic(manifest) == margins
-    with pytest.raises(InputError, match=r"validation_tre_mm is 1.5, and at most 1.4"):
-        generic({**manifest, "provenance": {"validation_tre_mm": 1.5}})
-    with pytest.raises(InputError, match=r"std_scale is 1.3"):
-        generic({**manifest, "trust": {**trust, "std_scale": 1.3}})
-    with pytest.raises(InputError, match="is of models of the preset clinic"):
-        generic({**manifest, "files": {}})
 
 
 def test_an_estimate_states_its_margins_or_why_it_has_none():

@@ -13,5 +13,12 @@ def write_depth_png(path: Path, frame: DepthFrame, depth_unit_mm: float = DEPTH_
     path.write_bytes(depth_png(frame, depth_unit_mm))
 
 
+def write_frame_folder(folder: Path, frame: DepthFrame) -> None:
+    """A frame in a folder of its own, as in scenes."""
+    folder.mkdir(parents=True)
+    write_depth_png(folder / "depth.png", frame)
+    write_intrinsics(folder / "intrinsics.json", frame.intrinsics)
+
+
 def write_intrinsics(path: Path, camera: Intrinsics, depth_unit_mm: float = DEPTH_UNIT_MM) -> None:
     write_json(path, intrinsics_json(camera, depth_unit_mm))

@@ -283,7 +283,6 @@ def _recordings() -> dict[str, Target]:
     packed = write_bag(folder / "packed", topics, "packed mcap")
     bag = write_bag(folder / "a.bag", topics, "bag")
     sqlite = write_bag(folder / "sqlite", topics, "sqlite3")
-    files = record(folder / "files", [update_number(0)], format="files")
     (file,) = [path for path in sqlite.iterdir() if path.suffix == ".db3"]
     return {
         "mcap": ([ours.read_bytes()], of_file(".mcap", play)),
@@ -291,7 +290,6 @@ def _recordings() -> dict[str, Target]:
         "db3": ([file.read_bytes()], of_file(".db3", play)),
         "rosbag2 folder": of_member(packed, "metadata.yaml", play),
         "packed mcap": of_member(packed, "packed.mcap", play),
-        "files, index": of_member(files, "index.jsonl", play),
         "times": of_member(_frames_with_times(folder), "times.csv", play),
     }
 

@@ -16,7 +16,7 @@ from stories import refusal, tumortrack
 from tumortrack.cli.locate import Locate
 from tumortrack.core import store
 from tumortrack.core.errors import InputError, NoEstimate
-from tumortrack.core.estimate import Estimate, Motion, OneWay
+from tumortrack.core.estimate import Estimate, Motion
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import Anatomy, CameraLabels, Mesh, OccupancyCloud
 from tumortrack.models.in_distribution import InDistributionRange
@@ -28,6 +28,7 @@ from tumortrack.tracking.files import write_estimate
 from tumortrack.tracking.points import camera_table, check_near_organ, read_points
 from tumortrack.training.model import save_model
 from tumortrack.training.presets import quick
+from tumortrack_lab.peers.base import OneWay
 
 MIDDLE = np.array([60.0, 40.0, -300.0])
 BOX = np.stack([MIDDLE - 30, MIDDLE + 30])

@@ -11,7 +11,7 @@ import trimesh
 from motions import Wave
 from stories import succeeded, tumortrack, write_phantom_case
 from tumortrack.core.errors import InputError, NoEstimate
-from tumortrack.core.estimate import Estimate, OneWay
+from tumortrack.core.estimate import Estimate
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import (
     Anatomy,
@@ -32,6 +32,7 @@ from tumortrack.simulate.scene_folder import (
     read_scene,
     read_targets,
 )
+from tumortrack_lab.peers.base import OneWay
 
 
 def ball(radius_mm, center_mm=(0.0, 0.0, 0.0)):

@@ -100,11 +100,8 @@ class Doctor:
 
 
 def describe(path: Path) -> list[str]:
-    """Lines about a case, model, run, scene, report or cloud.
-
-    Raises:
-        InputError: nothing that tumortrack knows.
-    """
+    """Lines about a case, model, run, scene, report or cloud. Raises InputError: nothing that
+    tumortrack knows."""
     if not path.exists():
         raise InputError(f"{path} does not exist.")
     if (path / store.MANIFEST).is_file():

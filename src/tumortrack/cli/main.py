@@ -38,7 +38,7 @@ _COMMANDS: tuple[type[Command], ...] = (
 )
 _ORDER = (
     *("demo", "prepare", "export", "train", "pretrain", "locate", "track", "plan", "resect"),
-    *("simulate", "twin", "evaluate", "margins", "generic-margins", "bench"),
+    *("simulate", "twin", "evaluate", "margins", "bench"),
     *("phantom-kit", "calibrate", "record", "reference"),
     *("compile", "onnx", "inspect", "doctor"),
 )
@@ -95,13 +95,16 @@ def leave() -> NoReturn:
     os._exit(0)
 
 
-def _commands() -> dict[str, Callable[..., Command]]:
-    """Ours, and those of other installed packages: entry points of the group
-    ``tumortrack.commands``."""
+def _commands(chosen: str) -> dict[str, Callable[..., Command]]:
+    """Ours, and of other installed packages' (entry points of the group ``tumortrack.commands``)
+    the chosen one, or all where there is none of that name."""
     found: dict[str, Callable[..., Command]] = {
         command.__name__.lower(): command for command in _COMMANDS
     }
+    if chosen in found:
+        return found
     others = sorted(entry_points(group="tumortrack.commands"), key=lambda point: point.name)
+    others = [point for point in others if point.name == chosen] or others
     found |= {point.name: point.load() for point in others}
     places = {name: place for place, name in enumerate(_ORDER)}
     return {name: found[name] for name in sorted(found, key=lambda n: places.get(n, len(places)))}
@@ -109,7 +112,7 @@ def _commands() -> dict[str, Callable[..., Command]]:
 
 def _parse(arguments: list[str]) -> Command:
     """Only the chosen command's options are made; all of them take several times as long."""
-    commands = _commands()
+    commands = _commands(arguments[0] if arguments else "")
     if arguments and (command := commands.get(arguments[0])) is not None:
         return tyro.cli(command, prog=f"tumortrack {arguments[0]}", args=arguments[1:])
     return tyro.extras.subcommand_cli_from_dict(

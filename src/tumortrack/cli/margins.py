@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from tyro.conf import Positional
 
@@ -25,8 +25,7 @@ class Margins:
 
     Attributes:
         model: folder that `train` wrote; the margins are kept in it.
-        scenes: folders of scene folders whose truth is known; without any, the generic calibration
-            that comes with this version, if one does.
+        scenes: folders of scene folders whose truth is known.
         confidence: the shares of cases in which the margins are to hold.
         widest: answers that miss by more mm than this are to be kept out.
         out: file for what was found scene by scene; what is in it already is not located again
@@ -53,8 +52,10 @@ class Margins:
             raise InputError(f"--widest {self.widest:g} is not allowed; choose 0.5 to 20 mm.")
         if self.seed < 0:
             raise InputError(f"--seed {self.seed} must be 0 or more.")
-        manifest = read_model_manifest(self.model)
-        margins = self._calibrated() if self.scenes else generic(manifest)
+        if not self.scenes:
+            raise InputError("give folders of scenes: tumortrack margins MODEL SCENES.")
+        read_model_manifest(self.model)
+        margins = self._calibrated()
         path = keep_margins(self.model, margins)
         for line in described(margins):
             say(line)
@@ -103,34 +104,6 @@ class Margins:
                     done[row.scene] = row
                     advance()
         return [done[str(one.folder.resolve())] for one in listed]
-
-
-def generic(manifest: dict[str, Any]) -> ModelMargins:
-    """The calibration that comes with this version, for a model with this manifest. InputError:
-    there is none, or it says nothing of such a model."""
-    from tumortrack.models.folder import has_shape
-    from tumortrack.models.margins import GENERIC, judged_by, read_sealed
-
-    if not GENERIC.is_file():
-        raise InputError(
-            "no margin is known: this version comes without a generic calibration. Give folders of "
-            "scenes: tumortrack margins MODEL SCENES."
-        )
-    if not has_shape(manifest):
-        raise InputError(
-            "no margin is known: the generic calibration is of models of the preset clinic. Give "
-            "folders of scenes: tumortrack margins MODEL SCENES."
-        )
-    margins = read_sealed(GENERIC)
-    for name, figure in judged_by(manifest).items():
-        if figure > margins.models[name]:
-            raise InputError(
-                f"no margin is known: {name} is {figure:.3g}, and at most "
-                f"{margins.models[name]:.3g} in the models of the generic calibration, so this one "
-                "may err by more. Train it longer, or give folders of scenes: tumortrack margins "
-                "MODEL SCENES."
-            )
-    return margins
 
 
 def described(margins: ModelMargins) -> list[str]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import UInt8
 
 Colour = tuple[int, int, int]
 
@@ -23,10 +23,6 @@ BACKGROUND: Colour = (22, 24, 29)
 
 _SWEEPS = ((0, 120, 240), (90, 60, 220), (205, 0, 130))
 
-# Probabilities from a guess to certainty.
-_LEVELS = (0.5, 0.75, 0.9, 1.0)
-_SHADES = ((215, 48, 39), (253, 174, 97), (217, 239, 139), (26, 152, 80))
-
 
 def part_colour(label: int) -> Colour:
     """Of label 1, 2, 3, ...: the organ, then the tumors, over again after the fifth."""
@@ -35,13 +31,6 @@ def part_colour(label: int) -> Colour:
 
 def label_colours(labels: UInt8[np.ndarray, " n"]) -> UInt8[np.ndarray, "n 3"]:
     return np.array([SEEN, *(part_colour(n) for n in range(1, 256))], np.uint8)[labels]
-
-
-def probability_colours(probability: Float[np.ndarray, " n"]) -> UInt8[np.ndarray, "n 3"]:
-    """Red at a half or less, over yellow to green at 1."""
-    shades = np.array(_SHADES, float)
-    mixed = [np.interp(probability, _LEVELS, shades[:, axis]) for axis in range(3)]
-    return np.stack(mixed, axis=1).astype(np.uint8)
 
 
 def css(colour: Colour) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol, runtime_checkable
 
@@ -43,21 +42,6 @@ class Motion(Protocol):
 
     def covariance_mm2(self, points_ct: Points, /) -> Float[np.ndarray, "n 3 3"] | None:
         """The same as a whole covariance, camera frame, mm^2."""
-
-
-@dataclass(frozen=True, eq=False)
-class OneWay:
-    """The motion of a method that knows only the way from the CT to the camera."""
-
-    carry: Callable[[Points], Points]
-
-    def back(self, points_camera: Points, /) -> None:
-        return None
-
-    def std_mm(self, points_ct: Points, /) -> None:
-        return None
-
-    largest_std_mm = covariance_mm2 = std_mm
 
 
 class Following(Config, frozen=True, kw_only=True):

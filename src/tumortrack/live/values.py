@@ -76,12 +76,9 @@ class Source(Protocol):
         ...
 
     def read(self, timeout_s: float) -> Observation | None:
-        """The newest frame that was not read before; None if none came in time.
-
-        Raises:
-            SourceLost, SourceEnded: as they say.
-            InputError: this frame cannot be used; the loop reports it and reads on.
-        """
+        """The newest frame that was not read before; None if none came in time. Raises SourceLost,
+        SourceEnded: as they say; InputError: this frame cannot be used; the loop reports it and
+        reads on."""
         ...
 
     def close(self) -> None:

@@ -48,14 +48,10 @@ def loosest_rule(
     rules: Sequence[Sequence[tuple[int, int]]], risk: float, error: float = ERROR
 ) -> int | None:
     """The number of the last rule before the first one that does not hold its risk in every group;
-    None where that is the first of all.
-
-    Args:
-        rules: of each rule, in an order fixed beforehand, best the strictest first, (misses,
-            accepted cases) of each group. Each is tested with the whole ``error``, which, as
-            testing ends with the first failure, is the largest chance that the one returned has a
-            larger risk in any group (fixed-sequence testing).
-    """
+    None where that is the first of all. ``rules``: of each rule, in an order fixed beforehand, best
+    the strictest first, (misses, accepted cases) of each group. Each is tested with the whole
+    ``error``, which, as testing ends with the first failure, is the largest chance that the one
+    returned has a larger risk in any group (fixed-sequence testing)."""
     for number, groups in enumerate(rules):
         if not all(risk_bound(misses, cases, error) <= risk for misses, cases in groups):
             return number - 1 if number else None

@@ -19,7 +19,6 @@ from tumortrack.core.errors import ArtifactError, InputError
 # those in ``measured``: margins that were found before are then refused.
 METHOD = 3
 NAME = "margins.json"
-GENERIC = Path(__file__).with_name("generic_margins.json")  # from several organs
 Kind = Literal["tumor", "kidney", "map"]
 UNKNOWN = "no margin is known for this model (tumortrack margins)"
 
@@ -85,15 +84,13 @@ class ModelMargins(Config, frozen=True):
     """What a model's margins are, and what they rest on.
 
     Attributes:
-        model_sha256: of the manifest of the model that they are of; empty in a generic calibration.
+        model_sha256: of the manifest of the model that they are of.
         table_sha256: of the calibration's results, scene by scene.
         limits: an estimate has a margin only where none of these is exceeded (``measured``); of
             those that pass, no more than may miss by more than ``widest_mm``, with 95 % confidence.
         shells: by rising confidence.
         groups: what was calibrated on, as it was given; ``joined``: of those, the ones that were
             too small to stand alone, and the larger one that spoke for each.
-        models: the worst that the calibration's models are by their own validation: a generic
-            calibration says nothing of a model that is worse (``judged_by``).
         risk_bound: upper bound of the share of accepted answers outside the widest margin of a
             tumor, in the worst group of the tested states, with 95 % confidence.
         accepted, missed: shares of all tested states: accepted; accepted and outside the margin.
@@ -112,7 +109,7 @@ class ModelMargins(Config, frozen=True):
     risk_bound: float
     accepted: float
     missed: float
-    models: dict[str, float] = msgspec.field(default_factory=dict)
+    models: dict[str, float] = msgspec.field(default_factory=dict)  # of older files, and empty
 
     def __post_init__(self) -> None:
         if not self.shells or not all(map(math.isfinite, self.limits.values())):
@@ -138,7 +135,7 @@ def read_margins(folder: Path) -> ModelMargins | None:
 
 
 def read_sealed(path: Path) -> ModelMargins:
-    """The same of any file: a generic calibration's."""
+    """The same of any file, whatever model it is of."""
     stored = store.read_json(path)
     content = stored.get("margins")
     if not isinstance(content, dict) or stored.get("sha256") != _digest(content):
@@ -159,19 +156,6 @@ _AGAIN = "Calibrate again (tumortrack margins MODEL SCENES), or remove the file.
 
 def _digest(content: dict[str, Any]) -> str:
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
-
-
-def judged_by(manifest: dict[str, Any]) -> dict[str, float]:
-    """How good a model is, by its manifest, and so by its validation: all the larger the worse.
-    InputError for one of another preset than clinic."""
-    trust, about = manifest.get("trust"), manifest.get("provenance", {})
-    if trust is None or "validation_tre_mm" not in about:
-        raise InputError("only models of the preset clinic have figures that margins ask for.")
-    return {
-        "usual_cost": trust["usual_cost"],
-        "std_scale": trust["std_scale"],
-        "validation_tre_mm": about["validation_tre_mm"],
-    }
 
 
 def measured(report: dict[str, Any]) -> dict[str, float]:

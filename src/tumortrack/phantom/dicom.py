@@ -31,14 +31,10 @@ def write_dicom_series(
 ) -> None:
     """Write a CT Image Storage series, one uncompressed file a slice (the third array axis).
 
-    UIDs follow from the volume and the seed. File names are in random order, so that a reader
-    must sort by ImagePositionPatient. Exposure as in the paper (90 kV, 13.6 mA). ``side``: of the
-    kidney (Laterality).
-
-    Raises:
-        InputError: ``folder`` exists; HU not finite or outside -1024..64511; sheared voxels.
-        StorageError: the disk refused; no part of the folder is left behind.
-    """
+    UIDs follow from the volume and the seed. File names are in random order, so that a reader must
+    sort by ImagePositionPatient. Exposure as in the paper (90 kV, 13.6 mA). ``side``: of the kidney
+    (Laterality). Raises InputError: ``folder`` exists; HU not finite or outside -1024..64511;
+    sheared voxels; StorageError: the disk refused; no part of the folder is left behind."""
     from pydicom import dcmwrite
 
     if not ((volume.hu >= _INTERCEPT) & (volume.hu <= _HIGHEST_HU)).all():

@@ -75,32 +75,12 @@ class PhantomParameters(Config, frozen=True):
                 )
 
 
-def second_phantom() -> PhantomParameters:
-    """Another kidney: three tumors, the deep one in the lower pole, one on the lateral rim."""
-    return PhantomParameters(
-        size_mm=(56.0, 47.0, 104.0),
-        bend_mm=9.0,
-        taper=0.04,
-        hilum_depth_mm=16.0,
-        shape_seed=7,
-        tumors=(
-            TumorParameters(diameter_mm=30.0, center_mm=(-3.0, 1.0, -20.0)),
-            TumorParameters(diameter_mm=26.0, center_mm=(-20.0, -12.0, 17.0)),
-            TumorParameters(diameter_mm=12.0, center_mm=(4.0, 2.0, 25.0)),
-        ),
-    )
-
-
 def phantom_labels(parameters: PhantomParameters, voxel_mm: float = 0.8) -> LabelVolume:
     """The phantom on an isotropic voxel grid along the LPS axes.
 
-    Labels: 0 outside, 1 organ, 2 the tumor of largest diameter, 3 the next, ...; a tumor wins
-    over the organ.
-
-    Raises:
-        InputError: ``voxel_mm`` outside 0.2..4, more than 50 million voxels, or a tumor wholly
-            outside the organ.
-    """
+    Labels: 0 outside, 1 organ, 2 the tumor of largest diameter, 3 the next, ...; a tumor wins over
+    the organ. Raises InputError: ``voxel_mm`` outside 0.2..4, more than 50 million voxels, or a
+    tumor wholly outside the organ."""
     if not 0.2 <= voxel_mm <= 4:
         raise InputError(f"voxel size {voxel_mm} mm: allowed are 0.2 to 4 mm.")
     reach_mm = np.array(parameters.size_mm) / 2

@@ -31,11 +31,7 @@ def random_anatomy(
     bulging, and the direction that faces the camera, to which the long axis rises or falls by up to
     ``rises_deg``: CT frame (LPS), mm; closed surfaces, tumors in label order.
 
-    The same seed gives the same kidney.
-
-    Raises:
-        InputError: a negative seed.
-    """
+    The same seed gives the same kidney. Raises InputError: a negative seed."""
     rng = np.random.default_rng([seed, 0x81D])
     parameters = _random_parameters(rng, lengths_mm, tumors_mm)
     turn = Rotation.random(rng=rng).as_matrix()

@@ -73,11 +73,8 @@ def scan(
     ``material_hu`` names by its label, that.
 
     Only the box round the labels is scanned. HU are whole numbers in -1024..3071; the same seed
-    gives the same volume.
-
-    Raises:
-        InputError: no label at all, or a scan of more than 400 million voxels.
-    """
+    gives the same volume. Raises InputError: no label at all, or a scan of more than 400 million
+    voxels."""
     body = _crop(labels)
     # Lower and upper corner in LPS of the grid's voxel centres
     ends = np.stack(np.meshgrid(*[(0, n - 1) for n in body.labels.shape]), -1).reshape(-1, 3)

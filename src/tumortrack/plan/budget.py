@@ -156,12 +156,9 @@ def planned_budget(
 
 
 def widened(config: ResectionConfig, budget: ErrorBudget) -> ResectionConfig:
-    """With the margin of healthy tissue that ``config`` asks for beyond all errors.
-
-    Raises:
-        InputError: the method keeps no margin below the tumor, or ``sigmas`` count errors twice.
-        NoPlan: it is wider than any that is planned.
-    """
+    """With the margin of healthy tissue that ``config`` asks for beyond all errors. Raises
+    InputError: the method keeps no margin below the tumor, or ``sigmas`` count errors twice;
+    NoPlan: it is wider than any that is planned."""
     if config.method != "margin" or config.sigmas > 0:
         raise InputError("--confidence needs the method margin, and no --sigmas.")
     wide_mm = config.margin_mm + budget.sum_mm
@@ -194,12 +191,9 @@ def plan_within(
     budget_of: Callable[[ResectionPlan], ErrorBudget],
     beyond_errors: bool = False,
 ) -> tuple[ResectionPlan, ResectionConfig, ErrorBudget]:
-    """A plan, as it was asked for in the end, and its budget.
-
-    Args:
-        beyond_errors: the margin is of healthy tissue, and all errors are added to it; a note says
-            what it is made of. Raises as ``widened``.
-    """
+    """A plan, as it was asked for in the end, and its budget. ``beyond_errors``: the margin is of
+    healthy tissue, and all errors are added to it; a note says what it is made of. Raises as
+    ``widened``."""
     plan = plan_resection(located, config)
     budget = budget_of(plan)
     if not beyond_errors:

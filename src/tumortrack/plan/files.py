@@ -65,13 +65,8 @@ def write_plan(
     overwrite: bool = False,
 ) -> None:
     """All or nothing. ``inputs``: sha256 of what it was made from; ``more`` adds files (pictures)
-    to the folder given to it.
-
-    Raises:
-        InputError: the folder exists and ``overwrite`` is False.
-        NoPlan: motions that would be refused when read.
-        StorageError: the disk refused.
-    """
+    to the folder given to it. Raises InputError: the folder exists and ``overwrite`` is False;
+    NoPlan: motions that would be refused when read; StorageError: the disk refused."""
     plan, motions, frames = content.plan, content.motions, content.frames
     if motions is not None:
         cell = from_builtins(content.cell, CellConfig, "cell")
@@ -111,11 +106,8 @@ def as_located(content: PlanFolder) -> Located:
 
 
 def read_plan(folder: Path) -> PlanFolder:
-    """
-    Raises:
-        ArtifactError: no plan, damaged, of another version, or with motions that the planner would
-            not have made.
-    """
+    """Raises ArtifactError: no plan, damaged, of another version, or with motions that the planner
+    would not have made."""
     manifest = store.read_manifest(folder, KIND)
     data, path = store.read_json(folder / _NAME), folder / _MOTIONS
     surfaces = {Path(file).stem for file in manifest["files"] if file.endswith(".ply")}

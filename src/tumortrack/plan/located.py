@@ -99,10 +99,7 @@ def notes_of_doubt(doubt: str, accept_poor: bool) -> tuple[str, ...]:
 
 
 def read_run(folder: Path) -> LocatedRun:
-    """
-    Raises:
-        ArtifactError: not a run of `locate`, damaged, or without its cloud.
-    """
+    """Raises ArtifactError: not a run of `locate`, damaged, or without its cloud."""
     manifest = read_manifest(folder, "run")
     path = folder / "occupancy.ply"
     try:

@@ -28,11 +28,8 @@ def concave_hull(points_mm: Float[np.ndarray, "n 2"]) -> Polygon:
     """The outline of a cloud's largest cluster.
 
     Edges may be as long as 5 sqrt(A / n), A being the convex hull's area: a fixed ratio, which GEOS
-    takes, would mean another length at every density.
-
-    Raises:
-        NoPlan: fewer than three points, or all on a line.
-    """
+    takes, would mean another length at every density. Raises NoPlan: fewer than three points, or
+    all on a line."""
     points = np.asarray(points_mm, float)
     if len(points) > _MOST:
         points = points[np.linspace(0, len(points) - 1, _MOST).astype(int)]
@@ -78,11 +75,8 @@ def arcs(
     ring_mm: Float[np.ndarray, "n 2"], wanted: Bool[np.ndarray, " n"], lead: int
 ) -> list[Float64[np.ndarray, "m 2"]]:
     """The runs of a closed ring's wanted points, each longer by ``lead`` points at both ends; the
-    whole ring, closed, where that leaves no gap.
-
-    Args:
-        ring_mm: evenly spaced, the first point not repeated.
-    """
+    whole ring, closed, where that leaves no gap. ``ring_mm``: evenly spaced, the first point not
+    repeated."""
     n = len(ring_mm)
     if not wanted.any():
         return []

@@ -30,12 +30,8 @@ _WHOLE = 0.99  # of another tumor's points
 
 
 def plan_resection(located: Located, config: ResectionConfig) -> ResectionPlan:
-    """The plan, table frame, mm.
-
-    Raises:
-        InputError: no such tumor.
-        NoPlan: nothing to cut, or not as asked; why.
-    """
+    """The plan, table frame, mm. Raises InputError: no such tumor; NoPlan: nothing to cut, or not
+    as asked; why."""
     label, share = _chosen_tumor(located, config)
     method = published_plan if config.method == "published" else margin_plan
     layers, cuts, grasp_mm = method(located, label, config)

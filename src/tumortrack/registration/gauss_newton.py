@@ -77,20 +77,21 @@ class GaussNewton:
     ) -> None:
         body, count, precision = rest.body, len(points_mm), _prior(rest, config)
         self._rest = rest
+        # Copies in C's order, and floats, whatever was given: the kernel is compiled for that, and
+        # would be once more for points that can't be written, or a whole number.
         self._problem = kernels.Problem(
             modes=LatticeField(body.modes, body.origin_mm, np.float32(body.spacing_mm)),
             center_ct=body.center_ct,
             distances=rest.distances[0],
             precision=precision,
             mean=body.mean,
-            points=np.ascontiguousarray(points_mm, np.float32),
+            points=np.array(points_mm, np.float32, order="C"),
             weight=min(config.n_effective / count, 1.0) / config.sigma_mm**2,
-            first_mm=config.first_mm,
-            last_mm=config.last_mm,
-            narrowing=config.narrowing,
-            enough_mm=config.enough_mm,
+            first_mm=float(config.first_mm),
+            last_mm=float(config.last_mm),
+            narrowing=float(config.narrowing),
+            enough_mm=float(config.enough_mm),
         )
-        # In C's order, whatever was given: the kernel is compiled for that.
         given = start.rotation, start.centre_mm, start.coefficients
         rotation, centre_mm, coefficients = (np.array(part, float, order="C") for part in given)
         left = np.empty(count, np.float32), np.empty_like(precision), np.empty(len(precision))

@@ -110,7 +110,7 @@ class ElasticMotion:
     def residual_rows(self, points_camera: Points) -> Float32[np.ndarray, "n q"]:
         """What shift, turn and coefficients each do to the signed distance (mm) of points, carried
         back, to the organ's surface at rest; that distance last."""
-        body, points = self.shape.body, np.ascontiguousarray(points_camera, np.float32)
+        body, points = self.shape.body, np.array(points_camera, np.float32, order="C")
         pose = Pose(body.center_ct, self.rotation, self.centre_mm)
         out = np.empty((len(points), kernels.POSE + len(self.coefficients) + 1), np.float32)
         known = body.modes, self.shape.distances[0], self._opposite, pose
@@ -118,8 +118,10 @@ class ElasticMotion:
         return out
 
     def _moved(self, kernel: Callable[..., None], flow: Flow, points_mm: Points) -> Moved:
-        points, out = np.ascontiguousarray(points_mm, np.float32), np.empty((len(points_mm), 3))
-        pose = Pose(self.shape.body.center_ct, self.rotation, self.centre_mm)
+        # Copies, in C's order: for other arrays the kernels would be compiled once more.
+        points, out = np.array(points_mm, np.float32, order="C"), np.empty((len(points_mm), 3))
+        rotation = np.ascontiguousarray(self.rotation)
+        pose = Pose(self.shape.body.center_ct, rotation, self.centre_mm)
         parallel_for(lambda part: kernel(flow, pose, points[part], out[part]), len(out), _AT_ONCE)
         return out
 

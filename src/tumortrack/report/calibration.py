@@ -73,11 +73,8 @@ class Listed:
 def list_states(folders: Sequence[Path], seed: int) -> list[Listed]:
     """One scene of every state, drawn by the seed. Meta.json names ``family``, ``visible_share``
     and ``state``; scenes without are of the family of their deformation, of unknown share, and a
-    state each. Left out is what shows no organ of the model's (``model_organ`` false).
-
-    Raises:
-        InputError: no scenes, or a share that is none.
-    """
+    state each. Left out is what shows no organ of the model's (``model_organ`` false). Raises
+    InputError: no scenes, or a share that is none."""
     scenes = [scene for folder in folders for scene in list_scenes(folder)]
     first: dict[tuple[str, ...], Listed] = {}
     for n in np.random.default_rng(seed).permutation(len(scenes)):
@@ -142,12 +139,8 @@ def margins_of(
     seed: int = 0,
 ) -> ModelMargins:
     """The margins that these states give; see docs/trust.md. Answers that miss by more than
-    ``widest_mm`` are to be kept out by limits.
-
-    Raises:
-        InputError: too few states, or no limits that hold their risk; says how many there are and
-            how many it takes.
-    """
+    ``widest_mm`` are to be kept out by limits. Raises InputError: too few states, or no limits that
+    hold their risk; says how many there are and how many it takes."""
     highest = max(confidences)
     turns = _dealt([row.label for row in rows], seed)
     good = [

@@ -49,12 +49,8 @@ def open_table(
     path: Path, head: dict[str, Any]
 ) -> Iterator[tuple[list[Row], Callable[[Row], None]]]:
     """The rows that are in a table already, and a function that adds one: on the disk before it
-    returns. A line that a killed process left unfinished is dropped.
-
-    Raises:
-        InputError: it was begun with another ``head``, or another process fills it.
-        StorageError: the disk refused.
-    """
+    returns. A line that a killed process left unfinished is dropped. Raises InputError: it was
+    begun with another ``head``, or another process fills it; StorageError: the disk refused."""
     with store.writing(path):
         stream = path.open("a+b")
     with stream:

@@ -45,11 +45,7 @@ def show_legend(
 
 
 def save(figure: Figure, path: Path) -> None:
-    """Write the PNG atomically.
-
-    Raises:
-        StorageError: the disk refused.
-    """
+    """Write the PNG atomically. Raises StorageError: the disk refused."""
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png")
     write_atomically(path, buffer.getvalue())

@@ -90,11 +90,8 @@ def triangle_distance(
 def surface_distances(
     estimate: Mesh, reference: Mesh, spacing_mm: float = SPACING_MM
 ) -> SurfaceDistances:
-    """Hausdorff distance and its kin between two surfaces in the same frame.
-
-    Raises:
-        InputError: one of them has no triangles.
-    """
+    """Hausdorff distance and its kin between two surfaces in the same frame. Raises InputError: one
+    of them has no triangles."""
     if len(estimate.faces) == 0 or len(reference.faces) == 0:
         raise InputError("surface distances need two surfaces with triangles; one is empty.")
     points_out, weights_out, _ = surface_samples(estimate, spacing_mm)

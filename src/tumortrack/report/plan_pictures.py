@@ -53,11 +53,8 @@ def plan_figure(plan: ResectionPlan, located: Located) -> Figure:
     """Organ, tumors, what comes away, strokes with their directions, and where it is held.
 
     Two axes in mm, down pointing down: from above x and -y, from the side x and -z. Strokes are
-    bold where they pass through the organ.
-
-    Raises:
-        InputError: what was located has no surface, or one that is not closed.
-    """
+    bold where they pass through the organ. Raises InputError: what was located has no surface, or
+    one that is not closed."""
     surfaces = organ_surfaces(located)
     if plan.label not in surfaces:
         raise InputError(f"{plan.tumor} was not located, so its plan can't be drawn.")

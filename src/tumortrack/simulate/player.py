@@ -99,11 +99,8 @@ class Indentation:
 
 
 class ScenePlayer:
-    """One case in motion. Building it solves the elastic states: some seconds.
-
-    Raises:
-        InputError: a case that makes no elastic body, or a configuration that doesn't fit it.
-    """
+    """One case in motion. Building it solves the elastic states: some seconds. Raises InputError: a
+    case that makes no elastic body, or a configuration that doesn't fit it."""
 
     def __init__(
         self,

@@ -71,12 +71,8 @@ class Scene:
     targets: Targets | None = None
 
     def write(self, folder: str | Path) -> None:
-        """Write a scene folder, all or nothing.
-
-        Raises:
-            InputError: the folder exists already.
-            StorageError: the disk refused.
-        """
+        """Write a scene folder, all or nothing. Raises InputError: the folder exists already;
+        StorageError: the disk refused."""
         with new_folder(Path(folder)) as aside:
             write_scene_files(aside, self)
 
@@ -101,13 +97,9 @@ def write_scene_files(folder: Path, scene: Scene) -> None:
 def read_scene(folder: Path) -> Scene:
     """Read a scene, ours or another program's.
 
-    Unless meta.json says that the kidney includes the tumors, a tumor that sticks out of
-    kidney.ply by more than 2 % of its volume is united with it.
-
-    Raises:
-        InputError: no such folder, no cloud or kidney, a file that cannot be read, surfaces that
-            are open or not in mm.
-    """
+    Unless meta.json says that the kidney includes the tumors, a tumor that sticks out of kidney.ply
+    by more than 2 % of its volume is united with it. Raises InputError: no such folder, no cloud or
+    kidney, a file that cannot be read, surfaces that are open or not in mm."""
     if not folder.is_dir():
         raise InputError(f"{folder} is no scene folder (it does not exist).")
     for name in ("cloud.ply", "kidney.ply"):

@@ -22,17 +22,13 @@ MARGIN = "_margin"  # ends the names of shells
 def write_estimate(
     folder: Path, estimate: Estimate, overwrite: bool = False, points: PointTable | None = None
 ) -> None:
-    """occupancy.ply (points with label and probability and, where the estimate knows the way
-    back, their place in the CT), labels.nii.gz (voxel -> camera frame, mm), labels.seg.nrrd (the
-    same for 3D Slicer), kidney.ply, tumor_1.ply, ... and report.json; tumor_1_margin.ply, ...,
-    the shells of the highest confidence, where margins are stated; points.csv, the given ``points``
-    of the CT and where they are now; all or nothing.
-
-    Raises:
-        InputError: the folder exists and ``overwrite`` is False; points without a motion.
-        NoEstimate: the motion has no answer for a point.
-        StorageError: the disk refused.
-    """
+    """occupancy.ply (points with label and probability and, where the estimate knows the way back,
+    their place in the CT), labels.nii.gz (voxel -> camera frame, mm), labels.seg.nrrd (the same for
+    3D Slicer), kidney.ply, tumor_1.ply, ... and report.json; tumor_1_margin.ply, ..., the shells of
+    the highest confidence, where margins are stated; points.csv, the given ``points`` of the CT and
+    where they are now; all or nothing. Raises InputError: the folder exists and ``overwrite`` is
+    False; points without a motion; NoEstimate: the motion has no answer for a point; StorageError:
+    the disk refused."""
     cloud, volume = estimate.cloud, estimate.volume
     assert volume is not None  # live estimates are the recording sink's
     organ = next(iter(estimate.meshes), "")

@@ -57,12 +57,9 @@ class PointTable:
 
 
 def read_points(path: Path) -> PointTable:
-    """Read points.csv, or a 3D Slicer markups file (.fcsv, .mrk.json).
-
-    Raises:
-        InputError: no such file, another format or unit, no points, a value that is no finite
-            number, or a Slicer file whose coordinate system is neither LPS nor RAS.
-    """
+    """Read points.csv, or a 3D Slicer markups file (.fcsv, .mrk.json). Raises InputError: no such
+    file, another format or unit, no points, a value that is no finite number, or a Slicer file
+    whose coordinate system is neither LPS nor RAS."""
     content = read_file(path, _MOST_BYTES, "Give the points in several files.")
     name = path.name.lower()
     parse = next((parse for end, parse in _PARSERS.items() if name.endswith(end)), None)
@@ -219,11 +216,8 @@ def _numbers_of(texts: list[str], where: str) -> tuple[float, float, float]:
 def check_near_organ(
     points_ct: Float[np.ndarray, "n 3"], organ_box_ct: Float[np.ndarray, "2 3"], name: str
 ) -> tuple[str, ...]:
-    """Notes on points that lie far from the organ in the CT.
-
-    Raises:
-        InputError: all do, or they lie about the organ only if read as RAS or as metres.
-    """
+    """Notes on points that lie far from the organ in the CT. Raises InputError: all do, or they lie
+    about the organ only if read as RAS or as metres."""
     lower, upper = organ_box_ct
 
     def distance(scale: Any = 1.0) -> np.ndarray:
@@ -259,11 +253,7 @@ def check_near_organ(
 
 def camera_table(table: PointTable, motion: Motion | None) -> bytes:
     """The table as CSV with camera_x, camera_y, camera_z and, where the motion knows it, std_mm.
-
-    Raises:
-        InputError: there is no motion.
-        NoEstimate: the motion has no answer for a point.
-    """
+    Raises InputError: there is no motion; NoEstimate: the motion has no answer for a point."""
     if motion is None:
         raise InputError("this estimate does not know where points of the CT are.")
     camera_mm, std_mm = motion.carry(table.points_ct), motion.std_mm(table.points_ct)

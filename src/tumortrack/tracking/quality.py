@@ -128,10 +128,7 @@ def unless_hidden(estimate: Estimate, last: Estimate) -> Estimate:
 
 def with_margin(estimate: Estimate, cloud: SensorCloud, margins: ModelMargins | None) -> Estimate:
     """The estimate with what its model's ``margins`` say in its report; where they say nothing of
-    such a one it is ``poor``: within the margin, or no answer.
-
-    Args:
-        cloud: in which it was located.
+    such a one it is ``poor``: within the margin, or no answer. ``cloud``: in which it was located.
     """
     report, organ = estimate.report, next(iter(estimate.meshes.values()))
     if margins is not None and estimate.quality == "good":

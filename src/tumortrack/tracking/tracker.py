@@ -96,11 +96,8 @@ class Tracker:
     ) -> Estimate:
         """The same, fast, for one frame of many: no volume, and a search that starts at the
         ``last`` estimate, if there is one a moment old. Models that know no motion smooth nothing.
-
-        Raises:
-            NoEstimate: as ``locate``.
-            InputError: the cloud is in metres; more than one look, as ``locate``.
-        """
+        Raises NoEstimate: as ``locate``; InputError: the cloud is in metres; more than one look, as
+        ``locate``."""
         # What fits worse all of a sudden may be something else that was put there.
         strictly = how.either_side if last is None else last.quality != "good" or not _unusual(last)
         with _of_several(others):
@@ -173,11 +170,8 @@ class FollowerConfig(Config, frozen=True, kw_only=True):
 
 
 class Follower:
-    """Locates in one frame after the other, each helped by the one before.
-
-    Raises:
-        InputError: smoothing, where the model knows no motion.
-    """
+    """Locates in one frame after the other, each helped by the one before. Raises InputError:
+    smoothing, where the model knows no motion."""
 
     def __init__(self, tracker: Tracker, config: FollowerConfig) -> None:
         if config.smoothing_s > 0 and tracker.anatomy_ct is None:
@@ -223,11 +217,8 @@ class Follower:
         camera_from_last: Affine = HERE,
     ) -> Estimate:
         """The estimate of this frame. ``others``: further looks at the same moment;
-        ``camera_from_last``: as in ``last_box_mm``.
-
-        Raises:
-            NoEstimate: see ``Tracker.follow``; the last estimate is forgotten then.
-        """
+        ``camera_from_last``: as in ``last_box_mm``. Raises NoEstimate: see ``Tracker.follow``; the
+        last estimate is forgotten then."""
         last, self._last, self._rests = self._recent(cloud.stamp_ns), None, False
         if last is not None and camera_from_last is not HERE:
             last = _seen_from(last, camera_from_last)

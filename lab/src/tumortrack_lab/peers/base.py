@@ -46,6 +46,21 @@ class Fit:
     report: dict = field(default_factory=dict)
 
 
+@dataclass(frozen=True, eq=False)
+class OneWay:
+    """The motion of a method that knows only the way from the CT to the camera."""
+
+    carry: Carry
+
+    def back(self, points_camera: Points, /) -> None:
+        return None
+
+    def std_mm(self, points_ct: Points, /) -> None:
+        return None
+
+    largest_std_mm = covariance_mm2 = std_mm
+
+
 @runtime_checkable
 class Peer(Protocol):
     """A method made ready for one patient."""

@@ -18,19 +18,19 @@ import tumortrack_lab.peers
 from tumortrack.core import store
 from tumortrack.core.config import to_builtins
 from tumortrack.core.errors import InputError
-from tumortrack.core.estimate import Estimate, OneWay
+from tumortrack.core.estimate import Estimate
 from tumortrack.core.patient import Patient
 from tumortrack.core.types import Anatomy
 from tumortrack.imaging.case import Case, load_case, save_case
 from tumortrack.imaging.surface import surfaces
 from tumortrack.models.folder import is_finished
-from tumortrack.phantom.digital import PhantomParameters, phantom_labels
+from tumortrack.phantom.digital import PhantomParameters, TumorParameters, phantom_labels
 from tumortrack.simulate.scene_folder import Scene
 from tumortrack.tracking.tracker import Tracker
 from tumortrack.training.model import load_model
 from tumortrack.training.presets import PRESETS
 from tumortrack.training.train import TrainingRun, TrainingStatus, train
-from tumortrack_lab.peers.base import estimate_of
+from tumortrack_lab.peers.base import OneWay, estimate_of
 from tumortrack_lab.peers.kinds import peer_kinds
 
 _UP_LPS = (0.0, -1.0, 0.0)
@@ -40,6 +40,22 @@ CLINIC = "clinic"
 MODELS: dict[str, tuple[str, Literal["limited", "full"]]] = {
     CLINIC: ("clinic", "limited"), "M_lim": ("quick", "limited"), "M_full": ("quick", "full"),
 }  # fmt: skip
+
+
+def second_phantom() -> PhantomParameters:
+    """Another kidney: three tumors, the deep one in the lower pole, one on the lateral rim."""
+    return PhantomParameters(
+        size_mm=(56.0, 47.0, 104.0),
+        bend_mm=9.0,
+        taper=0.04,
+        hilum_depth_mm=16.0,
+        shape_seed=7,
+        tumors=(
+            TumorParameters(diameter_mm=30.0, center_mm=(-3.0, 1.0, -20.0)),
+            TumorParameters(diameter_mm=26.0, center_mm=(-20.0, -12.0, 17.0)),
+            TumorParameters(diameter_mm=12.0, center_mm=(4.0, 2.0, 25.0)),
+        ),
+    )
 
 
 @dataclass(frozen=True, eq=False)

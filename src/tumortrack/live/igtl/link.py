@@ -36,11 +36,8 @@ class Link:
     """Sends messages to whoever is connected; a newcomer gets the newest of each kind.
 
     With ``connect`` it goes to that host's server itself, again and again until it is there;
-    otherwise it is the server on ``host``. ``port``: the server's.
-
-    Raises:
-        InputError: the port is taken, the host's name is unknown, or fastcrc is missing.
-    """
+    otherwise it is the server on ``host``. ``port``: the server's. Raises InputError: the port is
+    taken, the host's name is unknown, or fastcrc is missing."""
 
     def __init__(self, host: str, port: int, connect: str = "") -> None:
         igtl.crc64(b"")  # a missing package is reported before anything is opened

@@ -1,35 +1,27 @@
-"""Folders of frames as recordings: clouds, depth images, scenes, what ``FrameFolders`` writes."""
+"""Folders of frames as recordings: clouds, depth images, scenes."""
 
 from __future__ import annotations
 
 import csv
 import io
-import json
-import shutil
 from collections.abc import Callable
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 
-from tumortrack.core.errors import InputError, StorageError, TumortrackError
-from tumortrack.core.estimate import Estimate
-from tumortrack.core.mesh_files import read_anatomy, write_mesh
+from tumortrack.core.errors import InputError
+from tumortrack.core.mesh_files import read_anatomy
 from tumortrack.core.store import read_json
-from tumortrack.core.types import DepthFrame, Mesh, SensorCloud
-from tumortrack.live.values import Observation, RigidShape, TrackingResult, Workcell
+from tumortrack.core.types import DepthFrame, SensorCloud
+from tumortrack.live.values import Observation
 from tumortrack.sense import files
-from tumortrack.sense.ply import cloud_ply
 
 TIMES, INTRINSICS = "times.csv", "intrinsics.json"
-VIEW = "view_"  # a folder of frames by each further camera
 FRAMES, DEPTH, CLOUD, MASK = "frames", "depth.png", "cloud.ply", "mask.png"
 REPORT, META = "report.json", "meta.json"
-ABOUT = "recording.json"  # of what the sink wrote, frames or bag
-INDEX, SHAPES, WORKCELL = "index.jsonl", "shapes", "workcell.json"
-_ESTIMATE = "estimate"  # apart from what was seen: these surfaces are no truth
+ABOUT = "recording.json"  # beside what the sink ``recording`` wrote
 _STAMP_DIGITS = 12  # a name with fewer digits is a number of a frame, no time in ns
 _LARGEST_TABLE = 64 * 2**20  # bytes
 
@@ -45,9 +37,9 @@ class RecordedFrame(NamedTuple):
 def folder_frames(path: Path, fps: float, unit: Literal["mm", "m"]) -> list[RecordedFrame]:
     """The frames in a folder, by name; none is read before its turn.
 
-    Of: folders with depth.png and intrinsics.json, or cloud.ply (scenes, or what the sink
-    ``recording`` wrote as files); depth images (.png) beside one intrinsics.json; clouds (.ply,
-    .pcd, .npz; ``unit`` is theirs). Stamps: what meta.json or report.json says as ``stamp_ns``;
+    Of: folders with depth.png and intrinsics.json, or cloud.ply (scenes, or recordings as files of
+    tumortrack 0.1); depth images (.png) beside one intrinsics.json; clouds (.ply, .pcd, .npz;
+    ``unit`` is theirs). Stamps: what meta.json or report.json says as ``stamp_ns``;
     for loose files times.csv (``file,stamp_ns``), or file names of at least 12 digits, which are
     nanoseconds; else ``fps`` frames a second. Raises InputError where there are none of these.
     """
@@ -142,145 +134,3 @@ def _read_mask(path: Path, frame: DepthFrame | SensorCloud) -> np.ndarray:
     if mask is None:
         raise InputError(f"{path} must be 8-bit grey and as large as {DEPTH} beside it.")
     return mask
-
-
-class FrameFolders:
-    """``frames/00000012/``: depth.png and intrinsics.json (and mask.png), or cloud.ply;
-    report.json; ``estimate/``: occupancy.ply, kidney.ply, tumor_1.ply, ...; with arms
-    workcell.json: state, halted, joints (radians), lines and the places of shapes, in the
-    published frame; each surface stands once in ``shapes/``, in the shape's own frame. What
-    further cameras saw lies in ``view_2/frames/00000012/``, with its stamp in meta.json.
-
-    Depths are rounded to 0.1 mm; those that 16 bits of it cannot hold (from 6553.5 mm) are left
-    out. Files are not forced to the disk one by one, as that would take longer than a frame.
-    Where the disk refuses, the frame's folder is taken away again, and the next frame is tried.
-    """
-
-    def __init__(self, folder: Path, frames: bool) -> None:
-        self._root, self._frames = folder / FRAMES, frames
-        self._root.mkdir(parents=True)
-        self._index = (folder / INDEX).open("ab", buffering=0)
-        self._shapes = folder / SHAPES
-        self._surfaces: dict[str, tuple[Mesh, str]] = {}  # by shape: the last, and its file
-        self._written = 0
-
-    def publish(self, result: TrackingResult) -> None:
-        folder = self._root / f"{result.sequence:08d}"
-        try:
-            folder.mkdir()
-            if self._frames and result.observation is not None:
-                views = {view.number: view.seen for view in result.views}
-                self._write_views(folder, views or {1: result.observation})
-            if result.estimate is not None:
-                _write_estimate(folder / _ESTIMATE, result.estimate)
-            if result.workcell is not None:
-                _write_json(folder / WORKCELL, self._workcell(result.workcell))
-            _write_json(folder / REPORT, report(result))
-            line = json.dumps({**facts(result), "folder": folder.name}) + "\n"
-            self._index.write(line.encode())
-        except (OSError, StorageError) as error:
-            shutil.rmtree(folder, ignore_errors=True)
-            if isinstance(error, TumortrackError):
-                raise
-            raise StorageError(f"cannot write {folder}: {error.strerror or error}.") from error
-
-    def close(self) -> None:
-        self._index.close()
-
-    def _write_views(self, folder: Path, views: dict[int, Observation]) -> None:
-        for number, seen in views.items():
-            there = folder
-            if number > 1:
-                there = self._root.parent / f"{VIEW}{number}" / FRAMES / folder.name
-                there.mkdir(parents=True)
-                _write_json(there / META, {"stamp_ns": seen.stamp_ns})
-            _write_seen(there, seen)
-
-    def _workcell(self, cell: Workcell) -> dict[str, Any]:
-        return {
-            "state": cell.state,
-            "halted": cell.halted,
-            "joints_rad": {name: float(angle) for name, angle in cell.joints_rad.items()},
-            "shapes": {
-                shape.name: {
-                    "surface": f"{SHAPES}/{self._surface(shape)}",
-                    "published_from_shape": shape.published_from_shape.tolist(),
-                    "colour": shape.colour,
-                    "opacity": shape.opacity,
-                }
-                for shape in cell.shapes
-            },
-            "lines": {
-                line.name: {
-                    "points_mm": line.points_mm.tolist(),
-                    "colour": line.colour,
-                    "width_mm": line.width_mm,
-                }
-                for line in cell.lines
-            },
-        }
-
-    def _surface(self, shape: RigidShape) -> str:
-        """The name of the file with a shape's surface, written when it comes first."""
-        mesh, name = self._surfaces.get(shape.name, (None, ""))
-        if mesh is not shape.mesh:
-            self._shapes.mkdir(exist_ok=True)
-            name = f"{self._written:05d}.ply"
-            write_mesh(self._shapes / name, shape.mesh)
-            self._surfaces[shape.name] = shape.mesh, name
-            self._written += 1
-        return name
-
-
-def _write_seen(folder: Path, seen: Observation) -> None:
-    frame = seen.content
-    if not isinstance(frame, DepthFrame):
-        (folder / CLOUD).write_bytes(cloud_ply(frame.points_mm, {}))
-        return
-    steps = np.rint(frame.depth_mm / files.DEPTH_UNIT_MM)
-    held = np.where((steps >= 1) & (steps <= 65535), frame.depth_mm, np.nan)
-    (folder / DEPTH).write_bytes(files.depth_png(replace(frame, depth_mm=held), compress_level=1))
-    _write_json(folder / INTRINSICS, files.intrinsics_json(frame.intrinsics))
-    if seen.mask is not None:
-        from PIL import Image
-
-        grey = Image.fromarray(seen.mask.astype(np.uint8) * np.uint8(255))
-        grey.save(folder / MASK, format="PNG")
-
-
-def _write_estimate(folder: Path, estimate: Estimate) -> None:
-    folder.mkdir()
-    cloud = estimate.cloud
-    properties = {"label": cloud.labels, "probability": cloud.probability}
-    (folder / "occupancy.ply").write_bytes(cloud_ply(cloud.points_mm, properties))
-    for name, mesh in estimate.meshes.items():
-        write_mesh(folder / f"{name}.ply", mesh)
-
-
-def _write_json(path: Path, content: dict[str, Any]) -> None:
-    path.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
-
-
-def facts(result: TrackingResult) -> dict[str, Any]:
-    """One line about a result (JSON types)."""
-    seen = result.observation
-    kind = None if seen is None else "cloud" if isinstance(seen.content, SensorCloud) else "depth"
-    same = ("quality", "reason", "warning", "latency_ms", "cameras")
-    return {
-        "sequence": result.sequence,
-        "stamp_ns": result.stamp_ns,
-        "arrived_ns": None if seen is None else seen.arrived_ns,
-        "seen": kind,
-        **{name: getattr(result, name) for name in same},
-    }
-
-
-def report(result: TrackingResult) -> dict[str, Any]:
-    """Everything about a result: its facts, times of stages, and the estimate's own report, or
-    null with the reason."""
-    return {
-        **facts(result),
-        "organ_points": None if result.organ is None else len(result.organ.points_mm),
-        "seconds": dict(result.seconds),
-        "estimate": None if result.estimate is None else result.estimate.report,
-    }

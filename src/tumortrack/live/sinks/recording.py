@@ -1,5 +1,5 @@
 """A recording of observations and results, to be played again: a rosbag2 folder (MCAP), as
-`ros2 bag play` and Foxglove read it, by rosbags; or plain files."""
+`ros2 bag play` and Foxglove read it, by rosbags."""
 
 from __future__ import annotations
 
@@ -7,15 +7,15 @@ import json
 import shutil
 import time
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import Any, ClassVar
 
 import tumortrack
 from tumortrack.core.config import to_builtins
 from tumortrack.core.errors import InputError
 from tumortrack.core.store import read_json, write_json, writing
+from tumortrack.core.types import SensorCloud
 from tumortrack.live.poses import COLUMNS, pose_row
-from tumortrack.live.recording import folders
-from tumortrack.live.recording.folders import ABOUT, FRAMES, INDEX, SHAPES, FrameFolders, report
+from tumortrack.live.recording.folders import ABOUT
 from tumortrack.live.recording.mcap import CHUNK_S, STRING, McapBag, camera_messages
 from tumortrack.live.ros.messages import Messages, Outgoing
 from tumortrack.live.ros.results import ResultMessages
@@ -30,13 +30,11 @@ _ON_FULL_DISK = (
 
 
 class RecordingSinkConfig(SinkConfig, frozen=True, kw_only=True, tag="recording"):
-    """A new folder with every result.
+    """A new folder with every result and what the source saw: depth images as 32FC1 in metres
+    (float32 to 1e-5 mm), stamps exact.
 
     Attributes:
-        format: mcap, a rosbag2 folder (depth images as 32FC1 in metres: float32 to 1e-5 mm;
-            stamps exact); or files, a folder per frame (depth images in steps of 0.1 mm).
-        frames: also what the source saw; otherwise the recording cannot be played.
-        meshes_hz: mcap: surfaces at most so often; 0: with every result.
+        meshes_hz: surfaces at most so often; 0: with every result.
         overwrite: replace a recording of this kind.
     """
 
@@ -44,8 +42,6 @@ class RecordingSinkConfig(SinkConfig, frozen=True, kw_only=True, tag="recording"
     queue_size: ClassVar[int] = 30
 
     path: Path
-    format: Literal["mcap", "files"] = "mcap"
-    frames: bool = True
     meshes_hz: float = 2.0
     overwrite: bool = False
 
@@ -58,38 +54,31 @@ class RecordingSinkConfig(SinkConfig, frozen=True, kw_only=True, tag="recording"
         _make_room(self.path, self.overwrite)
         with writing(self.path):
             self.path.parent.mkdir(parents=True, exist_ok=True)
-            sink: McapFile | FrameFolders | WithPoses
-            if self.format == "mcap":
-                sink = McapFile(self.path, context, self.frames, self.meshes_hz)
-            else:
-                sink = FrameFolders(self.path, self.frames)
-            if context.published_frame.moves:
-                sink = WithPoses(sink, self.path / POSES)
+            sink = McapFile(self.path, context, self.meshes_hz)
+            moves = context.published_frame.moves
+            poses = WithPoses(sink, self.path / POSES) if moves else None
         frame = context.published_frame
         about = {
             "kind": _KIND,
             "tumortrack": tumortrack.__version__,
             "patient": to_builtins(context.patient),
-            "format": self.format,
             "parts": list(context.parts),
             "frame_id": frame.frame_id,
             "published_from_camera": frame.published_from_camera.tolist(),
-            # Plain files lie beside their depth images; messages are as they were published.
-            "estimate_frame": "camera" if self.format == "files" else frame.frame_id,
         }
         write_json(self.path / ABOUT, about)
         if context.cameras:
             rows = [pose.tolist() for pose in context.cameras]
             fixed = {"unit": "mm", "frame_id": frame.frame_id, "fixed_from_camera": rows}
             write_json(self.path / STILL, fixed)
-        return sink
+        return poses or sink
 
 
 class WithPoses:
     """Beside a recording, where the camera was in each frame: a table as `track --moving` reads it.
     Whatever the disk refuses raises, and the next result is tried."""
 
-    def __init__(self, sink: McapFile | FrameFolders, path: Path) -> None:
+    def __init__(self, sink: McapFile, path: Path) -> None:
         self._sink, self._file = sink, path.open("ab", buffering=0)
         self._file.write(f"{COLUMNS}\n".encode())
 
@@ -116,8 +105,7 @@ def _make_room(path: Path, overwrite: bool) -> None:
             "recording."
         )
     inside = {p.name for p in path.iterdir()} if path.is_dir() else {path.name}
-    ours = {ABOUT, INDEX, FRAMES, SHAPES, POSES, STILL, "metadata.yaml", f"{path.name}.mcap"}
-    inside = {name for name in inside if not name.startswith(folders.VIEW)}
+    ours = {ABOUT, POSES, STILL, "metadata.yaml", f"{path.name}.mcap"}
     is_ours = ABOUT in inside and read_json(path / ABOUT).get("kind") == _KIND
     if inside and (inside - ours or not is_ours or not path.is_dir()):
         raise InputError(
@@ -132,8 +120,8 @@ class McapFile:
     ``/camera_2/...``; ``/tumortrack/...`` the results as in ROS, and ``report`` (JSON); ``/tf``
     where the frames differ."""
 
-    def __init__(self, folder: Path, context: SinkContext, frames: bool, meshes_hz: float) -> None:
-        self._messages, self._frames = Messages(), frames
+    def __init__(self, folder: Path, context: SinkContext, meshes_hz: float) -> None:
+        self._messages = Messages()
         self._results = ResultMessages(self._messages, context, meshes_hz, observed=False)
         self._bag = McapBag(folder, self._messages, _ON_FULL_DISK)
 
@@ -148,14 +136,32 @@ class McapFile:
     def _messages_of(self, result: TrackingResult) -> list[Outgoing]:
         """With the full names of their topics."""
         make, frame = self._messages.make, result.published_frame
-        text = json.dumps(report(result), allow_nan=False)
+        text = json.dumps(_report(result), allow_nan=False)
         said = Outgoing("report", STRING, make(STRING, data=text))
         out = [*self._results.of(result), said]
         out = [one._replace(suffix=f"/tumortrack/{one.suffix}") for one in out]
-        if not self._frames or result.observation is None:
+        if result.observation is None:
             return out
         alone = CameraView(1, result.observation, frame.published_from_camera)
         for view in result.views or (alone,):
             where = view.published_from_camera, frame.frame_id
             out = [*camera_messages(view.seen, *where, self._messages, view.number), *out]
         return out
+
+
+def _report(result: TrackingResult) -> dict[str, Any]:
+    """Everything about a result (JSON types): facts, times of stages, and the estimate's own
+    report, or null with the reason."""
+    seen = result.observation
+    kind = None if seen is None else "cloud" if isinstance(seen.content, SensorCloud) else "depth"
+    same = ("quality", "reason", "warning", "latency_ms", "cameras")
+    return {
+        "sequence": result.sequence,
+        "stamp_ns": result.stamp_ns,
+        "arrived_ns": None if seen is None else seen.arrived_ns,
+        "seen": kind,
+        **{name: getattr(result, name) for name in same},
+        "organ_points": None if result.organ is None else len(result.organ.points_mm),
+        "seconds": dict(result.seconds),
+        "estimate": None if result.estimate is None else result.estimate.report,
+    }

@@ -301,11 +301,8 @@ def _check_step(step: Joints, seconds: float, jump_deg: float) -> None:
 
 
 class UrLink:
-    """ur_rtde's two interfaces to the controller of one arm. Not for two threads at once.
-
-    Raises:
-        InputError: ur_rtde is missing, or the arm cannot be reached or controlled.
-    """
+    """ur_rtde's two interfaces to the controller of one arm. Not for two threads at once. Raises
+    InputError: ur_rtde is missing, or the arm cannot be reached or controlled."""
 
     def __init__(self, host: str) -> None:
         try:

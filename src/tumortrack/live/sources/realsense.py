@@ -43,8 +43,6 @@ class RealSenseSourceConfig(SourceConfig, frozen=True, kw_only=True, tag="realse
     Attributes:
         device: empty, a serial number or a recording's path.
         width, height, fps: of a camera's depth stream; a recording has its own.
-        emitter: a camera's projector on or off; None: as it is. A D405 has none.
-        preset: of a camera's visual presets, as ``high_accuracy``; empty: as it is.
         global_time: stamps of a camera by this machine's clock, else by its own.
         realtime: a recording at its own speed, else every frame as it is asked for.
         picture: also what the camera saw in the depth image's pixels: in colour where the depth
@@ -57,8 +55,6 @@ class RealSenseSourceConfig(SourceConfig, frozen=True, kw_only=True, tag="realse
     width: int = 848
     height: int = 480
     fps: int = 30
-    emitter: bool | None = None
-    preset: str = ""
     global_time: bool = True
     realtime: bool = True
     picture: bool = False
@@ -118,9 +114,9 @@ class RealSenseSource:
         camera = Intrinsics(given.width, given.height, *focal, *center)
         self._intrinsics = plausible(camera, "the RealSense")
         self._unit_mm = float(f"{self._sensor.get_option(rs.option.depth_units) * 1000:.6g}")
-        if self._playback is None:
-            _set_up(rs, self._sensor, config)
         option = rs.option.global_time_enabled
+        if self._playback is None and self._sensor.supports(option):
+            self._sensor.set_option(option, int(config.global_time))
         tied = self._sensor.supports(option) and self._sensor.get_option(option)
         self.host_clock = self._playback is None and bool(tied)
         beside = [_picture_stream(rs, self._sensor, profile)] if config.picture else []
@@ -249,22 +245,3 @@ def _lens_of(profile: Any) -> tuple[Any, ...]:
     lens = profile.get_intrinsics()
     size = lens.width, lens.height, profile.fps(), max(profile.stream_index(), 1)
     return *size, lens.fx, lens.fy, lens.ppx, lens.ppy, *lens.coeffs
-
-
-def _set_up(rs: ModuleType, sensor: Any, config: RealSenseSourceConfig) -> None:
-    options: dict[str, tuple[Any, int]] = {}
-    if config.preset:
-        presets = rs.rs400_visual_preset.__members__
-        if config.preset not in presets:
-            raise InputError(
-                f"the RealSense has no preset {config.preset!r}. Allowed: {', '.join(presets)}."
-            )
-        options["preset"] = rs.option.visual_preset, int(presets[config.preset])
-    if config.emitter is not None:
-        options["emitter"] = rs.option.emitter_enabled, int(config.emitter)
-    if sensor.supports(rs.option.global_time_enabled):
-        options["global_time"] = rs.option.global_time_enabled, int(config.global_time)
-    for name, (option, value) in options.items():
-        if not sensor.supports(option) or sensor.is_option_read_only(option):
-            raise InputError(f"this RealSense has no {name} to set; leave the option out.")
-        sensor.set_option(option, value)

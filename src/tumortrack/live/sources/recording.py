@@ -20,7 +20,6 @@ from tumortrack.live.values import Observation, SourceConfig, SourceEnded, Sourc
 Frames = Callable[[], Iterator[RecordedFrame]]
 # Less than what the loop takes for a frozen source.
 _LONGEST_WAIT_S = 2.0
-_PERIOD_NS = 33_333_333  # of a recording of one frame that is played again
 
 
 class RecordingSourceConfig(SourceConfig, frozen=True, kw_only=True, tag="recording"):
@@ -30,7 +29,6 @@ class RecordingSourceConfig(SourceConfig, frozen=True, kw_only=True, tag="record
     Attributes:
         rate: 1 plays at the pace of the stamps, 2 twice as fast; 0: every frame, as fast as the
             loop takes them. Pauses of more than 2 s are cut to 2 s.
-        loop: begin again at the end; stamps go on rising.
         fps: of files that state no time.
         unit: of loose cloud files; bags are in metres, as ROS is, depth images state theirs.
         topic, info_topic: of a bag with several.
@@ -42,7 +40,6 @@ class RecordingSourceConfig(SourceConfig, frozen=True, kw_only=True, tag="record
 
     path: Path
     rate: float = 1.0
-    loop: bool = False
     fps: float = 30.0
     unit: Literal["mm", "m"] = "mm"
     topic: str = ""
@@ -92,7 +89,7 @@ class RecordingSource:
     ) -> None:
         self.lossless, self.dropped = config.rate == 0, 0
         self._close, self._rate = close, config.rate
-        self._frames = _endless(frames) if config.loop else frames()
+        self._frames = frames()
         self._next: RecordedFrame | None = None
         self._shown_ns: int | None = None  # stamp of the frame before
         self._due_s = 0.0  # when the next one is due, by time.monotonic
@@ -140,17 +137,3 @@ class RecordingSource:
             due, self._next = self._next, None
             if self.lossless:
                 return due
-
-
-def _endless(frames: Frames) -> Iterator[RecordedFrame]:
-    """The recording again and again, each time later by its length and one period."""
-    shift_ns = 0
-    while True:
-        stamps_ns = set()
-        for frame in frames():
-            stamps_ns.add(frame.stamp_ns)
-            yield frame._replace(stamp_ns=frame.stamp_ns + shift_ns)
-        if not any(stamps_ns):
-            return  # nothing in it can be read
-        length_ns = max(stamps_ns) - min(stamps_ns)
-        shift_ns += length_ns + (length_ns // max(len(stamps_ns) - 1, 1) or _PERIOD_NS)

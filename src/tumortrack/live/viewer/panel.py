@@ -247,7 +247,6 @@ class Panel:
                 ),
                 "observed": gui.add_checkbox("Observed points", default.observed),
                 "points": gui.add_dropdown("Labelled points", ("none", "tumors", "all")),
-                "coloured_by": gui.add_dropdown("Coloured by", ("label", "probability")),
                 "helpers": gui.add_checkbox("Axes, region", default.helpers),
             }
         self._shown = shown

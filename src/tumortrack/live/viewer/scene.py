@@ -52,7 +52,6 @@ class DisplayOptions:
     margin: bool = True
     ellipsoids: bool = False
     points: str = "none"  # none | tumors | all
-    coloured_by: str = "label"  # label | probability
     slice_plane: bool = False
     helpers: bool = True  # axes and the region of the organ's points
 
@@ -274,10 +273,7 @@ class ViewerScene:
         least = 2 if self.options.points == "tumors" else 1
         some = thinned(np.flatnonzero(placed.labels >= least), _MOST_LABELLED)
         self._points.points = placed.points_mm[some].astype(np.float32)
-        if self.options.coloured_by == "probability":
-            self._points.colors = colours.probability_colours(placed.probability[some])
-        else:
-            self._points.colors = colours.label_colours(placed.labels[some])
+        self._points.colors = colours.label_colours(placed.labels[some])
 
     def _margins_of(self, result: TrackingResult, placed: TransformedEstimate) -> dict[str, Mesh]:
         assert result.estimate is not None

@@ -45,11 +45,8 @@ def cut_pass(
     builder: TrajectoryBuilder, path_mm: Float64[np.ndarray, "n 3"], around: Surroundings
 ) -> None:
     """The instrument along a pass: in one direction throughout if that is possible, else in as few
-    legs as are; between them it leaves and comes from another side.
-
-    Raises:
-        Blocked: no direction is possible somewhere; the reason is the most frequent one.
-    """
+    legs as are; between them it leaves and comes from another side. Raises Blocked: no direction is
+    possible somewhere; the reason is the most frequent one."""
     for _ in range(_MOST_LEGS):
         done = _cut_leg(builder, path_mm, around)
         if done == len(path_mm) - 1:

@@ -38,11 +38,8 @@ def follow(
 
     The cheapest path through all branches of the inverse kinematics (Viterbi): it starts near
     ``near_rad`` (default: where the arm is) and turns joints as little as it can. Only what lies on
-    the cheapest path is tested for collisions, then struck out, until a path is free.
-
-    Raises:
-        Blocked: a pose out of reach, no path without a jump, or collisions on all of them.
-    """
+    the cheapest path is tested for collisions, then struck out, until a path is free. Raises
+    Blocked: a pose out of reach, no path without a jump, or collisions on all of them."""
     near = group.current_rad if near_rad is None else near_rad
     _reject_early(group, poses)
     joints = _branches(group, poses)

@@ -296,11 +296,8 @@ def warm_up() -> None:
 
 
 def replan(located: Located, joints_rad: Joints, progress: ResectionProgress) -> Planned:
-    """The plan for the organ as it lies now, from where the arms are; see ``plan_motions``.
-
-    Raises:
-        NoPlan: there is none.
-    """
+    """The plan for the organ as it lies now, from where the arms are; see ``plan_motions``. Raises
+    NoPlan: there is none."""
     config, cell = _setting[0]
     plan = plan_resection(located, config)
     organ = located.meshes["kidney"]

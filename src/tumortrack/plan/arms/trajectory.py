@@ -82,11 +82,8 @@ class TrajectoryBuilder:
         self.add((times, joints), cutting)
 
     def follow(self, arm: str, poses: Float64[np.ndarray, "n 4 4"], tip_mm_s: float) -> None:
-        """One arm's tip along poses that begin where it is, on or in the organ or not.
-
-        Raises:
-            Blocked: as ``paths.follow``.
-        """
+        """One arm's tip along poses that begin where it is, on or in the organ or not. Raises
+        Blocked: as ``paths.follow``."""
         self.go(arm, follow(self.group(arm, (CUTTER, HOLDER)), poses), tip_mm_s)
 
     def wait(self, seconds: float) -> None:
@@ -171,10 +168,7 @@ def together(
     speeds_rad_s: Float64[np.ndarray, " d"],
 ) -> Timed:
     """Every joint leaves at the same time and arrives at the same time, on the straight segment.
-
-    Raises:
-        Blocked: no such motion.
-    """
+    Raises Blocked: no such motion."""
     import ruckig
 
     # One joint that goes from 0 to 1, as slowly as the slowest of them needs: so all are on the
