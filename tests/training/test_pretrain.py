@@ -34,7 +34,7 @@ from tumortrack.simulate.deform import ElasticConfig
 from tumortrack.simulate.occupancy import OccupancyConfig
 from tumortrack.training.model import SHIPPED, PretrainedWeights, load_start, start_of
 from tumortrack.training.presets import clinic, pretraining, quick
-from tumortrack.training.pretrain import KidneyStream, pretrain
+from tumortrack.training.pretrain import KidneyStream, organ_of, pretrain
 from tumortrack.training.state import Pretraining, TrainingProgress, TrainingRun, provenance
 from tumortrack.training.task import TrainingTask, task_of
 from tumortrack.training.train import train
@@ -174,8 +174,9 @@ def test_a_stream_shows_every_kidney_in_the_same_frame_and_size(stream):
         rest = points @ rotation.transpose(0, 2, 1) + place[:, None]
         assert np.linalg.norm(rest - batch.points_mm, axis=-1).mean() < 6  # deformation alone
         assert np.ptp(rest[..., 2], axis=1).max() < 2.2 * UPRIGHT_MM
-        down = rotation @ [0, 0, -1.0]  # the upper side, towards the camera
-        assert (down[:, 2] < -0.7).all()
+        scenes, upright = organ_of(a_pretraining(), number)
+        upper = rotation @ upright.facing @ scenes.up_lps  # towards the camera, within the tilts
+        assert (upper[:, 2] < -0.7).all()
 
 
 def test_a_patient_is_placed_as_the_pretrained_network_places_any_organ(patient, task, start):

@@ -45,7 +45,7 @@ class KidneyStream:
         """The batch with this number, its lengths scaled with the organ's."""
         turn, which = divmod(index, self.run.anatomies)
         if which not in self._organs:
-            self._organs[which] = _organ(self.run, which)
+            self._organs[which] = organ_of(self.run, which)
         stream, upright = self._organs[which]
         clouds_mm, points_mm, labels, camera_from_ct = stream.batch(turn)
         poses, scale = upright.camera_from_upright(camera_from_ct), np.float32(upright.scale)
@@ -59,7 +59,7 @@ class KidneyStream:
         return {"run": self.run}
 
 
-def _organ(run: Pretraining, number: int) -> tuple[SceneStream, canonical_frame.CanonicalFrame]:
+def organ_of(run: Pretraining, number: int) -> tuple[SceneStream, canonical_frame.CanonicalFrame]:
     """The scenes and the upright frame of a run's random kidney with this number."""
     seed = int(np.random.default_rng([run.seed, 0x517E, number]).integers(1 << 31))
     config = run.config
