@@ -16,6 +16,7 @@ from jaxtyping import Float32, Float64, UInt8
 
 from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.estimate import FAR_MM
+from tumortrack.core.process import parallel_for
 from tumortrack.imaging.symmetry import alike, half_turns
 from tumortrack.models.config import RegistrationHeadConfig, TrainConfig
 from tumortrack.models.in_distribution import InDistributionRange, fit_mm, spread_mm
@@ -237,11 +238,15 @@ class RegistrationTask(TrainingTask):
         weights = b"".join(w.numpy(force=True).tobytes() for w in network.state_dict().values())
         if self._last is None or self._last[0] != weights:
             network.eval()
-            registration, fits = self._registration(network), []
-            for cloud in self._scenes.clouds_mm:
-                hypotheses = registration.propose(cloud)
-                fits.append((hypotheses[0], registration.best_fit(cloud, hypotheses)))
-            self._last = weights, fits
+            registration, clouds = self._registration(network), self._scenes.clouds_mm
+            proposed = [registration.propose(cloud) for cloud in clouds]
+            found: dict[int, RegistrationResult] = {}
+
+            def fit(part: slice) -> None:
+                found[part.start] = registration.best_fit(clouds[part.start], proposed[part.start])
+
+            parallel_for(fit, len(clouds), 1)
+            self._last = weights, [(proposed[n][0], found[n]) for n in range(len(clouds))]
         return self._last[1]
 
     def _registration(self, network: RegistrationNetwork) -> Registration:
