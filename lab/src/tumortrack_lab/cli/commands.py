@@ -1,7 +1,8 @@
 """The laboratory's commands: `tumortrack` finds them by its entry points' names."""
 
 from tumortrack_lab.cli.bench import Bench
+from tumortrack_lab.cli.fleet import Fleet
 from tumortrack_lab.cli.margins import GenericMargins
 from tumortrack_lab.cli.twin import Twin
 
-bench, generic_margins, twin = Bench, GenericMargins, Twin
+bench, fleet, generic_margins, twin = Bench, Fleet, GenericMargins, Twin

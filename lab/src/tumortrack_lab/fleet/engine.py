@@ -10,7 +10,7 @@ from __future__ import annotations
 import heapq
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sized
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from itertools import count
@@ -22,6 +22,10 @@ from tumortrack_lab.fleet.worker import Job, Report, job_of
 
 _LOOKED_AHEAD = 64  # wanted tasks that the store is asked about before their turn
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.5, 60.0  # between attempts
+
+
+Wanted = Task | Callable[[], Task]
+Found = tuple[bool, str | None]  # what the store has of a task (``Store.found``)
 
 
 class Executor(Protocol):
@@ -91,7 +95,7 @@ class _Node:
 
 
 def run(
-    wanted: Iterable[Task],
+    wanted: Iterable[Wanted],
     store: Store,
     executor: Executor,
     tries: int = 4,
@@ -100,12 +104,14 @@ def run(
 ) -> Iterator[Outcome]:
     """Do the wanted tasks, and what they need that the store lacks; yields each when it is settled.
 
+    A wanted task may also be a function that makes it, which is called when its turn is near, on
+    another thread: reading a patient's files for their hash takes its time.
     ``tries``: how often a task may fail for reasons that are not its own. ``again``: try also what
     the store says can't be done. ``show`` is called about twice a second.
     """
     store.open()
     fleet = _Fleet(store, executor, tries, again)
-    fleet.status.total = len(wanted) if hasattr(wanted, "__len__") else None
+    fleet.status.total = len(wanted) if isinstance(wanted, Sized) else None
     try:
         with ThreadPoolExecutor(8, "store") as pool:
             coming = _looked_up(wanted, store, pool)
@@ -125,21 +131,22 @@ def run(
         executor.close()
 
 
-Found = tuple[bool, str | None]
-
-
 def _looked_up(
-    wanted: Iterable[Task], store: Store, pool: ThreadPoolExecutor
+    wanted: Iterable[Wanted], store: Store, pool: ThreadPoolExecutor
 ) -> Iterator[tuple[Task, Found]]:
     """Wanted tasks with what the store has of them, asked ahead: object storage takes its time."""
-    asked: deque[tuple[Task, Future[Found]]] = deque()
-    for task in wanted:
-        asked.append((task, pool.submit(store.found, task.key)))
+
+    def look_up(one: Wanted) -> tuple[Task, Found]:
+        task = one if isinstance(one, Task) else one()
+        return task, store.found(task.key)
+
+    asked: deque[Future[tuple[Task, Found]]] = deque()
+    for one in wanted:
+        asked.append(pool.submit(look_up, one))
         if len(asked) >= _LOOKED_AHEAD:
-            first, answer = asked.popleft()
-            yield first, answer.result()
-    for first, answer in asked:
-        yield first, answer.result()
+            yield asked.popleft().result()
+    while asked:
+        yield asked.popleft().result()
 
 
 class _Fleet:
@@ -212,10 +219,10 @@ class _Fleet:
             del self.nodes[node.task.key]
             for one in node.wanted:
                 self._settle(Outcome(one, "done"))
-            for one in node.waited_for_by:
-                one.missing.discard(node.task.key)
-                if not one.missing and self.nodes.get(one.task.key) is one:
-                    self._push(one)
+            for waiting in node.waited_for_by:
+                waiting.missing.discard(node.task.key)
+                if not waiting.missing and self.nodes.get(waiting.task.key) is waiting:
+                    self._push(waiting)
         elif report.state == "cannot":
             self._give_up(node, "cannot", node.task.step, report.reason)
         elif report.state == "changed":
@@ -243,7 +250,7 @@ class _Fleet:
         """An input lies in the store damaged: the node waits until it has been made anew."""
         [task] = {one.key: one for one in node.task.inputs.values() if one.key == key}.values()
         assert isinstance(task, Task)
-        before = self.nodes.get(key)
+        before: _Node | Outcome | None = self.nodes.get(key)
         if before is None:
             self.store.remove(key)
             before = self._plan(task, node.place, (False, None))

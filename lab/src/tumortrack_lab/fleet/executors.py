@@ -1,4 +1,4 @@
-"""Who does a fleet's tasks: this process, one after the other, or Ray's on any number of machines."""
+"""Who does a fleet's tasks: this process, one after the other, or Ray on any number of machines."""
 
 from __future__ import annotations
 
@@ -74,7 +74,8 @@ class OnRay:
         except (ConnectionError, RuntimeError, ValueError, OSError) as error:
             self.close()
             words = str(error).strip().splitlines()[0]
-            raise InputError(f"Ray at {address or 'this machine'} cannot be used: {words}") from error
+            where = f"the Ray cluster at {address}" if address else "Ray on this machine"
+            raise InputError(f"{where} cannot be used: {words}") from error
         # A large task has a process of its own, whose memory is free again when it ends.
         self._small = ray.remote(max_calls=100, max_retries=0)(perform)
         self._large = ray.remote(max_calls=1, max_retries=0)(perform)

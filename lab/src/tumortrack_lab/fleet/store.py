@@ -73,7 +73,9 @@ class Store:
         try:
             if self.is_local:
                 _clear_old(Path(self.root) / _ASIDE)
-            self._files.pipe_file(f"{self.root}/store.txt", b"Results of tumortrack fleet, by key.\n")
+            self._files.pipe_file(
+                f"{self.root}/store.txt", b"Results of tumortrack fleet, by key.\n"
+            )
         except OSError as error:
             raise InputError(f"the store {self.url} cannot be written: {error}") from error
 

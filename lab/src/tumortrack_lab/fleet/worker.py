@@ -171,5 +171,3 @@ def _peak_mb() -> float:
             if line.startswith("VmHWM:"):
                 return max(child, int(line.split()[1]) / 1024)
     return max(child, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)
-
-
