@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import atexit
 import os
 import queue
 import secrets
 import shutil
+import socket
+import sys
 import tempfile
 import time
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from tumortrack.core.errors import InputError
+from tumortrack.core.errors import InputError, TumortrackError
 from tumortrack.core.process import available_cores
 from tumortrack_lab.fleet.worker import Job, Report, perform
 
@@ -21,6 +24,7 @@ if TYPE_CHECKING:
 
 _AHEAD = 2.0  # tasks handed over per core: the next ones are at hand when one ends
 _LOOK_S = 5.0  # between looks at which machines there are
+_SILENT_S = 8.0  # without a word from the cluster's head: it is gone
 _LARGE_MB = 2000
 _STORE_BYTES = 80 * 2**20  # Ray's least for its object store, which carries no data of ours
 
@@ -61,21 +65,23 @@ class OnRay:
             os.environ.setdefault("RAY_AUTH_TOKEN", secrets.token_hex(32))
         import ray
 
-        self._ray, self._folder = ray, None if address else _own_folder()
-        common: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR"}
+        self._ray, self._folder, self._is_lost = ray, None if address else _own_folder(), False
+        options: dict[str, Any] = {"address": address}
+        if self._folder is not None:
+            options = {"num_cpus": cores or available_cores(), "_temp_dir": str(self._folder)}
+            options["object_store_memory"] = _STORE_BYTES
+        # It has no switch for pages about lost machines; our own lines say what is done about them.
+        ray._private.worker.print_to_stdstream = lambda *data, **how: None
         try:
-            if self._folder is None:
-                ray.init(address=address, **common)
-            else:
-                ray.init(
-                    num_cpus=cores or available_cores(), object_store_memory=_STORE_BYTES,
-                    _temp_dir=str(self._folder), **common,
-                )  # fmt: skip
+            context = ray.init(log_to_driver=False, logging_level="ERROR", **options)
         except (ConnectionError, RuntimeError, ValueError, OSError) as error:
             self.close()
             words = str(error).strip().splitlines()[0]
             where = f"the Ray cluster at {address}" if address else "Ray on this machine"
             raise InputError(f"{where} cannot be used: {words}") from error
+        self.dashboard = context.dashboard_url
+        self._head = context.address_info["gcs_address"].rsplit(":", 1)
+        self._heard_s = time.monotonic()
         # A large task has a process of its own, whose memory is free again when it ends.
         self._small = ray.remote(max_calls=100, max_retries=0)(perform)
         self._large = ray.remote(max_calls=1, max_retries=0)(perform)
@@ -107,12 +113,33 @@ class OnRay:
                 found.append(self._ended.get_nowait())
         for key, _ in found:
             del self._refs[key]
+        if time.monotonic() - self._heard_s > 1.0:
+            self._look_for_head()
         return [(key, self._report(future)) for key, future in found]
 
     def close(self) -> None:
-        self._ray.shutdown()
+        if self._is_lost:  # it would wait for its head, or crash
+            atexit.register(_leave)
+        else:
+            self._ray.shutdown()
         if self._folder is not None:
             shutil.rmtree(self._folder, ignore_errors=True)
+
+    def _look_for_head(self) -> bool:
+        """Whether the cluster's head answers. TumortrackError: it has not for a while; Ray itself
+        would wait a minute and then end this process."""
+        try:
+            socket.create_connection((self._head[0], int(self._head[1])), 2.0).close()
+        except OSError as error:
+            if time.monotonic() - self._heard_s < _SILENT_S:
+                return False
+            self._is_lost = True
+            raise TumortrackError(
+                f"the head of the Ray cluster at {':'.join(self._head)} is gone ({error}). "
+                "Start the cluster again; the same command then resumes."
+            ) from error
+        self._heard_s = time.monotonic()
+        return True
 
     def _report(self, future: Future[Report]) -> Report:
         """What the task says; or, where it can't, what Ray says of its end."""
@@ -131,11 +158,17 @@ class OnRay:
 
     def _largest(self) -> list[dict[str, float]]:
         """What each machine has, as of a few seconds ago. TumortrackError: the cluster is gone."""
-        if time.monotonic() - self._looked_s > _LOOK_S:
+        if time.monotonic() - self._looked_s > _LOOK_S and self._look_for_head():
             nodes = self._ray.nodes()
             self._machines = [one["Resources"] for one in nodes if one["Alive"]] or [{}]
             self._looked_s = time.monotonic()
         return self._machines
+
+
+def _leave() -> None:
+    """End this process at once, before Ray's own end."""
+    sys.stdout.flush()
+    os._exit(TumortrackError.exit_code)
 
 
 def _own_folder() -> Path:
