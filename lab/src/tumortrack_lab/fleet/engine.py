@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterable, Iterator, Sized
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from itertools import count
-from typing import Literal, Protocol
+from typing import Literal, Protocol, runtime_checkable
 
 from tumortrack_lab.fleet.store import Store
 from tumortrack_lab.fleet.task import File, Needs, Task
@@ -28,6 +28,7 @@ Wanted = Task | Callable[[], Task]
 Found = tuple[bool, str | None]  # what the store has of a task (``Store.found``)
 
 
+@runtime_checkable
 class Executor(Protocol):
     """Who does the tasks."""
 

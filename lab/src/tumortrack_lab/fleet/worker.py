@@ -58,7 +58,7 @@ class Report:
 def job_of(task: Task, store: Store, needs: Needs, reasons: tuple[str, ...]) -> Job:
     """Raises TypeError: the work cannot be imported by its name."""
     name = f"{task.work.__module__}:{task.work.__qualname__}"  # type: ignore[attr-defined]
-    if resolve_name(name) is not task.work:
+    if resolve_name(name) is not task.work or name.startswith("__main__"):
         raise TypeError(f"{name} is another object than the work of {task.step}")
     inputs = {name: one if isinstance(one, File) else one.key for name, one in task.inputs.items()}
     who = f"{task.patient} {task.step}"
