@@ -123,3 +123,7 @@ def drive(address: str, url: str, count: int) -> None:
     except TumortrackError as error:
         print(json.dumps({"error": str(error)}), flush=True)
         sys.exit(error.exit_code)
+
+
+def user_file(path: Path) -> File:
+    return File(str(path), hashlib.sha256(path.read_bytes()).hexdigest())
