@@ -1,4 +1,4 @@
-"""The fleet's store and engine: what lies there is whole or not there, and nothing is done twice."""
+"""The fleet's store and engine: what lies there is whole or not there; nothing is done twice."""
 
 from __future__ import annotations
 
@@ -200,3 +200,32 @@ def test_without_the_extra_one_line_says_how_to_get_it():
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.returncode == 2
     assert done.stderr == "tumortrack: fleet needs ray: pip install 'tumortrack-lab[fleet]'\n"
+
+
+def test_what_another_run_is_doing_is_left_to_it(store, folder, monkeypatch):
+    monkeypatch.setattr(engine, "_ELSEWHERE_S", 0.0)
+    key = chain(0).key
+    assert store.claim(key, "other")
+    assert store.claim(key, "other")  # renewed
+    assert not store.claim(key, "mine")
+    looks = []
+
+    class Meanwhile(Serial):
+        """At the third look the other run has given it up."""
+
+        def start(self, job: Job) -> None:
+            super().start(job)
+            looks.append(self._done[-1][1].state)
+            if looks.count("elsewhere") == 3:
+                store.release(key)
+
+    [outcome] = run([chain(0)], store, Meanwhile())
+    assert outcome.state == "done"
+    assert looks == ["done", "done", *["elsewhere"] * 3, "done"]
+    assert store.claim(key, "mine")  # nothing is left of a claim when a task is over
+
+    claim = json.loads(store._files.cat_file(f"{store.root}/claims/{key}.json"))
+    for void in ({"process": 2**22 + 1}, {"host": "elsewhere", "time": claim["time"] - 61}):
+        text = json.dumps({**claim, "run": "other", **void}).encode()
+        store._files.pipe_file(f"{store.root}/claims/{key}.json", text)
+        assert store.claim(key, "mine")

@@ -8,6 +8,7 @@ with their number; of those under way the first is preferred, so that patients a
 from __future__ import annotations
 
 import heapq
+import secrets
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sized
@@ -22,6 +23,7 @@ from tumortrack_lab.fleet.worker import Job, Report, job_of
 
 _LOOKED_AHEAD = 64  # wanted tasks that the store is asked about before their turn
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.5, 60.0  # between attempts
+_ELSEWHERE_S = 2.0  # between looks at what another run is doing
 
 
 Wanted = Task | Callable[[], Task]
@@ -162,6 +164,7 @@ class _Fleet:
         self._later: list[tuple[float, int, _Node]] = []  # when; attempts that wait
         self._running = 0
         self._numbers = count()
+        self._run = secrets.token_hex(8)
 
     def has_room(self) -> bool:
         return self._running + len(self._ready) + len(self._later) < self.executor.room()
@@ -181,7 +184,8 @@ class _Fleet:
         while self._ready and self._running < self.executor.room():
             node = heapq.heappop(self._ready)[2]
             self._running += 1
-            self.executor.start(job_of(node.task, self.store, node.needs, node.reasons))
+            job = job_of(node.task, node.needs, self.store.url, self._run, node.reasons)
+            self.executor.start(job)
         for key, report in self.executor.finished(0.5):
             self._running -= 1
             self._react(self.nodes[key], report)
@@ -224,6 +228,8 @@ class _Fleet:
                 waiting.missing.discard(node.task.key)
                 if not waiting.missing and self.nodes.get(waiting.task.key) is waiting:
                     self._push(waiting)
+        elif report.state == "elsewhere":
+            self._wait(node, _ELSEWHERE_S)
         elif report.state == "cannot":
             self._give_up(node, "cannot", node.task.step, report.reason)
         elif report.state == "changed":
@@ -245,6 +251,9 @@ class _Fleet:
         if report.state == "damaged":
             return self._make_again(node, report.damaged)
         pause_s = min(_FIRST_PAUSE_S * 2 ** (len(node.reasons) - 1), _LONGEST_PAUSE_S)
+        self._wait(node, pause_s)
+
+    def _wait(self, node: _Node, pause_s: float) -> None:
         heapq.heappush(self._later, (time.monotonic() + pause_s, next(self._numbers), node))
 
     def _make_again(self, node: _Node, key: str) -> None:

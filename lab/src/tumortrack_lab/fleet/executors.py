@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import atexit
+import logging
 import os
 import queue
 import secrets
@@ -17,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 from tumortrack.core.errors import InputError, TumortrackError
 from tumortrack.core.process import available_cores
+from tumortrack_lab.fleet.store import is_running
 from tumortrack_lab.fleet.worker import Job, Report, perform
 
 if TYPE_CHECKING:
@@ -73,7 +75,7 @@ class OnRay:
         # It has no switch for pages about lost machines; our own lines say what is done about them.
         ray._private.worker.print_to_stdstream = lambda *data, **how: None
         try:
-            context = ray.init(log_to_driver=False, logging_level="ERROR", **options)
+            context: Any = ray.init(log_to_driver=False, logging_level=logging.ERROR, **options)
         except (ConnectionError, RuntimeError, ValueError, OSError) as error:
             self.close()
             words = str(error).strip().splitlines()[0]
@@ -176,16 +178,6 @@ def _own_folder() -> Path:
     place = Path(tempfile.gettempdir())
     for old in place.glob("tumortrack-ray-*-*"):
         with suppress(OSError, ValueError):
-            if old.stat().st_uid == os.getuid() and not _is_running(int(old.name.split("-")[2])):
+            if old.stat().st_uid == os.getuid() and not is_running(int(old.name.split("-")[2])):
                 shutil.rmtree(old, ignore_errors=True)
     return Path(tempfile.mkdtemp(prefix=f"tumortrack-ray-{os.getpid()}-", dir=place))
-
-
-def _is_running(process: int) -> bool:
-    try:
-        os.kill(process, 0)
-    except ProcessLookupError:
-        return False
-    except PermissionError:
-        pass
-    return True

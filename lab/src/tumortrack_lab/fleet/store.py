@@ -4,6 +4,7 @@
     KK/KEY/manifest.json  their sha256, written last: without it there is no result; or, of a task
                           that can't be done, why
     costs/KK/KEY.json     what it cost: apart, since results are equal bit for bit and costs are not
+    claims/KEY.json       who is doing it: a hint alone, that two runs don't do the same
 
 In a plain folder a result is moved into place in one step, and used where it lies; from elsewhere
 it is fetched into a cache on this machine. Storage must replace a single file in one step, as S3,
@@ -17,10 +18,11 @@ import hashlib
 import json
 import os
 import shutil
+import socket
 import tempfile
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -30,6 +32,7 @@ from tumortrack.core.store import MANIFEST, sha256_of
 from tumortrack_lab.fleet.task import File
 
 _ASIDE = "aside"  # what is being written, and what killed processes left there
+_CLAIMED_S = 60.0  # a claim that was not renewed for so long is void
 _KEPT_S = 24 * 3600  # what was cached or left aside, and nobody asked for for so long, is removed
 
 
@@ -136,6 +139,27 @@ class Store:
         if not self.is_local:
             shutil.rmtree(self._kept / key, ignore_errors=True)
 
+    def claim(self, key: str, run: str) -> bool:
+        """Say, again and again, that ``run`` is doing this; False: another run is, or was a minute
+        ago. Two that ask in the same moment may both hear True: then both do it, to the same
+        bits."""
+        now, here = time.time(), socket.gethostname()
+        try:
+            found = json.loads(self._files.cat_file(self._claim(key)))
+            gone = found["host"] == here and not is_running(found["process"])
+            if found["run"] != run and abs(now - found["time"]) < _CLAIMED_S and not gone:
+                return False
+        except (FileNotFoundError, ValueError):
+            pass
+        mine = {"run": run, "host": here, "process": os.getpid(), "time": now}
+        self._pipe(self._claim(key), json.dumps(mine).encode())
+        return True
+
+    def release(self, key: str) -> None:
+        """Nobody is doing it any more."""
+        with suppress(FileNotFoundError):
+            self._files.rm_file(self._claim(key))
+
     def cost(self, key: str) -> dict[str, Any]:
         """What a task cost, as the engine wrote it; empty: unknown."""
         try:
@@ -145,12 +169,7 @@ class Store:
         return found
 
     def put_cost(self, key: str, cost: dict[str, Any]) -> None:
-        content = json.dumps(cost, indent=1).encode()
-        if not self.is_local:
-            self._files.pipe_file(self._cost(key), content)
-            return
-        with _aside(Path(self.root), Path(self._cost(key)), is_file=True) as aside:
-            aside.write_bytes(content)
+        self._pipe(self._cost(key), json.dumps(cost, indent=1).encode())
 
     def user_file(self, file: File) -> Path:
         """A user's file on this machine; of a URL, a copy. InputError: it is another by now."""
@@ -201,6 +220,17 @@ class Store:
         inside = all(".." not in name.split("/") and name[:1] != "/" for name in found["files"])
         return found if found.get("key") == key and inside else {}
 
+    def _pipe(self, path: str, content: bytes) -> None:
+        """Write a small file in one step."""
+        if not self.is_local:
+            self._files.pipe_file(path, content)
+            return
+        with _aside(Path(self.root), Path(path), is_file=True) as aside:
+            aside.write_bytes(content)
+
+    def _claim(self, key: str) -> str:
+        return f"{self.root}/claims/{key}.json"
+
     def _place(self, key: str) -> str:
         return f"{self.root}/{key[:2]}/{key}"
 
@@ -218,6 +248,16 @@ class Store:
         for folder in (kept, kept / _ASIDE):
             _clear_old(folder)
         return kept
+
+
+def is_running(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:  # another user's
+        pass
+    return True
 
 
 @contextmanager

@@ -8,10 +8,11 @@ import resource
 import socket
 import sys
 import tempfile
+import threading
 import time
 import traceback
-from collections.abc import Mapping
-from contextlib import suppress
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -22,6 +23,8 @@ import tumortrack
 from tumortrack.core.errors import InputError, StorageError, TumortrackError
 from tumortrack_lab.fleet.store import DamagedError, Store, scratch
 from tumortrack_lab.fleet.task import File, Needs, Task, Work
+
+_RENEWED_S = 15.0  # between renewals of a claim
 
 
 @dataclass(frozen=True)
@@ -35,6 +38,7 @@ class Job:
     inputs: Mapping[str, str | File]  # keys of results in the store; users' files
     needs: Needs
     store: str
+    run: str  # its name, for claims
     reasons: tuple[str, ...] = ()
     tumortrack: str = tumortrack.__version__
 
@@ -43,26 +47,27 @@ class Job:
 class Report:
     """What became of an attempt.
 
-    there, done: the result lies in the store, before and now. cannot: it never can be done, which
-    the store says from now on. changed: a user's file is another by now. The others may do better
-    in another attempt: damaged (the result ``damaged`` must be made again first), memory (there was
-    too little), failed (anything else of the machine, or a defect of ours).
+    elsewhere: another run is doing it now. there, done: the result lies in the store, before and
+    now. cannot: it never can be done, which the store says from now on. changed: a user's file is
+    another by now. The others may do better in another attempt: damaged (the result ``damaged``
+    must be made again first), memory (there was too little), failed (anything else of the machine,
+    or a defect of ours).
     """
 
-    state: Literal["there", "done", "cannot", "changed", "damaged", "memory", "failed"]
+    state: Literal["elsewhere", "there", "done", "cannot", "changed", "damaged", "memory", "failed"]
     reason: str = ""
     damaged: str = ""
     cost: Mapping[str, Any] = field(default_factory=dict)
 
 
-def job_of(task: Task, store: Store, needs: Needs, reasons: tuple[str, ...]) -> Job:
+def job_of(task: Task, needs: Needs, store: str, run: str, reasons: tuple[str, ...]) -> Job:
     """Raises TypeError: the work cannot be imported by its name."""
     name = f"{task.work.__module__}:{task.work.__qualname__}"  # type: ignore[attr-defined]
     if resolve_name(name) is not task.work or name.startswith("__main__"):
         raise TypeError(f"{name} is another object than the work of {task.step}")
     inputs = {name: one if isinstance(one, File) else one.key for name, one in task.inputs.items()}
     who = f"{task.patient} {task.step}"
-    return Job(task.key, who, name, dict(task.options), inputs, needs, store.url, reasons)
+    return Job(task.key, who, name, dict(task.options), inputs, needs, store, run, reasons)
 
 
 def perform(job: Job) -> Report:
@@ -73,9 +78,13 @@ def perform(job: Job) -> Report:
         return Report("failed", f"{words}, the command {job.tumortrack}: install the same")
     try:
         store = _store(job.store)
-        if store.has(job.key):
-            return Report("there")
-        with tempfile.TemporaryDirectory(dir=scratch(), ignore_cleanup_errors=True) as folder:
+        if not store.claim(job.key, job.run):
+            return Report("elsewhere")
+        aside = tempfile.TemporaryDirectory(dir=scratch(), ignore_cleanup_errors=True)
+        with _claimed(job, store), aside as folder:
+            there, failure = store.found(job.key)
+            if there:
+                return Report("there") if failure is None else Report("cannot", failure)
             inputs = {
                 name: store.user_file(one) if isinstance(one, File) else store.get(one)
                 for name, one in job.inputs.items()
@@ -87,6 +96,27 @@ def perform(job: Job) -> Report:
         return Report("changed", str(error))
     except (Exception, SystemExit) as error:
         return _attempt_failed(error)
+
+
+@contextmanager
+def _claimed(job: Job, store: Store) -> Iterator[None]:
+    """Renews the claim now and then, and gives it up in the end."""
+    over = threading.Event()
+
+    def renew() -> None:
+        while not over.wait(_RENEWED_S):
+            with suppress(OSError):
+                store.claim(job.key, job.run)
+
+    thread = threading.Thread(target=renew, name="claim", daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        thread.join()
+        with suppress(OSError):
+            store.release(job.key)
 
 
 def _measured(job: Job, store: Store, inputs: Mapping[str, Path], out: Path) -> Report:
