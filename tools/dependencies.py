@@ -37,6 +37,7 @@ ALLOWED = {
 # licence file.
 SAID = {
     "apache software license": "Apache-2.0",
+    "apache 2.0": "Apache-2.0",
     "bsd license": "BSD",
     "3-clause bsd license": "BSD-3-Clause",
     "mit license": "MIT",
@@ -54,9 +55,8 @@ STATED = {
 
 def lock(upgrade: list[str]) -> None:
     """Resolve everything for every platform, and keep what is pinned unless told to upgrade."""
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
-    extras = ",".join(project["optional-dependencies"])
-    everything = f"-e {ROOT}[{extras}]\n-e {ROOT / 'lab'}\n-e {ROOT / 'experiment'}\n"
+    folders = (ROOT, ROOT / "lab", ROOT / "experiment")
+    everything = "".join(f"-e {folder}[{_extras(folder)}]\n" for folder in folders)
     pins = pinned(_resolved(everything, "".join(_locks().values()), upgrade))
     files: dict[str, list[str]] = {name: [] for name in _ABOUT}
     for name, text in pins.items():
@@ -69,6 +69,11 @@ def lock(upgrade: list[str]) -> None:
     tools = LOCKS / "tools.txt"
     kept = tools.read_text("utf-8") if tools.exists() else ""
     tools.write_text(_resolved("uv\npip-audit\n", kept, upgrade), "utf-8")
+
+
+def _extras(folder: Path) -> str:
+    project = tomllib.loads((folder / "pyproject.toml").read_text("utf-8"))["project"]
+    return ",".join(project.get("optional-dependencies", ()))
 
 
 def _resolved(wanted: str, kept: str, upgrade: list[str]) -> str:

@@ -38,7 +38,7 @@ _COMMANDS: tuple[type[Command], ...] = (
 )
 _ORDER = (
     *("demo", "prepare", "export", "train", "pretrain", "locate", "track", "plan", "resect"),
-    *("simulate", "twin", "evaluate", "margins", "bench"),
+    *("simulate", "twin", "evaluate", "margins", "bench", "fleet"),
     *("phantom-kit", "calibrate", "record", "reference"),
     *("compile", "onnx", "inspect", "doctor"),
 )

@@ -1,0 +1,161 @@
+"""`tumortrack fleet`: a list of patients -> a model, margins and an evaluation of each."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from tyro.conf import Positional
+
+from tumortrack.cli.console import console, say
+from tumortrack.core.errors import InputError, TumortrackError
+
+if TYPE_CHECKING:
+    from tumortrack_lab.fleet.engine import Executor, Outcome, Status
+    from tumortrack_lab.fleet.list import Patient
+    from tumortrack_lab.fleet.task import Task
+
+_EVERY_S = 15.0  # between lines where there is no terminal
+
+
+@dataclass(frozen=True, kw_only=True)
+class Fleet:
+    """Prepare, train and evaluate many patients, on this machine or many; the same command resumes.
+
+    Attributes:
+        list: CSV table of patients (docs/fleet.md).
+        out: folder to write.
+        address: of a Ray cluster (HOST:PORT, or auto on one of its machines); default: this
+            machine alone.
+        store: where results are kept, a folder or a URL such as s3://bucket/folder, which all
+            machines see; several runs may share it (default: OUT/store).
+        cores: of this machine, to use (default: all).
+        tries: attempts at a task whose machine, not whose patient, is at fault.
+        again: try also what was found to be impossible.
+        serial: one task after the other in this process, without Ray.
+    """
+
+    list: Positional[Path]
+    out: Positional[Path]
+    address: str | None = None
+    store: str | None = None
+    cores: int | None = None
+    tries: int = 4
+    again: bool = False
+    serial: bool = False
+
+    def run(self) -> None:
+        """Raises InputError: options that exclude each other, a list, store or cluster that can't
+        be used; TumortrackError: patients failed that another run may succeed with."""
+        self._check()
+        from tumortrack_lab.fleet.engine import run
+        from tumortrack_lab.fleet.list import read_list
+        from tumortrack_lab.fleet.results import write_results
+        from tumortrack_lab.fleet.store import Store
+
+        patients = read_list(self.list)
+        self.out.mkdir(parents=True, exist_ok=True)
+        store = Store(self.store or str(self.out / "store"))
+        store.open()
+        outcomes: dict[str, Outcome] = {}
+        wanted = [partial(_wanted, patient) for patient in patients]
+        with _screen() as show:
+            try:
+                for one in run(wanted, store, self._executor(), self.tries, self.again, show):
+                    outcomes[one.task.patient] = one
+                    if one.reason:
+                        say(f"{one.task.patient}: {one.step}: {one.reason}")
+            finally:  # also of what was done until Ctrl-C
+                write_results(self.out, patients, outcomes, store)
+        states = [one.state for one in outcomes.values()]
+        say(
+            f"{len(patients)} patients in {self.out}: {states.count('done')} done, "
+            f"{states.count('there')} before, {states.count('cannot')} impossible."
+        )
+        if failed := states.count("failed"):
+            raise TumortrackError(
+                f"{failed} of {len(patients)} patients failed for reasons that may pass (see "
+                "above); the same command tries them again."
+            )
+
+    def _check(self) -> None:
+        if self.serial and (self.address or self.cores):
+            raise InputError("--serial uses this process alone: no --address, no --cores.")
+        if self.address and self.cores:
+            raise InputError(
+                "--cores is of this machine alone; a cluster at --address has its own."
+            )
+        if self.cores is not None and self.cores < 1:
+            raise InputError(f"--cores {self.cores} must be at least 1.")
+        if self.tries < 1:
+            raise InputError(f"--tries {self.tries} must be at least 1.")
+        if self.address and not self.store:
+            raise InputError("--address needs --store: a folder or URL that all machines see.")
+        needed = [name for name in ("fsspec", "pyarrow", "ray") if not self.serial or name != "ray"]
+        if lacking := [name for name in needed if find_spec(name) is None]:
+            raise InputError(
+                f"fleet needs {' and '.join(lacking)}: pip install 'tumortrack-lab[fleet]'"
+            )
+
+    def _executor(self) -> Executor:
+        from tumortrack_lab.fleet.executors import OnRay, Serial
+
+        return Serial() if self.serial else OnRay(self.address, self.cores)
+
+
+def _wanted(patient: Patient) -> Task:
+    from tumortrack_lab.fleet.steps import chain
+
+    return chain(patient)["summary"]
+
+
+@contextmanager
+def _screen() -> Iterator[Callable[[Status], None]]:
+    """Yields a function that shows how far it is: on a terminal one live line, elsewhere a line now
+    and then."""
+    from rich.status import Status as Spinner
+
+    spinner = Spinner("starting ...", console=console)
+    shown_s, noted = -_EVERY_S, ""
+
+    def show(status: Status) -> None:
+        nonlocal shown_s, noted
+        if status.note != noted:
+            say(status.note)
+            noted = status.note
+        text = _line(status)
+        if console.is_terminal:
+            spinner.update(text)
+        elif time.monotonic() - shown_s >= _EVERY_S:
+            say(text)
+            shown_s = time.monotonic()
+
+    if console.is_terminal:
+        spinner.start()
+    try:
+        yield show
+    finally:
+        spinner.stop()
+
+
+def _line(status: Status) -> str:
+    left = "-"
+    if (seconds := status.seconds_left) is not None:
+        minutes, rest = divmod(int(seconds), 60)
+        left = f"{minutes // 60}:{minutes % 60:02d}:{rest:02d}"
+    words = [
+        f"patients {status.wanted}/{status.total} ({status.there} before)",
+        f"{status.per_hour:.1f} an hour",
+        f"{left} left",
+        f"{status.running} tasks under way",
+        f"{status.done} done",
+    ]
+    if status.failed or status.retried:
+        words.append(f"{status.failed} failed, {status.retried} tried again")
+    return " | ".join(words)

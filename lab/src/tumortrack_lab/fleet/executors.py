@@ -1,0 +1,183 @@
+"""Who does a fleet's tasks: this process, one after the other, or Ray on any number of machines."""
+
+from __future__ import annotations
+
+import atexit
+import logging
+import os
+import queue
+import secrets
+import shutil
+import socket
+import sys
+import tempfile
+import time
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from tumortrack.core.errors import InputError, TumortrackError
+from tumortrack.core.process import available_cores
+from tumortrack_lab.fleet.store import is_running
+from tumortrack_lab.fleet.worker import Job, Report, perform
+
+if TYPE_CHECKING:
+    from concurrent.futures import Future
+
+_AHEAD = 2.0  # tasks handed over per core: the next ones are at hand when one ends
+_LOOK_S = 5.0  # between looks at which machines there are
+_SILENT_S = 8.0  # without a word from the cluster's head: it is gone
+_LARGE_MB = 2000
+_STORE_BYTES = 80 * 2**20  # Ray's least for its object store, which carries no data of ours
+
+
+class Serial:
+    """One task at a time, in this process."""
+
+    def __init__(self) -> None:
+        self._done: list[tuple[str, Report]] = []
+
+    def room(self) -> int:
+        return 1
+
+    def start(self, job: Job) -> None:
+        self._done.append((job.key, perform(job)))
+
+    def finished(self, wait_s: float) -> list[tuple[str, Report]]:
+        if not self._done:
+            time.sleep(wait_s)
+        done, self._done = self._done, []
+        return done
+
+    def close(self) -> None:
+        pass
+
+
+class OnRay:
+    """Tasks as Ray's: on this machine with ``cores`` (default: all), or on the cluster at
+    ``address``.
+
+    Raises InputError: no cluster there.
+    """
+
+    def __init__(self, address: str | None = None, cores: int | None = None) -> None:
+        os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
+        if address is None:  # ours alone, on a machine with other users; not kept in their home
+            os.environ["RAY_AUTH_MODE"] = "token"
+            os.environ.setdefault("RAY_AUTH_TOKEN", secrets.token_hex(32))
+        import ray
+
+        self._ray, self._folder, self._is_lost = ray, None if address else _own_folder(), False
+        options: dict[str, Any] = {"address": address}
+        if self._folder is not None:
+            options = {"num_cpus": cores or available_cores(), "_temp_dir": str(self._folder)}
+            options["object_store_memory"] = _STORE_BYTES
+        # It has no switch for pages about lost machines; our own lines say what is done about them.
+        ray._private.worker.print_to_stdstream = lambda *data, **how: None
+        try:
+            context: Any = ray.init(log_to_driver=False, logging_level=logging.ERROR, **options)
+        except (ConnectionError, RuntimeError, ValueError, OSError) as error:
+            self.close()
+            words = str(error).strip().splitlines()[0]
+            where = f"the Ray cluster at {address}" if address else "Ray on this machine"
+            raise InputError(f"{where} cannot be used: {words}") from error
+        self.dashboard = context.dashboard_url
+        self._head = context.address_info["gcs_address"].rsplit(":", 1)
+        self._heard_s = time.monotonic()
+        # A large task has a process of its own, whose memory is free again when it ends.
+        self._small = ray.remote(max_calls=100, max_retries=0)(perform)
+        self._large = ray.remote(max_calls=1, max_retries=0)(perform)
+        self._ended: queue.SimpleQueue[tuple[str, Future[Report]]] = queue.SimpleQueue()
+        self._refs: dict[str, Any] = {}
+        self._looked_s, self._machines = -_LOOK_S, [dict[str, float]()]
+
+    def room(self) -> int:
+        return int(_AHEAD * sum(one.get("CPU", 0) for one in self._largest())) + 4
+
+    def start(self, job: Job) -> None:
+        """Its needs are held to what the largest machine has: there it runs alone, and slower."""
+        machines = self._largest()
+        most = {name: max(one.get(name, 0) for one in machines) for name in ("CPU", "memory")}
+        function = self._large if job.needs.memory_mb >= _LARGE_MB else self._small
+        ref = self._refs[job.key] = function.options(
+            name=job.name,
+            num_cpus=min(job.needs.cores, most["CPU"]),
+            memory=min(job.needs.memory_mb * 2**20, int(0.95 * most["memory"])),
+            num_gpus=job.needs.gpus,
+        ).remote(job)
+        ref.future().add_done_callback(lambda future: self._ended.put((job.key, future)))
+
+    def finished(self, wait_s: float) -> list[tuple[str, Report]]:
+        found = []
+        with suppress(queue.Empty):
+            found.append(self._ended.get(timeout=wait_s))
+            while True:
+                found.append(self._ended.get_nowait())
+        for key, _ in found:
+            del self._refs[key]
+        if time.monotonic() - self._heard_s > 1.0:
+            self._look_for_head()
+        return [(key, self._report(future)) for key, future in found]
+
+    def close(self) -> None:
+        if self._is_lost:  # it would wait for its head, or crash
+            atexit.register(_leave)
+        else:
+            self._ray.shutdown()
+        if self._folder is not None:
+            shutil.rmtree(self._folder, ignore_errors=True)
+
+    def _look_for_head(self) -> bool:
+        """Whether the cluster's head answers. TumortrackError: it has not for a while; Ray itself
+        would wait a minute and then end this process."""
+        try:
+            socket.create_connection((self._head[0], int(self._head[1])), 2.0).close()
+        except OSError as error:
+            if time.monotonic() - self._heard_s < _SILENT_S:
+                return False
+            self._is_lost = True
+            raise TumortrackError(
+                f"the head of the Ray cluster at {':'.join(self._head)} is gone ({error}). "
+                "Start the cluster again; the same command then resumes."
+            ) from error
+        self._heard_s = time.monotonic()
+        return True
+
+    def _report(self, future: Future[Report]) -> Report:
+        """What the task says; or, where it can't, what Ray says of its end."""
+        errors = self._ray.exceptions
+        try:
+            return future.result()
+        except errors.OutOfMemoryError:
+            return Report("memory", "ended by Ray: its machine ran out of memory")
+        except errors.WorkerCrashedError:  # as after the kernel's own choice when memory runs out
+            return Report("memory", "its process ended unexpectedly (killed, or out of memory)")
+        except errors.NodeDiedError:
+            return Report("failed", "its machine was lost")
+        except errors.RayError as error:
+            words = (str(error).strip().splitlines() or [""])[-1]
+            return Report("failed", f"{type(error).__name__}: {words}")
+
+    def _largest(self) -> list[dict[str, float]]:
+        """What each machine has, as of a few seconds ago. TumortrackError: the cluster is gone."""
+        if time.monotonic() - self._looked_s > _LOOK_S and self._look_for_head():
+            nodes = self._ray.nodes()
+            self._machines = [one["Resources"] for one in nodes if one["Alive"]] or [{}]
+            self._looked_s = time.monotonic()
+        return self._machines
+
+
+def _leave() -> None:
+    """End this process at once, before Ray's own end."""
+    sys.stdout.flush()
+    os._exit(TumortrackError.exit_code)
+
+
+def _own_folder() -> Path:
+    """For the sockets and logs of a Ray of our own; those of processes that were killed go."""
+    place = Path(tempfile.gettempdir())
+    for old in place.glob("tumortrack-ray-*-*"):
+        with suppress(OSError, ValueError):
+            if old.stat().st_uid == os.getuid() and not is_running(int(old.name.split("-")[2])):
+                shutil.rmtree(old, ignore_errors=True)
+    return Path(tempfile.mkdtemp(prefix=f"tumortrack-ray-{os.getpid()}-", dir=place))

@@ -1,0 +1,310 @@
+"""Where a fleet's results lie: folders by key, in a plain folder or in any of fsspec's storages.
+
+    KK/KEY/files/...      what a task wrote (KK: the first two letters of its key)
+    KK/KEY/manifest.json  their sha256, written last: without it there is no result; or, of a task
+                          that can't be done, why
+    costs/KK/KEY.json     what it cost: apart, since results are equal bit for bit and costs are not
+    claims/KEY.json       who is doing it: a hint alone, that two runs don't do the same
+
+In a plain folder a result is moved into place in one step, and used where it lies; from elsewhere
+it is fetched into a cache on this machine. Storage must replace a single file in one step, as S3,
+Google's and Azure's do.
+"""
+
+from __future__ import annotations
+
+import errno
+import hashlib
+import json
+import os
+import shutil
+import socket
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from tumortrack.core.errors import InputError
+from tumortrack.core.store import MANIFEST, sha256_of
+from tumortrack_lab.fleet.task import File
+
+_ASIDE = "aside"  # what is being written, and what killed processes left there
+_CLAIMED_S = 60.0  # a claim that was not renewed for so long is void
+_KEPT_S = 24 * 3600  # what was cached or left aside, and nobody asked for for so long, is removed
+
+
+class DamagedError(Exception):
+    """What lies under ``key`` is not what was put there."""
+
+    def __init__(self, key: str, what: str) -> None:
+        super().__init__(key, what)
+        self.key, self.what = key, what
+
+    def __str__(self) -> str:
+        return f"the result {self.key[:12]} in the store is damaged: {self.what}"
+
+
+class Store:
+    """Results by key. ``url``: a folder, or what fsspec understands (``s3://bucket/folder``), with
+    whatever credentials its storage finds by itself.
+
+    Raises InputError: an unknown storage, or one whose package is missing. All methods raise
+    OSError where the storage does.
+    """
+
+    def __init__(self, url: str, cache: Path | None = None) -> None:
+        import fsspec
+
+        try:
+            self._files, self.root = fsspec.core.url_to_fs(url, use_listings_cache=False)
+        except (ImportError, ValueError) as error:
+            raise InputError(f"the store {url} cannot be opened: {error}") from error
+        self.url = self.root if self.is_local else url
+        self._cache = cache
+
+    @property
+    def is_local(self) -> bool:
+        protocol = self._files.protocol
+        return "file" in ((protocol,) if isinstance(protocol, str) else protocol)
+
+    def open(self) -> None:
+        """Make sure that it can be written, and clear what was left aside long ago. InputError: it
+        can't be used."""
+        try:
+            if self.is_local:
+                _clear_old(Path(self.root) / _ASIDE)
+            self._files.pipe_file(
+                f"{self.root}/store.txt", b"Results of tumortrack fleet, by key.\n"
+            )
+        except OSError as error:
+            raise InputError(f"the store {self.url} cannot be written: {error}") from error
+
+    def has(self, key: str) -> bool:
+        """Whether a whole result lies there, of a task that could be done."""
+        return self.found(key) == (True, None)
+
+    def found(self, key: str) -> tuple[bool, str | None]:
+        """Whether something lies there; and if the task can't be done, why."""
+        manifest = self._manifest(key)
+        return bool(manifest), manifest.get("failure")
+
+    def get(self, key: str) -> Path:
+        """A folder on this machine with the result, not to be altered; every file's sha256 is
+        checked. DamagedError: it is not whole, or not there any more."""
+        files = self._manifest(key).get("files")
+        if files is None:
+            raise DamagedError(key, "it has no manifest")
+        place = f"{self._place(key)}/files"
+        if self.is_local:
+            _check(Path(place), key, files)
+            return Path(place)
+        folder = self._kept / key
+        try:
+            _check(folder, key, files)
+        except DamagedError:  # not fetched yet, or altered
+            shutil.rmtree(folder, ignore_errors=True)
+            with _aside(self._kept, folder) as aside:
+                for name in files:
+                    (aside / name).parent.mkdir(parents=True, exist_ok=True)
+                    try:
+                        self._files.get_file(f"{place}/{name}", str(aside / name))
+                    except FileNotFoundError as error:
+                        raise DamagedError(key, f"it lacks {name}") from error
+                _check(aside, key, files)
+        os.utime(folder)
+        return folder
+
+    def put(self, key: str, folder: Path) -> None:
+        """Keep what lies in ``folder``; nothing, where ``key`` is there already."""
+        if self.has(key):
+            return
+        paths = sorted(path for path in folder.rglob("*") if path.is_file())
+        names = [path.relative_to(folder).as_posix() for path in paths]
+        self._commit(key, folder, {name: sha256_of(folder / name) for name in names}, None)
+
+    def put_failure(self, key: str, reason: str) -> None:
+        """Keep that this task can't be done."""
+        self._commit(key, Path(), {}, reason)
+
+    def remove(self, key: str) -> None:
+        """Take a result away, its manifest first."""
+        place = self._place(key)
+        if self._files.exists(f"{place}/{MANIFEST}"):
+            self._files.rm_file(f"{place}/{MANIFEST}")
+        if self._files.exists(place):
+            self._files.rm(place, recursive=True)
+        if not self.is_local:
+            shutil.rmtree(self._kept / key, ignore_errors=True)
+
+    def claim(self, key: str, run: str) -> bool:
+        """Say, again and again, that ``run`` is doing this; False: another run is, or was a minute
+        ago. Two that ask in the same moment may both hear True: then both do it, to the same
+        bits."""
+        now, here = time.time(), socket.gethostname()
+        try:
+            found = json.loads(self._files.cat_file(self._claim(key)))
+            gone = found["host"] == here and not is_running(found["process"])
+            if found["run"] != run and abs(now - found["time"]) < _CLAIMED_S and not gone:
+                return False
+        except (FileNotFoundError, ValueError):
+            pass
+        mine = {"run": run, "host": here, "process": os.getpid(), "time": now}
+        self._pipe(self._claim(key), json.dumps(mine).encode())
+        return True
+
+    def release(self, key: str) -> None:
+        """Nobody is doing it any more."""
+        with suppress(FileNotFoundError):
+            self._files.rm_file(self._claim(key))
+
+    def cost(self, key: str) -> dict[str, Any]:
+        """What a task cost, as the engine wrote it; empty: unknown."""
+        try:
+            found: dict[str, Any] = json.loads(self._files.cat_file(self._cost(key)))
+        except (FileNotFoundError, ValueError):
+            return {}
+        return found
+
+    def put_cost(self, key: str, cost: dict[str, Any]) -> None:
+        self._pipe(self._cost(key), json.dumps(cost, indent=1).encode())
+
+    def user_file(self, file: File) -> Path:
+        """A user's file on this machine; of a URL, a copy. InputError: it is another by now."""
+        path = Path(file.path)
+        if "://" in file.path:
+            import fsspec
+
+            path = self._kept / file.sha256
+            if not path.exists():
+                files, source = fsspec.core.url_to_fs(file.path)
+                with _aside(self._kept, path, is_file=True) as aside:
+                    files.get_file(source, str(aside))
+        if not path.exists():
+            raise FileNotFoundError(f"{file.path} is not there (on this machine)")
+        if sha256_of(path) != file.sha256:
+            raise InputError(f"{file.path} was changed after the list was read; start again.")
+        return path
+
+    def _commit(self, key: str, folder: Path, files: dict[str, str], failure: str | None) -> None:
+        """The files, then the manifest; or all at once, by renaming a folder."""
+        manifest = {"key": key, "failure": failure, "files": files}
+        text = (json.dumps(manifest, indent=1) + "\n").encode()
+        place = self._place(key)
+        if not self.is_local:
+            for name in files:
+                self._files.put_file(str(folder / name), f"{place}/files/{name}")
+            self._files.pipe_file(f"{place}/{MANIFEST}", text)
+            return
+        with _aside(Path(self.root), Path(place)) as aside:
+            (aside / "files").mkdir()
+            for name in files:
+                (aside / "files" / name).parent.mkdir(parents=True, exist_ok=True)
+                shutil.copyfile(folder / name, aside / "files" / name)
+                _flush(aside / "files" / name)
+            (aside / MANIFEST).write_bytes(text)
+            _flush(aside / MANIFEST)
+            if Path(place).exists() and not self.has(key):  # a failure, tried again; or not whole
+                shutil.rmtree(place)
+
+    def _manifest(self, key: str) -> dict[str, Any]:
+        """Empty: there is none that can be read."""
+        try:
+            found = json.loads(self._files.cat_file(f"{self._place(key)}/{MANIFEST}"))
+        except (FileNotFoundError, NotADirectoryError, ValueError):
+            return {}
+        if not isinstance(found, dict) or not isinstance(found.get("files"), dict):
+            return {}
+        inside = all(".." not in name.split("/") and name[:1] != "/" for name in found["files"])
+        return found if found.get("key") == key and inside else {}
+
+    def _pipe(self, path: str, content: bytes) -> None:
+        """Write a small file in one step."""
+        if not self.is_local:
+            self._files.pipe_file(path, content)
+            return
+        with _aside(Path(self.root), Path(path), is_file=True) as aside:
+            aside.write_bytes(content)
+
+    def _claim(self, key: str) -> str:
+        return f"{self.root}/claims/{key}.json"
+
+    def _place(self, key: str) -> str:
+        return f"{self.root}/{key[:2]}/{key}"
+
+    def _cost(self, key: str) -> str:
+        return f"{self.root}/costs/{key[:2]}/{key}.json"
+
+    @cached_property
+    def _kept(self) -> Path:
+        """This machine's cache of this store, freed of what is old."""
+        if self._cache is not None:
+            kept = self._cache
+        else:
+            name = hashlib.sha256(self.url.encode()).hexdigest()[:12]
+            kept = scratch() / name
+        for folder in (kept, kept / _ASIDE):
+            _clear_old(folder)
+        return kept
+
+
+def is_running(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:  # another user's
+        pass
+    return True
+
+
+@contextmanager
+def _aside(root: Path, place: Path, is_file: bool = False) -> Iterator[Path]:
+    """A new folder (or the path of a file) on the same disk, which is then moved to ``place`` in
+    one step; if somebody else has put the same there meanwhile, theirs stays."""
+    (root / _ASIDE).mkdir(parents=True, exist_ok=True)
+    outer = Path(tempfile.mkdtemp(dir=root / _ASIDE))
+    inner = outer / place.name
+    try:
+        if not is_file:
+            inner.mkdir()
+        yield inner
+        place.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            os.replace(inner, place)
+        except OSError as error:
+            if error.errno not in (errno.ENOTEMPTY, errno.EEXIST):
+                raise
+    finally:
+        shutil.rmtree(outer, ignore_errors=True)
+
+
+def scratch() -> Path:
+    """A folder on this machine for what is only passing through, freed of what is old."""
+    folder = Path(tempfile.gettempdir()) / f"tumortrack-fleet-{os.getuid()}"
+    _clear_old(folder)
+    return folder
+
+
+def _clear_old(folder: Path) -> None:
+    """Make the folder, or remove from it what nobody has touched for a day."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for old in folder.iterdir():
+        if old.name != _ASIDE and time.time() - old.stat().st_mtime > _KEPT_S:
+            shutil.rmtree(old, ignore_errors=True) if old.is_dir() else old.unlink()
+
+
+def _check(folder: Path, key: str, files: dict[str, str]) -> None:
+    """DamagedError unless all files are there with these sha256."""
+    for name, digest in files.items():
+        if not (folder / name).is_file():
+            raise DamagedError(key, f"it lacks {name}")
+        if sha256_of(folder / name) != digest:
+            raise DamagedError(key, f"{name} was changed (sha256 differs)")
+
+
+def _flush(path: Path) -> None:
+    with path.open("rb") as stream:
+        os.fsync(stream.fileno())

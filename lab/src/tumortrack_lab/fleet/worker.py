@@ -1,0 +1,203 @@
+"""What is done where a task runs: its inputs fetched, its work called, its result put into the
+store. The same for every engine."""
+
+from __future__ import annotations
+
+import os
+import resource
+import socket
+import sys
+import tempfile
+import threading
+import time
+import traceback
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
+from pkgutil import resolve_name
+from typing import Any, Literal
+
+import tumortrack
+from tumortrack.core.errors import InputError, StorageError, TumortrackError
+from tumortrack_lab.fleet.store import DamagedError, Store, scratch
+from tumortrack_lab.fleet.task import File, Needs, Task, Work
+
+_RENEWED_S = 15.0  # between renewals of a claim
+
+
+@dataclass(frozen=True)
+class Job:
+    """A task as it travels: names and keys, no data. ``reasons``: why earlier attempts failed."""
+
+    key: str
+    name: str
+    work: str
+    options: Mapping[str, Any]
+    inputs: Mapping[str, str | File]  # keys of results in the store; users' files
+    needs: Needs
+    store: str
+    run: str  # its name, for claims
+    reasons: tuple[str, ...] = ()
+    tumortrack: str = tumortrack.__version__
+
+
+@dataclass(frozen=True)
+class Report:
+    """What became of an attempt.
+
+    elsewhere: another run is doing it now. there, done: the result lies in the store, before and
+    now. cannot: it never can be done, which the store says from now on. changed: a user's file is
+    another by now. The others may do better in another attempt: damaged (the result ``damaged``
+    must be made again first), memory (there was too little), failed (anything else of the machine,
+    or a defect of ours).
+    """
+
+    state: Literal["elsewhere", "there", "done", "cannot", "changed", "damaged", "memory", "failed"]
+    reason: str = ""
+    damaged: str = ""
+    cost: Mapping[str, Any] = field(default_factory=dict)
+
+
+def job_of(task: Task, needs: Needs, store: str, run: str, reasons: tuple[str, ...]) -> Job:
+    """Raises TypeError: the work cannot be imported by its name."""
+    name = f"{task.work.__module__}:{task.work.__qualname__}"  # type: ignore[attr-defined]
+    if resolve_name(name) is not task.work or name.startswith("__main__"):
+        raise TypeError(f"{name} is another object than the work of {task.step}")
+    inputs = {name: one if isinstance(one, File) else one.key for name, one in task.inputs.items()}
+    who = f"{task.patient} {task.step}"
+    return Job(task.key, who, name, dict(task.options), inputs, needs, store, run, reasons)
+
+
+def perform(job: Job) -> Report:
+    """Do a task, unless somebody has done it meanwhile. Never raises what another attempt could
+    mend: the report says it."""
+    if job.tumortrack != tumortrack.__version__:
+        words = f"{socket.gethostname()} has tumortrack {tumortrack.__version__}"
+        return Report("failed", f"{words}, the command {job.tumortrack}: install the same")
+    try:
+        store = _store(job.store)
+        if not store.claim(job.key, job.run):
+            return Report("elsewhere")
+        aside = tempfile.TemporaryDirectory(dir=scratch(), ignore_cleanup_errors=True)
+        with _claimed(job, store), aside as folder:
+            there, failure = store.found(job.key)
+            if there:
+                return Report("there") if failure is None else Report("cannot", failure)
+            inputs = {
+                name: store.user_file(one) if isinstance(one, File) else store.get(one)
+                for name, one in job.inputs.items()
+            }
+            return _measured(job, store, inputs, Path(folder))
+    except DamagedError as error:
+        return Report("damaged", str(error), error.key)
+    except InputError as error:
+        return Report("changed", str(error))
+    except (Exception, SystemExit) as error:
+        return _attempt_failed(error)
+
+
+@contextmanager
+def _claimed(job: Job, store: Store) -> Iterator[None]:
+    """Renews the claim now and then, and gives it up in the end."""
+    over = threading.Event()
+
+    def renew() -> None:
+        while not over.wait(_RENEWED_S):
+            with suppress(OSError):
+                store.claim(job.key, job.run)
+
+    thread = threading.Thread(target=renew, name="claim", daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        thread.join()
+        with suppress(OSError):
+            store.release(job.key)
+
+
+def _measured(job: Job, store: Store, inputs: Mapping[str, Path], out: Path) -> Report:
+    """Do the work and put away what came of it, with what it cost."""
+    meter = _Meter()
+    work: Work = resolve_name(job.work)
+    _set_threads(job.needs.cores)
+    try:
+        work(inputs, job.options, out, job.needs.cores)
+    except StorageError as error:  # the disk's, not the patient's
+        return _attempt_failed(error)
+    except TumortrackError as error:
+        reason = f"{type(error).__name__}: {error}"
+        for name, path in (*inputs.items(), ("OUT", out)):
+            reason = reason.replace(str(path), name)  # says the same wherever it is found
+        store.put_failure(job.key, reason)
+        report = Report("cannot", reason, cost=meter.cost(job, out))
+    else:
+        store.put(job.key, out)
+        report = Report("done", cost=meter.cost(job, out))
+    store.put_cost(job.key, dict(report.cost))
+    return report
+
+
+def _attempt_failed(error: BaseException) -> Report:
+    words = f"{type(error).__name__}: {error}"
+    if isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError":
+        return Report("memory", words)
+    if not isinstance(error, OSError | TumortrackError):  # a defect, perhaps: where
+        last = traceback.extract_tb(error.__traceback__)[-1]
+        words += f" ({Path(last.filename).name}, line {last.lineno})"
+    return Report("failed", words)
+
+
+@cache
+def _store(url: str) -> Store:
+    return Store(url)
+
+
+def _set_threads(cores: int) -> None:
+    """For libraries that are loaded, and for those that the work loads or starts."""
+    os.environ["OMP_NUM_THREADS"] = str(cores)
+    if "torch" in sys.modules:
+        sys.modules["torch"].set_num_threads(cores)
+    if "numba" in sys.modules:
+        numba = sys.modules["numba"]
+        numba.set_num_threads(min(cores, numba.config.NUMBA_NUM_THREADS))
+
+
+class _Meter:
+    """What passes between its making and ``cost``."""
+
+    def __init__(self) -> None:
+        with suppress(OSError):  # Linux: the peak is this task's, not of those before it
+            Path("/proc/self/clear_refs").write_text("5")
+        self._start_s, self._start_cpu_s = time.monotonic(), _cpu_s()
+
+    def cost(self, job: Job, out: Path) -> dict[str, Any]:
+        """Seconds, seconds of all cores, megabytes of memory at most, bytes of the result."""
+        return {
+            "task": job.name,
+            "seconds": round(time.monotonic() - self._start_s, 3),
+            "cpu_s": round(_cpu_s() - self._start_cpu_s, 3),
+            "peak_mb": round(_peak_mb(), 1),
+            "bytes": sum(path.stat().st_size for path in out.rglob("*") if path.is_file()),
+            "cores": job.needs.cores,
+            "host": socket.gethostname(),
+            "attempts": [*job.reasons, ""],
+        }
+
+
+def _cpu_s() -> float:
+    times = os.times()
+    return times.user + times.system + times.children_user + times.children_system
+
+
+def _peak_mb() -> float:
+    """The larger of this process's peak and its largest child's."""
+    child = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1024
+    with suppress(OSError):
+        for line in Path("/proc/self/status").read_text().splitlines():
+            if line.startswith("VmHWM:"):
+                return max(child, int(line.split()[1]) / 1024)
+    return max(child, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)
