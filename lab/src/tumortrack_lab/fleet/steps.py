@@ -79,7 +79,9 @@ def prepare(inputs: Inputs, options: Given, out: Path, cores: int) -> None:
     from tumortrack.imaging.case import save_case
     from tumortrack.report.pictures import qc_picture
 
-    given = {key: tuple(v) if isinstance(v, list) else v for key, v in options.items()}
+    given: dict[str, Any] = {
+        key: tuple(value) if isinstance(value, list) else value for key, value in options.items()
+    }
     given.pop("suffix")
     case = preparing.prepare(inputs["source"], preparing.PrepareOptions(**given))
     case = replace(case, report={**case.report, "source": "input"})
