@@ -25,29 +25,15 @@ SCENES, PATIENTS, LOOK, PAGE, PICTURES = (
 )  # fmt: skip
 FAR_MM = (3.0, 5.0)  # an answer called good with a tumor's middle farther off is named
 _MOST_WITHOUT = 0.5  # share of the scenes without a good answer
-_WORDS = {
-    "patient": "patient", "state": "state", "step": "step", "reason": "reason", "doubts": "doubts",
-    "side": "side", "input": "input", "kind": "kind", "position": "position",
-    "margin_reason": "margin_reason",
-}  # fmt: skip
-_NUMBERS = (
-    "organ_ml", "slice_mm", "spacing_x_mm", "spacing_y_mm", "spacing_z_mm", "half_turn_mm",
-    "tumors", "tumor_ml", "longest_mm", "depth_mm", "outer_share", "steps", "validation_tre_mm",
-    "validation_far", "scenes", "lost", "good", "poor", "refused", "middle_mm", "middle_95_mm",
-    "middle_worst_mm", "hausdorff_mm", "target_mm", "rigid_middle_mm", "rigid_hausdorff_mm",
-    "over_3_mm", "over_5_mm", "margin_states", "margin_answers", "largest_miss_mm", "holds_for",
-    "within_largest", "margin_90_mm", "margin_95_mm",
-)  # fmt: skip
 _ERRORS = ("middle_mm", "hausdorff_mm", "surface_mm", "outside_mm")
+_FIRST = ("patient", "state", "step", "reason", "doubts")
 _SCENE = (
-    *("patient", "tumor", "scene", "state", "family", "view", "segmentation"),
-    *("verdict", "reason", "hidden_share", "visible_share", *_ERRORS),
+    *("patient", "tumor", "scene", "family", "view", "verdict", "reason", *_ERRORS),
     *(f"rigid_{name}" for name in _ERRORS),
-    *("shape_middle_mm", "std_mm", "target_mm", "rigid_target_mm", "over_3_mm", "over_5_mm"),
+    *("std_mm", "target_mm", "rigid_target_mm", "over_3_mm", "over_5_mm"),
 )
-_TEXTS = ("patient", "tumor", "scene", "family", "segmentation", "verdict", "reason")
 _COLUMNS = {
-    "patient": "patient", "state": "", "kind": "tumor", "position": "at", "tumor_ml": "ml",
+    "patient": "patient", "state": "", "kind": "tumor", "position": "at", "ml": "ml",
     "organ_ml": "organ ml", "good": "good", "poor": "poor", "refused": "refused",
     "middle_mm": "centre mm", "rigid_middle_mm": "best rigid mm", "middle_worst_mm": "worst mm",
     "largest_miss_mm": "largest miss mm", "holds_for": "holds for", "margin_95_mm": "95 % margin",
@@ -70,17 +56,14 @@ def write_results(
     for patient in patients:
         outcome = outcomes.get(patient.name)
         row, mine = _read(patient.name, outcome, held)
-        why = reasons_to_look(row)
         if outcome is not None:
             _pictures(patient.name, outcome, held, out / PICTURES)
         rows.append(row)
         scenes += mine
-        looks += [{"patient": patient.name, "reason": one} for one in why]
-    people = pd.DataFrame(rows).reindex(columns=[*_WORDS, *_NUMBERS])
-    people = people.astype(dict.fromkeys(_NUMBERS, "float64") | dict.fromkeys(_WORDS, "string"))
-    lines = pd.DataFrame(scenes).reindex(columns=[*_SCENE])
-    lines = lines.astype({name: "string" if name in _TEXTS else "float64" for name in _SCENE})
-    for name, table in {PATIENTS: people, SCENES: lines}.items():
+        looks += [{"patient": patient.name, "reason": why} for why in reasons_to_look(row)]
+    for name, lines, columns in ((PATIENTS, rows, _FIRST), (SCENES, scenes, _SCENE)):
+        table = pd.DataFrame(lines)
+        table = table.reindex(columns=[*dict.fromkeys((*columns, *table.columns))])
         write_atomically(out / name, table.to_parquet(index=False))
     named = pd.DataFrame(looks, columns=["patient", "reason"])
     write_atomically(out / LOOK, named.to_csv(index=False, lineterminator="\n").encode())
@@ -115,19 +98,20 @@ def _read(
         about = {"state": outcome.state, "step": outcome.step, "reason": outcome.reason}
         return {"patient": name, **about}, []
     content = store.read_json(held.get(outcome.task.key) / "summary.json")
-    lines = [{"patient": name, **line} for line in tumor_lines(content["rows"])]
+    lines = [{"patient": name, **line} for line in tumor_lines(content)]
     return {"patient": name, "state": "done", **patient_row(content, lines)}, lines
 
 
-def tumor_lines(rows: Sequence[Mapping[str, Any]]) -> Iterator[dict[str, Any]]:
-    """A line of each scene and tumor; ``over_3_mm`` and ``over_5_mm``: called good, and farther
-    off."""
-    for row in rows:
-        for number, tumor in enumerate(row["tumors"], start=1):
-            line = {**row, "tumor": f"tumor_{number}", **tumor}
-            good, off_mm = row["verdict"] == "good", tumor.get("middle_mm", 0.0)
-            line |= {f"over_{far:g}_mm": float(good and off_mm > far) for far in FAR_MM}
-            yield line
+def tumor_lines(content: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
+    """A line of each scene and tumor, with how the tumor lies; ``over_3_mm``, ``over_5_mm``: called
+    good, and its middle farther off."""
+    for row in content["rows"]:
+        about = {key: value for key, value in row.items() if key != "tumors"}
+        pairs = zip(content["check"]["tumors"], row["tumors"], strict=True)
+        for number, (lies, errors) in enumerate(pairs, start=1):
+            good, off_mm = row["verdict"] == "good", errors.get("middle_mm", 0.0)
+            over = {f"over_{far:g}_mm": good and off_mm > far for far in FAR_MM}
+            yield {**about, "tumor": f"tumor_{number}", **lies, **errors, **over}
 
 
 def patient_row(content: Mapping[str, Any], lines: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
@@ -140,14 +124,10 @@ def patient_row(content: Mapping[str, Any], lines: Sequence[Mapping[str, Any]]) 
     good = every[every.verdict == "good"]
     limit = margin["largest_miss_mm"]
     missed = good.groupby("scene").outside_mm.max()
-    axes = ("spacing_x_mm", "spacing_y_mm", "spacing_z_mm")
-    spacing = dict(zip(axes, check["spacing_mm"], strict=True))
     row = {
         "doubts": "\n".join(check["doubts"]), "side": check["side"], "input": check["kind"],
-        **{name: check[name] for name in ("organ_ml", "slice_mm", "half_turn_mm")}, **spacing,
-        **{name: largest[name] for name in ("kind", "position", "longest_mm", "depth_mm")},
-        "outer_share": largest["outer_share"], "tumors": len(check["tumors"]),
-        "tumor_ml": largest["ml"], **content["model"],
+        **{name: check[name] for name in ("organ_ml", "slice_mm", "spacing_mm", "half_turn_mm")},
+        **largest, "tumors": len(check["tumors"]), **content["model"],
         "scenes": len(rows), "lost": len(content["failures"]),
         "middle_95_mm": good.middle_mm.quantile(0.95), "middle_worst_mm": good.middle_mm.max(),
         "rigid_middle_mm": every.rigid_middle_mm.median(),
@@ -164,9 +144,8 @@ def patient_row(content: Mapping[str, Any], lines: Sequence[Mapping[str, Any]]) 
         row[name] = good[name].median()
     for far in FAR_MM:
         row[f"over_{far:g}_mm"] = int(good[f"over_{far:g}_mm"].sum())
-    for confidence in (0.9, 0.95):
-        mm = margin["margin_mm"].get(f"{confidence:g}")
-        row[f"margin_{100 * confidence:g}_mm"] = mm
+    for percent in (90, 95):
+        row[f"margin_{percent}_mm"] = margin["margin_mm"].get(f"{percent / 100:g}")
     return row
 
 
