@@ -15,7 +15,7 @@ import pandas as pd
 from tumortrack.core.errors import NoEstimate
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import Anatomy, DepthFrame, Mesh
-from tumortrack.report.metrics import surface_distances
+from tumortrack.report.metrics import outward_miss, surface_distances
 from tumortrack.sense.camera import d405
 from tumortrack.sense.cloud import CloudConfig, cloud_from_depth
 from tumortrack.sense.noise import D405_NOISE, add_noise
@@ -23,7 +23,7 @@ from tumortrack.sense.render import render_depth
 from tumortrack.simulate.deform import ChainConfig, DragConfig, StretchConfig
 from tumortrack.simulate.deform.base import Deformation
 from tumortrack.simulate.scene import PoseConfig, SceneConfig, sample_pose
-from tumortrack.simulate.scene_folder import Scene
+from tumortrack.simulate.scene_folder import Scene, Targets
 from tumortrack.tracking.tracker import Tracker
 from tumortrack_lab.peers.base import fit_over_volume
 
@@ -65,9 +65,11 @@ def judge(
 
     Returns:
         ``verdict`` (refused, poor, good), ``reason``, and ``tumors``: of each the error of its
-        middle and, with ``surfaces``, the Hausdorff distance, of the estimate and of the best rigid
-        pose; the middle's error were the estimate moved rigidly onto the truth (``shape_``), and
-        the deviation that is stated of it; mm. No tumors where the scene shows another organ.
+        middle and, with ``surfaces``, the Hausdorff and the mean surface distance and how far the
+        true one sticks out of the one found, of the estimate and of the best rigid pose; the
+        middle's error were the estimate moved rigidly onto the truth (``shape_``), and the
+        deviation that is stated of it; mm. No tumors where the scene shows another organ. Where it
+        has targets, ``target_mm`` and ``rigid_target_mm`` are their mean errors.
     """
     row: dict[str, Any] = {"tumors": [], "verdict": "refused", "reason": ""}
     motion = None
@@ -81,7 +83,11 @@ def judge(
     if scene.meta.get("model_organ") is False:
         return row
     pose = fit_over_volume(anatomy_ct.organ, scene.reference.organ)[0]
-    onto = np.eye(4)
+    onto, targets = np.eye(4), scene.targets
+    if targets is not None:
+        row["rigid_target_mm"] = _mean_off(transform_points(pose, targets.points_ct), targets)
+        if motion is not None:
+            row["target_mm"] = _mean_off(motion.carry(targets.points_ct), targets)
     if motion is not None:
         found = anatomy_ct.organ.moved(motion.carry(anatomy_ct.organ.vertices_mm))
         onto = fit_over_volume(found, scene.reference.organ)[0]
@@ -98,6 +104,10 @@ def judge(
     return row
 
 
+def _mean_off(found_mm: np.ndarray, targets: Targets) -> float:
+    return float(np.linalg.norm(found_mm - targets.points_mm, axis=1).mean())
+
+
 def _laid(mesh: Mesh, pose: np.ndarray) -> Mesh:
     return mesh.moved(transform_points(pose, mesh.vertices_mm))
 
@@ -106,8 +116,10 @@ def _errors(found: Mesh, true: Mesh, prefix: str, surfaces: bool) -> dict[str, f
     off_mm = found.vertices_mm.mean(0) - true.vertices_mm.mean(0)  # the same vertices
     errors = {f"{prefix}middle_mm": float(np.linalg.norm(off_mm))}
     if surfaces:
-        far_mm = surface_distances(found, true, spacing_mm=2.0).hausdorff_mm
-        errors[f"{prefix}hausdorff_mm"] = far_mm
+        far = surface_distances(found, true, spacing_mm=2.0)
+        errors[f"{prefix}hausdorff_mm"] = far.hausdorff_mm
+        errors[f"{prefix}surface_mm"] = far.surface_mm
+        errors[f"{prefix}outside_mm"] = outward_miss(found, true)
     return errors
 
 

@@ -84,8 +84,7 @@ class World:
         """``mesh``: the tetrahedra (bench frame) of a world that goes on: filling an organ is not
         reproducible."""
         to_bench = bench_from_ct(case.anatomy.organ, case.up_lps)
-        pairs = zip(case.anatomy.names, case.anatomy.parts, strict=True)
-        few = Anatomy(tuple(_simpler(part, name) for name, part in pairs))
+        few = simplified(case.anatomy)
         there, axes = moved(few, to_bench), case.labels.lps_from_index[:3, :3]
         spacing = np.linalg.norm(axes, axis=0)
         if mesh is None:
@@ -207,8 +206,13 @@ class World:
         return Scene(cloud, reference, view.frame, meta, known)
 
 
-def _simpler(part: Mesh, name: str) -> Mesh:
-    return mesh_of(solid_of(part, name).simplify(_FINE_MM).refine_to_length(_EDGE_MM))
+def simplified(anatomy_ct: Anatomy) -> Anatomy:
+    """The anatomy whose triangles a world's scenes have."""
+    pairs = zip(anatomy_ct.names, anatomy_ct.parts, strict=True)
+    solids = (solid_of(part, name) for name, part in pairs)
+    return Anatomy(
+        tuple(mesh_of(one.simplify(_FINE_MM).refine_to_length(_EDGE_MM)) for one in solids)
+    )
 
 
 def _replaced(

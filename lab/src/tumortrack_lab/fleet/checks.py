@@ -1,0 +1,109 @@
+"""A prepared case in numbers: what no model should be trained for, and what a person should see."""
+
+from __future__ import annotations
+
+import re
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tumortrack.core.geometry import transform_points, unit
+from tumortrack.core.patient import UNKNOWN
+from tumortrack.core.types import Mesh
+from tumortrack.imaging.case import Case
+from tumortrack.imaging.volume import read_raw
+from tumortrack.registration.rest_shape import long_axis_of
+from tumortrack.report.metrics import distance_to_surface
+from tumortrack_lab.real.kidneys import ORGAN_ML, TUMOR_ML, kind_of, outer_share
+
+_ORGAN_AT_ALL_ML = (30.0, 1500.0)
+_POLE = 1 / 3  # of the organ's length, at either end
+_SLICE_MM = 5.0
+# What `prepare` notes of most inputs; all else is for a person's eye.
+_USUAL = re.compile(
+    r"few distinct whole numbers|the patient's \w+ kidney was chosen: it bears most tumor"
+    r"|\d+ specks beside the kidneys dropped \(0\.|holes of 0\.|the kidney; table, blocks"
+    r"|only one kidney in the map|\S+ is (kidney|tumor_\d+)$|\S+ states SPACE=RAS"
+)
+
+
+def is_cut_off(case: Case, source: Path, series: str | None) -> bool:
+    """Whether organ or tumor reach the border of the volume that the case was made from."""
+    if case.report["kind"] == "meshes":
+        return False
+    raw = read_raw(source, series)
+    found = np.argwhere(case.labels.labels > 0)
+    corners = np.array(list(product(*zip(found.min(0), found.max(0), strict=True))), float)
+    index_from_index = np.linalg.inv(raw.lps_from_index) @ case.labels.lps_from_index
+    there = transform_points(index_from_index, corners)
+    last = np.array(raw.array.shape[:3]) - 1
+    return bool((there < 0.5).any() or (there > last - 0.5).any())
+
+
+def described(case: Case) -> dict[str, Any]:
+    """JSON types: side, volumes, spacing (the thickest is the slices'), and of each tumor volume,
+    longest extent, depth of its middle below the organ's outer surface, share of its surface within
+    2 mm of that, kind, and position along the organ."""
+    organ_ml, *tumors_ml = case.report["volumes_ml"].values()
+    spacing = case.report["spacing_mm"]
+    turns = case.report.get("half_turn", {}).get("turns", [])
+    organ, tumors = case.anatomy.organ, case.anatomy.tumors
+    return {
+        "side": case.patient.side,
+        "kind": case.report["kind"],
+        "organ_ml": round(organ_ml, 2),
+        "spacing_mm": [round(mm, 3) for mm in spacing],
+        "slice_mm": round(max(spacing), 3),
+        "half_turn_mm": round(min((one["mean_mm"] for one in turns), default=0.0), 2),
+        "tumors": [
+            {"ml": round(ml, 3), **_placed(tumor, organ)}
+            for ml, tumor in zip(tumors_ml, tumors, strict=True)
+        ],
+    }
+
+
+def _placed(tumor: Mesh, organ: Mesh) -> dict[str, Any]:
+    middle = tumor.vertices_mm.mean(0)
+    axis = unit(long_axis_of(organ))
+    axis = axis * (1 if axis[2] >= 0 else -1)  # up, in LPS
+    along = organ.vertices_mm @ axis
+    share = float((middle @ axis - along.min()) / np.ptp(along))
+    position = "lower pole" if share < _POLE else "upper pole" if share > 1 - _POLE else "middle"
+    outer = outer_share(tumor, organ)
+    return {
+        "longest_mm": round(float(tumor.longest_mm), 2),
+        "depth_mm": round(float(distance_to_surface(middle[None], organ)[0]), 2),
+        "outer_share": round(outer, 3),
+        "kind": kind_of(outer),
+        "position": position,
+    }
+
+
+def failures(found: dict[str, Any], cut_off: bool) -> list[str]:
+    """What no model should be trained for."""
+    low, high = _ORGAN_AT_ALL_ML
+    reasons = {
+        "organ or tumor reach the border of the volume: they are cut off": cut_off,
+        f"the organ has {found['organ_ml']:.0f} ml, no {low:g} to {high:g}": not (
+            low <= found["organ_ml"] <= high
+        ),
+        "there is no tumor": not found["tumors"],
+    }
+    return [words for words, failed in reasons.items() if failed]
+
+
+def doubts(case: Case, found: dict[str, Any]) -> list[str]:
+    """What a person should look at."""
+    largest = max(one["ml"] for one in found["tumors"])
+    reasons = {
+        "the side is unknown": found["side"] == UNKNOWN,
+        f"the organ has {found['organ_ml']:.0f} ml": not (
+            ORGAN_ML[0] <= found["organ_ml"] <= ORGAN_ML[1]
+        ),
+        f"the largest tumor has {largest:.1f} ml": not TUMOR_ML[0] <= largest <= TUMOR_ML[1],
+        f"slices of {found['slice_mm']:g} mm": found["slice_mm"] > _SLICE_MM,
+    }
+    notes = [note for note in case.report["notes"] if not _USUAL.search(note)]
+    return [words for words, doubted in reasons.items() if doubted] + notes

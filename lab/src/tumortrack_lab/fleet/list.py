@@ -1,0 +1,156 @@
+"""LIST: a CSV table of patients, a row each: a name, an input, and options where they differ from
+the defaults."""
+
+from __future__ import annotations
+
+import csv
+import io
+import re
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from tumortrack.core import store
+from tumortrack.core.errors import InputError
+from tumortrack.core.geometry import direction_lps
+from tumortrack.imaging.prepare import PrepareOptions
+from tumortrack_lab.fleet.task import File
+
+_LARGEST = 64 * 2**20  # bytes
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
+MISSING = "missing"  # instead of a sha256: no file has it
+
+
+def _at_least(least: int) -> Callable[[str], int]:
+    def parse(cell: str) -> int:
+        value = int(cell)
+        if value < least:
+            raise ValueError(f"must be at least {least}")
+        return value
+
+    return parse
+
+
+def _window(cell: str) -> tuple[float, float]:
+    low, high = map(float, cell.split())
+    return low, high
+
+
+def _up(cell: str) -> str:
+    direction_lps(cell)
+    return cell
+
+
+# Options of `prepare`, as there; then of all that follows.
+_OF_PREPARE: dict[str, Callable[[str], Any]] = {
+    "side": str, "up": _up, "patient": str, "organ": int, "tumor": int, "series": str,
+    "unit": str, "min_tumor_ml": float, "kidney_hu": _window, "tumor_hu": _window,
+}  # fmt: skip
+_OF_CHAIN: dict[str, Callable[[str], Any]] = {
+    "steps": _at_least(0), "seed": _at_least(0), "margin_states": _at_least(1),
+    "test_states": _at_least(1), "views": _at_least(1),
+}  # fmt: skip
+COLUMNS = ("name", "input", *_OF_PREPARE, "start", *_OF_CHAIN)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Patient:
+    """A row of a list.
+
+    Attributes:
+        source: what `prepare` takes.
+        prepare: its options.
+        start: folder that `pretrain` wrote; None: the default.
+        steps: of training.
+        seed: of training and states.
+        margin_states: states of the twin that margins are found with.
+        test_states: others, on which the model is evaluated.
+        views: of each of these.
+    """
+
+    name: str
+    source: Path
+    prepare: dict[str, Any] = field(default_factory=dict)
+    start: Path | None = None
+    steps: int = 300
+    seed: int = 0
+    margin_states: int = 14
+    test_states: int = 14
+    views: int = 2
+
+
+def read_list(path: Path) -> list[Patient]:
+    """The patients of a list; paths are relative to it. Whether the inputs exist is not asked here.
+
+    Raises:
+        InputError: no such file, or rows that cannot be used: all of them, with their lines.
+    """
+    try:
+        text = store.read_file(path, _LARGEST, "Split the list.").decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path} is no text in UTF-8: {error}.") from error
+    reader = csv.reader(io.StringIO(text, newline=""), strict=True)
+    patients: dict[str, Patient] = {}
+    try:
+        head = [cell.strip() for cell in next(reader, [])]
+        wrong = _wrong_head(head)
+        for row in reader if not wrong else ():
+            cells = [cell.strip() for cell in row]
+            if not any(cells):
+                continue
+            try:
+                one = _patient(head, cells, path.parent)
+                if one.name in patients:
+                    raise InputError(f"{one.name} has a row already")
+                patients[one.name] = one
+            except InputError as error:
+                wrong.append(f"line {reader.line_num}: {str(error).rstrip('.')}")
+    except csv.Error as error:
+        raise InputError(f"{path} is no CSV table: line {reader.line_num}: {error}.") from error
+    if wrong:
+        raise InputError(f"{path} cannot be used:\n  " + "\n  ".join(wrong))
+    if not patients:
+        raise InputError(f"{path} lists no patients; give a row each under name,input.")
+    return list(patients.values())
+
+
+def _wrong_head(head: list[str]) -> list[str]:
+    wrong = [f"line 1: the column {name} is missing" for name in COLUMNS[:2] if name not in head]
+    for name in dict.fromkeys(head):
+        if name not in COLUMNS:
+            wrong.append(f"line 1: there is no option {name!r}; allowed: {', '.join(COLUMNS)}")
+        elif head.count(name) > 1:
+            wrong.append(f"line 1: the column {name} stands there twice")
+    return wrong
+
+
+def _patient(head: list[str], cells: list[str], folder: Path) -> Patient:
+    """Raises InputError: a cell that is not allowed."""
+    if len(cells) != len(head):
+        raise InputError(f"{len(cells)} cells under {len(head)} columns")
+    given = {name: cell for name, cell in zip(head, cells, strict=True) if cell}
+    name, source = given.pop("name", ""), given.pop("input", "")
+    if not _NAME.fullmatch(name):
+        raise InputError(f"the name {name!r} is not allowed: letters, digits, . _ - (64 at most)")
+    if not source:
+        raise InputError(f"{name} has no input")
+    parsed: dict[str, Any] = {}
+    for column, cell in given.items():
+        parse = {**_OF_PREPARE, **_OF_CHAIN, "start": folder.joinpath}[column]
+        try:
+            parsed[column] = parse(cell)
+        except ValueError as error:
+            raise InputError(f"{column} {cell!r} is not allowed: {error}") from error
+    prepare = {key: parsed.pop(key) for key in _OF_PREPARE if key in parsed}
+    PrepareOptions(**prepare)
+    return Patient(name=name, source=folder / source, prepare=prepare, **parsed)
+
+
+def hashed(path: Path) -> File:
+    """A user's file or folder with its content's sha256, computed each time (a folder of CT slices
+    takes a second or so); where it cannot be read, with none that any content has."""
+    try:
+        return File(str(path.absolute()), store.sha256_of(path))
+    except OSError:
+        return File(str(path.absolute()), MISSING)

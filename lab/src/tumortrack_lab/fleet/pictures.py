@@ -1,0 +1,49 @@
+"""Small pictures for the page of a fleet."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+
+_WIDTH = 720  # pixels
+
+
+def thumbnail(source: Path, out: Path) -> None:
+    """A picture, no wider than ``_WIDTH``, as WebP."""
+    from PIL import Image
+
+    with Image.open(source) as image:
+        size = min(_WIDTH, image.width), round(image.height * min(1, _WIDTH / image.width))
+        image.convert("RGB").resize(size).save(out, "WEBP", quality=80)
+
+
+def worst_picture(
+    model: Path, groups: Sequence[Path], rows: Sequence[dict[str, Any]], out: Path
+) -> None:
+    """The answer that is farthest off, good ones first, over the truth; without any answer the
+    first scene's truth. Nothing is drawn where there is no scene."""
+    from tumortrack.report.pictures import scene_picture
+    from tumortrack.report.protocol import evaluate_scene
+    from tumortrack.simulate.scene_folder import read_scene
+    from tumortrack.tracking.tracker import Tracker
+    from tumortrack.training.model import load_model
+
+    def far(row: dict[str, Any]) -> tuple[int, float]:
+        errors = [tumor.get("middle_mm", -np.inf) for tumor in row["tumors"]]
+        return ["refused", "poor", "good"].index(row["verdict"]), max(errors, default=-np.inf)
+
+    if not rows:
+        return
+    name = max(rows, key=far)["scene"]
+    [folder] = [group / name for group in groups if (group / name).is_dir()]
+    scene, tracker = read_scene(folder), Tracker(load_model(model, "cpu"))
+    entry, estimate = evaluate_scene(
+        lambda cloud: tracker.locate(cloud, seen=scene.depth), scene, name
+    )
+    with TemporaryDirectory() as aside:
+        scene_picture(scene, estimate, entry, Path(aside) / "scene.png")
+        thumbnail(Path(aside) / "scene.png", out)

@@ -1,0 +1,202 @@
+"""What came of a fleet: tables of patients and scenes, whom a person should look at, and a page."""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pandas as pd
+
+from tumortrack.core import store
+from tumortrack.core.store import write_atomically, writing
+from tumortrack_lab.fleet.pictures import thumbnail
+from tumortrack_lab.fleet.store import DamagedError
+
+if TYPE_CHECKING:
+    from tumortrack_lab.fleet.engine import Outcome
+    from tumortrack_lab.fleet.list import Patient
+    from tumortrack_lab.fleet.store import Store
+
+SCENES, PATIENTS, LOOK, PAGE, PICTURES = (
+    "scenes.parquet", "patients.parquet", "look.csv", "index.html", "pictures"
+)  # fmt: skip
+FAR_MM = (3.0, 5.0)  # an answer called good with a tumor's middle farther off is named
+_MOST_WITHOUT = 0.5  # share of the scenes without a good answer
+_ERRORS = ("middle_mm", "hausdorff_mm", "surface_mm", "outside_mm")
+_FIRST = ("patient", "state", "step", "reason", "doubts")
+_SCENE = (
+    *("patient", "tumor", "scene", "family", "view", "verdict", "reason", *_ERRORS),
+    *(f"rigid_{name}" for name in _ERRORS),
+    *("std_mm", "target_mm", "rigid_target_mm", "over_3_mm", "over_5_mm"),
+)
+_COLUMNS = {
+    "patient": "patient", "state": "", "kind": "tumor", "position": "at", "ml": "ml",
+    "organ_ml": "organ ml", "good": "good", "poor": "poor", "refused": "refused",
+    "middle_mm": "centre mm", "rigid_middle_mm": "best rigid mm", "middle_worst_mm": "worst mm",
+    "largest_miss_mm": "largest miss mm", "holds_for": "holds for", "margin_95_mm": "95 % margin",
+}  # fmt: skip
+_STYLE = (
+    'body { font: 14px/1.4 system-ui, "DejaVu Sans", sans-serif; margin: 16px; } table { '
+    "border-collapse: collapse; } th, td { padding: 4px 10px; text-align: left; border-bottom: "
+    "1px solid #dde3e9; vertical-align: top; } img { width: 300px; } .look { background: #fff6e0; }"
+)
+
+
+def write_results(
+    out: Path, patients: Sequence[Patient], outcomes: Mapping[str, Outcome], held: Store
+) -> None:
+    """Write a fleet's tables, page and pictures into ``out``, over those that lie there. Patients
+    without an outcome are not done yet. Raises StorageError."""
+    with writing(out):
+        (out / PICTURES).mkdir(parents=True, exist_ok=True)
+    rows, scenes, looks = [], [], []
+    for patient in patients:
+        outcome = outcomes.get(patient.name)
+        row, mine = _read(patient.name, outcome, held)
+        if outcome is not None:
+            _pictures(patient.name, outcome, held, out / PICTURES)
+        rows.append(row)
+        scenes += mine
+        looks += [{"patient": patient.name, "reason": why} for why in reasons_to_look(row)]
+    for name, lines, columns in ((PATIENTS, rows, _FIRST), (SCENES, scenes, _SCENE)):
+        table = pd.DataFrame(lines)
+        table = table.reindex(columns=[*dict.fromkeys((*columns, *table.columns))])
+        write_atomically(out / name, table.to_parquet(index=False))
+    named = pd.DataFrame(looks, columns=["patient", "reason"])
+    write_atomically(out / LOOK, named.to_csv(index=False, lineterminator="\n").encode())
+    write_atomically(out / PAGE, _page(rows, looks, out / PICTURES).encode())
+
+
+def reasons_to_look(row: Mapping[str, Any]) -> list[str]:
+    """Why a person should look at a patient."""
+    if row["state"] in ("cannot", "failed"):
+        return [f"{row['step']}: {row['reason']}"]
+    if row["state"] == "open":
+        return []
+    found = list(row["doubts"].split("\n")) if row["doubts"] else []
+    without = row["poor"] + row["refused"]
+    if row["scenes"] == 0:
+        found.append("no state of the twin could be made")
+    elif without > _MOST_WITHOUT:
+        found.append(f"{without:.0%} of {row['scenes']} scenes without a good answer")
+    if row["over_5_mm"]:
+        worst = f"the worst {row['middle_worst_mm']:.1f} mm off"
+        found.append(f"{row['over_5_mm']} answers called good over 5 mm off, {worst}")
+    return found
+
+
+def _read(
+    name: str, outcome: Outcome | None, held: Store
+) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+    """A patient's row, and those of tumors and scenes."""
+    if outcome is None:
+        return {"patient": name, "state": "open"}, []
+    if outcome.state in ("cannot", "failed"):
+        about = {"state": outcome.state, "step": outcome.step, "reason": outcome.reason}
+        return {"patient": name, **about}, []
+    content = store.read_json(held.get(outcome.task.key) / "summary.json")
+    lines = [{"patient": name, **line} for line in tumor_lines(content)]
+    return {"patient": name, "state": "done", **patient_row(content, lines)}, lines
+
+
+def tumor_lines(content: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
+    """A line of each scene and tumor, with how the tumor lies; ``over_3_mm``, ``over_5_mm``: called
+    good, and its middle farther off."""
+    for row in content["rows"]:
+        about = {key: value for key, value in row.items() if key != "tumors"}
+        pairs = zip(content["check"]["tumors"], row["tumors"], strict=True)
+        for number, (lies, errors) in enumerate(pairs, start=1):
+            good, off_mm = row["verdict"] == "good", errors.get("middle_mm", 0.0)
+            over = {f"over_{far:g}_mm": good and off_mm > far for far in FAR_MM}
+            yield {**about, "tumor": f"tumor_{number}", **lies, **errors, **over}
+
+
+def patient_row(content: Mapping[str, Any], lines: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """A patient's figures: of the largest tumor; errors are medians over all tumors of the scenes
+    that were answered good (the best rigid pose's: of all scenes); shares are of scenes."""
+    check, margin, rows = content["check"], content["margins"], content["rows"]
+    largest = max(check["tumors"], key=lambda one: one["ml"])
+    verdicts = [row["verdict"] for row in rows]
+    every = pd.DataFrame(lines).reindex(columns=[*_SCENE])
+    good = every[every.verdict == "good"]
+    limit = margin["largest_miss_mm"]
+    missed = good.groupby("scene").outside_mm.max()
+    row = {
+        "doubts": "\n".join(check["doubts"]), "side": check["side"], "input": check["kind"],
+        **{name: check[name] for name in ("organ_ml", "slice_mm", "spacing_mm", "half_turn_mm")},
+        **largest, "tumors": len(check["tumors"]), **content["model"],
+        "scenes": len(rows), "lost": len(content["failures"]),
+        "middle_95_mm": good.middle_mm.quantile(0.95), "middle_worst_mm": good.middle_mm.max(),
+        "rigid_middle_mm": every.rigid_middle_mm.median(),
+        "rigid_hausdorff_mm": every.rigid_hausdorff_mm.median(),
+        "target_mm": good.drop_duplicates("scene").target_mm.median(),
+        "margin_states": margin["states"], "margin_answers": margin["answers"],
+        "largest_miss_mm": limit, "holds_for": margin["holds_for"],
+        "within_largest": (missed <= limit).mean() if limit is not None and len(good) else None,
+        "margin_reason": margin["reason"],
+    }  # fmt: skip
+    for name in ("good", "poor", "refused"):
+        row[name] = verdicts.count(name) / len(rows) if rows else 0.0
+    for name in ("middle_mm", "hausdorff_mm"):
+        row[name] = good[name].median()
+    for far in FAR_MM:
+        row[f"over_{far:g}_mm"] = int(good[f"over_{far:g}_mm"].sum())
+    for percent in (90, 95):
+        row[f"margin_{percent}_mm"] = margin["margin_mm"].get(f"{percent / 100:g}")
+    return row
+
+
+def _pictures(name: str, outcome: Outcome, held: Store, out: Path) -> None:
+    """NAME.webp, of the case, and NAME-worst.webp; of a patient whose chain ended, the case."""
+    task = outcome.task
+    with writing(out):
+        if outcome.state in ("done", "there"):
+            folder = held.get(task.key)
+            for kind, place in {"case": f"{name}.webp", "worst": f"{name}-worst.webp"}.items():
+                if (picture := folder / f"{kind}.webp").exists():
+                    write_atomically(out / place, picture.read_bytes())
+            return
+        with suppress(DamagedError):  # it was not prepared
+            thumbnail(held.get(task.inputs["case"].key) / "qc.png", out / f"{name}.webp")
+
+
+def _page(
+    rows: Sequence[Mapping[str, Any]], looks: Sequence[Mapping[str, str]], pictures: Path
+) -> str:
+    states = [row["state"] for row in rows]
+    counts = ", ".join(f"{states.count(state)} {state}" for state in dict.fromkeys(states))
+    body = []
+    for row in rows:
+        name = row["patient"]
+        why = [one["reason"] for one in looks if one["patient"] == name]
+        cells = "".join(f"<td>{html.escape(_cell(row.get(key)))}</td>" for key in _COLUMNS)
+        images = "".join(
+            f'<a href="{PICTURES}/{path.name}"><img loading="lazy" src="{PICTURES}/{path.name}"'
+            f' alt="{path.stem}"></a>'
+            for path in (pictures / f"{name}.webp", pictures / f"{name}-worst.webp")
+            if path.exists()
+        )
+        said = f"<br>{'<br>'.join(map(html.escape, why))}" if why else ""
+        mark = ' class="look"' if why else ""
+        body.append(f"<tr{mark} id={name!r}>{cells}</tr>")
+        body.append(f'<tr{mark}><td colspan="{len(_COLUMNS)}">{images}{said}</td></tr>')
+    head = "".join(f"<th>{words}</th>" for words in _COLUMNS.values())
+    lines = "\n".join(body)
+    return (
+        f'<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8"><title>fleet</title>'
+        f"<style>{_STYLE}</style></head><body><h1>{len(rows)} patients: {counts}</h1>"
+        f"<p><b>For research use only.</b> {len({one['patient'] for one in looks})} need a "
+        f"person's eye (shaded; {LOOK}). Shares are of scenes; errors are medians over answers "
+        "called good; pictures: the case, and the answer that is farthest off.</p>"
+        f"<table><thead><tr>{head}</tr></thead><tbody>\n{lines}\n</tbody></table>"
+        "</body></html>\n"
+    )
+
+
+def _cell(value: Any) -> str:
+    if value is None or (isinstance(value, float) and pd.isna(value)):
+        return "–"
+    return f"{value:.2f}" if isinstance(value, float) else str(value)

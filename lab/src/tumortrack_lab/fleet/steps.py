@@ -1,0 +1,270 @@
+"""What is done for one patient: prepare -> check -> train -> states of the twin -> margins and
+evaluation -> summary.
+
+Each function is a ``Work``: it calls what the commands call, and writes the same bits wherever and
+whenever it runs: on one core, trained by steps, and without times, paths and file names, which
+model folders and tables of margins state elsewhere. Costs are the engine's to keep.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from tumortrack.core import store
+from tumortrack.core.errors import InputError, TumortrackError
+from tumortrack_lab.fleet import checks
+from tumortrack_lab.fleet.list import Patient, hashed
+from tumortrack_lab.fleet.task import File, Needs, Task
+
+# Eight families of physics have the wider world; cut organs are none that is still to be located.
+FAMILIES = ("rest", "plate", "clamp", "twist", "pull", "tether", "roll")
+_TEST = len(FAMILIES) * 100_000  # number of the first state that is evaluated on
+CONFIDENCES = (0.9, 0.95)
+Inputs = Mapping[str, Path]
+Given = Mapping[str, Any]
+
+
+def chain(patient: Patient) -> dict[str, Task]:
+    """The patient's tasks by step, each after those that it needs; ``summary`` is what is wanted.
+
+    States are made in groups of one of each family, a task a group: more states later leave those
+    that were there as they are. Those of evaluation are never those of margins.
+    """
+    steps: dict[str, Task] = {}
+    source = hashed(patient.source)
+
+    def add(
+        name: str, work: Any, options: Given, inputs: Mapping[str, Task | File], memory_mb: int
+    ) -> Task:
+        needs = Needs(memory_mb=memory_mb)
+        kind = name.rstrip("0123456789-")
+        steps[name] = Task(patient.name, kind, 1, work, dict(options), inputs, needs)
+        return steps[name]
+
+    kind = "" if patient.source.is_dir() else "".join(patient.source.suffixes[-2:])
+    given = {key: list(v) if isinstance(v, tuple) else v for key, v in patient.prepare.items()}
+    case = add("prepare", prepare, {**given, "suffix": kind}, {"source": source}, 3000)
+    series = {"series": patient.prepare.get("series")}
+    checked = add("check", check, series, {"case": case, "source": source}, 2000)
+    after = {"case": case, "check": checked}
+    started = {} if patient.start is None else {"start": hashed(patient.start)}
+    lesson = {"steps": patient.steps, "seed": patient.seed}
+    model = add("train", train, lesson, {**after, **started}, 2500)
+    groups: dict[str, dict[str, Task | File]] = {"margins": {}, "test": {}}
+    counts = {"margins": (0, patient.margin_states, 1)}
+    counts["test"] = _TEST, patient.test_states, patient.views
+    for kind, (first, count, views) in counts.items():
+        for n in range(first, first + count, len(FAMILIES)):
+            here = {
+                "first": n, "count": min(len(FAMILIES), first + count - n), "views": views,
+                "seed": patient.seed,
+            }  # fmt: skip
+            name = f"states-{kind}-{len(groups[kind])}"
+            groups[kind][f"states_{len(groups[kind]):04d}"] = add(name, states, here, after, 1500)
+    known = {"case": case, "model": model}
+    margin = add("margins", margins, {"seed": patient.seed}, {**known, **groups["margins"]}, 1500)
+    judged = add("evaluate", evaluate, {}, {**known, **groups["test"]}, 1500)
+    found = {**known, "check": checked, "margins": margin, "evaluate": judged}
+    add("summary", summary, {}, {**found, **groups["test"]}, 1500)
+    return steps
+
+
+def prepare(inputs: Inputs, options: Given, out: Path, cores: int) -> None:
+    """A case, as `tumortrack prepare` makes it; its source has no name."""
+    from dataclasses import replace
+
+    from tumortrack.imaging import prepare as preparing
+    from tumortrack.imaging.case import save_case
+    from tumortrack.report.pictures import qc_picture
+
+    given: dict[str, Any] = {
+        key: tuple(value) if isinstance(value, list) else value for key, value in options.items()
+    }
+    given.pop("suffix")
+    case = preparing.prepare(inputs["source"], preparing.PrepareOptions(**given))
+    case = replace(case, report={**case.report, "source": "input"})
+    qc_picture(case.labels, case.ct, case.anatomy, out / "qc.png", str(case.patient))
+    save_case(case, out)
+
+
+def check(inputs: Inputs, options: Given, out: Path, cores: int) -> None:
+    """check.json: the anatomy in numbers, and ``doubts``: what a person should look at. Raises
+    InputError: what no model should be trained for."""
+    from tumortrack.imaging.case import load_case
+
+    case = load_case(inputs["case"])
+    cut = checks.is_cut_off(case, inputs["source"], options["series"])
+    found = checks.described(case)
+    if failures := checks.failures(found, cut):
+        raise InputError(f"the quality check failed: {'; '.join(failures)}. Look at qc.png.")
+    store.write_json(out / "check.json", {**found, "doubts": checks.doubts(case, found)})
+
+
+def train(inputs: Inputs, options: Given, out: Path, cores: int) -> None:
+    """A model folder of the preset clinic, without its times and what only resuming needs."""
+    import shutil
+
+    from tumortrack.imaging.case import load_case
+    from tumortrack.training.model import load_start
+    from tumortrack.training.presets import clinic
+    from tumortrack.training.train import TrainingRun
+    from tumortrack.training.train import train as trained
+
+    case = load_case(inputs["case"])
+    run = TrainingRun(
+        anatomy_ct=case.anatomy, up_lps=case.up_lps,
+        case_sha256=store.sha256_of(inputs["case"] / store.MANIFEST),
+        config=clinic(case.anatomy), patient=case.patient, seed=options["seed"],
+        steps=options["steps"], device="cpu", workers=0,
+        start=load_start(inputs["start"]) if "start" in inputs else None,
+    )  # fmt: skip
+    trained(run, out, lambda status: None)
+    shutil.rmtree(out / "training")
+    manifest = store.read_json(out / store.MANIFEST)
+    del manifest["provenance"]["training_s"]
+    store.write_json(out / store.MANIFEST, manifest)
+
+
+def states(inputs: Inputs, options: Given, out: Path, cores: int) -> None:
+    """Scene folders of so many states of the wider world from the ``first`` on, in so many views,
+    and failures.json: states without an equilibrium, views without an organ."""
+    from tumortrack.imaging.case import load_case
+    from tumortrack_lab.tets import lattice
+    from tumortrack_lab.twin.apparatus import bench_from_ct
+    from tumortrack_lab.world.scenes import World, WorldConfig
+
+    case, sha256 = load_case(inputs["case"]), store.sha256_of(inputs["case"] / store.MANIFEST)
+    config = WorldConfig(seed=options["seed"], families=FAMILIES)
+    organ = case.anatomy.organ
+    lying = bench_from_ct(organ, case.up_lps)
+    there = organ.moved(organ.vertices_mm @ lying[:3, :3].T + lying[:3, 3])
+    world = World.of(case, sha256, config, lattice(there, config.edge_mm))
+    failures = {}
+    for number in range(options["first"], options["first"] + options["count"]):
+        family, _ = world.recipe(number)
+        try:
+            scene = world.scene(number)
+            scene.write(out / f"{number:06d}-{family}-0")
+        except TumortrackError as error:
+            failures[f"{number:06d}-{family}-0"] = f"{type(error).__name__}: {error}"
+            continue
+        for view in range(1, options["views"]):
+            name = f"{number:06d}-{family}-{view}"
+            try:
+                shown = world.kept(scene)
+                world.again(shown, number * 1000 + view, "none").write(out / name)
+            except TumortrackError as error:
+                failures[name] = f"{type(error).__name__}: {error}"
+    store.write_json(out / "failures.json", failures)
+
+
+def margins(inputs: Inputs, options: Given, out: Path, cores: int) -> None:
+    """margins.jsonl, a line a state, as `tumortrack margins` writes it; result.json; and where the
+    states are enough margins.json, which belongs into the model's folder.
+
+    result.json: ``states``, ``answers`` called good, ``reason`` why no margin is stated (empty: one
+    is), ``margin_mm`` by confidence (medians over these answers), and what the states say in any
+    case: ``largest_miss_mm`` over the answers, ``holds_for``, the chance that another answer of
+    such a state misses by no more, n / (n + 1), were the model and the answers' checks fixed
+    beforehand, as they are.
+    """
+    import msgspec
+    import numpy as np
+
+    from tumortrack.models.margins import NAME, write_sealed
+    from tumortrack.report import calibration, calibration_table
+    from tumortrack.simulate.scene_folder import read_scene
+    from tumortrack.tracking.tracker import Tracker
+    from tumortrack.training.model import load_model
+
+    seed, digest = options["seed"], store.sha256_of(inputs["model"] / store.MANIFEST)
+    tracker, rows = Tracker(load_model(inputs["model"], "cpu")), []
+    groups = [folder for name, folder in inputs.items() if name.startswith("states_")]
+    listed = calibration.list_states([folder for folder in groups if _scenes(folder)], seed)
+    for one in sorted(listed, key=lambda one: one.folder.name):
+        row = calibration.row_of(tracker, read_scene(one.folder), one, seed)
+        rows.append(msgspec.structs.replace(row, scene=one.folder.name))
+    head = calibration_table.head_of(digest, seed)
+    with calibration_table.open_table(out / "margins.jsonl", head) as (_, add):
+        for row in rows:
+            add(row)
+    good = [row for row in rows if not row.doubt]
+    misses = [row.score("tumor") for row in good if "tumor" in row.misses]
+    result: dict[str, Any] = {
+        "states": len(rows), "answers": len(good), "reason": "", "margin_mm": {},
+        "largest_miss_mm": max(misses, default=None),
+        "holds_for": len(misses) / (len(misses) + 1),
+    }  # fmt: skip
+    try:
+        table = store.sha256_of(out / "margins.jsonl")
+        found = calibration.margins_of(rows, table, CONFIDENCES, seed=seed)
+        write_sealed(out / NAME, msgspec.structs.replace(found, model_sha256=digest))
+        for shells in found.shells:
+            at = [
+                shells.radii["tumor"].at(s, r.measured) for r in good for _, s in r.misses["tumor"]
+            ]
+            known = [mm for mm in at if mm is not None]
+            result["margin_mm"][f"{shells.confidence:g}"] = float(np.median(known))
+    except InputError as error:
+        result["reason"] = f"too few states: {error}"
+    store.write_json(out / "result.json", result)
+
+
+def evaluate(inputs: Inputs, options: Given, out: Path, cores: int) -> None:
+    """rows.json: what is said of every scene, and how far it is off, beside the best rigid pose."""
+    from dataclasses import replace
+
+    from tumortrack.core.types import Anatomy
+    from tumortrack.imaging.case import load_case
+    from tumortrack.simulate.scene_folder import read_scene
+    from tumortrack.tracking.tracker import Tracker
+    from tumortrack.training.model import load_model
+    from tumortrack_lab.peers.base import matched_vertices
+    from tumortrack_lab.real.judging import judge
+    from tumortrack_lab.world.scenes import simplified
+
+    anatomy = simplified(load_case(inputs["case"]).anatomy)
+    tracker, rows = Tracker(load_model(inputs["model"], "cpu")), []
+    failures: dict[str, str] = {}
+    for folder in _groups(inputs):
+        failures |= store.read_json(folder / "failures.json")
+        for path in _scenes(folder):
+            scene = read_scene(path)
+            seen = [
+                rest.moved(matched_vertices(rest, part))  # in the order of the case's vertices
+                for rest, part in zip(anatomy.parts, scene.reference.parts, strict=True)
+            ]
+            scene = replace(scene, reference=Anatomy(tuple(seen)))
+            number, family, view = path.name.split("-")
+            about = {"scene": path.name, "state": int(number), "family": family, "view": int(view)}
+            about |= {name: scene.meta[name] for name in ("hidden_share", "visible_share")}
+            about["segmentation"] = scene.meta["segmentation"]["kind"]
+            rows.append(about | judge(tracker, anatomy, scene, scene.depth))
+    store.write_json(out / "rows.json", {"rows": rows, "failures": failures})
+
+
+def summary(inputs: Inputs, options: Given, out: Path, cores: int) -> None:
+    """summary.json: all that the fleet's tables hold of the patient; case.webp and, of the worst
+    answer, worst.webp."""
+    from tumortrack_lab.fleet.pictures import thumbnail, worst_picture
+
+    checked = store.read_json(inputs["check"] / "check.json")
+    result = store.read_json(inputs["margins"] / "result.json")
+    judged = store.read_json(inputs["evaluate"] / "rows.json")
+    model = store.read_json(inputs["model"] / store.MANIFEST)["provenance"]
+    trained = {key: v for key, v in model.items() if key.startswith("validation_")}
+    trained["steps"] = model["steps"]
+    content = {"check": checked, "margins": result, "model": trained, **judged}
+    store.write_json(out / "summary.json", content)
+    thumbnail(inputs["case"] / "qc.png", out / "case.webp")
+    worst_picture(inputs["model"], list(_groups(inputs)), judged["rows"], out / "worst.webp")
+
+
+def _groups(inputs: Inputs) -> Iterator[Path]:
+    return (inputs[name] for name in sorted(inputs) if name.startswith("states_"))
+
+
+def _scenes(folder: Path) -> list[Path]:
+    return sorted(path for path in folder.iterdir() if path.is_dir())
