@@ -19,6 +19,7 @@ from tumortrack_lab.fleet.task import File
 
 _LARGEST = 64 * 2**20  # bytes
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
+NOTHING = Path("none")  # to start a training from
 MISSING = "missing"  # instead of a sha256: no file has it
 
 
@@ -61,7 +62,7 @@ class Patient:
     Attributes:
         source: what `prepare` takes.
         prepare: its options.
-        start: folder that `pretrain` wrote; None: the default.
+        start: folder that `pretrain` wrote, or ``NOTHING``; None: the package's.
         steps: of training.
         seed: of training and states.
         margin_states: states of the twin that margins are found with.
@@ -137,11 +138,13 @@ def _patient(head: list[str], cells: list[str], folder: Path) -> Patient:
         raise InputError(f"{name} has no input")
     parsed: dict[str, Any] = {}
     for column, cell in given.items():
-        parse = {**_OF_PREPARE, **_OF_CHAIN, "start": folder.joinpath}[column]
+        parse = {**_OF_PREPARE, **_OF_CHAIN, "start": Path}[column]
         try:
             parsed[column] = parse(cell)
         except ValueError as error:
             raise InputError(f"{column} {cell!r} is not allowed: {error}") from error
+    if parsed.get("start", NOTHING) != NOTHING:
+        parsed["start"] = folder / parsed["start"]
     prepare = {key: parsed.pop(key) for key in _OF_PREPARE if key in parsed}
     PrepareOptions(**prepare)
     return Patient(name=name, source=folder / source, prepare=prepare, **parsed)

@@ -9,13 +9,16 @@ model folders and tables of margins state elsewhere. Costs are the engine's to k
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from functools import cache
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
 from tumortrack.core import store
 from tumortrack.core.errors import InputError, TumortrackError
+from tumortrack.models.folder import WEIGHTS
 from tumortrack_lab.fleet import checks
-from tumortrack_lab.fleet.list import Patient, hashed
+from tumortrack_lab.fleet.list import NOTHING, Patient, hashed
 from tumortrack_lab.fleet.task import File, Needs, Task
 
 # Eight families of physics have the wider world; cut organs are none that is still to be located.
@@ -49,9 +52,13 @@ def chain(patient: Patient) -> dict[str, Task]:
     series = {"series": patient.prepare.get("series")}
     checked = add("check", check, series, {"case": case, "source": source}, 2000)
     after = {"case": case, "check": checked}
-    started = {} if patient.start is None else {"start": hashed(patient.start)}
-    lesson = {"steps": patient.steps, "seed": patient.seed}
-    model = add("train", train, lesson, {**after, **started}, 2500)
+    lesson: dict[str, Any] = {"steps": patient.steps, "seed": patient.seed, "start": "its own"}
+    begun: dict[str, Task | File] = {}
+    if patient.start in (None, NOTHING):
+        lesson["start"] = _shipped() if patient.start is None else str(NOTHING)
+    else:
+        begun["start"] = hashed(patient.start)
+    model = add("train", train, lesson, {**after, **begun}, 2500)
     groups: dict[str, dict[str, Task | File]] = {"margins": {}, "test": {}}
     counts = {"margins": (0, patient.margin_states, 1)}
     counts["test"] = _TEST, patient.test_states, patient.views
@@ -69,6 +76,12 @@ def chain(patient: Patient) -> dict[str, Task]:
     found = {**known, "check": checked, "margins": margin, "evaluate": judged}
     add("summary", summary, {}, {**found, **groups["test"]}, 1500)
     return steps
+
+
+@cache
+def _shipped() -> str:
+    """sha256 of the weights that the package's trainings start from."""
+    return store.sha256_of(Path(str(files("tumortrack.models"))) / "kidneys" / WEIGHTS)
 
 
 def prepare(inputs: Inputs, options: Given, out: Path, cores: int) -> None:
@@ -106,22 +119,14 @@ def train(inputs: Inputs, options: Given, out: Path, cores: int) -> None:
     """A model folder of the preset clinic, without its times and what only resuming needs."""
     import shutil
 
-    from tumortrack.imaging.case import load_case
-    from tumortrack.training.model import load_start
-    from tumortrack.training.presets import clinic
-    from tumortrack.training.train import TrainingRun
-    from tumortrack.training.train import train as trained
+    from tumortrack import api
 
-    case = load_case(inputs["case"])
-    run = TrainingRun(
-        anatomy_ct=case.anatomy, up_lps=case.up_lps,
-        case_sha256=store.sha256_of(inputs["case"] / store.MANIFEST),
-        config=clinic(case.anatomy), patient=case.patient, seed=options["seed"],
-        steps=options["steps"], device="cpu", workers=0,
-        start=load_start(inputs["start"]) if "start" in inputs else None,
+    start: Any = inputs.get("start", options["start"])
+    api.train(
+        inputs["case"], out, steps=options["steps"], seed=options["seed"], device="cpu", workers=0,
+        start=None if start == _shipped() else start,
     )  # fmt: skip
-    trained(run, out, lambda status: None)
-    shutil.rmtree(out / "training")
+    shutil.rmtree(out / "training", ignore_errors=True)  # none, without a step
     manifest = store.read_json(out / store.MANIFEST)
     del manifest["provenance"]["training_s"]
     store.write_json(out / store.MANIFEST, manifest)
