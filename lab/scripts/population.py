@@ -14,7 +14,6 @@ result: what fails `prepare` or the fleet's quality check is listed as failed, w
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -42,6 +41,10 @@ _AGAINST: dict[str, tuple[str, tuple[float, ...]]] = {
     "depth_mm": ("its middle below the surface, mm", (0, 5, 10, 20, np.inf)),
     "slice_mm": ("thickest voxel edge, mm", (0, 1.01, 3.01, np.inf)),
     "outer_share": ("outer share of its surface", (0, 0.25, 0.5, 1.01)),
+}
+_SHOWN = {
+    "rigid_middle_mm": ("0.6", "best rigid pose"),
+    "middle_mm": ("C1", "located: median, 95th percentile"),
 }
 
 
@@ -188,7 +191,7 @@ def draw(scenes: pd.DataFrame, path: Path) -> None:
     figure = drawing.new_figure(10.0, 7.0, left=0.07, right=0.99, top=0.93, bottom=0.08)
     for number, (column, (words, _)) in enumerate(_AGAINST.items(), start=1):
         axes = figure.add_subplot(2, 2, number)
-        for name, color, label in _shown():
+        for name, (color, label) in _SHOWN.items():
             of = good.groupby(["patient", "tumor"])
             at, errors = of[column].first(), of[name]
             axes.vlines(at, errors.median(), errors.quantile(0.95), color=color, alpha=0.3)
@@ -198,13 +201,6 @@ def draw(scenes: pd.DataFrame, path: Path) -> None:
         axes.set_ylim(0, None)
     figure.axes[0].legend(frameon=False, fontsize=9)
     drawing.save(figure, path)
-
-
-def _shown() -> Sequence[tuple[str, str, str]]:
-    return (
-        ("rigid_middle_mm", "0.6", "best rigid pose"),
-        ("middle_mm", "C1", "located: median, 95th percentile"),
-    )
 
 
 if __name__ == "__main__":

@@ -120,12 +120,16 @@ def train(inputs: Inputs, options: Given, out: Path, cores: int) -> None:
     import shutil
 
     from tumortrack import api
+    from tumortrack.training.train import Interrupted
 
     start: Any = inputs.get("start", options["start"])
-    api.train(
-        inputs["case"], out, steps=options["steps"], seed=options["seed"], device="cpu", workers=0,
-        start=None if start == _shipped() else start,
-    )  # fmt: skip
+    try:
+        api.train(
+            inputs["case"], out, steps=options["steps"], seed=options["seed"], device="cpu",
+            workers=0, start=None if start == _shipped() else start,
+        )  # fmt: skip
+    except Interrupted as error:  # which says nothing of the patient
+        raise KeyboardInterrupt from error
     shutil.rmtree(out / "training", ignore_errors=True)  # none, without a step
     manifest = store.read_json(out / store.MANIFEST)
     del manifest["provenance"]["training_s"]
