@@ -34,8 +34,19 @@ from tumortrack.simulate.deform import ElasticConfig
 from tumortrack.simulate.occupancy import OccupancyConfig
 from tumortrack.training.model import SHIPPED, PretrainedWeights, load_start, start_of
 from tumortrack.training.presets import clinic, pretraining, quick
+<<<<<<< HEAD
 from tumortrack.training.pretrain import KidneyStream, organ_of, pretrain
 from tumortrack.training.state import Pretraining, TrainingProgress, TrainingRun, provenance
+=======
+from tumortrack.training.pretrain import KidneyStream, pretrain
+from tumortrack.training.state import (
+    Pretraining,
+    TrainingProgress,
+    TrainingRun,
+    TrainingState,
+    provenance,
+)
+>>>>>>> w/minute
 from tumortrack.training.task import TrainingTask, task_of
 from tumortrack.training.train import train
 
@@ -247,9 +258,8 @@ def test_a_model_says_what_it_started_from(patient, start, tmp_path):
     assert "start_sha256" not in provenance(plain, TrainingProgress(step=1), CPU)
 
 
-@pytest.mark.parametrize("end", [{"steps": 0}, {"steps": None, "minutes": 0.0}])
-def test_without_a_step_a_model_is_its_start(patient, task, start, end, tmp_path):
-    run, expected = replace(patient, **end), RegistrationNetwork(patient.config.network)
+def test_without_a_step_a_model_is_its_start(patient, task, start, tmp_path):
+    run, expected = replace(patient, steps=0), RegistrationNetwork(patient.config.network)
     made = train(run, tmp_path / "model", silent)
     task.initialize(expected)
     for name, value in expected.state_dict().items():
@@ -260,6 +270,9 @@ def test_without_a_step_a_model_is_its_start(patient, task, start, end, tmp_path
     assert sorted(p.suffix for p in (tmp_path / "model").iterdir()) == [
         *(".json", ".safetensors", ".safetensors")
     ]
+    for minutes, end in ((0.0, 0), (1.0, None)):  # none: settled on the way
+        timed = replace(patient, steps=None, minutes=minutes)
+        assert TrainingState(timed, CPU).progress.end == end
     with pytest.raises(InputError, match="starts from nothing"):
         replace(run, start=None)
 
