@@ -188,7 +188,14 @@ class RegistrationTask(TrainingTask):
 
     def model(self, network: RegistrationNetwork, provenance: dict[str, Any]) -> RegistrationModel:
         scenes, drafts = self._scenes, self._fits(network)
-        usual_cost = float(np.percentile([fit.cost for _, fit in drafts], _USUAL))
+        # What is usual of fits that are right: a network that has learnt little proposes many that
+        # are not, whose costs would pass for usual.
+        right = [
+            f.cost
+            for (_, f), off_mm in zip(drafts, self._off_mm(drafts), strict=True)
+            if off_mm <= FAR_MM
+        ]
+        usual_cost = float(np.percentile(right or [fit.cost for _, fit in drafts], _USUAL))
         more = self._registration(network).look_around
         fits = [  # as the model will make them, knowing the usual cost
             more(cloud, likeliest, fit) if fit.cost > usual_cost else fit
@@ -248,6 +255,16 @@ class RegistrationTask(TrainingTask):
             parallel_for(fit, len(clouds), 1)
             self._last = weights, [(proposed[n][0], found[n]) for n in range(len(clouds))]
         return self._last[1]
+
+    def _off_mm(self, drafts: list[tuple[ElasticMotion, RegistrationResult]]) -> list[float]:
+        """How far each validation scene's fit has the points inside from where they are, on
+        average."""
+        scenes, off_mm = self._scenes, []
+        for n, (_, fit) in enumerate(drafts):
+            inside = scenes.labels[n] > 0
+            away = fit.motion.carry(scenes.points_ct[n, inside]) - scenes.points_mm[n, inside]
+            off_mm.append(float(np.linalg.norm(away, axis=1).mean()))
+        return off_mm
 
     def _registration(self, network: RegistrationNetwork) -> Registration:
         return Registration(network, self._shape, self._run.config.refine)
