@@ -74,7 +74,7 @@ class Patient:
     source: Path
     prepare: dict[str, Any] = field(default_factory=dict)
     start: Path | None = None
-    steps: int = 300
+    steps: int = 200
     seed: int = 0
     margin_states: int = 14
     test_states: int = 14
