@@ -34,11 +34,7 @@ from tumortrack.simulate.deform import ElasticConfig
 from tumortrack.simulate.occupancy import OccupancyConfig
 from tumortrack.training.model import SHIPPED, PretrainedWeights, load_start, start_of
 from tumortrack.training.presets import clinic, pretraining, quick
-<<<<<<< HEAD
 from tumortrack.training.pretrain import KidneyStream, organ_of, pretrain
-from tumortrack.training.state import Pretraining, TrainingProgress, TrainingRun, provenance
-=======
-from tumortrack.training.pretrain import KidneyStream, pretrain
 from tumortrack.training.state import (
     Pretraining,
     TrainingProgress,
@@ -46,7 +42,6 @@ from tumortrack.training.state import (
     TrainingState,
     provenance,
 )
->>>>>>> w/minute
 from tumortrack.training.task import TrainingTask, task_of
 from tumortrack.training.train import train
 
