@@ -211,7 +211,8 @@ def a_run(case: Path, **changes: object) -> TrainingRun:
         ({"checkpoint_every_s": -1.0}, "--checkpoint-every is -1"),
         ({"minutes": float("nan")}, "minutes is nan"),
         ({"workers": -1}, "workers is -1"),
-        ({"steps": 0}, "steps is 0"),
+        ({"steps": -1}, "steps is -1"),
+        ({"steps": 0}, "starts from nothing"),
     ],
 )
 def test_impossible_runs_are_refused(case, changes, words):
