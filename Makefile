@@ -8,7 +8,7 @@ INSTALL := pip install --quiet --disable-pip-version-check --no-compile --no-dep
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help setup debian demo test test-hard check pretrained attack fuzz crash replay bench soak wheel lock licences audit results real minutes world sequences causes trust rehearsal population clean
+.PHONY: help setup debian demo test test-hard check pretrained attack fuzz crash replay bench soak wheel lock licences audit results real minutes world sequences causes trust rehearsal population scaling clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 10
@@ -96,6 +96,9 @@ causes: setup  ## shares of causes in the tumors' errors: fits told parts of the
 
 trust: setup  ## what margins are worth for physics and organs left out (ARGS="MODEL/margins.jsonl ...": an organ each)
 	$(BIN)/python lab/scripts/trust.py $(ARGS)
+
+scaling: setup  ## what the fleet's engine costs, on 1 to 8 workers and on paper (3 minutes; ARGS="--store OUT/store")
+	$(BIN)/python lab/scripts/fleet_scaling.py $(ARGS)
 
 population: setup  ## KiTS19's kidneys with tumors: their list for a fleet, and what came of it (ARGS="DATA --list FILE", then --fleet OUT)
 	$(BIN)/python lab/scripts/population.py $(ARGS)

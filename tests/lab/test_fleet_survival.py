@@ -32,6 +32,7 @@ FAULTS = {"P2-1": "killed", "P3-1": "memory", "P4-0": "disk", "P5-1": "defect"}
 def machines(tmp_path_factory) -> Iterator[Machines]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+        patch.setenv("RAY_worker_niceness", "0")
         patch.setenv("RAY_AUTH_MODE", "token")
         patch.setenv("RAY_AUTH_TOKEN", "0123456789abcdef" * 4)
         patch.setenv("FLEET_FOLDER", str(tmp_path_factory.mktemp("fleet")))
