@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -65,9 +66,11 @@ class Fleet:
         store.open()
         outcomes: dict[str, Outcome] = {}
         wanted = [partial(_wanted, patient) for patient in patients]
+        executor = self._executor()
+        signal.signal(signal.SIGTERM, signal.default_int_handler)  # Ray has one that dies
         with _screen() as show:
             try:
-                for one in run(wanted, store, self._executor(), self.tries, self.again, show):
+                for one in run(wanted, store, executor, self.tries, self.again, show):
                     outcomes[one.task.patient] = one
                     if one.reason:
                         say(f"{one.task.patient}: {one.step}: {one.reason}")
