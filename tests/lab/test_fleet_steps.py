@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import tempfile
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ import trimesh
 from tumortrack.core.errors import InputError
 from tumortrack.core.mesh_files import write_anatomy
 from tumortrack.core.types import Mesh
+from tumortrack.training import presets
 from tumortrack_lab.fleet import checks, results
 from tumortrack_lab.fleet.engine import run
 from tumortrack_lab.fleet.executors import Serial
@@ -83,7 +85,7 @@ def fleets(tmp_path_factory):
 
     made = []
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("tumortrack.training.presets.clinic", lambda *_: slim_clinic())
+        patch.setitem(presets.PRESETS, "clinic", lambda *_: slim_clinic())
         for name in ("erste", "zweite"):
             home = tmp_path_factory.mktemp(name)
             (home / f"{name} meshes").mkdir()
@@ -99,7 +101,6 @@ def fleets(tmp_path_factory):
             held = Store(str(home / "store"))
             tasks = [chain(patient)["summary"] for patient in patients]
             done = {one.task.patient: one for one in run(tasks, held, Serial(), tries=1)}
-            print({t.step: held.cost(t.key).get("cpu_s") for t in chain(patients[0]).values()})
             results.write_results(home / "out", patients, done, held)
             made.append((home, patients, held, done))
     return made
@@ -121,8 +122,8 @@ def test_a_chain_gives_the_same_bits_in_another_folder(fleets):
         assert files == files_of(second.get(task.key)), name
         texts = {name: data for name, data in files.items() if name.endswith((".json", ".jsonl"))}
         for file, data in texts.items():
-            for word in (b"/", b"erste", b"training_s"):
-                assert word not in data.replace(b"mm3/", b""), (name, file, word)
+            for word in (str(tempfile.gettempdir()).encode(), b"erste", b"training_s"):
+                assert word not in data, (name, file, word)
 
 
 def test_evaluation_has_states_of_its_own_and_more_views_of_them(fleets):
