@@ -121,8 +121,8 @@ def costs_of(store: Path) -> dict[str, dict[str, float]]:
 
 
 def on_paper(costs: dict[str, dict[str, float]], patients: int, efficiency: float) -> dict:
-    """What so many patients take, at these costs of one: CPU seconds, since a busy machine's waiting
-    is not the tasks'."""
+    """What so many patients take, at these costs of one. CPU seconds: a busy machine's waiting is
+    not the tasks'."""
     core_hours = patients * sum(one["cpu_s"] for one in costs.values()) / 3600 / efficiency
     count = patients * sum(one["tasks"] for one in costs.values())
     gigabytes = patients * sum(one["bytes"] for one in costs.values()) / 1e9
