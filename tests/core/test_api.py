@@ -26,7 +26,7 @@ SIGNATURES = {
     "simulate_scenes": "case count=1 seed=0 elastic=True noise=True",
     "track": "tracker source sinks=() until=None seconds=0.0 range_mm=None",
     "train": "case folder preset='clinic' config=None minutes=None steps=None seed=0 "
-    "device='auto' workers=None report=None",
+    "device='auto' workers=None start=None report=None",
 }
 VALUES = {"Case", "DepthFrame", "Estimate", "Intrinsics", "Look", "SensorCloud", "Tracker"}
 MODULES = {"errors", "presets"}

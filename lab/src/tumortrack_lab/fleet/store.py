@@ -251,11 +251,15 @@ class Store:
 
 
 def is_running(process: int) -> bool:
+    """Whether a process of this machine is; one that has ended and only waits to be noticed by its
+    parent is not."""
+    with suppress(OSError, IndexError):  # Linux
+        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] not in "ZX"
     try:
         os.kill(process, 0)
     except ProcessLookupError:
         return False
-    except PermissionError:  # another user's
+    except PermissionError:
         pass
     return True
 
