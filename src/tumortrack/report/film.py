@@ -160,8 +160,10 @@ class _FramePainter:
     def _seen(
         self, cell: Workcell, viewpoint: Viewpoint, size: tuple[int, int]
     ) -> UInt8[np.ndarray, "h w 3"]:
+        shadowed = viewpoint is self._far  # the arms' shadows would darken the close-up
         shapes = [
-            Body(s.mesh, rgb(s.colour), s.opacity, s.published_from_shape) for s in cell.shapes
+            Body(s.mesh, rgb(s.colour), s.opacity, s.published_from_shape, shadowed)
+            for s in cell.shapes
         ]
         least_mm = _LEAST_PIXELS * viewpoint.width_mm / size[0]
         lines = [

@@ -1,7 +1,7 @@
 """Shaded pictures of meshes without a display: stills in mm, and the frames of a film.
 
-A z-buffer in perspective or parallel, normals that are smooth but for creases, one light, and
-translucent bodies over the opaque ones. (matplotlib's own 3-D
+A z-buffer in perspective or parallel, normals that are smooth but for creases, one light, shadows
+on bodies that ask for them, and translucent bodies over the opaque ones. (matplotlib's own 3-D
 surfaces sort triangles by their middle, which shows tumors in front of the organ that hides them.)
 """
 
@@ -18,12 +18,13 @@ from tumortrack.core.colours import Colour
 from tumortrack.core.geometry import transform_points, triangles_of
 from tumortrack.core.types import Mesh
 from tumortrack.imaging.raster import expand
-from tumortrack.report.renderer_kernels import Triangles, nearest, shade
+from tumortrack.report.renderer_kernels import Light, Triangles, nearest, shade
 
 _SHARPER = 2  # pixels drawn per pixel shown, each way: smooth edges
 _CREASE = np.cos(np.radians(40.0))  # faces that meet at a sharper angle keep their edge
 _WORLD_LIGHT = np.array([-0.42, -0.5, 1.0])  # towards it: from the left, the front and above
 _VIEW_LIGHT = np.array([-0.35, -0.55, -1.0])  # right, down, away: over the viewer's left shoulder
+_SHADOW_PIXELS = 1024
 _SAME_MM = 0.6  # a translucent surface that close over an opaque one is the same one
 _DRAWN_MM = 0.3  # a pixel of a parallel view
 _FAR_MM = 10_000.0  # the viewer of a parallel view
@@ -40,12 +41,14 @@ def rgb(colour: Colour) -> RGB:
 
 @dataclass(frozen=True, eq=False)
 class Body:
-    """A surface somewhere in the world. ``opacity``: where seen face on; edges are denser."""
+    """A surface somewhere in the world. ``opacity``: where seen face on; edges are denser.
+    ``shadowed``: whether others cast shadows on it."""
 
     mesh: Mesh
     color: RGB
     opacity: float = 1.0
     world_from_mesh: Float[np.ndarray, "4 4"] | None = None
+    shadowed: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,10 +194,11 @@ def render(
     """
     width, height = (_SHARPER * n for n in size)
     solid = _join([body for body in bodies if body.opacity >= 1])
+    light = _light(solid if solid.shadowed.any() else _join([]), viewpoint)
     picture = np.empty((height, width, 3), np.float32)
     picture[:] = np.array(backdrop)
     near = np.full((height, width), -np.inf, np.float32)
-    near = _lay(picture, near, solid, viewpoint, 1.0)
+    near = _lay(picture, near, solid, viewpoint, light, 1.0)
 
     def far_first(body: Body) -> float:
         middle = body.mesh.box_mm.mean(0)[None]
@@ -203,7 +207,7 @@ def render(
         return -float(np.linalg.norm(middle[0] - viewpoint.place_mm))
 
     for body in sorted((body for body in bodies if body.opacity < 1), key=far_first):
-        _lay(picture, near, _join([body]), viewpoint, body.opacity)
+        _lay(picture, near, _join([body]), viewpoint, light, body.opacity)
     sharp = Image.fromarray(np.rint(255 * picture).astype(np.uint8))
     return np.asarray(sharp.reduce(_SHARPER))
 
@@ -223,6 +227,7 @@ def _join(bodies: list[Body]) -> Triangles:
         np.concatenate(corners).astype(np.float32),
         np.concatenate(normals),
         np.repeat(colors, each, axis=0),
+        np.repeat(np.array([body.shadowed for body in bodies], bool), each),
     )
 
 
@@ -252,9 +257,25 @@ def corner_normals(mesh: Mesh) -> Float32[np.ndarray, "f 3 3"]:
     return _NORMALS[mesh]
 
 
+def _light(triangles: Triangles, viewpoint: Viewpoint) -> Light:
+    """The light, and what stands in its way around the middle of the picture."""
+    across = np.cross([0.0, 1.0, 0.0], viewpoint.light)
+    across /= np.linalg.norm(across)
+    down = np.cross(viewpoint.light, across)
+    axes = np.stack([across, down, viewpoint.light]).astype(np.float32)
+    target_mm = viewpoint.place_mm + viewpoint.distance_mm * viewpoint.axes[2]
+    pixel_mm = 1.6 * viewpoint.width_mm / _SHADOW_PIXELS
+    middle = axes[:2] @ target_mm.astype(np.float32)
+    corner = (middle - pixel_mm * _SHADOW_PIXELS / 2).astype(np.float32)
+    seen = triangles.corners @ axes.T
+    seen[..., :2] = (seen[..., :2] - corner) / pixel_mm
+    near, _ = nearest(seen, _SHADOW_PIXELS, _SHADOW_PIXELS, np.inf, False)
+    return Light(axes, viewpoint.up.astype(np.float32), near, corner, pixel_mm)
+
+
 def _lay(
     picture: Float32[np.ndarray, "h w 3"], below: Float32[np.ndarray, "h w"],
-    triangles: Triangles, viewpoint: Viewpoint, opacity: float,
+    triangles: Triangles, viewpoint: Viewpoint, light: Light, opacity: float,
 ) -> Float32[np.ndarray, "h w"]:  # fmt: skip
     """Paint them where nothing in ``below`` is nearer; returns their nearness (-inf: nothing)."""
     size = picture.shape[1], picture.shape[0]
@@ -266,6 +287,5 @@ def _lay(
     one_mm = near**2 if perspective else np.float32(1.0)  # of nearness
     winner[near - _SAME_MM * one_mm <= below] = -1
     eye = viewpoint.place_mm.astype(np.float32), perspective
-    light = viewpoint.light.astype(np.float32), viewpoint.up.astype(np.float32)
     shade(picture, winner, seen, triangles, light, eye, opacity)
     return near
