@@ -44,7 +44,11 @@ _TEST_BODY = 2**20  # and the seed: elastic states that training with the same s
 
 def scan_phantom(folder: StrPath, seed: int = 1) -> Path:
     """Write a virtual CT of the built-in kidney phantom as a DICOM series, if none is there;
-    returns the folder, which ``prepare`` reads. Raises StorageError: the disk refused."""
+    returns the folder, which ``prepare`` reads.
+
+    Raises:
+        StorageError: the disk refused.
+    """
     from tumortrack.phantom import dicom, digital, scanner
 
     folder = Path(folder)
@@ -97,8 +101,11 @@ def prepare(
 
 
 def load_case(folder: StrPath) -> Case:
-    """Read a folder that ``prepare`` wrote. Raises ArtifactError: missing, of another schema, or
-    changed since."""
+    """Read a folder that ``prepare`` wrote.
+
+    Raises:
+        ArtifactError: missing, of another schema, or changed since.
+    """
     return read_case(Path(folder))
 
 
@@ -201,17 +208,23 @@ def train(
 
 
 def load_model(folder: StrPath, device: Device = "auto") -> Model:
-    """Read a folder that ``train`` wrote; ``Tracker(model)`` locates with it. Raises ArtifactError:
-    missing, unfinished, of another schema, damaged or changed; InputError: CUDA was asked for and
-    is not available."""
+    """Read a folder that ``train`` wrote; ``Tracker(model)`` locates with it.
+
+    Raises:
+        ArtifactError: missing, unfinished, of another schema, damaged or changed.
+        InputError: CUDA was asked for and is not available.
+    """
     from tumortrack.training import model
 
     return model.load_model(Path(folder), device)
 
 
 def read_cloud(path: StrPath, unit: Literal["mm", "m"] = "mm") -> SensorCloud:
-    """A cloud in the camera frame from .ply, .pcd or .npz; what was dropped is a warning. Raises
-    InputError: missing, damaged, of another kind, in metres, or without any point."""
+    """A cloud in the camera frame from .ply, .pcd or .npz; what was dropped is a warning.
+
+    Raises:
+        InputError: missing, damaged, of another kind, in metres, or without any point.
+    """
     from tumortrack.sense import files
     from tumortrack.sense.cloud import check_cloud
 
@@ -255,8 +268,12 @@ def find_organ(
 
 def save_estimate(estimate: Estimate, folder: StrPath, overwrite: bool = False) -> None:
     """Write what `tumortrack locate` writes: points, labelled volume, surfaces and report; camera
-    frame, mm. Raises InputError: the folder exists and ``overwrite`` is False; StorageError: the
-    disk refused."""
+    frame, mm.
+
+    Raises:
+        InputError: the folder exists and ``overwrite`` is False.
+        StorageError: the disk refused.
+    """
     from tumortrack.tracking.files import write_estimate
 
     write_estimate(Path(folder), estimate, overwrite)
@@ -360,8 +377,11 @@ def track(
 
 
 def named_sinks(sinks: Sequence[Any]) -> dict[str, Any]:
-    """Sinks, or their configurations, by the names that reports give them. Raises InputError: one
-    is not written as it must be, or is given twice."""
+    """Sinks, or their configurations, by the names that reports give them.
+
+    Raises:
+        InputError: one is not written as it must be, or is given twice.
+    """
     from tumortrack.live.spec import SINKS
 
     named: dict[str, Any] = {}
@@ -375,8 +395,12 @@ def named_sinks(sinks: Sequence[Any]) -> dict[str, Any]:
 
 @contextmanager
 def open_sinks(sinks: Mapping[str, Any], context: SinkContext) -> Iterator[list[SinkWorker]]:
-    """``named_sinks``, each at work in a thread of its own. Raises InputError: a sink cannot work;
-    StorageError: a sink cannot write."""
+    """``named_sinks``, each at work in a thread of its own.
+
+    Raises:
+        InputError: a sink cannot work.
+        StorageError: a sink cannot write.
+    """
     from tumortrack.live.values import SinkConfig
     from tumortrack.live.workers import SinkWorker
 

@@ -48,7 +48,7 @@ def test_every_name_has_a_docstring_with_what_it_raises(name):
     text = inspect.getdoc(getattr(tt, name)) or ""
     assert len(text) > 40
     if name in SIGNATURES and name not in ("estimate_from_surfaces", "simulate_scenes"):
-        assert "Raises" in text
+        assert "Raises:" in text
 
 
 def test_importing_the_package_loads_nothing_heavy():

@@ -31,9 +31,12 @@ class CoarseConfig(Config, frozen=True):
 def coarsened(
     anatomy_ct: Anatomy, scene: SceneConfig, coarse: CoarseConfig | None
 ) -> tuple[Anatomy, SceneConfig]:
-    """The anatomy and the configuration for coarser scenes; as they are without ``coarse``. Raises
-    InputError: the organ's surface is not closed; ``views`` of deformations that depend on the
-    view."""
+    """The anatomy and the configuration for coarser scenes; as they are without ``coarse``.
+
+    Raises:
+        InputError: the organ's surface is not closed; ``views`` of deformations that depend on the
+            view.
+    """
     if coarse is None:
         return anatomy_ct, scene
     from tumortrack.imaging.meshes import mesh_of, solid_of
