@@ -97,7 +97,7 @@ causes: setup  ## shares of causes in the tumors' errors: fits told parts of the
 trust: setup  ## what margins are worth for physics and organs left out (ARGS="MODEL/margins.jsonl ...": an organ each)
 	$(BIN)/python lab/scripts/trust.py $(ARGS)
 
-scaling: setup  ## what the fleet's engine costs, on 1 to 8 workers and on paper (3 minutes; ARGS="--store OUT/store")
+scaling: setup  ## what the fleet's engine costs, on 1 to 8 workers and on paper (3 minutes; ARGS="--list LIST --store OUT/store")
 	$(BIN)/python lab/scripts/fleet_scaling.py $(ARGS)
 
 population: setup  ## KiTS19's kidneys with tumors: their list for a fleet, and what came of it (ARGS="DATA --list FILE", then --fleet OUT)

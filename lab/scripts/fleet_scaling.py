@@ -1,47 +1,58 @@
 """What the fleet's engine costs: measured with small tasks, and on paper for many patients.
 
-    make scaling ARGS="[--out runs/scaling.json] [--store STORE] [--patients 1000 1000000]"
+    make scaling ARGS="[--list LIST --store OUT/store] [--patients 1000 1000000]"
 
 Tasks that only wait show what the engine adds on 1, 2, 4 and 8 workers, on few cores too; tasks
 that compute show the cores. A driver alone, whose tasks are nobody's, shows its own time and
-memory. With --store, a fleet's own store, its costs are averaged and laid out on paper.
+memory. With --list and --store, what a finished fleet's patients cost is averaged and laid out on
+paper. Both fill their blocks in docs/fleet.md.
 """
 
 from __future__ import annotations
 
 import hashlib
-import json
 import os
 import resource
-import sys
 import tempfile
 import time
-from collections import defaultdict
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from tumortrack.core.store import write_json
+import pandas as pd
+
+from tumortrack.cli.console import say
+from tumortrack.core.errors import InputError
 from tumortrack_lab.fleet.engine import run
 from tumortrack_lab.fleet.executors import OnRay, Serial
+from tumortrack_lab.fleet.list import Patient, read_list
+from tumortrack_lab.fleet.steps import chain
 from tumortrack_lab.fleet.store import Store
 from tumortrack_lab.fleet.task import Needs, Task
 from tumortrack_lab.fleet.worker import Job, Report
-from tumortrack_lab.study.trainings import run as command
+from tumortrack_lab.study import trainings
+from tumortrack_lab.study.document import table
+from tumortrack_lab.study.trainings import KeptOptions
 
 TASK_S, EACH, DRIVEN = 0.5, 12, 10_000  # a task's length; tasks a worker; tasks of the lone driver
 # Amazon's list prices, us-east-1, on demand: c7i (0.0446 USD a vCPU and hour; two vCPUs share a
 # core), S3 Standard (a GB and month, 1,000 writes, 1,000 reads): aws.amazon.com/ec2/pricing and
 # /s3/pricing.
 CORE_HOUR, GB_MONTH, WRITES, READS = 2 * 0.0446, 0.023, 0.005, 0.0004
+CORES = (8, 64, 1024)  # to state hours for
+MEASURED, PAPER = "scaling", "paper"  # blocks of the document
 
 
-@dataclass(frozen=True)
-class Scaling:
-    out: Path = Path("runs/scaling.json")
-    store: Path | None = None
+@dataclass(frozen=True, kw_only=True)
+class Scaling(KeptOptions):
+    list: Path | None = None
+    """Of a fleet that is done: what its patients cost."""
+    store: str | None = None
+    """Where that fleet's results are."""
     patients: tuple[int, ...] = (1000, 1_000_000)
+    out: Path = Path("runs/scaling")
+    document: Path = Path("docs/fleet.md")
 
 
 def wait(inputs: Mapping[str, Path], options: Mapping[str, Any], out: Path, cores: int) -> None:
@@ -101,75 +112,106 @@ def driven(folder: Path) -> dict[str, Any]:
     return {"tasks": DRIVEN, "ms_a_task": 1000 * used_s / DRIVEN, "grown_mb": grown / 1024}
 
 
-def costs_of(store: Path) -> dict[str, dict[str, float]]:
-    """Mean costs of a patient by step, of the patients whose tasks all left theirs."""
-    sums: dict[str, dict[str, float]] = defaultdict(lambda: defaultdict(float))
-    patients = set()
-    for path in store.glob("costs/??/*.json"):
-        cost = json.loads(path.read_text())
-        if "seconds" in cost:
-            patient, step = cost["task"].split(" ")
-            patients.add(patient)
-            for name in ("seconds", "cpu_s", "bytes"):
-                sums[step][name] += cost[name]
-            sums[step]["tasks"] += 1
-            sums[step]["peak_mb"] = max(sums[step]["peak_mb"], cost["peak_mb"] * len(patients))
+def costs_of(patients: list[Patient], store: Store) -> tuple[int, pd.DataFrame]:
+    """How many patients left the costs of all their tasks, and these costs by step: of a patient
+    ``tasks`` and means of ``cpu_s`` and ``mb``, of all ``most_s`` and ``peak_mb``."""
+    rows = []
+    for patient in patients:
+        steps = chain(patient)
+        costs = {name: store.cost(task.key) for name, task in steps.items()}
+        if all("cpu_s" in cost for cost in costs.values()):
+            rows += [
+                {"patient": patient.name, "step": name.rstrip("0123456789-"), **costs[name]}
+                for name in steps
+            ]
+    if not rows:
+        raise InputError("no patient of the list has left the costs of all its tasks there.")
+    frame = pd.DataFrame(rows)
+    people = frame.patient.nunique()
+    by = frame.groupby("step", sort=False)
+    found = {
+        "tasks": by.size() / people, "cpu_s": by.cpu_s.sum() / people,
+        "most_s": by.cpu_s.max(), "peak_mb": by.peak_mb.max(), "mb": by.bytes.sum() / people / 1e6,
+    }  # fmt: skip
+    return people, pd.DataFrame(found)
+
+
+def on_paper(costs: pd.DataFrame, patients: int, efficiency: float) -> dict[str, str]:
+    """What so many patients take, at these costs of one. CPU seconds: a busy machine's waiting is
+    not the tasks'."""
+    core_hours = patients * costs.cpu_s.sum() / 3600 / efficiency
+    count, gigabytes = patients * costs.tasks.sum(), patients * costs.mb.sum() / 1000
+    requests = count * (7 * WRITES + 12 * READS) / 1000  # 3 files, manifest, cost, claim twice
+    hours = ", ".join(f"{core_hours / cores:,.2g}" for cores in CORES)
+    usd = (core_hours * CORE_HOUR, requests, gigabytes * GB_MONTH)
     return {
-        step: {name: value / len(patients) for name, value in one.items()}
-        for step, one in sums.items()
+        "tasks": f"{count:,.0f}",
+        "core-hours, the engine's included": f"{core_hours:,.0f}",
+        f"hours on {', '.join(map(str, CORES))} cores": hours,
+        "stored, GB": f"{gigabytes:,.0f}",
+        "USD: cores; requests; storage a month": "; ".join(f"{one:,.1f}" for one in usd),
     }
 
 
-def on_paper(costs: dict[str, dict[str, float]], patients: int, efficiency: float) -> dict:
-    """What so many patients take, at these costs of one. CPU seconds: a busy machine's waiting is
-    not the tasks'."""
-    core_hours = patients * sum(one["cpu_s"] for one in costs.values()) / 3600 / efficiency
-    count = patients * sum(one["tasks"] for one in costs.values())
-    gigabytes = patients * sum(one["bytes"] for one in costs.values()) / 1e9
-    requests = count * (7 * WRITES + 12 * READS) / 1000  # 3 files, manifest, cost, claim twice
-    return {
-        "patients": patients, "tasks": count, "core_hours": core_hours, "gigabytes": gigabytes,
-        "hours_on": {cores: core_hours / cores for cores in (8, 64, 1024)},
-        "usd": {"cores": core_hours * CORE_HOUR, "requests": requests,
-                "a_month": gigabytes * GB_MONTH},
-    }  # fmt: skip
+def measured_block(rows: list[dict[str, Any]], driver: dict[str, Any]) -> str:
+    lines = [
+        [f"{row['work']}, {row['workers']} workers", f"{row['efficiency']:.1%}",
+         f"{row['overhead_ms']:.0f}", f"{row['load']:.1f}"] for row in rows
+    ]  # fmt: skip
+    head = ["tasks of 0.5 s that", "efficiency", "overhead, ms a task", "load of the machine"]
+    said = "The driver alone: {ms_a_task:.2f} ms of CPU a task, {grown_mb:.0f} MB more after "
+    return f"{table(head, lines)}\n\n{said.format(**driver)}{DRIVEN:,} tasks."
+
+
+def paper_block(people: int, costs: pd.DataFrame, efficiency: float, sizes: tuple[int, ...]) -> str:
+    lines = [
+        [step, f"{one.tasks:.3g}", f"{one.cpu_s:.1f} ({one.most_s:.0f})", f"{one.peak_mb:,.0f}",
+         f"{one.mb:.1f}"] for step, one in costs.iterrows()
+    ]  # fmt: skip
+    total = costs.sum()
+    lines.append(["a patient", f"{total.tasks:.3g}", f"{total.cpu_s:.0f}", "", f"{total.mb:.0f}"])
+    head = ["step", "tasks", "CPU seconds, mean (most)", "peak MB", "result, MB"]
+    papers = [on_paper(costs, size, efficiency) for size in sizes]
+    rows = [[what, *(paper[what] for paper in papers)] for what in papers[0]]
+    paper = table(["", *(f"{size:,} patients" for size in sizes)], rows)
+    return f"Means over {people} patients.\n\n{table(head, lines)}\n\n{paper}"
 
 
 def main(config: Scaling) -> None:
+    if (config.list is None) != (config.store is None):
+        raise InputError("--list and --store belong together: a fleet's, that is done.")
+    writer = config.begin("scaling", MEASURED, *([] if config.list is None else [PAPER]))
+    rows: list[dict[str, Any]] = []
     # Ray's workers give way to all others of a machine (nice 15), which here would be measured.
     os.environ["RAY_worker_niceness"] = "0"  # noqa: SIM112
     rounds = 200_000
     start_s = time.process_time()
     hashlib.pbkdf2_hmac("sha256", b"fleet", b"", rounds)
     rounds = int(rounds * TASK_S / (time.process_time() - start_s))
-    found: dict[str, Any] = {"load": os.getloadavg(), "cores": os.cpu_count(), "rows": []}
     with tempfile.TemporaryDirectory() as name:
-        found["driver"] = driven(Path(name))
-        print("driver: {ms_a_task:.2f} ms a task, {grown_mb:.0f} MB".format(**found["driver"]))
+        driver = driven(Path(name))
         plan = [(wait, w, {"seconds": TASK_S}) for w in (1, 2, 4, 8)]
         plan += [(compute, w, {"rounds": rounds}) for w in (1, 2)]
         for work, workers, options in plan:
+            load = os.getloadavg()[0]
             row = measured(workers, work, options, Path(name))
-            row["load"] = os.getloadavg()[0]
             row["efficiency"] = EACH * TASK_S / row["seconds"]
             row["overhead_ms"] = 1000 * (row["seconds"] - EACH * TASK_S) / EACH
-            found["rows"].append(row)
-            print(
-                "{work:8} {workers} workers: {tasks} tasks in {seconds:.1f} s, efficiency "
-                "{efficiency:.1%}, {overhead_ms:.0f} ms a task and worker".format(**row),
-                flush=True,
-            )
-    if config.store:
-        found["costs"] = costs_of(config.store)
-        worst = min(row["efficiency"] for row in found["rows"])
-        found["paper"] = [on_paper(found["costs"], n, worst) for n in config.patients]
-        print(json.dumps({"costs": found["costs"], "paper": found["paper"]}, indent=1))
-    config.out.parent.mkdir(parents=True, exist_ok=True)
-    write_json(config.out, found)
-    print(f"written to {config.out}", file=sys.stderr)
+            rows.append({**row, "load": load})
+            say(f"{work.__name__}, {workers} workers: efficiency {row['efficiency']:.1%}")
+    blocks = {MEASURED: f"{measured_block(rows, driver)}\n\n`{writer.command}`"}
+    if config.list is not None:
+        # Tasks that compute share cores with whatever else runs; the engine's share shows in those
+        # that wait.
+        worst = min(row["efficiency"] for row in rows if row["work"] == "wait")
+        people, costs = costs_of(read_list(config.list), Store(str(config.store)))
+        text = paper_block(people, costs, worst, config.patients)
+        blocks[PAPER] = f"{text}\n\n`{writer.command}`"
+    writer.write(blocks)
+    say(f"written to {config.document}")
 
 
 if __name__ == "__main__":
     import fleet_scaling  # this file, by a name that workers know
 
-    command(fleet_scaling.main, fleet_scaling.Scaling)
+    trainings.run(fleet_scaling.main, fleet_scaling.Scaling)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -124,6 +125,16 @@ def test_a_chain_gives_the_same_bits_in_another_folder(fleets):
         for file, data in texts.items():
             for word in (str(tempfile.gettempdir()).encode(), b"erste", b"training_s"):
                 assert word not in data, (name, file, word)
+
+
+def test_patients_are_shown_in_draws_of_their_own(fleets):
+    _, [one, other, *_], _, _ = fleets[1]
+
+    def seeds(patient):
+        steps = chain(patient)
+        return {steps[name].options["seed"] for name in ("states-margins-0", "states-test-0")}
+
+    assert len(seeds(one) | seeds(other) | seeds(replace(one, seed=1))) == 3
 
 
 def test_evaluation_has_states_of_its_own_and_more_views_of_them(fleets):

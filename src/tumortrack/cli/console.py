@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import Literal
@@ -12,6 +13,8 @@ from rich.console import Console
 from tumortrack.core.process import is_follower
 
 Device = Literal["auto", "cpu", "cuda"]
+
+_EVERY_S = 15.0  # between lines where there is no terminal
 
 # Of one training's processes the first alone speaks.
 console = Console(soft_wrap=True, highlight=False, quiet=is_follower())
@@ -40,6 +43,30 @@ def progress_bar(what: str, total: int) -> Iterator[Callable[[], None]]:
     with progress.Progress(*columns, console=console, transient=True) as bar:
         task = bar.add_task(what, total=total)
         yield lambda: bar.advance(task)
+
+
+@contextmanager
+def live_line(first: str) -> Iterator[Callable[..., None]]:
+    """Yields a function of a text, and of whether it is the last: on a terminal it changes one live
+    line, elsewhere it prints a line now and then."""
+    from rich.status import Status
+
+    spinner, shown_s = Status(first, console=console), -_EVERY_S
+
+    def show(text: str, last: bool = False) -> None:
+        nonlocal shown_s
+        if console.is_terminal:
+            spinner.update(text)
+        elif last or time.monotonic() - shown_s >= _EVERY_S:
+            say(text)
+            shown_s = time.monotonic()
+
+    if console.is_terminal:
+        spinner.start()
+    try:
+        yield show
+    finally:
+        spinner.stop()
 
 
 def keep_loaded() -> None:

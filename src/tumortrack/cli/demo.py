@@ -77,8 +77,9 @@ class Demo:
         say("5/5 locating kidney and tumors in each from one depth image")
         Evaluate(model=out / "model", variants=out / "dataset", report=out, grid=128).run()
         scenes = store.read_json(out / "report.json")["scenes"]
-        for first_s in [one["seconds"] for one in scenes if "seconds" in one][:1]:
-            say(f"labels to first estimate: {made_s + first_s:.0f} s, from the CT, with training.")
+        if "seconds" in scenes[0]:  # located
+            to_first_s = made_s + scenes[0]["seconds"]
+            say(f"labels to first estimate: {to_first_s:.0f} s, from the CT, with training.")
         say(f"open {out / 'index.html'} in a browser: estimate over truth, in 3-D, scene by scene.")
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -11,15 +10,13 @@ from typing import TYPE_CHECKING, Literal
 
 from tyro.conf import Positional
 
-from tumortrack.cli.console import Device, console, keep_loaded, say, say_notes
+from tumortrack.cli.console import Device, keep_loaded, live_line, say, say_notes
 from tumortrack.core import store
 from tumortrack.core.errors import InputError
 from tumortrack.core.process import is_follower
 
 if TYPE_CHECKING:
     from tumortrack.training.train import TrainingStatus
-
-_EVERY_S = 15.0  # between lines where there is no terminal
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -154,43 +151,32 @@ class Pretrain:
 
 @contextmanager
 def _training_screen() -> Iterator[Callable[[TrainingStatus], None]]:
-    """Yields a function that shows a status: on a terminal one live line, elsewhere a line now and
-    then."""
-    from rich.status import Status as Spinner
-
+    """Yields a function that shows a status."""
     from tumortrack.training.distributed import ProcessLost
     from tumortrack.training.state import Diverged
     from tumortrack.training.train import Interrupted
 
-    spinner = Spinner("making labelled points, starting workers ...", console=console)
-    shown_s, noted = -_EVERY_S, ""
+    noted = ""
 
     def show(status: TrainingStatus) -> None:
-        nonlocal shown_s, noted
+        nonlocal noted
         if status.note != noted:
             say(status.note)
             noted = status.note
         end = f"/{status.end}" if status.end is not None else ""
         miou = "-" if status.miou is None else f"{status.miou:.3f}"
         minutes, seconds = divmod(int(status.seconds_left), 60)
-        text = (
+        line(
             f"step {status.step}{end} | {status.samples_per_s:.0f} samples/s | loss "
             f"{status.loss:.4f} | validation mIoU {miou} | {minutes}:{seconds:02d} left | "
-            f"{status.waiting:.0%} waiting for scenes"
+            f"{status.waiting:.0%} waiting for scenes",
+            last=status.step == status.end,
         )
-        if console.is_terminal:
-            spinner.update(text)
-        elif time.monotonic() - shown_s >= _EVERY_S or status.step == status.end:
-            say(text)
-            shown_s = time.monotonic()
 
-    if console.is_terminal:
-        spinner.start()
     try:
-        yield show
+        with live_line("making labelled points, starting workers ...") as line:
+            yield show
     except (Interrupted, Diverged, ProcessLost) as error:
         if is_follower():  # the first process reports the same
             raise SystemExit(error.exit_code) from error
         raise
-    finally:
-        spinner.stop()

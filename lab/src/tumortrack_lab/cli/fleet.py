@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import signal
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -14,15 +13,13 @@ from typing import TYPE_CHECKING
 
 from tyro.conf import Positional
 
-from tumortrack.cli.console import console, say
+from tumortrack.cli.console import live_line, say
 from tumortrack.core.errors import InputError, TumortrackError
 
 if TYPE_CHECKING:
     from tumortrack_lab.fleet.engine import Executor, Outcome, Status
     from tumortrack_lab.fleet.list import Patient
     from tumortrack_lab.fleet.task import Task
-
-_EVERY_S = 15.0  # between lines where there is no terminal
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -120,31 +117,18 @@ def _wanted(patient: Patient) -> Task:
 
 @contextmanager
 def _screen() -> Iterator[Callable[[Status], None]]:
-    """Yields a function that shows how far it is: on a terminal one live line, elsewhere a line now
-    and then."""
-    from rich.status import Status as Spinner
-
-    spinner = Spinner("starting ...", console=console)
-    shown_s, noted = -_EVERY_S, ""
+    """Yields a function that shows how far it is."""
+    noted = ""
 
     def show(status: Status) -> None:
-        nonlocal shown_s, noted
+        nonlocal noted
         if status.note != noted:
             say(status.note)
             noted = status.note
-        text = _line(status)
-        if console.is_terminal:
-            spinner.update(text)
-        elif time.monotonic() - shown_s >= _EVERY_S:
-            say(text)
-            shown_s = time.monotonic()
+        line(_line(status))
 
-    if console.is_terminal:
-        spinner.start()
-    try:
+    with live_line("starting ...") as line:
         yield show
-    finally:
-        spinner.stop()
 
 
 def _line(status: Status) -> str:

@@ -8,6 +8,7 @@ model folders and tables of margins state elsewhere. Costs are the engine's to k
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Iterator, Mapping
 from functools import cache
 from importlib.resources import files
@@ -33,7 +34,9 @@ def chain(patient: Patient) -> dict[str, Task]:
     """The patient's tasks by step, each after those that it needs; ``summary`` is what is wanted.
 
     States are made in groups of one of each family, a task a group: more states later leave those
-    that were there as they are. Those of evaluation are never those of margins.
+    that were there as they are. Those of evaluation are never those of margins. A state's number
+    alone would draw the same load, view and sensor errors in every patient, so that many patients
+    would be few draws: the input's content is part of the seed.
     """
     steps: dict[str, Task] = {}
     source = hashed(patient.source)
@@ -60,13 +63,14 @@ def chain(patient: Patient) -> dict[str, Task]:
         begun["start"] = hashed(patient.start)
     model = add("train", train, lesson, {**after, **begun}, 2500)
     groups: dict[str, dict[str, Task | File]] = {"margins": {}, "test": {}}
+    drawn = hashlib.sha256(f"{source.sha256} {patient.seed}".encode()).hexdigest()
     counts = {"margins": (0, patient.margin_states, 1)}
     counts["test"] = _TEST, patient.test_states, patient.views
     for kind, (first, count, views) in counts.items():
         for n in range(first, first + count, len(FAMILIES)):
             here = {
                 "first": n, "count": min(len(FAMILIES), first + count - n), "views": views,
-                "seed": patient.seed,
+                "seed": int(drawn[:8], 16),
             }  # fmt: skip
             name = f"states-{kind}-{len(groups[kind])}"
             groups[kind][f"states_{len(groups[kind]):04d}"] = add(name, states, here, after, 1500)
