@@ -17,6 +17,7 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated
 
+import msgspec
 import pandas as pd
 import tyro
 
@@ -25,7 +26,7 @@ from tumortrack.cli.console import say
 from tumortrack.core import store
 from tumortrack.core.errors import InputError
 from tumortrack.imaging.case import Case
-from tumortrack.models.folder import WEIGHTS, is_finished
+from tumortrack.models.folder import KIND, WEIGHTS, is_finished
 from tumortrack.simulate.scene_folder import Scene, list_scenes, read_scene
 from tumortrack.tracking.tracker import Tracker
 from tumortrack.training.model import SHIPPED
@@ -48,7 +49,8 @@ class Options(trainings.KeptOptions):
     organs: Annotated[tuple[str, ...], tyro.conf.Positional]
     """NAME=FOLDER of each case that `tumortrack prepare` wrote."""
     lengths: tuple[str, ...] = ("0", "100", "400", "6000", "none:6000")
-    """Steps of each training; with none: in front from nothing, else from the head start."""
+    """Steps of each training, from the head start and on coarse scenes; with none: in front from
+    nothing, with full: on whole images of whole surfaces, with none:full: both."""
     start: Path | None = None
     """Head start (default: the package's)."""
     scenes: int = 60
@@ -80,24 +82,29 @@ def _of_length(
     name: str, folder: Path, world: Path | None, length: str, options: Options
 ) -> Iterator[dict]:
     """The rows of one model, a scene each."""
-    from_nothing, _, steps = length.rpartition(":")
-    if from_nothing not in ("", "none") or not steps.isdigit():
-        raise InputError(f"--lengths {length!r} must be steps, or none:steps.")
+    how, _, steps = length.rpartition(":")
+    if how not in ("", "none", "full", "none:full") or not steps.isdigit():
+        raise InputError(f"--lengths {length!r} must be steps, or none:, full:, none:full: before.")
     case_sha256 = store.sha256_of(folder / store.MANIFEST)
-    start = Path("none") if from_nothing else options.start or SHIPPED
-    of = from_nothing or store.sha256_of(start / WEIGHTS)[:8]
+    start = Path("none") if how.startswith("none") else options.start or SHIPPED
+    of = how.replace(":", "-") or store.sha256_of(start / WEIGHTS)[:8]
+    config = clinic(api.load_case(folder).anatomy)
+    if how.endswith("full"):
+        config = msgspec.structs.replace(config, coarse=None)
     model = options.out / name / f"{case_sha256[:8]}-{of}-{options.seed}-{steps}"
     if not is_finished(model):
         say(f"{name}: training for {length} steps")
         api.train(
-            folder, model, steps=int(steps), seed=options.seed, device=options.device, start=start
-        )
+            folder, model, config=config, steps=int(steps), seed=options.seed,
+            device=options.device, start=start,
+        )  # fmt: skip
     about = {
         "case": case_sha256, "scenes": options.scenes,
         "model": store.sha256_of(model / store.MANIFEST), "seed": options.seed,
         "world": None if world is None else store.sha256_of(world),
     }  # fmt: skip
-    known = {"organ": name, "length": length}
+    took = store.read_manifest(model, KIND)["provenance"]["training_s"]
+    known = {"organ": name, "length": length, "training_s": took}
 
     def measure() -> list[dict]:
         case = api.load_case(folder)
@@ -144,7 +151,7 @@ def tables(rows: list[dict]) -> str:
 
 def _table(what: str, lines: pd.DataFrame, column: str) -> str:
     """Verdicts of scenes and errors of tumors' middles, mm, by length and group."""
-    head = [what, "scenes", "good", "poor", "refused"]
+    head = [what, "training, s", "scenes", "good", "poor", "refused"]
     head += [f"good, over {far:g} mm" for far in FAR_MM]
     head += ["middle of tumors, median / 90 / 95 / worst", "called good", "best rigid pose"]
     body = []
@@ -152,7 +159,7 @@ def _table(what: str, lines: pd.DataFrame, column: str) -> str:
         verdicts = some.drop_duplicates("scene").verdict
         good = some[some.verdict == "good"]
         body.append([
-            ", ".join(map(str, key)), str(len(verdicts)),
+            ", ".join(map(str, key)), f"{some.training_s.median():.0f}", str(len(verdicts)),
             *(str((verdicts == one).sum()) for one in ("good", "poor", "refused")),
             *(f"{(good.middle_mm > far).mean():.1%}" if len(good) else "–" for far in FAR_MM),
             *map(quantiles, (some.middle_mm, good.middle_mm, some.rigid_middle_mm)),
