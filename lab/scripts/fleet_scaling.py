@@ -36,9 +36,9 @@ from tumortrack_lab.study.document import table
 from tumortrack_lab.study.trainings import KeptOptions
 
 TASK_S, EACH, DRIVEN = 0.5, 12, 10_000  # a task's length; tasks a worker; tasks of the lone driver
-# Amazon's list prices, us-east-1, on demand: c7i (0.0446 USD a vCPU and hour; two vCPUs share a
-# core), S3 Standard (a GB and month, 1,000 writes, 1,000 reads): aws.amazon.com/ec2/pricing and
-# /s3/pricing.
+# Amazon's list prices as remembered, us-east-1, on demand: c7i (0.0446 USD a vCPU and hour; two
+# vCPUs share a core), S3 Standard (a GB and month, 1,000 writes, 1,000 reads):
+# aws.amazon.com/ec2/pricing and /s3/pricing.
 CORE_HOUR, GB_MONTH, WRITES, READS = 2 * 0.0446, 0.023, 0.005, 0.0004
 CORES = (8, 64, 1024)  # to state hours for
 MEASURED, PAPER = "scaling", "paper"  # blocks of the document

@@ -233,15 +233,19 @@ def test_short_trainings_are_counted_by_scene_and_their_errors_by_tumor():
     def look(organ, verdict, *errors_mm):
         tumors = [{"middle_mm": mm, "rigid_middle_mm": 9.0, "kind": "between"} for mm in errors_mm]
         known = {"organ": organ, "length": "0", "source": "states"}
+        known["training_s"] = {"a": 10.0, "b": 14.0}[organ]
         return {**known, "verdict": verdict, "tumors": tumors}
 
     rows = [look("a", "good", 1.0, 4.0), look("a", "poor", 7.0), look("b", "good", 2.0, 1.0)]
     rows += [{**look("b", "refused", 0.0), "tumors": [{"rigid_middle_mm": 9.0, "kind": "between"}]}]
     found = table_of(rows)
     errors = "1.5 / 3.4 / 3.7 / 4.0"
-    assert f"| 0, states | 4 | 2 | 1 | 1 | 25.0% | 0.0% | 2.0 / 5.8 / 6.4 / 7.0 | {errors}" in found
-    assert "| 0, a | 2 | 1 | 1 | 0 | 50.0% |" in found
-    assert "| 0, between | 4 | 2 | 1 | 1 |" in found
+    assert (
+        f"| 0, states | 12 | 4 | 2 | 1 | 1 | 25.0% | 0.0% | 2.0 / 5.8 / 6.4 / 7.0 | {errors}"
+        in found
+    )
+    assert "| 0, a | 10 | 2 | 1 | 1 | 0 | 50.0% |" in found
+    assert "| 0, between | 12 | 4 | 2 | 1 | 1 |" in found
 
 
 def tiny(anatomy_ct, rotations):

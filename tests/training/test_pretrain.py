@@ -316,3 +316,13 @@ def test_the_commands_refuse_what_is_no_start_for_them(pretrained, tmp_path):
 
 def test_the_command_line_keeps_finished_weights(pretrained):
     assert "other options" in refusal(tumortrack("pretrain", pretrained, "--steps", 5))
+
+
+def test_a_head_start_shortens_what_nobody_has_limited(patient):
+    config = msgspec.structs.replace(patient.config, steps=60, steps_from_start=7)
+    run = replace(patient, config=config, steps=None)
+    assert run.end == TrainingState(run, CPU).progress.end == 7
+    assert replace(run, start=None).end == 60
+    assert replace(run, config=msgspec.structs.replace(config, steps_from_start=None)).end == 60
+    assert replace(run, minutes=1.0).end is None
+    assert replace(run, minutes=0.0).end == 0

@@ -32,7 +32,7 @@ class Demo:
     """
 
     out: Path = Path("runs/demo")
-    minutes: float = 2.0
+    minutes: float = 0.5
     scenes: int = 20
 
     def run(self) -> None:

@@ -107,7 +107,7 @@ class TrainConfig(Config, frozen=True):
     """Everything that decides the weights, apart from case, seed and number of steps; ``refine``
     is how an elastic body is fitted to the cloud, in validation and in use."""
 
-    LATER = ("refine", "coarse")
+    LATER = ("refine", "coarse", "steps_from_start")
 
     network: NetworkConfig
     scene: SceneConfig
@@ -123,3 +123,4 @@ class TrainConfig(Config, frozen=True):
     validate_every: int = 250  # steps
     refine: GaussNewtonConfig = GaussNewtonConfig()
     coarse: CoarseConfig | None = None  # training scenes; those of validation stay as they are
+    steps_from_start: int | None = None  # the preset's end with a head start; None: ``steps``

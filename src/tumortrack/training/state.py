@@ -68,6 +68,16 @@ class TrainingRun:
             )
 
     @property
+    def end(self) -> int | None:
+        """The last step; None where minutes settle it on the way."""
+        if self.steps is not None:
+            return self.steps
+        if self.minutes is not None:
+            return None if self.minutes else 0
+        short = None if self.start is None else self.config.steps_from_start
+        return self.config.steps if short is None else short
+
+    @property
     def identity(self) -> str:
         """sha256 of all that decides the weights, so that a resumed run is the same run."""
         start = {} if self.start is None else {"start": self.start.sha256}
@@ -90,6 +100,10 @@ class Pretraining:
 
     def __post_init__(self) -> None:
         _check(self, anatomies=1, steps=1, seed=0, workers=0)
+
+    @property
+    def end(self) -> int:
+        return self.steps
 
     @property
     def identity(self) -> str:
@@ -192,16 +206,13 @@ class TrainingState:
         self.run, self._device = run, device
         self.group = group or ProcessGroup(device)
         self._bf16 = has_fast_bfloat16(device)
-        config = run.config
+        network = run.config.network
         torch.manual_seed(run.seed)
-        new_network = model_class(config.network).new_network
-        self.network = new_network(config.network).to(device)
-        self.average = new_network(config.network).to(device).eval().requires_grad_(False)
+        new_network = model_class(network).new_network
+        self.network = new_network(network).to(device)
+        self.average = new_network(network).to(device).eval().requires_grad_(False)
         self.average.load_state_dict(self.network.state_dict())
-        # With other minutes the end is settled on the way.
-        whole: dict[float | None, int] = {None: config.steps, 0: 0}
-        end = whole.get(run.minutes) if run.steps is None else run.steps
-        self.progress = TrainingProgress(end=end)
+        self.progress = TrainingProgress(end=run.end)
         self._best: dict[str, Tensor] = {}
         self.learning_rate = 0.0  # of the last step
 
