@@ -42,10 +42,10 @@ check: setup  ## lint, types, import order, licences
 	$(BIN)/lint-imports
 	$(BIN)/python tools/dependencies.py licences
 
-debian:  ## install what tests need from Debian (ROS, RViz, Chromium)
+debian:  ## install what tests need from Debian (Chromium, Fast DDS)
 	tools/debian.sh
 
-test: check  ## check, then all tests (those of ROS, RViz and Chromium after `make debian`)
+test: check  ## check, then all tests (those of Chromium and Fast DDS after `make debian`)
 	OMP_NUM_THREADS=1 $(BIN)/pytest -n 3 --dist loadfile --no-loadscope-reorder
 
 pretrained: setup  ## the weights of random kidneys that the package ships (ARGS="--anatomies N --steps N")

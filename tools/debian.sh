@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Install what tests of ROS, RealSense and the web viewer need of Debian. Where that is not
+# Install what tests of ROS 2, RealSense and the web viewer need of Debian. Where that is not
 # possible (another system, no root), say so: those tests then skip, with this reason.
 set -euo pipefail
 cd "$(dirname "$0")"

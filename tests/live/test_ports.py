@@ -5,15 +5,11 @@ from __future__ import annotations
 
 import contextlib
 import http.client
-import os
 import socket
 import struct
-import tempfile
 import threading
-import xmlrpc.client
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import msgspec
 import pytest
@@ -25,12 +21,9 @@ from clock import PATIENCE_S, until
 from hostile_clients import MANY, crowd, drip, noise, resident_mb
 from igtl_objects import hear
 from live_objects import empty_update, small_setting, small_update
-from ros1_objects import listener, ros1_graph
 from tumortrack.live.igtl.link import MOST_RECEIVERS
 from tumortrack.live.network import Pace, is_loopback
-from tumortrack.live.ros import rospy_guard
 from tumortrack.live.sinks.openigtlink import OpenIgtLinkSinkConfig
-from tumortrack.live.sinks.ros import Ros1SinkConfig, Ros2SinkConfig
 from tumortrack.live.sinks.viewer import ViewerSink, ViewerSinkConfig
 from tumortrack.live.viewer.guard import MOST_CONNECTIONS, MOST_PAGES
 
@@ -226,17 +219,6 @@ def test_loopback_is_known_by_any_of_its_names():
     assert not any(map(is_loopback, ("0.0.0.0", "::", "192.168.1.4", "robot", "")))
 
 
-def test_ros1_is_open_where_ros_is_told_so(monkeypatch):
-    for name in ("ROS_IP", "ROS_HOSTNAME"):
-        monkeypatch.delenv(name, raising=False)
-    assert not rospy_guard.is_open("localhost")
-    assert rospy_guard.is_open("robot")
-    monkeypatch.setenv("ROS_IP", "192.168.1.4")
-    assert rospy_guard.is_open("localhost")
-    monkeypatch.setenv("ROS_HOSTNAME", "localhost")  # ROS asks this one first
-    assert not rospy_guard.is_open("localhost")
-
-
 def test_pace_lets_a_second_pass_and_then_holds_back():
     pace = Pace(100)
     waits = [pace.wait_s() for _ in range(300)]
@@ -360,69 +342,10 @@ def openigtlink_served() -> Iterator[Served]:
             sink.close()
 
 
-def ros1_ports() -> tuple[int, int]:
-    """Of this process's node: XML-RPC, TCPROS."""
-    import rospy
-    from rospy.impl import tcpros_base
-
-    calls = int(rospy.get_node_uri().split(":")[-1].strip("/"))
-    return calls, tcpros_base._tcpros_server.get_address()[1]
-
-
-@contextlib.contextmanager
-def ros1_served() -> Iterator[Served]:
-    ros1_graph()
-    sink = Ros1SinkConfig(namespace="/crowded", mesh_hz=1000).open(small_setting())
-    calls, tcpros = ros1_ports()
-    post = b"POST /RPC2 HTTP/1.1\r\nHost: x\r\nContent-Type: text/xml\r\nContent-Length: "
-    openings = {
-        calls: (
-            post + b"9000000000000\r\n\r\n<",
-            post + b"1000\r\n\r\n<methodCall>",
-            post + b"-1\r\n\r\n",
-        ),
-        tcpros: (
-            b"\xff\xff\xff\xff" + b"a" * 2**20,  # a header of 4 GB
-            b"\x10\0\0\0",  # one that does not come
-            b"\0\0\0\0",
-            b"\x05\0\0\0\xff\0\0\0a",
-        ),
-    }
-    at_rest = threading.active_count()
-    with tempfile.TemporaryDirectory() as name, listener("/crowded", Path(name)):
-
-        @contextlib.contextmanager
-        def joined() -> Iterator[object]:
-            sequence = 10**6
-            with listener("/crowded", Path(name), "joined") as other:
-
-                def came() -> bool:
-                    nonlocal sequence
-                    sequence += 1
-                    sink.publish(small_update(sequence))
-                    return bool(other.messages("cloud"))
-
-                until(came, "a newcomer's first message")
-                yield other
-
-        try:
-            yield Served(
-                lambda n: sink.publish(small_update(n)),
-                lambda: (Path(name) / "heard.jsonl").read_bytes().count(b"\n"),
-                joined,
-                lambda: threading.active_count() - at_rest,
-                2 * rospy_guard.MOST_CALLERS + rospy_guard.MOST_PEERS,
-                openings,
-            )
-        finally:
-            sink.close()
-
-
-SERVED = {"viewer": viewer_served, "openigtlink": openigtlink_served, "ros1": ros1_served}
+SERVED = {"viewer": viewer_served, "openigtlink": openigtlink_served}
 
 
 @pytest.mark.slow
-@pytest.mark.filterwarnings("ignore:notifyAll:DeprecationWarning")  # rospy's own
 @pytest.mark.parametrize("kind", list(SERVED))
 def test_who_behaves_goes_on_receiving_whatever_others_do(kind):
     with SERVED[kind]() as served:
@@ -458,32 +381,3 @@ def test_who_behaves_goes_on_receiving_whatever_others_do(kind):
             with served.joined():
                 goes_on()
         assert resident_mb() - before_mb < _ALLOWED_MB
-
-
-def test_ros1_listens_here_alone_and_refuses_calls_of_a_browsers_page():
-    ros1_graph()
-    sink = Ros1SinkConfig(namespace="/browsed").open(small_setting())
-    try:
-        ports = ros1_ports()
-        assert all(listening(one) == {LOOPBACK} for one in ports)
-        assert sink.notes[0].startswith("on this machine alone")
-        port = ports[0]
-        body = xmlrpc.client.dumps(("/x",), "getPid")
-        for headers, status in (({}, 200), ({"Origin": "http://tumors.example"}, 403)):
-            caller = http.client.HTTPConnection("127.0.0.1", port, timeout=PATIENCE_S)
-            caller.request("POST", "/RPC2", body, headers)
-            answer = caller.getresponse()
-            assert answer.status == status
-            assert (str(os.getpid()).encode() in answer.read()) == (status == 200)
-    finally:
-        sink.close()
-
-
-def test_ros2_says_who_reaches_it(monkeypatch):
-    for local in (False, True):
-        monkeypatch.setenv("ROS_LOCALHOST_ONLY", str(int(local)))
-        sink = Ros2SinkConfig(namespace="/reach").open(small_setting())
-        try:
-            assert ("anyone in this network" in sink.notes[0]) != local
-        finally:
-            sink.close()

@@ -359,36 +359,6 @@ def test_bags_of_every_kind_are_played(tmp_path, kind):
             RecordingSourceConfig(path=path, **options).open()
 
 
-ROSBAG = """
-import struct, sys
-import rosbag, rospy
-from sensor_msgs.msg import CameraInfo, Image
-from std_msgs.msg import Header
-with rosbag.Bag(sys.argv[1], "w", compression=sys.argv[2], chunk_threshold=100) as bag:
-    for n in range(4):
-        header = Header(stamp=rospy.Time(100 + n, 7), frame_id="arm")
-        image = Image(header=header, height=2, width=3, encoding="16UC1", step=6)
-        image.data = struct.pack("<6H", 120 + n, 0, 130, 140, 150, 160)
-        info = CameraInfo(header=header, height=2, width=3, D=[0.0] * 5)
-        info.K = [6.0, 0, 1.25, 0, 6.5, 0.5, 0, 0, 1]
-        bag.write("/arm/depth/image_raw", image, header.stamp)
-        bag.write("/arm/depth/camera_info", info, header.stamp)
-"""
-
-
-@pytest.mark.parametrize("packing", ["none", "bz2", "lz4"])
-def test_bags_of_ros_1_itself_are_played(tmp_path, packing):
-    if not Path("/usr/lib/python3/dist-packages/rosbag").is_dir():
-        pytest.skip("Debian's ROS packages are not installed: `make debian`")
-    command = ["/usr/bin/python3", "-c", ROSBAG, str(tmp_path / "r.bag"), packing]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
-    assert done.returncode == 0, done.stderr
-    got = play(tmp_path / "r.bag")
-    assert stamps(got) == [(100 + n) * 10**9 + 7 for n in range(4)]
-    assert [seen.content.depth_mm[0, 0] for seen in got] == [120, 121, 122, 123]
-    assert got[0].content.intrinsics.cx == 1.25
-
-
 def test_two_candidates_are_named_rather_than_guessed(tmp_path):
     frames = [frame_number(0)]
     topics = {

@@ -34,6 +34,7 @@ from tumortrack.live.ros.ros2 import open_bus
 from tumortrack.live.ros.sensors import messages_seen, plain_cloud
 from tumortrack.live.sinks.ros import Ros2SinkConfig as SinkRos2
 from tumortrack.live.sources.ros import Ros2SourceConfig as SourceRos2
+from tumortrack.live.spec import POSES, SINKS, SOURCES, Registry
 from tumortrack.live.values import Observation, Source
 from tumortrack.live.workers import SourceWorker
 from workcell_objects import with_arms, working
@@ -272,6 +273,12 @@ def test_damaged_bytes_are_not_sent(bus: Bus, messages: Messages) -> None:
     publisher.publish(cdr)
     with pytest.raises(TumortrackError, match=r"/points: a message of \d+ bytes was not sent"):
         publisher.publish(cdr[:60])
+
+
+@pytest.mark.parametrize("kinds", [SOURCES, SINKS, POSES])
+def test_whoever_asks_for_ros_1_is_told_what_to_do(kinds: Registry) -> None:
+    with pytest.raises(InputError, match=r"ROS 1 was removed.*ros1_bridge.*recording:PATH"):
+        kinds.parse("ros1:/camera/points?unit_mm=1")
 
 
 @pytest.mark.parametrize("value", ["233", "-1", "1.5", "home", "²"])

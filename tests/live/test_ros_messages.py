@@ -3,10 +3,7 @@ classes read them."""
 
 from __future__ import annotations
 
-import json
-import subprocess
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -42,11 +39,10 @@ from tumortrack.live.ros.sensors import (
     messages_seen,
 )
 from tumortrack.live.values import Observation, PublishedFrame, Workcell
-from workcell_objects import virtual, with_arms, workcell, working
+from workcell_objects import virtual, with_arms, working
 
 HUMBLE, NOETIC = Messages("humble"), Messages("noetic")
 STOCK = {HUMBLE: get_typestore(Stores.ROS2_HUMBLE), NOETIC: get_typestore(Stores.ROS1_NOETIC)}
-DEBIAN = Path("/usr/lib/python3/dist-packages/sensor_msgs")
 POINTS_M = np.array([[0.01, -0.02, 0.125], [0.003, 0.004, 0.13], [-0.05, 0.0, 0.2]])
 _TURN = Rotation.from_euler("xyz", [0.3, -1, 2]).as_matrix()
 BARE = Workcell("hold")  # nothing to show but its state
@@ -437,98 +433,6 @@ def test_bytes_are_those_of_plain_messages(messages, update):
         else:
             again = stock.serialize_ros1(stock.deserialize_ros1(raw, kind), kind)
         assert bytes(again) == bytes(raw), out.suffix
-
-
-RECEIVER = """
-import importlib, json, sys
-from pathlib import Path
-said = {}
-for line in Path(sys.argv[1], "list").read_text().splitlines():
-    name, kind, md5 = line.split()
-    package, _, short = kind.partition("/msg/")
-    cls = getattr(importlib.import_module(package + ".msg"), short)
-    raw = Path(sys.argv[1], name).read_bytes()
-    message = cls().deserialize(raw)
-    import io
-    again = io.BytesIO()
-    message.serialize(again)
-    entry = said[name] = {"same": again.getvalue() == raw, "md5": cls._md5sum == md5}
-    if short == "PointCloud2":
-        from sensor_msgs.point_cloud2 import read_points
-        entry["points"] = list(read_points(message, ("x", "y", "z", "label", "probability")))
-    if short == "MarkerArray":
-        entry["corners"] = {m.ns: [(p.x, p.y, p.z) for p in m.points] for m in message.markers}
-        entry["stamp"] = message.markers[0].header.stamp.to_nsec()
-    if short == "JointState":
-        entry["joints"] = dict(zip(message.name, message.position))
-    if short == "DiagnosticArray":
-        entry["said"] = {v.key: v.value for v in message.status[0].values}
-print(json.dumps(said))
-"""
-SENDER = """
-import struct, sys
-import rospy
-from sensor_msgs import point_cloud2
-from sensor_msgs.msg import CameraInfo, Image
-from std_msgs.msg import Header
-header = Header(stamp=rospy.Time(12, 34), frame_id="arm")
-cloud = point_cloud2.create_cloud_xyz32(header, [(0.01, -0.02, 0.125), (0.003, 0.004, 0.13)])
-image = Image(header=header, height=2, width=3, encoding="16UC1", step=6)
-image.data = struct.pack("<6H", 120, 0, 130, 140, 150, 160)
-info = CameraInfo(header=header, height=2, width=3, D=[0.0] * 5)
-info.K = [6.0, 0, 1.25, 0, 6.5, 0.5, 0, 0, 1]
-for name, message in (("cloud", cloud), ("image", image), ("info", info)):
-    with open(sys.argv[1] + "/" + name, "wb") as stream:
-        message.serialize(stream)
-"""
-
-
-def run_ros(script: str, folder: Path) -> str:
-    if not DEBIAN.is_dir():
-        pytest.skip("Debian's ROS packages are not installed: `make debian`")
-    command = ["/usr/bin/python3", "-c", script, str(folder)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
-    assert done.returncode == 0, done.stderr
-    return done.stdout
-
-
-def test_ros_s_own_classes_read_what_is_sent(tmp_path):
-    update, lines = replace(small_update(frames=TURNED), workcell=workcell(0.3)), []
-    for out in ResultMessages(NOETIC, with_arms()).of(update):
-        name = out.suffix.replace("/", "_")
-        (tmp_path / name).write_bytes(NOETIC.to_bytes(out.message))
-        lines.append(f"{name} {out.message_type} {NOETIC.definition(out.message_type)[1]}")
-    for n, out in enumerate(messages_seen(update.observation, NOETIC)):
-        (tmp_path / f"seen_{n}").write_bytes(NOETIC.to_bytes(out.message))
-        lines.append(f"seen_{n} {out.message_type} {NOETIC.definition(out.message_type)[1]}")
-    (tmp_path / "list").write_text("\n".join(lines))
-    said = json.loads(run_ros(RECEIVER, tmp_path))
-    assert len(said) == len(lines) == 11
-    assert all(entry["same"] and entry["md5"] for entry in said.values())
-    placed, points = update.transformed, np.array(said["cloud"]["points"])
-    np.testing.assert_allclose(points[:, :3] * 1000, placed.points_mm, atol=1e-4)
-    np.testing.assert_array_equal(points[:, 3], placed.labels)
-    np.testing.assert_allclose(points[:, 4], placed.probability)
-    assert said["meshes"]["stamp"] == STAMP_NS
-    kidney = placed.meshes["kidney"]
-    corners_mm = np.array(said["meshes"]["corners"]["kidney"]) * 1000
-    np.testing.assert_allclose(corners_mm, kidney.vertices_mm[kidney.faces.ravel()])
-    assert said["diagnostics"]["said"]["quality"] == "good"
-    assert said["joint_states"]["joints"] == workcell(0.3).joints_rad
-    cuts = {line.name: line.points_mm for line in workcell(0.3).lines}
-    np.testing.assert_allclose(np.array(said["workcell"]["corners"]["cut/2"]) * 1000, cuts["cut/2"])
-
-
-def test_what_ros_s_own_classes_send_is_read(tmp_path):
-    run_ros(SENDER, tmp_path)
-    cloud, image, info = (
-        NOETIC.from_bytes((tmp_path / name).read_bytes(), kind)
-        for name, kind in (("cloud", CLOUD), ("image", IMAGE), ("info", CAMERA_INFO))
-    )
-    np.testing.assert_allclose(cloud_of(cloud).points_mm, POINTS_M[:2] * 1000, rtol=1e-6)
-    frame = depth_of(image, info)
-    np.testing.assert_array_equal(frame.depth_mm, [[120, np.nan, 130], [140, 150, 160]])
-    assert (frame.stamp_ns, frame.intrinsics.cx) == (12_000_000_034, 1.25)
 
 
 def test_marker_arrays_of_humble_and_noetic_differ():

@@ -24,7 +24,6 @@ from tumortrack.core.errors import InputError
 from tumortrack.core.types import DepthFrame, SensorCloud
 from tumortrack.live.sources.realsense import RealSenseSource, RealSenseSourceConfig
 from tumortrack.live.sources.recording import RecordingSourceConfig
-from tumortrack.live.sources.ros import Ros1SourceConfig
 from tumortrack.live.sources.virtual import VirtualSource
 from tumortrack.live.values import Observation, Source, SourceEnded, SourceLost
 
@@ -88,24 +87,6 @@ def _ros2(kind: str) -> Iterator[Source]:
 
 
 @contextmanager
-def ros1_depth(_folder: Path) -> Iterator[Source]:
-    yield from _ros1({"/contract/depth/camera_info": "info", "/contract/depth/image_raw": "depth"})
-
-
-@contextmanager
-def ros1_cloud(_folder: Path) -> Iterator[Source]:
-    yield from _ros1({"/contract/points": "cloud"})
-
-
-def _ros1(topics: dict[str, str]) -> Iterator[Source]:
-    from ros1_objects import eventually, publisher, ros1_graph
-
-    ros1_graph()
-    with publisher(topics):
-        yield eventually(Ros1SourceConfig(topic=list(topics)[-1]).open, "the topic")
-
-
-@contextmanager
 def recorded_mcap(folder: Path) -> Iterator[Source]:
     pytest.importorskip("rosbags")
     path = record(folder / "r", [update_number(n) for n in range(8)])
@@ -136,8 +117,6 @@ KINDS: dict[str, Callable[[Path], AbstractContextManager[Source]]] = {
     "realsense": realsense,
     "realsense_playback": playback,
     "realsense_playback_frame_by_frame": playback_frame_by_frame,
-    "ros1_depth": ros1_depth,
-    "ros1_cloud": ros1_cloud,
 }
 
 

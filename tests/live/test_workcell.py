@@ -27,7 +27,7 @@ from tumortrack.live.sources.recording import RecordingSourceConfig
 from tumortrack.live.values import Observation, SinkContext, SourceEnded, TrackingResult
 from workcell_objects import CUT, REASON, TABLE, virtual, with_arms, workcell, working
 
-HUMBLE, NOETIC = Messages("humble"), Messages("noetic")
+HUMBLE = Messages("humble")
 NAMES = [shape.name for shape in workcell().shapes]
 
 
@@ -86,7 +86,7 @@ def test_joints_and_markers_say_where_everything_stands():
 
 
 def test_arms_are_told_of_without_an_estimate_and_why_they_stand():
-    results = ResultMessages(NOETIC, with_arms())
+    results = ResultMessages(HUMBLE, with_arms())
     out = sent(virtual(halted="the tumor moved by 6 mm"), results)
     assert len(out["workcell"].markers) == len(NAMES) + 3
     assert [m.action for m in out["meshes"].markers] == [3]  # DELETEALL: no estimate

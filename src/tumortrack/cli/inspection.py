@@ -35,7 +35,6 @@ _OPTIONAL = {
     "rosbags": "ROS messages and recordings",
     "cyclonedds": "ROS 2 without ROS",
     "rclpy": "ROS 2 through your ROS",
-    "rospy": "ROS 1",
     "pyrealsense2": "RealSense cameras",
     "highdicom": "DICOM segmentations",
     "pinocchio": "arms: kinematics and collisions",

@@ -40,7 +40,7 @@ _FPS = 30.0  # of an execution that no camera drives
 _NOTHING = "PLAYBACK of a stored plan: nothing is tracked"
 _FILM_FRAMES, _FILM_STEP_S = 120, 0.1
 _DRY_RUN = "DRY RUN: no arm is connected"
-_LIVE = ("realsense", "ros2", "ros1")  # sources that show the present
+_LIVE = ("realsense", "ros2")  # sources that show the present
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -160,7 +160,7 @@ class Resect(StatedPatient):
                 stored.frame_source != INVENTED
             ),
             "a plan made with --frame FILE that has camera_frame_id, as this source has": (
-                live is None or stored.frames.camera_frame_id or live.kind not in ("ros1", "ros2")
+                live is None or stored.frames.camera_frame_id or live.kind != "ros2"
             ),
             "a plan made with --cell FILE that gives both bases, and keeps to them": (
                 stored.cell_source != INVENTED

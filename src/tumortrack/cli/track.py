@@ -51,8 +51,8 @@ class Track(StatedPatient):
     """Follow kidney and tumors live, from a camera to viewers, recordings and robots.
 
     Sources and sinks are written kind:target?option=value&option=value. Sources: virtual:CASE,
-    recording:PATH, realsense[:SERIAL|FILE], ros2:TOPIC, ros1:TOPIC. Sinks: viewer[:PORT],
-    recording:FOLDER, ros2[:TOPIC], ros1[:TOPIC], openigtlink[:PORT], and for `resect` ur:HOST.
+    recording:PATH, realsense[:SERIAL|FILE], ros2:TOPIC. Sinks: viewer[:PORT],
+    recording:FOLDER, ros2[:TOPIC], openigtlink[:PORT], and for `resect` ur:HOST.
     Installed packages can add sources and sinks. A wrong one is answered with what is allowed.
     docs/live.md has examples.
 
@@ -68,7 +68,7 @@ class Track(StatedPatient):
         poses: JSON that says where all cameras stand, as for `locate`, SOURCE's first; results are
             in its frame, unless --frame gives another.
         moving: SOURCE's camera moves; where it is in each frame comes from file:POSES.csv, tf
-            (ros2:FIXED_FRAME, ros1:FIXED_FRAME) or a robot (ur:HOST). Where that gives poses of a
+            (ros2:FIXED_FRAME) or a robot (ur:HOST). Where that gives poses of a
             tool, --frame has tool_from_camera.
         scan: with --moving: begin with three looks at the organ at rest, from 30 degrees apart,
             within 5 s; what they show together is what the following starts from.

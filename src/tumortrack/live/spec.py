@@ -68,6 +68,11 @@ class Registry(Generic[C]):
             return EntryPoint(kind, self.built_in[kind], self.group).load()
         entries = self._entry_points()
         found = [entry for entry in entries if entry.name == kind]
+        if not found and kind == "ros1":
+            raise InputError(
+                f"{where}: ROS 1 was removed after its end of life, May 2025. Bridge its topics to "
+                "ROS 2 (ros1_bridge) and say ros2, or play a .bag: recording:PATH."
+            )
         if not found:
             allowed = sorted({*self.built_in, *(entry.name for entry in entries)})
             raise InputError(f"{where}: there is no kind {kind!r}. Allowed: {', '.join(allowed)}.")
@@ -105,7 +110,6 @@ SOURCES = Registry[SourceConfig](
         "realsense": f"{_LIVE}.sources.realsense:RealSenseSourceConfig",
         "recording": f"{_LIVE}.sources.recording:RecordingSourceConfig",
         "ros2": f"{_LIVE}.sources.ros:Ros2SourceConfig",
-        "ros1": f"{_LIVE}.sources.ros:Ros1SourceConfig",
     },
 )
 SINKS = Registry[SinkConfig](
@@ -116,7 +120,6 @@ SINKS = Registry[SinkConfig](
         "viewer": f"{_LIVE}.sinks.viewer:ViewerSinkConfig",
         "recording": f"{_LIVE}.sinks.recording:RecordingSinkConfig",
         "ros2": f"{_LIVE}.sinks.ros:Ros2SinkConfig",
-        "ros1": f"{_LIVE}.sinks.ros:Ros1SinkConfig",
         "openigtlink": f"{_LIVE}.sinks.openigtlink:OpenIgtLinkSinkConfig",
         "ur": f"{_LIVE}.sinks.ur:UrSinkConfig",
     },
@@ -130,7 +133,6 @@ POSES = Registry[PosesConfig](
     {
         "file": f"{_LIVE}.poses:PosesFileConfig",
         "ros2": f"{_LIVE}.ros.tf:Ros2PosesConfig",
-        "ros1": f"{_LIVE}.ros.tf:Ros1PosesConfig",
         "ur": f"{_LIVE}.robot:UrPosesConfig",
     },
 )

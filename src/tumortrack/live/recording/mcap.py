@@ -57,7 +57,7 @@ class McapBag:
         self._last_ns = max(self._last_ns, arrived_ns)
         for topic, message_type, message in out:
             if topic not in self._connections:
-                definition, _ = self._messages.definition(message_type)
+                definition = self._messages.definition(message_type)
                 type_hash = self._messages.type_hash(message_type)
                 self._connections[topic] = self._writer.add_connection(
                     topic, message_type, msgdef=definition, rihs01=type_hash

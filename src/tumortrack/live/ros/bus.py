@@ -1,8 +1,7 @@
 """A ROS graph as seen by one program: topics in and out as serialised bytes.
 
-Three implementations have the interface ``Bus``: ``dds.DdsBus`` (ROS 2 by Cyclone DDS, no ROS
-needed), ``ros2.RclpyBus`` (ROS 2 by the user's own ROS, with its RMW and security) and
-``rospy_node.RospyBus`` (ROS 1).
+Two implementations have the interface ``Bus``: ``dds.DdsBus`` (by Cyclone DDS, no ROS needed) and
+``ros2.RclpyBus`` (by the user's own ROS, with its RMW and security).
 """
 
 from __future__ import annotations
@@ -21,12 +20,10 @@ class Publisher(NamedTuple):
 
     ``publish`` sends a message, in ROS 2 CDR with its 4 bytes of header, or raises TumortrackError.
     ``flush`` returns when all reliable subscribers have what was sent, or after so many seconds.
-    ``wanted``: False if surely nobody subscribes.
     """
 
     publish: Callable[[bytes | memoryview], None]
     flush: Callable[[float], None]
-    wanted: Callable[[], bool] = lambda: True
 
 
 class Subscriber:
@@ -71,16 +68,10 @@ class Bus(Protocol):
         """Leave the graph."""
 
 
-def check_topic(kind: str, what: str, name: str) -> None:
-    """Raises InputError unless ``name`` is a topic's: in ROS 2 a full one such as
-    /camera/depth/image, in ROS 1 any (http://wiki.ros.org/Names)."""
-    if kind == "ros2" and not re.fullmatch(r"(/[A-Za-z_]\w*)+", name, re.ASCII):
+def check_topic(what: str, name: str) -> None:
+    """Raises InputError unless ``name`` is a topic's full one, such as /camera/depth/image."""
+    if not re.fullmatch(r"(/[A-Za-z_]\w*)+", name, re.ASCII):
         raise InputError(
             f"ros2: the {what} {name!r} is no full topic name; it must look like "
             "/camera/depth/image: letters, digits and underscores between slashes, no digit first."
-        )
-    if kind == "ros1" and not re.fullmatch(r"[/~]?[A-Za-z]\w*(/[A-Za-z]\w*)*", name, re.ASCII):
-        raise InputError(
-            f"{name!r} is no ROS topic; names look like /camera/depth/points: letters, digits, _ "
-            "and / between them."
         )

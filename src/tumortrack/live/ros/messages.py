@@ -1,4 +1,4 @@
-"""Messages of ROS 1 or 2, made from field names, and their bytes: CDR in ROS 2, its own form in 1.
+"""Messages of ROS 2, made from field names, and their bytes (CDR); and of ROS 1, as bags hold them.
 
 Types come from rosbags, a pure Python library that needs no ROS. ROS 1 has the same types by
 shorter names: ``sensor_msgs/msg/Image`` here is its ``sensor_msgs/Image``.
@@ -96,10 +96,9 @@ class Messages:
                 "receiver of the same ROS distribution?"
             ) from error
 
-    def definition(self, message_type: str) -> tuple[str, str]:
-        """The type in ROS's own words, with the types that it is made of; and the sum by which
-        ROS 1 knows it."""
-        return self._store.generate_msgdef(message_type, ros_version=1 if self._is_ros1 else 2)
+    def definition(self, message_type: str) -> str:
+        """The type in ROS 2's own words, with the types that it is made of."""
+        return self._store.generate_msgdef(message_type, ros_version=2)[0]
 
     def type_hash(self, message_type: str) -> str:
         """By which ROS 2 knows the type: ``RIHS01_...`` (REP 2011)."""

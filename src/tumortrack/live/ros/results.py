@@ -39,7 +39,7 @@ _STATE_COLOUR: Colour = (235, 238, 242)
 _KIDNEY_OPACITY = 0.35
 _TEXT_HEIGHT_M, _STATE_HEIGHT_M = 0.008, 0.025
 _TEXT_COLUMNS, _STATE_COLUMNS = 44, 70
-_GAP_M = 0.012  # between lines, besides their height: measured in RViz of ROS 1; ROS 2's has 0.005
+_GAP_M = 0.012  # between lines, besides their height: measured in RViz of ROS 1; RViz 2's has 0.005
 _ORIGIN = np.zeros(3)
 
 _POINT = np.dtype(

@@ -1,4 +1,4 @@
-"""Where a camera is by tf, as ROS 1 and ROS 2 publish it: /tf between stamps, /tf_static always."""
+"""Where a camera is by tf: /tf between stamps, /tf_static always."""
 
 from __future__ import annotations
 
@@ -14,7 +14,6 @@ from tumortrack.live.poses import CameraPoses, PoseBuffer, PosesConfig
 from tumortrack.live.ros.bus import Bus
 from tumortrack.live.ros.messages import MM_PER_M, stamp_of
 from tumortrack.live.ros.ros2 import Via, open_bus
-from tumortrack.live.ros.rospy_node import RospyBus
 from tumortrack.live.values import Observation
 
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
@@ -23,30 +22,18 @@ _MOST = 1000  # messages between two frames: 30 publishers of 1 kHz at 30 Hz
 _NOT_UNIT = 1e-3  # of a quaternion's length
 
 
-class TfPosesConfig(PosesConfig, frozen=True, kw_only=True):
-    """``frame``: the fixed one, base_link say. ``camera``: the camera's, or its tool's where the
-    calibration has tool_from_camera; empty: as the source's messages call it."""
+class Ros2PosesConfig(PosesConfig, frozen=True, kw_only=True, tag="ros2"):
+    """tf. ``frame``: the fixed one, base_link say. ``camera``: the camera's, or its tool's where
+    the calibration has tool_from_camera; empty: as the source's messages call it."""
 
     target: ClassVar[str] = "frame"
 
     frame: str
     camera: str = ""
-
-
-class Ros2PosesConfig(TfPosesConfig, frozen=True, kw_only=True, tag="ros2"):
-    """tf of ROS 2."""
-
     via: Via = "auto"
 
     def open(self) -> TfPoses:
         return TfPoses(open_bus(self.via), self.frame, self.camera)
-
-
-class Ros1PosesConfig(TfPosesConfig, frozen=True, kw_only=True, tag="ros1"):
-    """tf of ROS 1."""
-
-    def open(self) -> TfPoses:
-        return TfPoses(RospyBus(), self.frame, self.camera)
 
 
 class TfPoses(CameraPoses):

@@ -1,23 +1,20 @@
-"""Results published in a ROS graph: ROS 2, without ROS or through the user's, and ROS 1."""
+"""Results published in a ROS 2 graph, without ROS or through the user's."""
 
 from __future__ import annotations
 
 import time
 from typing import ClassVar
 
-from tumortrack.core.errors import InputError, TumortrackError
+from tumortrack.core.errors import TumortrackError
 from tumortrack.live.ros.bus import Bus, check_topic
 from tumortrack.live.ros.results import ResultMessages
 from tumortrack.live.ros.ros2 import Via, open_bus
-from tumortrack.live.ros.rospy_node import MasterLost, RospyBus
 from tumortrack.live.values import SinkConfig, SinkContext, TrackingResult
 
 _FLUSH_S = 0.2  # what was published last leaves within that time
-_CHECK_S = 1.0  # how often the ROS 1 master is asked whether it knows the topics
-_CHECK_SHARE = 0.1  # and at most so much of the time is spent waiting for its answer
 
 
-class RosSinkConfig(SinkConfig, frozen=True, kw_only=True):
+class Ros2SinkConfig(SinkConfig, frozen=True, kw_only=True, tag="ros2"):
     """Topics under ``namespace``: see ``live.ros.results``. ``mesh_hz``: surfaces, and arms'
     markers, at most so often; 0: with every result."""
 
@@ -25,39 +22,22 @@ class RosSinkConfig(SinkConfig, frozen=True, kw_only=True):
 
     namespace: str = "/tumortrack"
     mesh_hz: float = 10.0
+    via: Via = "auto"
 
     def __post_init__(self) -> None:
-        kind = str(self.__struct_config__.tag)
-        check_topic(kind, "namespace", self.namespace)
-        self.check_between(f"{kind}:", mesh_hz=(0, 1000))
-
-
-class Ros2SinkConfig(RosSinkConfig, frozen=True, kw_only=True, tag="ros2"):
-    """Topics of ROS 2."""
-
-    via: Via = "auto"
+        check_topic("namespace", self.namespace)
+        self.check_between("ros2:", mesh_hz=(0, 1000))
 
     def open(self, context: SinkContext) -> RosSink:
         """Join the graph and announce the topics."""
         return RosSink(self, context, open_bus(self.via))
 
 
-class Ros1SinkConfig(RosSinkConfig, frozen=True, kw_only=True, tag="ros1"):
-    """Topics of ROS 1."""
-
-    def open(self, context: SinkContext) -> Ros1Sink:
-        """Announce the topics. Raises InputError without rospy or without a master."""
-        try:
-            return Ros1Sink(self, context, RospyBus())
-        except MasterLost as error:
-            raise InputError(str(error)) from error
-
-
 class RosSink:
     """Subscribers get the newest result; a slow one misses some and delays nobody. At the end, and
     whenever there is no estimate, all topics say so."""
 
-    def __init__(self, config: RosSinkConfig, context: SinkContext, bus: Bus) -> None:
+    def __init__(self, config: Ros2SinkConfig, context: SinkContext, bus: Bus) -> None:
         self._bus, self.notes = bus, (bus.note,)
         self._results = ResultMessages(bus.messages, context, config.mesh_hz)
         self._last: TrackingResult | None = None
@@ -74,8 +54,7 @@ class RosSink:
         for suffix, _, message in self._results.of(result):
             publisher = self._publishers[suffix]
             try:
-                if publisher.wanted():
-                    publisher.publish(self._bus.messages.to_bytes(message))
+                publisher.publish(self._bus.messages.to_bytes(message))
             except TumortrackError as error:
                 failed.append(str(error))
         if failed:
@@ -97,26 +76,3 @@ class RosSink:
         finally:
             self._publishers = {}
             self._bus.close()
-
-
-class Ros1Sink(RosSink):
-    """Looks after its registrations. Without a master only those who were connected before get the
-    results, and ``publish`` raises MasterLost."""
-
-    _bus: RospyBus
-    _lost, _check_at_s = "", 0.0
-
-    def publish(self, result: TrackingResult) -> None:
-        super().publish(result)
-        start_s = time.monotonic()
-        self._check_at_s = self._check_at_s or start_s + _CHECK_S
-        if start_s >= self._check_at_s:
-            try:
-                self._bus.register_again()
-                self._lost = ""
-            except MasterLost as error:
-                self._lost = str(error)
-            end_s = time.monotonic()
-            self._check_at_s = end_s + max(_CHECK_S, (end_s - start_s) / _CHECK_SHARE)
-        if self._lost:
-            raise MasterLost(self._lost)

@@ -1,4 +1,4 @@
-"""Depth images or clouds of a ROS graph: ROS 2, without ROS or through the user's, and ROS 1."""
+"""Depth images or clouds of a ROS 2 graph, without ROS or through the user's."""
 
 from __future__ import annotations
 
@@ -14,7 +14,6 @@ from tumortrack.core.types import DepthFrame
 from tumortrack.live.ros.bus import Bus, Subscriber, check_topic
 from tumortrack.live.ros.messages import stamp_of
 from tumortrack.live.ros.ros2 import Via, open_bus
-from tumortrack.live.ros.rospy_node import RospyBus
 from tumortrack.live.ros.sensors import (
     CAMERA_INFO,
     CLOUD,
@@ -31,14 +30,16 @@ _LOOK_S = 0.1  # how often the graph is asked for the topic's type, until it is 
 # A late frame, or a camera's computer with a wrong time, is no other clock; a bag is older.
 _SAME_CLOCK_NS = 24 * 3600 * 1_000_000_000
 _MASK_APART_NS = 500_000_000  # a mask that is further from its frame shows another place
-_ALIVE_S = 1.0  # without a frame for so long: the ROS 1 master is asked
 
 
-class RosSourceConfig(SourceConfig, frozen=True, kw_only=True):
-    """A PointCloud2, or a depth Image with its CameraInfo; docs/ros.md has the options.
+class Ros2SourceConfig(SourceConfig, frozen=True, kw_only=True, tag="ros2"):
+    """A topic of ROS 2, by its full name: a PointCloud2, or a depth Image with its CameraInfo;
+    docs/ros.md has the options.
 
     ``clock``: whose time the stamps are. host: this machine's, or one kept equal to it; other:
-    another (simulated, replayed, of the camera); auto: see the kind.
+    another (simulated, replayed, of the camera); auto: host if the first frame's stamp is less than
+    a day off. A day, so that a stream that lags is recognised as such, and not taken for one with
+    its own clock.
     """
 
     target: ClassVar[str] = "topic"
@@ -49,64 +50,40 @@ class RosSourceConfig(SourceConfig, frozen=True, kw_only=True):
     rectified: bool = False
     unit_mm: float = 1.0
     clock: Literal["auto", "host", "other"] = "auto"
-
-    def __post_init__(self) -> None:
-        kind = str(self.__struct_config__.tag)
-        for name in (self.topic, *filter(None, (self.info, self.mask))):
-            check_topic(kind, "topic", name)
-        if not 0 < self.unit_mm <= 1000:
-            raise InputError(f"{kind}: unit_mm is {self.unit_mm:g}; it must lie in 0..1000 mm.")
-
-
-class Ros2SourceConfig(RosSourceConfig, frozen=True, kw_only=True, tag="ros2"):
-    """A topic of ROS 2, by its full name. ``clock=auto``: host if the first frame's stamp is less
-    than a day off. A day, so that a stream that lags is recognised as such, and not taken for one
-    with its own clock."""
-
     type: Literal["auto", "image", "cloud"] = "auto"
     via: Via = "auto"
 
     def __post_init__(self) -> None:
-        super().__post_init__()
+        for name in (self.topic, *filter(None, (self.info, self.mask))):
+            check_topic("topic", name)
+        if not 0 < self.unit_mm <= 1000:
+            raise InputError(f"ros2: unit_mm is {self.unit_mm:g}; it must lie in 0..1000 mm.")
         if self.type == "cloud" and (self.info or self.mask):
             raise InputError("ros2: info and mask belong to a depth image, and not to a cloud.")
 
     def open(self) -> RosSource:
         """Join the graph; the topic may come later."""
-        return RosSource(self, open_bus(self.via), _KINDS.get(self.type, ""), self.topic)
-
-
-class Ros1SourceConfig(RosSourceConfig, frozen=True, kw_only=True, tag="ros1"):
-    """A topic of ROS 1; the master knows its type. ``clock=auto``: other where ``/use_sim_time`` is
-    set, else host."""
-
-    def open(self) -> Ros1Source:
-        """Subscribe. Raises SourceLost without a master or a publisher, InputError without rospy
-        or if the topic is neither cloud nor image."""
-        return Ros1Source(self, RospyBus())
+        return RosSource(self, open_bus(self.via))
 
 
 class RosSource:
     """An open subscription, from reliable and best effort publishers alike. The newest frame wins.
-    No publisher is no fault: then nothing comes. ``kind``: of message; empty: what is published.
-    """
+    No publisher is no fault: then nothing comes."""
 
     lossless = False
-    _patience_s = 0.0  # after opening: the first CameraInfo and mask may still be on their way
 
-    def __init__(self, config: RosSourceConfig, bus: Bus, kind: str, topic: str) -> None:
+    def __init__(self, config: Ros2SourceConfig, bus: Bus) -> None:
         self._clock: str = config.clock  # or "known"
         self.host_clock = config.clock == "host"
         self._config, self._bus = config, bus
-        self._kind, self._topic = kind, topic
-        self._name = f"{config.__struct_config__.tag}:{config.topic}"
-        self._info_topic = config.info or topic.rpartition("/")[0] + "/camera_info"
+        self._kind = _KINDS.get(config.type, "")  # of message; empty: what is published
+        self._topic, self._name = config.topic, f"ros2:{config.topic}"
+        self._info_topic = config.info or config.topic.rpartition("/")[0] + "/camera_info"
         self._frames: Subscriber | None = None
         self._beside: list[tuple[str, Subscriber]] = []
         self._latest: dict[str, Any] = {}  # by type of message: CameraInfo and mask
         self._waiting: bytes | memoryview | None = None  # an image whose CameraInfo is not here yet
         self._passed = 0
-        self._opened_s = self._heard_s = time.monotonic()
         self._lock, self._closed = threading.Lock(), False
 
     @property
@@ -119,17 +96,14 @@ class RosSource:
         while True:
             if self._closed:
                 raise SourceLost(f"the source {self._name} is closed")
-            now_s = time.monotonic()
-            left_s = max(0.0, until_s - now_s)
+            left_s = max(0.0, until_s - time.monotonic())
             known = self._frames is not None or self._found(final=not left_s)
             raw = self._newest() if known else None
-            impatient = not left_s and now_s - self._opened_s >= self._patience_s
             complete = {kind for kind, _ in self._beside} <= self._latest.keys()
-            if raw is not None and (complete or impatient):
+            if raw is not None and (complete or not left_s):
                 self._waiting = None
                 return self._observed(raw, time.time_ns())
             if not left_s:
-                self._check_alive()
                 return None
             self._bus.wait(left_s if known else min(left_s, _LOOK_S))
 
@@ -138,9 +112,6 @@ class RosSource:
         with self._lock:
             self._closed = True
             self._bus.close()
-
-    def _check_alive(self) -> None:
-        """Raises SourceLost if nothing can come any more."""
 
     def _found(self, final: bool) -> bool:
         """Subscribe, once the type is known. ``final``: say what is wrong with what is there."""
@@ -180,7 +151,6 @@ class RosSource:
         if came := self._frames.take():
             self._passed += len(came) - 1 + (self._waiting is not None)
             self._waiting = came[-1]
-            self._heard_s = time.monotonic()
         return self._waiting
 
     def _observed(self, raw: bytes | memoryview, arrived_ns: int) -> Observation:
@@ -218,34 +188,3 @@ class RosSource:
                 f"{_MASK_APART_NS * 1e-9:g} s."
             )
         return mask
-
-
-class Ros1Source(RosSource):
-    """Lost when nothing comes and the master is gone or was restarted. Frames go from node to node:
-    without a master they may still come."""
-
-    _patience_s = 1.0
-    _bus: RospyBus
-
-    def __init__(self, config: Ros1SourceConfig, bus: RospyBus) -> None:
-        topic, known = bus.rospy.resolve_name(config.topic), bus.master.published_types()
-        usable = sorted(name for name, kind in known.items() if kind in _KINDS.values())
-        if topic not in known:
-            here = f"nobody publishes {topic} at {bus.master.uri}"
-            raise SourceLost(f"{here}. Clouds and images: {', '.join(usable[:12]) or 'none'}")
-        if topic not in usable:
-            raise InputError(f"{topic} is a {known[topic]}; it must be {CLOUD} or a depth {IMAGE}.")
-        super().__init__(config, bus, known[topic], topic)
-        if config.mask and self._kind == CLOUD:
-            raise InputError(f"ros1: a mask needs a depth image, and {topic} is a cloud.")
-        if self._clock == "auto":
-            simulated = bus.master.call("getParam", "/use_sim_time")
-            self._clock, self.host_clock = "known", simulated is not True
-        self._found(final=True)
-
-    def _check_alive(self) -> None:
-        if time.monotonic() - self._heard_s < _ALIVE_S:
-            return
-        self._heard_s = time.monotonic()
-        if not self._bus.listens(self._topic):
-            raise SourceLost("the ROS master was started anew; the topic is subscribed to again")
