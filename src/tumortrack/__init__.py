@@ -1,4 +1,4 @@
-"""tumortrack: kidney and tumors, located from one depth image of one side.
+"""tumortrack: an organ and its tumors, located from one depth image of one side.
 
     import tumortrack as tt
     estimate = tt.Tracker(tt.load_model("MODEL")).locate(tt.read_cloud("cloud.ply"))

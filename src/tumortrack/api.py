@@ -68,9 +68,9 @@ def prepare(
     Args:
         folder: where to write the case with a picture to check it by (qc.png); None: nowhere.
         overwrite: replace a case that lies there.
-        options: fields of ``imaging.prepare.PrepareOptions``: ``kidney_hu``, ``tumor_hu``,
-            ``labels``, ``side``, ``organ``, ``tumor``, ``up``, ``series``, ``unit``,
-            ``min_tumor_ml``, ``patient``.
+        options: fields of ``imaging.prepare.PrepareOptions``: ``name``, ``term``,
+            ``organ_hu``, ``tumor_hu``, ``labels``, ``side``, ``organ``, ``tumor``, ``up``,
+            ``series``, ``unit``, ``min_tumor_ml``, ``patient``.
 
     Returns:
         The case: anatomy as closed surfaces, labels and CT; CT frame, mm.
@@ -129,6 +129,7 @@ def simulate_scenes(
 
     deform = ElasticConfig() if elastic else DragConfig()
     config = SceneConfig(deform=(deform,), noise=D405_NOISE if noise else CLEAN)
+    config = config.seen_whole(case.anatomy)
     return list(map(scene_maker(case, config, seed), range(count)))
 
 
@@ -281,8 +282,9 @@ def save_estimate(estimate: Estimate, folder: StrPath, overwrite: bool = False) 
 
 def estimate_from_surfaces(surfaces: Mapping[str, Mesh], grid: int = 160) -> Estimate:
     """What another method says, in the form that ``evaluate`` compares: closed surfaces by part
-    (kidney, tumor_1, ...), camera frame, mm; the kidney's includes its tumors. They are taken as
-    right: nothing judges them. ``grid``: voxels along the longest side of the labelled volume.
+    (kidney or the organ's name, tumor_1, ...), camera frame, mm; the organ's, which comes first,
+    includes its tumors. They are taken as right: nothing judges them. ``grid``: voxels along the
+    longest side of the labelled volume.
     """
     from dataclasses import replace
 

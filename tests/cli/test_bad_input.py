@@ -163,7 +163,7 @@ def test_options_of_other_inputs_are_refused(tmp_path):
         (labels, {"tumor_hu": (200.0, 900.0)}),
         (labels, {"unit": "m"}),
         (labels, {"series": "1"}),
-        (meshes, {"kidney_hu": (0.0, 200.0)}),
+        (meshes, {"organ_hu": (0.0, 200.0)}),
         (meshes, {"labels": True}),
         (meshes, {"series": "1"}),
         (meshes, {"min_tumor_ml": 1.0}),

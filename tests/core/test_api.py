@@ -63,7 +63,7 @@ def test_an_unknown_name_is_an_attribute_error():
 
 
 def test_unknown_options_are_refused_with_those_there_are(tmp_path, unchecked):
-    with pytest.raises(tt.errors.InputError, match=r"no 'kidney'.*kidney_hu"):
+    with pytest.raises(tt.errors.InputError, match=r"no 'kidney'.*organ_hu"):
         tt.prepare(tmp_path, kidney=(1, 2))
     with pytest.raises(tt.errors.InputError, match="preset 'fast'; allowed: clinic"):
         tt.train(tmp_path, tmp_path, preset="fast")

@@ -80,7 +80,7 @@ def test_metres_are_recognised_and_converted_on_request(tmp_path):
     assert anatomy.organ.volume_mm3 == pytest.approx(ORGAN.volume, rel=1e-3)
     assert "no tumor in this folder" in notes
     save(tmp_path, "kidney.obj", trimesh.Trimesh(ORGAN.vertices * 40, ORGAN.faces))
-    with pytest.raises(InputError, match="a kidney has 20 to 400 mm"):
+    with pytest.raises(InputError, match="an organ has 15 to 600 mm"):
         read_mesh_folder(tmp_path)
 
 

@@ -137,7 +137,7 @@ def test_the_tumor_bearing_side_is_the_default():
         select_labels(two_kidneys(1, 1))
     alone, notes, _ = select_labels(two_kidneys(1, 1), "left")
     assert alone.labels.max() == 1
-    assert "no tumor in this kidney" in notes
+    assert "no tumor in this organ" in notes
 
 
 def test_tumor_numbers_are_kept_split_and_closed_up():

@@ -33,11 +33,11 @@ def listed(folder: Path, text: str) -> list[Patient]:
 
 
 def test_a_list_says_what_differs_from_the_defaults(tmp_path):
-    rows = "name,input,side,kidney_hu,views\nanna,ct/anna,left,-100 250,\n\nbo, /b.nii.gz ,,,3\n"
+    rows = "name,input,side,organ_hu,views\nanna,ct/anna,left,-100 250,\n\nbo, /b.nii.gz ,,,3\n"
     anna, bo = listed(tmp_path, rows)
     assert anna.source == tmp_path / "ct/anna"
     assert bo.source == Path("/b.nii.gz")
-    assert anna.prepare == {"side": "left", "kidney_hu": (-100.0, 250.0)}
+    assert anna.prepare == {"side": "left", "organ_hu": (-100.0, 250.0)}
     assert bo.prepare == {}
     assert (anna.views, bo.views) == (Patient(name="x", source=Path()).views, 3)
 

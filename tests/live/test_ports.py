@@ -121,7 +121,7 @@ def test_without_the_token_nothing_changes_and_the_arms_are_stopped(viewer):
     with page(viewer, token=False) as stranger:
         look(stranger)
         until(viewer._server.get_clients, "the page")
-        change(stranger, panel._shown["kidney"], 0.1)
+        change(stranger, panel._shown["organ"], 0.1)
         change(stranger, panel.pick, True)
         say(stranger, "ShareUrlRequest")  # viser would publish the server on the internet
         say(stranger, "ScenePointerMessage", event_type="click", ray_origin=[0, 0, 0],
@@ -134,8 +134,8 @@ def test_without_the_token_nothing_changes_and_the_arms_are_stopped(viewer):
     assert not viewer._picking
     assert viewer._server._share_tunnel is None
     with page(viewer) as owner:
-        change(owner, panel._shown["kidney"], 0.1)
-        until(lambda: panel.options.kidney == 0.1, "the change")
+        change(owner, panel._shown["organ"], 0.1)
+        until(lambda: panel.options.organ == 0.1, "the change")
         look(owner)  # only those who look may click
         until(lambda: len(viewer._server.get_clients()) == 1)
         change(owner, panel.pick, True)
@@ -145,10 +145,10 @@ def test_without_the_token_nothing_changes_and_the_arms_are_stopped(viewer):
 def test_a_page_with_the_token_of_an_earlier_run_only_watches(viewer):
     old = viewer.url[:-3] + "abc"
     with connect(old.replace("http", "ws"), subprotocols=[PROTOCOL], proxy=None) as one:  # type: ignore[list-item]
-        change(one, viewer._panel._shown["kidney"], 0.1)
+        change(one, viewer._panel._shown["organ"], 0.1)
         change(one, viewer._panel.abort, True)
         until(viewer._context.controls.aborted.is_set, "the stop")
-    assert viewer._panel.options.kidney != 0.1
+    assert viewer._panel.options.organ != 0.1
 
 
 def test_numbers_that_are_none_reach_nobody(viewer):
@@ -156,11 +156,11 @@ def test_numbers_that_are_none_reach_nobody(viewer):
     with page(viewer) as one:
         look(one, position=[float("nan"), 0, 0])
         look(one, position=[1e30, 0, 0])
-        change(one, viewer._panel._shown["kidney"], float("inf"))
+        change(one, viewer._panel._shown["organ"], float("inf"))
         say(one, "GuiUpdateMessage", uuid=viewer._panel.pick._impl.uuid, updates={"removed": True})
         look(one, position=[7, 8, 9])
         until(lambda: viewer._server.get_clients(), "the last look")
-    assert viewer._panel.options.kidney <= 1
+    assert viewer._panel.options.organ <= 1
     with page(viewer) as other:
         other.send(noise())
         gone(other)
@@ -172,8 +172,8 @@ def test_whoever_has_the_token_gets_in_where_strangers_fill_the_room(viewer):
         with pytest.raises(InvalidStatus, match="503"):
             page(viewer, token=False)
         with page(viewer) as owner:
-            change(owner, viewer._panel._shown["kidney"], 0.1)
-            until(lambda: viewer._panel.options.kidney == 0.1, "the change")
+            change(owner, viewer._panel._shown["organ"], 0.1)
+            until(lambda: viewer._panel.options.organ == 0.1, "the change")
         gone(watching[0])
 
 

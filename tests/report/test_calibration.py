@@ -41,7 +41,7 @@ def drawn(rng, per_group, liars=0.0, groups=GROUPS):
             tumors = tuple((float(miss), s) for miss in misses)
             rows.append(Row(
                 scene=str(rng.integers(1 << 60)), sha256="", label=label, measured=figures,
-                misses={"tumor": tumors, "kidney": tumors[:1]},
+                misses={"tumor": tumors, "organ": tumors[:1]},
             ))  # fmt: skip
     return rows
 
@@ -244,7 +244,7 @@ def test_an_estimate_states_its_margins_or_why_it_has_none():
     radius = margins.shells[1].radii["tumor"]
     assert stated_radius(said, "tumor_1").mm == radius.at(1.0, {})
     assert stated_radius(said, "tumor_1").words == f"90 % margin {radius.at(1.0, {}):.1f} mm"
-    assert stated_radius(said, "kidney").mm == margins.shells[1].radii["kidney"].at(2.0, {})
+    assert stated_radius(said, "kidney").mm == margins.shells[1].radii["organ"].at(2.0, {})
     assert stated_radius(said, "tumor_1", 0.8).mm < radius.at(1.0, {})
     assert stated_radius(said, "tumor_1", 0.95) is None
     assert stated_radius(said, "map") is None  # no scene had targets

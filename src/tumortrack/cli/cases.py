@@ -23,12 +23,14 @@ class Prepare:
     Attributes:
         input: DICOM folder, CT volume or label map (.nii, .nii.gz, .nrrd), or folder of meshes.
         case: folder to write.
-        kidney_hu: HU window of the kidney in a CT: low (inclusive) and high.
+        name: which organ it is; its files, parts and topics bear this name.
+        term: SNOMED CT code and meaning of the organ, where NAME is none of the usual ones.
+        organ_hu: HU window of the organ in a CT: low (inclusive) and high.
         tumor_hu: HU window of the tumors in a CT.
         labels: the input is a label map (mostly recognised by itself).
-        side: the patient's kidney to take from a label map (default: the one with the largest
-            tumor); of a CT or meshes, which one it is.
-        organ: label number of the kidney.
+        side: of organs in pairs, the patient's one to take from a label map (default: the one
+            with most tumor); of a CT or meshes, which one it is.
+        organ: label number of the organ.
         tumor: label number of the tumors; default: every label from 2 up. 0: none.
         up: patient direction that faces the camera: anterior, left, ... or "x,y,z" in LPS.
         series: which DICOM series, if the folder holds several (UID or number in the list).
@@ -41,7 +43,9 @@ class Prepare:
 
     input: Positional[Path]
     case: Positional[Path]
-    kidney_hu: tuple[float, float] = (-300.0, 300.0)
+    name: str = "kidney"
+    term: tuple[str, str] | None = None
+    organ_hu: tuple[float, float] = (-300.0, 300.0)
     tumor_hu: tuple[float, float] = (300.0, 1000.0)
     labels: bool = False
     side: Literal["left", "right"] | None = None
@@ -62,8 +66,10 @@ class Prepare:
         case = api.prepare(self.input, self.case, overwrite=self.overwrite, **options)
         say_notes(case.report.get("notes", []))
         say(str(case.patient))
-        if not case.patient.known:
-            say_notes(["state both (--patient ID --side left|right): real arms need them"])
+        kind = case.anatomy.kind
+        if not kind.identified(case.patient):
+            both = "both (--patient ID --side left|right): real arms need them"
+            say_notes([f"state {both if kind.in_pairs else '--patient ID: real arms need it'}"])
         for name, part in zip(case.anatomy.names, case.anatomy.parts, strict=True):
             say(f"{name}: {part.volume_mm3 / 1000:.1f} ml")
         say(f"case written to {self.case}; look at {self.case / 'qc.png'} before you rely on it.")
@@ -97,7 +103,7 @@ class Export:
         case = api.load_case(self.case)
         options = case.report.get("options", {})
         patient = case.patient
-        parts = segmentation.segments(case.anatomy.names, patient.side)
+        parts = segmentation.segments(case.anatomy.names, patient.side, case.anatomy.kind)
         labels = case.labels
         notes: tuple[str, ...] = ()
         with store.new_folder(self.out) as aside:
@@ -175,7 +181,7 @@ class Simulate:
         if self.scenes < 1:
             raise InputError(f"--scenes {self.scenes} must be at least 1.")
         case = api.load_case(self.case)
-        config = self.scene_config()
+        config = self.scene_config().seen_whole(case.anatomy)
         make = api.scene_maker(case, config, self.seed)
         about = {
             "case_sha256": store.sha256_of(self.case / store.MANIFEST),

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class Locate(StatedPatient):
-    """Locate kidney and tumors in one cloud or depth image, or in several of the organ at rest.
+    """Locate organ and tumors in one cloud or depth image, or in several of the organ at rest.
 
     Attributes:
         model: folder that `train` wrote.

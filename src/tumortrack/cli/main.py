@@ -118,7 +118,7 @@ def _parse(arguments: list[str]) -> Command:
     return tyro.extras.subcommand_cli_from_dict(
         commands,
         prog="tumortrack",
-        description="Locate kidney and tumors under deformation from one depth image. "
+        description="Locate an organ and its tumors under deformation from one depth image. "
         "Research software, not a medical device.",
         args=arguments,
     )

@@ -134,4 +134,4 @@ def described(margins: ModelMargins) -> list[str]:
     ]
 
 
-_WHAT = {"tumor": "a tumor's surface", "kidney": "the kidney's surface", "map": "mapped points"}
+_WHAT = {"tumor": "a tumor's surface", "organ": "the organ's surface", "map": "mapped points"}

@@ -108,7 +108,7 @@ class Plan(StatedPatient):
             from tumortrack.plan.arms.procedure import search_bases
             from tumortrack.plan.arms.trajectory import first_hit
 
-            start, organ = time.perf_counter(), located.meshes["kidney"]
+            start, organ = time.perf_counter(), located.organ
             placed, motions, moved = search_bases(resection, _below(organ, cell_config), organ)
             if hit := first_hit(motions, placed.config, organ):
                 raise NoPlan(f"the arms can't carry this out: {hit}. Place the organ otherwise.")

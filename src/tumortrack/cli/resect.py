@@ -21,6 +21,7 @@ from tumortrack.cli.stated import StatedPatient
 from tumortrack.core import store
 from tumortrack.core.config import to_builtins
 from tumortrack.core.errors import Aborted, ArtifactError, InputError
+from tumortrack.core.organ import KIDNEY, Organ, organ_first, organ_name
 from tumortrack.core.patient import Patient
 
 if TYPE_CHECKING:
@@ -94,8 +95,11 @@ class Resect(StatedPatient):
         stored.patient.check_is(self.stated, str(self.plan))
         if stored.motions is None or stored.cell is None:
             raise InputError(f"{self.plan} was planned with --no-arms; plan again without it.")
-        if lacking := sorted({"kidney", stored.plan.tumor} - stored.meshes.keys()):
-            raise ArtifactError(f"{self.plan} lacks {lacking[0]}.ply. Plan again.")
+        if (
+            organ_is := organ_name(stored.meshes)
+        ) is None or stored.plan.tumor not in stored.meshes:
+            lacking = stored.plan.tumor if organ_is else "the organ"
+            raise ArtifactError(f"{self.plan} lacks {lacking}'s surface. Plan again.")
         sinks = api.named_sinks(self.sinks).values()  # wrong: said before all that takes long
         config = OperationConfig(
             speed=self.speed, moved_mm=self._moved_mm(stored), replan_cut=self.replan_cut
@@ -110,7 +114,7 @@ class Resect(StatedPatient):
         from tumortrack.plan.arms.cell import ArmCell
         from tumortrack.plan.arms.trajectory import first_hit
 
-        organ = stored.meshes["kidney"]
+        organ = stored.meshes[organ_is]
         if hit := first_hit(stored.motions, cell_config, organ):
             raise ArtifactError(f"{self.plan}: its motions are not as planned: {hit}. Plan again.")
         cell = ArmCell(cell_config, organ)
@@ -137,6 +141,7 @@ class Resect(StatedPatient):
         model, source = self.live or ("", "")
         budget, moved_mm = stored.budget, self._moved_mm(stored)
         assumed = () if budget is None else budget.assumed
+        kind = Organ(name=organ_name(stored.meshes) or KIDNEY.name)
         needs = {
             "--live MODEL SOURCE, so that they stop where the tumor moves": live,
             f"a source that shows the present ({', '.join(_LIVE)}; not {source})": (
@@ -148,11 +153,12 @@ class Resect(StatedPatient):
             "a plan that says which case it was made on (locate and plan again)": (
                 stored.case_sha256
             ),
-            "--patient ID and --side, as you know them": self.stated.known,
+            "--patient ID and --side, as you know them": kind.identified(self.stated),
             f"a plan that says whose organ it is (this one's: {stored.patient})": (
-                stored.patient.known
+                kind.identified(stored.patient)
             ),
-            f"a model that says whose organ it is (not {model})": live is None or live.whose.known,
+            f"a model that says whose organ it is (not {model})": live is None
+            or kind.identified(live.whose),
             "a plan made on a good estimate (this one's was poor)": (
                 not any(note.startswith(POOR_ESTIMATE) for note in stored.plan.notes)
             ),
@@ -399,7 +405,7 @@ def _operation(
 
 
 def _organ_shapes(stored: PlanFolder) -> tuple[RigidShape, ...]:
-    """Kidney and tumors as they were planned on, no surface drawn twice."""
+    """Organ and tumors as they were planned on, no surface drawn twice."""
     import numpy as np
 
     from tumortrack.core.colours import part_colour
@@ -407,7 +413,7 @@ def _organ_shapes(stored: PlanFolder) -> tuple[RigidShape, ...]:
     from tumortrack.live.values import RigidShape
     from tumortrack.live.viewer.surfaces import bare_faces
 
-    names = sorted(stored.meshes)  # kidney before tumors
+    names = organ_first(stored.meshes)
     meshes = [stored.meshes[name] for name in names]
     meshes[0] = Mesh(meshes[0].vertices_mm, bare_faces(Anatomy(tuple(meshes))))
     opacity, still = [0.35] + [1.0] * len(names), np.eye(4)

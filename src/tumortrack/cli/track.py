@@ -48,7 +48,7 @@ class Arms:
 
 @dataclass(frozen=True, kw_only=True)
 class Track(StatedPatient):
-    """Follow kidney and tumors live, from a camera to viewers, recordings and robots.
+    """Follow organ and tumors live, from a camera to viewers, recordings and robots.
 
     Sources and sinks are written kind:target?option=value&option=value. Sources: virtual:CASE,
     recording:PATH, realsense[:SERIAL|FILE], ros2:TOPIC. Sinks: viewer[:PORT],

@@ -7,7 +7,7 @@ from jaxtyping import UInt8
 
 Colour = tuple[int, int, int]
 
-KIDNEY: Colour = (185, 102, 83)
+ORGAN_PART: Colour = (185, 102, 83)
 TUMORS = ((144, 238, 144), (255, 205, 60), (110, 190, 255), (240, 130, 230), (170, 150, 255))
 SEEN: Colour = (112, 118, 126)
 ORGAN: Colour = (225, 230, 235)
@@ -26,7 +26,7 @@ _SWEEPS = ((0, 120, 240), (90, 60, 220), (205, 0, 130))
 
 def part_colour(label: int) -> Colour:
     """Of label 1, 2, 3, ...: the organ, then the tumors, over again after the fifth."""
-    return KIDNEY if label == 1 else TUMORS[(label - 2) % len(TUMORS)]
+    return ORGAN_PART if label == 1 else TUMORS[(label - 2) % len(TUMORS)]
 
 
 def label_colours(labels: UInt8[np.ndarray, " n"]) -> UInt8[np.ndarray, "n 3"]:

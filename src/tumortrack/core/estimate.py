@@ -11,6 +11,7 @@ from jaxtyping import Float
 from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import Points
+from tumortrack.core.organ import KIDNEY, Organ
 from tumortrack.core.patient import NOBODY, Patient
 from tumortrack.core.types import CameraLabels, Mesh, OccupancyCloud
 
@@ -68,13 +69,14 @@ class Estimate:
 
     Attributes:
         volume: None where it was not requested (live).
-        meshes: kidney, tumor_1, ... -> closed surfaces; a part that was not found is absent. The
-            kidney's surface is the whole organ, tumors included, as in ``Anatomy``.
+        meshes: the organ's name, tumor_1, ... -> closed surfaces; a part that was not found is
+            absent. The organ's surface includes its tumors, as in ``Anatomy``.
         report: plain JSON: per part volume, centre, box and probability; ``timings`` in seconds.
         motion: where every point of the CT is, if the method knows that; ``unsmoothed``: before the
             mean over past frames: the next frame's search starts from it.
         quality: ``good`` or ``poor``, and the ``reason``: see ``tracking.quality.judged``.
         patient: whose organ the model is of; that this one lies there nothing verifies.
+        organ: which organ that is.
     """
 
     cloud: OccupancyCloud
@@ -86,3 +88,4 @@ class Estimate:
     quality: Quality = "poor"
     reason: str = "it was not judged"
     patient: Patient = NOBODY
+    organ: Organ = KIDNEY

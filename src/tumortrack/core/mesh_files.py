@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from tumortrack.core.errors import InputError
+from tumortrack.core.organ import KIDNEY, Organ
 from tumortrack.core.store import read_file, writing
 from tumortrack.core.types import Anatomy, Mesh
 
@@ -79,15 +80,15 @@ def _exported(mesh: Mesh, kind: str) -> bytes:
 
 
 def write_anatomy(folder: Path, anatomy: Anatomy) -> None:
-    """kidney.ply, tumor_1.ply, ... into a folder."""
+    """kidney.ply (or of the organ's name), tumor_1.ply, ... into a folder."""
     for name, part in zip(anatomy.names, anatomy.parts, strict=True):
         write_mesh(folder / f"{name}.ply", part)
 
 
-def read_anatomy(folder: Path) -> Anatomy:
-    """kidney.ply and tumor_1.ply, tumor_2.ply, ... (without a gap) from a folder; InputError where
-    there is no kidney.ply, or a mesh cannot be read."""
-    parts = [read_mesh(folder / "kidney.ply")]
+def read_anatomy(folder: Path, kind: Organ = KIDNEY) -> Anatomy:
+    """The organ's surface and tumor_1.ply, tumor_2.ply, ... (without a gap) from a folder;
+    InputError where there is no such organ, or a mesh cannot be read."""
+    parts = [read_mesh(folder / f"{kind.name}.ply")]
     while (path := folder / f"tumor_{len(parts)}.ply").exists():
         parts.append(read_mesh(path))
-    return Anatomy(tuple(parts))
+    return Anatomy(tuple(parts), kind)

@@ -6,6 +6,7 @@ Labels: 0 outside, 1 organ, 2, 3, ... tumors; a tumor wins where parts overlap.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, fields
 from functools import cached_property
 
@@ -15,6 +16,7 @@ from jaxtyping import Float, Float32, Float64, Int32, UInt8
 
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import spread_over
+from tumortrack.core.organ import KIDNEY, Organ
 
 OUTSIDE, ORGAN, FIRST_TUMOR = 0, 1, 2
 
@@ -131,9 +133,11 @@ class Mesh:
 @dataclass(frozen=True, eq=False)
 class Anatomy:
     """Closed surfaces, outermost first: ``parts[0]`` is the whole organ, tumors included (the
-    union), so that it is the visible surface; ``parts[n]`` is the tumor labelled n + 1."""
+    union), so that it is the visible surface; ``parts[n]`` is the tumor labelled n + 1. ``kind``:
+    which organ it is."""
 
     parts: tuple[Mesh, ...]
+    kind: Organ = KIDNEY
 
     def __post_init__(self) -> None:
         if len(self.parts) < 1:
@@ -141,8 +145,13 @@ class Anatomy:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """``kidney``, ``tumor_1``, ``tumor_2``, ...: also the mesh files' names."""
-        return part_names(len(self.parts))
+        """``kidney`` (or the organ's other name), ``tumor_1``, ``tumor_2``, ...: also the mesh
+        files' names."""
+        return part_names(len(self.parts), self.kind.name)
+
+    def of(self, parts: Iterable[Mesh]) -> Anatomy:
+        """The same organ with other surfaces."""
+        return Anatomy(tuple(parts), self.kind)
 
     @property
     def organ(self) -> Mesh:
@@ -153,9 +162,9 @@ class Anatomy:
         return self.parts[1:]
 
 
-def part_names(n_parts: int) -> tuple[str, ...]:
-    """Names of the parts by label 1, 2, 3, ...: kidney, tumor_1, tumor_2, ..."""
-    return ("kidney", *(f"tumor_{n}" for n in range(1, n_parts)))
+def part_names(n_parts: int, organ: str) -> tuple[str, ...]:
+    """Names of the parts by label 1, 2, 3, ...: the organ's, tumor_1, tumor_2, ..."""
+    return (organ, *(f"tumor_{n}" for n in range(1, n_parts)))
 
 
 @dataclass(frozen=True)

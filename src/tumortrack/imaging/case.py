@@ -10,6 +10,7 @@ from tumortrack.core import store
 from tumortrack.core.config import to_builtins
 from tumortrack.core.errors import ArtifactError, InputError
 from tumortrack.core.mesh_files import read_anatomy, write_anatomy
+from tumortrack.core.organ import organ_entry, organ_in
 from tumortrack.core.patient import NOBODY, Patient, patient_in
 from tumortrack.core.types import Anatomy, LabelVolume, Volume
 from tumortrack.imaging.nifti import write_nifti, write_volume_nifti
@@ -42,7 +43,8 @@ class Case:
 def save_case(case: Case, folder: Path) -> None:
     """Write the case's files into an existing (aside) folder and seal it with its manifest.
 
-    kidney.ply, tumor_1.ply, ..., labels.nii.gz, ct.nii.gz (of a CT) and manifest.json.
+    kidney.ply (or of the organ's name), tumor_1.ply, ..., labels.nii.gz, ct.nii.gz (of a CT) and
+    manifest.json.
 
     Raises:
         StorageError: the disk refused.
@@ -53,6 +55,7 @@ def save_case(case: Case, folder: Path) -> None:
     if case.ct is not None:
         write_volume_nifti(folder / "ct.nii.gz", case.ct.hu, case.ct.lps_from_index)
     content = {
+        "organ": organ_entry(case.anatomy.kind),
         "parts": list(case.anatomy.names),
         "up_lps": [float(x) for x in case.up_lps],
         "patient": to_builtins(case.patient),
@@ -72,13 +75,15 @@ def load_case(folder: Path) -> Case:
     is_direction = isinstance(up, list) and [type(x) for x in up] == [float] * 3
     if up is None or not is_direction or not isinstance(report, dict):
         raise ArtifactError(f"{folder / store.MANIFEST} is incomplete; run prepare again.")
-    anatomy = read_anatomy(folder)
-    if list(anatomy.names) != parts:
-        raise ArtifactError(f"{folder} lacks parts: {parts} expected, {list(anatomy.names)} found.")
     try:
-        patient = patient_in(manifest.get("patient"), str(folder / store.MANIFEST))
+        where = str(folder / store.MANIFEST)
+        patient = patient_in(manifest.get("patient"), where)
+        organ = organ_in(manifest.get("organ"), where)
     except InputError as error:
         raise ArtifactError(f"{error} Run prepare again.") from error
+    anatomy = read_anatomy(folder, organ)
+    if list(anatomy.names) != parts:
+        raise ArtifactError(f"{folder} lacks parts: {parts} expected, {list(anatomy.names)} found.")
     labels, ct = read_labels(folder / "labels.nii.gz"), folder / "ct.nii.gz"
     x, y, z = up
     volume = read_volume(ct) if ct.exists() else None

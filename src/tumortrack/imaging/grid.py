@@ -66,7 +66,7 @@ def check_size(
     if voxels > _MAX_VOXELS or needed > _MAX_BYTES:
         raise InputError(
             f"{path} claims {dims} voxels of {bytes_per_voxel} bytes; the limit is {_MAX_VOXELS} "
-            "voxels and 8 GiB. Crop or resample the volume round the kidney."
+            "voxels and 8 GiB. Crop or resample the volume round the organ."
         )
     if compressed is None:
         return
@@ -74,7 +74,7 @@ def check_size(
     if compressed and needed > _MUCH and _USUAL_BEST * stored < needed <= GZIP_BEST * stored:
         raise InputError(
             f"{path} would unpack from {stored / 2**20:.1f} MiB to {needed / 2**30:.1f} GiB, as no "
-            "scan does. Crop it round the kidney, or store it as 8-bit or 16-bit numbers."
+            "scan does. Crop it round the organ, or store it as 8-bit or 16-bit numbers."
         )
     if stored * (GZIP_BEST if compressed else 1) < needed:
         raise InputError(

@@ -11,24 +11,27 @@ import numpy as np
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import RAS_FROM_LPS, transform_points
 from tumortrack.core.mesh_files import SUFFIXES, read_mesh
+from tumortrack.core.organ import KIDNEY, Organ
 from tumortrack.core.types import FIRST_TUMOR, ORGAN, Anatomy, LabelVolume, Mesh, part_names
 from tumortrack.imaging.grid import grid_round
 from tumortrack.imaging.raster import winding_numbers
 from tumortrack.imaging.surface import largest_shell, surfaces
 
-_ORGAN_WORDS, _TUMOR_WORDS = ("kidney", "organ"), ("tumor", "tumour", "lesion", "mass")
-_ORGAN_MM = (20.0, 400.0)  # plausible longest extent
+_TUMOR_WORDS = ("tumor", "tumour", "lesion", "mass")
+_ORGAN_MM = (15.0, 600.0)  # plausible longest extent
 _VOXEL_MM = 1.0
 _MOST_TUMORS = 254  # labels 2 to 255
 _LARGEST_HOLE_MM = 10.0  # across; larger ones would invent anatomy
 _LARGEST_REMESH = 1.5  # change of volume that a remesh may make, as a ratio
 _RULE = (
-    "The rule: one file whose name contains kidney or organ is the organ; names with tumor, lesion "
-    "or mass are tumors, in order of name."
+    "The rule: one file whose name contains {} or organ is the organ; names with tumor, lesion or "
+    "mass are tumors, in order of name."
 )
 
 
-def read_mesh_folder(folder: Path, unit: str | None = None) -> tuple[Anatomy, list[str]]:
+def read_mesh_folder(
+    folder: Path, unit: str | None = None, kind: Organ = KIDNEY
+) -> tuple[Anatomy, list[str]]:
     """Read one organ and its tumors; LPS mm unless a file's comment states ``SPACE=RAS``.
 
     Small holes, doubled faces, inside-out surfaces and crossings are repaired with a note. The
@@ -45,7 +48,7 @@ def read_mesh_folder(folder: Path, unit: str | None = None) -> tuple[Anatomy, li
     """
     if not folder.is_dir():
         raise InputError(f"{folder} is not a folder of meshes.")
-    organ_file, *tumor_files = files = _files_by_name(folder)
+    organ_file, *tumor_files = files = _files_by_name(folder, kind.name)
     if unit not in (None, "mm", "m"):
         raise InputError(f"unit {unit!r} is not allowed: mm or m.")
     notes: list[str] = []
@@ -56,11 +59,11 @@ def read_mesh_folder(folder: Path, unit: str | None = None) -> tuple[Anatomy, li
     tumors = [closed_mesh(t, f.name, notes) for t, f in zip(tumors, tumor_files, strict=True)]
     for tumor, file in zip(tumors, tumor_files, strict=True):
         organ = _union(organ, tumor, file.name)
-    names = part_names(len(files))
+    names = part_names(len(files), kind.name)
     notes += [f"{file.name} is {name}" for file, name in zip(files, names, strict=True)]
     if not tumors:
         notes.append("no tumor in this folder")
-    return Anatomy((organ, *tumors)), notes
+    return Anatomy((organ, *tumors), kind), notes
 
 
 def label_meshes(anatomy: Anatomy) -> LabelVolume:
@@ -75,7 +78,7 @@ def label_meshes(anatomy: Anatomy) -> LabelVolume:
     return LabelVolume(labels, lps_from_index)
 
 
-def _files_by_name(folder: Path) -> list[Path]:
+def _files_by_name(folder: Path, organ: str) -> list[Path]:
     """The organ's file, then the tumors'."""
     files = sorted(p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES)
     if not files:
@@ -85,12 +88,12 @@ def _files_by_name(folder: Path) -> list[Path]:
         return [f for f in files if any(word in f.stem.lower() for word in words)]
 
     tumors = named(_TUMOR_WORDS)
-    organs = [f for f in named(_ORGAN_WORDS) if f not in tumors]
+    organs = [f for f in named((organ, "organ")) if f not in tumors]
     other = [f.name for f in files if f not in organs and f not in tumors]
     # kidney_tumor.stl names both: a tumor, as long as another file is plainly the organ.
     if len(organs) != 1 or other:
         problem = f"{len(organs)} name an organ" + (f", {other} name neither" if other else "")
-        raise InputError(f"{folder}: of {[f.name for f in files]} {problem}. {_RULE}")
+        raise InputError(f"{folder}: of {[f.name for f in files]} {problem}. {_RULE.format(organ)}")
     if len(tumors) > _MOST_TUMORS:
         raise InputError(f"{folder}: {len(tumors)} tumors; up to {_MOST_TUMORS} are read.")
     return [organs[0], *sorted(tumors, key=_natural)]
@@ -137,7 +140,7 @@ def _check_unit(path: Path, organ: Mesh, unit: str | None) -> None:
             f"{path} is {extent:.3g} mm long: it looks like metres. Give --unit m to convert."
         )
     raise InputError(
-        f"{path} is {extent:.4g} mm long; a kidney has {low:g} to {high:g} mm. Check its unit"
+        f"{path} is {extent:.4g} mm long; an organ has {low:g} to {high:g} mm. Check its unit"
         + (" (--unit m multiplied it by 1000)." if unit == "m" else ".")
     )
 

@@ -12,19 +12,20 @@ from tumortrack.core import store
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import direction_lps, spacing_mm
 from tumortrack.core.mesh_files import SUFFIXES
+from tumortrack.core.organ import Organ
 from tumortrack.core.patient import UNKNOWN, Patient, Side
-from tumortrack.core.types import ORGAN, LabelVolume, Volume
+from tumortrack.core.types import ORGAN, Anatomy, LabelVolume, Volume
 from tumortrack.imaging.case import Case
 from tumortrack.imaging.grid import grown_box, voxel_ml
 from tumortrack.imaging.meshes import label_meshes, read_mesh_folder
-from tumortrack.imaging.segment import KIDNEY_HU, TUMOR_HU, segment_ct
+from tumortrack.imaging.segment import ORGAN_HU, TUMOR_HU, segment_ct
 from tumortrack.imaging.select import MIN_TUMOR_ML, select_labels
 from tumortrack.imaging.surface import surfaces
 from tumortrack.imaging.symmetry import alike, half_turns, warning
 from tumortrack.imaging.volume import is_label_map, labels_of, read_raw, volume_of
 
 # Options that only one kind of input uses.
-_OF_CT, _OF_LABELS = ("kidney_hu", "tumor_hu"), ("labels", "organ", "tumor")
+_OF_CT, _OF_LABELS = ("organ_hu", "tumor_hu"), ("labels", "organ", "tumor")
 _UP_LPS = (0.0, -1.0, 0.0)  # until ``prepare`` sets what was asked for
 _LEAST_ORGAN_OUTSIDE = 0.02  # of the outer surface
 _MOST_CHANGE_PERCENT = 1.0  # of a part's volume, by smoothing; more is noted
@@ -35,19 +36,21 @@ class PrepareOptions:
     """What the user may state about an input.
 
     Attributes:
-        kidney_hu, tumor_hu: half-open HU windows [low, high) for a CT.
+        organ_hu, tumor_hu: half-open HU windows [low, high) for a CT.
         labels: the volume is a label map (recognised without this where it is plain).
-        side: the patient's ``left`` or ``right``: of a label map, the kidney to take (None: the
-            tumor-bearing one); of a CT by HU windows or meshes, which one it is.
+        side: the patient's ``left`` or ``right``, of organs in pairs: of a label map, the one to
+            take (None: the tumor-bearing one); of a CT by HU windows or meshes, which one it is.
         organ, tumor: label numbers; tumor None takes every label from 2 up, 0 none.
         up: the patient direction that faces the camera: a name, or three numbers in LPS.
         series: UID or number of one DICOM series among several.
         unit: of meshes, ``mm`` or ``m``; None: mm, and metres are refused with an explanation.
         min_tumor_ml: smaller tumors are reported and dropped.
         patient: an identifier, instead of the DICOM PatientID; None: that, or unknown.
+        name: which organ it is: lower-case letters, digits and _.
+        term: SNOMED CT code and meaning of an organ whose name is not known here.
     """
 
-    kidney_hu: tuple[float, float] = KIDNEY_HU
+    organ_hu: tuple[float, float] = ORGAN_HU
     tumor_hu: tuple[float, float] = TUMOR_HU
     labels: bool = False
     side: str | None = None
@@ -58,6 +61,8 @@ class PrepareOptions:
     unit: str | None = None
     min_tumor_ml: float = MIN_TUMOR_ML
     patient: str | None = None
+    name: str = "kidney"
+    term: tuple[str, str] | None = None
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.min_tumor_ml) and self.min_tumor_ml >= 0):
@@ -66,10 +71,16 @@ class PrepareOptions:
             raise InputError("label numbers must lie in 1..255 (tumor 0: none).")
         if self.side not in (None, "left", "right"):
             raise InputError(f"side {self.side!r} is not allowed: left or right (the patient's).")
+        self.kind.check_side(self.side)
         if self.unit not in (None, "mm", "m"):
             raise InputError(f"unit {self.unit!r} is not allowed: mm or m.")
         if self.patient is not None:
             Patient(self.patient)
+
+    @property
+    def kind(self) -> Organ:
+        """Which organ it is."""
+        return Organ(name=self.name, term=self.term)
 
     @property
     def stated_side(self) -> Side:
@@ -117,7 +128,7 @@ def _check_organ_outside(labels: LabelVolume) -> None:
     share = np.count_nonzero(outermost == ORGAN) / max(len(outermost), 1)
     if share < _LEAST_ORGAN_OUTSIDE:
         raise InputError(
-            f"tumors make up {1 - share:.0%} of the outer surface: they enclose the kidney. Check "
+            f"tumors make up {1 - share:.0%} of the outer surface: they enclose the organ. Check "
             "which part is the organ and which the tumor, and that all have one frame and unit."
         )
 
@@ -144,16 +155,23 @@ def _from_volume(path: Path, options: PrepareOptions) -> Case:
         source = labels_of(raw, path)
         del raw  # the largest maps are gigabytes: one copy is enough
         labels, more, side = select_labels(
-            source, options.side, options.organ, options.tumor, options.min_tumor_ml
+            source,
+            options.side,
+            options.organ,
+            options.tumor,
+            options.min_tumor_ml,
+            options.kind,
         )
     else:
         what = f"{path} is read as a CT (a label map needs --labels)"
         _refuse_unused(what, options, *_OF_LABELS, "unit")
         volume = volume_of(raw, path)
         del raw
-        labels, more = segment_ct(volume, options.kidney_hu, options.tumor_hu, options.min_tumor_ml)
+        labels, more = segment_ct(
+            volume, options.organ_hu, options.tumor_hu, options.min_tumor_ml, options.kind
+        )
         ct = _crop_ct(volume, labels)
-    anatomy, surface = surfaces(labels)
+    anatomy, surface = surfaces(labels, options.kind)
     notes += more
     notes += [
         f"{name}: the surface's volume is {change:+.1f} % off its labels'; it is too thin or hangs "
@@ -163,7 +181,9 @@ def _from_volume(path: Path, options: PrepareOptions) -> Case:
     ]
     report = {"kind": "label map" if as_labels else "ct", "notes": notes}
     patient = _patient(path, stated, options.patient, side)
-    return Case(anatomy, labels, _UP_LPS, {**report, **_measured(labels, surface)}, ct, patient)
+    return Case(
+        anatomy, labels, _UP_LPS, {**report, **_measured(labels, anatomy, surface)}, ct, patient
+    )
 
 
 def _patient(path: Path, stated: Patient, given: str | None, side: Side) -> Patient:
@@ -180,21 +200,23 @@ def _patient(path: Path, stated: Patient, given: str | None, side: Side) -> Pati
 def _from_meshes(folder: Path, options: PrepareOptions) -> Case:
     unused = (*_OF_CT, *_OF_LABELS, "series", "min_tumor_ml")
     _refuse_unused(f"{folder} holds meshes", options, *unused)
-    anatomy, notes = read_mesh_folder(folder, options.unit)
+    anatomy, notes = read_mesh_folder(folder, options.unit, options.kind)
     labels = label_meshes(anatomy)
     mesh_ml = [part.volume_mm3 / 1000 for part in anatomy.parts]
-    measured = _measured(labels, {"names": list(anatomy.names), "mesh_ml": mesh_ml})
+    measured = _measured(labels, anatomy, {"names": list(anatomy.names), "mesh_ml": mesh_ml})
     patient = Patient(options.patient or UNKNOWN, options.stated_side)
     report = {"kind": "meshes", "notes": notes, **measured}
     return Case(anatomy, labels, _UP_LPS, report, patient=patient)
 
 
-def _measured(labels: LabelVolume, surface: dict[str, list[Any]]) -> dict[str, Any]:
-    """Volumes by part from the labels (``kidney`` includes its tumors), and how they lie."""
+def _measured(
+    labels: LabelVolume, anatomy: Anatomy, surface: dict[str, list[Any]]
+) -> dict[str, Any]:
+    """Volumes by part from the labels (the organ's includes its tumors), and how they lie."""
     counts = np.bincount(labels.labels.ravel(), minlength=2) * voxel_ml(labels.lps_from_index)
     tumors = {f"tumor_{n - 1}": float(counts[n]) for n in range(2, len(counts))}
     return {
-        "volumes_ml": {"kidney": float(counts[1:].sum()), **tumors},
+        "volumes_ml": {anatomy.kind.name: float(counts[1:].sum()), **tumors},
         "surface": surface,
         "spacing_mm": spacing_mm(labels.lps_from_index).tolist(),
     }

@@ -1,7 +1,7 @@
 """Labels of organ and tumors from a phantom's CT by HU windows.
 
 The scan also shows a table, a registration block and partial-volume rims; one free-standing
-kidney is found among them.
+organ is found among them.
 """
 
 from __future__ import annotations
@@ -13,20 +13,21 @@ from jaxtyping import Bool, Float
 
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import spacing_mm
+from tumortrack.core.organ import KIDNEY, Organ
 from tumortrack.core.types import FIRST_TUMOR, ORGAN, LabelVolume, Volume
 from tumortrack.imaging import grid as grids
 from tumortrack.imaging.grid import bounding_box, components, depth_mm, extent_mm, voxel_ml
 from tumortrack.imaging.select import MIN_TUMOR_ML
 
-KIDNEY_HU = (-300.0, 300.0)
+ORGAN_HU = (-300.0, 300.0)
 TUMOR_HU = (300.0, 1000.0)
 _RIM_MM = 1.2  # half of what a partial-volume rim can measure, at voxels below a millimetre
 _REACH_MM = 30.0  # an exophytic tumor's far side may lie this far off the organ found
-_KIDNEY_ML = (20.0, 1000.0)
-_LONGEST_MM = 220.0
+# Volume and longest side of a kidney, and of any other organ.
+_KIDNEY_SIZES, _OTHER_SIZES = ((20.0, 1000.0), 220.0), ((10.0, 4000.0), 400.0)
 _THINNEST_MM = 15.0
 _STEP_MM = 1.5  # the search runs on cells of about this size
-_OPEN_MM = 3.0  # what is thinner than twice this is no kidney
+_OPEN_MM = 3.0  # what is thinner than twice this is no organ
 _CUT_RADII_MM = (3.0, 4.5, 6.0, 8.0, 10.0, 12.0, 15.0)
 _LEAST_SOLIDITY = 0.68  # share of the convex hull that is filled: real kidneys have 0.75 to 0.9
 _LEAST_FLATNESS = 0.28  # shortest over longest principal spread: real kidneys have 0.4 to 0.5
@@ -37,41 +38,42 @@ _LEAST_CONTACT = 0.08  # share of a tumor's surroundings that is parenchyma
 
 def segment_ct(
     volume: Volume,
-    kidney_hu: tuple[float, float] = KIDNEY_HU,
+    organ_hu: tuple[float, float] = ORGAN_HU,
     tumor_hu: tuple[float, float] = TUMOR_HU,
     min_tumor_ml: float = MIN_TUMOR_ML,
+    kind: Organ = KIDNEY,
 ) -> tuple[LabelVolume, list[str]]:
     """Segment a phantom's CT by HU windows (half open, [low, high)), as in the paper.
 
     Table, registration block, air and specks are dropped: see ``_find_organ``. A piece
     of the tumor window counts as a tumor when parenchyma fills at least 8 % of the shell 3 mm
     about it (a block beside the phantom has none: its own rim is too thin to be parenchyma).
-    The rim between an exophytic tumor and air falls into the kidney's window by partial volume;
+    The rim between an exophytic tumor and air falls into the organ's window by partial volume;
     where it is thinner than 2.4 mm (at least three voxels) it is given to the tumor.
 
     Returns:
         Labels 1 organ, 2, 3, ... tumors by volume, cropped round the organ; and notes.
 
     Raises:
-        InputError: unusable windows, or no kidney-like body (a patient's CT).
+        InputError: unusable windows, or no body like an organ (a patient's CT).
     """
-    limits = (*kidney_hu, *tumor_hu)
-    if not (np.isfinite(limits).all() and kidney_hu[0] < kidney_hu[1] <= tumor_hu[0] < tumor_hu[1]):
+    limits = (*organ_hu, *tumor_hu)
+    if not (np.isfinite(limits).all() and organ_hu[0] < organ_hu[1] <= tumor_hu[0] < tumor_hu[1]):
         raise InputError(
-            f"HU windows kidney {kidney_hu} and tumor {tumor_hu} are not usable: each needs "
-            "low < high, and the tumor's must lie above the kidney's."
+            f"HU windows organ {organ_hu} and tumor {tumor_hu} are not usable: each needs "
+            "low < high, and the tumor's must lie above the organ's."
         )
     hu, affine = volume.hu, volume.lps_from_index
-    solid = (hu >= kidney_hu[0]) & (hu < tumor_hu[1])
+    solid = (hu >= organ_hu[0]) & (hu < tumor_hu[1])
     dense = (hu >= tumor_hu[0]) & (hu < tumor_hu[1])
-    organ = _find_organ(solid, dense, affine)
+    organ = _find_organ(solid, dense, affine, kind)
     everything_ml = float(solid.sum()) * voxel_ml(affine)
     box = bounding_box(organ, affine, _REACH_MM)
     affine = grids.moved_origin(affine, box)
     organ, tumors, more = _tumors_of(organ[box], solid[box], dense[box], affine, min_tumor_ml)
     kept_ml = float(organ.sum()) * voxel_ml(affine)
     note = (
-        f"{kept_ml:.1f} ml of {everything_ml:.1f} ml between the HU limits are the kidney; table, "
+        f"{kept_ml:.1f} ml of {everything_ml:.1f} ml between the HU limits are the organ; table, "
         "blocks, rims and specks were dropped"
     )
     if len(tumors) > 254:
@@ -143,22 +145,27 @@ class _Grid:
     solid: Bool[np.ndarray, "i j k"]
     dense: Bool[np.ndarray, "i j k"]
     lps_from_index: Float[np.ndarray, "4 4"]
+    organ_ml: tuple[float, float]
+    longest_mm: float
 
     @property
     def steps_mm(self) -> np.ndarray:
         return spacing_mm(self.lps_from_index)
 
 
-def _find_organ(solid: np.ndarray, dense: np.ndarray, lps_from_index: np.ndarray) -> np.ndarray:
-    """The voxels of ``solid`` that belong to the one kidney-like body; ``dense`` is its part in the
-    tumor window.
+def _find_organ(
+    solid: np.ndarray, dense: np.ndarray, lps_from_index: np.ndarray, kind: Organ
+) -> np.ndarray:
+    """The voxels of ``solid`` that belong to the one body like an organ; ``dense`` is its part in
+    the tumor window.
 
     The rule, on cells of about 1.5 mm: erode by 3 mm, then by up to 15 mm, until a piece stands
     alone that, grown back and cut from its neighbours at the narrowest place (watershed of the
-    distance to the background), has 20 to 1000 ml, is 15 to 220 mm long in every direction,
-    fills two thirds of its convex hull, does not touch the scan's edge, is mostly kidney window
+    distance to the background), has 20 to 1000 ml, is 15 to 220 mm long in every direction (other
+    organs than kidneys: 10 to 4000 ml, up to 400 mm),
+    fills two thirds of its convex hull, does not touch the scan's edge, is mostly organ window
     and was cut along at most a quarter of its surface, and is no sheet (shortest over longest
-    principal spread above 0.28). The largest such piece is the kidney; a deeper cut replaces it
+    principal spread above 0.28). The largest such piece is the organ; a deeper cut replaces it
     only where that frees it of a sheet. Attached sheets thinner than 6 mm are removed.
     """
     from skimage.measure import block_reduce
@@ -169,14 +176,15 @@ def _find_organ(solid: np.ndarray, dense: np.ndarray, lps_from_index: np.ndarray
     filled, bright = (
         block_reduce(mask, blocks, np.mean, func_kwargs=single) >= 0.5 for mask in (solid, dense)
     )
-    grid = _Grid(filled, bright, lps_from_index @ np.diag([*factors, 1.0]))
+    sizes = _KIDNEY_SIZES if kind.name == KIDNEY.name else _OTHER_SIZES
+    grid = _Grid(filled, bright, lps_from_index @ np.diag([*factors, 1.0]), *sizes)
     region = _search(grid) if grid.solid.any() else None
     if region is None:
         raise InputError(
-            "no free-standing kidney was found in this CT: nothing between the HU limits is "
-            f"compact, {_KIDNEY_ML[0]:g} to {_KIDNEY_ML[1]:g} ml and apart from its surroundings. "
-            "Thresholds suit a phantom's CT; of a patient's CT segment the kidney first and give "
-            "the label map with --labels."
+            f"no free-standing {kind.words} was found in this CT: nothing between the HU limits is "
+            f"compact, {grid.organ_ml[0]:g} to {grid.organ_ml[1]:g} ml and apart from its "
+            "surroundings. Thresholds suit a phantom's CT; of a patient's CT segment the organ "
+            "first and give the label map with --labels."
         )
     return _refine(region, grid.solid & ~region, solid, factors)
 
@@ -185,17 +193,20 @@ def _search(grid: _Grid) -> np.ndarray | None:
     from scipy import ndimage
 
     depth = depth_mm(grid.solid, grid.steps_mm)
-    least = _KIDNEY_ML[0] / voxel_ml(grid.lps_from_index)
+    least = grid.organ_ml[0] / voxel_ml(grid.lps_from_index)
     found: np.ndarray | None = None
     for radius in _CUT_RADII_MM:
         pieces, counts = components(depth > radius)
         best: np.ndarray | None = None
         for n, box in enumerate(ndimage.find_objects(pieces)[:12], 1):
-            # Eroding by r leaves at least a few percent even of the smallest kidney.
-            if counts[n - 1] < 0.02 * least or extent_mm(box, grid.steps_mm).max() > _LONGEST_MM:
+            # Eroding by r leaves at least a few percent even of the smallest organ.
+            if (
+                counts[n - 1] < 0.02 * least
+                or extent_mm(box, grid.steps_mm).max() > grid.longest_mm
+            ):
                 continue
             region = _piece_region(pieces == n, depth, radius, grid)
-            if _is_kidney(region, grid) and (best is None or region.sum() > best.sum()):
+            if _is_organ(region, grid) and (best is None or region.sum() > best.sum()):
                 best = region
         if best is not None and (found is None or _sheds_sheet(found, best, grid)):
             found = best
@@ -203,7 +214,7 @@ def _search(grid: _Grid) -> np.ndarray | None:
 
 
 def _sheds_sheet(before: np.ndarray, after: np.ndarray, grid: _Grid) -> bool:
-    """A deeper cut is better where it frees the kidney of a flat thing, never of a lump."""
+    """A deeper cut is better where it frees the organ of a flat thing, never of a lump."""
     off = before & ~after
     return (
         bool((after & before).sum() > 0.9 * after.sum())
@@ -232,7 +243,7 @@ def _piece_region(core: np.ndarray, depth: np.ndarray, radius: float, grid: _Gri
     return region
 
 
-def _is_kidney(region: np.ndarray, grid: _Grid) -> bool:
+def _is_organ(region: np.ndarray, grid: _Grid) -> bool:
     if not region.any():
         return False
     ml = float(region.sum()) * voxel_ml(grid.lps_from_index)
@@ -240,9 +251,9 @@ def _is_kidney(region: np.ndarray, grid: _Grid) -> bool:
     extent = extent_mm(box, grid.steps_mm)
     at_edge = any(s.start == 0 or s.stop == n for s, n in zip(box, region.shape, strict=True))
     return (
-        _KIDNEY_ML[0] <= ml <= _KIDNEY_ML[1]
+        grid.organ_ml[0] <= ml <= grid.organ_ml[1]
         and not at_edge
-        and bool(extent.min() >= _THINNEST_MM and extent.max() <= _LONGEST_MM)
+        and bool(extent.min() >= _THINNEST_MM and extent.max() <= grid.longest_mm)
         and bool((region & grid.dense).sum() <= _MOST_TUMOR * region.sum())
         and _contact(region, grid.solid) <= _MOST_CONTACT
         and _flatness(region[box], grid.steps_mm) >= _LEAST_FLATNESS

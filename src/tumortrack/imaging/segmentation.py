@@ -22,6 +22,7 @@ import tumortrack
 from tumortrack.core.colours import part_colour
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import transform_points
+from tumortrack.core.organ import KIDNEY, Organ
 from tumortrack.core.patient import NOBODY, UNKNOWN, Patient, Side
 from tumortrack.core.store import write_atomically, writing
 from tumortrack.core.types import FIRST_TUMOR, ORGAN, LabelVolume
@@ -49,7 +50,7 @@ class Term(NamedTuple):
 
 STRUCTURE = Term("123037004", "SCT", "Anatomical Structure")
 ALTERED = Term("49755003", "SCT", "Morphologically Altered Structure")
-KIDNEY, MASS = Term("64033007", "SCT", "Kidney"), Term("4147007", "SCT", "Mass")
+MASS = Term("4147007", "SCT", "Mass")
 _SIDES: dict[Side, Term] = {
     "left": Term("7771000", "SCT", "Left"),
     "right": Term("24028007", "SCT", "Right"),
@@ -60,21 +61,28 @@ _SIDES: dict[Side, Term] = {
 class Segment:
     """One label of a map: the part's name, what it is, and its colour (red, green, blue: 0..255).
 
-    Labels do not overlap: the kidney's segment, label 1, is the parenchyma.
+    Labels do not overlap: the organ's segment, label 1, is the parenchyma.
     """
 
     label: int
     name: str
     side: Side = UNKNOWN
+    organ: Organ = KIDNEY
 
     @property
     def is_organ(self) -> bool:
         return self.label == ORGAN
 
     @property
+    def region(self) -> Term:
+        """The organ that it is, or lies in."""
+        code, meaning = self.organ.snomed
+        return Term(code, "SCT", meaning)
+
+    @property
     def terms(self) -> tuple[Term, Term]:
         """Category and type."""
-        return (STRUCTURE, KIDNEY) if self.is_organ else (ALTERED, MASS)
+        return (STRUCTURE, self.region) if self.is_organ else (ALTERED, MASS)
 
     @property
     def rgb(self) -> tuple[int, int, int]:
@@ -84,7 +92,7 @@ class Segment:
     def terminology(self) -> str:
         """As Slicer writes it: category, type and its modifier; region and its modifier."""
         side = str(_SIDES.get(self.side, "^^"))
-        where, region = (side, "^^~^^") if self.is_organ else ("^^", f"{KIDNEY}~{side}")
+        where, region = (side, "^^~^^") if self.is_organ else ("^^", f"{self.region}~{side}")
         category, kind = self.terms
         return (
             f"Segmentation category and type - DICOM master list~{category}~{kind}~{where}"
@@ -92,9 +100,11 @@ class Segment:
         )
 
 
-def segments(names: Iterable[str], side: Side = UNKNOWN) -> tuple[Segment, ...]:
-    """The segments of parts named kidney, tumor_1, ..., labelled 1, 2, ..."""
-    return tuple(Segment(label, name, side) for label, name in enumerate(names, ORGAN))
+def segments(
+    names: Iterable[str], side: Side = UNKNOWN, organ: Organ = KIDNEY
+) -> tuple[Segment, ...]:
+    """The segments of parts (the organ's name, tumor_1, ...), labelled 1, 2, ..."""
+    return tuple(Segment(label, name, side, organ) for label, name in enumerate(names, ORGAN))
 
 
 def write_seg_nrrd(
@@ -221,6 +231,7 @@ def _segmentation(
 
     digest = hashlib.sha256(pixels.tobytes())
     digest.update("".join(str(one.get("SOPInstanceUID")) for one in slices).encode())
+    organ = parts[0].organ
     entropy = ["tumortrack", digest.hexdigest()]
     try:
         return hd.seg.Segmentation(
@@ -236,8 +247,8 @@ def _segmentation(
             manufacturer_model_name="tumortrack",
             software_versions=tumortrack.__version__,
             device_serial_number="0",
-            content_label="KIDNEY_TUMORS",
-            series_description="Kidney and tumors (tumortrack)",
+            content_label=f"{organ.name[:9].upper()}_TUMORS",
+            series_description=f"{organ.words.capitalize()} and tumors (tumortrack)",
         )
     except AttributeError as error:  # highdicom's word for a tag that a slice lacks
         raise InputError(
@@ -262,7 +273,7 @@ def _description(part: Segment) -> Any:
         algorithm_identification=hd.AlgorithmIdentificationSequence(
             "tumortrack prepare", codes.cid7162.MorphologicalOperations, tumortrack.__version__
         ),
-        anatomic_regions=None if part.is_organ else [Code(*KIDNEY)],
+        anatomic_regions=None if part.is_organ else [Code(*part.region)],
         display_color=hd.color.CIELabColor.from_rgb(*part.rgb),
     )
     if part.side in _SIDES:

@@ -1,4 +1,4 @@
-"""One kidney and its tumors out of a label map."""
+"""One organ and its tumors out of a label map."""
 
 from __future__ import annotations
 
@@ -10,17 +10,18 @@ from jaxtyping import Float, Int32, UInt8
 
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import spacing_mm
+from tumortrack.core.organ import KIDNEY, Organ
 from tumortrack.core.patient import UNKNOWN, Side
 from tumortrack.core.types import FIRST_TUMOR, ORGAN, LabelVolume
 from tumortrack.imaging import grid
 
 MIN_TUMOR_ML = 0.2
 _GAP_MM = 3.0  # annotators and resampling leave such gaps; a thicker slice counts as one voxel
-_MIN_KIDNEY_ML, _MAX_KIDNEY_ML = 10.0, 2500.0  # a polycystic kidney can pass 2 litres
+_MIN_ML, _MAX_ML = 10.0, 4000.0  # of a small prostate; of a large liver
 _MIDLINE_MARGIN_MM = 20.0
-_KIDNEYS_APART_MM = 60.0  # their middles, from side to side (usually over 100): no torn kidney's
+_PAIR_APART_MM = 60.0  # middles, from side to side (kidneys' usually over 100): of no torn organ
 _MOST_TUMORS = 254
-_MOST_OF_BORDER = 1 / 3  # of the map's outermost voxels; a kidney cut in half covers a quarter
+_MOST_OF_BORDER = 1 / 3  # of the map's outermost voxels; an organ cut in half covers a quarter
 _MOST_RUGGED = 60.0  # area of all labels' borders over volume^(2/3); a voxelised ball has 7
 
 
@@ -57,7 +58,7 @@ class _Pieces:
 
 
 @dataclass(frozen=True)
-class _Kidney:
+class _Candidate:
     piece: int
     ml: float
     tumor_ml: float
@@ -70,28 +71,30 @@ def select_labels(
     organ: int = ORGAN,
     tumor: int | None = None,
     min_tumor_ml: float = MIN_TUMOR_ML,
+    kind: Organ = KIDNEY,
 ) -> tuple[LabelVolume, list[str], Side]:
-    """Keep one kidney (label 1) and its tumors (2, 3, ...), cropped with a margin.
+    """Keep one organ (label 1) and its tumors (2, 3, ...), cropped with a margin.
 
-    A kidney is a connected piece of organ and tumor voxels with at least 10 ml of organ and a
+    An organ is a connected piece of organ and tumor voxels with at least 10 ml of organ and a
     tenth of the largest one's volume (where there is none, the piece with most organ). A tumor
-    within 3 mm of a kidney belongs to it: see ``_attach_tumors``. One farther off is left out with
+    within 3 mm of an organ belongs to it: see ``_attach_tumors``. One farther off is left out with
     a note; other pieces are specks and dropped. A tumor is a piece of one tumor label inside that
-    kidney; smaller ones than ``min_tumor_ml`` become organ. Different tumor labels keep their
+    organ; smaller ones than ``min_tumor_ml`` become organ. Different tumor labels keep their
     order; the pieces of one label follow each other, largest first.
 
     Args:
-        side: the PATIENT's ``left`` or ``right``; None takes the kidney with most tumor.
+        side: the PATIENT's ``left`` or ``right``; None takes the organ with most tumor.
         organ: the organ's label.
         tumor: the tumor's label; None takes every other label from 2 up, 0 takes none.
+        kind: which organ it is; only of those in pairs is one chosen by its side.
 
     Returns:
-        The selected labels, notes on what was dropped or renumbered, and the kidney's side: as
-        the map shows it, if it has two kidneys; else what was asked for.
+        The selected labels, notes on what was dropped or renumbered, and the organ's side: as
+        the map shows it, if it has two kidneys, say; else what was asked for.
 
     Raises:
-        InputError: no organ, no such tumor label, two kidneys without tumor and no ``side``, no
-            tumor but one apart from every kidney.
+        InputError: no organ, no such tumor label, two of a pair without tumor and no ``side``,
+            no tumor but one apart from every organ.
     """
     labels, affine = label_volume.labels, label_volume.lps_from_index
     present = [int(n) for n in np.flatnonzero(grid.label_counts(labels)) if n > 0]
@@ -103,20 +106,20 @@ def select_labels(
     affine = grid.moved_origin(affine, box)
     numbered, _ = grid.components(counted[box])
     pieces = _Pieces(labels[box], numbered, affine, organ, tuple(tumors))
-    numbers = _kidney_pieces(pieces)
+    numbers = _large_pieces(pieces)
     pieces, notes, apart = _attach_tumors(pieces, numbers, min_tumor_ml)
-    kidneys = _kidneys(pieces, numbers)
-    notes += _left_out(pieces, kidneys, apart, min_tumor_ml)
-    chosen, more, found_side = _choose_kidney(kidneys, side, float(middle[0]))
+    found = _candidates(pieces, numbers)
+    notes += _left_out(pieces, found, apart, min_tumor_ml)
+    chosen, more, found_side = _choose(found, side, float(middle[0]), kind)
     notes += more
-    if not _MIN_KIDNEY_ML <= chosen.ml <= _MAX_KIDNEY_ML:
+    if not _MIN_ML <= chosen.ml <= _MAX_ML:
         raise InputError(
-            f"label {organ} and its tumors fill {chosen.ml:.1f} ml; a kidney has "
-            f"{_MIN_KIDNEY_ML:g} to {_MAX_KIDNEY_ML:g} ml. Check --organ, --tumor and the spacing."
+            f"label {organ} and its tumors fill {chosen.ml:.1f} ml; an organ has "
+            f"{_MIN_ML:g} to {_MAX_ML:g} ml. Check --organ, --tumor and the spacing."
         )
-    kidney = pieces.numbers == chosen.piece
-    box = grid.bounding_box(kidney, affine, 2.0)
-    own = np.where(kidney, pieces.labels, 0)[box].astype(np.uint8)
+    mine = pieces.numbers == chosen.piece
+    box = grid.bounding_box(mine, affine, 2.0)
+    own = np.where(mine, pieces.labels, 0)[box].astype(np.uint8)
     _check_ruggedness(own, affine)
     out, more = _number_tumors(own, tumors, grid.voxel_ml(affine), min_tumor_ml)
     return grid.cropped(out, grid.moved_origin(affine, box)), notes + more, found_side
@@ -137,7 +140,7 @@ def _check_border(counted: np.ndarray) -> None:
     if share > _MOST_OF_BORDER:
         raise InputError(
             f"organ and tumors cover {share:.0%} of the label map's border, so their surface is "
-            "cut off. Give a map that holds the whole kidney, with a margin about it."
+            "cut off. Give a map that holds the whole organ, with a margin about it."
         )
 
 
@@ -152,7 +155,7 @@ def _check_ruggedness(labels: np.ndarray, affine: np.ndarray) -> None:
     if area_mm2 > _MOST_RUGGED * volume_mm3 ** (2 / 3):
         raise InputError(
             f"the labels are torn to shreds: {volume_mm3 / 1000:.0f} ml with borders of "
-            f"{area_mm2 / 100:.0f} cm2, where a kidney and its tumors have a tenth. This is noise "
+            f"{area_mm2 / 100:.0f} cm2, where an organ and its tumors have a tenth. This is noise "
             "rather than a segmentation; smooth it, or draw it anew."
         )
 
@@ -176,16 +179,16 @@ def _tumor_labels(present: list[int], organ: int, tumor: int | None) -> list[int
     return [tumor]
 
 
-def _kidney_pieces(pieces: _Pieces) -> list[int]:
-    """The numbers of the pieces that hold enough organ to be a kidney, largest first."""
+def _large_pieces(pieces: _Pieces) -> list[int]:
+    """The numbers of the pieces that hold enough organ to be one, largest first."""
     whole_ml = pieces.whole_ml
-    large = np.flatnonzero(pieces.organ_ml >= _MIN_KIDNEY_ML).tolist()
-    if not large:  # a kidney nearly eaten up by its tumor, or a very small one
+    large = np.flatnonzero(pieces.organ_ml >= _MIN_ML).tolist()
+    if not large:  # an organ nearly eaten up by its tumor, or a very small one
         return [int(pieces.organ_ml.argmax())]
     return [n for n in large if whole_ml[n] >= whole_ml[large].max() / 10]
 
 
-def _kidneys(pieces: _Pieces, numbers: list[int]) -> list[_Kidney]:
+def _candidates(pieces: _Pieces, numbers: list[int]) -> list[_Candidate]:
     from scipy import ndimage
 
     boxes = ndimage.find_objects(pieces.numbers, max_label=max(numbers))
@@ -194,49 +197,47 @@ def _kidneys(pieces: _Pieces, numbers: list[int]) -> list[_Kidney]:
         box = boxes[n - 1]
         index = np.argwhere(pieces.numbers[box] == n).mean(0) + [s.start for s in box]
         x_mm = float((pieces.lps_from_index @ [*index, 1])[0])
-        out.append(_Kidney(n, float(pieces.whole_ml[n]), float(pieces.tumor_ml[n]), x_mm))
+        out.append(_Candidate(n, float(pieces.whole_ml[n]), float(pieces.tumor_ml[n]), x_mm))
     return out
 
 
 def _attach_tumors(
-    pieces: _Pieces, kidneys: list[int], min_tumor_ml: float
+    pieces: _Pieces, organs: list[int], min_tumor_ml: float
 ) -> tuple[_Pieces, list[str], list[int]]:
-    """Join every piece with a tumor of at least ``min_tumor_ml`` to a kidney within 3 mm.
+    """Join every piece with a tumor of at least ``min_tumor_ml`` to an organ within 3 mm.
 
     The gap (up to 3 mm, or one voxel where voxels are larger) is filled with organ, no wider
     than the two face each other, so that organ and tumor have one surface.
 
     Returns:
-        The pieces with joined ones numbered as their kidney, notes, and the numbers of the
+        The pieces with joined ones numbered as their organ, notes, and the numbers of the
         pieces that lie farther off.
     """
     notes: list[str] = []
     apart: list[int] = []
     beside = np.flatnonzero((pieces.tumor_ml > 0) & (pieces.tumor_ml >= min_tumor_ml)).tolist()
-    beside = [number for number in beside if number not in kidneys]
+    beside = [number for number in beside if number not in organs]
     if len(beside) > _MOST_TUMORS:
         raise InputError(
-            f"{len(beside)} tumors lie beside the kidneys, more than {_MOST_TUMORS}; raise "
+            f"{len(beside)} tumors lie beside the organ, more than {_MOST_TUMORS}; raise "
             "--min-tumor-ml or check the labels."
         )
     for number in beside:
         ml = float(pieces.tumor_ml[number])
-        joined = _joined(pieces, kidneys, number)
+        joined = _joined(pieces, organs, number)
         if joined is None:
             apart.append(number)
         else:
             pieces, gap_mm, bridge_ml = joined
             notes.append(
-                f"a tumor of {ml:.2f} ml lies {gap_mm:.1f} mm off the kidney's labels: taken as "
-                f"the kidney's, the gap filled with {bridge_ml:.2f} ml of organ"
+                f"a tumor of {ml:.2f} ml lies {gap_mm:.1f} mm off the organ's labels: taken as "
+                f"the organ's, the gap filled with {bridge_ml:.2f} ml of organ"
             )
     return pieces, notes, apart
 
 
-def _joined(
-    pieces: _Pieces, kidneys: list[int], number: int
-) -> tuple[_Pieces, float, float] | None:
-    """The pieces with one joined to its nearest kidney, the gap in mm and what fills it in ml."""
+def _joined(pieces: _Pieces, organs: list[int], number: int) -> tuple[_Pieces, float, float] | None:
+    """The pieces with one joined to its nearest organ, the gap in mm and what fills it in ml."""
     from scipy.ndimage import distance_transform_edt
 
     affine = pieces.lps_from_index
@@ -244,18 +245,18 @@ def _joined(
     reach_mm = max(_GAP_MM, float(spacing.max()))
     box = grid.bounding_box(pieces.numbers == number, affine, reach_mm + 2 * float(spacing.max()))
     numbers = pieces.numbers[box]
-    own, kidney = numbers == number, np.isin(numbers, kidneys)
-    if not kidney.any():
+    own, organ = numbers == number, np.isin(numbers, organs)
+    if not organ.any():
         return None
-    to_kidney, nearest = distance_transform_edt(~kidney, sampling=spacing, return_indices=True)
-    here = np.unravel_index(np.where(own, to_kidney, np.inf).argmin(), own.shape)
+    to_organ, nearest = distance_transform_edt(~organ, sampling=spacing, return_indices=True)
+    here = np.unravel_index(np.where(own, to_organ, np.inf).argmin(), own.shape)
     there = tuple(int(axis[here]) for axis in nearest)
     steps = np.abs(np.subtract(here, there))
     gap_mm = float(np.linalg.norm(np.maximum(steps - 1, 0) * spacing))  # between voxels' faces
     if gap_mm > reach_mm:
         return None
     to_own = distance_transform_edt(~own, sampling=spacing)
-    between = to_kidney + to_own <= float(to_kidney[here]) + float(np.median(spacing))
+    between = to_organ + to_own <= float(to_organ[here]) + float(np.median(spacing))
     bridge = between & (numbers == 0)
     joined, labels = pieces.numbers.copy(), pieces.labels.copy()
     joined[box][own | bridge] = numbers[there]
@@ -265,61 +266,65 @@ def _joined(
 
 
 def _left_out(
-    pieces: _Pieces, kidneys: list[_Kidney], apart: list[int], min_tumor_ml: float
+    pieces: _Pieces, organs: list[_Candidate], apart: list[int], min_tumor_ml: float
 ) -> list[str]:
-    """Notes on tumors that no kidney is near, and on specks; refused where no other tumor is."""
+    """Notes on tumors that no organ is near, and on specks; refused where no other tumor is."""
     notes: list[str] = []
-    rest_ml = np.delete(pieces.whole_ml, [0, *apart, *(k.piece for k in kidneys)])
+    rest_ml = np.delete(pieces.whole_ml, [0, *apart, *(k.piece for k in organs)])
     if n_specks := int((rest_ml > 0).sum()):
         notes.append(
-            f"{n_specks} specks beside the kidneys dropped ({rest_ml.sum():.2f} ml together)"
+            f"{n_specks} specks beside the organ dropped ({rest_ml.sum():.2f} ml together)"
         )
     if not apart:
         return notes
     text = " and ".join(f"{pieces.tumor_ml[n]:.1f} ml" for n in apart[:5])
-    if not any(k.tumor_ml > 0 and k.tumor_ml >= min_tumor_ml for k in kidneys):
+    if not any(k.tumor_ml > 0 and k.tumor_ml >= min_tumor_ml for k in organs):
         raise InputError(
-            f"the only tumor ({text}) lies more than {_GAP_MM:g} mm from every kidney. Check the "
+            f"the only tumor ({text}) lies more than {_GAP_MM:g} mm from the organ. Check the "
             "labels and --organ, or give --tumor 0 to leave it out."
         )
     notes.append(
-        f"LEFT OUT: tumor of {text}, more than {_GAP_MM:g} mm from every kidney. If it belongs to "
-        "the kidney, close the gap in the label map"
+        f"LEFT OUT: tumor of {text}, more than {_GAP_MM:g} mm from the organ. If it belongs to "
+        "it, close the gap in the label map"
     )
     return notes
 
 
-def _choose_kidney(
-    kidneys: list[_Kidney], side: str | None, middle_x_mm: float
-) -> tuple[_Kidney, list[str], Side]:
+def _choose(
+    found: list[_Candidate], side: str | None, middle_x_mm: float, kind: Organ
+) -> tuple[_Candidate, list[str], Side]:
     if side not in (None, "left", "right"):
         raise InputError(f"side {side!r} is not understood. Allowed: left, right (the patient's).")
-    best = max(kidneys, key=lambda kidney: (kidney.tumor_ml, kidney.ml))
-    alone = len(kidneys) == 1
-    xs = [kidney.x_mm for kidney in kidneys]
+    best = max(found, key=lambda one: (one.tumor_ml, one.ml))
+    alone = len(found) == 1
+    if not kind.in_pairs:
+        note = f"of {len(found)} large pieces the one with most tumor, or the largest, was taken"
+        stated: Side = "left" if side == "left" else "right" if side == "right" else UNKNOWN
+        return best, [] if alone else [note], stated
+    xs = [one.x_mm for one in found]
     if not alone:
         middle_x_mm = (min(xs) + max(xs)) / 2
     if side is None:
         if not alone and best.tumor_ml == 0:
             raise InputError(
-                f"the label map holds {len(kidneys)} kidneys and no tumor. Give --side left or "
+                f"the label map holds {len(found)} {kind.words}s and no tumor. Give --side left or "
                 "--side right (the patient's)."
             )
         name: Side = "left" if best.x_mm > middle_x_mm else "right"
-        note = f"the patient's {name} kidney was chosen: it bears most tumor"
-        plain = max(xs) - min(xs) > _KIDNEYS_APART_MM
+        note = f"the patient's {name} {kind.words} was chosen: it bears most tumor"
+        plain = max(xs) - min(xs) > _PAIR_APART_MM
         return best, [] if alone else [note], name if plain else UNKNOWN
     sign = 1 if side == "left" else -1
-    # With one kidney only the image's midline is known: near it, trust the user.
+    # With one organ only the image's midline is known: near it, trust the user.
     slack = _MIDLINE_MARGIN_MM if alone else 0.0
-    fitting = [k for k in kidneys if sign * (k.x_mm - middle_x_mm) > -slack]
+    fitting = [k for k in found if sign * (k.x_mm - middle_x_mm) > -slack]
     if not fitting:
         raise InputError(
-            f"no kidney on the patient's {side} side in this label map; its kidney lies on the "
-            "other side. Leave out --side, or check the map's orientation."
+            f"no {kind.words} on the patient's {side} side in this label map; its {kind.words} "
+            "lies on the other side. Leave out --side, or check the map's orientation."
         )
-    best = max(fitting, key=lambda kidney: (kidney.tumor_ml, kidney.ml))
-    note = "only one kidney in the map; its side was checked against the image's middle only"
+    best = max(fitting, key=lambda one: (one.tumor_ml, one.ml))
+    note = f"only one {kind.words} in the map; its side was checked against the image's middle only"
     return best, [note] if alone else [], "left" if side == "left" else "right"
 
 
@@ -355,5 +360,5 @@ def _number_tumors(
                 notes.append(f"tumor label {value} is now {number}")
             number += 1
     if number == FIRST_TUMOR:
-        notes.append("no tumor in this kidney")
+        notes.append("no tumor in this organ")
     return out, notes

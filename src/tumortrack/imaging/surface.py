@@ -13,10 +13,12 @@ import numpy as np
 
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import spacing_mm, transform_points
+from tumortrack.core.organ import KIDNEY, Organ
 from tumortrack.core.types import FIRST_TUMOR, Anatomy, LabelVolume, Mesh, part_names
 from tumortrack.imaging.grid import extent_mm, tight_box, voxel_ml
 
 _TRIANGLES = 28_000  # aimed at for the organ
+_LARGE_MM3 = 8e5  # of an organ that needs no steps as fine as 1.5 mm
 _BLUR_VOXELS = 0.9  # enough to melt steps of one voxel, too little to lose a small tumor
 _STEPS_ACROSS = 14  # cells across the thinnest extent of a small part
 _MOST_MARCHES = 16  # 2 to 4 suffice where the volume is a smooth function of the level
@@ -26,7 +28,9 @@ _REPORTED = (
 )
 
 
-def surfaces(label_volume: LabelVolume) -> tuple[Anatomy, dict[str, list[Any]]]:
+def surfaces(
+    label_volume: LabelVolume, kind: Organ = KIDNEY
+) -> tuple[Anatomy, dict[str, list[Any]]]:
     """The organ's surface (all labels from 1 up) and one per tumor, LPS mm, faces outward.
 
     Returns:
@@ -42,11 +46,12 @@ def surfaces(label_volume: LabelVolume) -> tuple[Anatomy, dict[str, list[Any]]]:
     if top == 0:
         raise InputError("the labels are empty: no organ to take a surface of.")
     masks = [labels > 0, *(labels == n for n in range(FIRST_TUMOR, top + 1))]
-    names = part_names(len(masks))
+    names = part_names(len(masks), kind.name)
     # The grid step that gives about the wanted number of triangles (about 2.2 per cell face)
     volume_mm3 = 1000 * float(masks[0].sum()) * voxel_ml(affine)
     area_mm2 = 1.35 * 4.836 * volume_mm3 ** (2 / 3)  # a kidney has 1.35 times a sphere's area
-    step = float(np.clip(np.sqrt(2.2 * area_mm2 / _TRIANGLES), 0.4, 1.5))
+    coarsest = 1.5 * max(1.0, volume_mm3 / _LARGE_MM3)
+    step = float(np.clip(np.sqrt(2.2 * area_mm2 / _TRIANGLES), 0.4, coarsest))
     parts, rows = [], []
     for name, mask in zip(names, masks, strict=True):
         if not mask.any():
@@ -62,7 +67,7 @@ def surfaces(label_volume: LabelVolume) -> tuple[Anatomy, dict[str, list[Any]]]:
         "names": list(names),
         **dict(zip(_REPORTED, columns, strict=True)),
     }
-    return Anatomy(tuple(parts)), report
+    return Anatomy(tuple(parts), kind), report
 
 
 def _surface(name: str, mask: np.ndarray, affine: np.ndarray, step_mm: float) -> Mesh:

@@ -8,6 +8,7 @@ from jaxtyping import Float64
 from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.estimate import Estimate
 from tumortrack.core.geometry import transform_points, unit
+from tumortrack.core.organ import is_tumor
 from tumortrack.core.types import Look, SensorCloud
 from tumortrack.live.values import CameraView
 from tumortrack.tracking.tracker import Tracker
@@ -73,5 +74,5 @@ class Scan:
 def _least_sure_mm(estimate: Estimate) -> float:
     """One standard deviation of the centre of the tumor, or else the organ, that is least sure."""
     parts = estimate.report["parts"]
-    names = [name for name in parts if name != "kidney"] or ["kidney"]
+    names = [name for name in parts if is_tumor(name)] or list(parts)
     return max(parts[name]["center_std_mm"] for name in names)

@@ -9,6 +9,7 @@ from typing import Any
 from tumortrack.core import store
 from tumortrack.core.errors import ArtifactError
 from tumortrack.core.estimate import FAR_MM
+from tumortrack.core.organ import Organ, organ_in
 from tumortrack.core.patient import Patient, patient_in
 
 KIND = "model"
@@ -56,6 +57,11 @@ def read_tensors(
 def patient_of(manifest: dict[str, Any], folder: Path) -> Patient:
     """Whose organ a model was trained for; InputError where its manifest says nonsense."""
     return patient_in(manifest.get("provenance", {}).get("patient"), str(folder))
+
+
+def organ_of(manifest: dict[str, Any], folder: Path) -> Organ:
+    """Which organ a model was trained for; InputError where its manifest says nonsense."""
+    return organ_in(manifest.get("provenance", {}).get("organ"), str(folder))
 
 
 def weakness_of(provenance: dict[str, Any]) -> str:

@@ -19,7 +19,7 @@ from tumortrack.core.errors import ArtifactError, InputError
 # those in ``measured``: margins that were found before are then refused.
 METHOD = 3
 NAME = "margins.json"
-Kind = Literal["tumor", "kidney", "map"]
+Kind = Literal["tumor", "organ", "map"]
 UNKNOWN = "no margin is known for this model (tumortrack margins)"
 
 
@@ -58,7 +58,7 @@ class Radius(Config, frozen=True):
 
 
 class Shells(Config, frozen=True):
-    """The radii that hold with one ``confidence``: of each tumor, of the kidney's surface, and of
+    """The radii that hold with one ``confidence``: of each tumor, of the organ's surface, and of
     any point that is mapped."""
 
     confidence: float
@@ -146,8 +146,11 @@ def read_sealed(path: Path) -> ModelMargins:
             f"{METHOD}, whose estimates differ. {_AGAIN}"
         )
     try:
+        for shells in content["shells"]:
+            if "kidney" in shells["radii"]:  # as older versions wrote it
+                shells["radii"]["organ"] = shells["radii"].pop("kidney")
         return from_builtins(content, ModelMargins, str(path))
-    except InputError as error:
+    except (InputError, KeyError, TypeError) as error:
         raise ArtifactError(f"{error} {_AGAIN}") from error
 
 
@@ -213,7 +216,7 @@ def stated_margin(
         return {"stated": [], "reason": "margins are of single clouds, not of smoothed motions"}
     parts, found, stated = report["parts"], measured(report), []
     kinds: dict[str, Kind] = {name: "tumor" for name in parts}
-    kinds |= {next(iter(parts)): "kidney", "map": "map"}
+    kinds |= {next(iter(parts)): "organ", "map": "map"}
     deviations = {name: part.get("surface_std_mm") for name, part in parts.items()}
     deviations["map"] = next(iter(deviations.values()))
     for shells in margins.shells:

@@ -13,6 +13,7 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor, nn
 
+from tumortrack.core.organ import Organ, organ_in
 from tumortrack.core.patient import Patient, patient_in
 from tumortrack.models.config import TrainConfig
 from tumortrack.models.in_distribution import InDistributionRange
@@ -60,6 +61,11 @@ class Model:
     def patient(self) -> Patient:
         """Whose organ it was trained for, as far as it is known."""
         return patient_in(self.provenance.get("patient"), "provenance")
+
+    @property
+    def organ(self) -> Organ:
+        """Which organ it was trained for."""
+        return organ_in(self.provenance.get("organ"), "provenance")
 
     def extra_files(self) -> dict[str, bytes]:
         """Files of a model folder besides the weights, by name."""

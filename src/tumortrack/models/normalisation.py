@@ -62,7 +62,7 @@ def without_strays(points_mm: Tensor, reach_mm: float) -> Tensor:
     """Clouds (B, N, 3) with every point that is not within reach of the others' middle replaced by
     one that is: a repeated point changes no maximum, and is never a farthest one. The middle is the
     coordinates' median, then twice the mean of the points within reach, so that background moves it
-    little (10 % of a plane behind a kidney: 0.5 mm, the mean of all by 5 mm). The order of the
+    little (10 % of a plane behind an organ: 0.5 mm, the mean of all by 5 mm). The order of the
     points that stay is kept."""
     if compiled(points_mm):
         out = torch.empty_like(points_mm, memory_format=torch.contiguous_format)

@@ -84,7 +84,7 @@ def describe_parts(
     names: tuple[str, ...], meshes: dict[str, Mesh], inside: OccupancyCloud
 ) -> dict[str, dict[str, Any]]:
     """Per part: volume, centre, box and how sure the labels inside it are (JSON types). The
-    kidney's numbers are those of the whole organ, tumors included."""
+    organ's numbers are those of the whole organ, tumors included."""
     parts: dict[str, dict[str, Any]] = {}
     counts = np.bincount(inside.labels, minlength=len(names) + 1)
     sums = np.bincount(inside.labels, inside.probability, len(names) + 1)

@@ -91,7 +91,7 @@ class OccupancyLocator:
                 step(finer)
         ball = np.linalg.norm(np.indices((16, 16, 16)).T - 7.5, axis=-1) < 5
         margins = np.where(ball, 1, -1).astype(np.float16)[None]
-        volume.part_surfaces(margins, ball.astype(np.uint8), np.eye(4), ("kidney",))
+        volume.part_surfaces(margins, ball.astype(np.uint8), np.eye(4), self.model.parts[:1])
 
 
 def _check_one(others: Sequence[Look]) -> None:

@@ -18,6 +18,7 @@ from tumortrack.core import store
 from tumortrack.core.config import from_builtins, to_builtins
 from tumortrack.core.errors import ArtifactError, InputError, NoPlan
 from tumortrack.core.mesh_files import read_mesh, write_mesh
+from tumortrack.core.organ import organ_first
 from tumortrack.core.patient import NOBODY, Patient, patient_in
 from tumortrack.core.types import Mesh
 from tumortrack.live.values import PublishedFrame
@@ -111,7 +112,9 @@ def read_plan(folder: Path) -> PlanFolder:
     manifest = store.read_manifest(folder, KIND)
     data, path = store.read_json(folder / _NAME), folder / _MOTIONS
     surfaces = {Path(file).stem for file in manifest["files"] if file.endswith(".ply")}
-    meshes = {name: read_mesh(folder / f"{name}.ply") for name in sorted(surfaces - {"strokes"})}
+    meshes = {
+        name: read_mesh(folder / f"{name}.ply") for name in organ_first(surfaces - {"strokes"})
+    }
     motions = _read_motions(path) if path.is_file() else None
     try:
         plan = from_plain(data["plan"])

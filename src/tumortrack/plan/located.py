@@ -15,9 +15,10 @@ from tumortrack.core.errors import ArtifactError, InputError, NoPlan
 from tumortrack.core.estimate import Motion
 from tumortrack.core.geometry import rigid, transform_points
 from tumortrack.core.mesh_files import read_mesh
+from tumortrack.core.organ import KIDNEY, is_tumor, organ_first, organ_name
 from tumortrack.core.patient import NOBODY, Patient, patient_in
 from tumortrack.core.store import read_json, read_manifest
-from tumortrack.core.types import Mesh, OccupancyCloud
+from tumortrack.core.types import ORGAN, Mesh, OccupancyCloud
 from tumortrack.plan.values import Located, name_of
 from tumortrack.sense.ply import parse_ply_properties
 from tumortrack.tracking.files import MARGIN
@@ -33,9 +34,9 @@ def table_under(meshes: Mapping[str, Mesh], stand_mm: float) -> Float64[np.ndarr
     x goes to the right in the picture, y to its top, z towards the camera; the origin lies on the
     table below the organ's middle. NoPlan: there is no organ.
     """
-    if "kidney" not in meshes:
+    if (organ := organ_name(meshes)) is None:
         raise NoPlan("no organ was located, so nothing can be planned. Locate it first.")
-    low, high = meshes["kidney"].box_mm
+    low, high = meshes[organ].box_mm
     x, y, _ = (low + high) / 2
     return rigid(np.diag([1.0, -1.0, -1.0]), np.array([-x, y, high[2] + stand_mm]))
 
@@ -50,7 +51,7 @@ def located(
     deviations, moved = {}, {}
     for name, mesh in meshes.items():
         moved[name] = mesh.moved(transform_points(table_from_camera, mesh.vertices_mm))
-        places = None if motion is None or name == "kidney" else motion.back(mesh.vertices_mm)
+        places = None if motion is None or not is_tumor(name) else motion.back(mesh.vertices_mm)
         std_mm = None if motion is None or places is None else motion.largest_std_mm(places)
         if std_mm is not None:
             deviations[name] = std_mm
@@ -80,7 +81,7 @@ class LocatedRun:
         deviations = {
             name: self.std_mm[nearest.query(mesh.vertices_mm)[1]]
             for name, mesh in found.meshes.items()
-            if name != "kidney"
+            if is_tumor(name)
         }
         return replace(found, std_mm=deviations)
 
@@ -121,8 +122,13 @@ def read_run(folder: Path) -> LocatedRun:
     cloud = OccupancyCloud(table[:, :3], table[:, 3], table[:, 4], stamp_ns)
     surfaces = {Path(file).stem for file in manifest["files"] if file.endswith(".ply")}
     surfaces = {name for name in surfaces if not name.endswith(MARGIN)}
-    meshes = {name: read_mesh(folder / f"{name}.ply") for name in sorted(surfaces - {path.stem})}
-    found = [name_of(label) for label in np.unique(cloud.labels) if label]
+    meshes = {
+        name: read_mesh(folder / f"{name}.ply") for name in organ_first(surfaces - {path.stem})
+    }
+    organ = organ_name(meshes) or KIDNEY.name
+    found = [
+        organ if label == ORGAN else name_of(label) for label in np.unique(cloud.labels) if label
+    ]
     lacking = [name for name in found if name not in meshes]
     if lacking:
         raise ArtifactError(

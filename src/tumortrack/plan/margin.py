@@ -53,7 +53,7 @@ _Grown = tuple[np.ndarray, np.ndarray]  # points of the tumor, and the margin th
 def margin_plan(located: Located, label: int, config: ResectionConfig) -> MethodResult:
     """The piece, its strokes, both from the top down, and where to hold; table frame, mm. Raises
     NoPlan: the margin with its uncertainty is wider than allowed; there is nothing to cut."""
-    columns, tumor = Columns.of(located.meshes["kidney"]), located.of(label)
+    columns, tumor = Columns.of(located.organ), located.of(label)
     layers = _layers(_grown_tumor(located, label, config), columns, config.layer_mm)
     slabs = list(zip(layers, (*layers[1:], None), strict=True))
     cuts: list[Cut] = []

@@ -24,7 +24,7 @@ from tumortrack.plan.values import (
     name_of,
 )
 
-_DIRECTIONS, _MOST = 192, 12_000  # of the hull, points it is made of: a kidney's is off by 0.5 mm
+_DIRECTIONS, _MOST = 192, 12_000  # of the hull, points it is made of: off by 0.5 mm
 _FEWEST = 30  # points that define a tumor's shape
 _WHOLE = 0.99  # of another tumor's points
 
@@ -98,8 +98,8 @@ def _chosen_tumor(located: Located, config: ResectionConfig) -> tuple[int, float
             f"{inside} wholly inside the organ ({shares[label]:.0%} outside its hull, "
             f"{config.least_exophytic:.0%} are needed): there is no contour to cut along."
         )
-    needed = ("kidney", *names)
-    if lacking := [part for part in needed if part not in located.meshes]:
+    _ = located.organ
+    if lacking := [part for part in names if part not in located.meshes]:
         raise NoPlan(f"{lacking[0]} has no surface to keep a margin from. Locate it again.")
     return label, shares[label]
 
@@ -146,7 +146,7 @@ def inside(layers: tuple[CutLayer, ...], points_mm: Float[np.ndarray, "n 3"]) ->
 
 def _volumes_ml(located: Located, label: int, taken: np.ndarray) -> dict[str, float]:
     """By counting points, which lie evenly in the organ."""
-    organ_ml = located.meshes["kidney"].volume_mm3 / 1000
+    organ_ml = located.organ.volume_mm3 / 1000
     each_ml = organ_ml / len(located.points_mm)
     tumor, healthy = located.labels == label, located.labels < FIRST_TUMOR
     masks = {

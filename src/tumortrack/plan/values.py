@@ -13,9 +13,10 @@ import numpy as np
 from jaxtyping import Float, Float64, UInt8
 
 from tumortrack.core.config import Config
-from tumortrack.core.errors import InputError
+from tumortrack.core.errors import InputError, NoPlan
+from tumortrack.core.organ import organ_name
 from tumortrack.core.patient import NOBODY, Patient
-from tumortrack.core.types import FIRST_TUMOR, Mesh, part_names
+from tumortrack.core.types import FIRST_TUMOR, Mesh
 
 Method = Literal["published", "margin"]
 Direction = Literal["shortest", "clockwise", "anticlockwise"]
@@ -66,17 +67,17 @@ class ResectionConfig(Config, frozen=True, kw_only=True):
 
 
 def name_of(label: int) -> str:
-    """1 is kidney, 2 is tumor_1."""
-    return part_names(label)[label - 1]
+    """2 is tumor_1, 3 is tumor_2."""
+    return f"tumor_{label - 1}"
 
 
 @dataclass(frozen=True, eq=False)
 class Located:
-    """Kidney and tumors as located, table frame, mm.
+    """Organ and tumors as located, table frame, mm.
 
     Attributes:
         points_mm, labels: the labelled cloud: label 1 organ without tumors, 2, 3, ... tumors.
-        meshes: closed surfaces: kidney (tumors included), tumor_1, ...
+        meshes: closed surfaces: the organ's name (tumors included), tumor_1, ...
         std_mm: per tumor, the standard deviation of each of its mesh's vertices along the axis that
             is least sure; left out where the estimate has none.
         margin: what margins the estimate states (``models.margins``).
@@ -92,6 +93,13 @@ class Located:
 
     def of(self, label: int) -> Float[np.ndarray, "m 3"]:
         return self.points_mm[self.labels == label]
+
+    @property
+    def organ(self) -> Mesh:
+        """The organ's surface; NoPlan where it was not located."""
+        if (name := organ_name(self.meshes)) is None:
+            raise NoPlan("no organ was located, so nothing can be planned. Locate it first.")
+        return self.meshes[name]
 
     @property
     def tumors(self) -> tuple[int, ...]:

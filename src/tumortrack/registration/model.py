@@ -10,7 +10,7 @@ from safetensors.numpy import load, save
 
 from tumortrack.core.config import Config, from_builtins, identity
 from tumortrack.core.errors import InputError
-from tumortrack.models.folder import SHAPE, read_tensors
+from tumortrack.models.folder import SHAPE, organ_of, read_tensors
 from tumortrack.models.model import Model
 from tumortrack.registration.gauss_newton_kernels import KERNEL
 from tumortrack.registration.network import RegistrationNetwork
@@ -55,7 +55,8 @@ class RegistrationModel(Model):
 
     @classmethod
     def from_folder(cls, folder: Path, manifest: dict[str, Any], **known: Any) -> RegistrationModel:
-        shape = RestShape.from_arrays(read_tensors(folder / SHAPE, load), len(known["parts"]))
+        kind = organ_of(manifest, folder)
+        shape = RestShape.from_arrays(read_tensors(folder / SHAPE, load), len(known["parts"]), kind)
         calibration = from_builtins(manifest["trust"], UncertaintyCalibration, f"{folder}: trust")
         if calibration.kernel != KERNEL:
             raise InputError(

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float32, Float64, UInt8
 
 from tumortrack.core.errors import InputError
+from tumortrack.core.organ import KIDNEY, Organ
 from tumortrack.core.process import parallel_for
 from tumortrack.core.types import Anatomy, Mesh
 from tumortrack.imaging.symmetry import alike, half_turns
@@ -89,7 +90,9 @@ class RestShape:
         return {**arrays, "half_turns": self.half_turns}
 
     @classmethod
-    def from_arrays(cls, arrays: dict[str, np.ndarray], n_parts: int) -> RestShape:
+    def from_arrays(
+        cls, arrays: dict[str, np.ndarray], n_parts: int, kind: Organ = KIDNEY
+    ) -> RestShape:
         """The inverse of ``to_arrays``; InputError for an array that is missing or misshapen."""
         try:
             body = {k.removeprefix(_BODY): v for k, v in arrays.items() if k.startswith(_BODY)}
@@ -105,7 +108,7 @@ class RestShape:
                 fields.append(DistanceField(values, np.asarray(origin, np.float32), float(spacing)))
         except KeyError as error:
             raise InputError(f"the organ's shape lacks {error}; train the model again.") from error
-        anatomy_ct = Anatomy(tuple(parts))
+        anatomy_ct = Anatomy(tuple(parts), kind)
         turns = arrays.get("half_turns")  # which older folders lack
         turns = _half_turns(anatomy_ct) if turns is None else turns
         if turns.shape[1:] != (4, 4) or not np.isfinite(turns).all():

@@ -122,7 +122,7 @@ def row_of(tracker: Tracker, scene: Scene, listed: Listed, seed: int) -> Row:
         if name not in estimate.meshes:
             raise InputError(f"{listed.folder} has a {name}, which this model does not know.")
         miss = outward_miss(estimate.meshes[name], truth), unsure[name]
-        misses.setdefault("tumor" if n else "kidney", []).append(miss)
+        misses.setdefault("tumor" if n else "organ", []).append(miss)
     if estimate.motion is not None and scene.targets is not None:
         off_mm = estimate.motion.carry(scene.targets.points_ct) - scene.targets.points_mm
         largest = float(np.linalg.norm(off_mm, axis=1).max())

@@ -22,7 +22,7 @@ Miss = tuple[float, float | None]  # outward miss or distance (mm), and s (mm)
 
 class Row(Config, frozen=True):
     """One state, located. ``doubt``: why there is no good estimate; ``misses``: of every tumor, of
-    the kidney's surface, and of the target that is farthest off."""
+    the organ's surface, and of the target that is farthest off."""
 
     scene: str
     sha256: str
@@ -88,8 +88,11 @@ def read_table(path: Path) -> tuple[dict[str, Any], list[Row]]:
 def _parsed(content: bytes, path: Path) -> tuple[dict[str, Any], list[Row]]:
     try:
         head, *lines = [json.loads(line) for line in content.splitlines()]
+        for line in lines:
+            if "kidney" in line.get("misses", {}):  # as older versions wrote it
+                line["misses"]["organ"] = line["misses"].pop("kidney")
         return dict(head), [from_builtins(line, Row, str(path)) for line in lines]
-    except (ValueError, TypeError) as error:
+    except (ValueError, TypeError, AttributeError) as error:
         raise InputError(f"{path} is no table of `tumortrack margins`: {error}.") from error
 
 

@@ -21,7 +21,7 @@ from tumortrack.core.types import Mesh
 from tumortrack.imaging.raster import voxelise
 from tumortrack.report.renderer import RGB, Body, Frame, ParallelView, rgb
 
-KIDNEY = rgb(colours.KIDNEY)
+ORGAN = rgb(colours.ORGAN_PART)
 ESTIMATED = (230 / 255, 140 / 255, 0.0)
 TRUE = (0.0, 90 / 255, 160 / 255)
 OBSERVED = (0.25, 0.25, 0.25)

@@ -168,7 +168,7 @@ def label_ious(estimate: CameraLabels, reference: Anatomy) -> dict[str, float]:
     """Intersection over union per part, on the estimate's voxel lattice.
 
     The lattice goes on beyond the estimate's box as far as the reference reaches, so truth
-    outside that box counts as missed. ``kidney`` means the parenchyma alone (label 1, tumors
+    outside that box counts as missed. The organ's name means the parenchyma alone (label 1, tumors
     excluded). A part that is absent from the estimate has IoU 0.
     """
     index_from_camera = np.linalg.inv(estimate.camera_from_index)

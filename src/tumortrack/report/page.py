@@ -15,12 +15,13 @@ from jaxtyping import Float
 from PIL import Image
 
 from tumortrack.core.estimate import Estimate
+from tumortrack.core.organ import is_tumor
 from tumortrack.core.patient import patient_in
 from tumortrack.core.store import write_atomically
 from tumortrack.core.types import Mesh
 from tumortrack.simulate.scene_folder import Scene
 
-_KIDNEY_CELL_MM, _TUMOR_CELL_MM = 2.5, 2.0
+_ORGAN_CELL_MM, _TUMOR_CELL_MM = 2.5, 2.0
 _COLUMNS = {
     "hausdorff_mm": "Hausdorff mm",
     "hausdorff_one_sided_mm": "one-sided mm",
@@ -42,7 +43,7 @@ def page_scene(name: str, scene: Scene, estimate: Estimate | None, picture: Path
     for part, mesh in shown.items():
         layers.append(_layer("mesh", f"{part} (estimate)", part, mesh))
     for part, mesh in zip(scene.reference.names, scene.reference.parts, strict=True):
-        kind = "truth" if part == "kidney" else "wire"
+        kind = "wire" if is_tumor(part) else "truth"
         layers.append(_layer(kind, f"{part} (truth)", part, mesh))
     webp = io.BytesIO()
     with Image.open(picture) as image:
@@ -92,7 +93,7 @@ def thinned(mesh: Mesh, cell_mm: float) -> Mesh:
 
 
 def _layer(kind: str, name: str, part: str, mesh: Mesh) -> dict[str, Any]:
-    small = thinned(mesh, _KIDNEY_CELL_MM if part == "kidney" else _TUMOR_CELL_MM)
+    small = thinned(mesh, _TUMOR_CELL_MM if is_tumor(part) else _ORGAN_CELL_MM)
     about = {"kind": kind, "part": part, "name": name.replace("_", " ")}
     faces = _base64(small.faces.astype("<u4").tobytes())
     return {**about, "v": _packed(small.vertices_mm), "f": faces}

@@ -18,9 +18,10 @@ from matplotlib.patches import Patch
 
 from tumortrack.core.estimate import Estimate
 from tumortrack.core.geometry import DIRECTIONS_LPS, transform_points
+from tumortrack.core.organ import is_tumor, organ_name
 from tumortrack.core.types import Anatomy, LabelVolume, Mesh, Volume
 from tumortrack.report import drawing
-from tumortrack.report.drawing import CENTRED, ESTIMATED, KIDNEY, OBSERVED, TRUE
+from tumortrack.report.drawing import CENTRED, ESTIMATED, OBSERVED, ORGAN, TRUE
 from tumortrack.report.renderer import RGB, Body, Frame, ParallelView
 from tumortrack.simulate.scene_folder import Scene
 
@@ -86,7 +87,7 @@ def scene_picture(
     targets = f"   target error {errors['mean']:.1f} mm" if errors else ""
     headline = f"{entry['name']}   mIoU {entry['miou']:.2f}{targets}{failed}"
     figure.suptitle(headline, x=0.02, ha="left", fontsize=13, fontweight="bold")
-    drawing.show_legend(figure, scene_legend(), 4, (0.985, 0.995))
+    drawing.show_legend(figure, scene_legend(scene.reference.kind.words), 4, (0.985, 0.995))
     drawing.save(figure, path)
 
 
@@ -97,9 +98,10 @@ def draw_solid_view(
     shown = dict(estimate.meshes) if estimate else {}
     everything = [mesh.vertices_mm for mesh in (*scene.reference.parts, *shown.values())]
     frame = view.frame_around(np.concatenate(everything), 6.0).widened(1.7)
-    kidney = [Body(shown.pop("kidney"), KIDNEY, 0.36)] if "kidney" in shown else []
+    name = organ_name(shown)
+    organ = [] if name is None else [Body(shown.pop(name), ORGAN, 0.36)]
     tumors = [Body(mesh, ESTIMATED) for mesh in shown.values()]
-    drawing.show_bodies(axes, view, [*tumors, *kidney], frame)
+    drawing.show_bodies(axes, view, [*tumors, *organ], frame)
     flat = view.project(scene.cloud.points_mm.astype(float))
     axes.scatter(flat[:, 0], flat[:, 1], s=2.5, color=OBSERVED, alpha=0.55, linewidths=0, zorder=3)
     for n, part in enumerate(scene.reference.parts):
@@ -119,12 +121,12 @@ def _draw_slice(
     around = [meshes[name].vertices_mm for meshes in (truth, shown) if name in meshes]
     frame = view.frame_around(np.concatenate(around), 12.0).widened(1.0)
     for part, mesh in shown.items():
-        color, width = (KIDNEY, 1.4) if part == "kidney" else (ESTIMATED, 2.4)
+        color, width = (ESTIMATED, 2.4) if is_tumor(part) else (ORGAN, 1.4)
         drawing.tint(axes, drawing.section_mask(mesh, view, frame, through_mm), frame, color)
         lines = drawing.section(mesh, view, through_mm)
         drawing.draw_lines(axes, lines, color=color, linewidth=width, zorder=3)
     for part, mesh in truth.items():
-        width = 1.1 if part == "kidney" else 2.0
+        width = 2.0 if is_tumor(part) else 1.1
         lines = drawing.section(mesh, view, through_mm)
         drawing.draw_lines(axes, lines, color=TRUE, linewidth=width, zorder=4)
     flat, middle = view.project(scene.cloud.points_mm.astype(float)), view.project(through_mm[None])
@@ -133,11 +135,11 @@ def _draw_slice(
     drawing.finish_view(axes, frame, _CAMERA_AXES[view])
 
 
-def scene_legend() -> list[Any]:
+def scene_legend(organ: str = "kidney") -> list[Any]:
     """Handles of what ``draw_solid_view`` shows."""
     return [
         Patch(facecolor=ESTIMATED, label="estimated tumor"),
-        Patch(facecolor=(*KIDNEY, 0.5), label="estimated kidney"),
+        Patch(facecolor=(*ORGAN, 0.5), label=f"estimated {organ}"),
         Line2D([], [], color=TRUE, linewidth=2, label="truth (outline)"),
         Line2D([], [], color=OBSERVED, marker=".", linestyle="", label="observed point"),
     ]
@@ -155,7 +157,7 @@ def qc_picture(
     """
     order = sorted(range(len(anatomy.tumors)), key=lambda n: -abs(anatomy.tumors[n].volume_mm3))
     rows = {anatomy.names[n + 1]: anatomy.tumors[n] for n in sorted(order[:_MOST_ROWS])}
-    rows = rows or {"kidney": anatomy.organ}
+    rows = rows or {anatomy.names[0]: anatomy.organ}
     height = 3.85 * len(rows)
     borders = {"left": 0.025, "right": 0.99, "bottom": 0.05 / (height + 1.0)}
     figure = drawing.new_figure(18.0, height + 1.0, top=height / (height + 1.0), **borders)
@@ -173,7 +175,7 @@ def qc_picture(
     frame = view.frame_around(anatomy.organ.vertices_mm, 8.0).widened(_ASPECT)
     colors = _part_colors(anatomy)
     tumors = [Body(*one) for one in zip(anatomy.tumors, colors[1:], strict=True)]
-    drawing.show_bodies(axes, view, [*tumors, Body(anatomy.organ, KIDNEY, 0.38)], frame)
+    drawing.show_bodies(axes, view, [*tumors, Body(anatomy.organ, ORGAN, 0.38)], frame)
     drawing.finish_view(axes, frame)
     _write_letters(axes, view, "black")
     axes.set_title("3-D, seen from the front", fontsize=10.5)

@@ -17,12 +17,12 @@ from matplotlib.patheffects import Normal, Stroke
 
 from tumortrack.core.colours import part_colour, sweep_colour
 from tumortrack.core.errors import InputError
-from tumortrack.core.patient import Patient
+from tumortrack.core.organ import KIDNEY, organ_first, organ_name
 from tumortrack.core.types import ORGAN, Mesh, part_names
 from tumortrack.imaging.meshes import mesh_of, solid_of
 from tumortrack.plan.values import Cut, CutLayer, Located, ResectionPlan
 from tumortrack.report import drawing
-from tumortrack.report.drawing import CENTRED, KIDNEY
+from tumortrack.report.drawing import CENTRED
 from tumortrack.report.renderer import RGB, Body, Frame, ParallelView, rgb
 from tumortrack.simulate.occupancy import contains
 
@@ -61,7 +61,7 @@ def plan_figure(plan: ResectionPlan, located: Located) -> Figure:
     organ = surfaces.pop(ORGAN)
     piece, rest = parted(organ, plan.layers)
     bodies = [Body(mesh, rgb(part_colour(label))) for label, mesh in surfaces.items()]
-    bodies += [Body(rest, KIDNEY, _ORGAN_OPACITY), Body(piece, _PIECE, _PIECE_OPACITY)]
+    bodies += [Body(rest, drawing.ORGAN, _ORGAN_OPACITY), Body(piece, _PIECE, _PIECE_OPACITY)]
     in_organ = [contains(organ, cut.path_mm) for cut in plan.cuts]
     reach_mm = plan.grasp_mm + np.array([0.0, 0.0, _APPROACH_MM])
     shown = [organ.vertices_mm, *(cut.path_mm for cut in plan.cuts), reach_mm[None]]
@@ -84,7 +84,7 @@ def plan_figure(plan: ResectionPlan, located: Located) -> Figure:
                 axes.text(u, v, f"tumor {label - ORGAN}", zorder=3, **CENTRED)
         drawing.finish_view(axes, frame, _ARROWS[view])
         axes.set_title(view.name, fontsize=11)
-    _words(figure, plan, located.patient)
+    _words(figure, plan, located)
     return figure
 
 
@@ -175,11 +175,11 @@ def _draw_grasp(axes: Axes, plan: ResectionPlan, view: ParallelView) -> None:
     axes.annotate("", (u, v - 4.0), (u, v - _APPROACH_MM), arrowprops=arrow, zorder=9)
 
 
-def _words(figure: Figure, plan: ResectionPlan, patient: Patient) -> None:
+def _words(figure: Figure, plan: ResectionPlan, located: Located) -> None:
     """Title, what comes away, and the legend."""
     ml, tumor = plan.volumes_ml, plan.tumor.replace("_", " ")
     sweeps = f"{plan.sweeps} sweep" + ("s" if plan.sweeps > 1 else "")
-    title = f"Resection of {tumor}, {patient}: {_METHODS[plan.method]}, {sweeps}"
+    title = f"Resection of {tumor}, {located.patient}: {_METHODS[plan.method]}, {sweeps}"
     figure.suptitle(
         title, x=0.014, y=0.975, ha="left", fontsize=13, fontweight="bold", parse_math=False
     )
@@ -199,7 +199,9 @@ def _words(figure: Figure, plan: ResectionPlan, patient: Patient) -> None:
     figure.text(0.014, 0.021, line, fontsize=9.5, va="center", color="0.35")
     colours = {n: rgb(sweep_colour(n, plan.sweeps)) for n in sorted({1, plan.sweeps})}
     handles = [
-        Patch(facecolor=(*KIDNEY, 0.5), label="kidney"),
+        Patch(
+            facecolor=(*drawing.ORGAN, 0.5), label=organ_first(located.meshes)[0].replace("_", " ")
+        ),
         Patch(facecolor=rgb(part_colour(plan.label)), label=tumor),
         Patch(facecolor=(*_PIECE, 0.45), edgecolor=_PIECE, label="comes away"),
         *(Line2D([], [], color=c, lw=2.8, label=f"sweep {n}") for n, c in colours.items()),
@@ -211,7 +213,8 @@ def _words(figure: Figure, plan: ResectionPlan, patient: Patient) -> None:
 
 def organ_surfaces(located: Located) -> dict[int, Mesh]:
     """By label 1 (the whole organ, tumors included), 2, ...: closed surfaces, table frame, mm."""
-    labels = {name: label for label, name in enumerate(part_names(255), start=1)}
+    organ = organ_name(located.meshes) or KIDNEY.name
+    labels = {name: label for label, name in enumerate(part_names(255, organ), start=1)}
     return {labels[name]: mesh for name, mesh in located.meshes.items() if name in labels}
 
 

@@ -52,7 +52,7 @@ def coarsened(
         noise=msgspec.structs.replace(scene.noise, **noise),
         views=coarse.views,
     )
-    return Anatomy((organ, *anatomy_ct.tumors)), config
+    return anatomy_ct.of((organ, *anatomy_ct.tumors)), config
 
 
 def _shorter(length_px: int, by: int) -> int:

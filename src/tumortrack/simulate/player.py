@@ -26,7 +26,13 @@ from tumortrack.core.types import Anatomy, DepthFrame, Intrinsics, Mesh
 from tumortrack.sense.camera import d405
 from tumortrack.sense.noise import D405_NOISE, NoiseConfig, add_noise
 from tumortrack.sense.render import render_depth
-from tumortrack.simulate.elastic.body import BodyConfig, Points, body_of, reduced_organ
+from tumortrack.simulate.elastic.body import (
+    BodyConfig,
+    Points,
+    body_of,
+    reduced_organ,
+    times_kidney,
+)
 from tumortrack.simulate.elastic.loads import ReducedProblem, in_bed
 from tumortrack.simulate.elastic.modes import LEVER_MM
 from tumortrack.simulate.scene import PoseConfig, sample_pose
@@ -34,6 +40,7 @@ from tumortrack.simulate.scene import PoseConfig, sample_pose
 SHAFT_MM = 4.0  # an instrument's radius
 _SHAFT_LENGTH_MM = 200.0
 _BREATH_S, _PUSH_S = 4.0, 6.0  # from one to the next
+_KIDNEY_MM = 118.0  # from the camera to a kidney
 _AWAY_MM = 160.0  # along its shaft: an instrument out of the picture
 _STEPS = 3  # along the body's field: within 0.02 mm of the exact position, for states as here
 _SWAY_S = (17.0, 23.0, 29.0, 19.0, 13.0, 31.0)  # periods of the camera's rotations and shifts
@@ -60,7 +67,9 @@ class ScenePlayerConfig(Config, frozen=True, kw_only=True):
 
     width: int = 424
     height: int = 240
-    distance_mm: float = 118.0  # depth of the organ's nearest point, before all motion
+    # Depth of the organ's nearest point, before all motion; of an organ larger than a kidney by
+    # default as much more.
+    distance_mm: float | None = None
     breath_mm: float = 6.0  # down the body and back
     swell: float = 0.01  # strain of the organ's volume with a breath
     push_mm: float = 8.0  # how deep an instrument presses, at each place in turn
@@ -73,7 +82,8 @@ class ScenePlayerConfig(Config, frozen=True, kw_only=True):
     body: BodyConfig = BodyConfig()
 
     def __post_init__(self) -> None:
-        self.check_between("the virtual room:", distance_mm=(60, 400))
+        if self.distance_mm is not None:
+            self.check_between("the virtual room:", distance_mm=(60, 400))
         d405(self.width, self.height)
 
 
@@ -115,7 +125,10 @@ class ScenePlayer:
         self.intrinsics = d405(config.width, config.height)
         self._seed, self._up = seed, up
         pose = PoseConfig(tilt_deg=8.0, sideways_mm=5.0)
-        near_mm = (config.distance_mm, config.distance_mm)
+        away_mm = config.distance_mm
+        if away_mm is None:
+            away_mm = min(_KIDNEY_MM * max(1.0, times_kidney(anatomy_ct)), 400.0)
+        near_mm = (away_mm, away_mm)
         self._camera_from_ct = sample_pose(pose, anatomy_ct.organ, up_lps, near_mm, rng)
         organ = self._organ = reduced_organ(anatomy_ct, up, config.body, rng)
         self._swollen = self._under("swell", ReducedProblem.expand, config.swell)
@@ -171,7 +184,7 @@ class ScenePlayer:
         parts = self.anatomy_ct.parts
         ends = np.cumsum([len(part.vertices_mm) for part in parts])
         vertices = np.split(self.carry(instant, self._vertices), ends[:-1])
-        return Anatomy(tuple(part.moved(v) for part, v in zip(parts, vertices, strict=True)))
+        return self.anatomy_ct.of(part.moved(v) for part, v in zip(parts, vertices, strict=True))
 
     def frame(self, instant: Instant, truth: Anatomy, stamp_ns: int) -> DepthFrame:
         """What the sensor sees at an instant with these true surfaces. Its noise follows from seed

@@ -37,10 +37,11 @@ from tumortrack.simulate.deform import (
     links_of,
 )
 from tumortrack.simulate.deform.base import Deformation, Points, View
-from tumortrack.simulate.elastic.body import BodyConfig, ElasticBody, build_body
+from tumortrack.simulate.elastic.body import BodyConfig, ElasticBody, build_body, times_kidney
 from tumortrack.simulate.occupancy import OccupancyConfig, PointSource
 
 STREAMS = ("train", "validation", "test")
+_FARTHEST_MM = 500.0  # that depth cameras for near things are specified for
 ATTEMPTS = 20  # draws of a recipe until one shows enough of the organ
 _STATE = 0x57A7E
 
@@ -85,6 +86,21 @@ class SceneConfig(Config, frozen=True):
     calibration: CalibrationConfig = CalibrationConfig()
     cloud_points: tuple[int, int] | None = None
     views: int = 1  # recipes in a row that show the same state, where all deformations are elastic
+
+    def seen_whole(self, anatomy_ct: Anatomy) -> SceneConfig:
+        """The same, with an organ that is larger than a kidney, for which the distances are meant,
+        as much farther off, so that it is pictured as a kidney is."""
+        times = max(1.0, times_kidney(anatomy_ct))
+        if times == 1.0:
+            return self
+        (low, high), (near_mm, far_mm) = self.pose.nearest_mm, self.free_nearest_mm
+        replace, cloud = msgspec.structs.replace, self.cloud
+        return replace(
+            self,
+            pose=replace(self.pose, nearest_mm=(times * low, times * high)),
+            cloud=replace(cloud, near_mm=times * cloud.near_mm, far_mm=times * cloud.far_mm),
+            free_nearest_mm=(times * near_mm, max(far_mm, min(times * far_mm, _FARTHEST_MM))),
+        )
 
     def __post_init__(self) -> None:
         if self.views > 1 and not all(isinstance(one, ElasticConfig) for one in self.deform):
@@ -190,8 +206,8 @@ class Simulator:
 
     def reference(self, scene: RenderedScene) -> Anatomy:
         """The anatomy as it lies in the scene, camera frame."""
-        parts = self.anatomy_ct.parts
-        return Anatomy(tuple(part.moved(scene.carry(part.vertices_mm)) for part in parts))
+        parts = (part.moved(scene.carry(part.vertices_mm)) for part in self.anatomy_ct.parts)
+        return self.anatomy_ct.of(parts)
 
     def draw(
         self, rng: np.random.Generator

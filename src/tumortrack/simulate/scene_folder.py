@@ -1,9 +1,9 @@
 """One scene on disk: what the sensor saw and the truth, in files that other programs can make.
 
-cloud.ply (camera frame, mm), depth.png (16 bit, steps of 0.1 mm) with intrinsics.json, kidney.ply,
-tumor_1.ply, ... (the truth, camera frame, mm), targets.csv (points inside the organ: label, ct_x,
-ct_y, ct_z in LPS, camera_x, camera_y, camera_z; mm) and meta.json. Depth, targets and meta.json may
-be absent.
+cloud.ply (camera frame, mm), depth.png (16 bit, steps of 0.1 mm) with intrinsics.json, kidney.ply
+(or of the organ's name), tumor_1.ply, ... (the truth, camera frame, mm), targets.csv (points
+inside the organ: label, ct_x, ct_y, ct_z in LPS, camera_x, camera_y, camera_z; mm) and meta.json.
+Depth, targets and meta.json may be absent.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from jaxtyping import Float, Float64, UInt8
 
 from tumortrack.core.errors import InputError
 from tumortrack.core.mesh_files import read_anatomy, write_anatomy
+from tumortrack.core.organ import KIDNEY, Organ, is_tumor, organ_entry, organ_in
 from tumortrack.core.store import new_folder, read_json, write_atomically, write_json
 from tumortrack.core.types import Anatomy, DepthFrame, SensorCloud
 from tumortrack.imaging.meshes import mesh_of, solid_of
@@ -26,7 +27,7 @@ from tumortrack.sense.files import depth_png, intrinsics_json, read_cloud, read_
 from tumortrack.sense.ply import write_cloud_ply
 from tumortrack.simulate.occupancy import contains, labels_of
 
-# Our own scenes state in meta.json that kidney.ply is the whole organ, tumors included.
+# Our own scenes state in meta.json that the organ's surface is of all of it, tumors included.
 _UNITED = "organ_includes_tumors"
 _STAMP = "stamp_ns"
 _TARGETS = "targets.csv"
@@ -91,25 +92,31 @@ def write_scene_files(folder: Path, scene: Scene) -> None:
         np.savetxt(text, table, numbers, delimiter=",", header=head, comments="")
         write_atomically(folder / _TARGETS, text.getvalue().encode())
     meta = {**scene.meta, "units": "mm", "frame": "camera", _STAMP: scene.cloud.stamp_ns}
-    write_json(folder / "meta.json", {**meta, _UNITED: True})
+    write_json(
+        folder / "meta.json",
+        {**meta, _UNITED: True, "organ": organ_entry(scene.reference.kind)},
+    )
 
 
 def read_scene(folder: Path) -> Scene:
     """Read a scene, ours or another program's.
 
-    Unless meta.json says that the kidney includes the tumors, a tumor that sticks out of kidney.ply
-    by more than 2 % of its volume is united with it. Raises InputError: no such folder, no cloud or
-    kidney, a file that cannot be read, surfaces that are open or not in mm."""
+    The organ is the one that meta.json names, else the one surface that is no tumor. Unless
+    meta.json says that it includes the tumors, a tumor that sticks out of it by more than 2 % of
+    its volume is united with it. Raises InputError: no such folder, no cloud or organ, a file
+    that cannot be read, surfaces that are open or not in mm."""
     if not folder.is_dir():
         raise InputError(f"{folder} is no scene folder (it does not exist).")
-    for name in ("cloud.ply", "kidney.ply"):
+    meta = read_json(folder / "meta.json") if (folder / "meta.json").exists() else {}
+    kind = organ_of_folder(folder, meta)
+    for name in ("cloud.ply", f"{kind.name}.ply"):
         if not (folder / name).is_file():
             raise InputError(
-                f"{folder} is no scene: it lacks {name}. A scene holds cloud.ply, kidney.ply and "
-                "tumor_1.ply, tumor_2.ply, ... in the camera frame, in mm."
+                f"{folder} is no scene: it lacks {name}. A scene holds cloud.ply, kidney.ply (or "
+                "of another organ's name) and tumor_1.ply, tumor_2.ply, ... in the camera frame, "
+                "in mm."
             )
-    meta = read_json(folder / "meta.json") if (folder / "meta.json").exists() else {}
-    reference = read_anatomy(folder)
+    reference = read_anatomy(folder, kind)
     _check_parts(folder, reference)
     if meta.get(_UNITED) is not True:
         reference = _united(folder, reference)
@@ -125,17 +132,31 @@ def read_scene(folder: Path) -> Scene:
     return Scene(cloud, reference, frame, meta, targets)
 
 
+def organ_of_folder(folder: Path, meta: dict[str, Any]) -> Organ:
+    """The organ that a scene's ``meta`` names, else that of its one surface which is no tumor;
+    where there is none, a kidney. Raises InputError: there are several."""
+    if "organ" in meta:
+        return organ_in(meta["organ"], str(folder / "meta.json"))
+    surfaces = {path.stem for path in folder.glob("*.ply")} - {"cloud"}
+    names = sorted(name for name in surfaces if not is_tumor(name))
+    if len(names) > 1 and KIDNEY.name not in names:
+        raise InputError(
+            f"{folder} has {' and '.join(names[:3])}, which are no tumors. One surface is the "
+            'organ; name it in meta.json: "organ": {"name": "liver"}.'
+        )
+    return Organ(name=names[0]) if len(names) == 1 else KIDNEY
+
+
 def list_scenes(folder: Path) -> list[Path]:
-    """The scene folders (those with a kidney.ply or cloud.ply) in a folder, by name; InputError
+    """The scene folders (those with a cloud.ply or a surface) in a folder, by name; InputError
     where there is none."""
     if not folder.is_dir():
         raise InputError(f"{folder} does not exist or is no folder.")
-    names = ("kidney.ply", "cloud.ply")
-    found = (path for path in folder.iterdir() if any((path / name).is_file() for name in names))
+    found = (path for path in folder.iterdir() if any(path.glob("*.ply")))
     scenes = sorted(path for path in found if not path.name.startswith("."))
     if not scenes:
         raise InputError(
-            f"{folder} holds no scenes: none of its folders has a cloud.ply and a kidney.ply. "
+            f"{folder} holds no scenes: none of its folders has a cloud.ply and a surface. "
             "Make some with: tumortrack simulate CASE DATASET."
         )
     return scenes
@@ -153,20 +174,20 @@ def _check_parts(folder: Path, anatomy: Anatomy) -> None:
     size_mm = anatomy.organ.longest_mm
     if not low <= size_mm <= high:
         raise InputError(
-            f"{folder / 'kidney.ply'} is {size_mm:.3g} wide; an organ has {low:g} to {high:g} mm. "
-            "Scale the meshes and the cloud to mm."
+            f"{folder / anatomy.kind.name}.ply is {size_mm:.3g} wide; an organ has {low:g} to "
+            f"{high:g} mm. Scale the meshes and the cloud to mm."
         )
 
 
 def _united(folder: Path, anatomy: Anatomy) -> Anatomy:
     """The same anatomy with every tumor that sticks out made part of the organ's surface."""
-    whole = organ = solid_of(anatomy.organ, str(folder / "kidney.ply"))
+    whole = organ = solid_of(anatomy.organ, str(folder / f"{anatomy.names[0]}.ply"))
     for name, mesh in zip(anatomy.names[1:], anatomy.tumors, strict=True):
         tumor = solid_of(mesh, str(folder / f"{name}.ply"))
         joined = organ + tumor
         if joined.volume() - organ.volume() > _STICKS_OUT * tumor.volume():
             organ = joined
-    return anatomy if organ is whole else Anatomy((mesh_of(organ), *anatomy.tumors))
+    return anatomy if organ is whole else anatomy.of((mesh_of(organ), *anatomy.tumors))
 
 
 def draw_targets(anatomy_ct: Anatomy, seed: int) -> InnerPoints:

@@ -9,6 +9,7 @@ import numpy as np
 from tumortrack.core import store
 from tumortrack.core.estimate import Estimate
 from tumortrack.core.mesh_files import write_mesh
+from tumortrack.core.organ import is_tumor
 from tumortrack.imaging.nifti import write_nifti
 from tumortrack.imaging.segmentation import segments, write_seg_nrrd
 from tumortrack.models.margins import stated_radius
@@ -24,26 +25,26 @@ def write_estimate(
 ) -> None:
     """occupancy.ply (points with label and probability and, where the estimate knows the way back,
     their place in the CT), labels.nii.gz (voxel -> camera frame, mm), labels.seg.nrrd (the same for
-    3D Slicer), kidney.ply, tumor_1.ply, ... and report.json; tumor_1_margin.ply, ..., the shells of
-    the highest confidence, where margins are stated; points.csv, the given ``points`` of the CT and
-    where they are now; all or nothing. Raises InputError: the folder exists and ``overwrite`` is
-    False; points without a motion; NoEstimate: the motion has no answer for a point; StorageError:
-    the disk refused."""
+    3D Slicer), kidney.ply (or of the organ's name), tumor_1.ply, ... and report.json;
+    tumor_1_margin.ply, ..., the shells of the highest confidence, where margins are stated;
+    points.csv, the given ``points`` of the CT and where they are now; all or nothing.
+
+    Raises InputError: the folder exists and ``overwrite`` is False; points without a motion;
+    NoEstimate: the motion has no answer for a point; StorageError: the disk refused."""
     cloud, volume = estimate.cloud, estimate.volume
     assert volume is not None  # live estimates are the recording sink's
-    organ = next(iter(estimate.meshes), "")
     with store.new_folder(folder, overwrite) as aside:
         values = {"label": cloud.labels, "probability": cloud.probability}
         values |= _places_in_ct(estimate)
         write_cloud_ply(aside / "occupancy.ply", cloud.points_mm, **values)
         labels, way = volume.labels, volume.camera_from_index
         write_nifti(aside / "labels.nii.gz", labels, way, lps=False)
-        parts = segments(estimate.report["parts"], estimate.patient.side)
+        parts = segments(estimate.report["parts"], estimate.patient.side, estimate.organ)
         write_seg_nrrd(aside / "labels.seg.nrrd", labels, way, parts)
         for name, mesh in estimate.meshes.items():
             write_mesh(aside / f"{name}.ply", mesh)
             margin = stated_radius(estimate.report.get("margin"), name)
-            if margin is not None and name != organ:
+            if margin is not None and is_tumor(name):
                 write_mesh(aside / f"{name}{MARGIN}.ply", exact_margin(mesh, margin.mm))
         if points is not None:
             table = camera_table(points, estimate.motion)

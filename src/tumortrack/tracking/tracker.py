@@ -15,6 +15,7 @@ from tumortrack.core.config import Config, to_builtins
 from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.estimate import Estimate, Following
 from tumortrack.core.geometry import HERE, Affine, transform_points
+from tumortrack.core.organ import organ_entry
 from tumortrack.core.process import keep_small_blocks
 from tumortrack.core.types import Anatomy, DepthFrame, Look, SensorCloud
 from tumortrack.models.folder import weakness_of
@@ -50,7 +51,7 @@ class Tracker:
 
     def __init__(self, model: Model) -> None:
         keep_small_blocks()
-        self.model, self._patient = model, model.patient
+        self.model, self._patient, self._organ = model, model.patient, model.organ
         self._weakness = weakness_of(model.provenance)
         self._locator = _LOCATORS[type(model)](model)
 
@@ -124,7 +125,8 @@ class Tracker:
         if estimate.quality == "poor" and not self._weakness:
             advice = what_to_do(estimate, cloud, others)
             estimate = doubted(estimate, f"{estimate.reason}; {advice}")
-        estimate = replace(estimate, patient=self._patient)
+        estimate = replace(estimate, patient=self._patient, organ=self._organ)
+        estimate.report["organ"] = organ_entry(self._organ)
         estimate.report["patient"] = to_builtins(self._patient)
         seconds = estimate.report["timings"]
         seconds["judge"] = time.perf_counter() - start

@@ -14,9 +14,10 @@ from torch import Tensor, nn
 from tumortrack.core import store
 from tumortrack.core.config import from_builtins, to_builtins
 from tumortrack.core.errors import ArtifactError, InputError
+from tumortrack.core.organ import Organ
 from tumortrack.core.types import part_names
 from tumortrack.models.config import NetworkConfig, RegistrationHeadConfig, TrainConfig
-from tumortrack.models.folder import KIND, WEIGHTS, read_model_manifest, read_tensors
+from tumortrack.models.folder import KIND, WEIGHTS, organ_of, read_model_manifest, read_tensors
 from tumortrack.models.hardware import choose_device
 from tumortrack.models.in_distribution import InDistributionRange
 from tumortrack.models.margins import read_margins
@@ -74,7 +75,7 @@ def load_model(folder: Path, device: str = "auto", with_margins: bool = True) ->
             manifest,
             network=network.eval().requires_grad_(False).to(where),
             config=config,
-            parts=_parts(manifest["parts"]),
+            parts=_parts(manifest["parts"], organ_of(manifest, folder)),
             query_box_mm=_query_box(manifest["query_box_mm"]),
             in_distribution=known,
             provenance=dict(manifest["provenance"]),
@@ -101,16 +102,16 @@ def _filled(kind: type[Model], config: NetworkConfig, weights: dict[str, Tensor]
     return network
 
 
-def _parts(stated: list[str]) -> tuple[str, ...]:
-    if not stated or tuple(stated) != part_names(len(stated)):
-        raise InputError(f"parts {stated} are not kidney, tumor_1, tumor_2, ...")
+def _parts(stated: list[str], organ: Organ) -> tuple[str, ...]:
+    if not stated or tuple(stated) != part_names(len(stated), organ.name):
+        raise InputError(f"parts {stated} are not {organ.name}, tumor_1, tumor_2, ...")
     return tuple(stated)
 
 
 def _query_box(stated: list[list[float]]) -> np.ndarray:
     box_mm = np.array(stated, float).reshape(2, 3)
     if not ((box_mm[0] < box_mm[1]).all() and (np.abs(box_mm) < _LARGEST_BOX_MM).all()):
-        raise InputError(f"query_box_mm {stated} is no box about a kidney.")
+        raise InputError(f"query_box_mm {stated} is no box about an organ.")
     return box_mm
 
 

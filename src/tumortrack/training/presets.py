@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Literal
 
+import msgspec
+
 from tumortrack.core.types import Anatomy
 from tumortrack.models.config import (
     MlpDecoderConfig,
@@ -36,7 +38,7 @@ def paper(anatomy: Anatomy, rotations: Rotations = "limited") -> TrainConfig:
     epochs; Adam 5e-4 x 0.99 per epoch, batch 40 and dropped points from the follow-up."""
     return TrainConfig(
         network=paper_network(len(anatomy.parts) + 1),
-        scene=SceneConfig(pose=PoseConfig(rotations=rotations)),
+        scene=SceneConfig(pose=PoseConfig(rotations=rotations)).seen_whole(anatomy),
         schedule=Schedule(kind="exponential", learning_rate=5e-4),
         batch_size=40,
         steps=200 * 31_000 // 40,
@@ -62,7 +64,7 @@ def quick(anatomy: Anatomy, rotations: Rotations = "limited") -> TrainConfig:
             noise=D405_NOISE,
             occupancy=OccupancyConfig(per_side=64),
             free_range=0.5,
-        ),
+        ).seen_whole(anatomy),
         schedule=Schedule(learning_rate=3e-3),
         batch_size=16,
         steps=12_000,
@@ -75,7 +77,8 @@ def clinic(anatomy: Anatomy, rotations: Rotations = "limited") -> TrainConfig:
     sensor errors, occlusion and background."""
     elastic = ElasticConfig()
     half_mm = half_length_mm(anatomy.organ, long_axis_of(anatomy.organ))
-    return _clinic(elastic, elastic.body.modes, half_mm, rotations)
+    config = _clinic(elastic, elastic.body.modes, half_mm, rotations)
+    return msgspec.structs.replace(config, scene=config.scene.seen_whole(anatomy))
 
 
 def pretraining(rotations: Rotations = "limited") -> TrainConfig:

@@ -24,6 +24,7 @@ from torch import Tensor
 from tumortrack.core import store
 from tumortrack.core.config import identity, to_builtins
 from tumortrack.core.errors import ArtifactError, InputError, TumortrackError
+from tumortrack.core.organ import organ_entry
 from tumortrack.core.patient import NOBODY, Patient
 from tumortrack.core.types import Anatomy
 from tumortrack.models.config import TrainConfig
@@ -157,6 +158,7 @@ def provenance(
         "case_sha256": run.case_sha256,
         "up_lps": list(run.up_lps),
         "patient": to_builtins(run.patient),
+        "organ": organ_entry(run.anatomy_ct.kind),
     }
     return about if run.start is None else {**about, "start_sha256": run.start.sha256}
 

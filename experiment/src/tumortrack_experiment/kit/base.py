@@ -83,8 +83,8 @@ def base_design(anatomy_ct: Anatomy, up_lps: Direction, config: BaseConfig) -> B
     """Lay the organ down, surround it with beads, and make what it lies on. The same case and
     configuration give the same base. Raises InputError: no place for the beads."""
     base_from_ct = laid_down(anatomy_ct.organ, up_lps)
-    anatomy = Anatomy(
-        tuple(p.moved(transform_points(base_from_ct, p.vertices_mm)) for p in anatomy_ct.parts)
+    anatomy = anatomy_ct.of(
+        p.moved(transform_points(base_from_ct, p.vertices_mm)) for p in anatomy_ct.parts
     )
     sockets = stands.Sockets.beside(anatomy.organ)
     standing = stands.stands_for(config.states, anatomy, sockets)

@@ -11,7 +11,6 @@ from tumortrack.cli.console import say, say_notes
 from tumortrack.core import store
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import transform_points
-from tumortrack.core.types import Anatomy
 from tumortrack.imaging.case import Case
 from tumortrack.imaging.volume import read_volume
 from tumortrack.simulate.occupancy import contains
@@ -55,11 +54,11 @@ def write_reference(given: ReferenceOptions) -> None:
     in_ct = name_beads(kit, middles_mm(balls), CT)
     one = register(kit, in_ct, in_view)
     inner = find_balls(volume, given.target_mm) if given.target_mm is not None else []
-    windows, others = (given.kidney_hu, given.tumor_hu), (parts, [*balls, *inner])
+    windows, others = (given.organ_hu, given.tumor_hu), (parts, [*balls, *inner])
     in_ct2, report = segment_deformed(volume, in_ct.device_from_base, kit, case, others, windows)
     say_notes(report["notes"])
     moved = (p.moved(transform_points(one.to_from, p.vertices_mm)) for p in in_ct2.parts)
-    anatomy = Anatomy(tuple(moved))
+    anatomy = in_ct2.of(moved)
     beads = in_view.points_mm[in_view.found], kit.bead_diameter_mm
     known = scenes.kit_pixels(frame, in_view.device_from_base, [*parts.values()], beads)
     cloud = scenes.organ_cloud(frame, known)

@@ -83,7 +83,7 @@ def segment_deformed(
         "tumor_shift_mm": np.linalg.norm(middles[order] - places, axis=1).tolist(),
         "notes": notes,
     }
-    return Anatomy((anatomy.organ, *tumors)), report
+    return case.anatomy.of((anatomy.organ, *tumors)), report
 
 
 def _cropped(volume: Volume, ct_from_base: np.ndarray, kit: Kit, rest_mm: np.ndarray) -> Volume:

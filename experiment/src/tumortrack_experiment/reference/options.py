@@ -20,7 +20,7 @@ class ReferenceOptions:
         case: folder that `prepare` wrote, of which the kit was made.
         state: which of the recording's; may be left out if it has one.
         series: which DICOM series, if the folder holds several.
-        kidney_hu: HU window of the organ: low (inclusive; half way from air, as its surface then
+        organ_hu: HU window of the organ: low (inclusive; half way from air, as its surface then
             lies where it is) and high.
         tumor_hu: HU window of the tumors.
         targets: .csv with ct_x,ct_y,ct_z: beads cast into the organ, as in the case's CT. By
@@ -36,7 +36,7 @@ class ReferenceOptions:
     case: Path
     state: str | None = None
     series: str | None = None
-    kidney_hu: tuple[float, float] = (-480.0, 300.0)
+    organ_hu: tuple[float, float] = (-480.0, 300.0)
     tumor_hu: tuple[float, float] = (300.0, 1000.0)
     targets: Path | None = None
     target_mm: float | None = None

@@ -75,7 +75,7 @@ def workloads(subject: BenchSubject, _: float) -> Iterator[Workload]:
     from tumortrack.plan.arms.config import CellConfig
     from tumortrack.plan.arms.procedure import plan_motions
 
-    organ = seen.meshes["kidney"]
+    organ = seen.organ
     cell, plan = ArmCell(CellConfig(), organ), plan_resection(seen, ours)
     motions = partial(plan_motions, plan, cell, organ)
     yield Workload(MOTIONS, f"margin, {plan.sweeps} sweeps", "plan", motions)

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from tumortrack.core.geometry import transform_points, unit
+from tumortrack.core.organ import KIDNEY
 from tumortrack.core.patient import UNKNOWN
 from tumortrack.core.types import Mesh
 from tumortrack.imaging.case import Case
@@ -18,14 +19,14 @@ from tumortrack.registration.rest_shape import long_axis_of
 from tumortrack.report.metrics import distance_to_surface
 from tumortrack_lab.real.kidneys import ORGAN_ML, TUMOR_ML, kind_of, outer_share
 
-_ORGAN_AT_ALL_ML = (30.0, 1500.0)
+_ORGAN_AT_ALL_ML = {True: (30.0, 1500.0), False: (10.0, 4000.0)}  # a kidney, another
 _POLE = 1 / 3  # of the organ's length, at either end
 _SLICE_MM = 5.0
 # What `prepare` notes of most inputs; all else is for a person's eye.
 _USUAL = re.compile(
-    r"few distinct whole numbers|the patient's \w+ kidney was chosen: it bears most tumor"
-    r"|\d+ specks beside the kidneys dropped \(0\.|holes of 0\.|the kidney; table, blocks"
-    r"|only one kidney in the map|\S+ is (kidney|tumor_\d+)$|\S+ states SPACE=RAS"
+    r"few distinct whole numbers|the patient's \w+ [\w ]+ was chosen: it bears most tumor"
+    r"|\d+ specks beside the organ dropped \(0\.|holes of 0\.|the organ; table, blocks"
+    r"|only one [\w ]+ in the map|\S+ is [a-z0-9_]+$|\S+ states SPACE=RAS"
 )
 
 
@@ -43,14 +44,15 @@ def is_cut_off(case: Case, source: Path, series: str | None) -> bool:
 
 
 def described(case: Case) -> dict[str, Any]:
-    """JSON types: side, volumes, spacing (the thickest is the slices'), and of each tumor volume,
-    longest extent, depth of its middle below the organ's outer surface, share of its surface within
-    2 mm of that, kind, and position along the organ."""
+    """JSON types: organ, side, volumes, spacing (the thickest is the slices'), and of each tumor
+    volume, longest extent, depth of its middle below the organ's outer surface, share of its
+    surface within 2 mm of that, kind, and position along the organ."""
     organ_ml, *tumors_ml = case.report["volumes_ml"].values()
     spacing = case.report["spacing_mm"]
     turns = case.report.get("half_turn", {}).get("turns", [])
     organ, tumors = case.anatomy.organ, case.anatomy.tumors
     return {
+        "organ": case.anatomy.kind.name,
         "side": case.patient.side,
         "kind": case.report["kind"],
         "organ_ml": round(organ_ml, 2),
@@ -83,7 +85,7 @@ def _placed(tumor: Mesh, organ: Mesh) -> dict[str, Any]:
 
 def failures(found: dict[str, Any], cut_off: bool) -> list[str]:
     """What no model should be trained for."""
-    low, high = _ORGAN_AT_ALL_ML
+    low, high = _ORGAN_AT_ALL_ML[found["organ"] == KIDNEY.name]
     reasons = {
         "organ or tumor reach the border of the volume: they are cut off": cut_off,
         f"the organ has {found['organ_ml']:.0f} ml, no {low:g} to {high:g}": not (
@@ -98,10 +100,9 @@ def doubts(case: Case, found: dict[str, Any]) -> list[str]:
     """What a person should look at."""
     largest = max(one["ml"] for one in found["tumors"])
     reasons = {
-        "the side is unknown": found["side"] == UNKNOWN,
-        f"the organ has {found['organ_ml']:.0f} ml": not (
-            ORGAN_ML[0] <= found["organ_ml"] <= ORGAN_ML[1]
-        ),
+        "the side is unknown": case.anatomy.kind.in_pairs and found["side"] == UNKNOWN,
+        f"the organ has {found['organ_ml']:.0f} ml": case.anatomy.kind.name == KIDNEY.name
+        and not (ORGAN_ML[0] <= found["organ_ml"] <= ORGAN_ML[1]),
         f"the largest tumor has {largest:.1f} ml": not TUMOR_ML[0] <= largest <= TUMOR_ML[1],
         f"slices of {found['slice_mm']:g} mm": found["slice_mm"] > _SLICE_MM,
     }

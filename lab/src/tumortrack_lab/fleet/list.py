@@ -45,8 +45,9 @@ def _up(cell: str) -> str:
 
 # Options of `prepare`, as there; then of all that follows.
 _OF_PREPARE: dict[str, Callable[[str], Any]] = {
+    "organ_name": str,
     "side": str, "up": _up, "patient": str, "organ": int, "tumor": int, "series": str,
-    "unit": str, "min_tumor_ml": float, "kidney_hu": _window, "tumor_hu": _window,
+    "unit": str, "min_tumor_ml": float, "organ_hu": _window, "tumor_hu": _window,
 }  # fmt: skip
 _OF_CHAIN: dict[str, Callable[[str], Any]] = {
     "steps": _at_least(0), "seed": _at_least(0), "margin_states": _at_least(1),
@@ -146,6 +147,8 @@ def _patient(head: list[str], cells: list[str], folder: Path) -> Patient:
     if parsed.get("start", NOTHING) != NOTHING:
         parsed["start"] = folder / parsed["start"]
     prepare = {key: parsed.pop(key) for key in _OF_PREPARE if key in parsed}
+    if "organ_name" in prepare:  # `name` is the row's
+        prepare["name"] = prepare.pop("organ_name")
     PrepareOptions(**prepare)
     return Patient(name=name, source=folder / source, prepare=prepare, **parsed)
 

@@ -229,7 +229,6 @@ def evaluate(inputs: Inputs, options: Given, out: Path, cores: int) -> None:
     """rows.json: what is said of every scene, and how far it is off, beside the best rigid pose."""
     from dataclasses import replace
 
-    from tumortrack.core.types import Anatomy
     from tumortrack.imaging.case import load_case
     from tumortrack.simulate.scene_folder import read_scene
     from tumortrack.tracking.tracker import Tracker
@@ -249,7 +248,7 @@ def evaluate(inputs: Inputs, options: Given, out: Path, cores: int) -> None:
                 rest.moved(matched_vertices(rest, part))  # in the order of the case's vertices
                 for rest, part in zip(anatomy.parts, scene.reference.parts, strict=True)
             ]
-            scene = replace(scene, reference=Anatomy(tuple(seen)))
+            scene = replace(scene, reference=anatomy.of(seen))
             number, family, view = path.name.split("-")
             about = {"scene": path.name, "state": int(number), "family": family, "view": int(view)}
             about |= {name: scene.meta[name] for name in ("hidden_share", "visible_share")}

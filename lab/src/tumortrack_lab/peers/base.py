@@ -123,7 +123,7 @@ def matched_vertices(rest: Mesh, moved: Mesh) -> Points:
         same = bool((vertex[rest.faces] == moved.faces).all() and (vertex >= 0).all())
     if not same:
         raise InputError(
-            "the rigid bound needs a scene made from this case: its kidney.ply must have the "
+            "the rigid bound needs a scene made from this case: its organ must have the "
             "same triangles as the case's. Make scenes with this case, or leave the bound out."
         )
     return moved.vertices_mm[vertex]

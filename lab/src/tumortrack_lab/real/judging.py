@@ -47,7 +47,7 @@ def scene_of(
     parts = [part.moved(deformation.apply(part.vertices_mm)) for part in anatomy_ct.parts]
     config = PoseConfig()
     pose = sample_pose(config, parts[0], up_lps, config.nearest_mm, rng)
-    there = Anatomy(tuple(_laid(part, pose) for part in parts))
+    there = anatomy_ct.of(_laid(part, pose) for part in parts)
     frame = render_depth(there.organ.vertices_mm, there.organ.faces, CAMERA)
     frame = add_noise(frame, D405_NOISE, rng)
     return Scene(cloud_from_depth(frame, CloudConfig(), rng), there, frame)

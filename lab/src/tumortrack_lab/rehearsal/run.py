@@ -17,6 +17,7 @@ from tumortrack.cli.console import say
 from tumortrack.core import store
 from tumortrack.core.errors import TumortrackError
 from tumortrack.core.geometry import Affine, transform_points
+from tumortrack.core.organ import is_tumor
 from tumortrack.core.types import Anatomy
 from tumortrack.imaging.case import load_case
 from tumortrack.report.metrics import surface_distances
@@ -235,7 +236,7 @@ def errors_mm(report: dict[str, Any]) -> dict[str, dict[str, float]]:
     """The tumors' errors in an evaluation: scene -> tumor -> mm between the boxes' centres."""
     return {
         scene["name"]: {
-            name: part["center_mm"] for name, part in scene["parts"].items() if name != "kidney"
+            name: part["center_mm"] for name, part in scene["parts"].items() if is_tumor(name)
         }
         for scene in report["scenes"]
     }

@@ -152,7 +152,7 @@ def scattered(estimate: Estimate) -> Estimate:
     """With a cloud as the tracker's: points at random in the organ's box, as many as it asks."""
     assert estimate.volume is not None
     labels, camera_from_index = estimate.volume.labels, estimate.volume.camera_from_index
-    low, high = estimate.meshes["kidney"].box_mm
+    low, high = estimate.meshes[estimate.organ.name].box_mm
     points_mm = np.random.default_rng(0).uniform(low, high, (QUERIES, 3))
     index = np.rint(transform_points(np.linalg.inv(camera_from_index), points_mm)).astype(int)
     found = labels[tuple(np.clip(index, 0, np.array(labels.shape) - 1).T)]

@@ -129,8 +129,8 @@ class Apparatus:
 
 def moved(anatomy: Anatomy, b_from_a: Float64[np.ndarray, "4 4"]) -> Anatomy:
     """An anatomy in another frame."""
-    return Anatomy(
-        tuple(part.moved(transform_points(b_from_a, part.vertices_mm)) for part in anatomy.parts)
+    return anatomy.of(
+        part.moved(transform_points(b_from_a, part.vertices_mm)) for part in anatomy.parts
     )
 
 

@@ -147,6 +147,7 @@ class StateCache:
     def __init__(self, folder: Path, run: TwinRun, case: Case, targets: InnerPoints) -> None:
         self._folder, self._run, self._case, self._targets = folder, run, case, targets
         self._bench: Any = None  # built when the first state is solved
+        self._kind = case.anatomy.kind
         self._parts = dict(zip(case.anatomy.names, case.anatomy.parts, strict=True))
 
     def has(self, name: str) -> bool:
@@ -157,9 +158,11 @@ class StateCache:
         if not self.has(name):
             self._solve(name, say)
         tensors, report, _ = self._read(name)
-        parts = tuple(part.moved(tensors[key]) for key, part in self._parts.items())
+        parts = [part.moved(tensors[key]) for key, part in self._parts.items()]
         targets_mm, bench_from_ct = tensors["targets"], tensors["bench_from_ct"]
-        return EquilibriumState(name, Anatomy(parts), targets_mm, bench_from_ct, report)
+        return EquilibriumState(
+            name, Anatomy(tuple(parts), self._kind), targets_mm, bench_from_ct, report
+        )
 
     def _solve(self, name: str, say: Callable[[str], None]) -> None:
         from safetensors.numpy import save

@@ -79,7 +79,7 @@ class Told:
     def of(cls, rest: Anatomy, reference: Anatomy, meta: Mapping[str, Any]) -> Told:
         """What an undisturbed scene of the world shows, its segmentation being right."""
         pairs = zip(rest.parts, reference.parts, strict=True)
-        true = Anatomy(tuple(a.moved(matched_vertices(a, b)) for a, b in pairs))
+        true = rest.of(a.moved(matched_vertices(a, b)) for a, b in pairs)
         there, at_rest = np.array(meta["camera_from_bench"]), np.array(meta["bench_from_ct"])
         return cls(rest, true, there, at_rest, meta["material"]["rim_mm"])
 

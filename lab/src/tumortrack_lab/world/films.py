@@ -115,7 +115,7 @@ class Film:
 def _parted(rest: Anatomy, vertices: Float[np.ndarray, "v 3"]) -> Anatomy:
     ends = np.cumsum([len(part.vertices_mm) for part in rest.parts])[:-1]
     pairs = zip(rest.parts, np.split(vertices, ends), strict=True)
-    return Anatomy(tuple(part.moved(places) for part, places in pairs))
+    return rest.of(part.moved(places) for part, places in pairs)
 
 
 def write_film(

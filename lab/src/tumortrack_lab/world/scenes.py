@@ -133,7 +133,7 @@ class World:
         if rng.uniform() < config.segmentation:
             kind = segmentation.KINDS[1 + rng.integers(len(segmentation.KINDS) - 1)]
         true, segmented = segmentation.perturbed(self.organ.anatomy, kind, self.slices_axis, rng)
-        truth = Anatomy(tuple(part.moved(state.carry(part.vertices_mm)) for part in true.parts))
+        truth = true.of(part.moved(state.carry(part.vertices_mm)) for part in true.parts)
         points = state.carry(transform_points(self.bench_from_ct, self.targets.points_ct))
         about = {"family": family, "segmentation": segmented, **state.about}
         shown = Shown(state, truth, self.targets.at(points), f"{config.seed}-{number}", about)
@@ -210,8 +210,8 @@ def simplified(anatomy_ct: Anatomy) -> Anatomy:
     """The anatomy whose triangles a world's scenes have."""
     pairs = zip(anatomy_ct.names, anatomy_ct.parts, strict=True)
     solids = (solid_of(part, name) for name, part in pairs)
-    return Anatomy(
-        tuple(mesh_of(one.simplify(_FINE_MM).refine_to_length(_EDGE_MM)) for one in solids)
+    return anatomy_ct.of(
+        mesh_of(one.simplify(_FINE_MM).refine_to_length(_EDGE_MM)) for one in solids
     )
 
 
@@ -223,7 +223,7 @@ def _replaced(
     if kind == "mirrored":
         flip = [1.0, -1.0, 1.0]
         parts = (Mesh(part.vertices_mm * flip, part.faces[:, ::-1]) for part in truth.parts)
-        return replace(state, wound=None), Anatomy(tuple(parts)), ()
+        return replace(state, wound=None), truth.of(parts), ()
     if kind == "foreign":
         other, up = random_anatomy(int(rng.integers(1 << 31)))
         return replace(state, wound=None), moved(other, bench_from_ct(other.organ, up)), ()
@@ -233,7 +233,7 @@ def _replaced(
         waves = rng.normal(0, 1.5, (3, 8))
         bumps = np.cos(ball.vertices_mm @ waves + rng.uniform(0, 6.3, 8)).mean(1, keepdims=True)
         thing = Mesh((ball.vertices_mm * (1 + 0.5 * bumps)) * half + [0, 0, half[2]], ball.faces)
-        return replace(state, wound=None), Anatomy((thing,)), ()
+        return replace(state, wound=None), truth.of((thing,)), ()
     if kind == "fat":
         angle, half = rng.uniform(0, 2 * np.pi), rng.uniform([12, 12, 15], [35, 35, 30])
         way = np.array([np.cos(angle), np.sin(angle), 0.0])

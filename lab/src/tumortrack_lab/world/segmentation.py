@@ -52,7 +52,7 @@ def perturbed(
         for part, shift in zip(anatomy.parts, shifts, strict=True)
     )
     rms = [float(np.sqrt((shift**2).mean())) for shift in shifts]
-    return Anatomy(parts), {"kind": kind, **about, "rms_mm": rms}
+    return anatomy.of(parts), {"kind": kind, **about, "rms_mm": rms}
 
 
 def normals(mesh: Mesh) -> Vertices:

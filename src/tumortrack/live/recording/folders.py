@@ -17,6 +17,7 @@ from tumortrack.core.store import read_json
 from tumortrack.core.types import DepthFrame, SensorCloud
 from tumortrack.live.values import Observation
 from tumortrack.sense import files
+from tumortrack.simulate.scene_folder import organ_of_folder
 
 TIMES, INTRINSICS = "times.csv", "intrinsics.json"
 FRAMES, DEPTH, CLOUD, MASK = "frames", "depth.png", "cloud.ply", "mask.png"
@@ -116,7 +117,9 @@ def _read_folder(folder: Path) -> Observation:
     else:
         frame = files.read_cloud(folder / CLOUD)[0]
     mask = _read_mask(folder / MASK, frame) if (folder / MASK).is_file() else None
-    truth = read_anatomy(folder) if (folder / "kidney.ply").is_file() else None
+    meta = read_json(folder / "meta.json") if (folder / "meta.json").is_file() else {}
+    kind = organ_of_folder(folder, meta)
+    truth = read_anatomy(folder, kind) if (folder / f"{kind.name}.ply").is_file() else None
     return Observation(frame, 0, mask, truth)
 
 

@@ -14,6 +14,7 @@ from jaxtyping import Float32
 
 from tumortrack.core.colours import GOOD, NONE, POOR, Colour, label_colours, part_colour
 from tumortrack.core.geometry import transform_points
+from tumortrack.core.organ import organ_name
 from tumortrack.core.patient import Patient
 from tumortrack.core.types import Mesh, SensorCloud
 from tumortrack.live.display import MOST_SEEN, seen_points, thinned, wxyz_of
@@ -36,7 +37,7 @@ _OK, _WARN, _ERROR, _STALE = range(4)  # DiagnosticStatus
 _LEVELS = {"good": _OK, "poor": _WARN, "none": _ERROR}
 _TEXT_COLOURS = {"good": GOOD, "poor": POOR, "none": NONE}
 _STATE_COLOUR: Colour = (235, 238, 242)
-_KIDNEY_OPACITY = 0.35
+_ORGAN_OPACITY = 0.35
 _TEXT_HEIGHT_M, _STATE_HEIGHT_M = 0.008, 0.025
 _TEXT_COLUMNS, _STATE_COLUMNS = 44, 70
 _GAP_M = 0.012  # between lines, besides their height: measured in RViz of ROS 1; RViz 2's has 0.005
@@ -112,7 +113,7 @@ class ResultMessages:
                 if (mesh := estimate.meshes.get(name)) is None:
                     markers.append({"ns": name, "action": _DELETE})
                 else:
-                    opacity = _KIDNEY_OPACITY if label == 1 else 1.0
+                    opacity = _ORGAN_OPACITY if label == 1 else 1.0
                     markers.append(_triangles(name, mesh, part_colour(label), opacity))
         if estimate is not None or result.workcell is None:  # else the workcell's text says it
             markers.append(_quality_text(result))
@@ -208,8 +209,8 @@ def _labelled_cloud(estimate: TransformedEstimate | None, header: Any, messages:
 def _quality_text(result: TrackingResult) -> dict[str, Any]:
     """Above the organ, as the camera sees it; without one, in front of the camera."""
     said, above_mm = _lines(result.describe()), np.array([[0.0, 0.0, 150.0]])
-    if result.estimate is not None and (organ := result.estimate.meshes.get("kidney")):
-        low, high = organ.box_mm
+    if result.estimate is not None and (name := organ_name(result.estimate.meshes)):
+        low, high = result.estimate.meshes[name].box_mm
         up_mm = 1000 * _TEXT_HEIGHT_M + _half_height_mm(said, _TEXT_HEIGHT_M)  # to its middle
         above_mm = np.array([[(low + high)[0] / 2, low[1] - up_mm, (low + high)[2] / 2]])
     place_mm = transform_points(result.published_frame.published_from_camera, above_mm)[0]

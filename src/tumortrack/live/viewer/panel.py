@@ -228,6 +228,7 @@ class Panel:
         self.slice = None
         default = DisplayOptions()
         shown: dict[str, Any] = {}  # by the option's name
+        label = parts[0].replace("_", " ").capitalize()
         if slices:
             with gui.add_folder("CT at the present position"):
                 self.slice = gui.add_image(np.zeros((8, 8, 3), np.uint8), format="jpeg")
@@ -237,7 +238,7 @@ class Panel:
                 shown["slice_plane"] = gui.add_checkbox("In the scene", default.slice_plane)
         with gui.add_folder("Show"):
             shown |= {
-                "kidney": gui.add_slider("Kidney", 0.0, 1.0, 0.05, default.kidney),
+                "organ": gui.add_slider(label, 0.0, 1.0, 0.05, default.organ),
                 "margin": gui.add_checkbox("Margins", default.margin),
                 "ellipsoids": gui.add_checkbox(
                     "95 % ellipsoids (diagnostic)",

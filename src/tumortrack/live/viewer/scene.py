@@ -48,7 +48,7 @@ class DisplayOptions:
     """What the user wants to see."""
 
     observed: bool = True
-    kidney: float = 0.35  # opacity
+    organ: float = 0.35  # opacity
     margin: bool = True
     ellipsoids: bool = False
     points: str = "none"  # none | tumors | all
@@ -91,6 +91,7 @@ class ViewerScene:
         )
         nodes.add_frame("/estimate", show_axes=False)
         self._shells, self._parts, self._ellipsoids = {}, {}, {}
+        self._name = context.parts[0]
         for label, name in enumerate(context.parts, start=1):
             look = {"color": colours.part_colour(label), "visible": False}
             if label > 1 and self._margin_mm != 0:
@@ -104,7 +105,7 @@ class ViewerScene:
                 path = f"/estimate/ellipsoid_{name}"
                 look |= {"color": _ELLIPSOID_COLOUR, "opacity": 0.8}
                 self._ellipsoids[name] = self._mesh(path, _NOTHING, **look)
-        self._points = self._cloud("/estimate/points", 0.3, colours.KIDNEY)
+        self._points = self._cloud("/estimate/points", 0.3, colours.ORGAN_PART)
         clear = np.zeros((2, 2, 4), np.uint8)
         self._slice = nodes.add_image("/estimate/slice", clear, 1, 1, format="png", **_FLAT)
         self._cell = nodes.add_frame("/workcell", show_axes=False, visible=False)
@@ -150,7 +151,7 @@ class ViewerScene:
         self.margins = self._margins_of(result, placed)
         for name, node in self._parts.items():
             mesh = placed.meshes.get(name, _NOTHING)
-            shown = self.look.last_drawn(self._bare(mesh)) if name == "kidney" else mesh
+            shown = self.look.last_drawn(self._bare(mesh)) if name == self._name else mesh
             _put_mesh(node, shown)
         for name, node in self._shells.items():
             _put_mesh(node, self.margins.get(name, _NOTHING))
@@ -176,15 +177,15 @@ class ViewerScene:
         if self._shown is None:
             return
         for name, node in self._parts.items():
-            node.visible = name != "kidney" or options.kidney > 0
-            if name != "kidney":  # solid, unless something is to be seen in it
+            node.visible = name != self._name or options.organ > 0
+            if name != self._name:  # solid, unless something is to be seen in it
                 looked_into = options.points != "none" or options.ellipsoids
                 node.opacity = _TUMOR_WITH_POINTS if looked_into else None
         for node in self._shells.values():
             node.visible = options.margin
         for node in self._ellipsoids.values():
             node.visible = options.ellipsoids
-        self._parts["kidney"].opacity = options.kidney
+        self._parts[self._name].opacity = options.organ
         self._points.visible = options.points != "none"
         self._slice.visible = options.slice_plane and self._has_slice
 

@@ -13,6 +13,7 @@ from tumortrack.core.colours import Colour
 from tumortrack.core.errors import InputError
 from tumortrack.core.estimate import Motion
 from tumortrack.core.geometry import spacing_mm, transform_points
+from tumortrack.core.organ import organ_name
 from tumortrack.core.types import Mesh
 from tumortrack.imaging.case import Case, load_case
 from tumortrack.live.values import SinkContext
@@ -158,11 +159,11 @@ def load_ct(case: str, context: SinkContext) -> CarriedCt:
 
 def plane_through(meshes: dict[str, Mesh], part: str, orientation: str) -> SlicePlane | None:
     """Through the middle of a part's present surface; centred on the organ, and as large."""
-    if part not in meshes or "kidney" not in meshes:
+    if part not in meshes or (organ := organ_name(meshes)) is None:
         return None
     across, down = np.array(ORIENTATIONS[orientation])
     normal = np.cross(across, down)
-    centre, middle = (meshes[name].box_mm.mean(0) for name in ("kidney", part))
+    centre, middle = (meshes[name].box_mm.mean(0) for name in (organ, part))
     everything = np.concatenate([mesh.box_mm for mesh in meshes.values()])
     side = _SLICE_ROOM * float(np.ptp(everything, axis=0).max())
     return SlicePlane(centre + normal * (normal @ (middle - centre)), across, down, side)

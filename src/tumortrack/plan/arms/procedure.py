@@ -300,7 +300,7 @@ def replan(located: Located, joints_rad: Joints, progress: ResectionProgress) ->
     NoPlan: there is none."""
     config, cell = _setting[0]
     plan = plan_resection(located, config)
-    organ = located.meshes["kidney"]
+    organ = located.organ
     from_sweep = progress.first_sweep(plan, located.meshes[plan.tumor])
     motions = plan_motions(plan, cell, organ, start_rad=joints_rad, from_sweep=from_sweep)
     if hit := first_hit(motions, cell.config, organ, begun=True):

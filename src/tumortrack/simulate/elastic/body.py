@@ -17,6 +17,7 @@ from jaxtyping import Float, Float32, Float64
 from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import unit
+from tumortrack.core.organ import KIDNEY
 from tumortrack.core.types import Anatomy
 from tumortrack.simulate.elastic.flow import LatticeField, combine, follow, project, steps_for
 
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
 Points = Float[np.ndarray, "n 3"]
 Moved = Float32[np.ndarray, "n 3"]
 Field = Float32[np.ndarray, "i j k 3"]
+_KIDNEY_MM = 115.0  # long
 _RIDGE = 1e-4  # mm2, on the covariance: no coefficient is ever known for sure
 _ARRAYS = ("origin_mm", "spacing_mm", "center_ct", "modes", "states")
 
@@ -156,6 +158,13 @@ def build_body(
     return body_of(reduced, np.array(states, np.float32))
 
 
+def times_kidney(anatomy_ct: Anatomy) -> float:
+    """An organ's length over a usual kidney's, to scale what is meant for kidneys; of all kidneys
+    1."""
+    kidney = anatomy_ct.kind.name == KIDNEY.name
+    return 1.0 if kidney else anatomy_ct.organ.longest_mm / _KIDNEY_MM
+
+
 def reduced_organ(
     anatomy_ct: Anatomy, up: Float64[np.ndarray, " 3"], config: BodyConfig, rng: np.random.Generator
 ) -> ReducedModel:
@@ -186,7 +195,7 @@ def reduced_organ(
     patches = patches_of(organ, config.patches, rng)
     loads = random_loads(solid, patches, up, config.responses, rng)
     modes = modes_of(solid, patches, config.modes, config.contrasts, loads)
-    return ReducedModel(solid, modes, patches)
+    return ReducedModel(solid, modes, patches, times_kidney(anatomy_ct))
 
 
 def body_of(reduced: ReducedModel, states: Float32[np.ndarray, "s m"]) -> ElasticBody:

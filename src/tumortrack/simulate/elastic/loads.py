@@ -5,6 +5,7 @@ underside, obstacles are stiff springs that only push. Each Newton step solves f
 that the last one left closed. Lengths in mm, stress in N/mm2 (1 kPa = 1e-3).
 
 A random load is a function in ``LOADS`` that adds itself to the problem of an organ in its bed.
+Its lengths are a kidney's, times the organ's length over a kidney's (``ReducedModel.times``).
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ _GRIP = 50 * KPA  # N/mm3, of what holds a place
 _WEIGHT = 1.05e-6 * 9.81  # N/mm3
 _EDGE_MM = 4.0  # over which an obstacle's edge fades
 _DEEPEST = 0.28  # of the organ's thickness, that a plate goes
-_FARTHEST_MM = 16.0  # that a place of the surface moves
+_FARTHEST_MM = 16.0  # that a place of a kidney's surface moves
 _TOGETHER = 32  # problems that are solved together: some 2 MB each
 _SWELLING = 0.025  # largest change of volume: leaves room below 3 % for what modes do to it
 
@@ -177,14 +178,15 @@ def poke(problem: ReducedProblem, rng: np.random.Generator) -> None:
     """A blunt instrument pressed into the surface that does not face down."""
     tip = _reachable(problem, rng)
     outward = unit(problem.organ.patches.normals[tip] + rng.normal(0, 0.25, 3))
-    problem.indent(tip, outward, rng.uniform(3, 10), rng.uniform(1, 14))
+    times = problem.organ.times
+    problem.indent(tip, outward, times * rng.uniform(3, 10), times * rng.uniform(1, 14))
 
 
 def pull(problem: ReducedProblem, rng: np.random.Generator) -> None:
     """Forceps pull at the surface."""
-    place, radius_mm = _reachable(problem, rng), rng.uniform(4, 9)
+    times, place, radius_mm = problem.organ.times, _reachable(problem, rng), rng.uniform(4, 9)
     along = unit(problem.organ.patches.normals[place] + rng.normal(0, 0.6, 3))
-    problem.hold(place, radius_mm, along * rng.uniform(1, 12))
+    problem.hold(place, times * radius_mm, along * (times * rng.uniform(1, 12)))
 
 
 def lift(problem: ReducedProblem, rng: np.random.Generator) -> None:
@@ -192,7 +194,8 @@ def lift(problem: ReducedProblem, rng: np.random.Generator) -> None:
     outward, up = rng.normal(size=3), problem.up
     outward -= 0.7 * up * (outward @ up)
     place, radius_mm = int(np.argmax(problem.organ.patches.points_mm @ outward)), rng.uniform(8, 20)
-    problem.hold(place, radius_mm, unit(rng.normal(size=3) + 0.7 * up) * rng.uniform(1, 12))
+    times, along = problem.organ.times, unit(rng.normal(size=3) + 0.7 * up)
+    problem.hold(place, times * radius_mm, along * (times * rng.uniform(1, 12)))
 
 
 def sag(problem: ReducedProblem, rng: np.random.Generator) -> None:
@@ -287,21 +290,22 @@ def random_problem(
 
 def state_of(problem: ReducedProblem) -> Float64[np.ndarray, " k"] | None:
     """Coefficients of the modes at rest; None for states that find no equilibrium or move a place
-    by more than 24 mm. Motions of 16 to 24 mm are scaled to 16."""
+    by more than 24 mm (of a kidney). Motions of 16 to 24 mm are scaled to 16."""
     found, organ = problem.equilibrium(), problem.organ
     if found is None:
         return None
     state = found[: organ.n_modes]
     farthest = np.linalg.norm(organ.moves[:, :, : organ.n_modes] @ state, axis=1).max()
-    return None if farthest > 1.5 * _FARTHEST_MM else state * min(1.0, _FARTHEST_MM / farthest)
+    most = _FARTHEST_MM * organ.times
+    return None if farthest > 1.5 * most else state * min(1.0, most / farthest)
 
 
 def _press_strip(problem: ReducedProblem, outward: np.ndarray, rng: np.random.Generator) -> None:
-    """A strip 10-70 mm wide across a random line, pressed in by up to ``_DEEPEST``."""
+    """A strip across a random line, pressed in by up to ``_DEEPEST``; of a kidney 10-70 mm wide."""
     patches = problem.organ.patches
     across = patches.points_mm @ unit(np.cross(outward, rng.normal(size=3)))
     low, high = np.percentile(across, [15, 85])
-    middle, width = rng.uniform(low, high), rng.uniform(10, 70)
+    middle, width = rng.uniform(low, high), problem.organ.times * rng.uniform(10, 70)
     foot = _faded(width / 2 - np.abs(across - middle)) * (patches.normals @ outward > 0)
     height = patches.points_mm @ outward
     depth = rng.uniform(0.02, _DEEPEST) * np.ptp(height)

@@ -181,11 +181,17 @@ def _total(weights: np.ndarray, along: np.ndarray) -> np.ndarray:
 
 
 class ReducedModel:
-    """A solid in the space of its modes and six rigid motions: k + 6 unknowns."""
+    """A solid in the space of its modes and six rigid motions: k + 6 unknowns. ``times``: how long
+    it is, over the kidney that the loads' lengths are meant for."""
 
     def __init__(
-        self, solid: LatticeSolid, modes: Float64[np.ndarray, "f k"], patches: Patches
+        self,
+        solid: LatticeSolid,
+        modes: Float64[np.ndarray, "f k"],
+        patches: Patches,
+        times: float = 1.0,
     ) -> None:
+        self.times = times
         k, n = modes.shape[1], len(solid.nodes)
         self.solid, self.modes, self.patches, self.n_modes = solid, modes, patches, k
         bent = solid.at(patches.points_mm, modes)

@@ -1,0 +1,131 @@
+"""Which organ it is: the name that files, parts and messages bear, and its standard term.
+
+Stated once, where a case is made; it travels from there to everything that is made of it. What is
+older than this value says nothing and is a kidney's.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from typing import Any
+
+from tumortrack.core.config import Config, from_builtins, to_builtins
+from tumortrack.core.errors import InputError
+from tumortrack.core.patient import UNKNOWN, Patient
+
+_NAME = re.compile(r"[a-z][a-z0-9_]{0,31}")
+_CODE = re.compile(r"[1-9][0-9]{5,17}")
+# Files, topics and entries of reports that are not parts bear these names.
+_TAKEN = (
+    *("camera", "case", "cloud", "depth", "estimate", "labels", "map", "observed", "occupancy"),
+    *("points", "quality", "state", "status", "strokes", "targets", "workcell"),
+)
+# SNOMED CT codes and meanings, as DICOM and 3D Slicer list them.
+_TERMS = {
+    "adrenal_gland": ("23451007", "Adrenal gland"),
+    "bladder": ("89837001", "Bladder"),
+    "brain": ("12738006", "Brain"),
+    "breast": ("76752008", "Breast"),
+    "colon": ("71854001", "Colon"),
+    "gallbladder": ("28231008", "Gallbladder"),
+    "heart": ("80891009", "Heart"),
+    "kidney": ("64033007", "Kidney"),
+    "liver": ("10200004", "Liver"),
+    "lung": ("39607008", "Lung"),
+    "ovary": ("15497006", "Ovary"),
+    "pancreas": ("15776009", "Pancreas"),
+    "prostate": ("41216001", "Prostate"),
+    "spleen": ("78961009", "Spleen"),
+    "stomach": ("69695003", "Stomach"),
+    "testis": ("40689003", "Testis"),
+    "thyroid": ("69748006", "Thyroid"),
+    "tongue": ("21974007", "Tongue"),
+    "uterus": ("35039007", "Uterus"),
+}
+_UNNAMED = ("113343008", "Organ")
+_IN_PAIRS = ("adrenal_gland", "breast", "kidney", "lung", "ovary", "testis")
+
+
+class Organ(Config, frozen=True):
+    """``name``: lower-case letters, digits and _. ``term``: SNOMED CT code and meaning; None: the
+    usual one of that name, or just an organ's. Raises InputError for others."""
+
+    name: str = "kidney"
+    term: tuple[str, str] | None = None
+
+    def __post_init__(self) -> None:
+        check_name(self.name, "the organ", "--name")
+        if self.term is not None:
+            code, meaning = self.term
+            plain = (
+                meaning.isprintable() and not set(meaning) & set("^~|") and 0 < len(meaning) < 65
+            )
+            if not (_CODE.fullmatch(code) and plain):
+                raise InputError(
+                    f"term {code!r} {meaning!r} is none: give a SNOMED CT code, 6 to 18 digits, "
+                    'and its meaning, up to 64 characters (--term 10200004 "Liver").'
+                )
+
+    @property
+    def snomed(self) -> tuple[str, str]:
+        """Code and meaning."""
+        return self.term or _TERMS.get(self.name, _UNNAMED)
+
+    @property
+    def words(self) -> str:
+        """The name for people."""
+        return self.name.replace("_", " ")
+
+    @property
+    def in_pairs(self) -> bool:
+        """Whether people have one on each side."""
+        return self.name in _IN_PAIRS
+
+    def check_side(self, side: str | None) -> None:
+        """InputError for a side of an organ that is known to have none."""
+        if side not in (None, UNKNOWN) and self.name in _TERMS and not self.in_pairs:
+            raise InputError(f"--side {side}: there is one {self.words} only. Leave --side out.")
+
+    def identified(self, patient: Patient) -> bool:
+        """Whether it is known whose it is and, of organs in pairs, which of the two."""
+        return patient.known or (patient.id != UNKNOWN and not self.in_pairs)
+
+
+def check_name(name: str, what: str, option: str) -> None:
+    """InputError for a name that no part or structure can bear."""
+    if not _NAME.fullmatch(name) or is_tumor(name) or name in _TAKEN or name.endswith("_margin"):
+        raise InputError(
+            f"{name!r} can't be the name of {what}: it needs 1 to 32 lower-case letters, digits or "
+            "_ and a letter first; it must not begin with tumor or end with _margin, and "
+            f"{', '.join(_TAKEN)} are taken. Give another with {option}."
+        )
+
+
+def is_tumor(name: str) -> bool:
+    """Whether a part of this name is a tumor (tumor_1, tumor_2, ...)."""
+    return name.startswith("tumor")
+
+
+KIDNEY = Organ()
+
+
+def organ_name(parts: Iterable[str]) -> str | None:
+    """Among the names of parts the organ's, whichever it is; None: only tumors."""
+    return next((name for name in parts if not is_tumor(name)), None)
+
+
+def organ_first(parts: Iterable[str]) -> list[str]:
+    """Sorted, the organ before its tumors."""
+    return sorted(parts, key=lambda name: (is_tumor(name), name))
+
+
+def organ_in(found: object, where: str) -> Organ:
+    """What a file of ours says under ``organ``; older ones say nothing: a kidney. InputError where
+    it is something else."""
+    return KIDNEY if found is None else from_builtins(found, Organ, f"{where}: organ")
+
+
+def organ_entry(organ: Organ) -> dict[str, Any]:
+    """What files say under ``organ``: the name, and SNOMED's code and meaning."""
+    return to_builtins(Organ(name=organ.name, term=organ.snomed))
