@@ -8,7 +8,7 @@ INSTALL := pip install --quiet --disable-pip-version-check --no-compile --no-dep
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help setup debian demo test test-hard check pretrained attack fuzz crash replay bench soak wheel lock licences audit results real minutes world sequences causes trust rehearsal population scaling clean
+.PHONY: help setup debian demo test test-hard check pretrained attack fuzz crash replay bench soak wheel lock licences audit results real minutes world sequences causes trust rehearsal population scaling site pictures clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 10
@@ -45,7 +45,10 @@ check: setup  ## lint, types, import order, licences
 debian:  ## install what tests need from Debian (Chromium, Fast DDS)
 	tools/debian.sh
 
-test: check  ## check, then all tests (those of Chromium and Fast DDS after `make debian`)
+site: setup  ## the documentation's site, strictly: build/site/index.html (`.venv/bin/mkdocs serve`: while you write)
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+
+test: check site  ## check, then all tests (those of Chromium and Fast DDS after `make debian`)
 	OMP_NUM_THREADS=1 $(BIN)/pytest -n 3 --dist loadfile --no-loadscope-reorder
 
 pretrained: setup  ## the weights of random kidneys that the package ships (ARGS="--anatomies N --steps N")
@@ -105,6 +108,14 @@ population: setup  ## KiTS19's kidneys with tumors: their list for a fleet, and 
 
 rehearsal: setup  ## the experiment on a bench that does not exist, by all its commands (ARGS="CASE MODEL OUT", after make demo)
 	$(BIN)/python lab/scripts/rehearsal.py $(ARGS)
+
+pictures: demo debian  ## the pictures in docs/images that the demo shows (docs/pictures.md has the others; 10 minutes)
+	cp runs/demo/scenes/dragged-0002.png docs/images/demo.png
+	$(BIN)/tumortrack locate runs/demo/model runs/demo/dataset/dragged-0002/cloud.ply runs/pictures/run --overwrite
+	$(BIN)/tumortrack plan runs/pictures/run runs/pictures/plan --margin 9 --overwrite
+	cp runs/pictures/plan/plan.png docs/images/plan.png
+	$(BIN)/tumortrack resect runs/pictures/plan --film docs/images/resection.gif
+	TUMORTRACK_PICTURES=docs/images TUMORTRACK_DEMO=runs/demo TUMORTRACK_PLAN=runs/pictures/plan $(BIN)/pytest -n0 tests/live/test_rviz.py tests/live/test_viewer_page.py
 
 wheel: setup  ## build the wheels of product, experiment and laboratory into dist/, with their dependencies (SBOM)
 	$(BIN)/pip wheel --quiet --no-deps --no-build-isolation --wheel-dir dist . ./experiment ./lab

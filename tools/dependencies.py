@@ -31,7 +31,8 @@ _APART = {"ur-rtde": "ur"}  # in a file of its own: `make setup` leaves it out
 # itself (MPL, EPL) or its own exchange (LGPL): all of them are imported, none is copied.
 ALLOWED = {
     "0BSD", "Apache-2.0", "BSD-2-Clause", "BSD-3-Clause", "BSD", "BSL-1.0", "CC0-1.0", "EPL-2.0",
-    "LGPL", "LLVM-exception", "MIT", "MIT-CMU", "MPL-2.0", "PSF-2.0", "Qhull", "Unlicense", "Zlib",
+    "ISC", "LGPL", "LLVM-exception", "MIT", "MIT-CMU", "MPL-2.0", "PSF-2.0", "Qhull", "Unlicense",
+    "Zlib",
 }  # fmt: skip
 # What packages say that say it otherwise, as found in their metadata or, with the reason, in their
 # licence file.
@@ -40,6 +41,7 @@ SAID = {
     "apache 2.0": "Apache-2.0",
     "bsd license": "BSD",
     "3-clause bsd license": "BSD-3-Clause",
+    "isc license (iscl)": "ISC",
     "mit license": "MIT",
     "mozilla public license 2.0 (mpl 2.0)": "MPL-2.0",
     "python software foundation license": "PSF-2.0",

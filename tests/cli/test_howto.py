@@ -1,0 +1,62 @@
+"""The how-to pages' commands, each page's run in the order in which a reader would type them.
+
+A fenced block marked `bash` is run as it stands; one with a title is not, and the title tells the
+reader why (a camera, a browser, minutes).
+"""
+
+import contextlib
+import re
+import shlex
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from stories import cloud_by_rays, looking_down
+from tumortrack.cli.main import run
+from tumortrack.imaging.case import load_case
+from tumortrack.sense.ply import write_cloud_ply
+
+PAGES = sorted((Path(__file__).parents[2] / "docs" / "how-to").glob("*.md"))
+LEFT = {  # what a page's commands leave behind, besides what they print
+    "camera": ("RUN/metadata.yaml", "again.json"),
+    "ct": ("CASE/qc.png", "RUN/tumor_2.ply", "RUN_WITH_POINTS/points.csv"),
+    "evaluate": ("REPORT/index.html",),
+    "plan": ("PLAN/plan.png",),
+    "ros2": ("report.json",),
+    "slicer": ("FOR_SLICER/case.seg.nrrd", "RUN/labels.seg.nrrd"),
+}
+
+
+def commands(page: Path) -> list[list[str]]:
+    blocks = re.findall(r"^```bash\n(.*?)^```$", page.read_text("utf-8"), re.M | re.S)
+    return [shlex.split(line, comments=True) for block in blocks for line in block.splitlines()]
+
+
+@pytest.fixture
+def desk(tmp_path, phantom_case, clinic_model):
+    """A reader's folder: a label map, a case and its model, a cloud, points of the CT."""
+    shutil.copy(phantom_case / "labels.nii.gz", tmp_path)
+    shutil.copytree(clinic_model, tmp_path / "MODEL")
+    case = load_case(phantom_case)
+    cloud = cloud_by_rays(case, looking_down(case)).astype(np.float32)
+    write_cloud_ply(tmp_path / "cloud.ply", cloud)
+    points = case.anatomy.tumors[0].vertices_mm[:3]
+    np.savetxt(tmp_path / "points.csv", points, delimiter=",", header="x,y,z", comments="")
+    return tmp_path
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_a_page_does_what_it_says(page, desk, phantom_case, capsys, monkeypatch):
+    monkeypatch.setenv("ROS_LOCALHOST_ONLY", "1")
+    if page.stem != "ct":  # whose reader makes the case
+        shutil.copytree(phantom_case, desk / "CASE")
+    found = commands(page)
+    assert found
+    with contextlib.chdir(desk):
+        for program, *arguments in found:
+            assert program == "tumortrack"
+            assert run(arguments) == 0, (arguments, capsys.readouterr().err)
+    for left in LEFT[page.stem]:
+        assert (desk / left).stat().st_size > 0

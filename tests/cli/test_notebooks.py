@@ -1,0 +1,68 @@
+"""The notebooks run as a reader runs them, and are kept without outputs."""
+
+import os
+from pathlib import Path
+
+import nbformat
+import numpy as np
+import pytest
+from nbclient import NotebookClient
+
+FILES = sorted((Path(__file__).parents[2] / "notebooks").glob("*.ipynb"))
+
+
+def codes(notebook: nbformat.NotebookNode) -> list[nbformat.NotebookNode]:
+    return [cell for cell in notebook.cells if cell.cell_type == "code"]
+
+
+def printed(cells: list[nbformat.NotebookNode]) -> str:
+    return "".join(o.text for cell in cells for o in cell.outputs if o.output_type == "stream")
+
+
+def test_they_are_kept_without_outputs():
+    assert len(FILES) == 3
+    for file in FILES:
+        for cell in codes(nbformat.read(file, 4)):
+            assert not cell.outputs
+            assert cell.execution_count is None
+
+
+@pytest.fixture(scope="module")
+def ran(tmp_path_factory, phantom_case, clinic_model):
+    """What each notebook's cells print: one kernel for all, emptied in between, so that PyTorch is
+    loaded once."""
+    folder = tmp_path_factory.mktemp("notebooks")
+    (folder / "case").symlink_to(phantom_case)
+    (folder / "model").symlink_to(clinic_model)
+    notebooks = [nbformat.read(file, 4) for file in FILES]
+    forget = nbformat.v4.new_code_cell("%reset -f")
+    joined = nbformat.v4.new_notebook()
+    joined.cells = [cell for book in notebooks for cell in (*codes(book), forget)]
+    environment = os.environ | {"TUMORTRACK_DEMO": str(folder), "MPLBACKEND": "agg"}
+    NotebookClient(joined, timeout=300, kernel_name="python3").execute(cwd=folder, env=environment)
+    return [codes(notebook) for notebook in notebooks]
+
+
+def test_a_tumor_is_located(ran):
+    assert "kidney: 1" in printed(ran[0])  # ml
+    off = [line for line in printed(ran[0]).splitlines() if line.startswith("tumor_1: centre off")]
+    assert 0 < float(off[0].split()[4]) < 15  # a model of 20 steps
+    assert any("image/png" in o.data for cell in ran[0] for o in cell.outputs if "data" in o)
+
+
+def test_estimates_stand_beside_the_best_rigid_pose(ran):
+    rows = [line.split() for line in printed(ran[1]).splitlines() if line[:5].strip().isdigit()]
+    assert len(rows) == 4
+    off, std, rigid = np.array([row[2:] for row in rows], float).T
+    assert (std > 0).all()
+    assert (rigid > 0.3).all()  # the scenes are deformed
+    assert np.median(off) < 15
+    assert "a ball: no estimate" in printed(ran[1]) or "a ball: poor" in printed(ran[1])
+
+
+def test_a_moving_organ_is_followed_in_a_notebook(ran):
+    said = printed(ran[2])
+    assert "6 estimates" in said
+    moved = float(said.split("tumor 1 moved by ")[1].split()[0])
+    assert moved > 0.05
+    assert said.count("is CT") == 3

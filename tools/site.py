@@ -1,0 +1,126 @@
+"""What MkDocs asks while it builds the site (`hooks` in mkdocs.yml).
+
+Makes reference/cli.md of the commands' own parsers, takes CONTRIBUTING.md and CHANGELOG.md in as
+pages, and turns links that leave docs/ into plain text: the site must work without the repository.
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import tyro
+from mkdocs.structure.files import File, Files
+from mkdocs.utils import get_relative_url
+
+from tumortrack.cli.main import _commands as all_commands
+
+ROOT = Path(__file__).parents[1]
+SHIM = "https://unpkg.com/iframe-worker/shim"
+TAKEN_IN = {"CONTRIBUTING.md": "contributing.md", "CHANGELOG.md": "changes.md"}
+
+
+def on_files(files: Files, config: Any) -> Files:
+    """Add the pages that are not files in docs/."""
+    pages = {page: (ROOT / name).read_text("utf-8") for name, page in TAKEN_IN.items()}
+    pages = {page: text.replace("](docs/", "](") for page, text in pages.items()}
+    pages["reference/cli.md"] = command_line()
+    for name, text in pages.items():
+        files.append(File.generated(config, name, content=text))
+    return files
+
+
+def on_page_markdown(markdown: str, **_: Any) -> str:
+    """Links into the repository become the text that they stand on."""
+    for name, page in TAKEN_IN.items():
+        markdown = markdown.replace(f"](../{name}", f"]({page}")
+    return re.sub(r"(?<!!)\[([^\]]+)\]\((?:\.\./)+(?:[^)]*)\)", _kept, markdown)
+
+
+def on_post_page(output: str, page: Any, **_: Any) -> str:
+    """The search's shim for pages opened from a folder: Material names a server, we have a copy."""
+    return output.replace(SHIM, get_relative_url("iframe-worker.js", page.url))
+
+
+def on_post_template(output_content: str, template_name: str, **_: Any) -> str:
+    """Likewise on the page that is shown for missing ones."""
+    return output_content.replace(SHIM, "iframe-worker.js")
+
+
+def _kept(link: re.Match[str]) -> str:
+    inside = re.match(r".*\]\(\.\./(\w[\w-]*\.md|images/)", link[0])
+    return link[0] if inside else link[1]
+
+
+def command_line() -> str:
+    """Every command with its options, as `--help` has them."""
+    text = [
+        "# Command line\n",
+        "This page is generated from the code: it says what `tumortrack COMMAND --help` says.\n",
+        "| command | |\n|---|---|",
+    ]
+    found = [
+        (f"tumortrack {name}", parser)
+        for name, command in all_commands("").items()
+        for parser in [_parser(command, name)]
+    ]
+    text += [
+        f"| [`{words}`](#{words.replace(' ', '-')}) | {_first(parser)} |" for words, parser in found
+    ]
+    for words, parser in found:
+        text += _section(words, parser, 2)
+    return "\n".join(text) + "\n"
+
+
+def _parser(command: Any, name: str) -> argparse.ArgumentParser:
+    with warnings.catch_warnings():
+        # tyro means to drop it; what it would be replaced by is the text of --help, in boxes.
+        warnings.simplefilter("ignore", DeprecationWarning)
+        return tyro.extras.get_parser(command, prog=f"tumortrack {name}")
+
+
+def _first(parser: argparse.ArgumentParser) -> str:
+    return " ".join((parser.description or "").split("\n\n")[0].split())
+
+
+def _section(words: str, parser: argparse.ArgumentParser, level: int) -> Iterator[str]:
+    yield f"\n{'#' * level} {words}\n"
+    yield (parser.description or "").strip() + "\n"
+    rows, below = [], []
+    for action in parser._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            below += [(f"{words} {name}", one) for name, one in action.choices.items()]
+        elif action.dest != "help":
+            rows.append(_row(action))
+    places = [_place(action) for action in parser._actions if _positional(action)]
+    places += ["KIND"] * bool(below)
+    yield f"```text\n{' '.join([words, *places, '[OPTIONS]'])}\n```\n"
+    if rows:
+        yield "| | value | meaning |\n|---|---|---|"
+        yield from rows
+    for name, one in below:
+        yield from _section(name, one, level + 1)
+
+
+def _positional(action: argparse.Action) -> bool:
+    return not action.option_strings and not isinstance(action, argparse._SubParsersAction)
+
+
+def _place(action: argparse.Action) -> str:
+    """The name of what stands there: a bare PATH would not tell the input from the output."""
+    name = action.dest.upper().replace("_", "-")
+    return f"[{name} ...]" if action.nargs == "*" else name
+
+
+def _row(action: argparse.Action) -> str:
+    name = ", ".join(f"`{option}`" for option in action.option_strings)
+    value = re.sub(r"\{None\}\||None,", "", str(action.metavar or ""))
+    said = " ".join((action.help or "").split()).replace(" (default: None)", "")
+    if not action.option_strings:
+        name, value = f"`{_place(action)}`", ""
+    cells = (name, f"`{value}`" if value else "", said)
+    return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
