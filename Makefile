@@ -117,8 +117,10 @@ pictures: demo debian  ## the pictures in docs/images that the demo shows (docs/
 	$(BIN)/tumortrack resect runs/pictures/plan --film docs/images/resection.gif
 	TUMORTRACK_PICTURES=docs/images TUMORTRACK_DEMO=runs/demo TUMORTRACK_PLAN=runs/pictures/plan $(BIN)/pytest -n0 tests/live/test_rviz.py tests/live/test_viewer_page.py
 
-wheel: setup  ## build the wheels of product, experiment and laboratory into dist/, with their dependencies (SBOM)
+wheel: setup $(TOOLS)  ## build the wheels of product, experiment and laboratory into dist/, with their dependencies (SBOM)
+	rm -rf dist build lab/build experiment/build  # modules that are gone would be packed from there
 	$(BIN)/pip wheel --quiet --no-deps --no-build-isolation --wheel-dir dist . ./experiment ./lab
+	.tools/bin/twine check --strict dist/*.whl
 	$(BIN)/python tools/dependencies.py sbom dist/tumortrack-*.whl dist/tumortrack_experiment-*.whl dist/tumortrack_lab-*.whl
 
 lock: setup $(TOOLS)  ## pin the dependencies by hash (ARGS=--upgrade: newest; ARGS="--upgrade-package NAME")

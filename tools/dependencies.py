@@ -70,7 +70,7 @@ def lock(upgrade: list[str]) -> None:
 
     tools = LOCKS / "tools.txt"
     kept = tools.read_text("utf-8") if tools.exists() else ""
-    tools.write_text(_resolved("uv\npip-audit\n", kept, upgrade), "utf-8")
+    tools.write_text(_resolved("uv\npip-audit\ntwine\n", kept, upgrade), "utf-8")
 
 
 def _extras(folder: Path) -> str:

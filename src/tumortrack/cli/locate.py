@@ -67,6 +67,11 @@ class Locate(StatedPatient):
         _check_grid(self.grid)
         paths = [self.cloud, self.out, *self.more]
         clouds, out = paths[:-1], paths[-1]
+        if self.model.is_file() and (self.cloud / store.MANIFEST).is_file():
+            raise InputError(
+                f"{self.model} stands where the model belongs, and {self.cloud} where the cloud. "
+                f"The order is: tumortrack locate {self.cloud} {self.model} {self.out}"
+            )
         store.check_place(out, "run", self.overwrite)
         points = self._points()
         frame_id, fixed_from_camera = self._poses(len(clouds))

@@ -14,7 +14,8 @@ import tyro
 
 from tumortrack.cli.cases import Export, Prepare, Simulate
 from tumortrack.cli.demo import Demo
-from tumortrack.cli.inspection import Doctor, Inspect
+from tumortrack.cli.doctor import Doctor
+from tumortrack.cli.inspection import Inspect
 from tumortrack.cli.locate import Evaluate, Locate
 from tumortrack.cli.margins import Margins
 from tumortrack.cli.models import Compile, Onnx
@@ -114,7 +115,9 @@ def _parse(arguments: list[str]) -> Command:
     """Only the chosen command's options are made; all of them take several times as long."""
     commands = _commands(arguments[0] if arguments else "")
     if arguments and (command := commands.get(arguments[0])) is not None:
-        return tyro.cli(command, prog=f"tumortrack {arguments[0]}", args=arguments[1:])
+        named = (tyro.conf.PositionalMetavarFromFieldName,)  # MODEL CLOUD OUT, not PATH PATH PATH
+        prog = f"tumortrack {arguments[0]}"
+        return tyro.cli(command, prog=prog, args=arguments[1:], config=named)
     return tyro.extras.subcommand_cli_from_dict(
         commands,
         prog="tumortrack",

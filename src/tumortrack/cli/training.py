@@ -84,8 +84,10 @@ class Train:
             done = load_model(self.model).provenance
             if done.get("run_sha256") != run.identity:
                 raise InputError(
-                    f"{self.model} holds a model of another case, preset, seed or option. Choose "
-                    "another MODEL folder."
+                    f"{self.model} holds a finished model ({done['steps']} steps, seed "
+                    f"{done['seed']}), trained with another case, --preset, --rotations, "
+                    "--minutes, --steps, --seed or --start. A finished training is not extended: "
+                    "choose another MODEL folder."
                 )
             say(f"{self.model} is trained already ({done['steps']} steps).")
             say_notes(filter(None, [weakness_of(done)]))

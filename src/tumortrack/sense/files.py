@@ -92,6 +92,8 @@ def read_cloud(path: Path, unit: Literal["mm", "m"] = "mm") -> tuple[SensorCloud
         InputError: missing, too large, damaged, of another kind, or without any point.
     """
     suffix = path.suffix.lower()
+    if path.is_dir():
+        raise InputError(f"{path} is a folder. Give a cloud in it, such as {path / 'cloud.ply'}.")
     if suffix not in CLOUD_SUFFIXES:
         raise InputError(f"{path}: unknown cloud type. Allowed: {', '.join(CLOUD_SUFFIXES)}.")
     if unit not in ("mm", "m"):

@@ -58,6 +58,8 @@ class RecordingSourceConfig(SourceConfig, frozen=True, kw_only=True, tag="record
             raise InputError(f"recording: unit_mm is {self.unit_mm:g}; it must lie in 0..100 mm.")
 
     def patient(self) -> Patient:
+        if not self.path.exists():
+            raise InputError(f"{self.path} does not exist, so it cannot be played.")
         about = (self.path if self.path.is_dir() else self.path.parent) / ABOUT
         if not about.is_file():
             return NOBODY
@@ -65,8 +67,7 @@ class RecordingSourceConfig(SourceConfig, frozen=True, kw_only=True, tag="record
 
     def open(self) -> RecordingSource:
         """Find the frames; none is read yet. Raises InputError if there are none to play."""
-        if not self.path.exists():
-            raise InputError(f"{self.path} does not exist, so it cannot be played.")
+        self.patient()
         if bag_files(self.path):
             chosen = self.topic, self.info_topic, self.rectified, self.unit_mm
             bag = BagRecording(self.path, *chosen)

@@ -7,7 +7,9 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
+from tumortrack.core import store
 from tumortrack.core.errors import InputError
+from tumortrack.core.patient import Patient, patient_in
 from tumortrack.live.values import Observation, SourceConfig, SourceLost
 
 if TYPE_CHECKING:
@@ -47,6 +49,9 @@ class VirtualSourceConfig(SourceConfig, frozen=True, kw_only=True, tag="virtual"
         self.check_between("virtual:", fps=(0.1, 1000))
         if self.seed < 0:
             raise InputError(f"virtual: seed is {self.seed}; it must be 0 or more.")
+
+    def patient(self) -> Patient:
+        return patient_in(store.read_manifest(self.case, "case").get("patient"), str(self.case))
 
     def player(self) -> ScenePlayer:
         """The room that this shows; building it takes some seconds. Raises ArtifactError if there

@@ -1,0 +1,62 @@
+"""`doctor`: what works here, and the command that installs what does not."""
+
+import os
+import re
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from extension_objects import distribution
+from tumortrack.cli.doctor import PURPOSES, Doctor, part
+
+ROOT = Path(__file__).parents[2]
+
+
+def test_it_finds_everything_on_one_screen_also_where_the_system_tells_no_affinity(
+    monkeypatch, capsys
+):
+    monkeypatch.delattr(os, "sched_getaffinity", raising=False)  # as on macOS
+    Doctor().run()
+    said = capsys.readouterr().out
+    assert int(re.search(r"cores: (\d+)", said).group(1)) >= 1
+    assert "BROKEN" not in said
+    assert "rosbags 0.1" in said
+    assert "compiled kernels are kept in" in said
+    assert len(said.splitlines()) <= 24
+
+
+@pytest.mark.parametrize("folder", [".", "experiment", "lab"])
+def test_it_knows_what_every_extra_is_for(folder):
+    project = tomllib.loads((ROOT / folder / "pyproject.toml").read_text())["project"]
+    extras = {*project.get("optional-dependencies", {}), ""} - {"dev"}
+    assert {extra for name, extra in PURPOSES if name == project["name"]} == extras
+
+
+@pytest.fixture
+def acme(tmp_path, monkeypatch):
+    """A distribution that needs what is not here, too old, or broken."""
+    distribution(tmp_path, "acme", {})
+    distribution(tmp_path, "shattered", {})
+    (tmp_path / "shattered.py").write_text("raise ImportError('libacme.so is not there')")
+    with (tmp_path / "acme-0.1.dist-info" / "METADATA").open("a") as metadata:
+        metadata.write(
+            "Requires-Dist: numpy>=2\n"
+            "Requires-Dist: no-such-package>=1; extra == 'far'\n"
+            "Requires-Dist: numpy<2; extra == 'old'\n"
+            "Requires-Dist: shattered; extra == 'wrong'\n"
+        )
+    monkeypatch.syspath_prepend(str(tmp_path))
+
+
+@pytest.mark.usefixtures("acme")
+def test_it_says_what_is_missing_unsupported_or_broken_and_what_to_type():
+    assert part("acme", "", "all").startswith("ok       acme: all; numpy ")
+    command = f"{sys.executable} -m pip install 'acme[far]'"
+    assert part("acme", "far", "") == (
+        f"absent   acme[far]: ; no-such-package is not installed; {command}"
+    )
+    assert re.search(r"BROKEN .* numpy 2\S+ is installed, but <2 is sup", part("acme", "old", ""))
+    assert "shattered 0.1: libacme.so is not there" in part("acme", "wrong", "")
+    assert part("nothing", "", "").endswith("-m pip install 'nothing'")
