@@ -70,7 +70,8 @@ def lock(upgrade: list[str]) -> None:
 
     tools = LOCKS / "tools.txt"
     kept = tools.read_text("utf-8") if tools.exists() else ""
-    tools.write_text(_resolved("uv\npip-audit\ntwine\n", kept, upgrade), "utf-8")
+    tools.write_text(text := _resolved("uv\npip-audit\ntwine\n", kept, upgrade), "utf-8")
+    (LOCKS / "uv.txt").write_text(pinned(text)["uv"], "utf-8")  # what `make setup` installs with
 
 
 def _extras(folder: Path) -> str:

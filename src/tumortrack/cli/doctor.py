@@ -20,7 +20,6 @@ from tumortrack.core.process import available_cores
 PURPOSES = {
     ("tumortrack", ""): "cases, training, locating, planning",
     ("tumortrack", "live"): "cameras, ROS 2, the web viewer, 3D Slicer, DICOM segmentations",
-    ("tumortrack", "report"): "the interactive page of an evaluation",
     ("tumortrack", "arms"): "motions of two arms",
     ("tumortrack", "ur"): "a real arm of Universal Robots",
     ("tumortrack", "pcd"): ".pcd clouds",
@@ -102,8 +101,10 @@ def part(name: str, extra: str, purpose: str) -> str:
 
 def _belongs(needed: Requirement, extra: str) -> bool:
     """Whether this machine needs it for that extra; "": always."""
-    always = needed.marker is None or needed.marker.evaluate({"extra": ""})
-    return not always and needed.marker.evaluate({"extra": extra}) if extra else always
+    marker = needed.marker
+    if marker is None or marker.evaluate({"extra": ""}):
+        return not extra
+    return marker.evaluate({"extra": extra})
 
 
 def _fault(needed: Requirement) -> str:

@@ -111,7 +111,10 @@ def read_cloud(path: Path, unit: Literal["mm", "m"] = "mm") -> tuple[SensorCloud
 
 def _pcd_points(content: bytes, name: str) -> np.ndarray:
     """x, y, z as floats (n, 3), in the file's unit; ascii, binary or compressed."""
-    from pypcd4 import PointCloud
+    try:
+        from pypcd4 import PointCloud
+    except ImportError as error:
+        raise InputError("a .pcd cloud needs pypcd4: pip install 'tumortrack[pcd]'.") from error
 
     _check_pcd_size(content, name)
     try:
