@@ -13,6 +13,7 @@ from clock import PATIENCE_S, until
 from igtl_objects import Heard, hear, hear_all, polydata_by_the_book
 from igtl_reader import IgtlStatus, unpack_polydata, unpack_status, unpack_transform
 from live_objects import STAMP_NS, empty_update, small_anatomy, small_setting, small_update
+from motions import Wave
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import rigid
 from tumortrack.live.igtl.message import Message, pack
@@ -44,7 +45,7 @@ def opened():
         one.close()
 
 
-ALL = 6  # STATUS, two TRANSFORM, three POLYDATA
+ALL = 7  # STATUS, two TRANSFORM, POINT, three POLYDATA
 
 
 def test_an_update_arrives_where_slicer_has_our_files(opened) -> None:
@@ -135,6 +136,8 @@ def test_no_estimate_is_said_and_leaves_nothing(opened) -> None:
         assert one.seconds > STAMP_NS / 1e9 + 0.03
         if kind == "POLYDATA":
             assert one.content == bytes(40)
+        if kind == "POINT":
+            assert one.content == b""
         if kind == "TRANSFORM":
             assert one.metadata["TransformStatus"] == "MISSING"
             np.testing.assert_array_equal(unpack_transform(one.content), np.eye(4))
@@ -150,11 +153,52 @@ def test_a_lost_part_goes_at_once_however_seldom_surfaces_are_sent(opened) -> No
     assert update.estimate is not None
     less = {k: m for k, m in update.estimate.meshes.items() if k != "tumor_2"}
     sink.publish(replace(update, estimate=replace(update.estimate, meshes=less)))
-    heard = hear_all(sock, 4)
+    heard = hear_all(sock, 5)
     assert ("POLYDATA", "kidney") not in heard
+    assert len(heard["POINT", "tumors"].content) == 136  # one point
     assert heard["POLYDATA", "tumor_2"].content == bytes(40)
     assert heard["TRANSFORM", "tumor_2"].metadata["TransformStatus"] == "MISSING"
     assert heard["TRANSFORM", "tumor_1"].metadata["TransformStatus"] == "OK"
+
+
+def test_margins_and_deviations_come_with_the_tumors(opened) -> None:
+    """The stated margin as a surface, std_mm of each vertex, and both in the centres' labels."""
+    import pyigtl
+
+    open_sink, open_receiver = opened
+    anatomy_ct = small_anatomy()
+    sink = open_sink(replace(small_setting(), anatomy_ct=anatomy_ct), mesh_hz=1000.0)
+    sock = open_receiver(sink)
+    update = small_update()
+    assert update.estimate is not None
+    stated = {"stated": [{"confidence": 0.95, "mm": {"tumor_1": 5.0}}]}
+    parts = update.estimate.report["parts"] | {}
+    parts["tumor_1"] = parts["tumor_1"] | {"center_std_mm": 1.26}
+    report = {**update.estimate.report, "margin": stated, "parts": parts}
+    sure = replace(update.estimate, report=report, motion=Wave(sure=True))
+    sink.publish(replace(update, estimate=sure))
+    heard = hear_all(sock, ALL + 2)  # the margin, and ct
+    shell = polydata_by_the_book(heard["POLYDATA", "tumor_1_margin"].content)["points"]
+    distances = np.linalg.norm(shell - [-14, 3, 120], axis=1)  # the tumor's radius is 6 mm
+    np.testing.assert_allclose(distances, 11.0, atol=0.05)
+    kind, size, std_mm = polydata_by_the_book(heard["POLYDATA", "tumor_1"].content)["std_mm"]
+    assert (kind, size) == (0, 1)  # one scalar of each point
+    x_ct = anatomy_ct.parts[1].vertices_mm[:, 0]
+    np.testing.assert_allclose(std_mm, 0.5 + np.abs(x_ct) / 100, rtol=1e-6)
+    client = pyigtl.OpenIGTLinkClient("127.0.0.1", sink.link.port)
+    try:
+        points = client.wait_for_message("tumors", timeout=PATIENCE_S)
+    finally:
+        client.stop()
+    assert points.names == [
+        "tumor_1, std 1.3 mm, 95 % margin 5.0 mm", "tumor_2, no margin stated",
+    ]  # fmt: skip
+    np.testing.assert_allclose(points.positions, [[-14, 3, 120], [6, -5, 138]], atol=1e-4)
+    sink.publish(update)
+    sock.settimeout(PATIENCE_S)
+    while (one := hear(sock)).device != "tumor_1_margin":
+        pass
+    assert one.content == bytes(40)
 
 
 def test_the_end_is_said(opened) -> None:
@@ -288,6 +332,9 @@ def test_what_cannot_work_is_refused(opened) -> None:
         OpenIgtLinkSinkConfig(port=taken.link.port).open(small_setting())
     with pytest.raises(InputError, match="there is no host"):
         OpenIgtLinkSinkConfig(connect="no..host").open(small_setting())
+    long = replace(small_setting(), parts=("thoracic_lymph_nodes_left",))
+    with pytest.raises(InputError, match="shorter --name"):
+        OpenIgtLinkSinkConfig(port=0).open(long)
     for bad in ({"port": 70000}, {"mesh_hz": -1.0}, {"cloud_hz": float("nan")}):
         with pytest.raises(InputError, match=next(iter(bad))):
             OpenIgtLinkSinkConfig(**bad)  # type: ignore[arg-type]

@@ -320,7 +320,7 @@ def test_export_writes_both(tmp_path: Path, capsys: pytest.CaptureFixture) -> No
     counts = np.bincount(labels.labels.ravel())
     assert [len(places[n]) for n in (1, 2, 3)] == counts[1:].tolist()
     Export(case=tmp_path / "case", out=tmp_path / "plain").run()
-    assert [p.name for p in (tmp_path / "plain").iterdir()] == ["case.seg.nrrd"]
+    assert sorted(p.name for p in (tmp_path / "plain").iterdir()) == ["case.seg.nrrd", "scene.mrb"]
     with pytest.raises(InputError, match="exists already"):
         Export(case=tmp_path / "case", out=tmp_path / "out").run()
     for option in ({"series": "1"}, {"patient": "PHANTOM"}):

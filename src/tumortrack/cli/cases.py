@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from tyro.conf import Positional
 
@@ -14,6 +14,7 @@ from tumortrack.core.errors import InputError
 
 if TYPE_CHECKING:
     from tumortrack.simulate.scene import SceneConfig
+    from tumortrack.tracking.slicer_scene import Scene
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,11 +78,16 @@ class Prepare:
 
 @dataclass(frozen=True, kw_only=True)
 class Export:
-    """Write a case's segmentation for 3D Slicer and, with its CT, as DICOM.
+    """Write a case, or what was located, as a scene for 3D Slicer, and a CT's as DICOM.
 
     Attributes:
-        case: folder that `prepare` wrote.
-        out: folder to write: case.seg.nrrd and, with --dicom, segmentation.dcm.
+        case: folder that `prepare` wrote, or alone one that `locate` wrote.
+        out: folder to write: scene.mrb; of a case also case.seg.nrrd and, with --dicom,
+            segmentation.dcm.
+        located: folder that `locate` wrote with this case's model: the scene shows its surfaces,
+            and the CT and its segmentation where the organ is.
+        live: HOST:PORT of a sink `openigtlink`: the scene connects to it, shows what it sends, and
+            has the CT follow the organ.
         dicom: folder of the CT's slices that the case's voxels come from.
         series: which of its series, if the folder holds several (UID or number in the list).
         patient: the PatientID of --dicom, where the case has a pseudonym.
@@ -89,35 +95,80 @@ class Export:
 
     case: Positional[Path]
     out: Positional[Path]
+    located: Path | None = None
+    live: str | None = None
     dicom: Path | None = None
     series: str | None = None
     patient: str | None = None
 
     def run(self) -> None:
+        from tumortrack.tracking.slicer_scene import Scene
+
+        if self.dicom is None and (self.series, self.patient) != (None, None):
+            raise InputError("--series and --patient are those of --dicom; give that folder too.")
+        if self.located is not None and self.live is not None:
+            raise InputError("--located shows what is done, --live what comes: give one of them.")
+        manifest = self.case / store.MANIFEST
+        is_run = manifest.is_file() and store.read_json(manifest).get("kind") == "run"
+        if is_run and (self.located, self.live, self.dicom) != (None, None, None):
+            raise InputError(
+                f"{self.case} was located. --located, --live and --dicom are for a case: "
+                "tumortrack export CASE OUT --located RUN."
+            )
+        scene = Scene()
+        notes: tuple[str, ...] = ()
+        with store.new_folder(self.out) as aside:
+            if is_run:
+                store.read_manifest(self.case, "run")
+                scene.add_run(self.case, store.read_json(self.case / "report.json"))
+            else:
+                notes = self._export_case(aside, scene)
+            scene.write(aside / "scene.mrb")
+        say_notes(notes)
+        say(f"written to {self.out}: {', '.join(sorted(p.name for p in self.out.iterdir()))}.")
+
+    def _export_case(self, aside: Path, scene: Scene) -> tuple[str, ...]:
+        """Adds the case to the scene and writes what else was asked for; notes."""
         from tumortrack import api
         from tumortrack.core.patient import Patient
         from tumortrack.imaging import segmentation
 
-        if self.dicom is None and (self.series, self.patient) != (None, None):
-            raise InputError("--series and --patient are those of --dicom; give that folder too.")
         case = api.load_case(self.case)
-        options = case.report.get("options", {})
-        patient = case.patient
+        labels, patient = case.labels, case.patient
         parts = segmentation.segments(case.anatomy.names, patient.side, case.anatomy.kind)
-        labels = case.labels
-        notes: tuple[str, ...] = ()
-        with store.new_folder(self.out) as aside:
-            segmentation.write_seg_nrrd(
-                aside / "case.seg.nrrd", labels.labels, labels.lps_from_index, parts
+        file = aside / "case.seg.nrrd"
+        segmentation.write_seg_nrrd(file, labels.labels, labels.lps_from_index, parts)
+        moved = (self.located, self.live) != (None, None)
+        scene.add_case(self.case, case, file.read_bytes(), moved)
+        if self.located is not None:
+            report = self._report_of(self.located)
+            scene.add_ct_transform(report["motion"]["camera_from_ct"])
+            scene.add_run(self.located, report)
+        if self.live is not None:
+            host, _, port = self.live.rpartition(":")
+            if not host or not port.isdecimal():
+                raise InputError(f"--live {self.live!r} must be HOST:PORT, as localhost:18944.")
+            scene.add_ct_transform(None)
+            scene.add_live(case.anatomy.names, host, int(port))
+        if self.dicom is None:
+            return ()
+        series = self.series or case.report.get("options", {}).get("series")
+        whose = Patient(patient.id if self.patient is None else self.patient, patient.side)
+        file = aside / "segmentation.dcm"
+        return segmentation.write_dicom_seg(file, labels, parts, self.dicom, series, whose)
+
+    def _report_of(self, run: Path) -> dict[str, Any]:
+        """Raises InputError: it was located with another case's model, or without a motion."""
+        store.read_manifest(run, "run")
+        report = store.read_json(run / "report.json")
+        if report["model"].get("case_sha256") != store.sha256_of(self.case / store.MANIFEST):
+            raise InputError(f"{run} was not located with a model of {self.case}: give its case.")
+        if "motion" not in report:
+            raise InputError(
+                f"{run} does not know where the CT is now: a model of the preset clinic does. "
+                "Export it alone: tumortrack export RUN OUT."
             )
-            if self.dicom is not None:
-                series = self.series or options.get("series")
-                file = aside / "segmentation.dcm"
-                named = patient.id if self.patient is None else self.patient
-                whose = Patient(named, patient.side)
-                notes = segmentation.write_dicom_seg(file, labels, parts, self.dicom, series, whose)
-        say_notes(notes)
-        say(f"written to {self.out}: {', '.join(sorted(p.name for p in self.out.iterdir()))}.")
+        return report
 
 
 @dataclass(frozen=True, kw_only=True)

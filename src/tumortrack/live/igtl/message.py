@@ -4,13 +4,13 @@ Header version 2 (protocol 3), which 3D Slicer (since 4.7), PLUS and pyigtl read
 metadata, so nothing could say in which frame a place is given or that a transform is missing.
 Headers of version 1 are read too, since clients' requests come in it. All numbers are big-endian.
 Source: the protocol's Documents/Protocol: header.md, timestamp.md, transform.md, status.md,
-polydata.md.
+polydata.md, point.md.
 """
 
 from __future__ import annotations
 
 import struct
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -19,6 +19,7 @@ from jaxtyping import Float, Int, Num
 from tumortrack.core.errors import InputError
 
 HEADER_SIZE = 58
+LONGEST_DEVICE = 20  # ASCII characters
 _HEADER = struct.Struct("> H 12s 20s Q Q Q")
 _EXTENDED = struct.Struct("> H H I I")
 _ENTRY = struct.Struct("> H H I")
@@ -30,6 +31,7 @@ _STATUS = struct.Struct("> H q 20s")
 _POLYDATA = struct.Struct("> 10I")
 _ATTRIBUTE = struct.Struct("> B B I")
 _POINT_SCALARS = 0x00
+_POINT = struct.Struct("> 64s 32s 4B 4f 20s")
 
 
 class ProtocolError(InputError):
@@ -78,7 +80,10 @@ def pack(message: Message) -> bytes:
     keys, values = b"".join(index), b"".join(texts)
     extended = _EXTENDED.pack(_EXTENDED.size, len(keys), len(values), 0)
     body = b"".join((extended, message.content, keys, values))
-    for what, given, size in (("type", message.type, 12), ("device name", message.device, 20)):
+    for what, given, size in (
+        ("type", message.type, 12),
+        ("device name", message.device, LONGEST_DEVICE),
+    ):
         if not given.isascii() or len(given) > size:
             raise ProtocolError(f"{what} {given!r}: at most {size} ASCII characters are allowed.")
     names = message.type.encode("ascii"), message.device.encode("ascii")
@@ -164,6 +169,17 @@ def pack_polydata(data: Polydata) -> bytes:
     values = [np.asarray(values).astype(">f4").tobytes() for values in data.scalars.values()]
     padding = bytes(len(names) % 2)
     return b"".join((head, points, lines, polygons, *kinds, names, padding, *values))
+
+
+def pack_points(
+    points_mm: Float[np.ndarray, "n 3"], labels: Sequence[str], rgb: tuple[int, int, int]
+) -> bytes:
+    """Fiducials of one colour; labels are cut to 63 bytes: the protocol's own library reads one of
+    64 past its end."""
+    return b"".join(
+        _POINT.pack(label.encode("ascii", "replace")[:63], b"Fiducial", *rgb, 255, *point, 0.0, b"")
+        for label, point in zip(labels, points_mm, strict=True)
+    )
 
 
 def _cells(cells: np.ndarray) -> bytes:

@@ -14,16 +14,22 @@ from typing import ClassVar, Literal
 import numpy as np
 from jaxtyping import Float64
 
+from tumortrack.core.colours import part_colour
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import RAS_FROM_LPS, rigid, transform_points
+from tumortrack.core.types import FIRST_TUMOR, Mesh
 from tumortrack.live.igtl import message as igtl
 from tumortrack.live.igtl.link import Link
 from tumortrack.live.igtl.message import Message, Polydata
 from tumortrack.live.meter import Rate
 from tumortrack.live.network import is_loopback
 from tumortrack.live.values import SinkConfig, SinkContext, TrackingResult
+from tumortrack.models.margins import stated_radius
+from tumortrack.tracking.files import MARGIN
+from tumortrack.tracking.shells import rough_margin
+from tumortrack.tracking.slicer_scene import CENTRES, CT, centre_label
 
-STATUS_DEVICE, CT_DEVICE, CLOUD_DEVICE, ARMS_DEVICE = "tumortrack", "ct", "occupancy", "arms"
+STATUS_DEVICE, CLOUD_DEVICE, ARMS_DEVICE = "tumortrack", "occupancy", "arms"
 _TIP = "/tip"  # how the names of shapes at the tips of tools end
 _NOTHING = Polydata(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32))
 _Content = tuple[str, str, bytes, dict[str, str]]  # type, device, content, metadata of its own
@@ -56,17 +62,25 @@ class OpenIgtLinkSinkConfig(SinkConfig, frozen=True, kw_only=True, tag="openigtl
         self.check_ranges("openigtlink:", "0 (none)", mesh_hz=1000, cloud_hz=1000)
 
     def open(self, context: SinkContext) -> OpenIgtLinkSink:
-        """Serve, or begin to try to connect. Raises InputError as ``Link``."""
+        """Serve, or begin to try to connect. Raises InputError as ``Link``, and for a part whose
+        name is too long for a message."""
+        if long := [name for name in context.parts if len(name) > igtl.LONGEST_DEVICE]:
+            raise InputError(
+                f"openigtlink: {long[0]!r} has {len(long[0])} letters, and OpenIGTLink allows "
+                f"{igtl.LONGEST_DEVICE}. Prepare the case with a shorter --name."
+            )
         return OpenIgtLinkSink(self, context)
 
 
 class OpenIgtLinkSink:
-    """Per result: STATUS ``tumortrack``, TRANSFORM of each tumor, and POLYDATA of each part.
+    """Per result: STATUS ``tumortrack``, TRANSFORM of each tumor, POINT ``tumors`` (their centres,
+    labelled with how sure they are), and POLYDATA of each part and of each stated margin.
 
     A tumor's TRANSFORM has its origin in the middle of the tumor's box; its axes are the CT's, as
     the organ is turned now, or, without a motion, those of the published frame. With a motion
-    TRANSFORM ``ct`` is the organ's pose. Without an estimate STATUS says why, transforms are the
-    identity with ``TransformStatus`` MISSING, and surfaces and cloud are empty.
+    TRANSFORM ``ct`` is the organ's pose, and vertices of tumors have the scalar ``std_mm``: one
+    standard deviation along the axis that is least sure. Without an estimate STATUS says why,
+    transforms are the identity with ``TransformStatus`` MISSING, and all else is empty.
 
     Where there may be arms also STATUS ``arms`` (well: its name is their state; not ready: halted,
     and why; not present: nothing is known), and a TRANSFORM of each tool's tip, named as its shape
@@ -79,6 +93,7 @@ class OpenIgtLinkSink:
         self.link = Link(config.host, config.port, config.connect)
         self._mesh_rate, self._cloud_rate = Rate(config.mesh_hz), Rate(config.cloud_hz)
         self._tips: set[str] = set()  # that ever were
+        self._margins: set[str] = set()  # likewise
         self._next, self._closed = 0, False
 
     @property
@@ -108,7 +123,10 @@ class OpenIgtLinkSink:
         about = {"frame_id": result.published_frame.frame_id, "sequence": str(result.sequence)}
         about |= {"patient": self._context.patient.id, "side": self._context.patient.side}
         contents = chain(
-            self._statuses(result, code), self._transforms(result), self._surfaces(result)
+            self._statuses(result, code),
+            self._transforms(result),
+            self._centres(result),
+            self._surfaces(result),
         )
         self.link.send(
             [
@@ -141,7 +159,7 @@ class OpenIgtLinkSink:
         pose = np.array(report["motion"]["camera_from_ct"]) if "motion" in report else None
         places: dict[str, Float64[np.ndarray, "4 4"] | None] = dict.fromkeys(tumors)
         if self._context.anatomy_ct is not None:
-            places[CT_DEVICE] = None if pose is None else way @ pose
+            places[CT] = None if pose is None else way @ pose
         turn = np.eye(3) if pose is None else (way @ pose)[:3, :3]
         for name in tumors:
             if (center_mm := result.center_mm(name)) is not None:
@@ -156,6 +174,16 @@ class OpenIgtLinkSink:
             known = {"TransformStatus": "MISSING" if place is None else "OK"}
             yield "TRANSFORM", name, igtl.pack_transform(turned), known
 
+    def _centres(self, result: TrackingResult) -> Iterator[_Content]:
+        report = {} if result.estimate is None else result.estimate.report
+        tumors = self._context.parts[1:]
+        places = {n: place for n in tumors if (place := result.center_mm(n)) is not None}
+        labels = [centre_label(report, name, result.quality != "good") for name in places]
+        points_mm = transform_points(self._axes, np.reshape([*places.values()], (-1, 3)))
+        if tumors:
+            colour = part_colour(FIRST_TUMOR)
+            yield "POINT", CENTRES, igtl.pack_points(points_mm, labels, colour), {}
+
     def _surfaces(self, result: TrackingResult) -> Iterator[_Content]:
         estimate = result.transformed
         contents: dict[str, Polydata] = {}
@@ -166,9 +194,8 @@ class OpenIgtLinkSink:
                 if (mesh := meshes.get(name)) is None:
                     contents[name] = _NOTHING
                 elif due:
-                    contents[name] = Polydata(
-                        transform_points(self._axes, mesh.vertices_mm), mesh.faces
-                    )
+                    contents[name] = self._surface(mesh, self._deviations(result, name))
+            contents |= self._shells(result, meshes, due)
         if self._config.cloud_hz:
             if estimate is None:
                 contents[CLOUD_DEVICE] = _NOTHING
@@ -181,3 +208,32 @@ class OpenIgtLinkSink:
                 contents[CLOUD_DEVICE] = Polydata(points, _NOTHING.triangles, segments, scalars)
         for name, content in contents.items():
             yield "POLYDATA", name, igtl.pack_polydata(content), {}
+
+    def _shells(
+        self, result: TrackingResult, meshes: dict[str, Mesh], due: bool
+    ) -> dict[str, Polydata]:
+        """The surfaces of the tumors' stated margins; empty where one is stated no more."""
+        said = {} if result.estimate is None else result.estimate.report.get("margin")
+        contents: dict[str, Polydata] = {}
+        for name in self._context.parts[1:]:
+            mesh, radius, shell = meshes.get(name), stated_radius(said, name), name + MARGIN
+            if mesh is None or radius is None:
+                contents |= {shell: _NOTHING} if shell in self._margins else {}
+            elif due:
+                self._margins.add(shell)
+                contents[shell] = self._surface(rough_margin(mesh, radius.mm))
+        return contents
+
+    def _surface(self, mesh: Mesh, scalars: dict[str, np.ndarray] | None = None) -> Polydata:
+        points_mm = transform_points(self._axes, mesh.vertices_mm)
+        return Polydata(points_mm, mesh.faces, scalars=scalars or {})
+
+    def _deviations(self, result: TrackingResult, name: str) -> dict[str, np.ndarray]:
+        """``std_mm`` of each vertex of a tumor, where the method knows it."""
+        parts, anatomy = self._context.parts, self._context.anatomy_ct
+        motion = None if result.estimate is None else result.estimate.motion
+        if motion is None or anatomy is None or name not in parts[1:]:
+            return {}
+        vertices_ct = anatomy.parts[parts.index(name)].vertices_mm
+        std_mm = motion.largest_std_mm(vertices_ct)
+        return {} if std_mm is None else {"std_mm": std_mm}
