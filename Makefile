@@ -11,7 +11,7 @@ UV := uv pip install --quiet --no-deps --require-hashes
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help setup debian demo test test-hard check pretrained attack fuzz crash replay bench soak wheel lock licences audit results real minutes world sequences causes trust rehearsal population scaling site pictures clean
+.PHONY: help setup debian demo test pytest test-hard check pretrained attack fuzz crash replay bench soak wheel lock licences audit results real minutes world sequences causes trust rehearsal population scaling site pictures clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 10
@@ -52,7 +52,9 @@ debian:  ## install what tests need from Debian (Chromium, Fast DDS)
 site: setup  ## the documentation's site, strictly: build/site/index.html (`.venv/bin/mkdocs serve`: while you write)
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
-test: check site  ## check, then all tests (those of Chromium and Fast DDS after `make debian`)
+test: check site pytest  ## check, then all tests (those of Chromium and Fast DDS after `make debian`)
+
+pytest: setup  ## the tests alone
 	OMP_NUM_THREADS=1 $(BIN)/pytest -n 3 --dist loadfile --no-loadscope-reorder
 
 pretrained: setup  ## the weights of random kidneys that the package ships (ARGS="--anatomies N --steps N")
@@ -122,7 +124,7 @@ pictures: demo debian  ## the pictures in docs/images that the demo shows (docs/
 	TUMORTRACK_PICTURES=docs/images TUMORTRACK_DEMO=runs/demo TUMORTRACK_PLAN=runs/pictures/plan $(BIN)/pytest -n0 tests/live/test_rviz.py tests/live/test_viewer_page.py
 
 wheel: setup $(TOOLS)  ## build the wheels of product, experiment and laboratory into dist/, with their dependencies (SBOM)
-	rm -rf dist build lab/build experiment/build  # modules that are gone would be packed from there
+	rm -rf dist build/lib lab/build experiment/build  # modules that are gone would be packed from there
 	$(BIN)/pip wheel --quiet --no-deps --no-build-isolation --wheel-dir dist . ./experiment ./lab
 	.tools/bin/twine check --strict dist/*.whl
 	$(BIN)/python tools/dependencies.py sbom dist/tumortrack-*.whl dist/tumortrack_experiment-*.whl dist/tumortrack_lab-*.whl

@@ -30,7 +30,7 @@ def test_it_finds_everything_on_one_screen_also_where_the_system_tells_no_affini
 @pytest.mark.parametrize("folder", [".", "experiment", "lab"])
 def test_it_knows_what_every_extra_is_for(folder):
     project = tomllib.loads((ROOT / folder / "pyproject.toml").read_text())["project"]
-    extras = {*project.get("optional-dependencies", {}), ""} - {"dev"}
+    extras = {*project.get("optional-dependencies", {}), ""} - {"dev", "docs"}
     assert {extra for name, extra in PURPOSES if name == project["name"]} == extras
 
 

@@ -84,6 +84,7 @@ class Locate(StatedPatient):
         from tumortrack.core.estimate import NO_CHECK_FAILED, UNVERIFIED
         from tumortrack.core.types import Look
         from tumortrack.models.margins import margin_words, stated_radius
+        from tumortrack.registration.kernels import carry
         from tumortrack.tracking.files import write_estimate
         from tumortrack.tracking.points import check_near_organ
         from tumortrack.tracking.tracker import Tracker
@@ -149,7 +150,8 @@ class Locate(StatedPatient):
         say(f"{NO_CHECK_FAILED}; {UNVERIFIED}." if good
             else f"POOR: {estimate.reason}. Do not rely on it.")  # fmt: skip
         seconds = estimate.report["timings"]["total"]
-        say(f"written to {out} (camera frame, mm) in {seconds:.2f} s.")
+        compiled = ", with compiling, once on this machine" if carry.stats.cache_misses else ""
+        say(f"written to {out} (camera frame, mm) in {seconds:.2f} s{compiled}.")
 
     def _points(self) -> PointTable | None:
         """The points of --map; what is wrong with them or the model is said before a wait."""
