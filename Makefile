@@ -121,7 +121,7 @@ pictures: demo debian  ## the pictures in docs/images that the demo shows (docs/
 	$(BIN)/tumortrack plan runs/pictures/run runs/pictures/plan --margin 9 --overwrite
 	cp runs/pictures/plan/plan.png docs/images/plan.png
 	$(BIN)/tumortrack resect runs/pictures/plan --film docs/images/resection.gif
-	TUMORTRACK_PICTURES=docs/images TUMORTRACK_DEMO=runs/demo TUMORTRACK_PLAN=runs/pictures/plan $(BIN)/pytest -n0 tests/live/test_rviz.py tests/live/test_viewer_page.py
+	TUMORTRACK_PICTURES=docs/images TUMORTRACK_DEMO=runs/demo TUMORTRACK_PLAN=runs/pictures/plan $(BIN)/pytest -n0 tests/live/test_viewer_page.py
 
 wheel: setup $(TOOLS)  ## build the wheels of product, experiment and laboratory into dist/, with their dependencies (SBOM)
 	rm -rf dist build/lib lab/build experiment/build  # modules that are gone would be packed from there

@@ -102,6 +102,8 @@ def test_a_plan_is_written_in_the_tables_frame(story):
     assert picture.shape[1] >= 1000
     assert picture.std() > 20
     assert "<robot" in (folder / "plan" / "cell.urdf").read_text()
+    stages = json.loads((folder / "plan" / "trajectories.json").read_text())["stages"]
+    assert (stages[0]["name"], stages[-1]["name"]) == ("approach", "home")
     with safe_open(folder / "plan" / "motions.safetensors", "np") as tensors:
         assert json.loads(tensors.metadata()["joints"]) == list(JOINTS)
     described = succeeded(tumortrack("inspect", folder / "plan"))

@@ -215,10 +215,11 @@ def test_the_loop_counts_ages_from_the_stamp_once_a_frame_came() -> None:
 def test_the_view_for_rviz_shows_what_is_published(
     name: str, frame: str, topics: list[str], messages: Messages
 ) -> None:
-    """Topics, frame and reliability of docs/ros/*.rviz are the sink's."""
-    view = (HERE.parents[1] / "docs" / "ros" / name).read_text(encoding="utf-8")
+    """Topics, frame and reliability of the views are the sink's."""
+    folder = HERE.parents[1] / "integrations" / "ros2" / "tumortrack_ros" / "rviz"
+    view = (folder / name).read_text(encoding="utf-8")
     out = ResultMessages(messages, with_arms()).of(empty_update())
-    sent = {f"/tumortrack/{one.suffix}" for one in out}
+    sent = {one.topic("/tumortrack") for one in out}
     shown = set(re.findall(r"Value: (/tumortrack\S+)", view))
     assert sorted(shown) == [f"/tumortrack/{topic}" for topic in topics]
     assert shown < sent
@@ -364,8 +365,9 @@ def test_the_way_through_rclpy(monkeypatch: pytest.MonkeyPatch, messages: Messag
         DurabilityPolicy=policy(TRANSIENT_LOCAL="transient local", VOLATILE="volatile"),
     )
     module("rclpy.duration", Duration=dict)
-    for package in ("sensor_msgs", "visualization_msgs", "geometry_msgs", "diagnostic_msgs"):
-        names = ("PointCloud2", "MarkerArray", "PointStamped", "DiagnosticArray")
+    standard = ("sensor_msgs", "visualization_msgs", "geometry_msgs", "diagnostic_msgs")
+    for package in (*standard, "tf2_msgs"):
+        names = ("PointCloud2", "MarkerArray", "PointStamped", "DiagnosticArray", "TFMessage")
         module(f"{package}.msg", **{name: name for name in names})
 
     source = SourceRos2(topic="/points").open()  # auto: rclpy is there now

@@ -9,6 +9,7 @@ import subprocess
 import threading
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -26,24 +27,30 @@ from live_objects import (
 )
 from ros2_objects import DOMAIN, Other, own_graph, peer, process, read_until
 from ros2_peer import frame_numbered, points_mm
-from tumortrack.core.errors import InputError
+from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.estimate import Estimate
+from tumortrack.core.geometry import rigid
 from tumortrack.core.types import OccupancyCloud, SensorCloud
 from tumortrack.live.ros import sensors
 from tumortrack.live.ros.bus import Bus
 from tumortrack.live.ros.dds import dds_name
 from tumortrack.live.ros.messages import Messages
-from tumortrack.live.ros.results import ResultMessages
+from tumortrack.live.ros.results import DIAGNOSTICS, ResultMessages
 from tumortrack.live.ros.ros2 import open_bus
 from tumortrack.live.ros.sensors import messages_seen, plain_cloud
+from tumortrack.live.ros.tf import TRANSFORMS, pose_of, transform_fields
+from tumortrack.live.sinks.moveit import SCENE, MoveItSinkConfig
 from tumortrack.live.sinks.ros import Ros2SinkConfig as SinkRos2
 from tumortrack.live.sources.ros import Ros2SourceConfig as SourceRos2
-from tumortrack.live.values import Observation, Sink, Source, TrackingResult
+from tumortrack.live.spec import POSES
+from tumortrack.live.values import Observation, PublishedFrame, Sink, Source, TrackingResult
 
 pytest.importorskip("cyclonedds", reason="cyclonedds is not installed (tumortrack[live])")
 
 HERE = Path(__file__).parents[1] / "support"
 CLOUD_DDS = "sensor_msgs::msg::dds_::PointCloud2_"
+TURNED = rigid(np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), np.array([50.0, -20, 300]))
+SHIFTED = rigid(np.diag([1.0, -1, -1]), np.array([0.0, 10, 60]))
 
 
 @pytest.fixture(autouse=True)
@@ -278,7 +285,8 @@ def built(folder: Path) -> Path:
 
 @pytest.mark.slow
 def test_fast_dds_hears_and_is_heard(tmp_path: Path, bus: Bus, messages: Messages) -> None:
-    """A cloud of ours arrives there byte for byte, an image from there here; noise does no harm."""
+    """A cloud of ours arrives there byte for byte, and tf, diagnostics and the planning scene; an
+    image from there here, and where the camera is by tf; noise does no harm."""
     program = built(tmp_path)
     files = []
     for suffix, kind, message in messages_seen(Observation(small_frame(), 0), messages):
@@ -287,6 +295,12 @@ def test_fast_dds_hears_and_is_heard(tmp_path: Path, bus: Bus, messages: Message
     noise = np.random.default_rng(1).integers(0, 256, 2000, np.uint8).tobytes()
     (tmp_path / "noise").write_bytes(bytes([0, 1, 0, 0]) + noise)
     files += ["rt/fast/noise", CLOUD_DDS, tmp_path / "noise"]
+    ways = {"tf": ("base_link", "tool0", TURNED), "tf_static": ("tool0", "optical", SHIFTED)}
+    for topic, (parent, child, way) in ways.items():
+        one = transform_fields(messages, 1, parent, child, way)
+        said = messages.to_bytes(messages.make(TRANSFORMS, transforms=[one]))
+        (tmp_path / topic).write_bytes(said)
+        files += [f"rt/{topic}", dds_name(TRANSFORMS), tmp_path / topic]
 
     header = messages.header(5, "camera")
     cloud = SensorCloud(points_mm()[:2000])
@@ -294,8 +308,20 @@ def test_fast_dds_hears_and_is_heard(tmp_path: Path, bus: Bus, messages: Message
     ours = bus.publisher("/tumortrack/cloud", sensors.CLOUD)
     image = SourceRos2(topic="/fast/depth/image_rect").open()
     damaged = SourceRos2(topic="/fast/noise").open()
+    poses = POSES.parse("ros2:base_link?via=dds").open()
     heard = tmp_path / "heard"
-    sub = ("sub", 4, "rt/tumortrack/cloud", CLOUD_DDS, heard)
+    kinds = {"/tf": TRANSFORMS, "/tf_static": TRANSFORMS, "/diagnostics": DIAGNOSTICS}
+    kinds |= {"/planning_scene": SCENE}
+    sub: list[object] = ["sub", 4, "rt/tumortrack/cloud", CLOUD_DDS, heard]
+    for topic, kind in kinds.items():
+        sub += [f"rt{topic}", dds_name(kind), tmp_path / f"heard_{topic[1:]}"]
+    frame = PublishedFrame("table", TURNED)
+    setting = replace(small_setting(), published_frame=frame)
+    sinks = (
+        SinkRos2(namespace="/theatre", camera_tf=True).open(setting),
+        MoveItSinkConfig(margin_mm=5.0).open(setting),
+    )
+    placed = None
     try:
         with (
             process(program, DOMAIN, *sub) as there,
@@ -306,14 +332,19 @@ def test_fast_dds_hears_and_is_heard(tmp_path: Path, bus: Bus, messages: Message
                 assert time.monotonic() < end_s + PATIENCE_S
                 ours.publish(cdr)
                 sent += 1
+                for sink in sinks:
+                    sink.publish(small_update(sent, frames=frame))
                 with contextlib.suppress(InputError):  # before the first CameraInfo
                     images.append(image.read(1 / 30))
+                    if images[-1] is not None and placed is None:
+                        with contextlib.suppress(NoEstimate):
+                            placed = poses.at(replace(images[-1], frame_id="optical"))
                 with contextlib.suppress(InputError):
                     assert damaged.read(0.0) is None
-            received = int(there.line())
+            received, *others = map(int, there.line().split())
     finally:
-        image.close()
-        damaged.close()
+        for one in (image, damaged, poses, *sinks):
+            one.close()
     seen = [one for one in images if one is not None]
     np.testing.assert_allclose(seen[-1].content.depth_mm, small_frame().depth_mm, rtol=2e-7)
     ages_ms = [(one.arrived_ns - one.stamp_ns) * 1e-6 for one in seen]
@@ -323,3 +354,26 @@ def test_fast_dds_hears_and_is_heard(tmp_path: Path, bus: Bus, messages: Message
     assert image.host_clock
     assert received > 0
     assert heard.read_bytes().rstrip(b"\0") == cdr.rstrip(b"\0")
+    assert placed is not None  # Fast DDS said the camera on the tool before we listened
+    np.testing.assert_allclose(placed, TURNED @ SHIFTED, atol=1e-9)
+    assert all(others)
+    tf, static, status, scene = (
+        messages.from_bytes((tmp_path / f"heard_{topic[1:]}").read_bytes(), kind)
+        for topic, kind in kinds.items()
+    )
+    update = small_update(frames=frame)
+    assert [one.child_frame_id for one in tf.transforms] == [f"theatre/{name}" for name in PARTS]
+    for name, one in zip(PARTS, tf.transforms, strict=True):
+        way = pose_of(one)
+        assert way is not None
+        np.testing.assert_allclose(way[:3, 3], update.center_mm(name), atol=1e-9)
+    (camera,) = static.transforms
+    np.testing.assert_allclose(pose_of(camera), TURNED, atol=1e-9)
+    assert (camera.header.frame_id, camera.child_frame_id) == ("table", "camera")
+    assert {value.key for value in status.status[0].values} > {"quality", "rate_hz", "dropped"}
+    objects = {one.id: one for one in scene.world.collision_objects}
+    wanted = {f"tumortrack/{name}" for name in PARTS}
+    assert objects.keys() == wanted | {f"{name}/margin" for name in wanted if "tumor" in name}
+    tumor = objects["tumortrack/tumor_1"].meshes[0].vertices
+    off_mm = 1000 * np.array([[p.x, p.y, p.z] for p in tumor]) - update.center_mm("tumor_1")
+    np.testing.assert_allclose(np.linalg.norm(off_mm, axis=1), 6, atol=0.5)

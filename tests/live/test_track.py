@@ -195,7 +195,7 @@ def test_a_source_that_vanishes_ends_with_a_reason(world, tmp_path):
     [
         (["camera"], "Allowed: realsense, recording, rehearsal, ros2, virtual"),
         (["virtual"], "lacks its case. Write virtual:CASE"),
-        (["virtual:CASE", "screen"], "Allowed: openigtlink, recording, ros2, ur, viewer"),
+        (["virtual:CASE", "screen"], "Allowed: moveit, openigtlink, recording, ros2, ur, viewer"),
         (["virtual:CASE", "viewer:abc"], "Write viewer[:port]"),
         (["virtual:CASE", "viewer", "viewer"], "'viewer' is given twice"),
         (["virtual:CASE", "--smoothing", "9"], "allowed: 0 (off) to 5 s"),

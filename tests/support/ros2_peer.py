@@ -116,7 +116,7 @@ def hear(seconds: float) -> None:
     messages = bus.messages
     _reliable = reliably(bus)
     out = ResultMessages(messages, small_setting()).of(empty_update())
-    kinds = {one.suffix: one.message_type for one in out}
+    kinds = {one.suffix: one.message_type for one in out if not one.suffix.startswith("/")}
     heard = {name: bus.subscriber(f"/tumortrack/{name}", kind) for name, kind in kinds.items()}
     print(json.dumps({"listens": sorted(heard)}), flush=True)
     end_s = time.monotonic() + seconds

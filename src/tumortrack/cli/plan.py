@@ -132,7 +132,11 @@ class Plan(StatedPatient):
             draw_plan(resection, located, aside / "plan.png")
             if self.arms:
                 from tumortrack.plan.arms.body import cell_urdf
+                from tumortrack.plan.ros_trajectories import ros_trajectories
 
+                assert motions is not None
+                said = ros_trajectories(motions, frames.frame_id)
+                store.write_atomically(aside / "trajectories.json", said)
                 store.write_atomically(aside / "cell.urdf", cell_urdf(placed.config).encode())
 
         digest = store.sha256_of(self.run_folder / store.MANIFEST)

@@ -52,7 +52,7 @@ class Track(StatedPatient):
 
     Sources and sinks are written kind:target?option=value&option=value. Sources: virtual:CASE,
     recording:PATH, realsense[:SERIAL|FILE], ros2:TOPIC. Sinks: viewer[:PORT],
-    recording:FOLDER, ros2[:TOPIC], openigtlink[:PORT], and for `resect` ur:HOST.
+    recording:FOLDER, ros2[:TOPIC], moveit, openigtlink[:PORT], and for `resect` ur:HOST.
     Installed packages can add sources and sinks. A wrong one is answered with what is allowed.
     docs/live.md has examples.
 

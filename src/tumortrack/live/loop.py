@@ -220,6 +220,7 @@ class Loop:
             published if lead is None else published.of_camera(lead.published_from_camera),
             seconds,
             latency_ms=1000 * _age_s(born_ns),
+            dropped=self._cameras.dropped,
             views=tuple(views) if several else (),
             cameras=camera_words(numbers, absent) if several else self.views.scanned,
         )

@@ -120,6 +120,7 @@ SINKS = Registry[SinkConfig](
         "viewer": f"{_LIVE}.sinks.viewer:ViewerSinkConfig",
         "recording": f"{_LIVE}.sinks.recording:RecordingSinkConfig",
         "ros2": f"{_LIVE}.sinks.ros:Ros2SinkConfig",
+        "moveit": f"{_LIVE}.sinks.moveit:MoveItSinkConfig",
         "openigtlink": f"{_LIVE}.sinks.openigtlink:OpenIgtLinkSinkConfig",
         "ur": f"{_LIVE}.sinks.ur:UrSinkConfig",
     },

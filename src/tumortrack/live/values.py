@@ -210,6 +210,7 @@ class TrackingResult:
             not have this machine's clock: from the arrival; if it waits for the loop: from the
             reading); None if no frame came.
         workcell: what the arms do with it; None without arms.
+        dropped: frames so far that newer ones overtook.
         views: of several cameras: what each saw. ``cameras``: which of them the estimate is from,
             and of the others why not; of a scan what each look added. In words; else empty.
     """
@@ -226,6 +227,7 @@ class TrackingResult:
     seconds: Mapping[str, float] = field(default_factory=dict)
     latency_ms: float | None = None
     workcell: Workcell | None = None
+    dropped: int = 0
     views: tuple[CameraView, ...] = ()
     cameras: str = ""
 

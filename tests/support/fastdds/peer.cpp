@@ -1,10 +1,11 @@
 // A program that speaks ROS 2's topics over eProsima Fast DDS, without ROS: serialised messages
 // as they are, no generated code. Built and run by tests/test_ros2_processes.py.
 //
-//   peer DOMAIN sub SECONDS TOPIC TYPE FILE
-//       listens; FILE gets the last message, standard output the number of messages
+//   peer DOMAIN sub SECONDS TOPIC TYPE FILE [TOPIC TYPE FILE ...]
+//       listens; each FILE gets the last message, standard output the numbers of messages
 //   peer DOMAIN pub SECONDS HZ TOPIC TYPE FILE [TOPIC TYPE FILE ...]
-//       sends the files' bytes, with the present time as their header's stamp
+//       sends the files' bytes, with the present time as their (first) header's stamp
+// What ends in tf_static is kept for those who come later, sent once, and asked for like that.
 #include <atomic>
 #include <chrono>
 #include <cstring>
@@ -93,31 +94,48 @@ static Topic* topic_of(DomainParticipant* member, const std::string& name, const
     return member->create_topic(name, type, TOPIC_QOS_DEFAULT);
 }
 
-static int listen(DomainParticipant* member, double seconds, char** names)
+static bool is_kept(const std::string& topic)
+{
+    return topic.size() > 9 && topic.compare(topic.size() - 9, 9, "tf_static") == 0;
+}
+
+static int listen(DomainParticipant* member, double seconds, int n, char** names)
 {
     DataReaderQos qos;
     qos.reliability().kind = RELIABLE_RELIABILITY_QOS;
     qos.history().depth = 5;
     qos.endpoint().history_memory_policy =
         eprosima::fastrtps::rtps::PREALLOCATED_WITH_REALLOC_MEMORY_MODE;
-    Listener listener;
+    std::vector<Listener> listeners(n / 3);
     Subscriber* subscriber = member->create_subscriber(SUBSCRIBER_QOS_DEFAULT);
-    subscriber->create_datareader(topic_of(member, names[0], names[1]), qos, &listener);
+    for (int i = 0; i + 2 < n; i += 3)
+    {
+        qos.durability().kind =
+            is_kept(names[i]) ? TRANSIENT_LOCAL_DURABILITY_QOS : VOLATILE_DURABILITY_QOS;
+        subscriber->create_datareader(
+            topic_of(member, names[i], names[i + 1]), qos, &listeners[i / 3]);
+    }
     std::this_thread::sleep_for(std::chrono::duration<double>(seconds));
-    std::lock_guard<std::mutex> guard(listener.lock);
-    std::ofstream(names[2], std::ios::binary).write(listener.last.data(), listener.last.size());
-    std::cout << listener.count << std::endl;
+    for (int i = 0; i + 2 < n; i += 3)
+    {
+        Listener& one = listeners[i / 3];
+        std::lock_guard<std::mutex> guard(one.lock);
+        std::ofstream(names[i + 2], std::ios::binary).write(one.last.data(), one.last.size());
+        std::cout << one.count << (i + 5 < n ? " " : "");
+    }
+    std::cout << std::endl;
     return 0;
 }
 
-static void stamp_now(Bytes& message)
+// ``at``: where in the bytes the stamp is: a TFMessage begins with how many transforms it has.
+static void stamp_now(Bytes& message, size_t at)
 {
     const auto now = std::chrono::system_clock::now().time_since_epoch();
     const auto ns = std::chrono::duration_cast<std::chrono::nanoseconds>(now).count();
     const int32_t seconds = static_cast<int32_t>(ns / 1000000000);
     const uint32_t rest = static_cast<uint32_t>(ns % 1000000000);
-    std::memcpy(message.data() + 4, &seconds, 4);
-    std::memcpy(message.data() + 8, &rest, 4);
+    std::memcpy(message.data() + at, &seconds, 4);
+    std::memcpy(message.data() + at + 4, &rest, 4);
 }
 
 static int publish(DomainParticipant* member, double seconds, double hz, int n, char** names)
@@ -135,6 +153,8 @@ static int publish(DomainParticipant* member, double seconds, double hz, int n, 
     {
         std::ifstream file(names[i + 2], std::ios::binary);
         messages.emplace_back(std::istreambuf_iterator<char>(file), std::istreambuf_iterator<char>());
+        qos.durability().kind =
+            is_kept(names[i]) ? TRANSIENT_LOCAL_DURABILITY_QOS : VOLATILE_DURABILITY_QOS;
         writers.push_back(publisher->create_datawriter(topic_of(member, names[i], names[i + 1]), qos));
     }
     const auto end = Clock::now() + std::chrono::duration<double>(seconds);
@@ -144,8 +164,12 @@ static int publish(DomainParticipant* member, double seconds, double hz, int n, 
     {
         for (size_t i = 0; i < writers.size(); ++i)
         {
-            stamp_now(messages[i]);
-            writers[i]->write(&messages[i]);
+            const std::string type = names[3 * i + 1];
+            if (!is_kept(names[3 * i]) || count == 0)
+            {
+                stamp_now(messages[i], type.find("TFMessage") == std::string::npos ? 4 : 8);
+                writers[i]->write(&messages[i]);
+            }
         }
         next += std::chrono::duration_cast<Clock::duration>(std::chrono::duration<double>(1 / hz));
         std::this_thread::sleep_until(next);
@@ -169,7 +193,7 @@ int main(int argc, char** argv)
     const double seconds = std::stod(argv[3]);
     if (std::string(argv[2]) == "sub")
     {
-        return listen(member, seconds, argv + 4);
+        return listen(member, seconds, argc - 4, argv + 4);
     }
     return publish(member, seconds, std::stod(argv[4]), argc - 5, argv + 5);
 }

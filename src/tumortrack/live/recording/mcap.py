@@ -14,10 +14,9 @@ import numpy as np
 
 from tumortrack.core.errors import InputError, StorageError
 from tumortrack.core.geometry import Affine
-from tumortrack.live.display import wxyz_of
-from tumortrack.live.ros.messages import MM_PER_M, Messages, Outgoing, xyz
+from tumortrack.live.ros.messages import Messages, Outgoing
 from tumortrack.live.ros.sensors import CAMERA_FRAME, messages_seen
-from tumortrack.live.ros.tf import TRANSFORMS
+from tumortrack.live.ros.tf import TRANSFORMS, transform_fields
 from tumortrack.live.values import Observation
 
 CHUNK_S = 0.25  # a killed program loses what is in no chunk yet
@@ -113,14 +112,8 @@ def camera_messages(
         for one in messages_seen(seen, messages, camera)
     ]
     if camera != frame_id:
-        turn = wxyz_of(fixed_from_camera[:3, :3]).tolist()
-        transform = {
-            "translation": xyz(fixed_from_camera[:3, 3] / MM_PER_M),
-            "rotation": dict(zip("wxyz", turn, strict=True)),
-        }
-        header = messages.header(seen.stamp_ns, frame_id)
-        stamped = {"header": header, "child_frame_id": camera, "transform": transform}
-        out.append(Outgoing("/tf", TRANSFORMS, messages.make(TRANSFORMS, transforms=[stamped])))
+        said = transform_fields(messages, seen.stamp_ns, frame_id, camera, fixed_from_camera)
+        out.append(Outgoing("/tf", TRANSFORMS, messages.make(TRANSFORMS, transforms=[said])))
     return out
 
 

@@ -16,7 +16,7 @@ from tumortrack.live.ros.messages import Messages
 
 
 class Publisher(NamedTuple):
-    """One topic out: reliable, volatile, the newest message only, as ROS 2 nodes publish.
+    """One topic out: reliable, the newest message only, volatile unless it was asked to be latched.
 
     ``publish`` sends a message, in ROS 2 CDR with its 4 bytes of header, or raises TumortrackError.
     ``flush`` returns when all reliable subscribers have what was sent, or after so many seconds.
@@ -51,7 +51,9 @@ class Bus(Protocol):
     messages: Messages
     note: str
 
-    def publisher(self, topic: str, kind: str) -> Publisher: ...
+    def publisher(self, topic: str, kind: str, latched: bool = False) -> Publisher:
+        """Announce ``topic``. ``latched``: who subscribes later gets the newest message, too
+        (transient local), as on /tf_static."""
 
     def subscriber(self, topic: str, kind: str, most: int = 5, latched: bool = False) -> Subscriber:
         """Listen to ``topic`` and hold up to ``most`` messages. ``latched``: what was published

@@ -101,9 +101,11 @@ class DdsBus:
                 "names; ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST keeps it on this machine"
             )
 
-    def publisher(self, topic: str, kind: str) -> Publisher:
-        reliable, volatile = Policy.Reliability.Reliable(_BLOCKED_NS), Policy.Durability.Volatile
-        writer: Any = DataWriter(self._writers, *self._endpoint(topic, kind, reliable, volatile, 1))
+    def publisher(self, topic: str, kind: str, latched: bool = False) -> Publisher:
+        durability = Policy.Durability
+        kept = durability.TransientLocal if latched else durability.Volatile
+        reliable = Policy.Reliability.Reliable(_BLOCKED_NS)
+        writer: Any = DataWriter(self._writers, *self._endpoint(topic, kind, reliable, kept, 1))
         # By ctypes, and not by the extension module: that one keeps Python's lock while it waits
         # for a slow subscriber.
         write = DDS._dll_handle.dds_write

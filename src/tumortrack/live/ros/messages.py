@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from tumortrack.core.errors import InputError
+from tumortrack.live.ros.interfaces import INTERFACES
 
 Distro = Literal["noetic", "humble"]
 
@@ -25,11 +26,14 @@ _ZEROS = bytes(4096)  # in ROS 1's form any message, with nothing in it
 
 
 class Outgoing(NamedTuple):
-    """A message, and the end of the name of its topic (``meshes``)."""
+    """A message, and the end of the name of its topic (``meshes``), or a whole name (``/tf``)."""
 
     suffix: str
     message_type: str
     message: Any
+
+    def topic(self, namespace: str) -> str:
+        return self.suffix if self.suffix.startswith("/") else f"{namespace}/{self.suffix}"
 
 
 class PointBlock:
@@ -130,12 +134,15 @@ def stamp_of(header: Any) -> int:
 def _store(distro: Distro) -> Any:
     """A typestore that also writes ``PointBlock``. Shared: it never changes afterwards."""
     try:
-        from rosbags.typesys import Stores, get_typestore
+        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
     except ImportError as error:
         raise InputError(
             "ROS messages need the package rosbags: pip install 'tumortrack[live]'."
         ) from error
     store = get_typestore(Stores.ROS1_NOETIC if distro == "noetic" else Stores.ROS2_HUMBLE)
+    if distro != "noetic":
+        for name, text in INTERFACES.items():
+            store.register(get_types_from_msg(text, name))
     known = store.get_msgdef(_POINT)
 
     def size(pos: int, point: Any, _store: Any) -> int:

@@ -7,13 +7,15 @@ cloud, deleted markers, places that are NaN, a diagnostic with the reason.
 from __future__ import annotations
 
 import textwrap
+import time
+from collections import deque
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float32
 
 from tumortrack.core.colours import GOOD, NONE, POOR, Colour, label_colours, part_colour
-from tumortrack.core.geometry import transform_points
+from tumortrack.core.geometry import rigid, transform_points
 from tumortrack.core.organ import organ_name
 from tumortrack.core.patient import Patient
 from tumortrack.core.types import Mesh, SensorCloud
@@ -21,6 +23,7 @@ from tumortrack.live.display import MOST_SEEN, seen_points, thinned, wxyz_of
 from tumortrack.live.meter import Rate
 from tumortrack.live.ros.messages import MM_PER_M, Messages, Outgoing, PointBlock, xyz
 from tumortrack.live.ros.sensors import CLOUD, cloud_message, plain_cloud
+from tumortrack.live.ros.tf import TRANSFORMS, transform_fields
 from tumortrack.live.values import SinkContext, TrackingResult, TransformedEstimate, Workcell
 
 MARKERS = "visualization_msgs/msg/MarkerArray"
@@ -33,11 +36,13 @@ _DELETE, _DELETE_ALL = 2, 3  # Marker's actions
 _LINE, _TEXT, _TRIANGLES = 4, 9, 11  # and types
 # Markers vanish if nothing follows, so that a stopped loop leaves nothing that looks current.
 _LIFETIME_S = 2
+_STATUS_HZ = 1.0  # of /diagnostics, as rqt's monitor expects it; and at once where a level changes
+_RATE_OVER = 30  # results
 _OK, _WARN, _ERROR, _STALE = range(4)  # DiagnosticStatus
 _LEVELS = {"good": _OK, "poor": _WARN, "none": _ERROR}
 _TEXT_COLOURS = {"good": GOOD, "poor": POOR, "none": NONE}
 _STATE_COLOUR: Colour = (235, 238, 242)
-_ORGAN_OPACITY = 0.35
+ORGAN_OPACITY = 0.35
 _TEXT_HEIGHT_M, _STATE_HEIGHT_M = 0.008, 0.025
 _TEXT_COLUMNS, _STATE_COLUMNS = 44, 70
 _GAP_M = 0.012  # between lines, besides their height: measured in RViz of ROS 1; RViz 2's has 0.005
@@ -53,22 +58,30 @@ class ResultMessages:
     """The messages of one publisher. It remembers what it showed of the arms, so that what is gone
     is deleted.
 
-    ``hz``: triangles, arms' markers and observed points at most so often (0: with every result);
-    without ``observed`` those points are left out.
+    ``namespace``: of their topics; frames on tf are called by it. ``hz``: triangles, arms' markers
+    and observed points at most so often (0: with every result); without ``observed`` those points
+    are left out.
     """
 
     def __init__(
-        self, messages: Messages, context: SinkContext, hz: float = 0.0, observed: bool = True
+        self,
+        messages: Messages,
+        context: SinkContext,
+        hz: float = 0.0,
+        observed: bool = True,
+        namespace: str = "/tumortrack",
     ) -> None:
         self._messages, self._context, self._observed = messages, context, observed
+        self._namespace = namespace.removeprefix("/")
+        self._status_rate, self._levels = Rate(_STATUS_HZ), list[int]()
+        self._times_s = deque[float](maxlen=_RATE_OVER)  # of the last results
         self._meshes_rate, self._markers_rate, self._points_rate = Rate(hz), Rate(hz), Rate(hz)
         self._shown: set[str] = set()
         self._shown_state: tuple[str, bool] | None = None
 
     def of(self, result: TrackingResult) -> list[Outgoing]:
-        """What is published of one result; docs/ros.md says it topic by topic. Nothing is sent on
-        /tf, so a camera's own cloud could not be shown beside what it saw (``observed``). Raises
-        InputError for a stamp that ROS can't say."""
+        """What is published of one result; docs/ros.md says it topic by topic. Raises InputError
+        for a stamp that ROS can't say."""
         header = self._messages.header(result.stamp_ns, result.published_frame.frame_id)
         out: list[Outgoing] = []
 
@@ -87,9 +100,15 @@ class ResultMessages:
             center_mm = result.center_mm(name)
             metres = np.full(3, np.nan) if center_mm is None else center_mm / MM_PER_M
             send(f"{name}/center", PLACE, header=header, point=xyz(metres))
+        out.append(Outgoing("/tf", TRANSFORMS, self._frames(result)))
+        self._times_s.append(time.monotonic())
         arms = [_arms_status(result)] if self._context.arms else []
-        status = [_estimate_status(result, self._context.patient), *arms]
+        status = [_estimate_status(result, self._context.patient, self._hz()), *arms]
         send("diagnostics", DIAGNOSTICS, header=header, status=status)
+        levels = [one["level"] for one in status]
+        if self._status_rate.due() or levels != self._levels:
+            send("/diagnostics", DIAGNOSTICS, header=header, status=status)
+        self._levels = levels
         if not self._context.arms:
             return out
         joints = {} if result.workcell is None else result.workcell.joints_rad
@@ -102,6 +121,27 @@ class ResultMessages:
             out.append(Outgoing("observed", CLOUD, seen))
         return out
 
+    def _frames(self, result: TrackingResult) -> Any:
+        """A transform to each part, of good estimates alone: tf can't say that one is poor. The
+        origin is the middle of the part's box; the axes are the CT's, as the organ is turned now,
+        or, where no motion is known, the published frame's."""
+        parent, transforms, turn = result.published_frame, [], np.eye(3)
+        if result.estimate is not None and result.quality == "good":
+            if (motion := result.estimate.report.get("motion")) is not None:
+                turn = (parent.published_from_camera @ np.array(motion["camera_from_ct"]))[:3, :3]
+            for name in result.estimate.meshes:
+                center_mm = result.center_mm(name)
+                assert center_mm is not None
+                place, child = rigid(turn, center_mm), f"{self._namespace}/{name}"
+                of_whom = result.stamp_ns, parent.frame_id, child
+                transforms.append(transform_fields(self._messages, *of_whom, place))
+        return self._messages.make(TRANSFORMS, transforms=transforms)
+
+    def _hz(self) -> float:
+        """Results a second, over the last ones."""
+        past_s = self._times_s[-1] - self._times_s[0]
+        return (len(self._times_s) - 1) / past_s if past_s > 0 else 0.0
+
     def _organ(self, result: TrackingResult) -> list[dict[str, Any]]:
         """Triangles per part and a text of their quality; everything deleted without estimate."""
         estimate = result.transformed
@@ -109,11 +149,12 @@ class ResultMessages:
         if estimate is None:
             markers.append({"action": _DELETE_ALL})
         elif self._meshes_rate.due():
-            for label, name in enumerate(self._context.parts, start=1):
+            names = dict.fromkeys((*self._context.parts, *estimate.meshes))
+            for label, name in enumerate(names, start=1):
                 if (mesh := estimate.meshes.get(name)) is None:
                     markers.append({"ns": name, "action": _DELETE})
                 else:
-                    opacity = _ORGAN_OPACITY if label == 1 else 1.0
+                    opacity = ORGAN_OPACITY if label == 1 else 1.0
                     markers.append(_triangles(name, mesh, part_colour(label), opacity))
         if estimate is not None or result.workcell is None:  # else the workcell's text says it
             markers.append(_quality_text(result))
@@ -158,7 +199,7 @@ class ResultMessages:
         return points_mm
 
 
-def _estimate_status(result: TrackingResult, patient: Patient) -> dict[str, Any]:
+def _estimate_status(result: TrackingResult, patient: Patient, hz: float) -> dict[str, Any]:
     values: dict[str, Any] = {
         "patient": patient.id,
         "side": patient.side,
@@ -166,6 +207,8 @@ def _estimate_status(result: TrackingResult, patient: Patient) -> dict[str, Any]
         "sequence": result.sequence,
         "stamp_ns": result.stamp_ns,
         "points": 0 if result.organ is None else len(result.organ.points_mm),
+        "rate_hz": f"{hz:.1f}",
+        "dropped": result.dropped,
     }
     if result.latency_ms is not None:
         values["latency_ms"] = f"{result.latency_ms:.3f}"

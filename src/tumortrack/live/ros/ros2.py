@@ -55,10 +55,12 @@ class RclpyBus:
         self._closed = False
         self.note = "as far as the sourced ROS 2 reaches, whoever is there can see and publish"
 
-    def publisher(self, topic: str, kind: str) -> Publisher:
+    def publisher(self, topic: str, kind: str, latched: bool = False) -> Publisher:
         from rclpy.duration import Duration
 
-        profile = self._qos.QoSProfile(depth=1)  # its defaults are ROS 2's: reliable, volatile
+        durability = self._qos.DurabilityPolicy
+        kept = durability.TRANSIENT_LOCAL if latched else durability.VOLATILE
+        profile = self._qos.QoSProfile(depth=1, durability=kept)  # and by default reliable
         writer = self._node.create_publisher(_message_class(kind), topic, profile)
 
         def publish(raw: bytes | memoryview) -> None:

@@ -7,6 +7,8 @@ skew of the camera; see each message): whatever is refused is an InputError.
 
 from __future__ import annotations
 
+import io
+import struct
 from typing import Any
 
 import numpy as np
@@ -21,6 +23,7 @@ from tumortrack.sense.cloud import seen_points
 
 CLOUD = "sensor_msgs/msg/PointCloud2"
 IMAGE = "sensor_msgs/msg/Image"
+COMPRESSED = "sensor_msgs/msg/CompressedImage"
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 CAMERA_FRAME = "camera"
 _UINT8, _FLOAT32, _FLOAT64 = 2, 7, 8  # PointField's numbers
@@ -28,6 +31,8 @@ _FLOATS = {_FLOAT32: "f4", _FLOAT64: "f8"}
 _POINT_FIELDS = {"|u1": _UINT8, "<f4": _FLOAT32, "<u4": _FLOAT32}  # four bytes of colour, by PCL
 DEPTHS = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
 _MASKS = {"mono8": "u1", "8UC1": "u1"}
+_PACKED = struct.Struct("<i2f")  # a number for the packing, and two of compressedDepth's
+_PNG = ["compressedDepth", "png"]
 _LONGEST_SIDE = 8192  # as of Intrinsics
 
 
@@ -110,6 +115,33 @@ def depth_of(image: Any, info: Any, rectified: bool = False, unit_mm: float = 1.
         depth_mm *= np.float32(unit_mm if values.dtype.kind == "u" else 1000)
     depth_mm[~((depth_mm > 0) & (depth_mm < np.inf))] = np.nan
     return DepthFrame(depth_mm, intrinsics, stamp_of(image.header))
+
+
+def image_of(message: Any, messages: Messages) -> Any:
+    """The depth Image in a CompressedImage of image_transport's ``compressedDepth``: a PNG of 16
+    bits behind 12 bytes, the depth itself or, of metres, a / (value - b). Raises InputError for
+    another packing (JPEG, RVL), and for damaged ones."""
+    from PIL import Image
+
+    encoding, _, packing = str(message.format).partition(";")
+    if encoding not in DEPTHS or packing.split() not in (["compressedDepth"], _PNG):
+        raise InputError(
+            f"a packed image came with the format {str(message.format)[:60]!r}; it must be a depth "
+            "image of image_transport's compressedDepth with PNG. Else give the raw topic."
+        )
+    data = bytes(message.data)
+    try:
+        with Image.open(io.BytesIO(data[_PACKED.size :]), formats=["PNG"]) as picture:
+            if not picture.mode.startswith("I;16") or max(picture.size) > _LONGEST_SIDE:
+                raise ValueError(f"mode {picture.mode}, {picture.width} x {picture.height}")
+            depth = np.asarray(picture)
+        _, a, b = _PACKED.unpack_from(data)
+    except Exception as error:  # Pillow raises anything on a damaged file
+        raise InputError(f"a packed depth image came that is damaged ({error}).") from error
+    if DEPTHS[encoding] == "f4":
+        with np.errstate(all="ignore"):  # what has no return is dropped later on
+            depth = np.where(depth == 0, np.nan, a / (depth - np.float64(b))).astype(np.float32)
+    return _image(depth, encoding, message.header, messages)
 
 
 def frame_of(message: Any) -> str:

@@ -1,4 +1,5 @@
-"""Where a camera is by tf: /tf between stamps, /tf_static always."""
+"""Transforms of tf: how they are said, and where a camera is by them (/tf between stamps,
+/tf_static always)."""
 
 from __future__ import annotations
 
@@ -10,9 +11,10 @@ from scipy.spatial.transform import Rotation
 
 from tumortrack.core.errors import NoEstimate
 from tumortrack.core.geometry import Affine, rigid
+from tumortrack.live.display import wxyz_of
 from tumortrack.live.poses import CameraPoses, PoseBuffer, PosesConfig
 from tumortrack.live.ros.bus import Bus
-from tumortrack.live.ros.messages import MM_PER_M, stamp_of
+from tumortrack.live.ros.messages import MM_PER_M, Messages, stamp_of, xyz
 from tumortrack.live.ros.ros2 import Via, open_bus
 from tumortrack.live.values import Observation
 
@@ -98,6 +100,22 @@ class TfPoses(CameraPoses):
         while (parent := self._known.get(names[-1], ("",))[0]) and parent not in names:
             names.append(parent)
         return names
+
+
+def transform_fields(
+    messages: Messages, stamp_ns: int, parent: str, child: str, parent_from_child: Affine
+) -> dict[str, Any]:
+    """The fields of a TransformStamped, of a pose in mm. Raises InputError for a stamp that ROS
+    can't say."""
+    turn = wxyz_of(parent_from_child[:3, :3]).tolist()
+    return {
+        "header": messages.header(stamp_ns, parent),
+        "child_frame_id": child,
+        "transform": {
+            "translation": xyz(parent_from_child[:3, 3] / MM_PER_M),
+            "rotation": dict(zip("wxyz", turn, strict=True)),
+        },
+    }
 
 
 def pose_of(message: Any) -> Affine | None:

@@ -139,7 +139,7 @@ class McapFile:
         text = json.dumps(_report(result), allow_nan=False)
         said = Outgoing("report", STRING, make(STRING, data=text))
         out = [*self._results.of(result), said]
-        out = [one._replace(suffix=f"/tumortrack/{one.suffix}") for one in out]
+        out = [one._replace(suffix=one.topic("/tumortrack")) for one in out]
         if result.observation is None:
             return out
         alone = CameraView(1, result.observation, frame.published_from_camera)

@@ -6,22 +6,27 @@ import time
 from typing import ClassVar
 
 from tumortrack.core.errors import TumortrackError
-from tumortrack.live.ros.bus import Bus, check_topic
+from tumortrack.core.geometry import Affine
+from tumortrack.live.ros.bus import Bus, Publisher, check_topic
 from tumortrack.live.ros.results import ResultMessages
 from tumortrack.live.ros.ros2 import Via, open_bus
-from tumortrack.live.values import SinkConfig, SinkContext, TrackingResult
+from tumortrack.live.ros.sensors import CAMERA_FRAME
+from tumortrack.live.ros.tf import TRANSFORMS, transform_fields
+from tumortrack.live.values import CameraView, SinkConfig, SinkContext, TrackingResult
 
 _FLUSH_S = 0.2  # what was published last leaves within that time
 
 
 class Ros2SinkConfig(SinkConfig, frozen=True, kw_only=True, tag="ros2"):
     """Topics under ``namespace``: see ``live.ros.results``. ``mesh_hz``: surfaces, and arms'
-    markers, at most so often; 0: with every result."""
+    markers, at most so often; 0: with every result. ``camera_tf``: also say, on /tf_static, where
+    cameras that stand still are; not where somebody else says it of the same frames."""
 
     target: ClassVar[str] = "namespace"
 
     namespace: str = "/tumortrack"
     mesh_hz: float = 10.0
+    camera_tf: bool = False
     via: Via = "auto"
 
     def __post_init__(self) -> None:
@@ -39,17 +44,23 @@ class RosSink:
 
     def __init__(self, config: Ros2SinkConfig, context: SinkContext, bus: Bus) -> None:
         self._bus, self.notes = bus, (bus.note,)
-        self._results = ResultMessages(bus.messages, context, config.mesh_hz)
+        namespace = config.namespace
+        self._results = ResultMessages(bus.messages, context, config.mesh_hz, True, namespace)
         self._last: TrackingResult | None = None
+        self._cameras: dict[str, Affine] = {}  # that /tf_static has
+        self._static: Publisher | None = None
+        if config.camera_tf and not context.published_frame.moves:
+            self._static = bus.publisher("/tf_static", TRANSFORMS, latched=True)
         nothing = TrackingResult(sequence=0, stamp_ns=0, published_frame=context.published_frame)
         self._publishers = {
-            suffix: bus.publisher(f"{config.namespace}/{suffix}", message_type)
-            for suffix, message_type, _ in self._results.of(nothing)
+            one.suffix: bus.publisher(one.topic(namespace), one.message_type)
+            for one in self._results.of(nothing)
         }
 
     def publish(self, result: TrackingResult) -> None:
         """Send it on every topic, on the others too where one fails."""
         self._last = result
+        self._say_cameras(result)
         failed: list[str] = []
         for suffix, _, message in self._results.of(result):
             publisher = self._publishers[suffix]
@@ -59,6 +70,27 @@ class RosSink:
                 failed.append(str(error))
         if failed:
             raise TumortrackError(" ".join(failed))
+
+    def _say_cameras(self, result: TrackingResult) -> None:
+        """Where they are, all in one message that is kept, once another one is known."""
+        if self._static is None or result.observation is None:
+            return
+        frame, messages = result.published_frame, self._bus.messages
+        alone = CameraView(1, result.observation, frame.published_from_camera)
+        cameras = {
+            view.seen.frame_id or CAMERA_FRAME: view.published_from_camera
+            for view in result.views or (alone,)
+        }
+        cameras.pop(frame.frame_id, None)
+        if cameras.keys() <= self._cameras.keys():
+            return
+        self._cameras |= cameras
+        said = [
+            transform_fields(messages, result.stamp_ns, frame.frame_id, name, place)
+            for name, place in self._cameras.items()
+        ]
+        message = messages.make(TRANSFORMS, transforms=said)
+        self._static.publish(messages.to_bytes(message))
 
     def close(self) -> None:
         """Say that it is over, so that no estimate stays on a screen, and leave."""

@@ -17,15 +17,18 @@ from tumortrack.live.ros.ros2 import Via, open_bus
 from tumortrack.live.ros.sensors import (
     CAMERA_INFO,
     CLOUD,
+    COMPRESSED,
     IMAGE,
     cloud_of,
     depth_of,
     frame_of,
+    image_of,
     mask_of,
 )
 from tumortrack.live.values import Observation, SourceConfig, SourceLost
 
-_KINDS = {"image": IMAGE, "cloud": CLOUD}
+_KINDS = {"image": IMAGE, "packed": COMPRESSED, "cloud": CLOUD}
+_PACKED = "/compressedDepth"  # how image_transport calls the topic, behind the image's name
 _LOOK_S = 0.1  # how often the graph is asked for the topic's type, until it is known
 # A late frame, or a camera's computer with a wrong time, is no other clock; a bag is older.
 _SAME_CLOCK_NS = 24 * 3600 * 1_000_000_000
@@ -50,7 +53,7 @@ class Ros2SourceConfig(SourceConfig, frozen=True, kw_only=True, tag="ros2"):
     rectified: bool = False
     unit_mm: float = 1.0
     clock: Literal["auto", "host", "other"] = "auto"
-    type: Literal["auto", "image", "cloud"] = "auto"
+    type: Literal["auto", "image", "packed", "cloud"] = "auto"
     via: Via = "auto"
 
     def __post_init__(self) -> None:
@@ -78,7 +81,8 @@ class RosSource:
         self._config, self._bus = config, bus
         self._kind = _KINDS.get(config.type, "")  # of message; empty: what is published
         self._topic, self._name = config.topic, f"ros2:{config.topic}"
-        self._info_topic = config.info or config.topic.rpartition("/")[0] + "/camera_info"
+        beside = config.topic.removesuffix(_PACKED).rpartition("/")[0]
+        self._info_topic = config.info or f"{beside}/camera_info"
         self._frames: Subscriber | None = None
         self._beside: list[tuple[str, Subscriber]] = []
         self._latest: dict[str, Any] = {}  # by type of message: CameraInfo and mask
@@ -121,13 +125,13 @@ class RosSource:
                 return False
             if not self._kind:
                 there = self._bus.types_of(self._topic)
-                wanted = {IMAGE} if mask else set(_KINDS.values())
+                wanted = set(_KINDS.values()) - ({CLOUD} if mask else set())
                 usable = there & wanted
                 if len(usable) != 1 and final and there:
                     raise InputError(
                         f"{self._topic} is published as {' and as '.join(sorted(there))}; it must "
-                        f"be {' or '.join(sorted(wanted))}, and one of them (say which: type=cloud "
-                        "or type=image)."
+                        f"be {' or '.join(sorted(wanted))}, and one of them (say which: "
+                        "type=cloud, image or packed)."
                     )
                 if len(usable) != 1:
                     return False
@@ -137,7 +141,7 @@ class RosSource:
             self._beside = [
                 (kind, self._bus.subscriber(topic, kind, 1, latched))
                 for latched in (False, True)
-                for topic, kind in (beside if self._kind == IMAGE else ())
+                for topic, kind in (() if self._kind == CLOUD else beside)
                 if topic
             ]
             self._frames = self._bus.subscriber(self._topic, self._kind)
@@ -155,6 +159,8 @@ class RosSource:
 
     def _observed(self, raw: bytes | memoryview, arrived_ns: int) -> Observation:
         message = self._bus.messages.from_bytes(raw, self._kind)
+        if self._kind == COMPRESSED:
+            message = image_of(message, self._bus.messages)
         if self._clock == "auto":
             self._clock = "known"
             self.host_clock = abs(arrived_ns - stamp_of(message.header)) < _SAME_CLOCK_NS

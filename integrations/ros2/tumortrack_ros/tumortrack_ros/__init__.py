@@ -1,0 +1,1 @@
+"""tumortrack as a node of ROS 2."""

@@ -1,0 +1,141 @@
+"""Organ, tumors and their margins as obstacles in MoveIt's planning scene; over ROS 2."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any, ClassVar
+
+import numpy as np
+from jaxtyping import Float64
+
+from tumortrack.core.colours import PICKED, Colour, part_colour
+from tumortrack.core.types import Mesh
+from tumortrack.live.meter import Rate
+from tumortrack.live.ros.bus import check_topic
+from tumortrack.live.ros.messages import MM_PER_M, Messages, PointBlock
+from tumortrack.live.ros.results import ORGAN_OPACITY
+from tumortrack.live.ros.ros2 import Via, open_bus
+from tumortrack.live.values import SinkConfig, SinkContext, TrackingResult
+
+SCENE = "moveit_msgs/msg/PlanningScene"
+_MARGIN_OPACITY = 0.25
+_BALL = 100  # directions in which a margin is laid round a surface
+_HERE = {"orientation": {"w": 1.0}}
+
+
+class MoveItSinkConfig(SinkConfig, frozen=True, kw_only=True, tag="moveit"):
+    """Differences to the scene on ``topic``, at most ``hz`` times a second (0: with every result).
+
+    ``detail_mm``: obstacles' triangles are about as long. ``margin_mm``: an obstacle round each
+    tumor, the convex body that holds all within so many mm of it; 0: none.
+    """
+
+    target: ClassVar[str] = "topic"
+
+    topic: str = "/planning_scene"
+    hz: float = 1.0
+    detail_mm: float = 3.0
+    margin_mm: float = 0.0
+    via: Via = "auto"
+
+    def __post_init__(self) -> None:
+        check_topic("topic", self.topic)
+        limits = {"hz": (0, 100), "detail_mm": (0.5, 20), "margin_mm": (0, 50)}
+        self.check_between("moveit:", **limits)
+
+    def open(self, context: SinkContext) -> MoveItSink:
+        """Join the graph and announce the topic."""
+        return MoveItSink(self, context)
+
+
+class MoveItSink:
+    """Only good estimates move the obstacles, and nothing takes them away, not even the end: a
+    planner that forgot the organ would lead an arm through it."""
+
+    def __init__(self, config: MoveItSinkConfig, context: SinkContext) -> None:
+        self._config, self._context, self._rate = config, context, Rate(config.hz)
+        self._bus = open_bus(config.via)
+        self.notes = (self._bus.note,)
+        self._publisher = self._bus.publisher(config.topic, SCENE)
+
+    def publish(self, result: TrackingResult) -> None:
+        """Raises TumortrackError: it was not sent."""
+        if result.transformed is None or result.quality != "good" or not self._rate.due():
+            return
+        messages = self._bus.messages
+        header = messages.header(result.stamp_ns, result.published_frame.frame_id)
+        objects, colours = [], []
+        for name, mesh, colour, opacity in self._obstacles(result.transformed.meshes):
+            rgb = dict(zip("rgb", (value / 255 for value in colour), strict=True))
+            colours.append({"id": name, "color": {**rgb, "a": opacity}})
+            said = {"id": name, "header": header, "pose": _HERE, "mesh_poses": [_HERE]}
+            objects.append({**said, "meshes": [_mesh_fields(messages, mesh)]})  # operation 0: ADD
+        scene = messages.make(
+            SCENE,
+            is_diff=True,
+            robot_state={"is_diff": True},
+            world={"collision_objects": objects},
+            object_colors=colours,
+        )
+        self._publisher.publish(messages.to_bytes(scene))
+
+    def close(self) -> None:
+        """Leave the graph."""
+        self._bus.close()
+
+    def _obstacles(self, meshes: dict[str, Mesh]) -> list[tuple[str, Mesh, Colour, float]]:
+        """Name, surface, colour and opacity of each, published frame."""
+        organ, *tumors = self._context.parts
+        found = []
+        for label, (name, mesh) in enumerate(meshes.items(), start=1):
+            opacity = ORGAN_OPACITY if name == organ else 1.0
+            few = coarser(mesh, self._config.detail_mm)
+            found.append((f"tumortrack/{name}", few, part_colour(label), opacity))
+            if name in tumors and self._config.margin_mm:
+                wider = widened_hull(mesh, self._config.margin_mm)
+                found.append((f"tumortrack/{name}/margin", wider, PICKED, _MARGIN_OPACITY))
+        return found
+
+
+def coarser(mesh: Mesh, cell_mm: float) -> Mesh:
+    """The surface with one vertex in each cube of space, the mean of those that were there: open
+    surfaces stay open, and no point moves by more than the cube's diagonal."""
+    cubes = np.floor(mesh.vertices_mm / cell_mm).astype(np.int64)
+    _, owner, sizes = np.unique(cubes, axis=0, return_inverse=True, return_counts=True)
+    owner = owner.ravel()
+    sums = [np.bincount(owner, axis) for axis in mesh.vertices_mm.T]
+    faces = owner[mesh.faces]
+    turned = np.roll(faces, 1, axis=1)
+    return Mesh(np.stack(sums, axis=1) / sizes[:, None], faces[(faces != turned).all(1)])
+
+
+def widened_hull(mesh: Mesh, margin_mm: float) -> Mesh:
+    """A convex body that holds every point within ``margin_mm`` of the surface."""
+    from scipy.spatial import ConvexHull
+
+    corners = mesh.vertices_mm[ConvexHull(mesh.vertices_mm).vertices]
+    ball = _directions(_BALL)
+    inside = -ConvexHull(ball).equations[:, 3].max()  # radius of the ball that fits into theirs
+    points = (corners[:, None] + ball * (margin_mm / inside)).reshape(-1, 3)
+    hull = ConvexHull(points)
+    faces = hull.simplices.copy()
+    a, b, c = points[faces].transpose(1, 0, 2)
+    inward = np.einsum("ij,ij->i", np.cross(b - a, c - a), hull.equations[:, :3]) < 0
+    faces[inward] = faces[inward][:, ::-1]
+    used, renumbered = np.unique(faces, return_inverse=True)
+    return Mesh(points[used], renumbered.reshape(faces.shape))
+
+
+def _directions(n: int) -> Float64[np.ndarray, "n 3"]:
+    """Unit vectors, evenly over the sphere (Fibonacci's lattice)."""
+    number = np.arange(n) + 0.5
+    z, turn = 1 - 2 * number / n, np.pi * (1 + np.sqrt(5)) * number
+    flat = np.sqrt(1 - z**2)
+    return np.stack([flat * np.cos(turn), flat * np.sin(turn), z], axis=1)
+
+
+def _mesh_fields(messages: Messages, mesh: Mesh) -> dict[str, Any]:
+    """Of a shape_msgs/Mesh, metres."""
+    one = messages.make("shape_msgs/msg/MeshTriangle")
+    faces = [replace(one, vertex_indices=face) for face in mesh.faces.astype(np.uint32)]
+    return {"vertices": PointBlock(mesh.vertices_mm / MM_PER_M), "triangles": faces}
