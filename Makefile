@@ -40,8 +40,8 @@ demo: setup  ## CT -> tumors located in unseen deformed scenes (about 4 minutes 
 	$(BIN)/tumortrack demo
 
 check: setup  ## lint, types, import order, licences
-	$(BIN)/ruff check src lab experiment tests examples tools
-	$(BIN)/ruff format --check src lab experiment tests examples tools
+	$(BIN)/ruff check src lab experiment tests examples tools notebooks
+	$(BIN)/ruff format --check src lab experiment tests examples tools notebooks
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 	$(BIN)/python tools/dependencies.py licences
