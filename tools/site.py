@@ -7,6 +7,7 @@ pages, and turns links that leave docs/ into plain text: the site must work with
 from __future__ import annotations
 
 import argparse
+import posixpath
 import re
 import warnings
 from collections.abc import Iterator
@@ -34,11 +35,17 @@ def on_files(files: Files, config: Any) -> Files:
     return files
 
 
-def on_page_markdown(markdown: str, **_: Any) -> str:
+def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
     """Links into the repository become the text that they stand on."""
-    for name, page in TAKEN_IN.items():
-        markdown = markdown.replace(f"](../{name}", f"]({page}")
-    return re.sub(r"(?<!!)\[([^\]]+)\]\((?:\.\./)+(?:[^)]*)\)", _kept, markdown)
+    for name, taken in TAKEN_IN.items():
+        markdown = markdown.replace(f"](../{name}", f"]({taken}")
+    here = posixpath.dirname(page.file.src_uri)
+
+    def kept(link: re.Match[str]) -> str:
+        inside = not posixpath.normpath(posixpath.join(here, link[2])).startswith("..")
+        return link[0] if inside else link[1]
+
+    return re.sub(r"(?<!!)\[([^\]]+)\]\((\.\./[^)]*)\)", kept, markdown)
 
 
 def on_post_page(output: str, page: Any, **_: Any) -> str:
@@ -49,11 +56,6 @@ def on_post_page(output: str, page: Any, **_: Any) -> str:
 def on_post_template(output_content: str, template_name: str, **_: Any) -> str:
     """Likewise on the page that is shown for missing ones."""
     return output_content.replace(SHIM, "iframe-worker.js")
-
-
-def _kept(link: re.Match[str]) -> str:
-    inside = re.match(r".*\]\(\.\./(\w[\w-]*\.md|images/)", link[0])
-    return link[0] if inside else link[1]
 
 
 def command_line() -> str:

@@ -177,8 +177,9 @@ def train(
         folder: the model's, to write.
         preset: ``clinic`` registers the organ of the CT, ``quick`` and ``paper`` label points.
         config: a changed preset instead: ``msgspec.structs.replace(presets.clinic(anatomy), ...)``.
-        minutes, steps: where to stop; at most one of them (default: the preset's end); 0: learn
-            nothing, take what training starts from.
+        minutes: when to stop (default: the preset's end); 0: learn nothing, take what training
+            starts from.
+        steps: likewise; give at most one of the two.
         workers: processes that make scenes (default: as the machine allows).
         start: folder that `pretrain` wrote, or ``none`` (default: the package's, for ``clinic``).
         report: called every few seconds.
