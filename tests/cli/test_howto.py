@@ -23,6 +23,7 @@ LEFT = {  # what a page's commands leave behind, besides what they print
     "camera": ("RUN/metadata.yaml", "again.json"),
     "ct": ("CASE/qc.png", "RUN/tumor_2.ply", "RUN_WITH_POINTS/points.csv"),
     "evaluate": ("REPORT/index.html",),
+    "organ": ("LIVER/liver.ply",),
     "plan": ("PLAN/plan.png",),
     "ros2": ("report.json",),
     "slicer": ("FOR_SLICER/case.seg.nrrd", "RUN/labels.seg.nrrd"),
