@@ -70,7 +70,9 @@ def stamps(got: list) -> list[int]:
 def test_depth_images_come_back(tmp_path):
     mask = np.zeros((CAMERA.height, CAMERA.width), bool)
     mask[3:9, 4:40] = True
-    updates = [update_number(0), update_number(1, mask=mask), empty_update(2), update_number(3)]
+    rgb = np.random.default_rng(0).integers(0, 255, (CAMERA.height, CAMERA.width, 3), np.uint8)
+    one = update_number(1, mask=mask, picture=rgb)
+    updates = [update_number(0), one, empty_update(2), update_number(3, picture=rgb[..., 0])]
     got = play(record(tmp_path / "r", updates))
     assert stamps(got) == [updates[n].stamp_ns for n in (0, 1, 3)]
     for seen, n in zip(got, (0, 1, 3), strict=True):
@@ -81,6 +83,9 @@ def test_depth_images_come_back(tmp_path):
         np.testing.assert_allclose(back.depth_mm, sent.depth_mm, rtol=2e-7)
     assert got[0].mask is got[2].mask is None
     np.testing.assert_array_equal(got[1].mask, mask)
+    assert got[0].picture is None
+    np.testing.assert_array_equal(got[1].picture, rgb)
+    np.testing.assert_array_equal(got[2].picture, rgb[..., 0])
     assert all(seen.truth is None for seen in got)
 
 

@@ -37,6 +37,7 @@ from tumortrack.live.ros.sensors import (
     depth_of,
     mask_of,
     messages_seen,
+    picture_of,
 )
 from tumortrack.live.values import Observation, PublishedFrame, Workcell
 from workcell_objects import virtual, with_arms, working
@@ -264,6 +265,21 @@ def test_a_mask_is_what_is_not_zero():
     np.testing.assert_array_equal(mask_of(image_message(values, "mono8", 3)), values > 0)
     with pytest.raises(InputError, match="mask"):
         mask_of(image_message(values.astype(np.uint16), "16UC1"))
+
+
+def test_a_picture_is_red_green_and_blue_of_the_depth_image_s_pixels_and_moment():
+    frame = small_frame(STAMP_NS)
+    shape = (*frame.depth_mm.shape, 3)
+    rgb = np.random.default_rng(0).integers(0, 255, shape, np.uint8)
+    bgr = image_message(rgb[..., ::-1].copy(), "bgr8", 5)
+    np.testing.assert_array_equal(picture_of(bgr, frame), rgb)
+    assert picture_of(bgr, small_frame(STAMP_NS + 1)) is None
+    grey = image_message(rgb[..., 0].copy(), "mono8")
+    np.testing.assert_array_equal(picture_of(grey, frame), rgb[..., 0])
+    with pytest.raises(InputError, match="Align"):
+        picture_of(image_message(rgb[1:, :, 0].copy(), "mono8"), frame)
+    with pytest.raises(InputError, match="16UC1"):
+        picture_of(image_message(rgb[..., 0].astype(np.uint16), "16UC1"), frame)
 
 
 @settings(max_examples=200, deadline=None)

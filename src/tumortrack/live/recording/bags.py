@@ -23,7 +23,8 @@ from tumortrack.live.values import Observation
 _KINDS = (sensors.IMAGE, sensors.CLOUD)
 SUFFIXES = (".mcap", ".db3", ".bag")
 ESTIMATES = "/tumortrack/"  # topics of our own estimates, which are no input
-MASK_TOPIC = "/camera/mask"
+OWN_DEPTH = "/camera/depth/image_rect"  # of the sink ``recording``
+MASK_TOPIC, PICTURE_TOPIC = "/camera/mask", "/camera/color/image_raw"
 _REALSENSE = "/device_0/"  # how the RealSense SDK names all its topics
 # https://mcap.dev/spec
 _MAGIC = b"\x89MCAP0\r\n"
@@ -31,9 +32,9 @@ _DATA_END = 0x0F
 
 
 class BagRecording:
-    """An open bag: depth images, each with the camera_info that came last and the mask of its own
-    stamp, or clouds. An empty topic is the only one there is; ``rectified`` and ``unit_mm`` as in
-    ``ros.sensors.depth_of``. Raises InputError if it is no bag or damaged, or if there is not
+    """An open bag: depth images, each with the camera_info that came last and mask and picture of
+    its own stamp, or clouds. An empty topic is the only one there is; ``rectified`` and ``unit_mm``
+    as in ``ros.sensors.depth_of``. Raises InputError if it is no bag or damaged, or if there is not
     exactly one topic to choose.
     """
 
@@ -67,29 +68,35 @@ class BagRecording:
     def frames(self) -> Iterator[RecordedFrame]:
         """From first to last; each call starts again. A damaged frame is one whose ``load``
         raises."""
-        info = self._first(self._info_topic) if self._info_topic else None
-        mask, stamp_ns = None, 0
-        waiting: Any = None  # an image: its camera_info and mask may follow it
+        first = self._first(self._info_topic) if self._info_topic else None
+        beside: dict[str, Any] = {self._info_topic: first}  # by topic: the last
+        stamp_ns = 0
+        waiting: Any = None  # an image: what belongs to it may follow it
         topics = {self._topic, self._info_topic, MASK_TOPIC}
+        if self._topic == OWN_DEPTH:  # elsewhere the picture's pixels may be other ones
+            topics.add(PICTURE_TOPIC)
         for topic, message in chain(self._all(topics), [("", None)]):
             if topic and topic != self._topic:
-                info, mask = (info, message) if topic == MASK_TOPIC else (message, mask)
+                beside[topic] = message
                 continue
             if waiting is not None:
-                yield RecordedFrame(stamp_ns, partial(self._observed, waiting, info, mask))
+                yield RecordedFrame(stamp_ns, partial(self._observed, waiting, {**beside}))
             if message is not None and not isinstance(message, InputError):
                 stamp_ns = stamp_of(message.header)
             waiting = message
 
-    def _observed(self, message: Any, info: Any, mask: Any) -> Observation:
+    def _observed(self, message: Any, beside: dict[str, Any]) -> Observation:
         if isinstance(message, InputError):
             raise message
+        info, mask = beside[self._info_topic], beside.get(MASK_TOPIC)
         if info is None:
             return Observation(sensors.cloud_of(message), 0, frame_id=sensors.frame_of(message))
         frame = sensors.depth_of(message, info, self._rectified, self._unit_mm)
         here = mask is not None and stamp_of(mask.header) == frame.stamp_ns
         seen = sensors.mask_of(mask) if here else None
-        return Observation(frame, 0, seen, frame_id=sensors.frame_of(message))
+        picture = beside.get(PICTURE_TOPIC)
+        picture = picture and sensors.picture_of(picture, frame)
+        return Observation(frame, 0, seen, None, sensors.frame_of(message), picture)
 
     def _all(self, topics: set[str]) -> Iterator[tuple[str, Any]]:
         """Topic and message in the order of their recording; without a topic an InputError, where

@@ -12,7 +12,7 @@ import struct
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, UInt8
 
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import DepthFrame, Intrinsics, SensorCloud
@@ -33,6 +33,7 @@ DEPTHS = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
 _MASKS = {"mono8": "u1", "8UC1": "u1"}
 _PACKED = struct.Struct("<i2f")  # a number for the packing, and two of compressedDepth's
 _PNG = ["compressedDepth", "png"]
+_PICTURES = {"rgb8": "3u1", "bgr8": "3u1", "mono8": "u1", "8UC1": "u1"}
 _LONGEST_SIDE = 8192  # as of Intrinsics
 
 
@@ -154,6 +155,20 @@ def mask_of(image: Any) -> Bool[np.ndarray, "h w"]:
     return _pixels(image, _MASKS, "a mask") != 0
 
 
+def picture_of(image: Any, frame: DepthFrame) -> UInt8[np.ndarray, "h w *rgb"] | None:
+    """An rgb8, bgr8 or mono8 image as the picture of a depth image's pixels; None where it is of
+    another moment. Raises InputError where it is of another size."""
+    if stamp_of(image.header) != frame.stamp_ns:
+        return None
+    picture = _pixels(image, _PICTURES, "a picture")
+    if picture.shape[:2] != frame.depth_mm.shape:
+        raise InputError(
+            f"a picture of {picture.shape[1]} x {picture.shape[0]} pixels came for depth images of "
+            f"{frame.intrinsics.width} x {frame.intrinsics.height}. Align one with the other."
+        )
+    return picture[..., ::-1] if image.encoding == "bgr8" else picture
+
+
 def _intrinsics_of(info: Any, rectified: bool) -> Intrinsics:
     width, height = int(info.width), int(info.height)
     roi = info.roi
@@ -183,7 +198,8 @@ def _intrinsics_of(info: Any, rectified: bool) -> Intrinsics:
 
 
 def _pixels(image: Any, allowed: dict[str, str], what: str) -> np.ndarray:
-    """The values of a single-channel image (height, width), in this machine's byte order."""
+    """The values of an image (height, width), in this machine's byte order; of several channels
+    (height, width, channels)."""
     code = allowed.get(image.encoding)
     if code is None:
         raise InputError(
@@ -191,15 +207,16 @@ def _pixels(image: Any, allowed: dict[str, str], what: str) -> np.ndarray:
             f"{', '.join(allowed)}."
         )
     width, height, step = int(image.width), int(image.height), int(image.step)
-    data = np.frombuffer(image.data, np.uint8)
+    data, wide = np.frombuffer(image.data, np.uint8), np.dtype(code).itemsize
     fits = 0 < width <= _LONGEST_SIDE and 0 < height <= _LONGEST_SIDE
-    if not fits or step < width * int(code[1]) or step * height > data.nbytes:
+    if not fits or step < width * wide or step * height > data.nbytes:
         raise InputError(
             f"{what} came that claims {width} x {height} pixels in rows of {step} bytes, and holds "
             f"{data.nbytes} bytes; it is damaged (allowed: up to {_LONGEST_SIDE} a side)."
         )
     order = ">" if image.is_bigendian else "<"
-    values = np.ndarray((height, width), order + code, data, 0, (step, int(code[1])))
+    pixel = np.dtype(code).newbyteorder(order)
+    values = np.ndarray((height, width), pixel, data, 0, (step, wide))
     return values.astype(values.dtype.newbyteorder("="))
 
 

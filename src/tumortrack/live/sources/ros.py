@@ -24,6 +24,7 @@ from tumortrack.live.ros.sensors import (
     frame_of,
     image_of,
     mask_of,
+    picture_of,
 )
 from tumortrack.live.values import Observation, SourceConfig, SourceLost
 
@@ -50,6 +51,7 @@ class Ros2SourceConfig(SourceConfig, frozen=True, kw_only=True, tag="ros2"):
     topic: str
     info: str = ""
     mask: str = ""
+    picture: str = ""
     rectified: bool = False
     unit_mm: float = 1.0
     clock: Literal["auto", "host", "other"] = "auto"
@@ -57,12 +59,12 @@ class Ros2SourceConfig(SourceConfig, frozen=True, kw_only=True, tag="ros2"):
     via: Via = "auto"
 
     def __post_init__(self) -> None:
-        for name in (self.topic, *filter(None, (self.info, self.mask))):
+        for name in (self.topic, *filter(None, (self.info, self.mask, self.picture))):
             check_topic("topic", name)
         if not 0 < self.unit_mm <= 1000:
             raise InputError(f"ros2: unit_mm is {self.unit_mm:g}; it must lie in 0..1000 mm.")
-        if self.type == "cloud" and (self.info or self.mask):
-            raise InputError("ros2: info and mask belong to a depth image, and not to a cloud.")
+        if self.type == "cloud" and (self.info or self.mask or self.picture):
+            raise InputError("ros2: info, mask and picture belong to a depth image, not a cloud.")
 
     def open(self) -> RosSource:
         """Join the graph; the topic may come later."""
@@ -84,8 +86,8 @@ class RosSource:
         beside = config.topic.removesuffix(_PACKED).rpartition("/")[0]
         self._info_topic = config.info or f"{beside}/camera_info"
         self._frames: Subscriber | None = None
-        self._beside: list[tuple[str, Subscriber]] = []
-        self._latest: dict[str, Any] = {}  # by type of message: CameraInfo and mask
+        self._beside: list[tuple[str, str, Subscriber]] = []
+        self._latest: dict[str, Any] = {}  # by topic: CameraInfo, mask and picture
         self._waiting: bytes | memoryview | None = None  # an image whose CameraInfo is not here yet
         self._passed = 0
         self._lock, self._closed = threading.Lock(), False
@@ -103,7 +105,7 @@ class RosSource:
             left_s = max(0.0, until_s - time.monotonic())
             known = self._frames is not None or self._found(final=not left_s)
             raw = self._newest() if known else None
-            complete = {kind for kind, _ in self._beside} <= self._latest.keys()
+            complete = {topic for topic, *_ in self._beside} <= self._latest.keys()
             if raw is not None and (complete or not left_s):
                 self._waiting = None
                 return self._observed(raw, time.time_ns())
@@ -136,10 +138,11 @@ class RosSource:
                 if len(usable) != 1:
                     return False
                 (self._kind,) = usable
-            beside = ((self._info_topic, CAMERA_INFO), (mask, IMAGE))
+            images = ((mask, IMAGE), (self._config.picture, IMAGE))
+            beside = ((self._info_topic, CAMERA_INFO), *images)
             # In both ways: some nodes publish it once and keep it for those who come later.
             self._beside = [
-                (kind, self._bus.subscriber(topic, kind, 1, latched))
+                (topic, kind, self._bus.subscriber(topic, kind, 1, latched))
                 for latched in (False, True)
                 for topic, kind in (() if self._kind == CLOUD else beside)
                 if topic
@@ -149,9 +152,9 @@ class RosSource:
 
     def _newest(self) -> bytes | memoryview | None:
         assert self._frames is not None
-        for kind, subscriber in self._beside:
+        for topic, kind, subscriber in self._beside:
             for raw in subscriber.take():
-                self._latest[kind] = self._bus.messages.from_bytes(raw, kind)
+                self._latest[topic] = self._bus.messages.from_bytes(raw, kind)
         if came := self._frames.take():
             self._passed += len(came) - 1 + (self._waiting is not None)
             self._waiting = came[-1]
@@ -166,7 +169,7 @@ class RosSource:
             self.host_clock = abs(arrived_ns - stamp_of(message.header)) < _SAME_CLOCK_NS
         if self._kind == CLOUD:
             return Observation(cloud_of(message), arrived_ns, frame_id=frame_of(message))
-        info = self._latest.get(CAMERA_INFO)
+        info = self._latest.get(self._info_topic)
         if info is None:
             raise InputError(
                 f"images come on {self._topic}, but no camera_info on {self._info_topic}. "
@@ -174,11 +177,14 @@ class RosSource:
             )
         frame = depth_of(message, info, self._config.rectified, self._config.unit_mm)
         mask = self._mask_for(frame) if self._config.mask else None
-        return Observation(frame, arrived_ns, mask, frame_id=frame_of(message))
+        image = self._latest.get(self._config.picture)
+        picture = image and picture_of(image, frame)  # one of another moment shows other pixels
+        return Observation(frame, arrived_ns, mask, None, frame_of(message), picture)
 
     def _mask_for(self, frame: DepthFrame) -> Bool[np.ndarray, "h w"]:
         """The newest mask, held against the frame that it goes with."""
-        topic, image, camera = self._config.mask, self._latest.get(IMAGE), frame.intrinsics
+        topic, camera = self._config.mask, frame.intrinsics
+        image = self._latest.get(topic)
         if image is None:
             raise InputError(f"no mask came on {topic} so far.")
         mask, older_ns = mask_of(image), frame.stamp_ns - stamp_of(image.header)
