@@ -185,6 +185,7 @@ class Simulate:
         rotations: poses, as in `train`.
         squeeze: also squeeze and bend the organ as a whole.
         noise: with the depth sensor's noise.
+        sensor: whose, as in `train`.
         elastic: deform the organ as an elastic body in its bed does (plates, instruments, pulls,
             weight, swelling), instead of by the paper's table.
     """
@@ -198,6 +199,7 @@ class Simulate:
     rotations: Literal["limited", "full"] = "limited"
     squeeze: bool = False
     noise: bool = True
+    sensor: Literal["d405", "stereo"] = "d405"
     elastic: bool = False
 
     def run(self) -> None:
@@ -205,7 +207,7 @@ class Simulate:
         say(f"{self.scenes} scenes written to {self.dataset}.")
 
     def scene_config(self) -> SceneConfig:
-        from tumortrack.sense.noise import CLEAN, D405_NOISE
+        from tumortrack.sense.noise import CLEAN, SENSORS
         from tumortrack.simulate import deform
         from tumortrack.simulate.deform.drag import CONFIGURATIONS
         from tumortrack.simulate.scene import PoseConfig, SceneConfig
@@ -220,7 +222,7 @@ class Simulate:
             height=480,
             pose=PoseConfig(rotations=self.rotations),
             deform=tuple(chains if self.squeeze else models),
-            noise=D405_NOISE if self.noise else CLEAN,
+            noise=SENSORS[self.sensor] if self.noise else CLEAN,
         )
 
     def write(self, prefix: str = "") -> None:

@@ -30,6 +30,8 @@ class Train:
             and paper label points.
         rotations: poses to learn: any turn about the camera's axis and tilts up to 15 degrees
             (clinic: 30), or every rotation.
+        sensor: whose errors the scenes have: a RealSense D405's, or those of depth by matching a
+            stereo endoscope's pictures.
         minutes: stop after about so long (default: the preset's end). 0: learn nothing, take what
             training starts from.
         steps: stop after exactly so many steps.
@@ -45,6 +47,7 @@ class Train:
     model: Positional[Path]
     preset: Literal["clinic", "quick", "paper"] = "clinic"
     rotations: Literal["limited", "full"] = "limited"
+    sensor: Literal["d405", "stereo"] = "d405"
     minutes: float | None = None
     steps: int | None = None
     seed: int = 0
@@ -68,11 +71,11 @@ class Train:
 
         from tumortrack.models.folder import is_finished, weakness_of
         from tumortrack.training.model import load_model, start_of
-        from tumortrack.training.presets import PRESETS
+        from tumortrack.training.presets import PRESETS, seen_by
         from tumortrack.training.train import TrainingRun, train
 
         keep_loaded()
-        config = PRESETS[self.preset](case.anatomy, self.rotations)
+        config = seen_by(PRESETS[self.preset](case.anatomy, self.rotations), self.sensor)
         run = TrainingRun(
             anatomy_ct=case.anatomy, up_lps=case.up_lps,
             case_sha256=store.sha256_of(self.case / store.MANIFEST),

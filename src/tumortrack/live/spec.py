@@ -108,6 +108,7 @@ SOURCES = Registry[SourceConfig](
     {
         "virtual": f"{_LIVE}.sources.virtual:VirtualSourceConfig",
         "realsense": f"{_LIVE}.sources.realsense:RealSenseSourceConfig",
+        "stereo": f"{_LIVE}.sources.stereo:StereoSourceConfig",
         "recording": f"{_LIVE}.sources.recording:RecordingSourceConfig",
         "ros2": f"{_LIVE}.sources.ros:Ros2SourceConfig",
     },

@@ -8,11 +8,14 @@ Axial noise: the error of a disparity of s pixels is z^2 s / (f b). For a D405 a
 (f = 447 px, baseline b = 18 mm) and the s = 0.08 that RealSense's engineers advise (0.032 at best;
 github.com/realsenseai/librealsense issue 3904) this is 0.22 mm (0.09 mm) at 150 mm. Correlation:
 one matching window spans several pixels, so near pixels err together.
+
+A matcher on a stereo endoscope's pictures errs in two ways more: the nearer surface spreads over
+edges, and what one camera alone sees has no match.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -25,6 +28,7 @@ from tumortrack.sense.camera import pinhole_of
 if TYPE_CHECKING:
     from tumortrack.sense.kernels import Seen
 
+_NOTHING_MM = np.float32(1e6)
 REFERENCE_MM = 150.0  # the distance at which ``axial_mm`` is stated
 
 
@@ -80,7 +84,13 @@ class NoiseConfig(Config, frozen=True, kw_only=True):
     scatter_share: false points per true one, in pixels without return; their depths are uniform
         from the nearest true depth to the farthest, and ``scatter_mm`` to either side.
     quantum_mm: depth unit of the sensor.
+    fatten_px: how far the nearer surface spreads over what lies ``edge_mm`` or more behind an edge:
+        standard deviation of a normal distribution's magnitude, alike over about ``hole_px``.
+    shadow_px_mm: focal length times baseline; what the right camera does not see, or has outside
+        its picture, is lost.
     """
+
+    LATER = ("fatten_px", "shadow_px_mm")
 
     axial_mm: float = 0.0
     correlated_share: float = 0.0
@@ -97,6 +107,8 @@ class NoiseConfig(Config, frozen=True, kw_only=True):
     scatter_share: float = 0.0
     scatter_mm: float = 10.0
     quantum_mm: float = 0.0
+    fatten_px: float = 0.0
+    shadow_px_mm: float = 0.0
 
     def __post_init__(self) -> None:
         for name in self.__struct_fields__:
@@ -105,7 +117,7 @@ class NoiseConfig(Config, frozen=True, kw_only=True):
                 raise InputError(f"noise {name} is {value}; it must be 0 (off) or positive.")
             if name.endswith("_share") and value > 1:
                 raise InputError(f"noise {name} is {value}; a share lies in 0..1.")
-            if name.endswith("_px") and value < 1:
+            if name in ("correlation_px", "edge_px", "hole_px") and value < 1:
                 raise InputError(f"noise {name} is {value}; at least 1 pixel is needed.")
         if not self.grazing_degrees < 90:
             raise InputError(f"noise grazing_degrees is {self.grazing_degrees}; it must be < 90.")
@@ -125,6 +137,28 @@ D405_NOISE = NoiseConfig(
 )
 
 
+def stereo_noise(focal_px: float, baseline_mm: float, disparity_px: float = 0.3) -> NoiseConfig:
+    """Of depth by semi-global matching of two pictures; ``focal_px`` and ``baseline_mm`` are the
+    endoscope's, ``disparity_px`` the standard deviation of its matches (docs/method.md). Lengths in
+    pixels are of an image as wide as training's, 424."""
+    return NoiseConfig(
+        axial_mm=REFERENCE_MM**2 * disparity_px / (focal_px * baseline_mm),
+        correlated_share=0.95,
+        hole_share=0.02,
+        grazing_share=0.5,
+        distortion_mm=1.0,
+        fatten_px=2.0,
+        shadow_px_mm=220 * baseline_mm,
+    )
+
+
+# Lenses and baseline as of a surgical robot's endoscope at 1280 x 1024.
+STEREO_NOISE = stereo_noise(1040.0, 4.4)
+
+Sensor = Literal["d405", "stereo"]
+SENSORS: dict[Sensor, NoiseConfig] = {"d405": D405_NOISE, "stereo": STEREO_NOISE}
+
+
 def add_noise(frame: DepthFrame, config: NoiseConfig, rng: np.random.Generator) -> DepthFrame:
     """The frame as a noisy sensor would have seen it; the frame itself if all parts are off.
 
@@ -136,6 +170,8 @@ def add_noise(frame: DepthFrame, config: NoiseConfig, rng: np.random.Generator) 
         return frame
     from tumortrack.sense.kernels import seen_pixels
 
+    if config.fatten_px or config.shadow_px_mm:
+        frame = frame.with_depth(_matched(frame.depth_mm, config, seed + 6))
     true_mm = frame.depth_mm
     seen = seen_pixels(true_mm)
     depths_mm = true_mm.ravel()[seen.pixels]
@@ -150,6 +186,34 @@ def add_noise(frame: DepthFrame, config: NoiseConfig, rng: np.random.Generator) 
             values_mm *= quantum_mm
         out_mm.ravel()[pixels] = values_mm
     return frame.with_depth(out_mm)
+
+
+def _matched(true_mm: np.ndarray, config: NoiseConfig, seed: int) -> np.ndarray:
+    """What two cameras' pictures have matches for, and where these belong to a nearer surface."""
+    from scipy.ndimage import minimum_filter
+
+    from tumortrack.sense import kernels
+
+    out_mm = true_mm.copy()
+    disparity_px = config.shadow_px_mm / np.nan_to_num(true_mm, nan=_NOTHING_MM)
+    lost = disparity_px > np.arange(true_mm.shape[1])  # outside the right picture
+    for k in range(1, int(disparity_px.max()) + 1):  # hidden by what stands k pixels to the right
+        lost[:, :-k] |= disparity_px[:, k:] - disparity_px[:, :-k] > k + 0.5
+    out_mm[lost] = np.nan
+    if not config.fatten_px:
+        return out_mm
+    every = kernels.seen_pixels(np.zeros(true_mm.shape, np.float32))
+    smooth = kernels.smooth_at(every, true_mm.shape, config.hole_px, seed).reshape(true_mm.shape)
+    wide_px = config.fatten_px * np.abs(smooth)
+    depth_mm = np.nan_to_num(true_mm, nan=_NOTHING_MM)
+    near_mm = minimum_filter(depth_mm, 3)
+    # Only from jumps: a slope is nearer in its neighbours too.
+    near_mm[depth_mm - near_mm < config.edge_mm] = _NOTHING_MM
+    for step in range(1, int(wide_px.max() + 0.5) + 1):
+        fat = (near_mm < depth_mm - config.edge_mm) & (wide_px > step - 0.5)
+        out_mm[fat] = np.fmin(out_mm, near_mm)[fat]
+        near_mm = minimum_filter(near_mm, 3)
+    return out_mm
 
 
 def _disturb(

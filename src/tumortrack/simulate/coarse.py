@@ -45,11 +45,12 @@ def coarsened(
     if coarse.surface_mm:
         organ = mesh_of(solid_of(organ, "organ").simplify(coarse.surface_mm))
     noise = {name: _shorter(getattr(scene.noise, name), coarse.pixels) for name in _LENGTHS_PX}
+    wide = {n: getattr(scene.noise, n) / coarse.pixels for n in ("fatten_px", "shadow_px_mm")}
     config = msgspec.structs.replace(
         scene,
         width=scene.width // coarse.pixels,
         height=scene.height // coarse.pixels,
-        noise=msgspec.structs.replace(scene.noise, **noise),
+        noise=msgspec.structs.replace(scene.noise, **noise, **wide),
         views=coarse.views,
     )
     return anatomy_ct.of((organ, *anatomy_ct.tumors)), config

@@ -286,4 +286,6 @@ def region_for(
     axes = np.linalg.svd(vertices - vertices.mean(0), full_matrices=False)[2]
     extents_mm = np.ptp(vertices @ axes.T, axis=0)
     size_mm = (0.7 * float(extents_mm.min()), 1.25 * float(extents_mm.max()))
-    return RegionConfig(crop=crop, box_mm=box_mm, organ_mm=size_mm)
+    # A surface as uneven as a noisy sensor shows it is not many pieces.
+    noise_mm = max(RegionConfig().noise_mm, scene.noise.axial_mm)
+    return RegionConfig(crop=crop, box_mm=box_mm, organ_mm=size_mm, noise_mm=noise_mm)

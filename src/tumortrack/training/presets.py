@@ -7,6 +7,7 @@ from typing import Literal
 
 import msgspec
 
+from tumortrack.core.errors import InputError
 from tumortrack.core.types import Anatomy
 from tumortrack.models.config import (
     MlpDecoderConfig,
@@ -21,7 +22,7 @@ from tumortrack.models.normalisation import Aligned, CloudBox
 from tumortrack.registration.canonical_frame import FIELDS, UPRIGHT_MM, half_length_mm
 from tumortrack.registration.rest_shape import long_axis_of
 from tumortrack.sense.clutter import ClutterConfig
-from tumortrack.sense.noise import D405_NOISE, CalibrationConfig
+from tumortrack.sense.noise import CLEAN, D405_NOISE, SENSORS, CalibrationConfig, Sensor
 from tumortrack.sense.occlusion import OcclusionConfig
 from tumortrack.simulate.coarse import CoarseConfig
 from tumortrack.simulate.deform import ChainConfig, DragConfig, ElasticConfig, StretchConfig
@@ -182,3 +183,18 @@ PRESETS: dict[str, Callable[[Anatomy, Rotations], TrainConfig]] = {
     "quick": quick,
     "paper": paper,
 }
+
+
+def seen_by(config: TrainConfig, sensor: Sensor) -> TrainConfig:
+    """The same preset for scenes as another sensor sees them. Raises InputError: its scenes have no
+    noise of a sensor."""
+    noise = config.scene.noise
+    if noise == SENSORS[sensor] or (noise == CLEAN and sensor == "d405"):
+        return config
+    if noise == CLEAN:
+        raise InputError(
+            f"--sensor {sensor} says whose noise scenes have, and this preset's have none. Choose "
+            "the preset clinic."
+        )
+    scene = msgspec.structs.replace(config.scene, noise=SENSORS[sensor])
+    return msgspec.structs.replace(config, scene=scene)

@@ -11,6 +11,7 @@ from tumortrack.core import store
 from tumortrack.core.errors import InputError
 from tumortrack.core.patient import Patient, patient_in
 from tumortrack.live.values import Observation, SourceConfig, SourceLost
+from tumortrack.sense.noise import Sensor
 
 if TYPE_CHECKING:
     from tumortrack.simulate.player import ScenePlayer
@@ -28,6 +29,7 @@ class VirtualSourceConfig(SourceConfig, frozen=True, kw_only=True, tag="virtual"
         table, drape: what lies about the organ.
         instrument: a shaft that comes and pushes, else nothing does.
         breathing, camera_motion, noise: the rest that can be switched off.
+        sensor: whose noise.
     """
 
     target: ClassVar[str] = "case"
@@ -44,6 +46,7 @@ class VirtualSourceConfig(SourceConfig, frozen=True, kw_only=True, tag="virtual"
     breathing: bool = True
     camera_motion: bool = True
     noise: bool = True
+    sensor: Sensor = "d405"
 
     def __post_init__(self) -> None:
         self.check_between("virtual:", fps=(0.1, 1000))
@@ -57,7 +60,7 @@ class VirtualSourceConfig(SourceConfig, frozen=True, kw_only=True, tag="virtual"
         """The room that this shows; building it takes some seconds. Raises ArtifactError if there
         is no case, InputError if case or options make no scene."""
         from tumortrack.imaging.case import load_case
-        from tumortrack.sense.noise import CLEAN, D405_NOISE
+        from tumortrack.sense.noise import CLEAN, SENSORS
         from tumortrack.simulate.player import ScenePlayer, ScenePlayerConfig
 
         off = [
@@ -67,7 +70,7 @@ class VirtualSourceConfig(SourceConfig, frozen=True, kw_only=True, tag="virtual"
         ]
         same = ("width", "height", "distance_mm", "table", "drape")
         options = {name: getattr(self, name) for name in same} | dict.fromkeys(off, 0.0)
-        noise = D405_NOISE if self.noise else CLEAN
+        noise = SENSORS[self.sensor] if self.noise else CLEAN
         config = ScenePlayerConfig(noise=noise, **options)
         case = load_case(self.case)
         return ScenePlayer(case.anatomy, case.up_lps, config, self.seed)
