@@ -195,7 +195,7 @@ def _matched(true_mm: np.ndarray, config: NoiseConfig, seed: int) -> np.ndarray:
     from tumortrack.sense import kernels
 
     out_mm = true_mm.copy()
-    disparity_px = config.shadow_px_mm / np.nan_to_num(true_mm, nan=_NOTHING_MM)
+    disparity_px = config.shadow_px_mm / np.nan_to_num(true_mm, nan=float(_NOTHING_MM))
     lost = disparity_px > np.arange(true_mm.shape[1])  # outside the right picture
     for k in range(1, int(disparity_px.max()) + 1):  # hidden by what stands k pixels to the right
         lost[:, :-k] |= disparity_px[:, k:] - disparity_px[:, :-k] > k + 0.5
@@ -205,7 +205,7 @@ def _matched(true_mm: np.ndarray, config: NoiseConfig, seed: int) -> np.ndarray:
     every = kernels.seen_pixels(np.zeros(true_mm.shape, np.float32))
     smooth = kernels.smooth_at(every, true_mm.shape, config.hole_px, seed).reshape(true_mm.shape)
     wide_px = config.fatten_px * np.abs(smooth)
-    depth_mm = np.nan_to_num(true_mm, nan=_NOTHING_MM)
+    depth_mm = np.nan_to_num(true_mm, nan=float(_NOTHING_MM))
     near_mm = minimum_filter(depth_mm, 3)
     # Only from jumps: a slope is nearer in its neighbours too.
     near_mm[depth_mm - near_mm < config.edge_mm] = _NOTHING_MM

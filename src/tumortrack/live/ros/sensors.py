@@ -214,8 +214,7 @@ def _pixels(image: Any, allowed: dict[str, str], what: str) -> np.ndarray:
             f"{what} came that claims {width} x {height} pixels in rows of {step} bytes, and holds "
             f"{data.nbytes} bytes; it is damaged (allowed: up to {_LONGEST_SIDE} a side)."
         )
-    order = ">" if image.is_bigendian else "<"
-    pixel = np.dtype(code).newbyteorder(order)
+    pixel = np.dtype(code).newbyteorder(">" if image.is_bigendian else "<")
     values = np.ndarray((height, width), pixel, data, 0, (step, wide))
     return values.astype(values.dtype.newbyteorder("="))
 
