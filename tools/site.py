@@ -16,12 +16,10 @@ from typing import Any
 
 import tyro
 from mkdocs.structure.files import File, Files
-from mkdocs.utils import get_relative_url
 
 from tumortrack.cli.main import _commands as all_commands
 
 ROOT = Path(__file__).parents[1]
-SHIM = "https://unpkg.com/iframe-worker/shim"
 TAKEN_IN = {"CONTRIBUTING.md": "contributing.md", "CHANGELOG.md": "changes.md"}
 
 
@@ -46,16 +44,6 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
         return link[0] if inside else link[1]
 
     return re.sub(r"(?<!!)\[([^\]]+)\]\((\.\./[^)]*)\)", kept, markdown)
-
-
-def on_post_page(output: str, page: Any, **_: Any) -> str:
-    """The search's shim for pages opened from a folder: Material names a server, we have a copy."""
-    return output.replace(SHIM, get_relative_url("iframe-worker.js", page.url))
-
-
-def on_post_template(output_content: str, template_name: str, **_: Any) -> str:
-    """Likewise on the page that is shown for missing ones."""
-    return output_content.replace(SHIM, "iframe-worker.js")
 
 
 def command_line() -> str:
