@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -13,7 +14,7 @@ from typing import TYPE_CHECKING
 
 from tyro.conf import Positional
 
-from tumortrack.cli.console import live_line, say
+from tumortrack.cli.console import console, live_line, say
 from tumortrack.core.errors import InputError, TumortrackError
 
 if TYPE_CHECKING:
@@ -64,6 +65,7 @@ class Fleet:
         outcomes: dict[str, Outcome] = {}
         wanted = [partial(_wanted, patient) for patient in patients]
         executor = self._executor()
+        _say_dashboard(getattr(executor, "dashboard", ""))
         signal.signal(signal.SIGTERM, signal.default_int_handler)  # Ray has one that dies
         with _screen() as show:
             try:
@@ -107,6 +109,16 @@ class Fleet:
         from tumortrack_lab.fleet.executors import OnRay, Serial
 
         return Serial() if self.serial else OnRay(self.address, self.cores)
+
+
+def _say_dashboard(address: str) -> None:
+    """Where Ray shows its tasks, if it can. The run's token lets others start programs here: it is
+    shown on a terminal alone."""
+    if not address or find_spec("aiohttp_cors") is None:  # of ray[default]
+        return
+    token = os.environ.get("RAY_AUTH_TOKEN", "")
+    asked = f"; it asks for this token: {token}" if token and console.is_terminal else ""
+    say(f"Ray's dashboard: http://{address}{asked}")
 
 
 def _wanted(patient: Patient) -> Task:
