@@ -69,8 +69,8 @@ def prepare(
         folder: where to write the case with a picture to check it by (qc.png); None: nowhere.
         overwrite: replace a case that lies there.
         options: fields of ``imaging.prepare.PrepareOptions``: ``name``, ``term``,
-            ``organ_hu``, ``tumor_hu``, ``labels``, ``side``, ``organ``, ``tumor``, ``up``,
-            ``series``, ``unit``, ``min_tumor_ml``, ``patient``.
+            ``structure``, ``organ_hu``, ``tumor_hu``, ``labels``, ``side``, ``organ``,
+            ``tumor``, ``up``, ``series``, ``unit``, ``min_tumor_ml``, ``patient``.
 
     Returns:
         The case: anatomy as closed surfaces, labels and CT; CT frame, mm.
@@ -473,7 +473,7 @@ def plan_resection(
     table_from_camera = places.table_under(run.meshes, stand_mm)
     if isinstance(run, Estimate):
         doubt = "" if run.quality == "good" else run.reason
-        seen = places.located(run.cloud, run.meshes, run.motion, table_from_camera)
+        seen = places.located(run.cloud, run.meshes, run.motion, table_from_camera, run.structures)
         seen = replace(seen, patient=run.patient, margin=run.report.get("margin"))
     else:
         doubt, seen = run.doubt, run.located(table_from_camera)

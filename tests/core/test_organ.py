@@ -2,8 +2,8 @@ import json
 
 import numpy as np
 import pytest
-from support.organ_objects import liver, prostate
 
+from organ_objects import liver, prostate
 from tumortrack.core.errors import ArtifactError, InputError
 from tumortrack.core.mesh_files import write_anatomy
 from tumortrack.core.organ import KIDNEY, Organ, organ_first, organ_name

@@ -6,7 +6,7 @@ from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from tyro.conf import Positional, arg
+from tyro.conf import Positional, UseAppendAction, arg
 
 from tumortrack.cli.console import progress_bar, say, say_notes
 from tumortrack.core import store
@@ -26,6 +26,8 @@ class Prepare:
         case: folder to write.
         name: which organ it is; its files, parts and topics bear this name.
         term: SNOMED CT code and meaning of the organ, where NAME is none of the usual ones.
+        structure: NAME=NUMBER (a label) or NAME=PATH (a mesh, closed or open), again for every
+            one: vessels and the like, which move with the organ.
         organ_hu: HU window of the organ in a CT: low (inclusive) and high.
         tumor_hu: HU window of the tumors in a CT.
         labels: the input is a label map (mostly recognised by itself).
@@ -46,6 +48,7 @@ class Prepare:
     case: Positional[Path]
     name: str = "kidney"
     term: tuple[str, str] | None = None
+    structure: UseAppendAction[tuple[str, ...]] = ()
     organ_hu: Annotated[tuple[float, float], arg(aliases=["--kidney-hu"])] = (-300.0, 300.0)
     tumor_hu: tuple[float, float] = (300.0, 1000.0)
     labels: bool = False
@@ -82,8 +85,8 @@ class Export:
 
     Attributes:
         case: folder that `prepare` wrote, or alone one that `locate` wrote.
-        out: folder to write: scene.mrb; of a case also case.seg.nrrd and, with --dicom,
-            segmentation.dcm.
+        out: folder to write: scene.mrb; of a case also case.seg.nrrd, structures as
+            PLY and, with --dicom, segmentation.dcm.
         located: folder that `locate` wrote with this case's model: the scene shows its surfaces,
             and the CT and its segmentation where the organ is.
         live: HOST:PORT of a sink `openigtlink`: the scene connects to it, shows what it sends, and
@@ -130,6 +133,7 @@ class Export:
     def _export_case(self, aside: Path, scene: Scene) -> tuple[str, ...]:
         """Adds the case to the scene and writes what else was asked for; notes."""
         from tumortrack import api
+        from tumortrack.core.mesh_files import write_mesh
         from tumortrack.core.patient import Patient
         from tumortrack.imaging import segmentation
 
@@ -138,6 +142,8 @@ class Export:
         parts = segmentation.segments(case.anatomy.names, patient.side, case.anatomy.kind)
         file = aside / "case.seg.nrrd"
         segmentation.write_seg_nrrd(file, labels.labels, labels.lps_from_index, parts)
+        for name, mesh in case.anatomy.structures.items():
+            write_mesh(aside / f"{name}.ply", mesh)
         moved = (self.located, self.live) != (None, None)
         scene.add_case(self.case, case, file.read_bytes(), moved)
         if self.located is not None:

@@ -9,7 +9,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from tyro.conf import Positional
+from tyro.conf import Positional, UseAppendAction
 
 from tumortrack.cli.console import say, say_notes
 from tumortrack.cli.stated import StatedPatient
@@ -43,6 +43,8 @@ class Plan(StatedPatient):
             (default 0).
         confidence: the margin is of healthy tissue, beyond all errors, with the tumor's place as
             sure as this: 0.95, say (`tumortrack margins`; docs/trust.md).
+        keep_away: STRUCTURE=MM, again for every structure: refuse a plan whose cuts come nearer
+            to it.
         config: JSON file with these and all other choices of the planner (docs/resection.md).
         frame: JSON file that says where the camera is; the plan is then in the robot's frame, whose
             z must point up. Without it, the camera is taken to look straight down.
@@ -64,6 +66,7 @@ class Plan(StatedPatient):
     margin: float | None = None
     sigmas: float | None = None
     confidence: float | None = None
+    keep_away: UseAppendAction[tuple[str, ...]] = ()
     config: Path | None = None
     frame: Path | None = None
     stand: float | None = None
@@ -152,6 +155,8 @@ class Plan(StatedPatient):
         names = {"method": "method", "tumor": "tumor", "margin": "margin_mm", "sigmas": "sigmas"}
         options = {key: getattr(self, name) for name, key in names.items()}
         given = {key: value for key, value in options.items() if value is not None}
+        if self.keep_away:
+            given["keep_away"] = dict(map(_structure_mm, self.keep_away))
         return from_builtins({**written, **given}, ResectionConfig, str(self.config or "options"))
 
     def _budget(
@@ -214,6 +219,15 @@ def check_arms_installed() -> None:
     needed = ("pinocchio", "coal", "toppra", "ruckig", "ur_analytic_ik")
     if missing := [name for name in needed if find_spec(name) is None]:
         raise InputError(f"arms need {', '.join(missing)}: pip install 'tumortrack[arms]'.")
+
+
+def _structure_mm(option: str) -> tuple[str, float]:
+    """Of STRUCTURE=MM; InputError for anything else."""
+    name, _, text = option.partition("=")
+    try:
+        return name, float(text)
+    except ValueError as error:
+        raise InputError(f"--keep-away {option!r} is not STRUCTURE=MM, artery=3 say.") from error
 
 
 def _below(organ: Mesh, config: CellConfig) -> CellConfig:

@@ -231,7 +231,7 @@ class Resect(StatedPatient):
             estimate = result.estimate
             assert estimate is not None
             motion = estimate.motion if unsure else None
-            return located(estimate.cloud, estimate.meshes, motion, way)
+            return located(estimate.cloud, estimate.meshes, motion, way, estimate.structures)
 
         again = msgspec.structs.replace(stored.config, tumor=stored.plan.tumor)
         # In a process of its own: planning for a second must not hold up a frame.

@@ -74,6 +74,8 @@ class Train:
         from tumortrack.training.presets import PRESETS, seen_by
         from tumortrack.training.train import TrainingRun, train
 
+        if case.anatomy.structures and self.preset != "clinic":
+            say_notes([f"{self.preset} knows no motion: structures are left out; clinic has them"])
         keep_loaded()
         config = seen_by(PRESETS[self.preset](case.anatomy, self.rotations), self.sensor)
         run = TrainingRun(

@@ -9,6 +9,7 @@ Colour = tuple[int, int, int]
 
 ORGAN_PART: Colour = (185, 102, 83)
 TUMORS = ((144, 238, 144), (255, 205, 60), (110, 190, 255), (240, 130, 230), (170, 150, 255))
+STRUCTURES = ((214, 40, 40), (70, 110, 220), (245, 225, 170), (150, 110, 60), (60, 170, 160))
 SEEN: Colour = (112, 118, 126)
 ORGAN: Colour = (225, 230, 235)
 REGION: Colour = (64, 70, 82)
@@ -27,6 +28,11 @@ _SWEEPS = ((0, 120, 240), (90, 60, 220), (205, 0, 130))
 def part_colour(label: int) -> Colour:
     """Of label 1, 2, 3, ...: the organ, then the tumors, over again after the fifth."""
     return ORGAN_PART if label == 1 else TUMORS[(label - 2) % len(TUMORS)]
+
+
+def structure_colour(number: int) -> Colour:
+    """Of structure 0, 1, 2, ..., over again after the fifth."""
+    return STRUCTURES[number % len(STRUCTURES)]
 
 
 def label_colours(labels: UInt8[np.ndarray, " n"]) -> UInt8[np.ndarray, "n 3"]:

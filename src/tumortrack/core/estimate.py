@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
@@ -77,6 +78,7 @@ class Estimate:
         quality: ``good`` or ``poor``, and the ``reason``: see ``tracking.quality.judged``.
         patient: whose organ the model is of; that this one lies there nothing verifies.
         organ: which organ that is.
+        structures: what else of the CT moves with it, by name; empty without a motion.
     """
 
     cloud: OccupancyCloud
@@ -89,3 +91,4 @@ class Estimate:
     reason: str = "it was not judged"
     patient: Patient = NOBODY
     organ: Organ = KIDNEY
+    structures: Mapping[str, Mesh] = field(default_factory=dict)

@@ -6,8 +6,8 @@ Labels: 0 outside, 1 organ, 2, 3, ... tumors; a tumor wins where parts overlap.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass, fields
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, fields
 from functools import cached_property
 
 import numpy as np
@@ -134,10 +134,11 @@ class Mesh:
 class Anatomy:
     """Closed surfaces, outermost first: ``parts[0]`` is the whole organ, tumors included (the
     union), so that it is the visible surface; ``parts[n]`` is the tumor labelled n + 1. ``kind``:
-    which organ it is."""
+    which organ it is. ``structures``: further surfaces that move with it, closed or open."""
 
     parts: tuple[Mesh, ...]
     kind: Organ = KIDNEY
+    structures: Mapping[str, Mesh] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if len(self.parts) < 1:
@@ -150,7 +151,7 @@ class Anatomy:
         return part_names(len(self.parts), self.kind.name)
 
     def of(self, parts: Iterable[Mesh]) -> Anatomy:
-        """The same organ with other surfaces."""
+        """The same organ with other surfaces, and no structures."""
         return Anatomy(tuple(parts), self.kind)
 
     @property

@@ -52,7 +52,7 @@ def read_mesh_folder(
     if unit not in (None, "mm", "m"):
         raise InputError(f"unit {unit!r} is not allowed: mm or m.")
     notes: list[str] = []
-    organ, *tumors = [_read(file, 1000.0 if unit == "m" else 1.0, notes) for file in files]
+    organ, *tumors = [read_lps(file, 1000.0 if unit == "m" else 1.0, notes) for file in files]
     _check_unit(organ_file, organ, unit)
     # A bed cut out for an inner tumor is no outside: the outermost shell is the organ.
     organ = largest_shell(closed_mesh(organ, organ_file.name, notes))
@@ -104,7 +104,9 @@ def _natural(path: Path) -> list[Any]:
     return [int(p) if p.isdigit() else p for p in re.split(r"(\d+)", path.stem.lower())]
 
 
-def _read(path: Path, scale: float, notes: list[str]) -> Mesh:
+def read_lps(path: Path, scale: float, notes: list[str]) -> Mesh:
+    """A mesh file's vertices times ``scale``, LPS; a conversion from RAS is noted. InputError where
+    it is none, or of an unknown frame."""
     mesh = read_mesh(path)
     if not np.abs(mesh.vertices_mm).max() < 1e7:
         raise InputError(f"{path} has vertices kilometres away; it is damaged or not in mm.")

@@ -14,12 +14,18 @@ from tumortrack.core.geometry import direction_lps, spacing_mm
 from tumortrack.core.mesh_files import SUFFIXES
 from tumortrack.core.organ import Organ
 from tumortrack.core.patient import UNKNOWN, Patient, Side
-from tumortrack.core.types import ORGAN, Anatomy, LabelVolume, Volume
+from tumortrack.core.types import ORGAN, Anatomy, LabelVolume, Mesh, Volume
 from tumortrack.imaging.case import Case
 from tumortrack.imaging.grid import grown_box, voxel_ml
 from tumortrack.imaging.meshes import label_meshes, read_mesh_folder
 from tumortrack.imaging.segment import ORGAN_HU, TUMOR_HU, segment_ct
 from tumortrack.imaging.select import MIN_TUMOR_ML, select_labels
+from tumortrack.imaging.structures import (
+    described,
+    read_structures,
+    set_apart,
+    stated_structures,
+)
 from tumortrack.imaging.surface import surfaces
 from tumortrack.imaging.symmetry import alike, half_turns, warning
 from tumortrack.imaging.volume import is_label_map, labels_of, read_raw, volume_of
@@ -47,6 +53,8 @@ class PrepareOptions:
         min_tumor_ml: smaller tumors are reported and dropped.
         patient: an identifier, instead of the DICOM PatientID; None: that, or unknown.
         name: which organ it is: lower-case letters, digits and _.
+        structure: ``NAME=NUMBER`` of a label map, or ``NAME=PATH`` of a mesh: surfaces that move
+            with the organ.
         term: SNOMED CT code and meaning of an organ whose name is not known here.
     """
 
@@ -63,6 +71,7 @@ class PrepareOptions:
     patient: str | None = None
     name: str = "kidney"
     term: tuple[str, str] | None = None
+    structure: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.min_tumor_ml) and self.min_tumor_ml >= 0):
@@ -72,6 +81,7 @@ class PrepareOptions:
         if self.side not in (None, "left", "right"):
             raise InputError(f"side {self.side!r} is not allowed: left or right (the patient's).")
         self.kind.check_side(self.side)
+        stated_structures(self.structure, self.name)
         if self.unit not in (None, "mm", "m"):
             raise InputError(f"unit {self.unit!r} is not allowed: mm or m.")
         if self.patient is not None:
@@ -104,6 +114,7 @@ def prepare(input: Path, options: PrepareOptions | None = None) -> Case:
         is_meshes = any(p.suffix.lower() in SUFFIXES for p in inside)
         case = _from_meshes(input, options) if is_meshes else _from_volume(input, options)
         _check_organ_outside(case.labels)
+        case = _with_structures(case, options)
         source_sha256 = store.sha256_of(input)
     except OSError as error:
         raise InputError(f"{input} cannot be read: {error.strerror or error}.") from error
@@ -117,6 +128,22 @@ def prepare(input: Path, options: PrepareOptions | None = None) -> Case:
     }
     origin |= {"half_turn": looks, "notes": [*notes, said] if said else notes}
     return replace(case, up_lps=up, report={**case.report, **origin})
+
+
+def _with_structures(case: Case, options: PrepareOptions) -> Case:
+    """With those in mesh files as well, and what is known of all."""
+    stated = stated_structures(options.structure, options.name)
+    read, notes = read_structures(stated, options.unit)
+    structures = {**case.anatomy.structures, **read}
+    if lacking := [name for name in stated if name not in structures]:
+        raise InputError(
+            f"--structure {lacking[0]}={stated[lacking[0]]}: a number is a label of a label map, "
+            "and this is none. Give a mesh."
+        )
+    about, more = described(structures, case.anatomy, case.labels)
+    report = {**case.report, "notes": [*case.report["notes"], *notes, *more]}
+    anatomy = replace(case.anatomy, structures=structures)
+    return replace(case, anatomy=anatomy, report={**report, "structures": about})
 
 
 def _check_organ_outside(labels: LabelVolume) -> None:
@@ -147,13 +174,16 @@ def _from_volume(path: Path, options: PrepareOptions) -> Case:
         _refuse_unused(f"{path} is one file", options, "series")
     raw = read_raw(path, options.series)
     as_labels = options.labels or (path.is_file() and is_label_map(raw))
-    ct, notes, stated, side = None, list(raw.notes), raw.patient, options.stated_side
+    structures: dict[str, Mesh] = {}
+    ct, notes, whose, side = None, list(raw.notes), raw.patient, options.stated_side
     if as_labels:
         _refuse_unused(f"{path} is read as a label map", options, *_OF_CT, "unit")
         if not options.labels:
             notes.append("few distinct whole numbers: read as a label map, not as a CT")
         source = labels_of(raw, path)
         del raw  # the largest maps are gigabytes: one copy is enough
+        stated = stated_structures(options.structure, options.name)
+        source, structures = set_apart(source, stated, options.organ)
         labels, more, side = select_labels(
             source,
             options.side,
@@ -172,6 +202,7 @@ def _from_volume(path: Path, options: PrepareOptions) -> Case:
         )
         ct = _crop_ct(volume, labels)
     anatomy, surface = surfaces(labels, options.kind)
+    anatomy = replace(anatomy, structures=structures)
     notes += more
     notes += [
         f"{name}: the surface's volume is {change:+.1f} % off its labels'; it is too thin or hangs "
@@ -180,7 +211,7 @@ def _from_volume(path: Path, options: PrepareOptions) -> Case:
         if abs(change) > _MOST_CHANGE_PERCENT
     ]
     report = {"kind": "label map" if as_labels else "ct", "notes": notes}
-    patient = _patient(path, stated, options.patient, side)
+    patient = _patient(path, whose, options.patient, side)
     return Case(
         anatomy, labels, _UP_LPS, {**report, **_measured(labels, anatomy, surface)}, ct, patient
     )

@@ -56,7 +56,7 @@ def surfaces(
     for name, mask in zip(names, masks, strict=True):
         if not mask.any():
             raise InputError(f"the labels have no voxel of {name}; number the tumors without gap.")
-        mesh = _surface(name, mask, affine, step)
+        mesh = surface_of(name, mask, affine, step)
         ml, mesh_ml = float(mask.sum()) * voxel_ml(affine), mesh.volume_mm3 / 1000
         distance = _boundary_distance(mesh, mask, affine)
         p95 = np.percentile(distance, 95)
@@ -70,7 +70,16 @@ def surfaces(
     return Anatomy(tuple(parts), kind), report
 
 
-def _surface(name: str, mask: np.ndarray, affine: np.ndarray, step_mm: float) -> Mesh:
+def surface_of(
+    name: str,
+    mask: np.ndarray,
+    affine: np.ndarray,
+    step_mm: float,
+    keep: Callable[[Mesh], Mesh] | None = None,
+) -> Mesh:
+    """The closed surface of a mask, LPS mm, faces outward, with the mask's volume. ``keep``: what
+    of its pieces; None: the largest. Raises InputError: it is too small or thin for a surface."""
+    keep = keep or largest_shell
     from scipy import ndimage
 
     spacing = spacing_mm(affine)
@@ -98,7 +107,7 @@ def _surface(name: str, mask: np.ndarray, affine: np.ndarray, step_mm: float) ->
         vertices, faces, _, _ = measure.marching_cubes(field, level, gradient_direction="ascent")
         vertices_mm = transform_points(affine, vertices.astype(np.float64) * scale + offset)
         mesh = Mesh(vertices_mm, faces[:, ::-1] if np.linalg.det(affine[:3, :3]) < 0 else faces)
-        mesh = largest_shell(mesh)
+        mesh = keep(mesh)
         mesh = mesh if mesh.volume_mm3 > 0 else Mesh(mesh.vertices_mm, mesh.faces[:, ::-1])
         return mesh, mesh.volume_mm3 / wanted_mm3 - 1
 

@@ -132,6 +132,7 @@ class TransformedEstimate:
     labels: UInt8[np.ndarray, " n"]
     probability: Float32[np.ndarray, " n"]
     meshes: dict[str, Mesh]
+    structures: dict[str, Mesh] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
@@ -237,12 +238,12 @@ class TrackingResult:
         if self.estimate is None:
             return None
         way, cloud = self.published_frame.published_from_camera, self.estimate.cloud
-        meshes = {
-            name: mesh.moved(transform_points(way, mesh.vertices_mm))
-            for name, mesh in self.estimate.meshes.items()
-        }
+        meshes, structures = (
+            {name: one.moved(transform_points(way, one.vertices_mm)) for name, one in some.items()}
+            for some in (self.estimate.meshes, self.estimate.structures)
+        )
         points_mm = transform_points(way, cloud.points_mm)
-        return TransformedEstimate(points_mm, cloud.labels, cloud.probability, meshes)
+        return TransformedEstimate(points_mm, cloud.labels, cloud.probability, meshes, structures)
 
     def center_mm(self, part: str) -> Float64[np.ndarray, " 3"] | None:
         """The centre of a part's box (of its axes in the camera frame), in the published frame."""
@@ -307,6 +308,11 @@ class SinkContext:
     patient: Patient = NOBODY
     cameras: tuple[Float64[np.ndarray, "4 4"], ...] = ()
     tip_mm: Callable[[str, Float64[np.ndarray, " 6"]], Float64[np.ndarray, " 3"]] | None = None
+
+    @property
+    def structures(self) -> tuple[str, ...]:
+        """Names of what else moves with the organ."""
+        return () if self.anatomy_ct is None else tuple(self.anatomy_ct.structures)
 
 
 @runtime_checkable

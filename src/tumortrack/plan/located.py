@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -46,6 +46,7 @@ def located(
     meshes: Mapping[str, Mesh],
     motion: Motion | None,
     table_from_camera: Float[np.ndarray, "4 4"],
+    structures: Mapping[str, Mesh] | None = None,
 ) -> Located:
     """An estimate's parts (camera frame) in the table's frame, with the tumors' uncertainty."""
     deviations, moved = {}, {}
@@ -56,7 +57,12 @@ def located(
         if std_mm is not None:
             deviations[name] = std_mm
     points_mm = transform_points(table_from_camera, cloud.points_mm)
-    return Located(points_mm, cloud.labels, moved, deviations, cloud.stamp_ns)
+    carried = {
+        name: mesh.moved(transform_points(table_from_camera, mesh.vertices_mm))
+        for name, mesh in (structures or {}).items()
+    }
+    stamp_ns = cloud.stamp_ns
+    return Located(points_mm, cloud.labels, moved, deviations, stamp_ns, structures=carried)
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,10 +76,11 @@ class LocatedRun:
     doubt: str = ""  # why it is poor; empty: it is good
     patient: Patient = NOBODY
     margin: dict[str, Any] | None = None  # as in its report
+    structures: Mapping[str, Mesh] = field(default_factory=dict)
 
     def located(self, table_from_camera: Float[np.ndarray, "4 4"]) -> Located:
         """In the table's frame; a surface's uncertainty is that of the nearest points."""
-        found = located(self.cloud, self.meshes, None, table_from_camera)
+        found = located(self.cloud, self.meshes, None, table_from_camera, self.structures)
         found = replace(found, patient=self.patient, margin=self.margin)
         if self.std_mm is None:
             return found
@@ -125,6 +132,8 @@ def read_run(folder: Path) -> LocatedRun:
     meshes = {
         name: read_mesh(folder / f"{name}.ply") for name in organ_first(surfaces - {path.stem})
     }
+    carried = report.get("structures", [])
+    structures = {name: meshes.pop(name) for name in list(meshes) if name in carried}
     organ = organ_name(meshes) or KIDNEY.name
     found = [
         organ if label == ORGAN else name_of(label) for label in np.unique(cloud.labels) if label
@@ -138,4 +147,4 @@ def read_run(folder: Path) -> LocatedRun:
         std_mm = parse_ply_properties(content, str(path), ("largest_std_mm",))[:, 0]
     except InputError:  # a method, or an older version, without it
         std_mm = None
-    return LocatedRun(cloud, meshes, std_mm, doubt, patient, report.get("margin"))
+    return LocatedRun(cloud, meshes, std_mm, doubt, patient, report.get("margin"), structures)

@@ -8,9 +8,10 @@ from __future__ import annotations
 import numpy as np
 import shapely
 from jaxtyping import Float
-from scipy.spatial import ConvexHull, QhullError
+from scipy.spatial import ConvexHull, QhullError, cKDTree
 
 from tumortrack.core.errors import InputError, NoPlan
+from tumortrack.core.organ import organ_name
 from tumortrack.core.types import FIRST_TUMOR, ORGAN
 from tumortrack.plan.margin import margin_plan
 from tumortrack.plan.outline import common, concave_hull, evenly, grown, polygon_of, rings_of
@@ -25,6 +26,7 @@ from tumortrack.plan.values import (
 )
 
 _DIRECTIONS, _MOST = 192, 12_000  # of the hull, points it is made of: off by 0.5 mm
+_WALL_MM = 1.0  # between points of the piece's wall and of structures
 _FEWEST = 30  # points that define a tumor's shape
 _WHOLE = 0.99  # of another tumor's points
 
@@ -37,7 +39,7 @@ def plan_resection(located: Located, config: ResectionConfig) -> ResectionPlan:
     layers, cuts, grasp_mm = method(located, label, config)
     taken = inside(layers, located.points_mm)
     volumes_ml = _volumes_ml(located, label, taken)
-    notes = _others(located, label, taken, layers)
+    notes = _others(located, label, taken, layers) + _kept_away(located, layers, cuts, config)
     healthy_share = volumes_ml["healthy"] / volumes_ml["parenchyma"]
     if healthy_share > config.most_healthy:
         raise NoPlan(
@@ -98,9 +100,11 @@ def _chosen_tumor(located: Located, config: ResectionConfig) -> tuple[int, float
             f"{inside} wholly inside the organ ({shares[label]:.0%} outside its hull, "
             f"{config.least_exophytic:.0%} are needed): there is no contour to cut along."
         )
-    _ = located.organ
-    if lacking := [part for part in names if part not in located.meshes]:
-        raise NoPlan(f"{lacking[0]} has no surface to keep a margin from. Locate it again.")
+    needed = (organ_name(located.meshes), *names)
+    if lacking := [part for part in needed if part not in located.meshes]:
+        raise NoPlan(
+            f"{lacking[0] or 'the organ'} has no surface to keep a margin from. Locate it again."
+        )
     return label, shares[label]
 
 
@@ -142,6 +146,37 @@ def inside(layers: tuple[CutLayer, ...], points_mm: Float[np.ndarray, "n 3"]) ->
         shapely.prepare(area)
         found[near] = shapely.contains_xy(area, x[near], y[near])
     return found
+
+
+def _kept_away(
+    located: Located, layers: tuple[CutLayer, ...], cuts: tuple[Cut, ...], config: ResectionConfig
+) -> tuple[str, ...]:
+    """Structures that nobody asked to keep away from. InputError: one that was not located; NoPlan:
+    a stroke, or the wall of the piece, comes nearer to one than it may."""
+    if lacking := sorted(config.keep_away.keys() - located.structures.keys()):
+        raise InputError(
+            f"keep away from {lacking[0]}: located were {', '.join(located.structures) or 'none'}."
+        )
+    high = located.organ.box_mm[1, 2]
+    walls = [
+        np.column_stack([ring, np.full(len(ring), z)])
+        for layer in layers
+        for z in np.arange(layer.bottom_mm, min(layer.top_mm, high) + _WALL_MM, _WALL_MM)
+        for ring in (evenly(np.concatenate([one, one[:1]]), _WALL_MM) for one in layer.rings_mm)
+    ]
+    cut_mm = np.concatenate([*(cut.path_mm for cut in cuts), *walls])
+    for name, least_mm in config.keep_away.items():
+        away_mm, _ = cKDTree(located.structures[name].spread_mm(_WALL_MM)).query(cut_mm)
+        nearest = int(away_mm.argmin())
+        if away_mm[nearest] < least_mm:
+            x, y, z = cut_mm[nearest]
+            raise NoPlan(
+                f"a cut would come within {away_mm[nearest]:.1f} mm of {name}, at x {x:.0f}, "
+                f"y {y:.0f}, z {z:.0f} mm (table); {least_mm:g} mm are to be kept. "
+                "Ask for a smaller margin or distance, or plan another tumor."
+            )
+    others = [name for name in located.structures if name not in config.keep_away]
+    return (f"Nothing keeps the cuts away from {', '.join(others)}.",) if others else ()
 
 
 def _volumes_ml(located: Located, label: int, taken: np.ndarray) -> dict[str, float]:

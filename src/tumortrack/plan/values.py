@@ -6,9 +6,11 @@ All in the ``table`` frame, mm: z up against gravity, its origin on the table's 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
+import msgspec
 import numpy as np
 from jaxtyping import Float, Float64, UInt8
 
@@ -44,6 +46,7 @@ class ResectionConfig(Config, frozen=True, kw_only=True):
         lead_mm: strokes begin and end so far outside the organ.
         least_exophytic: a tumor with a smaller share outside the organ's hull lies wholly inside.
         most_healthy: the largest share of the organ's healthy tissue that a plan may take.
+        keep_away: structures that no cut may come near to, with the least distance in mm.
     """
 
     method: Method = "margin"
@@ -59,10 +62,13 @@ class ResectionConfig(Config, frozen=True, kw_only=True):
     least_exophytic: float = 0.05
     most_healthy: float = 0.5
     most_margin_mm: float = 20.0
+    keep_away: dict[str, float] = msgspec.field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self.check_between("plan:", margin_mm=MARGIN_MM, most_margin_mm=(20, 60), sigmas=(0, 10))
         self.check_between("plan:", spacing_mm=(0.2, 10), layer_mm=(1, 20), stroke_mm=(1, 30))
+        if not all(0 < mm <= 50 for mm in self.keep_away.values()):
+            raise InputError(f"plan: keep_away is {self.keep_away}; allowed: above 0 to 50 mm.")
         self.check_between("plan:", lead_mm=(0, 30), least_exophytic=(0, 1), most_healthy=(0, 1))
 
 
@@ -81,6 +87,7 @@ class Located:
         std_mm: per tumor, the standard deviation of each of its mesh's vertices along the axis that
             is least sure; left out where the estimate has none.
         margin: what margins the estimate states (``models.margins``).
+        structures: further surfaces that were carried along, closed or open.
     """
 
     points_mm: Float[np.ndarray, "n 3"]
@@ -90,6 +97,7 @@ class Located:
     stamp_ns: int = 0
     patient: Patient = NOBODY
     margin: dict[str, Any] | None = None
+    structures: Mapping[str, Mesh] = field(default_factory=dict)
 
     def of(self, label: int) -> Float[np.ndarray, "m 3"]:
         return self.points_mm[self.labels == label]

@@ -67,6 +67,7 @@ class _Registered:
     meshes: dict[str, Mesh]
     sample_mm2: Float[np.ndarray, "k 3 3"]
     middle_mm2: Float[np.ndarray, "parts 3 3"]
+    structures: dict[str, Mesh]
 
     def probability(self, mine: _OrganPoints) -> Float32[np.ndarray, " n"]:
         """The chance that each point lies on the side of the nearest surface where it was found,
@@ -86,7 +87,9 @@ class RegistrationLocator:
         anatomy = model.shape.anatomy_ct
         self.anatomy_ct: Anatomy | None = anatomy
         vertices = [part.vertices_mm for part in anatomy.parts]
-        self._vertices_ct = np.concatenate(vertices).astype(np.float32)
+        self._surfaces = (*anatomy.parts, *anatomy.structures.values())
+        together = np.concatenate([mesh.vertices_mm for mesh in self._surfaces])
+        self._vertices_ct = together.astype(np.float32)
         few = [_SAMPLES // 2, *[64] * len(anatomy.tumors)]
         some = [v[:: max(1, len(v) // count)] for v, count in zip(vertices, few, strict=True)]
         self._samples_ct = np.concatenate(some)
@@ -112,7 +115,8 @@ class RegistrationLocator:
         report = self._report(frame, placed, inside, size=size, voxel_mm=voxel_mm)
         self._add_looks(report, looks, fit, others)
         volume = CameraLabels(labels, camera_from_index)
-        return Estimate(inside, volume, placed.meshes, report, placed.motion)
+        made = Estimate(inside, volume, placed.meshes, report, placed.motion)
+        return replace(made, structures=placed.structures)
 
     def follow(
         self, cloud: SensorCloud, last: Estimate | None, how: Following, others: Sequence[Look] = ()
@@ -148,7 +152,8 @@ class RegistrationLocator:
         smoothing = {"time_s": how.smoothing_s, "lag_ms": 1000 * lag_s}
         report = self._report(frame, placed, inside, size=size, smoothing=smoothing)
         self._add_looks(report, looks, fit, others)
-        return Estimate(inside, None, placed.meshes, report, placed.motion, unsmoothed)
+        made = Estimate(inside, None, placed.meshes, report, placed.motion, unsmoothed)
+        return replace(made, structures=placed.structures)
 
     def _looks(self, frame: Frame, others: Sequence[Look], every: int = 1) -> Looks:
         """The first camera's points, and those of further looks."""
@@ -202,20 +207,24 @@ class RegistrationLocator:
         )
         anatomy = self._shape.anatomy_ct
         moved = motion.carry(self._vertices_ct)
-        ends = np.cumsum([len(part.vertices_mm) for part in anatomy.parts])[:-1]
-        parts = zip(anatomy.names, anatomy.parts, np.split(moved, ends), strict=True)
-        meshes = {name: part.moved(places) for name, part, places in parts}
+        ends = np.cumsum([len(mesh.vertices_mm) for mesh in self._surfaces])[:-1]
+        names = (*anatomy.names, *anatomy.structures)
+        there = zip(names, self._surfaces, np.split(moved, ends), strict=True)
+        surfaces = {name: mesh.moved(places) for name, mesh, places in there}
+        structures = {name: surfaces.pop(name) for name in anatomy.structures}
         known_mm2 = motion.covariance_mm2(
             np.concatenate([self._samples_ct, self._shape.middles_ct])
         )
         assert known_mm2 is not None
         count = len(self._samples_ct)
-        return _Registered(fit, motion, meshes, known_mm2[:count], known_mm2[count:])
+        return _Registered(fit, motion, surfaces, known_mm2[:count], known_mm2[count:], structures)
 
     def _report(
         self, frame: Frame, placed: _Registered, inside: OccupancyCloud, **more: Any
     ) -> dict[str, Any]:
         fit, motion, process = placed.fit, placed.motion, placed.motion.discrepancy
+        if placed.structures:
+            more["structures"] = list(placed.structures)
         parts = describe_parts(self._model.parts, placed.meshes, inside)
         surfaces = np.split(placed.sample_mm2, self._sample_ends)
         for part, mm2, its_mm2 in zip(parts.values(), placed.middle_mm2, surfaces, strict=True):

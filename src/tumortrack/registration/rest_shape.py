@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float32, Float64, UInt8
 
 from tumortrack.core.errors import InputError
-from tumortrack.core.organ import KIDNEY, Organ
+from tumortrack.core.organ import KIDNEY, Organ, check_name
 from tumortrack.core.process import parallel_for
 from tumortrack.core.types import Anatomy, Mesh
 from tumortrack.imaging.symmetry import alike, half_turns
@@ -21,7 +21,7 @@ _STEPS = 40  # of a distance field, along the part's longest side
 _FINEST_MM, _COARSEST_MM = 0.5, 2.0
 _REACH = 10  # steps about a part; farther out the distance is that of the nearest border
 _AT_ONCE = 4096  # points: a thread's part
-_BODY = "body."
+_BODY, _STRUCTURE, _VERTICES = "body.", "structure.", "vertices_mm"
 
 
 def distance_of(mesh: Mesh) -> DistanceField:
@@ -87,6 +87,9 @@ class RestShape:
         for n, (part, field) in enumerate(zip(self.anatomy_ct.parts, self.distances, strict=True)):
             named = {"vertices_mm": part.vertices_mm, "faces": part.faces, **field._asdict()}
             arrays |= {f"{n}.{name}": np.asarray(value) for name, value in named.items()}
+        for name, mesh in self.anatomy_ct.structures.items():
+            arrays[f"{_STRUCTURE}{name}.{_VERTICES}"] = mesh.vertices_mm
+            arrays[f"{_STRUCTURE}{name}.faces"] = mesh.faces
         return {**arrays, "half_turns": self.half_turns}
 
     @classmethod
@@ -106,9 +109,17 @@ class RestShape:
                 parts.append(Mesh(vertices, faces))
                 values = np.ascontiguousarray(values, np.float32)
                 fields.append(DistanceField(values, np.asarray(origin, np.float32), float(spacing)))
+            ends = f".{_VERTICES}"
+            structures = {}
+            for key in arrays:
+                if key.startswith(_STRUCTURE) and key.endswith(ends):
+                    name = key.removeprefix(_STRUCTURE).removesuffix(ends)
+                    check_name(name, "a structure", "--structure")
+                    faces = arrays[f"{_STRUCTURE}{name}.faces"]
+                    structures[name] = Mesh(arrays[key], faces)
         except KeyError as error:
             raise InputError(f"the organ's shape lacks {error}; train the model again.") from error
-        anatomy_ct = Anatomy(tuple(parts), kind)
+        anatomy_ct = Anatomy(tuple(parts), kind, structures)
         turns = arrays.get("half_turns")  # which older folders lack
         turns = _half_turns(anatomy_ct) if turns is None else turns
         if turns.shape[1:] != (4, 4) or not np.isfinite(turns).all():

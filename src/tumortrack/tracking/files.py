@@ -25,7 +25,7 @@ def write_estimate(
 ) -> None:
     """occupancy.ply (points with label and probability and, where the estimate knows the way back,
     their place in the CT), labels.nii.gz (voxel -> camera frame, mm), labels.seg.nrrd (the same for
-    3D Slicer), kidney.ply (or of the organ's name), tumor_1.ply, ... and report.json;
+    3D Slicer), kidney.ply (or of the organ's name), tumor_1.ply, ..., structures and report.json;
     tumor_1_margin.ply, ..., the shells of the highest confidence, where margins are stated;
     points.csv, the given ``points`` of the CT and where they are now; all or nothing.
 
@@ -46,6 +46,8 @@ def write_estimate(
             margin = stated_radius(estimate.report.get("margin"), name)
             if margin is not None and is_tumor(name):
                 write_mesh(aside / f"{name}{MARGIN}.ply", exact_margin(mesh, margin.mm))
+        for name, mesh in estimate.structures.items():
+            write_mesh(aside / f"{name}.ply", mesh)
         if points is not None:
             table = camera_table(points, estimate.motion)
             store.write_atomically(aside / "points.csv", table)

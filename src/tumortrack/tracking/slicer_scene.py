@@ -18,7 +18,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from tumortrack.core import store
-from tumortrack.core.colours import part_colour
+from tumortrack.core.colours import Colour, part_colour, structure_colour
 from tumortrack.core.geometry import RAS_FROM_LPS
 from tumortrack.core.types import FIRST_TUMOR, ORGAN
 from tumortrack.imaging.case import Case
@@ -74,6 +74,7 @@ class Scene:
         if not moved:
             for label, name in enumerate(case.anatomy.names, ORGAN):
                 self._add_model(name, label, (folder / f"{name}.ply").read_bytes())
+            self._add_structures(folder, case.anatomy.structures)
             named = zip(case.anatomy.names[1:], case.anatomy.tumors, strict=True)
             middles = [(name, mesh.box_mm.mean(0).tolist()) for name, mesh in named]
             self._add_points(CENTRES, middles)
@@ -90,6 +91,7 @@ class Scene:
                     self._add_model(shown, part["label"], file.read_bytes())
             if part["found"] and part["label"] >= FIRST_TUMOR:
                 centres.append((centre_label(report, name, poor), part["center_mm"]))
+        self._add_structures(folder, report.get("structures", ()))
         self._add_points(CENTRES, centres)
         if (table := folder / "points.csv").exists():
             rows = list(csv.DictReader(io.StringIO(table.read_text())))
@@ -115,11 +117,18 @@ class Scene:
         going = {"persistent": "1", "state": "1", "checkCRC": "1"}
         self._node("IGTLConnector", "tumortrack", **client, **going)
 
-    def _add_model(self, name: str, label: int, content: bytes | None = None) -> None:
+    def _add_structures(self, folder: Path, names: Iterable[str]) -> None:
+        for number, name in enumerate(names):
+            content = (folder / f"{name}.ply").read_bytes()
+            self._add_model(name, FIRST_TUMOR, content, structure_colour(number))
+
+    def _add_model(
+        self, name: str, label: int, content: bytes | None = None, colour: Colour | None = None
+    ) -> None:
         shell = name.endswith(MARGIN)
         opacity = _SHELL_OPACITY if shell else _ORGAN_OPACITY if label == ORGAN else 1.0
         look = {
-            "color": " ".join(f"{channel / 255:.4g}" for channel in part_colour(label)),
+            "color": " ".join(f"{channel / 255:.4g}" for channel in colour or part_colour(label)),
             "opacity": f"{opacity:g}",
             "visibility2D": "true",
             "backfaceCulling": "false",

@@ -14,7 +14,15 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float32
 
-from tumortrack.core.colours import GOOD, NONE, POOR, Colour, label_colours, part_colour
+from tumortrack.core.colours import (
+    GOOD,
+    NONE,
+    POOR,
+    Colour,
+    label_colours,
+    part_colour,
+    structure_colour,
+)
 from tumortrack.core.geometry import rigid, transform_points
 from tumortrack.core.organ import organ_name
 from tumortrack.core.patient import Patient
@@ -156,6 +164,8 @@ class ResultMessages:
                 else:
                     opacity = ORGAN_OPACITY if label == 1 else 1.0
                     markers.append(_triangles(name, mesh, part_colour(label), opacity))
+            for number, (name, mesh) in enumerate(estimate.structures.items()):
+                markers.append(_triangles(name, mesh, structure_colour(number), 1.0))
         if estimate is not None or result.workcell is None:  # else the workcell's text says it
             markers.append(_quality_text(result))
         return markers

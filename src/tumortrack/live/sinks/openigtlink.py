@@ -189,8 +189,9 @@ class OpenIgtLinkSink:
         contents: dict[str, Polydata] = {}
         if self._config.mesh_hz:
             # What is gone is deleted at once; what is there may wait until it is due.
-            meshes, due = (estimate.meshes, self._mesh_rate.due()) if estimate else ({}, True)
-            for name in self._context.parts:
+            due = estimate is None or self._mesh_rate.due()
+            meshes = {**estimate.meshes, **estimate.structures} if estimate else {}
+            for name in (*self._context.parts, *self._context.structures):
                 if (mesh := meshes.get(name)) is None:
                     contents[name] = _NOTHING
                 elif due:

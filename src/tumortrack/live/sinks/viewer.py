@@ -294,6 +294,8 @@ class ViewerSink:
                 yield mesh, colour, 2 if label > 1 else 1
             if (margin := margins.get(name)) is not None:
                 yield margin.moved(transform_points(back, margin.vertices_mm)), colour, 1
+        for number, mesh in enumerate(result.estimate.structures.values()):
+            yield mesh, colours.structure_colour(number), 1
 
     def _toggle_picking(self) -> None:
         """The next click in the scene chooses the organ; asked twice: it does not."""

@@ -240,6 +240,7 @@ class Panel:
             shown |= {
                 "organ": gui.add_slider(label, 0.0, 1.0, 0.05, default.organ),
                 "margin": gui.add_checkbox("Margins", default.margin),
+                "structures": gui.add_checkbox("Structures", default.structures),
                 "ellipsoids": gui.add_checkbox(
                     "95 % ellipsoids (diagnostic)",
                     default.ellipsoids,

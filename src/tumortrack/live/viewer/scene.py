@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, partial
+from itertools import chain
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -50,6 +51,7 @@ class DisplayOptions:
     observed: bool = True
     organ: float = 0.35  # opacity
     margin: bool = True
+    structures: bool = True
     ellipsoids: bool = False
     points: str = "none"  # none | tumors | all
     slice_plane: bool = False
@@ -105,6 +107,12 @@ class ViewerScene:
                 path = f"/estimate/ellipsoid_{name}"
                 look |= {"color": _ELLIPSOID_COLOUR, "opacity": 0.8}
                 self._ellipsoids[name] = self._mesh(path, _NOTHING, **look)
+        self._structures = {}
+        for number, name in enumerate(context.structures):
+            colour = colours.structure_colour(number)
+            self._structures[name] = self._mesh(
+                f"/estimate/{name}", _NOTHING, color=colour, side="double", visible=False
+            )
         self._points = self._cloud("/estimate/points", 0.3, colours.ORGAN_PART)
         clear = np.zeros((2, 2, 4), np.uint8)
         self._slice = nodes.add_image("/estimate/slice", clear, 1, 1, format="png", **_FLAT)
@@ -155,13 +163,16 @@ class ViewerScene:
             _put_mesh(node, shown)
         for name, node in self._shells.items():
             _put_mesh(node, self.margins.get(name, _NOTHING))
+        for name, node in self._structures.items():
+            _put_mesh(node, placed.structures.get(name, _NOTHING))
         self._shown = result, placed
         self.apply()
 
     def hide(self) -> None:
         """Nothing of any estimate stays. Surfaces are emptied, not made invisible: browsers show
         the one a frame later than the other, and old surfaces could not come back."""
-        for node in (*self._parts.values(), *self._shells.values(), *self._ellipsoids.values()):
+        shown = self._parts, self._shells, self._ellipsoids, self._structures
+        for node in chain.from_iterable(group.values() for group in shown):
             _put_mesh(node, _NOTHING)
         self._points.points, self._points.colors = _NO_POINTS, _NO_POINTS.astype(np.uint8)
         self._shown = None
@@ -185,6 +196,8 @@ class ViewerScene:
             node.visible = options.margin
         for node in self._ellipsoids.values():
             node.visible = options.ellipsoids
+        for node in self._structures.values():
+            node.visible = options.structures
         self._parts[self._name].opacity = options.organ
         self._points.visible = options.points != "none"
         self._slice.visible = options.slice_plane and self._has_slice

@@ -1,0 +1,94 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from organ_objects import liver
+from tumortrack.core.errors import InputError
+from tumortrack.core.mesh_files import read_mesh, write_mesh
+from tumortrack.core.types import LabelVolume, Mesh
+from tumortrack.imaging.case import load_case, save_case
+from tumortrack.imaging.nifti import write_nifti
+from tumortrack.imaging.prepare import PrepareOptions, prepare
+from tumortrack.imaging.structures import TRUSTED_MM, set_apart, stated_structures
+
+VESSEL = 4
+
+
+def with_vessel(voxel_mm=3.0) -> LabelVolume:
+    """A tube of 9 mm radius along y: from the liver's middle out of its front by 20 mm and more."""
+    volume = liver((((-50, -20, 10), 15.0),), voxel_mm)
+    labels = volume.labels.copy()
+    index = np.indices(labels.shape).reshape(3, -1).T
+    x, _, z = (index * voxel_mm + volume.lps_from_index[:3, 3]).T
+    y = index[:, 1] * voxel_mm + volume.lps_from_index[1, 3]
+    tube = ((x + 10) ** 2 + z**2 < 9.0**2) & (y < 0)
+    labels.reshape(-1)[tube] = VESSEL
+    return LabelVolume(labels, volume.lps_from_index)
+
+
+@pytest.fixture(scope="module")
+def label_map(tmp_path_factory):
+    volume = with_vessel()
+    path = tmp_path_factory.mktemp("structures") / "labels.nii.gz"
+    write_nifti(path, volume.labels, volume.lps_from_index, lps=True)
+    return path
+
+
+def test_a_label_is_carried_and_leaves_the_organ_whole(label_map, tmp_path):
+    options = PrepareOptions(name="liver", structure=(f"vessel={VESSEL}",), tumor=2)
+    case = prepare(label_map, options)
+    assert case.anatomy.names == ("liver", "tumor_1")  # the vessel is no tumor
+    assert case.anatomy.organ.volume_mm3 == pytest.approx(1_660e3, rel=0.01)
+    vessel = case.anatomy.structures["vessel"]
+    length = -with_vessel().lps_from_index[1, 3]
+    assert vessel.volume_mm3 == pytest.approx(np.pi * 81 * length, rel=0.1)
+    about = case.report["structures"]["vessel"]
+    assert about["outside_mm"] == pytest.approx(length - 50, abs=9)
+    assert 0.1 < about["extrapolated"] < 0.6
+    assert any("its motion is a guess" in note for note in case.report["notes"])
+    save_case(case, tmp_path)
+    again = load_case(tmp_path).anatomy
+    assert list(again.structures) == ["vessel"]
+    assert again.structures["vessel"].box_mm == pytest.approx(vessel.box_mm, abs=1e-4)
+
+
+def test_open_meshes_are_taken_as_they_are(label_map, tmp_path):
+    sheet = Mesh(
+        np.array([[0.0, -60, 0], [10, -60, 0], [0, 0, 0], [10, 0, 3]]),
+        np.array([[0, 1, 2], [1, 3, 2]]),
+    )
+    write_mesh(tmp_path / "cut.stl", sheet)
+    options = PrepareOptions(name="liver", structure=(f"cut={tmp_path / 'cut.stl'}",), tumor=2)
+    found = prepare(label_map, options).anatomy.structures["cut"]
+    assert len(found.faces) == 2
+    assert found.box_mm == pytest.approx(sheet.box_mm)
+    write_mesh(tmp_path / "far.ply", sheet.moved(sheet.vertices_mm + 500))
+    far = replace(options, structure=(f"cut={tmp_path / 'far.ply'}",))
+    with pytest.raises(InputError, match="from the organ"):
+        prepare(label_map, far)
+    assert len(read_mesh(tmp_path / "far.ply").faces) == 2
+
+
+@pytest.mark.parametrize(
+    ("said", "why"),
+    [
+        (("artery",), "NAME=NUMBER"),
+        (("liver=3",), "taken"),
+        (("a=3", "a=4"), "taken"),
+        (("tumor_1=3",), "can't be the name of a structure"),
+        (("../x=3",), "can't be the name of a structure"),
+    ],
+)
+def test_what_names_no_structure_is_refused(said, why):
+    with pytest.raises(InputError, match=why):
+        stated_structures(said, "liver")
+    assert stated_structures(("a=3", "b=c/d.stl"), "liver")["a"] == 3
+
+
+def test_labels_that_are_not_there_or_the_organs_are_refused():
+    volume = with_vessel(6.0)
+    for number in (1, 9):
+        with pytest.raises(InputError, match="the map's labels are"):
+            set_apart(volume, {"artery": number}, 1)
+    assert TRUSTED_MM == 5.0

@@ -1,0 +1,83 @@
+"""A structure rides along with the organ's motion: estimate, files, planner, sinks."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from live_objects import ball, empty_update, small_anatomy, small_setting, small_update
+from tumortrack.core.geometry import transform_points
+from tumortrack.core.types import Mesh, SensorCloud
+from tumortrack.live.ros.messages import Messages
+from tumortrack.live.ros.results import ResultMessages
+from tumortrack.live.sinks.openigtlink import OpenIgtLinkSinkConfig
+from tumortrack.plan.located import read_run
+from tumortrack.registration.rest_shape import RestShape
+from tumortrack.tracking.files import write_estimate
+from tumortrack.tracking.tracker import Tracker
+from tumortrack.training.model import load_model
+
+
+@pytest.fixture(scope="module")
+def carried(clinic_model):
+    """An estimate of a model that knows a planned cut, an open sheet through the organ."""
+    model = load_model(clinic_model, "cpu")
+    anatomy = model.shape.anatomy_ct
+    low, high = anatomy.organ.box_mm
+    x, y = np.meshgrid(np.linspace(low[0], high[0], 9), np.linspace(low[1], high[1], 9))
+    points = np.stack([x.ravel(), y.ravel(), np.full(81, (low + high)[2] / 2)], axis=1)
+    a = (np.arange(8)[:, None] * 9 + np.arange(8)).ravel()
+    sheet = Mesh(
+        points,
+        np.concatenate([np.stack([a, a + 1, a + 9], 1), np.stack([a + 1, a + 10, a + 9], 1)]),
+    )
+    known = replace(model.shape, anatomy_ct=replace(anatomy, structures={"cut": sheet}))
+    again = RestShape.from_arrays(known.to_arrays(), len(anatomy.parts))
+    assert (again.anatomy_ct.structures["cut"].vertices_mm == points).all()
+    case_like = replace(model, shape=again)
+    down = np.diag([1.0, -1.0, -1.0, 1.0])
+    down[:3, 3] = [0, 0, 150]
+    turned = transform_points(down, anatomy.organ.vertices_mm - anatomy.organ.box_mm.mean(0))
+    cloud = SensorCloud(turned[turned[:, 2] < 150][::4])
+    estimate = Tracker(case_like).locate(cloud, 24)
+    return sheet, estimate
+
+
+def test_it_moves_as_the_motion_says(carried):
+    sheet, estimate = carried
+    there = estimate.motion.carry(sheet.vertices_mm)
+    assert estimate.structures["cut"].vertices_mm == pytest.approx(there, abs=1e-4)
+    assert np.linalg.norm(there - sheet.vertices_mm, axis=1).min() > 10
+    assert set(estimate.meshes) == set(estimate.report["parts"])
+    assert estimate.report["structures"] == ["cut"]
+
+
+def test_it_is_written_and_read_as_what_it_is(carried, tmp_path):
+    _, estimate = carried
+    write_estimate(tmp_path / "run", estimate)
+    run = read_run(tmp_path / "run")
+    assert set(run.meshes) == set(estimate.meshes)
+    table = np.diag([1.0, -1.0, -1.0, 1.0])
+    moved = transform_points(table, estimate.structures["cut"].vertices_mm)
+    seen = run.located(table).structures["cut"]
+    assert np.sort(seen.vertices_mm, 0) == pytest.approx(np.sort(moved, 0), abs=1e-3)
+
+
+def test_every_sink_gets_it():
+    vessel = ball((0.0, 0.0, 125.0), 3.0)
+    update = small_update()
+    estimate = replace(update.estimate, structures={"vessel": vessel})
+    update = replace(update, estimate=estimate)
+    anatomy = replace(small_anatomy(), structures={"vessel": vessel})
+    context = replace(small_setting(), anatomy_ct=anatomy)
+    messages = {out.suffix: out.message for out in ResultMessages(Messages(), context).of(update)}
+    marker = next(one for one in messages["meshes"].markers if one.ns == "vessel")
+    assert len(marker.points) == 3 * len(vessel.faces)
+    sink = OpenIgtLinkSinkConfig(port=0).open(context)
+    try:
+        sent = {name: more for _, name, _, more in sink._surfaces(update)}
+        assert "vessel" in sent
+        gone = {name for _, name, _, _ in sink._surfaces(empty_update())}
+        assert "vessel" in gone  # emptied, so that no old surface stays
+    finally:
+        sink.close()
