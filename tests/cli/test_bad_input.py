@@ -140,7 +140,7 @@ def test_an_existing_case_is_kept_unless_told(tmp_path):
         (["--up", "sideways"], "anterior"),
         (["--up", "0,0,0"], "three numbers"),
         (["--organ", "300"], "1..255"),
-        (["--kidney-hu", "300", "-300"], "low < high"),
+        (["--organ-hu", "300", "-300"], "low < high"),
         (["--patient", " "], "is no identifier"),
         (["--organ", "2", "--tumor", "0"], "--organ, --tumor means nothing"),
         (["--unit", "m"], "--unit means nothing"),
