@@ -61,13 +61,20 @@ def scan_phantom(folder: StrPath, seed: int = 1) -> Path:
 
 
 def prepare(
-    source: StrPath, folder: StrPath | None = None, *, overwrite: bool = False, **options: Any
+    source: StrPath,
+    folder: StrPath | None = None,
+    *,
+    overwrite: bool = False,
+    segment: str | None = None,
+    **options: Any,
 ) -> Case:
     """A case from a DICOM folder, a CT volume, a label map or a folder of meshes.
 
     Args:
         folder: where to write the case with a picture to check it by (qc.png); None: nowhere.
         overwrite: replace a case that lies there.
+        segment: of a CT: what segments it, as ``prepare --segment``; its label map is kept beside
+            ``folder`` (FOLDER.labels.nii.gz).
         options: fields of ``imaging.prepare.PrepareOptions``: ``name``, ``term``,
             ``structure``, ``organ_hu``, ``tumor_hu``, ``labels``, ``side``, ``organ``,
             ``tumor``, ``up``, ``series``, ``unit``, ``min_tumor_ml``, ``patient``.
@@ -89,7 +96,16 @@ def prepare(
         raise InputError(f"prepare knows no {unknown[0]!r}; allowed: {', '.join(known)}.")
     if folder is not None:
         store.check_place(Path(folder), KIND, overwrite)
-    case = preparing.prepare(Path(source), preparing.PrepareOptions(**options))
+    asked = preparing.PrepareOptions(**options)
+    if segment is None:
+        case = preparing.prepare(Path(source), asked)
+    elif folder is None:
+        raise InputError("segment needs a folder, beside which the label map is kept.")
+    else:
+        from tumortrack.imaging.segmenter import segmented_case
+
+        keep = Path(folder).with_name(f"{Path(folder).name}.labels.nii.gz")
+        case = segmented_case(Path(source), segment, asked, keep)
     if folder is not None:
         from tumortrack.report.pictures import qc_picture
 

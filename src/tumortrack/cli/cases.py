@@ -31,6 +31,9 @@ class Prepare:
         organ_hu: HU window of the organ in a CT: low (inclusive) and high.
         tumor_hu: HU window of the tumors in a CT.
         labels: the input is a label map (mostly recognised by itself).
+        segment: segment the CT by a tool of yours, with weights that you have:
+            totalsegmentator, totalsegmentator:TASK (liver_lesions, ...: also tumors),
+            nnunet:FOLDER or monai:BUNDLE. Its label map is kept beside CASE (docs/segment.md).
         side: of organs in pairs, the patient's one to take from a label map (default: the one
             with most tumor); of a CT or meshes, which one it is.
         organ: label number of the organ.
@@ -52,6 +55,7 @@ class Prepare:
     organ_hu: Annotated[tuple[float, float], arg(aliases=["--kidney-hu"])] = (-300.0, 300.0)
     tumor_hu: tuple[float, float] = (300.0, 1000.0)
     labels: bool = False
+    segment: str | None = None
     side: Literal["left", "right"] | None = None
     organ: int = 1
     tumor: int | None = None
@@ -67,7 +71,9 @@ class Prepare:
         from tumortrack.imaging.prepare import PrepareOptions
 
         options = {field.name: getattr(self, field.name) for field in fields(PrepareOptions)}
-        case = api.prepare(self.input, self.case, overwrite=self.overwrite, **options)
+        case = api.prepare(
+            self.input, self.case, overwrite=self.overwrite, segment=self.segment, **options
+        )
         say_notes(case.report.get("notes", []))
         say(str(case.patient))
         kind = case.anatomy.kind

@@ -31,7 +31,7 @@ from tumortrack.imaging.symmetry import alike, half_turns, warning
 from tumortrack.imaging.volume import is_label_map, labels_of, read_raw, volume_of
 
 # Options that only one kind of input uses.
-_OF_CT, _OF_LABELS = ("organ_hu", "tumor_hu"), ("labels", "organ", "tumor")
+_OF_CT, OF_LABELS = ("organ_hu", "tumor_hu"), ("labels", "organ", "tumor")
 _UP_LPS = (0.0, -1.0, 0.0)  # until ``prepare`` sets what was asked for
 _LEAST_ORGAN_OUTSIDE = 0.02  # of the outer surface
 _MOST_CHANGE_PERCENT = 1.0  # of a part's volume, by smoothing; more is noted
@@ -160,7 +160,7 @@ def _check_organ_outside(labels: LabelVolume) -> None:
         )
 
 
-def _refuse_unused(what: str, options: PrepareOptions, *unused: str) -> None:
+def refuse_unused(what: str, options: PrepareOptions, *unused: str) -> None:
     """Refuse options that this kind of input would ignore."""
     usual = PrepareOptions()
     given = [name for name in unused if getattr(options, name) != getattr(usual, name)]
@@ -171,13 +171,13 @@ def _refuse_unused(what: str, options: PrepareOptions, *unused: str) -> None:
 
 def _from_volume(path: Path, options: PrepareOptions) -> Case:
     if not path.is_dir():
-        _refuse_unused(f"{path} is one file", options, "series")
+        refuse_unused(f"{path} is one file", options, "series")
     raw = read_raw(path, options.series)
     as_labels = options.labels or (path.is_file() and is_label_map(raw))
     structures: dict[str, Mesh] = {}
-    ct, notes, whose, side = None, list(raw.notes), raw.patient, options.stated_side
+    ct, notes, stated, side = None, list(raw.notes), raw.patient, options.stated_side
     if as_labels:
-        _refuse_unused(f"{path} is read as a label map", options, *_OF_CT, "unit")
+        refuse_unused(f"{path} is read as a label map", options, *_OF_CT, "unit")
         if not options.labels:
             notes.append("few distinct whole numbers: read as a label map, not as a CT")
         source = labels_of(raw, path)
@@ -194,13 +194,13 @@ def _from_volume(path: Path, options: PrepareOptions) -> Case:
         )
     else:
         what = f"{path} is read as a CT (a label map needs --labels)"
-        _refuse_unused(what, options, *_OF_LABELS, "unit")
+        refuse_unused(what, options, *OF_LABELS, "unit")
         volume = volume_of(raw, path)
         del raw
         labels, more = segment_ct(
             volume, options.organ_hu, options.tumor_hu, options.min_tumor_ml, options.kind
         )
-        ct = _crop_ct(volume, labels)
+        ct = crop_ct(volume, labels)
     anatomy, surface = surfaces(labels, options.kind)
     anatomy = replace(anatomy, structures=structures)
     notes += more
@@ -211,13 +211,13 @@ def _from_volume(path: Path, options: PrepareOptions) -> Case:
         if abs(change) > _MOST_CHANGE_PERCENT
     ]
     report = {"kind": "label map" if as_labels else "ct", "notes": notes}
-    patient = _patient(path, whose, options.patient, side)
+    patient = whose(path, stated, options.patient, side)
     return Case(
         anatomy, labels, _UP_LPS, {**report, **_measured(labels, anatomy, surface)}, ct, patient
     )
 
 
-def _patient(path: Path, stated: Patient, given: str | None, side: Side) -> Patient:
+def whose(path: Path, stated: Patient, given: str | None, side: Side) -> Patient:
     """Whose organ it is: ``stated`` by the file; ``given`` by the user, instead; on the ``side``
     that was selected or given. InputError where the file says the other side."""
     if stated.differs(Patient(side=side)):
@@ -229,8 +229,8 @@ def _patient(path: Path, stated: Patient, given: str | None, side: Side) -> Pati
 
 
 def _from_meshes(folder: Path, options: PrepareOptions) -> Case:
-    unused = (*_OF_CT, *_OF_LABELS, "series", "min_tumor_ml")
-    _refuse_unused(f"{folder} holds meshes", options, *unused)
+    unused = (*_OF_CT, *OF_LABELS, "series", "min_tumor_ml")
+    refuse_unused(f"{folder} holds meshes", options, *unused)
     anatomy, notes = read_mesh_folder(folder, options.unit, options.kind)
     labels = label_meshes(anatomy)
     mesh_ml = [part.volume_mm3 / 1000 for part in anatomy.parts]
@@ -253,7 +253,7 @@ def _measured(
     }
 
 
-def _crop_ct(volume: Volume, labels: LabelVolume) -> Volume:
+def crop_ct(volume: Volume, labels: LabelVolume) -> Volume:
     """The CT on the labels' crop; beyond the scan's edge it is air."""
     shape = labels.labels.shape
     index_from_lps = np.linalg.inv(volume.lps_from_index)
