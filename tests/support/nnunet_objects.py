@@ -53,6 +53,9 @@ def tiny_model(folder: Path, labels: dict) -> Path:
     for name in ("raw", "preprocessed", "results"):
         (folder / name).mkdir()
         os.environ[f"nnUNet_{name}"] = str(folder / name)  # read when nnunetv2 is imported
+    data = folder / "preprocessed" / "Dataset900_Beans" / "nnUNetPlans_3d_fullres"
+    data.mkdir(parents=True)
+    (data / "case.npz").touch()  # the trainer looks what kind of files there are
     from nnunetv2.training.nnUNetTrainer.nnUNetTrainer import nnUNetTrainer
 
     dataset = {
