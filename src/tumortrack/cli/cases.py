@@ -173,7 +173,9 @@ class Export:
         """Raises InputError: it was located with another case's model, or without a motion."""
         store.read_manifest(run, "run")
         report = store.read_json(run / "report.json")
-        if report["model"].get("case_sha256") != store.sha256_of(self.case / store.MANIFEST):
+        if report.get("model", {}).get("case_sha256") != store.sha256_of(
+            self.case / store.MANIFEST
+        ):
             raise InputError(f"{run} was not located with a model of {self.case}: give its case.")
         if "motion" not in report:
             raise InputError(

@@ -84,7 +84,7 @@ class Scene:
         how sure they are, and mapped points; camera frame."""
         voxels = (folder / "labels.seg.nrrd").read_bytes()
         self._add("Segmentation", "located", {}, ("SegmentationStorage", "labels.seg.nrrd", voxels))
-        poor, centres = report["quality"]["verdict"] != "good", []
+        poor, centres = report.get("quality", {}).get("verdict") != "good", []
         for name, part in report["parts"].items():
             for shown in (name, name + MARGIN):
                 if (file := folder / f"{shown}.ply").exists():
