@@ -373,7 +373,7 @@ def test_fast_dds_hears_and_is_heard(tmp_path: Path, bus: Bus, messages: Message
     assert {value.key for value in status.status[0].values} > {"quality", "rate_hz", "dropped"}
     objects = {one.id: one for one in scene.world.collision_objects}
     wanted = {f"tumortrack/{name}" for name in PARTS}
-    assert objects.keys() == wanted | {f"{name}/margin" for name in wanted if "tumor" in name}
+    assert objects.keys() == wanted | {f"{name}/margin" for name in wanted if "tumor_" in name}
     tumor = objects["tumortrack/tumor_1"].meshes[0].vertices
     off_mm = 1000 * np.array([[p.x, p.y, p.z] for p in tumor]) - update.center_mm("tumor_1")
     np.testing.assert_allclose(np.linalg.norm(off_mm, axis=1), 6, atol=0.5)

@@ -17,7 +17,9 @@ import tyro
 from PIL import Image
 
 import tumortrack
+from clock import until
 from live_objects import PARTS, ball, empty_update, small_setting, small_update
+from ros2_objects import own_graph
 from tumortrack.cli.track import Track
 from tumortrack.core.errors import InputError
 from tumortrack.core.estimate import Estimate
@@ -25,8 +27,9 @@ from tumortrack.core.geometry import rigid
 from tumortrack.core.types import Mesh
 from tumortrack.live.ros.messages import Messages
 from tumortrack.live.ros.results import ResultMessages
+from tumortrack.live.ros.ros2 import open_bus
 from tumortrack.live.ros.sensors import COMPRESSED, image_of
-from tumortrack.live.ros.tf import pose_of
+from tumortrack.live.ros.tf import TRANSFORMS, pose_of
 from tumortrack.live.sinks.moveit import SCENE, coarser, widened_hull
 from tumortrack.live.spec import SINKS
 from tumortrack.live.values import PublishedFrame, TrackingResult
@@ -207,6 +210,52 @@ def test_a_plan_s_motions_are_trajectories_of_all_joints():
               for one in trajectory.points]  # fmt: skip
     np.testing.assert_allclose(starts, times)
     assert [one.velocities[0] for one in trajectory.points] == [0, pytest.approx(0.7), 0]
+
+
+def test_obstacles_arrive_of_good_estimates_and_cameras_are_kept_for_latecomers():
+    pytest.importorskip("cyclonedds", reason="cyclonedds is not installed (tumortrack[live])")
+    setting = replace(small_setting(), published_frame=PLACED)
+    good = small_update(frames=PLACED)
+    with own_graph():
+        bus = open_bus("dds")
+        heard = bus.subscriber("/scene", SCENE)
+        scene = SINKS.parse("moveit:/scene?margin_mm=5&hz=0").open(setting)
+        sink = SINKS.parse("ros2:/theatre?camera_tf=true").open(setting)
+        try:
+            sink.publish(good)
+            late = bus.subscriber("/tf_static", TRANSFORMS, latched=True)
+
+            def came() -> list:
+                scene.publish(replace(good, quality="poor", warning="seen from one side"))
+                scene.publish(good)
+                return heard.take()
+
+            said = MESSAGES.from_bytes(until(came)[-1], SCENE)
+            (camera,) = MESSAGES.from_bytes(until(late.take)[-1], TRANSFORMS).transforms
+            while heard.take():
+                bus.wait(0.1)
+            scene.publish(empty_update())
+            scene.close()  # nothing is taken away
+            assert not heard.take()
+        finally:
+            for one in (scene, sink, bus):
+                one.close()
+    assert said.is_diff
+    assert said.robot_state.is_diff
+    objects = {one.id: one for one in said.world.collision_objects}
+    names = {f"tumortrack/{name}" for name in PARTS}
+    assert objects.keys() == names | {f"{name}/margin" for name in names if "tumor_" in name}
+    assert {one.operation for one in objects.values()} == {0}  # ADD
+    for name in PARTS:
+        (mesh,) = objects[f"tumortrack/{name}"].meshes
+        points_mm = 1000 * np.array([[p.x, p.y, p.z] for p in mesh.vertices])
+        corners = np.array([one.vertex_indices for one in mesh.triangles])
+        expected = coarser(good.transformed.meshes[name], 3.0)
+        np.testing.assert_allclose(points_mm, expected.vertices_mm, atol=1e-9)
+        assert np.array_equal(corners, expected.faces)
+        assert objects[f"tumortrack/{name}"].header.frame_id == "table"
+    assert (camera.header.frame_id, camera.child_frame_id) == ("table", "camera")
+    np.testing.assert_allclose(pose_of(camera), PLACED.published_from_camera, atol=1e-9)
 
 
 # --- the package for a ROS 2 workspace; its node, launch file and build need ROS, and are not run

@@ -148,23 +148,14 @@ def _store(distro: Distro) -> Any:
     def size(pos: int, point: Any, _store: Any) -> int:
         return pos + getattr(point, "nbytes", 24)
 
-    def writer(write_one: Any) -> Any:
-        def write(raw: memoryview, pos: int, point: Any, store: Any) -> int:
-            if not isinstance(point, np.ndarray):
-                return write_one(raw, pos, point, store)
-            raw[pos : pos + point.nbytes] = point.data.cast("B")
-            return pos + point.nbytes
-
-        return write
+    def write(raw: memoryview, pos: int, point: Any, store: Any) -> int:
+        if not isinstance(point, np.ndarray):
+            return known.serialize_cdr_le(raw, pos, point, store)
+        raw[pos : pos + point.nbytes] = point.data.cast("B")
+        return pos + point.nbytes
 
     # No fixed size: whoever holds points then asks `size`, and aligns before it writes.
     store.cache[_POINT] = dataclasses.replace(
-        known,
-        size_cdr=0,
-        size_ros1=0,
-        getsize_cdr=size,
-        getsize_ros1=size,
-        serialize_cdr_le=writer(known.serialize_cdr_le),
-        serialize_ros1=writer(known.serialize_ros1),
+        known, size_cdr=0, getsize_cdr=size, serialize_cdr_le=write
     )
     return store
