@@ -210,7 +210,7 @@ def sbom(wheel: Path) -> dict[str, Any]:
     1.6, https://cyclonedx.org/docs/1.6/json/)."""
     name, version = wheel.name.split("-")[:2]
     name, locked = canonicalize_name(name), versions()
-    extras = set(distribution(name).metadata.get_all("Provides-Extra") or ()) - {"dev"}
+    extras = set(distribution(name).metadata.get_all("Provides-Extra") or ()) - {"dev", "docs"}
     packages = needed(name, extras)
     packages.pop(name)
     components = [_component(key, package, locked) for key, package in sorted(packages.items())]
