@@ -117,9 +117,9 @@ def test_the_model_says_what_it_was_made_from(case, quick_model):
     again = tumortrack(*train_command(case, quick_model))
     assert "trained already" in succeeded(again)
     more = [*train_command(case, quick_model), "--seed", 1]
-    assert "another case, preset, seed or option" in refusal(tumortrack(*more))
+    assert "(12 steps, seed 0)" in refusal(tumortrack(*more))
     other = ["train", case, quick_model, "--steps", STEPS["quick"]]  # the default is clinic
-    assert "another case, preset, seed or option" in refusal(tumortrack(*other))
+    assert "--preset" in refusal(tumortrack(*other))
 
 
 def test_a_changed_weights_file_or_schema_is_refused(quick_model, tmp_path):

@@ -20,6 +20,7 @@ from tumortrack.core.process import available_cores
 PURPOSES = {
     ("tumortrack", ""): "cases, training, locating, planning",
     ("tumortrack", "live"): "cameras, ROS 2, the web viewer, 3D Slicer, DICOM segmentations",
+    ("tumortrack", "stereo"): "depth from two pictures",
     ("tumortrack", "arms"): "motions of two arms",
     ("tumortrack", "ur"): "a real arm of Universal Robots",
     ("tumortrack", "pcd"): ".pcd clouds",

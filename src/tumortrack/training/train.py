@@ -15,6 +15,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TypeVar
 
@@ -294,11 +295,9 @@ def ctrl_c() -> Iterator[Callable[[], bool]]:
 
 @contextmanager
 def history(folder: Path, progress: TrainingProgress) -> Iterator[Callable[..., None]]:
-    """history.jsonl and TensorBoard: yields a function that writes a validation's ``_SCALARS``. On
-    resuming, records after the checkpoint are dropped first. A full disk raises StorageError,
-    except on leaving after another error, which is kept."""
-    from torch.utils.tensorboard import SummaryWriter
-
+    """history.jsonl and, where TensorBoard is installed, its curves: yields a function that writes
+    a validation's ``_SCALARS``. On resuming, records after the checkpoint are dropped first. A full
+    disk raises StorageError, except on leaving after another error, which is kept."""
     path, files = folder / "history.jsonl", ExitStack()
     with _history_errors(folder):
         if path.exists():
@@ -307,8 +306,12 @@ def history(folder: Path, progress: TrainingProgress) -> Iterator[Callable[..., 
             kept = [line for line in whole if json.loads(line)["step"] <= progress.step]
             write_atomically(path, "".join(kept).encode())
         stream = files.enter_context(path.open("a", buffering=1, encoding="utf-8"))
-        board = SummaryWriter(folder / "tensorboard", purge_step=progress.step + 1)
-        files.callback(board.close)
+        board = None
+        if find_spec("tensorboard"):  # an extra; history.jsonl holds the same numbers
+            from torch.utils.tensorboard import SummaryWriter
+
+            board = SummaryWriter(folder / "tensorboard", purge_step=progress.step + 1)
+            files.callback(board.close)
 
     def write(*values: float) -> None:
         line = {"step": progress.step, "elapsed_s": round(progress.elapsed_s, 1)}
@@ -316,8 +319,9 @@ def history(folder: Path, progress: TrainingProgress) -> Iterator[Callable[..., 
             line[name] = float(f"{value:{digits}}")
         with _history_errors(folder):
             stream.write(json.dumps(line) + "\n")
-            for value, (_, tag, _) in zip(values, _SCALARS, strict=True):
-                board.add_scalar(tag, value, progress.step)
+            if board is not None:
+                for value, (_, tag, _) in zip(values, _SCALARS, strict=True):
+                    board.add_scalar(tag, value, progress.step)
 
     try:
         yield write
