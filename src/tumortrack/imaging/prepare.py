@@ -182,8 +182,8 @@ def _from_volume(path: Path, options: PrepareOptions) -> Case:
             notes.append("few distinct whole numbers: read as a label map, not as a CT")
         source = labels_of(raw, path)
         del raw  # the largest maps are gigabytes: one copy is enough
-        stated = stated_structures(options.structure, options.name)
-        source, structures = set_apart(source, stated, options.organ)
+        named = stated_structures(options.structure, options.name)
+        source, structures = set_apart(source, named, options.organ)
         labels, more, side = select_labels(
             source,
             options.side,
