@@ -199,6 +199,8 @@ def test_wrong_answers_are_named():
 
 
 def test_an_organ_that_is_none_fails():
-    whole = {"organ_ml": 150.0, "tumors": [{"ml": 4.0}]}
+    whole = {"organ": "kidney", "organ_ml": 150.0, "tumors": [{"ml": 4.0}]}
     assert checks.failures(whole, cut_off=False) == []
     assert len(checks.failures({**whole, "organ_ml": 9.0, "tumors": []}, cut_off=True)) == 3
+    assert len(checks.failures({**whole, "organ_ml": 2000.0}, cut_off=False)) == 1
+    assert checks.failures({**whole, "organ": "liver", "organ_ml": 2000.0}, cut_off=False) == []
