@@ -20,9 +20,10 @@ SMALL = endoscope(320, 240, 260.0)
 def folder(tmp_path_factory):
     """Three pairs of a wall with a random texture, 6, 7 and 8 pixels apart, of straight lenses."""
     folder = tmp_path_factory.mktemp("stereo")
+    matrix = ((260.0, 0, 160), (0, 260.0, 120), (0, 0, 1))
     straight = msgspec.structs.replace(
-        SMALL, K2=SMALL.K1, D1=(0.0,) * 5, D2=(0.0,) * 5, R=((1, 0, 0), (0, 1, 0), (0, 0, 1)),
-        T=(-4.0, 0.0, 0.0),
+        SMALL, K1=matrix, K2=matrix, D1=(0.0,) * 5, D2=(0.0,) * 5,
+        R=((1, 0, 0), (0, 1, 0), (0, 0, 1)), T=(-4.0, 0.0, 0.0),
     )  # fmt: skip
     (folder / "stereo.json").write_bytes(msgspec.json.encode(straight))
     fine = np.random.default_rng(0).normal(128, 60, (240, 340, 3))

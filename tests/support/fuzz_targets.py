@@ -8,6 +8,7 @@ import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
+import msgspec
 import numpy as np
 
 Read = Callable[[bytes], object]
@@ -51,8 +52,14 @@ def _images() -> dict[str, Target]:
     import zlib
 
     from attack_clouds import png_of
+    from stereo_objects import endoscope
     from tumortrack.sense.files import read_depth_png, read_intrinsics
+    from tumortrack.sense.stereo import read_calibration
 
+    stereo = msgspec.json.encode(endoscope())
+    yaml = (
+        b"%YAML:1.0\n---\nK1: !!opencv-matrix\n   rows: 1\n   cols: 1\n   dt: d\n   data: [ 1. ]\n"
+    )
     camera = {"width": 16, "height": 12, "fx": 10.0, "fy": 10.0, "cx": 8, "cy": 6}
     text = json.dumps({**camera, "depth_unit_mm": 0.1}).encode()
     intrinsics = scratch() / "intrinsics.json"
@@ -60,6 +67,7 @@ def _images() -> dict[str, Target]:
     png = png_of(16, 12, 16, zlib.compress(bytes(33 * 12)))
     return {
         "intrinsics": ([text], of_file(".json", read_intrinsics)),
+        "stereo calibration": ([stereo, yaml], of_file(".yaml", read_calibration)),
         "depth image": ([png], of_file(".png", lambda path: read_depth_png(path, intrinsics))),
     }
 

@@ -24,6 +24,8 @@ from tumortrack.sense.camera import plausible
 Rows = tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]
 
 _LARGEST_FILE = 2**20  # bytes, of a calibration
+_MOST_NUMBERS = 20  # in one of its matrices; the longest distortion has 14
+_MOST_BRACKETS = 500
 _BASELINE_MM = (1.0, 300.0)  # a stereo endoscope has 4 to 6
 _LARGEST_TURN = 0.5  # rad: cameras that look elsewhere share too little
 _STEPS = 16  # SGBM's disparities are in sixteenths of a pixel, and their range in whole 16 pixels
@@ -51,24 +53,28 @@ def read_calibration(path: Path) -> StereoCalibration:
     """From JSON, YAML or XML: matrices as OpenCV's FileStorage writes them, or plain lists; what
     else the file holds is ignored. Raises InputError: missing, damaged, or it lacks something."""
     cv2, text = opencv(), read_file(path, _LARGEST_FILE).decode("utf-8", "replace")
+    if sum(map(text.count, "[{<")) > _MOST_BRACKETS:  # in each other they end the process
+        raise InputError(f"{path} is long. Leave nothing in it but the calibration.")
     try:
         storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
         there = set(storage.root().keys()) & set(StereoCalibration.__struct_fields__)
-        found = {name: _value(storage.getNode(name)) for name in there}
-    except (cv2.error, SystemError) as error:
+        found = {name: _value(storage.getNode(name), path) for name in there}
+        for name in found.keys() & {"D1", "D2", "T"}:  # columns, or rows
+            found[name] = np.ravel(found[name]).tolist()
+    except (cv2.error, SystemError, ValueError, RecursionError) as error:
         raise InputError(
             f"{path} is no JSON, YAML or XML that OpenCV reads. Write it by cv2.FileStorage."
         ) from error
-    for name in found.keys() & {"D1", "D2", "T"}:  # columns, or rows
-        found[name] = np.ravel(found[name]).tolist()
     return from_builtins(found, StereoCalibration, str(path))
 
 
-def _value(node: Any) -> Any:
-    if node.isMap():
+def _value(node: Any, path: Path) -> Any:
+    if node.isMap():  # a matrix, whose size is only claimed so far
+        if not 0 < node.getNode("rows").real() * node.getNode("cols").real() <= _MOST_NUMBERS:
+            raise InputError(f"{path}: {node.name()} is no small matrix; it is damaged.")
         return node.mat().tolist()
     if node.isSeq():
-        return [_value(node.at(n)) for n in range(node.size())]
+        return [_value(node.at(n), path) for n in range(node.size())]
     if node.isString():
         return node.string()
     return int(node.real()) if node.isInt() else node.real()

@@ -121,13 +121,13 @@ class RosSource:
 
     def _found(self, final: bool) -> bool:
         """Subscribe, once the type is known. ``final``: say what is wrong with what is there."""
-        mask = self._config.mask
+        mask, picture = self._config.mask, self._config.picture
         with self._lock:
             if self._closed:
                 return False
             if not self._kind:
                 there = self._bus.types_of(self._topic)
-                wanted = set(_KINDS.values()) - ({CLOUD} if mask else set())
+                wanted = set(_KINDS.values()) - ({CLOUD} if mask or picture else set())
                 usable = there & wanted
                 if len(usable) != 1 and final and there:
                     raise InputError(
@@ -138,8 +138,7 @@ class RosSource:
                 if len(usable) != 1:
                     return False
                 (self._kind,) = usable
-            images = ((mask, IMAGE), (self._config.picture, IMAGE))
-            beside = ((self._info_topic, CAMERA_INFO), *images)
+            beside = ((self._info_topic, CAMERA_INFO), (mask, IMAGE), (picture, IMAGE))
             # In both ways: some nodes publish it once and keep it for those who come later.
             self._beside = [
                 (topic, kind, self._bus.subscriber(topic, kind, 1, latched))
