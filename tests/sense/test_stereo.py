@@ -94,7 +94,7 @@ def test_the_organ_is_located_by_it(seen, clinic_model):
         assert np.linalg.norm(estimate.meshes[name].vertices_mm.mean(0) - true_mm) < 3.0, name
 
 
-@pytest.mark.parametrize("suffix", ["yaml", "xml", "json", "plain.json"])
+@pytest.mark.parametrize("suffix", ["yaml", "json", "plain.json"])
 def test_a_calibration_of_opencv_s_is_read(tmp_path, suffix):
     file, calibration = tmp_path / f"stereo.{suffix}", endoscope()
     if suffix == "plain.json":
@@ -114,18 +114,18 @@ def test_a_calibration_of_opencv_s_is_read(tmp_path, suffix):
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("", "no JSON, YAML or XML"),
-        ("{", "no JSON, YAML or XML"),
+        ("", "no calibration in JSON"),
+        ("{", "no calibration in JSON"),
+        ('<?xml version="1.0"?><opencv_storage></opencv_storage>', "as .json or .yaml"),
         ("%YAML:1.0\n---\nwidth: 640\n", "missing required field"),
         ('{"K1": 3}', "K1"),
-        ('{"K1": {"a": 1}}', "K1 is no small matrix"),
-        ('{"D1": [1, [2, 3]]}', "no JSON, YAML or XML"),
-        ('{"K1": ' + "[" * 100_000, "is long"),
-        ('{"K1": ' + "[" * 400, "no JSON, YAML or XML"),
+        ('{"K1": {"a": 1}}', "no calibration in JSON"),
+        ('{"D1": [1, [2, 3]]}', "D1|no calibration"),
+        ('{"K1": ' + "[" * 100_000, "no calibration in JSON"),
         (
             "%YAML:1.0\n---\nK1: !!opencv-matrix\n   rows: 30000\n   cols: 30000\n   dt: d\n"
             "   data: [ 1. ]\n",
-            "K1 is no small matrix",
+            "no calibration in JSON",
         ),
     ],
 )

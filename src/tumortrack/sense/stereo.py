@@ -7,6 +7,8 @@ turned against it by ``StereoRig.rectified_from_left``, mostly by less than a fe
 
 from __future__ import annotations
 
+import json
+import re
 from pathlib import Path
 from types import ModuleType
 from typing import Any, Literal
@@ -24,8 +26,11 @@ from tumortrack.sense.camera import plausible
 Rows = tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]
 
 _LARGEST_FILE = 2**20  # bytes, of a calibration
-_MOST_NUMBERS = 20  # in one of its matrices; the longest distortion has 14
-_MOST_BRACKETS = 500
+# Of OpenCV's YAML, which is no YAML: a matrix, and a number or word, each at a line's beginning.
+_MATRIX = re.compile(
+    r"^(\w+): *!!opencv-matrix\s+rows: *(\d+)\s+cols: *(\d+)\s+dt: *\w+\s+data: *\[([^\]]*)\]", re.M
+)
+_PLAIN = re.compile(r'^(\w+): *("?[\w.+-]+"?) *$', re.M)
 _BASELINE_MM = (1.0, 300.0)  # a stereo endoscope has 4 to 6
 _LARGEST_TURN = 0.5  # rad: cameras that look elsewhere share too little
 _STEPS = 16  # SGBM's disparities are in sixteenths of a pixel, and their range in whole 16 pixels
@@ -50,34 +55,41 @@ class StereoCalibration(Config, frozen=True, kw_only=True):
 
 
 def read_calibration(path: Path) -> StereoCalibration:
-    """From JSON, YAML or XML: matrices as OpenCV's FileStorage writes them, or plain lists; what
-    else the file holds is ignored. Raises InputError: missing, damaged, or it lacks something."""
-    cv2, text = opencv(), read_file(path, _LARGEST_FILE).decode("utf-8", "replace")
-    if sum(map(text.count, "[{<")) > _MOST_BRACKETS:  # in each other they end the process
-        raise InputError(f"{path} is long. Leave nothing in it but the calibration.")
+    """From JSON or YAML: matrices as ``cv2.FileStorage`` writes them, or plain lists of JSON; what
+    else the file holds is ignored. OpenCV's own reader is not asked: damaged files end it, and the
+    process with it. Raises InputError: missing, damaged, or it lacks something."""
+    text = read_file(path, _LARGEST_FILE).decode("utf-8", "replace")
     try:
-        storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
-        there = set(storage.root().keys()) & set(StereoCalibration.__struct_fields__)
-        found = {name: _value(storage.getNode(name), path) for name in there}
-        for name in found.keys() & {"D1", "D2", "T"}:  # columns, or rows
-            found[name] = np.ravel(found[name]).tolist()
-    except (cv2.error, SystemError, ValueError, RecursionError) as error:
+        found = _of_yaml(text) if text.startswith("%YAML") else json.loads(text)
+        names = found.keys() & set(StereoCalibration.__struct_fields__)
+        given = {name: _value(found[name]) for name in names}
+    except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
         raise InputError(
-            f"{path} is no JSON, YAML or XML that OpenCV reads. Write it by cv2.FileStorage."
+            f"{path} is no calibration in JSON or in OpenCV's YAML. Write it by cv2.FileStorage, "
+            "as .json or .yaml."
         ) from error
-    return from_builtins(found, StereoCalibration, str(path))
+    for name in given.keys() & {"D1", "D2", "T"}:  # columns, or rows
+        rows = given[name]
+        if isinstance(rows, list) and all(isinstance(row, list) for row in rows):
+            given[name] = [number for row in rows for number in row]
+    return from_builtins(given, StereoCalibration, str(path))
 
 
-def _value(node: Any, path: Path) -> Any:
-    if node.isMap():  # a matrix, whose size is only claimed so far
-        if not 0 < node.getNode("rows").real() * node.getNode("cols").real() <= _MOST_NUMBERS:
-            raise InputError(f"{path}: {node.name()} is no small matrix; it is damaged.")
-        return node.mat().tolist()
-    if node.isSeq():
-        return [_value(node.at(n), path) for n in range(node.size())]
-    if node.isString():
-        return node.string()
-    return int(node.real()) if node.isInt() else node.real()
+def _of_yaml(text: str) -> dict[str, Any]:
+    """The numbers, words and matrices at the top."""
+    matrices = {
+        name: {"rows": int(rows), "cols": int(cols), "data": list(map(float, data.split(",")))}
+        for name, rows, cols, data in _MATRIX.findall(text)
+    }
+    plain = {name: word.strip('"') for name, word in _PLAIN.findall(text)}
+    return matrices | {name: int(w) if w.isdecimal() else w for name, w in plain.items()}
+
+
+def _value(given: Any) -> Any:
+    """Rows of a matrix, or what is none as it is. ValueError: its size is not what it claims."""
+    if not isinstance(given, dict):
+        return given
+    return np.reshape(given["data"], (given["rows"], given["cols"])).tolist()
 
 
 class StereoRig:
