@@ -64,7 +64,8 @@ def tiny_model(folder: Path, labels: dict) -> Path:
     }  # fmt: skip
     plans = _plans()
     torch.manual_seed(0)
-    trainer = nnUNetTrainer(plans, "3d_fullres", 0, dataset, torch.device("cpu"))
+    given = {**plans, "continue_training": False}  # as its command does
+    trainer = nnUNetTrainer(given, "3d_fullres", 0, dataset, torch.device("cpu"))
     trainer.initialize()
     kinds = torch.from_numpy(np.random.default_rng(0).integers(0, 3, (2, 1, 16, 16, 16)))
     image = (torch.tensor([-100.0, 100.0, 400.0])[kinds] - 100) / 150
