@@ -55,7 +55,7 @@ site: setup  ## the documentation's site, strictly: build/site/index.html (`.ven
 test: check site pytest  ## check, then all tests (those of Chromium and Fast DDS after `make debian`)
 
 pytest: setup  ## the tests alone
-	OMP_NUM_THREADS=1 $(BIN)/pytest -n 3 --dist loadfile --no-loadscope-reorder
+	OMP_NUM_THREADS=1 $(BIN)/pytest -n 4 --dist loadfile --no-loadscope-reorder
 
 pretrained: setup  ## the weights of random kidneys that the package ships (ARGS="--anatomies N --steps N")
 	$(BIN)/tumortrack pretrain runs/kidneys $(ARGS)

@@ -42,7 +42,8 @@ def environment(wheel, tmp_path_factory):
     for path in Path(sysconfig.get_path("purelib")).iterdir():
         if "tumortrack" not in path.name:
             (linked / path.name).symlink_to(path)
-    (packages / "dependencies.pth").write_text(f"{linked}\n")
+    here = f"import site; site.addsitedir({str(linked)!r})\n"  # reads the .pth files there, too
+    (packages / "dependencies.pth").write_text(here)
     with zipfile.ZipFile(wheel) as archive:
         archive.extractall(packages)
     return place

@@ -19,7 +19,7 @@ SIGNATURES = {
     "load_model": "folder device='auto'",
     "plan_resection": "located picture=None stand_mm=None accept_poor=False accept_budget=False "
     "confidence=None options",
-    "prepare": "source folder=None overwrite=False options",
+    "prepare": "source folder=None overwrite=False segment=None options",
     "read_cloud": "path unit='mm'",
     "save_estimate": "estimate folder overwrite=False",
     "scan_phantom": "folder seed=1",

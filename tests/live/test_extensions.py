@@ -108,7 +108,9 @@ def test_a_broken_package_breaks_its_own_kind_alone(example, tmp_path, monkeypat
     }.items():
         with pytest.raises(InputError, match=said):
             SINKS.parse(kind)
-    with pytest.raises(InputError, match=r"Allowed: csv, lost, number, openigtlink, .*viewer"):
+    with pytest.raises(
+        InputError, match=r"Allowed: csv, lost, moveit, number, openigtlink, .*viewer"
+    ):
         SINKS.parse("screen")
     faults = {(one.package, one.kind): one.fault for one in extensions()}
     assert faults["tumortrack-example", "csv"] == faults["tumortrack-example", "image"] == ""

@@ -193,7 +193,7 @@ def test_a_source_that_vanishes_ends_with_a_reason(world, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["camera"], "Allowed: realsense, recording, rehearsal, ros2, virtual"),
+        (["camera"], "Allowed: realsense, recording, rehearsal, ros2, stereo, virtual"),
         (["virtual"], "lacks its case. Write virtual:CASE"),
         (["virtual:CASE", "screen"], "Allowed: moveit, openigtlink, recording, ros2, ur, viewer"),
         (["virtual:CASE", "viewer:abc"], "Write viewer[:port]"),
