@@ -9,6 +9,9 @@ from pathlib import Path
 import jaxtyping
 import pytest
 
+# Ray reads these once, when whatever test imports it first: its clusters of these tests ask for a
+# token, which other users of the machine do not have.
+os.environ |= {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": "0123456789abcdef" * 4}
 ROOT = Path(__file__).parents[1]
 PACKAGES = (
     ROOT / "src" / "tumortrack",

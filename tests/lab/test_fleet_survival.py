@@ -34,8 +34,6 @@ def machines(tmp_path_factory) -> Iterator[Machines]:
         patch.setenv("RAY_USAGE_STATS_ENABLED", "0")
         patch.setenv("RAY_worker_niceness", "0")
         patch.setenv("RAY_raylet_start_wait_time_s", "300")
-        patch.setenv("RAY_AUTH_MODE", "token")
-        patch.setenv("RAY_AUTH_TOKEN", "0123456789abcdef" * 4)
         patch.setenv("FLEET_FOLDER", str(tmp_path_factory.mktemp("fleet")))
         patch.setenv("PYTHONPATH", os.pathsep.join(filter(None, sys.path)))
         machines = Machines()
