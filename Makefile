@@ -36,7 +36,7 @@ $(TOOLS): requirements/tools.txt
 	.tools/bin/$(INSTALL) --require-hashes -r requirements/tools.txt
 	touch $@
 
-demo: setup  ## CT -> tumors located in unseen deformed scenes (about 4 minutes once installed)
+demo: setup  ## CT -> tumors located in unseen deformed scenes (about 2 minutes once installed)
 	$(BIN)/tumortrack demo
 
 check: setup  ## lint, types, import order, licences
