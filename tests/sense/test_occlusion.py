@@ -201,12 +201,9 @@ def test_presets_draw_the_scenes_they_drew_before_these_faults_existed(preset, m
     now = [simulator.render(recipe(i)) for i in range(6)]
     for name in ("occlude", "miscalibrate"):
         monkeypatch.setattr(scene_module, name, lambda frame, config, rng: frame)
+    uncropped = scene_module.CloudConfig(near_mm=1.0, far_mm=1e4)
     monkeypatch.setattr(
-        scene_module,
-        "crop_of",
-        lambda config, free, rng: (
-            scene_module.CloudConfig(near_mm=1.0, far_mm=1e4) if free else config.cloud
-        ),
+        Simulator, "_crop", lambda self, free, rng: uncropped if free else config.cloud
     )
     for index, stage in enumerate(now):
         before = simulator.render(recipe(index))

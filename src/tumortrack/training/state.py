@@ -30,9 +30,9 @@ from tumortrack.core.types import Anatomy
 from tumortrack.models.config import TrainConfig
 from tumortrack.models.hardware import has_fast_bfloat16
 from tumortrack.models.model import Network
-from tumortrack.simulate.batched.stream import Tensors
 from tumortrack.training.distributed import ProcessGroup
 from tumortrack.training.model import PretrainedWeights, model_class
+from tumortrack.training.scenes import Tensors
 
 _FILE = "checkpoint.safetensors"
 _FLOOR = 0.01  # of the peak learning rate, at the end of the tail
@@ -53,7 +53,6 @@ class TrainingRun:
     workers: int | None = None  # processes that make scenes; None: as the machine allows
     checkpoint_every_s: float = 30.0
     start: PretrainedWeights | None = None  # of a registration network
-    scenes: Literal["auto", "workers", "device"] = "auto"  # who makes them; see ``training.scenes``
     patient: Patient = NOBODY  # whose organ it is
 
     def __post_init__(self) -> None:

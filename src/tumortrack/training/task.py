@@ -16,7 +16,7 @@ from jaxtyping import Float32, Float64, UInt8
 
 from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.estimate import FAR_MM
-from tumortrack.core.process import parallel_for
+from tumortrack.core.process import parallel_map
 from tumortrack.imaging.symmetry import alike, half_turns
 from tumortrack.models.config import RegistrationHeadConfig, TrainConfig
 from tumortrack.models.in_distribution import InDistributionRange, fit_mm, spread_mm
@@ -246,14 +246,10 @@ class RegistrationTask(TrainingTask):
         if self._last is None or self._last[0] != weights:
             network.eval()
             registration, clouds = self._registration(network), self._scenes.clouds_mm
-            proposed = [registration.propose(cloud) for cloud in clouds]
-            found: dict[int, RegistrationResult] = {}
-
-            def fit(part: slice) -> None:
-                found[part.start] = registration.best_fit(clouds[part.start], proposed[part.start])
-
-            parallel_for(fit, len(clouds), 1)
-            self._last = weights, [(proposed[n][0], found[n]) for n in range(len(clouds))]
+            proposed = [(cloud, registration.propose(cloud)) for cloud in clouds]
+            fits = parallel_map(lambda one: registration.best_fit(*one), proposed)
+            likeliest = (hypotheses[0] for _, hypotheses in proposed)
+            self._last = weights, list(zip(likeliest, fits, strict=True))
         return self._last[1]
 
     def _off_mm(self, drafts: list[tuple[ElasticMotion, RegistrationResult]]) -> list[float]:
