@@ -69,8 +69,6 @@ class SceneConfig(Config, frozen=True):
     from that range, log-uniformly, instead of ``cloud.n_points``.
     """
 
-    LATER = ("occlusion", "calibration", "cloud_points", "views")
-
     width: int = 424
     height: int = 240
     pose: PoseConfig = PoseConfig()

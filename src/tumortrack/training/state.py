@@ -22,7 +22,7 @@ from safetensors.torch import save
 from torch import Tensor
 
 from tumortrack.core import store
-from tumortrack.core.config import identity, to_builtins
+from tumortrack.core.config import to_builtins
 from tumortrack.core.errors import ArtifactError, InputError, TumortrackError
 from tumortrack.core.organ import organ_entry
 from tumortrack.core.patient import NOBODY, Patient
@@ -127,7 +127,7 @@ def _check(run: Run, **smallest: int) -> None:
 
 
 def _sha256(run: Run, **more: object) -> str:
-    content = {"config": identity(run.config), "seed": run.seed, "steps": run.steps, **more}
+    content = {"config": to_builtins(run.config), "seed": run.seed, "steps": run.steps, **more}
     content["schema"] = store.SCHEMA
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
@@ -224,7 +224,6 @@ class TrainingState:
         return torch.optim.Adam(
             self.network.parameters(),
             config.schedule.learning_rate,
-            weight_decay=config.weight_decay,
             fused=True,  # a twentieth of the quick step on a CPU
         )
 
@@ -253,8 +252,9 @@ class TrainingState:
             ) from error
         if metadata.get("identity") != self.run.identity:
             raise ArtifactError(
-                f"{work.parent} holds a run with another case, preset, seed or option. Give the "
-                "same command to resume it, or another MODEL folder to start a new one."
+                f"{work.parent} holds a run with another case, preset, seed or option, or of "
+                "another version. Give the same command to resume it, or another MODEL folder to "
+                "start a new one."
             )
         self.progress = progress
         self.network.load_state_dict(groups["network"])

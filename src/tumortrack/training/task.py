@@ -26,7 +26,6 @@ from tumortrack.occupancy.network import Latent, OccupancyNetwork
 from tumortrack.occupancy.volume import FIT_STEPS, lattice_over, surface_distances
 from tumortrack.registration.canonical_frame import carry_over, upright_of
 from tumortrack.registration.gauss_newton import RegistrationResult, posterior
-from tumortrack.registration.gauss_newton_kernels import KERNEL
 from tumortrack.registration.looks import Looks
 from tumortrack.registration.model import RegistrationModel, UncertaintyCalibration
 from tumortrack.registration.motion import ElasticMotion
@@ -234,9 +233,7 @@ class RegistrationTask(TrainingTask):
         return RegistrationModel(
             **self._fields(network, about, ranges),
             shape=self._shape,
-            calibration=UncertaintyCalibration(
-                std_scale=std_scale, usual_cost=usual_cost, kernel=KERNEL
-            ),
+            calibration=UncertaintyCalibration(std_scale=std_scale, usual_cost=usual_cost),
         )
 
     def _fits(self, network: RegistrationNetwork) -> list[tuple[ElasticMotion, RegistrationResult]]:
