@@ -83,7 +83,7 @@ print("used")
 READ = """
 from tumortrack.core.config import from_builtins
 from tumortrack.simulate.scene import SceneConfig
-from_builtins({"deform": [{"type": "rest"}]}, SceneConfig, "scene.json")
+from_builtins({"deform": [{"type": "drag"}]}, SceneConfig, "scene.json")
 """
 
 

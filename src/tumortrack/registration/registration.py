@@ -79,21 +79,11 @@ class Registration:
     either_side: bool = False
 
     def register(
-        self, points_mm: Points, usual_cost: float = math.inf, timed: Timer = nullcontext
-    ) -> RegistrationResult:
-        """The whole method; ``timed("encode")`` and ``timed("refine")`` time its halves."""
-        with timed("encode"):
-            hypotheses = self.propose(points_mm)
-        with timed("refine"):
-            return self.best_fit(points_mm, hypotheses, usual_cost)
-
-    def register_all(
         self, looks: Looks, usual_cost: float = math.inf, timed: Timer = nullcontext
     ) -> Laid:
-        """The whole method for several looks at one still organ, each of which proposes; and the
-        looks as the further cameras are corrected then."""
-        if looks.count == 1:
-            return self.register(looks.points_mm, usual_cost, timed), looks
+        """The whole method for one or several looks at a still organ, each of which proposes; and
+        the looks as the further cameras are corrected then. ``timed("encode")`` and
+        ``timed("refine")`` time its halves."""
         with timed("encode"):
             hypotheses = []
             for n, pose in enumerate(looks.camera_from_look):
@@ -102,6 +92,8 @@ class Registration:
         whole = replace(self, config=looks.weighed(self.config))
         with timed("refine"):
             fit = whole.best_fit(looks.points_mm, hypotheses, usual_cost)
+            if looks.count == 1:
+                return fit, looks
             # Each with its own places of the cameras.
             return best_laid([self._laid(looks, one) for one in (fit, *fit.rivals)])
 

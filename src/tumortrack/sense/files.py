@@ -219,10 +219,8 @@ def read_camera(path: Path | None) -> tuple[Intrinsics | None, DepthCorrection]:
 
 
 def _correction(data: dict[str, Any], path: Path) -> DepthCorrection:
-    (scale,), (offset_mm,) = (
-        _numbers(data.get(key, default), key, path)
-        for key, default in (("depth_scale", 1.0), ("depth_offset_mm", 0.0))
-    )
+    scale = _numbers(data.get("depth_scale", 1.0), "depth_scale", path)[0]
+    offset_mm = _numbers(data.get("depth_offset_mm", 0.0), "depth_offset_mm", path)[0]
     return DepthCorrection(scale=scale, offset_mm=offset_mm)
 
 

@@ -32,7 +32,6 @@ from tumortrack.simulate.deform import (
     ChainConfig,
     DragConfig,
     ElasticConfig,
-    RestConfig,
     installed,
     links_of,
 )
@@ -73,7 +72,7 @@ class SceneConfig(Config, frozen=True):
     height: int = 240
     pose: PoseConfig = PoseConfig()
     # One a scene, drawn uniformly.
-    deform: tuple[installed.LinkConfig | ChainConfig | RestConfig, ...] = (DragConfig(),)
+    deform: tuple[installed.LinkConfig | ChainConfig, ...] = (DragConfig(),)
     clutter: ClutterConfig = ClutterConfig()
     noise: NoiseConfig = NoiseConfig()
     cloud: CloudConfig = CloudConfig()
