@@ -16,8 +16,8 @@ _CGROUPS = Path("/sys/fs/cgroup")
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD, _M_MMAP_MAX = -1, -3, -4  # glibc's malloc.h
 _MMAP_MAX = 65536  # glibc's default
 _SMALL = 32 * 2**20  # bytes: the largest threshold that glibc accepts
-T = TypeVar("T")
-R = TypeVar("R")
+_Item = TypeVar("_Item")
+_Made = TypeVar("_Made")
 
 
 def is_follower() -> bool:
@@ -67,9 +67,9 @@ def parallel_for(body: Callable[[slice], object], count: int, chunk: int) -> Non
         other.result()
 
 
-def parallel_map(call: Callable[[T], R], items: Sequence[T]) -> list[R]:
+def parallel_map(call: Callable[[_Item], _Made], items: Sequence[_Item]) -> list[_Made]:
     """What ``call`` makes of each item, in their order, by ``parallel_for``."""
-    made: dict[int, R] = {}
+    made: dict[int, _Made] = {}
 
     def make(part: slice) -> None:
         made[part.start] = call(items[part.start])

@@ -226,10 +226,7 @@ def _correction(data: dict[str, Any], path: Path) -> DepthCorrection:
 
 def _camera(path: Path) -> tuple[Intrinsics, dict[str, Any]]:
     """The camera, and all that its file has."""
-    try:
-        data = read_json(path)
-    except (ValueError, RecursionError) as error:  # numbers of thousands of digits, deep nesting
-        raise InputError(f"{path} cannot be read as JSON: {error}.") from error
+    data = read_json(path)
     for key in _DISTORTION_KEYS:
         if any(_numbers(data.get(key, 0), key, path)):
             raise InputError(
