@@ -27,13 +27,12 @@ from tumortrack.phantom.digital import PhantomParameters, phantom_labels
 from tumortrack.sense.cloud import CloudConfig
 from tumortrack.sense.files import read_cloud
 from tumortrack.sense.region import Hints, RegionConfig, organ_points
-from tumortrack.simulate.batched.stream import DeviceStream, why_not
 from tumortrack.simulate.scene import SceneStream
 from tumortrack.simulate.scene_folder import draw_targets
 from tumortrack.tracking.tracker import Follower, FollowerConfig, Tracker
 from tumortrack.training.model import load_model
 from tumortrack.training.presets import PRESETS, pretraining
-from tumortrack.training.pretrain import kidney_stream
+from tumortrack.training.pretrain import KidneyStream
 from tumortrack.training.state import Pretraining
 from tumortrack.training.task import task_of
 from tumortrack.training.train import TrainingRun, train
@@ -140,9 +139,6 @@ def scene() -> Entries:
         stream = SceneStream(*given, course.body)  # type: ignore[arg-type]
         for index in (0, 7):
             yield from under(f"{preset}/{index}", batch(stream.batch(index)))
-        if why_not(stream) is None:  # as a GPU makes them, here on the CPU
-            tensors = DeviceStream(stream, torch.device("cpu")).batch(3)
-            yield from ((f"{preset}/batched/{n}", part) for n, part in enumerate(tensors))
 
 
 def batch(made: Any) -> Entries:
@@ -151,7 +147,7 @@ def batch(made: Any) -> Entries:
 
 def pretrain() -> Entries:
     config = msgspec.structs.replace(pretraining(), batch_size=2)
-    kidneys = kidney_stream(Pretraining(config, anatomies=1, steps=1))
+    kidneys = KidneyStream(Pretraining(config, anatomies=1, steps=1))
     yield from under("scene", batch(kidneys.batch(1)))
     command("pretrain", "start", "--anatomies", 1, "--steps", 3, "--workers", 0, *CPU)
     yield from under("weights", files("start", "*"))

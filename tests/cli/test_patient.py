@@ -78,7 +78,7 @@ def test_an_empty_variable_in_a_script_is_no_leave_to_take_anybody(clinic_model,
     assert words in refusal(tumortrack(*track, "--patient", stated))
 
 
-def test_folders_from_before_know_nobody_and_serve_nobody_in_particular(
+def test_folders_that_say_nothing_know_nobody_and_serve_nobody_in_particular(
     clinic_model, run, tmp_path
 ):
     model, old = tmp_path / "model", tmp_path / "run"

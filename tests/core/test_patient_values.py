@@ -11,7 +11,7 @@ from tumortrack.core.patient import NOBODY, Patient, patient_in
 A, B = Patient("A", "left"), Patient("B", "left")
 
 
-def test_it_comes_back_from_a_file_and_older_files_know_nobody():
+def test_it_comes_back_from_a_file_and_one_that_says_nothing_knows_nobody():
     assert patient_in(to_builtins(A), "here") == A
     assert patient_in(None, "here") == NOBODY
     for nonsense in ({"id": "A", "side": "up"}, {"id": "A", "name": "Doe"}, "A"):

@@ -19,7 +19,7 @@ from tumortrack.core import store
 from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.geometry import rigid
 from tumortrack.core.types import Anatomy, Mesh, SensorCloud
-from tumortrack.simulate.deform import RestConfig
+from tumortrack.simulate.deform import DragConfig
 from tumortrack.simulate.occupancy import OccupancyConfig
 from tumortrack.simulate.scene import SceneConfig, SceneRecipe, Simulator
 from tumortrack.simulate.scene_folder import Scene
@@ -267,7 +267,8 @@ def phantom(tmp_path_factory):
     """The phantom with two simulated scenes under the twin's names."""
     root = tmp_path_factory.mktemp("study")
     case = write_phantom_case(root / "case")
-    simulator = Simulator(case.anatomy, case.up_lps, SceneConfig(deform=(RestConfig(),)))
+    at_rest = SceneConfig(deform=(DragConfig(steps=()),))
+    simulator = Simulator(case.anatomy, case.up_lps, at_rest)
     for number, variant in enumerate(("D0", "D1")):
         stage = simulator.render(SceneRecipe(3, "test", number))
         scene = Scene(stage.cloud, simulator.reference(stage), stage.frame)

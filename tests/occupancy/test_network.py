@@ -179,8 +179,7 @@ def test_octaves_have_known_values() -> None:
 def test_set_abstraction_equals_the_plain_concatenation(norm: str) -> None:
     torch.manual_seed(0)
     level = SetAbstraction(ratio=0.25, radius=0.8, neighbours=6, widths=(8, 12))
-    config = PointNet2Config(levels=(level,), widths=(4,), norm=norm)
-    module = _Level(level, 5, config).double()
+    module = _Level(level, 5, norm).double()
     points, features = torch.randn(2, 40, 3).double(), torch.randn(2, 40, 5).double()
     chosen = farthest_points(points, 10)
     plain = []

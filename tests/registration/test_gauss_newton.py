@@ -17,7 +17,7 @@ from scipy.special import ndtr
 from covering import cover
 from elastic_objects import CENTER, RADII
 from tumortrack.core.estimate import Following
-from tumortrack.core.process import parallel_for
+from tumortrack.core.process import parallel_for, parallel_map
 from tumortrack.core.types import Mesh, SensorCloud
 from tumortrack.imaging.raster import label_grid, winding_numbers
 from tumortrack.models.config import GaussNewtonConfig
@@ -85,6 +85,9 @@ def test_parts_are_all_done_once_and_errors_come_back():
     assert (done == 1).all()
     with pytest.raises(ZeroDivisionError):
         parallel_for(lambda part: 1 // (part.start - 9900), len(done), 300)
+    assert parallel_map(lambda n: n * n, range(7)) == [0, 1, 4, 9, 16, 25, 36]
+    with pytest.raises(ZeroDivisionError):
+        parallel_map(lambda n: 1 // n, [2, 1, 0])
 
 
 # --- refinement ---

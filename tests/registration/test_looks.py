@@ -163,9 +163,9 @@ def test_one_look_is_what_it_was(tracker):
     points = points_of(image(placed(), np.eye(4))).points_mm[::20]
     looks, registration = Looks.of([points]), tracker.model.registration()
     assert looks.points_mm is points
-    fit, same = registration.register_all(looks)
+    fit, same = registration.register(looks)
     assert same is looks
-    alone = registration.register(points)
+    alone = registration.best_fit(points, registration.propose(points))
     np.testing.assert_array_equal(fit.motion.carry(INNER), alone.motion.carry(INNER))
     assert fit.cost == alone.cost
     config, motion, body = registration.config, alone.motion, alone.motion.shape.body

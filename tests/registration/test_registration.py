@@ -132,13 +132,12 @@ def test_a_shape_survives_its_arrays():
     np.testing.assert_array_equal(again.long_axis, shape().long_axis)
     assert again.half_turns is arrays["half_turns"]  # not found anew, which takes 0.2 s
     assert len(again.half_turns)
-    older = RestShape.from_arrays({k: v for k, v in arrays.items() if k != "half_turns"}, 2)
-    np.testing.assert_array_equal(older.half_turns, again.half_turns)
     for damaged in (np.full((1, 4, 4), np.nan), np.eye(4)):
         with pytest.raises(InputError, match="half turns are damaged"):
             RestShape.from_arrays({**arrays, "half_turns": damaged}, 2)
-    with pytest.raises(InputError, match=r"1\.values_mm"):
-        RestShape.from_arrays({k: v for k, v in arrays.items() if k != "1.values_mm"}, 2)
+    for name in ("1.values_mm", "half_turns"):
+        with pytest.raises(InputError, match=name):
+            RestShape.from_arrays({k: v for k, v in arrays.items() if k != name}, 2)
 
 
 def test_the_long_axis_is_the_ellipsoids():

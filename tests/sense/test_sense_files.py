@@ -271,14 +271,15 @@ def test_a_stored_frame_gives_the_same_cloud_as_the_live_one(tmp_path):
     assert np.linalg.norm(live - again, axis=1).max() < 0.0501 * 1.5  # along the line of sight
 
 
-def test_depth_unit_comes_from_the_file_or_the_caller(tmp_path):
+def test_the_depths_unit_is_what_the_intrinsics_file_says(tmp_path):
     png, camera = tmp_path / "depth.png", tmp_path / "intrinsics.json"
-    write_depth_png(png, wall(130.0), depth_unit_mm=0.25)
-    write_intrinsics(camera, SMALL, depth_unit_mm=0.25)
-    assert (read_depth_png(png, camera).depth_mm == 130).all()
-    assert (read_depth_png(png, camera, depth_unit_mm=1.0).depth_mm == 520).all()
+    write_depth_png(png, wall(130.0))  # 1,300 steps
+    for unit_mm in (0.25, 1.0):
+        write_intrinsics(camera, SMALL, unit_mm)
+        assert (read_depth_png(png, camera).depth_mm == 1300 * unit_mm).all()
+    write_intrinsics(camera, SMALL, 0.0)
     with pytest.raises(InputError, match="depth_unit_mm"):
-        read_depth_png(png, camera, depth_unit_mm=0)
+        read_depth_png(png, camera)
 
 
 def test_depths_are_corrected_as_the_intrinsics_file_says(tmp_path):

@@ -32,8 +32,9 @@ from tumortrack.simulate.elastic.loads import (
     LOADS,
     ReducedProblem,
     in_bed,
-    random_state,
+    random_problem,
     random_states,
+    state_of,
 )
 from tumortrack.simulate.elastic.modes import ReducedModel, modes_of, patches_of, random_loads
 from tumortrack.simulate.occupancy import OccupancyConfig, OccupancyPool
@@ -352,7 +353,7 @@ def test_the_same_seed_gives_the_same_body_and_another_another(body):
 
 def test_a_state_that_moves_far_is_scaled_back(reduced):
     rng = np.random.default_rng(0)
-    states = [random_state(reduced, np.array(UP), 0.2, rng) for _ in range(150)]
+    states = [state_of(random_problem(reduced, np.array(UP), 0.2, rng)) for _ in range(150)]
     farthest = [
         np.linalg.norm(reduced.moves[:, :, : reduced.n_modes] @ s, axis=1).max()
         for s in states

@@ -55,8 +55,6 @@ import tumortrack.simulate.deform
 assert "shifting" not in sys.modules  # imported when a configuration is read
 from render_objects import anatomy
 from tumortrack.core.config import from_builtins, to_builtins
-from tumortrack.simulate.batched.stream import why_not
-from tumortrack.simulate.scene import SceneStream
 from tumortrack.simulate.occupancy import OccupancyPool
 from tumortrack.simulate.scene import SceneConfig, SceneRecipe, Simulator, body_for
 
@@ -68,7 +66,6 @@ assert pickle.loads(pickle.dumps(config)) == config
 organ, up = anatomy(), (0.0, -1.0, 0.0)
 assert body_for(organ, up, config, 0) is None
 simulator, pool = Simulator(organ, up, config), OccupancyPool(organ, config.occupancy, 0)
-assert "deformations other than" in why_not(SceneStream(organ, up, config, pool, 0, "test", 1))
 records = []
 for index in range(16):
     scene = simulator.render(SceneRecipe(0, "test", index))
@@ -86,7 +83,7 @@ print("used")
 READ = """
 from tumortrack.core.config import from_builtins
 from tumortrack.simulate.scene import SceneConfig
-from_builtins({"deform": [{"type": "rest"}]}, SceneConfig, "scene.json")
+from_builtins({"deform": [{"type": "drag"}]}, SceneConfig, "scene.json")
 """
 
 

@@ -14,7 +14,7 @@ from tumortrack.sense.camera import deproject
 from tumortrack.sense.cloud import CloudConfig
 from tumortrack.sense.clutter import ClutterConfig
 from tumortrack.sense.noise import D405_NOISE
-from tumortrack.simulate.deform import DragConfig, RestConfig
+from tumortrack.simulate.deform import DragConfig, StretchConfig
 from tumortrack.simulate.occupancy import OccupancyConfig, OccupancyPool
 from tumortrack.simulate.scene import (
     STREAMS,
@@ -74,9 +74,9 @@ def test_every_seed_stream_and_index_is_a_scene_of_its_own(simulator, pool):
 
 
 def test_configuration_survives_json_and_names_its_deformations():
-    config = SceneConfig(deform=(RestConfig(), DragConfig(falloff="variance")), free_range=0.25)
+    config = SceneConfig(deform=(StretchConfig(), DragConfig(falloff="variance")), free_range=0.25)
     data = to_builtins(config)
-    assert [d["type"] for d in data["deform"]] == ["rest", "drag"]
+    assert [d["type"] for d in data["deform"]] == ["stretch", "drag"]
     assert from_builtins(data, SceneConfig, "here") == config
     with pytest.raises(InputError, match="squeeze"):
         from_builtins({**data, "deform": [{"type": "squeeze"}]}, SceneConfig, "here")
@@ -111,7 +111,7 @@ def test_the_cloud_is_a_unique_draw_of_the_image_in_range(simulator):
 
 
 def test_free_scenes_are_seen_from_anywhere_and_keep_their_depth():
-    config = SceneConfig(occupancy=SMALL, free_range=1.0, deform=(RestConfig(),))
+    config = SceneConfig(occupancy=SMALL, free_range=1.0, deform=(DragConfig(steps=()),))
     free = Simulator(ANATOMY, UP, config)
     nearest = []
     for index in range(30):
@@ -149,11 +149,12 @@ def test_labelled_points_lie_in_the_scene_as_the_reference_does(simulator, pool)
 
 
 def test_deformations_are_chosen_with_equal_chance():
-    both = SceneConfig(deform=(RestConfig(), DragConfig()), width=160, height=90, occupancy=SMALL)
+    models = StretchConfig(), DragConfig()
+    both = SceneConfig(deform=models, width=160, height=90, occupancy=SMALL)
     simulator = Simulator(ANATOMY, UP, both)
     kinds = [simulator.render(recipe(i)).deformation.record()["kind"] for i in range(60)]
     assert 18 < kinds.count("drag") < 42
-    assert kinds.count("drag") + kinds.count("rest") == 60
+    assert kinds.count("drag") + kinds.count("stretch") == 60
 
 
 def test_background_joins_a_scene_and_changes_nothing_else():

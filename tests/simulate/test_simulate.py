@@ -11,7 +11,6 @@ from scipy.stats import kstest
 from render_objects import anatomy, sphere
 from tumortrack.core.errors import TumortrackError
 from tumortrack.core.geometry import direction_lps, transform_points
-from tumortrack.simulate.deform import RestConfig
 from tumortrack.simulate.deform.base import View
 from tumortrack.simulate.deform.drag import CONFIGURATIONS, DragConfig, Drags, _centres
 from tumortrack.simulate.scene import PoseConfig, _turn, sample_pose
@@ -217,7 +216,7 @@ def test_the_tables_numbers_read_as_variances_fold_space():
     assert least < -0.4
 
 
-def test_deformations_record_what_they_did_and_rest_does_nothing():
+def test_deformations_record_what_they_did_and_no_drag_does_nothing():
     drags = DragConfig().sample(VIEW, np.random.default_rng(3))
     record = drags.record()
     again = Drags(
@@ -225,9 +224,9 @@ def test_deformations_record_what_they_did_and_rest_does_nothing():
     )
     points = ORGAN.vertices_mm
     np.testing.assert_array_equal(again.apply(points), drags.apply(points))
-    rest = RestConfig().sample(VIEW, np.random.default_rng(3))
-    np.testing.assert_array_equal(rest.apply(points), points.astype(np.float32))
-    assert rest.record() == {"kind": "rest"}
+    none = DragConfig(steps=()).sample(VIEW, np.random.default_rng(3))
+    np.testing.assert_array_equal(none.apply(points), points.astype(np.float32))
+    assert none.record() == {"kind": "drag", "centres_ct": [], "shifts_mm": [], "sigmas_mm": []}
 
 
 def test_centres_are_dragged_as_any_point_bit_for_bit():

@@ -9,8 +9,8 @@ from tumortrack.core.types import DepthFrame, Intrinsics
 from tumortrack.sense.files import DEPTH_UNIT_MM, depth_png, intrinsics_json
 
 
-def write_depth_png(path: Path, frame: DepthFrame, depth_unit_mm: float = DEPTH_UNIT_MM) -> None:
-    path.write_bytes(depth_png(frame, depth_unit_mm))
+def write_depth_png(path: Path, frame: DepthFrame) -> None:
+    path.write_bytes(depth_png(frame))
 
 
 def write_frame_folder(folder: Path, frame: DepthFrame) -> None:
@@ -21,4 +21,4 @@ def write_frame_folder(folder: Path, frame: DepthFrame) -> None:
 
 
 def write_intrinsics(path: Path, camera: Intrinsics, depth_unit_mm: float = DEPTH_UNIT_MM) -> None:
-    write_json(path, intrinsics_json(camera, depth_unit_mm))
+    write_json(path, intrinsics_json(camera) | {"depth_unit_mm": depth_unit_mm})

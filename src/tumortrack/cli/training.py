@@ -163,13 +163,7 @@ def _training_screen() -> Iterator[Callable[[TrainingStatus], None]]:
     from tumortrack.training.state import Diverged
     from tumortrack.training.train import Interrupted
 
-    noted = ""
-
     def show(status: TrainingStatus) -> None:
-        nonlocal noted
-        if status.note != noted:
-            say(status.note)
-            noted = status.note
         end = f"/{status.end}" if status.end is not None else ""
         miou = "-" if status.miou is None else f"{status.miou:.3f}"
         minutes, seconds = divmod(int(status.seconds_left), 60)

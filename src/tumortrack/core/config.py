@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, TypeVar
+from typing import Any, TypeVar
 
 import msgspec
 
@@ -11,10 +11,7 @@ from tumortrack.core.errors import InputError
 
 class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Base of every configuration value. Subclasses that take part in a typed union (one kind, one
-    file) add ``tag=...``. ``LATER`` names fields that came after the first hashes of such values;
-    see ``identity``."""
-
-    LATER: ClassVar[tuple[str, ...]] = ()
+    file) add ``tag=...``."""
 
     def check_ranges(self, what: str, least: str = "0 (off)", **most: float) -> None:
         """Refuse each named field that is not in 0..most, by an InputError with this range, its
@@ -39,30 +36,6 @@ C = TypeVar("C", bound=msgspec.Struct)
 def to_builtins(config: msgspec.Struct) -> dict[str, Any]:
     """The configuration as JSON would return it, every key written out."""
     return msgspec.json.decode(msgspec.json.encode(config))
-
-
-def identity(config: msgspec.Struct) -> dict[str, Any]:
-    """``to_builtins`` without the fields named in ``LATER`` where they have their default, so that
-    artifacts from before there was such a field keep their hash."""
-    written = to_builtins(config)
-    _drop_later(config, written)
-    return written
-
-
-def _drop_later(value: Any, written: Any) -> None:
-    if isinstance(value, tuple):
-        for one, its in zip(value, written, strict=True):
-            _drop_later(one, its)
-    elif isinstance(value, Config):
-        for field in msgspec.structs.fields(value):
-            here = getattr(value, field.name)
-            default = field.default
-            if field.default_factory is not msgspec.NODEFAULT:
-                default = field.default_factory()
-            if field.name in value.LATER and here == default:
-                del written[field.name]
-            else:
-                _drop_later(here, written[field.name])
 
 
 def from_builtins(data: object, kind: type[C], where: str) -> C:

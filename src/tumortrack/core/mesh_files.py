@@ -50,9 +50,9 @@ def write_mesh(path: Path, mesh: Mesh) -> None:
     states ``SPACE=LPS``, which 3D Slicer looks for; also for meshes in the camera frame: Slicer
     shows all files of a run as if their frame were the patient's. StorageError where the disk
     refuses."""
-    kind = path.suffix.lower().removeprefix(".")
+    content = {".ply": _ply, ".stl": _stl}[path.suffix](mesh)
     with writing(path):
-        path.write_bytes(_ply(mesh) if kind == "ply" else _exported(mesh, kind))
+        path.write_bytes(content)
 
 
 def _ply(mesh: Mesh) -> bytes:
@@ -68,15 +68,12 @@ def _ply(mesh: Mesh) -> bytes:
     return header.encode() + mesh.vertices_mm.astype("<f4").tobytes() + faces.tobytes()
 
 
-def _exported(mesh: Mesh, kind: str) -> bytes:
+def _stl(mesh: Mesh) -> bytes:
     import trimesh
+    from trimesh.exchange.stl import export_stl
 
-    out = trimesh.Trimesh(mesh.vertices_mm, mesh.faces, process=False)
-    content = out.export(file_type=kind)
-    data = content if isinstance(content, bytes) else str(content).encode()
-    if kind == "stl":
-        return _SPACE.ljust(_STL_HEADER, b"\0") + data[_STL_HEADER:]
-    return b"# " + _SPACE + b"\n" + data
+    solid = trimesh.Trimesh(mesh.vertices_mm, mesh.faces, process=False)
+    return _SPACE.ljust(_STL_HEADER, b"\0") + export_stl(solid)[_STL_HEADER:]
 
 
 def write_anatomy(folder: Path, anatomy: Anatomy) -> None:

@@ -1,7 +1,6 @@
 """Which organ it is: the name that files, parts and messages bear, and its standard term.
 
-Stated once, where a case is made; it travels from there to everything that is made of it. What is
-older than this value says nothing and is a kidney's.
+Stated once, where a case is made; it travels from there to everything that is made of it.
 """
 
 from __future__ import annotations
@@ -121,8 +120,7 @@ def organ_first(parts: Iterable[str]) -> list[str]:
 
 
 def organ_in(found: object, where: str) -> Organ:
-    """What a file of ours says under ``organ``; older ones say nothing: a kidney. InputError where
-    it is something else."""
+    """What a file says under ``organ``; nothing: a kidney. InputError where it is no organ."""
     return KIDNEY if found is None else from_builtins(found, Organ, f"{where}: organ")
 
 

@@ -66,6 +66,5 @@ NOBODY = Patient()  # nothing is known
 
 
 def patient_in(found: object, where: str) -> Patient:
-    """What a file of ours says under ``patient``; older ones say nothing: unknown. InputError where
-    it is something else."""
+    """What a file says under ``patient``; nothing: unknown. InputError where it is no patient."""
     return NOBODY if found is None else from_builtins(found, Patient, f"{where}: patient")

@@ -22,7 +22,15 @@ from typing import Any
 import tumortrack
 from tumortrack.core.errors import ArtifactError, InputError, StorageError
 
-SCHEMA = 1
+SCHEMA = 2  # raise it with every change of what a folder holds or its numbers rest on
+_MADE_BY = {  # by kind
+    "case": "prepare INPUT CASE",
+    "twin": "twin CASE SCENES",
+    "pretrained": "pretrain OUT",
+    "model": "train CASE MODEL",
+    "run": "locate MODEL CLOUD OUT",
+    "plan": "plan RUN PLAN",
+}
 MANIFEST = "manifest.json"
 _LARGEST_MANIFEST = 16 * 2**20  # bytes: refused before it is read
 
@@ -225,9 +233,10 @@ def read_manifest(folder: Path, kind: str) -> dict[str, Any]:
     if manifest.get("kind") != kind:
         raise ArtifactError(f"{folder} is a {manifest.get('kind')!r}; a {kind!r} is needed here.")
     if manifest.get("schema") != SCHEMA:
+        command = f": tumortrack {_MADE_BY[kind]}" if kind in _MADE_BY else ""
         raise ArtifactError(
             f"{folder} has schema {manifest.get('schema')!r}; this tumortrack reads schema "
-            f"{SCHEMA}. Make it again with this version."
+            f"{SCHEMA}. Make it again with this version{command}."
         )
     files = manifest.get("files")
     if not isinstance(files, dict):

@@ -107,15 +107,12 @@ class TrainConfig(Config, frozen=True):
     """Everything that decides the weights, apart from case, seed and number of steps; ``refine``
     is how an elastic body is fitted to the cloud, in validation and in use."""
 
-    LATER = ("refine", "coarse", "steps_from_start")
-
     network: NetworkConfig
     scene: SceneConfig
     schedule: Schedule
     batch_size: int
     steps: int  # the preset's end
     drop_points: float = 0.0  # each batch loses a random fraction, up to this, of what is encoded
-    weight_decay: float = 0.0
     ema: float = 0.999  # 0: the plain weights are kept
     training_pairs: int = 0  # 0: endless; else scenes repeat after so many
     validation_pairs: int = 64

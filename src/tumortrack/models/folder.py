@@ -66,7 +66,7 @@ def organ_of(manifest: dict[str, Any], folder: Path) -> Organ:
 
 def weakness_of(provenance: dict[str, Any]) -> str:
     """Why no estimate of a model should be relied on, by what training knows of it, and what to do;
-    empty: no reason is known. Folders made before it was stored say nothing."""
+    empty: no reason is known."""
     far, half_turn_mm = provenance.get("validation_far"), provenance.get("half_turn_mm")
     if isinstance(far, float) and far > _MOST_FAR:
         return (

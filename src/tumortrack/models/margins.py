@@ -109,7 +109,6 @@ class ModelMargins(Config, frozen=True):
     risk_bound: float
     accepted: float
     missed: float
-    models: dict[str, float] = msgspec.field(default_factory=dict)  # of older files, and empty
 
     def __post_init__(self) -> None:
         if not self.shells or not all(map(math.isfinite, self.limits.values())):
@@ -146,11 +145,8 @@ def read_sealed(path: Path) -> ModelMargins:
             f"{METHOD}, whose estimates differ. {_AGAIN}"
         )
     try:
-        for shells in content["shells"]:
-            if "kidney" in shells["radii"]:  # as older versions wrote it
-                shells["radii"]["organ"] = shells["radii"].pop("kidney")
         return from_builtins(content, ModelMargins, str(path))
-    except (InputError, KeyError, TypeError) as error:
+    except InputError as error:
         raise ArtifactError(f"{error} {_AGAIN}") from error
 
 

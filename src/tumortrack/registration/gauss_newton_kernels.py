@@ -16,7 +16,6 @@ from tumortrack.core.compiled import numba
 from tumortrack.registration.kernels import POSE, DistanceField, Flow, Pose, add_rows
 from tumortrack.simulate.elastic.flow import BLOCK, LatticeField, block, combine, steps_of
 
-KERNEL = "geman-mcclure"  # names the two functions below: rename it with them
 _AT_ONCE = 256  # points whose rows stay in the cache; also so many are summed in single precision
 _APART = 16  # numbers between rows of sums: rows a power of two apart share a cache's lines
 

@@ -103,7 +103,7 @@ class RegistrationLocator:
         """See ``tracking.tracker.Tracker.locate``."""
         frame = Frame(self._model, cloud, seed, np.random.default_rng(seed))
         looks = self._looks(frame, others)
-        fit, looks = self._registration.register_all(looks, 0.0, frame.stage)
+        fit, looks = self._registration.register(looks, 0.0, frame.stage)
         size, placed = self._size(looks, fit), self._checked(looks, fit, frame)
         organ = placed.meshes[self._model.parts[0]]
         with frame.stage("fine"):
@@ -135,7 +135,7 @@ class RegistrationLocator:
         if not found or how.thorough or min(fit.cost for fit, _ in found) > usual:
             enough = 0.0 if not found else usual if how.thorough else np.inf
             method = replace(self._registration, either_side=how.either_side)
-            found.append(method.register_all(looks, enough, frame.stage))
+            found.append(method.register(looks, enough, frame.stage))
         fit, looks = best_laid(found)
         size, unsmoothed, lag_s = self._size(looks, fit), fit.motion, 0.0
         if last is not None and isinstance(last.motion, ElasticMotion) and how.smoothing_s > 0:

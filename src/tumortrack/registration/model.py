@@ -8,11 +8,9 @@ from typing import Any
 
 from safetensors.numpy import load, save
 
-from tumortrack.core.config import Config, from_builtins, identity
-from tumortrack.core.errors import InputError
+from tumortrack.core.config import Config, from_builtins, to_builtins
 from tumortrack.models.folder import SHAPE, organ_of, read_tensors
 from tumortrack.models.model import Model
-from tumortrack.registration.gauss_newton_kernels import KERNEL
 from tumortrack.registration.network import RegistrationNetwork
 from tumortrack.registration.registration import Registration
 from tumortrack.registration.rest_shape import RestShape
@@ -20,14 +18,10 @@ from tumortrack.registration.rest_shape import RestShape
 
 class UncertaintyCalibration(Config, frozen=True):
     """What validation scenes taught: standard deviations are multiplied by ``std_scale``; where a
-    fit costs more than ``usual_cost``, a search made anew looks all around. Both hold for one
-    robust kernel; folders that name none were made with the first."""
-
-    LATER = ("kernel",)
+    fit costs more than ``usual_cost``, a search made anew looks all around."""
 
     std_scale: float
     usual_cost: float
-    kernel: str = "geman-mcclure"
 
     def __post_init__(self) -> None:
         self.check_between("calibration", std_scale=(0.05, 50), usual_cost=(1e-3, 1e6))
@@ -51,16 +45,11 @@ class RegistrationModel(Model):
         return {SHAPE: save(self.shape.to_arrays())}
 
     def extra_entries(self) -> dict[str, Any]:
-        return {"trust": identity(self.calibration)}
+        return {"trust": to_builtins(self.calibration)}
 
     @classmethod
     def from_folder(cls, folder: Path, manifest: dict[str, Any], **known: Any) -> RegistrationModel:
         kind = organ_of(manifest, folder)
         shape = RestShape.from_arrays(read_tensors(folder / SHAPE, load), len(known["parts"]), kind)
         calibration = from_builtins(manifest["trust"], UncertaintyCalibration, f"{folder}: trust")
-        if calibration.kernel != KERNEL:
-            raise InputError(
-                f"{folder}: its fits were calibrated with the robust kernel {calibration.kernel}; "
-                f"here it is {KERNEL}. Make another model: tumortrack train CASE MODEL."
-            )
         return cls(shape=shape, calibration=calibration, **known)

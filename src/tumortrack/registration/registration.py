@@ -30,7 +30,7 @@ from scipy.spatial.transform import Rotation
 
 from tumortrack.core.errors import NoEstimate
 from tumortrack.core.geometry import Points, transform_points
-from tumortrack.core.process import parallel_for
+from tumortrack.core.process import parallel_map
 from tumortrack.models.config import GaussNewtonConfig
 from tumortrack.models.in_distribution import RIVAL_COST
 from tumortrack.registration.gauss_newton import GaussNewton, RegistrationResult, refine
@@ -79,21 +79,11 @@ class Registration:
     either_side: bool = False
 
     def register(
-        self, points_mm: Points, usual_cost: float = math.inf, timed: Timer = nullcontext
-    ) -> RegistrationResult:
-        """The whole method; ``timed("encode")`` and ``timed("refine")`` time its halves."""
-        with timed("encode"):
-            hypotheses = self.propose(points_mm)
-        with timed("refine"):
-            return self.best_fit(points_mm, hypotheses, usual_cost)
-
-    def register_all(
         self, looks: Looks, usual_cost: float = math.inf, timed: Timer = nullcontext
     ) -> Laid:
-        """The whole method for several looks at one still organ, each of which proposes; and the
-        looks as the further cameras are corrected then."""
-        if looks.count == 1:
-            return self.register(looks.points_mm, usual_cost, timed), looks
+        """The whole method for one or several looks at a still organ, each of which proposes; and
+        the looks as the further cameras are corrected then. ``timed("encode")`` and
+        ``timed("refine")`` time its halves."""
         with timed("encode"):
             hypotheses = []
             for n, pose in enumerate(looks.camera_from_look):
@@ -102,6 +92,8 @@ class Registration:
         whole = replace(self, config=looks.weighed(self.config))
         with timed("refine"):
             fit = whole.best_fit(looks.points_mm, hypotheses, usual_cost)
+            if looks.count == 1:
+                return fit, looks
             # Each with its own places of the cameras.
             return best_laid([self._laid(looks, one) for one in (fit, *fit.rivals)])
 
@@ -185,7 +177,7 @@ class Registration:
                 place = likeliest.centre_mm + share * (rotation @ across) * [1, 1, 0]
                 start = ElasticMotion(stiff, rotation, place, stiff.body.mean)
                 descents.append(GaussNewton(stiff, points_mm[:_FEW_POINTS], start, config))
-        parallel_for(lambda part: descents[part.start].run(_STIFF_STEPS), len(descents), 1)
+        parallel_map(lambda one: one.run(_STIFF_STEPS), descents)
         found: list[ElasticMotion] = []
         for descent in sorted(descents, key=_cost):
             motion = descent.result().motion
@@ -224,10 +216,10 @@ class Registration:
             GaussNewton(self.rest, points_mm, start, self.config, moved) for start, moved in starts
         ]
         trial, steps = min(_TRIAL_STEPS, self.config.steps), self.config.steps
-        parallel_for(lambda part: descents[part.start].run(trial), len(descents), 1)
+        parallel_map(lambda one: one.run(trial), descents)
         most = _MAX_COST_RATIO * min(least, *(descent.cost for descent in descents))
         left = [descent for descent in descents if descent.cost <= most]
-        parallel_for(lambda part: left[part.start].run(steps), len(left), 1)
+        parallel_map(lambda one: one.run(steps), left)
         return [descent.result() for descent in left]
 
 

@@ -117,11 +117,10 @@ class RestShape:
                     check_name(name, "a structure", "--structure")
                     faces = arrays[f"{_STRUCTURE}{name}.faces"]
                     structures[name] = Mesh(arrays[key], faces)
+            turns = arrays["half_turns"]
         except KeyError as error:
             raise InputError(f"the organ's shape lacks {error}; train the model again.") from error
         anatomy_ct = Anatomy(tuple(parts), kind, structures)
-        turns = arrays.get("half_turns")  # which older folders lack
-        turns = _half_turns(anatomy_ct) if turns is None else turns
         if turns.shape[1:] != (4, 4) or not np.isfinite(turns).all():
             raise InputError("the organ's half turns are damaged; train the model again.")
         return cls(anatomy_ct, ElasticBody.from_arrays(body), tuple(fields), turns)
@@ -141,13 +140,10 @@ def shape_of(
     """The shape of an anatomy with its body; a second or two, unless its parts' distances are
     known."""
     distances = distances or distances_of(anatomy_ct)
-    return RestShape(anatomy_ct, body, distances, _half_turns(anatomy_ct))
+    turns = np.array([one.ct_from_ct for one in alike(half_turns(anatomy_ct))])
+    return RestShape(anatomy_ct, body, distances, turns.reshape(-1, 4, 4))
 
 
 def distances_of(anatomy_ct: Anatomy) -> tuple[DistanceField, ...]:
     """One field per part."""
     return tuple(map(distance_of, anatomy_ct.parts))
-
-
-def _half_turns(anatomy_ct: Anatomy) -> Float64[np.ndarray, "t 4 4"]:
-    return np.array([one.ct_from_ct for one in alike(half_turns(anatomy_ct))]).reshape(-1, 4, 4)

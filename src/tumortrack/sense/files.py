@@ -219,19 +219,14 @@ def read_camera(path: Path | None) -> tuple[Intrinsics | None, DepthCorrection]:
 
 
 def _correction(data: dict[str, Any], path: Path) -> DepthCorrection:
-    (scale,), (offset_mm,) = (
-        _numbers(data.get(key, default), key, path)
-        for key, default in (("depth_scale", 1.0), ("depth_offset_mm", 0.0))
-    )
+    scale = _numbers(data.get("depth_scale", 1.0), "depth_scale", path)[0]
+    offset_mm = _numbers(data.get("depth_offset_mm", 0.0), "depth_offset_mm", path)[0]
     return DepthCorrection(scale=scale, offset_mm=offset_mm)
 
 
 def _camera(path: Path) -> tuple[Intrinsics, dict[str, Any]]:
     """The camera, and all that its file has."""
-    try:
-        data = read_json(path)
-    except (ValueError, RecursionError) as error:  # numbers of thousands of digits, deep nesting
-        raise InputError(f"{path} cannot be read as JSON: {error}.") from error
+    data = read_json(path)
     for key in _DISTORTION_KEYS:
         if any(_numbers(data.get(key, 0), key, path)):
             raise InputError(
@@ -263,19 +258,15 @@ def _numbers(value: object, key: str, path: Path) -> list[float]:
     return numbers
 
 
-def intrinsics_json(intrinsics: Intrinsics, depth_unit_mm: float = DEPTH_UNIT_MM) -> dict[str, Any]:
+def intrinsics_json(intrinsics: Intrinsics) -> dict[str, Any]:
     """intrinsics.json beside a depth.png: the pinhole and what one step of depth means."""
     values = {key: getattr(intrinsics, key) for key in _PINHOLE_KEYS}
-    return {**values, "depth_unit_mm": depth_unit_mm}
+    return {**values, "depth_unit_mm": DEPTH_UNIT_MM}
 
 
-def read_depth_png(
-    path: Path, intrinsics_path: Path, depth_unit_mm: float | None = None
-) -> DepthFrame:
-    """A 16-bit depth image; 0 is no return.
-
-    One step is ``depth_unit_mm``, else what the intrinsics file states, else 0.1 mm; then what that
-    file states as correction.
+def read_depth_png(path: Path, intrinsics_path: Path) -> DepthFrame:
+    """A 16-bit depth image; 0 is no return. One step is what the intrinsics file states, else 0.1
+    mm; then what that file states as correction.
 
     Raises:
         InputError: not a single-channel 16-bit PNG, or of another size than the intrinsics.
@@ -283,7 +274,7 @@ def read_depth_png(
     from PIL import Image
 
     intrinsics, data = _camera(intrinsics_path)
-    stated = data.get("depth_unit_mm", DEPTH_UNIT_MM) if depth_unit_mm is None else depth_unit_mm
+    stated = data.get("depth_unit_mm", DEPTH_UNIT_MM)
     unit_mm = _numbers(stated, "depth_unit_mm", intrinsics_path)[0]
     if not 0 < unit_mm <= 100:
         raise InputError(f"depth_unit_mm is {unit_mm}; it must lie in 0..100 mm per step.")
@@ -305,23 +296,21 @@ def read_depth_png(
     return DepthFrame(_correction(data, intrinsics_path).corrected(depth_mm), intrinsics)
 
 
-def depth_png(
-    frame: DepthFrame, depth_unit_mm: float = DEPTH_UNIT_MM, compress_level: int = 6
-) -> bytes:
-    """The depth as a 16-bit PNG in steps of ``depth_unit_mm``; NaN becomes 0. ``compress_level`` 1
-    takes a sixth of the time, for a fifth more bytes.
+def depth_png(frame: DepthFrame, compress_level: int = 6) -> bytes:
+    """The depth as a 16-bit PNG in steps of 0.1 mm; NaN becomes 0. ``compress_level`` 1 takes a
+    sixth of the time, for a fifth more bytes.
 
     Raises:
         InputError: a depth that 16 bits of this unit cannot hold.
     """
     from PIL import Image
 
-    steps = np.rint(frame.depth_mm.astype(np.float64) / depth_unit_mm)
+    steps = np.rint(frame.depth_mm.astype(np.float64) / DEPTH_UNIT_MM)
     seen = np.isfinite(steps)
     if not ((steps[seen] >= 1) & (steps[seen] <= 65535)).all():
         raise InputError(
-            f"a depth lies outside {depth_unit_mm:g}..{65535 * depth_unit_mm:g} mm, which 16 bits "
-            f"of {depth_unit_mm:g} mm hold; choose a larger depth_unit_mm or crop the frame."
+            f"a depth lies outside {DEPTH_UNIT_MM:g}..{65535 * DEPTH_UNIT_MM:g} mm, which 16 bits "
+            f"of {DEPTH_UNIT_MM:g} mm hold; crop the frame."
         )
     stream = io.BytesIO()
     image = Image.fromarray(np.where(seen, steps, 0).astype(np.uint16))

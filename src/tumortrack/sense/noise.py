@@ -90,8 +90,6 @@ class NoiseConfig(Config, frozen=True, kw_only=True):
         its picture, is lost.
     """
 
-    LATER = ("fatten_px", "shadow_px_mm")
-
     axial_mm: float = 0.0
     correlated_share: float = 0.0
     correlation_px: int = 5

@@ -14,6 +14,7 @@ from jaxtyping import Float, Float32, Int32
 from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import DepthFrame
+from tumortrack.sense.kernels import order_patch, order_shaft, seen_pixels, take_first
 
 _SAMPLED = 200  # pixels that show where the organ lies
 _STEEPEST = 0.6  # slope of what is left in: 30 degrees
@@ -86,8 +87,6 @@ def occlude(frame: DepthFrame, config: OcclusionConfig, rng: np.random.Generator
 
 
 def _look(frame: DepthFrame, rng: np.random.Generator) -> _View:
-    from tumortrack.sense.kernels import seen_pixels
-
     pixels, starts = seen_pixels(frame.depth_mm)
     rows = np.repeat(np.arange(len(starts) - 1, dtype=np.int32), np.diff(starts))
     columns = pixels - rows * np.int32(frame.intrinsics.width)
@@ -100,8 +99,6 @@ def _look(frame: DepthFrame, rng: np.random.Generator) -> _View:
 
 def _hide(seen: _View, most: int, config: OcclusionConfig, rng: np.random.Generator) -> np.ndarray:
     """Which pixels are hidden: by shafts, patches, or shafts and patches."""
-    from tumortrack.sense.kernels import take_first
-
     hidden = np.zeros(len(seen.depth_mm), np.bool_)
     left, kind = most, rng.uniform()
     if kind > _PATCHES_ALONE:
@@ -116,8 +113,6 @@ def _hide(seen: _View, most: int, config: OcclusionConfig, rng: np.random.Genera
 
 def _shaft(seen: _View, config: OcclusionConfig, rng: np.random.Generator) -> np.ndarray:
     """A straight shaft from any side, its tip over a random pixel of the organ or beyond it."""
-    from tumortrack.sense.kernels import order_shaft
-
     at = rng.integers(len(seen.depth_mm))
     towards = _direction(rng)
     tip = np.array([seen.columns[at], seen.rows[at]], float)
@@ -131,8 +126,6 @@ def _shaft(seen: _View, config: OcclusionConfig, rng: np.random.Generator) -> np
 
 def _patch(seen: _View, rng: np.random.Generator) -> np.ndarray:
     """Fat or a drape: a blob or a half plane, from any border of the organ inwards."""
-    from tumortrack.sense.kernels import order_patch
-
     inwards = _direction(rng)
     across = np.array([-inwards[1], inwards[0]])
     start = seen.some[np.argmin(seen.some @ inwards)] + rng.uniform(-0.1, 0.1, 2) * seen.width_px
@@ -154,8 +147,6 @@ def _leave_in(
     rng: np.random.Generator,
 ) -> None:
     """The occluder's own surface, a tilted plane, at one end of what it hides."""
-    from tumortrack.sense.kernels import take_first
-
     columns, rows, organ_mm = seen.columns[hidden], seen.rows[hidden], seen.depth_mm[hidden]
     shown = np.zeros(len(organ_mm), np.bool_)
     x, y = _direction(rng).astype(np.float32)

@@ -13,7 +13,8 @@ from tumortrack.core.config import Config
 from tumortrack.core.types import Anatomy
 from tumortrack.simulate.scene import SceneConfig
 
-_LENGTHS_PX = ("correlation_px", "edge_px", "hole_px")  # of the noise
+_LENGTHS_PX = ("correlation_px", "edge_px", "hole_px")  # of the noise: whole pixels
+_WIDTHS_PX = ("fatten_px", "shadow_px_mm")
 
 
 class CoarseConfig(Config, frozen=True):
@@ -44,17 +45,13 @@ def coarsened(
     organ = anatomy_ct.organ
     if coarse.surface_mm:
         organ = mesh_of(solid_of(organ, "organ").simplify(coarse.surface_mm))
-    noise = {name: _shorter(getattr(scene.noise, name), coarse.pixels) for name in _LENGTHS_PX}
-    wide = {n: getattr(scene.noise, n) / coarse.pixels for n in ("fatten_px", "shadow_px_mm")}
+    wide = {n: getattr(scene.noise, n) / coarse.pixels for n in (*_LENGTHS_PX, *_WIDTHS_PX)}
+    whole = {name: max(1, round(wide[name])) for name in _LENGTHS_PX}
     config = msgspec.structs.replace(
         scene,
         width=scene.width // coarse.pixels,
         height=scene.height // coarse.pixels,
-        noise=msgspec.structs.replace(scene.noise, **noise, **wide),
+        noise=msgspec.structs.replace(scene.noise, **{**wide, **whole}),
         views=coarse.views,
     )
     return anatomy_ct.of((organ, *anatomy_ct.tumors)), config
-
-
-def _shorter(length_px: int, by: int) -> int:
-    return max(1, round(length_px / by))

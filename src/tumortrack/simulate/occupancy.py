@@ -61,18 +61,18 @@ class PartPool:
         chosen = _following(int(rng.integers(len(self.labels))), count, len(self.labels))
         return self.points_ct[chosen], self.labels[chosen]
 
-    def nearest(self, first: int, count: int, k: int) -> Int64[np.ndarray, " m"]:
-        """Of the ``count`` points from ``first`` on the ``k`` inside that are nearest to the
-        surface, and ``k`` outside; on a side in any order."""
-        drawn, chosen = _following(first, count, len(self.labels)), []
+    def nearest(self, k: int, rng: np.random.Generator) -> Int64[np.ndarray, " m"]:
+        """Of the points from a random one on, so many that ``k`` lie on either side, the ``k``
+        inside that are nearest to the surface, and ``k`` outside; on a side in any order."""
+        drawn, chosen = _following(*self._window(k, rng), len(self.labels)), []
         inside = self.inside[drawn]
         for side in (drawn[inside], drawn[~inside]):
             every = len(side) == k
             chosen.append(side if every else side[np.argpartition(self.distance_mm[side], k)[:k]])
         return np.concatenate(chosen)
 
-    def window(self, k: int, rng: np.random.Generator) -> tuple[int, int]:
-        """A random first point and so many points from it on that ``k`` lie on either side."""
+    def _window(self, k: int, rng: np.random.Generator) -> tuple[int, int]:
+        """A random first point, and how many from it on."""
         before, rarer = self._counts
         count = int(k / rarer * 1.1)
         while True:
@@ -108,21 +108,14 @@ class OccupancyPool:
 
     def draw(self, rng: np.random.Generator) -> tuple[Points, Labels]:
         """One scene's points (CT frame, undeformed) and labels; the same number every time."""
-        *near, (first, count) = self.windows(rng)
-        k, far = self.config.per_side, _following(first, count, len(self.far_labels))
-        chosen = [(p, p.nearest(*window, k)) for p, window in zip(self.parts, near, strict=True)]
+        k, share = self.config.per_side, self.config.far_share
+        chosen = [(part, part.nearest(k, rng)) for part in self.parts]
+        count = round(2 * k * len(self.parts) * share / (1 - share))
+        far = _following(int(rng.integers(len(self.far_labels))), count, len(self.far_labels))
         return (
             np.concatenate([*(p.points_ct[c] for p, c in chosen), self.far_points_ct[far]]),
             np.concatenate([*(p.labels[c] for p, c in chosen), self.far_labels[far]]),
         )
-
-    def windows(self, rng: np.random.Generator) -> list[tuple[int, int]]:
-        """Which points of the pool a scene considers, as (first, count): of each part enough on
-        either side of its surface; last those anywhere."""
-        windows = [part.window(self.config.per_side, rng) for part in self.parts]
-        near = 2 * self.config.per_side * len(self.parts)
-        count = round(near * self.config.far_share / (1 - self.config.far_share))
-        return [*windows, (int(rng.integers(len(self.far_labels))), count)]
 
 
 PointSource = FixedPoints | OccupancyPool  # of the labelled points of scenes

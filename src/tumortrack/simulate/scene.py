@@ -32,7 +32,6 @@ from tumortrack.simulate.deform import (
     ChainConfig,
     DragConfig,
     ElasticConfig,
-    RestConfig,
     installed,
     links_of,
 )
@@ -42,7 +41,7 @@ from tumortrack.simulate.occupancy import OccupancyConfig, PointSource
 
 STREAMS = ("train", "validation", "test")
 _FARTHEST_MM = 500.0  # that depth cameras for near things are specified for
-ATTEMPTS = 20  # draws of a recipe until one shows enough of the organ
+_ATTEMPTS = 20  # draws of a recipe until one shows enough of the organ
 _STATE = 0x57A7E
 
 
@@ -69,13 +68,11 @@ class SceneConfig(Config, frozen=True):
     from that range, log-uniformly, instead of ``cloud.n_points``.
     """
 
-    LATER = ("occlusion", "calibration", "cloud_points", "views")
-
     width: int = 424
     height: int = 240
     pose: PoseConfig = PoseConfig()
     # One a scene, drawn uniformly.
-    deform: tuple[installed.LinkConfig | ChainConfig | RestConfig, ...] = (DragConfig(),)
+    deform: tuple[installed.LinkConfig | ChainConfig, ...] = (DragConfig(),)
     clutter: ClutterConfig = ClutterConfig()
     noise: NoiseConfig = NoiseConfig()
     cloud: CloudConfig = CloudConfig()
@@ -209,43 +206,15 @@ class Simulator:
         parts = (part.moved(scene.carry(part.vertices_mm)) for part in self.anatomy_ct.parts)
         return self.anatomy_ct.of(parts)
 
-    def draw(
-        self, rng: np.random.Generator
-    ) -> tuple[Float64[np.ndarray, "4 4"], Deformation, bool]:
-        """Of the next scene of this generator: ``camera_from_ct``, deformation, and whether it is
-        seen from any distance and not cropped."""
-        camera_from_ct, free = self._pose(rng)
-        return camera_from_ct, self._deformation(camera_from_ct, rng), free
-
-    def _pose(self, rng: np.random.Generator) -> tuple[Float64[np.ndarray, "4 4"], bool]:
-        config = self.config
-        free = bool(rng.uniform() < config.free_range)
-        nearest = config.free_nearest_mm if free else config.pose.nearest_mm
-        return sample_pose(config.pose, self._hull_ct, self.up_lps, nearest, rng), free
-
-    def _deformation(
-        self, camera_from_ct: Float64[np.ndarray, "4 4"], rng: np.random.Generator
-    ) -> Deformation:
-        model = self.config.deform[rng.integers(len(self.config.deform))]
-        return model.sample(self._view(camera_from_ct), rng)
-
-    def _draw_shared(
-        self, recipe: SceneRecipe, rng: np.random.Generator
-    ) -> tuple[Float64[np.ndarray, "4 4"], Deformation, bool]:
-        """As ``draw``, with the state that the recipes beside this one show as well."""
-        camera_from_ct, free = self._pose(rng)
-        number = recipe.stream, recipe.seed, recipe.index // self.config.views
-        if self._shared is None or self._shared.number != number:
-            drawn = self._deformation(camera_from_ct, recipe.state(self.config.views))
-            self._shared = _SharedState(number, drawn)
-        return camera_from_ct, self._shared, free
-
     def _render(self, recipe: SceneRecipe) -> tuple[RenderedScene, np.random.Generator]:
         config, organ = self.config, self.anatomy_ct.organ
-        for attempt in range(ATTEMPTS):
+        for attempt in range(_ATTEMPTS):
             rng = recipe.generator(attempt)
-            drawn = self.draw(rng) if config.views == 1 else self._draw_shared(recipe, rng)
-            camera_from_ct, deformation, free = drawn
+            free = bool(rng.uniform() < config.free_range)
+            nearest_mm = config.free_nearest_mm if free else config.pose.nearest_mm
+            placed = self._hull_ct, self.up_lps, nearest_mm
+            camera_from_ct = sample_pose(config.pose, *placed, rng)
+            deformation = self._deformation(recipe, camera_from_ct, rng)
             vertices = transform_points(camera_from_ct, deformation.apply(organ.vertices_mm))
             frame = render_depth(vertices, organ.faces, self._intrinsics)
             frame = add_clutter(frame, config.clutter, rng)
@@ -253,11 +222,42 @@ class Simulator:
             frame = miscalibrate(frame, config.calibration, rng)
             frame = add_noise(frame, config.noise, rng)
             try:
-                cloud = cloud_from_depth(frame, crop_of(config, free, rng), rng)
+                cloud = cloud_from_depth(frame, self._crop(free, rng), rng)
             except NoEstimate:  # the crop left too few points: another draw of the same recipe
                 continue
             return RenderedScene(camera_from_ct, deformation, frame, cloud), rng
-        raise shows_nothing(recipe)
+        raise TumortrackError(
+            f"{recipe}: no pose in {_ATTEMPTS} shows enough of the organ; check the camera's range "
+            "and the distances in the scene configuration."
+        )
+
+    def _deformation(
+        self,
+        recipe: SceneRecipe,
+        camera_from_ct: Float64[np.ndarray, "4 4"],
+        rng: np.random.Generator,
+    ) -> Deformation:
+        """Drawn from ``rng``; or the state that the recipes beside this one show as well."""
+        views = self.config.views
+        number = recipe.stream, recipe.seed, recipe.index // views
+        if self._shared is not None and self._shared.number == number:
+            return self._shared
+        drawing = rng if views == 1 else recipe.state(views)
+        model = self.config.deform[drawing.integers(len(self.config.deform))]
+        drawn = model.sample(self._view(camera_from_ct), drawing)
+        if views == 1:
+            return drawn
+        self._shared = _SharedState(number, drawn)
+        return self._shared
+
+    def _crop(self, free: bool, rng: np.random.Generator) -> CloudConfig:
+        """The depth range and number of points of this scene's cloud."""
+        cloud, n_points = self.config.cloud, self.config.cloud.n_points
+        if self.config.cloud_points is not None:
+            fewest, most = self.config.cloud_points
+            n_points = round(math.exp(rng.uniform(math.log(fewest), math.log(most))))
+        near_mm, far_mm = (1.0, 1e4) if free else (cloud.near_mm, cloud.far_mm)
+        return CloudConfig(near_mm=near_mm, far_mm=far_mm, n_points=n_points)
 
     def _view(self, camera_from_ct: Float64[np.ndarray, "4 4"]) -> View:
         eye_ct, camera = np.linalg.inv(camera_from_ct)[:3, 3], self._intrinsics
@@ -359,23 +359,6 @@ def refill(points_mm: Num[np.ndarray, m * row], n: int) -> Num[np.ndarray, n * r
     """A cloud of fewer than ``n`` points repeats them, so that clouds stack; max pooling is not
     affected."""
     return points_mm[np.arange(n) % len(points_mm)]
-
-
-def shows_nothing(recipe: SceneRecipe) -> TumortrackError:
-    return TumortrackError(
-        f"{recipe}: no pose in {ATTEMPTS} shows enough of the organ; check the camera's range and "
-        "the distances in the scene configuration."
-    )
-
-
-def crop_of(config: SceneConfig, free: bool, rng: np.random.Generator) -> CloudConfig:
-    """The depth range and number of points of this scene's cloud."""
-    near_mm, far_mm = (1.0, 1e4) if free else (config.cloud.near_mm, config.cloud.far_mm)
-    n_points = config.cloud.n_points
-    if config.cloud_points is not None:
-        fewest, most = config.cloud_points
-        n_points = round(math.exp(rng.uniform(math.log(fewest), math.log(most))))
-    return CloudConfig(near_mm=near_mm, far_mm=far_mm, n_points=n_points)
 
 
 def body_for(

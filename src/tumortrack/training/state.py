@@ -22,7 +22,7 @@ from safetensors.torch import save
 from torch import Tensor
 
 from tumortrack.core import store
-from tumortrack.core.config import identity, to_builtins
+from tumortrack.core.config import to_builtins
 from tumortrack.core.errors import ArtifactError, InputError, TumortrackError
 from tumortrack.core.organ import organ_entry
 from tumortrack.core.patient import NOBODY, Patient
@@ -30,9 +30,9 @@ from tumortrack.core.types import Anatomy
 from tumortrack.models.config import TrainConfig
 from tumortrack.models.hardware import has_fast_bfloat16
 from tumortrack.models.model import Network
-from tumortrack.simulate.batched.stream import Tensors
 from tumortrack.training.distributed import ProcessGroup
 from tumortrack.training.model import PretrainedWeights, model_class
+from tumortrack.training.scenes import Tensors
 
 _FILE = "checkpoint.safetensors"
 _FLOOR = 0.01  # of the peak learning rate, at the end of the tail
@@ -53,7 +53,6 @@ class TrainingRun:
     workers: int | None = None  # processes that make scenes; None: as the machine allows
     checkpoint_every_s: float = 30.0
     start: PretrainedWeights | None = None  # of a registration network
-    scenes: Literal["auto", "workers", "device"] = "auto"  # who makes them; see ``training.scenes``
     patient: Patient = NOBODY  # whose organ it is
 
     def __post_init__(self) -> None:
@@ -128,7 +127,7 @@ def _check(run: Run, **smallest: int) -> None:
 
 
 def _sha256(run: Run, **more: object) -> str:
-    content = {"config": identity(run.config), "seed": run.seed, "steps": run.steps, **more}
+    content = {"config": to_builtins(run.config), "seed": run.seed, "steps": run.steps, **more}
     content["schema"] = store.SCHEMA
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
@@ -225,7 +224,6 @@ class TrainingState:
         return torch.optim.Adam(
             self.network.parameters(),
             config.schedule.learning_rate,
-            weight_decay=config.weight_decay,
             fused=True,  # a twentieth of the quick step on a CPU
         )
 
@@ -254,8 +252,9 @@ class TrainingState:
             ) from error
         if metadata.get("identity") != self.run.identity:
             raise ArtifactError(
-                f"{work.parent} holds a run with another case, preset, seed or option. Give the "
-                "same command to resume it, or another MODEL folder to start a new one."
+                f"{work.parent} holds a run with another case, preset, seed or option, or of "
+                "another version. Give the same command to resume it, or another MODEL folder to "
+                "start a new one."
             )
         self.progress = progress
         self.network.load_state_dict(groups["network"])

@@ -16,9 +16,9 @@ from jaxtyping import Float32, Float64, UInt8
 
 from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.estimate import FAR_MM
-from tumortrack.core.process import parallel_for
+from tumortrack.core.process import parallel_map
 from tumortrack.imaging.symmetry import alike, half_turns
-from tumortrack.models.config import RegistrationHeadConfig, TrainConfig
+from tumortrack.models.config import RegistrationHeadConfig
 from tumortrack.models.in_distribution import InDistributionRange, fit_mm, spread_mm
 from tumortrack.models.model import Model
 from tumortrack.occupancy.model import OccupancyModel
@@ -26,7 +26,6 @@ from tumortrack.occupancy.network import Latent, OccupancyNetwork
 from tumortrack.occupancy.volume import FIT_STEPS, lattice_over, surface_distances
 from tumortrack.registration.canonical_frame import carry_over, upright_of
 from tumortrack.registration.gauss_newton import RegistrationResult, posterior
-from tumortrack.registration.gauss_newton_kernels import KERNEL
 from tumortrack.registration.looks import Looks
 from tumortrack.registration.model import RegistrationModel, UncertaintyCalibration
 from tumortrack.registration.motion import ElasticMotion
@@ -79,15 +78,35 @@ class TrainingTask(ABC):
     def model(self, network: Any, provenance: dict[str, Any]) -> Model:
         """The finished model of the network."""
 
-    @cached_property
-    def _scenes(self) -> ValidationScenes:
-        run = self._run
-        simulator = Simulator(run.anatomy_ct, run.up_lps, run.config.scene, self.body)
-        return validation_scenes(simulator, self._pool(), run.config, run.seed)
-
     @abstractmethod
     def _pool(self) -> PartPool:
         """Points about the organ, to validate on."""
+
+    @cached_property
+    def _scenes(self) -> ValidationScenes:
+        """The first scenes of the ``validation`` stream."""
+        run, config, pool, rows = self._run, self._run.config, self._pool(), []
+        simulator = Simulator(run.anatomy_ct, run.up_lps, config.scene, self.body)
+        for index in range(config.validation_pairs):
+            recipe = SceneRecipe(run.seed, "validation", index)
+            scene = simulator.render(recipe)
+            drawn, answer = pool.draw_evenly(recipe.generator(999), config.validation_points)
+            observed = scene.cloud.points_mm
+            organ = scene.carry(run.anatomy_ct.organ.vertices_mm) - np.median(observed, axis=0)
+            box = np.array([organ.min(0), organ.max(0)], float)
+            cloud = refill(observed, config.scene.cloud.n_points)
+            rows.append((cloud, drawn, scene.carry(drawn), answer, box))
+        return ValidationScenes(*(np.stack(column) for column in zip(*rows, strict=True)))
+
+    def _mean_iou(self, guess: UInt8[np.ndarray, "s q"]) -> float:
+        """Mean over the parts (organ, tumors; not the outside) of the IoU of labels over all points
+        of the validation scenes."""
+        n_classes = len(self._run.anatomy_ct.parts) + 1
+        pairs = guess.astype(np.int64).ravel() * n_classes + self._scenes.labels.ravel()
+        table = np.bincount(pairs, minlength=n_classes**2).reshape(n_classes, n_classes)
+        both = table.diagonal()
+        either = table.sum(0) + table.sum(1) - both
+        return float((both / np.maximum(either, 1))[1:].mean())
 
     def _fields(
         self, network: Any, provenance: dict[str, Any], clouds_mm: Sequence[tuple[float, float]]
@@ -121,8 +140,13 @@ class OccupancyTask(TrainingTask):
     def initialize(self, network: OccupancyNetwork) -> None:
         """An occupancy network knows nothing at first."""
 
+    @torch.no_grad()
     def miou(self, network: OccupancyNetwork) -> float:
-        return label_miou(network, self._scenes, len(self._run.anatomy_ct.parts) + 1, self._device)
+        network.eval()
+        arrays = self._scenes.clouds_mm, self._scenes.points_mm
+        batches = (torch.from_numpy(v).to(self._device).split(_AT_ONCE) for v in arrays)
+        guess = torch.cat([network(*pair).argmax(-1) for pair in zip(*batches, strict=True)])
+        return self._mean_iou(guess.to(torch.uint8).cpu().numpy())
 
     @torch.no_grad()
     def model(self, network: OccupancyNetwork, provenance: dict[str, Any]) -> OccupancyModel:
@@ -184,16 +208,16 @@ class RegistrationTask(TrainingTask):
         for (_, fit), points_mm in zip(self._fits(network), scenes.points_mm, strict=True):
             rest = fit.motion.back(points_mm).astype(np.float32)
             guesses.append(self._shape.labels_at(rest)[0])
-        return mean_iou_of(np.stack(guesses), scenes.labels, len(self._run.anatomy_ct.parts) + 1)
+        return self._mean_iou(np.stack(guesses))
 
     def model(self, network: RegistrationNetwork, provenance: dict[str, Any]) -> RegistrationModel:
         scenes, drafts = self._scenes, self._fits(network)
         # What is usual of fits that are right: a network that has learnt little proposes many that
         # are not, whose costs would pass for usual.
         right = [
-            f.cost
-            for (_, f), off_mm in zip(drafts, self._off_mm(drafts), strict=True)
-            if off_mm <= FAR_MM
+            fit.cost
+            for n, (_, fit) in enumerate(drafts)
+            if _mean_mm(self._away_mm(n, fit)) <= FAR_MM
         ]
         usual_cost = float(np.percentile(right or [fit.cost for _, fit in drafts], _USUAL))
         more = self._registration(network).look_around
@@ -202,25 +226,17 @@ class RegistrationTask(TrainingTask):
             for cloud, (likeliest, fit) in zip(scenes.clouds_mm, drafts, strict=True)
         ]
         errors, nearest, ratios = [], [], []
-        for cloud, fit, points_mm, points_ct, labels in zip(
-            scenes.clouds_mm,
-            fits,
-            scenes.points_mm,
-            scenes.points_ct,
-            scenes.labels,
-            strict=True,
-        ):
-            inside_ct, inside_mm = points_ct[labels > 0], points_mm[labels > 0]
+        for n, (cloud, fit) in enumerate(zip(scenes.clouds_mm, fits, strict=True)):
             motion = replace(
                 posterior(fit.motion, Looks.of([cloud]), self._run.config.refine),
                 calibration=self._run.config.scene.calibration,
             )
-            known_mm2 = motion.covariance_mm2(inside_ct)
+            known_mm2 = motion.covariance_mm2(scenes.points_ct[n, scenes.labels[n] > 0])
             assert known_mm2 is not None
-            away = motion.carry(inside_ct) - inside_mm
-            errors.append(np.linalg.norm(away, axis=1).mean())
-            others = [rival.motion.carry(inside_ct) - inside_mm for rival in fit.rivals]
-            nearest.append(min(np.linalg.norm(off, axis=1).mean() for off in (away, *others)))
+            away = self._away_mm(n, fit)
+            others = [self._away_mm(n, rival) for rival in fit.rivals]
+            errors.append(_mean_mm(away))
+            nearest.append(min(map(_mean_mm, (away, *others))))
             solved = np.linalg.solve(known_mm2, away[..., None])[..., 0]
             ratios.append(np.sqrt((solved * away).sum(1)))
         std_scale = float(np.quantile(np.concatenate(ratios), _COVERED)) / _RADIUS
@@ -234,9 +250,7 @@ class RegistrationTask(TrainingTask):
         return RegistrationModel(
             **self._fields(network, about, ranges),
             shape=self._shape,
-            calibration=UncertaintyCalibration(
-                std_scale=std_scale, usual_cost=usual_cost, kernel=KERNEL
-            ),
+            calibration=UncertaintyCalibration(std_scale=std_scale, usual_cost=usual_cost),
         )
 
     def _fits(self, network: RegistrationNetwork) -> list[tuple[ElasticMotion, RegistrationResult]]:
@@ -246,28 +260,24 @@ class RegistrationTask(TrainingTask):
         if self._last is None or self._last[0] != weights:
             network.eval()
             registration, clouds = self._registration(network), self._scenes.clouds_mm
-            proposed = [registration.propose(cloud) for cloud in clouds]
-            found: dict[int, RegistrationResult] = {}
-
-            def fit(part: slice) -> None:
-                found[part.start] = registration.best_fit(clouds[part.start], proposed[part.start])
-
-            parallel_for(fit, len(clouds), 1)
-            self._last = weights, [(proposed[n][0], found[n]) for n in range(len(clouds))]
+            proposed = [(cloud, registration.propose(cloud)) for cloud in clouds]
+            fits = parallel_map(lambda one: registration.best_fit(*one), proposed)
+            likeliest = (hypotheses[0] for _, hypotheses in proposed)
+            self._last = weights, list(zip(likeliest, fits, strict=True))
         return self._last[1]
 
-    def _off_mm(self, drafts: list[tuple[ElasticMotion, RegistrationResult]]) -> list[float]:
-        """How far each validation scene's fit has the points inside from where they are, on
-        average."""
-        scenes, off_mm = self._scenes, []
-        for n, (_, fit) in enumerate(drafts):
-            inside = scenes.labels[n] > 0
-            away = fit.motion.carry(scenes.points_ct[n, inside]) - scenes.points_mm[n, inside]
-            off_mm.append(float(np.linalg.norm(away, axis=1).mean()))
-        return off_mm
+    def _away_mm(self, scene: int, fit: RegistrationResult) -> Float64[np.ndarray, "n 3"]:
+        """From where the points inside are in a validation scene to where its fit has them."""
+        scenes, inside = self._scenes, self._scenes.labels[scene] > 0
+        found_mm = fit.motion.carry(scenes.points_ct[scene, inside])
+        return found_mm - scenes.points_mm[scene, inside]
 
     def _registration(self, network: RegistrationNetwork) -> Registration:
         return Registration(network, self._shape, self._run.config.refine)
+
+
+def _mean_mm(offsets_mm: Float64[np.ndarray, "n 3"]) -> float:
+    return float(np.linalg.norm(offsets_mm, axis=1).mean())
 
 
 def _learnt_points(run: TrainingRun) -> FixedPoints:
@@ -295,48 +305,7 @@ class ValidationScenes:
     boxes_mm: Float64[np.ndarray, "s 2 3"]  # the organ's, relative to the points' median
 
 
-def validation_scenes(
-    simulator: Simulator, pool: PartPool, config: TrainConfig, seed: int
-) -> ValidationScenes:
-    """The first scenes of the ``validation`` stream."""
-    vertices = simulator.anatomy_ct.organ.vertices_mm
-    n = config.scene.cloud.n_points
-    rows = []
-    for index in range(config.validation_pairs):
-        recipe = SceneRecipe(seed, "validation", index)
-        stage = simulator.render(recipe)
-        drawn, answer = pool.draw_evenly(recipe.generator(999), config.validation_points)
-        observed = stage.cloud.points_mm
-        organ = stage.carry(vertices) - np.median(observed, axis=0)
-        box = np.array([organ.min(0), organ.max(0)], float)
-        rows.append((refill(observed, n), drawn, stage.carry(drawn), answer, box))
-    return ValidationScenes(*(np.stack(column) for column in zip(*rows, strict=True)))
-
-
-def mean_iou_of(
-    guess: UInt8[np.ndarray, ...], labels: UInt8[np.ndarray, ...], n_classes: int
-) -> float:
-    """Mean over the parts (organ, tumors; not the outside) of the IoU over all points."""
-    pairs = guess.astype(np.int64).ravel() * n_classes + labels.ravel()
-    table = np.bincount(pairs, minlength=n_classes**2).reshape(n_classes, n_classes)
-    both = table.diagonal()
-    either = table.sum(0) + table.sum(1) - both
-    return float((both / np.maximum(either, 1))[1:].mean())
-
-
 def grown_box(boxes_mm: Float64[np.ndarray, "s 2 3"]) -> Float64[np.ndarray, "2 3"]:
     """The box of all the boxes, 10 % larger."""
     lower, upper = boxes_mm[:, 0].min(0), boxes_mm[:, 1].max(0)
     return np.stack([lower - 0.05 * (upper - lower), upper + 0.05 * (upper - lower)])
-
-
-@torch.no_grad()
-def label_miou(
-    network: OccupancyNetwork, scenes: ValidationScenes, n_classes: int, device: torch.device
-) -> float:
-    """``mean_iou_of`` the network's labels."""
-    network.eval()
-    clouds, points = (torch.from_numpy(v).to(device) for v in (scenes.clouds_mm, scenes.points_mm))
-    pairs = zip(clouds.split(_AT_ONCE), points.split(_AT_ONCE), strict=True)
-    guess = torch.cat([network(*pair).argmax(-1) for pair in pairs])
-    return mean_iou_of(guess.to(torch.uint8).cpu().numpy(), scenes.labels, n_classes)

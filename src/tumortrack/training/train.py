@@ -29,7 +29,7 @@ from tumortrack.simulate.coarse import coarsened
 from tumortrack.simulate.scene import SceneStream
 from tumortrack.training.distributed import ProcessGroup, process_group
 from tumortrack.training.model import load_model, save_model
-from tumortrack.training.scenes import Scenes, scenes_for
+from tumortrack.training.scenes import Scenes, batches
 from tumortrack.training.state import (
     TrainingProgress,
     TrainingRun,
@@ -65,7 +65,6 @@ class TrainingStatus:
     samples_per_s: float
     loss: float
     miou: float | None  # of the last validation
-    note: str = ""  # on how scenes are made, where a user should know
     waiting: float = 0.0  # fraction of the time that was spent waiting for scenes
 
 
@@ -134,7 +133,8 @@ def _scenes(
     about = anatomy_ct, run.up_lps, scene, task.points, run.seed
     stream = SceneStream(*about, "train", group.local_size(config.batch_size), task.body)
     period = config.training_pairs // config.batch_size * group.size
-    return scenes_for(stream, steps, period, workers, group.device, run.scenes)
+    made = batches(stream.batch, steps, period, workers, group.device)
+    return Scenes(made, f"{workers} processes")
 
 
 def run_steps(
@@ -166,7 +166,7 @@ def run_steps(
             if group.is_main and (due or clock.due("checkpoint", run.checkpoint_every_s)):
                 state.save(work)
             if group.is_main and (done or clock.due("report", REPORT_EVERY_S)):
-                report(_status(state, clock, loss, miou, scenes.note))
+                report(_status(state, clock, loss, miou))
             if done:
                 break
             if stop:
@@ -174,13 +174,13 @@ def run_steps(
 
 
 def _status(
-    state: TrainingState, clock: TrainingClock, loss: float, miou: float | None, note: str
+    state: TrainingState, clock: TrainingClock, loss: float, miou: float | None
 ) -> TrainingStatus:
     run, progress, rate = state.run, state.progress, clock.rate()
     left = ((progress.end or run.config.steps) - progress.step) / rate
     if progress.end is None and run.minutes is not None:
         left = min(left, run.minutes * 60 - progress.elapsed_s)
-    about = rate * run.config.batch_size, loss, miou, note, clock.waiting()
+    about = rate * run.config.batch_size, loss, miou, clock.waiting()
     return TrainingStatus(progress.step, progress.end, max(left, 0.0), *about)
 
 

@@ -89,11 +89,8 @@ class NaiveOccupancy:
             points = points[:, torch.arange(config.n_points) * n // config.n_points]
         features = points[..., :0]
         for number, level in enumerate(config.levels):
-            n = points.shape[1]
-            k = math.ceil(level.ratio * n)
-            strided = (torch.arange(k) * n // k).expand(len(points), -1)
-            chosen = farthest_points(points, k) if config.sampling == "fps" else strided
-            centres = rows_of(points, chosen)
+            k = math.ceil(level.ratio * points.shape[1])
+            centres = rows_of(points, farthest_points(points, k))
             near = neighbours(points, centres, level.radius, level.neighbours)
             offsets = (rows_of(points, near) - centres[:, :, None]) / level.radius
             grouped = torch.cat([offsets, rows_of(features, near)], -1)

@@ -204,8 +204,7 @@ def whole(subject: BenchSubject, budget_s: float) -> Iterator[Workload]:
 def _whole_training(
     subject: BenchSubject, preset: str, device: Device, budget_s: float
 ) -> Workload:
-    """A preset as a user trains it: workers, or the GPU itself, make scenes, the network learns
-    them."""
+    """A preset as a user trains it: workers make scenes, the network learns them."""
     config = replace(subject.presets[preset](subject.anatomy), validation_pairs=4)
     run = TrainingRun(subject.anatomy, UP, "", config, SEED, minutes=budget_s / 60, device=device)
     seen: list[tuple[float, TrainingStatus]] = []

@@ -26,6 +26,7 @@ from tumortrack.core.geometry import Points, transform_points, triangles_of
 from tumortrack.core.mesh_files import read_mesh
 from tumortrack.core.types import Anatomy, Mesh, SensorCloud
 from tumortrack.models.report import Frame
+from tumortrack.registration.looks import Looks
 from tumortrack.registration.model import RegistrationModel
 from tumortrack.report.metrics import distance_to_surface, surface_samples
 from tumortrack.sense.cloud import CloudConfig, cloud_from_depth
@@ -185,7 +186,8 @@ def located(tracker: Tracker, cloud: SensorCloud) -> tuple[dict[str, Any], Any]:
         assert isinstance(model, RegistrationModel)
         frame = Frame(model, cloud, 0, np.random.default_rng(0))
         usual = model.calibration.usual_cost
-        fit = model.registration().register(frame.points_mm, usual, frame.stage)
+        looks = Looks.of([frame.points_mm])
+        fit, _ = model.registration().register(looks, usual, frame.stage)
         return {"verdict": "refused", "reason": str(error), "cost": fit.cost / usual}, fit.motion
     cost = estimate.report["fit_cost"]["now"] / estimate.report["fit_cost"]["usual"]
     return {"verdict": estimate.quality, "reason": estimate.reason, "cost": cost}, estimate.motion

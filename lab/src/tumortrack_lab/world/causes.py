@@ -12,7 +12,6 @@ from collections.abc import Callable, Mapping
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import count, islice
 from typing import Any
 
 import msgspec
@@ -34,7 +33,7 @@ from tumortrack.sense.camera import d405
 from tumortrack.sense.cloud import CloudConfig, cloud_from_depth
 from tumortrack.simulate.elastic.body import BodyConfig, ElasticBody, body_of, reduced_organ
 from tumortrack.simulate.elastic.flow import steps_for
-from tumortrack.simulate.elastic.loads import random_state
+from tumortrack.simulate.elastic.loads import random_states
 from tumortrack.simulate.elastic.modes import ReducedModel
 from tumortrack.simulate.scene_folder import Scene
 from tumortrack.tracking.tracker import Tracker
@@ -223,9 +222,8 @@ class Priors:
             if ratio is not None:  # in every state
                 fixed = partial(reduced.stiffness, contrast=ratio)
                 drawn.stiffness = lambda modulus, contrast: fixed(modulus)  # type: ignore[method-assign]
-            found = (random_state(drawn, up, config.bed_anywhere, rng) for _ in count())
-            states = islice((one for one in found if one is not None), config.states)
-            return body_of(reduced, np.array(list(states), np.float32))
+            states = random_states(drawn, up, config.bed_anywhere, rng, config.states)
+            return body_of(reduced, np.array(states, np.float32))
 
         tissues = {poisson: reduced(poisson) for poisson in POISSONS}
         self._poissons = {poisson: library(one) for poisson, one in tissues.items()}

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import math
-from typing import Literal
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
 from tumortrack.core.config import Config
-from tumortrack.models import sampling as sampled
 from tumortrack.models.layers import Layer, Norm, greatest, greatest_above_zero, stack
-from tumortrack.models.sampling import take, traced
+from tumortrack.models.sampling import ball_query, farthest_points, strided_points, take, traced
 
 _AT_ONCE = 128  # centres
 
@@ -30,13 +28,12 @@ class SetAbstraction(Config, frozen=True):
 
 class PointNet2Config(Config, frozen=True, tag="pointnet2"):
     """``levels``, then an MLP of ``widths`` on [position, feature] and its maximum: the latent.
-    ``n_points``: larger clouds are first thinned to so many, by stride (None: take all).
-    ``sampling``: how the centres are chosen. Stride needs points in random order."""
+    ``n_points``: larger clouds, in random order, are first thinned to so many, by stride (None:
+    take all)."""
 
     levels: tuple[SetAbstraction, ...]
     widths: tuple[int, ...]
     norm: Norm = "batch"
-    sampling: Literal["fps", "strided"] = "fps"
     n_points: int | None = None
 
     @property
@@ -56,7 +53,7 @@ class PointNet2(nn.Module):
         self.config = config
         features = [0, *(level.widths[-1] for level in config.levels)]
         self.levels = nn.ModuleList(
-            _Level(level, n_features, config)
+            _Level(level, n_features, config.norm)
             for level, n_features in zip(config.levels, features, strict=False)
         )
         self.summary = stack((3 + features[-1], *config.widths), config.norm)
@@ -64,7 +61,7 @@ class PointNet2(nn.Module):
     def forward(self, points: Tensor) -> Tensor:
         limit = self.config.n_points
         if limit is not None and points.shape[1] > limit:
-            points = take(points, sampled.strided_points(points, limit))
+            points = take(points, strided_points(points, limit))
         features: Tensor | None = None
         for level in self.levels:
             points, features = level(points, features)
@@ -79,18 +76,16 @@ class _Level(nn.Module):
     is made once per point, before the neighbours are gathered. Offsets are taken in full
     precision and divided by the radius."""
 
-    def __init__(self, level: SetAbstraction, n_features: int, config: PointNet2Config) -> None:
+    def __init__(self, level: SetAbstraction, n_features: int, norm: Norm) -> None:
         super().__init__()
-        self.level, self.sampling = level, config.sampling
-        self.first = Layer(3 + n_features, level.widths[0], config.norm)
-        self.rest = stack(level.widths, config.norm)
+        self.level = level
+        self.first = Layer(3 + n_features, level.widths[0], norm)
+        self.rest = stack(level.widths, norm)
 
     def forward(self, points: Tensor, features: Tensor | None) -> tuple[Tensor, Tensor]:
-        level, n = self.level, points.shape[1]
-        choose = sampled.farthest_points if self.sampling == "fps" else sampled.strided_points
-        chosen = choose(points, math.ceil(level.ratio * n))
-        centres = take(points, chosen)
-        neighbours = sampled.ball_query(points, centres, level.radius, level.neighbours)
+        level, count = self.level, math.ceil(self.level.ratio * points.shape[1])
+        centres = take(points, farthest_points(points, count))
+        neighbours = ball_query(points, centres, level.radius, level.neighbours)
         weight, projected = self.first.linear.weight, None
         if features is not None:
             projected = functional.linear(features, weight[:, 3:])

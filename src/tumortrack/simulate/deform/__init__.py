@@ -1,4 +1,4 @@
-"""Deformations: one file per model; and several one after the other, or none.
+"""Deformations: one file per model; and several one after the other.
 
 A model's configuration samples parameters from what the camera sees (``sample``); the sampled
 deformation is a value that maps any point of the CT frame to its new place (``apply``) and can be
@@ -20,7 +20,7 @@ from tumortrack.simulate.deform.drag import DragConfig
 from tumortrack.simulate.deform.elastic import ElasticConfig
 from tumortrack.simulate.deform.stretch import StretchConfig
 
-__all__ = ["ChainConfig", "DragConfig", "ElasticConfig", "RestConfig", "StretchConfig"]
+__all__ = ["ChainConfig", "DragConfig", "ElasticConfig", "StretchConfig"]
 
 
 @dataclass(frozen=True)
@@ -50,16 +50,3 @@ class ChainConfig(Config, frozen=True, tag="chain"):
 def links_of(model: Config) -> tuple[Config, ...]:
     """A model's links: of one that is no chain, itself."""
     return model.links if isinstance(model, ChainConfig) else (model,)
-
-
-class RestConfig(Config, frozen=True, tag="rest"):
-    """The organ as it was in the CT, for rigid scenes: its own sample."""
-
-    def sample(self, view: View, rng: np.random.Generator) -> RestConfig:
-        return self
-
-    def apply(self, points_ct: Points) -> Points:
-        return points_ct.astype(np.float32)
-
-    def record(self) -> dict[str, Any]:
-        return {"kind": "rest"}

@@ -51,7 +51,8 @@ class Drags:
 
 
 class DragConfig(Config, frozen=True, tag="drag"):
-    """Drags of vertices that the camera sees, by default the table's configuration 3."""
+    """Drags of vertices that the camera sees, by default the table's configuration 3; without
+    steps the organ stays as it was in the CT."""
 
     steps: tuple[Step, ...] = CONFIGURATIONS[3]
     falloff: Literal["sigma", "variance"] = "sigma"
@@ -75,10 +76,10 @@ def _visible_vertices(view: View, count: int, rng: np.random.Generator) -> np.nd
     vertices = view.anatomy_ct.organ.vertices_mm
     chosen = np.empty((0, 3))
     for _ in range(100):
-        drawn = vertices[rng.integers(len(vertices), size=4 * count)]
-        chosen = np.concatenate([chosen, drawn[view.visible(drawn)]])
         if len(chosen) >= count:
             return chosen[:count]
+        drawn = vertices[rng.integers(len(vertices), size=4 * count)]
+        chosen = np.concatenate([chosen, drawn[view.visible(drawn)]])
     raise TumortrackError("the camera sees none of the organ's vertices; check the pose range.")
 
 

@@ -32,7 +32,7 @@ else:
         """``LinkConfig``: the deformations that may stand in a chain."""
         if name != "LinkConfig":
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-        known = {"chain": None, "rest": None}
+        known: dict[str, Any] = {"chain": None}
         known |= {kind.__struct_config__.tag: kind for kind in _OURS}
         for point in sorted(entry_points(group=GROUP), key=lambda point: point.name):
             kind = _loaded(point)

@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from tumortrack.core.compiled import numba
 from tumortrack.core.geometry import perpendicular, unit
-from tumortrack.core.process import parallel_for
+from tumortrack.core.process import parallel_map
 from tumortrack.simulate.elastic.modes import ReducedModel
 
 KPA = 1e-3  # N/mm2
@@ -241,37 +241,19 @@ def in_bed(organ: ReducedModel, up: Vector, rng: np.random.Generator) -> Reduced
     return problem
 
 
-def random_state(
-    organ: ReducedModel, up: Vector, anywhere: float, rng: np.random.Generator
-) -> Float64[np.ndarray, " k"] | None:
-    """Coefficients of the modes after one or two random loads, as ``random_problem`` has them and
-    ``state_of`` finds them."""
-    return state_of(random_problem(organ, up, anywhere, rng))
-
-
 def random_states(
     organ: ReducedModel, up: Vector, anywhere: float, rng: np.random.Generator, count: int
 ) -> list[Float64[np.ndarray, " k"]]:
-    """The first ``count`` states of twice as many loads at most; fewer where few are at rest. They
-    are drawn in turn and solved on two threads: the same as by ``random_state``."""
+    """The first ``count`` states (``state_of``) of twice as many loads at most; fewer where few are
+    at rest. They are drawn in turn and solved on two threads."""
     states: list[Float64[np.ndarray, " k"]] = []
     for first in range(0, 2 * count, _TOGETHER):
         some = range(first, min(first + _TOGETHER, 2 * count))
         problems = [random_problem(organ, up, anywhere, rng) for _ in some]
-        states += [state for state in _solved(problems) if state is not None]
+        states += [state for state in parallel_map(state_of, problems) if state is not None]
         if len(states) >= count:
             break
     return states[:count]
-
-
-def _solved(problems: list[ReducedProblem]) -> list[Float64[np.ndarray, " k"] | None]:
-    found: dict[int, Float64[np.ndarray, " k"] | None] = {}
-
-    def solve(part: slice) -> None:
-        found[part.start] = state_of(problems[part.start])
-
-    parallel_for(solve, len(problems), 1)
-    return [found[n] for n in range(len(problems))]
 
 
 def random_problem(

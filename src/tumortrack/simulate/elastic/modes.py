@@ -99,7 +99,7 @@ def random_loads(
     solid: LatticeSolid, patches: Patches, up: np.ndarray, count: int, rng: np.random.Generator
 ) -> Float64[np.ndarray, "f n"]:
     """Forces at the nodes, one column a load. They only have to be diverse: magnitudes, and how an
-    organ in its bed responds, are decided for every state by itself (``loads.random_state``)."""
+    organ in its bed responds, are decided for every state by itself (``loads.state_of``)."""
     draw = _Tractions(patches, solid.center_mm, up, rng)
     kinds = (draw.squeeze, draw.poke, draw.hang, draw.bend, draw.shear)
     shares = np.array([0.36, 0.28, 0.12, 0.16, 0.08])
