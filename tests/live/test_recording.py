@@ -16,11 +16,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
 from rosbags.highlevel import AnyReader
 
 from clock import PATIENCE_S, Clock
-from depth_files import write_depth_png, write_frame_folder, write_intrinsics
+from depth_files import write_depth_png, write_intrinsics
 from live_objects import (
     CAMERA,
     PARTS,
@@ -281,12 +280,6 @@ def test_stamps_of_files(tmp_path):
     assert stamps(play(named)) == [1790000000000000500, 1790000000040000007]
     numbered = cloud_files(tmp_path / "m", ["000.ply", "001.ply"])
     assert np.diff(stamps(play(numbered, fps=4))) == [250_000_000]
-    (numbered / "times.csv").write_text("file,stamp_ns\n001.ply,77\n000.ply,33\n")
-    assert stamps(play(numbered)) == [33, 77]
-    for text in ("file,stamp_ns\n001.ply,77\n", "name\nx\n", "file,stamp_ns\n000.ply,soon\n"):
-        (numbered / "times.csv").write_text(text)
-        with pytest.raises(InputError, match=r"times\.csv"):
-            RecordingSourceConfig(path=numbered).open()
 
 
 def test_clouds_in_metres(tmp_path):
@@ -308,19 +301,6 @@ def test_depth_images_beside_one_camera(tmp_path):
     (tmp_path / "intrinsics.json").unlink()
     with pytest.raises(InputError, match=r"intrinsics\.json"):
         RecordingSourceConfig(path=tmp_path).open()
-
-
-def test_masks_lie_beside_depth_images(tmp_path):
-    mask = np.zeros((CAMERA.height, CAMERA.width), np.uint8)
-    mask[3:9, 4:40] = 255
-    for n in range(3):
-        write_frame_folder(tmp_path / "frames" / f"{n}", frame_number(n))
-    Image.fromarray(mask).save(tmp_path / "frames" / "1" / "mask.png")
-    Image.fromarray(mask[1:]).save(tmp_path / "frames" / "2" / "mask.png")
-    one, two, wrong = play(tmp_path)
-    assert one.mask is None
-    np.testing.assert_array_equal(two.mask, mask > 0)
-    assert "as large as depth.png" in str(wrong)
 
 
 def test_scenes_bring_their_truth(tmp_path):
