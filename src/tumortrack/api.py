@@ -90,8 +90,6 @@ def prepare(
     from tumortrack.imaging.case import KIND, save_case
 
     known = preparing.PrepareOptions.__dataclass_fields__
-    if "kidney_hu" in options:  # its name until 0.2
-        options["organ_hu"] = options.pop("kidney_hu")
     if unknown := sorted(set(options) - set(known)):
         raise InputError(f"prepare knows no {unknown[0]!r}; allowed: {', '.join(known)}.")
     if folder is not None:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
-from tyro.conf import Positional, UseAppendAction, arg
+from tyro.conf import Positional, UseAppendAction
 
 from tumortrack.cli.console import progress_bar, say, say_notes
 from tumortrack.core import store
@@ -52,7 +52,7 @@ class Prepare:
     name: str = "kidney"
     term: tuple[str, str] | None = None
     structure: UseAppendAction[tuple[str, ...]] = ()
-    organ_hu: Annotated[tuple[float, float], arg(aliases=["--kidney-hu"])] = (-300.0, 300.0)
+    organ_hu: tuple[float, float] = (-300.0, 300.0)
     tumor_hu: tuple[float, float] = (300.0, 1000.0)
     labels: bool = False
     segment: str | None = None

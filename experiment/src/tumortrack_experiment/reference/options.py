@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
 
-from tyro.conf import Positional, arg
+from tyro.conf import Positional
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,7 +36,7 @@ class ReferenceOptions:
     case: Path
     state: str | None = None
     series: str | None = None
-    organ_hu: Annotated[tuple[float, float], arg(aliases=["--kidney-hu"])] = (-480.0, 300.0)
+    organ_hu: tuple[float, float] = (-480.0, 300.0)
     tumor_hu: tuple[float, float] = (300.0, 1000.0)
     targets: Path | None = None
     target_mm: float | None = None

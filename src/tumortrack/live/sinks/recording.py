@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import shutil
 import time
@@ -19,7 +20,7 @@ from tumortrack.live.recording.folders import ABOUT
 from tumortrack.live.recording.mcap import CHUNK_S, STRING, McapBag, camera_messages
 from tumortrack.live.ros.messages import Messages, Outgoing
 from tumortrack.live.ros.results import ResultMessages
-from tumortrack.live.values import CameraView, Sink, SinkConfig, SinkContext, TrackingResult
+from tumortrack.live.values import CameraView, SinkConfig, SinkContext, TrackingResult
 
 _KIND = "recording"
 POSES, STILL = "poses.csv", "poses.json"  # of a camera that moves; of several that stand still
@@ -48,15 +49,13 @@ class RecordingSinkConfig(SinkConfig, frozen=True, kw_only=True, tag="recording"
     def __post_init__(self) -> None:
         self.check_between("recording:", meshes_hz=(0, 1000))
 
-    def open(self, context: SinkContext) -> Sink:
+    def open(self, context: SinkContext) -> RecordingSink:
         """Raises InputError if the folder exists, and is no recording or ``overwrite`` was not
         given."""
         _make_room(self.path, self.overwrite)
         with writing(self.path):
             self.path.parent.mkdir(parents=True, exist_ok=True)
-            sink = McapFile(self.path, context, self.meshes_hz)
-            moves = context.published_frame.moves
-            poses = WithPoses(sink, self.path / POSES) if moves else None
+            sink = RecordingSink(self.path, context, self.meshes_hz)
         frame = context.published_frame
         about = {
             "kind": _KIND,
@@ -71,28 +70,7 @@ class RecordingSinkConfig(SinkConfig, frozen=True, kw_only=True, tag="recording"
             rows = [pose.tolist() for pose in context.cameras]
             fixed = {"unit": "mm", "frame_id": frame.frame_id, "fixed_from_camera": rows}
             write_json(self.path / STILL, fixed)
-        return poses or sink
-
-
-class WithPoses:
-    """Beside a recording, where the camera was in each frame: a table as `track --moving` reads it.
-    Whatever the disk refuses raises, and the next result is tried."""
-
-    def __init__(self, sink: McapFile, path: Path) -> None:
-        self._sink, self._file = sink, path.open("ab", buffering=0)
-        self._file.write(f"{COLUMNS}\n".encode())
-
-    def publish(self, result: TrackingResult) -> None:
-        self._sink.publish(result)
-        if result.observation is not None:
-            frame, stamp_ns = result.published_frame, result.stamp_ns
-            row = pose_row(stamp_ns, frame.frame_id, frame.published_from_camera)
-            with writing(Path(self._file.name)):
-                self._file.write(row.encode())
-
-    def close(self) -> None:
-        self._file.close()
-        self._sink.close()
+        return sink
 
 
 def _make_room(path: Path, overwrite: bool) -> None:
@@ -115,22 +93,34 @@ def _make_room(path: Path, overwrite: bool) -> None:
     shutil.rmtree(path)
 
 
-class McapFile:
+class RecordingSink:
     """Topics: ``/camera/...`` what the source saw, in the camera's frame, of further cameras
     ``/camera_2/...``; ``/tumortrack/...`` the results as in ROS, and ``report`` (JSON); ``/tf``
-    where the frames differ."""
+    where the frames differ. Beside them, of a camera that moves, where it was in each frame: a
+    table as `track --moving` reads it."""
 
     def __init__(self, folder: Path, context: SinkContext, meshes_hz: float) -> None:
         self._messages = Messages()
         self._results = ResultMessages(self._messages, context, meshes_hz, observed=False)
         self._bag = McapBag(folder, self._messages, _ON_FULL_DISK)
+        self._poses: io.FileIO | None = None
+        if context.published_frame.moves:
+            self._poses = io.FileIO(folder / POSES, "a")
+            self._poses.write(f"{COLUMNS}\n".encode())
 
     def publish(self, result: TrackingResult) -> None:
-        seen = result.observation
+        """Whatever the disk refuses raises, and the next result is tried."""
+        seen, frame = result.observation, result.published_frame
         arrived_ns = time.time_ns() if seen is None else seen.arrived_ns
         self._bag.write(arrived_ns, self._messages_of(result))
+        if seen is not None and self._poses is not None:
+            row = pose_row(result.stamp_ns, frame.frame_id, frame.published_from_camera)
+            with writing(Path(self._poses.name)):
+                self._poses.write(row.encode())
 
     def close(self) -> None:
+        if self._poses is not None:
+            self._poses.close()
         self._bag.close()
 
     def _messages_of(self, result: TrackingResult) -> list[Outgoing]:
