@@ -141,24 +141,19 @@ def test_without_a_picture_there_are_estimates_only(tmp_path):
         RecordingSourceConfig(path=path).open()
 
 
-def test_an_existing_folder_is_replaced_only_if_it_is_a_recording(tmp_path):
+def test_an_existing_folder_is_never_written_into(tmp_path):
     path = record(tmp_path / "mcap", [update_number(0)])
     about = json.loads((path / "recording.json").read_text())
     assert (about["kind"], about["parts"]) == ("recording", list(PARTS))
     assert about["patient"] == {"id": "P1", "side": "left"}
-    with pytest.raises(InputError, match="exists"):
-        record(path, [])
-    record(path, [update_number(n) for n in range(2)], overwrite=True)
-    assert len(play(path)) == 2
-    (path / "thesis.tex").write_text("years of work")
-    with pytest.raises(InputError, match="not replaced"):
-        record(path, [], overwrite=True)
     (tmp_path / "other").mkdir()
-    (tmp_path / "other" / "recording.json").write_text('{"kind": "song"}')
-    for path in (tmp_path / "other", tmp_path / "mcap" / "recording.json"):
-        with pytest.raises(InputError):
-            record(path, [], overwrite=True)
-        assert path.exists()
+    for there in (path, tmp_path / "other", path / "recording.json"):
+        before = sorted(tmp_path.rglob("*"))
+        with pytest.raises(InputError, match="exists"):
+            record(there, [])
+        assert sorted(tmp_path.rglob("*")) == before
+    assert json.loads((path / "recording.json").read_text()) == about
+    assert len(play(path)) == 1
 
 
 def test_a_file_cut_anywhere_gives_the_frames_before(tmp_path):
@@ -478,9 +473,7 @@ def test_close_ends_a_read_that_waits(tmp_path, monkeypatch):
     assert time.monotonic() - start < PATIENCE_S
 
 
-def test_the_second_of_two_that_begin_to_record_into_one_folder_is_refused(tmp_path, monkeypatch):
-    """Both looked before either had made it."""
-    monkeypatch.setattr("tumortrack.live.sinks.recording._make_room", lambda *_: None)
+def test_the_second_of_two_that_begin_to_record_into_one_folder_is_refused(tmp_path):
     first = RecordTo(path=tmp_path / "tape").open(small_setting())
     with pytest.raises(InputError, match="exists"):
         RecordTo(path=tmp_path / "tape").open(small_setting())

@@ -14,15 +14,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float32
 
-from tumortrack.core.colours import (
-    GOOD,
-    NONE,
-    POOR,
-    Colour,
-    label_colours,
-    part_colour,
-    structure_colour,
-)
+from tumortrack.core import colours
+from tumortrack.core.colours import Colour
 from tumortrack.core.geometry import rigid, transform_points
 from tumortrack.core.organ import organ_name
 from tumortrack.core.patient import Patient
@@ -48,7 +41,7 @@ _STATUS_HZ = 1.0  # of /diagnostics, as rqt's monitor expects it; and at once wh
 _RATE_OVER = 30  # results
 _OK, _WARN, _ERROR, _STALE = range(4)  # DiagnosticStatus
 _LEVELS = {"good": _OK, "poor": _WARN, "none": _ERROR}
-_TEXT_COLOURS = {"good": GOOD, "poor": POOR, "none": NONE}
+_TEXT_COLOURS = {"good": colours.GOOD, "poor": colours.POOR, "none": colours.NONE}
 _STATE_COLOUR: Colour = (235, 238, 242)
 ORGAN_OPACITY = 0.35
 _TEXT_HEIGHT_M, _STATE_HEIGHT_M = 0.008, 0.025
@@ -160,9 +153,9 @@ class ResultMessages:
                     markers.append({"ns": name, "action": _DELETE})
                 else:
                     opacity = ORGAN_OPACITY if label == 1 else 1.0
-                    markers.append(_triangles(name, mesh, part_colour(label), opacity))
+                    markers.append(_triangles(name, mesh, colours.part_colour(label), opacity))
             for number, (name, mesh) in enumerate(estimate.structures.items()):
-                markers.append(_triangles(name, mesh, structure_colour(number), 1.0))
+                markers.append(_triangles(name, mesh, colours.structure_colour(number), 1.0))
         if estimate is not None or result.workcell is None:  # else the workcell's text says it
             markers.append(_quality_text(result))
         return markers
@@ -250,7 +243,7 @@ def _labelled_cloud(estimate: TransformedEstimate | None, header: Any, messages:
         metres = estimate.points_mm / np.float32(MM_PER_M)
         table["x"], table["y"], table["z"] = metres.T
         table["label"], table["probability"] = estimate.labels, estimate.probability
-        red, green, blue = label_colours(estimate.labels).T.astype(np.uint32)
+        red, green, blue = colours.label_colours(estimate.labels).T.astype(np.uint32)
         table["rgb"] = red << 16 | green << 8 | blue  # PCL's packing
     return cloud_message(table, header, messages)
 
@@ -277,7 +270,7 @@ def _state_text(result: TrackingResult, cell: Workcell) -> dict[str, Any]:
     corners = np.concatenate(spots) if spots else np.zeros((1, 3))
     place_mm = (corners.min(0) + corners.max(0)) / 2
     place_mm[2] = corners[:, 2].max() - _half_height_mm(said, _STATE_HEIGHT_M)
-    colour, scale = NONE if cell.halted else _STATE_COLOUR, {"z": _STATE_HEIGHT_M}
+    colour, scale = colours.NONE if cell.halted else _STATE_COLOUR, {"z": _STATE_HEIGHT_M}
     return _drawn(_STATE, _TEXT, colour, place_mm, text=said, scale=scale)
 
 

@@ -5,15 +5,13 @@ from __future__ import annotations
 
 import io
 import json
-import shutil
 import time
 from pathlib import Path
 from typing import Any, ClassVar
 
 import tumortrack
 from tumortrack.core.config import to_builtins
-from tumortrack.core.errors import InputError
-from tumortrack.core.store import read_json, write_json, writing
+from tumortrack.core.store import write_json, writing
 from tumortrack.core.types import SensorCloud
 from tumortrack.live.poses import COLUMNS, pose_row
 from tumortrack.live.recording.folders import ABOUT
@@ -22,7 +20,6 @@ from tumortrack.live.ros.messages import Messages, Outgoing
 from tumortrack.live.ros.results import ResultMessages
 from tumortrack.live.values import CameraView, SinkConfig, SinkContext, TrackingResult
 
-_KIND = "recording"
 POSES, STILL = "poses.csv", "poses.json"  # of a camera that moves; of several that stand still
 _ON_FULL_DISK = (
     f"The recording ends {CHUNK_S:g} s before or less; it can be played with recording:FOLDER, and "
@@ -36,7 +33,6 @@ class RecordingSinkConfig(SinkConfig, frozen=True, kw_only=True, tag="recording"
 
     Attributes:
         meshes_hz: surfaces at most so often; 0: with every result.
-        overwrite: replace a recording of this kind.
     """
 
     target: ClassVar[str] = "path"
@@ -44,21 +40,18 @@ class RecordingSinkConfig(SinkConfig, frozen=True, kw_only=True, tag="recording"
 
     path: Path
     meshes_hz: float = 2.0
-    overwrite: bool = False
 
     def __post_init__(self) -> None:
         self.check_between("recording:", meshes_hz=(0, 1000))
 
     def open(self, context: SinkContext) -> RecordingSink:
-        """Raises InputError if the folder exists, and is no recording or ``overwrite`` was not
-        given."""
-        _make_room(self.path, self.overwrite)
+        """Raises InputError if the folder exists."""
         with writing(self.path):
             self.path.parent.mkdir(parents=True, exist_ok=True)
             sink = RecordingSink(self.path, context, self.meshes_hz)
         frame = context.published_frame
         about = {
-            "kind": _KIND,
+            "kind": "recording",
             "tumortrack": tumortrack.__version__,
             "patient": to_builtins(context.patient),
             "parts": list(context.parts),
@@ -71,26 +64,6 @@ class RecordingSinkConfig(SinkConfig, frozen=True, kw_only=True, tag="recording"
             fixed = {"unit": "mm", "frame_id": frame.frame_id, "fixed_from_camera": rows}
             write_json(self.path / STILL, fixed)
         return sink
-
-
-def _make_room(path: Path, overwrite: bool) -> None:
-    """Refuse what exists; or take an older recording away, if nothing else lies in it."""
-    if not path.exists():
-        return
-    if not overwrite:
-        raise InputError(
-            f"{path} exists already. Choose another folder, or give overwrite=true to replace the "
-            "recording."
-        )
-    inside = {p.name for p in path.iterdir()} if path.is_dir() else {path.name}
-    ours = {ABOUT, POSES, STILL, "metadata.yaml", f"{path.name}.mcap"}
-    is_ours = ABOUT in inside and read_json(path / ABOUT).get("kind") == _KIND
-    if inside and (inside - ours or not is_ours or not path.is_dir()):
-        raise InputError(
-            f"{path} is no recording of tumortrack's, or holds something else too, so it is not "
-            "replaced. Choose another folder."
-        )
-    shutil.rmtree(path)
 
 
 class RecordingSink:
