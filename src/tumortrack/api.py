@@ -90,8 +90,6 @@ def prepare(
     from tumortrack.imaging.case import KIND, save_case
 
     known = preparing.PrepareOptions.__dataclass_fields__
-    if "kidney_hu" in options:  # its name until 0.2
-        options["organ_hu"] = options.pop("kidney_hu")
     if unknown := sorted(set(options) - set(known)):
         raise InputError(f"prepare knows no {unknown[0]!r}; allowed: {', '.join(known)}.")
     if folder is not None:
@@ -398,11 +396,8 @@ def track(
 
 
 def named_sinks(sinks: Sequence[Any]) -> dict[str, Any]:
-    """Sinks, or their configurations, by the names that reports give them.
-
-    Raises:
-        InputError: one is not written as it must be, or is given twice.
-    """
+    """Sinks, or their configurations, by the names that reports give them. Raises InputError: one
+    is not written as it must be, or is given twice."""
     from tumortrack.live.spec import SINKS
 
     named: dict[str, Any] = {}
@@ -416,12 +411,8 @@ def named_sinks(sinks: Sequence[Any]) -> dict[str, Any]:
 
 @contextmanager
 def open_sinks(sinks: Mapping[str, Any], context: SinkContext) -> Iterator[list[SinkWorker]]:
-    """``named_sinks``, each at work in a thread of its own.
-
-    Raises:
-        InputError: a sink cannot work.
-        StorageError: a sink cannot write.
-    """
+    """``named_sinks``, each at work in a thread of its own. Raises InputError, StorageError: one
+    cannot work, or not write."""
     from tumortrack.live.values import SinkConfig
     from tumortrack.live.workers import SinkWorker
 

@@ -96,7 +96,7 @@ def recorded_mcap(folder: Path) -> Iterator[Source]:
 @contextmanager
 def recorded_files(folder: Path) -> Iterator[Source]:
     for n in range(8):
-        write_frame_folder(folder / "frames" / f"{n}", frame_number(n))
+        write_frame_folder(folder / f"{n}", frame_number(n))
     yield RecordingSourceConfig(path=folder).open()
 
 

@@ -298,19 +298,7 @@ def _recordings() -> dict[str, Target]:
         "db3": ([file.read_bytes()], of_file(".db3", play)),
         "rosbag2 folder": of_member(packed, "metadata.yaml", play),
         "packed mcap": of_member(packed, "packed.mcap", play),
-        "times": of_member(_frames_with_times(folder), "times.csv", play),
     }
-
-
-def _frames_with_times(folder: Path) -> Path:
-    from tumortrack.sense.ply import write_cloud_ply
-
-    place = folder / "times"
-    place.mkdir()
-    for name in ("a", "b"):
-        write_cloud_ply(place / f"{name}.ply", np.ones((3, 3), np.float32) * 120)
-    (place / "times.csv").write_text("file,stamp_ns\na.ply,1\nb.ply,2\n")
-    return place
 
 
 def of_member(folder: Path, name: str, read: Callable[[Path], object]) -> Target:

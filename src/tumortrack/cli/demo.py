@@ -5,8 +5,8 @@ from __future__ import annotations
 import shutil
 import time
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any
 
 import tumortrack
 from tumortrack.cli.cases import Prepare, Simulate
@@ -63,17 +63,10 @@ class Demo:
         # Elastic ones are of states that training did not draw from. Training shows no drags; these
         # are of two of the paper's configurations, the one it trains with and the one with the most
         # drags, and squeezed and bent as a whole.
-        kinds: tuple[tuple[str, int, dict[str, Any]], ...] = (
-            ("elastic", elastic, {"elastic": True}),
-            ("dragged", dragged, {"configuration": (3, 6), "squeeze": True}),
-        )
-        for kind, count, options in kinds:
-            if count > 0:
-                case, dataset = out / "case", out / "dataset"
-                made = Simulate(
-                    case=case, dataset=dataset, scenes=count, seed=_SCENE_SEED, **options
-                )
-                made.write(f"{kind}-")
+        unseen = partial(Simulate, case=out / "case", dataset=out / "dataset", seed=_SCENE_SEED)
+        unseen(scenes=elastic, elastic=True).write("elastic-")
+        if dragged:
+            unseen(scenes=dragged, configuration=(3, 6), squeeze=True).write("dragged-")
         say("5/5 locating kidney and tumors in each from one depth image")
         Evaluate(model=out / "model", variants=out / "dataset", report=out, grid=128).run()
         scenes = store.read_json(out / "report.json")["scenes"]

@@ -16,6 +16,7 @@ from tumortrack.core.config import to_builtins
 from tumortrack.core.errors import InputError
 
 if TYPE_CHECKING:
+    from tumortrack.core.estimate import Estimate
     from tumortrack.core.geometry import Affine
     from tumortrack.core.types import DepthFrame, SensorCloud
     from tumortrack.models.model import Model
@@ -81,9 +82,7 @@ class Locate(StatedPatient):
 
         import numpy as np
 
-        from tumortrack.core.estimate import NO_CHECK_FAILED, UNVERIFIED
         from tumortrack.core.types import Look
-        from tumortrack.models.margins import margin_words, stated_radius
         from tumortrack.registration.kernels import carry
         from tumortrack.tracking.files import write_estimate
         from tumortrack.tracking.points import check_near_organ
@@ -128,27 +127,7 @@ class Locate(StatedPatient):
         )
         write_estimate(out, estimate, self.overwrite, points)
         say_notes(notes)
-        margin = estimate.report.get("margin", {})
-        for name, part in estimate.report["parts"].items():
-            if part["found"]:
-                x, y, z = part["center_mm"]
-                radius = stated_radius(margin, name)
-                say(
-                    f"{name}: {part['volume_ml']:.1f} ml, centre ({x:.1f}, {y:.1f}, {z:.1f}) mm"
-                    + (f", {radius.words}" if radius else "")
-                )
-            else:
-                say(f"{name}: not found")
-        if points is not None:
-            file = out / "points.csv"
-            radius = stated_radius(margin, "map")
-            said = f"; {radius.words} for all of them" if radius else ""
-            say(f"{len(points.points_ct)} points of the CT: their places are in {file}{said}")
-        if not margin.get("stated"):
-            say(margin_words(margin))
-        good = estimate.quality == "good"
-        say(f"{NO_CHECK_FAILED}; {UNVERIFIED}." if good
-            else f"POOR: {estimate.reason}. Do not rely on it.")  # fmt: skip
+        _say_found(estimate, points, out)
         seconds = estimate.report["timings"]["total"]
         compiled = ", with compiling, once on this machine" if carry.stats.cache_misses else ""
         say(f"written to {out} (camera frame, mm) in {seconds:.2f} s{compiled}.")
@@ -226,6 +205,32 @@ class Locate(StatedPatient):
             return crop_cloud(seen, near, far) if self.range else seen
         crop = CloudConfig(near_mm=near, far_mm=far, n_points=trained.n_points)
         return cloud_from_depth(seen, crop, np.random.default_rng(self.seed))
+
+
+def _say_found(estimate: Estimate, points: PointTable | None, out: Path) -> None:
+    """What is where, and how far that is to be trusted."""
+    from tumortrack.core.estimate import NO_CHECK_FAILED, UNVERIFIED
+    from tumortrack.models.margins import margin_words, stated_radius
+
+    margin = estimate.report.get("margin", {})
+    for name, part in estimate.report["parts"].items():
+        said = "not found"
+        if part["found"]:
+            x, y, z = part["center_mm"]
+            said = f"{part['volume_ml']:.1f} ml, centre ({x:.1f}, {y:.1f}, {z:.1f}) mm"
+            said += f", {radius.words}" if (radius := stated_radius(margin, name)) else ""
+        say(f"{name}: {said}")
+    if points is not None:
+        radius = stated_radius(margin, "map")
+        said = f"; {radius.words} for all of them" if radius else ""
+        file = out / "points.csv"
+        say(f"{len(points.points_ct)} points of the CT: their places are in {file}{said}")
+    if not margin.get("stated"):
+        say(margin_words(margin))
+    if estimate.quality == "good":
+        say(f"{NO_CHECK_FAILED}; {UNVERIFIED}.")
+    else:
+        say(f"POOR: {estimate.reason}. Do not rely on it.")
 
 
 @dataclass(frozen=True, kw_only=True)

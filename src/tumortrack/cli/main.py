@@ -37,12 +37,6 @@ _COMMANDS: tuple[type[Command], ...] = (
     *(Demo, Prepare, Export, Train, Pretrain, Locate, Track, Plan, Resect),
     *(Simulate, Evaluate, Margins, Compile, Onnx, Inspect, Doctor),
 )
-_ORDER = (
-    *("demo", "prepare", "export", "train", "pretrain", "locate", "track", "plan", "resect"),
-    *("simulate", "twin", "evaluate", "margins", "bench", "fleet"),
-    *("phantom-kit", "calibrate", "record", "reference"),
-    *("compile", "onnx", "inspect", "doctor"),
-)
 _OBJECTS_A_COLLECTION = 20_000
 _LEFT_AT_ONCE = ["locate"]  # holds nothing open in the end, and is waited for
 
@@ -97,18 +91,14 @@ def leave() -> NoReturn:
 
 
 def _commands(chosen: str) -> dict[str, Callable[..., Command]]:
-    """Ours, and of other installed packages' (entry points of the group ``tumortrack.commands``)
+    """Ours, and behind them other installed packages' (entry points of ``tumortrack.commands``):
     the chosen one, or all where there is none of that name."""
-    found: dict[str, Callable[..., Command]] = {
-        command.__name__.lower(): command for command in _COMMANDS
-    }
-    if chosen in found:
-        return found
+    ours = {command.__name__.lower(): command for command in _COMMANDS}
+    if chosen in ours:
+        return {**ours}
     others = sorted(entry_points(group="tumortrack.commands"), key=lambda point: point.name)
     others = [point for point in others if point.name == chosen] or others
-    found |= {point.name: point.load() for point in others}
-    places = {name: place for place, name in enumerate(_ORDER)}
-    return {name: found[name] for name in sorted(found, key=lambda n: places.get(n, len(places)))}
+    return {**ours, **{point.name: point.load() for point in others}}
 
 
 def _parse(arguments: list[str]) -> Command:

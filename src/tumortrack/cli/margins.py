@@ -77,16 +77,15 @@ class Margins:
         self, listed: list[Listed], known: list[Row], add: Callable[[Row], None]
     ) -> list[Row]:
         """A row for every state; those that are known are not located again."""
+        states = {str(one.folder.resolve()): one for one in listed}
         done = {row.scene: row for row in known}
-        for one in listed:
-            row = done.get(str(one.folder.resolve()))
-            if row is not None and row.sha256 != store.sha256_of(one.folder):
+        for scene, one in states.items():
+            if scene in done and done[scene].sha256 != store.sha256_of(one.folder):
                 raise InputError(
                     f"{one.folder} was changed since it was located. Remove the table, or give "
                     "another --out."
                 )
-        left = [one for one in listed if str(one.folder.resolve()) not in done]
-        if left:
+        if left := [one for scene, one in states.items() if scene not in done]:
             from tumortrack.cli.locate import check_case
             from tumortrack.report.calibration import row_of
             from tumortrack.simulate.scene_folder import read_scene
@@ -103,7 +102,7 @@ class Margins:
                     add(row)
                     done[row.scene] = row
                     advance()
-        return [done[str(one.folder.resolve())] for one in listed]
+        return [done[scene] for scene in states]
 
 
 def described(margins: ModelMargins) -> list[str]:

@@ -5,19 +5,19 @@ from __future__ import annotations
 import itertools
 import signal
 import sys
+import termios
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tyro.conf import Positional
 
 from tumortrack.cli import track
-from tumortrack.cli.console import Device, progress_bar, say
+from tumortrack.cli.console import progress_bar, say
 from tumortrack.cli.plan import check_arms_installed
-from tumortrack.cli.stated import StatedPatient
 from tumortrack.core import store
 from tumortrack.core.config import to_builtins
 from tumortrack.core.errors import Aborted, ArtifactError, InputError
@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from tumortrack.plan import operation as operations
     from tumortrack.plan.arms.cell import ArmCell
     from tumortrack.plan.files import PlanFolder
+    from tumortrack.plan.motions import Motions
     from tumortrack.plan.values import Located
 
 _FPS = 30.0  # of an execution that no camera drives
@@ -45,7 +46,7 @@ _LIVE = ("realsense", "ros2")  # sources that show the present
 
 
 @dataclass(frozen=True, kw_only=True)
-class Resect(StatedPatient):
+class Resect(track.Following):
     """Carry a plan out with virtual arms, shown by the same sinks as `track`.
 
     Attributes:
@@ -56,37 +57,25 @@ class Resect(StatedPatient):
             is no good estimate, and the plan is made anew once the tumor has moved.
         replan_cut: plan anew even after the first sweep has begun, though the model knows only the
             intact organ; otherwise the arms halt instead.
-        range: as in `track`.
-        box: as in `track`.
-        whole: as in `track`.
-        intrinsics: as in `track`.
         speed: of the arms; 2 is twice as fast as planned.
         moved: the tumor counts as moved once its surface is so many mm from where it was planned
             (root mean square; default: what the plan allows for).
         film: write an animated GIF of the stored plan instead.
         report: file for states, halts and the budget of errors (default: runs/resect-TIME.json).
-        device: auto takes CUDA if there is a GPU.
     """
 
     plan: Positional[Path]
     sinks: Positional[tuple[str, ...]] = ()
     live: tuple[Path, str] | None = None
     replan_cut: bool = False
-    range: tuple[float, float] | None = None
-    box: tuple[float, float, float, float, float, float] | None = None
-    whole: bool = False
-    intrinsics: Path | None = None
     speed: float = 1.0
     moved: float | None = None
     film: Path | None = None
     report: Path | None = None
-    device: Device = "auto"
 
     def run(self) -> None:
         from tumortrack import api
-        from tumortrack.core.config import from_builtins
         from tumortrack.live.sinks.ur import UrSinkConfig
-        from tumortrack.plan.arms.config import CellConfig
         from tumortrack.plan.files import read_plan
         from tumortrack.plan.operation import OperationConfig
 
@@ -95,41 +84,32 @@ class Resect(StatedPatient):
         stored.patient.check_is(self.stated, str(self.plan))
         if stored.motions is None or stored.cell is None:
             raise InputError(f"{self.plan} was planned with --no-arms; plan again without it.")
-        if (
-            organ_is := organ_name(stored.meshes)
-        ) is None or stored.plan.tumor not in stored.meshes:
-            lacking = stored.plan.tumor if organ_is else "the organ"
+        organ = organ_name(stored.meshes)
+        if organ is None or stored.plan.tumor not in stored.meshes:
+            lacking = stored.plan.tumor if organ else "the organ"
             raise ArtifactError(f"{self.plan} lacks {lacking}'s surface. Plan again.")
         sinks = api.named_sinks(self.sinks).values()  # wrong: said before all that takes long
-        config = OperationConfig(
-            speed=self.speed, moved_mm=self._moved_mm(stored), replan_cut=self.replan_cut
-        )
-        cell_config = from_builtins(stored.cell, CellConfig, str(self.plan))
+        moved_mm = self._moved_mm(stored)
+        config = OperationConfig(speed=self.speed, moved_mm=moved_mm, replan_cut=self.replan_cut)
         arms = [sink for sink in sinks if isinstance(sink, UrSinkConfig)]
         moving = [arm for arm in arms if arm.execute]
         live = None if self.live is None else _live_of(*self.live, stored)
         if moving:
             self._check_real(stored, moving, live)
-
-        from tumortrack.plan.arms.cell import ArmCell
-        from tumortrack.plan.arms.trajectory import first_hit
-
-        organ = stored.meshes[organ_is]
-        if hit := first_hit(stored.motions, cell_config, organ):
-            raise ArtifactError(f"{self.plan}: its motions are not as planned: {hit}. Plan again.")
-        cell = ArmCell(cell_config, organ)
+        cell = _checked_cell(self.plan, stored, stored.motions, organ)
+        procedure = _Procedure(self, stored, stored.motions, cell, config, arms)
         if self.film is not None:
             if self.live is not None or self.sinks:
                 raise InputError("--film shows the stored plan; give it without sinks and --live.")
-            _write_film(stored, cell, self.film)
+            procedure.film(self.film)
             return
         _confirm(moving, stored.patient)
         with _dry_run([arm for arm in arms if not arm.execute], moving):
             say(str(stored.patient))
             if live is None:
-                self._execute(stored, cell, config, arms)
+                procedure.execute()
             else:
-                self._follow(stored, cell, config, arms, live)
+                procedure.follow(live)
 
     def _check_real(
         self, stored: PlanFolder, arms: Sequence[UrSinkConfig], live: _Live | None
@@ -202,14 +182,19 @@ class Resect(StatedPatient):
         planned_mm = MOVED_MM if stored.budget is None else stored.budget.motion_mm
         return planned_mm if self.moved is None else self.moved
 
-    def _follow(
-        self,
-        stored: PlanFolder,
-        cell: ArmCell,
-        config: operations.OperationConfig,
-        arms: Sequence[UrSinkConfig],
-        live: _Live,
-    ) -> None:
+
+@dataclass(frozen=True, eq=False)
+class _Procedure:
+    """A stored plan that is carried out. ``arms``: real ones, connected or not."""
+
+    asked: Resect
+    stored: PlanFolder
+    motions: Motions
+    cell: ArmCell
+    config: operations.OperationConfig
+    arms: Sequence[UrSinkConfig]
+
+    def follow(self, live: _Live) -> None:
         """Beside the live loop: every estimate is looked at, and planned on where the tumor
         moved."""
         from concurrent.futures import ProcessPoolExecutor
@@ -217,18 +202,16 @@ class Resect(StatedPatient):
 
         import msgspec
 
+        from tumortrack.live.cameras import CameraSetup
         from tumortrack.plan.arms import procedure
         from tumortrack.plan.arms.cell import tip_places
         from tumortrack.plan.live_budget import LiveBudget
         from tumortrack.plan.located import located
 
-        assert self.live is not None
-        model, source = self.live
-
-        way = stored.frames.published_from_camera
+        stored, asked, frames = self.stored, self.asked, self.stored.frames
 
         def locate(result: TrackingResult, unsure: bool = False) -> Located:
-            estimate = result.estimate
+            estimate, way = result.estimate, frames.published_from_camera
             assert estimate is not None
             motion = estimate.motion if unsure else None
             return located(estimate.cloud, estimate.meshes, motion, way, estimate.structures)
@@ -236,7 +219,7 @@ class Resect(StatedPatient):
         again = msgspec.structs.replace(stored.config, tumor=stored.plan.tumor)
         # In a process of its own: planning for a second must not hold up a frame.
         with ProcessPoolExecutor(
-            1, get_context("spawn"), procedure.begin_worker, (again, cell.config)
+            1, get_context("spawn"), procedure.begin_worker, (again, self.cell.config)
         ) as planner:
 
             def replan(
@@ -253,44 +236,34 @@ class Resect(StatedPatient):
             begun = planner.submit(procedure.warm_up)
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
             begun.result()
-            late_s = max((arm.lookahead_s for arm in arms), default=0.0)
+            late_s = max((arm.lookahead_s for arm in self.arms), default=0.0)
             budget = LiveBudget(stored.budget, late_s) if stored.budget else None
-            operation = _operation(
-                stored, cell, config, locate=locate, replan=replan, budget=budget
-            )
+            operation = self._operation(locate=locate, replan=replan, budget=budget)
+            setup = CameraSetup(frames, {live.named: live.source})
+            about = {"plan_config": to_builtins(self.config)}
+            same = {one.name: getattr(asked, one.name) for one in fields(track.Following)}
             track.Track(
-                model=model, source=source, sinks=self.sinks, range=self.range, box=self.box,
-                whole=self.whole, intrinsics=self.intrinsics, report=self.report,
-                device=self.device, patient=self.patient, side=self.side,
-            ).run(track.Arms(
-                operation, stored.frames, {"plan_config": to_builtins(config)}, live.source,
-                tip_places(cell.config), bool(arms),
-            ))  # fmt: skip
-        _say_end(operation, arms)
+                model=live.model, source=live.named, sinks=asked.sinks, report=asked.report, **same
+            ).run(
+                track.Arms(operation, setup, about, tip_places(self.cell.config), bool(self.arms))
+            )
+        self._say_end(operation)
 
-    def _execute(
-        self,
-        stored: PlanFolder,
-        cell: ArmCell,
-        config: operations.OperationConfig,
-        arms: Sequence[UrSinkConfig],
-    ) -> None:
+    def execute(self) -> None:
         """Without a camera: the stored motions in real time."""
         from tumortrack import api
         from tumortrack.live.values import Controls, SinkContext, TrackingResult
 
-        assert stored.motions is not None
-        operation = _operation(stored, cell, config)
+        stored, frames, controls = self.stored, self.stored.frames, Controls()
+        operation = self._operation()
         operation.still_life = _organ_shapes(stored)
-        report = track.report_path(self.report, "resect")
-        frames = stored.frames
-        controls = Controls()
+        report = track.report_path(self.asked.report, "resect")
         context = SinkContext(tuple(stored.meshes), frames, None, controls, True, stored.patient)
         stop = track.stopping(lambda: operation.abort(track.STOPPED))
-        with stop, api.open_sinks(api.named_sinks(self.sinks), context) as sinks:
+        with stop, api.open_sinks(api.named_sinks(self.asked.sinks), context) as sinks:
             track.say_opened(sinks)
-            say(f"{stored.motions.seconds / config.speed:.0f} s in frame {frames.frame_id!r}; "
-                "Ctrl-C stops the arms.")  # fmt: skip
+            seconds = self.motions.seconds / self.config.speed
+            say(f"{seconds:.0f} s in frame {frames.frame_id!r}; Ctrl-C stops the arms.")
             errors: dict[str, str] = {}
             shown, started = "", time.monotonic()
             for sequence in itertools.count():
@@ -304,7 +277,7 @@ class Resect(StatedPatient):
                     sink.put(result)
                 track.say_failures(sinks, errors)
                 assert result.workcell is not None
-                text = track.stage_words(result.workcell.state, bool(arms))
+                text = track.stage_words(result.workcell.state, bool(self.arms))
                 text += f": {result.workcell.halted}" if result.workcell.halted else ""
                 if text != shown:
                     say(shown := text)
@@ -320,17 +293,75 @@ class Resect(StatedPatient):
         }
         store.write_json(report, content)
         say(f"written to {report}.")
-        _say_end(operation, arms)
+        self._say_end(operation)
         track.check_closed(sinks)
+
+    def film(self, path: Path) -> None:
+        """An animated GIF of about twelve seconds."""
+        from tumortrack.live.values import TrackingResult
+        from tumortrack.plan.files import as_located
+        from tumortrack.plan.operation import OperationConfig
+        from tumortrack.report.film import FPS, film, moments_s
+
+        times_s = moments_s(self.motions, _FILM_FRAMES)
+        operation = replace(self, config=OperationConfig())._operation()
+        nothing = TrackingResult(0, 0, reason=_NOTHING)
+
+        def frames() -> Iterator[Workcell]:
+            now_s = 0.0
+            for time_s in times_s.tolist():
+                cell = operation.act(nothing, now_s).workcell
+                while now_s < time_s:  # heard it of the time less often, the arms would halt
+                    now_s = min(now_s + _FILM_STEP_S, time_s)
+                    cell = operation.act(nothing, now_s).workcell
+                assert cell is not None
+                yield replace(cell, state=f"VIRTUAL: {cell.state}")
+
+        with progress_bar("drawing", len(times_s)) as advance:
+            film(frames(), as_located(self.stored), path, progress=advance)
+        say(f"written to {path}: {self.motions.seconds:.0f} s in {len(times_s) / FPS:.0f}.")
+
+    def _operation(self, **live: Any) -> operations.Operation:
+        from tumortrack.plan.operation import Operation, Planned
+
+        planned = Planned(self.stored.plan, self.stored.meshes, self.motions)
+        return Operation(planned, self.config, self.cell.shapes, **live)
+
+    def _say_end(self, operation: operations.Operation) -> None:
+        found = operation.summary()
+        if found["state"] != "done":
+            if found["halted"] == track.STOPPED:
+                raise KeyboardInterrupt
+            raise Aborted(f"the resection was {found['state']}: {found['halted']}.")
+        if any(arm.execute for arm in self.arms):
+            say("done: all motions were sent; see where the arms stand.")
+        else:
+            say(f"done: {'nothing moved' if self.arms else 'both virtual arms are home'}.")
+
+
+def _checked_cell(path: Path, stored: PlanFolder, motions: Motions, organ: str) -> ArmCell:
+    """Raises ArtifactError: in it the motions hit something, so they are not those planned."""
+    from tumortrack.core.config import from_builtins
+    from tumortrack.plan.arms.cell import ArmCell
+    from tumortrack.plan.arms.config import CellConfig
+    from tumortrack.plan.arms.trajectory import first_hit
+
+    config = from_builtins(stored.cell, CellConfig, str(path))
+    if hit := first_hit(motions, config, stored.meshes[organ]):
+        raise ArtifactError(f"{path}: its motions are not as planned: {hit}. Plan again.")
+    return ArmCell(config, stored.meshes[organ])
 
 
 @dataclass(frozen=True, eq=False)
 class _Live:
-    """Of --live: the source; the model's case, by its digest (empty where unknown), and whose."""
+    """Of --live: the model's folder, case (its digest; empty where unknown) and patient; the
+    source, and how it was written."""
 
-    source: SourceConfig
+    model: Path
     case: str
     whose: Patient
+    named: str
+    source: SourceConfig
 
     @property
     def kind(self) -> str:
@@ -357,14 +388,12 @@ def _live_of(model: Path, source: str, stored: PlanFolder) -> _Live:
             f"{model} was trained for another case than the one that was planned on. Give a model "
             "of that case, or plan on what this model locates."
         )
-    return _Live(SOURCES.parse(source), case, whose)
+    return _Live(model, case, whose, source, SOURCES.parse(source))
 
 
 def _confirm(arms: Sequence[UrSinkConfig], patient: Patient) -> None:
     """A person at the terminal types each arm's address; InputError: something else."""
     for arm in arms:
-        import termios  # not on Windows, where no terminal would be found above
-
         termios.tcflush(sys.stdin, termios.TCIFLUSH)  # what was typed before it was asked for
         say(
             f"The {arm.arm} at {arm.host} is about to move: as soon as an estimate is good, and "
@@ -394,16 +423,6 @@ def _dry_run(dry: Sequence[UrSinkConfig], moving: Sequence[UrSinkConfig]) -> Ite
             say(line)
 
 
-def _operation(
-    stored: PlanFolder, cell: ArmCell, config: operations.OperationConfig, **live: Any
-) -> operations.Operation:
-    from tumortrack.plan.operation import Operation, Planned
-
-    assert stored.motions is not None
-    planned = Planned(stored.plan, stored.meshes, stored.motions)
-    return Operation(planned, config, cell.shapes, **live)
-
-
 def _organ_shapes(stored: PlanFolder) -> tuple[RigidShape, ...]:
     """Organ and tumors as they were planned on, no surface drawn twice."""
     import numpy as np
@@ -421,43 +440,3 @@ def _organ_shapes(stored: PlanFolder) -> tuple[RigidShape, ...]:
         RigidShape(f"planned/{name}", mesh, still, part_colour(n + 1), opacity[n])
         for n, (name, mesh) in enumerate(zip(names, meshes, strict=True))
     )
-
-
-def _say_end(operation: operations.Operation, arms: Sequence[UrSinkConfig]) -> None:
-    """``arms``: real ones, connected or not."""
-    found = operation.summary()
-    if found["state"] == "done":
-        if any(arm.execute for arm in arms):
-            say("done: all motions were sent; see where the arms stand.")
-        else:
-            say(f"done: {'nothing moved' if arms else 'both virtual arms are home'}.")
-        return
-    if found["halted"] == track.STOPPED:
-        raise KeyboardInterrupt
-    raise Aborted(f"the resection was {found['state']}: {found['halted']}.")
-
-
-def _write_film(stored: PlanFolder, cell: ArmCell, path: Path) -> None:
-    """An animated GIF of about twelve seconds."""
-    from tumortrack.live.values import TrackingResult
-    from tumortrack.plan.files import as_located
-    from tumortrack.plan.operation import OperationConfig
-    from tumortrack.report.film import FPS, film, moments_s
-
-    assert stored.motions is not None
-    times_s = moments_s(stored.motions, _FILM_FRAMES)
-    operation = _operation(stored, cell, OperationConfig())
-
-    def frames() -> Iterator[Workcell]:
-        now_s = 0.0
-        for time_s in times_s.tolist():
-            frame = operation.act(TrackingResult(0, 0, reason=_NOTHING), now_s)
-            while now_s < time_s:  # heard it of the time less often, the arms would halt
-                now_s = min(now_s + _FILM_STEP_S, time_s)
-                frame = operation.act(TrackingResult(0, 0, reason=_NOTHING), now_s)
-            assert frame.workcell is not None
-            yield replace(frame.workcell, state=f"VIRTUAL: {frame.workcell.state}")
-
-    with progress_bar("drawing", len(times_s)) as advance:
-        film(frames(), as_located(stored), path, progress=advance)
-    say(f"written to {path}: {stored.motions.seconds:.0f} s in {len(times_s) / FPS:.0f}.")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import signal
 import time
@@ -22,7 +23,7 @@ from tumortrack.core.errors import InputError, StorageError
 if TYPE_CHECKING:
     from tumortrack.live.cameras import Cameras, CameraSetup
     from tumortrack.live.loop import Loop, LoopConfig
-    from tumortrack.live.values import PublishedFrame, SourceConfig, TrackingResult
+    from tumortrack.live.values import TrackingResult
     from tumortrack.live.workers import SinkWorker
     from tumortrack.models.model import Model
     from tumortrack.plan.operation import Operation
@@ -36,18 +37,39 @@ _STORE_S = 10.0  # between two writings of the report: kill -9 loses no more
 
 @dataclass(frozen=True, eq=False)
 class Arms:
-    """Arms that act on what is tracked, and the frame in which everything is then published."""
+    """Arms that act on what is tracked. ``setup``: what they were checked with; ``about`` them, for
+    the report; ``tip_mm``: as of ``SinkContext``; ``ur``: there are sinks of real arms, connected
+    or not."""
 
-    companion: Operation
-    frames: PublishedFrame
+    operation: Operation
+    setup: CameraSetup
     about: dict[str, Any]
-    source: SourceConfig
-    tip_mm: Any  # as ``SinkContext``'s
-    ur: bool  # sinks of real arms, connected or not
+    tip_mm: Any
+    ur: bool
 
 
 @dataclass(frozen=True, kw_only=True)
-class Track(StatedPatient):
+class Following(StatedPatient):
+    """Options of commands that follow an organ.
+
+    Attributes:
+        range: keep depths between NEAR and FAR mm (default: those that the model has learned).
+        box: keep what lies in a box: two opposite corners X Y Z X Y Z, camera frame, mm.
+        whole: what is in range and box is the organ alone; do not look for it among other things.
+        intrinsics: JSON with the camera's width, height, fx, fy, cx, cy in pixels, instead of what
+            the source says, and perhaps a correction of depths, as `calibrate camera` writes it.
+        device: auto takes CUDA if there is a GPU.
+    """
+
+    range: tuple[float, float] | None = None
+    box: tuple[float, float, float, float, float, float] | None = None
+    whole: bool = False
+    intrinsics: Path | None = None
+    device: Device = "auto"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Track(Following):
     """Follow organ and tumors live, from a camera to viewers, recordings and robots.
 
     Sources and sinks are written kind:target?option=value&option=value. Sources: virtual:CASE,
@@ -60,9 +82,6 @@ class Track(StatedPatient):
         model: folder that `train` wrote.
         source: where frames come from.
         sinks: where estimates go; any number.
-        range: keep depths between NEAR and FAR mm (default: those that the model has learned).
-        box: keep what lies in a box: two opposite corners X Y Z X Y Z, camera frame, mm.
-        whole: what is in range and box is the organ alone; do not look for it among other things.
         frame: JSON file that says where the camera is; results are then in the robot's frame.
         views: further cameras that stand still; what all see at about one moment is laid together.
         poses: JSON that says where all cameras stand, as for `locate`, SOURCE's first; results are
@@ -72,8 +91,6 @@ class Track(StatedPatient):
             tool, --frame has tool_from_camera.
         scan: with --moving: begin with three looks at the organ at rest, from 30 degrees apart,
             within 5 s; what they show together is what the following starts from.
-        intrinsics: JSON with the camera's width, height, fx, fy, cx, cy in pixels, instead of what
-            the source says, and perhaps a correction of depths, as `calibrate camera` writes it.
         smoothing: time constant in s of a mean over past estimates; the lag is in the report.
         rescan: every so many s, search for the organ as in a first frame.
         stale: frames older than so many s are refused; a pause is reported after four fifths of it.
@@ -83,21 +100,16 @@ class Track(StatedPatient):
         seconds: end so many s after the first frame; 0: never.
         report: file for latencies, counts and reasons (default: runs/track-TIME.json).
         seed: of the random points.
-        device: auto takes CUDA if there is a GPU.
     """
 
     model: Positional[Path]
     source: Positional[str]
     sinks: Positional[tuple[str, ...]] = ()
-    range: tuple[float, float] | None = None
-    box: tuple[float, float, float, float, float, float] | None = None
-    whole: bool = False
     frame: Path | None = None
     views: tuple[str, ...] = ()
     poses: Path | None = None
     moving: str = ""
     scan: bool = False
-    intrinsics: Path | None = None
     smoothing: float = 0.0
     rescan: float = 1.0
     stale: float = 0.5
@@ -106,21 +118,17 @@ class Track(StatedPatient):
     seconds: float = 0.0
     report: Path | None = None
     seed: int = 0
-    device: Device = "auto"
 
     def run(self, arms: Arms | None = None) -> None:
         """Until the source ends, the time is up, the arms have ended, or Ctrl-C."""
         from tumortrack import api
         from tumortrack.core.config import to_builtins
-        from tumortrack.live.cameras import Cameras, CameraSetup
-        from tumortrack.live.values import Controls, SinkContext
+        from tumortrack.live.cameras import Cameras
+        from tumortrack.live.values import SinkContext
         from tumortrack.live.workers import SourceWorker
         from tumortrack.models.folder import patient_of, read_model_manifest
 
-        if arms is None:
-            setup = self._cameras()
-        else:  # read once: what executes is what was checked
-            setup = CameraSetup(arms.frames, {self.source: arms.source})
+        setup = self._cameras() if arms is None else arms.setup  # what executes was checked
         frames, named = setup.published, api.named_sinks(self.sinks)
         manifest = read_model_manifest(self.model)  # what is wrong, before PyTorch's seconds
         patient = patient_of(manifest, self.model)
@@ -139,28 +147,26 @@ class Track(StatedPatient):
         if setup.still and tracker.anatomy_ct is None:
             raise InputError("--views needs a model that knows a motion: preset clinic.")
         config = self._loop_config(model)
-        tip_mm = None if arms is None else arms.tip_mm
         context = SinkContext(
             model.parts,
             frames,
             tracker.anatomy_ct,
-            Controls(),
-            arms is not None,
-            model.patient,
-            setup.still,
-            tip_mm,
+            arms=arms is not None,
+            patient=model.patient,
+            cameras=setup.still,
+            tip_mm=None if arms is None else arms.tip_mm,
         )
-        companion = None if arms is None else arms.companion
-        loop = Loop(tracker, context, config, companion)
+        loop = Loop(tracker, context, config, None if arms is None else arms.operation)
 
         def stop() -> None:
-            if companion is not None:
-                companion.abort(STOPPED)
+            if arms is not None:
+                arms.operation.abort(STOPPED)
             loop.stop()
 
         say("warming up ...")
         loop.warm()
         way = frames.published_from_camera
+        placed = None if frames.moves else way.tolist()
         about = {
             "patient": to_builtins(model.patient),
             "model": model.provenance,
@@ -168,10 +174,7 @@ class Track(StatedPatient):
             "source": self.source,
             "sinks": list(self.sinks),
             "config": to_builtins(config),
-            "frame": {
-                "frame_id": frames.frame_id,
-                "published_from_camera": None if frames.moves else way.tolist(),
-            },
+            "frame": {"frame_id": frames.frame_id, "published_from_camera": placed},
             "views": list(self.views),
             "moving": self.moving,
             "published_from_cameras": [place.tolist() for place in setup.still],
@@ -189,8 +192,7 @@ class Track(StatedPatient):
             closing(begin()) as cameras,
         ):
             say_opened(sinks)
-            ur = arms is not None and arms.ur
-            screen = _Screen(loop, cameras, sinks, report, about, companion, ur)
+            screen = _Screen(loop, cameras, sinks, report, about, arms)
             ending.callback(screen.end)  # once all workers have flushed
             say(f"{model.patient}: tracking {', '.join(setup.sources)} in frame "
                 f"{frames.frame_id!r}; Ctrl-C ends it.")  # fmt: skip
@@ -199,18 +201,15 @@ class Track(StatedPatient):
     def _cameras(self) -> CameraSetup:
         from tumortrack.live.cameras import camera_setup
 
-        wrong = {
-            "--box lies before one camera that stands still": self.box
-            and (self.views or self.moving),
-            "--intrinsics is of one camera; with --views each says its own": (
-                self.intrinsics and self.views
-            ),
-            "--scan is of one camera that moves (--moving); several look all the time": (
-                self.scan and not self.moving
-            ),
-        }
-        if found := [what for what, there in wrong.items() if there]:
-            raise InputError(f"{found[0]}. Leave it out.")
+        wrong = ""
+        if self.box and (self.views or self.moving):
+            wrong = "--box lies before one camera that stands still"
+        elif self.intrinsics and self.views:
+            wrong = "--intrinsics is of one camera; with --views each says its own"
+        elif self.scan and not self.moving:
+            wrong = "--scan is of one camera that moves (--moving); several look all the time"
+        if wrong:
+            raise InputError(f"{wrong}. Leave it out.")
         return camera_setup((self.source, *self.views), self.poses, self.moving, self.frame)
 
     def _loop_config(self, model: Model) -> LoopConfig:
@@ -219,10 +218,11 @@ class Track(StatedPatient):
         from tumortrack.tracking.tracker import FollowerConfig, region_for
 
         box = None if self.box is None else (self.box[:3], self.box[3:])
+        region = region_for(model, range_mm=self.range, box_mm=box, whole=self.whole)
         follower = FollowerConfig(rescan_s=self.rescan, smoothing_s=self.smoothing, seed=self.seed)
         intrinsics, correction = read_camera(self.intrinsics)
         return LoopConfig(
-            region=region_for(model, range_mm=self.range, box_mm=box, whole=self.whole),
+            region=region,
             follower=follower,
             intrinsics=intrinsics,
             correction=correction,
@@ -300,8 +300,7 @@ class _Screen:
     sinks: list[SinkWorker]
     report: Path
     about: dict[str, Any]
-    arms: Operation | None
-    ur: bool
+    arms: Arms | None
 
     def __post_init__(self) -> None:
         self._started = self._shown = self._stored = time.monotonic()
@@ -315,7 +314,7 @@ class _Screen:
         state = result.describe()
         kind = re.sub(r"\d", "", state)  # numbers change with every frame
         if (cell := result.workcell) is not None:
-            stage = stage_words(cell.state, self.ur)
+            stage = stage_words(cell.state, self.arms is not None and self.arms.ur)
             state += f"; arms: {stage}" + (f" ({cell.halted})" if cell.halted else "")
             state += "" if cell.left_mm is None else f"; {cell.left_mm:.1f} mm of the margin left"
             kind += cell.state + re.sub(r"\d", "", cell.halted)
@@ -385,7 +384,7 @@ class _Screen:
             "table_in_camera": watch and watch.table_in_camera,
             "frame_notes": frames.notes,
             **summary(self.loop, self.source, self.sinks),
-            **({} if self.arms is None else {"resection": self.arms.summary()}),
+            **({} if self.arms is None else {"resection": self.arms.operation.summary()}),
         }
         try:
             store.write_json(self.report, content)
@@ -397,11 +396,6 @@ class _Screen:
 
 
 def _resident_mb() -> float:
-    """Memory of this process now, or its peak so far where the system offers no more."""
-    import resource
-
-    try:
-        pages = int(Path("/proc/self/statm").read_text().split()[1])
-    except OSError:
-        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    return pages * resource.getpagesize() / 2**20
+    """Memory of this process now."""
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return pages * os.sysconf("SC_PAGE_SIZE") / 2**20

@@ -18,8 +18,6 @@ _LARGEST_MM, _LARGEST_DEG = 100.0, 10.0  # with more, it is no calibration
 _NOT_UNIT = 1e-3  # of a normal's length: files have few digits
 
 _TOOL = "tool_from_camera"
-_CAMERA = "camera_from_robot", "robot_from_camera"
-_MATRICES = *_CAMERA, "camera_from_marker", "robot_from_marker", _TOOL
 
 Rows = tuple[tuple[float, float, float, float], ...]
 
@@ -63,8 +61,8 @@ def read_frames(path: Path, moves: bool = False) -> PublishedFrame:
     file = from_builtins(read_json(path), CalibrationFile, str(path))
     matrices = {
         name: read_rigid(rows, file.unit, f"{path}: {name}")
-        for name in _MATRICES
-        if (rows := getattr(file, name)) is not None
+        for name in file.__struct_fields__
+        if "_from_" in name and (rows := getattr(file, name)) is not None
     }
     if moves != (_TOOL in matrices):
         raise InputError(

@@ -19,7 +19,7 @@ from tumortrack.core.geometry import Affine, read_rigid
 from tumortrack.core.store import read_file, read_json
 from tumortrack.core.types import DepthFrame, SensorCloud
 from tumortrack.live.poses import FilePoses
-from tumortrack.live.recording.folders import ABOUT, DEPTH, FRAMES, INTRINSICS, META
+from tumortrack.live.recording.folders import ABOUT, DEPTH, INTRINSICS, META
 from tumortrack.live.values import Observation
 from tumortrack.sense.files import read_depth_png
 from tumortrack_experiment.record.read import read_recorded
@@ -58,8 +58,7 @@ def read_shots(folder: Path) -> list[Shot]:
     """The pictures in a folder, by name: loose ones; folders with colour.png or infrared.png each
     (and depth.png, intrinsics.json, meta.json); or a recording, whose states are a pose each.
     Raises InputError: there are none, one is damaged, or they differ in size."""
-    root = folder / FRAMES if (folder / FRAMES).is_dir() else folder
-    inside = sorted(p for p in root.iterdir() if p.name[0] != ".") if root.is_dir() else []
+    inside = sorted(p for p in folder.iterdir() if p.name[0] != ".") if folder.is_dir() else []
     names = [name + suffix for name in _NAMES for suffix in _SUFFIXES]
     files = [next((p / n for n in names if (p / n).is_file()), None) for p in inside if p.is_dir()]
     if any(p.suffix == ".mcap" for p in inside):

@@ -42,12 +42,19 @@ class Link:
     def __init__(self, host: str, port: int, connect: str = "") -> None:
         igtl.crc64(b"")  # a missing package is reported before anything is opened
         self._listener: socket.socket | None = None
-        if connect:
-            _check_host(connect, port)
-        else:
-            self._listener = _listen(host, port)
-            port = self._listener.getsockname()[1]
         self.port = port
+        try:
+            if connect:
+                socket.getaddrinfo(connect, port)
+            else:
+                self._listener = socket.create_server((host, port), backlog=16)
+                self.port = self._listener.getsockname()[1]
+        except (OSError, ValueError) as error:  # ValueError: a name that cannot be one
+            fault = f"there is no host {connect!r}: {error}."
+            if not connect:
+                cure = "Choose another port, or end the program that has it."
+                fault = f"cannot listen on {host}:{port}: {error}. {cure}"
+            raise InputError(f"openigtlink: {fault}") from error
         # The thread's own; others only look.
         self._newest: dict[Key, bytes] = {}
         self.receivers: list[_Receiver] = []
@@ -187,20 +194,3 @@ class _Receiver:
                         await self.writer.drain()
             self._came.clear()
             self.busy = False
-
-
-def _listen(host: str, port: int) -> socket.socket:
-    try:
-        return socket.create_server((host, port), backlog=16)
-    except (OSError, ValueError) as error:  # ValueError: a name that cannot be one
-        raise InputError(
-            f"openigtlink: cannot listen on {host}:{port}: {error}. Choose another port, or end "
-            "the program that has it."
-        ) from error
-
-
-def _check_host(host: str, port: int) -> None:
-    try:
-        socket.getaddrinfo(host, port)
-    except (OSError, ValueError) as error:
-        raise InputError(f"openigtlink: there is no host {host!r}: {error}.") from error

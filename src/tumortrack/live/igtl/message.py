@@ -80,10 +80,8 @@ def pack(message: Message) -> bytes:
     keys, values = b"".join(index), b"".join(texts)
     extended = _EXTENDED.pack(_EXTENDED.size, len(keys), len(values), 0)
     body = b"".join((extended, message.content, keys, values))
-    for what, given, size in (
-        ("type", message.type, 12),
-        ("device name", message.device, LONGEST_DEVICE),
-    ):
+    limits = ("type", message.type, 12), ("device name", message.device, LONGEST_DEVICE)
+    for what, given, size in limits:
         if not given.isascii() or len(given) > size:
             raise ProtocolError(f"{what} {given!r}: at most {size} ASCII characters are allowed.")
     names = message.type.encode("ascii"), message.device.encode("ascii")

@@ -42,7 +42,7 @@ class McapBag:
             # Version 8 is Humble's.
             writer: Any = Writer(folder, version=8, storage_plugin=StoragePlugin.MCAP)
             writer.open()
-        except WriterError as error:  # another process began to record into it a moment ago
+        except WriterError as error:
             raise InputError(f"{folder} exists already. Choose another folder.") from error
         self._writer, self._storage = writer, writer.storage
         self._storage.bio.close()  # what is buffered could not be taken back on a full disk

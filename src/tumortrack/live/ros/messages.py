@@ -9,13 +9,13 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterable, Iterator
 from functools import cache
+from importlib.resources import files
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Float64
 
 from tumortrack.core.errors import InputError
-from tumortrack.live.ros.interfaces import INTERFACES
 
 Distro = Literal["noetic", "humble"]
 
@@ -141,8 +141,8 @@ def _store(distro: Distro) -> Any:
         ) from error
     store = get_typestore(Stores.ROS1_NOETIC if distro == "noetic" else Stores.ROS2_HUMBLE)
     if distro != "noetic":
-        for name, text in INTERFACES.items():
-            store.register(get_types_from_msg(text, name))
+        text = files(__package__).joinpath("moveit.msg").read_text("utf-8")
+        store.register(get_types_from_msg(text, "moveit_msgs/msg/PlanningScene"))
     known = store.get_msgdef(_POINT)
 
     def size(pos: int, point: Any, _store: Any) -> int:

@@ -6,23 +6,16 @@ cloud, deleted markers, places that are NaN, a diagnostic with the reason.
 
 from __future__ import annotations
 
-import textwrap
 import time
 from collections import deque
+from textwrap import fill
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float32
 
-from tumortrack.core.colours import (
-    GOOD,
-    NONE,
-    POOR,
-    Colour,
-    label_colours,
-    part_colour,
-    structure_colour,
-)
+from tumortrack.core import colours
+from tumortrack.core.colours import Colour
 from tumortrack.core.geometry import rigid, transform_points
 from tumortrack.core.organ import organ_name
 from tumortrack.core.patient import Patient
@@ -48,11 +41,11 @@ _STATUS_HZ = 1.0  # of /diagnostics, as rqt's monitor expects it; and at once wh
 _RATE_OVER = 30  # results
 _OK, _WARN, _ERROR, _STALE = range(4)  # DiagnosticStatus
 _LEVELS = {"good": _OK, "poor": _WARN, "none": _ERROR}
-_TEXT_COLOURS = {"good": GOOD, "poor": POOR, "none": NONE}
+_TEXT_COLOURS = {"good": colours.GOOD, "poor": colours.POOR, "none": colours.NONE}
 _STATE_COLOUR: Colour = (235, 238, 242)
 ORGAN_OPACITY = 0.35
 _TEXT_HEIGHT_M, _STATE_HEIGHT_M = 0.008, 0.025
-_TEXT_COLUMNS, _STATE_COLUMNS = 44, 70
+_TEXT_COLUMNS, _STATE_COLUMNS = 44, 70  # RViz breaks no line: long ones leave the screen
 _GAP_M = 0.012  # between lines, besides their height: measured in RViz of ROS 1; RViz 2's has 0.005
 _ORIGIN = np.zeros(3)
 
@@ -110,8 +103,10 @@ class ResultMessages:
             send(f"{name}/center", PLACE, header=header, point=xyz(metres))
         out.append(Outgoing("/tf", TRANSFORMS, self._frames(result)))
         self._times_s.append(time.monotonic())
+        past_s = self._times_s[-1] - self._times_s[0]
+        hz = (len(self._times_s) - 1) / past_s if past_s > 0 else 0.0
         arms = [_arms_status(result)] if self._context.arms else []
-        status = [_estimate_status(result, self._context.patient, self._hz()), *arms]
+        status = [_estimate_status(result, self._context.patient, hz), *arms]
         send("diagnostics", DIAGNOSTICS, header=header, status=status)
         levels = [one["level"] for one in status]
         if self._status_rate.due() or levels != self._levels:
@@ -145,11 +140,6 @@ class ResultMessages:
                 transforms.append(transform_fields(self._messages, *of_whom, place))
         return self._messages.make(TRANSFORMS, transforms=transforms)
 
-    def _hz(self) -> float:
-        """Results a second, over the last ones."""
-        past_s = self._times_s[-1] - self._times_s[0]
-        return (len(self._times_s) - 1) / past_s if past_s > 0 else 0.0
-
     def _organ(self, result: TrackingResult) -> list[dict[str, Any]]:
         """Triangles per part and a text of their quality; everything deleted without estimate."""
         estimate = result.transformed
@@ -163,9 +153,9 @@ class ResultMessages:
                     markers.append({"ns": name, "action": _DELETE})
                 else:
                     opacity = ORGAN_OPACITY if label == 1 else 1.0
-                    markers.append(_triangles(name, mesh, part_colour(label), opacity))
+                    markers.append(_triangles(name, mesh, colours.part_colour(label), opacity))
             for number, (name, mesh) in enumerate(estimate.structures.items()):
-                markers.append(_triangles(name, mesh, structure_colour(number), 1.0))
+                markers.append(_triangles(name, mesh, colours.structure_colour(number), 1.0))
         if estimate is not None or result.workcell is None:  # else the workcell's text says it
             markers.append(_quality_text(result))
         return markers
@@ -200,13 +190,12 @@ class ResultMessages:
 
     def _points(self, result: TrackingResult) -> Float32[np.ndarray, "n 3"] | None:
         """What the camera saw, published frame; None: they are not due."""
-        points_mm = np.zeros((0, 3), np.float32)
-        if result.observation is not None:
-            if not self._points_rate.due():
-                return None
-            points_mm = thinned(seen_points(result.observation), MOST_SEEN)
-            points_mm = transform_points(result.published_frame.published_from_camera, points_mm)
-        return points_mm
+        if result.observation is None:
+            return np.zeros((0, 3), np.float32)
+        if not self._points_rate.due():
+            return None
+        points_mm = thinned(seen_points(result.observation), MOST_SEEN)
+        return transform_points(result.published_frame.published_from_camera, points_mm)
 
 
 def _estimate_status(result: TrackingResult, patient: Patient, hz: float) -> dict[str, Any]:
@@ -254,14 +243,14 @@ def _labelled_cloud(estimate: TransformedEstimate | None, header: Any, messages:
         metres = estimate.points_mm / np.float32(MM_PER_M)
         table["x"], table["y"], table["z"] = metres.T
         table["label"], table["probability"] = estimate.labels, estimate.probability
-        red, green, blue = label_colours(estimate.labels).T.astype(np.uint32)
+        red, green, blue = colours.label_colours(estimate.labels).T.astype(np.uint32)
         table["rgb"] = red << 16 | green << 8 | blue  # PCL's packing
     return cloud_message(table, header, messages)
 
 
 def _quality_text(result: TrackingResult) -> dict[str, Any]:
     """Above the organ, as the camera sees it; without one, in front of the camera."""
-    said, above_mm = _lines(result.describe()), np.array([[0.0, 0.0, 150.0]])
+    said, above_mm = fill(result.describe(), _TEXT_COLUMNS), np.array([[0.0, 0.0, 150.0]])
     if result.estimate is not None and (name := organ_name(result.estimate.meshes)):
         low, high = result.estimate.meshes[name].box_mm
         up_mm = 1000 * _TEXT_HEIGHT_M + _half_height_mm(said, _TEXT_HEIGHT_M)  # to its middle
@@ -273,21 +262,16 @@ def _quality_text(result: TrackingResult) -> dict[str, Any]:
 
 def _state_text(result: TrackingResult, cell: Workcell) -> dict[str, Any]:
     """Hung from the height of what is highest (where arms are, z is up): a view of all has room."""
-    said = _lines(_describe(cell), _STATE_COLUMNS)
+    said = fill(_describe(cell), _STATE_COLUMNS)
     if result.estimate is None:
-        said += f"\n{_lines(result.describe(), _STATE_COLUMNS)}"
+        said += f"\n{fill(result.describe(), _STATE_COLUMNS)}"
     box_mm, lines_mm = cell.box_mm, [line.points_mm for line in cell.drawn_lines]
     spots = lines_mm if box_mm is None else [box_mm, *lines_mm]
     corners = np.concatenate(spots) if spots else np.zeros((1, 3))
     place_mm = (corners.min(0) + corners.max(0)) / 2
     place_mm[2] = corners[:, 2].max() - _half_height_mm(said, _STATE_HEIGHT_M)
-    colour, scale = NONE if cell.halted else _STATE_COLOUR, {"z": _STATE_HEIGHT_M}
+    colour, scale = colours.NONE if cell.halted else _STATE_COLOUR, {"z": _STATE_HEIGHT_M}
     return _drawn(_STATE, _TEXT, colour, place_mm, text=said, scale=scale)
-
-
-def _lines(said: str, columns: int = _TEXT_COLUMNS) -> str:
-    """RViz breaks no line: a long one leaves the screen on both sides."""
-    return textwrap.fill(said, columns)
 
 
 def _half_height_mm(said: str, height_m: float) -> float:

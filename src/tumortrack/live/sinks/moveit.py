@@ -6,7 +6,6 @@ from dataclasses import replace
 from typing import Any, ClassVar
 
 import numpy as np
-from jaxtyping import Float64
 
 from tumortrack.core.colours import PICKED, Colour, part_colour
 from tumortrack.core.types import Mesh
@@ -19,7 +18,6 @@ from tumortrack.live.values import SinkConfig, SinkContext, TrackingResult
 
 SCENE = "moveit_msgs/msg/PlanningScene"
 _MARGIN_OPACITY = 0.25
-_BALL = 100  # directions in which a margin is laid round a surface
 _HERE = {"orientation": {"w": 1.0}}
 
 
@@ -111,27 +109,15 @@ def coarser(mesh: Mesh, cell_mm: float) -> Mesh:
 
 def widened_hull(mesh: Mesh, margin_mm: float) -> Mesh:
     """A convex body that holds every point within ``margin_mm`` of the surface."""
-    from scipy.spatial import ConvexHull
+    from trimesh import PointCloud
+    from trimesh.creation import icosphere
 
-    corners = mesh.vertices_mm[ConvexHull(mesh.vertices_mm).vertices]
-    ball = _directions(_BALL)
-    inside = -ConvexHull(ball).equations[:, 3].max()  # radius of the ball that fits into theirs
-    points = (corners[:, None] + ball * (margin_mm / inside)).reshape(-1, 3)
-    hull = ConvexHull(points)
-    faces = hull.simplices.copy()
-    a, b, c = points[faces].transpose(1, 0, 2)
-    inward = np.einsum("ij,ij->i", np.cross(b - a, c - a), hull.equations[:, :3]) < 0
-    faces[inward] = faces[inward][:, ::-1]
-    used, renumbered = np.unique(faces, return_inverse=True)
-    return Mesh(points[used], renumbered.reshape(faces.shape))
-
-
-def _directions(n: int) -> Float64[np.ndarray, "n 3"]:
-    """Unit vectors, evenly over the sphere (Fibonacci's lattice)."""
-    number = np.arange(n) + 0.5
-    z, turn = 1 - 2 * number / n, np.pi * (1 + np.sqrt(5)) * number
-    flat = np.sqrt(1 - z**2)
-    return np.stack([flat * np.cos(turn), flat * np.sin(turn), z], axis=1)
+    ball = icosphere(2)
+    within = np.einsum("ij,ij->i", ball.triangles_center, ball.face_normals).min()  # radius
+    corners = PointCloud(mesh.vertices_mm).convex_hull.vertices
+    points = corners[:, None] + ball.vertices * (margin_mm / within)
+    hull = PointCloud(points.reshape(-1, 3)).convex_hull
+    return Mesh(hull.vertices, hull.faces)
 
 
 def _mesh_fields(messages: Messages, mesh: Mesh) -> dict[str, Any]:

@@ -3,25 +3,23 @@
 
 from __future__ import annotations
 
+import io
 import json
-import shutil
 import time
 from pathlib import Path
 from typing import Any, ClassVar
 
 import tumortrack
 from tumortrack.core.config import to_builtins
-from tumortrack.core.errors import InputError
-from tumortrack.core.store import read_json, write_json, writing
+from tumortrack.core.store import write_json, writing
 from tumortrack.core.types import SensorCloud
 from tumortrack.live.poses import COLUMNS, pose_row
 from tumortrack.live.recording.folders import ABOUT
 from tumortrack.live.recording.mcap import CHUNK_S, STRING, McapBag, camera_messages
 from tumortrack.live.ros.messages import Messages, Outgoing
 from tumortrack.live.ros.results import ResultMessages
-from tumortrack.live.values import CameraView, Sink, SinkConfig, SinkContext, TrackingResult
+from tumortrack.live.values import CameraView, SinkConfig, SinkContext, TrackingResult
 
-_KIND = "recording"
 POSES, STILL = "poses.csv", "poses.json"  # of a camera that moves; of several that stand still
 _ON_FULL_DISK = (
     f"The recording ends {CHUNK_S:g} s before or less; it can be played with recording:FOLDER, and "
@@ -35,7 +33,6 @@ class RecordingSinkConfig(SinkConfig, frozen=True, kw_only=True, tag="recording"
 
     Attributes:
         meshes_hz: surfaces at most so often; 0: with every result.
-        overwrite: replace a recording of this kind.
     """
 
     target: ClassVar[str] = "path"
@@ -43,23 +40,18 @@ class RecordingSinkConfig(SinkConfig, frozen=True, kw_only=True, tag="recording"
 
     path: Path
     meshes_hz: float = 2.0
-    overwrite: bool = False
 
     def __post_init__(self) -> None:
         self.check_between("recording:", meshes_hz=(0, 1000))
 
-    def open(self, context: SinkContext) -> Sink:
-        """Raises InputError if the folder exists, and is no recording or ``overwrite`` was not
-        given."""
-        _make_room(self.path, self.overwrite)
+    def open(self, context: SinkContext) -> RecordingSink:
+        """Raises InputError if the folder exists."""
         with writing(self.path):
             self.path.parent.mkdir(parents=True, exist_ok=True)
-            sink = McapFile(self.path, context, self.meshes_hz)
-            moves = context.published_frame.moves
-            poses = WithPoses(sink, self.path / POSES) if moves else None
+            sink = RecordingSink(self.path, context, self.meshes_hz)
         frame = context.published_frame
         about = {
-            "kind": _KIND,
+            "kind": "recording",
             "tumortrack": tumortrack.__version__,
             "patient": to_builtins(context.patient),
             "parts": list(context.parts),
@@ -71,66 +63,37 @@ class RecordingSinkConfig(SinkConfig, frozen=True, kw_only=True, tag="recording"
             rows = [pose.tolist() for pose in context.cameras]
             fixed = {"unit": "mm", "frame_id": frame.frame_id, "fixed_from_camera": rows}
             write_json(self.path / STILL, fixed)
-        return poses or sink
+        return sink
 
 
-class WithPoses:
-    """Beside a recording, where the camera was in each frame: a table as `track --moving` reads it.
-    Whatever the disk refuses raises, and the next result is tried."""
-
-    def __init__(self, sink: McapFile, path: Path) -> None:
-        self._sink, self._file = sink, path.open("ab", buffering=0)
-        self._file.write(f"{COLUMNS}\n".encode())
-
-    def publish(self, result: TrackingResult) -> None:
-        self._sink.publish(result)
-        if result.observation is not None:
-            frame, stamp_ns = result.published_frame, result.stamp_ns
-            row = pose_row(stamp_ns, frame.frame_id, frame.published_from_camera)
-            with writing(Path(self._file.name)):
-                self._file.write(row.encode())
-
-    def close(self) -> None:
-        self._file.close()
-        self._sink.close()
-
-
-def _make_room(path: Path, overwrite: bool) -> None:
-    """Refuse what exists; or take an older recording away, if nothing else lies in it."""
-    if not path.exists():
-        return
-    if not overwrite:
-        raise InputError(
-            f"{path} exists already. Choose another folder, or give overwrite=true to replace the "
-            "recording."
-        )
-    inside = {p.name for p in path.iterdir()} if path.is_dir() else {path.name}
-    ours = {ABOUT, POSES, STILL, "metadata.yaml", f"{path.name}.mcap"}
-    is_ours = ABOUT in inside and read_json(path / ABOUT).get("kind") == _KIND
-    if inside and (inside - ours or not is_ours or not path.is_dir()):
-        raise InputError(
-            f"{path} is no recording of tumortrack's, or holds something else too, so it is not "
-            "replaced. Choose another folder."
-        )
-    shutil.rmtree(path)
-
-
-class McapFile:
+class RecordingSink:
     """Topics: ``/camera/...`` what the source saw, in the camera's frame, of further cameras
     ``/camera_2/...``; ``/tumortrack/...`` the results as in ROS, and ``report`` (JSON); ``/tf``
-    where the frames differ."""
+    where the frames differ. Beside them, of a camera that moves, where it was in each frame: a
+    table as `track --moving` reads it."""
 
     def __init__(self, folder: Path, context: SinkContext, meshes_hz: float) -> None:
         self._messages = Messages()
         self._results = ResultMessages(self._messages, context, meshes_hz, observed=False)
         self._bag = McapBag(folder, self._messages, _ON_FULL_DISK)
+        self._poses: io.FileIO | None = None
+        if context.published_frame.moves:
+            self._poses = io.FileIO(folder / POSES, "a")
+            self._poses.write(f"{COLUMNS}\n".encode())
 
     def publish(self, result: TrackingResult) -> None:
-        seen = result.observation
+        """Whatever the disk refuses raises, and the next result is tried."""
+        seen, frame = result.observation, result.published_frame
         arrived_ns = time.time_ns() if seen is None else seen.arrived_ns
         self._bag.write(arrived_ns, self._messages_of(result))
+        if seen is not None and self._poses is not None:
+            row = pose_row(result.stamp_ns, frame.frame_id, frame.published_from_camera)
+            with writing(Path(self._poses.name)):
+                self._poses.write(row.encode())
 
     def close(self) -> None:
+        if self._poses is not None:
+            self._poses.close()
         self._bag.close()
 
     def _messages_of(self, result: TrackingResult) -> list[Outgoing]:

@@ -10,7 +10,8 @@ from __future__ import annotations
 import threading
 import time
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from typing import ClassVar, Literal, NamedTuple
 
 import numpy as np
@@ -148,7 +149,7 @@ class UrSink:
                 self._trouble = ""
                 raise TumortrackError(trouble)
             cell = result.workcell
-            try:
+            with self._giving_up():
                 if cell is None or cell.halted:
                     self._counts["no arms" if cell is None else "halted"] += 1
                     self._stop()
@@ -157,15 +158,6 @@ class UrSink:
                     # Where it stood still on a cut, what follows begins there, cut or not.
                     self._cutting = cell.cutting or (self._cutting and self._last is None)
                     self._go(_target(cell.joints_rad, self._names), result.stamp_ns)
-            except TumortrackError as error:
-                self._counts["refused"] += 1
-                self._give_up()
-                self._stop()
-                raise TumortrackError(f"ur {self._config.arm}: {error}") from error
-            except Exception as error:  # of ur_rtde, which raises anything
-                self._give_up()
-                self._break(error)
-                raise TumortrackError(self._fault) from error
 
     def close(self) -> None:
         """Stop the arm, and let it go."""
@@ -181,34 +173,42 @@ class UrSink:
             finally:
                 self._link.close()
 
-    def _give_up(self) -> None:
-        """This arm no longer does what was planned: all arms stop for good."""
-        if self._link is not None:
-            self._controls.aborted.set()
+    @contextmanager
+    def _giving_up(self) -> Iterator[None]:
+        """Where what is inside fails, this arm no longer does what was planned: all arms stop for
+        good, and TumortrackError says why."""
+        try:
+            yield
+        except Exception as error:
+            if self._link is not None:
+                self._controls.aborted.set()
+            if not isinstance(error, TumortrackError):  # of ur_rtde, which raises anything
+                self._break(error)
+                raise TumortrackError(self._fault) from error
+            self._counts["refused"] += 1
+            self._stop()
+            raise TumortrackError(f"ur {self._config.arm}: {error}") from error
 
     def _go(self, planned: Joints, stamp_ns: int) -> None:
-        now_s = time.monotonic()
-        seconds = _SHORTEST_S
-        lag_rad = np.zeros(6)
-        if self._link is not None:
-            joints_rad = self._look_at(self._link, planned)
-            if self._last is None:
+        now_s, last, link = time.monotonic(), self._last, self._link
+        if link is not None:
+            joints_rad = self._look_at(link, planned)
+            if last is None:
                 self._ease = joints_rad - planned, now_s
         beside_rad, begun_s = self._ease
         target = planned + beside_rad * max(1 - (now_s - begun_s) / EASE_S, 0.0)
-        if (last := self._last) is not None:
+        follow_s, lag_rad = _LONGEST_S, np.zeros(6)
+        if last is not None:
             # Targets are as far apart as their stamps say, or came: a thread may have waited.
             seconds = max(now_s - last.when_s, (stamp_ns - last.stamp_ns) * 1e-9, _SHORTEST_S)
             _check_step(target - last.joints, seconds, self._config.jump_deg)
+            follow_s = min(seconds, _LONGEST_S)
             # servoJ comes after its targets by the time it looks ahead, and one target.
             lag_rad = np.abs(target - last.joints) * (1 + self._config.lookahead_s / seconds)
-        if self._link is not None:
-            if last is None:
-                seconds = _LONGEST_S
-            follow_s = float(np.clip(seconds, _SHORTEST_S, _LONGEST_S))
-            self._link.servo(target, follow_s, self._config.lookahead_s, self._config.gain)
+        if link is not None:
+            link.servo(target, follow_s, self._config.lookahead_s, self._config.gain)
         self._last = _Sent(planned, target, now_s, stamp_ns, lag_rad)
-        self._counts["would send" if self._link is None else "sent"] += 1
+        self._counts["would send" if link is None else "sent"] += 1
 
     def _look_at(self, link: UrLink, planned: Joints) -> Joints:
         """Where the arm is. Raises TumortrackError where it cannot follow, meets something, or is
@@ -255,17 +255,12 @@ class UrSink:
                 if self._fault or self._link is None:
                     return
                 try:
-                    if self._last is not None:
-                        self._look_at(self._link, self._last.planned)
-                    self._link.kick()
+                    with self._giving_up():
+                        if self._last is not None:
+                            self._look_at(self._link, self._last.planned)
+                        self._link.kick()
                 except TumortrackError as error:
-                    self._trouble = f"ur {self._config.arm}: {error}"
-                    self._counts["refused"] += 1
-                    self._give_up()
-                    self._stop()
-                except Exception as error:
-                    self._give_up()
-                    self._break(error)
+                    self._trouble = str(error)
 
 
 def _target(joints_rad: Mapping[str, float], names: tuple[str, ...]) -> Joints:

@@ -11,24 +11,13 @@ from jaxtyping import Bool
 
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import DepthFrame
+from tumortrack.live.ros import sensors
 from tumortrack.live.ros.bus import Bus, Subscriber, check_topic
 from tumortrack.live.ros.messages import stamp_of
 from tumortrack.live.ros.ros2 import Via, open_bus
-from tumortrack.live.ros.sensors import (
-    CAMERA_INFO,
-    CLOUD,
-    COMPRESSED,
-    IMAGE,
-    cloud_of,
-    depth_of,
-    frame_of,
-    image_of,
-    mask_of,
-    picture_of,
-)
 from tumortrack.live.values import Observation, SourceConfig, SourceLost
 
-_KINDS = {"image": IMAGE, "packed": COMPRESSED, "cloud": CLOUD}
+_KINDS = {"image": sensors.IMAGE, "packed": sensors.COMPRESSED, "cloud": sensors.CLOUD}
 _PACKED = "/compressedDepth"  # how image_transport calls the topic, behind the image's name
 _LOOK_S = 0.1  # how often the graph is asked for the topic's type, until it is known
 # A late frame, or a camera's computer with a wrong time, is no other clock; a bag is older.
@@ -127,7 +116,7 @@ class RosSource:
                 return False
             if not self._kind:
                 there = self._bus.types_of(self._topic)
-                wanted = set(_KINDS.values()) - ({CLOUD} if mask or picture else set())
+                wanted = set(_KINDS.values()) - ({sensors.CLOUD} if mask or picture else set())
                 usable = there & wanted
                 if len(usable) != 1 and final and there:
                     raise InputError(
@@ -138,12 +127,13 @@ class RosSource:
                 if len(usable) != 1:
                     return False
                 (self._kind,) = usable
-            beside = ((self._info_topic, CAMERA_INFO), (mask, IMAGE), (picture, IMAGE))
+            beside = {self._info_topic: sensors.CAMERA_INFO, mask: sensors.IMAGE}
+            beside[picture] = sensors.IMAGE
             # In both ways: some nodes publish it once and keep it for those who come later.
             self._beside = [
                 (topic, kind, self._bus.subscriber(topic, kind, 1, latched))
                 for latched in (False, True)
-                for topic, kind in (() if self._kind == CLOUD else beside)
+                for topic, kind in ({} if self._kind == sensors.CLOUD else beside).items()
                 if topic
             ]
             self._frames = self._bus.subscriber(self._topic, self._kind)
@@ -161,24 +151,26 @@ class RosSource:
 
     def _observed(self, raw: bytes | memoryview, arrived_ns: int) -> Observation:
         message = self._bus.messages.from_bytes(raw, self._kind)
-        if self._kind == COMPRESSED:
-            message = image_of(message, self._bus.messages)
+        if self._kind == sensors.COMPRESSED:
+            message = sensors.image_of(message, self._bus.messages)
         if self._clock == "auto":
             self._clock = "known"
             self.host_clock = abs(arrived_ns - stamp_of(message.header)) < _SAME_CLOCK_NS
-        if self._kind == CLOUD:
-            return Observation(cloud_of(message), arrived_ns, frame_id=frame_of(message))
+        frame_id = sensors.frame_of(message)
+        if self._kind == sensors.CLOUD:
+            return Observation(sensors.cloud_of(message), arrived_ns, frame_id=frame_id)
         info = self._latest.get(self._info_topic)
         if info is None:
             raise InputError(
                 f"images come on {self._topic}, but no camera_info on {self._info_topic}. "
                 f"Name its topic: {self._name}?info=/.../camera_info."
             )
-        frame = depth_of(message, info, self._config.rectified, self._config.unit_mm)
+        frame = sensors.depth_of(message, info, self._config.rectified, self._config.unit_mm)
         mask = self._mask_for(frame) if self._config.mask else None
         image = self._latest.get(self._config.picture)
-        picture = image and picture_of(image, frame)  # one of another moment shows other pixels
-        return Observation(frame, arrived_ns, mask, None, frame_of(message), picture)
+        # One of another moment shows other pixels.
+        picture = image and sensors.picture_of(image, frame)
+        return Observation(frame, arrived_ns, mask, None, frame_id, picture)
 
     def _mask_for(self, frame: DepthFrame) -> Bool[np.ndarray, "h w"]:
         """The newest mask, held against the frame that it goes with."""
@@ -186,7 +178,7 @@ class RosSource:
         image = self._latest.get(topic)
         if image is None:
             raise InputError(f"no mask came on {topic} so far.")
-        mask, older_ns = mask_of(image), frame.stamp_ns - stamp_of(image.header)
+        mask, older_ns = sensors.mask_of(image), frame.stamp_ns - stamp_of(image.header)
         if mask.shape != frame.depth_mm.shape:
             raise InputError(
                 f"a mask of {mask.shape[1]} x {mask.shape[0]} pixels came for depth images of "
