@@ -102,7 +102,7 @@ def prepare(
     elif folder is None:
         raise InputError("segment needs a folder, beside which the label map is kept.")
     else:
-        from tumortrack.imaging.segmenter import segmented_case
+        from tumortrack.imaging.segmentation_tool import segmented_case
 
         keep = Path(folder).with_name(f"{Path(folder).name}.labels.nii.gz")
         case = segmented_case(Path(source), segment, asked, keep)
