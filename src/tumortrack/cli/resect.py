@@ -84,9 +84,7 @@ class Resect(StatedPatient):
 
     def run(self) -> None:
         from tumortrack import api
-        from tumortrack.core.config import from_builtins
         from tumortrack.live.sinks.ur import UrSinkConfig
-        from tumortrack.plan.arms.config import CellConfig
         from tumortrack.plan.files import read_plan
         from tumortrack.plan.operation import OperationConfig
 
@@ -104,7 +102,6 @@ class Resect(StatedPatient):
         config = OperationConfig(
             speed=self.speed, moved_mm=self._moved_mm(stored), replan_cut=self.replan_cut
         )
-        cell_config = from_builtins(stored.cell, CellConfig, str(self.plan))
         arms = [sink for sink in sinks if isinstance(sink, UrSinkConfig)]
         moving = [arm for arm in arms if arm.execute]
         live = None if self.live is None else _live_of(*self.live, stored)
@@ -115,9 +112,9 @@ class Resect(StatedPatient):
         from tumortrack.plan.arms.trajectory import first_hit
 
         organ = stored.meshes[organ_is]
-        if hit := first_hit(stored.motions, cell_config, organ):
+        if hit := first_hit(stored.motions, stored.cell, organ):
             raise ArtifactError(f"{self.plan}: its motions are not as planned: {hit}. Plan again.")
-        cell = ArmCell(cell_config, organ)
+        cell = ArmCell(stored.cell, organ)
         if self.film is not None:
             if self.live is not None or self.sinks:
                 raise InputError("--film shows the stored plan; give it without sinks and --live.")
@@ -140,7 +137,7 @@ class Resect(StatedPatient):
 
         model, source = self.live or ("", "")
         budget, moved_mm = stored.budget, self._moved_mm(stored)
-        assumed = () if budget is None else budget.assumed
+        assumed = budget.assumed
         kind = Organ(name=organ_name(stored.meshes) or KIDNEY.name)
         needs = {
             "--live MODEL SOURCE, so that they stop where the tumor moves": live,
@@ -173,7 +170,7 @@ class Resect(StatedPatient):
             ),
             f"--speed up to 1, not {self.speed:g}": self.speed <= 1,
             "a plan whose margin covers its errors (plan again with a wider one)": (
-                budget is not None and budget.left_mm >= 0
+                budget.left_mm >= 0
             ),
             "a plan by a model that says how unsure it is (preset clinic)": (
                 "tracking" not in assumed
@@ -184,9 +181,7 @@ class Resect(StatedPatient):
             "a plan with the tools' error (tool_error_mm in the --cell file)": (
                 "tool" not in assumed
             ),
-            f"--moved as planned with, not {moved_mm:g}": (
-                budget is None or moved_mm <= budget.motion_mm
-            ),
+            f"--moved as planned with, not {moved_mm:g}": moved_mm <= budget.motion_mm,
             "each arm once, at an address of its own": (
                 len(arms) == len({arm.arm for arm in arms}) == len({arm.host for arm in arms})
             ),
@@ -197,10 +192,7 @@ class Resect(StatedPatient):
             raise InputError(f"the arm at {names} may not move. It needs: {'; '.join(lacking)}.")
 
     def _moved_mm(self, stored: PlanFolder) -> float:
-        from tumortrack.plan.budget import MOVED_MM
-
-        planned_mm = MOVED_MM if stored.budget is None else stored.budget.motion_mm
-        return planned_mm if self.moved is None else self.moved
+        return stored.budget.motion_mm if self.moved is None else self.moved
 
     def _follow(
         self,
@@ -220,7 +212,7 @@ class Resect(StatedPatient):
         from tumortrack.plan.arms import procedure
         from tumortrack.plan.arms.cell import tip_places
         from tumortrack.plan.live_budget import LiveBudget
-        from tumortrack.plan.located import located
+        from tumortrack.plan.located import of_estimate
 
         assert self.live is not None
         model, source = self.live
@@ -228,10 +220,8 @@ class Resect(StatedPatient):
         way = stored.frames.published_from_camera
 
         def locate(result: TrackingResult, unsure: bool = False) -> Located:
-            estimate = result.estimate
-            assert estimate is not None
-            motion = estimate.motion if unsure else None
-            return located(estimate.cloud, estimate.meshes, motion, way, estimate.structures)
+            assert result.estimate is not None
+            return of_estimate(result.estimate, unsure).moved(way)
 
         again = msgspec.structs.replace(stored.config, tumor=stored.plan.tumor)
         # In a process of its own: planning for a second must not hold up a frame.
@@ -254,7 +244,7 @@ class Resect(StatedPatient):
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
             begun.result()
             late_s = max((arm.lookahead_s for arm in arms), default=0.0)
-            budget = LiveBudget(stored.budget, late_s) if stored.budget else None
+            budget = LiveBudget(stored.budget, late_s)
             operation = _operation(
                 stored, cell, config, locate=locate, replan=replan, budget=budget
             )
