@@ -88,9 +88,6 @@ def read_table(path: Path) -> tuple[dict[str, Any], list[Row]]:
 def _parsed(content: bytes, path: Path) -> tuple[dict[str, Any], list[Row]]:
     try:
         head, *lines = [json.loads(line) for line in content.splitlines()]
-        for line in lines:
-            if "kidney" in line.get("misses", {}):  # as older versions wrote it
-                line["misses"]["organ"] = line["misses"].pop("kidney")
         return dict(head), [from_builtins(line, Row, str(path)) for line in lines]
     except (ValueError, TypeError, AttributeError) as error:
         raise InputError(f"{path} is no table of `tumortrack margins`: {error}.") from error
