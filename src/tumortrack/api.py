@@ -100,7 +100,7 @@ def prepare(
     elif folder is None:
         raise InputError("segment needs a folder, beside which the label map is kept.")
     else:
-        from tumortrack.imaging.segmenter import segmented_case
+        from tumortrack.imaging.segmentation_tool import segmented_case
 
         keep = Path(folder).with_name(f"{Path(folder).name}.labels.nii.gz")
         case = segmented_case(Path(source), segment, asked, keep)
@@ -475,16 +475,13 @@ def plan_resection(
     from tumortrack.plan.values import ResectionConfig
 
     config = from_builtins(options, ResectionConfig, "plan_resection")
-    run = located if isinstance(located, Estimate) else places.read_run(Path(located))
-    stand_mm = places.STAND_MM if stand_mm is None else stand_mm
-    table_from_camera = places.table_under(run.meshes, stand_mm)
-    if isinstance(run, Estimate):
-        doubt = "" if run.quality == "good" else run.reason
-        seen = places.located(run.cloud, run.meshes, run.motion, table_from_camera, run.structures)
-        seen = replace(seen, patient=run.patient, margin=run.report.get("margin"))
+    if isinstance(located, Estimate):
+        seen = places.of_estimate(located)
     else:
-        doubt, seen = run.doubt, run.located(table_from_camera)
-    notes = places.notes_of_doubt(doubt, accept_poor)
+        seen = places.read_run(Path(located))
+    stand_mm = places.STAND_MM if stand_mm is None else stand_mm
+    seen = seen.moved(places.table_under(seen.meshes, stand_mm))
+    notes = places.notes_of_doubt(seen.doubt, accept_poor)
     budget_of = partial(budget.planned_budget, located=seen, confidence=confidence)
     plan, _, errors = budget.plan_within(seen, config, budget_of, confidence is not None)
     plan = replace(plan, notes=(*notes, *plan.notes))

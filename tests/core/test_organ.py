@@ -11,7 +11,7 @@ from tumortrack.core.patient import Patient
 from tumortrack.core.types import Anatomy, LabelVolume
 from tumortrack.imaging.case import Case, load_case, save_case
 from tumortrack.imaging.prepare import PrepareOptions, prepare
-from tumortrack.imaging.segmentation import segments
+from tumortrack.imaging.segmentation_files import segments
 from tumortrack.imaging.select import select_labels
 from tumortrack.imaging.surface import surfaces
 from tumortrack.simulate.scene import SceneConfig
@@ -65,14 +65,15 @@ def test_a_livers_files_bear_its_name(tmp_path):
     assert again.of(again.tumors).kind == LIVER.__replace__(term=LIVER.snomed)
 
 
-def test_a_case_that_names_no_organ_is_a_kidneys(tmp_path):
+def test_a_case_that_names_no_organ_or_a_strange_one_is_refused(tmp_path):
     anatomy = surfaces(prostate(voxel_mm=2.0))[0]
     save_case(Case(anatomy, prostate(voxel_mm=2.0), UP), tmp_path)
     path = tmp_path / "manifest.json"
     manifest = json.loads(path.read_text())
     del manifest["organ"]
     path.write_text(json.dumps(manifest))
-    assert load_case(tmp_path).anatomy.kind == KIDNEY
+    with pytest.raises(ArtifactError, match=r"`organ`.*Run prepare again"):
+        load_case(tmp_path)
     path.write_text(json.dumps({**manifest, "organ": {"name": "../../x"}}))
     with pytest.raises(ArtifactError, match="--name"):
         load_case(tmp_path)

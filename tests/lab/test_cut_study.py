@@ -14,7 +14,7 @@ from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.geometry import rigid, transform_points
 from tumortrack.core.types import Anatomy, Mesh, SensorCloud
 from tumortrack.imaging.meshes import mesh_of, solid_of
-from tumortrack.plan.located import located
+from tumortrack.plan.located import of_estimate
 from tumortrack.plan.resection import plan_resection
 from tumortrack.simulate.scene_folder import Scene
 from tumortrack_lab.cut import cut
@@ -58,7 +58,7 @@ def moved(anatomy, b_from_a):
 
 def located_as_it_is(anatomy):
     estimate = scattered(estimate_of(Fit(lambda points: points), anatomy))
-    return located(estimate.cloud, estimate.meshes, None, np.eye(4))
+    return of_estimate(estimate, unsure=False)
 
 
 def test_a_plan_on_the_truth_takes_the_tumor_with_the_margin_that_was_asked_for():

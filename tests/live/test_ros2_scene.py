@@ -33,8 +33,8 @@ from tumortrack.live.ros.tf import TRANSFORMS, pose_of
 from tumortrack.live.sinks.moveit import SCENE, coarser, widened_hull
 from tumortrack.live.spec import SINKS
 from tumortrack.live.values import PublishedFrame, TrackingResult
+from tumortrack.plan.files import ros_trajectories
 from tumortrack.plan.motions import JOINTS, Motions, MotionStage
-from tumortrack.plan.ros_trajectories import ros_trajectories
 
 MESSAGES = Messages()
 QUARTER = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])

@@ -33,7 +33,7 @@ from tumortrack.plan.budget import (
     widened,
 )
 from tumortrack.plan.live_budget import LiveBudget
-from tumortrack.plan.located import located as placed
+from tumortrack.plan.located import of_estimate
 from tumortrack.plan.resection import plan_resection
 from tumortrack.plan.values import CutLayer, ResectionConfig
 
@@ -180,7 +180,7 @@ def test_a_tumor_is_as_unsure_as_along_its_least_sure_axis():
     live.add_up(update(0, std_mm=2.0), "tumor_1", tumor, 0.0, 15.0)  # over all axes 1.2
     assert live.now.tracking_mm == 6.0
     estimate = update(0, std_mm=2.0).estimate
-    seen = placed(estimate.cloud, estimate.meshes, estimate.motion, np.eye(4))
+    seen = of_estimate(estimate)
     assert {*seen.std_mm} == {"tumor_1", "tumor_2"}
     assert (seen.std_mm["tumor_1"] == 2.0).all()
 

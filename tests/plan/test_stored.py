@@ -15,7 +15,6 @@ from safetensors.numpy import load_file, save_file
 from arm_objects import organ, plan
 from plan_objects import RADIUS_MM, TUMOR_MM, located, sphere
 from tumortrack.core import store
-from tumortrack.core.config import to_builtins
 from tumortrack.core.errors import ArtifactError, NoPlan
 from tumortrack.live.values import PublishedFrame
 from tumortrack.plan.arms import procedure
@@ -24,7 +23,8 @@ from tumortrack.plan.arms.config import CellConfig
 from tumortrack.plan.arms.kinematics import level_pose
 from tumortrack.plan.arms.procedure import plan_motions
 from tumortrack.plan.arms.trajectory import first_hit
-from tumortrack.plan.files import INVENTED, PlanFolder, read_plan, write_plan
+from tumortrack.plan.budget import ErrorBudget
+from tumortrack.plan.files import PlanFolder, read_plan, write_plan
 from tumortrack.plan.motions import CUTTER, JOINTS, Motions
 from tumortrack.plan.operation import ResectionProgress
 from tumortrack.plan.values import ResectionConfig
@@ -37,8 +37,8 @@ def content():
     motions = plan_motions(plan(), ArmCell(CONFIG, organ()), organ())
     meshes = {"kidney": organ(), "tumor_1": sphere(TUMOR_MM, RADIUS_MM)}
     return PlanFolder(
-        plan(), ResectionConfig(), PublishedFrame("base"), meshes, to_builtins(CONFIG), motions,
-        "c" * 64, "f" * 64, "e" * 64,
+        plan(), ResectionConfig(), PublishedFrame("base"), meshes, ErrorBudget(margin_mm=5.0),
+        CONFIG, motions, "c" * 64, "f" * 64, "e" * 64,
     )  # fmt: skip
 
 
@@ -72,12 +72,20 @@ def test_a_plan_keeps_its_motions_and_where_its_frame_and_cell_come_from(content
     for one, other in zip(read.motions.stages, content.motions.stages, strict=True):
         assert np.array_equal(one.joints_rad, other.joints_rad)
     assert (read.frame_source, read.cell_source) == ("f" * 64, "e" * 64)
-    old = changed(
-        stored, tmp_path / "old",
-        plan_json=lambda data: [data.pop(f"{name}_source") for name in ("frame", "cell")],
-    )  # fmt: skip
-    read = read_plan(old)
-    assert (read.frame_source, read.cell_source) == (INVENTED, INVENTED)
+    assert (read.budget, read.cell) == (content.budget, CONFIG)
+
+
+@pytest.mark.parametrize("lacking", ["frame_source", "cell_source", "budget", "patient", "cell"])
+def test_a_plan_that_lacks_what_arms_are_judged_by_is_refused(stored, tmp_path, lacking):
+    folder = changed(stored, tmp_path / "plan", plan_json=lambda data: data.pop(lacking))
+    with pytest.raises(ArtifactError, match=f"lacks or spoils '{lacking}'; plan again"):
+        read_plan(folder)
+
+
+def test_motions_without_the_cell_that_they_are_for_are_refused(stored, tmp_path):
+    folder = changed(stored, tmp_path / "plan", plan_json=lambda data: data.update(cell=None))
+    with pytest.raises(ArtifactError, match="no cell that they are for"):
+        read_plan(folder)
 
 
 def put(name, value):

@@ -184,23 +184,6 @@ def test_see_through_bodies_tint_what_is_behind_them_alone() -> None:
     np.testing.assert_array_equal(render([red, under], down, (64, 64))[32, 32], alone)
 
 
-def test_what_stands_in_the_light_casts_a_shadow() -> None:
-    plate = solid(trimesh.creation.box((600, 600, 2)))
-    table = Body(plate, (0.8, 0.8, 0.8), shadowed=True)
-    ball = Body(ellipsoid(np.array([0.0, 0.0, 60.0]), 20.0), RED)
-    down = Viewpoint.towards(np.zeros(3), np.array([0.0, -1.0, 900.0]), 400.0, parallel=True)
-    bare, shaded = (
-        render(bodies, down, (200, 200)).astype(int) for bodies in ([table], [table, ball])
-    )
-    darker = (bare - shaded > 40).all(2) & (np.ptp(shaded, axis=2) < 10)  # and not the ball
-    rows, columns = np.nonzero(darker)
-    # The light comes from the left and the front: the shadow falls to the right and the back.
-    assert columns.mean() > 105
-    assert rows.mean() < 95
-    unlit = render([replace(table, shadowed=False), ball], down, (200, 200)).astype(int)
-    np.testing.assert_array_equal(unlit[darker], bare[darker])
-
-
 def test_edges_stay_sharp_and_balls_smooth() -> None:
     box = solid(trimesh.creation.box((10, 20, 30)))
     assert np.abs(corner_normals(box)).max(2) == pytest.approx(1.0)

@@ -28,7 +28,7 @@ from tumortrack.core.patient import Patient
 from tumortrack.core.types import CameraLabels, LabelVolume, Mesh, Volume
 from tumortrack.imaging.case import Case, save_case
 from tumortrack.imaging.meshes import read_mesh_folder
-from tumortrack.imaging.segmentation import segments, write_dicom_seg, write_seg_nrrd
+from tumortrack.imaging.segmentation_files import segments, write_dicom_seg, write_seg_nrrd
 from tumortrack.imaging.surface import surfaces
 from tumortrack.imaging.volume import read_labels
 from tumortrack.phantom.dicom import write_dicom_series

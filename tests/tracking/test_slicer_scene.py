@@ -171,7 +171,8 @@ def test_what_does_not_fit_is_refused(folders: tuple[Path, Path], tmp_path: Path
     case_of = store.read_manifest(case, "case")
     for file in case_of["files"]:
         (other / file).write_bytes((case / file).read_bytes())
-    store.seal(other, "case", {k: case_of[k] for k in ("parts", "up_lps", "report")}, "lps")
+    keys = ("organ", "structures", "parts", "up_lps", "patient")
+    store.seal(other, "case", {**{k: case_of[k] for k in keys}, "report": {"notes": []}}, "lps")
     with pytest.raises(InputError, match="give its case"):
         Export(case=other, out=out, located=run).run()
     assert not out.exists()

@@ -59,7 +59,7 @@ def test_it_is_written_and_read_as_what_it_is(carried, tmp_path):
     assert set(run.meshes) == set(estimate.meshes)
     table = np.diag([1.0, -1.0, -1.0, 1.0])
     moved = transform_points(table, estimate.structures["cut"].vertices_mm)
-    seen = run.located(table).structures["cut"]
+    seen = run.moved(table).structures["cut"]
     assert np.sort(seen.vertices_mm, 0) == pytest.approx(np.sort(moved, 0), abs=1e-3)
 
 

@@ -141,7 +141,7 @@ class Export:
         from tumortrack import api
         from tumortrack.core.mesh_files import write_mesh
         from tumortrack.core.patient import Patient
-        from tumortrack.imaging import segmentation
+        from tumortrack.imaging import segmentation_files as segmentation
 
         case = api.load_case(self.case)
         labels, patient = case.labels, case.patient

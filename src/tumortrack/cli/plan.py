@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from tumortrack.live.values import PublishedFrame
     from tumortrack.plan.arms.config import CellConfig
     from tumortrack.plan.budget import ErrorBudget
-    from tumortrack.plan.located import LocatedRun
     from tumortrack.plan.values import Located, ResectionConfig, ResectionPlan
 
 _BASES = ("cutter_base", "holder_base")
@@ -78,7 +77,6 @@ class Plan(StatedPatient):
     overwrite: bool = False
 
     def run(self) -> None:
-        from tumortrack.core.config import to_builtins
         from tumortrack.plan.budget import heeded, plan_within
         from tumortrack.plan.files import INVENTED, KIND, PlanFolder, write_plan
         from tumortrack.plan.located import notes_of_doubt, read_run
@@ -96,7 +94,7 @@ class Plan(StatedPatient):
         say(str(run.patient))
         doubts = notes_of_doubt(run.doubt, self.accept_poor)
         frames = self._frame(run, cell_config.stand_mm)
-        located = run.located(frames.published_from_camera)
+        located = run.moved(frames.published_from_camera)
         budget_of = partial(self._budget, located=located, frames=frames, cell=cell_config)
         resection, config, budget = plan_within(
             located, config, budget_of, self.confidence is not None
@@ -115,7 +113,7 @@ class Plan(StatedPatient):
             placed, motions, moved = search_bases(resection, _below(organ, cell_config), organ)
             if hit := first_hit(motions, placed.config, organ):
                 raise NoPlan(f"the arms can't carry this out: {hit}. Place the organ otherwise.")
-            cell_used = to_builtins(placed.config)
+            cell_used = placed.config
             cell_source = INVENTED if moved else bases_source
             say(
                 f"arms: {len(motions.stages)} stages, {motions.seconds:.0f} s; planned in "
@@ -125,21 +123,16 @@ class Plan(StatedPatient):
                 say(f"note: {moved}")
         model = store.read_json(self.run_folder / "report.json").get("model")
         content = PlanFolder(
-            resection, config, frames, located.meshes, cell_used, motions,
+            resection, config, frames, located.meshes, budget, cell_used, motions,
             str(model.get("case_sha256") or "") if isinstance(model, dict) else "",
             store.sha256_of(self.frame) if self.frame else INVENTED, cell_source, run.patient,
-            budget,
         )  # fmt: skip
 
         def pictures(aside: Path) -> None:
             draw_plan(resection, located, aside / "plan.png")
             if self.arms:
                 from tumortrack.plan.arms.body import cell_urdf
-                from tumortrack.plan.ros_trajectories import ros_trajectories
 
-                assert motions is not None
-                said = ros_trajectories(motions, frames.frame_id)
-                store.write_atomically(aside / "trajectories.json", said)
                 store.write_atomically(aside / "cell.urdf", cell_urdf(placed.config).encode())
 
         digest = store.sha256_of(self.run_folder / store.MANIFEST)
@@ -191,7 +184,7 @@ class Plan(StatedPatient):
         source = store.sha256_of(self.cell) if self.cell and given else INVENTED
         return config if self.stand is None else replace(config, stand_mm=self.stand), source
 
-    def _frame(self, run: LocatedRun, stand_mm: float) -> PublishedFrame:
+    def _frame(self, run: Located, stand_mm: float) -> PublishedFrame:
         """The table's frame: of the calibration, or of a camera that looks down."""
         from tumortrack.live.calibration_file import read_frames
         from tumortrack.live.values import PublishedFrame

@@ -30,10 +30,12 @@ if TYPE_CHECKING:
     import numpy as np
     from jaxtyping import Float64
 
+    from tumortrack.core.types import Mesh
     from tumortrack.live.sinks.ur import UrSinkConfig
     from tumortrack.live.values import RigidShape, SourceConfig, TrackingResult, Workcell
     from tumortrack.plan import operation as operations
     from tumortrack.plan.arms.cell import ArmCell
+    from tumortrack.plan.arms.config import CellConfig
     from tumortrack.plan.files import PlanFolder
     from tumortrack.plan.motions import Motions
     from tumortrack.plan.values import Located
@@ -96,7 +98,7 @@ class Resect(track.Following):
         live = None if self.live is None else _live_of(*self.live, stored)
         if moving:
             self._check_real(stored, moving, live)
-        cell = _checked_cell(self.plan, stored, stored.motions, organ)
+        cell = _checked_cell(self.plan, stored.motions, stored.cell, stored.meshes[organ])
         procedure = _Procedure(self, stored, stored.motions, cell, config, arms)
         if self.film is not None:
             if self.live is not None or self.sinks:
@@ -120,7 +122,7 @@ class Resect(track.Following):
 
         model, source = self.live or ("", "")
         budget, moved_mm = stored.budget, self._moved_mm(stored)
-        assumed = () if budget is None else budget.assumed
+        assumed = budget.assumed
         kind = Organ(name=organ_name(stored.meshes) or KIDNEY.name)
         needs = {
             "--live MODEL SOURCE, so that they stop where the tumor moves": live,
@@ -153,7 +155,7 @@ class Resect(track.Following):
             ),
             f"--speed up to 1, not {self.speed:g}": self.speed <= 1,
             "a plan whose margin covers its errors (plan again with a wider one)": (
-                budget is not None and budget.left_mm >= 0
+                budget.left_mm >= 0
             ),
             "a plan by a model that says how unsure it is (preset clinic)": (
                 "tracking" not in assumed
@@ -164,9 +166,7 @@ class Resect(track.Following):
             "a plan with the tools' error (tool_error_mm in the --cell file)": (
                 "tool" not in assumed
             ),
-            f"--moved as planned with, not {moved_mm:g}": (
-                budget is None or moved_mm <= budget.motion_mm
-            ),
+            f"--moved as planned with, not {moved_mm:g}": moved_mm <= budget.motion_mm,
             "each arm once, at an address of its own": (
                 len(arms) == len({arm.arm for arm in arms}) == len({arm.host for arm in arms})
             ),
@@ -177,10 +177,7 @@ class Resect(track.Following):
             raise InputError(f"the arm at {names} may not move. It needs: {'; '.join(lacking)}.")
 
     def _moved_mm(self, stored: PlanFolder) -> float:
-        from tumortrack.plan.budget import MOVED_MM
-
-        planned_mm = MOVED_MM if stored.budget is None else stored.budget.motion_mm
-        return planned_mm if self.moved is None else self.moved
+        return stored.budget.motion_mm if self.moved is None else self.moved
 
 
 @dataclass(frozen=True, eq=False)
@@ -206,15 +203,13 @@ class _Procedure:
         from tumortrack.plan.arms import procedure
         from tumortrack.plan.arms.cell import tip_places
         from tumortrack.plan.live_budget import LiveBudget
-        from tumortrack.plan.located import located
+        from tumortrack.plan.located import of_estimate
 
         stored, asked, frames = self.stored, self.asked, self.stored.frames
 
         def locate(result: TrackingResult, unsure: bool = False) -> Located:
-            estimate, way = result.estimate, frames.published_from_camera
-            assert estimate is not None
-            motion = estimate.motion if unsure else None
-            return located(estimate.cloud, estimate.meshes, motion, way, estimate.structures)
+            assert result.estimate is not None
+            return of_estimate(result.estimate, unsure).moved(frames.published_from_camera)
 
         again = msgspec.structs.replace(stored.config, tumor=stored.plan.tumor)
         # In a process of its own: planning for a second must not hold up a frame.
@@ -237,7 +232,7 @@ class _Procedure:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
             begun.result()
             late_s = max((arm.lookahead_s for arm in self.arms), default=0.0)
-            budget = LiveBudget(stored.budget, late_s) if stored.budget else None
+            budget = LiveBudget(stored.budget, late_s)
             operation = self._operation(locate=locate, replan=replan, budget=budget)
             setup = CameraSetup(frames, {live.named: live.source})
             about = {"plan_config": to_builtins(self.config)}
@@ -339,17 +334,14 @@ class _Procedure:
             say(f"done: {'nothing moved' if self.arms else 'both virtual arms are home'}.")
 
 
-def _checked_cell(path: Path, stored: PlanFolder, motions: Motions, organ: str) -> ArmCell:
+def _checked_cell(path: Path, motions: Motions, cell: CellConfig, organ: Mesh) -> ArmCell:
     """Raises ArtifactError: in it the motions hit something, so they are not those planned."""
-    from tumortrack.core.config import from_builtins
     from tumortrack.plan.arms.cell import ArmCell
-    from tumortrack.plan.arms.config import CellConfig
     from tumortrack.plan.arms.trajectory import first_hit
 
-    config = from_builtins(stored.cell, CellConfig, str(path))
-    if hit := first_hit(motions, config, stored.meshes[organ]):
+    if hit := first_hit(motions, cell, organ):
         raise ArtifactError(f"{path}: its motions are not as planned: {hit}. Plan again.")
-    return ArmCell(config, stored.meshes[organ])
+    return ArmCell(cell, organ)
 
 
 @dataclass(frozen=True, eq=False)

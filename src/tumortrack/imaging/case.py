@@ -6,12 +6,14 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import msgspec
+
 from tumortrack.core import store
 from tumortrack.core.config import to_builtins
 from tumortrack.core.errors import ArtifactError, InputError
 from tumortrack.core.mesh_files import read_anatomy, read_mesh, write_anatomy, write_mesh
-from tumortrack.core.organ import check_name, organ_entry, organ_in
-from tumortrack.core.patient import NOBODY, Patient, patient_in
+from tumortrack.core.organ import Organ, check_name, organ_entry
+from tumortrack.core.patient import NOBODY, Patient
 from tumortrack.core.types import Anatomy, LabelVolume, Volume
 from tumortrack.imaging.nifti import write_nifti, write_volume_nifti
 from tumortrack.imaging.volume import read_labels, read_volume
@@ -40,14 +42,22 @@ class Case:
     patient: Patient = NOBODY
 
 
+class _Manifest(msgspec.Struct):
+    """What a case's manifest says beside what all manifests say."""
+
+    organ: Organ
+    structures: list[str]
+    parts: list[str]
+    up_lps: tuple[float, float, float]
+    patient: Patient
+    report: dict[str, Any]
+
+
 def save_case(case: Case, folder: Path) -> None:
     """Write the case's files into an existing (aside) folder and seal it with its manifest.
 
     kidney.ply (or of the organ's name), tumor_1.ply, ..., a surface of each structure,
-    labels.nii.gz, ct.nii.gz (of a CT) and manifest.json.
-
-    Raises:
-        StorageError: the disk refused.
+    labels.nii.gz, ct.nii.gz (of a CT) and manifest.json. Raises StorageError: the disk refused.
     """
     write_anatomy(folder, case.anatomy)
     for name, mesh in case.anatomy.structures.items():
@@ -68,30 +78,19 @@ def save_case(case: Case, folder: Path) -> None:
 
 
 def load_case(folder: Path) -> Case:
-    """Read a case folder, every file checked against its sha256.
-
-    Raises:
-        ArtifactError: not a case, of another schema, damaged or changed.
-    """
-    manifest = store.read_manifest(folder, KIND)
-    parts, up, report = (manifest.get(key) for key in ("parts", "up_lps", "report"))
-    is_direction = isinstance(up, list) and [type(x) for x in up] == [float] * 3
-    if up is None or not is_direction or not isinstance(report, dict):
-        raise ArtifactError(f"{folder / store.MANIFEST} is incomplete; run prepare again.")
+    """Read a case folder, every file checked against its sha256. Raises ArtifactError: not a case,
+    of another schema, damaged or changed."""
     try:
-        where = str(folder / store.MANIFEST)
-        patient = patient_in(manifest.get("patient"), where)
-        organ = organ_in(manifest.get("organ"), where)
-        names = [str(name) for name in manifest.get("structures", [])]
-        for name in names:
+        said = msgspec.convert(store.read_manifest(folder, KIND), _Manifest)
+        for name in said.structures:
             check_name(name, "a structure", "--structure")
-    except InputError as error:
-        raise ArtifactError(f"{error} Run prepare again.") from error
-    structures = {name: read_mesh(folder / f"{name}.ply") for name in names}
-    anatomy = replace(read_anatomy(folder, organ), structures=structures)
-    if list(anatomy.names) != parts:
-        raise ArtifactError(f"{folder} lacks parts: {parts} expected, {list(anatomy.names)} found.")
+    except (InputError, msgspec.ValidationError) as error:
+        where, reason = folder / store.MANIFEST, str(error).rstrip(".")
+        raise ArtifactError(f"{where} is no case's: {reason}. Run prepare again.") from error
+    structures = {name: read_mesh(folder / f"{name}.ply") for name in said.structures}
+    anatomy = replace(read_anatomy(folder, said.organ), structures=structures)
+    if (found := list(anatomy.names)) != said.parts:
+        raise ArtifactError(f"{folder} lacks parts: {said.parts} expected, {found} found.")
     labels, ct = read_labels(folder / "labels.nii.gz"), folder / "ct.nii.gz"
-    x, y, z = up
     volume = read_volume(ct) if ct.exists() else None
-    return Case(anatomy, labels, (x, y, z), report, volume, patient)
+    return Case(anatomy, labels, said.up_lps, said.report, volume, said.patient)

@@ -64,9 +64,7 @@ def find_series(folder: Path, series: str | None = None) -> Series:
 
     The rule among several: the only one with modality CT and at least 10 slices of one size and
     orientation. Otherwise ``series`` must name one: its UID or its number in the error's list.
-
-    Raises:
-        InputError: no series, several, a missing, double or stray slice; images of two patients.
+    Raises InputError: no series, several, a missing, double or stray slice; images of two patients.
     """
     groups, notes = _groups(folder)
     slices = _choose(folder, groups, series)
@@ -96,10 +94,7 @@ def find_series(folder: Path, series: str | None = None) -> Series:
 
 def read_dicom(folder: Path, series: str | None = None) -> RawVolume:
     """Read one CT series of a folder, chosen as by ``find_series``: rescaled values (HU), float32.
-
-    Raises:
-        InputError: see ``find_series``; damaged pixels.
-    """
+    Raises InputError: see ``find_series``; damaged pixels."""
     import SimpleITK as sitk  # noqa: N813
 
     found = find_series(folder, series)

@@ -43,16 +43,12 @@ def check_size(
     path: Path,
     shape: tuple[int, ...],
     bytes_per_voxel: int,
-    compressed: bool | None = None,
+    compressed: bool,
     stored: int | None = None,
 ) -> None:
     """Refuse a shape that is no volume or too large, and a file too short to hold what its header
-    claims (``compressed`` None: no bound is known; ``stored`` None: the file's size), before
-    anything is allocated.
-
-    Raises:
-        InputError: not three axes, fewer than two voxels along one, above the limits; truncated.
-    """
+    claims (``stored`` None: the file's size), before anything is allocated. Raises InputError: not
+    three axes, fewer than two voxels along one, above the limits; truncated."""
     dims = " x ".join(str(n) for n in shape)
     if len(shape) != 3:
         raise InputError(
@@ -68,8 +64,6 @@ def check_size(
             f"{path} claims {dims} voxels of {bytes_per_voxel} bytes; the limit is {_MAX_VOXELS} "
             "voxels and 8 GiB. Crop or resample the volume round the organ."
         )
-    if compressed is None:
-        return
     stored = path.stat().st_size if stored is None else stored
     if compressed and needed > _MUCH and _USUAL_BEST * stored < needed <= GZIP_BEST * stored:
         raise InputError(

@@ -32,19 +32,15 @@ _RULE = (
 def read_mesh_folder(
     folder: Path, unit: str | None = None, kind: Organ = KIDNEY
 ) -> tuple[Anatomy, list[str]]:
-    """Read one organ and its tumors; LPS mm unless a file's comment states ``SPACE=RAS``.
+    """Read one organ and its tumors, LPS mm; and notes on every change.
 
-    Small holes, doubled faces, inside-out surfaces and crossings are repaired with a note. The
-    organ becomes the union of organ and tumors.
+    Files are LPS unless a comment in them states ``SPACE=RAS``. Small holes, doubled faces,
+    inside-out surfaces and crossings are repaired. The organ becomes the union of organ and tumors.
+    Raises InputError: unclear names, open or damaged meshes, wrong unit, a tumor apart from the
+    organ.
 
     Args:
         unit: ``m`` converts metres; None or ``mm``: millimetres (metres are recognised, refused).
-
-    Returns:
-        The anatomy (LPS mm) and notes on every change.
-
-    Raises:
-        InputError: unclear names, open or damaged meshes, wrong unit, a tumor apart from the organ.
     """
     if not folder.is_dir():
         raise InputError(f"{folder} is not a folder of meshes.")
@@ -96,12 +92,11 @@ def _files_by_name(folder: Path, organ: str) -> list[Path]:
         raise InputError(f"{folder}: of {[f.name for f in files]} {problem}. {_RULE.format(organ)}")
     if len(tumors) > _MOST_TUMORS:
         raise InputError(f"{folder}: {len(tumors)} tumors; up to {_MOST_TUMORS} are read.")
-    return [organs[0], *sorted(tumors, key=_natural)]
 
+    def natural(path: Path) -> list[Any]:  # tumor_2 before tumor_10
+        return [int(p) if p.isdigit() else p for p in re.split(r"(\d+)", path.stem.lower())]
 
-def _natural(path: Path) -> list[Any]:
-    """tumor_2 before tumor_10."""
-    return [int(p) if p.isdigit() else p for p in re.split(r"(\d+)", path.stem.lower())]
+    return [organs[0], *sorted(tumors, key=natural)]
 
 
 def read_lps(path: Path, scale: float, notes: list[str]) -> Mesh:
@@ -164,10 +159,8 @@ def closed_mesh(mesh: Mesh, name: str, notes: list[str]) -> Mesh:
     """Repair what can be repaired safely; every change adds a note that names the file.
 
     Doubled faces are removed, holes up to 10 mm across are closed, faces are turned outward, and a
-    mesh that crosses itself is remeshed from its winding numbers.
-
-    Raises:
-        InputError: open beyond that, or not a surface.
+    mesh that crosses itself is remeshed from its winding numbers. Raises InputError: open beyond
+    that, or not a surface.
     """
     import trimesh
 

@@ -11,8 +11,6 @@ import logging
 import math
 import struct
 import zlib
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -46,12 +44,9 @@ _MOST_BEHIND = 16 * 2**20  # bytes after the voxels
 
 
 def read_nifti(path: Path) -> grid.RawVolume:
-    """Read .nii or .nii.gz. The sform places it, or the qform where there is no sform.
-
-    Raises:
-        InputError: damaged, not 3-D, too large, without or with contradictory orientation,
-            not in millimetres.
-    """
+    """Read .nii or .nii.gz. The sform places it, or the qform where there is no sform. Raises
+    InputError: damaged, not 3-D, too large, without or with contradictory orientation, not in
+    millimetres."""
     compressed = path.suffix.lower() == ".gz"
     stream: Any
     try:
@@ -67,6 +62,8 @@ def _read(path: Path, stream: Any, compressed: bool) -> grid.RawVolume:
     import nibabel
     from nibabel.volumeutils import apply_read_scaling
 
+    # It would log what it mends in a header: errors here name what is wrong.
+    nibabel.imageglobals.logger.setLevel(logging.CRITICAL)
     head = stream.read(_LONGEST_HEADER)
     kinds = {348: nibabel.Nifti1Header, 540: nibabel.Nifti2Header}
     sizes = [struct.unpack(order + "i", head[:4].ljust(4, b"\0"))[0] for order in "<>"]
@@ -74,8 +71,7 @@ def _read(path: Path, stream: Any, compressed: bool) -> grid.RawVolume:
     if size is None:
         raise InputError(f"{path} is no NIfTI file (its header has {sizes[0]} bytes, not 348).")
     try:
-        with _silent(nibabel.imageglobals.logger):
-            header = kinds[size](head[:size])
+        header = kinds[size](head[:size])
         shape = tuple(int(n) for n in header.get_data_shape())
         dtype = header.get_data_dtype()
         units = header.get_xyzt_units()[0]
@@ -123,17 +119,6 @@ def _voxels(path: Path, stream: Any, n_bytes: int, compressed: bool) -> bytes:
     return data
 
 
-@contextmanager
-def _silent(logger: logging.Logger) -> Iterator[None]:
-    """Without nibabel's log of headers that it mends: errors here name what is wrong."""
-    level = logger.level
-    logger.setLevel(logging.CRITICAL)
-    try:
-        yield
-    finally:
-        logger.setLevel(level)
-
-
 def _lps_from_index(path: Path, header: Any) -> Float[np.ndarray, "4 4"]:
     """The affine the header states; never a guess, since a guess may mirror the patient."""
     try:
@@ -174,15 +159,13 @@ def write_nifti(
     frame_from_index: Float[np.ndarray, "4 4"],
     lps: bool,
 ) -> None:
-    """Write an array in its own number type as .nii or .nii.gz, units mm.
+    """Write an array in its own number type as .nii or .nii.gz, units mm. Raises InputError:
+    numbers of a type that NIfTI does not know, or more than 32,767 along an axis; StorageError: the
+    disk refused; an older file is untouched.
 
     Args:
         frame_from_index: index -> mm. Patient frame (``lps`` True): converted from LPS to NIfTI's
             RAS. Camera frame (``lps`` False): written as it is.
-
-    Raises:
-        InputError: numbers of a type that NIfTI does not know, or more than 32,767 along an axis.
-        StorageError: the disk refused; an older file is untouched.
     """
     kind = f"{array.dtype.kind}{array.dtype.itemsize}"
     if kind not in _TYPES or max(array.shape) > np.iinfo(np.int16).max:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -17,8 +17,8 @@ from tumortrack.core.patient import UNKNOWN, Patient, Side
 from tumortrack.core.types import ORGAN, Anatomy, LabelVolume, Mesh, Volume
 from tumortrack.imaging.case import Case
 from tumortrack.imaging.grid import grown_box, voxel_ml
+from tumortrack.imaging.hu_windows import ORGAN_HU, TUMOR_HU, segment_ct
 from tumortrack.imaging.meshes import label_meshes, read_mesh_folder
-from tumortrack.imaging.segment import ORGAN_HU, TUMOR_HU, segment_ct
 from tumortrack.imaging.select import MIN_TUMOR_ML, select_labels
 from tumortrack.imaging.structures import (
     described,
@@ -32,7 +32,6 @@ from tumortrack.imaging.volume import is_label_map, labels_of, read_raw, volume_
 
 # Options that only one kind of input uses.
 _OF_CT, OF_LABELS = ("organ_hu", "tumor_hu"), ("labels", "organ", "tumor")
-_UP_LPS = (0.0, -1.0, 0.0)  # until ``prepare`` sets what was asked for
 _LEAST_ORGAN_OUTSIDE = 0.02  # of the outer surface
 _MOST_CHANGE_PERCENT = 1.0  # of a part's volume, by smoothing; more is noted
 
@@ -82,6 +81,7 @@ class PrepareOptions:
             raise InputError(f"side {self.side!r} is not allowed: left or right (the patient's).")
         self.kind.check_side(self.side)
         stated_structures(self.structure, self.name)
+        direction_lps(self.up)
         if self.unit not in (None, "mm", "m"):
             raise InputError(f"unit {self.unit!r} is not allowed: mm or m.")
         if self.patient is not None:
@@ -94,17 +94,13 @@ class PrepareOptions:
 
     @property
     def stated_side(self) -> Side:
-        return "left" if self.side == "left" else "right" if self.side == "right" else UNKNOWN
+        return cast(Side, self.side or UNKNOWN)  # it was checked above
 
 
 def prepare(input: Path, options: PrepareOptions | None = None) -> Case:
-    """Read any supported input and make a case of it; nothing is written.
-
-    Raises:
-        InputError: no usable input there.
-    """
+    """Read any supported input and make a case of it; nothing is written. Raises InputError: no
+    usable input there."""
     options = options or PrepareOptions()
-    up = direction_lps(options.up)
     try:
         if not input.exists():
             raise InputError(f"{input} does not exist.")
@@ -127,7 +123,7 @@ def prepare(input: Path, options: PrepareOptions | None = None) -> Case:
         "turns": [{k: v for k, v in asdict(one).items() if k != "ct_from_ct"} for one in turns],
     }
     origin |= {"half_turn": looks, "notes": [*notes, said] if said else notes}
-    return replace(case, up_lps=up, report={**case.report, **origin})
+    return replace(case, report={**case.report, **origin})
 
 
 def _with_structures(case: Case, options: PrepareOptions) -> Case:
@@ -175,7 +171,8 @@ def _from_volume(path: Path, options: PrepareOptions) -> Case:
     raw = read_raw(path, options.series)
     as_labels = options.labels or (path.is_file() and is_label_map(raw))
     structures: dict[str, Mesh] = {}
-    ct, notes, stated, side = None, list(raw.notes), raw.patient, options.stated_side
+    up, ct, notes = direction_lps(options.up), None, list(raw.notes)
+    stated, side = raw.patient, options.stated_side
     if as_labels:
         refuse_unused(f"{path} is read as a label map", options, *_OF_CT, "unit")
         if not options.labels:
@@ -186,7 +183,7 @@ def _from_volume(path: Path, options: PrepareOptions) -> Case:
         source, structures = set_apart(source, named, options.organ)
         labels, more, side = select_labels(
             source,
-            options.side,
+            options.stated_side,
             options.organ,
             options.tumor,
             options.min_tumor_ml,
@@ -210,11 +207,9 @@ def _from_volume(path: Path, options: PrepareOptions) -> Case:
         for name, change in zip(surface["names"], surface["change_percent"], strict=True)
         if abs(change) > _MOST_CHANGE_PERCENT
     ]
-    report = {"kind": "label map" if as_labels else "ct", "notes": notes}
+    kind, measured = "label map" if as_labels else "ct", _measured(labels, anatomy, surface)
     patient = whose(path, stated, options.patient, side)
-    return Case(
-        anatomy, labels, _UP_LPS, {**report, **_measured(labels, anatomy, surface)}, ct, patient
-    )
+    return Case(anatomy, labels, up, {"kind": kind, "notes": notes, **measured}, ct, patient)
 
 
 def whose(path: Path, stated: Patient, given: str | None, side: Side) -> Patient:
@@ -237,7 +232,7 @@ def _from_meshes(folder: Path, options: PrepareOptions) -> Case:
     measured = _measured(labels, anatomy, {"names": list(anatomy.names), "mesh_ml": mesh_ml})
     patient = Patient(options.patient or UNKNOWN, options.stated_side)
     report = {"kind": "meshes", "notes": notes, **measured}
-    return Case(anatomy, labels, _UP_LPS, report, patient=patient)
+    return Case(anatomy, labels, direction_lps(options.up), report, patient=patient)
 
 
 def _measured(

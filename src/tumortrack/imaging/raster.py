@@ -28,10 +28,8 @@ def winding_numbers(
 
     Each triangle adds +1 or -1 to every voxel behind it. A closed mesh (in some frame, mm) whose
     faces turn outward and that does not cross itself gives 0 outside and 1 inside, and nothing
-    else. ``frame_from_index``: array index -> that frame; any invertible affine.
-
-    Raises:
-        InputError: the grid is too large.
+    else. ``frame_from_index``: array index -> that frame; any invertible affine. Raises InputError:
+    the grid is too large.
     """
     out = _room(shape, np.int16)
     _fill(mesh, frame_from_index, out, 0)

@@ -67,7 +67,7 @@ class _Candidate:
 
 def select_labels(
     label_volume: LabelVolume,
-    side: str | None = None,
+    side: Side = UNKNOWN,
     organ: int = ORGAN,
     tumor: int | None = None,
     min_tumor_ml: float = MIN_TUMOR_ML,
@@ -75,15 +75,15 @@ def select_labels(
 ) -> tuple[LabelVolume, list[str], Side]:
     """Keep one organ (label 1) and its tumors (2, 3, ...), cropped with a margin.
 
-    An organ is a connected piece of organ and tumor voxels with at least 10 ml of organ and a
-    tenth of the largest one's volume (where there is none, the piece with most organ). A tumor
-    within 3 mm of an organ belongs to it: see ``_attach_tumors``. One farther off is left out with
-    a note; other pieces are specks and dropped. A tumor is a piece of one tumor label inside that
-    organ; smaller ones than ``min_tumor_ml`` become organ. Different tumor labels keep their
-    order; the pieces of one label follow each other, largest first.
+    An organ is a connected piece of organ and tumor voxels: see ``_large_pieces``. A tumor within 3
+    mm of an organ belongs to it: see ``_attach_tumors``. One farther off is left out with a note;
+    other pieces are specks and dropped. A tumor is a piece of one tumor label inside that organ;
+    smaller ones than ``min_tumor_ml`` become organ. Different tumor labels keep their order; the
+    pieces of one label follow each other, largest first. Raises InputError: no organ, no such tumor
+    label, two of a pair without tumor and no ``side``, no tumor but one apart from every organ.
 
     Args:
-        side: the PATIENT's ``left`` or ``right``; None takes the organ with most tumor.
+        side: the PATIENT's ``left`` or ``right``; unknown: the organ with most tumor is taken.
         organ: the organ's label.
         tumor: the tumor's label; None takes every other label from 2 up, 0 takes none.
         kind: which organ it is; only of those in pairs is one chosen by its side.
@@ -91,10 +91,6 @@ def select_labels(
     Returns:
         The selected labels, notes on what was dropped or renumbered, and the organ's side: as
         the map shows it, if it has two kidneys, say; else what was asked for.
-
-    Raises:
-        InputError: no organ, no such tumor label, two of a pair without tumor and no ``side``,
-            no tumor but one apart from every organ.
     """
     labels, affine = label_volume.labels, label_volume.lps_from_index
     present = [int(n) for n in np.flatnonzero(grid.label_counts(labels)) if n > 0]
@@ -180,7 +176,8 @@ def _tumor_labels(present: list[int], organ: int, tumor: int | None) -> list[int
 
 
 def _large_pieces(pieces: _Pieces) -> list[int]:
-    """The numbers of the pieces that hold enough organ to be one, largest first."""
+    """The numbers of the pieces that are organs, largest first: with at least 10 ml of organ and a
+    tenth of the largest one's volume; where there is none, the one with most organ."""
     whole_ml = pieces.whole_ml
     large = np.flatnonzero(pieces.organ_ml >= _MIN_ML).tolist()
     if not large:  # an organ nearly eaten up by its tumor, or a very small one
@@ -208,10 +205,8 @@ def _attach_tumors(
 
     The gap (up to 3 mm, or one voxel where voxels are larger) is filled with organ, no wider
     than the two face each other, so that organ and tumor have one surface.
-
-    Returns:
-        The pieces with joined ones numbered as their organ, notes, and the numbers of the
-        pieces that lie farther off.
+    Returns the pieces with joined ones numbered as their organ, notes, and the numbers of the
+    pieces that lie farther off.
     """
     notes: list[str] = []
     apart: list[int] = []
@@ -291,20 +286,17 @@ def _left_out(
 
 
 def _choose(
-    found: list[_Candidate], side: str | None, middle_x_mm: float, kind: Organ
+    found: list[_Candidate], side: Side, middle_x_mm: float, kind: Organ
 ) -> tuple[_Candidate, list[str], Side]:
-    if side not in (None, "left", "right"):
-        raise InputError(f"side {side!r} is not understood. Allowed: left, right (the patient's).")
     best = max(found, key=lambda one: (one.tumor_ml, one.ml))
     alone = len(found) == 1
     if not kind.in_pairs:
         note = f"of {len(found)} large pieces the one with most tumor, or the largest, was taken"
-        stated: Side = "left" if side == "left" else "right" if side == "right" else UNKNOWN
-        return best, [] if alone else [note], stated
+        return best, [] if alone else [note], side
     xs = [one.x_mm for one in found]
     if not alone:
         middle_x_mm = (min(xs) + max(xs)) / 2
-    if side is None:
+    if side == UNKNOWN:
         if not alone and best.tumor_ml == 0:
             raise InputError(
                 f"the label map holds {len(found)} {kind.words}s and no tumor. Give --side left or "
@@ -325,7 +317,7 @@ def _choose(
         )
     best = max(fitting, key=lambda one: (one.tumor_ml, one.ml))
     note = f"only one {kind.words} in the map; its side was checked against the image's middle only"
-    return best, [note] if alone else [], "left" if side == "left" else "right"
+    return best, [note] if alone else [], side
 
 
 def _number_tumors(

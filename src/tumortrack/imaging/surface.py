@@ -31,15 +31,13 @@ _REPORTED = (
 def surfaces(
     label_volume: LabelVolume, kind: Organ = KIDNEY
 ) -> tuple[Anatomy, dict[str, list[Any]]]:
-    """The organ's surface (all labels from 1 up) and one per tumor, LPS mm, faces outward.
+    """The organ's surface (all labels from 1 up) and one per tumor, LPS mm, faces outward. Raises
+    InputError: no organ, a gap in the tumor numbers, or a part too small for a surface.
 
     Returns:
         The anatomy, and lists of a number per part, organ first: ``names``, ``labels_ml``,
         ``mesh_ml``, ``change_percent``, and how far mesh vertices lie from the labels' boundary:
         ``distance_mean_voxels``, ``distance_95_voxels``, ``distance_max_voxels``.
-
-    Raises:
-        InputError: no organ, a gap in the tumor numbers, or a part too small for a surface.
     """
     labels, affine = label_volume.labels, label_volume.lps_from_index
     top = int(labels.max())

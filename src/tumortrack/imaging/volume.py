@@ -6,7 +6,6 @@ https://teem.sourceforge.net/nrrd/format.html.
 
 from __future__ import annotations
 
-import bz2
 import math
 import re
 import zlib
@@ -24,7 +23,7 @@ _DETACHED = (".nhdr", ".mhd", ".hdr", ".img")
 _MOST_LABELS = 32  # distinct values that still look like a label map
 _MAX_HEADER = 2**20
 _MOST_BEHIND = 16 * 2**20  # bytes after the voxels
-_IS_GZIP = {"raw": False, "gzip": True, "gz": True}  # of bzip2, compression has no known bound
+_IS_GZIP = {"raw": False, "gzip": True, "gz": True}
 _TYPES = {
     **dict.fromkeys(("signed char", "int8", "int8_t"), "i1"),
     **dict.fromkeys(("uchar", "unsigned char", "uint8", "uint8_t"), "u1"),
@@ -47,11 +46,8 @@ _LPS_FROM_SPACE = {
 
 
 def read_raw(path: Path, series: str | None = None) -> grid.RawVolume:
-    """Read the voxels of any supported volume in their stored type.
-
-    Raises:
-        InputError: missing, unknown type, detached, damaged, not a plausible patient volume.
-    """
+    """Read the voxels of any supported volume in their stored type. Raises InputError: missing,
+    unknown type, detached, damaged, not a plausible patient volume."""
     name = path.name.lower()
     if path.is_dir():
         return read_dicom(path, series)
@@ -128,18 +124,20 @@ def _whole_numbers(array: np.ndarray) -> np.ndarray | None:
 
 
 def _read_nrrd(path: Path) -> grid.RawVolume:
-    """Read an attached .nrrd (raw, gzip or bzip2) with a stated patient space."""
+    """Read an attached .nrrd (raw or gzip) with a stated patient space."""
     fields, start = _header(path)
+    encoding = fields.get("encoding", "raw").lower()
+    if encoding not in _IS_GZIP:
+        raise InputError(f"{path}: encoding {encoding!r} is not read. Export as raw or gzip.")
     try:
         shape = tuple(int(n) for n in fields["sizes"].split())
         dtype = np.dtype(_TYPES[fields["type"].lower()])
-        encoding = fields.get("encoding", "raw").lower()
         lps_from_index = _lps_from_index(path, fields) if len(shape) == 3 else np.eye(4)
     except (KeyError, ValueError, OverflowError) as error:
         raise InputError(
             f"{path}: the NRRD header is damaged or lacks a field ({error}). Export it again."
         ) from error
-    grid.check_size(path, shape, dtype.itemsize, _IS_GZIP.get(encoding))
+    grid.check_size(path, shape, dtype.itemsize, _IS_GZIP[encoding])
     grid.check_affine(path, lps_from_index)
     if fields.get("dimension") != "3":
         raise InputError(f"{path}: dimension {fields.get('dimension')} is not that of its sizes.")
@@ -147,7 +145,7 @@ def _read_nrrd(path: Path) -> grid.RawVolume:
         if fields.get("endian", "").lower() not in ("little", "big"):
             raise InputError(f"{path}: the NRRD header states no byte order. Export it again.")
         dtype = dtype.newbyteorder("<" if fields["endian"].lower() == "little" else ">")
-    data = _voxels(path, start, encoding, math.prod(shape) * dtype.itemsize)
+    data = _voxels(path, start, _IS_GZIP[encoding], math.prod(shape) * dtype.itemsize)
     array = np.frombuffer(data, dtype).reshape(shape, order="F")
     return grid.RawVolume(array.astype(dtype.newbyteorder("="), copy=False), lps_from_index)
 
@@ -199,28 +197,20 @@ def _vector(text: str) -> list[float]:
     return numbers
 
 
-def _voxels(path: Path, start: int, encoding: str, n_bytes: int) -> bytes:
+def _voxels(path: Path, start: int, compressed: bool, n_bytes: int) -> bytes:
     """At most ``n_bytes`` of voxels: a compressed file cannot unpack to more."""
     with path.open("rb") as stream:
         stream.seek(start)
         stored = stream.read()
-    whole = True  # with its checksum, which stands at the end
-    try:
-        if encoding == "raw":
-            data = stored[:n_bytes]
-        elif encoding in _IS_GZIP:
-            packed = zlib.decompressobj(wbits=31)
+    data, whole = stored[:n_bytes], True  # whole: with its checksum, which stands at the end
+    if compressed:
+        packed = zlib.decompressobj(wbits=31)
+        try:
             data = packed.decompress(stored, n_bytes)
             packed.decompress(packed.unconsumed_tail, _MOST_BEHIND)
-            whole = packed.eof
-        elif encoding in ("bzip2", "bz2"):
-            blocks = bz2.BZ2Decompressor()
-            data = blocks.decompress(stored, n_bytes)
-            whole = blocks.eof or bool(blocks.decompress(b"", _MOST_BEHIND) or blocks.eof)
-        else:
-            raise InputError(f"{path}: encoding {encoding!r} is not read. Export as raw or gzip.")
-    except (zlib.error, OSError, EOFError) as error:
-        raise InputError(f"{path}: its compressed voxels are damaged: {error}.") from error
+        except zlib.error as error:
+            raise InputError(f"{path}: its compressed voxels are damaged: {error}.") from error
+        whole = packed.eof
     if len(data) < n_bytes:
         raise InputError(f"{path} is truncated: {len(data)} of {n_bytes} bytes of voxels.")
     if not whole:

@@ -1,4 +1,5 @@
-"""The folder of a plan: numbers as JSON, strokes and surfaces as PLY, motions as safetensors.
+"""The folder of a plan: numbers as JSON, strokes and surfaces as PLY, motions as safetensors and,
+for MoveIt, in ROS's own words (moveit_msgs/RobotTrajectory).
 
 Everything in it is in the table's frame, mm; ``plan.json`` has ``table_from_camera``.
 """
@@ -15,11 +16,10 @@ import msgspec
 import numpy as np
 
 from tumortrack.core import store
-from tumortrack.core.config import from_builtins, to_builtins
 from tumortrack.core.errors import ArtifactError, InputError, NoPlan
 from tumortrack.core.mesh_files import read_mesh, write_mesh
 from tumortrack.core.organ import organ_first
-from tumortrack.core.patient import NOBODY, Patient, patient_in
+from tumortrack.core.patient import NOBODY, Patient
 from tumortrack.core.types import Mesh
 from tumortrack.live.values import PublishedFrame
 from tumortrack.plan.arms.config import CellConfig
@@ -38,24 +38,35 @@ _LONGEST_S = 4 * 3600.0  # no resection takes so long
 
 @dataclass(frozen=True, eq=False)
 class PlanFolder:
-    """What a plan's folder holds. ``cell``: the workcell's configuration that the motions are for,
-    as JSON; motions and cell are None where no arms were planned. ``case_sha256``: of the case that
-    the organ was located by; empty where unknown. ``frame_source``, ``cell_source``: the sha256 of
-    the user's file that gave the frame, and the places of the arms; or ``INVENTED``. ``patient``:
-    whose organ, as far as it is known. ``budget``: None in plans of older versions. ``frames``:
-    where a live run publishes that carries the plan out."""
+    """What a plan's folder holds. ``cell``: the workcell that the motions are for; motions and cell
+    are None where no arms were planned. ``case_sha256``: of the case that the organ was located by;
+    empty where unknown. ``frame_source``, ``cell_source``: the sha256 of the user's file that gave
+    the frame, and the places of the arms; or ``INVENTED``. ``patient``: whose organ, as far as it
+    is known. ``frames``: where a live run publishes that carries the plan out."""
 
     plan: ResectionPlan
     config: ResectionConfig
     frames: PublishedFrame
     meshes: dict[str, Mesh]
-    cell: dict[str, Any] | None = None
+    budget: ErrorBudget
+    cell: CellConfig | None = None
     motions: Motions | None = None
     case_sha256: str = ""
     frame_source: str = INVENTED
     cell_source: str = INVENTED
     patient: Patient = NOBODY
-    budget: ErrorBudget | None = None
+
+
+# What stands in plan.json under its own name.
+_STORED: dict[str, Any] = {
+    "config": ResectionConfig,
+    "budget": ErrorBudget,
+    "cell": CellConfig | None,
+    "case_sha256": str,
+    "frame_source": str,
+    "cell_source": str,
+    "patient": Patient,
+}
 
 
 def write_plan(
@@ -70,31 +81,33 @@ def write_plan(
     NoPlan: motions that would be refused when read; StorageError: the disk refused."""
     plan, motions, frames = content.plan, content.motions, content.frames
     if motions is not None:
-        cell = from_builtins(content.cell, CellConfig, "cell")
-        for fault in _faults(motions, cell, plan.sweeps):
+        assert content.cell is not None  # the one that the motions are for
+        for fault in _faults(motions, content.cell, plan.sweeps):
             raise NoPlan(f"the arms can't carry this out: {fault}.")
     data = {
         "frame_id": frames.frame_id,
         "table_from_camera": frames.published_from_camera.tolist(),
-        "config": to_builtins(content.config),
+        "config": content.config,
         "case_sha256": content.case_sha256,
-        "patient": to_builtins(content.patient),
+        "patient": content.patient,
         "frame_source": content.frame_source,
         "cell_source": content.cell_source,
         "camera_frame_id": frames.camera_frame_id,
         "table_in_camera": frames.table_in_camera,
         "plan": as_builtins(plan),
-        "budget": content.budget and to_builtins(content.budget),
+        "budget": content.budget,
         "cell": content.cell,
         "seconds": motions and motions.seconds,
     }
     with store.new_folder(folder, overwrite) as aside:
-        store.write_json(aside / _NAME, data)
+        store.write_json(aside / _NAME, msgspec.to_builtins(data))
         store.write_atomically(aside / _STROKES, _strokes(plan))
         for name, mesh in content.meshes.items():
             write_mesh(aside / f"{name}.ply", mesh)
         if motions is not None:
             _write_motions(aside / _MOTIONS, motions)
+            trajectories = ros_trajectories(motions, frames.frame_id)
+            store.write_atomically(aside / "trajectories.json", trajectories)
         more(aside)
         store.seal(aside, KIND, {"inputs": inputs}, frame=frames.frame_id)
 
@@ -118,36 +131,22 @@ def read_plan(folder: Path) -> PlanFolder:
     motions = _read_motions(path) if path.is_file() else None
     try:
         plan = from_plain(data["plan"])
-        if motions is not None:
-            cell = from_builtins(data["cell"], CellConfig, str(folder / _NAME))
-            for fault in _faults(motions, cell, plan.sweeps):
-                raise ArtifactError(f"{path} can't be carried out: {fault}. Plan again.")
-        budget, where = data.get("budget"), str(folder / _NAME)
-        frame_source = str(data.get("frame_source", INVENTED))
+        read = {name: msgspec.convert(data[name], kind) for name, kind in _STORED.items()}
         frames = PublishedFrame(
             str(data["frame_id"]),
             np.array(data["table_from_camera"], float),
-            frame_source != INVENTED,
-            str(data.get("camera_frame_id", "")),
-            msgspec.convert(data.get("table_in_camera"), tuple[float, float, float, float] | None),
+            read["frame_source"] != INVENTED,
+            str(data["camera_frame_id"]),
+            msgspec.convert(data["table_in_camera"], tuple[float, float, float, float] | None),
         )
-        return PlanFolder(
-            plan=plan,
-            config=from_builtins(data["config"], ResectionConfig, where),
-            frames=frames,
-            meshes=meshes,
-            cell=data["cell"],
-            motions=motions,
-            case_sha256=str(data["case_sha256"] or ""),
-            frame_source=frame_source,
-            cell_source=str(data.get("cell_source", INVENTED)),
-            patient=patient_in(data.get("patient"), where),
-            budget=None if budget is None else from_builtins(budget, ErrorBudget, where),
-        )
-    except ArtifactError:
-        raise
     except (KeyError, TypeError, ValueError, InputError, msgspec.ValidationError) as error:
         raise ArtifactError(f"{folder / _NAME} lacks or spoils {error}; plan again.") from error
+    if motions is not None:
+        if read["cell"] is None:
+            raise ArtifactError(f"{folder} has motions and no cell that they are for. Plan again.")
+        for fault in _faults(motions, read["cell"], plan.sweeps):
+            raise ArtifactError(f"{path} can't be carried out: {fault}. Plan again.")
+    return PlanFolder(plan=plan, frames=frames, meshes=meshes, motions=motions, **read)
 
 
 def as_builtins(plan: ResectionPlan) -> dict[str, Any]:
@@ -220,6 +219,36 @@ def _read_motions(path: Path) -> Motions:
         reason = str(error).rstrip(".")
         raise ArtifactError(f"{path} cannot be read: {reason}. Plan again.") from error
     return Motions(stages)
+
+
+def ros_trajectories(motions: Motions, frame_id: str) -> bytes:
+    """Motions for MoveIt as JSON, which ROS 2 reads as YAML: ``stages``, each with its ``name``,
+    ``seconds`` and the ``trajectory`` of all joints, where any moves; radians, seconds. Each begins
+    where the one before ended."""
+    stages = [
+        {"name": stage.name, "seconds": stage.seconds, "trajectory": _trajectory(stage, frame_id)}
+        for stage in motions.stages
+        if len(stage.times_s) > 1
+    ]
+    return json.dumps({"frame_id": frame_id, "stages": stages}).encode()
+
+
+def _trajectory(stage: MotionStage, frame_id: str) -> dict[str, Any]:
+    """At rest at both ends."""
+    speeds = np.gradient(stage.joints_rad, stage.times_s, axis=0)
+    speeds[[0, -1]] = 0
+    points = []
+    for time_s, joints, speed in zip(stage.times_s, stage.joints_rad, speeds, strict=True):
+        seconds, nanoseconds = divmod(round(time_s * 1e9), 1_000_000_000)
+        points.append(
+            {
+                "positions": np.round(joints, 7).tolist(),
+                "velocities": np.round(speed, 6).tolist(),
+                "time_from_start": {"sec": seconds, "nanosec": nanoseconds},
+            }
+        )
+    about = {"header": {"frame_id": frame_id}, "joint_names": list(JOINTS), "points": points}
+    return {"joint_trajectory": about}
 
 
 def _faults(motions: Motions, cell: CellConfig, sweeps: int) -> Iterator[str]:

@@ -37,7 +37,8 @@ class LiveBudget:
         self._planned, self._servo_s = planned, servo_s
         self.now: ErrorBudget | None = None
         self.worst: ErrorBudget | None = None
-        self._places: deque[tuple[int, np.ndarray]] = deque()  # of the tumor, by stamps
+        # Of the tumor's middle, by stamps
+        self._places: deque[tuple[int, Float64[np.ndarray, " 3"]]] = deque()
 
     def add_up(
         self, update: TrackingResult, part: str, tumor: Mesh, motion_mm: float, margin_mm: float
@@ -96,7 +97,7 @@ class LiveBudget:
 
     def _speed_mm_s(self, stamp_ns: int, tumor: Mesh) -> float:
         """Of the tumor's middle, over the last moments; 0 where it was not seen before."""
-        places: deque[tuple[int, Float64[np.ndarray, " 3"]]] = self._places
+        places = self._places
         if places and not 0 < stamp_ns - places[-1][0] <= 1e9 * _GAP_S:
             places.clear()
         places.append((stamp_ns, tumor.vertices_mm.mean(0)))

@@ -7,7 +7,7 @@ All in the ``table`` frame, mm: z up against gravity, its origin on the table's 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import msgspec
@@ -16,6 +16,7 @@ from jaxtyping import Float, Float64, UInt8
 
 from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError, NoPlan
+from tumortrack.core.geometry import transform_points
 from tumortrack.core.organ import organ_name
 from tumortrack.core.patient import NOBODY, Patient
 from tumortrack.core.types import FIRST_TUMOR, Mesh
@@ -77,9 +78,16 @@ def name_of(label: int) -> str:
     return f"tumor_{label - 1}"
 
 
+def organ_surface(meshes: Mapping[str, Mesh]) -> Mesh:
+    """The organ's surface; NoPlan where there is none."""
+    if (name := organ_name(meshes)) is None:
+        raise NoPlan("no organ was located, so nothing can be planned. Locate it first.")
+    return meshes[name]
+
+
 @dataclass(frozen=True, eq=False)
 class Located:
-    """Organ and tumors as located, table frame, mm.
+    """Organ and tumors as located, mm; table frame, or before they are ``moved`` the camera's.
 
     Attributes:
         points_mm, labels: the labelled cloud: label 1 organ without tumors, 2, 3, ... tumors.
@@ -88,6 +96,7 @@ class Located:
             is least sure; left out where the estimate has none.
         margin: what margins the estimate states (``models.margins``).
         structures: further surfaces that were carried along, closed or open.
+        doubt: why the estimate is poor; empty: it is good.
     """
 
     points_mm: Float[np.ndarray, "n 3"]
@@ -98,6 +107,16 @@ class Located:
     patient: Patient = NOBODY
     margin: dict[str, Any] | None = None
     structures: Mapping[str, Mesh] = field(default_factory=dict)
+    doubt: str = ""
+
+    def moved(self, b_from_a: Float[np.ndarray, "4 4"]) -> Located:
+        """The same in another frame."""
+        points_mm = transform_points(b_from_a, self.points_mm)
+        meshes, structures = (
+            {name: mesh.moved(transform_points(b_from_a, mesh.vertices_mm)) for name, mesh in of}
+            for of in (self.meshes.items(), self.structures.items())
+        )
+        return replace(self, points_mm=points_mm, meshes=meshes, structures=structures)
 
     def of(self, label: int) -> Float[np.ndarray, "m 3"]:
         return self.points_mm[self.labels == label]
@@ -105,9 +124,7 @@ class Located:
     @property
     def organ(self) -> Mesh:
         """The organ's surface; NoPlan where it was not located."""
-        if (name := organ_name(self.meshes)) is None:
-            raise NoPlan("no organ was located, so nothing can be planned. Locate it first.")
-        return self.meshes[name]
+        return organ_surface(self.meshes)
 
     @property
     def tumors(self) -> tuple[int, ...]:

@@ -164,9 +164,7 @@ def margins_of(
     groups, joined = _grouped(accepted["calibrate"], _ALONE * least)
     shells: list[Shells] = []
     for confidence in sorted(confidences):
-        radii = {}
-        for kind in kinds:
-            radii[kind] = _radius(groups, kind, forms[kind], confidence)
+        radii = {kind: _radius(groups, kind, forms[kind], confidence) for kind in kinds}
         shells.append(Shells(confidence=confidence, radii=radii))
     tested, last = accepted["test"], shells[-1].radii[kinds[0]]
     least = conformal.least_tested(1 - highest, _ERROR, misses=1)
@@ -265,8 +263,11 @@ def _tested(
     for rules in sequences:
         answers = [[row for row in rows if _accepted(row, limits)] for limits in rules]
         tables = [
-            {name: (_beyond(of, kind, widest_mm), len(of)) for name, of in groups.items()}
-            for groups in (_grouped(taken, least)[0] for taken in answers)
+            {
+                name: (sum(row.score(kind) > widest_mm for row in of), len(of))
+                for name, of in _grouped(taken, least)[0].items()
+            }
+            for taken in answers
         ]
         number = conformal.loosest_rule([[*one.values()] for one in tables], risk, _ERROR)
         if number is not None:
@@ -281,10 +282,6 @@ def _tested(
             "lower --confidence."
         )
     return max(held, key=itemgetter(0))[1]
-
-
-def _beyond(rows: Sequence[Row], kind: Kind, widest_mm: float) -> int:
-    return sum(row.score(kind) > widest_mm for row in rows)
 
 
 def _misses(rows: Sequence[Row], kind: Kind, radius: Radius) -> int:

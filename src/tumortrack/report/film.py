@@ -57,16 +57,13 @@ def film(
 
     Seen obliquely from the front: whatever has a slash in its name (an arm's parts) is in the
     picture in all frames; in the corner the organ from near by. The same frames give the same
-    bytes; frames that look the same are one that lasts longer.
+    bytes; frames that look the same are one that lasts longer. Raises InputError: no frame, nothing
+    in them, or another kind of file; StorageError: the disk refused.
 
     Args:
         frames, located: table frame, mm; ``FPS`` frames a second.
         path: ``.gif``, written atomically.
         progress: called after each frame.
-
-    Raises:
-        InputError: no frame, nothing in them, or another kind of file.
-        StorageError: the disk refused.
     """
     if path.suffix.lower() != ".gif":
         raise InputError(f"{path}: a film is an animated GIF; give a name that ends in .gif.")
@@ -160,10 +157,8 @@ class _FramePainter:
     def _seen(
         self, cell: Workcell, viewpoint: Viewpoint, size: tuple[int, int]
     ) -> UInt8[np.ndarray, "h w 3"]:
-        shadowed = viewpoint is self._far  # the arms' shadows would darken the close-up
         shapes = [
-            Body(s.mesh, rgb(s.colour), s.opacity, s.published_from_shape, shadowed)
-            for s in cell.shapes
+            Body(s.mesh, rgb(s.colour), s.opacity, s.published_from_shape) for s in cell.shapes
         ]
         least_mm = _LEAST_PIXELS * viewpoint.width_mm / size[0]
         lines = [

@@ -140,10 +140,8 @@ def outward_miss(estimate: Mesh, reference: Mesh) -> float:
 
 
 def target_errors(motion: Motion, targets: Targets) -> dict[str, float]:
-    """Target registration error: how far from their true places the motion carries the targets.
-
-    Returns:
-        ``mean``, ``rms``, ``median``, ``p95`` and ``max`` in mm, and ``count`` (of targets).
+    """Target registration error: how far from their true places the motion carries the targets;
+    ``mean``, ``rms``, ``median``, ``p95`` and ``max`` in mm, and ``count`` (of targets).
 
     Source: Fitzpatrick & West 2001, "The distribution of target registration error in rigid-body
     point-based registration", doi 10.1109/42.952729.

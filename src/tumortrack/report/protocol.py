@@ -44,18 +44,15 @@ def evaluate_scenes(
 ) -> dict[str, Any]:
     """Evaluate ``locate`` on every scene of a folder.
 
-    Writes OUT/scenes/NAME.png, OUT/index.html and, last, OUT/report.json (each atomically; a
-    report that lies there is replaced).
+    Writes OUT/scenes/NAME.png, OUT/index.html and, last, OUT/report.json (each atomically; a report
+    that lies there is replaced). Raises InputError: no scenes, or a scene that cannot be read;
+    StorageError: the disk refused.
 
     Args:
         locate: observed cloud (camera frame, mm) -> estimate; raises NoEstimate or InputError
             where it can say nothing, which counts as a failed scene.
         progress: called after each scene.
         about: plain JSON that the report repeats: the model and options behind ``locate``.
-
-    Raises:
-        InputError: no scenes, or a scene that cannot be read.
-        StorageError: the disk refused.
     """
     folders = list_scenes(scenes_dir)
     with writing(out):
@@ -152,8 +149,7 @@ def summarise(entries: list[dict[str, Any]]) -> dict[str, Any]:
     found is ``RULE``.
     """
     summary: dict[str, Any] = {}
-    names = sorted({part for entry in entries for part in entry["parts"]}, key=_part_order)
-    for name in names:
+    for name in dict.fromkeys(part for entry in entries for part in entry["parts"]):
         rows = [entry["parts"][name] for entry in entries if name in entry["parts"]]
         medians = {key: _median([row.get(key, np.inf) for row in rows]) for key in DISTANCES}
         summary[name] = {
@@ -209,8 +205,3 @@ def _median(values: list[float]) -> float | None:
     ordered = np.sort(np.array(values, float))
     low, high = ordered[(len(ordered) - 1) // 2], ordered[len(ordered) // 2]
     return float((low + high) / 2) if np.isfinite(high) else None
-
-
-def _part_order(name: str) -> tuple[int, str]:
-    number = name.rpartition("_")[2]
-    return (int(number) if number.isdigit() else 0, name)

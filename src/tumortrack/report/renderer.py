@@ -1,8 +1,8 @@
 """Shaded pictures of meshes without a display: stills in mm, and the frames of a film.
 
-A z-buffer in perspective or parallel, normals that are smooth but for creases, one light, shadows
-on bodies that ask for them, and translucent bodies over the opaque ones. (matplotlib's own 3-D
-surfaces sort triangles by their middle, which shows tumors in front of the organ that hides them.)
+A z-buffer in perspective or parallel, normals that are smooth but for creases, one light, and
+translucent bodies over the opaque ones. (matplotlib's own 3-D surfaces sort triangles by their
+middle, which shows tumors in front of the organ that hides them.)
 """
 
 from __future__ import annotations
@@ -11,20 +11,19 @@ from dataclasses import dataclass
 from weakref import WeakKeyDictionary
 
 import numpy as np
+import trimesh
 from jaxtyping import Float, Float32, UInt8
 from PIL import Image
 
 from tumortrack.core.colours import Colour
-from tumortrack.core.geometry import transform_points, triangles_of
+from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import Mesh
-from tumortrack.imaging.raster import expand
-from tumortrack.report.renderer_kernels import Light, Triangles, nearest, shade
+from tumortrack.report.renderer_kernels import Triangles, nearest, shade
 
 _SHARPER = 2  # pixels drawn per pixel shown, each way: smooth edges
-_CREASE = np.cos(np.radians(40.0))  # faces that meet at a sharper angle keep their edge
+_CREASE_RAD = np.radians(40.0)  # faces that meet at a sharper angle keep their edge
 _WORLD_LIGHT = np.array([-0.42, -0.5, 1.0])  # towards it: from the left, the front and above
 _VIEW_LIGHT = np.array([-0.35, -0.55, -1.0])  # right, down, away: over the viewer's left shoulder
-_SHADOW_PIXELS = 1024
 _SAME_MM = 0.6  # a translucent surface that close over an opaque one is the same one
 _DRAWN_MM = 0.3  # a pixel of a parallel view
 _FAR_MM = 10_000.0  # the viewer of a parallel view
@@ -41,14 +40,12 @@ def rgb(colour: Colour) -> RGB:
 
 @dataclass(frozen=True, eq=False)
 class Body:
-    """A surface somewhere in the world. ``opacity``: where seen face on; edges are denser.
-    ``shadowed``: whether others cast shadows on it."""
+    """A surface somewhere in the world. ``opacity``: where seen face on; edges are denser."""
 
     mesh: Mesh
     color: RGB
     opacity: float = 1.0
     world_from_mesh: Float[np.ndarray, "4 4"] | None = None
-    shadowed: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,11 +191,10 @@ def render(
     """
     width, height = (_SHARPER * n for n in size)
     solid = _join([body for body in bodies if body.opacity >= 1])
-    light = _light(solid if solid.shadowed.any() else _join([]), viewpoint)
     picture = np.empty((height, width, 3), np.float32)
     picture[:] = np.array(backdrop)
     near = np.full((height, width), -np.inf, np.float32)
-    near = _lay(picture, near, solid, viewpoint, light, 1.0)
+    near = _lay(picture, near, solid, viewpoint, 1.0)
 
     def far_first(body: Body) -> float:
         middle = body.mesh.box_mm.mean(0)[None]
@@ -207,7 +203,7 @@ def render(
         return -float(np.linalg.norm(middle[0] - viewpoint.place_mm))
 
     for body in sorted((body for body in bodies if body.opacity < 1), key=far_first):
-        _lay(picture, near, _join([body]), viewpoint, light, body.opacity)
+        _lay(picture, near, _join([body]), viewpoint, body.opacity)
     sharp = Image.fromarray(np.rint(255 * picture).astype(np.uint8))
     return np.asarray(sharp.reduce(_SHARPER))
 
@@ -227,7 +223,6 @@ def _join(bodies: list[Body]) -> Triangles:
         np.concatenate(corners).astype(np.float32),
         np.concatenate(normals),
         np.repeat(colors, each, axis=0),
-        np.repeat(np.array([body.shadowed for body in bodies], bool), each),
     )
 
 
@@ -235,47 +230,23 @@ _NORMALS: WeakKeyDictionary[Mesh, np.ndarray] = WeakKeyDictionary()  # a link's 
 
 
 def corner_normals(mesh: Mesh) -> Float32[np.ndarray, "f 3 3"]:
-    """Unit normal at each face's corners: the mean of the faces about the same place that make no
-    crease with this one, weighted by their areas."""
+    """Unit normal at each face's corners: the mean of the faces about the same place, but for those
+    beyond a crease."""
     if (known := _NORMALS.get(mesh)) is not None:
         return known
-    area = triangles_of(mesh.vertices_mm, mesh.faces)[1]
-    unit = area / np.maximum(np.linalg.norm(area, axis=1, keepdims=True), 1e-12)
-    _, place = np.unique(mesh.vertices_mm, axis=0, return_inverse=True)
-    corner = place.reshape(-1)[mesh.faces].reshape(-1)
-    order = np.argsort(corner, kind="stable")
-    first = np.searchsorted(corner[order], np.arange(corner.max(initial=-1) + 2))
-    mine, n = expand(np.diff(first)[corner])  # every corner with every face about its place
-    other = order[first[corner[mine]] + n] // 3
-    smooth = (unit[mine // 3] * unit[other]).sum(1) >= _CREASE
-    smooth |= other == mine // 3
-    mine, other = mine[smooth], other[smooth]
-    sums = [np.bincount(mine, area[other, axis], len(corner)) for axis in range(3)]
-    normals = np.stack(sums, axis=1).reshape(-1, 3, 3)
-    normals = normals / np.maximum(np.linalg.norm(normals, axis=2, keepdims=True), 1e-12)
-    _NORMALS[mesh] = normals.astype(np.float32)
-    return _NORMALS[mesh]
-
-
-def _light(triangles: Triangles, viewpoint: Viewpoint) -> Light:
-    """The light, and what stands in its way around the middle of the picture."""
-    across = np.cross([0.0, 1.0, 0.0], viewpoint.light)
-    across /= np.linalg.norm(across)
-    down = np.cross(viewpoint.light, across)
-    axes = np.stack([across, down, viewpoint.light]).astype(np.float32)
-    target_mm = viewpoint.place_mm + viewpoint.distance_mm * viewpoint.axes[2]
-    pixel_mm = 1.6 * viewpoint.width_mm / _SHADOW_PIXELS
-    middle = axes[:2] @ target_mm.astype(np.float32)
-    corner = (middle - pixel_mm * _SHADOW_PIXELS / 2).astype(np.float32)
-    seen = triangles.corners @ axes.T
-    seen[..., :2] = (seen[..., :2] - corner) / pixel_mm
-    near, _ = nearest(seen, _SHADOW_PIXELS, _SHADOW_PIXELS, np.inf, False)
-    return Light(axes, viewpoint.up.astype(np.float32), near, corner, pixel_mm)
+    joined = trimesh.Trimesh(mesh.vertices_mm, mesh.faces)  # corners at the same place are one
+    smooth = trimesh.graph.smooth_shade(joined, _CREASE_RAD, facet_minarea=None)
+    alone = [np.arange(len(mesh.faces))]  # where no face has a neighbour
+    order = smooth.metadata.get("original_components", alone)
+    normals = np.empty((len(mesh.faces), 3, 3), np.float32)
+    normals[np.concatenate(order)] = smooth.vertex_normals[smooth.faces]
+    _NORMALS[mesh] = normals
+    return normals
 
 
 def _lay(
     picture: Float32[np.ndarray, "h w 3"], below: Float32[np.ndarray, "h w"],
-    triangles: Triangles, viewpoint: Viewpoint, light: Light, opacity: float,
+    triangles: Triangles, viewpoint: Viewpoint, opacity: float,
 ) -> Float32[np.ndarray, "h w"]:  # fmt: skip
     """Paint them where nothing in ``below`` is nearer; returns their nearness (-inf: nothing)."""
     size = picture.shape[1], picture.shape[0]
@@ -286,6 +257,7 @@ def _lay(
     near, winner = nearest(seen, *size, limit, perspective)
     one_mm = near**2 if perspective else np.float32(1.0)  # of nearness
     winner[near - _SAME_MM * one_mm <= below] = -1
+    light = viewpoint.light.astype(np.float32), viewpoint.up.astype(np.float32)
     eye = viewpoint.place_mm.astype(np.float32), perspective
     shade(picture, winner, seen, triangles, light, eye, opacity)
     return near

@@ -5,31 +5,17 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float32
+from jaxtyping import Float32
 
 from tumortrack.core.compiled import numba
 
-_SHADOW_BIAS = 4.0  # pixels of the shadow's picture: a surface doesn't shade itself
-
 
 class Triangles(NamedTuple):
-    """Of many bodies, world frame, mm: each one's corners, their normals, its colour, and whether
-    others cast shadows on it."""
+    """Of many bodies, world frame, mm: each one's corners, their normals, and its colour."""
 
     corners: Float32[np.ndarray, "t 3 3"]
     normals: Float32[np.ndarray, "t 3 3"]
     colors: Float32[np.ndarray, "t 3"]
-    shadowed: Bool[np.ndarray, " t"]
-
-
-class Light(NamedTuple):
-    """A light, and what it sees: how far up towards it each pixel's first surface lies."""
-
-    axes: Float32[np.ndarray, "3 3"]  # rows: across, down, towards the light
-    up: Float32[np.ndarray, " 3"]  # where the rest of the light comes from
-    near: Float32[np.ndarray, "s s"]
-    corner: Float32[np.ndarray, " 2"]  # of its first pixel, mm along across and down
-    pixel_mm: float
 
 
 @numba.njit(cache=True, nogil=True)
@@ -105,24 +91,13 @@ def _dot(one, two):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def _dark(spot, light):  # type: ignore[no-untyped-def]
-    """Whether something lies between this place and the light."""
-    axes, step = light.axes, light.pixel_mm
-    u, v = _dot(axes[0], spot) - light.corner[0], _dot(axes[1], spot) - light.corner[1]
-    column, row = int(np.rint(u / step)), int(np.rint(v / step))
-    side = light.near.shape[0]
-    if not (0 <= column < side and 0 <= row < side):
-        return False
-    return light.near[row, column] > _dot(axes[2], spot) + _SHADOW_BIAS * step
-
-
-@numba.njit(cache=True, nogil=True)
 def shade(picture, winner, seen, triangles, light, eye, opacity):  # type: ignore[no-untyped-def]
     """Lay each pixel's triangle (-1: none) over what is there; a diffuse light, a little gloss.
 
-    Seen as in ``nearest``; the eye is a place and whether it sees in perspective.
+    Seen as in ``nearest``; the light is a direction towards it and one where the rest of the light
+    comes from; the eye is a place and whether it sees in perspective.
     """
-    (place, perspective), sun = eye, light.axes[2]
+    (place, perspective), (sun, up) = eye, light
     for y in range(winner.shape[0]):
         for x in range(winner.shape[1]):
             t = winner[y, x]
@@ -137,13 +112,11 @@ def shade(picture, winner, seen, triangles, light, eye, opacity):  # type: ignor
             toward = _dot(normal, view) * far * scale
             scale = scale if toward >= 0 else -scale  # of a surface seen from behind
             lit, gloss = max(_dot(normal, sun) * scale, 0.0), 0.0
-            if lit > 0 and triangles.shadowed[t] and _dark(spot, light):
-                lit = 0.0
-            elif lit > 0:  # about the direction half way between the light and the viewer
+            if lit > 0:  # about the direction half way between the light and the viewer
                 half = (sun[0] + view[0] * far, sun[1] + view[1] * far, sun[2] + view[2] * far)
                 gloss = _dot(normal, half) * scale / np.sqrt(_dot(half, half))
                 gloss = 0.16 * max(gloss, 0.0) ** 40
-            strength = 0.46 + 0.1 * _dot(normal, light.up) * scale + 0.5 * lit
+            strength = 0.46 + 0.1 * _dot(normal, up) * scale + 0.5 * lit
             slant = 1 - abs(toward)
             cover = opacity + (1 - opacity) * 0.75 * slant * slant
             for d in range(3):

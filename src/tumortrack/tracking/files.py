@@ -11,7 +11,7 @@ from tumortrack.core.estimate import Estimate
 from tumortrack.core.mesh_files import write_mesh
 from tumortrack.core.organ import is_tumor
 from tumortrack.imaging.nifti import write_nifti
-from tumortrack.imaging.segmentation import segments, write_seg_nrrd
+from tumortrack.imaging.segmentation_files import segments, write_seg_nrrd
 from tumortrack.models.margins import stated_radius
 from tumortrack.sense.ply import write_cloud_ply
 from tumortrack.tracking.points import PointTable, camera_table

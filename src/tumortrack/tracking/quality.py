@@ -60,22 +60,23 @@ def judged(
 
     Poor is an estimate that fits the points worse than usual in validation, through which the
     camera sees, that lies where a cloud has no points, that lacks a tumor, or that says itself that
-    a tumor's place is unsure. Good means no more than that none holds.
+    a tumor's place is unsure. Good means no more than that none holds. Raises NoEstimate: a depth
+    image sees through so much of it that the organ cannot lie there. Clouds refuse nothing: they
+    may be joined from several views.
 
     Args:
         seen: all that the camera saw, not the organ's points alone, where it is known.
         strictly: the fit must be no worse than usual, whatever the camera sees round the organ.
         others: more looks at it; the one that says most against the estimate counts.
-
-    Raises:
-        NoEstimate: a depth image sees through so much of it that the organ cannot lie there. Clouds
-            refuse nothing: they may be joined from several views.
     """
     organ = next(iter(estimate.meshes.values()))
     views, looks = [(organ, seen)], estimate.report.get("looks")
     if looks is not None:
         before = zip(others, looks["camera_from_look"][1:], strict=True)
-        views += [(_before(organ, pose), one.seen) for one, pose in before]
+        for one, camera_from_look in before:
+            look_from_camera = np.linalg.inv(np.array(camera_from_look))
+            there_mm = transform_points(look_from_camera, organ.vertices_mm)
+            views.append((organ.moved(there_mm), one.seen))
     by_image = [seen_through(there, view) for there, view in views if isinstance(view, DepthFrame)]
     clouds = [cloud_shares(there, view) for there, view in views if isinstance(view, SensorCloud)]
     unseen = max((share for _, share in clouds), default=0.0)
@@ -104,12 +105,6 @@ def judged(
     quality: Quality = "poor" if reason else "good"
     estimate.report["quality"] = {"verdict": quality, "reason": reason}
     return replace(estimate, quality=quality, reason=reason)
-
-
-def _before(organ: Mesh, camera_from_look: Sequence[Sequence[float]]) -> Mesh:
-    """The organ's surface in a further look's frame."""
-    look_from_camera = np.linalg.inv(np.array(camera_from_look))
-    return organ.moved(transform_points(look_from_camera, organ.vertices_mm))
 
 
 def unless_hidden(estimate: Estimate, last: Estimate) -> Estimate:

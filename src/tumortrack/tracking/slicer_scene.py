@@ -36,10 +36,8 @@ _File = tuple[str, str, bytes]  # kind of node that reads it, name, content
 
 def centre_label(report: dict[str, Any], name: str, poor: bool) -> str:
     """How people read a tumor's centre: its name and, as far as it is known, how sure it is."""
-    radius, std_mm = (
-        stated_radius(report.get("margin"), name),
-        report["parts"][name].get("center_std_mm"),
-    )
+    radius = stated_radius(report.get("margin"), name)
+    std_mm = report["parts"][name].get("center_std_mm")
     said = [f"{name} POOR" if poor else name] + ([] if std_mm is None else [f"std {std_mm:.1f} mm"])
     return ", ".join([*said, radius.words if radius else "no margin stated"])
 

@@ -14,8 +14,8 @@ from tumortrack.core.mesh_files import read_mesh
 from tumortrack.core.types import Anatomy, Mesh, Volume
 from tumortrack.imaging.case import Case
 from tumortrack.imaging.grid import grown_box, moved_origin, voxel_ml
+from tumortrack.imaging.hu_windows import segment_ct
 from tumortrack.imaging.raster import voxelise
-from tumortrack.imaging.segment import segment_ct
 from tumortrack.imaging.surface import surfaces
 from tumortrack_experiment.kit_file import Kit
 from tumortrack_experiment.register.in_ct import Ball

@@ -26,7 +26,7 @@ from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import Anatomy, OccupancyCloud
 from tumortrack.models.margins import NAME, read_margins
 from tumortrack.plan.budget import ErrorBudget, plan_within, planned_budget
-from tumortrack.plan.located import located
+from tumortrack.plan.located import of_estimate
 from tumortrack.plan.values import Located, ResectionConfig, ResectionPlan
 from tumortrack.plan.values import Method as PlanMethod
 from tumortrack.registration.locator import QUERIES
@@ -200,8 +200,7 @@ def cut_one(
     except (NoEstimate, InputError) as error:
         refused = {"refused": str(error)}
         return [{"tumor": name, "planner": p.name, **refused} for name in tumors for p in planners]
-    found = located(estimate.cloud, estimate.meshes, estimate.motion, table_from_camera)
-    found = replace(found, margin=estimate.report.get("margin"))
+    found = of_estimate(estimate).moved(table_from_camera)
     about = {"good": estimate.quality == "good"}
     return [
         {"tumor": name, "planner": p.name, **about, **_planned_and_cut(true, found, p, name)}

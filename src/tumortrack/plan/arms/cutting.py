@@ -163,12 +163,17 @@ class Surroundings:
     def __init__(self, organ: Mesh, config: CellConfig, plan: ResectionPlan) -> None:
         self._solid = solid_of(organ, "the organ's surface")
         self._layers, self._grasp_mm, self._config = plan.layers, plan.grasp_mm, config
-        # A plan asks for the same few heights again and again.
+        electrode_mm = ELECTRODE_RADIUS_MM + config.contact_mm
+        # A little less than what collides: the exact test comes later.
+        pencil_mm = 0.8 * (PENCIL_RADIUS_MM + config.organ_clearance_mm)
+        pencil_cup_mm = PENCIL_RADIUS_MM + config.clearance_mm
+        clear_cup_mm = ELECTRODE_RADIUS_MM + config.clearance_mm + 1.0
+        # By height; a plan asks for the same few again and again.
         self._organ = cache(self._section)
         self._healthy = cache(self._without_piece)
-        self._bars_electrode = cache(self._electrode_obstacle)
-        self._bars_pencil = cache(self._pencil_obstacle)
-        self._not_clear = cache(self._within_clearance)
+        self._bars_electrode = cache(lambda z: self._cup(z, electrode_mm))
+        self._bars_pencil = cache(lambda z: self._near(z, pencil_mm, pencil_cup_mm))
+        self._not_clear = cache(lambda z: self._near(z, _CLEAR_MM, clear_cup_mm))
 
     def depth_mm(self, point_mm: Float64[np.ndarray, " 3"]) -> float:
         """How much organ there is straight above a point."""
@@ -232,18 +237,6 @@ class Surroundings:
         heights = (height_mm - organ_mm, height_mm, height_mm + organ_mm)
         organ = shapely.union_all([self._organ(h) for h in heights]).buffer(organ_mm, 4)
         return shapely.union(organ, self._cup(height_mm, cup_mm))
-
-    def _electrode_obstacle(self, height_mm: float) -> Any:
-        return self._cup(height_mm, ELECTRODE_RADIUS_MM + self._config.contact_mm)
-
-    def _pencil_obstacle(self, height_mm: float) -> Any:
-        # A little less than what collides: the exact test comes later.
-        margin = 0.8 * (PENCIL_RADIUS_MM + self._config.organ_clearance_mm)
-        return self._near(height_mm, margin, PENCIL_RADIUS_MM + self._config.clearance_mm)
-
-    def _within_clearance(self, height_mm: float) -> Any:
-        around = ELECTRODE_RADIUS_MM + self._config.clearance_mm
-        return self._near(height_mm, _CLEAR_MM, around + 1.0)
 
 
 @dataclass(frozen=True, eq=False)

@@ -127,14 +127,12 @@ def connect(
     rng: np.random.Generator | None = None,
     detours: Sequence[Float64[np.ndarray, "c d"]] = (),
 ) -> Float64[np.ndarray, "m d"]:
-    """A smooth path of the moving joints from where they are to a goal.
+    """A smooth path of the moving joints from where they are to a goal. Raises Blocked: start or
+    goal collide, or no path was found.
 
     Args:
         rng: for the search; None: only the straight path and the detours are tried.
         detours: corners of paths to try before a search, in joint space.
-
-    Raises:
-        Blocked: start or goal collide, or no path was found.
     """
     start_rad = group.current_rad
     for place, joints in (("where it is", start_rad), ("where it should go", goal_rad)):

@@ -49,7 +49,8 @@ def plan_motions(
     from_sweep: int | None = None,
     seed: int = 0,
 ) -> Motions:
-    """Both arms through the whole procedure; the same every time.
+    """Both arms through the whole procedure; the same every time. Raises NoPlan: a place out of
+    reach, or a collision that could not be avoided, and what to do; InputError: an invalid start.
 
     Args:
         organ: the whole organ as it lies now, closed, table frame, mm.
@@ -57,10 +58,6 @@ def plan_motions(
             leaves straight back.
         from_sweep: the grasper holds already and stays where it is; begin with this sweep, counted
             from 1; one more than there are: release and go home.
-
-    Raises:
-        NoPlan: a place out of reach, or a collision that could not be avoided, and what to do.
-        InputError: an invalid start.
     """
     cell = cell if cell.organ is organ else ArmCell(cell.config, organ)
     start = cell.home_rad if start_rad is None else np.array(start_rad, float)
@@ -198,19 +195,13 @@ def _go_home(builder: TrajectoryBuilder) -> None:
 def search_bases(
     plan: ResectionPlan, config: CellConfig, organ: Mesh, seed: int = 0
 ) -> tuple[ArmCell, Motions, str]:
-    """The motions from where the arms stand, or else from elsewhere round the table.
+    """The motions from where the arms stand, or else from elsewhere round the table; the workcell
+    that they are for, with the organ; and a note for the user on what was changed, empty: nothing.
 
     A small fixed grid of places for both bases, on their pedestals and facing as they do: first
     those within reach of every stroke, near to where the arms stand now; then the first for which
-    the whole procedure can be planned.
-
-    Returns:
-        The workcell (with the organ), the motions, and a note for the user on what was changed:
-        empty where nothing was.
-
-    Raises:
-        NoPlan: no place will do; the reason is the one for the places where the arms stand now.
-    """
+    the whole procedure can be planned. Raises NoPlan: no place will do; the reason is the one for
+    the places where the arms stand now."""
     cell = ArmCell(config, organ)
     try:
         return cell, plan_motions(plan, cell, organ, seed=seed), ""

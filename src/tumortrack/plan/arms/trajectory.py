@@ -118,13 +118,11 @@ def along(
     tip_mm: Float64[np.ndarray, "m 3"] | None = None,
     tip_mm_s: float = 0.0,
 ) -> Timed:
-    """Times from 0 and joints (n, d) along a path, at rest at both ends.
+    """Times from 0 and joints (n, d) along a path, at rest at both ends. Raises Blocked: no such
+    motion (the path has a kink that can't be taken).
 
     Args:
         tip_mm: where the tip is at each point; its speed stays below ``tip_mm_s``.
-
-    Raises:
-        Blocked: no such motion (the path has a kink that can't be taken).
     """
     import toppra
     from toppra import constraint

@@ -8,7 +8,7 @@ from imaging_objects import kidney_labels
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import LabelVolume, Volume
 from tumortrack.imaging.grid import label_counts, voxel_ml
-from tumortrack.imaging.segment import segment_ct
+from tumortrack.imaging.hu_windows import segment_ct
 from tumortrack.imaging.select import select_labels
 from tumortrack.imaging.surface import surfaces
 

@@ -48,7 +48,6 @@ _LESIONS = {
 }
 _TUMOR = re.compile("tumou?r|lesion|cancer|carcinoma|mass")
 _SAME_MM = 0.01  # of the label map's grid
-Names = dict[str, tuple[int, ...]]  # a structure's numbers in a label map
 # Where the organ is, and where its tumors are; None: the tool knows none.
 Masks = tuple[Bool[np.ndarray, "i j k"], Bool[np.ndarray, "i j k"] | None]
 
@@ -72,15 +71,13 @@ class Tool:
 
 
 def segmented_case(ct: Path, spec: str, options: PrepareOptions, keep: Path) -> Case:
-    """A case of a CT that a tool segments; its output goes to this process's.
+    """A case of a CT that a tool segments; its output goes to this process's. Raises InputError: an
+    unknown tool, one that is not installed or lacks its weights, one that fails or finds no such
+    organ; and as ``prepare``.
 
     Args:
         spec: totalsegmentator, totalsegmentator:TASK, nnunet:FOLDER or monai:BUNDLE.
         keep: file for the label map in our numbers; it must not exist.
-
-    Raises:
-        InputError: an unknown tool, one that is not installed or lacks its weights, one that
-            fails or finds no such organ; and as ``prepare``.
     """
     refuse_unused("--segment makes the labels", options, *OF_LABELS)
     if keep.exists():
@@ -192,6 +189,8 @@ def _totalsegmentator(task: str, organ: str) -> Tool:
 
 
 def _nnunet(model: Path, organ: str) -> Tool:
+    import torch
+
     program = _program("nnUNetv2_predict_from_modelfolder", "nnunetv2")
     dataset = _json(model / "dataset.json", "nnunet")
     folds = sorted(file.parent for file in model.glob("fold_*/checkpoint_final.pth"))
@@ -203,10 +202,10 @@ def _nnunet(model: Path, organ: str) -> Tool:
     channels, ending = dataset.get("channel_names", {}), dataset.get("file_ending")
     if len(channels) != 1 or ending != ".nii.gz":
         raise InputError(f"{model} takes {channels} as {ending}; what we have is one CT, .nii.gz.")
-    names = _names(dataset.get("labels", {}), model)
-    chosen = _chosen(names, organ, model)
+    chosen = _chosen(dataset.get("labels", {}), organ, model)
+    device = "cuda" if torch.cuda.is_available() else "cpu"
     command = (
-        *(program, "-i", "in", "-o", "out", "-m", str(model), "-device", _device()),
+        *(program, "-i", "in", "-o", "out", "-m", str(model), "-device", device),
         *("-npp", "1", "-nps", "1", "-f", *(fold.name.removeprefix("fold_") for fold in folds)),
     )
     weights = (model / "dataset.json", model / "plans.json", *folds)
@@ -227,7 +226,7 @@ def _monai(bundle: Path, organ: str) -> Tool:
         names = {str(name): int(number) for number, name in said.items()}
     except (KeyError, ValueError, AttributeError) as error:
         raise InputError(f"{bundle}: metadata.json does not name its labels ({error}).") from error
-    chosen = _chosen(_names(names, bundle), organ, bundle)
+    chosen = _chosen(names, organ, bundle)
     config = next((bundle / "configs").glob("inference.*"), bundle / "configs" / "inference.json")
     command = (
         *(sys.executable, "-m", "monai.bundle", "run", "--config_file", str(config)),
@@ -243,19 +242,16 @@ def _json(path: Path, kind: str) -> dict[str, Any]:
     return store.read_json(path)
 
 
-def _names(labels: dict[str, Any], where: Path) -> Names:
-    """Numbers by name; a region (nnU-Net) has several."""
+def _chosen(labels: dict[str, Any], organ: str, where: Path) -> tuple[list[int], list[int]]:
+    """The organ's numbers and the tumors', by the names of labels; a region (nnU-Net) has several
+    numbers."""
     try:
-        return {
+        names = {
             name.lower(): tuple(numbers) if isinstance(numbers, list) else (int(numbers),)
             for name, numbers in labels.items()
         }
     except (TypeError, ValueError) as error:
         raise InputError(f"{where}: its labels {str(labels)[:200]} have no numbers.") from error
-
-
-def _chosen(names: Names, organ: str, where: Path) -> tuple[list[int], list[int]]:
-    """The organ's numbers and the tumors'."""
     mine = {organ, f"{organ}_left", f"{organ}_right", f"left_{organ}", f"right_{organ}"}
     tumors = sorted({n for name in names if _TUMOR.search(name) for n in names[name]})
     organs = sorted({n for name in mine & names.keys() for n in names[name]} - set(tumors))
@@ -286,9 +282,3 @@ def _voxels(file: Path, ct: Volume) -> np.ndarray:
     if not same or not np.allclose(raw.lps_from_index, ct.lps_from_index, atol=_SAME_MM):
         raise InputError(f"{file.name} has another grid than the CT that the tool was given.")
     return np.rint(raw.array).astype(np.int64)
-
-
-def _device() -> str:
-    import torch
-
-    return "cuda" if torch.cuda.is_available() else "cpu"

@@ -43,20 +43,14 @@ def segment_ct(
     min_tumor_ml: float = MIN_TUMOR_ML,
     kind: Organ = KIDNEY,
 ) -> tuple[LabelVolume, list[str]]:
-    """Segment a phantom's CT by HU windows (half open, [low, high)), as in the paper.
+    """Segment a phantom's CT by HU windows (half open, [low, high)), as in the paper: labels 1
+    organ, 2, 3, ... tumors by volume, cropped round the organ; and notes.
 
-    Table, registration block, air and specks are dropped: see ``_find_organ``. A piece
-    of the tumor window counts as a tumor when parenchyma fills at least 8 % of the shell 3 mm
-    about it (a block beside the phantom has none: its own rim is too thin to be parenchyma).
-    The rim between an exophytic tumor and air falls into the organ's window by partial volume;
-    where it is thinner than 2.4 mm (at least three voxels) it is given to the tumor.
-
-    Returns:
-        Labels 1 organ, 2, 3, ... tumors by volume, cropped round the organ; and notes.
-
-    Raises:
-        InputError: unusable windows, or no body like an organ (a patient's CT).
-    """
+    Table, registration block, air and specks are dropped: see ``_find_organ``. A piece of the tumor
+    window with little parenchyma about it is no tumor but a block beside the phantom, whose own rim
+    is too thin to be parenchyma. The rim between an exophytic tumor and air falls into the organ's
+    window by partial volume; where it is thin it is given to the tumor. Raises InputError: unusable
+    windows, or no body like an organ (a patient's CT)."""
     limits = (*organ_hu, *tumor_hu)
     if not (np.isfinite(limits).all() and organ_hu[0] < organ_hu[1] <= tumor_hu[0] < tumor_hu[1]):
         raise InputError(
@@ -117,11 +111,14 @@ def _tumors_of(
         tumors.append(whole)
     notes = []
     if small:
-        text = f"{len(small)} bright pieces below {min_tumor_ml:g} ml became organ"
-        notes.append(f"{text} (largest {max(small):.3f} ml)")
+        notes.append(
+            f"{len(small)} bright pieces below {min_tumor_ml:g} ml became organ (largest "
+            f"{max(small):.3f} ml)"
+        )
     if beside:
-        text = f"{len(beside)} bright pieces beside the organ dropped"
-        notes.append(f"{text} (largest {max(beside):.1f} ml)")
+        notes.append(
+            f"{len(beside)} bright pieces beside the organ dropped (largest {max(beside):.1f} ml)"
+        )
     if not tumors:
         notes.append("no tumor found in this organ")
     organ = ndimage.binary_fill_holes(components(organ)[0] == 1)
@@ -159,14 +156,10 @@ def _find_organ(
     """The voxels of ``solid`` that belong to the one body like an organ; ``dense`` is its part in
     the tumor window.
 
-    The rule, on cells of about 1.5 mm: erode by 3 mm, then by up to 15 mm, until a piece stands
-    alone that, grown back and cut from its neighbours at the narrowest place (watershed of the
-    distance to the background), has 20 to 1000 ml, is 15 to 220 mm long in every direction (other
-    organs than kidneys: 10 to 4000 ml, up to 400 mm),
-    fills two thirds of its convex hull, does not touch the scan's edge, is mostly organ window
-    and was cut along at most a quarter of its surface, and is no sheet (shortest over longest
-    principal spread above 0.28). The largest such piece is the organ; a deeper cut replaces it
-    only where that frees it of a sheet. Attached sheets thinner than 6 mm are removed.
+    On coarse cells: erode by little, then by more, until a piece stands alone that, grown back and
+    cut from its neighbours at the narrowest place (watershed of the distance to the background),
+    is like an organ (``_is_organ``). The largest such piece is the organ; a deeper cut replaces it
+    only where that frees it of a sheet. Thin sheets that are attached to it are removed.
     """
     from skimage.measure import block_reduce
 

@@ -113,14 +113,12 @@ def write_seg_nrrd(
     lps_from_index: Float[np.ndarray, "4 4"],
     parts: Sequence[Segment],
 ) -> None:
-    """Write labels as one layer of segments, gzip; all bytes follow from the arguments.
+    """Write labels as one layer of segments, gzip; all bytes follow from the arguments. Raises
+    StorageError: the disk refused; an older file is untouched.
 
     Args:
         lps_from_index: index -> LPS mm. Labels before the camera: their camera frame, which Slicer
             then shows as if it were the patient's.
-
-    Raises:
-        StorageError: the disk refused; an older file is untouched.
     """
     columns = ["(" + ",".join(repr(float(n)) for n in c) + ")" for c in lps_from_index[:3].T]
     lines = [
@@ -167,20 +165,15 @@ def write_dicom_seg(
     patient: Patient = NOBODY,
 ) -> tuple[str, ...]:
     """Write ``labels`` as a binary segmentation on the slices in ``folder``: viewers overlay it.
+    Returns notes on what else was in the folder.
+    Raises InputError: no such series; another patient's; another grid; slices that lack what a
+    segmentation must repeat; highdicom is not installed; StorageError: the disk refused.
 
     Args:
         parts: as many as there are labels, in their order.
         folder, series: the CT, as for ``read_dicom``. It need not be what the labels were made
             from, but their voxels must coincide (axes may be turned or run the other way).
         patient: whose labels these are.
-
-    Returns:
-        Notes on what else was in the folder.
-
-    Raises:
-        InputError: no such series; another patient's; another grid; slices that lack what a
-            segmentation must repeat; highdicom is not installed.
-        StorageError: the disk refused.
     """
     import pydicom
 
