@@ -32,11 +32,10 @@ from tumortrack.simulate.scene import SceneStream
 from tumortrack.simulate.scene_folder import draw_targets
 from tumortrack.tracking.tracker import Follower, FollowerConfig, Tracker
 from tumortrack.training.model import load_model
-from tumortrack.training.presets import PRESETS, pretraining
-from tumortrack.training.pretrain import kidney_stream
-from tumortrack.training.state import Pretraining
+from tumortrack.training.presets import PRESETS
 from tumortrack.training.task import task_of
 from tumortrack.training.train import TrainingRun, train
+from tumortrack_lab.pretraining.pretrain import KidneyStream, Pretraining, pretraining
 from tumortrack_lab.twin.dataset import StateCache, TwinRun
 from tumortrack_lab.twin.views import VIEWS, ViewConfig, make_scene
 
@@ -151,7 +150,7 @@ def batch(made: Any) -> Entries:
 
 def pretrain() -> Entries:
     config = msgspec.structs.replace(pretraining(), batch_size=2)
-    kidneys = kidney_stream(Pretraining(config, anatomies=1, steps=1))
+    kidneys = KidneyStream(Pretraining(config, anatomies=1, steps=1))
     yield from under("scene", batch(kidneys.batch(1)))
     command("pretrain", "start", "--anatomies", 1, "--steps", 3, "--workers", 0, *CPU)
     yield from under("weights", files("start", "*"))
