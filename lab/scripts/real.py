@@ -84,12 +84,7 @@ class Organ:
 
     def by_kind(self, rows: list[dict]) -> list[dict]:
         """The rows, and of each tumor its kind."""
-        organ, *tumors = self.case.anatomy.parts
-        kinds = [kidneys.kind_of(kidneys.outer_share(tumor, organ)) for tumor in tumors]
-        for row in rows:
-            for tumor, kind in zip(row["tumors"], kinds, strict=False):
-                tumor["kind"] = kind
-        return rows
+        return kidneys.with_kinds(rows, self.case.anatomy)
 
     def tracker(self) -> Tracker:
         return Tracker(api.load_model(self.model_folder, "cpu"))

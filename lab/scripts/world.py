@@ -128,7 +128,7 @@ def _plans(options: Options, world: World, model: Path, made: list[str]) -> str:
     for name, method in product(made, (resection.calibrated(model), resection.truth())):
         variant, _, view = name.rpartition("-")
         about = case, method, [variant], view, 160, options.out / "plans" / name
-        rows += measured(*about, resection.cut_in_world, **resection.cutting())
+        rows += measured(*about, resection.cut_one, **resection.cutting())
         say(f"planned {name} ({method.name})")
     good = {row["variant"] for row in rows if row.get("good")}
     for row in rows:
