@@ -23,7 +23,7 @@ from tumortrack.cli.console import say
 from tumortrack.core.errors import TumortrackError
 from tumortrack.phantom.digital import PhantomParameters
 from tumortrack.training.train import TrainingStatus
-from tumortrack_lab.study import goals, tables, trainings
+from tumortrack_lab.study import goals, scripts, tables
 from tumortrack_lab.study.measure import measured
 from tumortrack_lab.study.methods import (
     CLINIC,
@@ -55,7 +55,7 @@ RULES: dict[Section, str] = {
 
 
 @dataclass(frozen=True, kw_only=True)
-class Options(trainings.KeptOptions):
+class Options(scripts.KeptOptions):
     """Regenerate the tables of docs/results.md."""
 
     case: tuple[str, ...] = ()
@@ -158,4 +158,4 @@ def lines() -> Callable[[str, TrainingStatus], None]:
 
 
 if __name__ == "__main__":
-    trainings.run(main, Options)
+    scripts.run(main, Options)

@@ -24,7 +24,7 @@ from tumortrack.core import store
 from tumortrack.core.config import to_builtins
 from tumortrack.core.errors import InputError, TumortrackError
 from tumortrack.tracking.tracker import Tracker
-from tumortrack_lab.study import trainings
+from tumortrack_lab.study import scripts
 from tumortrack_lab.study.document import ReportWriter
 from tumortrack_lab.study.tumor_sites import tumor_sites_of
 from tumortrack_lab.twin.dataset import claim
@@ -113,7 +113,7 @@ def _follow(options: Options, model: Path, films: list[Film]) -> None:
     for done, film in enumerate(films, start=1):
         for method in options.methods:
             judge = partial(following.judge, following.METHODS[method](tracker), film, sites)
-            rows = trainings.kept(film.folder / f"{method}.json", about, judge)
+            rows = scripts.kept(film.folder / f"{method}.json", about, judge)
             errors = pd.DataFrame(rows).reindex(columns=["center_mm"])["center_mm"]
             say(f"{done}/{len(films)} {film.folder.name}, {method}: {errors.median():.1f} mm off")
     rows = [row for out in (options.out, *options.others) for row in tables.rows_in(out)]
@@ -122,7 +122,7 @@ def _follow(options: Options, model: Path, films: list[Film]) -> None:
     store.write_atomically(options.out / "table.md", text.encode())
     print(text)
     if options.document is not None:
-        writer = ReportWriter(options.document, trainings.make_command("sequences"))
+        writer = ReportWriter(options.document, scripts.make_command("sequences"))
         plot, moving = writer.image("sequences_press"), writer.image("sequences_film")
         moving = moving.with_suffix(".gif")
         pictures.draw(found, plot)
@@ -134,4 +134,4 @@ def _follow(options: Options, model: Path, films: list[Film]) -> None:
 
 
 if __name__ == "__main__":
-    trainings.run(main, Options)
+    scripts.run(main, Options)
