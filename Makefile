@@ -11,7 +11,7 @@ UV := uv pip install --quiet --no-deps --require-hashes
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help setup debian demo test pytest test-hard check pretrained attack fuzz crash replay bench soak wheel lock licences audit results real minutes world sequences causes trust rehearsal population scaling site pictures clean
+.PHONY: help setup debian demo test pytest test-hard check pretrained attack fuzz crash replay bench soak wheel lock licences audit results real minutes world sequences trust rehearsal population scaling site pictures clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 10
@@ -99,9 +99,6 @@ world: setup  ## scenes of wider physics, noise and views, and how a model does 
 
 sequences: setup  ## an organ pressed, pushed, rolled, breathing, turned over, and how it is followed (ARGS="CASE OUT --model MODEL")
 	$(BIN)/python lab/scripts/sequences.py $(ARGS)
-
-causes: setup  ## shares of causes in the tumors' errors: fits told parts of the truth (ARGS="CASE WORLD MODEL OUT", after `make world`)
-	$(BIN)/python lab/scripts/causes.py $(ARGS)
 
 trust: setup  ## what margins are worth for physics and organs left out (ARGS="MODEL/margins.jsonl ...": an organ each)
 	$(BIN)/python lab/scripts/trust.py $(ARGS)

@@ -31,11 +31,10 @@ from tumortrack.simulate.scene import SceneStream
 from tumortrack.simulate.scene_folder import draw_targets
 from tumortrack.tracking.tracker import Follower, FollowerConfig, Tracker
 from tumortrack.training.model import load_model
-from tumortrack.training.presets import PRESETS, pretraining
-from tumortrack.training.pretrain import KidneyStream
-from tumortrack.training.state import Pretraining
+from tumortrack.training.presets import PRESETS
 from tumortrack.training.task import task_of
 from tumortrack.training.train import TrainingRun, train
+from tumortrack_lab.pretraining.pretrain import KidneyStream, Pretraining, pretraining
 from tumortrack_lab.twin.dataset import StateCache, TwinRun
 from tumortrack_lab.twin.views import VIEWS, ViewConfig, make_scene
 

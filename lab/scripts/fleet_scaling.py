@@ -31,9 +31,9 @@ from tumortrack_lab.fleet.steps import chain
 from tumortrack_lab.fleet.store import Store
 from tumortrack_lab.fleet.task import Needs, Task
 from tumortrack_lab.fleet.worker import Job, Report
-from tumortrack_lab.study import trainings
+from tumortrack_lab.study import scripts
 from tumortrack_lab.study.document import table
-from tumortrack_lab.study.trainings import KeptOptions
+from tumortrack_lab.study.scripts import KeptOptions
 
 TASK_S, EACH, DRIVEN = 0.5, 12, 10_000  # a task's length; tasks a worker; tasks of the lone driver
 # Amazon's list prices as remembered, us-east-1, on demand: c7i (0.0446 USD a vCPU and hour; two
@@ -214,4 +214,4 @@ def main(config: Scaling) -> None:
 if __name__ == "__main__":
     import fleet_scaling  # this file, by a name that workers know
 
-    trainings.run(fleet_scaling.main, fleet_scaling.Scaling)
+    scripts.run(fleet_scaling.main, fleet_scaling.Scaling)

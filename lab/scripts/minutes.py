@@ -33,7 +33,7 @@ from tumortrack.training.model import SHIPPED
 from tumortrack.training.presets import clinic
 from tumortrack_lab.real import kidneys
 from tumortrack_lab.real.judging import DRAGGED, by_tumor, judge, quantiles
-from tumortrack_lab.study import trainings
+from tumortrack_lab.study import scripts
 from tumortrack_lab.study.document import table
 from tumortrack_lab.study.methods import named_folders
 
@@ -43,7 +43,7 @@ Made = list[tuple[str, Callable[[], Scene]]]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Options(trainings.KeptOptions):
+class Options(scripts.KeptOptions):
     """Short trainings beside a whole one, on organs that no training has seen."""
 
     organs: Annotated[tuple[str, ...], tyro.conf.Positional]
@@ -122,7 +122,7 @@ def _of_length(
             found.append(row)
         return found
 
-    rows = trainings.kept(model.with_suffix(".json"), about, measure)
+    rows = scripts.kept(model.with_suffix(".json"), about, measure)
     say(f"{name}, {length} steps: {quantiles(by_tumor(rows).middle_mm)} mm")
     for row in rows:
         yield {**known, **row}
@@ -168,4 +168,4 @@ def _table(what: str, lines: pd.DataFrame, column: str) -> str:
 
 
 if __name__ == "__main__":
-    trainings.run(main, Options)
+    scripts.run(main, Options)

@@ -29,7 +29,7 @@ from tumortrack.report import drawing
 from tumortrack_lab.fleet.results import LOOK, PATIENTS, SCENES
 from tumortrack_lab.real.judging import quantiles
 from tumortrack_lab.real.kidneys import SET_ASIDE, WHERE
-from tumortrack_lab.study import trainings
+from tumortrack_lab.study import scripts
 from tumortrack_lab.study.document import ReportWriter, table
 
 DEVELOPMENT = (0, 2, 3)
@@ -74,7 +74,7 @@ def main(options: Options) -> None:
         write_atomically(options.list, "\n".join(["name,input", *lines, ""]).encode())
         say(f"{len(lines)} kidneys listed in {options.list}.")
     if options.fleet is not None:
-        writer = ReportWriter(options.document, trainings.make_command("population"))
+        writer = ReportWriter(options.document, scripts.make_command("population"))
         writer.check([BLOCK])
         image = writer.image("population")
         text = block(options.fleet, image)
@@ -204,4 +204,4 @@ def draw(scenes: pd.DataFrame, path: Path) -> None:
 
 
 if __name__ == "__main__":
-    trainings.run(main, Options)
+    scripts.run(main, Options)

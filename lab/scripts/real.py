@@ -29,7 +29,7 @@ from tumortrack.models.folder import is_finished
 from tumortrack.tracking.tracker import Tracker
 from tumortrack_lab.real import kidneys, lungs, silicone
 from tumortrack_lab.real.judging import DRAGGED, by_tumor, judge, quantiles, scene_of
-from tumortrack_lab.study import trainings
+from tumortrack_lab.study import scripts
 from tumortrack_lab.study.document import table
 from tumortrack_lab.study.methods import named_folders
 
@@ -39,7 +39,7 @@ ERRORS = "median / 90 / 95 / worst, mm"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Options(trainings.KeptOptions):
+class Options(scripts.KeptOptions):
     """Real kidneys, real deformations, and silicone."""
 
     data: Annotated[Path, tyro.conf.Positional]
@@ -84,12 +84,7 @@ class Organ:
 
     def by_kind(self, rows: list[dict]) -> list[dict]:
         """The rows, and of each tumor its kind."""
-        organ, *tumors = self.case.anatomy.parts
-        kinds = [kidneys.kind_of(kidneys.outer_share(tumor, organ)) for tumor in tumors]
-        for row in rows:
-            for tumor, kind in zip(row["tumors"], kinds, strict=False):
-                tumor["kind"] = kind
-        return rows
+        return kidneys.with_kinds(rows, self.case.anatomy)
 
     def tracker(self) -> Tracker:
         return Tracker(api.load_model(self.model_folder, "cpu"))
@@ -170,7 +165,7 @@ def _dragged(organ: Organ) -> list[dict]:
 
     folder = organ.options.out / "dragged"
     folder.mkdir(exist_ok=True)
-    return trainings.kept(folder / f"{organ.name}.json", about, measure)
+    return scripts.kept(folder / f"{organ.name}.json", about, measure)
 
 
 def lungs_block(organs: list[Organ], options: Options) -> str:
@@ -236,7 +231,7 @@ def _breathed(organ: Organ, patient: int, field, options: Options) -> list[dict]
 
     folder = options.out / "lungs"
     folder.mkdir(exist_ok=True)
-    return trainings.kept(folder / f"{organ.name}-{patient}.json", about, measure)
+    return scripts.kept(folder / f"{organ.name}-{patient}.json", about, measure)
 
 
 def _states(organ: Organ, patient: int, field: lungs.Field) -> Iterator[dict]:
@@ -338,7 +333,7 @@ def _bent(
             say(f"{name} {which}: {rows[-1]}")
         return rows
 
-    return trainings.kept(folder / "rows.json", about, measure)
+    return scripts.kept(folder / "rows.json", about, measure)
 
 
 def _bent_table(
@@ -365,4 +360,4 @@ def _bent_table(
 
 
 if __name__ == "__main__":
-    trainings.run(main, Options)
+    scripts.run(main, Options)

@@ -16,7 +16,7 @@ from tumortrack.cli.console import say
 from tumortrack_lab.rehearsal import tables
 from tumortrack_lab.rehearsal.mishaps import Mishaps
 from tumortrack_lab.rehearsal.run import Rehearsal
-from tumortrack_lab.study import trainings
+from tumortrack_lab.study import scripts
 from tumortrack_lab.study.document import ReportWriter
 
 BLOCK = "rehearsal"
@@ -60,4 +60,4 @@ def main(options: Options) -> None:
 
 
 if __name__ == "__main__":
-    trainings.run(main, Options)
+    scripts.run(main, Options)

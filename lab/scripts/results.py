@@ -23,7 +23,7 @@ from tumortrack.cli.console import say
 from tumortrack.core.errors import TumortrackError
 from tumortrack.phantom.digital import PhantomParameters
 from tumortrack.training.train import TrainingStatus
-from tumortrack_lab.study import goals, resection, tables, trainings
+from tumortrack_lab.study import goals, scripts, tables
 from tumortrack_lab.study.measure import measured
 from tumortrack_lab.study.methods import (
     CLINIC,
@@ -42,7 +42,7 @@ from tumortrack_lab.twin.views import VARIANTS
 EVERY_S = 15.0  # between lines of progress
 PHANTOMS = {"phantom": PhantomParameters(), "second_phantom": second_phantom()}
 VIEW = "noise"
-Section = Literal["accuracy", "goals", "resection"]
+Section = Literal["accuracy", "goals"]
 Rows = list[dict[str, Any]]
 RULES: dict[Section, str] = {
     "accuracy": "Distances in mm: median / 90 % / 95 % / worst of all scenes and seeds (nearest "
@@ -51,12 +51,11 @@ RULES: dict[Section, str] = {
     "least squares, so a single distance may come out below it. No method can use it. Target "
     "error: mean over the scene's inner targets, for methods that carry points.",
     "goals": goals.RULE,
-    "resection": resection.RULE,
 }
 
 
 @dataclass(frozen=True, kw_only=True)
-class Options(trainings.KeptOptions):
+class Options(scripts.KeptOptions):
     """Regenerate the tables of docs/results.md."""
 
     case: tuple[str, ...] = ()
@@ -64,7 +63,7 @@ class Options(trainings.KeptOptions):
     sections: tuple[Section, ...] = get_args(Section)
     """Which blocks to make."""
     models: tuple[str, ...] = (CLINIC,)
-    """In accuracy and resection: clinic, and M_lim and M_full (quick)."""
+    """In accuracy: clinic, and M_lim and M_full (quick)."""
     peers: tuple[str, ...] = (goals.RIGID, "rigid", "elastic")
     """Beside them in accuracy (docs/peers.md)."""
     clinic_steps: int = 6_000
@@ -72,8 +71,7 @@ class Options(trainings.KeptOptions):
     steps: int = 12_000
     """Of training the others."""
     seeds: tuple[int, ...] = (0, 1, 2)
-    """Of training the phantoms' models: of network, scenes and elastic body; in the resection the
-    first alone."""
+    """Of training the phantoms' models: of network, scenes and elastic body."""
     case_seeds: tuple[int, ...] | None = None
     """Of training --case (the same as the phantoms')."""
     variants: tuple[str, ...] = tuple(VARIANTS)
@@ -99,10 +97,7 @@ def main(options: Options) -> None:
             for method in methods_of(section, case, options, trainer):
                 say(f"{case.name}: {method.name}, seed {method.seed}")
                 about = case, method, options.variants, VIEW, options.grid, options.out / "rows"
-                if section == "resection":
-                    rows += measured(*about, resection.cut_one, **resection.cutting())
-                else:
-                    rows += measured(*about)
+                rows += measured(*about)
         texts = [*texts_of(section, rows, cases), tables.caption(rows, writer.command)]
         writer.write({section: "\n\n".join(texts) + f" {RULES[section]}"})
         say(f"{section}: block written to {options.document}")
@@ -129,20 +124,15 @@ def methods_of(
     """One after the other, so that one model is held at a time."""
     seeds = options.seeds if case.name in PHANTOMS else options.case_seeds or options.seeds
     models = (CLINIC,) if section == "goals" else options.models
-    for name, seed in product(models, seeds[:1] if section == "resection" else seeds):
+    for name, seed in product(models, seeds):
         steps = options.clinic_steps if name == CLINIC else options.steps
         yield trainer.model(case, name, seed, steps)
-    if section == "resection":
-        yield resection.truth()
-        return
     for name in options.peers if section == "accuracy" else (goals.RIGID,):
         yield peer(name, case)
 
 
 def texts_of(section: Section, rows: Rows, cases: list[StudyCase]) -> list[str]:
     """The tables of a section."""
-    if section == "resection":
-        return [resection.tables_of(rows)]
     frame = tables.tidy(rows)
     sites = {case.name: tumor_sites_of(case.anatomy_ct) for case in cases}
     if section == "goals":
@@ -168,4 +158,4 @@ def lines() -> Callable[[str, TrainingStatus], None]:
 
 
 if __name__ == "__main__":
-    trainings.run(main, Options)
+    scripts.run(main, Options)

@@ -24,11 +24,11 @@ from tumortrack.core import store
 from tumortrack.core.config import to_builtins
 from tumortrack.core.errors import InputError, TumortrackError
 from tumortrack.tracking.tracker import Tracker
-from tumortrack_lab.study import trainings
+from tumortrack_lab.study import scripts
 from tumortrack_lab.study.document import ReportWriter
 from tumortrack_lab.study.tumor_sites import tumor_sites_of
 from tumortrack_lab.twin.dataset import claim
-from tumortrack_lab.world import colour, following, pictures, tables
+from tumortrack_lab.world import following, pictures, tables
 from tumortrack_lab.world.films import ALL_KINDS, Film, FilmConfig, read_film, write_film
 from tumortrack_lab.world.paths import KINDS
 from tumortrack_lab.world.scenes import TETS, World, WorldConfig
@@ -51,12 +51,8 @@ class Options:
     """Undisturbed scenes of this case that `make world` made: their states are gone through."""
     views: int = 1
     """Cameras: 1, or 3 (above the organ, and 45 degrees to either side)."""
-    fps: float = 10.0
-    """Frames a second."""
     seed: int = 0
     """Of everything."""
-    colour: bool = False
-    """Also pictures of a colour camera in each one's place (0.2 s a frame and camera)."""
     model: Path | None = None
     """Follow with it (folder that `tumortrack train` wrote)."""
     methods: tuple[str, ...] = ("track", "first-look")
@@ -77,7 +73,7 @@ def main(options: Options) -> None:
         raise InputError("jump, hidden and random go through solved states; name some: --states.")
     if options.views not in (1, 3):
         raise InputError(f"--views is {options.views}; allowed: 1, 3.")
-    config = FilmConfig(seed=options.seed, fps=options.fps, views=options.views)
+    config = FilmConfig(seed=options.seed, views=options.views)
     world, states = _opened(options, config)
     wanted = [(kind, number) for number in range(options.count) for kind in options.kinds]
     todo = [(k, n) for k, n in wanted if not (options.out / f"{k}-{n:03d}").exists()]
@@ -92,10 +88,6 @@ def main(options: Options) -> None:
         say(f"{done}/{len(todo)} {kind}-{number:03d} {what}; {left_min:.0f} min left")
     folders = [options.out / f"{kind}-{number:03d}" for kind, number in wanted]
     films = [read_film(folder) for folder in folders if folder.exists()]
-    for done, film in enumerate(films if options.colour else (), start=1):
-        if not (film.folder / "colour.json").exists():
-            colour.paint(film)
-            say(f"{done}/{len(films)} {film.folder.name} painted")
     if options.model is not None:
         _follow(options, options.model, films)
 
@@ -121,7 +113,7 @@ def _follow(options: Options, model: Path, films: list[Film]) -> None:
     for done, film in enumerate(films, start=1):
         for method in options.methods:
             judge = partial(following.judge, following.METHODS[method](tracker), film, sites)
-            rows = trainings.kept(film.folder / f"{method}.json", about, judge)
+            rows = scripts.kept(film.folder / f"{method}.json", about, judge)
             errors = pd.DataFrame(rows).reindex(columns=["center_mm"])["center_mm"]
             say(f"{done}/{len(films)} {film.folder.name}, {method}: {errors.median():.1f} mm off")
     rows = [row for out in (options.out, *options.others) for row in tables.rows_in(out)]
@@ -130,7 +122,7 @@ def _follow(options: Options, model: Path, films: list[Film]) -> None:
     store.write_atomically(options.out / "table.md", text.encode())
     print(text)
     if options.document is not None:
-        writer = ReportWriter(options.document, trainings.make_command("sequences"))
+        writer = ReportWriter(options.document, scripts.make_command("sequences"))
         plot, moving = writer.image("sequences_press"), writer.image("sequences_film")
         moving = moving.with_suffix(".gif")
         pictures.draw(found, plot)
@@ -142,4 +134,4 @@ def _follow(options: Options, model: Path, films: list[Film]) -> None:
 
 
 if __name__ == "__main__":
-    trainings.run(main, Options)
+    scripts.run(main, Options)

@@ -18,7 +18,7 @@ import tempfile
 from pathlib import Path
 
 from tumortrack_lab.soak.run import SoakConfig, soak
-from tumortrack_lab.study.trainings import run
+from tumortrack_lab.study.scripts import run
 
 
 def main(config: SoakConfig) -> None:

@@ -17,7 +17,7 @@ import tyro
 
 from tumortrack.cli.console import say
 from tumortrack.report.calibration import WIDEST_MM
-from tumortrack_lab.study import trainings, trust
+from tumortrack_lab.study import scripts, trust
 from tumortrack_lab.study.document import ReportWriter
 
 BLOCKS = [f"trust-{name}" for name in ("coverage", "ranks", "reliability", "risk", "worst")]
@@ -41,7 +41,7 @@ class Options:
 
 def main(options: Options) -> None:
     """Calibrate on the others, test on what is left out, and write it down."""
-    writer = ReportWriter(options.document, trainings.make_command("trust"))
+    writer = ReportWriter(options.document, scripts.make_command("trust"))
     writer.check(BLOCKS)
     tables = trust.read_tables(options.tables)
     states = trust.states_of([row for table in tables for row in table.rows])
@@ -74,4 +74,4 @@ def main(options: Options) -> None:
 
 
 if __name__ == "__main__":
-    trainings.run(main, Options)
+    scripts.run(main, Options)

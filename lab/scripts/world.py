@@ -27,7 +27,7 @@ from tumortrack.core import store
 from tumortrack.core.config import to_builtins
 from tumortrack.core.errors import InputError, TumortrackError
 from tumortrack.simulate.scene_folder import Scene, list_scenes, read_scene
-from tumortrack_lab.study import resection, trainings
+from tumortrack_lab.study import resection, scripts
 from tumortrack_lab.study.document import ReportWriter
 from tumortrack_lab.study.measure import measured
 from tumortrack_lab.study.methods import study_case
@@ -79,7 +79,7 @@ def main(options: Options) -> None:
             raise InputError(f"{unknown[0]!r} is not known; allowed: {', '.join(known)}.")
     block = "world" if set(options.disturb) == {"none"} else "world-disturbed"
     block = "world-plans" if options.plans else block
-    writer = ReportWriter(options.document or Path(), trainings.make_command("world"))
+    writer = ReportWriter(options.document or Path(), scripts.make_command("world"))
     if options.document is not None:
         writer.check([block])
     config = WorldConfig(
@@ -128,7 +128,7 @@ def _plans(options: Options, world: World, model: Path, made: list[str]) -> str:
     for name, method in product(made, (resection.calibrated(model), resection.truth())):
         variant, _, view = name.rpartition("-")
         about = case, method, [variant], view, 160, options.out / "plans" / name
-        rows += measured(*about, resection.cut_in_world, **resection.cutting())
+        rows += measured(*about, resection.cut_one, **resection.cutting())
         say(f"planned {name} ({method.name})")
     good = {row["variant"] for row in rows if row.get("good")}
     for row in rows:
@@ -172,4 +172,4 @@ def _open(options: Options, config: WorldConfig) -> World:
 
 
 if __name__ == "__main__":
-    trainings.run(main, Options)
+    scripts.run(main, Options)

@@ -62,6 +62,10 @@ def test_commands_and_an_example_run_from_the_wheel(environment, tmp_path):
     listed = run(*command, "--help", env=clean)
     assert "locate" in listed
     assert "twin" not in listed  # the laboratory's
+    for name, package in (("pretrain", "tumortrack-lab"), ("record", "tumortrack-experiment")):
+        without = subprocess.run([*command, name], capture_output=True, text=True, env=clean)
+        assert without.returncode == 2
+        assert f"tumortrack: the command {name} belongs to {package}" in without.stderr
     example = ROOT / "examples" / "01_prepare_and_look.py"
     assert "kidney: 1" in run(python, example, tmp_path, env=clean, cwd=tmp_path)
     assert (tmp_path / "case" / "qc.png").stat().st_size > 10_000

@@ -22,7 +22,7 @@ from tumortrack.cli.models import Compile, Onnx
 from tumortrack.cli.plan import Plan
 from tumortrack.cli.resect import Resect
 from tumortrack.cli.track import Track
-from tumortrack.cli.training import Pretrain, Train
+from tumortrack.cli.training import Train
 from tumortrack.core.errors import InputError, StorageError, TumortrackError
 
 
@@ -34,9 +34,14 @@ class Command(Protocol):
 
 
 _COMMANDS: tuple[type[Command], ...] = (
-    *(Demo, Prepare, Export, Train, Pretrain, Locate, Track, Plan, Resect),
+    *(Demo, Prepare, Export, Train, Locate, Track, Plan, Resect),
     *(Simulate, Evaluate, Margins, Compile, Onnx, Inspect, Doctor),
 )
+# Whose they are: where that is not installed, they are no typing errors.
+_OF_OTHERS = {
+    **dict.fromkeys(("pretrain", "twin", "bench", "fleet"), "tumortrack-lab"),
+    **dict.fromkeys(("phantom-kit", "calibrate", "record", "reference"), "tumortrack-experiment"),
+}
 _OBJECTS_A_COLLECTION = 20_000
 _LEFT_AT_ONCE = ["locate"]  # holds nothing open in the end, and is waited for
 
@@ -108,6 +113,12 @@ def _parse(arguments: list[str]) -> Command:
         named = (tyro.conf.PositionalMetavarFromFieldName,)  # MODEL CLOUD OUT, not PATH PATH PATH
         prog = f"tumortrack {arguments[0]}"
         return tyro.cli(command, prog=prog, args=arguments[1:], config=named)
+    if arguments and arguments[0] in _OF_OTHERS:
+        package = _OF_OTHERS[arguments[0]]
+        raise InputError(
+            f"the command {arguments[0]} belongs to {package}, which is not installed here: "
+            f"pip install {package}"
+        )
     return tyro.extras.subcommand_cli_from_dict(
         commands,
         prog="tumortrack",

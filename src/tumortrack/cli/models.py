@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from tumortrack.models.model import Model
 
 _GRID = 32
+_VOXEL_MM, _UP_LPS = 1.5, (0.0, -1.0, 0.0)  # of the built-in phantom
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,7 +28,7 @@ class Compile:
 
     Attributes:
         model: folder that `train` wrote; nothing is written into it. Without one, what a new
-            patient's model needs is compiled as well, on a random kidney.
+            patient's model needs is compiled as well, on the built-in phantom.
         device: auto takes CUDA if there is a GPU.
     """
 
@@ -50,7 +51,7 @@ class Compile:
             inside = 5.0 - np.linalg.norm(points_mm - _GRID / 4, axis=1)
             return torch.from_numpy(np.column_stack([-inside, inside]).astype(np.float32))
 
-        model = load_model(self.model, self.device) if self.model else _random_model(self.device)
+        model = load_model(self.model, self.device) if self.model else _phantom_model(self.device)
         tracker = Tracker(model)
         tracker.warm()
         grid = np.diag([0.5, 0.5, 0.5, 1.0])
@@ -63,17 +64,18 @@ class Compile:
         say("kernels: compiled and kept for every model of this machine.")
 
 
-def _random_model(device: Device) -> Model:
-    """Of a random kidney, made as `train --minutes 0` makes one; none of it stays."""
-    from tumortrack.phantom.kidneys import random_anatomy
+def _phantom_model(device: Device) -> Model:
+    """Of the built-in phantom, made as `train --minutes 0` makes one; none of it stays."""
+    from tumortrack.imaging.surface import surfaces
+    from tumortrack.phantom.digital import PhantomParameters, phantom_labels
     from tumortrack.training.model import start_of
     from tumortrack.training.presets import clinic
     from tumortrack.training.train import TrainingRun, train
 
-    anatomy, up = random_anatomy(0)
+    anatomy = surfaces(phantom_labels(PhantomParameters(), _VOXEL_MM))[0]
     config = clinic(anatomy)
     start = start_of(config.network, None)
-    run = TrainingRun(anatomy, up, "none", config, steps=0, device=device, start=start)
+    run = TrainingRun(anatomy, _UP_LPS, "none", config, steps=0, device=device, start=start)
     with TemporaryDirectory() as folder:
         return train(run, Path(folder), lambda _: None)
 

@@ -1,4 +1,4 @@
-"""Training: `train`, `pretrain`, and what is seen of them."""
+"""Training: `train`, and what is seen of it."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ class Train:
             say(f"{self.model} is trained already ({done['steps']} steps).")
             say_notes(filter(None, [weakness_of(done)]))
             return
-        with _training_screen() as show:
+        with training_screen() as show:
             about = train(run, self.model, show).provenance
         say(
             f"model written to {self.model}: {about['steps']} steps in {about['training_s']:.0f} "
@@ -106,58 +106,8 @@ class Train:
         say_notes(filter(None, [weakness_of(about)]))
 
 
-@dataclass(frozen=True, kw_only=True)
-class Pretrain:
-    """Teach a network on random kidneys, as a start for `train`; the same command resumes.
-
-    Attributes:
-        out: folder to write.
-        anatomies: how many random kidneys.
-        steps: stop after exactly so many steps.
-        seed: of kidneys, weights and scenes.
-        device: auto takes CUDA if there is a GPU.
-        workers: processes that make scenes (default: as the machine allows).
-        checkpoint_every: seconds; a crash loses at most the steps since.
-    """
-
-    out: Positional[Path]
-    anatomies: int = 400
-    steps: int = 10_000
-    seed: int = 0
-    device: Device = "auto"
-    workers: int | None = None
-    checkpoint_every: float = 30.0
-
-    def run(self) -> None:
-        from tumortrack.training.model import PRETRAINED
-        from tumortrack.training.presets import pretraining
-        from tumortrack.training.pretrain import pretrain
-        from tumortrack.training.state import Pretraining
-
-        run = Pretraining(
-            config=pretraining(), anatomies=self.anatomies, steps=self.steps, seed=self.seed,
-            device=self.device, workers=self.workers, checkpoint_every_s=self.checkpoint_every,
-        )  # fmt: skip
-        if (self.out / store.MANIFEST).is_file():
-            done = store.read_manifest(self.out, PRETRAINED).get("provenance", {})
-            if done.get("run_sha256") != run.identity:
-                raise InputError(
-                    f"{self.out} holds weights of other options or another seed. Choose another "
-                    "folder."
-                )
-            say(f"{self.out} is pretrained already ({done['steps']} steps).")
-            return
-        with _training_screen() as show:
-            about = pretrain(run, self.out, show)
-        say(
-            f"weights written to {self.out}: {about['steps']} steps over {about['anatomies']} "
-            f"random kidneys in {about['training_s']:.0f} s. Use them: tumortrack train CASE MODEL "
-            f"--start {self.out}"
-        )
-
-
 @contextmanager
-def _training_screen() -> Iterator[Callable[[TrainingStatus], None]]:
+def training_screen() -> Iterator[Callable[[TrainingStatus], None]]:
     """Yields a function that shows a status."""
     from tumortrack.training.distributed import ProcessLost
     from tumortrack.training.state import Diverged

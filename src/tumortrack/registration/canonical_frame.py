@@ -20,7 +20,6 @@ from tumortrack.core.geometry import Direction, Matrix, Points, Vector
 from tumortrack.core.types import Mesh
 from tumortrack.registration.network import POSE_OUTPUTS, RegistrationNetwork, facing_rotation
 
-Poses = Float[np.ndarray, "b 4 4"]
 UPRIGHT_MM = 55.0  # half the length of every organ in its upright frame
 FIELDS = 24  # second degree: 30 vector fields, less 6 of rigid motion
 _RIGID = 6
@@ -41,14 +40,6 @@ class CanonicalFrame:
     def in_ct(self, points: Points) -> Points:
         """Points of the upright frame in the CT's."""
         return points @ self.facing / self.scale + self.center_ct
-
-    def camera_from_upright(self, camera_from_ct: Poses) -> Poses:
-        """Poses of the upright organ before a camera whose lengths are scaled likewise."""
-        poses = np.tile(np.eye(4), (len(camera_from_ct), 1, 1))
-        rotation = camera_from_ct[:, :3, :3]
-        poses[:, :3, :3] = rotation @ self.facing.T
-        poses[:, :3, 3] = self.scale * (rotation @ self.center_ct + camera_from_ct[:, :3, 3])
-        return poses
 
 
 def half_length_mm(organ_ct: Mesh, long_axis: Vector) -> float:
@@ -97,13 +88,6 @@ def _monomials(points: Points) -> Float[np.ndarray, "m 30"]:
     constant = np.tile(eye, (len(x), 1, 1))
     fields = np.concatenate([constant, turns, stretches, squares], axis=1)
     return fields.transpose(0, 2, 1).reshape(3 * len(x), -1)
-
-
-def initialize_canonical(network: RegistrationNetwork) -> None:
-    """Tell a network to be pretrained what it places: the points and fields of any organ."""
-    points = generic_points(len(network.points))
-    network.points.copy_(torch.as_tensor(points.astype(np.float32)))
-    network.modes.copy_(torch.as_tensor(generic_fields(points).astype(np.float32)))
 
 
 @torch.no_grad()

@@ -145,18 +145,6 @@ def _shared(config: NetworkConfig) -> tuple[Any, ...]:
     return config.encoder, getattr(config.decoder, "width", None), reach
 
 
-def save_start(
-    network: nn.Module, config: NetworkConfig, provenance: dict[str, Any], folder: Path
-) -> None:
-    """Write weights, in half precision, and manifest into an existing folder, the manifest last."""
-    halves = {k: v.detach().cpu().half().contiguous() for k, v in network.state_dict().items()}
-    store.write_atomically(folder / WEIGHTS, save(halves))
-    options = " ".join(f"--{k} {provenance[k]}" for k in ("anatomies", "steps", "seed"))
-    about = {**provenance, "command": f"tumortrack pretrain OUT {options}"}
-    content = {"provenance": about, "config": to_builtins(config)}
-    store.seal(folder, PRETRAINED, content, frame="camera")
-
-
 def load_start(folder: Path) -> PretrainedWeights:
     """Read a folder that `pretrain` wrote; one that is missing, of another kind, damaged or not of
     this version raises ArtifactError."""

@@ -19,7 +19,7 @@ from tumortrack.models.config import (
 from tumortrack.models.encoders.heightmap import HeightMapConfig
 from tumortrack.models.encoders.pointnet2 import PointNet2Config, SetAbstraction
 from tumortrack.models.normalisation import Aligned, CloudBox
-from tumortrack.registration.canonical_frame import FIELDS, UPRIGHT_MM, half_length_mm
+from tumortrack.registration.canonical_frame import half_length_mm
 from tumortrack.registration.rest_shape import long_axis_of
 from tumortrack.sense.clutter import ClutterConfig
 from tumortrack.sense.noise import CLEAN, D405_NOISE, SENSORS, CalibrationConfig, Sensor
@@ -27,7 +27,6 @@ from tumortrack.sense.occlusion import OcclusionConfig
 from tumortrack.simulate.coarse import CoarseConfig
 from tumortrack.simulate.deform import ChainConfig, DragConfig, ElasticConfig, StretchConfig
 from tumortrack.simulate.deform.drag import CONFIGURATIONS
-from tumortrack.simulate.elastic.body import BodyConfig
 from tumortrack.simulate.occupancy import OccupancyConfig
 from tumortrack.simulate.scene import PoseConfig, SceneConfig
 
@@ -78,22 +77,15 @@ def clinic(anatomy: Anatomy, rotations: Rotations = "limited") -> TrainConfig:
     sensor errors, occlusion and background."""
     elastic = ElasticConfig()
     half_mm = half_length_mm(anatomy.organ, long_axis_of(anatomy.organ))
-    config = _clinic(elastic, elastic.body.modes, half_mm, rotations)
+    config = clinic_rules(elastic, elastic.body.modes, half_mm, rotations)
     return msgspec.structs.replace(config, scene=config.scene.seen_whole(anatomy))
 
 
-def pretraining(rotations: Rotations = "limited") -> TrainConfig:
-    """The scenes and network of ``clinic``, for many organs in their common frame, each with a
-    small elastic body that takes half a second to build."""
-    elastic = ElasticConfig(
-        body=BodyConfig(cells=500, modes=24, responses=120, patches=250, states=200)
-    )
-    return _clinic(elastic, FIELDS, UPRIGHT_MM, rotations)
-
-
-def _clinic(
+def clinic_rules(
     elastic: ElasticConfig, modes: int, scale_mm: float, rotations: Rotations
 ) -> TrainConfig:
+    """Scenes and network of ``clinic`` for an elastic body, modes of which the network tells the
+    state, and half of the organ's length, mm."""
     return TrainConfig(
         network=clinic_network(modes, scale_mm),
         scene=SceneConfig(

@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from functools import cached_property
@@ -38,8 +39,28 @@ _FILE = "checkpoint.safetensors"
 _FLOOR = 0.01  # of the peak learning rate, at the end of the tail
 
 
+class Run(ABC):
+    """What the training loop has to know of a run; ``steps`` or ``minutes`` settle its end."""
+
+    config: TrainConfig
+    seed: int
+    steps: int | None
+    minutes: float | None
+    checkpoint_every_s: float
+
+    @property
+    @abstractmethod
+    def end(self) -> int | None:
+        """The last step; None where minutes settle it on the way."""
+
+    @property
+    @abstractmethod
+    def identity(self) -> str:
+        """sha256 of all that decides the weights, so that a resumed run is the same run."""
+
+
 @dataclass(frozen=True)
-class TrainingRun:
+class TrainingRun(Run):
     """What to train, on what, for how long: to the end of ``steps``, or about ``minutes``."""
 
     anatomy_ct: Anatomy
@@ -56,7 +77,7 @@ class TrainingRun:
     patient: Patient = NOBODY  # whose organ it is
 
     def __post_init__(self) -> None:
-        _check(self, seed=0, steps=0, workers=0)
+        check_run(self, seed=0, steps=0, workers=0)
         if self.minutes is not None and not 0 <= self.minutes < float("inf"):
             raise InputError(f"minutes is {self.minutes}; it must be 0 or more.")
         if self.start is not None:
@@ -69,7 +90,6 @@ class TrainingRun:
 
     @property
     def end(self) -> int | None:
-        """The last step; None where minutes settle it on the way."""
         if self.steps is not None:
             return self.steps
         if self.minutes is not None:
@@ -79,42 +99,11 @@ class TrainingRun:
 
     @property
     def identity(self) -> str:
-        """sha256 of all that decides the weights, so that a resumed run is the same run."""
         start = {} if self.start is None else {"start": self.start.sha256}
-        return _sha256(self, case=self.case_sha256, minutes=self.minutes, **start)
+        return run_sha256(self, case=self.case_sha256, minutes=self.minutes, **start)
 
 
-@dataclass(frozen=True)
-class Pretraining:
-    """What to pretrain: on how many random kidneys, for how many steps."""
-
-    config: TrainConfig
-    anatomies: int
-    steps: int
-    seed: int = 0
-    device: Literal["auto", "cpu", "cuda"] = "auto"
-    workers: int | None = None
-    checkpoint_every_s: float = 30.0
-
-    minutes = None  # steps alone decide
-
-    def __post_init__(self) -> None:
-        _check(self, anatomies=1, steps=1, seed=0, workers=0)
-
-    @property
-    def end(self) -> int:
-        return self.steps
-
-    @property
-    def identity(self) -> str:
-        """sha256 of all that decides the weights."""
-        return _sha256(self, anatomies=self.anatomies)
-
-
-Run = TrainingRun | Pretraining
-
-
-def _check(run: Run, **smallest: int) -> None:
+def check_run(run: Run, **smallest: int) -> None:
     """Refuse numbers smaller than these, and impossible times between checkpoints."""
     for name, least in smallest.items():
         value = getattr(run, name)
@@ -126,7 +115,8 @@ def _check(run: Run, **smallest: int) -> None:
         )
 
 
-def _sha256(run: Run, **more: object) -> str:
+def run_sha256(run: Run, **more: object) -> str:
+    """Of configuration, seed, steps and what else decides the weights."""
     content = {"config": to_builtins(run.config), "seed": run.seed, "steps": run.steps, **more}
     content["schema"] = store.SCHEMA
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()

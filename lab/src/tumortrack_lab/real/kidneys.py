@@ -23,7 +23,7 @@ from tumortrack import api
 from tumortrack.core import store
 from tumortrack.core.errors import InputError
 from tumortrack.core.patient import UNKNOWN
-from tumortrack.core.types import Mesh
+from tumortrack.core.types import Anatomy, Mesh
 from tumortrack.imaging.case import Case
 from tumortrack.imaging.volume import read_labels
 from tumortrack.report.metrics import distance_to_surface, surface_samples
@@ -85,6 +85,15 @@ def described(case: Case, path: Path) -> dict[str, Any]:
 def kind_of(share: float) -> str:
     kinds = (kind for kind, (low, high) in KINDS.items() if low <= share < high)
     return next(kinds, "between")
+
+
+def with_kinds(rows: list[dict[str, Any]], anatomy: Anatomy) -> list[dict[str, Any]]:
+    """The rows of a case's scenes, and of each tumor its kind."""
+    kinds = [kind_of(outer_share(tumor, anatomy.organ)) for tumor in anatomy.tumors]
+    for row in rows:
+        for tumor, kind in zip(row["tumors"], kinds, strict=False):
+            tumor["kind"] = kind
+    return rows
 
 
 def prepared(data: Path, number: int, folder: Path) -> Case:

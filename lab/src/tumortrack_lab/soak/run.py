@@ -22,9 +22,9 @@ from tumortrack.live.sources.virtual import VirtualSourceConfig
 from tumortrack.live.spec import SINKS, SOURCES
 from tumortrack.live.values import Controls, PublishedFrame, SinkContext, SourceEnded
 from tumortrack.live.workers import SinkWorker, SourceWorker
-from tumortrack.phantom.kidneys import random_anatomy
 from tumortrack.simulate.player import ScenePlayer, ScenePlayerConfig
 from tumortrack.tracking.tracker import Tracker, region_for
+from tumortrack_lab.pretraining.kidneys import random_anatomy
 from tumortrack_lab.soak.faults import FAULTS, Fault, FaultyCamera, FaultySink, Schedule, Tapes
 from tumortrack_lab.soak.judge import Judge
 from tumortrack_lab.soak.table import document, memory_marks

@@ -13,7 +13,7 @@ from tumortrack.core.estimate import Estimate
 from tumortrack.report.protocol import evaluate_scene
 from tumortrack.simulate.scene_folder import read_scene
 from tumortrack_lab.bench.machine import cpu_name
-from tumortrack_lab.study import trainings
+from tumortrack_lab.study import scripts
 from tumortrack_lab.study.document import make_folder
 from tumortrack_lab.study.methods import Method, StudyCase
 
@@ -47,7 +47,7 @@ def measured(
 
     make_folder(folder)
     name = f"{case.name}-{method.name}-{method.seed}-{view}-{one.__name__}.json"
-    return trainings.kept(folder / name, about, measure)
+    return scripts.kept(folder / name, about, measure)
 
 
 def _machine() -> dict[str, Any]:

@@ -1,11 +1,11 @@
-"""Does it cut the tumor out? Plans made on estimates, and on the truth itself, cut the truth."""
+"""Does it cut the tumor out? Plans made on a calibrated model's estimates, and on the truth itself,
+cut the true organs of the wider world."""
 
 from __future__ import annotations
 
 import math
 import re
 from collections import Counter
-from collections.abc import Sequence
 from dataclasses import asdict, replace
 from functools import cache
 from operator import itemgetter
@@ -28,7 +28,6 @@ from tumortrack.models.margins import NAME, read_margins
 from tumortrack.plan.budget import ErrorBudget, plan_within, planned_budget
 from tumortrack.plan.located import of_estimate
 from tumortrack.plan.values import Located, ResectionConfig, ResectionPlan
-from tumortrack.plan.values import Method as PlanMethod
 from tumortrack.registration.locator import QUERIES
 from tumortrack.simulate.scene_folder import Scene, read_scene
 from tumortrack.tracking.tracker import Tracker
@@ -67,22 +66,19 @@ RULE = (
     "of the plans that were made, tumors' shares rounded down. Truth: planned on the true organ, "
     f"the bound. As asked: the mm before a plus are kept, less the cut's voxels of {VOXEL_MM:g} mm;"
     f" with Clopper and Pearson's interval of 95 %. “+ {SIGMAS:g} sd”: and {SIGMAS:g} standard "
-    "deviations of the estimate more, at each place of the tumor's surface; with the paper's "
-    "planner, which has one margin, as many as the least certain place needs. “+ 95 % radius”: and "
+    "deviations of the estimate more, at each place of the tumor's surface. “+ 95 % radius”: and "
     "the tumor's calibrated margin more; “and other errors”: and those of hand-eye, tool and "
     "motion, none of which is simulated, together as `plan --confidence` adds them. Left out: "
     "tissue does not move or give way while it is cut, nobody pulls at the piece, the instrument "
-    "takes no tissue with it, and it reaches all of a level sheet below the piece, of which the "
-    "paper's planner gives the outline alone."
+    "takes no tissue with it, and it reaches all of a level sheet below the piece."
 )
 
 
 class Planner(Config, frozen=True):
-    """One way to plan: by whose rules, and how many standard deviations of the estimate are added
-    to the margin; or with which ``confidence`` all errors are, as `plan --confidence` does it.
-    ``still``: of these the tumor's radius alone, for nothing else is off in a simulated cut."""
+    """One way to plan: how many standard deviations of the estimate are added to the margin, or
+    with which ``confidence`` all errors are, as `plan --confidence` does it. ``still``: of these
+    the tumor's radius alone, for nothing else is off in a simulated cut."""
 
-    method: PlanMethod
     sigmas: float = 0.0
     margin_mm: float = MARGIN_MM
     confidence: float = 0.0
@@ -94,7 +90,7 @@ class Planner(Config, frozen=True):
         if self.confidence:
             what = "radius" if self.still else "radius and other errors"
             more = f" + {100 * self.confidence:g} % {what}"
-        return f"{self.method}, {self.margin_mm:g} mm{more}"
+        return f"{self.margin_mm:g} mm{more}"
 
     def plan(self, found: Located, tumor: str) -> ResectionPlan:
         """Raises InputError and NoPlan as ``plan_within``."""
@@ -104,26 +100,18 @@ class Planner(Config, frozen=True):
             others = {"hand_eye_mm": 0.0, "tool_mm": 0.0, "motion_mm": 0.0, "assumed": ()}
             return msgspec.structs.replace(budget, **(others if self.still else {}))
 
-        return plan_within(found, self.config(found, tumor), budget_of, self.confidence > 0)[0]
-
-    def config(self, found: Located, tumor: str) -> ResectionConfig:
-        """The paper's planner has one margin for all of the tumor: it is given what the least
-        certain place needs."""
-        margin_mm, sigmas = self.margin_mm, self.sigmas
-        if self.method == "published" and sigmas and tumor in found.std_mm:
-            margin_mm, sigmas = margin_mm + sigmas * float(found.std_mm[tumor].max()), 0.0
-        return ResectionConfig(method=self.method, tumor=tumor, margin_mm=margin_mm, sigmas=sigmas)
+        config = ResectionConfig(tumor=tumor, margin_mm=self.margin_mm, sigmas=self.sigmas)
+        return plan_within(found, config, budget_of, self.confidence > 0)[0]
 
 
-PLANNERS = tuple(Planner(method=m, sigmas=s) for m in ("published", "margin") for s in (0, SIGMAS))
-# In the wider world, with a calibrated model; all but the last keep the same healthy tissue.
-CALIBRATED = (
-    *PLANNERS[2:],
-    Planner(method="margin", confidence=0.95, still=True),
-    Planner(method="margin", confidence=0.95),
-    Planner(method="margin", confidence=0.95, margin_mm=1.0),
+# All but the last keep the same healthy tissue.
+PLANNERS = (
+    Planner(),
+    Planner(sigmas=SIGMAS),
+    Planner(confidence=0.95, still=True),
+    Planner(confidence=0.95),
+    Planner(confidence=0.95, margin_mm=1.0),
 )
-_ALL = tuple(dict.fromkeys((*PLANNERS, *CALIBRATED)))
 
 
 def calibrated(folder: Path) -> Method:
@@ -167,28 +155,20 @@ def cutting() -> dict[str, Any]:
     """What else decides a measurement whose estimate is planned on and cut."""
     planning = (Path(tumortrack.__file__).parent / "plan").glob("*.py")
     code = code_sha256([*planning, Path(tumortrack_lab.cut.__file__)])
-    planners = [to_builtins(planner) for planner in _ALL]
+    planners = [to_builtins(planner) for planner in PLANNERS]
     return {"cutting": {"planners": planners, "voxel_mm": VOXEL_MM, "code_sha256": code}}
 
 
-def cut_in_world(
+def cut_one(
     case: StudyCase, method: Method, variant: str, view: str, grid: int
 ) -> list[dict[str, Any]]:
-    """``cut_one`` by the planners of a calibrated model."""
-    return cut_one(case, method, variant, view, grid, CALIBRATED)
-
-
-def cut_one(
-    case: StudyCase, method: Method, variant: str, view: str, grid: int,
-    planners: Sequence[Planner] = PLANNERS,
-) -> list[dict[str, Any]]:  # fmt: skip
     """One scene: a row for each exophytic tumor and planner: ``refused`` and why, or what the cut
     did (``CutResult``); ``good``: the estimate, if there is one. Raises InputError: a scene that
     does not say where the table is."""
     scene = read_scene(case.scene(variant, view))
     if "camera_from_bench" not in scene.meta:
         raise InputError(
-            f"{variant}-{view} does not say where its table is; make it with tumortrack twin."
+            f"{variant}-{view} does not say where its table is; make it with make world."
         )
     table_from_camera = np.linalg.inv(np.array(scene.meta["camera_from_bench"], float))
     true = moved(scene.reference, table_from_camera)
@@ -199,13 +179,13 @@ def cut_one(
         estimate = method.locate(scene, grid)
     except (NoEstimate, InputError) as error:
         refused = {"refused": str(error)}
-        return [{"tumor": name, "planner": p.name, **refused} for name in tumors for p in planners]
+        return [{"tumor": name, "planner": p.name, **refused} for name in tumors for p in PLANNERS]
     found = of_estimate(estimate).moved(table_from_camera)
     about = {"good": estimate.quality == "good"}
     return [
         {"tumor": name, "planner": p.name, **about, **_planned_and_cut(true, found, p, name)}
         for name in tumors
-        for p in planners
+        for p in PLANNERS
         if not (p.sigmas or p.confidence) or found.std_mm  # others know no uncertainty
     ]
 
@@ -225,7 +205,7 @@ def tidy_plans(rows: list[dict[str, Any]]) -> pd.DataFrame:
     columns = ["case", "method", "planner", "refused", "promised_ml", *_RESULTS]
     frame = pd.DataFrame(rows).reindex(columns=columns)
     frame = frame.astype(dict.fromkeys(_RESULTS[1:5], float))
-    planners = pd.Categorical(frame.planner, [planner.name for planner in _ALL])
+    planners = pd.Categorical(frame.planner, [planner.name for planner in PLANNERS])
     methods = sorted(frame.method.unique(), key=lambda name: name == TRUTH)
     frame = frame.assign(planner=planners, method=pd.Categorical(frame.method, methods))
     return ordered(frame, ["case"])
@@ -243,7 +223,7 @@ def tables_of(rows: list[dict[str, Any]]) -> str:
         ]
         texts += ["Each case:", table(("case", *_HEAD), each, left=3)]
     refused = Counter(
-        f"{label_of(method)}, {_label(planner)}: {_NUMBER.sub('N', reason.partition(': ')[0])}"
+        f"{label_of(method)}, {planner}: {_NUMBER.sub('N', reason.partition(': ')[0])}"
         for (method, planner), plans in groups(frame, "method", "planner")
         for reason in plans.refused.dropna()
     )
@@ -257,22 +237,18 @@ def _rows(frame: pd.DataFrame) -> list[list[str]]:
     for (method, planner), plans in groups(frame, "method", "planner"):
         made = plans[plans.refused.isna()]
         free, removed = made[made.detached.astype(bool)], 100 * made.removed_share
-        row = [label_of(method), _label(planner), f"{len(made)} of {len(plans)}"]
+        row = [label_of(method), planner, f"{len(made)} of {len(plans)}"]
         row += [f"{n} of {len(made)}" for n in (len(free), (made.removed_share >= _WHOLE).sum())]
         row += [_text(share, down=True) for share in (removed.median(), removed.min())]
         row.append(_text(made.left_ml.max(), digits=2))
         row += map(_text, (made.margin_mm.median(), made.margin_mm.min()))
-        least_mm = {p.name: p.margin_mm for p in _ALL}[planner] - VOXEL_MM
+        least_mm = {p.name: p.margin_mm for p in PLANNERS}[planner] - VOXEL_MM
         row.append(share_words((made.margin_mm >= least_mm).sum(), len(made)))
         row += [str((made.margin_mm < 0).sum()), str(made.hurt.map(bool).sum())]
         parenchyma_ml = free.promised_ml.map(itemgetter("parenchyma")).astype(float)
         part = 100 * (free.healthy_ml / parenchyma_ml).mean()
         rows.append([*row, f"{_text(free.healthy_ml.mean())} ({_text(part, 0)} %)"])
     return rows
-
-
-def _label(planner: str) -> str:
-    return planner.replace("published", "the paper's", 1).replace("margin", "ours", 1)
 
 
 def _text(value: float, digits: int = 1, down: bool = False) -> str:

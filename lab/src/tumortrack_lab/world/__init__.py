@@ -8,8 +8,8 @@ state one random draw of tissue, bed and load; ``organ`` and ``forces``: what th
 ``scenes``: all of it by number. A scene is one state, seen once. ``lab/scripts/world.py`` (`make
 world`) writes and measures them.
 
-``paths``: organs on the move; ``films``: what cameras see of them, and the truth; ``colour``:
-pictures of it; ``following``: how followers do. ``lab/scripts/sequences.py`` (`make sequences`).
+``paths``: organs on the move; ``films``: what cameras see of them, and the truth; ``following``:
+how followers do. ``lab/scripts/sequences.py`` (`make sequences`).
 
 The solid and its solver are the twin's (``twin.solid``, ``twin.equilibrium``). What is still
 missing: vessels, fat and neighbours as bodies of their own, blood and perfusion, hands that touch

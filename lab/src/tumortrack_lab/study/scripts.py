@@ -1,4 +1,4 @@
-"""What scripts that train and judge share: kept rows, the command line."""
+"""What scripts share: options, kept rows, the command line."""
 
 from __future__ import annotations
 

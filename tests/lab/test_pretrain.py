@@ -19,7 +19,6 @@ from tumortrack.cli.training import Train
 from tumortrack.core import store
 from tumortrack.core.errors import ArtifactError, InputError
 from tumortrack.core.types import Mesh
-from tumortrack.phantom.kidneys import random_anatomy
 from tumortrack.registration.canonical_frame import (
     FIELDS,
     UPRIGHT_MM,
@@ -33,10 +32,8 @@ from tumortrack.registration.rest_shape import long_axis_of
 from tumortrack.simulate.deform import ElasticConfig
 from tumortrack.simulate.occupancy import OccupancyConfig
 from tumortrack.training.model import SHIPPED, PretrainedWeights, load_start, start_of
-from tumortrack.training.presets import clinic, pretraining, quick
-from tumortrack.training.pretrain import KidneyStream, organ_of, pretrain
+from tumortrack.training.presets import clinic, quick
 from tumortrack.training.state import (
-    Pretraining,
     TrainingProgress,
     TrainingRun,
     TrainingState,
@@ -44,6 +41,14 @@ from tumortrack.training.state import (
 )
 from tumortrack.training.task import TrainingTask, task_of
 from tumortrack.training.train import train
+from tumortrack_lab.pretraining.kidneys import random_anatomy
+from tumortrack_lab.pretraining.pretrain import (
+    KidneyStream,
+    Pretraining,
+    organ_of,
+    pretrain,
+    pretraining,
+)
 
 CPU = torch.device("cpu")
 TINY_BODY = msgspec.structs.replace(SMALL, modes=12, responses=24, patches=80, states=8)
@@ -232,7 +237,7 @@ def test_a_crashed_pretraining_ends_with_the_weights_of_one_that_was_not(
 
     run = replace(a_pretraining(), checkpoint_every_s=0.0)
     broken = tmp_path / "broken"
-    monkeypatch.setattr("tumortrack.training.pretrain.KidneyStream", lambda _: stream)
+    monkeypatch.setattr("tumortrack_lab.pretraining.pretrain.KidneyStream", lambda _: stream)
     with monkeypatch.context() as patch:
         patch.setattr("tumortrack.training.train.REPORT_EVERY_S", 0.0)  # after the first step
         with pytest.raises(RuntimeError, match="power cut"):

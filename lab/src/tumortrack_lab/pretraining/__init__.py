@@ -1,0 +1,1 @@
+"""A head start for every patient: one network taught on random kidneys."""
