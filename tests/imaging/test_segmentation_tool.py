@@ -4,6 +4,7 @@ installed."""
 from __future__ import annotations
 
 import json
+import os
 import sys
 from pathlib import Path
 
@@ -146,6 +147,33 @@ def test_an_nnunet_folder_is_checked_before_it_runs(
     refused("knows liver, and no kidney")
     (model / "dataset.json").write_text(json.dumps(about | {"channel_names": {"0": "a", "1": "b"}}))
     refused("one CT")
+
+
+def test_names_are_understood_as_published_models_write_them(
+    scanned: tuple[Path, LabelVolume], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ct, truth = scanned
+    program, model = tmp_path / "bin" / "nnUNetv2_predict_from_modelfolder", tmp_path / "model"
+    program.parent.mkdir()
+    program.write_text(f"""#!{sys.executable}
+import nibabel, numpy as np
+ct = nibabel.load("in/ct_0000.nii.gz")
+labels = np.select([ct.get_fdata() > 250, ct.get_fdata() > 0], [7, 3]).astype(np.uint8)
+nibabel.save(nibabel.Nifti1Image(labels, ct.affine), "out/ct.nii.gz")
+""")
+    program.chmod(0o755)
+    monkeypatch.setenv("PATH", str(program.parent), prepend=os.pathsep)
+    (model / "fold_0").mkdir(parents=True)
+    (model / "fold_0" / "checkpoint_final.pth").write_text("")
+    (model / "plans.json").write_text("{}")
+    labels = {"background": 0, "Spleen": 1, "Right Kidney": 3, "renal-Neoplasm": 7}
+    about = {"channel_names": {"0": "CT"}, "file_ending": ".nii.gz", "labels": labels}
+    (model / "dataset.json").write_text(json.dumps(about))
+    options = PrepareOptions(side="right")
+    case = segmented_case(ct, f"nnunet:{model}", options, tmp_path / "new.nii.gz")
+    assert case.anatomy.names == ("kidney", "tumor_1", "tumor_2")
+    counts, wanted = (np.bincount(v.ravel())[1:] for v in (case.labels.labels, truth.labels))
+    assert sorted(counts.tolist()) == sorted(wanted.tolist())
 
 
 def test_nnunet_runs_end_to_end(scanned: tuple[Path, LabelVolume], tmp_path: Path) -> None:

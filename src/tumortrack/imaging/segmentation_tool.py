@@ -46,7 +46,7 @@ _LESIONS = {
     "liver_vessels": (8, ("liver_tumor",)),
     "kidney_cysts": (789, ("kidney_cyst_left", "kidney_cyst_right")),
 }
-_TUMOR = re.compile("tumou?r|lesion|cancer|carcinoma|mass")
+_TUMOR = re.compile("tumou?r|neoplasm|lesion|cancer|carcinoma|mass")
 _SAME_MM = 0.01  # of the label map's grid
 # Where the organ is, and where its tumors are; None: the tool knows none.
 Masks = tuple[Bool[np.ndarray, "i j k"], Bool[np.ndarray, "i j k"] | None]
@@ -67,7 +67,7 @@ class Tool:
         try:
             return version(self.package)
         except PackageNotFoundError:  # of another environment
-            return "unknown"
+            return "(version unknown)"
 
 
 def segmented_case(ct: Path, spec: str, options: PrepareOptions, keep: Path) -> Case:
@@ -214,7 +214,7 @@ def _nnunet(model: Path, organ: str) -> Tool:
 
 def _monai(bundle: Path, organ: str) -> Tool:
     if find_spec("monai") is None:
-        raise InputError("MONAI is not installed. Install it: pip install 'monai[fire]'.")
+        raise InputError("MONAI is not installed. Install it: pip install 'monai[fire,ignite]'.")
     if not (bundle / "models").is_dir():
         raise InputError(
             f"{bundle} is no MONAI bundle with weights: it lacks models/. Fetch one yourself: "
@@ -247,7 +247,9 @@ def _chosen(labels: dict[str, Any], organ: str, where: Path) -> tuple[list[int],
     numbers."""
     try:
         names = {
-            name.lower(): tuple(numbers) if isinstance(numbers, list) else (int(numbers),)
+            re.sub(r"[\s-]+", "_", name.lower()): tuple(numbers)
+            if isinstance(numbers, list)
+            else (int(numbers),)
             for name, numbers in labels.items()
         }
     except (TypeError, ValueError) as error:
