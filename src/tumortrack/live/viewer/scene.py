@@ -19,7 +19,7 @@ from tumortrack.core import colours
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import Mesh
 from tumortrack.live import values as live
-from tumortrack.live.display import MOST_SEEN, seen_points, thinned, wxyz_of
+from tumortrack.live.display import MOST_SEEN, seen_colours, seen_points, thinned, wxyz_of
 from tumortrack.live.values import TrackingResult, TransformedEstimate
 from tumortrack.live.viewer.look import Viewpoint
 from tumortrack.live.viewer.slices import SlicePlane
@@ -74,7 +74,7 @@ class ViewerScene:
         self.options = DisplayOptions()
         self.margins: dict[str, Mesh] = {}  # of the shown estimate, published frame
         self._shown: tuple[TrackingResult, TransformedEstimate] | None = None
-        self._has_organ = self._has_slice = False
+        self._has_organ = self._has_slice = self._looks_at_colours = False
         self.look = Viewpoint(server, self._way)
         self._make_nodes(context)
 
@@ -144,6 +144,8 @@ class ViewerScene:
         for node, points in ((self._seen, seen), (self._organ, organ)):
             there = transform_points(self._way, thinned(points, MOST_SEEN))
             node.points = there.astype(np.float32)
+        picture = None if result.observation is None else seen_colours(result.observation)
+        self._seen.colors = np.array(colours.SEEN, np.uint8) if picture is None else picture
         if len(organ):
             lower, upper = organ.min(0), organ.max(0)
             corners = transform_points(self._way, lower + _CORNERS * (upper - lower))
@@ -182,7 +184,8 @@ class ViewerScene:
     def apply(self) -> None:
         """Show and hide nodes by the options and by what there is."""
         options = self.options
-        self._seen.visible = self._organ.visible = options.observed
+        self._seen.visible = options.observed
+        self._organ.visible = options.observed and not self._looks_at_colours
         self._axes.visible = options.helpers
         self._region.visible = options.helpers and self._has_organ
         if self._shown is None:
@@ -226,6 +229,11 @@ class ViewerScene:
         self._slice.render_width = self._slice.render_height = plane.side_mm
         solid = (picture > 8).any(2, keepdims=True)
         self._slice.image = np.concatenate([picture, solid.astype(np.uint8) * 255], axis=2)
+        self.apply()
+
+    def look_at_colours(self, asked: bool) -> None:
+        """Nothing lies over what was seen, as long as a click is asked for."""
+        self._looks_at_colours = asked
         self.apply()
 
     def mark(self, point_mm: Float[np.ndarray, " 3"] | None) -> None:
