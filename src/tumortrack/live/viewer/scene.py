@@ -36,6 +36,7 @@ _MOST_LABELLED = 15_000  # points shown
 _ELLIPSOID = 2.7955
 _ELLIPSOID_COLOUR = 255, 255, 255  # stands out from every part
 _TUMOR_WITH_POINTS = 0.3  # opacity
+_SEEN_MM, _LOOKED_AT_MM = 0.2, 1.0  # size of points; while a click is asked for
 _NO_POINTS = np.zeros((0, 3), np.float32)
 _NOTHING = Mesh(np.zeros((3, 3)), np.array([[0, 1, 2]]))
 _CORNERS = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
@@ -84,7 +85,7 @@ class ViewerScene:
         self._axes = nodes.add_frame(
             "/camera", axes_length=12.0, axes_radius=0.35, wxyz=turn, position=eye_mm
         )
-        self._seen = self._cloud("/seen", 0.2, colours.SEEN)
+        self._seen = self._cloud("/seen", _SEEN_MM, colours.SEEN)
         self._organ = self._cloud("/organ", 0.3, colours.ORGAN)
         blank = np.zeros((12, 2, 3), np.float32)
         self._region = nodes.add_line_segments("/region", blank, colours.REGION, **_HAIRLINE)
@@ -232,8 +233,9 @@ class ViewerScene:
         self.apply()
 
     def look_at_colours(self, asked: bool) -> None:
-        """Nothing lies over what was seen, as long as a click is asked for."""
+        """Nothing lies over what was seen, and it is seen well, as long as a click is asked for."""
         self._looks_at_colours = asked
+        self._seen.point_size = _LOOKED_AT_MM if asked else _SEEN_MM
         self.apply()
 
     def mark(self, point_mm: Float[np.ndarray, " 3"] | None) -> None:
