@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 _NAMES = {  # by the module that has them
     "api": "estimate_from_surfaces evaluate find_organ load_case load_model plan_resection prepare "
-    "read_cloud save_estimate scan_phantom simulate_scenes track train",
+    "read_cloud save_estimate scan_phantom simulate_scenes teach track train",
     "core": "errors",
     "core.estimate": "Estimate",
     "core.types": "DepthFrame Intrinsics Look SensorCloud",

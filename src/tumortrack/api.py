@@ -17,10 +17,10 @@ from textwrap import fill
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, UInt8
 
 from tumortrack.core import store
-from tumortrack.core.errors import InputError, StorageError
+from tumortrack.core.errors import InputError, NoEstimate, StorageError
 from tumortrack.core.estimate import Estimate
 from tumortrack.core.types import DepthFrame, Mesh, SensorCloud
 from tumortrack.imaging.case import Case
@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from tumortrack.models.config import TrainConfig
     from tumortrack.models.model import Model
     from tumortrack.plan.values import ResectionPlan
+    from tumortrack.sense.region.taught import Taught
     from tumortrack.simulate.scene import SceneConfig
     from tumortrack.simulate.scene_folder import Scene
     from tumortrack.tracking.tracker import Tracker
@@ -261,6 +262,8 @@ def find_organ(
     box_mm: tuple[tuple[float, float, float], tuple[float, float, float]] | None = None,
     mask: Bool[np.ndarray, "h w"] | None = None,
     picked_mm: Float[np.ndarray, " 3"] | None = None,
+    picture: UInt8[np.ndarray, "h w *rgb"] | None = None,
+    taught: Taught | None = None,
     seed: int = 0,
 ) -> SensorCloud:
     """The organ's points among table, drape, instruments and hands; camera frame, mm.
@@ -271,17 +274,41 @@ def find_organ(
         box_mm: two opposite corners of a region of interest.
         mask: of a depth image, True where the organ may be.
         picked_mm: a point on the organ: the piece that it lies on is taken.
+        picture: grey, or red, green and blue, in the depth image's pixels; for ``taught``, what
+            ``teach`` says of organ and surroundings.
 
     Raises:
-        NoEstimate: nothing is left that may be the organ; says which step took the rest.
+        NoEstimate: nothing is left that may be the organ, and which step took the rest; or what
+            was taught cannot be used on this picture.
         InputError: an option that is not allowed.
     """
     from tumortrack.sense.region import Hints, organ_points
     from tumortrack.tracking.tracker import region_for
 
     region = region_for(model, range_mm=range_mm, box_mm=box_mm)
-    hints = Hints(mask=mask, picked_mm=picked_mm)
-    return organ_points(content, region, hints, np.random.default_rng(seed)).cloud
+    hints = Hints(mask, picked_mm, None, picture, taught)
+    found = organ_points(content, region, hints, np.random.default_rng(seed))
+    if found.doubt:
+        raise NoEstimate(found.doubt)
+    return found.cloud
+
+
+def teach(
+    frame: DepthFrame,
+    picture: UInt8[np.ndarray, "h w *rgb"],
+    organ: Sequence[tuple[int, int]],
+    beside: Sequence[tuple[int, int]],
+) -> Taught:
+    """What the organ looks like in colour and depth, from pixels (row, column) on it and beside it,
+    two of each at least; for ``find_organ``.
+
+    Raises:
+        InputError: a pixel shows too little, or organ and surroundings look alike.
+    """
+    from tumortrack.sense.region import taught
+
+    pixels = [(pixel, True) for pixel in organ] + [(pixel, False) for pixel in beside]
+    return taught.teach([taught.look(frame, picture, *pixel) for pixel in pixels])
 
 
 def save_estimate(estimate: Estimate, folder: StrPath, overwrite: bool = False) -> None:

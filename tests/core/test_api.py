@@ -14,7 +14,8 @@ from live_objects import ball
 SIGNATURES = {
     "estimate_from_surfaces": "surfaces grid=160",
     "evaluate": "locate scenes report=None",
-    "find_organ": "content model=None range_mm=None box_mm=None mask=None picked_mm=None seed=0",
+    "find_organ": "content model=None range_mm=None box_mm=None mask=None picked_mm=None "
+    "picture=None taught=None seed=0",
     "load_case": "folder",
     "load_model": "folder device='auto'",
     "plan_resection": "located picture=None stand_mm=None accept_poor=False accept_budget=False "
@@ -24,6 +25,7 @@ SIGNATURES = {
     "save_estimate": "estimate folder overwrite=False",
     "scan_phantom": "folder seed=1",
     "simulate_scenes": "case count=1 seed=0 elastic=True noise=True",
+    "teach": "frame picture organ beside",
     "track": "tracker source sinks=() until=None seconds=0.0 range_mm=None",
     "train": "case folder preset='clinic' config=None minutes=None steps=None seed=0 "
     "device='auto' workers=None start=None report=None",

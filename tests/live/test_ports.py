@@ -122,7 +122,7 @@ def test_without_the_token_nothing_changes_and_the_arms_are_stopped(viewer):
         look(stranger)
         until(viewer._server.get_clients, "the page")
         change(stranger, panel._shown["organ"], 0.1)
-        change(stranger, panel.pick, True)
+        change(stranger, panel.clicks[True], True)
         say(stranger, "ShareUrlRequest")  # viser would publish the server on the internet
         say(stranger, "ScenePointerMessage", event_type="click", ray_origin=[0, 0, 0],
             ray_direction=[0, 0, 1], screen_pos=[[0.5, 0.5]], modifier=None)  # fmt: skip
@@ -131,15 +131,15 @@ def test_without_the_token_nothing_changes_and_the_arms_are_stopped(viewer):
         change(stranger, panel.abort, True)  # what came before it has been seen by then
         until(controls.aborted.is_set, "the stop")
     assert panel.options == before
-    assert not viewer._picking
+    assert viewer._asked is None
     assert viewer._server._share_tunnel is None
     with page(viewer) as owner:
         change(owner, panel._shown["organ"], 0.1)
         until(lambda: panel.options.organ == 0.1, "the change")
         look(owner)  # only those who look may click
         until(lambda: len(viewer._server.get_clients()) == 1)
-        change(owner, panel.pick, True)
-        until(lambda: viewer._picking, "the choice")
+        change(owner, panel.clicks[True], True)
+        until(lambda: viewer._asked, "the choice")
 
 
 def test_a_page_with_the_token_of_an_earlier_run_only_watches(viewer):
@@ -157,7 +157,12 @@ def test_numbers_that_are_none_reach_nobody(viewer):
         look(one, position=[float("nan"), 0, 0])
         look(one, position=[1e30, 0, 0])
         change(one, viewer._panel._shown["organ"], float("inf"))
-        say(one, "GuiUpdateMessage", uuid=viewer._panel.pick._impl.uuid, updates={"removed": True})
+        say(
+            one,
+            "GuiUpdateMessage",
+            uuid=viewer._panel.clicks[True]._impl.uuid,
+            updates={"removed": True},
+        )
         look(one, position=[7, 8, 9])
         until(lambda: viewer._server.get_clients(), "the last look")
     assert viewer._panel.options.organ <= 1

@@ -273,6 +273,10 @@ def test_a_picture_is_red_green_and_blue_of_the_depth_image_s_pixels_and_moment(
     bgr = image_message(rgb[..., ::-1].copy(), "bgr8", 5)
     np.testing.assert_array_equal(picture_of(bgr, frame), rgb)
     assert picture_of(bgr, small_frame(STAMP_NS + 1)) is None
+    four = np.dstack([rgb[..., ::-1], np.full(shape[:2], 255, np.uint8)])
+    np.testing.assert_array_equal(picture_of(image_message(four, "bgra8", 5), frame), rgb)
+    four = np.dstack([rgb, four[..., 3]])
+    np.testing.assert_array_equal(picture_of(image_message(four, "rgba8"), frame), rgb)
     grey = image_message(rgb[..., 0].copy(), "mono8")
     np.testing.assert_array_equal(picture_of(grey, frame), rgb[..., 0])
     with pytest.raises(InputError, match="Align"):

@@ -146,7 +146,7 @@ def check_arms(browser: Browser, feed: Feed, shown: TrackingResult, setting: Sin
 def check_click(browser: Browser, setting: SinkContext) -> None:
     """A click on the scene gives the seen point under it, in the published frame."""
     rect = browser.box("canvas")
-    browser.click_text("Click the organ")
+    browser.click_text("This is the organ")
     until(lambda: "Now click" in browser.text(), "being asked to click")
     column, row = 40, -25  # pixels from the middle of the view
     browser.click(rect[0] + rect[2] / 2 + column, rect[1] + rect[3] / 2 + row)
@@ -157,8 +157,8 @@ def check_click(browser: Browser, setting: SinkContext) -> None:
     focal = rect[3] / 2 / np.tan(0.45)  # the view starts where the camera is, 0.9 rad high
     assert picked[2] > 100
     assert picked[:2] == pytest.approx(np.array([column, row]) * picked[2] / focal, abs=3)
-    until(lambda: "Choose again" in browser.text(), "the way back")
-    browser.click_text("Choose again")
+    until(lambda: "Forget" in browser.text(), "the way back")
+    browser.click_text("Forget")
     until(lambda: setting.controls.picked_mm is None, "forgetting")
 
 

@@ -17,7 +17,7 @@ from tumortrack.sense.noise import D405_NOISE, NoiseConfig, add_noise
 from tumortrack.sense.render import render_depth
 
 BASELINE_MM = 18.0  # of a D405
-BACKGROUND, ORGAN, SHAFT, HAND = range(4)
+BACKGROUND, ORGAN, SHAFT, HAND, FAT = range(5)
 
 
 @dataclass(frozen=True)
@@ -26,8 +26,9 @@ class Props:
 
     distance_mm: camera to the organ's top. tilt_degrees: of the table. waves_mm: height of the
     drape's waves. bed: the organ lies half sunk in something soft that rises around it. cavity: it
-    lies in a hole, below, level with or above what surrounds the hole. up: which way of the organ
-    points up, in its own frame; None: one of its two broad sides, by chance.
+    lies in a hole, below, level with or above what surrounds the hole. fat: some lies against the
+    organ, flush with it. up: which way of the organ points up, in its own frame; None: one of its
+    two broad sides, by chance.
     """
 
     distance_mm: tuple[float, float] = (110.0, 200.0)
@@ -37,6 +38,7 @@ class Props:
     hand: bool = False
     bed: bool = False
     cavity: bool = False
+    fat: bool = False
     up: tuple[float, float, float] | None = None
 
 
@@ -59,12 +61,14 @@ DIFFICULTIES = {
 @dataclass(frozen=True, eq=False)
 class Scene:
     """``frame``: as seen, with noise. ``what``: of every pixel, which object is the nearest; an
-    organ's pixel that flew over 3 mm is BACKGROUND. ``camera_from_organ``: its pose."""
+    organ's pixel that flew over 3 mm is BACKGROUND. ``kinds``: the same without noise.
+    ``camera_from_organ``: its pose."""
 
     frame: DepthFrame
     clean: DepthFrame
     what: np.ndarray
     camera_from_organ: np.ndarray
+    kinds: np.ndarray
 
 
 def kidney_of(label_map: Path) -> Mesh:
@@ -103,6 +107,8 @@ def make_scene(
         (BACKGROUND, ground.surface()),
         (ORGAN, organ.moved(transform_points(table_from_organ, organ.vertices_mm))),
     ]
+    if props.fat:
+        things.append((FAT, _fat(things[1][1], rng)))
     if props.shafts:
         count = rng.integers(1, props.shafts + 1)
         things += [(SHAFT, _shaft(size_mm, top_mm[2], rng)) for _ in range(count)]
@@ -120,8 +126,9 @@ def make_scene(
     shaded[stereo_shadow(clean)] = np.nan
     frame = add_noise(DepthFrame(shaded, camera, 5), noise, rng)
     flown = (what == ORGAN) & ~(np.abs(frame.depth_mm - depth_mm) < 3)
+    kinds = what.copy()
     what[flown] = BACKGROUND
-    return Scene(frame, clean, what, camera_from_table @ table_from_organ)
+    return Scene(frame, clean, what, camera_from_table @ table_from_organ, kinds)
 
 
 def stereo_shadow(frame: DepthFrame) -> np.ndarray:
@@ -219,6 +226,34 @@ def _shaft(size_mm: np.ndarray, top_mm: float, rng: np.random.Generator) -> Mesh
     towards = [np.cos(around) * np.cos(rise), np.sin(around) * np.cos(rise), np.sin(rise)]
     rod = _capsule(tip, tip + 300 * np.array(towards), radius)
     return Mesh(rod.vertices, rod.faces)
+
+
+def _fat(organ: Mesh, rng: np.random.Generator) -> Mesh:
+    """A layer against a third to a half of the organ's outline that goes on at its height, without
+    a crease, and ends 15 to 40 mm farther out. In the table's frame."""
+    from scipy.ndimage import distance_transform_edt, gaussian_filter
+
+    side = np.arange(-120.0, 121.0)  # mm, a cell each
+    far = 10_000.0  # from so far above all rays are parallel
+    above = Intrinsics(len(side), len(side), far, far, 120.0, 120.0)
+    seen = organ.vertices_mm * [1, -1, -1] + [0, 0, far]
+    organ_mm = far - np.nan_to_num(render_depth(seen, organ.faces, above).depth_mm, nan=far)
+    x, y = np.meshgrid(side, -side)
+    level = rng.uniform(0.5, 0.85) * organ_mm.max()
+    away = distance_transform_edt(organ_mm < level)
+    turn = np.arctan2(y, x) - rng.uniform(0, 2 * np.pi)
+    turn = np.abs((turn + np.pi) % (2 * np.pi) - np.pi)
+    wide = rng.uniform(15, 40) + 5 * np.cos(3 * turn)
+    here = (turn < rng.uniform(1.0, 1.6)) & (away < wide) & (np.hypot(x, y) > 5)
+    lumps = gaussian_filter(rng.normal(size=x.shape), 5.0)
+    plateau = np.where(away > 0, level + lumps / lumps.std() * 0.5, organ_mm)
+    height = gaussian_filter(np.maximum(organ_mm, plateau), 5.0)
+    n = len(side)
+    a = (np.arange(n - 1)[:, None] * n + np.arange(n - 1)).ravel()
+    faces = np.concatenate([np.stack([a, a + n, a + 1], 1), np.stack([a + 1, a + n, a + n + 1], 1)])
+    return Mesh(
+        np.stack([x.ravel(), y.ravel(), height.ravel()], 1), faces[here.ravel()[faces].all(1)]
+    )
 
 
 def _hand(size_mm: np.ndarray, top_mm: float, rng: np.random.Generator) -> Mesh:

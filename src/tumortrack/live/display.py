@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Float, Float32, Int, UInt8
 
 from tumortrack.core.types import DepthFrame, SensorCloud
 from tumortrack.live.values import Observation
@@ -17,14 +17,26 @@ def seen_points(observation: Observation) -> Float32[np.ndarray, "n 3"]:
     content = observation.content
     if isinstance(content, SensorCloud):
         return content.points_mm
-    assert isinstance(content, DepthFrame)
-    height, width = content.depth_mm.shape
+    index = _seen_pixels(content)
+    depth_mm = content.depth_mm.ravel()[index].astype(np.float64)
+    return deproject_pixels(index, depth_mm, content.intrinsics)
+
+
+def seen_colours(observation: Observation) -> UInt8[np.ndarray, "n 3"] | None:
+    """Of these points, where there is a picture."""
+    content, picture = observation.content, observation.picture
+    if picture is None or isinstance(content, SensorCloud):
+        return None
+    colours = picture.reshape(content.depth_mm.size, -1)[_seen_pixels(content)]
+    return np.broadcast_to(colours, (len(colours), 3))
+
+
+def _seen_pixels(frame: DepthFrame) -> Int[np.ndarray, " n"]:
+    height, width = frame.depth_mm.shape
     step = max(1, int(np.ceil(np.sqrt(height * width / MOST_SEEN))))
     rows, columns = np.mgrid[0:height:step, 0:width:step]
-    depth_mm = content.depth_mm[::step, ::step].ravel()
-    there = np.flatnonzero(np.isfinite(depth_mm) & (depth_mm > 0))
-    index = (rows * width + columns).ravel()[there]
-    return deproject_pixels(index, depth_mm[there].astype(np.float64), content.intrinsics)
+    there = frame.depth_mm[::step, ::step] > 0
+    return (rows * width + columns)[there]
 
 
 def thinned(rows: np.ndarray, most: int) -> np.ndarray:

@@ -13,18 +13,21 @@ from abc import abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import ClassVar, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, ClassVar, Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, UInt8
+from jaxtyping import Bool, Float, Float32, Float64, UInt8
 
 from tumortrack.core.config import Config
-from tumortrack.core.errors import TumortrackError
+from tumortrack.core.errors import InputError, TumortrackError
 from tumortrack.core.estimate import NO_CHECK_FAILED, UNVERIFIED, Estimate, Quality
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.patient import NOBODY, Patient
 from tumortrack.core.types import Anatomy, DepthFrame, Mesh, SensorCloud
 from tumortrack.models.margins import margin_words
+
+if TYPE_CHECKING:
+    from tumortrack.sense.region.taught import Click, Taught
 
 
 class SourceLost(TumortrackError):
@@ -286,10 +289,42 @@ class ArmsController(Protocol):
 @dataclass(eq=False)
 class Controls:
     """What the user asks of the running loop; from any thread. ``picked_mm``: this point (published
-    frame) lies on the organ: track the piece that it is on. ``aborted``: the arms stop for good."""
+    frame) lies on the organ: track the piece that it is on. ``aborted``: the arms stop for good.
+    ``clicks``: what clicks in pictures showed; ``taught``: what follows from them, as far as they
+    can be told apart; ``colour``: how far, in words."""
 
     picked_mm: Float64[np.ndarray, " 3"] | None = None
     aborted: threading.Event = field(default_factory=threading.Event)
+    clicks: tuple[Click, ...] = ()
+    taught: Taught | None = None
+    colour: str = ""
+
+    def click(self, seen: Observation, place_mm: Float[np.ndarray, " 3"], organ: bool) -> None:
+        """The user clicked on this place (camera frame), and says whether it is the organ's. Raises
+        InputError: there is no picture, or it shows too little there; then nothing changes."""
+        from tumortrack.sense.camera import project
+        from tumortrack.sense.region.taught import look, teach
+
+        if seen.picture is None or not isinstance(seen.content, DepthFrame):
+            raise InputError(
+                "this source gives no picture to learn colours from (realsense?picture=true, "
+                "ros2:TOPIC?picture=TOPIC, stereo)."
+            )
+        ((column, row),), _ = project(place_mm[None], seen.content.intrinsics)
+        new = look(seen.content, seen.picture, (round(row), round(column)), organ)
+        self.clicks, self.taught = (*self.clicks, new), None
+        try:
+            self.taught = teach(self.clicks)
+            said = f"in use: {100 * self.taught.right:.0f} % of a click are told by the others"
+        except InputError as error:
+            said = f"not in use: {error}"
+        count = sum(one.organ for one in self.clicks)
+        beside = len(self.clicks) - count
+        self.colour = f"clicks: {count} on the organ, {beside} beside it; {said}"
+
+    def forget(self) -> None:
+        """Whatever was clicked on."""
+        self.picked_mm, self.clicks, self.taught, self.colour = None, (), None, ""
 
 
 @dataclass(frozen=True, eq=False)

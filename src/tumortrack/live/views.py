@@ -18,6 +18,7 @@ from tumortrack.live.frames import FrameCheck
 from tumortrack.live.scan import Scan
 from tumortrack.live.values import CameraView, PublishedFrame, SinkContext
 from tumortrack.sense.region import Hints, RegionConfig, organ_points
+from tumortrack.sense.region.taught import Taught
 from tumortrack.tracking.tracker import Follower
 
 _PICK_S = 3.0  # without the organ: a pick is forgotten
@@ -44,6 +45,7 @@ class ViewsLocator:
         self._published_from_last = context.published_frame.published_from_camera
         self._picked: Float64[np.ndarray, " 3"] | None = None  # by the user, published frame
         self._place_mm: Float64[np.ndarray, " 3"] | None = None  # where that is by now
+        self._taught: Taught | None = None  # likewise
         self._found_s = time.monotonic()
         # Of the first camera by its calibration, of others as they come.
         self.frames = FrameCheck(context.published_frame, region, frozen_s)
@@ -103,9 +105,9 @@ class ViewsLocator:
             doubt = frames.check(seen)
         with timed(seconds, "organ"):
             rng = np.random.default_rng((self._seed, seen.stamp_ns))
-            organ = organ_points(seen.content, self._region, self._hints(view), rng).cloud
+            organ = organ_points(seen.content, self._region, self._hints(view), rng)
         frames.check_new(seen.content)  # that it shows nothing would be said before
-        return organ, doubt
+        return organ.cloud, "; ".join(filter(None, (doubt, organ.doubt)))
 
     def _camera_from_last(self, view: CameraView) -> Affine:
         """From the frame of the last estimate."""
@@ -115,6 +117,9 @@ class ViewsLocator:
 
     def _heed_pick(self) -> None:
         controls = self._context.controls
+        if controls.taught is not self._taught:  # what was taken for the organ may be wrong
+            self._taught = controls.taught
+            self._follower.forget()
         if controls.picked_mm is not self._picked:  # the user chose again
             self._picked = self._place_mm = controls.picked_mm
             self._found_s = time.monotonic()
@@ -130,7 +135,8 @@ class ViewsLocator:
         if last_box_mm is None and self._place_mm is not None:
             camera_from_published = np.linalg.inv(view.published_from_camera)
             place_mm = transform_points(camera_from_published, self._place_mm[None])[0]
-        return Hints(mask=view.seen.mask, picked_mm=place_mm, last_box_mm=last_box_mm)
+        seen = view.seen
+        return Hints(seen.mask, place_mm, last_box_mm, seen.picture, self._taught)
 
     def _follow_pick(self, view: CameraView, organ: SensorCloud) -> None:
         """The organ was found: what the user picked moves along with it."""

@@ -33,7 +33,7 @@ DEPTHS = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
 _MASKS = {"mono8": "u1", "8UC1": "u1"}
 _PACKED = struct.Struct("<i2f")  # a number for the packing, and two of compressedDepth's
 _PNG = ["compressedDepth", "png"]
-_PICTURES = {"rgb8": "3u1", "bgr8": "3u1", "mono8": "u1", "8UC1": "u1"}
+_PICTURES = {"rgb8": "3u1", "bgr8": "3u1", "rgba8": "4u1", "bgra8": "4u1"} | _MASKS
 _LONGEST_SIDE = 8192  # as of Intrinsics
 
 
@@ -156,8 +156,8 @@ def mask_of(image: Any) -> Bool[np.ndarray, "h w"]:
 
 
 def picture_of(image: Any, frame: DepthFrame) -> UInt8[np.ndarray, "h w *rgb"] | None:
-    """An rgb8, bgr8 or mono8 image as the picture of a depth image's pixels; None where it is of
-    another moment. Raises InputError where it is of another size."""
+    """An rgb8, bgr8, rgba8, bgra8 or mono8 image as the picture of a depth image's pixels; None
+    where it is of another moment. Raises InputError where it is of another size."""
     if stamp_of(image.header) != frame.stamp_ns:
         return None
     picture = _pixels(image, _PICTURES, "a picture")
@@ -166,7 +166,9 @@ def picture_of(image: Any, frame: DepthFrame) -> UInt8[np.ndarray, "h w *rgb"] |
             f"a picture of {picture.shape[1]} x {picture.shape[0]} pixels came for depth images of "
             f"{frame.intrinsics.width} x {frame.intrinsics.height}. Align one with the other."
         )
-    return picture[..., ::-1] if image.encoding == "bgr8" else picture
+    if picture.ndim == 3:
+        picture = picture[..., 2::-1] if image.encoding.startswith("bgr") else picture[..., :3]
+    return picture
 
 
 def _intrinsics_of(info: Any, rectified: bool) -> Intrinsics:

@@ -27,7 +27,7 @@ from tumortrack.live.display import seen_points
 from tumortrack.live.network import is_loopback
 from tumortrack.live.values import SinkConfig, SinkContext, TrackingResult
 from tumortrack.live.viewer.look import point_under
-from tumortrack.live.viewer.panel import ABORTED, CANCEL, CLICK, Panel, State, StatusPanel
+from tumortrack.live.viewer.panel import ABORTED, Panel, State, StatusPanel
 from tumortrack.live.viewer.scene import ViewerScene
 from tumortrack.live.viewer.slices import load_ct, plane_through, slice_picture
 
@@ -99,7 +99,7 @@ class ViewerSink:
         self._hidden_count = 0  # a slice made before the last hiding is void
         self._counter = 0
         self._fault: BaseException | None = None  # for the next publish to raise
-        self._picking = False
+        self._asked: bool | None = None  # for a click on the organ (True) or beside it
         self._state: State = "waiting"
         self._server.scene.set_background_image(np.full((4, 4, 3), colours.BACKGROUND, np.uint8))
         self._scene = ViewerScene(self._server, context, config.margin_mm)
@@ -121,8 +121,9 @@ class ViewerSink:
 
         for switch in panel.switches:
             switch.on_update(changed)
-        panel.pick.on_click(lambda _: self._toggle_picking())
-        panel.forget.on_click(lambda _: self._mark(None))
+        panel.clicks[True].on_click(lambda _: self._ask(True))
+        panel.clicks[False].on_click(lambda _: self._ask(False))
+        panel.forget.on_click(lambda _: self._forget())
         self._guard.on_refused = self._refused
         if self._context.arms:
             panel.abort.on_click(lambda _: self._abort())
@@ -297,40 +298,48 @@ class ViewerSink:
         for number, mesh in enumerate(result.estimate.structures.values()):
             yield mesh, colours.structure_colour(number), 1
 
-    def _toggle_picking(self) -> None:
-        """The next click in the scene chooses the organ; asked twice: it does not."""
+    def _ask(self, organ: bool) -> None:
+        """The next click in the scene is on the organ, or beside it; asked twice: on nothing."""
         with self._lock:
-            self._picking = not self._picking
-            if self._picking:
-                self._server.scene.on_click()(self._clicked)
-            else:
+            if self._asked is not None:
                 self._server.scene.remove_click_callback(self._clicked)
-            self._panel.pick.label = CANCEL if self._picking else CLICK
-            self._panel.forget.visible = self._context.controls.picked_mm is not None
+            self._asked = None if self._asked is organ else organ
+            if self._asked is not None:
+                self._server.scene.on_click()(self._clicked)
+            self._scene.look_at_colours(self._asked is not None)
+            self._panel.say_clicks(self._asked, self._context.controls)
 
     def _clicked(self, event: SceneClickEvent) -> None:
         with self._lock:
-            if not self._picking:
+            organ, result = self._asked, self._result
+            if organ is None:
                 return
-            self._toggle_picking()
-            result = self._result
-            if result is None or result.observation is None:
+            self._ask(organ)
+            if result is None or (seen := result.observation) is None:
                 event.client.add_notification("Nothing is seen at present", "Click again later.")
                 return
-            way = result.published_frame.published_from_camera
-            seen = transform_points(way, seen_points(result.observation).astype(float))
-            point = point_under(seen, np.array(event.ray_origin), np.array(event.ray_direction))
-            if point is None:
+            way, points_mm = result.published_frame.published_from_camera, seen_points(seen)
+            ray = np.array(event.ray_origin), np.array(event.ray_direction)
+            place_mm = point_under(transform_points(way, points_mm.astype(float)), *ray)
+            if place_mm is None:
                 event.client.add_notification("No observed point there", "Click on the points.")
-            else:
-                self._mark(point)
+                return
+            controls = self._context.controls
+            try:
+                controls.click(seen, transform_points(np.linalg.inv(way), place_mm[None])[0], organ)
+            except InputError as error:
+                if not organ or seen.picture is not None:
+                    event.client.add_notification("This click taught no colour", str(error))
+            if organ:
+                controls.picked_mm = place_mm
+                self._scene.mark(place_mm)
+            self._panel.say_clicks(None, controls)
 
-    def _mark(self, point_mm: np.ndarray | None) -> None:
-        """The user clicked here (published frame), or on 'Choose again'."""
+    def _forget(self) -> None:
         with self._lock:
-            self._context.controls.picked_mm = point_mm
-            self._scene.mark(point_mm)
-            self._panel.forget.visible = point_mm is not None
+            self._context.controls.forget()
+            self._scene.mark(None)
+            self._panel.say_clicks(self._asked, self._context.controls)
 
     def _abort(self) -> None:
         with self._lock:

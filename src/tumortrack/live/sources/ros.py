@@ -7,7 +7,7 @@ import time
 from typing import Any, ClassVar, Literal
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, UInt8
 
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import DepthFrame
@@ -19,6 +19,7 @@ from tumortrack.live.values import Observation, SourceConfig, SourceLost
 
 _KINDS = {"image": sensors.IMAGE, "packed": sensors.COMPRESSED, "cloud": sensors.CLOUD}
 _PACKED = "/compressedDepth"  # how image_transport calls the topic, behind the image's name
+_PICTURE_S = 0.03  # so much later than its depth image a picture may come: a frame at 30 Hz
 _LOOK_S = 0.1  # how often the graph is asked for the topic's type, until it is known
 # A late frame, or a camera's computer with a wrong time, is no other clock; a bag is older.
 _SAME_CLOCK_NS = 24 * 3600 * 1_000_000_000
@@ -141,13 +142,16 @@ class RosSource:
 
     def _newest(self) -> bytes | memoryview | None:
         assert self._frames is not None
-        for topic, kind, subscriber in self._beside:
-            for raw in subscriber.take():
-                self._latest[topic] = self._bus.messages.from_bytes(raw, kind)
+        self._take_beside()
         if came := self._frames.take():
             self._passed += len(came) - 1 + (self._waiting is not None)
             self._waiting = came[-1]
         return self._waiting
+
+    def _take_beside(self) -> None:
+        for topic, kind, subscriber in self._beside:
+            for raw in subscriber.take():
+                self._latest[topic] = self._bus.messages.from_bytes(raw, kind)
 
     def _observed(self, raw: bytes | memoryview, arrived_ns: int) -> Observation:
         message = self._bus.messages.from_bytes(raw, self._kind)
@@ -167,10 +171,21 @@ class RosSource:
             )
         frame = sensors.depth_of(message, info, self._config.rectified, self._config.unit_mm)
         mask = self._mask_for(frame) if self._config.mask else None
-        image = self._latest.get(self._config.picture)
-        # One of another moment shows other pixels.
-        picture = image and sensors.picture_of(image, frame)
+        picture = self._picture_for(frame) if self._config.picture else None
         return Observation(frame, arrived_ns, mask, None, frame_id, picture)
+
+    def _picture_for(self, frame: DepthFrame) -> UInt8[np.ndarray, "h w *rgb"] | None:
+        """That of the frame's own moment, which may come a little later; one of another moment
+        shows other pixels."""
+        topic, until_s = self._config.picture, time.monotonic() + _PICTURE_S
+        while (image := self._latest.get(topic)) is None or (
+            stamp_of(image.header) < frame.stamp_ns
+        ):
+            if (left_s := until_s - time.monotonic()) <= 0 or self._closed:
+                break
+            self._bus.wait(left_s)
+            self._take_beside()
+        return image and sensors.picture_of(image, frame)
 
     def _mask_for(self, frame: DepthFrame) -> Bool[np.ndarray, "h w"]:
         """The newest mask, held against the frame that it goes with."""

@@ -17,7 +17,7 @@ from tumortrack.core import colours
 from tumortrack.core.colours import Colour, css, part_colour
 from tumortrack.core.estimate import NO_CHECK_FAILED, UNVERIFIED
 from tumortrack.core.patient import NOBODY
-from tumortrack.live.values import TrackingResult, Workcell
+from tumortrack.live.values import Controls, TrackingResult, Workcell
 from tumortrack.live.viewer.look import View
 from tumortrack.live.viewer.scene import DisplayOptions
 from tumortrack.live.viewer.slices import ORIENTATIONS
@@ -30,7 +30,11 @@ State = Literal["waiting", "good", "poor", "none", "stale"]
 
 _WIDTH = 360  # pixels; what lies over the scene leaves this much room
 ABORT, ABORTED = "Stop the arms for good", "The arms were stopped for good"
-CLICK, CANCEL = "Click the organ", "Now click on the organ (again: cancel)"
+CLICKS = {True: "This is the organ", False: "This is not the organ"}
+CANCEL = {
+    True: "Now click on the organ (again: cancel)",
+    False: "Now click beside it (again: cancel)",
+}
 SILENCE_S = 2  # without a word from the server the page itself says so
 
 # What stands in the panel, and unless all is well over the scene too; its colour.
@@ -215,10 +219,15 @@ class Panel:
         self.whose = gui.add_html(f"<div style='padding:4px 12px'><b>{escape(whose)}</b></div>")
         gui.add_html(_PAGE)  # of one height: what is to be clicked must not jump
         self.stage = gui.add_html("")
-        self.pick = gui.add_button(
-            CLICK, hint="Of several things before the camera, choose the one that is the organ"
-        )
-        self.forget = gui.add_button("Choose again", visible=False)
+        self.clicks = {
+            True: gui.add_button(
+                CLICKS[True],
+                hint="Choose the thing that is the organ; a picture teaches its colour",
+            ),
+            False: gui.add_button(CLICKS[False], hint="Teach the colour of fat, a hand, a drape"),
+        }
+        self.colour = gui.add_html("")
+        self.forget = gui.add_button("Forget", visible=False)
         if arms:
             self.abort = gui.add_button(
                 ABORT, color="red", hint="The arms stop, and move no more in this run"
@@ -260,6 +269,14 @@ class Panel:
 
     def say(self, status: StatusPanel) -> None:
         self.stage.content = status.stage()
+
+    def say_clicks(self, asked: bool | None, controls: Controls) -> None:
+        """``asked``: for a click on the organ, beside it, or for none."""
+        for organ, button in self.clicks.items():
+            button.label = (CANCEL if organ is asked else CLICKS)[organ]
+        self.forget.visible = controls.picked_mm is not None or bool(controls.clicks)
+        words = escape(controls.colour)
+        self.colour.content = words and f"<div class='tumortrack-numbers'>{words}</div>"
 
     def put_slice(self, picture: UInt8[np.ndarray, "h w 3"] | None) -> None:
         if self.slice is not None:

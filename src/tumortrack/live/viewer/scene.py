@@ -19,7 +19,7 @@ from tumortrack.core import colours
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import Mesh
 from tumortrack.live import values as live
-from tumortrack.live.display import MOST_SEEN, seen_points, thinned, wxyz_of
+from tumortrack.live.display import MOST_SEEN, seen_colours, seen_points, thinned, wxyz_of
 from tumortrack.live.values import TrackingResult, TransformedEstimate
 from tumortrack.live.viewer.look import Viewpoint
 from tumortrack.live.viewer.slices import SlicePlane
@@ -36,6 +36,7 @@ _MOST_LABELLED = 15_000  # points shown
 _ELLIPSOID = 2.7955
 _ELLIPSOID_COLOUR = 255, 255, 255  # stands out from every part
 _TUMOR_WITH_POINTS = 0.3  # opacity
+_SEEN_MM, _LOOKED_AT_MM = 0.2, 1.0  # size of points; while a click is asked for
 _NO_POINTS = np.zeros((0, 3), np.float32)
 _NOTHING = Mesh(np.zeros((3, 3)), np.array([[0, 1, 2]]))
 _CORNERS = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
@@ -74,7 +75,7 @@ class ViewerScene:
         self.options = DisplayOptions()
         self.margins: dict[str, Mesh] = {}  # of the shown estimate, published frame
         self._shown: tuple[TrackingResult, TransformedEstimate] | None = None
-        self._has_organ = self._has_slice = False
+        self._has_organ = self._has_slice = self._looks_at_colours = False
         self.look = Viewpoint(server, self._way)
         self._make_nodes(context)
 
@@ -84,7 +85,7 @@ class ViewerScene:
         self._axes = nodes.add_frame(
             "/camera", axes_length=12.0, axes_radius=0.35, wxyz=turn, position=eye_mm
         )
-        self._seen = self._cloud("/seen", 0.2, colours.SEEN)
+        self._seen = self._cloud("/seen", _SEEN_MM, colours.SEEN)
         self._organ = self._cloud("/organ", 0.3, colours.ORGAN)
         blank = np.zeros((12, 2, 3), np.float32)
         self._region = nodes.add_line_segments("/region", blank, colours.REGION, **_HAIRLINE)
@@ -144,6 +145,8 @@ class ViewerScene:
         for node, points in ((self._seen, seen), (self._organ, organ)):
             there = transform_points(self._way, thinned(points, MOST_SEEN))
             node.points = there.astype(np.float32)
+        picture = None if result.observation is None else seen_colours(result.observation)
+        self._seen.colors = np.array(colours.SEEN, np.uint8) if picture is None else picture
         if len(organ):
             lower, upper = organ.min(0), organ.max(0)
             corners = transform_points(self._way, lower + _CORNERS * (upper - lower))
@@ -182,7 +185,8 @@ class ViewerScene:
     def apply(self) -> None:
         """Show and hide nodes by the options and by what there is."""
         options = self.options
-        self._seen.visible = self._organ.visible = options.observed
+        self._seen.visible = options.observed
+        self._organ.visible = options.observed and not self._looks_at_colours
         self._axes.visible = options.helpers
         self._region.visible = options.helpers and self._has_organ
         if self._shown is None:
@@ -226,6 +230,12 @@ class ViewerScene:
         self._slice.render_width = self._slice.render_height = plane.side_mm
         solid = (picture > 8).any(2, keepdims=True)
         self._slice.image = np.concatenate([picture, solid.astype(np.uint8) * 255], axis=2)
+        self.apply()
+
+    def look_at_colours(self, asked: bool) -> None:
+        """Nothing lies over what was seen, and it is seen well, as long as a click is asked for."""
+        self._looks_at_colours = asked
+        self._seen.point_size = _LOOKED_AT_MM if asked else _SEEN_MM
         self.apply()
 
     def mark(self, point_mm: Float[np.ndarray, " 3"] | None) -> None:

@@ -18,6 +18,7 @@ from tumortrack.sense.region.choose import take_one_piece
 from tumortrack.sense.region.picture import Hints, RegionConfig, keep_inside
 from tumortrack.sense.region.pieces import remove_flying
 from tumortrack.sense.region.plane import remove_plane
+from tumortrack.sense.region.taught import colours_of
 
 __all__ = ["Hints", "Region", "RegionConfig", "organ_points"]
 
@@ -33,26 +34,30 @@ class Region:
         taken: (h, w) uint8, the same for each pixel of the working picture: numbers into
             ``STEPS``, 0 the organ. Of a cloud: as a camera at its origin sees it.
         seconds: time it took.
+        doubt: why what clicks have taught could not be used, so that depth alone decided; or
+            nothing.
     """
 
     cloud: SensorCloud
     counts: dict[str, int]
     taken: np.ndarray
     seconds: float
+    doubt: str = ""
 
 
 def organ_points(
     content: DepthFrame | SensorCloud, config: RegionConfig, hints: Hints, rng: np.random.Generator
 ) -> Region:
-    """Crop by range, region of interest, mask and last estimate; remove the plane behind and
-    flying points; take one piece, and what continues it behind something nearer.
+    """Crop by range, region of interest, mask and last estimate; remove what clicks have taught to
+    be something else, the plane behind and flying points; take one piece, and what continues it
+    behind something nearer.
 
     Of large images only every second (third ...) pixel is used. The same generator gives the same
     points.
 
     Raises:
         NoEstimate: fewer than 200 points are left; the message lists which step took how many.
-        InputError: the mask is not of the image's size, or was given with a cloud.
+        InputError: mask or picture is not of the image's size, or a mask was given with a cloud.
     """
     start = time.perf_counter()
     if isinstance(content, DepthFrame):
@@ -68,6 +73,7 @@ def organ_points(
     if hints.last_box_mm is not None and config.last_margin_mm > 0:
         margin_mm = config.last_margin_mm * np.array([[-1.0], [1.0]])
         keep_inside(picture, hints.last_box_mm + margin_mm, pictures.LAST_BOX)
+    doubt = "" if hints.taught is None else _remove_taught(picture, content, hints)
     if config.plane:
         remove_plane(picture, config, rng)
     if config.flying:
@@ -84,8 +90,23 @@ def organ_points(
             f"only {len(left)} points are left for the organ; at least {FEWEST_POINTS} are needed. "
             f"Of {picture.taken.size} pixels went to: {took or 'nothing'} (range "
             f"{config.crop.near_mm:g}..{config.crop.far_mm:g} mm). Move the camera, widen what "
-            "took most, or switch that step off."
+            "took most, or switch that step off." + (doubt and f" Also, {doubt}.")
         )
     drawn = rng.choice(left, min(len(left), config.crop.n_points), replace=False)
     cloud = SensorCloud(picture.points(drawn), content.stamp_ns)
-    return Region(cloud, counts, picture.taken, time.perf_counter() - start)
+    return Region(cloud, counts, picture.taken, time.perf_counter() - start, doubt)
+
+
+def _remove_taught(
+    working: pictures.Picture, content: DepthFrame | SensorCloud, hints: Hints
+) -> str:
+    """Take what is plainly not the organ; or why that cannot be said of this frame."""
+    seen = None
+    if hints.picture is not None and isinstance(content, DepthFrame):
+        seen = colours_of(content, hints.picture)
+    assert hints.taught is not None
+    try:
+        working.take(hints.taught.beside(working, seen), pictures.COLOUR)
+    except NoEstimate as error:
+        return f"what the clicks taught is not used: {error}"
+    return ""

@@ -5,9 +5,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, UInt8
 
 from tumortrack.core.compiled import numba
 from tumortrack.core.config import Config
@@ -16,16 +17,19 @@ from tumortrack.core.types import DepthFrame, SensorCloud
 from tumortrack.sense.camera import Pinhole, deproject_pixels
 from tumortrack.sense.cloud import CloudConfig
 
+if TYPE_CHECKING:
+    from tumortrack.sense.region.taught import Taught
+
 MOST_PIXELS = 110_000  # of a working picture: 424 x 240, and every second pixel of 848 x 480
 _POINTS_PER_PIXEL = 2
 _WIDEST = 2.0  # tangent of the largest angle from the optical axis in a rasterised cloud
 _BINS = 1000  # of the histogram of tangents
 
 # What became of a pixel: still the organ's, or the step that took it.
-ORGAN, NO_RETURN, RANGE, BOX, MASK, LAST_BOX, PLANE, FLYING, THIN, PIECES = range(10)
+ORGAN, NO_RETURN, RANGE, BOX, MASK, LAST_BOX, COLOUR, PLANE, FLYING, THIN, PIECES = range(11)
 STEPS = (
-    *("organ", "no return", "range", "box", "mask"),
-    *("last box", "plane", "flying", "thin", "other pieces"),
+    *("organ", "no return", "range", "box", "mask", "last box"),
+    *("colour", "plane", "flying", "thin", "other pieces"),
 )
 
 jit = numba.njit(cache=True, nogil=True)
@@ -103,11 +107,15 @@ class Hints:
         picked_mm: a point on the organ, camera frame: it decides which piece is taken. Organs move:
             once there is an estimate, give its box instead.
         last_box_mm: lower and upper corner of the last estimate's organ, camera frame.
+        taught: what clicks have taught of organ and surroundings; it looks at ``picture``, which
+            has a depth image's pixels. None: only geometry counts.
     """
 
     mask: Bool[np.ndarray, "h w"] | None = None
     picked_mm: Float[np.ndarray, " 3"] | None = None
     last_box_mm: Float[np.ndarray, "2 3"] | None = None
+    picture: UInt8[np.ndarray, "h w *rgb"] | None = None
+    taught: Taught | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,6 +137,13 @@ class Picture:
     def footprint(self) -> float:
         """Width of a pixel at distance 1."""
         return 2 / (self.pinhole.fx + self.pinhole.fy)
+
+    @property
+    def pixel_mm(self) -> float:
+        """Width of a pixel at the median depth."""
+        some = self.depth_mm[::4, ::4]
+        some = some[some > 0]
+        return self.footprint * float(np.median(some)) if some.size else 1.0
 
     def take(self, where: np.ndarray, step: int) -> None:
         """Give the pixels (h, w, bool) that are still the organ's to a step."""
@@ -153,11 +168,17 @@ class Picture:
         return dict(zip(STEPS, found.tolist(), strict=True))
 
 
-def picture_of_frame(frame: DepthFrame, mask: np.ndarray | None) -> Picture:
-    """Every pixel of a small frame, every second, third ... of a large one."""
-    camera = frame.intrinsics
+def some_pixels(frame: DepthFrame) -> tuple[slice, slice]:
+    """Rows and columns of the working picture: all of a small frame, every second, third ... of a
+    large one."""
     step = int(np.ceil(np.sqrt(frame.depth_mm.size / MOST_PIXELS)))
-    some = (slice(step // 2, None, step), slice(step // 2, None, step))
+    return slice(step // 2, None, step), slice(step // 2, None, step)
+
+
+def picture_of_frame(frame: DepthFrame, mask: np.ndarray | None) -> Picture:
+    """Of a frame's ``some_pixels``."""
+    camera, some = frame.intrinsics, some_pixels(frame)
+    step = some[0].step
     depth_mm = frame.depth_mm[some].copy()
     taken = np.isnan(depth_mm).view(np.uint8) * np.uint8(NO_RETURN)
 
