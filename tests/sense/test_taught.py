@@ -15,11 +15,11 @@ from depth_objects import SMALL, dome, pixels
 from region_objects import DRAPED, FAT, ORGAN, make_scene, precision_recall
 from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.types import DepthFrame, SensorCloud
-from tumortrack.phantom.kidneys import random_anatomy
 from tumortrack.sense.camera import deproject
 from tumortrack.sense.cloud import CloudConfig
 from tumortrack.sense.region import Hints, RegionConfig, organ_points
 from tumortrack.sense.region.taught import look, teach
+from tumortrack_lab.pretraining.kidneys import random_anatomy
 
 CONFIG = RegionConfig(crop=CloudConfig(near_mm=60.0, far_mm=400.0))
 RED, YELLOW, GREEN = (168, 82, 70), (222, 188, 112), (62, 108, 102)
