@@ -11,7 +11,7 @@ UV := uv pip install --quiet --no-deps --require-hashes
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help setup debian demo test pytest test-hard check pretrained attack fuzz crash replay bench soak wheel lock licences audit results real minutes world sequences trust rehearsal population scaling site pictures clean
+.PHONY: help setup debian kernels demo test pytest test-hard check pretrained attack fuzz crash replay bench soak wheel lock licences audit results real minutes world sequences trust rehearsal population scaling site pictures clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 10
@@ -49,10 +49,13 @@ check: setup  ## lint, types, import order, licences
 debian:  ## install what tests need from Debian (Chromium, Fast DDS)
 	tools/debian.sh
 
+kernels: setup  ## compile what the first estimates would wait for, once instead of in each test process
+	$(BIN)/tumortrack compile --device cpu
+
 site: setup  ## the documentation's site, strictly: build/site/index.html (`.venv/bin/mkdocs serve`: while you write)
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
-test: check site pytest  ## check, then all tests (those of Chromium and Fast DDS after `make debian`)
+test: check site kernels pytest  ## check, then all tests (those of Chromium and Fast DDS after `make debian`)
 
 pytest: setup  ## the tests alone
 	OMP_NUM_THREADS=1 $(BIN)/pytest -n 4 --dist loadfile --no-loadscope-reorder
