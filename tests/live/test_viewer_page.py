@@ -184,8 +184,6 @@ def test_pictures_for_the_documentation(tmp_path):
             until(lambda: answers(port), "the viewer")
             browser.open(f"http://127.0.0.1:{port}")
             until(lambda: "NO CHECK FAILED" in browser.text(), "an estimate")
-            close = "document.querySelector('.mantine-Notification-closeButton')?.click()"
-            browser.call("Runtime.evaluate", expression=close)
             time.sleep(8)
             save(browser, "viewer.png")
             process.send_signal(signal.SIGSTOP)
@@ -212,8 +210,6 @@ def test_picture_of_a_resection_for_the_documentation(tmp_path):
             assert address  # with the token: without it a page may change nothing
             browser.open(address[0])
             until(lambda: "ARMS: sweep 2" in browser.text(), "the second sweep", 200)
-            close = "document.querySelector('.mantine-Notification-closeButton')?.click()"
-            browser.call("Runtime.evaluate", expression=close)
             browser.click_text("organ")
             time.sleep(3)
             save(browser, "viewer_resection.png")

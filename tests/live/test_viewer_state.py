@@ -79,8 +79,6 @@ def test_all_parts_of_the_screen_are_of_one_frame_under_load():
         with Browser(780, 800) as browser:
             browser.open(f"http://127.0.0.1:{sink.port}")
             until(lambda: "WAITING" in browser.text(), "the page")
-            close = "document.querySelector('.mantine-Notification-closeButton')?.click()"
-            browser.call("Runtime.evaluate", expression=close)
             numbers = [_number_of(browser, sink, *state) for state in STATES]
             browser.call("Emulation.setCPUThrottlingRate", rate=4)
             for thread in threads:

@@ -44,6 +44,11 @@ def chromium() -> str:
     pytest.skip("Chromium is not installed: `make debian`")
 
 
+# viser's note that there is no GPU lies over the scene until somebody closes it.
+_NO_NOTES = """addEventListener('DOMContentLoaded', () => document.head.insertAdjacentHTML(
+    'beforeend', '<style>.mantine-Notification-root { display: none !important }</style>'))"""
+
+
 class Browser:
     """One page in a browser of its own; a context manager that ends it."""
 
@@ -66,6 +71,8 @@ class Browser:
                 deviceScaleFactor=1,
                 mobile=False,
             )
+            self.call("Page.enable")
+            self.call("Page.addScriptToEvaluateOnNewDocument", source=_NO_NOTES)
         except BaseException:
             self._end()
             raise

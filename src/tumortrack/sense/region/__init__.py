@@ -15,7 +15,8 @@ from tumortrack.core.types import DepthFrame, SensorCloud
 from tumortrack.sense.cloud import FEWEST_POINTS
 from tumortrack.sense.region import picture as pictures
 from tumortrack.sense.region.choose import take_one_piece
-from tumortrack.sense.region.picture import Hints, RegionConfig, keep_inside
+from tumortrack.sense.region.hints import Hints
+from tumortrack.sense.region.picture import RegionConfig, keep_inside
 from tumortrack.sense.region.pieces import remove_flying
 from tumortrack.sense.region.plane import remove_plane
 from tumortrack.sense.region.taught import colours_of

@@ -8,12 +8,12 @@ from typing import NamedTuple
 import numpy as np
 
 from tumortrack.core.errors import NoEstimate
+from tumortrack.sense.region.hints import Hints
 from tumortrack.sense.region.picture import (
     FLYING,
     LAST_BOX,
     PIECES,
     THIN,
-    Hints,
     Picture,
     RegionConfig,
     jit,
