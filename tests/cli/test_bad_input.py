@@ -8,6 +8,7 @@ import nibabel
 import numpy as np
 import pytest
 import trimesh
+import tyro
 
 from stories import refusal, succeeded, tumortrack
 from tumortrack.cli.cases import Prepare
@@ -223,3 +224,8 @@ def test_the_demo_replaces_nothing_but_a_demo(tmp_path, monkeypatch):
     (demo / "notes.txt").write_text("dear")
     with pytest.raises(InputError, match=r"notes\.txt"):
         Demo(out=demo, scenes=1).run()
+
+
+def test_the_window_of_hu_keeps_its_old_name():
+    told = tyro.cli(Prepare, args=["ct.nii.gz", "case", "--kidney-hu", "-200", "250"])
+    assert told.organ_hu == (-200.0, 250.0)
