@@ -106,6 +106,25 @@ def test_what_other_nodes_see_of_a_topic(bus: Bus) -> None:
     assert publisher  # it lives as long as whoever asked for it holds it
 
 
+def test_a_topic_that_nobody_publishes_is_said_with_those_there_are(bus, monkeypatch) -> None:
+    source = SourceRos2(topic="/camera/depht/image").open()
+    try:
+        assert source.read(0.0) is None  # it may not be heard of yet
+        monkeypatch.setattr("tumortrack.live.sources.ros._ALONE_S", 0.0)
+        with pytest.raises(InputError, match="/camera/depht/image; nor any image or cloud"):
+            source.read(0.0)
+        publishers = [bus.publisher("/camera/depth/image", sensors.IMAGE)]
+        publishers += [bus.publisher("/camera/depth/camera_info", sensors.CAMERA_INFO)]
+        until(lambda: bus.types_of("/camera/depth/camera_info"))
+        with pytest.raises(InputError, match=r"clouds seen: /camera/depth/image\. Look at the top"):
+            source.read(0.0)
+        publishers.append(bus.publisher("/camera/depht/image", sensors.IMAGE))
+        until(lambda: bus.types_of("/camera/depht/image"))
+        assert source.read(0.0) is None  # and now it is listened to
+    finally:
+        source.close()
+
+
 def test_a_program_joins_once_and_what_it_left_is_gone(bus: Bus) -> None:
     """One participant however often topics are opened; their types are never freed, for Cyclone
     reads them without a lock. Writers and readers end with whoever opened them."""

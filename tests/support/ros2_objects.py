@@ -18,6 +18,7 @@ from unittest import mock
 
 from clock import PATIENCE_S, until
 from live_objects import PARTS, small_anatomy, small_frame
+from tumortrack.core.errors import InputError
 from tumortrack.core.types import SensorCloud
 from tumortrack.live.ros.bus import Bus
 from tumortrack.live.ros.ros2 import open_bus
@@ -80,7 +81,17 @@ def sending(kind: str, hz: float = 50) -> Iterator[str]:
 
 
 def read_until(source: Source) -> Observation:
-    return until(lambda: source.read(0.2), "a frame")
+    """Its first frame, of a publisher that may still be starting."""
+
+    def frame() -> Observation | None:
+        try:
+            return source.read(0.2)
+        except InputError as error:
+            if "nobody publishes" not in str(error):
+                raise
+            return None
+
+    return until(frame, "a frame")
 
 
 class Other:

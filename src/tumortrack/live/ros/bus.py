@@ -63,6 +63,9 @@ class Bus(Protocol):
     def types_of(self, topic: str) -> set[str]:
         """Message types (``sensor_msgs/msg/Image``) with which the topic is published now."""
 
+    def topics(self) -> dict[str, set[str]]:
+        """The message types of all topics that are published now."""
+
     def wait(self, timeout_s: float) -> None:
         """Return as soon as a subscriber has something to take, or when the time is up."""
 

@@ -140,11 +140,18 @@ class DdsBus:
         return subscriber
 
     def types_of(self, topic: str) -> set[str]:
+        return self.topics().get(topic, set())
+
+    def topics(self) -> dict[str, set[str]]:
         mask = core.ViewState.Any | core.SampleState.Any | core.InstanceState.Alive
         alive = core.ReadCondition(self._published, mask)
         known = self._published.read(_MOST_ENDPOINTS, alive)
-        here = [one for one in known if one.topic_name == "rt" + topic]
-        return {ros_name(one.type_name) or one.type_name for one in here}
+        found: dict[str, set[str]] = {}
+        for one in known:
+            if one.topic_name.startswith("rt/"):
+                kind = ros_name(one.type_name) or one.type_name
+                found.setdefault(one.topic_name.removeprefix("rt"), set()).add(kind)
+        return found
 
     def wait(self, timeout_s: float) -> None:
         # Closed meanwhile by another thread: nothing will come.

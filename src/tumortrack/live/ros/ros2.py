@@ -91,6 +91,9 @@ class RclpyBus:
     def types_of(self, topic: str) -> set[str]:
         return {one.topic_type for one in self._node.get_publishers_info_by_topic(topic)}
 
+    def topics(self) -> dict[str, set[str]]:
+        return {topic: set(kinds) for topic, kinds in self._node.get_topic_names_and_types()}
+
     def wait(self, timeout_s: float) -> None:
         with self._lock:
             if not self._closed:

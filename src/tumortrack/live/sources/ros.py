@@ -20,6 +20,7 @@ from tumortrack.live.values import Observation, SourceConfig, SourceLost
 _KINDS = {"image": sensors.IMAGE, "packed": sensors.COMPRESSED, "cloud": sensors.CLOUD}
 _PACKED = "/compressedDepth"  # how image_transport calls the topic, behind the image's name
 _PICTURE_S = 0.03  # so much later than its depth image a picture may come: a frame at 30 Hz
+_ALONE_S = 2.0  # until then a topic that nobody publishes may only not be heard of yet
 _LOOK_S = 0.1  # how often the graph is asked for the topic's type, until it is known
 # A late frame, or a camera's computer with a wrong time, is no other clock; a bag is older.
 _SAME_CLOCK_NS = 24 * 3600 * 1_000_000_000
@@ -63,7 +64,7 @@ class Ros2SourceConfig(SourceConfig, frozen=True, kw_only=True, tag="ros2"):
 
 class RosSource:
     """An open subscription, from reliable and best effort publishers alike. The newest frame wins.
-    No publisher is no fault: then nothing comes."""
+    Before there is a publisher nothing comes; after 2 s that is said."""
 
     lossless = False
 
@@ -80,6 +81,7 @@ class RosSource:
         self._latest: dict[str, Any] = {}  # by topic: CameraInfo, mask and picture
         self._waiting: bytes | memoryview | None = None  # an image whose CameraInfo is not here yet
         self._passed = 0
+        self._opened_s = time.monotonic()
         self._lock, self._closed = threading.Lock(), False
 
     @property
@@ -125,6 +127,8 @@ class RosSource:
                         f"be {' or '.join(sorted(wanted))}, and one of them (say which: "
                         "type=cloud, image or packed)."
                     )
+                if final and not there and time.monotonic() - self._opened_s > _ALONE_S:
+                    raise InputError(self._alone())
                 if len(usable) != 1:
                     return False
                 (self._kind,) = usable
@@ -139,6 +143,15 @@ class RosSource:
             ]
             self._frames = self._bus.subscriber(self._topic, self._kind)
         return True
+
+    def _alone(self) -> str:
+        published = self._bus.topics().items()
+        seen = sorted(topic for topic, kinds in published if kinds & set(_KINDS.values()))
+        there = f"images and clouds seen: {', '.join(seen)}" if seen else "nor any image or cloud"
+        return (
+            f"nobody publishes {self._topic}; {there}. Look at the topic's name, at ROS_DOMAIN_ID "
+            "and at the network."
+        )
 
     def _newest(self) -> bytes | memoryview | None:
         assert self._frames is not None
