@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import signal
 import sys
-import termios
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -386,6 +385,8 @@ def _live_of(model: Path, source: str, stored: PlanFolder) -> _Live:
 def _confirm(arms: Sequence[UrSinkConfig], patient: Patient) -> None:
     """A person at the terminal types each arm's address; InputError: something else."""
     for arm in arms:
+        import termios  # not on Windows, where no terminal would be found above
+
         termios.tcflush(sys.stdin, termios.TCIFLUSH)  # what was typed before it was asked for
         say(
             f"The {arm.arm} at {arm.host} is about to move: as soon as an estimate is good, and "
