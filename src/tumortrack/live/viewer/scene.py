@@ -75,7 +75,7 @@ class ViewerScene:
         self.options = DisplayOptions()
         self.margins: dict[str, Mesh] = {}  # of the shown estimate, published frame
         self._shown: tuple[TrackingResult, TransformedEstimate] | None = None
-        self._has_organ = self._has_slice = self._has_colours = self._looks_at_colours = False
+        self._has_organ = self._has_slice = self._looks_at_colours = False
         self.look = Viewpoint(server, self._way)
         self._make_nodes(context)
 
@@ -146,11 +146,7 @@ class ViewerScene:
             there = transform_points(self._way, thinned(points, MOST_SEEN))
             node.points = there.astype(np.float32)
         picture = None if result.observation is None else seen_colours(result.observation)
-        if picture is not None:
-            self._seen.colors = picture
-        elif self._has_colours:
-            self._seen.colors = np.array(colours.SEEN, np.uint8)
-        self._has_colours = picture is not None
+        self._seen.colors = np.array(colours.SEEN, np.uint8) if picture is None else picture
         if len(organ):
             lower, upper = organ.min(0), organ.max(0)
             corners = transform_points(self._way, lower + _CORNERS * (upper - lower))
