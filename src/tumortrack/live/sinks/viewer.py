@@ -39,7 +39,9 @@ if TYPE_CHECKING:
 _STALE_S = 1.0
 _TICK_S = 0.2  # the status grows older, and slices are renewed, this often
 _SLICE_PIXELS = 320
-_PARKED_S = 1.0  # for viser's thread to stand still, else what changes may arrive in pieces
+# For viser's thread to stand still, else what changes may arrive in pieces: on a busy machine, or
+# in a full garbage collection, it may not come to run for a second.
+_PARKED_S = 5.0
 _TOLD_S = 5.0  # between two notices to a visitor who may only watch
 
 
