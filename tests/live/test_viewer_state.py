@@ -106,6 +106,24 @@ def test_all_parts_of_the_screen_are_of_one_frame_under_load():
     assert not wrong, f"{len(wrong)} of {_SHOTS}: {wrong}"
 
 
+def test_a_change_waits_for_a_sender_that_is_held_up():
+    """Two seconds, as when Python collects garbage in a large program: else the page gets a part of
+    the change before the rest."""
+    sink = ViewerSinkConfig(port=0).open(small_setting())
+    sending = sink._server.get_event_loop()
+    before, after = threading.Event(), threading.Event()
+    try:
+        sending.call_soon_threadsafe(time.sleep, 2.0)
+        sending.call_soon_threadsafe(before.set)
+        with sink._page():
+            assert before.is_set(), "what it still had to send would go out within the change"
+            sending.call_soon_threadsafe(after.set)
+            assert not after.wait(0.3), "something can be sent while the change is made"
+        assert after.wait(5)
+    finally:
+        sink.close()
+
+
 Place = tuple[slice, slice]
 
 
