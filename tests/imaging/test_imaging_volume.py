@@ -221,6 +221,20 @@ def test_implausible_nifti_headers_are_refused(tmp_path, change, words):
         read_volume(tmp_path / "v.nii")
 
 
+def test_a_mended_header_is_not_told_by_nibabel_whose_log_stays_as_it_was(tmp_path, capfd):
+    import nibabel
+
+    image = nibabel.Nifti1Image(np.zeros((2, 3, 4), np.int16), np.diag([-2.0, -2, 3, 1]))
+    nibabel.save(image, tmp_path / "ct.nii")
+    raw = bytearray((tmp_path / "ct.nii").read_bytes())
+    raw[80:84] = np.float32(-2).tobytes()  # pixdim[1], which has to be positive
+    (tmp_path / "ct.nii").write_bytes(raw)
+    before = nibabel.imageglobals.logger.level
+    assert nifti.read_nifti(tmp_path / "ct.nii").array.shape == (2, 3, 4)
+    assert nibabel.imageglobals.logger.level == before
+    assert capfd.readouterr().err == ""
+
+
 def test_contradictory_orientations_are_refused(tmp_path):
     import nibabel
 

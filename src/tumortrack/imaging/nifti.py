@@ -41,6 +41,8 @@ _EQUAL_STEPS = 0.01  # of sform and qform, relatively
 _LONGEST_HEADER = 540  # bytes: NIfTI-2's
 _MAX_OFFSET = 16 * 2**20  # bytes of header and extensions before the voxels
 _MOST_BEHIND = 16 * 2**20  # bytes after the voxels
+# nibabel would log what it mends in a header: errors here name what is wrong.
+_UNSAID = logging.Logger("nibabel", logging.CRITICAL)
 
 
 def read_nifti(path: Path) -> grid.RawVolume:
@@ -62,8 +64,6 @@ def _read(path: Path, stream: Any, compressed: bool) -> grid.RawVolume:
     import nibabel
     from nibabel.volumeutils import apply_read_scaling
 
-    # It would log what it mends in a header: errors here name what is wrong.
-    nibabel.imageglobals.logger.setLevel(logging.CRITICAL)
     head = stream.read(_LONGEST_HEADER)
     kinds = {348: nibabel.Nifti1Header, 540: nibabel.Nifti2Header}
     sizes = [struct.unpack(order + "i", head[:4].ljust(4, b"\0"))[0] for order in "<>"]
@@ -71,7 +71,8 @@ def _read(path: Path, stream: Any, compressed: bool) -> grid.RawVolume:
     if size is None:
         raise InputError(f"{path} is no NIfTI file (its header has {sizes[0]} bytes, not 348).")
     try:
-        header = kinds[size](head[:size])
+        header = kinds[size](head[:size], check=False)
+        header.check_fix(logger=_UNSAID)
         shape = tuple(int(n) for n in header.get_data_shape())
         dtype = header.get_data_dtype()
         units = header.get_xyzt_units()[0]
