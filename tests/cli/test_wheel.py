@@ -8,6 +8,7 @@ import sysconfig
 import tomllib
 import venv
 import zipfile
+from importlib.metadata import version
 from pathlib import Path
 
 import pytest
@@ -56,6 +57,7 @@ def test_commands_and_an_example_run_from_the_wheel(environment, tmp_path):
     assert str(environment) in run(python, "-c", code, env=clean)
     command = [python, "-m", "tumortrack"]
     assert "--minutes" in run(*command, "demo", "--help", env=clean)
+    assert run(*command, "--version", env=clean) == f"tumortrack {version('tumortrack')}\n"
     said = run(*command, "doctor", env=clean)
     assert re.search(r"ok       tumortrack: .* torch \d", said)
     assert "BROKEN" not in said

@@ -12,6 +12,7 @@ from typing import NoReturn, Protocol, runtime_checkable
 
 import tyro
 
+import tumortrack
 from tumortrack.cli.cases import Export, Prepare, Simulate
 from tumortrack.cli.demo import Demo
 from tumortrack.cli.doctor import Doctor
@@ -64,6 +65,9 @@ def main() -> None:
 
 def run(arguments: list[str]) -> int:
     """One command: its exit code. A known error is one line, never a traceback."""
+    if arguments == ["--version"]:
+        print(f"tumortrack {tumortrack.__version__}")
+        return 0
     try:
         _parse(arguments).run()
         sys.stdout.flush()
