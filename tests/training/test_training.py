@@ -100,7 +100,7 @@ def test_ctrl_c_keeps_the_state_and_says_how_to_go_on(case, tmp_path):
     assert "Traceback" not in errors
     assert (model / "training" / "checkpoint.safetensors").exists()
     message = refusal(tumortrack("train", case, model, *options, "--seed", 1))
-    assert "another case, preset, seed or option" in message
+    assert "differs from this command in --seed (0 there, 1 here). Give" in message
 
 
 @pytest.mark.slow
@@ -117,9 +117,12 @@ def test_the_model_says_what_it_was_made_from(case, quick_model):
     again = tumortrack(*train_command(case, quick_model))
     assert "trained already" in succeeded(again)
     more = [*train_command(case, quick_model), "--seed", 1]
-    assert "(12 steps, seed 0)" in refusal(tumortrack(*more))
+    message = refusal(tumortrack(*more))
+    assert "(12 steps, seed 0), whose command differs" in message
+    assert "from this one in --seed (0 there, 1 here). A finished" in message
     other = ["train", case, quick_model, "--steps", STEPS["quick"]]  # the default is clinic
-    assert "--preset" in refusal(tumortrack(*other))
+    message = refusal(tumortrack(*other))
+    assert "in --preset, --rotations, --sensor or the version, and in --start. A" in message
 
 
 def test_a_changed_weights_file_or_schema_is_refused(quick_model, tmp_path):

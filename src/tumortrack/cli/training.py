@@ -87,12 +87,11 @@ class Train:
         )  # fmt: skip
         if is_finished(self.model):
             done = load_model(self.model).provenance
-            if done.get("run_sha256") != run.identity:
+            if differences := run.differences(done.get("decided_by", {})):
                 raise InputError(
                     f"{self.model} holds a finished model ({done['steps']} steps, seed "
-                    f"{done['seed']}), trained with another case, --preset, --rotations, "
-                    "--minutes, --steps, --seed or --start. A finished training is not extended: "
-                    "choose another MODEL folder."
+                    f"{done['seed']}), whose command differs from this one in {differences}. A "
+                    "finished training is not extended: choose another MODEL folder."
                 )
             say(f"{self.model} is trained already ({done['steps']} steps).")
             say_notes(filter(None, [weakness_of(done)]))

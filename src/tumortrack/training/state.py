@@ -10,7 +10,7 @@ import hashlib
 import json
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
@@ -55,8 +55,21 @@ class Run(ABC):
 
     @property
     @abstractmethod
-    def identity(self) -> str:
-        """sha256 of all that decides the weights, so that a resumed run is the same run."""
+    def decided_by(self) -> dict[str, Any]:
+        """All that decides the weights, by the options that say it (long ones as a sha256), so that
+        a resumed run is the same run."""
+
+    def differences(self, kept: Mapping[str, Any]) -> str:
+        """What the run that was ``decided_by`` these was given differently; empty: it is this
+        one."""
+        found = []
+        for name, here in self.decided_by.items():
+            there = kept.get(name)
+            values = ["not given" if value is None else str(value) for value in (there, here)]
+            hashed = isinstance(there or here, str)
+            if there != here:
+                found += [name if hashed else f"{name} ({values[0]} there, {values[1]} here)"]
+        return ", and in ".join(found)
 
 
 @dataclass(frozen=True)
@@ -98,9 +111,10 @@ class TrainingRun(Run):
         return self.config.steps if short is None else short
 
     @property
-    def identity(self) -> str:
-        start = {} if self.start is None else {"start": self.start.sha256}
-        return run_sha256(self, case=self.case_sha256, minutes=self.minutes, **start)
+    def decided_by(self) -> dict[str, Any]:
+        start = None if self.start is None else self.start.sha256
+        options = {"CASE": self.case_sha256, "--minutes": self.minutes, "--start": start}
+        return {**common_to_runs(self), **options}
 
 
 def check_run(run: Run, **smallest: int) -> None:
@@ -115,11 +129,11 @@ def check_run(run: Run, **smallest: int) -> None:
         )
 
 
-def run_sha256(run: Run, **more: object) -> str:
-    """Of configuration, seed, steps and what else decides the weights."""
-    content = {"config": to_builtins(run.config), "seed": run.seed, "steps": run.steps, **more}
-    content["schema"] = store.SCHEMA
-    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+def common_to_runs(run: Run) -> dict[str, Any]:
+    """What of ``decided_by`` every kind of run has."""
+    config = json.dumps([store.SCHEMA, to_builtins(run.config)], sort_keys=True).encode()
+    rules = {"--preset, --rotations, --sensor or the version": hashlib.sha256(config).hexdigest()}
+    return {**rules, "--seed": run.seed, "--steps": run.steps}
 
 
 @dataclass
@@ -143,7 +157,7 @@ def provenance(
         "validation_miou": round(progress.best_miou, 4),
         "device": torch.cuda.get_device_name(device) if device.type == "cuda" else "cpu",
         "threads": torch.get_num_threads(),
-        "run_sha256": run.identity,
+        "decided_by": run.decided_by,
         "case_sha256": run.case_sha256,
         "up_lps": list(run.up_lps),
         "patient": to_builtins(run.patient),
@@ -233,6 +247,7 @@ class TrainingState:
             with safe_open(path, framework="pt") as file:
                 metadata = file.metadata() or {}
                 progress = TrainingProgress(**json.loads(metadata["progress"]))
+                kept = dict(json.loads(metadata["decided_by"]))
                 for key in file.keys():  # noqa: SIM118 - safe_open is no dict
                     group, name = key.split("/", 1)
                     groups.setdefault(group, {})[name] = file.get_tensor(key)
@@ -240,11 +255,10 @@ class TrainingState:
             raise ArtifactError(
                 f"{path} is damaged: {error}. Remove {work.parent} and train again."
             ) from error
-        if metadata.get("identity") != self.run.identity:
+        if differences := self.run.differences(kept):
             raise ArtifactError(
-                f"{work.parent} holds a run with another case, preset, seed or option, or of "
-                "another version. Give the same command to resume it, or another MODEL folder to "
-                "start a new one."
+                f"{work.parent} holds a run that differs from this command in {differences}. Give "
+                "the same command to resume it, or another MODEL folder to start a new one."
             )
         self.progress = progress
         self.network.load_state_dict(groups["network"])
@@ -273,7 +287,10 @@ class TrainingState:
             for group, members in groups.items()
             for name, tensor in members.items()
         }
-        metadata = {"progress": json.dumps(asdict(self.progress)), "identity": self.run.identity}
+        metadata = {
+            "progress": json.dumps(asdict(self.progress)),
+            "decided_by": json.dumps(self.run.decided_by),
+        }
         store.write_atomically(work / _FILE, save(tensors, metadata))
 
     def step(self, batch: Tensors) -> float:

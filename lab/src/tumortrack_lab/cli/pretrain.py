@@ -45,10 +45,10 @@ class Pretrain:
         )  # fmt: skip
         if (self.out / store.MANIFEST).is_file():
             done = store.read_manifest(self.out, PRETRAINED).get("provenance", {})
-            if done.get("run_sha256") != run.identity:
+            if differences := run.differences(done.get("decided_by", {})):
                 raise InputError(
-                    f"{self.out} holds weights of other options or another seed. Choose another "
-                    "folder."
+                    f"{self.out} holds weights whose command differs from this one in "
+                    f"{differences}. Choose another folder."
                 )
             say(f"{self.out} is pretrained already ({done['steps']} steps).")
             return

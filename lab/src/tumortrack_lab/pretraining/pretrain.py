@@ -42,7 +42,7 @@ from tumortrack.simulate.scene import Batch, SceneStream, body_for
 from tumortrack.training.model import PRETRAINED
 from tumortrack.training.presets import Rotations, clinic_rules
 from tumortrack.training.scenes import Scenes, batches
-from tumortrack.training.state import Run, TrainingState, check_run, run_sha256
+from tumortrack.training.state import Run, TrainingState, check_run, common_to_runs
 from tumortrack.training.train import Report, divide_cores, run_steps, work_folder
 from tumortrack_lab.pretraining.kidneys import random_anatomy
 
@@ -76,8 +76,8 @@ class Pretraining(Run):
         return self.steps
 
     @property
-    def identity(self) -> str:
-        return run_sha256(self, anatomies=self.anatomies)
+    def decided_by(self) -> dict[str, Any]:
+        return {**common_to_runs(self), "--anatomies": self.anatomies}
 
 
 def pretraining(rotations: Rotations = "limited") -> TrainConfig:
@@ -156,7 +156,7 @@ def pretrain(run: Pretraining, folder: Path, report: Report) -> dict[str, Any]:
             "anatomies": run.anatomies,
             "steps": state.progress.step,
             "training_s": round(state.progress.elapsed_s, 1),
-            "run_sha256": run.identity,
+            "decided_by": run.decided_by,
         }
         save_start(state.average, run.config.network, about, folder)
         return about

@@ -197,7 +197,7 @@ class Trainer(NamedTuple):
         )
         # A finished model of another run is refused by training, with a clear text.
         about = store.read_json(folder / store.MANIFEST) if is_finished(folder) else {}
-        if about.get("provenance", {}).get("run_sha256") != run.identity:
+        if run.differences(about.get("provenance", {}).get("decided_by", {})):
             threads = torch.get_num_threads()
             label = f"{case.name} {name} seed {seed}"
             train(run, folder, lambda status: self.report(label, status))
