@@ -82,7 +82,7 @@ def scene_picture(
             else "not found"
         )
         axes.set_title(f"{what}\n{found}", fontsize=9.5)
-    failed = "" if entry["failed"] is None else f"   {textwrap.shorten(entry['failed'], 60)}"
+    failed = "" if entry["failed"] is None else f"\n{textwrap.shorten(entry['failed'], 130)}"
     errors = entry.get("tre_mm")
     targets = f"   target error {errors['mean']:.1f} mm" if errors else ""
     headline = f"{entry['name']}   mIoU {entry['miou']:.2f}{targets}{failed}"
