@@ -31,6 +31,7 @@ from tumortrack_lab.real.judging import quantiles
 from tumortrack_lab.real.kidneys import SET_ASIDE, WHERE
 from tumortrack_lab.study import scripts
 from tumortrack_lab.study.document import ReportWriter, table
+from tumortrack_lab.study.trust import BANDS, band_of
 
 DEVELOPMENT = (0, 2, 3)
 BLOCK = "population"
@@ -135,15 +136,18 @@ def _margins(people: pd.DataFrame) -> str:
 
 
 def _groups(scenes: pd.DataFrame) -> str:
-    """Verdicts and errors, by how tumors lie."""
-    given = {"all": pd.Series("all", scenes.index), "kind": scenes.kind, "at": scenes.position}
+    """Verdicts and errors, by what was done to the organ and how tumors lie."""
+    given: dict[str, pd.Series] = {"all": pd.Series("all", scenes.index), "state": scenes.family}
+    bands = pd.Categorical(scenes.hidden_share.map(band_of), BANDS)
+    given["hidden"] = pd.Series(bands, scenes.index)
+    given |= {"kind": scenes.kind, "at": scenes.position}
     for column, (words, limits) in _AGAINST.items():
-        given[words] = pd.cut(scenes[column], limits, right=False).astype(str)
+        given[words] = pd.cut(scenes[column], limits, right=False)
     head = ["", "tumors", "scenes", "good, poor, refused", f"centre, {_ERRORS}", "best rigid pose"]
     head += ["Hausdorff", "best rigid pose", "over 3, 5 mm"]
     body = []
     for words, values in given.items():
-        for value, mine in scenes.groupby(values):
+        for value, mine in scenes.groupby(values, observed=True):
             good = mine[mine.verdict == "good"]
             shares = [
                 f"{(mine.verdict == name).mean():.0%}" for name in ("good", "poor", "refused")
