@@ -161,6 +161,20 @@ def test_the_way_there_and_back_is_none():
     np.testing.assert_allclose((homogeneous @ motion.camera_from_ct.T)[:, :3], rigid, atol=1e-9)
 
 
+@pytest.mark.parametrize("way", ["carry", "back", "covariance_mm2", "std_mm", "largest_std_mm"])
+def test_what_is_no_list_of_finite_points_is_refused(way, unchecked):
+    """NaN ended the process, and other shapes were read beyond their end."""
+    motion, points = dataclasses.replace(placed(), covariance=np.eye(6 + SMALL.modes)), inside(5)
+    ask = getattr(motion, way)
+    assert np.isfinite(ask(points)).all()
+    for wrong in (points[:, :2], points.T, points[0], points[None], np.hstack([points, points])):
+        with pytest.raises(InputError, match="points are n x 3"):
+            ask(wrong)
+    points[[1, 3], 0] = np.nan, np.inf
+    with pytest.raises(InputError, match="2 of 5 points have NaN or infinity"):
+        ask(points)
+
+
 def test_a_librarys_states_have_a_rarity_of_one_on_average():
     rarities = [placed(state).rarity for state in range(len(shape().body.states))]
     assert np.mean(rarities) == pytest.approx(1, abs=0.03)

@@ -27,7 +27,7 @@ NO_CHECK_FAILED, UNVERIFIED = "fit: no check failed", "its place is not verified
 @runtime_checkable
 class Motion(Protocol):
     """One frame's correspondence: undeformed CT (LPS, mm) <-> camera frame (mm). It takes any
-    finite points, also outside the organ, and returns finite ones."""
+    finite points, n x 3, also outside the organ, and returns finite ones; InputError for others."""
 
     def carry(self, points_ct: Points, /) -> Points:
         """CT points in the camera frame."""

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float32, Float64
 from scipy.spatial.transform import Rotation
 
+from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import Points, rigid
 from tumortrack.core.process import parallel_for
 from tumortrack.registration import kernels
@@ -83,7 +84,7 @@ class ElasticMotion:
         first order, of the discrepancy, the rivals and the camera's calibration."""
         if self.covariance is None:
             return None
-        points = np.ascontiguousarray(points_ct, np.float32)
+        points = _given(points_ct)
         out, places_mm = np.empty((len(points), 3, 3)), self.carry(points)
         parallel_for(lambda part: self._spread(points[part], out[part]), len(points), _FEW)
         out = self.rotation @ out @ self.rotation.T
@@ -118,8 +119,7 @@ class ElasticMotion:
         return out
 
     def _moved(self, kernel: Callable[..., None], flow: Flow, points_mm: Points) -> Moved:
-        # Copies, in C's order: for other arrays the kernels would be compiled once more.
-        points, out = np.array(points_mm, np.float32, order="C"), np.empty((len(points_mm), 3))
+        points, out = _given(points_mm), np.empty((len(points_mm), 3))
         rotation = np.ascontiguousarray(self.rotation)
         pose = Pose(self.shape.body.center_ct, rotation, self.centre_mm)
         parallel_for(lambda part: kernel(flow, pose, points[part], out[part]), len(out), _AT_ONCE)
@@ -136,6 +136,17 @@ class ElasticMotion:
     @property
     def _opposite(self) -> Flow:
         return self._flow._replace(velocity=-self._flow.velocity)
+
+
+def _given(points_mm: Points) -> Float32[np.ndarray, "n 3"]:
+    """A copy, in C's order: for other arrays the kernels would be compiled once more. Raises
+    InputError for what would have them read beyond an array."""
+    points = np.array(points_mm, np.float32, order="C")
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise InputError(f"points are n x 3, one a row, mm; these have the shape {points.shape}.")
+    if bad := np.count_nonzero(~np.isfinite(points).all(axis=1)):
+        raise InputError(f"{bad} of {len(points)} points have NaN or infinity; leave them out.")
+    return points
 
 
 def blend(a: ElasticMotion, b: ElasticMotion, share: float) -> ElasticMotion:

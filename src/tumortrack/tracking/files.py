@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from tumortrack.core import store
+from tumortrack.core.errors import InputError
 from tumortrack.core.estimate import Estimate
 from tumortrack.core.mesh_files import write_mesh
 from tumortrack.core.organ import is_tumor
@@ -29,10 +30,15 @@ def write_estimate(
     tumor_1_margin.ply, ..., the shells of the highest confidence, where margins are stated;
     points.csv, the given ``points`` of the CT and where they are now; all or nothing.
 
-    Raises InputError: the folder exists and ``overwrite`` is False; points without a motion;
+    Raises InputError: the folder exists and ``overwrite`` is False; points without a motion; an
+    estimate without a volume;
     NoEstimate: the motion has no answer for a point; StorageError: the disk refused."""
     cloud, volume = estimate.cloud, estimate.volume
-    assert volume is not None  # live estimates are the recording sink's
+    if volume is None:
+        raise InputError(
+            "this estimate is of a live frame and has no labelled volume to write; give one of "
+            "`locate`, or keep live ones with the sink recording."
+        )
     with store.new_folder(folder, overwrite) as aside:
         values = {"label": cloud.labels, "probability": cloud.probability}
         values |= _places_in_ct(estimate)
