@@ -104,6 +104,20 @@ def test_ctrl_c_keeps_the_state_and_says_how_to_go_on(case, tmp_path):
 
 
 @pytest.mark.slow
+def test_a_script_need_not_guard_its_main_part(case, tmp_path):
+    """Processes that make scenes ran it again, failed, and it waited for good."""
+    script = tmp_path / "mine.py"
+    given = f"{str(case)!r}, {str(tmp_path / 'model')!r}, preset='quick', steps=2, workers=1"
+    script.write_text(f"import tumortrack as tt\ntt.train({given})\nprint(__file__)")
+    done = subprocess.run(
+        [sys.executable, script], capture_output=True, text=True, timeout=300, env=environment()
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.split() == [str(script)]
+    assert load_model(tmp_path / "model").provenance["steps"] == 2
+
+
+@pytest.mark.slow
 def test_the_model_says_what_it_was_made_from(case, quick_model):
     about = load_model(quick_model).provenance
     assert about["steps"] == STEPS["quick"]

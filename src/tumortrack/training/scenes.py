@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import atexit
 import os
+import pickle
 import signal
-from collections.abc import Callable, Generator
+import sys
+from collections.abc import Callable, Generator, Iterator
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from typing import Any
 
@@ -48,8 +51,25 @@ def batches(
         worker_init_fn=_quiet_worker,
         pin_memory=device.type == "cuda",  # copies then overlap with the work before
     )
-    for batch in loader:
+    needs_main = workers > 0 and b"__main__" in pickle.dumps(make)
+    with nullcontext() if needs_main else _main_left_alone():
+        made = iter(loader)
+    for batch in made:
         yield tuple(batch)
+
+
+@contextmanager
+def _main_left_alone() -> Iterator[None]:
+    """Processes started inside do not run the user's program from its first line, as they would to
+    have what it defines: without an ``if __name__ == "__main__"`` it would train there once more,
+    fail, and leave this process waiting for good."""
+    main, names = sys.modules["__main__"], ("__file__", "__spec__")
+    hidden = {name: vars(main)[name] for name in names if name in vars(main)}
+    vars(main).update(dict.fromkeys(hidden))
+    try:
+        yield
+    finally:
+        vars(main).update(hidden)
 
 
 class _Made(Dataset[Any]):
