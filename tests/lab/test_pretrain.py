@@ -320,7 +320,8 @@ def test_the_commands_refuse_what_is_no_start_for_them(pretrained, tmp_path):
 
 
 def test_the_command_line_keeps_finished_weights(pretrained):
-    assert "other options" in refusal(tumortrack("pretrain", pretrained, "--steps", 5))
+    message = refusal(tumortrack("pretrain", pretrained, "--steps", 5))
+    assert "in --steps (4 there, 5 here), and in --anatomies (2 there, 400 here)." in message
 
 
 def test_a_head_start_shortens_what_nobody_has_limited(patient):
