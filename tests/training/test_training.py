@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import resource
@@ -16,6 +17,7 @@ import numpy as np
 import pytest
 import torch
 
+from clock import until
 from stories import COMMAND, STEPS, environment, refusal, succeeded, train_command, tumortrack
 from tumortrack.core.config import from_builtins, to_builtins
 from tumortrack.core.errors import ArtifactError, InputError
@@ -101,6 +103,37 @@ def test_ctrl_c_keeps_the_state_and_says_how_to_go_on(case, tmp_path):
     assert (model / "training" / "checkpoint.safetensors").exists()
     message = refusal(tumortrack("train", case, model, *options, "--seed", 1))
     assert "differs from this command in --seed (0 there, 1 here). Give" in message
+
+
+@pytest.mark.slow
+def test_ctrl_c_while_processes_start_ends_the_training(case, tmp_path):
+    """As a terminal sends it, to all of them: it ended one that was loading, and the training
+    waited for good to write to it."""
+    options = ["--preset", "quick", "--steps", "100000", "--workers", "1"]
+    command = [*COMMAND, "train", str(case), str(tmp_path / "stopped"), *options]
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment(),
+        start_new_session=True,
+    ) as process:  # fmt: skip
+        try:
+            until(lambda: "spawn_main" in _commands_below(process.pid), "a process for scenes")
+            time.sleep(0.3)  # it imports
+            os.killpg(process.pid, signal.SIGINT)
+            _, errors = process.communicate(timeout=60)
+        finally:
+            if process.poll() is None:
+                os.killpg(process.pid, signal.SIGKILL)
+    assert process.returncode == 130
+    assert "Traceback" not in errors
+
+
+def _commands_below(pid: int) -> str:
+    """Command lines of a process's children."""
+    found = []
+    for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split():
+        with contextlib.suppress(OSError):  # it has ended
+            found.append(Path(f"/proc/{child}/cmdline").read_text())
+    return " ".join(found)
 
 
 @pytest.mark.slow

@@ -10,6 +10,7 @@ import sys
 from collections.abc import Callable, Generator, Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
+from multiprocessing import resource_tracker
 from typing import Any
 
 import torch
@@ -51,25 +52,34 @@ def batches(
         worker_init_fn=_quiet_worker,
         pin_memory=device.type == "cuda",  # copies then overlap with the work before
     )
-    needs_main = workers > 0 and b"__main__" in pickle.dumps(make)
-    with nullcontext() if needs_main else _main_left_alone():
+    with _starting_processes(make) if workers else nullcontext():
         made = iter(loader)
     for batch in made:
         yield tuple(batch)
 
 
 @contextmanager
-def _main_left_alone() -> Iterator[None]:
-    """Processes started inside do not run the user's program from its first line, as they would to
-    have what it defines: without an ``if __name__ == "__main__"`` it would train there once more,
-    fail, and leave this process waiting for good."""
-    main, names = sys.modules["__main__"], ("__file__", "__spec__")
-    hidden = {name: vars(main)[name] for name in names if name in vars(main)}
-    vars(main).update(dict.fromkeys(hidden))
+def _starting_processes(make: Callable[[int], Batch]) -> Iterator[None]:
+    """Around the start of processes that do not live without what they are sent: where one ended
+    before, this one would wait for good to write to it.
+
+    Ctrl-C, which a terminal sends to all of them, waits for the end of the start, and is never seen
+    by the new ones. And they do not run the user's program from its first line, as they would to
+    have what it defines, unless ``make`` needs that: without an ``if __name__ == "__main__"`` it
+    would train there once more, and fail.
+    """
+    main = vars(sys.modules["__main__"])
+    hidden = {name: main[name] for name in ("__file__", "__spec__") if name in main}
+    if b"__main__" in pickle.dumps(make):
+        hidden = {}
+    resource_tracker.ensure_running()  # its own start would let signals through
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM})
+    main.update(dict.fromkeys(hidden))
     try:
         yield
     finally:
-        vars(main).update(hidden)
+        main.update(hidden)
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 class _Made(Dataset[Any]):
