@@ -54,10 +54,13 @@ class Run(ABC):
         """The last step; None where minutes settle it on the way."""
 
     @property
-    @abstractmethod
     def decided_by(self) -> dict[str, Any]:
         """All that decides the weights, by the options that say it (long ones as a sha256), so that
         a resumed run is the same run."""
+        config = json.dumps([store.SCHEMA, to_builtins(self.config)], sort_keys=True).encode()
+        rules = "--preset, --rotations, --sensor or the version"
+        found = {rules: hashlib.sha256(config).hexdigest()}
+        return {**found, "--seed": self.seed, "--steps": self.steps}
 
     def differences(self, kept: Mapping[str, Any]) -> str:
         """What the run that was ``decided_by`` these was given differently; empty: it is this
@@ -114,7 +117,7 @@ class TrainingRun(Run):
     def decided_by(self) -> dict[str, Any]:
         start = None if self.start is None else self.start.sha256
         options = {"CASE": self.case_sha256, "--minutes": self.minutes, "--start": start}
-        return {**common_to_runs(self), **options}
+        return {**super().decided_by, **options}
 
 
 def check_run(run: Run, **smallest: int) -> None:
@@ -127,13 +130,6 @@ def check_run(run: Run, **smallest: int) -> None:
         raise InputError(
             f"--checkpoint-every is {run.checkpoint_every_s}; give seconds, 0 or more."
         )
-
-
-def common_to_runs(run: Run) -> dict[str, Any]:
-    """What of ``decided_by`` every kind of run has."""
-    config = json.dumps([store.SCHEMA, to_builtins(run.config)], sort_keys=True).encode()
-    rules = {"--preset, --rotations, --sensor or the version": hashlib.sha256(config).hexdigest()}
-    return {**rules, "--seed": run.seed, "--steps": run.steps}
 
 
 @dataclass

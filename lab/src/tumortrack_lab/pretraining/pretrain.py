@@ -42,7 +42,7 @@ from tumortrack.simulate.scene import Batch, SceneStream, body_for
 from tumortrack.training.model import PRETRAINED
 from tumortrack.training.presets import Rotations, clinic_rules
 from tumortrack.training.scenes import Scenes, batches
-from tumortrack.training.state import Run, TrainingState, check_run, common_to_runs
+from tumortrack.training.state import Run, TrainingState, check_run
 from tumortrack.training.train import Report, divide_cores, run_steps, work_folder
 from tumortrack_lab.pretraining.kidneys import random_anatomy
 
@@ -77,7 +77,7 @@ class Pretraining(Run):
 
     @property
     def decided_by(self) -> dict[str, Any]:
-        return {**common_to_runs(self), "--anatomies": self.anatomies}
+        return {**super().decided_by, "--anatomies": self.anatomies}
 
 
 def pretraining(rotations: Rotations = "limited") -> TrainConfig:
