@@ -135,6 +135,9 @@ def test_seg_nrrd_names_colours_and_terms(tmp_path: Path) -> None:
 def test_a_runs_files_share_one_frame(tmp_path: Path) -> None:
     """Voxels of labels.seg.nrrd lie inside the meshes beside it, both taken as LPS."""
     estimate = small_estimate()
+    with pytest.raises(InputError, match="has no labelled volume to write"):
+        write_estimate(tmp_path / "live", estimate)
+    assert not (tmp_path / "live").exists()
     shape, voxel_mm = (60, 62, 64), 1.0
     camera_from_index = np.eye(4)
     camera_from_index[:3, 3] = [-26, -33, 98]

@@ -144,7 +144,8 @@ def _given(points_mm: Points) -> Float32[np.ndarray, "n 3"]:
     points = np.array(points_mm, np.float32, order="C")
     if points.ndim != 2 or points.shape[1] != 3:
         raise InputError(f"points are n x 3, one a row, mm; these have the shape {points.shape}.")
-    if bad := np.count_nonzero(~np.isfinite(points).all(axis=1)):
+    if not np.isfinite(points).all():
+        bad = np.count_nonzero(~np.isfinite(points).all(axis=1))
         raise InputError(f"{bad} of {len(points)} points have NaN or infinity; leave them out.")
     return points
 
