@@ -69,7 +69,7 @@ def _starting_processes(make: Callable[[int], Batch]) -> Iterator[None]:
     would train there once more, and fail.
     """
     main = vars(sys.modules["__main__"])
-    hidden = {name: main[name] for name in ("__file__", "__spec__") if name in main}
+    hidden: dict[str, Any] = {name: main[name] for name in ("__file__", "__spec__") if name in main}
     if b"__main__" in pickle.dumps(make):
         hidden = {}
     resource_tracker.ensure_running()  # its own start would let signals through
