@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from jaxtyping import Bool, Float
 
@@ -74,26 +76,87 @@ def _z_buffer(vertices, faces, shape, pinhole):  # type: ignore[no-untyped-def]
 
 
 class Visibility:
-    """Which vertices of one fixed mesh a camera sees: exact, by ray, on a tree built once."""
+    """Which points on one fixed mesh an eye sees: exact, by ray.
+
+    All rays leave one eye, so a triangle can hide only points within its bounds in the eye's
+    picture: these are found by bisection, and no tree is needed.
+    """
 
     _TOLERANCE_MM = 0.05  # a ray to a vertex hits the vertex's own triangles at about its length
 
     def __init__(self, mesh: Mesh) -> None:
-        from embreex.mesh_construction import TriangleMesh
-        from embreex.rtcore_scene import EmbreeScene
-
-        self._scene = EmbreeScene()
-        self._origin = mesh.vertices_mm.mean(0)  # keep numbers small: Embree works in float32
-        corners = (mesh.vertices_mm - self._origin)[mesh.faces]
-        self._triangles = TriangleMesh(self._scene, corners.astype(np.float32))
+        self._centre = mesh.vertices_mm.mean(0)
+        self._vertices = np.ascontiguousarray(mesh.vertices_mm - self._centre, np.float64)
+        self._faces = np.ascontiguousarray(mesh.faces, np.int32)
 
     def __call__(
         self, points_mm: Float[np.ndarray, "n 3"], eye_mm: Float[np.ndarray, " 3"]
     ) -> Bool[np.ndarray, " n"]:
         """True where nothing of the mesh lies between the eye and the point (mesh's frame)."""
-        eye = (eye_mm - self._origin).astype(np.float32)
-        rays = (points_mm - self._origin).astype(np.float32) - eye
-        length = np.linalg.norm(rays, axis=1)
-        origins = np.broadcast_to(eye, rays.shape).copy()
-        hit_mm = self._scene.run(origins, rays / length[:, None], query="DISTANCE")
-        return hit_mm >= length - self._TOLERANCE_MM
+        eye = np.asarray(eye_mm, np.float64) - self._centre
+        axes = np.linalg.svd(eye[None])[2]  # rows: along the line of sight, and two across it
+        axes = np.stack([axes[1], axes[2], -axes[0] * np.sign(axes[0] @ eye)])
+        rays = (np.asarray(points_mm, np.float64) - self._centre - eye) @ axes.T
+        vertices = (self._vertices - eye) @ axes.T
+        order = np.argsort(_across(rays)[:, 0], kind="stable")
+        hidden = np.empty(len(rays), np.bool_)
+        hidden[order] = _hidden(
+            rays[order], _across(rays)[order], vertices, _across(vertices), self._faces,
+            self._TOLERANCE_MM,
+        )  # fmt: skip
+        return ~hidden
+
+
+def _across(points: np.ndarray) -> np.ndarray:
+    """x / z and y / z of points (n, 3) before an eye; infinite where they are not before it."""
+    before = points[:, 2:] > 1e-6
+    return np.divide(points[:, :2], points[:, 2:], np.full((len(points), 2), np.inf), where=before)
+
+
+@numba.njit(cache=True, nogil=True)
+def _hidden(rays, rays_uv, vertices, vertices_uv, faces, tolerance_mm):  # type: ignore[no-untyped-def]
+    """Whether a triangle crosses each ray (n, 3), sorted by its first coordinate in the picture,
+    nearer to the eye than its end by more than the tolerance (Moeller and Trumbore 1997,
+    doi 10.1080/10867651.1997.10487468)."""
+    hidden = np.zeros(len(rays), np.bool_)
+    slack = 1e-9  # rounding: a ray along an edge belongs to both triangles
+    before = np.searchsorted(rays_uv[:, 0], np.inf)  # rays from here on point away from the mesh
+    lowest = rays_uv[0, 0] if before else 0.0
+    columns = 256.0 / max(rays_uv[before - 1, 0] - lowest, slack) if before else 0.0
+    starts = np.zeros(259, np.int64)  # of each column of the picture among the rays
+    for i in range(before):
+        starts[int((rays_uv[i, 0] - lowest) * columns) + 1 :] += 1
+    for f in range(len(faces)):
+        a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
+        left = min(vertices_uv[a, 0], vertices_uv[b, 0], vertices_uv[c, 0])
+        right = max(vertices_uv[a, 0], vertices_uv[b, 0], vertices_uv[c, 0])
+        top = min(vertices_uv[a, 1], vertices_uv[b, 1], vertices_uv[c, 1])
+        bottom = max(vertices_uv[a, 1], vertices_uv[b, 1], vertices_uv[c, 1])
+        bounded = right < np.inf
+        first, last = 0, len(rays)
+        if bounded:
+            first = starts[int(min(max((left - slack - lowest) * columns, 0.0), 257.0))]
+            last = starts[int(min(max((right + slack - lowest) * columns + 1, 0.0), 258.0))]
+        ax, ay, az = vertices[a, 0], vertices[a, 1], vertices[a, 2]
+        e1x, e1y, e1z = vertices[b, 0] - ax, vertices[b, 1] - ay, vertices[b, 2] - az
+        e2x, e2y, e2z = vertices[c, 0] - ax, vertices[c, 1] - ay, vertices[c, 2] - az
+        # The eye is the origin; q is the normal's moment, the same for every ray.
+        qx, qy, qz = ay * e1z - az * e1y, az * e1x - ax * e1z, ax * e1y - ay * e1x
+        reach = -(e2x * qx + e2y * qy + e2z * qz)
+        for i in range(first, last):
+            outside = rays_uv[i, 1] < top - slack or rays_uv[i, 1] > bottom + slack
+            if hidden[i] or (bounded and outside):
+                continue
+            x, y, z = rays[i, 0], rays[i, 1], rays[i, 2]
+            px, py, pz = y * e2z - z * e2y, z * e2x - x * e2z, x * e2y - y * e2x
+            area = e1x * px + e1y * py + e1z * pz
+            if area == 0.0:
+                continue
+            s = -(ax * px + ay * py + az * pz) / area
+            t = -(x * qx + y * qy + z * qz) / area
+            if s < -slack or t < -slack or s + t > 1 + slack:
+                continue
+            share = reach / area  # of the ray, from the eye to the triangle
+            length = math.sqrt(x * x + y * y + z * z)
+            hidden[i] = 0 < share * length < length - tolerance_mm
+    return hidden
