@@ -1,14 +1,20 @@
 # Bare `make` lists the targets. Everything is installed into .venv from PyPI, by hash.
 PYTHON ?= python3
 BIN := .venv/bin
+TRACKER := .venv/.tracker
 SETUP := .venv/.installed
 TOOLS := .tools/.installed
-INSTALL := pip install --quiet --disable-pip-version-check --no-compile --no-deps
-# uv fetches and unpacks side by side, in a fraction of pip's time. It does not read pip's settings
-# (a mirror, a proxy's certificate): where it fails, pip does the work.
-UV := uv pip install --quiet --no-deps --require-hashes
+PIP := pip install --quiet --disable-pip-version-check --no-compile --no-deps
 # Whatever the environment says: without kept bytecode every start compiles PyTorch anew, for 4 s.
 unexport PYTHONDONTWRITEBYTECODE
+
+# uv fetches and unpacks side by side, in a fraction of pip's time. It does not read pip's settings
+# (a mirror, a company's certificate): where it fails, pip does the work.
+define INSTALL
+	VIRTUAL_ENV=.venv $(BIN)/uv pip install --quiet --no-deps --require-hashes -r $(1) 2>.venv/uv.log || { \
+	echo "uv could not install $(1) (.venv/uv.log says why); pip does, which takes longer"; \
+	$(BIN)/$(PIP) --require-hashes -r $(1); }
+endef
 
 .DEFAULT_GOAL := help
 .PHONY: help setup debian kernels demo test pytest test-hard check pretrained attack fuzz crash replay bench soak wheel lock licences audit results real minutes world sequences trust rehearsal population scaling site pictures clean
@@ -16,28 +22,35 @@ unexport PYTHONDONTWRITEBYTECODE
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 10
 
-setup: $(SETUP)  ## install everything into .venv
+setup: $(SETUP)  ## install everything into .venv: tracker, laboratory, experiment, what tests and the site need
 
-# PyTorch's CPU build is taken where pip knows of it, else PyPI's, which on Linux needs CUDA's packages.
-$(SETUP): pyproject.toml lab/pyproject.toml experiment/pyproject.toml requirements/lock.txt requirements/cuda.txt requirements/torch-cpu.txt requirements/uv.txt
-	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "tumortrack needs Python 3.11 or newer; give make PYTHON=python3.11")'
-	$(PYTHON) -m venv .venv
-	$(BIN)/$(INSTALL) --require-hashes -r requirements/torch-cpu.txt 2>/dev/null || echo "PyTorch: PyPI's build"
-	$(BIN)/$(INSTALL) --require-hashes -r requirements/uv.txt
-	VIRTUAL_ENV=.venv $(BIN)/$(UV) -r requirements/lock.txt || $(BIN)/$(INSTALL) --require-hashes -r requirements/lock.txt
-	if $(BIN)/python -c 'from importlib.metadata import requires; print(requires("torch"))' | grep -q nvidia; then \
-	$(BIN)/$(INSTALL) --require-hashes -r requirements/cuda.txt; fi
-	$(BIN)/$(INSTALL) --no-build-isolation -e . -e experiment -e lab
+# PyTorch's CPU build is taken where pip knows of it, else PyPI's, which on x86-64 needs CUDA's packages.
+$(TRACKER): pyproject.toml requirements/core.txt requirements/cuda.txt requirements/torch-cpu.txt requirements/uv.txt
+	@$(PYTHON) -c 'import sys; sys.exit(not (3, 11) <= sys.version_info < (3, 15) and "tumortrack needs Python 3.11 to 3.14, and this is " + sys.version.split()[0] + "; give make PYTHON=python3.12, or another of these")'
+	@$(PYTHON) -c 'import ensurepip, venv' || { echo "$(PYTHON) cannot make environments; on Debian and Ubuntu: apt-get install python3-venv" >&2; exit 1; }
+	$(PYTHON) -m venv --clear .venv
+	@$(BIN)/$(PIP) --require-hashes -r requirements/torch-cpu.txt 2>/dev/null || echo "PyTorch: PyPI's build"
+	@$(BIN)/$(PIP) --require-hashes -r requirements/uv.txt
+	@$(call INSTALL,requirements/core.txt)
+	@if $(BIN)/python -c 'from importlib.metadata import requires; print(requires("torch"))' | grep -q nvidia; then \
+	echo "PyTorch's CUDA packages: some 3 GB"; $(call INSTALL,requirements/cuda.txt); fi
+	$(BIN)/$(PIP) --no-build-isolation -e .
 	$(BIN)/python -I -m pip check  # -I: what PYTHONPATH names, as ROS sets it, is none of ours
-	touch $@
+	@touch $@
+
+$(SETUP): $(TRACKER) lab/pyproject.toml experiment/pyproject.toml requirements/rest.txt
+	@$(call INSTALL,requirements/rest.txt)
+	$(BIN)/$(PIP) --no-build-isolation -e experiment -e lab
+	$(BIN)/python -I -m pip check
+	@touch $@
 
 $(TOOLS): requirements/tools.txt
 	$(PYTHON) -m venv .tools
-	.tools/bin/$(INSTALL) --require-hashes -r requirements/tools.txt
+	.tools/bin/$(PIP) --require-hashes -r requirements/tools.txt
 	touch $@
 
-demo: setup  ## CT -> tumors located in unseen deformed scenes (about 2 minutes once installed)
-	$(BIN)/tumortrack demo
+demo: $(TRACKER)  ## install the tracker, then CT -> tumors located in unseen deformed scenes (ARGS="--scenes 2")
+	$(BIN)/tumortrack demo $(ARGS)
 
 check: setup  ## lint, types, import order, licences
 	$(BIN)/ruff check src lab experiment tests examples tools notebooks
@@ -131,6 +144,7 @@ wheel: setup $(TOOLS)  ## build the wheels of product, experiment and laboratory
 
 lock: setup $(TOOLS)  ## pin the dependencies by hash (ARGS=--upgrade: newest; ARGS="--upgrade-package NAME")
 	PATH="$(CURDIR)/.tools/bin:$$PATH" $(BIN)/python tools/dependencies.py lock $(ARGS)
+	PATH="$(CURDIR)/.tools/bin:$$PATH" $(BIN)/python tools/dependencies.py wheels
 
 licences: setup  ## list the dependencies' licences in docs/dependencies.md; fails on one not allowed
 	$(BIN)/python tools/dependencies.py table
@@ -138,7 +152,7 @@ licences: setup  ## list the dependencies' licences in docs/dependencies.md; fai
 
 audit: $(TOOLS)  ## known vulnerabilities of all that is pinned; fails also if PyPI does not answer
 	@.tools/bin/pip-audit --strict --progress-spinner off --disable-pip --require-hashes \
-	$(foreach name,lock cuda ur tools,-r requirements/$(name).txt) || { echo \
+	$(foreach name,core rest cuda ur tools,-r requirements/$(name).txt) || { echo \
 	"audit: not passed: there are vulnerabilities (listed above), or PyPI could not be asked" >&2; exit 1; }
 
 clean:  ## remove .venv and caches (runs/ stays)

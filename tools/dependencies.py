@@ -1,6 +1,7 @@
 """The packages that this one stands on: locked by hash, their licences, what a wheel brings along.
 
 tools/dependencies.py lock [--upgrade]   requirements/*.txt, of pyproject.toml's ranges
+tools/dependencies.py wheels             refuses a pin without a wheel where it is wanted
 tools/dependencies.py licences           refuses a licence that is not allowed
 tools/dependencies.py table              docs/dependencies.md
 tools/dependencies.py sbom WHEEL         CycloneDX 1.6 beside a wheel: WHEEL.cdx.json
@@ -8,6 +9,7 @@ tools/dependencies.py sbom WHEEL         CycloneDX 1.6 beside a wheel: WHEEL.cdx
 
 from __future__ import annotations
 
+import itertools
 import json
 import re
 import subprocess
@@ -59,11 +61,12 @@ def lock(upgrade: list[str]) -> None:
     """Resolve everything for every platform, and keep what is pinned unless told to upgrade."""
     folders = (ROOT, ROOT / "lab", ROOT / "experiment")
     everything = "".join(f"-e {folder}[{_extras(folder)}]\n" for folder in folders)
-    pins = pinned(_resolved(everything, "".join(_locks().values()), upgrade))
+    resolved = _resolved(everything, "".join(_locks().values()), upgrade)
+    core = pinned(_resolved(f"-e {ROOT}\n", resolved, []))  # keeps what is resolved
     files: dict[str, list[str]] = {name: [] for name in _ABOUT}
-    for name, text in pins.items():
-        cuda = re.match(r"nvidia-|cuda-|triton$", name)
-        files["cuda" if cuda else _APART.get(name, "lock")].append(text)
+    for name, text in pinned(resolved).items():
+        rest = "core" if name in core else _APART.get(name, "rest")
+        files["cuda" if re.match(r"nvidia-|cuda-|triton$", name) else rest].append(text)
     for name, texts in files.items():
         head = f"# {_ABOUT[name]} Made by `make lock`; ranges are in pyproject.toml.\n"
         (LOCKS / f"{name}.txt").write_text(head + "".join(texts), "utf-8")
@@ -74,6 +77,26 @@ def lock(upgrade: list[str]) -> None:
     (LOCKS / "uv.txt").write_text(pinned(text)["uv"], "utf-8")  # what `make setup` installs with
 
 
+# What is supported: each Python on each kind of Linux machine, from glibc 2.28 on.
+_PYTHONS = ("3.11.0", "3.12.0", "3.13.0", "3.14.0")
+_PLATFORMS = ("x86_64-manylinux_2_28", "aarch64-manylinux_2_28")
+_NEEDS_NO_WHEEL = "crcmod"  # pure Python where there is no compiler
+
+
+def without_wheels() -> list[str]:
+    """What uv says where a pin has no wheel; nothing is installed, PyPI is asked."""
+    wrong = []
+    files = [word for name in _ABOUT if name != "ur" for word in ("-r", str(LOCKS / f"{name}.txt"))]
+    options = ["--dry-run", "--no-deps", "--only-binary", ":all:", "--no-binary", _NEEDS_NO_WHEEL]
+    for python, platform in itertools.product(_PYTHONS, _PLATFORMS):
+        where = ["--python-version", python, "--python-platform", platform, "--target", "build"]
+        command = ["uv", "pip", "install", "--quiet", *options, *where, *files]
+        run = subprocess.run(command, check=False, capture_output=True, text=True, cwd=ROOT)
+        if run.returncode:
+            wrong.append(f"Python {python}, {platform}: {run.stderr.strip()}")
+    return wrong
+
+
 def _extras(folder: Path) -> str:
     project = tomllib.loads((folder / "pyproject.toml").read_text("utf-8"))["project"]
     return ",".join(project.get("optional-dependencies", ()))
@@ -82,7 +105,7 @@ def _extras(folder: Path) -> str:
 def _resolved(wanted: str, kept: str, upgrade: list[str]) -> str:
     """A lock file of these requirements, its versions as in ``kept`` where that is possible."""
     own = [word for name in OWN for word in ("--no-emit-package", name)]
-    options = ["--universal", "--python-version", "3.11", "--generate-hashes", "--no-header"]
+    options = ["--universal", "--python-version", "3.11.0", "--generate-hashes", "--no-header"]
     with tempfile.TemporaryDirectory() as folder:
         source, made = Path(folder) / "in.txt", Path(folder) / "out.txt"
         source.write_text(wanted, "utf-8")
@@ -93,7 +116,8 @@ def _resolved(wanted: str, kept: str, upgrade: list[str]) -> str:
 
 
 _ABOUT = {
-    "lock": "Everything that `make setup` installs, by hash.",
+    "core": "The tracker alone, by hash: what `make demo` installs.",
+    "rest": "All that `make setup` installs beyond it: extras, experiment, laboratory, tests, site.",
     "cuda": "What PyPI's PyTorch for Linux needs besides; its CPU build does not.",
     "ur": "For real arms: pip install --require-hashes --no-deps -r requirements/ur.txt",
 }
@@ -256,15 +280,19 @@ def main(arguments: list[str]) -> int:
     match arguments:
         case ["lock", *upgrade]:
             lock(upgrade)
+        case ["wheels"]:
+            wrong = without_wheels()
+            print("\n".join(wrong) or "every pin has a wheel for every Python and machine")
+            return len(wrong) > 0
         case ["licences"]:
-            wrong = {
+            refused = {
                 name: licence(package)
                 for name, package in everything().items()
                 if not is_allowed(licence(package))
             }
-            for name, said in wrong.items():
+            for name, said in refused.items():
                 print(f"{name}: the licence {said or 'is not stated, which'!r} is not allowed")
-            return len(wrong) > 0
+            return len(refused) > 0
         case ["table"]:
             TABLE.write_text(table(), "utf-8")
         case ["sbom", *wheels] if wheels:

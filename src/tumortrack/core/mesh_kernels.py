@@ -1,6 +1,8 @@
-"""Kernels on meshes that are moved in every frame."""
+"""Kernels on meshes: volumes, and points inside."""
 
 from __future__ import annotations
+
+import numpy as np
 
 from tumortrack.core.compiled import numba
 
@@ -15,3 +17,63 @@ def signed_volume(vertices, faces):  # type: ignore[no-untyped-def]
         area = (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
         triple += area * (a[2] + b[2] + c[2] - 3 * vertices[0, 2])
     return triple / 6
+
+
+@numba.njit(cache=True, nogil=True)
+def contained(points, vertices, faces):  # type: ignore[no-untyped-def]
+    """Whether points (n, 3) lie inside a closed surface: an odd number of its faces (f, 3) lies
+    above such a point.
+
+    A point belongs to one of two triangles that share an edge, never to both or none: both look at
+    that edge from its lower end and get the same sign (crossing rule of Shimrat 1962,
+    doi 10.1145/368637.368653). Only points near a triangle are looked at, in cells of a grid.
+    """
+    n = len(points)
+    inside = np.zeros(n, np.bool_)
+    if n == 0:
+        return inside
+    side = int(np.sqrt(n / 2)) + 1
+    x0, y0 = points[:, 0].min(), points[:, 1].min()
+    per_x = side / max(points[:, 0].max() - x0, 1e-9) * (1 - 1e-12)
+    per_y = side / max(points[:, 1].max() - y0, 1e-9) * (1 - 1e-12)
+    cells = np.empty(n, np.int64)
+    starts = np.zeros(side * side + 1, np.int64)
+    for i in range(n):
+        column = min(int((points[i, 0] - x0) * per_x), side - 1)
+        cells[i] = min(int((points[i, 1] - y0) * per_y), side - 1) * side + column
+        starts[cells[i] + 1] += 1
+    starts = np.cumsum(starts)
+    order = np.argsort(cells, kind="mergesort")
+    for f in range(len(faces)):
+        a, b, c = vertices[faces[f, 0]], vertices[faces[f, 1]], vertices[faces[f, 2]]
+        left = (min(a[0], b[0], c[0]) - x0) * per_x
+        right = (max(a[0], b[0], c[0]) - x0) * per_x
+        bottom = (min(a[1], b[1], c[1]) - y0) * per_y
+        top = (max(a[1], b[1], c[1]) - y0) * per_y
+        if right < 0 or top < 0 or left > side or bottom > side:
+            continue
+        first, last = int(max(left, 0)), int(min(right, side - 1))
+        area = (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
+        for row in range(int(max(bottom, 0)), int(min(top, side - 1)) + 1):
+            start = starts[row * side + min(first, side - 1)]
+            for k in range(start, starts[row * side + last + 1]):
+                i = order[k]
+                x, y = points[i, 0], points[i, 1]
+                crossed = _left_of(a, b, x, y) != _left_of(b, c, x, y)
+                if crossed == _left_of(c, a, x, y) or area == 0:
+                    continue
+                s = ((x - a[0]) * (c[1] - a[1]) - (y - a[1]) * (c[0] - a[0])) / area
+                t = ((b[0] - a[0]) * (y - a[1]) - (b[1] - a[1]) * (x - a[0])) / area
+                if a[2] + s * (b[2] - a[2]) + t * (c[2] - a[2]) > points[i, 2]:
+                    inside[i] = not inside[i]
+    return inside
+
+
+@numba.njit(cache=True, inline="always")
+def _left_of(a, b, x, y):  # type: ignore[no-untyped-def]
+    """Whether an edge, seen in the plane of x and y, passes the point at its right."""
+    if (a[1] > y) == (b[1] > y):
+        return False
+    if a[1] > b[1]:
+        a, b = b, a
+    return (b[0] - a[0]) * (y - a[1]) - (x - a[0]) * (b[1] - a[1]) > 0

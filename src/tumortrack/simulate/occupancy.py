@@ -153,10 +153,15 @@ def _part_pool(
 
 
 def contains(mesh: Mesh, points_mm: Points) -> Bool[np.ndarray, " n"]:
-    """True for points inside a closed mesh (ray parity by Embree, two directions)."""
-    import trimesh
+    """True for points inside a closed mesh, by the parity of its faces beyond each point."""
+    from scipy.spatial.transform import Rotation
 
-    return trimesh.Trimesh(mesh.vertices_mm, mesh.faces, process=False).contains(points_mm)
+    from tumortrack.core.mesh_kernels import contained
+
+    # Turned, so that no edge of a mesh or grid drawn along the axes passes a point exactly.
+    askew = Rotation.from_rotvec([0.3, 0.5, 0.7]).as_matrix()
+    points, vertices = np.asarray(points_mm, float) @ askew, mesh.vertices_mm @ askew
+    return contained(points, vertices, np.ascontiguousarray(mesh.faces, np.int64))
 
 
 def labels_of(anatomy: Anatomy, points_mm: Points) -> Labels:

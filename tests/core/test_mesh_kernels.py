@@ -1,0 +1,46 @@
+"""Points inside a surface: against solid angles, and shapes of known size."""
+
+import numpy as np
+import trimesh
+
+from render_objects import bumpy
+from tumortrack.core.types import Mesh
+from tumortrack.simulate.occupancy import contains
+
+
+def winding_number(mesh, points):
+    """Solid angle of all faces seen from each point, over 4 pi (van Oosterom and Strackee 1983,
+    doi 10.1109/TBME.1983.325207): 1 inside a closed surface, 0 outside."""
+    a, b, c = (mesh.vertices_mm[mesh.faces[:, k]][None] - points[:, None] for k in range(3))
+    la, lb, lc = (np.linalg.norm(corner, axis=2) for corner in (a, b, c))
+    triple = np.einsum("pfk,pfk->pf", a, np.cross(b, c))
+    below = la * lb * lc + (a * b).sum(2) * lc + (b * c).sum(2) * la + (c * a).sum(2) * lb
+    return np.arctan2(triple, below).sum(1) / (2 * np.pi)
+
+
+def test_points_inside_agree_with_the_winding_number():
+    mesh = bumpy(30, (10, 20, 30), 4)
+    lower, upper = mesh.box_mm
+    points = np.random.default_rng(1).uniform(lower - 5, upper + 5, (1500, 3))
+    expected = winding_number(mesh, points) > 0.5
+    assert 300 < expected.sum() < 1200
+    np.testing.assert_array_equal(contains(mesh, points), expected)
+
+
+def test_a_grid_in_line_with_the_faces_is_counted_exactly():
+    box = trimesh.creation.box((1, 1, 1))
+    mesh = Mesh(box.vertices, box.faces)
+    grid = np.stack(np.meshgrid(*[np.arange(-1, 1.01, 0.1) + 0.05] * 3), -1).reshape(-1, 3)
+    inside = contains(mesh, grid)
+    assert inside.sum() == 10**3
+    np.testing.assert_array_equal(inside, (np.abs(grid) < 0.5).all(1))
+    assert not contains(mesh, grid[:0]).any()
+
+
+def test_what_stands_inside_a_hollow_is_outside():
+    outer, inner = trimesh.creation.icosphere(3, 10.0), trimesh.creation.icosphere(3, 5.0)
+    inner.invert()
+    both = trimesh.util.concatenate([outer, inner])
+    points = np.array([[0.0, 0, 0], [0, 7, 0], [0, 0, 12], [-7, 1, 1]])
+    inside = contains(Mesh(both.vertices, both.faces), points)
+    np.testing.assert_array_equal(inside, [False, True, False, True])
