@@ -8,10 +8,10 @@ PIP := pip install --quiet --disable-pip-version-check --no-compile --no-deps
 # Whatever the environment says: without kept bytecode every start compiles PyTorch anew, for 4 s.
 unexport PYTHONDONTWRITEBYTECODE
 
-# uv fetches and unpacks side by side, in a fraction of pip's time. It does not read pip's settings
-# (a mirror, a company's certificate): where it fails, pip does the work.
+# uv fetches and unpacks side by side, in a fraction of pip's time. It reads the certificates that the system trusts, but not pip's
+# settings (a mirror): where it fails, pip does the work.
 define INSTALL
-	VIRTUAL_ENV=.venv $(BIN)/uv pip install --quiet --no-deps --require-hashes -r $(1) 2>.venv/uv.log || { \
+	VIRTUAL_ENV=.venv $(BIN)/uv pip install --quiet --system-certs --no-deps --require-hashes -r $(1) 2>.venv/uv.log || { \
 	echo "uv could not install $(1) (.venv/uv.log says why); pip does, which takes longer"; \
 	$(BIN)/$(PIP) --require-hashes -r $(1); }
 endef
