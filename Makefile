@@ -17,7 +17,7 @@ define INSTALL
 endef
 
 .DEFAULT_GOAL := help
-.PHONY: help setup debian kernels demo test pytest test-hard check pretrained attack fuzz crash replay bench soak wheel lock licences audit results real minutes world sequences trust rehearsal population scaling site pictures clean
+.PHONY: help setup debian kernels demo test quick pythons pytest test-hard check pretrained attack fuzz crash replay bench soak wheel lock licences audit results real minutes world sequences trust rehearsal population scaling site pictures clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 10
@@ -69,6 +69,12 @@ site: setup  ## the documentation's site, strictly: build/site/index.html (`.ven
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
 test: check site kernels pytest  ## check, then all tests (those of Chromium and Fast DDS after `make debian`)
+
+quick: setup  ## the quickest tests of the tracker (a minute)
+	OMP_NUM_THREADS=1 $(BIN)/pytest -q -n 2 -m 'not slow' tests/core tests/sense tests/imaging tests/phantom
+
+pythons:  ## a fresh clone with every Python here: install, short demo, doctor, quick tests (ARGS=/usr/bin/python3)
+	tools/pythons.sh $(ARGS)
 
 pytest: setup  ## the tests alone
 	OMP_NUM_THREADS=1 $(BIN)/pytest -n 4 --dist loadfile --no-loadscope-reorder

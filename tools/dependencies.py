@@ -117,7 +117,7 @@ def _resolved(wanted: str, kept: str, upgrade: list[str]) -> str:
 
 _ABOUT = {
     "core": "The tracker alone, by hash: what `make demo` installs.",
-    "rest": "All that `make setup` installs beyond it: extras, experiment, laboratory, tests, site.",
+    "rest": "All else that `make setup` installs: extras, experiment, laboratory, tests, site.",
     "cuda": "What PyPI's PyTorch for Linux needs besides; its CPU build does not.",
     "ur": "For real arms: pip install --require-hashes --no-deps -r requirements/ur.txt",
 }

@@ -8,8 +8,6 @@ import time
 import numpy as np
 import pytest
 
-pytest.importorskip("pyrealsense2")
-
 from clock import PATIENCE_S, until
 from realsense_objects import HEIGHT, WIDTH, Camera, raw_depth, record
 from tumortrack.core.errors import InputError

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import needs
 from clock import PATIENCE_S, until
 from live_objects import (
     empty_update,
@@ -39,7 +40,7 @@ from tumortrack.live.values import Observation, Source
 from tumortrack.live.workers import SourceWorker
 from workcell_objects import with_arms, working
 
-pytest.importorskip("cyclonedds", reason="cyclonedds is not installed (tumortrack[live])")
+needs.module("cyclonedds", "tumortrack[live], x86-64, Python up to 3.13")
 
 HERE = Path(__file__).parents[1] / "support"
 CLOUD_DDS = "sensor_msgs::msg::dds_::PointCloud2_"

@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import needs
 from clock import PATIENCE_S, until
 from live_objects import (
     CAMERA,
@@ -45,7 +46,7 @@ from tumortrack.live.sources.ros import Ros2SourceConfig as SourceRos2
 from tumortrack.live.spec import POSES
 from tumortrack.live.values import Observation, PublishedFrame, Sink, Source, TrackingResult
 
-pytest.importorskip("cyclonedds", reason="cyclonedds is not installed (tumortrack[live])")
+needs.module("cyclonedds", "tumortrack[live], x86-64, Python up to 3.13")
 
 HERE = Path(__file__).parents[1] / "support"
 CLOUD_DDS = "sensor_msgs::msg::dds_::PointCloud2_"
@@ -274,9 +275,9 @@ def publish_at(sink: Sink, hz: float, seconds: float) -> list[float]:
 def built(folder: Path) -> Path:
     """The Fast DDS peer; skips where it cannot be built."""
     if not shutil.which("g++"):
-        pytest.skip("g++ is not installed: `make debian`")
+        needs.missing("g++ is not installed: make debian")
     if not Path("/usr/include/fastdds").is_dir():
-        pytest.skip("Fast DDS's headers are not installed: `make debian`")
+        needs.missing("Fast DDS's headers are not installed: make debian")
     made = folder / "peer"
     sources = ["-std=c++17", "-O0", str(HERE / "fastdds" / "peer.cpp"), "-o", str(made)]
     subprocess.run(["g++", *sources, "-lfastrtps", "-lfastcdr"], check=True, timeout=600)

@@ -16,6 +16,7 @@ import pytest
 import tyro
 from PIL import Image
 
+import needs
 import tumortrack
 from clock import until
 from live_objects import PARTS, ball, empty_update, small_setting, small_update
@@ -177,7 +178,7 @@ def test_the_scene_s_options_are_checked():
 
 
 def test_moveit_s_types_are_those_that_a_second_library_makes():
-    pytest.importorskip("cyclonedds", reason="cyclonedds is not installed (tumortrack[live])")
+    needs.module("cyclonedds", "tumortrack[live], x86-64, Python up to 3.13")
     from tumortrack.live.ros.dds import idl_type
 
     scene = MESSAGES.make(SCENE, name="theatre", is_diff=True, robot_state={"is_diff": True})
@@ -213,7 +214,7 @@ def test_a_plan_s_motions_are_trajectories_of_all_joints():
 
 
 def test_obstacles_arrive_of_good_estimates_and_cameras_are_kept_for_latecomers():
-    pytest.importorskip("cyclonedds", reason="cyclonedds is not installed (tumortrack[live])")
+    needs.module("cyclonedds", "tumortrack[live], x86-64, Python up to 3.13")
     setting = replace(small_setting(), published_frame=PLACED)
     good = small_update(frames=PLACED)
     with own_graph():

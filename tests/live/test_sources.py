@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import needs
 from clock import PATIENCE_S, until
 from depth_files import write_frame_folder
 from recording_objects import frame_number, record, update_number
@@ -37,7 +38,7 @@ def virtual(_folder: Path) -> Iterator[Source]:
 
 @contextmanager
 def realsense(_folder: Path) -> Iterator[Source]:
-    pytest.importorskip("pyrealsense2")
+    needs.module("pyrealsense2", "make debian")
     from realsense_objects import Camera, Streaming
 
     camera = Camera()
@@ -70,7 +71,7 @@ def ros2_clouds(_folder: Path) -> Iterator[Source]:
 
 @contextmanager
 def _ros2(kind: str) -> Iterator[Source]:
-    pytest.importorskip("cyclonedds")
+    needs.module("cyclonedds", "tumortrack[live], x86-64, Python up to 3.13")
     from ros2_objects import own_graph, sending
     from tumortrack.live.sources.ros import Ros2SourceConfig
 
@@ -88,7 +89,6 @@ def _ros2(kind: str) -> Iterator[Source]:
 
 @contextmanager
 def recorded_mcap(folder: Path) -> Iterator[Source]:
-    pytest.importorskip("rosbags")
     path = record(folder / "r", [update_number(n) for n in range(8)])
     yield RecordingSourceConfig(path=path, rate=0).open()
 
@@ -101,7 +101,7 @@ def recorded_files(folder: Path) -> Iterator[Source]:
 
 
 def _recording(folder: Path) -> str:
-    pytest.importorskip("pyrealsense2")
+    needs.module("pyrealsense2", "make debian")
     from realsense_objects import record
 
     record(str(folder / "frames.db3"), frames=8)

@@ -15,9 +15,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pytest
 from PIL import Image
 
+import needs
 from clock import PATIENCE_S, until
 
 FLAGS = (
@@ -41,7 +41,7 @@ def chromium() -> str:
     for name in ("chromium", "chromium-browser", "google-chrome"):
         if found := shutil.which(name):
             return found
-    pytest.skip("Chromium is not installed: `make debian`")
+    needs.missing("Chromium is not installed: make debian")
 
 
 # viser's note that there is no GPU lies over the scene until somebody closes it.

@@ -6,9 +6,11 @@ import threading
 import time
 
 import numpy as np
-import pyrealsense2 as rs
 
+import needs
 from clock import PATIENCE_S
+
+rs = needs.module("pyrealsense2", "make debian")  # without libusb it cannot be loaded
 
 WIDTH, HEIGHT, UNIT_M = 848, 480, 0.0001
 
