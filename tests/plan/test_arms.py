@@ -56,9 +56,8 @@ def _cutting_tips(cell, motions, between=4):
 
 
 @MODELS
-def test_three_sources_of_kinematics_agree(model):
+def test_the_description_s_kinematics_are_the_maker_s_numbers(model):
     import pinocchio as pin
-    import ur_analytic_ik
 
     built = pin.buildModelFromXML(body.cell_urdf(CellConfig(cutter_model=model.name)))
     data = built.createData()
@@ -69,8 +68,6 @@ def test_three_sources_of_kinematics_agree(model):
         pin.framesForwardKinematics(built, data, np.r_[joints, np.zeros(6)])
         found = data.oMf[base].inverse() * data.oMf[flange]
         assert np.abs(found.homogeneous - plain).max() < 1e-9
-        other = getattr(ur_analytic_ik, model.name).forward_kinematics(*joints)
-        assert np.abs(other - plain).max() < 1e-9
 
 
 @MODELS
@@ -78,24 +75,6 @@ def test_an_arm_stretched_out_reaches_what_its_lengths_add_up_to(model):
     flange = flange_pose(model, np.zeros(6))
     assert flange[0, 3] == pytest.approx(model.a_mm[1] + model.a_mm[2])
     assert abs(flange[0, 3]) == pytest.approx(model.reach_mm, rel=0.1)
-
-
-@MODELS
-def test_inverse_kinematics_come_back(model):
-    for joints in np.random.default_rng(2).uniform(-np.pi, np.pi, (200, 6)):
-        pose = flange_pose(model, joints)
-        found = kinematics.inverse_kinematics(model, pose)
-        assert 1 <= len(found) <= 8
-        assert np.abs(found - joints).max(1).min() < 1e-6
-        for branch in found:
-            assert np.abs(flange_pose(model, branch) - pose).max() < 1e-6
-
-
-@MODELS
-def test_nothing_reaches_beyond_the_arm(model):
-    pose = np.eye(4)
-    pose[:3, 3] = [1.5 * model.reach_mm, 0.0, 200.0]
-    assert kinematics.inverse_kinematics(model, pose).shape == (0, 6)
 
 
 def test_turns_by_whole_turns_stay_within_limits():

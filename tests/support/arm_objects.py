@@ -60,22 +60,20 @@ def nearest_mm(cell, joints_rad):
 
 
 def flange_pose(model, joints_rad):
-    """``base_from_flange``, mm, by the plain product of the six Denavit-Hartenberg transforms.
+    """``base_from_flange`` (..., 4, 4), mm, of joints (..., 6), by the plain product of the six
+    Denavit-Hartenberg transforms.
 
-    Slow, and independent of every library: what the others are checked against.
+    Independent of every library: what the others are checked against.
     """
     base_from_flange = np.eye(4)
-    rows = zip(joints_rad, model.a_mm, model.d_mm, model.alpha_rad, strict=True)
-    for theta, a, d, alpha in rows:
+    joints = np.moveaxis(np.asarray(joints_rad), -1, 0)
+    for theta, a, d, alpha in zip(joints, model.a_mm, model.d_mm, model.alpha_rad, strict=True):
         (ct, st), (ca, sa) = (np.cos(theta), np.sin(theta)), (np.cos(alpha), np.sin(alpha))
-        base_from_flange = base_from_flange @ np.array(
-            [
-                [ct, -st * ca, st * sa, a * ct],
-                [st, ct * ca, -ct * sa, a * st],
-                [0.0, sa, ca, d],
-                [0.0, 0.0, 0.0, 1.0],
-            ]
-        )
+        step = np.zeros((*theta.shape, 4, 4))
+        step[..., 0, :] = np.stack([ct, -st * ca, st * sa, a * ct], -1)
+        step[..., 1, :] = np.stack([st, ct * ca, -ct * sa, a * st], -1)
+        step[..., 2:, :] = [[0.0, sa, ca, d], [0.0, 0.0, 0.0, 1.0]]
+        base_from_flange = base_from_flange @ step
     return base_from_flange
 
 

@@ -74,7 +74,7 @@ def keep_loaded() -> None:
 
     PyTorch and its kin make objects by the hundred thousand that live to the end of the process.
     The collector would look through them while frames wait, and for half a second at the end.
-    Don't call it after modules made by nanobind (manifold3d, ur_analytic_ik) are loaded: they
-    report leaks if they are not collected at the end.
+    Don't call it after modules made by nanobind (manifold3d) are loaded: they report leaks if they
+    are not collected at the end.
     """
     gc.freeze()

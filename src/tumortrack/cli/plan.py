@@ -209,7 +209,7 @@ class Plan(StatedPatient):
 
 def check_arms_installed() -> None:
     """Raises InputError where a library that motions need is missing."""
-    needed = ("pinocchio", "coal", "toppra", "ruckig", "ur_analytic_ik")
+    needed = ("pinocchio", "coal", "toppra", "ruckig")
     if missing := [name for name in needed if find_spec(name) is None]:
         raise InputError(f"arms need {', '.join(missing)}: pip install 'tumortrack[arms]'.")
 

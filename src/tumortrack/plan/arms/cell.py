@@ -19,7 +19,8 @@ from tumortrack.core.types import Mesh
 from tumortrack.live.values import RigidShape
 from tumortrack.plan.arms import body
 from tumortrack.plan.arms.config import CellConfig
-from tumortrack.plan.arms.kinematics import ArmModel, Pose, inverse_kinematics, nearest_turn
+from tumortrack.plan.arms.inverse_kinematics import inverse_kinematics
+from tumortrack.plan.arms.kinematics import ArmModel, Pose, nearest_turn
 from tumortrack.plan.motions import ARMS, CUTTER, HOLDER, Joints
 
 ORGAN = "organ"

@@ -1,4 +1,4 @@
-"""Kinematics of UR5 and UR10e: their maker's published numbers, and analytic inverse kinematics.
+"""Kinematics of UR5 and UR10e: their maker's published numbers, and turns of their joints.
 
 Lengths and angles: Universal Robots, 'DH parameters for calculations of kinematics and dynamics',
 https://www.universal-robots.com/articles/ur/application-installation/
@@ -18,7 +18,6 @@ from tumortrack.core.geometry import rigid
 Pose = Float64[np.ndarray, "4 4"]  # of frame b in frame a: ``a_from_b``, mm
 TURN = 2 * np.pi
 _QUARTER = np.pi / 2
-_EXACT_MM, _EXACT_RAD = 1e-3, 1e-5  # of inverse kinematics
 _ALPHA = np.array([_QUARTER, 0.0, 0.0, _QUARTER, -_QUARTER, 0.0])
 # All joints turn +-360 degrees; an elbow beyond 180 would pass through its own arm, so it is kept
 # within (as Universal Robots' own ROS description does).
@@ -28,9 +27,8 @@ _LIMITS = np.array([TURN, TURN, np.pi, TURN, TURN, TURN])
 class ArmModel(NamedTuple):
     """One type of arm, standard Denavit-Hartenberg: Rz(joint) Tz(d) Tx(a) Rx(alpha) per joint.
 
-    Arrays are per joint (6,). ``name``: as ``ur_analytic_ik`` calls it; ``speeds_rad_s`` and
-    ``reach_mm`` (from the base to the flange's middle): the maker's maxima; ``limits_rad``: of the
-    joints, in both directions.
+    Arrays are per joint (6,). ``speeds_rad_s`` and ``reach_mm`` (from the base to the flange's
+    middle): the maker's maxima; ``limits_rad``: of the joints, in both directions.
     """
 
     name: str
@@ -62,26 +60,6 @@ MODELS = {model.name: model for model in (UR5, UR10E)}
 # move (URScript manual, movej): a pace for work beside people, far below what either arm can do.
 ACCELERATION_RAD_S2 = 1.4
 JERK_RAD_S3 = 10.0
-
-
-def inverse_kinematics(model: ArmModel, base_from_flange: Pose) -> Float64[np.ndarray, "k 6"]:
-    """Joint angles (k, 6) in -pi..pi, k from 0 to 8, that bring the flange to a pose (mm).
-
-    Shoulder left or right, elbow up or down, wrist flipped or not. Each is kept only if forward
-    kinematics lead back to the pose: at singular poses the closed form yields others too.
-    """
-    import ur_analytic_ik
-
-    solver, pose_m = getattr(ur_analytic_ik, model.name), np.array(base_from_flange, order="C")
-    pose_m[:3, 3] /= 1000
-
-    def reaches(joints_rad: np.ndarray) -> bool:
-        off = np.abs(solver.forward_kinematics(*joints_rad) - pose_m)
-        off[:3, 3] *= _EXACT_RAD / (_EXACT_MM / 1000)
-        return bool(off.max() < _EXACT_RAD)  # False where there is a NaN
-
-    joints = np.array([j for j in solver.inverse_kinematics(pose_m) if reaches(j)]).reshape(-1, 6)
-    return wrapped(joints)
 
 
 def wrapped(angles_rad: np.ndarray) -> np.ndarray:
