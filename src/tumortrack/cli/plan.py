@@ -211,7 +211,10 @@ def check_arms_installed() -> None:
     """Raises InputError where a library that motions need is missing."""
     needed = ("pinocchio", "coal", "toppra", "ruckig")
     if missing := [name for name in needed if find_spec(name) is None]:
-        raise InputError(f"arms need {', '.join(missing)}: pip install 'tumortrack[arms]'.")
+        raise InputError(
+            f"arms need {', '.join(missing)}: pip install 'tumortrack[arms]'. toppra and ruckig "
+            "have packages for x86-64 alone; elsewhere plan the cuts with --no-arms."
+        )
 
 
 def _structure_mm(option: str) -> tuple[str, float]:

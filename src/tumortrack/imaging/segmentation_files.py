@@ -219,7 +219,9 @@ def _segmentation(
     try:
         import highdicom as hd
     except ImportError as error:
-        raise InputError("--dicom needs highdicom: pip install 'tumortrack[live]'.") from error
+        raise InputError(
+            "--dicom needs highdicom: pip install 'tumortrack[live]'. It exists for Python up to 3.13."
+        ) from error
     from pydicom.uid import generate_uid
 
     digest = hashlib.sha256(pixels.tobytes())

@@ -24,7 +24,8 @@ def open_bus(via: Via) -> Bus:
         from tumortrack.live.ros.dds import DdsBus
     except ImportError as error:
         raise InputError(
-            "ROS 2 without ROS needs the package cyclonedds: pip install 'tumortrack[live]'."
+            "ROS 2 without ROS needs the package cyclonedds: pip install 'tumortrack[live]'. It "
+            "exists for x86-64 and Python up to 3.13; elsewhere use your ROS's own rclpy."
         ) from error
     return DdsBus(messages)
 
