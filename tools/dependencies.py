@@ -170,9 +170,12 @@ def needed(
 
 
 def everything() -> dict[str, Distribution]:
-    """All that is installed of what is locked."""
+    """All that is installed of what is locked, but CUDA's packages: NVIDIA's own licence allows
+    their use, PyPI's PyTorch asks for them, and nothing here imports them."""
     found = {}
-    for name in versions():
+    for name in (
+        name for file, text in _locks().items() if file != "cuda" for name in pinned(text)
+    ):
         try:
             found[name] = distribution(name)
         except PackageNotFoundError:
@@ -222,7 +225,9 @@ _TABLE = """# Dependencies
 What `make setup` installs, and under which licence; made by `make licences`, which fails on one
 that is not allowed. Allowed are licences that ask only for attribution, and those whose terms
 concern changes to the package itself (MPL, EPL) or that it can be replaced (LGPL): packages are
-imported, not copied. GPL, AGPL and packages that state no licence are refused.
+imported, not copied. GPL, AGPL and packages that state no licence are refused. Not listed are
+CUDA's packages, under NVIDIA's own licence: PyPI's PyTorch for x86-64 Linux asks for them, and
+PyTorch's CPU build does without.
 
 | package | version | licence |
 |---|---|---|

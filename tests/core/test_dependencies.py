@@ -52,7 +52,9 @@ def test_what_is_installed_is_what_is_locked_and_its_licences_are_listed(tool):
     for name, package in tool.everything().items():
         assert package.version.split("+")[0] == locked[name][0], f"{name}: run make setup"
     assert tool.main(["licences"]) == 0
-    assert tool.TABLE.read_text("utf-8") == tool.table(), "run make licences"
+    rows, made = (set(text.splitlines()) for text in (tool.TABLE.read_text("utf-8"), tool.table()))
+    assert len(made) > 50
+    assert made <= rows, "run make licences"  # some are for one Python or machine alone
 
 
 @pytest.mark.parametrize(
