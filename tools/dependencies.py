@@ -173,9 +173,8 @@ def everything() -> dict[str, Distribution]:
     """All that is installed of what is locked, but CUDA's packages: NVIDIA's own licence allows
     their use, PyPI's PyTorch asks for them, and nothing here imports them."""
     found = {}
-    for name in (
-        name for file, text in _locks().items() if file != "cuda" for name in pinned(text)
-    ):
+    ours = [pinned(text) for file, text in _locks().items() if file != "cuda"]
+    for name in (name for pins in ours for name in pins):
         try:
             found[name] = distribution(name)
         except PackageNotFoundError:

@@ -19,31 +19,32 @@ def signed_volume(vertices, faces):  # type: ignore[no-untyped-def]
     return triple / 6
 
 
-@numba.njit(cache=True, nogil=True)
-def contained(points, vertices, faces):  # type: ignore[no-untyped-def]
+def contained(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Whether points (n, 3) lie inside a closed surface: an odd number of its faces (f, 3) lies
-    above such a point.
+    above such a point."""
+    side = int(np.sqrt(len(points) / 2)) + 1  # of a grid of cells over x and y
+    lower = points[:, :2].min(0, initial=np.inf)
+    per_mm = side / np.maximum(points[:, :2].max(0, initial=-np.inf) - lower, 1e-9)
+    column, row = np.minimum((points[:, :2] - lower) * per_mm, side - 1).astype(np.int64).T
+    order = np.argsort(row * side + column, kind="stable")
+    starts = np.searchsorted((row * side + column)[order], np.arange(side * side + 1))
+    sorted_inside = _above(points[order], vertices, faces, side, starts, (*lower, *per_mm))
+    inside = np.empty(len(points), np.bool_)
+    inside[order] = sorted_inside
+    return inside
+
+
+@numba.njit(cache=True, nogil=True)
+def _above(points, vertices, faces, side, starts, grid):  # type: ignore[no-untyped-def]
+    """Whether an odd number of faces lies above each point. Points are sorted by the cell of the
+    grid that they are in; only those in cells below a face are looked at.
 
     A point belongs to one of two triangles that share an edge, never to both or none: both look at
     that edge from its lower end and get the same sign (crossing rule of Shimrat 1962,
-    doi 10.1145/368637.368653). Only points near a triangle are looked at, in cells of a grid.
+    doi 10.1145/368637.368653).
     """
-    n = len(points)
-    inside = np.zeros(n, np.bool_)
-    if n == 0:
-        return inside
-    side = int(np.sqrt(n / 2)) + 1
-    x0, y0 = points[:, 0].min(), points[:, 1].min()
-    per_x = side / max(points[:, 0].max() - x0, 1e-9) * (1 - 1e-12)
-    per_y = side / max(points[:, 1].max() - y0, 1e-9) * (1 - 1e-12)
-    cells = np.empty(n, np.int64)
-    starts = np.zeros(side * side + 1, np.int64)
-    for i in range(n):
-        column = min(int((points[i, 0] - x0) * per_x), side - 1)
-        cells[i] = min(int((points[i, 1] - y0) * per_y), side - 1) * side + column
-        starts[cells[i] + 1] += 1
-    starts = np.cumsum(starts)
-    order = np.argsort(cells, kind="mergesort")
+    inside = np.zeros(len(points), np.bool_)
+    x0, y0, per_x, per_y = grid
     for f in range(len(faces)):
         a, b, c = vertices[faces[f, 0]], vertices[faces[f, 1]], vertices[faces[f, 2]]
         left = (min(a[0], b[0], c[0]) - x0) * per_x
@@ -56,8 +57,7 @@ def contained(points, vertices, faces):  # type: ignore[no-untyped-def]
         area = (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
         for row in range(int(max(bottom, 0)), int(min(top, side - 1)) + 1):
             start = starts[row * side + min(first, side - 1)]
-            for k in range(start, starts[row * side + last + 1]):
-                i = order[k]
+            for i in range(start, starts[row * side + last + 1]):
                 x, y = points[i, 0], points[i, 1]
                 crossed = _left_of(a, b, x, y) != _left_of(b, c, x, y)
                 if crossed == _left_of(c, a, x, y) or area == 0:

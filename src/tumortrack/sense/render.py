@@ -99,11 +99,14 @@ class Visibility:
         rays = (np.asarray(points_mm, np.float64) - self._centre - eye) @ axes.T
         vertices = (self._vertices - eye) @ axes.T
         order = np.argsort(_across(rays)[:, 0], kind="stable")
+        uv = _across(rays)[order]
+        before = uv[np.isfinite(uv[:, 0]), 0]  # other rays point away from the mesh
+        lowest, width = (before[0], np.ptp(before) / 256 + 1e-12) if len(before) else (0.0, 1.0)
+        starts = np.searchsorted(before, lowest + width * np.arange(258))  # of columns of rays
         hidden = np.empty(len(rays), np.bool_)
-        hidden[order] = _hidden(
-            rays[order], _across(rays)[order], vertices, _across(vertices), self._faces,
-            self._TOLERANCE_MM,
-        )  # fmt: skip
+        columns = (starts, lowest, width)
+        seen, meshed = (rays[order], uv), (vertices, _across(vertices), self._faces)
+        hidden[order] = _hidden(*seen, *meshed, columns, self._TOLERANCE_MM)
         return ~hidden
 
 
@@ -114,18 +117,14 @@ def _across(points: np.ndarray) -> np.ndarray:
 
 
 @numba.njit(cache=True, nogil=True)
-def _hidden(rays, rays_uv, vertices, vertices_uv, faces, tolerance_mm):  # type: ignore[no-untyped-def]
+def _hidden(rays, rays_uv, vertices, vertices_uv, faces, columns, tolerance_mm):  # type: ignore[no-untyped-def]
     """Whether a triangle crosses each ray (n, 3), sorted by its first coordinate in the picture,
     nearer to the eye than its end by more than the tolerance (Moeller and Trumbore 1997,
-    doi 10.1080/10867651.1997.10487468)."""
+    doi 10.1080/10867651.1997.10487468). columns: where each starts, the first's place, the width.
+    """
+    starts, lowest, width = columns
     hidden = np.zeros(len(rays), np.bool_)
     slack = 1e-9  # rounding: a ray along an edge belongs to both triangles
-    before = np.searchsorted(rays_uv[:, 0], np.inf)  # rays from here on point away from the mesh
-    lowest = rays_uv[0, 0] if before else 0.0
-    columns = 256.0 / max(rays_uv[before - 1, 0] - lowest, slack) if before else 0.0
-    starts = np.zeros(259, np.int64)  # of each column of the picture among the rays
-    for i in range(before):
-        starts[int((rays_uv[i, 0] - lowest) * columns) + 1 :] += 1
     for f in range(len(faces)):
         a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
         left = min(vertices_uv[a, 0], vertices_uv[b, 0], vertices_uv[c, 0])
@@ -135,8 +134,8 @@ def _hidden(rays, rays_uv, vertices, vertices_uv, faces, tolerance_mm):  # type:
         bounded = right < np.inf
         first, last = 0, len(rays)
         if bounded:
-            first = starts[int(min(max((left - slack - lowest) * columns, 0.0), 257.0))]
-            last = starts[int(min(max((right + slack - lowest) * columns + 1, 0.0), 258.0))]
+            first = starts[int(min(max((left - slack - lowest) / width, 0.0), 257.0))]
+            last = starts[int(min(max((right + slack - lowest) / width + 1, 0.0), 257.0))]
         ax, ay, az = vertices[a, 0], vertices[a, 1], vertices[a, 2]
         e1x, e1y, e1z = vertices[b, 0] - ax, vertices[b, 1] - ay, vertices[b, 2] - az
         e2x, e2y, e2z = vertices[c, 0] - ax, vertices[c, 1] - ay, vertices[c, 2] - az
