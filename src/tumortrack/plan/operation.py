@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float64
 from scipy.spatial import cKDTree
 
-from tumortrack.core.colours import Colour
+from tumortrack.core.colours import CUT, NOW, TO_CUT
 from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError, TumortrackError
 from tumortrack.core.types import Mesh
@@ -27,9 +27,6 @@ from tumortrack.plan.live_budget import LiveBudget
 from tumortrack.plan.motions import ABORTED, JOINTS, Execution, Joints, Motions
 from tumortrack.plan.values import Located, ResectionPlan
 
-TO_CUT: Colour = (0, 120, 240)
-NOW: Colour = (255, 90, 30)
-CUT: Colour = (120, 40, 40)
 _SAME_MM = 0.2  # of heights
 _OTHERS = 2.0  # other parts may have moved so many times as far as the tumor
 _COMPARED = 500  # points of surfaces whose triangles differ

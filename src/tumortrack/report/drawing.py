@@ -17,14 +17,14 @@ from trimesh.intersections import mesh_plane
 
 from tumortrack.core import colours
 from tumortrack.core.store import write_atomically
-from tumortrack.core.types import Mesh
+from tumortrack.core.types import FIRST_TUMOR, Mesh
 from tumortrack.imaging.raster import voxelise
 from tumortrack.report.renderer import RGB, Body, Frame, ParallelView, rgb
 
 ORGAN = rgb(colours.ORGAN_PART)
-ESTIMATED = (230 / 255, 140 / 255, 0.0)
-TRUE = (0.0, 90 / 255, 160 / 255)
-OBSERVED = (0.25, 0.25, 0.25)
+ESTIMATED = rgb(colours.part_colour(FIRST_TUMOR))  # of one tumor, or a curve
+TRUE = rgb(colours.TRUTH)
+OBSERVED = rgb(colours.OBSERVED)
 CENTRED: dict[str, Any] = {"ha": "center", "va": "center"}
 
 

@@ -1,7 +1,7 @@
 """Pictures that a surgeon can read: the estimate over the truth, and a prepared case.
 
-Orange is what was estimated, blue is the truth (a pair that every colour vision tells apart).
-Nothing needs a display.
+Every part has its own colour (core/colours.py); dark blue outlines are the truth. Nothing needs a
+display.
 """
 
 from __future__ import annotations
@@ -16,13 +16,14 @@ from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
+from tumortrack.core.colours import name_colour
 from tumortrack.core.estimate import Estimate
 from tumortrack.core.geometry import DIRECTIONS_LPS, transform_points
 from tumortrack.core.organ import is_tumor, organ_name
 from tumortrack.core.types import Anatomy, LabelVolume, Mesh, Volume
 from tumortrack.report import drawing
-from tumortrack.report.drawing import CENTRED, ESTIMATED, OBSERVED, ORGAN, TRUE
-from tumortrack.report.renderer import RGB, Body, Frame, ParallelView
+from tumortrack.report.drawing import CENTRED, OBSERVED, ORGAN, TRUE
+from tumortrack.report.renderer import RGB, Body, Frame, ParallelView, rgb
 from tumortrack.simulate.scene_folder import Scene
 
 FROM_CAMERA = ParallelView("seen from the camera", (1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
@@ -39,9 +40,6 @@ PLANES = (
     ParallelView("coronal", (1.0, 0.0, 0.0), (0.0, 0.0, -1.0)),
     ParallelView("sagittal", (0.0, 1.0, 0.0), (0.0, 0.0, -1.0)),
 )
-# On grey, apart in every colour vision: organ light orange, tumors yellow, sky blue, green, purple.
-_ORGAN_LINE = (1.0, 0.62, 0.45)
-_TUMOR_COLORS = ((0.97, 0.88, 0.22), (0.34, 0.71, 0.91), (0.56, 0.93, 0.56), (0.85, 0.55, 0.75))
 _SOFT_TISSUE_HU = (-160.0, 240.0)
 _MARGIN_MM, _ASPECT = 18.0, 1.22
 _MOST_ROWS = 6  # tumors with slices of their own
@@ -87,7 +85,7 @@ def scene_picture(
     targets = f"   target error {errors['mean']:.1f} mm" if errors else ""
     headline = f"{entry['name']}   mIoU {entry['miou']:.2f}{targets}{failed}"
     figure.suptitle(headline, x=0.02, ha="left", fontsize=13, fontweight="bold")
-    drawing.show_legend(figure, scene_legend(scene.reference.kind.words), 4, (0.985, 0.995))
+    drawing.show_legend(figure, scene_legend(*scene.reference.names), 5, (0.985, 0.995))
     drawing.save(figure, path)
 
 
@@ -100,7 +98,7 @@ def draw_solid_view(
     frame = view.frame_around(np.concatenate(everything), 6.0).widened(1.7)
     name = organ_name(shown)
     organ = [] if name is None else [Body(shown.pop(name), ORGAN, 0.36)]
-    tumors = [Body(mesh, ESTIMATED) for mesh in shown.values()]
+    tumors = [Body(mesh, rgb(name_colour(part))) for part, mesh in shown.items()]
     drawing.show_bodies(axes, view, [*tumors, *organ], frame)
     flat = view.project(scene.cloud.points_mm.astype(float))
     axes.scatter(flat[:, 0], flat[:, 1], s=2.5, color=OBSERVED, alpha=0.55, linewidths=0, zorder=3)
@@ -121,7 +119,7 @@ def _draw_slice(
     around = [meshes[name].vertices_mm for meshes in (truth, shown) if name in meshes]
     frame = view.frame_around(np.concatenate(around), 12.0).widened(1.0)
     for part, mesh in shown.items():
-        color, width = (ESTIMATED, 2.4) if is_tumor(part) else (ORGAN, 1.4)
+        color, width = rgb(name_colour(part)), 2.4 if is_tumor(part) else 1.4
         drawing.tint(axes, drawing.section_mask(mesh, view, frame, through_mm), frame, color)
         lines = drawing.section(mesh, view, through_mm)
         drawing.draw_lines(axes, lines, color=color, linewidth=width, zorder=3)
@@ -135,11 +133,12 @@ def _draw_slice(
     drawing.finish_view(axes, frame, _CAMERA_AXES[view])
 
 
-def scene_legend(organ: str = "kidney") -> list[Any]:
-    """Handles of what ``draw_solid_view`` shows."""
+def scene_legend(organ: str = "kidney", *tumors: str) -> list[Any]:
+    """Handles of what ``draw_solid_view`` shows, by the parts' names: the truth's and the points'
+    last."""
     return [
-        Patch(facecolor=ESTIMATED, label="estimated tumor"),
-        Patch(facecolor=(*ORGAN, 0.5), label=f"estimated {organ}"),
+        Patch(facecolor=(*ORGAN, 0.5), label=f"estimated {organ.replace('_', ' ')}"),
+        *(Patch(facecolor=rgb(name_colour(t)), label=t.replace("_", " ")) for t in tumors),
         Line2D([], [], color=TRUE, linewidth=2, label="truth (outline)"),
         Line2D([], [], color=OBSERVED, marker=".", linestyle="", label="observed point"),
     ]
@@ -266,5 +265,4 @@ def _write_letters(axes: Axes, view: ParallelView, color: str) -> None:
 
 def _part_colors(anatomy: Anatomy) -> list[RGB]:
     """Of the organ and of each tumor."""
-    few = len(_TUMOR_COLORS)
-    return [_ORGAN_LINE, *(_TUMOR_COLORS[n % few] for n in range(len(anatomy.tumors)))]
+    return [rgb(name_colour(name)) for name in anatomy.names]

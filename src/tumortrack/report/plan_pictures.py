@@ -15,7 +15,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.patheffects import Normal, Stroke
 
-from tumortrack.core.colours import part_colour, sweep_colour
+from tumortrack.core.colours import PIECE, part_colour, sweep_colour
 from tumortrack.core.errors import InputError
 from tumortrack.core.organ import KIDNEY, organ_first, organ_name
 from tumortrack.core.types import ORGAN, Mesh, part_names
@@ -35,7 +35,7 @@ _ARROWS = {
 _METHODS = {"published": "as published", "margin": "margin kept all round"}
 
 _ASPECT = 1.28
-_PIECE = (0.36, 0.5, 0.95)
+_PIECE = rgb(PIECE)
 _GRASP = (0.1, 0.1, 0.12)
 _APPROACH_MM, _CUP_MM = 24.0, 5.0
 _ORGAN_OPACITY, _PIECE_OPACITY = 0.36, 0.3

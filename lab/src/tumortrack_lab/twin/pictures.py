@@ -26,5 +26,5 @@ def twin_picture(scene: Scene, path: Path) -> None:
         draw_solid_view(figure.add_subplot(1, 3, number), scene, None, view)
     words = f"{scene.meta['variant']}, {scene.meta['view']}"
     figure.suptitle(words, x=0.02, ha="left", fontsize=13, fontweight="bold")
-    drawing.show_legend(figure, scene_legend()[2:], 2, (0.99, 1.0))
+    drawing.show_legend(figure, scene_legend()[-2:], 2, (0.99, 1.0))
     drawing.save(figure, path)
