@@ -6,7 +6,6 @@ display.
 
 from __future__ import annotations
 
-import textwrap
 from pathlib import Path
 from typing import Any
 
@@ -60,9 +59,8 @@ def scene_picture(
     shown = estimate.meshes if estimate else {}
     slices = [(name, view) for name in scene.reference.names[1:] for view in _SLICES]
     rows = -(-len(slices) // 4)
-    height_in = 5.1 + 4.05 * rows
-    top, bottom = 1 - 0.85 / height_in, 0.15 / height_in
-    figure = drawing.new_figure(14.0, height_in, top=top, bottom=bottom)
+    height_in = 4.6 + 4.05 * rows
+    figure = drawing.new_figure(14.0, height_in, top=1 - 0.35 / height_in, bottom=0.15 / height_in)
     outer = figure.add_gridspec(2, 1, height_ratios=[4.1, 3.95 * max(rows, 0.01)], hspace=0.13)
     above = outer[0].subgridspec(1, 2, wspace=0.04)
     for column, view in enumerate(_SLICES):
@@ -79,13 +77,14 @@ def scene_picture(
             if part["found"]
             else "not found"
         )
-        axes.set_title(f"{what}\n{found}", fontsize=9.5)
-    failed = "" if entry["failed"] is None else f"\n{textwrap.shorten(entry['failed'], 130)}"
+        drawing.title_axes(axes, f"{what}\n{found}", 9.5)
+    failed = [f"FAILED: {entry['failed']}"] if entry["failed"] else []
+    poor = [f"POOR ESTIMATE: {entry['reason']}"] if entry.get("quality") == "poor" else []
     errors = entry.get("tre_mm")
     targets = f"   target error {errors['mean']:.1f} mm" if errors else ""
-    headline = f"{entry['name']}   mIoU {entry['miou']:.2f}{targets}{failed}"
-    figure.suptitle(headline, x=0.02, ha="left", fontsize=13, fontweight="bold")
-    drawing.show_legend(figure, scene_legend(*scene.reference.names), 5, (0.985, 0.995))
+    headline = f"{entry['name']}   mIoU {entry['miou']:.2f}{targets}"
+    handles = scene_legend(*scene.reference.names)
+    drawing.add_words(figure, headline, [*failed, *poor], (), handles)
     drawing.save(figure, path)
 
 
@@ -108,7 +107,7 @@ def draw_solid_view(
         u, v = view.project(mesh.box_mm.mean(0)[None])[0, :2]
         axes.text(u, v, name.split("_")[-1], fontweight="bold", **CENTRED)
     drawing.finish_view(axes, frame, _CAMERA_AXES[view])
-    axes.set_title(view.name, fontsize=11)
+    drawing.title_axes(axes, view.name)
 
 
 def _draw_slice(
@@ -157,9 +156,9 @@ def qc_picture(
     order = sorted(range(len(anatomy.tumors)), key=lambda n: -abs(anatomy.tumors[n].volume_mm3))
     rows = {anatomy.names[n + 1]: anatomy.tumors[n] for n in sorted(order[:_MOST_ROWS])}
     rows = rows or {anatomy.names[0]: anatomy.organ}
-    height = 3.85 * len(rows)
-    borders = {"left": 0.025, "right": 0.99, "bottom": 0.05 / (height + 1.0)}
-    figure = drawing.new_figure(18.0, height + 1.0, top=height / (height + 1.0), **borders)
+    height = 3.85 * len(rows) + 0.4
+    borders = {"left": 0.025, "right": 0.99, "bottom": 0.05 / height}
+    figure = drawing.new_figure(18.0, height, top=1 - 0.35 / height, **borders)
     grid = figure.add_gridspec(len(rows), 4, wspace=0.03, hspace=0.12)
     shown: LabelVolume | Volume = ct if ct is not None else case_labels
     window = _window(shown, anatomy)
@@ -182,12 +181,11 @@ def qc_picture(
     dropped = len(order) > _MOST_ROWS
     more = f" (slices through the {_MOST_ROWS} largest of {len(order)} tumors)" if dropped else ""
     title = f"Prepared case over its {what}{more}" + (f": {whose}" if whose else "")
-    figure.suptitle(title, x=0.015, ha="left", fontweight="bold", parse_math=False)
     handles = [
         Patch(facecolor=color, label=f"{name.replace('_', ' ')} {part.volume_mm3 / 1000:.1f} ml")
         for color, name, part in zip(colors, anatomy.names, anatomy.parts, strict=True)
     ]
-    drawing.show_legend(figure, handles, 6, (0.99, 0.995))
+    drawing.add_words(figure, title, (), (), handles)
     drawing.save(figure, path)
 
 
