@@ -165,7 +165,7 @@ def test_a_plan_is_carried_out_and_recorded(story, tmp_path):
     )  # fmt: skip
     stages = [stage.name for stage in read_plan(folder / "plan").motions.stages]
     assert stages[:4] == ["approach", "grasp", "hold", "sweep 1"]
-    assert stages[-2:] == ["release", "home"]
+    assert stages[-3:] == ["lift", "release", "home"]
     lines = said.splitlines()
     assert lines[-1] == "done: both virtual arms are home."
     found = json.loads(report.read_text())["resection"]

@@ -132,6 +132,7 @@ class Operation:
         budget: LiveBudget | None = None,
     ) -> None:
         self.planned, self._config = planned, config
+        self._warnings = planned.plan.warnings  # of another plan too: the budget stays accepted
         self._draw, self._locate, self._replan = draw, locate, replan
         self._budget = budget
         self._execution = Execution(planned.motions)
@@ -197,8 +198,9 @@ class Operation:
 
     @property
     def _note(self) -> str:
-        """What is wrong with all estimates by now."""
-        return CUT_NOTE if self._cut and self._locate is not None else ""
+        """What is wrong with the plan, and with all estimates by now."""
+        heads = [warning.split(":")[0].rstrip(".") for warning in self._warnings]
+        return "; ".join([*heads, *([CUT_NOTE] if self._cut and self._locate is not None else [])])
 
     def summary(self) -> dict[str, Any]:
         """For the report: states and when they began, halts, new plans."""

@@ -6,6 +6,7 @@ display.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -144,13 +145,19 @@ def scene_legend(organ: str = "kidney", *tumors: str) -> list[Any]:
 
 
 def qc_picture(
-    case_labels: LabelVolume, ct: Volume | None, anatomy: Anatomy, path: Path, whose: str = ""
+    case_labels: LabelVolume,
+    ct: Volume | None,
+    anatomy: Anatomy,
+    path: Path,
+    whose: str = "",
+    warnings: Sequence[str] = (),
 ) -> None:
     """Orthogonal slices with outlines, a row through each tumor, and a 3-D view: is everything
     outlined, and on the right side?
 
     All in the patient's frame (LPS, mm). The labels are shown as grey where there is no CT. Of
-    more than six tumors the six largest have rows. ``whose``: stands in the title. The PNG is
+    more than six tumors the six largest have rows. ``whose``: stands in the title; the ``warnings``
+    over it. The PNG is
     written atomically.
     """
     order = sorted(range(len(anatomy.tumors)), key=lambda n: -abs(anatomy.tumors[n].volume_mm3))
@@ -165,7 +172,8 @@ def qc_picture(
     for row, (name, part) in enumerate(rows.items()):
         for column, view in enumerate(PLANES):
             axes = figure.add_subplot(grid[row, column])
-            _draw_plane(axes, (shown, window), anatomy, view, part.box_mm.mean(0))
+            through_mm = in_voxels(part.box_mm.mean(0), shown.lps_from_index)
+            _draw_plane(axes, (shown, window), anatomy, view, through_mm)
             if column == 0:
                 title = f"through {name.replace('_', ' ')}"
                 axes.set_ylabel(title, fontsize=12, fontweight="bold")
@@ -185,7 +193,7 @@ def qc_picture(
         Patch(facecolor=color, label=f"{name.replace('_', ' ')} {part.volume_mm3 / 1000:.1f} ml")
         for color, name, part in zip(colors, anatomy.names, anatomy.parts, strict=True)
     ]
-    drawing.add_words(figure, title, (), (), handles)
+    drawing.add_words(figure, title, warnings, (), handles)
     drawing.save(figure, path)
 
 
@@ -212,6 +220,15 @@ def _draw_plane(
     axis = int(np.argmax(np.abs(view.axes[2])))
     letter = ("LPS" if through_mm[axis] >= 0 else "RAI")[axis]
     axes.set_title(f"{view.name}, {letter} {abs(through_mm[axis]):.1f} mm", fontsize=10.5)
+
+
+def in_voxels(
+    point_mm: Float[np.ndarray, " 3"], lps_from_index: Float[np.ndarray, "4 4"]
+) -> Float[np.ndarray, " 3"]:
+    """The middle of the nearest voxel: a plane through it shows voxels that lie in it, not half a
+    voxel beside it, so that slice and outline belong together."""
+    index = np.rint(transform_points(np.linalg.inv(lps_from_index), point_mm[None]))
+    return transform_points(lps_from_index, index)[0]
 
 
 def slice_volume(
