@@ -28,7 +28,7 @@ from tumortrack.plan.operation import (
     ResectionProgress,
 )
 from tumortrack.plan.resection import plan_resection
-from tumortrack.plan.values import ResectionConfig
+from tumortrack.plan.values import OVER_BUDGET, POOR_ESTIMATE, ResectionConfig
 
 STATES = ("approach", "grasp", "hold", "sweep 1", "sweep 2", "lift", "release", "home")
 FRAME_S = 1 / 30
@@ -546,3 +546,12 @@ def test_surfaces_of_other_triangles_are_compared_by_their_distance():
 def test_nonsense_is_refused(bad):
     with pytest.raises(InputError, match="allowed"):
         OperationConfig(**bad)
+
+
+def test_the_plans_warnings_go_with_every_state():
+    notes = (f"{POOR_ESTIMATE}: too little is seen.", "a note", f"{OVER_BUDGET}: 9 mm of error.")
+    world = World(plan=replace(PLAN, notes=notes))
+    for cell in (world.frame(), world.frames(200), world.frames(3)):
+        assert f"({POOR_ESTIMATE}; {OVER_BUDGET}" in cell.state
+    assert "a note" not in world.frame().state
+    assert OVER_BUDGET in world.operation.summary()["note"]

@@ -121,7 +121,7 @@ class Resect(track.Following):
     ) -> None:
         """Raises InputError that lists what is missing for real arms to move."""
         from tumortrack.plan.files import INVENTED
-        from tumortrack.plan.located import POOR_ESTIMATE
+        from tumortrack.plan.values import POOR_ESTIMATE
 
         model, source = self.live or ("", "")
         budget, moved_mm = stored.budget, self._moved_mm(stored)
