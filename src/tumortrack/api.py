@@ -13,7 +13,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import asdict
 from pathlib import Path
-from textwrap import fill
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -109,10 +108,11 @@ def prepare(
         from tumortrack.report.pictures import qc_picture
 
         with store.new_folder(Path(folder), overwrite) as aside:
-            whose = str(case.patient)
-            if said := case.report["half_turn"]["warning"]:
-                whose += f"\nWARNING: {fill(said, 150)}"
-            qc_picture(case.labels, case.ct, case.anatomy, aside / "qc.png", whose)
+            warnings = [note for note in case.report["notes"] if note.startswith("LEFT OUT")]
+            if doubtful := case.report["half_turn"]["warning"]:
+                warnings.append(doubtful)
+            about = str(case.patient), warnings
+            qc_picture(case.labels, case.ct, case.anatomy, aside / "qc.png", *about)
             save_case(case, aside)
     return case
 

@@ -1,6 +1,7 @@
 """Kits: beads that tell where they are, stands that press as far as they say, files that agree."""
 
 import json
+import re
 import zipfile
 from itertools import combinations
 
@@ -145,6 +146,9 @@ def test_files_hold_what_kit_json_says(kit, anatomy):
     sheet = (kit / "sheet.html").read_text()
     assert "@" not in sheet.split("</style>")[1]
     assert "http" not in sheet
+    assert "<h1>Phantom kit of case case (patient" in sheet
+    bolts = sum(check["value"] for check in checks if check["what"] == "bolts")
+    assert re.search(rf"nylon bolts M4 x 25 mm.*<td>{bolts:.0f}<td>", sheet)
     assert sheet.count("<img") == 4  # bench, two molds, D2
 
 
@@ -194,3 +198,12 @@ def test_what_cannot_be_used_is_told_from_what_should_be_looked_at():
     assert checked("x", "pressed_mm", 7.9, 8.0).verdict == "FAILS"
     with pytest.raises(InputError, match="twice"):
         BaseConfig(states=("D1", "D1"))
+
+
+def test_checks_read_as_sentences_with_their_units():
+    assert checked("base", "fits_bed", True).number == "yes"
+    assert checked("base", "fits_bed", False).number == "no"
+    assert checked("base", "fits_bed", False).limits == "yes"
+    assert checked("organ", "keys", 6).number == "6"
+    assert checked("organ", "cast_differs_mm", 0.0002).number == "under 0.01 mm"
+    assert checked("organ", "least_wall_mm", 1.284).number == "1.28 mm"

@@ -21,7 +21,9 @@ from tumortrack.plan.motions import CUTTER, HOLDER, JOINTS
 from tumortrack.plan.values import Cut
 
 MODELS = pytest.mark.parametrize("model", kinematics.MODELS.values(), ids=lambda model: model.name)
-HOLDS = {"approach": (), "grasp": (HOLDER,), "hold": (HOLDER,), "release": (HOLDER,), "home": ()}
+HOLDING = ("grasp", "hold", "lift", "release")
+HOLDS = {"approach": (), "home": ()} | dict.fromkeys(HOLDING, (HOLDER,))
+LAST = ["lift", "release", "home"]
 
 
 @pytest.fixture(scope="module")
@@ -215,7 +217,7 @@ def test_cells_that_can_t_be_are_refused(wrong):
 
 def test_the_procedure_has_its_stages_without_gaps(cell, motions):
     names = [stage.name for stage in motions.stages]
-    assert names == ["approach", "grasp", "hold", "sweep 1", "sweep 2", "release", "home"]
+    assert names == ["approach", "grasp", "hold", "sweep 1", "sweep 2", "lift", "release", "home"]
     assert np.array_equal(motions.stages[0].joints_rad[0], cell.home_rad)
     assert np.allclose(motions.stages[-1].joints_rad[-1], cell.home_rad, atol=1e-9)
     for one, other in itertools.pairwise(motions.stages):
@@ -326,7 +328,7 @@ def test_arms_begin_anew_in_the_middle_of_a_cut(cell, motions):
     sweep = motions.stages[3]
     middle = sweep.joints_rad[np.flatnonzero(sweep.cutting)[200]]
     anew = plan_motions(plan((0, 3, 0)), cell, organ((0, 3, 0)), middle, from_sweep=1)
-    assert [stage.name for stage in anew.stages] == ["sweep 1", "sweep 2", "release", "home"]
+    assert [stage.name for stage in anew.stages] == ["sweep 1", "sweep 2", *LAST]
     joints = anew.stages[0].joints_rad
     assert np.array_equal(joints[0], middle)
     assert np.array_equal(joints[:, 6:], np.repeat(middle[None, 6:], len(joints), 0))  # it holds
@@ -339,7 +341,7 @@ def test_arms_begin_anew_in_the_middle_of_a_cut(cell, motions):
     assert [stage.name for stage in whole.stages] == [stage.name for stage in motions.stages]
     assert np.array_equal(whole.stages[0].joints_rad[0], middle)  # both withdraw first
     only = plan_motions(plan(), cell, cell.organ, motions.stages[5].joints_rad[0], from_sweep=3)
-    assert [stage.name for stage in only.stages] == ["release", "home"]
+    assert [stage.name for stage in only.stages] == LAST
 
 
 @pytest.mark.parametrize("turn_rad", [2e-6, 1e-4, 0.1, 3.0])

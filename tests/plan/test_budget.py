@@ -21,13 +21,13 @@ from tumortrack.live.sinks.ur import OFF_MM
 from tumortrack.plan.budget import (
     HAND_EYE_MM,
     LEAST_TRACKING_MM,
-    OVER_BUDGET,
     TERMS,
     TOOL_MM,
     UNKNOWN_TRACKING_MM,
     ErrorBudget,
     heeded,
     kept_mm,
+    kept_words,
     plan_within,
     planned_budget,
     widened,
@@ -35,7 +35,7 @@ from tumortrack.plan.budget import (
 from tumortrack.plan.live_budget import LiveBudget
 from tumortrack.plan.located import of_estimate
 from tumortrack.plan.resection import plan_resection
-from tumortrack.plan.values import CutLayer, ResectionConfig
+from tumortrack.plan.values import OVER_BUDGET, CutLayer, ResectionConfig
 
 NAMES = [f"{name.replace('-', '_')}_mm" for name in TERMS]
 millimetres = st.floats(0, 50)
@@ -265,3 +265,20 @@ def test_live_the_margin_of_the_moment_counts():
     why, _ = live.add_up(of, "tumor_1", sphere(TUMOR_MM, RADIUS_MM), 0.0, 20.0)
     assert why == "the estimate states no 90 % margin, with which it was planned"
     assert (live.now.tracking_mm, live.now.confidence) == (LEAST_TRACKING_MM, 0)
+
+
+def test_the_margin_in_words_is_the_one_that_the_budget_counts():
+    seen = located()
+    plan = plan_resection(seen, ResectionConfig(margin_mm=5.0))
+    kept = planned_budget(plan, seen).margin_mm
+    words = kept_words(plan, seen)
+    assert words.startswith(f"margin {kept:.1f} mm")
+    assert ("(5 mm asked for)" in words) == (f"{kept:.1f}" != "5.0")
+    into = plan_resection(seen, ResectionConfig(method="published", margin_mm=1.0))
+    narrow = replace(
+        into, layers=tuple(CutLayer(x.bottom_mm + 4, x.top_mm, x.rings_mm) for x in into.layers)
+    )
+    deep = planned_budget(narrow, seen).margin_mm
+    assert deep < -3
+    asked = "(1 mm asked for)"
+    assert kept_words(narrow, seen) == f"the cut goes {-deep:.1f} mm into the tumor {asked}"

@@ -28,9 +28,9 @@ from tumortrack.plan.operation import (
     ResectionProgress,
 )
 from tumortrack.plan.resection import plan_resection
-from tumortrack.plan.values import ResectionConfig
+from tumortrack.plan.values import OVER_BUDGET, POOR_ESTIMATE, ResectionConfig
 
-STATES = ("approach", "grasp", "hold", "sweep 1", "sweep 2", "release", "home")
+STATES = ("approach", "grasp", "hold", "sweep 1", "sweep 2", "lift", "release", "home")
 FRAME_S = 1 / 30
 GOOD = replace(small_update(), quality="good")
 SEEN = located(n=8_000)
@@ -252,7 +252,7 @@ def test_a_whole_procedure_on_an_organ_that_keeps_still():
 NO_ESTIMATE = {"estimate": None, "reason": "no frame for 0.6 s", "quality": "none"}
 
 
-@pytest.mark.parametrize("state", [s for s in STATES if s not in ("release", "home")])
+@pytest.mark.parametrize("state", [s for s in STATES if s not in ("lift", "release", "home")])
 @pytest.mark.parametrize(
     ("doubt", "said"),
     [
@@ -384,7 +384,7 @@ def test_what_is_not_cut_yet_is_cut_in_whatever_sweeps_the_new_plan_has(degrees,
 
 def test_after_the_last_sweep_no_estimate_is_needed_any_more():
     world = World()
-    world.until("release")
+    world.until("lift")
     assert world.frame(**NO_ESTIMATE).halted == ""
     world.until(DONE, **NO_ESTIMATE)
 
@@ -460,7 +460,7 @@ def test_less_motion_than_allowed_can_be_too_much_and_is_planned_anew():
 
 def test_after_the_last_sweep_the_tumor_may_go():
     world = World()
-    world.until("release")
+    world.until("lift")
     world.shift = np.array([0.0, 0.0, 60.0])  # the grasper carries it away
     assert world.frame().halted == ""
     world.until(DONE)
@@ -546,3 +546,12 @@ def test_surfaces_of_other_triangles_are_compared_by_their_distance():
 def test_nonsense_is_refused(bad):
     with pytest.raises(InputError, match="allowed"):
         OperationConfig(**bad)
+
+
+def test_the_plans_warnings_go_with_every_state():
+    notes = (f"{POOR_ESTIMATE}: too little is seen.", "a note", f"{OVER_BUDGET}: 9 mm of error.")
+    world = World(plan=replace(PLAN, notes=notes))
+    for cell in (world.frame(), world.frames(200), world.frames(3)):
+        assert f"({POOR_ESTIMATE}; {OVER_BUDGET}" in cell.state
+    assert "a note" not in world.frame().state
+    assert OVER_BUDGET in world.operation.summary()["note"]

@@ -232,9 +232,14 @@ def test_the_floor_is_cut_where_the_next_layer_is_smaller():
 
 
 def test_volumes_are_those_of_the_bodies():
-    plan = plan_resection(located(), OURS)
+    seen = located()
+    plan = plan_resection(seen, OURS)
     assert plan.volumes_ml["tumor"] == pytest.approx(4 / 3 * np.pi * 1.2**3, rel=0.05)
     assert plan.volumes_ml["piece"] > plan.volumes_ml["tumor"]
+    surface_ml = {name: mesh.volume_mm3 / 1000 for name, mesh in seen.meshes.items()}
+    assert plan.volumes_ml["tumor"] == pytest.approx(surface_ml["tumor_1"])  # as `locate` states it
+    whole = plan.volumes_ml["parenchyma"] + plan.volumes_ml["tumor"]
+    assert whole == pytest.approx(surface_ml["kidney"]) == pytest.approx(plan.volumes_ml["organ"])
     assert plan.volumes_ml["piece"] == pytest.approx(
         plan.volumes_ml["tumor"] + plan.volumes_ml["healthy"], rel=1e-6
     )

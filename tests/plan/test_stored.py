@@ -30,6 +30,7 @@ from tumortrack.plan.operation import ResectionProgress
 from tumortrack.plan.values import ResectionConfig
 
 CONFIG = CellConfig()
+FIRST, LAST = ("approach", "grasp", "hold"), ("lift", "release", "home")
 
 
 @pytest.fixture(scope="module")
@@ -131,8 +132,8 @@ def turn(arrays):
         (lambda a: a.update({n: v[:0] for n, v in a.items()}), "must match"),
         (turn, "cutter_elbow_joint turns beyond its limit in approach"),
         (shift, r"jumps by 0\.001 rad at sweep 1"),
-        (rename("approach", "grasp", "hold", "sweep 2", "sweep 1", "release", "home"), "stages"),
-        (rename("approach", "grasp", "hold", "sweep x", "sweep 2", "release", "home"), "stages"),
+        (rename(*FIRST, "sweep 2", "sweep 1", *LAST), "stages"),
+        (rename(*FIRST, "sweep x", "sweep 2", *LAST), "stages"),
         (rename("approach"), "stages are approach"),
     ],
 )

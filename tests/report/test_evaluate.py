@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from tumortrack.core.colours import part_colour
 from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.estimate import Estimate
 from tumortrack.core.types import (
@@ -27,11 +28,12 @@ from tumortrack.report.pictures import (
     FROM_SIDE,
     PLANES,
     border_letters,
+    in_voxels,
     qc_picture,
     slice_volume,
 )
 from tumortrack.report.protocol import evaluate_scenes, failure, summarise, summary_table
-from tumortrack.report.renderer import Body, Frame, ParallelView
+from tumortrack.report.renderer import Body, Frame, ParallelView, rgb
 from tumortrack.simulate.scene_folder import Scene
 
 
@@ -356,7 +358,7 @@ def test_qc_picture_shows_outlines(tmp_path, with_ct):
     whose = r"patient $\frac$, left side"  # no formula
     qc_picture(LabelVolume(labels, lps_from_index), ct, parts, tmp_path / "qc.png", whose)
     flat = imread(tmp_path / "qc.png")[..., :3].reshape(-1, 3)
-    for color in ((1.0, 0.62, 0.45), (0.97, 0.88, 0.22)):
+    for color in (rgb(part_colour(1)), rgb(part_colour(2))):
         assert (np.abs(flat - color) < 0.03).all(1).sum() > 300
     assert list(tmp_path.iterdir()) == [tmp_path / "qc.png"]
 
@@ -374,6 +376,35 @@ def test_qc_picture_cuts_through_every_tumor(tmp_path):
     picture = imread(tmp_path / "qc.png")[..., :3]
     top, left = picture.shape[0] // 10, int(0.74 * picture.shape[1])  # no legend, no 3-D view
     rows = np.array_split(picture[top:, :left], 2)
-    for row, color in zip(rows, ((0.97, 0.88, 0.22), (0.34, 0.71, 0.91)), strict=True):
+    for row, color in zip(rows, (rgb(part_colour(2)), rgb(part_colour(3))), strict=True):
         drawn = (np.abs(row - color) < 0.03).all(2)
         assert all(part.sum() > 50 for part in np.array_split(drawn, 3, axis=1))
+
+
+def test_slice_and_outline_of_coarse_voxels_belong_together():
+    """A bar that leans by 45 degrees, in voxels of 3 mm; the plane asked for lies between two
+    layers of voxels, so that the nearest one's slice is 1.5 mm beside the bar's own section."""
+    step, n = 3.0, 31
+    lps_from_index = np.diag([step, step, step, 1.0])
+    i, j, k = np.indices((n, n, n))
+    bar = ((np.abs(i - k) <= 2) & (np.abs(j - 15) <= 2)).astype(np.uint8)
+    corners = step * np.array(
+        [[k + x, 15 + y, k] for k in (5, 25) for x in (-2.5, 2.5) for y in (-2.5, 2.5)]
+    )
+    solid = trimesh.Trimesh(corners, trimesh.convex.convex_hull(corners).faces, process=False)
+    mesh = Mesh(trimesh.convex.convex_hull(solid).vertices, trimesh.convex.convex_hull(solid).faces)
+    view, between_mm = PLANES[0], step * np.array([15.0, 15.0, 15.5])
+    frame = Frame(0.0, 90.0, 0.0, 90.0)
+
+    def apart_mm(through_mm):
+        picture = slice_volume(bar, lps_from_index, view, frame, through_mm)
+        middle = frame.pixel_centres()[0][(picture == 1).any(0)].mean()
+        return abs(middle - section(mesh, view, through_mm)[..., 0].mean(axis=(0, 1)))
+
+    through_mm = in_voxels(between_mm, lps_from_index)
+    assert np.abs(through_mm - between_mm).max() == pytest.approx(step / 2)
+    assert apart_mm(between_mm) == pytest.approx(step / 2, abs=0.3)
+    assert apart_mm(through_mm) < 0.3
+    turned = trimesh.transformations.rotation_matrix(0.4, (1, 2, 3)) @ lps_from_index
+    index = np.linalg.inv(turned) @ [*in_voxels(np.array([20.0, 31.0, 7.0]), turned), 1.0]
+    np.testing.assert_allclose(index, np.rint(index), atol=1e-9)

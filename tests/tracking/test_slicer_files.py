@@ -118,7 +118,7 @@ def test_seg_nrrd_names_colours_and_terms(tmp_path: Path) -> None:
         "~SCT^123037004^Anatomical Structure~SCT^64033007^Kidney~SCT^7771000^Left"
         "~Anatomic codes - DICOM master list~^^~^^|",
     }
-    assert pairs["Segment1_Color"] == "0.564706 0.933333 0.564706"
+    assert pairs["Segment1_Color"] == "0.901961 0.623529 0"
     assert pairs["Segment1_Extent"] == "2 2 3 3 4 4"
     assert pairs["Segment1_Tags"] == (
         "TerminologyEntry:Segmentation category and type - DICOM master list"

@@ -25,6 +25,12 @@ def say(text: str) -> None:
     console.print(text, markup=False)
 
 
+def warn(warnings: Iterable[str]) -> None:
+    """A line each, whole, that stands out: in red where there are colours, and by its word."""
+    for text in warnings:
+        console.print(f"WARNING: {text}", style="bold red", markup=False)
+
+
 def say_notes(notes: Iterable[str]) -> None:
     for note in notes:
         say(f"note: {note}")

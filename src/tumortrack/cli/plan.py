@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Literal
 
 from tyro.conf import Positional, UseAppendAction
 
-from tumortrack.cli.console import say, say_notes
+from tumortrack.cli.console import say, say_notes, warn
 from tumortrack.cli.stated import StatedPatient
 from tumortrack.core import store
 from tumortrack.core.errors import InputError, NoPlan
@@ -103,7 +103,7 @@ class Plan(StatedPatient):
         for line in budget.table():
             say(line)
         resection = heeded(resection, budget, self.accept_budget)
-        _say_plan(resection)
+        _say_plan(resection, located)
         motions, cell_used, cell_source = None, None, INVENTED
         if self.arms:
             from tumortrack.plan.arms.procedure import search_bases
@@ -137,7 +137,8 @@ class Plan(StatedPatient):
 
         digest = store.sha256_of(self.run_folder / store.MANIFEST)
         write_plan(self.plan, content, {"run": digest}, pictures, self.overwrite)
-        say(f"written to {self.plan} (frame {frames.frame_id!r}, mm); look at plan.png there.")
+        end = " Mind the warnings above." if resection.warnings else ""
+        say(f"written to {self.plan} (frame {frames.frame_id!r}, mm); look at plan.png there.{end}")
 
     def _resection_config(self) -> ResectionConfig:
         """What the file says, and over that what was given on the command line."""
@@ -237,7 +238,10 @@ def _below(organ: Mesh, config: CellConfig) -> CellConfig:
     return replace(config, middle_mm=middle_mm)
 
 
-def _say_plan(resection: ResectionPlan) -> None:
+def _say_plan(resection: ResectionPlan, located: Located) -> None:
+    from tumortrack.plan.budget import kept_words
+
+    warn(resection.warnings)
     ml = resection.volumes_ml
     say(
         f"{resection.tumor} ({ml['tumor']:.1f} ml, {resection.exophytic:.0%} outside the organ's "
@@ -245,8 +249,8 @@ def _say_plan(resection: ResectionPlan) -> None:
         f"{sum(cut.length_mm for cut in resection.cuts):.0f} mm."
     )
     say(
-        f"margin {resection.margin_mm:g} mm; {ml['piece']:.1f} ml come away, of that "
+        f"{kept_words(resection, located)}; {ml['piece']:.1f} ml come away, of that "
         f"{ml['healthy']:.1f} ml healthy tissue ({ml['healthy'] / ml['parenchyma']:.0%} of the "
         "organ's)."
     )
-    say_notes(resection.notes)
+    say_notes(note for note in resection.notes if note not in resection.warnings)

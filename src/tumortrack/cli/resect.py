@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 from tyro.conf import Positional
 
 from tumortrack.cli import track
-from tumortrack.cli.console import progress_bar, say
+from tumortrack.cli.console import live_line, say, warn
 from tumortrack.cli.plan import check_arms_installed
 from tumortrack.core import store
 from tumortrack.core.config import to_builtins
@@ -81,6 +81,8 @@ class Resect(track.Following):
         from tumortrack.plan.operation import OperationConfig
 
         check_arms_installed()
+        if self.film is not None:
+            say(f"A film of {self.plan}, usually within a minute: tests its motions, then draws.")
         stored = read_plan(self.plan)
         stored.patient.check_is(self.stated, str(self.plan))
         if stored.motions is None or stored.cell is None:
@@ -102,11 +104,13 @@ class Resect(track.Following):
         if self.film is not None:
             if self.live is not None or self.sinks:
                 raise InputError("--film shows the stored plan; give it without sinks and --live.")
+            warn(stored.plan.warnings)
             procedure.film(self.film)
             return
         _confirm(moving, stored.patient)
         with _dry_run([arm for arm in arms if not arm.execute], moving):
             say(str(stored.patient))
+            warn(stored.plan.warnings)
             if live is None:
                 procedure.execute()
             else:
@@ -117,7 +121,7 @@ class Resect(track.Following):
     ) -> None:
         """Raises InputError that lists what is missing for real arms to move."""
         from tumortrack.plan.files import INVENTED
-        from tumortrack.plan.located import POOR_ESTIMATE
+        from tumortrack.plan.values import POOR_ESTIMATE
 
         model, source = self.live or ("", "")
         budget, moved_mm = stored.budget, self._moved_mm(stored)
@@ -280,7 +284,11 @@ class _Procedure:
                 time.sleep(max(0.0, started + (sequence + 1) / _FPS - time.monotonic()))
         content = {
             "patient": to_builtins(stored.patient),
-            "plan": {"tumor": stored.plan.tumor, "method": stored.plan.method},
+            "plan": {
+                "tumor": stored.plan.tumor,
+                "method": stored.plan.method,
+                "warnings": stored.plan.warnings,
+            },
             "frame": frames.frame_id,
             "resection": operation.summary(),
             "sinks": {sink.name: sink.summary() for sink in sinks},
@@ -298,7 +306,8 @@ class _Procedure:
         from tumortrack.report.film import FPS, film, moments_s
 
         times_s = moments_s(self.motions, _FILM_FRAMES)
-        operation = replace(self, config=OperationConfig())._operation()
+        plain = replace(self.stored, plan=replace(self.stored.plan, notes=()))  # the film has them
+        operation = replace(self, stored=plain, config=OperationConfig())._operation()
         nothing = TrackingResult(0, 0, reason=_NOTHING)
 
         def frames() -> Iterator[Workcell]:
@@ -309,10 +318,21 @@ class _Procedure:
                     now_s = min(now_s + _FILM_STEP_S, time_s)
                     cell = operation.act(nothing, now_s).workcell
                 assert cell is not None
-                yield replace(cell, state=f"VIRTUAL: {cell.state}")
+                yield cell
 
-        with progress_bar("drawing", len(times_s)) as advance:
-            film(frames(), as_located(self.stored), path, progress=advance)
+        drawn, first_s = itertools.count(), 0.0
+        with live_line("choosing views and colours") as show:
+            show("choosing views and colours ...")
+
+            def advance() -> None:
+                nonlocal first_s
+                n = next(drawn)
+                first_s = first_s or time.monotonic()
+                left_s = (time.monotonic() - first_s) / max(n, 1) * (len(times_s) - n)
+                if n:
+                    show(f"frame {n} of {len(times_s)}, about {left_s:.0f} s left")
+
+            film(frames(), as_located(self.stored), path, progress=advance, plan=self.stored.plan)
         say(f"written to {path}: {self.motions.seconds:.0f} s in {len(times_s) / FPS:.0f}.")
 
     def _operation(self, **live: Any) -> operations.Operation:

@@ -3,7 +3,7 @@ segmentation of the CT that they were drawn on.
 
 Formats: https://slicer.readthedocs.io/en/latest/developer_guide/modules/segmentations.html,
 https://teem.sourceforge.net/nrrd/format.html; DICOM PS3.3 A.51 (Segmentation IOD), through
-highdicom. Terms are SNOMED CT's, and colours those that Slicer gives to them.
+highdicom. Terms are SNOMED CT's.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from tumortrack.core.geometry import transform_points
 from tumortrack.core.organ import KIDNEY, Organ
 from tumortrack.core.patient import NOBODY, UNKNOWN, Patient, Side
 from tumortrack.core.store import write_atomically, writing
-from tumortrack.core.types import FIRST_TUMOR, ORGAN, LabelVolume
+from tumortrack.core.types import ORGAN, LabelVolume
 from tumortrack.imaging.dicom import Series, find_series
 from tumortrack.imaging.grid import tight_box
 from tumortrack.imaging.nifti import GZIP_LEVEL
@@ -86,7 +86,7 @@ class Segment:
 
     @property
     def rgb(self) -> tuple[int, int, int]:
-        return part_colour(ORGAN if self.is_organ else FIRST_TUMOR)
+        return part_colour(self.label)
 
     @property
     def terminology(self) -> str:

@@ -23,7 +23,14 @@ from tumortrack.live.sinks.ur import OFF_MM
 from tumortrack.models.margins import StatedRadius, margin_words, stated_radius
 from tumortrack.plan.outline import evenly_round, polygon_of
 from tumortrack.plan.resection import inside, plan_resection
-from tumortrack.plan.values import MARGIN_MM, CutLayer, Located, ResectionConfig, ResectionPlan
+from tumortrack.plan.values import (
+    MARGIN_MM,
+    OVER_BUDGET,
+    CutLayer,
+    Located,
+    ResectionConfig,
+    ResectionPlan,
+)
 
 # So many standard deviations, but no less than the largest Hausdorff distance of a tumor of any
 # organ in docs/results.md (clinic, case_00000). Not calibrated: see docs/resection.md.
@@ -37,7 +44,6 @@ HAND_EYE_MM = 2.0
 # that are not calibrated are off by some 20 times that.
 TOOL_MM = 1.0
 MOVED_MM = 2.0  # allowed for at planning: the tumor may move so far before the arms halt
-OVER_BUDGET = "PLANNED OVER ITS ERROR BUDGET"
 TERMS = ("tracking", "hand-eye", "tool", "motion", "lag")
 _SPACING_MM = 0.25  # of points on the planned cut
 
@@ -228,6 +234,17 @@ def kept_mm(layers: tuple[CutLayer, ...], points_mm: Float[np.ndarray, "n 3"]) -
         below = area
     outside = ~inside(layers, points_mm)
     return float(-nearest_mm[outside].max() if outside.any() else nearest_mm.min())
+
+
+def kept_words(plan: ResectionPlan, located: Located) -> str:
+    """The margin that is kept, and, where it differs, what was asked for."""
+    kept = kept_mm(plan.layers, tumor_points(plan, located))
+    asked = f"{plan.margin_mm:g} mm asked for"
+    if kept < 0:
+        return f"the cut goes {-kept:.1f} mm into the tumor ({asked})"
+    return f"margin {kept:.1f} mm" + (
+        "" if f"{kept:.1f}" == f"{plan.margin_mm:.1f}" else f" ({asked})"
+    )
 
 
 def tumor_points(plan: ResectionPlan, located: Located) -> Float64[np.ndarray, "n 3"]:

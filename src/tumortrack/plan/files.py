@@ -24,7 +24,7 @@ from tumortrack.core.types import Mesh
 from tumortrack.live.values import PublishedFrame
 from tumortrack.plan.arms.config import CellConfig
 from tumortrack.plan.budget import ErrorBudget
-from tumortrack.plan.motions import JOINTS, Motions, MotionStage
+from tumortrack.plan.motions import JOINTS, LIFT, RELEASE, Motions, MotionStage
 from tumortrack.plan.values import Located, ResectionConfig, ResectionPlan
 from tumortrack.sense.ply import cloud_ply
 
@@ -255,7 +255,7 @@ def _faults(motions: Motions, cell: CellConfig, sweeps: int) -> Iterator[str]:
     """What the planner would not have done."""
     names = [stage.name for stage in motions.stages]
     cuts = [f"sweep {n}" for n in range(1, sweeps + 1)]
-    if names != ["approach", "grasp", "hold", *cuts, "release", "home"]:
+    if names != ["approach", "grasp", "hold", *cuts, LIFT, RELEASE, "home"]:
         yield f"its stages are {', '.join(names) or 'none'}"
     for stage in motions.stages:
         if not (np.isfinite(stage.times_s).all() and np.isfinite(stage.joints_rad).all()):

@@ -19,12 +19,11 @@ from tumortrack.core.organ import KIDNEY, is_tumor, organ_first, organ_name
 from tumortrack.core.patient import NOBODY, Patient
 from tumortrack.core.store import read_json, read_manifest
 from tumortrack.core.types import ORGAN, Mesh, OccupancyCloud
-from tumortrack.plan.values import Located, name_of, organ_surface
+from tumortrack.plan.values import POOR_ESTIMATE, Located, name_of, organ_surface
 from tumortrack.sense.ply import parse_ply_properties
 from tumortrack.tracking.files import MARGIN
 
 STAND_MM = 120.0  # the organ's lowest point over the table, where it is not known
-POOR_ESTIMATE = "PLANNED ON A POOR ESTIMATE"
 
 
 def table_under(meshes: Mapping[str, Mesh], stand_mm: float) -> Float64[np.ndarray, "4 4"]:

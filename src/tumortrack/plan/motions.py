@@ -18,6 +18,7 @@ ARMS = (CUTTER, HOLDER)
 Joints = Float64[np.ndarray, " 12"]  # radians, in the order of ``JOINTS``
 JOINTS = tuple(f"{arm}_{joint}" for arm in ARMS for joint in UR_JOINTS)
 DONE, ABORTED = "done", "aborted"
+LIFT, RELEASE = "lift", "release"
 _BRAKE_RAD_S2 = 4.0  # of the fastest joint, where arms are halted in the middle of a motion
 _SHORTEST_BRAKE_S = 0.1
 _COME_UP_S = 0.3  # three times what servoing looks ahead; the way in to a cut takes longer
@@ -25,7 +26,8 @@ _COME_UP_S = 0.3  # three times what servoing looks ahead; the way in to a cut t
 
 @dataclass(frozen=True, eq=False)
 class MotionStage:
-    """One state of the procedure: approach, grasp, hold, sweep 1, sweep 2, ..., release, home.
+    """One state of the procedure: approach, grasp, hold, sweep 1, sweep 2, ..., lift,
+    release, home.
 
     Attributes:
         times_s: rising from 0; one entry where nothing moves.

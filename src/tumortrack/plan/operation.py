@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float64
 from scipy.spatial import cKDTree
 
-from tumortrack.core.colours import Colour
+from tumortrack.core.colours import CUT, NOW, TO_CUT
 from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError, TumortrackError
 from tumortrack.core.types import Mesh
@@ -27,9 +27,6 @@ from tumortrack.plan.live_budget import LiveBudget
 from tumortrack.plan.motions import ABORTED, JOINTS, Execution, Joints, Motions
 from tumortrack.plan.values import Located, ResectionPlan
 
-TO_CUT: Colour = (0, 120, 240)
-NOW: Colour = (255, 90, 30)
-CUT: Colour = (120, 40, 40)
 _SAME_MM = 0.2  # of heights
 _OTHERS = 2.0  # other parts may have moved so many times as far as the tumor
 _COMPARED = 500  # points of surfaces whose triangles differ
@@ -135,6 +132,7 @@ class Operation:
         budget: LiveBudget | None = None,
     ) -> None:
         self.planned, self._config = planned, config
+        self._warnings = planned.plan.warnings  # of another plan too: the budget stays accepted
         self._draw, self._locate, self._replan = draw, locate, replan
         self._budget = budget
         self._execution = Execution(planned.motions)
@@ -200,8 +198,9 @@ class Operation:
 
     @property
     def _note(self) -> str:
-        """What is wrong with all estimates by now."""
-        return CUT_NOTE if self._cut and self._locate is not None else ""
+        """What is wrong with the plan, and with all estimates by now."""
+        heads = [warning.split(":")[0].rstrip(".") for warning in self._warnings]
+        return "; ".join([*heads, *([CUT_NOTE] if self._cut and self._locate is not None else [])])
 
     def summary(self) -> dict[str, Any]:
         """For the report: states and when they began, halts, new plans."""

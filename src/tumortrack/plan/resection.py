@@ -12,10 +12,11 @@ from scipy.spatial import ConvexHull, QhullError, cKDTree
 
 from tumortrack.core.errors import InputError, NoPlan
 from tumortrack.core.organ import organ_name
-from tumortrack.core.types import FIRST_TUMOR, ORGAN
+from tumortrack.core.types import ORGAN
 from tumortrack.plan.margin import margin_plan
 from tumortrack.plan.outline import common, concave_hull, evenly, grown, polygon_of, rings_of
 from tumortrack.plan.values import (
+    UNGUARDED,
     Cut,
     CutLayer,
     Located,
@@ -176,21 +177,26 @@ def _kept_away(
                 "Ask for a smaller margin or distance, or plan another tumor."
             )
     others = [name for name in located.structures if name not in config.keep_away]
-    return (f"Nothing keeps the cuts away from {', '.join(others)}.",) if others else ()
+    return (f"{UNGUARDED} {', '.join(others)}.",) if others else ()
 
 
 def _volumes_ml(located: Located, label: int, taken: np.ndarray) -> dict[str, float]:
-    """By counting points, which lie evenly in the organ."""
+    """Of closed surfaces, as `locate` states them; how much of the parenchyma comes away is counted
+    among its points, which lie evenly in it."""
     organ_ml = located.organ.volume_mm3 / 1000
-    each_ml = organ_ml / len(located.points_mm)
-    tumor, healthy = located.labels == label, located.labels < FIRST_TUMOR
-    masks = {
-        "parenchyma": healthy,
-        "tumor": tumor,
-        "piece": taken | tumor,
-        "healthy": taken & healthy,
+    tumors_ml = {n: located.meshes[name_of(n)].volume_mm3 / 1000 for n in located.tumors}
+    parenchyma_ml = organ_ml - sum(tumors_ml.values())
+    healthy_ml = parenchyma_ml * float(taken[located.labels == ORGAN].mean())
+    with_it_ml = [
+        ml for n, ml in tumors_ml.items() if n == label or taken[located.labels == n].any()
+    ]
+    return {
+        "organ": organ_ml,
+        "parenchyma": parenchyma_ml,
+        "tumor": tumors_ml[label],
+        "piece": healthy_ml + sum(with_it_ml),
+        "healthy": healthy_ml,
     }
-    return {"organ": organ_ml, **{k: each_ml * float(mask.sum()) for k, mask in masks.items()}}
 
 
 def _others(

@@ -26,6 +26,10 @@ Direction = Literal["shortest", "clockwise", "anticlockwise"]
 StrokeKind = Literal["wall", "floor"]
 Rings = tuple[Float64[np.ndarray, "_ 2"], ...]
 MARGIN_MM = (1.0, 20.0)  # allowed
+# How the notes begin that a plan must never lose: pictures and screens show them first.
+POOR_ESTIMATE = "PLANNED ON A POOR ESTIMATE"
+OVER_BUDGET = "PLANNED OVER ITS ERROR BUDGET"
+UNGUARDED = "Nothing keeps the cuts away from"
 
 
 class ResectionConfig(Config, frozen=True, kw_only=True):
@@ -209,6 +213,12 @@ class ResectionPlan:
     exophytic: float
     stamp_ns: int = 0
     notes: tuple[str, ...] = ()
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """The notes that forbid to rely on it."""
+        alarming = (POOR_ESTIMATE, OVER_BUDGET, UNGUARDED)
+        return tuple(note for note in self.notes if note.startswith(alarming))
 
     @property
     def sweeps(self) -> int:

@@ -1,10 +1,12 @@
-"""The parts pictures are drawn with: figures without a display, sections of meshes, scale bars."""
+"""The parts pictures are drawn with: figures without a display, words that are never cut off,
+sections of meshes, scale bars."""
 
 from __future__ import annotations
 
 import io
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import trimesh
@@ -13,18 +15,27 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
+from matplotlib.font_manager import FontProperties
+from matplotlib.legend import Legend
+from matplotlib.text import Text
 from trimesh.intersections import mesh_plane
 
 from tumortrack.core import colours
 from tumortrack.core.store import write_atomically
-from tumortrack.core.types import Mesh
+from tumortrack.core.types import FIRST_TUMOR, Mesh
 from tumortrack.imaging.raster import voxelise
 from tumortrack.report.renderer import RGB, Body, Frame, ParallelView, rgb
 
 ORGAN = rgb(colours.ORGAN_PART)
-ESTIMATED = (230 / 255, 140 / 255, 0.0)
-TRUE = (0.0, 90 / 255, 160 / 255)
-OBSERVED = (0.25, 0.25, 0.25)
+ESTIMATED = rgb(colours.part_colour(FIRST_TUMOR))  # of one tumor, or a curve
+TRUE = rgb(colours.TRUTH)
+OBSERVED = rgb(colours.OBSERVED)
+_WARNING: dict[str, Any] = {
+    **{"fontsize": 12, "fontweight": "bold", "color": "white"},
+    "bbox": {"facecolor": rgb(colours.NONE), "edgecolor": "none", "boxstyle": "square,pad=0.3"},
+}
+SIGN = "\N{WARNING SIGN}"
+_EDGE_IN = 0.17
 CENTRED: dict[str, Any] = {"ha": "center", "va": "center"}
 
 
@@ -36,11 +47,112 @@ def new_figure(width_in: float, height_in: float, **borders: float) -> Figure:
     return figure
 
 
+def wrapped(text: str, width: float, length_of: Callable[[str], float]) -> list[str]:
+    """The text in lines no longer than ``width`` (in the unit of ``length_of``), broken between
+    words, and within a word that is longer. Nothing is left out."""
+    lines = []
+    for paragraph in text.splitlines() or [""]:
+        line = ""
+        for word in paragraph.split():
+            if line and length_of(f"{line} {word}") > width:
+                lines.append(line)
+                line = ""
+            line = f"{line} {word}" if line else word
+            while len(line) > 1 and length_of(line) > width:
+                fits = (n for n in range(len(line) - 1, 1, -1) if length_of(line[:n]) <= width)
+                fit = next(fits, 1)
+                lines.append(line[:fit])
+                line = line[fit:]
+        lines.append(line)
+    return lines
+
+
+def add_words(
+    figure: Figure,
+    title: str,
+    warnings: Sequence[str] = (),
+    below: Sequence[str] = (),
+    handles: Sequence[Any] = (),
+) -> None:
+    """Write what a figure says, whole: over its axes each warning in a red box with a sign, then
+    the title and the legend; under them lines. The figure becomes taller by the room that they
+    need. Call it once, when all axes are there."""
+    over = [*_paragraphs(figure, [f"{SIGN} WARNING: {text}" for text in warnings], _WARNING)]
+    over += _paragraphs(figure, [title], {"fontsize": 13, "fontweight": "bold"})
+    over += [_legend(figure, handles)] if handles else []
+    under = [*_paragraphs(figure, below, {"fontsize": 10.5})]
+    above_in, below_in = (_stacked_in(figure, artists) for artists in (over, under))
+    pars, old_in = figure.subplotpars, figure.get_figheight()
+    axes_in = pars.bottom * old_in + below_in, pars.top * old_in + below_in
+    new_in = old_in + above_in + below_in
+    figure.set_figheight(new_in)
+    figure.subplots_adjust(bottom=axes_in[0] / new_in, top=axes_in[1] / new_in)
+    for artists, y_in in ((over, new_in - _EDGE_IN), (under, below_in)):
+        for artist in artists:
+            place = _EDGE_IN / figure.get_figwidth(), y_in / new_in
+            if isinstance(artist, Legend):
+                artist.set_bbox_to_anchor(place, figure.transFigure)
+            else:
+                artist.set_position(place)
+            y_in -= _height_in(figure, artist)
+
+
+def _paragraphs(figure: Figure, texts: Sequence[str], style: dict[str, Any]) -> Iterator[Text]:
+    """Wrapped to the figure's width."""
+    canvas = cast(FigureCanvasAgg, figure.canvas)
+    font = FontProperties(size=style["fontsize"], weight=style.get("fontweight"))
+    room = (figure.get_figwidth() - 3 * _EDGE_IN) * figure.dpi
+
+    def length_of(text: str) -> float:
+        return canvas.get_renderer().get_text_width_height_descent(text, font, False)[0]
+
+    for text in texts:
+        lines = "\n".join(wrapped(text, room, length_of))
+        yield figure.text(0, 0, lines, va="top", linespacing=1.25, parse_math=False, **style)
+
+
+def _legend(figure: Figure, handles: Sequence[Any]) -> Legend:
+    """Without a frame, in as few rows as the figure's width allows."""
+    style = {"loc": "upper left", "frameon": False, "fontsize": 9.5, "borderpad": 0}
+    style |= {"borderaxespad": 0, "columnspacing": 1.4, "handlelength": 1.6}
+    for columns in range(len(handles), 0, -1):
+        legend = figure.legend(handles=list(handles), ncols=columns, **style)
+        width_in = legend.get_window_extent().width / figure.dpi
+        if columns == 1 or width_in <= figure.get_figwidth() - 2 * _EDGE_IN:
+            break
+        legend.remove()
+    return legend
+
+
+def _height_in(figure: Figure, artist: Text | Legend) -> float:
+    """With the space under it."""
+    boxed = isinstance(artist, Text) and artist.get_bbox_patch() is not None
+    return artist.get_window_extent().height / figure.dpi + (0.2 if boxed else 0.1)
+
+
+def _stacked_in(figure: Figure, artists: Sequence[Text | Legend]) -> float:
+    heights_in = [_height_in(figure, artist) for artist in artists]
+    return sum(heights_in) + _EDGE_IN if artists else 0.0
+
+
+def title_axes(axes: Axes, text: str, size: float = 11.0) -> None:
+    """A title over axes, wrapped to their width; the room for its lines is the caller's."""
+    figure = cast(Figure, axes.figure)
+    title = axes.set_title("", fontsize=size, parse_math=False)
+    room = axes.get_position().width * figure.bbox.width
+
+    def length_of(part: str) -> float:
+        title.set_text(part)
+        return title.get_window_extent().width
+
+    title.set_text("\n".join(wrapped(text, room, length_of)))
+
+
 def show_legend(
-    figure: Figure, handles: list[Any], columns: int, corner: tuple[float, float], **style: Any
+    figure: Figure, handles: list[Any], columns: int, corner: tuple[float, float]
 ) -> None:
     """A legend without a frame; ``corner`` is its upper right one, as shares of the figure."""
-    style = {"loc": "upper right", "frameon": False, "fontsize": 9.5, **style}
+    style: dict[str, Any] = {"loc": "upper right", "frameon": False, "fontsize": 9.5}
     figure.legend(handles=handles, ncols=columns, bbox_to_anchor=corner, **style)
 
 

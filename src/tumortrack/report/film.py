@@ -6,9 +6,11 @@ MP4 is not offered: no encoder among the Python packages comes under a permissiv
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
+from typing import NamedTuple
 
 import matplotlib
 import numpy as np
@@ -17,15 +19,17 @@ from jaxtyping import Float, Float64, UInt8
 from PIL import Image, ImageDraw, ImageFont
 from trimesh.creation import sweep_polygon
 
-from tumortrack.core.colours import BACKGROUND, NONE, part_colour
+from tumortrack.core.colours import ARMS, BACKGROUND, NONE, WHITE, Colour, part_colour
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.store import write_atomically
 from tumortrack.core.types import ORGAN, Mesh
 from tumortrack.live.values import Polyline, Workcell
-from tumortrack.plan.motions import Motions
-from tumortrack.plan.values import Located
-from tumortrack.report.plan_pictures import organ_surfaces
+from tumortrack.plan.motions import LIFT, RELEASE, Motions
+from tumortrack.plan.resection import inside
+from tumortrack.plan.values import Located, ResectionPlan
+from tumortrack.report.drawing import SIGN, wrapped
+from tumortrack.report.plan_pictures import organ_surfaces, parted
 from tumortrack.report.renderer import Body, Viewpoint, render, rgb
 
 FPS = 10  # a GIF counts hundredths of a second
@@ -44,6 +48,11 @@ _SAMPLES = 8  # frames from which the colours are chosen
 _LOOKED_AT, _EVERY = 40, 3  # frames, and every which vertex, that the viewpoint is chosen from
 _LEAST_FRAMES = 2  # of a stage
 _LAST_S = 1.5  # the last picture stays
+_PLAYBACK = "PLAYBACK of a stored plan, SIMULATED: nothing is tracked"
+_MEANING = {
+    LIFT: ": the holder lifts the piece out",
+    RELEASE: ": a person takes the piece from the cup",
+}
 
 
 def film(
@@ -52,8 +61,13 @@ def film(
     path: Path,
     size: tuple[int, int] = (640, 480),
     progress: Callable[[], None] = lambda: None,
+    plan: ResectionPlan | None = None,
 ) -> None:
     """Write the frames as an animated GIF that begins again when it has ended.
+
+    Over every frame stand, whole, that it is a playback, simulated; the plan's warnings; the state
+    and why the arms halt; the patient. Once the holder lifts, the piece goes with it, and after the
+    release it is gone.
 
     Seen obliquely from the front: whatever has a slash in its name (an arm's parts) is in the
     picture in all frames; in the corner the organ from near by. The same frames give the same
@@ -63,13 +77,15 @@ def film(
     Args:
         frames, located: table frame, mm; ``FPS`` frames a second.
         path: ``.gif``, written atomically.
+        size: of the scene, pixels; the words come on top.
+        plan: what is carried out: its warnings and its piece; None: the organ stays whole.
         progress: called after each frame.
     """
     if path.suffix.lower() != ".gif":
         raise InputError(f"{path}: a film is an animated GIF; give a name that ends in .gif.")
     if not (cells := list(frames)):
         raise InputError("there is no frame to film: the arms did nothing.")
-    painter = _FramePainter(cells, located, size)
+    painter = _FramePainter(cells, located, size, plan)
     chosen = np.linspace(0, len(cells) - 1, min(_SAMPLES, len(cells))).astype(int).tolist()
     some = [np.asarray(painter.picture(n))[::2, ::2] for n in chosen]
     sheet, plain = Image.fromarray(np.concatenate(some)), Image.Dither.NONE
@@ -114,7 +130,13 @@ def moments_s(motions: Motions, frames: int) -> Float64[np.ndarray, " n"]:
 class _FramePainter:
     """Draws frame by frame; viewpoints, organ and letters stay the same."""
 
-    def __init__(self, frames: list[Workcell], located: Located, size: tuple[int, int]) -> None:
+    def __init__(
+        self,
+        frames: list[Workcell],
+        located: Located,
+        size: tuple[int, int],
+        plan: ResectionPlan | None,
+    ) -> None:
         self._frames, self._size = frames, size
         self._organ = [
             Body(mesh, rgb(part_colour(label)), _ORGAN_OPACITY if label == ORGAN else 1.0)
@@ -130,33 +152,59 @@ class _FramePainter:
         self._near = Viewpoint.towards(target, place, near.width_mm, True, before_mm)
         flat = self._far.project(organ_mm, size)[:, :2]
         self._spot = (*(flat.min(0) - 4).round().tolist(), *(flat.max(0) + 4).round().tolist())
-        font = f"{matplotlib.get_data_path()}/fonts/ttf/DejaVuSans.ttf"
-        self._letters = [ImageFont.truetype(font, size[1] // share) for share in (20, 34)]
         self._tubes: dict[tuple[int, float], tuple[Polyline, Mesh]] = {}
+        self._warnings = () if plan is None else plan.warnings
         self._whose = str(located.patient)
+        told = {(cell.state, cell.halted): cell for cell in frames}
+        self._room = max(words_strip(self._words(cell), size)[0].height for cell in told.values())
+        self._lifted_from = next((n for n, c in enumerate(frames) if c.state == LIFT), len(frames))
+        self._stays, self._goes = self._organ, list[Body]()
+        if plan is not None and self._lifted_from < len(frames):
+            self._stays, self._goes = _divided(located, plan)
+
+    def _words(self, cell: Workcell) -> list[Paragraph]:
+        """What stands over a frame, the weightiest first."""
+        halted = [Paragraph(f"halted: {cell.halted}", NONE)] if cell.halted else []
+        return [
+            Paragraph(_PLAYBACK, WHITE, ARMS),
+            *(Paragraph(f"{SIGN} WARNING: {text}", WHITE, NONE) for text in self._warnings),
+            Paragraph(cell.state + _MEANING.get(cell.state, ""), BACKGROUND, large=True),
+            *halted,
+            Paragraph(self._whose, BACKGROUND),
+        ]
+
+    def _bodies(self, n: int) -> list[Body]:
+        """Organ, tumors and the piece, which goes where the holder does."""
+        if n < self._lifted_from:
+            return self._organ
+        before, now = (_holder(self._frames[k]) for k in (max(self._lifted_from - 1, 0), n))
+        gone = all(cell.state not in (LIFT, RELEASE) for cell in self._frames[n:])
+        if gone or before is None or now is None:
+            return self._stays
+        moved = now @ np.linalg.inv(before)
+        return [*self._stays, *(replace(body, world_from_mesh=moved) for body in self._goes)]
 
     def picture(self, n: int) -> Image.Image:
         """Frame n, in full colour."""
         cell = self._frames[n]
-        out = Image.fromarray(self._seen(cell, self._far, self._size))
-        close = Image.fromarray(self._seen(cell, self._near, self._close_size))
+        scene = Image.fromarray(self._shown(n, self._far, self._size))
+        close = Image.fromarray(self._shown(n, self._near, self._close_size))
         left, top = (whole - part - 8 for whole, part in zip(self._size, close.size, strict=True))
         top -= 10
-        out.paste(close, (left, top))
-        draw = ImageDraw.Draw(out)
+        scene.paste(close, (left, top))
+        draw = ImageDraw.Draw(scene)
         draw.rectangle(self._spot, outline=_FRAME)  # what is shown from near
         draw.rectangle((left - 1, top - 1, left + close.width, top + close.height), outline=_FRAME)
-        large, small = self._letters
-        draw.text((12, 10), cell.state, fill=BACKGROUND, font=large)
-        if cell.halted:
-            draw.text((12, 18 + large.size), f"halted: {cell.halted}", fill=NONE, font=small)
-        draw.text((12, self._size[1] - 20 - small.size), self._whose, fill=BACKGROUND, font=small)
         self._draw_progress(draw, n)
+        out = Image.new("RGB", (self._size[0], self._room + self._size[1]), WHITE)
+        out.paste(words_strip(self._words(cell), self._size)[0], (0, 0))
+        out.paste(scene, (0, self._room))
         return out
 
-    def _seen(
-        self, cell: Workcell, viewpoint: Viewpoint, size: tuple[int, int]
+    def _shown(
+        self, n: int, viewpoint: Viewpoint, size: tuple[int, int]
     ) -> UInt8[np.ndarray, "h w 3"]:
+        cell = self._frames[n]
         shapes = [
             Body(s.mesh, rgb(s.colour), s.opacity, s.published_from_shape) for s in cell.shapes
         ]
@@ -165,7 +213,7 @@ class _FramePainter:
             Body(self._tube(line, max(line.width_mm, least_mm)), rgb(line.colour))
             for line in cell.drawn_lines
         ]
-        return render(shapes + lines + self._organ, viewpoint, size, _BACKDROP)
+        return render(shapes + lines + self._bodies(n), viewpoint, size, _BACKDROP)
 
     def _tube(self, line: Polyline, width_mm: float) -> Mesh:
         key = id(line.points_mm), width_mm  # the line is kept, so its points' id stays theirs
@@ -185,6 +233,63 @@ class _FramePainter:
             if n >= first:
                 colour = NONE if cell.halted and state == cell.state else (60, 110, 190)
                 draw.rectangle((x[0], box[0], max(x[1] - 2, x[0]), box[1]), fill=colour)
+
+
+class Paragraph(NamedTuple):
+    """Words of one colour, on another where that is given."""
+
+    text: str
+    ink: Colour
+    paper: Colour | None = None
+    large: bool = False
+
+
+def words_strip(
+    paragraphs: Sequence[Paragraph], size: tuple[int, int]
+) -> tuple[Image.Image, list[tuple[float, float, float, float]]]:
+    """All the words, wrapped, under each other on white: as wide as the scene of this size, and as
+    high as they need; and each line's box (left, top, right, bottom), pixels."""
+    file = f"{matplotlib.get_data_path()}/fonts/ttf/DejaVuSans.ttf"
+    shares = {True: (20, 15), False: (30, 11)}  # of the scene's height, and the least, pixels
+    fonts = {
+        large: ImageFont.truetype(file, max(least, size[1] // share))
+        for large, (share, least) in shares.items()
+    }
+    lines, y = [], 6
+    for paragraph in paragraphs:
+        font = fonts[paragraph.large]
+        for text in wrapped(paragraph.text, size[0] - 24, font.getlength):
+            lines.append((paragraph, text, font, y))
+            y += round(1.35 * font.size)
+        y += 6
+    strip = Image.new("RGB", (size[0], y), WHITE)
+    draw, boxes = ImageDraw.Draw(strip), []
+    for paragraph, _, font, top in lines:  # first, so that none covers a word
+        if paragraph.paper is not None:
+            around = 6, top - 2, size[0] - 7, top + round(1.35 * font.size) + 1
+            draw.rectangle(around, fill=paragraph.paper)
+    for paragraph, text, font, top in lines:
+        draw.text((12, top), text, fill=paragraph.ink, font=font)
+        boxes.append(draw.textbbox((12, top), text, font=font))
+    return strip, boxes
+
+
+def _divided(located: Located, plan: ResectionPlan) -> tuple[list[Body], list[Body]]:
+    """What stays, and what comes away."""
+    surfaces = organ_surfaces(located)
+    piece, rest = parted(surfaces.pop(ORGAN), plan.layers)
+    shade = rgb(part_colour(ORGAN))
+    halves = [Body(rest, shade, _ORGAN_OPACITY)], [Body(piece, shade, _ORGAN_OPACITY)]
+    for label, mesh in surfaces.items():
+        goes = label == plan.label or bool(inside(plan.layers, mesh.box_mm.mean(0)[None])[0])
+        halves[goes].append(Body(mesh, rgb(part_colour(label))))
+    return halves
+
+
+def _holder(cell: Workcell) -> Float64[np.ndarray, "4 4"] | None:
+    """Where the holder's cup is."""
+    places = (s.published_from_shape for s in cell.shapes if s.name == "holder/cup")
+    return next(places, None)
 
 
 def _reach(frames: list[Workcell]) -> Float[np.ndarray, "n 3"]:

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Float
 from PIL import Image
 
+from tumortrack.core.colours import OBSERVED, ORGAN_PART, TRUTH, TUMORS
 from tumortrack.core.estimate import Estimate
 from tumortrack.core.organ import is_tumor
 from tumortrack.core.patient import patient_in
@@ -69,6 +70,8 @@ def write_page(report: dict[str, Any], scenes: list[dict[str, Any]], path: Path)
     whose = f"{patient_in(report.get('patient'), 'report')}. "
     page = page.replace("@COUNTS@", html.escape(whose + _counts(report["summary"])))
     page = page.replace("@RULE@", html.escape(report["rule"]))
+    shades = {"truth": TRUTH, "points": OBSERVED, "organ": ORGAN_PART, "tumors": TUMORS}
+    page = page.replace("@COLOURS@", json.dumps(shades))
     head, script = page.split("@PLOTLY@")
     middle, tail = script.split("@DATA@")
     text = "".join((head, get_plotlyjs(), middle, embedded, tail))

@@ -1,12 +1,12 @@
 """Pictures that a surgeon can read: the estimate over the truth, and a prepared case.
 
-Orange is what was estimated, blue is the truth (a pair that every colour vision tells apart).
-Nothing needs a display.
+Every part has its own colour (core/colours.py); dark blue outlines are the truth. Nothing needs a
+display.
 """
 
 from __future__ import annotations
 
-import textwrap
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,13 +16,14 @@ from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
+from tumortrack.core.colours import name_colour
 from tumortrack.core.estimate import Estimate
 from tumortrack.core.geometry import DIRECTIONS_LPS, transform_points
 from tumortrack.core.organ import is_tumor, organ_name
 from tumortrack.core.types import Anatomy, LabelVolume, Mesh, Volume
 from tumortrack.report import drawing
-from tumortrack.report.drawing import CENTRED, ESTIMATED, OBSERVED, ORGAN, TRUE
-from tumortrack.report.renderer import RGB, Body, Frame, ParallelView
+from tumortrack.report.drawing import CENTRED, OBSERVED, ORGAN, TRUE
+from tumortrack.report.renderer import RGB, Body, Frame, ParallelView, rgb
 from tumortrack.simulate.scene_folder import Scene
 
 FROM_CAMERA = ParallelView("seen from the camera", (1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
@@ -39,9 +40,6 @@ PLANES = (
     ParallelView("coronal", (1.0, 0.0, 0.0), (0.0, 0.0, -1.0)),
     ParallelView("sagittal", (0.0, 1.0, 0.0), (0.0, 0.0, -1.0)),
 )
-# On grey, apart in every colour vision: organ light orange, tumors yellow, sky blue, green, purple.
-_ORGAN_LINE = (1.0, 0.62, 0.45)
-_TUMOR_COLORS = ((0.97, 0.88, 0.22), (0.34, 0.71, 0.91), (0.56, 0.93, 0.56), (0.85, 0.55, 0.75))
 _SOFT_TISSUE_HU = (-160.0, 240.0)
 _MARGIN_MM, _ASPECT = 18.0, 1.22
 _MOST_ROWS = 6  # tumors with slices of their own
@@ -62,9 +60,8 @@ def scene_picture(
     shown = estimate.meshes if estimate else {}
     slices = [(name, view) for name in scene.reference.names[1:] for view in _SLICES]
     rows = -(-len(slices) // 4)
-    height_in = 5.1 + 4.05 * rows
-    top, bottom = 1 - 0.85 / height_in, 0.15 / height_in
-    figure = drawing.new_figure(14.0, height_in, top=top, bottom=bottom)
+    height_in = 4.6 + 4.05 * rows
+    figure = drawing.new_figure(14.0, height_in, top=1 - 0.35 / height_in, bottom=0.15 / height_in)
     outer = figure.add_gridspec(2, 1, height_ratios=[4.1, 3.95 * max(rows, 0.01)], hspace=0.13)
     above = outer[0].subgridspec(1, 2, wspace=0.04)
     for column, view in enumerate(_SLICES):
@@ -81,13 +78,14 @@ def scene_picture(
             if part["found"]
             else "not found"
         )
-        axes.set_title(f"{what}\n{found}", fontsize=9.5)
-    failed = "" if entry["failed"] is None else f"\n{textwrap.shorten(entry['failed'], 130)}"
+        drawing.title_axes(axes, f"{what}\n{found}", 9.5)
+    failed = [f"FAILED: {entry['failed']}"] if entry["failed"] else []
+    poor = [f"POOR ESTIMATE: {entry['reason']}"] if entry.get("quality") == "poor" else []
     errors = entry.get("tre_mm")
     targets = f"   target error {errors['mean']:.1f} mm" if errors else ""
-    headline = f"{entry['name']}   mIoU {entry['miou']:.2f}{targets}{failed}"
-    figure.suptitle(headline, x=0.02, ha="left", fontsize=13, fontweight="bold")
-    drawing.show_legend(figure, scene_legend(scene.reference.kind.words), 4, (0.985, 0.995))
+    headline = f"{entry['name']}   mIoU {entry['miou']:.2f}{targets}"
+    handles = scene_legend(*scene.reference.names)
+    drawing.add_words(figure, headline, [*failed, *poor], (), handles)
     drawing.save(figure, path)
 
 
@@ -100,7 +98,7 @@ def draw_solid_view(
     frame = view.frame_around(np.concatenate(everything), 6.0).widened(1.7)
     name = organ_name(shown)
     organ = [] if name is None else [Body(shown.pop(name), ORGAN, 0.36)]
-    tumors = [Body(mesh, ESTIMATED) for mesh in shown.values()]
+    tumors = [Body(mesh, rgb(name_colour(part))) for part, mesh in shown.items()]
     drawing.show_bodies(axes, view, [*tumors, *organ], frame)
     flat = view.project(scene.cloud.points_mm.astype(float))
     axes.scatter(flat[:, 0], flat[:, 1], s=2.5, color=OBSERVED, alpha=0.55, linewidths=0, zorder=3)
@@ -110,7 +108,7 @@ def draw_solid_view(
         u, v = view.project(mesh.box_mm.mean(0)[None])[0, :2]
         axes.text(u, v, name.split("_")[-1], fontweight="bold", **CENTRED)
     drawing.finish_view(axes, frame, _CAMERA_AXES[view])
-    axes.set_title(view.name, fontsize=11)
+    drawing.title_axes(axes, view.name)
 
 
 def _draw_slice(
@@ -121,7 +119,7 @@ def _draw_slice(
     around = [meshes[name].vertices_mm for meshes in (truth, shown) if name in meshes]
     frame = view.frame_around(np.concatenate(around), 12.0).widened(1.0)
     for part, mesh in shown.items():
-        color, width = (ESTIMATED, 2.4) if is_tumor(part) else (ORGAN, 1.4)
+        color, width = rgb(name_colour(part)), 2.4 if is_tumor(part) else 1.4
         drawing.tint(axes, drawing.section_mask(mesh, view, frame, through_mm), frame, color)
         lines = drawing.section(mesh, view, through_mm)
         drawing.draw_lines(axes, lines, color=color, linewidth=width, zorder=3)
@@ -135,39 +133,47 @@ def _draw_slice(
     drawing.finish_view(axes, frame, _CAMERA_AXES[view])
 
 
-def scene_legend(organ: str = "kidney") -> list[Any]:
-    """Handles of what ``draw_solid_view`` shows."""
+def scene_legend(organ: str = "kidney", *tumors: str) -> list[Any]:
+    """Handles of what ``draw_solid_view`` shows, by the parts' names: the truth's and the points'
+    last."""
     return [
-        Patch(facecolor=ESTIMATED, label="estimated tumor"),
-        Patch(facecolor=(*ORGAN, 0.5), label=f"estimated {organ}"),
+        Patch(facecolor=(*ORGAN, 0.5), label=f"estimated {organ.replace('_', ' ')}"),
+        *(Patch(facecolor=rgb(name_colour(t)), label=t.replace("_", " ")) for t in tumors),
         Line2D([], [], color=TRUE, linewidth=2, label="truth (outline)"),
         Line2D([], [], color=OBSERVED, marker=".", linestyle="", label="observed point"),
     ]
 
 
 def qc_picture(
-    case_labels: LabelVolume, ct: Volume | None, anatomy: Anatomy, path: Path, whose: str = ""
+    case_labels: LabelVolume,
+    ct: Volume | None,
+    anatomy: Anatomy,
+    path: Path,
+    whose: str = "",
+    warnings: Sequence[str] = (),
 ) -> None:
     """Orthogonal slices with outlines, a row through each tumor, and a 3-D view: is everything
     outlined, and on the right side?
 
     All in the patient's frame (LPS, mm). The labels are shown as grey where there is no CT. Of
-    more than six tumors the six largest have rows. ``whose``: stands in the title. The PNG is
+    more than six tumors the six largest have rows. ``whose``: stands in the title; the ``warnings``
+    over it. The PNG is
     written atomically.
     """
     order = sorted(range(len(anatomy.tumors)), key=lambda n: -abs(anatomy.tumors[n].volume_mm3))
     rows = {anatomy.names[n + 1]: anatomy.tumors[n] for n in sorted(order[:_MOST_ROWS])}
     rows = rows or {anatomy.names[0]: anatomy.organ}
-    height = 3.85 * len(rows)
-    borders = {"left": 0.025, "right": 0.99, "bottom": 0.05 / (height + 1.0)}
-    figure = drawing.new_figure(18.0, height + 1.0, top=height / (height + 1.0), **borders)
+    height = 3.85 * len(rows) + 0.4
+    borders = {"left": 0.025, "right": 0.99, "bottom": 0.05 / height}
+    figure = drawing.new_figure(18.0, height, top=1 - 0.35 / height, **borders)
     grid = figure.add_gridspec(len(rows), 4, wspace=0.03, hspace=0.12)
     shown: LabelVolume | Volume = ct if ct is not None else case_labels
     window = _window(shown, anatomy)
     for row, (name, part) in enumerate(rows.items()):
         for column, view in enumerate(PLANES):
             axes = figure.add_subplot(grid[row, column])
-            _draw_plane(axes, (shown, window), anatomy, view, part.box_mm.mean(0))
+            through_mm = in_voxels(part.box_mm.mean(0), shown.lps_from_index)
+            _draw_plane(axes, (shown, window), anatomy, view, through_mm)
             if column == 0:
                 title = f"through {name.replace('_', ' ')}"
                 axes.set_ylabel(title, fontsize=12, fontweight="bold")
@@ -183,12 +189,11 @@ def qc_picture(
     dropped = len(order) > _MOST_ROWS
     more = f" (slices through the {_MOST_ROWS} largest of {len(order)} tumors)" if dropped else ""
     title = f"Prepared case over its {what}{more}" + (f": {whose}" if whose else "")
-    figure.suptitle(title, x=0.015, ha="left", fontweight="bold", parse_math=False)
     handles = [
         Patch(facecolor=color, label=f"{name.replace('_', ' ')} {part.volume_mm3 / 1000:.1f} ml")
         for color, name, part in zip(colors, anatomy.names, anatomy.parts, strict=True)
     ]
-    drawing.show_legend(figure, handles, 6, (0.99, 0.995))
+    drawing.add_words(figure, title, warnings, (), handles)
     drawing.save(figure, path)
 
 
@@ -215,6 +220,15 @@ def _draw_plane(
     axis = int(np.argmax(np.abs(view.axes[2])))
     letter = ("LPS" if through_mm[axis] >= 0 else "RAI")[axis]
     axes.set_title(f"{view.name}, {letter} {abs(through_mm[axis]):.1f} mm", fontsize=10.5)
+
+
+def in_voxels(
+    point_mm: Float[np.ndarray, " 3"], lps_from_index: Float[np.ndarray, "4 4"]
+) -> Float[np.ndarray, " 3"]:
+    """The middle of the nearest voxel: a plane through it shows voxels that lie in it, not half a
+    voxel beside it, so that slice and outline belong together."""
+    index = np.rint(transform_points(np.linalg.inv(lps_from_index), point_mm[None]))
+    return transform_points(lps_from_index, index)[0]
 
 
 def slice_volume(
@@ -266,5 +280,4 @@ def _write_letters(axes: Axes, view: ParallelView, color: str) -> None:
 
 def _part_colors(anatomy: Anatomy) -> list[RGB]:
     """Of the organ and of each tumor."""
-    few = len(_TUMOR_COLORS)
-    return [_ORGAN_LINE, *(_TUMOR_COLORS[n % few] for n in range(len(anatomy.tumors)))]
+    return [rgb(name_colour(name)) for name in anatomy.names]

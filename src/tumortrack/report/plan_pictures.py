@@ -3,7 +3,6 @@ what was located and planned: organ, tumors, the piece that comes away."""
 
 from __future__ import annotations
 
-import textwrap
 from pathlib import Path
 
 import manifold3d
@@ -15,11 +14,12 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.patheffects import Normal, Stroke
 
-from tumortrack.core.colours import part_colour, sweep_colour
+from tumortrack.core.colours import PIECE, name_colour, part_colour, sweep_colour
 from tumortrack.core.errors import InputError
 from tumortrack.core.organ import KIDNEY, organ_first, organ_name
 from tumortrack.core.types import ORGAN, Mesh, part_names
 from tumortrack.imaging.meshes import mesh_of, solid_of
+from tumortrack.plan.budget import kept_words
 from tumortrack.plan.values import Cut, CutLayer, Located, ResectionPlan
 from tumortrack.report import drawing
 from tumortrack.report.drawing import CENTRED
@@ -32,10 +32,10 @@ _ARROWS = {
     FROM_ABOVE: {"x": (1.0, 0.0), "y": (0.0, -1.0)},
     FROM_SIDE: {"x": (1.0, 0.0), "z": (0.0, -1.0)},
 }
-_METHODS = {"published": "as published", "margin": "margin kept all round"}
+_METHODS = {"published": "published method", "margin": "margin method"}
 
 _ASPECT = 1.28
-_PIECE = (0.36, 0.5, 0.95)
+_PIECE = rgb(PIECE)
 _GRASP = (0.1, 0.1, 0.12)
 _APPROACH_MM, _CUP_MM = 24.0, 5.0
 _ORGAN_OPACITY, _PIECE_OPACITY = 0.36, 0.3
@@ -45,16 +45,17 @@ _MOST_ARROWED = 8  # sweeps with arrows
 
 
 def draw_plan(plan: ResectionPlan, located: Located, path: Path) -> None:
-    """Write ``plan_figure`` as a PNG of 1200 x 600 pixels, atomically; raises as it does."""
+    """Write ``plan_figure`` as a PNG, atomically; raises as it does."""
     drawing.save(plan_figure(plan, located), path)
 
 
 def plan_figure(plan: ResectionPlan, located: Located) -> Figure:
-    """Organ, tumors, what comes away, strokes with their directions, and where it is held.
+    """Warnings first; organ, tumors, what comes away, strokes with their directions, and where it
+    is held.
 
-    Two axes in mm, down pointing down: from above x and -y, from the side x and -z. Strokes are
-    bold where they pass through the organ. Raises InputError: what was located has no surface, or
-    one that is not closed."""
+    Two axes in mm at one scale, down pointing down: from above x and -y, from the side x and -z.
+    Strokes are bold where they pass through the organ. 1200 pixels wide, as high as it needs.
+    Raises InputError: what was located has no surface, or one that is not closed."""
     surfaces = organ_surfaces(located)
     if plan.label not in surfaces:
         raise InputError(f"{plan.tumor} was not located, so its plan can't be drawn.")
@@ -65,11 +66,13 @@ def plan_figure(plan: ResectionPlan, located: Located) -> Figure:
     in_organ = [contains(organ, cut.path_mm) for cut in plan.cuts]
     reach_mm = plan.grasp_mm + np.array([0.0, 0.0, _APPROACH_MM])
     shown = [organ.vertices_mm, *(cut.path_mm for cut in plan.cuts), reach_mm[None]]
-    borders = {"left": 0.012, "right": 0.988, "top": 0.845, "bottom": 0.1}
-    figure = drawing.new_figure(12.0, 6.0, **borders, wspace=0.02)
+    borders = {"left": 0.012, "right": 0.988, "top": 0.94, "bottom": 0.01}
+    figure = drawing.new_figure(12.0, 4.8, **borders, wspace=0.02)
+    frames = [view.frame_around(np.concatenate(shown), 7.0) for view in (FROM_ABOVE, FROM_SIDE)]
+    widest_mm = max(frame.widened(_ASPECT).width_mm for frame in frames)
     for column, view in enumerate((FROM_ABOVE, FROM_SIDE)):
+        frame = frames[column].widened(_ASPECT, widest_mm)
         axes = figure.add_subplot(1, 2, column + 1)
-        frame = view.frame_around(np.concatenate(shown), 7.0).widened(_ASPECT)
         drawing.show_bodies(axes, view, bodies, frame)
         if len(piece.faces):
             drawing.outline(axes, piece, view, frame, _PIECE, 0.9)
@@ -81,7 +84,9 @@ def plan_figure(plan: ResectionPlan, located: Located) -> Figure:
         for label, mesh in surfaces.items():
             if label != plan.label:
                 u, v = view.project(mesh.box_mm.mean(0)[None])[0, :2]
-                axes.text(u, v, f"tumor {label - ORGAN}", zorder=3, **CENTRED)
+                halo = [Stroke(linewidth=2.5, foreground="white"), Normal()]
+                style = {**CENTRED, "zorder": 9, "path_effects": halo}
+                axes.text(u, v, f"tumor {label - ORGAN}", **style)
         drawing.finish_view(axes, frame, _ARROWS[view])
         axes.set_title(view.name, fontsize=11)
     _words(figure, plan, located)
@@ -176,39 +181,28 @@ def _draw_grasp(axes: Axes, plan: ResectionPlan, view: ParallelView) -> None:
 
 
 def _words(figure: Figure, plan: ResectionPlan, located: Located) -> None:
-    """Title, what comes away, and the legend."""
+    """Warnings, title, legend; what comes away, and all other notes."""
     ml, tumor = plan.volumes_ml, plan.tumor.replace("_", " ")
     sweeps = f"{plan.sweeps} sweep" + ("s" if plan.sweeps > 1 else "")
-    title = f"Resection of {tumor}, {located.patient}: {_METHODS[plan.method]}, {sweeps}"
-    figure.suptitle(
-        title, x=0.014, y=0.975, ha="left", fontsize=13, fontweight="bold", parse_math=False
-    )
+    title = f"Plan to resect {tumor}, {located.patient}: {_METHODS[plan.method]}, {sweeps}"
     share = ml["healthy"] / ml["parenchyma"]
-    line = (
+    lines = [
         f"{ml['piece']:.1f} ml come away: {ml['tumor']:.1f} ml tumor and {ml['healthy']:.1f} ml "
-        f"healthy tissue ({share:.0%} of the organ's)"
-    )
-    figure.text(0.014, 0.055, line, fontsize=11, va="center")
-    about = [
-        f"margin {plan.margin_mm:g} mm",
-        f"{plan.exophytic:.0%} of the tumor outside the organ's hull",
-        f"{sum(cut.length_mm for cut in plan.cuts) / 10:.0f} cm of cuts, bold in the organ",
-        *plan.notes,
+        f"healthy tissue ({share:.0%} of the organ's)",
+        f"{kept_words(plan, located)}; {plan.exophytic:.0%} of the tumor outside the organ's "
+        f"hull; {sum(cut.length_mm for cut in plan.cuts) / 10:.0f} cm of cuts, bold in the organ",
+        *(note for note in plan.notes if note not in plan.warnings),
     ]
-    line = textwrap.shorten(" · ".join(about), 190)
-    figure.text(0.014, 0.021, line, fontsize=9.5, va="center", color="0.35")
-    colours = {n: rgb(sweep_colour(n, plan.sweeps)) for n in sorted({1, plan.sweeps})}
+    ends = {n: rgb(sweep_colour(n, plan.sweeps)) for n in sorted({1, plan.sweeps})}
+    organ, *tumors = organ_first(located.meshes)
     handles = [
-        Patch(
-            facecolor=(*drawing.ORGAN, 0.5), label=organ_first(located.meshes)[0].replace("_", " ")
-        ),
-        Patch(facecolor=rgb(part_colour(plan.label)), label=tumor),
+        Patch(facecolor=(*drawing.ORGAN, 0.5), label=organ.replace("_", " ")),
+        *(Patch(facecolor=rgb(name_colour(t)), label=t.replace("_", " ")) for t in tumors),
         Patch(facecolor=(*_PIECE, 0.45), edgecolor=_PIECE, label="comes away"),
-        *(Line2D([], [], color=c, lw=2.8, label=f"sweep {n}") for n, c in colours.items()),
+        *(Line2D([], [], color=c, lw=2.8, label=f"sweep {n}") for n, c in ends.items()),
         Line2D([], [], color=_GRASP, marker="o", mfc="none", mew=1.8, ls="", label="grasp"),
     ]
-    corner = 0.992, 0.945
-    drawing.show_legend(figure, handles, 6, corner, columnspacing=1.2, handlelength=1.6)
+    drawing.add_words(figure, title, plan.warnings, lines, handles)
 
 
 def organ_surfaces(located: Located) -> dict[int, Mesh]:

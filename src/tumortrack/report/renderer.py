@@ -123,9 +123,14 @@ class Frame:
             self.top + (np.arange(height) + 0.5) * pixel_mm,
         )
 
-    def widened(self, aspect: float) -> Frame:
-        """The smallest about the same middle with width = aspect * height that holds this one."""
-        half_height = max(self.bottom - self.top, (self.right - self.left) / aspect) / 2
+    @property
+    def width_mm(self) -> float:
+        return self.right - self.left
+
+    def widened(self, aspect: float, least_mm: float = 0.0) -> Frame:
+        """The smallest about the same middle with width = aspect * height that holds this one and
+        is ``least_mm`` wide."""
+        half_height = max(self.bottom - self.top, max(self.width_mm, least_mm) / aspect) / 2
         half_width = aspect * half_height
         x, y = (self.left + self.right) / 2, (self.top + self.bottom) / 2
         return Frame(x - half_width, x + half_width, y - half_height, y + half_height)

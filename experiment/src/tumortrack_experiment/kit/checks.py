@@ -16,29 +16,31 @@ from tumortrack_experiment.kit.stands import COMPRESSION_MM, PLATE_MM, midsectio
 from tumortrack_experiment.kit.values import PrintedPart
 from tumortrack_experiment.kit_file import LEAST_BEADS
 
+_LEAST_SHOWN = 0.01
 _RAYS, _LINES_MM = 2000, 1.2  # three lines of a nozzle of 0.4 mm: thinner walls break
 # By name: what it is, unit, least, most, and whether the kit is of no use beyond.
+_COUNT, _YES = "", "yes or no"  # units
 _LIMITS: dict[str, tuple[str, str, float | None, float | None, bool]] = {
-    "open_edges": ("edges open after STL", "", 0, 0, True),
-    "fits_bed": ("fits the bed", "(1: yes)", 1, 1, True),
+    "open_edges": ("edges that are open after STL", _COUNT, 0, 0, True),
+    "fits_bed": ("fits the printer's bed", _YES, 1, 1, True),
     "least_wall_mm": ("least wall", "mm", _LINES_MM, None, False),
-    "thin_percent": ("surface over less than 1.2 mm", "%", None, 5, False),
-    "cast_error_percent": ("cast volume off by", "%", -1, 1, True),
-    "cast_differs_mm": ("cast surface off by, mean", "mm", None, 0.2, False),
+    "thin_percent": ("surface with less than 1.2 mm of material", "%", None, 5, False),
+    "cast_error_percent": ("error of the cast's volume", "%", -1, 1, True),
+    "cast_differs_mm": ("mean error of the cast's surface", "mm", None, 0.2, False),
     "halves_overlap_mm3": ("halves overlap", "mm3", None, 1, False),
-    "undercut_percent": ("surface under cuts", "%", None, None, False),
-    "undercut_depth_mm": ("cast yields by", "mm", 0, MoldConfig().largest_undercut_mm, False),
+    "undercut_percent": ("surface that undercuts the mold", "%", None, None, False),
+    "undercut_depth_mm": ("the cast yields by", "mm", 0, MoldConfig().largest_undercut_mm, False),
     "steep_parting_deg": ("parting's slope, 95 %", "deg", None, 70, False),
-    "keys": ("keys", "", 2, None, False),
-    "bolts": ("bolts", "", 2, None, False),
+    "keys": ("keys that centre the halves", _COUNT, 2, None, False),
+    "bolts": ("bolts", _COUNT, 2, None, False),
     "firmness": ("firmness of its pins", "of 1", 0.2, None, False),
     "pressed_mm": ("midsection pressed by", "mm", None, None, True),
-    "deepest_mm": ("anything under its plate by", "mm", None, 25, False),
-    "bead_gap_mm": ("least difference of distances", "mm", 1, None, True),
-    "mirror_mm": ("misfit if mirrored", "mm", 3, None, True),
-    "tre_mm": ("expected TRE", "mm", None, 0.3, False),
-    "steady_mm": ("weight inside it by", "mm", 5, None, False),
-    "seen": ("seen whole, fewest", "", LEAST_BEADS, None, True),
+    "deepest_mm": ("the plate presses somewhere by", "mm", None, 25, False),
+    "bead_gap_mm": ("least difference between two beads' distances", "mm", 1, None, True),
+    "mirror_mm": ("misfit of mirrored beads", "mm", 3, None, True),
+    "tre_mm": ("expected error of place (TRE)", "mm", None, 0.3, False),
+    "steady_mm": ("centre of weight inside its support by", "mm", 5, None, False),
+    "seen": ("fewest beads that a camera sees whole", _COUNT, LEAST_BEADS, None, True),
 }  # fmt: skip
 
 
@@ -53,6 +55,15 @@ class Check(Config, frozen=True, kw_only=True):
     limits: str
     verdict: str
 
+    @property
+    def number(self) -> str:
+        """The value with its unit, as a person writes it."""
+        if self.unit == _YES:
+            return "yes" if self.value else "no"
+        if self.unit in ("mm", "mm3", "%") and 0 <= self.value < _LEAST_SHOWN:
+            return f"under {_LEAST_SHOWN:g} {self.unit}"
+        return f"{self.value:.3g} {self.unit}".strip()
+
 
 def checked(where: str, name: str, value: float, exactly: float | None = None) -> Check:
     """A number held against its limits, or against what it must be to within 0.05."""
@@ -63,7 +74,8 @@ def checked(where: str, name: str, value: float, exactly: float | None = None) -
     good = above and (most is None or value <= most + 1e-6)
     ends = ("at least", least), ("at most", most)
     limits = ", ".join(f"{word} {end:g}" for word, end in ends if end is not None)
-    limits = f"exactly {least:g}" if least == most is not None else limits
+    if least == most is not None:
+        limits = "yes" if unit == _YES else f"exactly {least:g}"
     verdict = "good" if good else "FAILS" if needed else "look"
     value = round(float(value), 3) + 0.0
     return Check(where=where, what=what, value=value, unit=unit, limits=limits, verdict=verdict)

@@ -18,6 +18,10 @@ if TYPE_CHECKING:
 _WORSE = ("good", "look", "FAILS")
 
 
+def _say_step(what: str) -> None:
+    say(f"  {what} ...")
+
+
 @dataclass(frozen=True, kw_only=True)
 class PhantomKit:
     """Make the parts that cast a case as a phantom and squeeze it on a bench.
@@ -63,6 +67,7 @@ class PhantomKit:
         )
         mold = MoldConfig(wall_mm=self.wall, bed_mm=self.bed)
         mix = Mix(pva_percent=self.pva, cycles=self.cycles)
+        say(f"designing the kit of {self.case}; usually half a minute ...")
         case = api.load_case(self.case)
         if not case.anatomy.tumors:
             raise InputError(
@@ -70,21 +75,22 @@ class PhantomKit:
                 "it from a scan or labels with one."
             )
         digest = store.sha256_of(self.case / store.MANIFEST)
-        made = design_kit(case.anatomy, case.up_lps, base, mold, mix)
+        made = design_kit(case.anatomy, case.up_lps, base, mold, mix, _say_step)
         with store.new_folder(self.out, self.overwrite) as aside:
-            write_kit(made, aside, digest)
+            _say_step("files and the sheet")
+            write_kit(made, aside, digest, f"{self.case.resolve().name} ({case.patient})")
         self._report(made)
 
     def _report(self, made: Design) -> None:
         for where in dict.fromkeys(check.where for check in made.checks):
             rows = [check for check in made.checks if check.where == where]
-            said = ", ".join(f"{row.what} {row.value:g} {row.unit}".strip() for row in rows)
-            say(f"{max((row.verdict for row in rows), key=_WORSE.index):5} {where}: {said}")
+            numbers = ", ".join(f"{row.what}: {row.number}" for row in rows)
+            say(f"{max((row.verdict for row in rows), key=_WORSE.index):5} {where}: {numbers}")
         say(f"{len(made.parts)} parts, written to {self.out}; print {self.out / 'sheet.html'}.")
         texts: dict[str, list[str]] = {verdict: [] for verdict in _WORSE}
         for row in made.checks:
-            number = f"{row.what} {row.value:g} {row.unit}".strip()
-            texts[row.verdict].append(f"{row.where}: {number}, {row.limits} is wanted")
+            wanted = f"wanted: {row.limits}" if row.limits else "no limit"
+            texts[row.verdict].append(f"{row.where}: {row.what}: {row.number} ({wanted})")
         say_notes(texts["look"])
         if texts["FAILS"]:
             raise TumortrackError(f"this kit cannot be used as it is. {'; '.join(texts['FAILS'])}.")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -32,11 +33,18 @@ class Design:
 
 
 def design_kit(
-    anatomy: Anatomy, up_lps: Direction, base_config: BaseConfig, mold_config: MoldConfig, mix: Mix
+    anatomy: Anatomy,
+    up_lps: Direction,
+    base_config: BaseConfig,
+    mold_config: MoldConfig,
+    mix: Mix,
+    progress: Callable[[str], None] = lambda _: None,
 ) -> Design:
-    """Molds, base and stands of a case, measured. Raises InputError: the base does not fit the
-    printer's bed in one piece, or what the parts' functions say."""
+    """Molds, base and stands of a case, measured. ``progress`` hears what comes next. Raises
+    InputError: the base does not fit the printer's bed in one piece, or what the parts' functions
+    say."""
     bed = mold_config.bed_mm
+    progress("base, beads and stands")
     base = base_design(anatomy, up_lps, base_config)
     plate, *standing = base.parts
     if not fits(plate, bed):
@@ -46,8 +54,11 @@ def design_kit(
             "printed in one piece, or its beads' places are not known. Take a larger printer, "
             "or fewer or smaller beads."
         )
+    progress("the organ's mold")
     organ = organ_mold(anatomy, mold_config)
+    progress("the tumors' molds")
     molds = (organ, *tumor_molds(anatomy, mold_config, organ.pins))
+    progress("checks of all parts")
     names = ("organ", *(f"tumor {n}" for n in range(1, len(molds))))
     others = [p for part in (*standing, coupon_mold()) for p in split_to_bed(part, bed)]
     checks = [row for n, m in zip(names, molds, strict=True) for row in check_mold(n, m)]

@@ -20,15 +20,16 @@ KIND = "kit"
 _APART_MM = 10.0  # between parts in the 3MF file
 
 
-def write_kit(design: Design, folder: Path, case_sha256: str) -> None:
-    """Its files, sealed, into an empty folder: meshes lie as they are printed."""
+def write_kit(design: Design, folder: Path, case_sha256: str, whose: str = "") -> None:
+    """Its files, sealed, into an empty folder: meshes lie as they are printed. ``whose``: names the
+    case on the sheet."""
     for part in design.parts:
         write_mesh(folder / f"{part.name}.stl", laid_mesh(part))
     (folder / "kit.3mf").write_bytes(_three_mf(design.parts))
     kit = kit_of(design, case_sha256)
     store.write_json(folder / KIT_FILE, to_builtins(kit))
     store.write_json(folder / "checks.json", {"checks": list(map(to_builtins, design.checks))})
-    write_sheet(design, kit, folder / "sheet.html")
+    write_sheet(design, kit, folder / "sheet.html", whose)
     content = {
         "case_sha256": case_sha256, "states": list(kit.states), "parts": len(kit.parts),
         "beads": f"{len(kit.beads)} of {kit.bead_diameter_mm:g} mm",

@@ -19,7 +19,7 @@ from tumortrack.core.types import Mesh
 from tumortrack.imaging.meshes import mesh_of
 from tumortrack.report.renderer import Body, Viewpoint, render
 from tumortrack_experiment.kit import recipe
-from tumortrack_experiment.kit.casting import rod
+from tumortrack_experiment.kit.casting import THICK_MM, rod
 from tumortrack_experiment.kit.solids import ball
 from tumortrack_experiment.kit_file import Kit
 
@@ -64,8 +64,9 @@ def mold_picture(mold: OrganMold, cast: Sequence[Mesh]) -> np.ndarray:
     return _picture(bodies, np.array([0.7, -1.0, 0.35]))
 
 
-def write_sheet(design: Design, kit: Kit, path: Path) -> None:
-    """Pictures, steps and tables, atomically. Raises StorageError: the disk refused."""
+def write_sheet(design: Design, kit: Kit, path: Path, whose: str = "") -> None:
+    """Pictures, steps and tables, atomically; ``whose``: the case's name. Raises StorageError: the
+    disk refused."""
     made = recipe.batches(design.mix, kit.organ_ml, kit.tumors_ml)
     plastic, pins = sum(part.volume_ml for part in kit.parts), design.molds[0].pins
     organ, *tumors = design.anatomy_ct.parts
@@ -75,11 +76,13 @@ def write_sheet(design: Design, kit: Kit, path: Path) -> None:
     shown = [s for s in kit.states if any(part.state == s for part in design.base.parts)]
     rows = [
         f"<tr class={c.verdict}><td>" + "<td>".join(
-            (c.where, c.what, f"{c.value:.2f} {c.unit}", c.limits, c.verdict)) + "</tr>"
+            (c.where, c.what, c.number, c.limits, c.verdict)) + "</tr>"
         for c in design.checks
     ]  # fmt: skip
     texts = {
-        "CASE": kit.case_sha256[:12],
+        "CASE": html.escape(whose or kit.case_sha256[:12]), "DIGEST": kit.case_sha256[:12],
+        "BOLTS": f"{sum(dict(mold.checks)['bolts'] for mold in design.molds):.0f}",
+        "BOLT": f"{2 * THICK_MM:g}",
         "ORGAN": f"{kit.organ_ml:.1f}",
         "TUMORS": ", ".join(f"{ml:.1f}" for ml in kit.tumors_ml),
         "STATES": ", ".join(kit.states),

@@ -184,12 +184,14 @@ def _page(
         body.append(f"<tr{mark} id={name!r}>{cells}</tr>")
         body.append(f'<tr{mark}><td colspan="{len(_COLUMNS)}">{images}{said}</td></tr>')
     head = "".join(f"<th>{words}</th>" for words in _COLUMNS.values())
+    doubtful = len({one["patient"] for one in looks})
+    people = "1 patient" if doubtful == 1 else f"{doubtful or 'none'} of the patients"
     lines = "\n".join(body)
     return (
         f'<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8"><title>fleet</title>'
         f"<style>{_STYLE}</style></head><body><h1>{len(rows)} patients: {counts}</h1>"
-        f"<p><b>For research use only.</b> {len({one['patient'] for one in looks})} need a "
-        f"person's eye (shaded; {LOOK}). Shares are of scenes; errors are medians over answers "
+        f"<p><b>For research use only.</b> A person should look at {people} (shaded; {LOOK}). "
+        "Shares are of scenes; errors are medians over answers "
         "called good; pictures: the case, and the answer that is farthest off.</p>"
         f"<table><thead><tr>{head}</tr></thead><tbody>\n{lines}\n</tbody></table>"
         "</body></html>\n"

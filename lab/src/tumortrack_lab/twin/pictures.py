@@ -25,6 +25,5 @@ def twin_picture(scene: Scene, path: Path) -> None:
     for number, view in enumerate((FROM_CAMERA, FROM_SIDE), start=2):
         draw_solid_view(figure.add_subplot(1, 3, number), scene, None, view)
     words = f"{scene.meta['variant']}, {scene.meta['view']}"
-    figure.suptitle(words, x=0.02, ha="left", fontsize=13, fontweight="bold")
-    drawing.show_legend(figure, scene_legend()[2:], 2, (0.99, 1.0))
+    drawing.add_words(figure, words, handles=scene_legend()[-2:])
     drawing.save(figure, path)

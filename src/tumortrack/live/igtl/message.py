@@ -16,6 +16,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Float, Int, Num
 
+from tumortrack.core.colours import Colour
 from tumortrack.core.errors import InputError
 
 HEADER_SIZE = 58
@@ -170,13 +171,13 @@ def pack_polydata(data: Polydata) -> bytes:
 
 
 def pack_points(
-    points_mm: Float[np.ndarray, "n 3"], labels: Sequence[str], rgb: tuple[int, int, int]
+    points_mm: Float[np.ndarray, "n 3"], labels: Sequence[str], colours: Sequence[Colour]
 ) -> bytes:
-    """Fiducials of one colour; labels are cut to 63 bytes: the protocol's own library reads one of
+    """Fiducials; labels are cut to 63 bytes: the protocol's own library reads one of
     64 past its end."""
     return b"".join(
         _POINT.pack(label.encode("ascii", "replace")[:63], b"Fiducial", *rgb, 255, *point, 0.0, b"")
-        for label, point in zip(labels, points_mm, strict=True)
+        for label, rgb, point in zip(labels, colours, points_mm, strict=True)
     )
 
 

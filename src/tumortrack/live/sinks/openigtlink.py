@@ -14,10 +14,10 @@ from typing import ClassVar, Literal
 import numpy as np
 from jaxtyping import Float64
 
-from tumortrack.core.colours import part_colour
+from tumortrack.core.colours import name_colour
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import RAS_FROM_LPS, rigid, transform_points
-from tumortrack.core.types import FIRST_TUMOR, Mesh
+from tumortrack.core.types import Mesh
 from tumortrack.live.igtl import message as igtl
 from tumortrack.live.igtl.link import Link
 from tumortrack.live.igtl.message import Message, Polydata
@@ -181,8 +181,8 @@ class OpenIgtLinkSink:
         labels = [centre_label(report, name, result.quality != "good") for name in places]
         points_mm = transform_points(self._axes, np.reshape([*places.values()], (-1, 3)))
         if tumors:
-            colour = part_colour(FIRST_TUMOR)
-            yield "POINT", CENTRES, igtl.pack_points(points_mm, labels, colour), {}
+            shades = [name_colour(name) for name in places]
+            yield "POINT", CENTRES, igtl.pack_points(points_mm, labels, shades), {}
 
     def _surfaces(self, result: TrackingResult) -> Iterator[_Content]:
         estimate = result.transformed

@@ -1,4 +1,5 @@
-"""From a resection plan to motions of both arms: approach, grasp, hold, sweeps, release, home.
+"""From a resection plan to motions of both arms: approach, grasp, hold, sweeps, lift, release,
+home.
 
 Also the worker that plans anew beside the live loop: a process of its own, which holds up no frame.
 """
@@ -22,7 +23,16 @@ from tumortrack.plan.arms.cutting import Surroundings, level_poses
 from tumortrack.plan.arms.kinematics import level_pose, yaw_of
 from tumortrack.plan.arms.paths import connect, follow, out_of_reach
 from tumortrack.plan.arms.trajectory import TrajectoryBuilder, along, first_hit, together
-from tumortrack.plan.motions import ARMS, CUTTER, HOLDER, JOINTS, Joints, Motions
+from tumortrack.plan.motions import (
+    ARMS,
+    CUTTER,
+    HOLDER,
+    JOINTS,
+    LIFT,
+    RELEASE,
+    Joints,
+    Motions,
+)
 from tumortrack.plan.operation import Planned, ResectionProgress
 from tumortrack.plan.resection import plan_resection
 from tumortrack.plan.values import Located, ResectionConfig, ResectionPlan
@@ -57,7 +67,7 @@ def plan_motions(
         start_rad: where the arms are (twelve joints), if not at home. An instrument in tissue first
             leaves straight back.
         from_sweep: the grasper holds already and stays where it is; begin with this sweep, counted
-            from 1; one more than there are: release and go home.
+            from 1; one more than there are: lift, release and go home.
     """
     cell = cell if cell.organ is organ else ArmCell(cell.config, organ)
     start = cell.home_rad if start_rad is None else np.array(start_rad, float)
@@ -149,8 +159,10 @@ def _cut_and_finish(
         for path_mm in cutting.passes(cut for cut in plan.cuts if cut.sweep == sweep):
             cutting.cut_pass(builder, path_mm, around)
         builder.close(f"sweep {sweep}")
-    _let_go(builder)
-    builder.close("release")
+    _rise(builder)
+    builder.close(LIFT)
+    builder.wait(_LET_GO_S)
+    builder.close(RELEASE)
     _go_home(builder)
     builder.close("home")
     return Motions(builder.stages)
@@ -166,12 +178,12 @@ def _withdraw(builder: TrajectoryBuilder, around: Surroundings, holding: bool) -
         builder.follow(CUTTER, level_poses(leave, yaw), builder.cell.config.cutting_mm_s)
     pair = builder.cell.collisions(builder.joints_rad, (CUTTER,))
     if not holding and pair is not None and TOUCHES[HOLDER] in pair:
-        _let_go(builder)
+        builder.wait(_LET_GO_S)
+        _rise(builder)
 
 
-def _let_go(builder: TrajectoryBuilder) -> None:
-    """Vacuum off, then straight up."""
-    builder.wait(_LET_GO_S)
+def _rise(builder: TrajectoryBuilder) -> None:
+    """The holder goes straight up, after the last cut with the piece."""
     tip = builder.tip(HOLDER)
     rising = _lowering(tip[:3, 3], yaw_of(tip))[::-1]
     builder.follow(HOLDER, rising, builder.cell.config.grasping_mm_s)

@@ -30,7 +30,7 @@ _CRAWL, _CRAWL_S = 2.0, 3.0  # a motion longer than so many times the least, and
 _SLACK = 0.97  # of the acceleration: toppra keeps its limits at grid points only
 _THERE_RAD = 1e-6  # a thousandth of a millimetre at the tip: no motion to be timed
 
-# Who may touch the organ, but in sweeps and at the release, where both may
+# Who may touch the organ, but in sweeps, lift and release, where both may
 _TOUCHING: dict[str, tuple[str, ...]] = {
     "approach": (),
     "grasp": (HOLDER,),
