@@ -63,6 +63,8 @@ def live_line(first: str) -> Iterator[Callable[..., None]]:
 
     if console.is_terminal:
         spinner.start()
+    else:
+        say(first)
     try:
         yield show
     finally:

@@ -32,8 +32,8 @@ class Train:
             (clinic: 30), or every rotation.
         sensor: whose errors the scenes have: a RealSense D405's, or those of depth by matching a
             stereo endoscope's pictures.
-        minutes: stop after about so long (default: the preset's end). 0: learn nothing, take what
-            training starts from.
+        minutes: train for about so long, once kernels are compiled and the first step is done
+            (default: to the preset's end). 0: learn nothing, take what training starts from.
         steps: stop after exactly so many steps.
         seed: of weights and scenes.
         device: auto takes CUDA if there is a GPU.
@@ -69,7 +69,7 @@ class Train:
             raise InputError(f"--workers {self.workers} must be 0 or more.")
         case = load_case(self.case)  # report what is wrong so far before PyTorch's seconds
 
-        from tumortrack.models.folder import is_finished, weakness_of
+        from tumortrack.models.folder import is_finished, training_words, weakness_of
         from tumortrack.training.model import load_model, start_of
         from tumortrack.training.presets import PRESETS, seen_by
         from tumortrack.training.train import TrainingRun, train
@@ -98,11 +98,10 @@ class Train:
             return
         with training_screen() as show:
             about = train(run, self.model, show).provenance
-        say(
-            f"model written to {self.model}: {about['steps']} steps in {about['training_s']:.0f} "
-            f"s, validation mIoU {about['validation_miou']:.3f}."
-        )
-        say_notes(filter(None, [weakness_of(about)]))
+        say(f"model written to {self.model}: {training_words(about)}.")
+        few = bool(self.minutes) and about["steps"] < config.schedule.warmup_steps
+        hint = "so few steps teach nearly nothing; train longer, or on a machine with less to do"
+        say_notes(filter(None, [hint if few else "", weakness_of(about)]))
 
 
 @contextmanager
@@ -114,11 +113,13 @@ def training_screen() -> Iterator[Callable[[TrainingStatus], None]]:
 
     def show(status: TrainingStatus) -> None:
         end = f"/{status.end}" if status.end is not None else ""
-        miou = "-" if status.miou is None else f"{status.miou:.3f}"
+        validated = "" if status.miou is None else f"validation mIoU {status.miou:.3f} | "
+        if status.tre_mm is not None:
+            validated = f"validation {status.tre_mm:.1f} mm off | "
         minutes, seconds = divmod(int(status.seconds_left), 60)
         line(
             f"step {status.step}{end} | {status.samples_per_s:.0f} samples/s | loss "
-            f"{status.loss:.4f} | validation mIoU {miou} | {minutes}:{seconds:02d} left | "
+            f"{status.loss:.4f} | {validated}{minutes}:{seconds:02d} left | "
             f"{status.waiting:.0%} waiting for scenes",
             last=status.step == status.end,
         )

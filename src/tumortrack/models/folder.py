@@ -81,6 +81,19 @@ def weakness_of(provenance: dict[str, Any]) -> str:
     return ""
 
 
+def training_words(provenance: dict[str, Any]) -> str:
+    """How long a model was trained, and how far off it is on its validation scenes."""
+    steps, seconds = provenance["steps"], provenance.get("training_s")  # a fleet's have none
+    words = f"{steps} step{'s' * (steps != 1)}"
+    words += "" if seconds is None else f" in {seconds:.0f} s"
+    if "validation_tre_mm" in provenance:
+        return (
+            f"{words}; in validation points inside are {provenance['validation_tre_mm']:.1f} mm "
+            f"off (median), {provenance['validation_far']:.0%} of scenes over {FAR_MM:g} mm"
+        )
+    return f"{words}; validation mIoU {provenance['validation_miou']:.3f}"
+
+
 def has_shape(manifest: dict[str, Any]) -> bool:
     """Whether the model knows the organ's shape, and so which point of the CT lies where."""
     return SHAPE in manifest["files"]
