@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import string
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+import tomllib
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,8 +17,6 @@ from tumortrack.core import store
 from tumortrack.core.errors import InputError
 
 Content = Mapping[str, Any]  # of a JSON file
-# A sentence with entries in braces; or of each member of an entry, with its {name} and {value}.
-Sentence = str | tuple[str, str]
 
 _KNOWN = (
     "folders that commands write (cases, models, runs, plans, scenes, recordings, evaluations, "
@@ -62,116 +61,65 @@ class _Words(string.Formatter):
         return found, first
 
 
-def _words(content: Content, sentences: Iterable[Sentence]) -> Iterator[str]:
-    """Sentences filled from JSON; left out are those whose entries are missing or empty."""
+def _words(content: Content, sentences: Iterable[str | list[str]]) -> Iterator[str]:
+    """Sentences as inspect.toml has them, filled from JSON."""
     for sentence in sentences:
         entry, template = ("", sentence) if isinstance(sentence, str) else sentence
-        members: Any = content
+        members: Any = content if entry else [{}]
         with suppress(KeyError, TypeError, IndexError, ValueError):
             for key in filter(None, entry.split(".")):
                 members = members[key]
-            some = members.items() if entry and isinstance(members, dict) else enumerate(members)
-            for name, value in some if entry else [("", "")]:
-                inner = value if isinstance(value, dict) else {}
-                yield _Words().vformat(template, (), {**content, **inner, "name": name,
-                                                      "value": value})  # fmt: skip
+            pairs = members.items() if isinstance(members, dict) else enumerate(members)
+            for name, value in pairs:
+                own = value if isinstance(value, dict) else {}
+                inner = {**content, **own, "name": name, "value": value}
+                with suppress(KeyError, TypeError, IndexError, ValueError):
+                    yield _Words().vformat(template, (), inner)
 
 
-_PATIENT = "patient {patient[id]}, side {patient[side]}"
-_CASE: tuple[Sentence, ...] = (
-    _PATIENT,
-    "made from a {report[kind]}, {report[source]}",
-    "voxels of {report[spacing_mm][0]:.3g} x {report[spacing_mm][1]:.3g} x "
-    "{report[spacing_mm][2]:.3g} mm",
-    ("report.volumes_ml", "{name}: {value:.1f} ml"),
-    ("structures", "{value} moves with it"),
-    "WARNING: {report[half_turn][warning]}",
-    ("report.notes", "note: {value}"),
-)
-_RUN: tuple[Sentence, ...] = (
-    "verdict: {quality[verdict]}",
-    "because {quality[reason]}",
-    _PATIENT,
-    ("parts", "{name}: {volume_ml:.1f} ml, centre ({center_mm[0]:.1f}, {center_mm[1]:.1f}, "
-     "{center_mm[2]:.1f}) mm"),
-    ("parts", "{name}: one standard deviation of its centre is {center_std_mm:.1f} mm"),
-    ("missing", "{value}: not found"),
-    "{margin_words}",
-)  # fmt: skip
-_PLAN: tuple[Sentence, ...] = (
-    _PATIENT,
-    "{plan[tumor]}, {plan[volumes_ml][tumor]:.1f} ml: {plan[volumes_ml][piece]:.1f} ml come away, "
-    "of that {plan[volumes_ml][healthy]:.1f} ml healthy tissue",
-    "margin {plan[margin_mm]:.1f} mm; the cuts keep {budget[margin_mm]:.1f} mm from the tumor as "
-    "it was located, which may be off by {budget[tracking_mm]:.1f} mm",
-    "two arms carry it out in {seconds:.0f} s",
-    ("plan.notes", "note: {value}"),
-)
-_RESECT = ("arms: {resection[state]}", ("resection.halts", "halted ({value} x): {name}"))
-_TRACK: tuple[Sentence, ...] = (
-    "{updates} updates in {seconds:.1f} s, {rate:.1f} a second: {share[0]:.0%} good, "
-    "{share[1]:.0%} poor, {share[2]:.0%} none",
-    _PATIENT,
-    "from {source}",
-    ("sinks", "to {name}: {delivered} delivered, {dropped} missed"),
-    ("reasons", "no estimate in {value} of {updates}: {name}"),
-    "latency {latency_ms[p50]:.1f} ms (median; 95 %: {latency_ms[p95]:.1f} ms)",
-    ("center_error_mm", "{name}: centre off by {p50:.1f} mm (median; 95 %: {p95:.1f} mm)"),
-    *_RESECT,
-)
-_FILES: tuple[Sentence, ...] = (  # --frame, --poses, --intrinsics
-    "frame {frame_id}",
-    "off by up to {error_mm:g} mm",
-    "{width:g} x {height:g} pixels, focal lengths {fx:.1f} and {fy:.1f} pixels",
-    "one step of its depth images: {depth_unit_mm:g} mm",
-    "depths are corrected: {depth_scale:g} times what is measured, {depth_offset_mm:+g} mm",
-)
-
-
-def _run(report: Content) -> Iterator[str]:
-    from tumortrack.models.margins import margin_words
-
-    missing = [name for name, part in report["parts"].items() if not part["found"]]
-    margin = margin_words(report.get("margin"))
-    return _words({**report, "missing": missing, "margin_words": margin}, _RUN)
-
-
-def _track(report: Content) -> Iterator[str]:
-    counts = *report["estimates"].values(), report["no_estimate"]
-    share = [count / max(sum(counts), 1) for count in counts]
-    rate = sum(counts) / max(report["seconds"], 1e-9)
-    return _words({**report, "share": share, "rate": rate}, _TRACK)
-
-
-def _evaluation(report: Content) -> Iterable[str]:
-    return [f"{k}: {v}" for k, v in report["summary"].items()]
-
-
-# What JSON files are, by keys that they have, the most telling first.
-_BY_KEYS: tuple[tuple[set[str], str, Callable[[Content], Iterable[str]]], ...] = (
-    ({"rule", "summary", "scenes"}, "an evaluation report", _evaluation),
-    ({"quality", "parts"}, "a report of `locate`", _run),
-    ({"updates", "estimates"}, "a report of `track`", _track),
-    ({"resection"}, "a report of `resect`", lambda found: _words(found, _RESECT)),
-    ({"table_from_camera", "plan"}, "a plan", lambda found: _words(found, _PLAN)),
-    ({"margins", "sha256"}, "margins; inspect their model's folder", lambda _: ()),
-    ({"fixed_from_camera"}, "poses of cameras (--poses)", lambda found: _words(found, _FILES)),
-    ({"frame_id", "unit"}, "a calibration (--frame)", lambda found: _words(found, _FILES)),
-    ({"width", "fx"}, "a camera (--intrinsics)", lambda found: _words(found, _FILES)),
-)
-_BY_NAME = {  # of a file that lies in a folder
-    "twin.json": "twin scenes that are not finished; the same `twin` command resumes them",
-    "training": "a training that has not ended; the same command resumes it",
-    "patients.parquet": "a fleet's results: index.html shows them, look.csv names who needs a look",
-    "scene.mrb": "a scene for 3D Slicer, by `export`; open scene.mrb there",
-}
+def _evaluation(report: Content) -> list[str]:
+    return ["an evaluation report", *(f"{k}: {v}" for k, v in report["summary"].items())]
 
 
 def _json(path: Path) -> list[str]:
     """Of a JSON file; nothing where it is not known."""
     content = store.read_json(path)
-    known = ([name, *lines(content)] for keys, name, lines in _BY_KEYS if content.keys() >= keys)
-    return next(known, [])
+    if content.keys() >= {"rule", "summary", "scenes"}:
+        return _evaluation(content)
+    for kind in _kinds():
+        if "keys" in kind and content.keys() >= {*kind["keys"]}:
+            filled = _words(_with_figures(content, path.parent), kind.get("sentences", ()))
+            return [kind["name"], *filled]
+    return []
+
+
+def _kinds() -> Iterable[dict[str, Any]]:
+    return tomllib.loads(Path(__file__).with_name("inspect.toml").read_text("utf-8")).values()
+
+
+def _with_figures(content: Content, folder: Path) -> Content:
+    """With what follows from a file's entries."""
+    from tumortrack.cli.margins import described
+    from tumortrack.models.folder import training_words, weakness_of
+    from tumortrack.models.margins import UNKNOWN, margin_words, read_margins
+
+    figures: dict[str, Any] = {}
+    if "query_box_mm" in content:
+        about, margins = content["provenance"], read_margins(folder)
+        does = "labels points; it does not know which point of the CT lies where (no `--map`)"
+        if content["config"]["network"]["decoder"]["type"] == "warp":
+            does = "places the organ of the CT; `locate --map` says where points of the CT are"
+        figures = {"does": does, "trained": training_words(about), "weakness": weakness_of(about)}
+        figures["part_names"] = ", ".join(content["parts"])
+        figures["margins"] = described(margins) if margins else [UNKNOWN]
+    elif "quality" in content:
+        figures["margin_words"] = margin_words(content.get("margin"))
+        figures["missing"] = [name for name, p in content["parts"].items() if not p["found"]]
+    elif "updates" in content:
+        counts = *content["estimates"].values(), content["no_estimate"]
+        figures["share"] = [count / max(sum(counts), 1) for count in counts]
+        figures["rate"] = sum(counts) / max(content["seconds"], 1e-9)
+    return {**content, **figures}
 
 
 def _artifact(folder: Path) -> Iterable[str]:
@@ -183,38 +131,13 @@ def _artifact(folder: Path) -> Iterable[str]:
         f"{name} (tumortrack {manifest['tumortrack']}; {manifest['units']}, {manifest['frame']} "
         "frame); all files are as they were written"
     )
-    if kind == "case":
-        yield from _words(manifest, _CASE)
-    elif kind == "model":
-        yield from _model(folder, manifest)
-    elif kind in ("run", "plan"):
-        yield from _json(folder / {"run": "report.json"}.get(kind, "plan.json"))[1:]
-    elif isinstance(manifest.get("scenes"), dict):
+    if isinstance(manifest.get("scenes"), dict):
         yield from _sealed_scenes(folder, manifest["scenes"])
-    else:
-        for key, value in [*manifest.items()][5:]:  # behind kind, schema, version, units and frame
-            if isinstance(value, str | int | float):
-                yield f"{key.replace('_', ' ')}: {value}"
+    told = {"run": "report.json", "plan": "plan.json", "kit": "kit.json"}.get(kind, store.MANIFEST)
+    lines = _json(folder / told)[1:]
+    plain = ((k, v) for k, v in [*manifest.items()][5:] if isinstance(v, str | int | float))
+    yield from lines or (f"{key.replace('_', ' ')}: {value}" for key, value in plain)
     yield f"files: {', '.join(manifest['files'])}"
-
-
-def _model(folder: Path, manifest: Content) -> Iterable[str]:
-    from tumortrack.cli.margins import described
-    from tumortrack.models.folder import training_words, weakness_of
-    from tumortrack.models.margins import UNKNOWN, read_margins
-
-    about, network = manifest["provenance"], manifest["config"]["network"]
-    yield from _words(about, [_PATIENT])
-    encoder, decoder = (network.get(n, {}).get("type", "?") for n in ("encoder", "decoder"))
-    does = "labels points; it does not know which point of the CT lies where (no `--map`)"
-    if decoder == "warp":
-        does = "places the organ of the CT; `locate --map` says where points of the CT are"
-    yield f"{encoder} + {decoder}: {does}"
-    yield f"parts: {', '.join(manifest['parts'])}"
-    yield f"trained for {training_words(about)}"
-    yield from _words({"weakness": weakness_of(about)}, ["WARNING: {weakness}"])
-    margins = read_margins(folder)
-    yield from described(margins) if margins else [UNKNOWN]
 
 
 def _sealed_scenes(folder: Path, scenes: Mapping[str, str]) -> Iterable[str]:
@@ -234,15 +157,18 @@ def _folder(path: Path) -> Iterable[str]:
     inside = {p.name for p in path.iterdir()}
     if store.MANIFEST in inside:
         return _artifact(path)
-    if words := [words for name, words in _BY_NAME.items() if name in inside]:
-        return words
+    scenes = sum((path / name / "cloud.ply").is_file() for name in inside)
+    if "twin.json" in inside:
+        return [f"twin scenes, not finished ({scenes} so far); the same `twin` command goes on"]
+    if named := [kind["name"] for kind in _kinds() if kind.get("file") in inside]:
+        return named
     if "cloud.ply" in inside:
         return _scene(path)
     if "report.json" in inside:
         return _json(path / "report.json")
     if bag_files(path):
         return _recording(path)
-    if scenes := sum((path / name / "cloud.ply").is_file() for name in inside):
+    if scenes:
         return [f"{scenes} scenes; `tumortrack evaluate` reads them"]
     if meshes := sum(_is_mesh(path / name) for name in inside):
         return [f"{meshes} meshes; `tumortrack prepare` makes a case of them"]
@@ -289,7 +215,8 @@ def _recording(path: Path) -> Iterable[str]:
     files = [path] if path.is_file() else path.rglob("*")
     size_mb = sum(file.stat().st_size for file in files) / 2**20
     yield f"a recording of {seconds:.1f} s, {size_mb:.1f} MB"
-    yield from _words(store.read_json(about) if about.is_file() else {}, [_PATIENT])
+    said = store.read_json(about) if about.is_file() else {}
+    yield from _words(said, ["patient {patient[id]}, side {patient[side]}"])
     for topic, count in frames.items():
         yield f"{topic}: {count} frames, {count / max(seconds, 1e-9):.1f} a second"
 

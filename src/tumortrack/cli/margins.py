@@ -85,7 +85,10 @@ class Margins:
                     f"{one.folder} was changed since it was located. Remove the table, or give "
                     "another --out."
                 )
-        if left := [one for scene, one in states.items() if scene not in done]:
+        left = [one for scene, one in states.items() if scene not in done]
+        if not left:
+            return [done[scene] for scene in states]
+        with progress_bar("locating", len(left)) as advance:
             from tumortrack.cli.locate import check_case
             from tumortrack.report.calibration import row_of
             from tumortrack.simulate.scene_folder import read_scene
@@ -96,12 +99,11 @@ class Margins:
             model = load_model(self.model, self.device, with_margins=False)
             check_case(model, [one.folder for one in left])
             tracker = Tracker(model)
-            with progress_bar("margins", len(left)) as advance:
-                for one in left:
-                    row = row_of(tracker, read_scene(one.folder), one, self.seed)
-                    add(row)
-                    done[row.scene] = row
-                    advance()
+            for one in left:
+                row = row_of(tracker, read_scene(one.folder), one, self.seed)
+                add(row)
+                done[row.scene] = row
+                advance()
         return [done[scene] for scene in states]
 
 

@@ -14,6 +14,13 @@ from tumortrack.cli.console import Device, keep_loaded, live_line, say, say_note
 from tumortrack.core import store
 from tumortrack.core.errors import InputError
 from tumortrack.core.process import is_follower
+from tumortrack.models.folder import (
+    check_trainable,
+    is_finished,
+    read_model_manifest,
+    training_words,
+    weakness_of,
+)
 
 if TYPE_CHECKING:
     from tumortrack.training.train import TrainingStatus
@@ -68,9 +75,10 @@ class Train:
         if self.workers is not None and self.workers < 0:
             raise InputError(f"--workers {self.workers} must be 0 or more.")
         case = load_case(self.case)  # report what is wrong so far before PyTorch's seconds
+        check_trainable(self.model)
+        say("starting ...")
 
-        from tumortrack.models.folder import is_finished, training_words, weakness_of
-        from tumortrack.training.model import load_model, start_of
+        from tumortrack.training.model import start_of
         from tumortrack.training.presets import PRESETS, seen_by
         from tumortrack.training.train import TrainingRun, train
 
@@ -86,11 +94,11 @@ class Train:
             start=start_of(config.network, self.start), patient=case.patient,
         )  # fmt: skip
         if is_finished(self.model):
-            done = load_model(self.model).provenance
-            if differences := run.differences(done.get("decided_by", {})):
+            done = read_model_manifest(self.model)["provenance"]
+            if differ := run.differences(done.get("decided_by", {})):
                 raise InputError(
                     f"{self.model} holds a finished model ({done['steps']} steps, seed "
-                    f"{done['seed']}), whose command differs from this one in {differences}. A "
+                    f"{done['seed']}), whose command differs from this one in {differ}. A "
                     "finished training is not extended: choose another MODEL folder."
                 )
             say(f"{self.model} is trained already ({done['steps']} steps).")

@@ -26,6 +26,14 @@ def is_finished(folder: Path) -> bool:
     return (folder / store.MANIFEST).is_file()
 
 
+def check_trainable(folder: Path) -> None:
+    """InputError where what lies in a folder is neither a training nor a model."""
+    if folder.is_dir() and not any(folder.iterdir()):
+        return
+    if not (folder / "training").is_dir() and not is_finished(folder):
+        store.check_place(folder, "", None)
+
+
 def read_model_manifest(folder: Path) -> dict[str, Any]:
     """The manifest of a finished model; ArtifactError for no model, a training that has not ended,
     another schema, a file missing or changed."""

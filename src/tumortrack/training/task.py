@@ -217,7 +217,9 @@ class RegistrationTask(TrainingTask):
 
     def tre_mm(self, network: RegistrationNetwork) -> float:
         fits = self._fits(network)
-        return float(np.median([_mean_mm(self._away_mm(n, fit)) for n, (_, fit) in enumerate(fits)]))
+        return float(
+            np.median([_mean_mm(self._away_mm(n, fit)) for n, (_, fit) in enumerate(fits)])
+        )
 
     def model(self, network: RegistrationNetwork, provenance: dict[str, Any]) -> RegistrationModel:
         scenes, drafts = self._scenes, self._fits(network)

@@ -24,6 +24,7 @@ import torch
 from tumortrack.core.errors import InputError, StorageError, TumortrackError
 from tumortrack.core.process import available_cores, keep_freed_memory
 from tumortrack.core.store import write_atomically, writing
+from tumortrack.models.folder import check_trainable
 from tumortrack.models.model import Model
 from tumortrack.simulate.coarse import coarsened
 from tumortrack.simulate.scene import SceneStream
@@ -106,8 +107,9 @@ def _train(run: TrainingRun, work: Path, group: ProcessGroup, report: Report) ->
     """The model, in the main process."""
     config, device = run.config, group.device
     workers = divide_cores(device, run.workers, group.on_machine)
-    task = task_of(run, device)
     state = TrainingState(run, device, group)
+    state.resume(work)  # another run's is refused before what takes long
+    task = task_of(run, device)
     state.initialize(task.initialize)
     state.resume(work)
     end = config.steps if state.progress.end is None else state.progress.end
@@ -197,6 +199,7 @@ def work_folder(folder: Path, writes: bool = True) -> Iterator[Path]:
     if not writes:
         yield work
         return
+    check_trainable(folder)
     with writing(work):
         work.mkdir(parents=True, exist_ok=True)
         lock = (work / _LOCK).open("w")
