@@ -169,9 +169,9 @@ def _folder(path: Path) -> Iterable[str]:
     if bag_files(path):
         return _recording(path)
     if scenes:
-        return [f"{scenes} scenes; `tumortrack evaluate` reads them"]
+        return [f"{scenes} scene{'s' * (scenes != 1)}; `tumortrack evaluate` reads them"]
     if meshes := sum(_is_mesh(path / name) for name in inside):
-        return [f"{meshes} meshes; `tumortrack prepare` makes a case of them"]
+        return [f"a folder of meshes ({meshes}); `tumortrack prepare` makes a case of them"]
     with suppress(InputError):
         frames = len(folder_frames(path, 30.0, "mm"))
         return [f"{frames} frames, a file each; `track` plays them from recording:{path}"]
@@ -217,8 +217,11 @@ def _recording(path: Path) -> Iterable[str]:
     yield f"a recording of {seconds:.1f} s, {size_mb:.1f} MB"
     said = store.read_json(about) if about.is_file() else {}
     yield from _words(said, ["patient {patient[id]}, side {patient[side]}"])
+    if "corrected" in said:
+        yield f"its depths were {'' if said['corrected'] else 'not '}corrected by --intrinsics"
     for topic, count in frames.items():
-        yield f"{topic}: {count} frames, {count / max(seconds, 1e-9):.1f} a second"
+        rate = f", {(count - 1) / seconds:.1f} a second" if seconds else ""
+        yield f"{topic}: {count} frame{'s' * (count != 1)}{rate}"
 
 
 def _volume(path: Path) -> Iterable[str]:

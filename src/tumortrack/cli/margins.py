@@ -65,6 +65,12 @@ class Margins:
         from tumortrack.report import calibration, calibration_table
 
         listed = calibration.list_states(self.scenes, self.seed)  # before PyTorch's seconds
+        highest = max(self.confidence)
+        if len(listed) < (needed := calibration.least_states(highest)):
+            raise InputError(
+                f"{len(listed)} scenes given, a state each; about {needed} are needed for margins "
+                f"that hold in {100 * highest:g} % of cases. Give more, or a lower --confidence."
+            )
         digest = store.sha256_of(self.model / store.MANIFEST)
         table = self.out or self.model / "margins.jsonl"
         head = calibration_table.head_of(digest, self.seed)

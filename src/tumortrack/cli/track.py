@@ -130,6 +130,7 @@ class Track(Following):
         from tumortrack.live.values import SinkContext
         from tumortrack.live.workers import SourceWorker
         from tumortrack.models.folder import patient_of, read_model_manifest
+        from tumortrack.sense.files import DepthCorrection, read_camera
 
         setup = self._cameras() if arms is None else arms.setup  # what executes was checked
         frames, named = setup.published, api.named_sinks(self.sinks)
@@ -138,6 +139,12 @@ class Track(Following):
         patient.check_is(self.stated, str(self.model))
         for text, source_config in setup.sources.items():
             source_config.patient().check_shown(patient, text)
+            corrects = read_camera(self.intrinsics)[1] != DepthCorrection()
+            if corrects and getattr(source_config, "is_corrected", False):
+                raise InputError(
+                    f"the depths of {text} were corrected as they were recorded. Leave --intrinsics "
+                    "out, or give it without depth_scale and depth_offset_mm."
+                )
         report = report_path(self.report, "track")
 
         from tumortrack.live.loop import Loop
@@ -158,6 +165,7 @@ class Track(Following):
             patient=model.patient,
             cameras=setup.still,
             tip_mm=None if arms is None else arms.tip_mm,
+            corrected=config.correction != DepthCorrection(),
         )
         loop = Loop(tracker, context, config, None if arms is None else arms.operation)
 
@@ -218,7 +226,7 @@ class Track(Following):
 
     def _loop_config(self, model: Model) -> LoopConfig:
         from tumortrack.live.loop import LoopConfig
-        from tumortrack.sense.files import read_camera
+        from tumortrack.sense.files import DepthCorrection, read_camera
         from tumortrack.tracking.tracker import FollowerConfig, region_for
 
         box = None if self.box is None else (self.box[:3], self.box[3:])
