@@ -104,12 +104,11 @@ def test_a_case_and_what_lies_in_it(phantom_case):
     said = say(phantom_case)
     assert "a case (tumortrack" in said
     assert "patient P1, side right" in said
-    assert "ml; if closed" not in said
     assert "a label map" in say(phantom_case / "labels.nii.gz")
     assert "voxels of 1.5 x 1.5 x 1.5 mm" in say(phantom_case / "labels.nii.gz")
     organ = say(phantom_case / "kidney.ply")
-    assert "a mesh of " in organ
-    assert " ml if closed" in organ
+    assert "a mesh, " in organ
+    assert " ml if it is closed" in organ
 
 
 def test_a_kind_of_another_distribution_is_told_by_what_it_states(tmp_path):
@@ -128,13 +127,17 @@ def test_a_kind_of_another_distribution_is_told_by_what_it_states(tmp_path):
 def test_clouds_depth_images_meshes_and_frames(tmp_path):
     points_mm = np.array([[0.0, 0, 100], [10, 20, 130]], np.float32)
     write_cloud_ply(tmp_path / "cloud.ply", points_mm)
-    assert "a cloud of 2 points; 10 x 20 x 30 mm large" in say(tmp_path / "cloud.ply")
+    assert "a cloud of 2 points, 10 x 20 x 30 mm large round (5, 10, 115) mm" in say(
+        tmp_path / "cloud.ply"
+    )
     corners = np.array([[0.0, 0, 0], [10, 0, 0], [0, 10, 0], [0, 0, 10]])
     faces = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
     (tmp_path / "meshes").mkdir()
     write_mesh(tmp_path / "meshes" / "kidney.ply", Mesh(corners, faces))
     assert "a folder of meshes (1); `tumortrack prepare`" in say(tmp_path / "meshes")
-    assert "4 triangles, 0.2 ml if closed" in say(tmp_path / "meshes" / "kidney.ply")
+    assert "a mesh, 10 x 10 x 10 mm large round (5, 5, 5) mm; 0.2 ml if it is closed" in say(
+        tmp_path / "meshes" / "kidney.ply"
+    )
     frames, camera = tmp_path / "frames", d405(424, 240)
     frames.mkdir()
     depth_mm = np.full((240, 424), 150.0, np.float32)
@@ -181,7 +184,7 @@ def test_what_is_not_known_is_answered_with_what_is(tmp_path):
     (tmp_path / "other.json").write_text(json.dumps({"a": 1}))
     (tmp_path / "empty").mkdir()
     for path in (tmp_path / "notes.txt", tmp_path / "other.json", tmp_path / "empty"):
-        with pytest.raises(InputError, match="nothing that inspect knows. It knows folders"):
+        with pytest.raises(InputError, match=r"nothing that inspect knows\. It knows folders"):
             describe(path)
     with pytest.raises(InputError, match="does not exist"):
         describe(tmp_path / "nowhere")

@@ -188,11 +188,6 @@ def _file(path: Path) -> Iterable[str]:
         return _volume(path)
     if name.endswith(SUFFIXES):
         return _recording(path)
-    if name == "margins.jsonl":
-        from tumortrack.report.calibration_table import read_table
-
-        doubts = [row.doubt for row in read_table(path)[1]]
-        return [f"a table of `margins`: {len(doubts)} states, {doubts.count('')} answered as good"]
     return _points(path)
 
 
@@ -217,8 +212,8 @@ def _recording(path: Path) -> Iterable[str]:
     yield f"a recording of {seconds:.1f} s, {size_mb:.1f} MB"
     said = store.read_json(about) if about.is_file() else {}
     yield from _words(said, ["patient {patient[id]}, side {patient[side]}"])
-    if "corrected" in said:
-        yield f"its depths were {'' if said['corrected'] else 'not '}corrected by --intrinsics"
+    if said.get("corrected"):
+        yield "its depths were corrected by --intrinsics"
     for topic, count in frames.items():
         rate = f", {(count - 1) / seconds:.1f} a second" if seconds else ""
         yield f"{topic}: {count} frame{'s' * (count != 1)}{rate}"
@@ -257,7 +252,7 @@ def _points(path: Path) -> list[str]:
     from tumortrack.core.mesh_files import read_mesh
     from tumortrack.sense.files import CLOUD_SUFFIXES, read_cloud, read_depth_png
 
-    camera, notes = path.with_name("intrinsics.json"), ()
+    camera = path.with_name("intrinsics.json")
     if path.suffix.lower() == ".png" and camera.is_file():
         depth_mm = read_depth_png(path, camera).depth_mm
         near, far = np.nanpercentile(depth_mm, (1, 99))
@@ -265,13 +260,17 @@ def _points(path: Path) -> list[str]:
         return [f"a depth image of {size} pixels, nearly all at {near:.0f} to {far:.0f} mm"]
     if _is_mesh(path):
         mesh = read_mesh(path)
-        points_mm = mesh.vertices_mm
-        what = f"a mesh of {len(mesh.faces)} triangles, {mesh.volume_mm3 / 1000:.1f} ml if closed"
-    elif path.suffix.lower() in CLOUD_SUFFIXES:
-        cloud, notes = read_cloud(path)
-        points_mm, what = cloud.points_mm, f"a cloud of {len(cloud.points_mm)} points"
-    else:
+        return [f"a mesh, {_size(mesh.box_mm)}; {mesh.volume_mm3 / 1000:.1f} ml if it is closed"]
+    if path.suffix.lower() not in CLOUD_SUFFIXES:
         return []
-    size_mm = " x ".join(f"{mm:.0f}" for mm in np.ptp(points_mm, axis=0))
-    middle = ", ".join(f"{mm:.1f}" for mm in (points_mm.min(0) + points_mm.max(0)) / 2)
-    return [f"{what}; {size_mm} mm large, its middle at ({middle}) mm", *notes]
+    cloud, notes = read_cloud(path)
+    points_mm = cloud.points_mm
+    box_mm = np.array([points_mm.min(0), points_mm.max(0)])
+    return [f"a cloud of {len(points_mm)} points, {_size(box_mm)}", *notes]
+
+
+def _size(box_mm: Any) -> str:
+    size, middle = (
+        [f"{mm:.0f}" for mm in each] for each in (box_mm[1] - box_mm[0], box_mm.mean(0))
+    )
+    return f"{' x '.join(size)} mm large round ({', '.join(middle)}) mm"

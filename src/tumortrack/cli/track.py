@@ -142,8 +142,8 @@ class Track(Following):
             corrects = read_camera(self.intrinsics)[1] != DepthCorrection()
             if corrects and getattr(source_config, "is_corrected", False):
                 raise InputError(
-                    f"the depths of {text} were corrected as they were recorded. Leave --intrinsics "
-                    "out, or give it without depth_scale and depth_offset_mm."
+                    f"the depths of {text} were corrected as they were recorded. Leave "
+                    "--intrinsics out, or give it without depth_scale and depth_offset_mm."
                 )
         report = report_path(self.report, "track")
 
@@ -226,7 +226,7 @@ class Track(Following):
 
     def _loop_config(self, model: Model) -> LoopConfig:
         from tumortrack.live.loop import LoopConfig
-        from tumortrack.sense.files import DepthCorrection, read_camera
+        from tumortrack.sense.files import read_camera
         from tumortrack.tracking.tracker import FollowerConfig, region_for
 
         box = None if self.box is None else (self.box[:3], self.box[3:])

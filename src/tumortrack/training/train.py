@@ -107,9 +107,9 @@ def _train(run: TrainingRun, work: Path, group: ProcessGroup, report: Report) ->
     """The model, in the main process."""
     config, device = run.config, group.device
     workers = divide_cores(device, run.workers, group.on_machine)
-    state = TrainingState(run, device, group)
-    state.resume(work)  # another run's is refused before what takes long
+    TrainingState(run, device, group).resume(work)  # another run's: refused before the long part
     task = task_of(run, device)
+    state = TrainingState(run, device, group)
     state.initialize(task.initialize)
     state.resume(work)
     end = config.steps if state.progress.end is None else state.progress.end
