@@ -125,11 +125,13 @@ def described(margins: ModelMargins) -> list[str]:
                     size += f" + {radius.bend_mm:g} mm x root of rarity"
                 size = f"{radius.scaled:.2f} x ({size})"
             lines.append(f"{100 * shells.confidence:g} % margin of {_WHAT[kind]}: {size}")
-    lines += ["family, visible share, organ: states, good, accepted, tested, calibrated"]
-    for group in margins.groups:
-        counts = group.states, group.good, group.accepted, group.tested, group.calibrated
-        lines.append(f"  {', '.join(group.label)}: {', '.join(map(str, counts))}")
-    lines += [f"  {small} is too small: {large} speaks for it" for small, large in
+    lines += [
+        f"{', '.join(group.label)} (family, visible share, organ): {group.states} states, "
+        f"{group.good} good, {group.accepted} with an answer: {group.tested} to test limits, "
+        f"{group.calibrated} to find margins"
+        for group in margins.groups
+    ]
+    lines += [f"{small} has too few of them: {large} counts instead" for small, large in
               margins.joined.items()]  # fmt: skip
     limits = ", ".join(f"{name} {limit:.3g}" for name, limit in margins.limits.items())
     return [

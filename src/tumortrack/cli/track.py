@@ -233,6 +233,7 @@ class Track(Following):
         region = region_for(model, range_mm=self.range, box_mm=box, whole=self.whole)
         follower = FollowerConfig(rescan_s=self.rescan, smoothing_s=self.smoothing, seed=self.seed)
         intrinsics, correction = read_camera(self.intrinsics)
+        first_s = max(self.seconds, _OPENING_S, 2 * self.stale)
         return LoopConfig(
             region=region,
             follower=follower,
@@ -241,9 +242,7 @@ class Track(Following):
             stale_s=self.stale,
             frozen_s=self.frozen,
             scan=self.scan,
-            give_up_s=min(self.give_up, max(self.seconds, _OPENING_S))
-            if self.seconds
-            else self.give_up,
+            give_up_s=min(self.give_up, first_s) if self.seconds else self.give_up,
             seconds=self.seconds,
         )
 

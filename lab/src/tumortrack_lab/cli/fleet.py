@@ -142,13 +142,13 @@ def _screen() -> Iterator[Callable[[Status], None]]:
         if status.note != noted:
             say(status.note)
             noted = status.note
-        line(_line(status))
+        line(progress_words(status))
 
     with live_line("starting ...") as line:
         yield show
 
 
-def _line(status: Status) -> str:
+def progress_words(status: Status) -> str:
     rate = "time left unknown until the first patient is through"
     if (seconds := status.seconds_left) is not None:
         minutes, rest = divmod(int(seconds), 60)
