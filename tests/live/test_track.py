@@ -114,7 +114,7 @@ def test_a_recording_is_played_back_to_the_same_estimates(world, tmp_path):
 def test_depths_that_were_corrected_are_not_corrected_again(world, tmp_path):
     camera = tmp_path / "camera.json"
     fields = ("width", "height", "fx", "fy", "cx", "cy")
-    values = {name: getattr(d405(), name) for name in fields}
+    values = {name: getattr(d405(424, 240), name) for name in fields}
     camera.write_text(json.dumps({**values, "depth_scale": 1.002, "depth_offset_mm": -0.3}))
     given = ("--intrinsics", camera, "--report")
     first = ("track", world.model, virtual(world, fps=10), f"recording:{tmp_path / 'live'}")

@@ -17,6 +17,13 @@ from tumortrack.core import store
 from tumortrack.core.errors import InputError
 
 Content = Mapping[str, Any]  # of a JSON file
+_TOLD_BY = {  # of a kind of folder, by another file than its manifest
+    "run": "report.json",
+    "plan": "plan.json",
+    "kit": "kit.json",
+    "camera": "intrinsics.json",
+    "hand-eye calibration": "calibration.json",
+}
 
 _KNOWN = (
     "folders that commands write (cases, models, runs, plans, scenes, recordings, evaluations, "
@@ -133,8 +140,7 @@ def _artifact(folder: Path) -> Iterable[str]:
     )
     if isinstance(manifest.get("scenes"), dict):
         yield from _sealed_scenes(folder, manifest["scenes"])
-    told = {"run": "report.json", "plan": "plan.json", "kit": "kit.json"}.get(kind, store.MANIFEST)
-    lines = _json(folder / told)[1:]
+    lines = _json(folder / _TOLD_BY.get(kind, store.MANIFEST))[1:]
     plain = ((k, v) for k, v in [*manifest.items()][5:] if isinstance(v, str | int | float))
     yield from lines or (f"{key.replace('_', ' ')}: {value}" for key, value in plain)
     yield f"files: {', '.join(manifest['files'])}"
