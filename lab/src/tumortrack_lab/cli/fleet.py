@@ -61,8 +61,8 @@ class Fleet:
         from tumortrack_lab.fleet.store import Store
 
         patients = read_list(self.list)
-        begun = any((self.out / name).exists() for name in ("store", PATIENTS))
-        if not begun and not (self.out.is_dir() and not any(self.out.iterdir())):
+        inside = {p.name for p in self.out.iterdir()} if self.out.is_dir() else {""}
+        if inside - {self.list.name} and not inside & {"store", PATIENTS}:
             check_place(self.out, "", None)  # what lies there is no fleet's
         self.out.mkdir(parents=True, exist_ok=True)
         store = Store(self.store or str(self.out / "store"))
