@@ -194,8 +194,8 @@ def train(
         folder: the model's, to write.
         preset: ``clinic`` registers the organ of the CT, ``quick`` and ``paper`` label points.
         config: a changed preset instead: ``msgspec.structs.replace(presets.clinic(anatomy), ...)``.
-        minutes: when to stop (default: the preset's end); 0: learn nothing, take what training
-            starts from.
+        minutes: of training, from the end of its first step (default: to the preset's end); 0:
+            learn nothing, take what training starts from.
         steps: likewise; give at most one of the two.
         workers: processes that make scenes (default: as the machine allows).
         start: folder that `pretrain` wrote, or ``none`` (default: the package's, for ``clinic``).

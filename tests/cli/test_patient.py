@@ -40,7 +40,7 @@ def test_they_travel_from_the_case_to_model_run_and_plan(phantom_case, clinic_mo
     assert "patient P1, right side" in succeeded(tumortrack(*plan, "--patient", "P1"))
     assert read_plan(tmp_path / "plan").patient == Patient("P1", "right")
     said = succeeded(tumortrack("inspect", phantom_case))
-    assert "patient: {'id': 'P1', 'side': 'right'}" in said
+    assert "patient P1, side right" in said
 
 
 @pytest.mark.parametrize("stated", OTHERS)

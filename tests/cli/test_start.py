@@ -99,6 +99,6 @@ def test_a_broken_command_of_another_package_stops_no_other(monkeypatch, tmp_pat
     broken = EntryPoint("broken", "nowhere.at_all:Command", "tumortrack.commands")
     monkeypatch.setattr(main, "entry_points", lambda group: (broken,))
     assert main.run(["inspect", str(tmp_path)]) == 2
-    assert "is no case" in capsys.readouterr().err
+    assert "nothing that inspect knows" in capsys.readouterr().err
     with pytest.raises(ModuleNotFoundError):
         main.run(["broken"])

@@ -11,9 +11,11 @@ from pathlib import Path
 
 import pytest
 
+from clock import Clock
 from fleet_objects import chain, executions, patients, results, user_file
+from tumortrack_lab.cli.fleet import progress_words
 from tumortrack_lab.fleet import engine
-from tumortrack_lab.fleet.engine import Outcome, run
+from tumortrack_lab.fleet.engine import Outcome, Status, run
 from tumortrack_lab.fleet.executors import Serial
 from tumortrack_lab.fleet.store import DamagedError, Store
 from tumortrack_lab.fleet.task import Task
@@ -229,3 +231,15 @@ def test_what_another_run_is_doing_is_left_to_it(store, folder, monkeypatch):
         text = json.dumps({**claim, "run": "other", **void}).encode()
         store._files.pipe_file(f"{store.root}/claims/{key}.json", text)
         assert store.claim(key, "mine")
+
+
+def test_no_rate_is_told_before_a_patient_is_through(monkeypatch):
+    clock = Clock()
+    monkeypatch.setattr(engine, "time", clock)
+    status = Status(total=3, wanted=1, there=1, started_s=clock.monotonic())
+    clock.sleep(3600.0)
+    words = progress_words(status)
+    assert "time left unknown until the first patient is through" in words
+    assert "an hour" not in words
+    status.wanted = 2
+    assert "1.0 an hour | 1:00:00 left" in progress_words(status)

@@ -16,6 +16,7 @@ import pytest
 from rosbags.highlevel import AnyReader
 
 from stories import COMMAND, environment, refusal, succeeded, tumortrack
+from tumortrack.sense.camera import d405
 
 pytestmark = pytest.mark.slow
 
@@ -108,6 +109,22 @@ def test_a_recording_is_played_back_to_the_same_estimates(world, tmp_path):
     assert {one["stamp_ns"] for one in reports(replay) if one["seen"]} == {
         one["stamp_ns"] for one in frames
     }
+
+
+def test_depths_that_were_corrected_are_not_corrected_again(world, tmp_path):
+    camera = tmp_path / "camera.json"
+    fields = ("width", "height", "fx", "fy", "cx", "cy")
+    values = {name: getattr(d405(424, 240), name) for name in fields}
+    camera.write_text(json.dumps({**values, "depth_scale": 1.002, "depth_offset_mm": -0.3}))
+    given = ("--intrinsics", camera, "--report")
+    first = ("track", world.model, virtual(world, fps=10), f"recording:{tmp_path / 'live'}")
+    succeeded(tumortrack(*first, "--seconds", 1, *PATIENT, *given, tmp_path / "live.json"))
+    assert told(tmp_path / "live" / "recording.json")["corrected"] is True
+    again = ("track", world.model, f"recording:{tmp_path / 'live'}?rate=0", *given)
+    line = refusal(tumortrack(*again, tmp_path / "again.json"))
+    assert "were corrected as they were recorded. Leave --intrinsics out" in line
+    camera.write_text(json.dumps(values))
+    succeeded(tumortrack(*again, tmp_path / "again.json"))
 
 
 def test_ctrl_c_ends_cleanly_and_flushes(world, tmp_path):

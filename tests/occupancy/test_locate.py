@@ -368,7 +368,7 @@ def test_inspect_says_what_things_are(work, out, scenes, evaluated):
         (scenes, "3 scenes"),
         (scenes / "0000", "a scene"),
         (evaluated, "an evaluation report"),
-        (work / "cloud.ply", "points from"),
+        (work / "cloud.ply", "a cloud of"),
     ):
         assert words in "\n".join(describe(path))
     assert "a case" in succeeded(tumortrack("inspect", work / "case"))

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 import torch
 
-from clock import until
+from clock import Clock, until
 from stories import COMMAND, STEPS, environment, refusal, succeeded, train_command, tumortrack
 from tumortrack.core.config import from_builtins, to_builtins
 from tumortrack.core.errors import ArtifactError, InputError
@@ -26,8 +26,10 @@ from tumortrack.core.types import Anatomy
 from tumortrack.imaging.case import load_case
 from tumortrack.models.config import RegistrationHeadConfig, TrainConfig
 from tumortrack.models.normalisation import CloudBox
+from tumortrack.training import train as training_loop
 from tumortrack.training.model import load_model
 from tumortrack.training.presets import clinic, paper, quick
+from tumortrack.training.scenes import Scenes
 from tumortrack.training.state import (
     Diverged,
     TrainingProgress,
@@ -35,7 +37,14 @@ from tumortrack.training.state import (
     learning_rate,
     settle_end,
 )
-from tumortrack.training.train import TrainingRun, divide_cores, train, work_folder
+from tumortrack.training.train import (
+    TrainingClock,
+    TrainingRun,
+    divide_cores,
+    run_steps,
+    train,
+    work_folder,
+)
 from warp_objects import train_slim
 
 
@@ -94,7 +103,7 @@ def test_ctrl_c_keeps_the_state_and_says_how_to_go_on(case, tmp_path):
         command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment()
     ) as process:
         assert process.stdout is not None
-        assert "samples/s" in process.stdout.readline()
+        assert any("samples/s" in line for line in process.stdout)
         process.send_signal(signal.SIGINT)
         _, errors = process.communicate(timeout=300)
     assert process.returncode == 130
@@ -411,3 +420,35 @@ def test_minutes_fix_the_last_step_once(case):
     assert progress.end == round(300 / head)
     progress.elapsed_s = 1e6
     assert not settle_end(config, progress, 1.0)
+
+
+@pytest.mark.parametrize("compiling_s", [1.0, 300.0])
+def test_minutes_are_of_training_whatever_its_start_takes(case, tmp_path, monkeypatch, compiling_s):
+    clock = Clock()
+    monkeypatch.setattr(training_loop, "time", clock)
+    anatomy, config = load_case(case).anatomy, quick(load_case(case).anatomy)
+    run = TrainingRun(anatomy, (0.0, -1.0, 0.0), "none", config, minutes=0.5)
+    state, statuses = TrainingState(run, torch.device("cpu")), []
+
+    def step(_):
+        clock.sleep(0.1 if state.progress.step else compiling_s)
+        state.progress.step += 1
+        return 1.0
+
+    monkeypatch.setattr(state, "step", step)
+    scenes = Scenes((() for _ in range(10_000)), "nobody")
+    run_steps(state, scenes, tmp_path, statuses.append)
+    assert state.progress.step == pytest.approx(300, abs=3)
+    assert state.progress.elapsed_s == pytest.approx(30, abs=0.3)
+    assert statuses[0].samples_per_s == pytest.approx(10 * config.batch_size, rel=0.1)
+    assert statuses[0].seconds_left == pytest.approx(25, abs=0.5)
+
+
+def test_one_step_has_a_pace_and_takes_no_time_of_its_own(monkeypatch):
+    clock, progress = Clock(), TrainingProgress(elapsed_s=7.0)
+    monkeypatch.setattr(training_loop, "time", clock)
+    own = TrainingClock(progress)
+    clock.sleep(4.0)
+    progress.step = 1
+    own.count_step()
+    assert (own.elapsed(), own.rate()) == pytest.approx((7.0, 0.25))

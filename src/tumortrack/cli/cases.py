@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tyro.conf import Positional, UseAppendAction, arg
 
-from tumortrack.cli.console import progress_bar, say, say_notes
+from tumortrack.cli.console import live_line, progress_bar, say, say_notes
 from tumortrack.core import store
 from tumortrack.core.errors import InputError
 
@@ -67,13 +67,14 @@ class Prepare:
     overwrite: bool = False
 
     def run(self) -> None:
-        from tumortrack import api
-        from tumortrack.imaging.prepare import PrepareOptions
+        with live_line(f"reading {self.input}, making surfaces ..."):
+            from tumortrack import api
+            from tumortrack.imaging.prepare import PrepareOptions
 
-        options = {field.name: getattr(self, field.name) for field in fields(PrepareOptions)}
-        case = api.prepare(
-            self.input, self.case, overwrite=self.overwrite, segment=self.segment, **options
-        )
+            options = {field.name: getattr(self, field.name) for field in fields(PrepareOptions)}
+            case = api.prepare(
+                self.input, self.case, overwrite=self.overwrite, segment=self.segment, **options
+            )
         say_notes(case.report.get("notes", []))
         say(str(case.patient))
         kind = case.anatomy.kind
@@ -249,13 +250,13 @@ class Simulate:
             raise InputError(f"--scenes {self.scenes} must be at least 1.")
         case = api.load_case(self.case)
         config = self.scene_config().seen_whole(case.anatomy)
-        make = api.scene_maker(case, config, self.seed)
         about = {
             "case_sha256": store.sha256_of(self.case / store.MANIFEST),
             "case_volumes_mm3": [part.volume_mm3 for part in case.anatomy.parts],
             "config": to_builtins(config),
         }
         with progress_bar("simulate", self.scenes) as advance:
+            make = api.scene_maker(case, config, self.seed)
             for index in range(self.scenes):
                 folder = self.dataset / f"{prefix}{index:04d}"
                 if folder.exists():

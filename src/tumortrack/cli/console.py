@@ -38,26 +38,30 @@ def say_notes(notes: Iterable[str]) -> None:
 
 @contextmanager
 def progress_bar(what: str, total: int) -> Iterator[Callable[[], None]]:
-    """A bar with rate and time left; yields a function that advances it by one."""
-    from rich import progress
+    """A line of what is done, how fast, and of the time left; yields a function to call as each of
+    ``total`` is done. Begin it before what takes seconds to load."""
+    done, began_s = 0, time.monotonic()
 
-    columns = (
-        progress.TextColumn("{task.description}"),
-        *(progress.BarColumn(), progress.MofNCompleteColumn()),
-        *(progress.TimeElapsedColumn(), progress.TimeRemainingColumn()),
-    )
-    with progress.Progress(*columns, console=console, transient=True) as bar:
-        task = bar.add_task(what, total=total)
-        yield lambda: bar.advance(task)
+    with live_line(f"{what}: 0 of {total} ...") as show:
+
+        def advance() -> None:
+            nonlocal done
+            done += 1
+            each_s = (time.monotonic() - began_s) / done
+            minutes, seconds = divmod(round(each_s * (total - done)), 60)
+            rate = f"{1 / each_s:.1f} a second" if each_s < 1 else f"{each_s:.1f} s each"
+            show(f"{what}: {done} of {total} | {rate} | {minutes}:{seconds:02d} left")
+
+        yield advance
 
 
 @contextmanager
 def live_line(first: str) -> Iterator[Callable[..., None]]:
-    """Yields a function of a text, and of whether it is the last: on a terminal it changes one live
-    line, elsewhere it prints a line now and then."""
+    """Says ``first`` at once. Yields a function of a text, and of whether it is the last: on a
+    terminal it changes one live line, elsewhere it prints a line now and then."""
     from rich.status import Status
 
-    spinner, shown_s = Status(first, console=console), -_EVERY_S
+    spinner, shown_s = Status(first, console=console), time.monotonic()
 
     def show(text: str, last: bool = False) -> None:
         nonlocal shown_s
@@ -69,6 +73,8 @@ def live_line(first: str) -> Iterator[Callable[..., None]]:
 
     if console.is_terminal:
         spinner.start()
+    else:
+        say(first)
     try:
         yield show
     finally:

@@ -27,7 +27,7 @@ class Demo:
 
     Attributes:
         out: folder for everything the demo makes; what an earlier demo left there is replaced.
-        minutes: of training.
+        minutes: of training, once kernels are compiled (half a minute, once on a machine).
         scenes: unseen deformed scenes to locate tumors in.
     """
 
@@ -52,7 +52,7 @@ class Demo:
         say("2/5 segmenting the CT, making surfaces")
         began = time.perf_counter()
         Prepare(input=out / "ct_dicom", case=out / "case").run()
-        say(f"3/5 training for {self.minutes:g} minutes")
+        say(f"3/5 training for {self.minutes:g} minutes, once its kernels are compiled")
         Train(case=out / "case", model=out / "model", minutes=self.minutes).run()
         made_s = time.perf_counter() - began
         dragged, elastic = self.scenes // 2, self.scenes - self.scenes // 2

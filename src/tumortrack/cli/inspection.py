@@ -1,9 +1,14 @@
-"""What lies in a folder: `inspect`."""
+"""What lies in a folder or file, in sentences: `inspect`."""
 
 from __future__ import annotations
 
+import string
+import tomllib
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from tyro.conf import Positional
 
@@ -11,15 +16,28 @@ from tumortrack.cli.console import say
 from tumortrack.core import store
 from tumortrack.core.errors import InputError
 
-_NAMES = {"pretrained": "pretrained weights"}  # where the kind is no noun
+Content = Mapping[str, Any]  # of a JSON file
+_TOLD_BY = {  # of a kind of folder, by another file than its manifest
+    "run": "report.json",
+    "plan": "plan.json",
+    "kit": "kit.json",
+    "camera": "intrinsics.json",
+    "hand-eye calibration": "calibration.json",
+}
+
+_KNOWN = (
+    "folders that commands write (cases, models, runs, plans, scenes, recordings, evaluations, "
+    "fleets, kits, calibrations), their reports, calibration and intrinsics files, clouds, depth "
+    "images beside intrinsics.json, meshes, CTs and label maps"
+)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Inspect:
-    """Say what a case, model, run, scene or report is.
+    """Say what a folder or file is, and what is in it.
 
     Attributes:
-        path: folder or file.
+        path: what a command wrote or reads.
     """
 
     path: Positional[Path]
@@ -30,92 +48,235 @@ class Inspect:
 
 
 def describe(path: Path) -> list[str]:
-    """Lines about a case, model, run, scene, report or cloud. Raises InputError: nothing that
-    tumortrack knows."""
+    """Lines about a folder or file. Raises InputError: nothing that is known here; ArtifactError:
+    it is damaged."""
     if not path.exists():
         raise InputError(f"{path} does not exist.")
-    if (path / store.MANIFEST).is_file():
-        return _artifact(path)
-    if (path / "twin.json").is_file():
-        made = sum((p / "cloud.ply").is_file() for p in path.iterdir())
-        return [
-            f"{path}: twin scenes that are not finished ({made} so far); the same `twin` command "
-            "resumes them."
-        ]
-    if (path / "training").is_dir():
-        return [f"{path}: a training that has not ended; the same command resumes it."]
-    if (path / "cloud.ply").is_file():
-        return _scene(path)
-    if path.is_dir() and any((p / "cloud.ply").is_file() for p in path.iterdir()):
-        from tumortrack.simulate.scene_folder import list_scenes
-
-        return [f"{path}: {len(list_scenes(path))} scenes; `tumortrack evaluate` reads them."]
-    report = path / "report.json" if path.is_dir() else path
-    if report.name == "report.json" and report.is_file():
-        summary = store.read_json(report).get("summary", {})
-        return [f"{path}: an evaluation report.", *(f"  {k}: {v}" for k, v in summary.items())]
-    from tumortrack.sense.files import CLOUD_SUFFIXES, read_cloud
-
-    if path.suffix.lower() in CLOUD_SUFFIXES:
-        cloud, notes = read_cloud(path)
-        lower, upper = cloud.points_mm.min(0), cloud.points_mm.max(0)
-        box = f"{lower.round(1).tolist()} to {upper.round(1).tolist()}"
-        return [f"{path}: {len(cloud.points_mm)} points from {box}", *notes]
-    raise InputError(
-        f"{path} is no case, model, run, scene, report or cloud of tumortrack's. "
-        "Volumes and label maps go to `tumortrack prepare`."
-    )
+    lines = [line.removesuffix(".") for line in (_folder if path.is_dir() else _file)(path)]
+    if not lines:
+        raise InputError(f"{path} is nothing that inspect knows. It knows {_KNOWN}.")
+    return [f"{path}: {lines[0]}.", *(f"  {line}." for line in lines[1:])]
 
 
-def _artifact(folder: Path) -> list[str]:
+class _Words(string.Formatter):
+    """Raises KeyError for an entry that is missing or empty."""
+
+    def get_field(self, field_name: str, args: Sequence[Any], kwargs: Content) -> Any:
+        found, first = super().get_field(field_name, args, kwargs)
+        if found is None or (isinstance(found, str | list | dict) and not found):
+            raise KeyError(field_name)
+        return found, first
+
+
+def _words(content: Content, sentences: Iterable[str | list[str]]) -> Iterator[str]:
+    """Sentences as inspect.toml has them, filled from JSON."""
+    for sentence in sentences:
+        entry, template = ("", sentence) if isinstance(sentence, str) else sentence
+        members: Any = content if entry else [{}]
+        with suppress(KeyError, TypeError, IndexError, ValueError):
+            for key in filter(None, entry.split(".")):
+                members = members[key]
+            pairs = members.items() if isinstance(members, dict) else enumerate(members)
+            for name, value in pairs:
+                own = value if isinstance(value, dict) else {}
+                inner = {**content, **own, "name": name, "value": value}
+                with suppress(KeyError, TypeError, IndexError, ValueError):
+                    yield _Words().vformat(template, (), inner)
+
+
+def _evaluation(report: Content) -> list[str]:
+    return ["an evaluation report", *(f"{k}: {v}" for k, v in report["summary"].items())]
+
+
+def _json(path: Path) -> list[str]:
+    """Of a JSON file; nothing where it is not known."""
+    content = store.read_json(path)
+    if content.keys() >= {"rule", "summary", "scenes"}:
+        return _evaluation(content)
+    for kind in _kinds():
+        if "keys" in kind and content.keys() >= {*kind["keys"]}:
+            filled = _words(_with_figures(content, path.parent), kind.get("sentences", ()))
+            return [kind["name"], *filled]
+    return []
+
+
+def _kinds() -> Iterable[dict[str, Any]]:
+    return tomllib.loads(Path(__file__).with_name("inspect.toml").read_text("utf-8")).values()
+
+
+def _with_figures(content: Content, folder: Path) -> Content:
+    """With what follows from a file's entries."""
+    from tumortrack.cli.margins import described
+    from tumortrack.models.folder import training_words, weakness_of
+    from tumortrack.models.margins import UNKNOWN, margin_words, read_margins
+
+    figures: dict[str, Any] = {}
+    if "query_box_mm" in content:
+        about, margins = content["provenance"], read_margins(folder)
+        does = "labels points; it does not know which point of the CT lies where (no `--map`)"
+        if content["config"]["network"]["decoder"]["type"] == "warp":
+            does = "places the organ of the CT; `locate --map` says where points of the CT are"
+        figures = {"does": does, "trained": training_words(about), "weakness": weakness_of(about)}
+        figures["part_names"] = ", ".join(content["parts"])
+        figures["margins"] = described(margins) if margins else [UNKNOWN]
+    elif "quality" in content:
+        figures["margin_words"] = margin_words(content.get("margin"))
+        figures["missing"] = [name for name, p in content["parts"].items() if not p["found"]]
+    elif "updates" in content:
+        counts = *content["estimates"].values(), content["no_estimate"]
+        figures["share"] = [count / max(sum(counts), 1) for count in counts]
+        figures["rate"] = sum(counts) / max(content["seconds"], 1e-9)
+    return {**content, **figures}
+
+
+def _artifact(folder: Path) -> Iterable[str]:
+    """Of a folder with a manifest; of other distributions' kinds, what is a word or a number."""
     kind = str(store.read_json(folder / store.MANIFEST).get("kind"))
     manifest = store.read_manifest(folder, kind)
-    lines = [
-        f"{folder}: {_NAMES.get(kind, f'a {kind}')} (schema {manifest['schema']}, tumortrack "
-        f"{manifest['tumortrack']}); {manifest['units']}, {manifest['frame']} frame; all files as "
-        "they were written."
-    ]
-    if isinstance(scenes := manifest.get("scenes"), dict):  # with the digests they were sealed by
-        as_sealed = {
-            name: (folder / name).is_dir() and store.sha256_of(folder / name) == digest
-            for name, digest in scenes.items()
-        }
-        changed = ", ".join(name for name, same in as_sealed.items() if not same)
-        verdict = "all as they were sealed; `tumortrack evaluate` reads them."
-        if changed:
-            verdict = f"CHANGED or missing since they were sealed: {changed}"
-        return [*lines, f"  {len(scenes)} scenes: {', '.join(scenes)}", f"  {verdict}"]
-    if kind == "model":
-        from tumortrack.cli.margins import described
-        from tumortrack.models.folder import weakness_of
-        from tumortrack.models.margins import UNKNOWN, read_margins
+    name = {"pretrained": "pretrained weights"}.get(kind, f"a {kind}")  # where it is no noun
+    yield (
+        f"{name} (tumortrack {manifest['tumortrack']}; {manifest['units']}, {manifest['frame']} "
+        "frame); all files are as they were written"
+    )
+    if isinstance(manifest.get("scenes"), dict):
+        yield from _sealed_scenes(folder, manifest["scenes"])
+    lines = _json(folder / _TOLD_BY.get(kind, store.MANIFEST))[1:]
+    plain = ((k, v) for k, v in [*manifest.items()][5:] if isinstance(v, str | int | float))
+    yield from lines or (f"{key.replace('_', ' ')}: {value}" for key, value in plain)
+    yield f"files: {', '.join(manifest['files'])}"
 
-        network = manifest.get("config", {}).get("network", {})
-        encoder, decoder = (network.get(n, {}).get("type", "?") for n in ("encoder", "decoder"))
-        does = "labels points; it does not know which point of the CT lies where (no `--map`)"
-        if decoder == "warp":
-            does = "places the organ of the CT; `locate --map` says where points of the CT are"
-        lines.append(f"  {encoder} + {decoder}: {does}")
-        weakness = weakness_of(manifest.get("provenance", {}))
-        lines += [f"  WARNING: {weakness}"] if weakness else []
-        margins = read_margins(folder)
-        lines += [f"  {line}" for line in (described(margins) if margins else [UNKNOWN])]
-    if kind == "case":
-        said = manifest.get("report", {}).get("half_turn", {}).get("warning")
-        lines += [f"  WARNING: {said}"] if said else []
-    skip = {"kind", "schema", "tumortrack", "units", "frame", "files", "config"}
-    lines += [f"  {key}: {value}" for key, value in manifest.items() if key not in skip]
-    return [*lines, f"  files: {', '.join(manifest['files'])}"]
+
+def _sealed_scenes(folder: Path, scenes: Mapping[str, str]) -> Iterable[str]:
+    """With the digests that they were sealed by."""
+    yield f"{len(scenes)} scenes: {', '.join(scenes)}"
+    digests = {n: store.sha256_of(folder / n) for n in scenes if (folder / n).is_dir()}
+    if changed := [name for name, digest in scenes.items() if digests.get(name) != digest]:
+        yield f"CHANGED or missing since they were sealed: {', '.join(changed)}"
+    else:
+        yield "all as they were sealed; `tumortrack evaluate` reads them"
+
+
+def _folder(path: Path) -> Iterable[str]:
+    from tumortrack.live.recording.bags import bag_files
+    from tumortrack.live.recording.folders import folder_frames
+
+    inside = {p.name for p in path.iterdir()}
+    if store.MANIFEST in inside:
+        return _artifact(path)
+    scenes = sum((path / name / "cloud.ply").is_file() for name in inside)
+    if "twin.json" in inside:
+        return [f"twin scenes, not finished ({scenes} so far); the same `twin` command goes on"]
+    if named := [kind["name"] for kind in _kinds() if kind.get("file") in inside]:
+        return named
+    if "cloud.ply" in inside:
+        return _scene(path)
+    if "report.json" in inside:
+        return _json(path / "report.json")
+    if bag_files(path):
+        return _recording(path)
+    if scenes:
+        return [f"{scenes} scene{'s' * (scenes != 1)}; `tumortrack evaluate` reads them"]
+    if meshes := sum(_is_mesh(path / name) for name in inside):
+        return [f"a folder of meshes ({meshes}); `tumortrack prepare` makes a case of them"]
+    with suppress(InputError):
+        frames = len(folder_frames(path, 30.0, "mm"))
+        return [f"{frames} frames, a file each; `track` plays them from recording:{path}"]
+    return _volume(path) if inside else []
+
+
+def _file(path: Path) -> Iterable[str]:
+    from tumortrack.live.recording.bags import SUFFIXES
+
+    name = path.name.lower()
+    if name.endswith(".json"):
+        return _json(path)
+    if name.endswith((".nii", ".nii.gz", ".nrrd")):
+        return _volume(path)
+    if name.endswith(SUFFIXES):
+        return _recording(path)
+    return _points(path)
 
 
 def _scene(folder: Path) -> list[str]:
     from tumortrack.simulate.scene_folder import read_scene
 
     scene = read_scene(folder)
-    volumes = ", ".join(
-        f"{name} {part.volume_mm3 / 1000:.1f} ml"
-        for name, part in zip(scene.reference.names, scene.reference.parts, strict=True)
-    )
+    parts = zip(scene.reference.names, scene.reference.parts, strict=True)
+    volumes = ", ".join(f"{name} {part.volume_mm3 / 1000:.1f} ml" for name, part in parts)
     targets = f", {len(scene.targets.labels)} targets" if scene.targets else ""
-    points = f"{len(scene.cloud.points_mm)} points"
-    return [f"{folder}: a scene with {points}; truth: {volumes}{targets}."]
+    return [f"a scene with {len(scene.cloud.points_mm)} points; truth: {volumes}{targets}"]
+
+
+def _recording(path: Path) -> Iterable[str]:
+    from tumortrack.live.recording.bags import bag_contents
+    from tumortrack.live.recording.folders import ABOUT
+
+    about = (path if path.is_dir() else path.parent) / ABOUT
+    frames, seconds = bag_contents(path)
+    files = [path] if path.is_file() else path.rglob("*")
+    size_mb = sum(file.stat().st_size for file in files) / 2**20
+    yield f"a recording of {seconds:.1f} s, {size_mb:.1f} MB"
+    said = store.read_json(about) if about.is_file() else {}
+    yield from _words(said, ["patient {patient[id]}, side {patient[side]}"])
+    if said.get("corrected"):
+        yield "its depths were corrected by --intrinsics"
+    for topic, count in frames.items():
+        rate = f", {(count - 1) / seconds:.1f} a second" if seconds else ""
+        yield f"{topic}: {count} frame{'s' * (count != 1)}{rate}"
+
+
+def _volume(path: Path) -> Iterable[str]:
+    import numpy as np
+
+    from tumortrack.imaging.volume import is_label_map, read_raw
+
+    raw = read_raw(path)
+    spacing_mm = np.linalg.norm(raw.lps_from_index[:3, :3], axis=0)
+    size, spacing = " x ".join(map(str, raw.array.shape)), [f"{mm:.3g}" for mm in spacing_mm]
+    yield f"a {'label map' if is_label_map(raw) else 'CT'}; `tumortrack prepare` reads it"
+    yield f"{size} voxels of {' x '.join(spacing)} mm"
+    if is_label_map(raw):
+        labels, counts = np.unique(raw.array[raw.array > 0], return_counts=True)
+        for label, ml in zip(labels, counts * spacing_mm.prod() / 1000, strict=True):
+            yield f"label {label:g}: {ml:.1f} ml"
+    else:
+        yield f"{raw.array.min():g} to {raw.array.max():g} HU"
+
+
+def _is_mesh(path: Path) -> bool:
+    """A PLY without faces is a cloud."""
+    suffix = path.suffix.lower()
+    if suffix != ".ply" or not path.is_file():
+        return suffix in (".stl", ".obj")
+    with path.open("rb") as stream:
+        return b"element face" in stream.read(4096)
+
+
+def _points(path: Path) -> list[str]:
+    import numpy as np
+
+    from tumortrack.core.mesh_files import read_mesh
+    from tumortrack.sense.files import CLOUD_SUFFIXES, read_cloud, read_depth_png
+
+    camera = path.with_name("intrinsics.json")
+    if path.suffix.lower() == ".png" and camera.is_file():
+        depth_mm = read_depth_png(path, camera).depth_mm
+        near, far = np.nanpercentile(depth_mm, (1, 99))
+        size = " x ".join(map(str, depth_mm.shape[::-1]))
+        return [f"a depth image of {size} pixels, nearly all at {near:.0f} to {far:.0f} mm"]
+    if _is_mesh(path):
+        mesh = read_mesh(path)
+        return [f"a mesh, {_size(mesh.box_mm)}; {mesh.volume_mm3 / 1000:.1f} ml if it is closed"]
+    if path.suffix.lower() not in CLOUD_SUFFIXES:
+        return []
+    cloud, notes = read_cloud(path)
+    points_mm = cloud.points_mm
+    box_mm = np.array([points_mm.min(0), points_mm.max(0)])
+    return [f"a cloud of {len(points_mm)} points, {_size(box_mm)}", *notes]
+
+
+def _size(box_mm: Any) -> str:
+    size, middle = (
+        [f"{mm:.0f}" for mm in each] for each in (box_mm[1] - box_mm[0], box_mm.mean(0))
+    )
+    return f"{' x '.join(size)} mm large round ({', '.join(middle)}) mm"

@@ -65,6 +65,12 @@ class Margins:
         from tumortrack.report import calibration, calibration_table
 
         listed = calibration.list_states(self.scenes, self.seed)  # before PyTorch's seconds
+        highest = max(self.confidence)
+        if len(listed) < (needed := calibration.least_states(highest)):
+            raise InputError(
+                f"{len(listed)} scenes given, a state each; about {needed} are needed for margins "
+                f"that hold in {100 * highest:g} % of cases. Give more, or a lower --confidence."
+            )
         digest = store.sha256_of(self.model / store.MANIFEST)
         table = self.out or self.model / "margins.jsonl"
         head = calibration_table.head_of(digest, self.seed)
@@ -85,7 +91,10 @@ class Margins:
                     f"{one.folder} was changed since it was located. Remove the table, or give "
                     "another --out."
                 )
-        if left := [one for scene, one in states.items() if scene not in done]:
+        left = [one for scene, one in states.items() if scene not in done]
+        if not left:
+            return [done[scene] for scene in states]
+        with progress_bar("locating", len(left)) as advance:
             from tumortrack.cli.locate import check_case
             from tumortrack.report.calibration import row_of
             from tumortrack.simulate.scene_folder import read_scene
@@ -96,12 +105,11 @@ class Margins:
             model = load_model(self.model, self.device, with_margins=False)
             check_case(model, [one.folder for one in left])
             tracker = Tracker(model)
-            with progress_bar("margins", len(left)) as advance:
-                for one in left:
-                    row = row_of(tracker, read_scene(one.folder), one, self.seed)
-                    add(row)
-                    done[row.scene] = row
-                    advance()
+            for one in left:
+                row = row_of(tracker, read_scene(one.folder), one, self.seed)
+                add(row)
+                done[row.scene] = row
+                advance()
         return [done[scene] for scene in states]
 
 
@@ -117,11 +125,13 @@ def described(margins: ModelMargins) -> list[str]:
                     size += f" + {radius.bend_mm:g} mm x root of rarity"
                 size = f"{radius.scaled:.2f} x ({size})"
             lines.append(f"{100 * shells.confidence:g} % margin of {_WHAT[kind]}: {size}")
-    lines += ["family, visible share, organ: states, good, accepted, tested, calibrated"]
-    for group in margins.groups:
-        counts = group.states, group.good, group.accepted, group.tested, group.calibrated
-        lines.append(f"  {', '.join(group.label)}: {', '.join(map(str, counts))}")
-    lines += [f"  {small} is too small: {large} speaks for it" for small, large in
+    lines += [
+        f"{', '.join(group.label)} (family, visible share, organ): {group.states} states, "
+        f"{group.good} good, {group.accepted} with an answer: {group.tested} to test limits, "
+        f"{group.calibrated} to find margins"
+        for group in margins.groups
+    ]
+    lines += [f"{small} has too few of them: {large} counts instead" for small, large in
               margins.joined.items()]  # fmt: skip
     limits = ", ".join(f"{name} {limit:.3g}" for name, limit in margins.limits.items())
     return [

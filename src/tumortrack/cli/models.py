@@ -38,6 +38,8 @@ class Compile:
     def run(self) -> None:
         """Fill numba's cache: one frame and one answer in full; models that place an organ are
         shown their own."""
+        say("compiling ...")
+
         import numpy as np
         import torch
 
@@ -101,8 +103,8 @@ class Onnx:
         out = self.out
         if out.suffix != ".onnx":
             raise InputError(f"{out} must end in .onnx.")
-        if out.exists() and not self.overwrite:
-            raise InputError(f"{out} exists already. Choose another file, or give --overwrite.")
+        if not (out.is_file() and self.overwrite):
+            store.check_place(out, "ONNX", self.overwrite)
         if not out.parent.is_dir():
             raise InputError(f"{out.parent} is no folder; make it first.")
         read_model_manifest(self.model)

@@ -105,6 +105,7 @@ class Resect(track.Following):
             if self.live is not None or self.sinks:
                 raise InputError("--film shows the stored plan; give it without sinks and --live.")
             warn(stored.plan.warnings)
+            store.check_place(self.film, "", None)
             procedure.film(self.film)
             return
         _confirm(moving, stored.patient)

@@ -32,6 +32,7 @@ _SAY_S, _SAY_PLAIN_S = 1.0, 5.0  # between two lines of state: on a terminal, in
 STOPPED = "stopped by the user"  # why arms stand
 _ENDS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _SETTLED_S = 60.0  # by then all buffers have their size: memory that grows on is a leak
+_OPENING_S = 5.0  # the first frame may take so long, however short a run is wanted
 _STORE_S = 10.0  # between two writings of the report: kill -9 loses no more
 
 
@@ -97,7 +98,8 @@ class Track(Following):
         frozen: an image that repeats bit for bit for so many s is refused; 0: it may repeat, as
             of a simulated camera without noise.
         give_up: end after so many s without a frame.
-        seconds: end so many s after the first frame; 0: never.
+        seconds: end so many s after the first frame, and without one after as many (but 5 at
+            least: cameras take time to open); 0: never.
         report: file for latencies, counts and reasons (default: runs/track-TIME.json).
         seed: of the random points.
     """
@@ -124,9 +126,11 @@ class Track(Following):
         from tumortrack import api
         from tumortrack.core.config import to_builtins
         from tumortrack.live.cameras import Cameras
+        from tumortrack.live.sinks.recording import RecordingSinkConfig
         from tumortrack.live.values import SinkContext
         from tumortrack.live.workers import SourceWorker
         from tumortrack.models.folder import patient_of, read_model_manifest
+        from tumortrack.sense.files import DepthCorrection, read_camera
 
         setup = self._cameras() if arms is None else arms.setup  # what executes was checked
         frames, named = setup.published, api.named_sinks(self.sinks)
@@ -135,6 +139,12 @@ class Track(Following):
         patient.check_is(self.stated, str(self.model))
         for text, source_config in setup.sources.items():
             source_config.patient().check_shown(patient, text)
+            corrects = read_camera(self.intrinsics)[1] != DepthCorrection()
+            if corrects and getattr(source_config, "is_corrected", False):
+                raise InputError(
+                    f"the depths of {text} were corrected as they were recorded. Leave "
+                    "--intrinsics out, or give it without depth_scale and depth_offset_mm."
+                )
         report = report_path(self.report, "track")
 
         from tumortrack.live.loop import Loop
@@ -155,6 +165,7 @@ class Track(Following):
             patient=model.patient,
             cameras=setup.still,
             tip_mm=None if arms is None else arms.tip_mm,
+            corrected=config.correction != DepthCorrection(),
         )
         loop = Loop(tracker, context, config, None if arms is None else arms.operation)
 
@@ -192,8 +203,9 @@ class Track(Following):
             closing(begin()) as cameras,
         ):
             say_opened(sinks)
-            screen = _Screen(loop, cameras, sinks, report, about, arms)
-            ending.callback(screen.end)  # once all workers have flushed
+            new = [one.path for one in named.values() if isinstance(one, RecordingSinkConfig)]
+            screen = _Screen(loop, cameras, sinks, report, about, arms, new)
+            ending.push(screen.end)  # once all workers have flushed
             say(f"{model.patient}: tracking {', '.join(setup.sources)} in frame "
                 f"{frames.frame_id!r}; Ctrl-C ends it.")  # fmt: skip
             loop.run(cameras, sinks, screen.show)
@@ -221,6 +233,7 @@ class Track(Following):
         region = region_for(model, range_mm=self.range, box_mm=box, whole=self.whole)
         follower = FollowerConfig(rescan_s=self.rescan, smoothing_s=self.smoothing, seed=self.seed)
         intrinsics, correction = read_camera(self.intrinsics)
+        first_s = max(self.seconds, _OPENING_S, 2 * self.stale)
         return LoopConfig(
             region=region,
             follower=follower,
@@ -229,7 +242,7 @@ class Track(Following):
             stale_s=self.stale,
             frozen_s=self.frozen,
             scan=self.scan,
-            give_up_s=self.give_up,
+            give_up_s=min(self.give_up, first_s) if self.seconds else self.give_up,
             seconds=self.seconds,
         )
 
@@ -265,8 +278,8 @@ def report_path(path: Path | None, command: str) -> Path:
     """Where the report goes; its folder is made."""
     if path is None:
         path = Path("runs") / f"{command}-{datetime.now(UTC):%Y%m%dT%H%M%SZ}.json"
-    elif path.exists():
-        raise InputError(f"{path} exists already. Choose another file for --report.")
+    else:
+        store.check_place(path, "", None)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -301,16 +314,19 @@ class _Screen:
     report: Path
     about: dict[str, Any]
     arms: Arms | None
+    recordings: list[Path]  # folders that this run made
 
     def __post_init__(self) -> None:
         self._started = self._shown = self._stored = time.monotonic()
         self._before, self._state, self._changed, self._unwritten = 0, "", 0.0, ""
         self._errors: dict[str, str] = {}
         self._notes = 0  # of those about the camera's frame, that were said
+        self._seen = False  # a frame came
         self._memory_mb = {"start": round(_resident_mb(), 1)}
 
     def show(self, result: TrackingResult) -> None:
         """Called with every result."""
+        self._seen |= result.observation is not None
         state = result.describe()
         kind = re.sub(r"\d", "", state)  # numbers change with every frame
         if (cell := result.workcell) is not None:
@@ -331,8 +347,12 @@ class _Screen:
         if now - self._stored >= _STORE_S:
             self._store()
 
-    def end(self) -> None:
-        """The last lines."""
+    def end(self, error: type[BaseException] | None, *_: object) -> None:
+        """The last lines. A start that failed leaves nothing: the next one may use its names."""
+        if error is not None and not self._seen:
+            for path in (*self.recordings, self.report):
+                store.remove(path)
+            return
         self._store()
         source, statistics = self.source, self.loop.statistics
         counts, latency = statistics.counts, statistics.latency

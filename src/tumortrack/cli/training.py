@@ -14,6 +14,13 @@ from tumortrack.cli.console import Device, keep_loaded, live_line, say, say_note
 from tumortrack.core import store
 from tumortrack.core.errors import InputError
 from tumortrack.core.process import is_follower
+from tumortrack.models.folder import (
+    check_trainable,
+    is_finished,
+    read_model_manifest,
+    training_words,
+    weakness_of,
+)
 
 if TYPE_CHECKING:
     from tumortrack.training.train import TrainingStatus
@@ -32,8 +39,8 @@ class Train:
             (clinic: 30), or every rotation.
         sensor: whose errors the scenes have: a RealSense D405's, or those of depth by matching a
             stereo endoscope's pictures.
-        minutes: stop after about so long (default: the preset's end). 0: learn nothing, take what
-            training starts from.
+        minutes: train for about so long, once kernels are compiled and the first step is done
+            (default: to the preset's end). 0: learn nothing, take what training starts from.
         steps: stop after exactly so many steps.
         seed: of weights and scenes.
         device: auto takes CUDA if there is a GPU.
@@ -68,9 +75,10 @@ class Train:
         if self.workers is not None and self.workers < 0:
             raise InputError(f"--workers {self.workers} must be 0 or more.")
         case = load_case(self.case)  # report what is wrong so far before PyTorch's seconds
+        check_trainable(self.model)
+        say("starting ...")
 
-        from tumortrack.models.folder import is_finished, weakness_of
-        from tumortrack.training.model import load_model, start_of
+        from tumortrack.training.model import start_of
         from tumortrack.training.presets import PRESETS, seen_by
         from tumortrack.training.train import TrainingRun, train
 
@@ -86,11 +94,11 @@ class Train:
             start=start_of(config.network, self.start), patient=case.patient,
         )  # fmt: skip
         if is_finished(self.model):
-            done = load_model(self.model).provenance
-            if differences := run.differences(done.get("decided_by", {})):
+            done = read_model_manifest(self.model)["provenance"]
+            if differ := run.differences(done.get("decided_by", {})):
                 raise InputError(
                     f"{self.model} holds a finished model ({done['steps']} steps, seed "
-                    f"{done['seed']}), whose command differs from this one in {differences}. A "
+                    f"{done['seed']}), whose command differs from this one in {differ}. A "
                     "finished training is not extended: choose another MODEL folder."
                 )
             say(f"{self.model} is trained already ({done['steps']} steps).")
@@ -98,11 +106,10 @@ class Train:
             return
         with training_screen() as show:
             about = train(run, self.model, show).provenance
-        say(
-            f"model written to {self.model}: {about['steps']} steps in {about['training_s']:.0f} "
-            f"s, validation mIoU {about['validation_miou']:.3f}."
-        )
-        say_notes(filter(None, [weakness_of(about)]))
+        say(f"model written to {self.model}: {training_words(about)}.")
+        few = bool(self.minutes) and about["steps"] < config.schedule.warmup_steps
+        hint = "so few steps teach nearly nothing; train longer, or on a machine with less to do"
+        say_notes(filter(None, [hint if few else "", weakness_of(about)]))
 
 
 @contextmanager
@@ -114,11 +121,13 @@ def training_screen() -> Iterator[Callable[[TrainingStatus], None]]:
 
     def show(status: TrainingStatus) -> None:
         end = f"/{status.end}" if status.end is not None else ""
-        miou = "-" if status.miou is None else f"{status.miou:.3f}"
+        validated = "" if status.miou is None else f"validation mIoU {status.miou:.3f} | "
+        if status.tre_mm is not None:
+            validated = f"validation {status.tre_mm:.1f} mm off | "
         minutes, seconds = divmod(int(status.seconds_left), 60)
         line(
             f"step {status.step}{end} | {status.samples_per_s:.0f} samples/s | loss "
-            f"{status.loss:.4f} | validation mIoU {miou} | {minutes}:{seconds:02d} left | "
+            f"{status.loss:.4f} | {validated}{minutes}:{seconds:02d} left | "
             f"{status.waiting:.0%} waiting for scenes",
             last=status.step == status.end,
         )

@@ -118,17 +118,18 @@ def seal(folder: Path, kind: str, content: dict[str, Any], frame: str) -> None:
     write_json(folder / MANIFEST, {**head, "frame": frame, **content, "files": files})
 
 
-def check_place(path: Path, kind: str, overwrite: bool) -> None:
+def check_place(path: Path, kind: str, overwrite: bool | None) -> None:
     """InputError for a place where something lies that must stay: ``overwrite`` replaces an empty
     folder or an artifact of the same kind in which nothing else lies, and nothing but that, for a
-    mistyped path must not cost the user's files."""
+    mistyped path must not cost the user's files. None: who asks has no such option."""
     try:
         if not path.exists():
             return
     except OSError as error:  # a name that is too long
         raise InputError(f"{path} cannot be written: {error.strerror}.") from error
     if not overwrite:
-        raise InputError(f"{path} exists already. Choose another path, or give --overwrite.")
+        advice = "." if overwrite is None else ", or give --overwrite."
+        raise InputError(f"{path} exists already. Choose another path{advice}")
     if not path.is_dir():
         raise InputError(f"{path} is a file; --overwrite replaces only a {kind} folder.")
     if not (inside := [p.name for p in path.iterdir()]):
@@ -149,7 +150,7 @@ def check_place(path: Path, kind: str, overwrite: bool) -> None:
 
 
 @contextmanager
-def new_folder(path: Path, overwrite: bool = False) -> Iterator[Path]:
+def new_folder(path: Path, overwrite: bool | None = None) -> Iterator[Path]:
     """Fill a folder aside, then move it to ``path`` in one step; on any error nothing appears. What
     it replaces must be empty or of the kind that the new folder's manifest states: InputError as by
     ``check_place``. StorageError where the disk is full or not writable."""
@@ -178,11 +179,11 @@ def new_folder(path: Path, overwrite: bool = False) -> Iterator[Path]:
         except OSError:
             os.rename(old, path)
             raise
-        _remove(old)
+        remove(old)
     except OSError as error:
         raise StorageError(f"cannot write {path}: {error.strerror or error}.") from error
     finally:
-        _remove(aside)
+        remove(aside)
         if ours is not None:
             os.close(ours)
 
@@ -207,14 +208,15 @@ def _clear(path: Path) -> None:
     name = glob.escape(path.name)
     for stale in path.parent.glob(f".{name}.????????.part"):
         if (descriptor := _lock(stale)) is not None:
-            _remove(stale)
+            remove(stale)
             os.close(descriptor)
     for old in path.parent.glob(f".{name}.????????.old"):
         if not old.with_suffix(".part").exists():
-            os.rename(old, path) if not path.exists() else _remove(old)
+            os.rename(old, path) if not path.exists() else remove(old)
 
 
-def _remove(path: Path) -> None:
+def remove(path: Path) -> None:
+    """Take a file or folder away, if it is there."""
     if path.is_dir() and not path.is_symlink():
         shutil.rmtree(path, ignore_errors=True)
     else:

@@ -159,7 +159,7 @@ class Loop:
             if now_s >= ends_s:
                 return
             if now_s - fresh_s > self._config.give_up_s:
-                trouble = f": {source_worker.trouble}" if source_worker.trouble else ""
+                trouble = f": {source_worker.trouble}".rstrip(": .")
                 raise SourceLost(
                     f"no frame for {now_s - fresh_s:.0f} s{trouble}. Look at the camera or the "
                     "topic, then start again."

@@ -333,7 +333,8 @@ class SinkContext:
     the organ in the CT (LPS, mm), if the model has it: estimates then have a motion, and their
     meshes its triangles. ``arms``: results may have a workcell. ``patient``: whose organ the model
     is of. ``cameras``: where several stand still, published frame. ``tip_mm``: where the tool's tip
-    of an arm (cutter, holder) is, by the arm's six joints; published frame."""
+    of an arm (cutter, holder) is, by the arm's six joints; published frame. ``corrected``: depths
+    are corrected before sinks see them."""
 
     parts: tuple[str, ...]
     published_frame: PublishedFrame
@@ -343,6 +344,7 @@ class SinkContext:
     patient: Patient = NOBODY
     cameras: tuple[Float64[np.ndarray, "4 4"], ...] = ()
     tip_mm: Callable[[str, Float64[np.ndarray, " 6"]], Float64[np.ndarray, " 3"]] | None = None
+    corrected: bool = False
 
     @property
     def structures(self) -> tuple[str, ...]:

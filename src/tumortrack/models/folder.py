@@ -26,6 +26,14 @@ def is_finished(folder: Path) -> bool:
     return (folder / store.MANIFEST).is_file()
 
 
+def check_trainable(folder: Path) -> None:
+    """InputError where what lies in a folder is neither a training nor a model."""
+    if folder.is_dir() and not any(folder.iterdir()):
+        return
+    if not (folder / "training").is_dir() and not is_finished(folder):
+        store.check_place(folder, "", None)
+
+
 def read_model_manifest(folder: Path) -> dict[str, Any]:
     """The manifest of a finished model; ArtifactError for no model, a training that has not ended,
     another schema, a file missing or changed."""
@@ -79,6 +87,19 @@ def weakness_of(provenance: dict[str, Any]) -> str:
             "apart), and this method can't try both ways; train with --preset clinic"
         )
     return ""
+
+
+def training_words(provenance: dict[str, Any]) -> str:
+    """How long a model was trained, and how far off it is on its validation scenes."""
+    steps, seconds = provenance["steps"], provenance.get("training_s")  # a fleet's have none
+    words = f"{steps} step{'s' * (steps != 1)}"
+    words += "" if seconds is None else f" in {seconds:.0f} s"
+    if "validation_tre_mm" in provenance:
+        return (
+            f"{words}; in validation points inside are {provenance['validation_tre_mm']:.1f} mm "
+            f"off (median), {provenance['validation_far']:.0%} of scenes over {FAR_MM:g} mm"
+        )
+    return f"{words}; validation mIoU {provenance['validation_miou']:.3f}"
 
 
 def has_shape(manifest: dict[str, Any]) -> bool:

@@ -156,7 +156,8 @@ def _kept_away(
     a stroke, or the wall of the piece, comes nearer to one than it may."""
     if lacking := sorted(config.keep_away.keys() - located.structures.keys()):
         raise InputError(
-            f"keep away from {lacking[0]}: located were {', '.join(located.structures) or 'none'}."
+            f"--keep-away {lacking[0]}: there is no such structure in this estimate. It has: "
+            f"{', '.join(located.structures) or 'none'}."
         )
     high = located.organ.box_mm[1, 2]
     walls = [

@@ -5,6 +5,7 @@ The unit is the physical state: one scene of each counts. docs/trust.md says wha
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import product
@@ -148,7 +149,8 @@ def margins_of(
     ]
     if not good:
         raise InputError(
-            f"no good estimate among {turns.count('choose')} states to choose limits on."
+            f"no good estimate among the {turns.count('choose')} of {len(rows)} scenes that limits "
+            "are chosen on. Give more scenes, or a model that is trained longer."
         )
     located = [row for row in rows if not row.doubt]
     kinds: list[Kind] = [kind for kind in get_args(Kind) if all(kind in r.misses for r in located)]
@@ -185,6 +187,13 @@ def margins_of(
         accepted=len(tested) / len(some["test"]),
         missed=_misses(tested, kinds[0], last) / len(some["test"]),
     )
+
+
+def least_states(confidence: float, misses: int = 0) -> int:
+    """How many states it takes, all answered, to show that margins hold so often, where so many of
+    the answers that are tested miss them."""
+    tested = conformal.least_tested(1 - confidence, _ERROR, misses=misses)
+    return math.ceil(tested * len(_TURNS) / _TURNS.count("test"))
 
 
 def _dealt(labels: Sequence[conformal.Label], seed: int) -> list[_Turn]:
@@ -273,13 +282,12 @@ def _tested(
         if number is not None:
             held.append((len(answers[number]), rules[number]))
     if not held:
-        said = "; ".join(f"{m} of {n} of {name}" for name, (m, n) in tables[0].items())
-        none = conformal.least_tested(risk, _ERROR)
+        said = "; ".join(f"{name}: {m} of {n}" for name, (m, n) in tables[0].items())
         raise InputError(
-            f"no limits hold {100 * risk:.3g} %: of the answers in each group, {said} "
-            f"miss by more than {widest_mm:g} mm. It takes {none} without such a one, {least} with "
-            "one, and 2.5 times as many states in all. Give more scenes, a wider --widest, or a "
-            "lower --confidence."
+            f"no limits hold {100 * risk:.3g} %. Tested answers that miss by more than "
+            f"{widest_mm:g} mm: {said}. If none does, about {least_states(1 - risk)} scenes are "
+            f"needed, and {least_states(1 - risk, misses=1)} if one does. Give more scenes, a "
+            "wider --widest, or a lower --confidence."
         )
     return max(held, key=itemgetter(0))[1]
 

@@ -61,6 +61,8 @@ def open_table(
         stream.seek(0)
         content = stream.read()
         whole = content[: content.rfind(b"\n") + 1]
+        begun = json.dumps(head, allow_nan=False).encode().startswith(content)
+        known_head, rows = (head, []) if begun else _parsed(whole, path)  # foreign: left as it is
         stream.truncate(len(whole))
 
         def add(data: object) -> None:
@@ -71,7 +73,6 @@ def open_table(
 
         if not whole:
             add(head)
-        known_head, rows = (head, []) if not whole else _parsed(whole, path)
         if differ := [name for name in head if known_head.get(name) != head[name]]:
             raise InputError(
                 f"{path} was begun with another {' and '.join(differ)}. Remove it, or give another "

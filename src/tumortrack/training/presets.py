@@ -185,8 +185,8 @@ def seen_by(config: TrainConfig, sensor: Sensor) -> TrainConfig:
         return config
     if noise == CLEAN:
         raise InputError(
-            f"--sensor {sensor} says whose noise scenes have, and this preset's have none. Choose "
-            "the preset clinic."
+            f"--sensor {sensor}: scenes of this preset have no sensor's noise. Leave it out, or "
+            "choose the preset clinic."
         )
     scene = msgspec.structs.replace(config.scene, noise=SENSORS[sensor])
     return msgspec.structs.replace(config, scene=scene)

@@ -100,8 +100,8 @@ class TrainingRun(Run):
             self.start.check(self.config.network)
         elif 0 in (self.steps, self.minutes):
             raise InputError(
-                "without a step of training a model is what it starts from, and this one starts "
-                "from nothing: give it minutes or steps, or the preset clinic and its head start."
+                "no minutes and no steps leave a model as it starts, and this one starts from "
+                "nothing. Give minutes or steps, or the preset clinic with its head start."
             )
 
     @property

@@ -74,6 +74,11 @@ class TrainingTask(ABC):
     def miou(self, network: Any) -> float:
         """On the validation scenes."""
 
+    def tre_mm(self, network: Any) -> float | None:
+        """There: median over the scenes of the mean error of points inside; None without a
+        motion."""
+        return None
+
     @abstractmethod
     def model(self, network: Any, provenance: dict[str, Any]) -> Model:
         """The finished model of the network."""
@@ -209,6 +214,12 @@ class RegistrationTask(TrainingTask):
             rest = fit.motion.back(points_mm).astype(np.float32)
             guesses.append(self._shape.labels_at(rest)[0])
         return self._mean_iou(np.stack(guesses))
+
+    def tre_mm(self, network: RegistrationNetwork) -> float:
+        fits = self._fits(network)
+        return float(
+            np.median([_mean_mm(self._away_mm(n, fit)) for n, (_, fit) in enumerate(fits)])
+        )
 
     def model(self, network: RegistrationNetwork, provenance: dict[str, Any]) -> RegistrationModel:
         scenes, drafts = self._scenes, self._fits(network)

@@ -14,7 +14,7 @@ import signal
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TypeVar
@@ -24,7 +24,8 @@ import torch
 from tumortrack.core.errors import InputError, StorageError, TumortrackError
 from tumortrack.core.process import available_cores, keep_freed_memory
 from tumortrack.core.store import write_atomically, writing
-from tumortrack.models.model import Model, Network
+from tumortrack.models.folder import check_trainable
+from tumortrack.models.model import Model
 from tumortrack.simulate.coarse import coarsened
 from tumortrack.simulate.scene import SceneStream
 from tumortrack.training.distributed import ProcessGroup, process_group
@@ -66,6 +67,7 @@ class TrainingStatus:
     loss: float
     miou: float | None  # of the last validation
     waiting: float = 0.0  # fraction of the time that was spent waiting for scenes
+    tre_mm: float | None = None  # of the last validation, where the method knows a motion
 
 
 class Interrupted(TumortrackError):
@@ -105,6 +107,7 @@ def _train(run: TrainingRun, work: Path, group: ProcessGroup, report: Report) ->
     """The model, in the main process."""
     config, device = run.config, group.device
     workers = divide_cores(device, run.workers, group.on_machine)
+    TrainingState(run, device, group).resume(work)  # another run's: refused before the long part
     task = task_of(run, device)
     state = TrainingState(run, device, group)
     state.initialize(task.initialize)
@@ -115,7 +118,7 @@ def _train(run: TrainingRun, work: Path, group: ProcessGroup, report: Report) ->
     else:
         steps = range(state.progress.step, end)
         scenes = _scenes(run, task, group.local_batches(steps), group, workers)
-        run_steps(state, scenes, work, report, task.miou)
+        run_steps(state, scenes, work, report, task)
     if not group.is_main:
         return None
     origin = {**provenance(run, state.progress, device), "scenes": scenes.maker if end else "none"}
@@ -142,23 +145,24 @@ def run_steps(
     scenes: Scenes,
     work: Path,
     report: Report,
-    miou_of: Callable[[Network], float] | None = None,
+    task: TrainingTask | None = None,
 ) -> None:
-    """All steps to the end; the main process writes checkpoints into ``work``, reports and, with
-    ``miou_of``, validates. Raises as ``train``."""
+    """All steps to the end; the main process writes checkpoints into ``work``, reports and, with a
+    ``task``, validates. Raises as ``train``."""
     run, group, progress = state.run, state.group, state.progress
-    clock, miou = TrainingClock(progress), None
+    clock, miou, tre_mm = TrainingClock(progress), None, None
     with ExitStack() as stack:
-        validates = miou_of is not None and group.is_main
+        validates = task is not None and group.is_main
         write = stack.enter_context(history(work, progress)) if validates else None
         stopped = stack.enter_context(ctrl_c())
         for batch in clock.timed(stack.enter_context(closing(scenes.batches))):
             loss = state.step(batch)
+            clock.count_step()
             progress.elapsed_s, stop = group.all_reduce(clock.elapsed(), stopped())
             settled = settle_end(run.config, progress, run.minutes)
             done = progress.step == progress.end
-            if miou_of and write and (done or progress.step % run.config.validate_every == 0):
-                miou = miou_of(state.average)
+            if task and write and (done or progress.step % run.config.validate_every == 0):
+                miou, tre_mm = task.miou(state.average), task.tre_mm(state.average)
                 state.keep_if_best(miou)
                 speed = clock.rate() * run.config.batch_size
                 write(loss, miou, speed, state.learning_rate, clock.waiting())
@@ -166,7 +170,7 @@ def run_steps(
             if group.is_main and (due or clock.due("checkpoint", run.checkpoint_every_s)):
                 state.save(work)
             if group.is_main and (done or clock.due("report", REPORT_EVERY_S)):
-                report(_status(state, clock, loss, miou))
+                report(replace(_status(state, clock, loss, miou), tre_mm=tre_mm))
             if done:
                 break
             if stop:
@@ -195,6 +199,7 @@ def work_folder(folder: Path, writes: bool = True) -> Iterator[Path]:
     if not writes:
         yield work
         return
+    check_trainable(folder)
     with writing(work):
         work.mkdir(parents=True, exist_ok=True)
         lock = (work / _LOCK).open("w")
@@ -235,11 +240,13 @@ def divide_cores(device: torch.device, workers: int | None, sharing: int = 1) ->
 
 
 class TrainingClock:
-    """Time spent in all sessions of a run, and when things are due again."""
+    """Time spent in all sessions of a run, and when things are due again. A session's time begins
+    when its first step is done: before, processes start and kernels are compiled."""
 
     def __init__(self, progress: TrainingProgress) -> None:
         self._progress, self._first_step = progress, progress.step
         self._start, self._before = time.monotonic(), progress.elapsed_s
+        self._first_s = 0.0
         self._last: dict[str, float] = {}
         self._waited = 0.0
 
@@ -251,6 +258,12 @@ class TrainingClock:
             yield item
             began = time.monotonic()
 
+    def count_step(self) -> None:
+        """After each step."""
+        if not self._first_s:
+            self._first_s, self._first_step = self._session_s(), self._progress.step
+            self._start, self._waited = time.monotonic(), 0.0
+
     def elapsed(self) -> float:
         return self._before + self._session_s()
 
@@ -259,8 +272,9 @@ class TrainingClock:
         return self._waited / self._session_s()
 
     def rate(self) -> float:
-        """Steps per second in this session."""
-        return (self._progress.step - self._first_step) / self._session_s()
+        """Steps per second in this session; as long as there is only one, by that one's time."""
+        steps = self._progress.step - self._first_step
+        return steps / self._session_s() if steps else 1 / max(self._first_s, 1e-9)
 
     def due(self, what: str, every_s: float) -> bool:
         now = time.monotonic()

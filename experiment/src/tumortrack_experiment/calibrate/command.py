@@ -65,8 +65,8 @@ class CalibrateBoard(WithBoard):
     def run(self) -> None:
         from tumortrack_experiment.calibrate.board import draw_board
 
-        if self.out.exists() and not self.overwrite:
-            raise InputError(f"{self.out} exists already. Choose another path, or --overwrite.")
+        if not (self.out.is_file() and self.overwrite):
+            store.check_place(self.out, "board", self.overwrite)
         draw_board(self.board, self.out)
         say(f"written to {self.out}; print it at 100 %, and measure its rulers.")
 

@@ -134,7 +134,8 @@ class Guide:
         if answer not in (_AGAIN, _QUIT):
             self._known = self._known or table
             taken = {"quality": to_builtins(quality), "warnings": list(filter(None, wrong))}
-            self.folder.keep(taken, table_in_camera=self._known)
+            corrected = self.correction != DepthCorrection()
+            self.folder.keep(taken, table_in_camera=self._known, corrected=corrected)
         return answer
 
     def _ask(self) -> str:

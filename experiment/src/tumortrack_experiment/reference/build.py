@@ -43,8 +43,7 @@ def write_reference(given: ReferenceOptions) -> None:
     case = case_of_kit(given.case, kit)
     states = states_in(given.recording, kit)
     state = one_of(states, given.state, given.recording)
-    if (folder := given.scenes / state).exists():
-        raise InputError(f"{folder} exists already. Choose another SCENES folder.")
+    store.check_place(folder := given.scenes / state, "scene", None)
     volume = read_volume(given.ct, given.series)
     parts = parts_in(kit, given.kit, state)
     moments = moments_of(states[state], state)

@@ -8,6 +8,7 @@ from typing import Literal
 
 from rich.console import Console
 
+from tumortrack.core import store
 from tumortrack.core.errors import InputError
 
 TRAINED = Path("runs/bench")  # models trained to be measured
@@ -56,6 +57,9 @@ class Bench:
             raise InputError(
                 "--model and --cloud belong together: a model, and a cloud of its organ."
             )
+        for path in (self.out, self.out.with_name(f"{self.out.stem}_curves.json")):
+            if path.exists() and "machine" not in store.read_json(path):
+                store.check_place(path, "", None)  # no bench wrote it
         words = ["tumortrack bench", *(["--only", *self.only] if self.only else [])]
         words += [f"--{name}" for name in ("quick", "curves") if getattr(self, name)]
         command = " ".join(words)
@@ -67,6 +71,7 @@ class Bench:
         tasks = tasks_of(common, self.only or tuple(GROUPS), curves, available_cores())
         with console.status("starting ...") as status:
             report = status.update if console.is_terminal else say
+            report("starting ...")
             found = measure(tasks, command, report, lambda row, left: say(line(row, left)))
         shown = console if console.is_terminal else Console(width=_WIDE)
         shown.print(rich_table(found))

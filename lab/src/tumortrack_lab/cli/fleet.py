@@ -16,6 +16,7 @@ from tyro.conf import Positional
 
 from tumortrack.cli.console import console, live_line, say
 from tumortrack.core.errors import InputError, TumortrackError
+from tumortrack.core.store import check_place
 
 if TYPE_CHECKING:
     from tumortrack_lab.fleet.engine import Executor, Outcome, Status
@@ -53,12 +54,16 @@ class Fleet:
         """Raises InputError: options that exclude each other, a list, store or cluster that can't
         be used; TumortrackError: patients failed that another run may succeed with."""
         self._check()
+        say("starting ...")
         from tumortrack_lab.fleet.engine import run
         from tumortrack_lab.fleet.list import read_list
-        from tumortrack_lab.fleet.results import write_results
+        from tumortrack_lab.fleet.results import PATIENTS, write_results
         from tumortrack_lab.fleet.store import Store
 
         patients = read_list(self.list)
+        inside = {p.name for p in self.out.iterdir()} if self.out.is_dir() else {""}
+        if inside - {self.list.name} and not inside & {"store", PATIENTS}:
+            check_place(self.out, "", None)  # what lies there is no fleet's
         self.out.mkdir(parents=True, exist_ok=True)
         store = Store(self.store or str(self.out / "store"))
         store.open()
@@ -137,21 +142,20 @@ def _screen() -> Iterator[Callable[[Status], None]]:
         if status.note != noted:
             say(status.note)
             noted = status.note
-        line(_line(status))
+        line(progress_words(status))
 
     with live_line("starting ...") as line:
         yield show
 
 
-def _line(status: Status) -> str:
-    left = "-"
+def progress_words(status: Status) -> str:
+    rate = "time left unknown until the first patient is through"
     if (seconds := status.seconds_left) is not None:
         minutes, rest = divmod(int(seconds), 60)
-        left = f"{minutes // 60}:{minutes % 60:02d}:{rest:02d}"
+        rate = f"{status.per_hour:.1f} an hour | {minutes // 60}:{minutes % 60:02d}:{rest:02d} left"
     words = [
         f"patients {status.wanted}/{status.total} ({status.there} before)",
-        f"{status.per_hour:.1f} an hour",
-        f"{left} left",
+        rate,
         f"{status.running} tasks under way",
         f"{status.done} done",
     ]

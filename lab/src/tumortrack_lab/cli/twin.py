@@ -34,13 +34,15 @@ class Twin:
     def run(self) -> None:
         """Make what is missing of these states and views; empty means all. Raises InputError: no
         case, unknown names, or scenes made from something else."""
-        from tumortrack_lab.twin.dataset import TwinRun, make_scenes
-        from tumortrack_lab.twin.views import VARIANTS, VIEWS
-
-        run = TwinRun(self.case, seed=self.seed)
-        states: tuple[str, ...] = self.states or tuple(VARIANTS)
-        with console.status("twin ...") as line:
+        with console.status("starting ...") as line:
             report = line.update if console.is_terminal else say
+            report("starting ...")
+
+            from tumortrack_lab.twin.dataset import TwinRun, make_scenes
+            from tumortrack_lab.twin.views import VARIANTS, VIEWS
+
+            run = TwinRun(self.case, seed=self.seed)
+            states: tuple[str, ...] = self.states or tuple(VARIANTS)
             made = make_scenes(
                 run, self.scenes, states, self.views or VIEWS,
                 lambda now: report(f"{now.share:.0%} {now.text}"),

@@ -88,7 +88,7 @@ def failures(found: dict[str, Any], cut_off: bool) -> list[str]:
     low, high = _ORGAN_AT_ALL_ML[found["organ"] == KIDNEY.name]
     reasons = {
         "organ or tumor reach the border of the volume: they are cut off": cut_off,
-        f"the organ has {found['organ_ml']:.0f} ml, no {low:g} to {high:g}": not (
+        f"the organ has {found['organ_ml']:.0f} ml; allowed: {low:g} to {high:g}": not (
             low <= found["organ_ml"] <= high
         ),
         "there is no tumor": not found["tumors"],

@@ -5,6 +5,7 @@ from __future__ import annotations
 import html
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
+from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -38,10 +39,9 @@ _COLUMNS = {
     "middle_mm": "centre mm", "rigid_middle_mm": "best rigid mm", "middle_worst_mm": "worst mm",
     "largest_miss_mm": "largest miss mm", "holds_for": "holds for", "margin_95_mm": "95 % margin",
 }  # fmt: skip
-_STYLE = (
-    'body { font: 14px/1.4 system-ui, "DejaVu Sans", sans-serif; margin: 16px; } table { '
-    "border-collapse: collapse; } th, td { padding: 4px 10px; text-align: left; border-bottom: "
-    "1px solid #dde3e9; vertical-align: top; } img { width: 300px; } .look { background: #fff6e0; }"
+_STYLE = (  # beside that of an evaluation's page
+    "main { max-width: none; } section { overflow-x: auto; } th, td { text-align: left; "
+    "vertical-align: top; } img { width: 300px; } .look { background: #fff6e0; }"
 )
 
 
@@ -184,18 +184,26 @@ def _page(
         body.append(f"<tr{mark} id={name!r}>{cells}</tr>")
         body.append(f'<tr{mark}><td colspan="{len(_COLUMNS)}">{images}{said}</td></tr>')
     head = "".join(f"<th>{words}</th>" for words in _COLUMNS.values())
-    doubtful = len({one["patient"] for one in looks})
-    people = "1 patient" if doubtful == 1 else f"{doubtful or 'none'} of the patients"
     lines = "\n".join(body)
+    report = resources.files("tumortrack.report").joinpath("page.html").read_text("utf-8")
+    style = report.split("<style>")[1].split("</style>")[0] + _STYLE
+    people = len({one["patient"] for one in looks})
     return (
-        f'<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8"><title>fleet</title>'
-        f"<style>{_STYLE}</style></head><body><h1>{len(rows)} patients: {counts}</h1>"
-        f"<p><b>For research use only.</b> A person should look at {people} (shaded; {LOOK}). "
-        "Shares are of scenes; errors are medians over answers "
-        "called good; pictures: the case, and the answer that is farthest off.</p>"
+        '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">'
+        f"<title>tumortrack: a fleet</title><style>{style}</style></head><body>"
+        f"<header><h1>{_patients(len(rows))}: {counts}</h1><p>tumortrack: a fleet</p></header>"
+        '<main><section class="notice"><b>For research use only.</b> Not a medical device.'
+        f"</section><section><p>To be looked at by a person: {_patients(people)} (shaded; {LOOK}). "
+        "Shares are of scenes; errors are medians over answers called good; pictures: the case, "
+        "and the answer that is farthest off.</p>"
         f"<table><thead><tr>{head}</tr></thead><tbody>\n{lines}\n</tbody></table>"
-        "</body></html>\n"
+        "</section></main></body></html>\n"
     )
+
+
+def _patients(number: int) -> str:
+    return f"{number} patient{'s' * (number != 1)}"
 
 
 def _cell(value: Any) -> str:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, closing, contextmanager, suppress
 from functools import partial
 from itertools import chain
 from pathlib import Path
@@ -189,6 +189,23 @@ def bag_files(path: Path) -> list[Path]:
         return [path] if path.suffix.lower() in SUFFIXES else []
     inside = (p for p in path.iterdir() if p.suffix.lower() in SUFFIXES and p.is_file())
     return sorted(inside, key=lambda p: (len(p.name), p.name))
+
+
+def bag_contents(path: Path) -> tuple[dict[str, int], float]:
+    """How many depth images or clouds a bag has, by topic, and how many seconds it lasts; of one
+    without its end, as a killed recorder leaves it, too. InputError where it cannot be read."""
+    counts: dict[str, int] = {}
+    times_ns: list[int] = []
+    for file in bag_files(path):
+        with _guarded(path):
+            reader = _opened(file)
+            with closing(reader):
+                kinds = [c for c in reader.connections if c.msgtype in _KINDS]
+                for connection, time_ns, _ in reader.messages(kinds) if kinds else ():
+                    counts[connection.topic] = counts.get(connection.topic, 0) + 1
+                    times_ns.append(time_ns)
+    inputs = {topic: n for topic, n in counts.items() if not topic.startswith(ESTIMATES)}
+    return inputs, (max(times_ns) - min(times_ns)) * 1e-9 if times_ns else 0.0
 
 
 def _opened(path: Path) -> Any:

@@ -43,7 +43,7 @@ class McapBag:
             writer: Any = Writer(folder, version=8, storage_plugin=StoragePlugin.MCAP)
             writer.open()
         except WriterError as error:
-            raise InputError(f"{folder} exists already. Choose another folder.") from error
+            raise InputError(f"{folder} exists already. Choose another path.") from error
         self._writer, self._storage = writer, writer.storage
         self._storage.bio.close()  # what is buffered could not be taken back on a full disk
         self._storage.bio = self._file = _WholeWrites(self._storage.path)

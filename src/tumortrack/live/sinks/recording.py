@@ -55,6 +55,7 @@ class RecordingSinkConfig(SinkConfig, frozen=True, kw_only=True, tag="recording"
             "tumortrack": tumortrack.__version__,
             "patient": to_builtins(context.patient),
             "parts": list(context.parts),
+            "corrected": context.corrected,
             "frame_id": frame.frame_id,
             "published_from_camera": frame.published_from_camera.tolist(),
         }

@@ -65,6 +65,12 @@ class RecordingSourceConfig(SourceConfig, frozen=True, kw_only=True, tag="record
             return NOBODY
         return patient_in(read_json(about).get("patient"), str(about))
 
+    @property
+    def is_corrected(self) -> bool:
+        """Whether its depths were corrected before they were recorded, as far as it says so."""
+        about = (self.path if self.path.is_dir() else self.path.parent) / ABOUT
+        return about.is_file() and read_json(about).get("corrected") is True
+
     def open(self) -> RecordingSource:
         """Find the frames; none is read yet. Raises InputError if there are none to play."""
         self.patient()

@@ -84,8 +84,8 @@ def _cut_leg(builder: TrajectoryBuilder, path_mm: np.ndarray, around: Surroundin
         raise next(blocked for blocked in reasons if str(blocked) == often)
     x, y, z = path_mm[0]
     raise Blocked(
-        f"from no direction the {CUTTER} comes to ({x:.0f}, {y:.0f}, {z:.0f}) mm without its grip "
-        f"in the organ or the electrode at the {HOLDER}"
+        f"the {CUTTER} reaches ({x:.0f}, {y:.0f}, {z:.0f}) mm from no direction: its grip would "
+        f"be in the organ, or its electrode at the {HOLDER}"
     )
 
 

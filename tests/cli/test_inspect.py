@@ -1,0 +1,198 @@
+"""`inspect` in sentences, with units, of whatever commands write and read."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from importlib import resources
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from stories import refusal, tumortrack
+from tumortrack.cli.inspection import describe
+from tumortrack.core import store
+from tumortrack.core.errors import InputError
+from tumortrack.core.geometry import HERE
+from tumortrack.core.mesh_files import write_mesh
+from tumortrack.core.types import DepthFrame, Mesh
+from tumortrack.live.recording.mcap import McapBag, camera_messages
+from tumortrack.live.ros.messages import Messages
+from tumortrack.live.values import Observation
+from tumortrack.sense.camera import d405
+from tumortrack.sense.files import depth_png, intrinsics_json
+from tumortrack.sense.ply import write_cloud_ply
+
+PATIENT = {"id": "P1", "side": "left"}
+PARTS = {
+    "kidney": {"label": 1, "found": True, "volume_ml": 180.06, "center_mm": [1.0, -2.04, 150.0],
+               "center_std_mm": 0.84},
+    "tumor_1": {"label": 2, "found": False},
+}  # fmt: skip
+RUN = {
+    "quality": {"verdict": "poor", "reason": "the fit is worse than usual; look from elsewhere"},
+    "patient": PATIENT,
+    "parts": PARTS,
+    "margin": {"stated": [], "reason": "a poor estimate has no margin"},
+}
+TRACK = {
+    "patient": PATIENT, "source": "virtual:CASE", "seconds": 10.0, "updates": 200,
+    "sinks": {"viewer": {"delivered": 199, "dropped": 1}},
+    "estimates": {"good": 150, "poor": 30}, "no_estimate": 20,
+    "reasons": {"no organ": 15, "the frame is # s old": 5}, "dropped": 3, "defects": [],
+    "latency_ms": {"count": 200, "p50": 16.04, "p95": 30.0},
+    "center_error_mm": {"tumor_1": {"count": 180, "p50": 1.2, "p95": 3.4}},
+}  # fmt: skip
+PLAN = {
+    "table_from_camera": np.eye(4).tolist(), "patient": PATIENT, "seconds": 93.2,
+    "plan": {"tumor": "tumor_1", "margin_mm": 9.0, "cuts": [], "notes": ["PLANNED OVER BUDGET"],
+             "volumes_ml": {"tumor": 11.6, "piece": 30.0, "healthy": 18.4}},
+    "budget": {"margin_mm": 8.9, "tracking_mm": 4.2},
+}  # fmt: skip
+CALIBRATION = {"frame_id": "base", "unit": "mm", "robot_from_camera": [], "error_mm": 0.8}
+CAMERA = {"width": 848, "height": 480, "fx": 433.0, "fy": 433.0, "cx": 424, "cy": 240,
+          "depth_unit_mm": 0.1, "depth_scale": 1.01, "depth_offset_mm": -0.5}  # fmt: skip
+
+
+def say(path: Path) -> str:
+    """What is said of a file or folder; numbers have units and dicts are none of them."""
+    said = "\n".join(describe(path))
+    assert said.startswith(f"{path}: ")
+    assert "{" not in said
+    assert "[" not in said
+    return said
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (RUN, ("a report of `locate`", "verdict: poor", "kidney: 180.1 ml", "(1.0, -2.0, 150.0) mm",
+               "is 0.8 mm", "tumor_1: not found", "a poor estimate has no margin")),
+        (TRACK, ("200 updates in 10.0 s, 20.0 a second: 75% good, 15% poor, 10% none",
+                 "no estimate in 15 of 200: no organ", "latency 16.0 ms (median; 95 %: 30.0 ms)",
+                 "tumor_1: centre off by 1.2 mm", "to viewer: 199 delivered, 1 missed")),
+        ({"patient": PATIENT, "resection": {"state": "done", "halts": {"no estimate": 2}}},
+         ("a report of `resect`", "arms: done", "arms halted (2 x): no estimate")),
+        (PLAN, ("tumor_1, 11.6 ml", "keep 8.9 mm", "18.4 ml healthy", "carry it out in 93 s",
+                "note: PLANNED OVER BUDGET")),
+        (CALIBRATION, ("a calibration (--frame)", "frame base", "off by up to 0.8 mm")),
+        (CAMERA, ("848 x 480 pixels", "1.01 times what is measured, -0.5 mm")),
+    ],
+)  # fmt: skip
+def test_json_files_are_told_by_their_keys(content, words, tmp_path):
+    path = tmp_path / "content.json"
+    store.write_json(path, content)
+    said = say(path)
+    for word in words:
+        assert word in said
+
+
+def test_the_verdict_comes_first_and_its_reason_next(tmp_path):
+    store.write_json(tmp_path / "report.json", RUN)
+    lines = describe(tmp_path)
+    assert lines[1:3] == [
+        "  verdict: poor.",
+        "  because the fit is worse than usual; look from elsewhere.",
+    ]
+    good = {**RUN, "quality": {"verdict": "good", "reason": ""}}
+    store.write_json(tmp_path / "report.json", good)
+    assert describe(tmp_path)[1:3] == ["  verdict: good.", "  patient P1, side left."]
+
+
+def test_a_case_and_what_lies_in_it(phantom_case):
+    said = say(phantom_case)
+    assert "a case (tumortrack" in said
+    assert "patient P1, side right" in said
+    assert "a label map" in say(phantom_case / "labels.nii.gz")
+    assert "voxels of 1.5 x 1.5 x 1.5 mm" in say(phantom_case / "labels.nii.gz")
+    organ = say(phantom_case / "kidney.ply")
+    assert "a mesh, " in organ
+    assert " ml if it is closed" in organ
+
+
+def test_a_kind_of_another_distribution_is_told_by_what_it_states(tmp_path):
+    with store.new_folder(tmp_path / "lens") as aside:
+        (aside / "a.txt").write_text("a")
+        content = {"report": "report.json", "states": ["D1"], "config": {"not": "said"}}
+        store.seal(aside, "lens", content, frame="camera")
+    said = say(tmp_path / "lens")
+    assert "a lens (tumortrack" in said
+    assert "report: report.json" in said
+    assert "said" not in said
+    (tmp_path / "lens" / "a.txt").write_text("b")
+    assert "was changed" in refusal(tumortrack("inspect", tmp_path / "lens"))
+
+
+def test_clouds_depth_images_meshes_and_frames(tmp_path):
+    points_mm = np.array([[0.0, 0, 100], [10, 20, 130]], np.float32)
+    write_cloud_ply(tmp_path / "cloud.ply", points_mm)
+    assert "a cloud of 2 points, 10 x 20 x 30 mm large round (5, 10, 115) mm" in say(
+        tmp_path / "cloud.ply"
+    )
+    corners = np.array([[0.0, 0, 0], [10, 0, 0], [0, 10, 0], [0, 0, 10]])
+    faces = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
+    (tmp_path / "meshes").mkdir()
+    write_mesh(tmp_path / "meshes" / "kidney.ply", Mesh(corners, faces))
+    assert "a folder of meshes (1); `tumortrack prepare`" in say(tmp_path / "meshes")
+    assert "a mesh, 10 x 10 x 10 mm large round (5, 5, 5) mm; 0.2 ml if it is closed" in say(
+        tmp_path / "meshes" / "kidney.ply"
+    )
+    frames, camera = tmp_path / "frames", d405(424, 240)
+    frames.mkdir()
+    depth_mm = np.full((240, 424), 150.0, np.float32)
+    (frames / "1.png").write_bytes(depth_png(DepthFrame(depth_mm, camera)))
+    store.write_json(frames / "intrinsics.json", intrinsics_json(camera))
+    assert "424 x 240 pixels, nearly all at 150 to 150 mm" in say(frames / "1.png")
+    assert f"recording:{frames}" in say(frames)
+
+
+@pytest.mark.parametrize("ended", [True, False])
+def test_a_recording_its_length_rate_and_whether_its_depths_were_corrected(tmp_path, ended):
+    """Also one without its end, as a killed recorder leaves it."""
+    folder, messages = tmp_path / "seen", Messages()
+    bag = McapBag(folder, messages, "")
+    for n in range(11):
+        depth = DepthFrame(np.full((240, 424), 150.0, np.float32), d405(424, 240), 10**18 + n)
+        seen = Observation(depth, 10**18 + n * 10**8)
+        bag.write(seen.arrived_ns, camera_messages(seen, HERE, "camera", messages))
+    bag.flush()
+    if ended:
+        bag.close()
+    store.write_json(folder / "recording.json", {"patient": PATIENT, "corrected": True})
+    said = say(folder if ended else folder / "seen.mcap")
+    assert "a recording of 1.0 s" in said
+    assert "/camera/depth/image_rect: 11 frames, 10.0 a second" in said
+    assert "patient P1, side left" in said
+    assert "its depths were corrected" in said
+
+
+def test_what_lies_in_a_folder_says_what_it_is(tmp_path):
+    for name, words in (
+        ("training", "a training that has not ended"),
+        ("patients.parquet", "a fleet's results"),
+        ("scene.mrb", "a scene for 3D Slicer"),
+        ("twin.json", "not finished (0 so far)"),
+    ):
+        (tmp_path / name).mkdir(exist_ok=True)
+        (tmp_path / name / name).touch()
+        assert words in say(tmp_path / name)
+
+
+def test_what_is_not_known_is_answered_with_what_is(tmp_path):
+    (tmp_path / "notes.txt").write_text("x")
+    (tmp_path / "other.json").write_text(json.dumps({"a": 1}))
+    (tmp_path / "empty").mkdir()
+    for path in (tmp_path / "notes.txt", tmp_path / "other.json", tmp_path / "empty"):
+        with pytest.raises(InputError, match=r"nothing that inspect knows\. It knows folders"):
+            describe(path)
+    with pytest.raises(InputError, match="does not exist"):
+        describe(tmp_path / "nowhere")
+
+
+def test_every_sentence_of_the_table_is_one(tmp_path):
+    table = resources.files("tumortrack.cli").joinpath("inspect.toml").read_text("utf-8")
+    for kind in tomllib.loads(table).values():
+        assert {"name"} < kind.keys() <= {"name", "keys", "file", "sentences"}
+        for sentence in kind.get("sentences", ()):
+            assert isinstance(sentence, str) or len(sentence) == 2
