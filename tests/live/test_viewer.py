@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import socket
 import threading
 from dataclasses import dataclass, replace
@@ -195,6 +196,20 @@ def test_section_of_a_ball_is_its_circle():
     assert np.linalg.norm(segments, axis=2) == pytest.approx(8.0, abs=0.03)
     length = np.linalg.norm(segments[:, 0] - segments[:, 1], axis=1).sum()
     assert length == pytest.approx(16 * np.pi, rel=0.01)
+
+
+def test_a_section_leaves_nothing_for_the_collector():
+    """It would lie in memory until then, a megabyte a slice."""
+    plane = SlicePlane(np.zeros(3), np.array([1.0, 0, 0]), np.array([0, 1.0, 0]), 50.0)
+    mesh = ball((0, 0, 2.0), 10.0)
+    plane.section(mesh)
+    gc.collect()
+    gc.disable()
+    try:
+        assert len(plane.section(mesh)) > 20
+        assert gc.collect() == 0
+    finally:
+        gc.enable()
 
 
 def test_slice_outlines_lie_on_the_surface():

@@ -51,12 +51,18 @@ class SlicePlane:
 
     def section(self, mesh: Mesh) -> Float64[np.ndarray, "m 2 2"]:
         """Where a surface crosses the plane, as segments; (column, row) in mm from the centre."""
-        from trimesh import Trimesh
-        from trimesh.intersections import mesh_plane
-
-        solid = Trimesh(mesh.vertices_mm, mesh.faces, process=False)
-        lines = mesh_plane(solid, np.cross(self.across, self.down), self.centre_mm)
-        return (lines - self.centre_mm) @ np.stack([self.across, self.down], axis=1)
+        height_mm = (mesh.vertices_mm - self.centre_mm) @ np.cross(self.across, self.down)
+        above = height_mm[mesh.faces] > 0
+        # Not trimesh: its surfaces refer to themselves, and fill the memory until they are
+        # collected, a megabyte a slice.
+        cut = above.any(1) & ~above.all(1)
+        faces, above = mesh.faces[cut], above[cut]
+        alone = np.where(above.sum(1) == 1, above.argmax(1), above.argmin(1))  # on its side
+        corners = np.take_along_axis(faces, (alone[:, None] + np.arange(3)) % 3, axis=1)
+        places_mm, heights = mesh.vertices_mm[corners] - self.centre_mm, height_mm[corners]
+        share = heights[:, :1] / (heights[:, :1] - heights[:, 1:])
+        ends_mm = places_mm[:, :1] + share[..., None] * (places_mm[:, 1:] - places_mm[:, :1])
+        return ends_mm @ np.stack([self.across, self.down], axis=1)
 
 
 class CarriedCt:
