@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import socket
 import threading
 from dataclasses import dataclass, replace
@@ -22,6 +23,7 @@ from tumortrack.core.patient import Patient
 from tumortrack.core.store import new_folder
 from tumortrack.core.types import Anatomy, LabelVolume, Mesh, Volume
 from tumortrack.imaging.case import Case, save_case
+from tumortrack.live.display import seen_points
 from tumortrack.live.sinks import viewer
 from tumortrack.live.sinks.viewer import ViewerSink, ViewerSinkConfig
 from tumortrack.live.values import PublishedFrame, SinkContext, TrackingResult
@@ -30,7 +32,7 @@ from tumortrack.live.viewer.panel import StatusPanel
 from tumortrack.live.viewer.slices import CarriedCt, SlicePlane, plane_through, slice_picture
 from tumortrack.live.viewer.surfaces import bare_faces
 from tumortrack.tracking.shells import exact_margin, rough_margin
-from workcell_objects import REASON, virtual, with_arms, workcell, working
+from workcell_objects import virtual, with_arms, workcell, working
 
 TURN = Rotation.from_euler("xyz", [20, -35, 50], degrees=True).as_matrix()
 ROBOT = PublishedFrame("robot", rigid(TURN, np.array([400.0, -250.0, 90.0])))
@@ -157,22 +159,33 @@ def test_slice_shows_the_ct_where_it_is_now(with_ct):
     rows, columns = (axis.ravel() for axis in np.mgrid[3:36:6, 2:46:7])  # the bar is below
     x, y = (columns - 23.5) / 2, (rows - 23.5) / 2  # mm from the middle
     places = MOTION.back(plane.centre_mm + np.outer(x, across) + np.outer(y, down))
-    expected = ct.grey(places).astype(int)
+    expected = ct.picture(places).astype(int)
     assert np.ptp(expected) > 60
-    close = np.abs(picture[rows, columns].astype(int) - expected[:, None]).max(1) <= 3
+    close = np.abs(picture[rows, columns].astype(int) - expected).max(1) <= 3
     assert close.all() if with_ct else close.mean() > 0.8  # labels are mixed at their borders
 
 
 def test_grey_rises_with_the_ct_fades_and_ends():
     ct = CarriedCt(sloped_case())
     direction = np.array([2.0, -1.0, 0.5]) / np.sqrt(5.25)
-    inside = ct.grey(np.outer([-12.0, 0.0, 12.0], direction)).astype(int)
+    inside = ct.picture(np.outer([-12.0, 0.0, 12.0], direction))[:, 0].astype(int)
     steps = np.diff(inside)
     assert steps[0] > 30
     assert steps[0] == pytest.approx(steps[1], abs=1)
-    right = ct.grey(np.array([[19.0, 0, 0], [30.0, 0, 0], [400.0, 0, 0]]))
+    right = ct.picture(np.array([[19.0, 0, 0], [30.0, 0, 0], [400.0, 0, 0]]))[:, 0]
     assert right[0] > right[1] > 0  # the CT is brighter there, but the organ is far
     assert right[2] == 0
+
+
+def test_labels_have_their_parts_colours_and_nothing_is_round_them():
+    labels = CarriedCt(sloped_case(with_ct=False))
+    assert (labels.name, CarriedCt(sloped_case()).name) == ("Label map", "CT")
+    kidney, tumor, *outside = labels.picture(
+        np.array([[-9.0, 0, 0], [8.0, 0, 0], [26.0, 0, 0], [400.0, 0, 0]])
+    )
+    assert kidney / max(kidney) == pytest.approx(np.array(part_colour(1)) / 185, abs=0.02)
+    assert tumor / max(tumor) == pytest.approx(np.array(TUMORS[0]) / 230, abs=0.02)
+    assert not np.any(outside)
 
 
 def test_section_of_a_ball_is_its_circle():
@@ -183,6 +196,20 @@ def test_section_of_a_ball_is_its_circle():
     assert np.linalg.norm(segments, axis=2) == pytest.approx(8.0, abs=0.03)
     length = np.linalg.norm(segments[:, 0] - segments[:, 1], axis=1).sum()
     assert length == pytest.approx(16 * np.pi, rel=0.01)
+
+
+def test_a_section_leaves_nothing_for_the_collector():
+    """It would lie in memory until then, a megabyte a slice."""
+    plane = SlicePlane(np.zeros(3), np.array([1.0, 0, 0]), np.array([0, 1.0, 0]), 50.0)
+    mesh = ball((0, 0, 2.0), 10.0)
+    plane.section(mesh)
+    gc.collect()
+    gc.disable()
+    try:
+        assert len(plane.section(mesh)) > 20
+        assert gc.collect() == 0
+    finally:
+        gc.enable()
 
 
 def test_slice_outlines_lie_on_the_surface():
@@ -274,7 +301,8 @@ def test_the_shell_is_the_stated_margin_and_without_one_there_is_none(sinks, clo
     off_mm = np.linalg.norm(shell - tumor, axis=1)
     assert off_mm == pytest.approx(3.0, abs=1e-3)
     assert not drawn(sink, "margin_tumor_2")  # of which none is stated
-    assert "95 % margin 3.0 mm" in sink._panel.stage.content
+    assert "<th>95 % margin</th>" in sink._panel.stage.content
+    assert "<td>3.0 mm</td>" in sink._panel.stage.content
     assert "±" not in sink._panel.stage.content
 
 
@@ -311,6 +339,25 @@ def test_an_ellipsoid_is_the_covariances_and_shown_when_asked_for(sinks, clock):
     assert not drawn(sink, "ellipsoid_tumor_1")
     sink.publish(empty_update(2))
     assert not drawn(sink, "ellipsoid_tumor_1")
+
+
+def test_nothing_that_was_seen_lies_over_the_organ_unless_a_click_is_asked_for(sinks, clock):
+    sink, nodes = sinks(hz=60), {}
+    update = small_update()
+    assert update.organ is not None
+    seen, organ = seen_points(update.observation), update.organ.points_mm
+    low, high = ((organ[:, :2] / organ[:, 2:]).min(0), (organ[:, :2] / organ[:, 2:]).max(0))
+    before = ((seen[:, :2] / seen[:, 2:] >= low) & (seen[:, :2] / seen[:, 2:] <= high)).all(1)
+    before &= seen[:, 2] <= organ[:, 2].max()
+    assert 100 < before.sum() < len(seen) - 100
+    for asked in (False, True):
+        if asked:
+            sink._ask(True)
+        clock.sleep(1 / 60)
+        sink.publish(replace(update, sequence=int(asked)))
+        nodes[asked] = sink._server.scene.get_handle_by_name("/seen").points
+    np.testing.assert_allclose(nodes[False], seen[~before], atol=1e-3)
+    np.testing.assert_allclose(nodes[True], seen, atol=1e-3)
 
 
 def test_a_camera_that_moves_is_shown_where_it_was_and_who_took_part_is_said(sinks, clock):
@@ -351,14 +398,14 @@ def test_estimate_that_cannot_be_shown_hides_the_one_before(sinks, clock):
     update = small_update(0)
     assert update.estimate is not None
     sink.publish(update)
-    broken = replace(update.estimate, report={"parts": {"kidney": {}}})
+    broken = replace(update.estimate, report={"parts": {"kidney": {"found": True}}})
     clock.sleep(1 / 60)
     with pytest.raises(KeyError):
         sink.publish(replace(update, sequence=1, estimate=broken))
     assert not drawn(sink, "kidney")
     beat = sink._counter
     until(lambda: sink._counter > beat, "the watch's next word")
-    assert "NO ESTIMATE" in sink._panel.stage.content
+    assert "NONE" in sink._panel.stage.content
     assert "cannot be shown" in sink._panel.stage.content
 
 
@@ -460,7 +507,11 @@ def test_arms_are_shown_without_an_estimate_and_never_after_silence(sinks, clock
     sink.publish(virtual(1))
     assert nodes("/workcell").visible
     assert not drawn(sink, "kidney")
-    assert REASON in sink._panel.stage.content
+    assert "PLAYBACK" in sink._panel.stage.content
+    assert "not a live estimate" in sink._panel.stage.content
+    assert "tumortrack-tint" not in sink._panel.stage.content
+    look_at = sink._server.initial_camera.look_at
+    assert look_at == pytest.approx(np.array([14, 3, 36]), abs=0.1)  # the cuts' middle
     sink.publish(small_update(2))
     assert not nodes("/workcell").visible
     nowhere = replace(workcell().shapes[0], published_from_shape=np.zeros((4, 4)))
@@ -481,15 +532,25 @@ def test_arms_are_shown_without_an_estimate_and_never_after_silence(sinks, clock
 def test_status_says_why_and_no_old_numbers():
     update = replace(empty_update(), reason="depth < 110 mm & hidden")
     flag = StatusPanel("none", update, 0.1, 7).stage()
-    assert "NO ESTIMATE" in flag
+    assert "NONE" in flag
     assert "depth &lt; 110 mm &amp; hidden" in flag
     stale = StatusPanel("stale", small_update(), 3.21, 8)
     assert "3.2 s" in stale.stage()
-    assert "0.75" in StatusPanel("good", small_update(), 0.1, 8).numbers()
+    sure = small_update()
+    assert sure.estimate is not None
+    part = {**sure.estimate.report["parts"]["tumor_1"], "center_std_mm": 1.84}
+    parts = {**sure.estimate.report["parts"], "tumor_1": part}
+    sure = replace(sure, estimate=replace(sure.estimate, report={"parts": parts}))
+    good = StatusPanel("good", sure, 0.1, 8, parts=PARTS).numbers()
+    assert "standard deviation of place" in good
+    assert "tumor 1</td><td>0.9 ml</td><td>1.8 mm</td>" in good
+    assert "0.75" not in good  # a probability of points, which reads as certainty
+    doubtful = StatusPanel("poor", replace(sure, quality="poor"), 0.1, 8, parts=PARTS).numbers()
+    assert "tumor 1</td><td>0.9 ml</td><td>–</td>" in doubtful
     cell = replace(workcell(), left_mm=1.23)
     arms = StatusPanel("good", replace(small_update(), workcell=cell), 0.1, 9, arms=True)
     assert "1.2 mm of the margin are left" in arms.flag()
-    assert "0.75" not in stale.numbers()
+    assert " ml" not in replace(stale, parts=PARTS).numbers()
 
 
 def test_tumors_differ_in_colour():

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from browser import Browser
+from browser import Browser, of_first_tumor
 from clock import until
 from live_objects import small_setting, small_update
 from tumortrack.core import colours
@@ -50,8 +50,7 @@ STATES = (
 
 def _parts(picture: np.ndarray) -> tuple[str, bool]:
     """Where the first tumor is drawn, and whether the page is framed in red."""
-    r, g, b = picture[150:700, 20:400].astype(int).transpose(2, 0, 1)
-    columns = np.nonzero((g >= r) & (g > b + 15) & (g > 60))[1]
+    columns = np.nonzero(of_first_tumor(picture[150:700, 20:400]))[1]
     side = "left" if len(columns) and columns.mean() < 240 else "right"
     red = np.abs(picture[400:500, 2:10].astype(int) - colours.NONE).max() < 12
     return side if len(columns) > 100 else "none", bool(red)

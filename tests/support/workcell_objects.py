@@ -24,7 +24,7 @@ from tumortrack.live.values import (
 UR = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
 # The camera of the small objects looks straight down onto their middle, 130 mm away.
 TABLE = PublishedFrame("table", rigid(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 160.0])))
-CUTTER, HOLDER, TOP = (245, 150, 40), (70, 150, 240), (200, 205, 212)
+CUTTER, HOLDER, TOP = (40, 190, 70), (70, 150, 240), (200, 205, 212)
 CUT = (255, 40, 160)
 REASON = "PLAYBACK of a stored plan: nothing is tracked"
 
@@ -104,6 +104,7 @@ def virtual(sequence: int = 0, progress: float = 0.0, halted: str = "") -> Track
         reason=REASON,
         published_frame=TABLE,
         workcell=workcell(progress, halted),
+        playback=True,
     )
 
 

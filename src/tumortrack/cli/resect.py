@@ -269,9 +269,10 @@ class _Procedure:
                 if controls.aborted.is_set():
                     operation.abort("stopped by the viewer, or a real arm gave up")
                 now_ns = time.time_ns()
-                result = operation.act(
-                    TrackingResult(sequence, now_ns, reason=_NOTHING, published_frame=frames)
+                nothing = TrackingResult(
+                    sequence, now_ns, reason=_NOTHING, published_frame=frames, playback=True
                 )
+                result = operation.act(nothing)
                 for sink in sinks:
                     sink.put(result)
                 track.say_failures(sinks, errors)

@@ -217,6 +217,7 @@ class TrackingResult:
         dropped: frames so far that newer ones overtook.
         views: of several cameras: what each saw. ``cameras``: which of them the estimate is from,
             and of the others why not; of a scan what each look added. In words; else empty.
+        playback: a stored plan is shown; nothing is tracked, and there never is an estimate.
     """
 
     sequence: int
@@ -234,6 +235,7 @@ class TrackingResult:
     dropped: int = 0
     views: tuple[CameraView, ...] = ()
     cameras: str = ""
+    playback: bool = False
 
     @cached_property
     def transformed(self) -> TransformedEstimate | None:

@@ -105,7 +105,7 @@ class ViewerSink:
         self._state: State = "waiting"
         self._server.scene.set_background_image(np.full((4, 4, 3), colours.BACKGROUND, np.uint8))
         self._scene = ViewerScene(self._server, context, config.margin_mm)
-        whose, slices = str(context.patient), self._ct is not None
+        whose, slices = str(context.patient), "" if self._ct is None else self._ct.name
         self._panel = Panel(self._server, context.parts, slices, context.arms, whose)
         self._connect()
         self._say("waiting")
@@ -219,7 +219,7 @@ class ViewerSink:
             else:
                 self._scene.show(result)
                 self._shown = result
-            self._say("none" if result.estimate is None else result.quality)
+            self._say("playback" if result.playback else result.quality)
         except Exception as error:
             self._hide()
             reason = f"this estimate cannot be shown ({error!r})"
@@ -247,7 +247,8 @@ class ViewerSink:
         late_s = 0.0 if result is None else (result.latency_ms or 0.0) / 1000
         since_s = self._came if state == "stale" else self._drawn
         age_s = 0.0 if result is None else time.monotonic() - since_s + late_s
-        self._panel.say(StatusPanel(state, result, age_s, self._counter, self._context.arms))
+        arms, parts = self._context.arms, self._context.parts
+        self._panel.say(StatusPanel(state, result, age_s, self._counter, arms, parts))
 
     def _keep_watch(self) -> None:
         """Says how old the last frame is, hides what got too old, renews the slice."""

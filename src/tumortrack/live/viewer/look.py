@@ -13,10 +13,12 @@ from tumortrack.live.values import Workcell
 if TYPE_CHECKING:
     from viser import CameraHandle, ClientHandle, ViserServer
 
-View = Literal["organ", "arms"]
+View = Literal["organ", "tools", "arms"]
 
 _FIRST_LOOK_MM = 130.0
-_FOV_RADIANS = 0.9
+_FOV_RADIANS = 0.9  # up and down; of a narrow page more, so that it sees as much sideways:
+_LEAST_ACROSS, _SAME_RADIANS = 0.8, 1e-3
+_ROUND_CUTS_MM = 120.0  # what is looked at round the cuts: the organ, both tools
 # Onto a workcell: from before it, somewhat from the left and from above; its frame's z is up.
 _OVERVIEW_FROM, _UP = np.array([-0.45, -1.0, 0.6]), np.array([0.0, 0.0, 1.0])
 _ROOM = 0.85  # a cell is wide and flat: its box fits into less than its sphere
@@ -65,16 +67,17 @@ class Viewpoint:
                 client.camera.look_at = self._organ_mm
 
     def oversee(self, cell: Workcell) -> None:
-        """There is a workcell: when it comes first, all look at it whole."""
+        """There is a workcell: when it comes first, all look at where it works."""
         first, self._cell = self._cell is None, cell
         if first:
             camera = self._server.initial_camera
-            camera.position, camera.look_at, camera.up = self._view("arms")
+            camera.position, camera.look_at, camera.up = self._view("tools")
             for client in self._server.get_clients().values():
-                self.turn(client, "arms")
+                self.turn(client, "tools")
 
     def turn(self, client: ClientHandle, towards: View) -> None:
-        """Let a visitor look at the organ from the camera's place, or at the whole workcell."""
+        """Let a visitor look at the organ from the camera's place, at the tools round the cuts, or
+        at the whole workcell."""
         eye_mm, middle_mm, up = self._view(towards)
         with client.atomic():
             client.camera.up_direction = up
@@ -84,6 +87,11 @@ class Viewpoint:
     def _view(self, towards: View) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Eye, what it looks at, up."""
         box_mm = None if towards == "organ" or self._cell is None else self._cell.box_mm
+        lines = [] if self._cell is None else self._cell.drawn_lines
+        if towards == "tools" and lines:
+            points_mm = np.concatenate([line.points_mm for line in lines])
+            room_mm = np.array([[-_ROUND_CUTS_MM], [_ROUND_CUTS_MM]])
+            box_mm = np.stack([points_mm.min(0), points_mm.max(0)]) + room_mm
         if box_mm is None:
             return self._way[:3, 3], self._organ_mm, -self._way[:3, 1]
         middle_mm = box_mm.mean(0)
@@ -100,9 +108,14 @@ class Viewpoint:
         return Mesh(np.concatenate([surface.vertices_mm, corners]), surface.faces)
 
     def _follow(self, client: ClientHandle) -> None:
-        @client.camera.on_update
-        def _(camera: CameraHandle) -> None:
+        def moved(camera: CameraHandle) -> None:
             self._eye_mm = camera.position
+            across = 2 * np.arctan(np.tan(_LEAST_ACROSS / 2) / camera.aspect)
+            if abs(camera.fov - (fov := max(_FOV_RADIANS, float(across)))) > _SAME_RADIANS:
+                camera.fov = fov
+
+        moved(client.camera)
+        client.camera.on_update(moved)
 
 
 def point_under(

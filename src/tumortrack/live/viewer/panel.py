@@ -3,7 +3,6 @@ switches."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from html import escape
 from importlib.resources import files
@@ -26,24 +25,25 @@ from tumortrack.models.margins import margin_words, stated_radius
 if TYPE_CHECKING:
     from viser import ViserServer
 
-State = Literal["waiting", "good", "poor", "none", "stale"]
+State = Literal["waiting", "good", "poor", "none", "stale", "playback"]
 
 _WIDTH = 360  # pixels; what lies over the scene leaves this much room
 ABORT, ABORTED = "Stop the arms for good", "The arms were stopped for good"
-CLICKS = {True: "This is the organ", False: "This is not the organ"}
+CLICKS = {True: "Point at the organ", False: "Point beside it"}
 CANCEL = {
     True: "Now click on the organ (again: cancel)",
     False: "Now click beside it (again: cancel)",
 }
 SILENCE_S = 2  # without a word from the server the page itself says so
 
-# What stands in the panel, and unless all is well over the scene too; its colour.
-_HEADINGS: dict[State, tuple[str, Colour]] = {
-    "waiting": ("WAITING", colours.STALE),
-    "good": (NO_CHECK_FAILED.upper(), colours.GOOD),
-    "poor": ("POOR ESTIMATE", colours.POOR),
-    "none": ("NO ESTIMATE", colours.NONE),
-    "stale": ("STALE", colours.STALE),
+# Over the scene and in the panel: a shape, the state's own word and a colour tell states apart.
+_SIGNS: dict[State, tuple[str, Colour]] = {
+    "waiting": ("○", colours.STALE),
+    "good": ("●", colours.GOOD),  # a tick would say more than is known
+    "poor": ("▲", colours.POOR),
+    "none": ("✕", colours.NONE),
+    "stale": ("◆", colours.STALE),
+    "playback": ("►", colours.ARMS),
 }
 _EMPTY: tuple[State, ...] = ("waiting", "none", "stale")
 
@@ -65,13 +65,14 @@ _SILENCE = (
 @dataclass(frozen=True, eq=False)
 class StatusPanel:
     """What is said of the result that is shown. ``age_s``: since its frame; ``counter``: another
-    with each message; ``arms``: there may be some."""
+    with each message; ``arms``: there may be some; ``parts``: the model's, the organ first."""
 
     state: State
     result: TrackingResult | None
     age_s: float
     counter: int
     arms: bool = False
+    parts: tuple[str, ...] = ()
 
     @property
     def alarming(self) -> bool:
@@ -96,16 +97,21 @@ class StatusPanel:
 
     def flag(self) -> str:
         """How good, of which frame; what the arms do."""
-        text, colour = _HEADINGS[self.state]
-        return _box(text, colour, self._number()) + (self._arms()[0] if self.arms else "")
+        heading, colour = self._heading
+        return _box(heading, colour, self._number()) + (self._arms()[0] if self.arms else "")
+
+    @property
+    def _heading(self) -> tuple[str, Colour]:
+        shape, colour = _SIGNS[self.state]
+        return f"{shape} {self.state.upper()}", colour
 
     def _over_scene(self) -> str:
         """A banner with the reason; where it is alarming the whole page in its colour; the page's
         watch."""
-        heading, colour = _HEADINGS[self.state]
-        tint, size = "", 16 if self.state == "good" else 20
+        heading, colour = self._heading
+        tint, size = "", "quiet" if self.state == "good" else "plain"
         if self.alarming:
-            size = 44  # big where there is nothing to see
+            size = "loud"  # big where there is nothing to see
             style = f"background:{css(colour)}48;color:{css(colour)}"
             tint = f"<div class='tumortrack-tint' style='{style}'></div>"
         why = f"{self._number()}: {self._reason()}"
@@ -124,48 +130,70 @@ class StatusPanel:
         text = f"{cell.state}: HALTED" if cell.halted else cell.state
         left = "" if cell.left_mm is None else f"{cell.left_mm:.1f} mm of the margin are left"
         box = _box(f"ARMS: {text}", colour, cell.halted or left)
-        return box, _over("bottom", 20, colour, text, cell.halted)
+        return box, _over("bottom", "plain", colour, text, cell.halted)
 
     def _reason(self) -> str:
         if self.state == "waiting":
             return "no frame has come yet"
         if self.state == "stale":
             return f"nothing has come for {self.age_s:.1f} s; the last estimate is hidden"
+        if self.state == "playback":
+            return "not a live estimate: a stored plan is shown, nothing is tracked"
         assert self.result is not None
         if self.state == "good":
-            return UNVERIFIED
-        return self.result.reason if self.state == "none" else self.result.warning
+            return f"{NO_CHECK_FAILED}; {UNVERIFIED}"
+        return f"no estimate: {self.result.reason}" if self.state == "none" else self.result.warning
 
     def numbers(self) -> str:
-        """Probabilities, age, latency and the stages' times."""
+        """Each part's volume, standard deviation and margin; latency and age."""
         result = self.result
         if result is None:
             return ""
         latency = "–" if result.latency_ms is None else f"{result.latency_ms:.0f} ms"
-        parts = ""
+        report: dict[str, Any] = {}
         if result.estimate is not None and self.state in ("good", "poor"):
             report = result.estimate.report
-            parts = _parts(report)
             lag_ms = report.get("smoothing", {}).get("lag_ms", 0.0)
             latency += f" + {lag_ms:.0f} smoothing" if lag_ms >= 0.5 else ""
-        stages = {k: v for k, v in result.seconds.items() if "." not in k}  # "a.b" is a part of a
-        times = " · ".join(f"{escape(k)} {1000 * v:.1f}" for k, v in stages.items())
+        parts = "" if self.state == "playback" else self._parts(report)
         return (
             f"<div class='tumortrack-numbers'>{parts}"
-            "<div style='display:flex;justify-content:space-between;margin-top:6px'>"
-            f"<span>latency <b>{latency}</b></span><span>last frame <b>{self.age_s:.1f} s</b> ago"
-            "</span></div>"
-            f"<div>{escape(result.cameras)}</div>"
-            "<div style='opacity:0.65;font-size:12px;min-height:36px'>"
-            f"{times and 'stages, ms: '}{times}</div></div>"
+            f"<div class='tumortrack-row'><span>latency <b>{latency}</b></span>"
+            f"<span>last frame <b>{self.age_s:.1f} s</b> ago</span></div>"
+            f"<div>{escape(result.cameras)}</div></div>"
         )
 
+    def _parts(self, report: dict[str, Any]) -> str:
+        """A row for each part, with and without an estimate: what is below must not jump. Under a
+        failed check the deviation is no longer the place's, and is left out."""
+        said, good = report.get("margin", {}), self.state == "good"
+        stated = said["stated"][-1]["confidence"] if said.get("stated") else None
+        heads = ["", "volume", "standard deviation of place"]
+        heads += [f"{100 * stated:g} % margin"] if stated else []
+        rows = []
+        for label, name in enumerate(self.parts, start=1):
+            part, margin = report.get("parts", {}).get(name, {}), stated_radius(said, name)
+            std_mm = part.get("center_std_mm") if good else None
+            cells = [
+                f"<i style='background:{css(part_colour(label))}'></i>"
+                + escape(name.replace("_", " "))
+                + (" (not found)" if part.get("found") is False else ""),
+                f"{part['volume_ml']:.1f} ml" if part.get("found") else "–",
+                "–" if std_mm is None else f"{std_mm:.1f} mm",
+            ]
+            cells += [f"{margin.mm:.1f} mm" if margin else "–"] if stated else []
+            rows.append(f"<tr><td>{'</td><td>'.join(cells)}</td></tr>")
+        table = f"<table><tr><th>{'</th><th>'.join(heads)}</th></tr>{''.join(rows)}</table>"
+        none = escape(margin_words(said)) if report and not stated else ""
+        return f"{table}<div class='tumortrack-none'>{none}</div>"
 
-def _over(edge: str, size: int, colour: Colour, text: str, why: str) -> str:
+
+def _over(edge: str, size: str, colour: Colour, text: str, why: str) -> str:
     """A box over the scene."""
     return (
-        f"<div class='tumortrack-over' style='{edge}:18px'><div style='background:{css(colour)};"
-        f"font-size:{size}px'>{escape(text)}<small>{escape(why)}</small></div></div>"
+        f"<div class='tumortrack-over tumortrack-{size}' style='{edge}:18px'>"
+        f"<div style='background:{css(colour)}'>{escape(text)}<small>{escape(why)}</small></div>"
+        "</div>"
     )
 
 
@@ -177,38 +205,16 @@ def _box(text: str, colour: Colour, why: str = "") -> str:
     )
 
 
-def _parts(report: Mapping[str, Any]) -> str:
-    """A row per part: colour, name, probability as a bar and number, volume, margin; and why there
-    is no margin."""
-    rows, said = [], report.get("margin", {})
-    for name, part in report.get("parts", {}).items():
-        swatch = f"background:{css(part_colour(part['label']))}"
-        probability = part.get("probability")
-        if not part.get("found") or probability is None:
-            rest = "<td colspan=4 style='opacity:0.7'>not found</td>"
-        else:
-            margin = stated_radius(said, name)
-            bar = f"<div style='{swatch};width:{100 * probability:.0f}%'></div>"
-            rest = (
-                f"<td><div class='tumortrack-bar'>{bar}</div></td><td>{probability:.2f}</td>"
-                f"<td>{part['volume_ml']:.1f} ml</td>"
-                f"<td>{margin.words if margin else ''}</td>"
-            )
-        label = escape(name.replace("_", " "))
-        rows.append(f"<tr><td><i style='{swatch}'></i>{label}</td>{rest}</tr>")
-    none = f"<div>{escape(margin_words(said))}</div>" if not said.get("stated") else ""
-    return f"<table>{''.join(rows)}</table>{none}"
-
-
 class Panel:
-    """The elements, shared by all clients; whoever made it says what they do. ``slices``: with the
-    CT; ``arms``: with what they do; ``whose``: organ it is, in words."""
+    """The elements, shared by all clients; whoever made it says what they do. The result comes
+    first, then what shows it, then what changes it. ``slices``: what they show; empty: there are
+    none; ``arms``: with what they do; ``whose``: organ it is, in words."""
 
     def __init__(
         self,
         server: ViserServer,
         parts: tuple[str, ...],
-        slices: bool = False,
+        slices: str = "",
         arms: bool = False,
         whose: str = str(NOBODY),
     ) -> None:
@@ -216,35 +222,43 @@ class Panel:
         gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
         gui.main_panel.dock_right()
         gui.main_panel.set_width(_WIDTH)
-        self.whose = gui.add_html(f"<div style='padding:4px 12px'><b>{escape(whose)}</b></div>")
+        self.whose = gui.add_html(
+            f"<div class='tumortrack-row tumortrack-whose'><b>{escape(whose)}</b>"
+            "<label><input type='checkbox' id='tumortrack-more'> more</label></div>"
+        )
         gui.add_html(_PAGE)  # of one height: what is to be clicked must not jump
         self.stage = gui.add_html("")
-        self.clicks = {
-            True: gui.add_button(
-                CLICKS[True],
-                hint="Choose the thing that is the organ; a picture teaches its colour",
-            ),
-            False: gui.add_button(CLICKS[False], hint="Teach the colour of fat, a hand, a drape"),
-        }
-        self.colour = gui.add_html("")
-        self.forget = gui.add_button("Forget", visible=False)
         if arms:
             self.abort = gui.add_button(
                 ABORT, color="red", hint="The arms stop, and move no more in this run"
             )
-            self.views = gui.add_button_group("Look at", get_args(View))
         gui.add_html('<div id="tumortrack-numbers"></div>')
+        if arms:
+            self.views = gui.add_button_group("Look at", get_args(View))
         self.slice = None
         default = DisplayOptions()
         shown: dict[str, Any] = {}  # by the option's name
         label = parts[0].replace("_", " ").capitalize()
         if slices:
-            with gui.add_folder("CT at the present position"):
+            with gui.add_folder(f"{slices} at the present position"):
                 self.slice = gui.add_image(np.zeros((8, 8, 3), np.uint8), format="jpeg")
                 self.slice.visible = False
                 self.through = gui.add_dropdown("Through", parts[1:] or parts)
                 self.plane = gui.add_dropdown("Plane", tuple(ORIENTATIONS))
                 shown["slice_plane"] = gui.add_checkbox("In the scene", default.slice_plane)
+        with gui.add_folder("Is something else tracked?"):
+            self.clicks = {
+                True: gui.add_button(
+                    CLICKS[True],
+                    color="gray",
+                    hint="Choose the thing that is the organ; a picture teaches its colour",
+                ),
+                False: gui.add_button(
+                    CLICKS[False], color="gray", hint="Teach the colour of fat, a hand, a drape"
+                ),
+            }
+            self.colour = gui.add_html("")
+            self.forget = gui.add_button("Forget", color="gray", visible=False)
         with gui.add_folder("Show"):
             shown |= {
                 "organ": gui.add_slider(label, 0.0, 1.0, 0.05, default.organ),

@@ -13,7 +13,7 @@ from itertools import chain
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 
 from tumortrack.core import colours
 from tumortrack.core.geometry import transform_points
@@ -36,7 +36,8 @@ _MOST_LABELLED = 15_000  # points shown
 _ELLIPSOID = 2.7955
 _ELLIPSOID_COLOUR = 255, 255, 255  # stands out from every part
 _TUMOR_WITH_POINTS = 0.3  # opacity
-_SEEN_MM, _LOOKED_AT_MM = 0.2, 1.0  # size of points; while a click is asked for
+# Size of points: small, they lie over the tumors; of what was seen, while a click is asked for.
+_SEEN_MM, _ORGAN_MM, _LOOKED_AT_MM = 0.15, 0.15, 1.0
 _NO_POINTS = np.zeros((0, 3), np.float32)
 _NOTHING = Mesh(np.zeros((3, 3)), np.array([[0, 1, 2]]))
 _CORNERS = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
@@ -86,7 +87,7 @@ class ViewerScene:
             "/camera", axes_length=12.0, axes_radius=0.35, wxyz=turn, position=eye_mm
         )
         self._seen = self._cloud("/seen", _SEEN_MM, colours.SEEN)
-        self._organ = self._cloud("/organ", 0.3, colours.ORGAN)
+        self._organ = self._cloud("/organ", _ORGAN_MM, colours.ORGAN)
         blank = np.zeros((12, 2, 3), np.float32)
         self._region = nodes.add_line_segments("/region", blank, colours.REGION, **_HAIRLINE)
         self._picked = nodes.add_icosphere(
@@ -139,14 +140,17 @@ class ViewerScene:
         """Show what this result saw; nothing, if it saw nothing."""
         seen = _NO_POINTS if result.observation is None else seen_points(result.observation)
         organ = _NO_POINTS if result.organ is None else result.organ.points_mm
+        beside = np.ones(len(seen), bool)
+        if len(organ) and not self._looks_at_colours:
+            beside = ~_before(seen, organ)
         if not np.array_equal(way := result.published_frame.published_from_camera, self._way):
             self._way, self._axes.position = way, way[:3, 3]
             self._axes.wxyz = wxyz_of(way[:3, :3])
-        for node, points in ((self._seen, seen), (self._organ, organ)):
+        for node, points in ((self._seen, seen[beside]), (self._organ, organ)):
             there = transform_points(self._way, thinned(points, MOST_SEEN))
             node.points = there.astype(np.float32)
         picture = None if result.observation is None else seen_colours(result.observation)
-        self._seen.colors = np.array(colours.SEEN, np.uint8) if picture is None else picture
+        self._seen.colors = np.array(colours.SEEN, np.uint8) if picture is None else picture[beside]
         if len(organ):
             lower, upper = organ.min(0), organ.max(0)
             corners = transform_points(self._way, lower + _CORNERS * (upper - lower))
@@ -346,3 +350,12 @@ def _put_mesh(node: MeshHandle, mesh: Mesh) -> None:
     if not np.array_equal(node.faces, mesh.faces):
         node.faces = mesh.faces.astype(np.uint32)
     node.vertices = mesh.vertices_mm.astype(np.float32)
+
+
+def _before(
+    points_mm: Float[np.ndarray, "n 3"], organ_mm: Float[np.ndarray, "m 3"]
+) -> Bool[np.ndarray, " n"]:
+    """Which points the camera sees within or before the organ's: they would cover the tumors."""
+    sides, there = (xyz[:, :2] / np.maximum(xyz[:, 2:], 1.0) for xyz in (organ_mm, points_mm))
+    inside = ((there >= sides.min(0)) & (there <= sides.max(0))).all(1)
+    return inside & (points_mm[:, 2] <= organ_mm[:, 2].max())

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Float32, Float64, UInt8
 
-from tumortrack.core.colours import Colour
+from tumortrack.core.colours import Colour, label_colours
 from tumortrack.core.errors import InputError
 from tumortrack.core.estimate import Motion
 from tumortrack.core.geometry import spacing_mm, transform_points
@@ -26,6 +26,7 @@ ORIENTATIONS: dict[str, tuple[tuple[float, ...], tuple[float, ...]]] = {
 }
 _SURE_MM, _UNSURE_MM = 5.0, 20.0  # outside the organ the motion is a guess: the CT fades out
 _FAINT = 0.3
+_FILL = 0.6  # brightness of a label: the outlines of what was estimated stand out from it
 _SLICE_ROOM = 1.15  # side of a slice in the organ's largest extent
 _SAME_ORGAN_MM = 3.0  # a case's surface may differ from the model's by so much
 _BAR_MM = 10
@@ -50,31 +51,39 @@ class SlicePlane:
 
     def section(self, mesh: Mesh) -> Float64[np.ndarray, "m 2 2"]:
         """Where a surface crosses the plane, as segments; (column, row) in mm from the centre."""
-        from trimesh import Trimesh
-        from trimesh.intersections import mesh_plane
-
-        solid = Trimesh(mesh.vertices_mm, mesh.faces, process=False)
-        lines = mesh_plane(solid, np.cross(self.across, self.down), self.centre_mm)
-        return (lines - self.centre_mm) @ np.stack([self.across, self.down], axis=1)
+        height_mm = (mesh.vertices_mm - self.centre_mm) @ np.cross(self.across, self.down)
+        above = height_mm[mesh.faces] > 0
+        # Not trimesh: its surfaces refer to themselves, and fill the memory until they are
+        # collected, a megabyte a slice.
+        cut = above.any(1) & ~above.all(1)
+        faces, above = mesh.faces[cut], above[cut]
+        alone = np.where(above.sum(1) == 1, above.argmax(1), above.argmin(1))  # on its side
+        corners = np.take_along_axis(faces, (alone[:, None] + np.arange(3)) % 3, axis=1)
+        places_mm, heights = mesh.vertices_mm[corners] - self.centre_mm, height_mm[corners]
+        share = heights[:, :1] / (heights[:, :1] - heights[:, 1:])
+        ends_mm = places_mm[:, :1] + share[..., None] * (places_mm[:, 1:] - places_mm[:, :1])
+        return ends_mm @ np.stack([self.across, self.down], axis=1)
 
 
 class CarriedCt:
-    """A case's CT, or its labels where it has none, as grey values at points of the CT."""
+    """A case's CT, or its labels where it has none, as a picture at points of the CT; ``name``:
+    which of the two."""
 
     def __init__(self, case: Case) -> None:
         from scipy.ndimage import distance_transform_edt
 
         labels, ct = case.labels, case.ct
+        self.name = "Label map" if ct is None else "CT"
+        self._labels, self._label_index_from_lps = (
+            labels.labels,
+            np.linalg.inv(labels.lps_from_index),
+        )
+        self._hu = None if ct is None else ct.hu
+        if ct is None:
+            return
         organ = labels.labels > 0
         outside_mm = distance_transform_edt(~organ, sampling=spacing_mm(labels.lps_from_index))
         self._outside_mm = outside_mm.astype(np.float32)
-        self._label_index_from_lps = np.linalg.inv(labels.lps_from_index)
-        if ct is None:
-            self._values, self._order = labels.labels.astype(np.float32), 0
-            self._index_from_lps = self._label_index_from_lps
-            self._window = -0.5, float(self._values.max())
-            return
-        self._values, self._order = ct.hu, 1
         self._index_from_lps = np.linalg.inv(ct.lps_from_index)
         # Black and white: the organ's values (of each tenth voxel), and as much again round them.
         inside = transform_points(labels.lps_from_index, np.argwhere(organ)[::10].astype(float))
@@ -82,14 +91,20 @@ class CarriedCt:
         room = max(50.0, 0.5 * float(high - low))
         self._window = float(low) - room, float(high) + room
 
-    def grey(self, points_ct: Float[np.ndarray, "n 3"]) -> UInt8[np.ndarray, " n"]:
-        """Grey values: 0 where there is no CT, faint far outside the organ."""
-        values = _sample(self._values, self._index_from_lps, points_ct, self._order)
+    def picture(self, points_ct: Float[np.ndarray, "n 3"]) -> UInt8[np.ndarray, "n 3"]:
+        """Grey values: 0 where there is no CT, faint far outside the organ. Without a CT the parts'
+        colours, black outside them."""
+        if self._hu is None:
+            labels = _sample(self._labels, self._label_index_from_lps, points_ct, 0)
+            labels = np.nan_to_num(labels).astype(np.uint8)
+            return np.where(labels[:, None] > 0, _FILL * label_colours(labels), 0).astype(np.uint8)
+        values = _sample(self._hu, self._index_from_lps, points_ct, 1)
         low, high = self._window
         share = np.clip((values - low) / (high - low), 0, 1)
         outside_mm = _sample(self._outside_mm, self._label_index_from_lps, points_ct, 1)
         fade = np.interp(outside_mm, (_SURE_MM, _UNSURE_MM), (1.0, _FAINT))
-        return np.nan_to_num(255 * share * fade).astype(np.uint8)
+        grey = np.nan_to_num(255 * share * fade).astype(np.uint8)
+        return np.repeat(grey[:, None], 3, axis=1)
 
 
 def slice_picture(
@@ -109,9 +124,9 @@ def slice_picture(
     points_ct = motion.back(plane.points(sampled))
     if points_ct is None:
         return None
-    grey = Image.fromarray(ct.grey(points_ct).reshape(sampled, sampled))
+    coarse = Image.fromarray(ct.picture(points_ct).reshape(sampled, sampled, 3))
     fine = _FINER * pixels  # lines are drawn finer and then shrunk, so that they are smooth
-    image = grey.resize((fine, fine), Image.Resampling.BILINEAR).convert("RGB")
+    image = coarse.resize((fine, fine), Image.Resampling.BILINEAR)
     draw = ImageDraw.Draw(image)
     per_mm = fine / plane.side_mm
     for mesh, colour, width in outlines:
