@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from attack_registry import ATTACKS, FINISH, Attack, Made, attack, may_finish, must_finish
+from attack_registry import ATTACKS, FINISH, Attack, Made, attack, must_finish
 from attack_volumes import ball
 
 
