@@ -4,12 +4,14 @@ import os
 import re
 import sys
 import tomllib
+from importlib import import_module
 from pathlib import Path
 
 import pytest
 
 from extension_objects import distribution
 from tumortrack.cli.doctor import PURPOSES, Doctor, part
+from tumortrack.cli.main import run
 
 ROOT = Path(__file__).parents[2]
 
@@ -52,11 +54,45 @@ def acme(tmp_path, monkeypatch):
 
 @pytest.mark.usefixtures("acme")
 def test_it_says_what_is_missing_unsupported_or_broken_and_what_to_type():
-    assert part("acme", "", "all").startswith("ok       acme: all; numpy ")
+    def line(*about):
+        (said,) = part(*about)
+        return said
+
+    assert line("acme", "", "all").startswith("ok       acme: all; numpy ")
     command = f"{sys.executable} -m pip install 'acme[far]'"
-    assert part("acme", "far", "") == (
+    assert line("acme", "far", "") == (
         f"absent   acme[far]: ; no-such-package is not installed; {command}"
     )
-    assert re.search(r"BROKEN .* numpy 2\S+ is installed, but <2 is sup", part("acme", "old", ""))
-    assert "shattered 0.1: libacme.so is not there" in part("acme", "wrong", "")
-    assert part("nothing", "", "").endswith("-m pip install 'nothing'")
+    assert re.search(r"BROKEN .* numpy 2\S+ is installed, but <2 is sup", line("acme", "old", ""))
+    assert "shattered 0.1: libacme.so is not there" in line("acme", "wrong", "")
+    assert line("nothing", "", "").endswith("-m pip install 'nothing'")
+
+
+def without(monkeypatch, package, error):
+    def find(name):
+        if name == package:
+            raise ImportError(error)
+        return import_module(name)
+
+    monkeypatch.setattr("tumortrack.cli.doctor.import_module", find)
+
+
+def test_a_library_that_is_missing_costs_only_the_part_that_needs_it(monkeypatch, capsys):
+    missing = "libusb-1.0.so.0: cannot open shared object file: No such file or directory"
+    without(monkeypatch, "pyrealsense2", missing)
+    Doctor().run()  # what is absent is no fault
+    said = capsys.readouterr().out
+    assert re.search(r"^ok       tumortrack\[live\]: .*but for what follows; .*viser ", said, re.M)
+    assert re.search(
+        rf"^absent   RealSense cameras: pyrealsense2 \S+: {missing}; apt-get install libusb-1.0-0$",
+        said,
+        re.M,
+    )
+
+
+def test_what_is_installed_and_does_not_work_is_told_by_the_exit_status(monkeypatch, capsys):
+    without(monkeypatch, "viser", "undefined symbol: PyObject_Vast")
+    assert run(["doctor"]) == 1
+    said = capsys.readouterr()
+    assert re.search(r"^BROKEN   the web viewer: viser \S+: undefined symbol", said.out, re.M)
+    assert "1 of what is installed here does not work" in said.err

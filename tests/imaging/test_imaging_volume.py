@@ -235,6 +235,29 @@ def test_a_mended_header_is_not_told_by_nibabel_whose_log_stays_as_it_was(tmp_pa
     assert capfd.readouterr().err == ""
 
 
+@pytest.mark.parametrize("unscaled", [(1.0, 0.0), (0.0, 0.0), (np.nan, np.nan)])
+@pytest.mark.parametrize("order", "<>")
+def test_either_byte_order_is_read_and_no_scale_means_the_numbers_as_they_are(
+    tmp_path, order, unscaled
+):
+    import nibabel
+
+    voxels = np.arange(-30, 90, dtype=order + "i2").reshape(4, 5, 6)
+    header = nibabel.Nifti1Header(endianness=order)
+    header.set_data_shape(voxels.shape)
+    header.set_data_dtype(voxels.dtype)
+    header.set_sform(np.eye(4), code=1)
+    header["vox_offset"], header["magic"] = 352, b"n+1"
+    header["scl_slope"], header["scl_inter"] = unscaled
+    content = header.binaryblock + bytes(4) + voxels.tobytes(order="F")
+    (tmp_path / "v.nii.gz").write_bytes(gzip.compress(content))
+    np.testing.assert_array_equal(read_volume(tmp_path / "v.nii.gz").hu, voxels)
+    header["scl_slope"], header["scl_inter"] = 2, np.nan  # a scale that is lost in part
+    (tmp_path / "v.nii").write_bytes(header.binaryblock + content[348:])
+    with pytest.raises(InputError, match="intercept"):
+        read_volume(tmp_path / "v.nii")
+
+
 def test_contradictory_orientations_are_refused(tmp_path):
     import nibabel
 

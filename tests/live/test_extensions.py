@@ -131,12 +131,42 @@ def test_doctor_names_what_other_packages_add(tmp_path):
         *installed_example(tmp_path / "site"),
         distribution(tmp_path / "other", "acme-sources", broken),
     ]
-    said = succeeded(with_packages(folders, "doctor"))
+    done = with_packages(folders, "doctor")
+    assert done.returncode == 1  # something that is installed does not work
+    said = done.stdout
+    assert "ok       deformation twist of the package tumortrack-example" in said
     assert "ok       sink csv of the package tumortrack-example" in said
     assert "BROKEN   source lost of the package acme-sources: " in said
     assert "no_such_module" in said
 
 
 def test_the_documentation_shows_the_example_as_it_is():
-    shown = (EXAMPLE.parents[2] / "docs" / "live.md").read_text()
-    assert (EXAMPLE / "tumortrack_example" / "csv.py").read_text() in shown
+    for page, file in (("live.md", "csv.py"), ("architecture.md", "twist.py")):
+        shown = (EXAMPLE.parents[2] / "docs" / page).read_text()
+        assert (EXAMPLE / "tumortrack_example" / file).read_text() in shown
+
+
+def test_the_examples_deformation_turns_one_end_against_the_other(example):
+    from tumortrack.core.types import Anatomy
+    from tumortrack.simulate.deform.base import View
+    from tumortrack_example.twist import TwistConfig
+
+    view = View(Anatomy((small_box(),)), visible=lambda points: np.ones(len(points), bool))
+    twist = TwistConfig(most_degrees=30).sample(view, np.random.default_rng(0))
+    ends = np.array([[10.0, 0, -20], [10.0, 0, 20]])
+    moved = twist.apply(ends)
+    first, second = np.degrees(np.arctan2(moved[:, 1], moved[:, 0]))
+    assert second - first == pytest.approx(np.degrees(40 * twist.radians_per_mm), abs=1e-3)
+    assert 0.5 < abs(second - first) <= 30
+    np.testing.assert_allclose(
+        np.linalg.norm(moved, axis=1), np.linalg.norm(ends, axis=1), rtol=1e-6
+    )
+
+
+def small_box():
+    import trimesh
+
+    from tumortrack.core.types import Mesh
+
+    box = trimesh.creation.box((20, 20, 40))
+    return Mesh(box.vertices, box.faces)

@@ -232,7 +232,7 @@ def test_a_negative_seed_is_refused(tracker, seen, work):
     with pytest.raises(InputError, match="seed is -1"):
         tracker.locate(SensorCloud(seen[0]), seed=-1)
     simulated = ["simulate", work / "case", work / "negative", "--seed", -1]
-    assert "seed -1" in refusal(tumortrack(*simulated))
+    assert "seed is -1" in refusal(tumortrack(*simulated))
     assert not (work / "negative").exists()
 
 

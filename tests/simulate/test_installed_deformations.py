@@ -40,7 +40,7 @@ class TakenConfig(Config, frozen=True, tag="drag"):
     def sample(self, view, rng): ...
 
 
-class Unsampled(Config, frozen=True, tag="unsampled"):
+class Unsampled(Config, frozen=True, tag="shift"):
     pass
 
 
@@ -83,7 +83,12 @@ print("used")
 READ = """
 from tumortrack.core.config import from_builtins
 from tumortrack.simulate.scene import SceneConfig
-from_builtins({"deform": [{"type": "drag"}]}, SceneConfig, "scene.json")
+read = [{"type": "drag"}, {"type": "chain", "links": [{"type": "stretch"}]}]
+from_builtins({"deform": read}, SceneConfig, "scene.json")
+print("read")
+"""
+NAME = """
+from_builtins({"deform": [{"type": "shift", "most_mm": 9}]}, SceneConfig, "scene.json")
 """
 
 
@@ -115,14 +120,15 @@ def test_the_foreign_module_may_be_imported_first(tmp_path):
     [
         ("shifting:Absent", "AttributeError"),
         ("absent_module:ShiftConfig", "No module named 'absent_module'"),
-        ("shifting:nothing", "it is no tumortrack.core.config.Config with a tag"),
+        ("shifting:nothing", "it is not a tumortrack.core.config.Config"),
         ("shifting:Unsampled", "it has no method sample"),
-        ("shifting:TakenConfig", "its tag 'drag' is taken"),
+        ("shifting:TakenConfig", "its tag is 'drag'; it must be 'shift'"),
     ],
 )
-def test_a_broken_one_is_named_with_its_package(tmp_path, value, why):
-    done = run(tmp_path, value, READ)
+def test_a_broken_one_is_refused_with_its_package_where_it_is_named_alone(tmp_path, value, why):
+    done = run(tmp_path, value, READ + NAME)
+    assert done.stdout == "read\n", done.stderr
     last = done.stderr.strip().splitlines()[-1]
-    assert last.startswith("tumortrack.core.errors.InputError: the deformation 'shift' of ")
+    assert last.startswith("tumortrack.core.errors.PackageError: the deformation 'shift' of ")
     assert "shifting-organs" in last
     assert why in last

@@ -244,6 +244,19 @@ def _map_is_a_fifo(folder: Path, base: Path) -> Made:
     return ["locate", base / "model", cloud, folder / "out", "--map", folder / "map.csv"]
 
 
+@attack
+def _map_at_1e300(folder: Path, base: Path) -> Made:
+    (folder / "map.csv").write_text("x,y,z\n1e300,-1e300,1e300\n")
+    cloud = base / "scenes" / "0000" / "cloud.ply"
+    return ["locate", base / "model", cloud, folder / "out", "--map", folder / "map.csv"]
+
+
+@attack
+def _seed_of_100_bits(folder: Path, base: Path) -> Made:
+    cloud = base / "scenes" / "0000" / "cloud.ply"
+    return ["locate", base / "model", cloud, folder / "out", "--seed", 10**30]
+
+
 def views(folder: Path, base: Path, *poses: object, **changed: object) -> Made:
     """Two views of a right cloud, from such places."""
     cloud = base / "scenes" / "0000" / "cloud.ply"

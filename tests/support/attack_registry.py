@@ -10,11 +10,17 @@ Made = list[object]
 Attack = Callable[[Path, Path], Made]  # (empty folder, base: case, model, scenes, run, plan)
 ATTACKS: dict[str, Attack] = {}
 FINISH: set[str] = set()  # may also end well, with a note or a verdict other than good
+MUST_FINISH: set[str] = set()  # odd, but right: to be read
 
 
 def attack(make: Attack) -> Attack:
     ATTACKS[make.__name__.strip("_")] = make
     return make
+
+
+def must_finish(make: Attack) -> Attack:
+    MUST_FINISH.add(make.__name__.strip("_"))
+    return may_finish(make)
 
 
 def may_finish(make: Attack) -> Attack:

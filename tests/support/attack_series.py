@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import struct
 import zlib
 from collections.abc import Callable
@@ -11,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from attack_registry import ATTACKS, FINISH, Attack, Made, attack, may_finish
+from attack_registry import ATTACKS, FINISH, Attack, Made, attack, must_finish
 from attack_volumes import ball
 
 
@@ -185,9 +186,9 @@ def _dicom_cut_files(folder: Path, base: Path) -> Made:
     return dicom(folder, change)
 
 
-@may_finish
+@must_finish
 def _dicom_latin1_names(folder: Path, base: Path) -> Made:
-    """File names that are no UTF-8: read all the same, or refused."""
+    """File names that are no UTF-8."""
 
     def change(slices: list[Any]) -> None:
         for n, (dataset, path) in enumerate(slices):
@@ -275,7 +276,7 @@ def _mesh_260_tumors(folder: Path, base: Path) -> Made:
     return meshes(folder, kidney=sphere(30), **{f"tumor_{n}": one for n in range(1, 261)})
 
 
-@may_finish
+@must_finish
 def _mesh_material_is_a_fifo(folder: Path, base: Path) -> Made:
     """Materials are not looked for."""
     made = meshes(
@@ -285,13 +286,19 @@ def _mesh_material_is_a_fifo(folder: Path, base: Path) -> Made:
     return made
 
 
-@may_finish
+@must_finish
 def _mesh_texture_is_a_fifo(folder: Path, base: Path) -> Made:
-    content = sphere(30).export(file_type="ply", encoding="ascii")
-    content = content.replace(b"ply\n", b"ply\ncomment TextureFile pipe\n", 1)
+    content = sphere(30).export(file_type="ply")
+    content = content.replace(b"1.0\n", b"1.0\ncomment TextureFile pipe\n", 1)
     made = meshes(folder, kidney__ply=content)
     os.mkfifo(folder / "meshes" / "pipe")
     return made
+
+
+@must_finish
+def _mesh_stl_normals_are_words(folder: Path, base: Path) -> Made:
+    content = sphere(30).export(file_type="stl_ascii").encode()
+    return meshes(folder, kidney__stl=re.sub(rb"normal .*", b"normal up up up", content))
 
 
 @attack

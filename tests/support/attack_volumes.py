@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from attack_registry import ATTACKS, Made, attack, may_finish
+from attack_registry import ATTACKS, Made, attack, may_finish, must_finish
 
 
 def ball(size: int = 40) -> np.ndarray:
@@ -51,6 +51,17 @@ def volume(folder: Path, change: Callable[[bytearray], None], data: bytes | None
 
 def put(form: str, offset: int, *values: object) -> Callable[[bytearray], None]:
     return lambda header: struct.pack_into(form, header, offset, *values)
+
+
+@must_finish
+def _nifti_big_endian(folder: Path, base: Path) -> Made:
+    """With the scale that nibabel leaves in headers whose scale it has applied."""
+    import nibabel
+
+    header = nibabel.Nifti1Header(bytes(nifti_header((60, 60, 60), 4, 16)[:348]))
+    header["scl_slope"] = header["scl_inter"] = np.nan
+    content = header.as_byteswapped(">").binaryblock + bytes(4)
+    return packed(folder, gzip.compress(content + ball(60).astype(">i2").tobytes("F")))
 
 
 for name, form, offset, values in (

@@ -21,7 +21,7 @@ import attack_artifacts  # noqa: F401  each adds its attacks
 import attack_clouds  # noqa: F401
 import attack_series  # noqa: F401
 import attack_volumes  # noqa: F401
-from attack_registry import ATTACKS, FINISH
+from attack_registry import ATTACKS, FINISH, MUST_FINISH
 
 SECONDS, MEGABYTES = 20.0, 1024
 WITHOUT_BASE = (  # how the names of attacks begin that need nothing but their own folder
@@ -147,12 +147,16 @@ def _fault(
         return f"killed ({signal.Signals(-code).name})"
     if "Traceback" in output:
         return "traceback"
+    if "Warning: " in output:  # Python's, as NumPy gives
+        return "warning"
     if seconds > SECONDS / 2:
         return "slow"
     if megabytes > MEGABYTES:
         return "memory"
     if code == 0:
         return "" if name in FINISH else "accepted"
+    if name in MUST_FINISH:
+        return "refused"
     if len(lines) != 1 or code == 1:
         return "no clear line"
     return f"left {left[0]}" if [path for path in left if not path.endswith("report.json")] else ""

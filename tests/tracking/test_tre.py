@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ import trimesh
 from motions import Wave
 from stories import succeeded, tumortrack, write_phantom_case
 from tumortrack.core.errors import InputError, NoEstimate
-from tumortrack.core.estimate import Estimate
+from tumortrack.core.estimate import Estimate, Following
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import (
     Anatomy,
@@ -21,10 +22,12 @@ from tumortrack.core.types import (
     SensorCloud,
 )
 from tumortrack.imaging.case import load_case
+from tumortrack.live.sources.virtual import VirtualSourceConfig
 from tumortrack.report.metrics import label_grid, target_errors
 from tumortrack.report.page import target_text
 from tumortrack.report.protocol import evaluate_scene, evaluate_scenes, summarise, summary_table
 from tumortrack.simulate.occupancy import labels_of
+from tumortrack.simulate.scene import SceneRecipe
 from tumortrack.simulate.scene_folder import (
     Scene,
     Targets,
@@ -100,9 +103,18 @@ def test_the_true_motion_has_no_error_and_a_rigid_one_has_the_waves():
 # --- scenes hold targets ---
 
 
-def test_a_negative_seed_is_refused():
-    with pytest.raises(InputError, match="seed -1 must be 0 or more"):
-        draw_targets(anatomy_ct(), -1)
+@pytest.mark.parametrize("seed", [-1, 2**32, 10**30])
+def test_a_seed_of_more_than_32_bits_is_refused(seed):
+    allowed = f"the seed is {seed}; allowed: whole numbers from 0 to 4294967295"
+    for use in (
+        lambda: draw_targets(anatomy_ct(), seed),
+        lambda: SceneRecipe(seed, "test", 0),
+        lambda: Following(seed=seed),
+        lambda: VirtualSourceConfig(case=Path("case"), seed=seed),
+    ):
+        with pytest.raises(InputError, match=allowed):
+            use()
+    assert len(draw_targets(anatomy_ct(), 2**32 - 1).points_ct)
 
 
 def test_targets_come_back_from_a_scenes_folder(tmp_path):

@@ -5,15 +5,17 @@ from __future__ import annotations
 import platform
 import shutil
 import sys
+from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib import import_module
-from importlib.metadata import PackageNotFoundError, requires, version
+from importlib.metadata import PackageNotFoundError, entry_points, requires, version
 from importlib.util import find_spec
 from pathlib import Path
 
 from packaging.requirements import Requirement
 
 from tumortrack.cli.console import say
+from tumortrack.core.errors import TumortrackError
 from tumortrack.core.process import available_cores
 
 # What each distribution and its extras are for; "" is what it always needs.
@@ -38,35 +40,39 @@ _MODULES = {  # where it is not named as its package
     "scikit-image": "skimage",
     "ur_rtde": "rtde_control",
 }
+# Packages of an extra that serve a part of it alone: without them the rest works.
+_PARTS = {
+    "rosbags": "recordings, and messages of ROS",
+    "cyclonedds": "ROS 2",
+    "viser": "the web viewer",
+    "fastcrc": "OpenIGTLink to 3D Slicer",
+    "pyrealsense2": "RealSense cameras",
+    "highdicom": "DICOM segmentations",
+}
 _ABSENT = " is not installed"
-_CURES = {"pyrealsense2": " (apt-get install libusb-1.0-0)"}
+# Libraries of the system that pip cannot bring.
+_SYSTEM = {"pyrealsense2": ("libusb", "apt-get install libusb-1.0-0")}
 
 
 @dataclass(frozen=True, kw_only=True)
 class Doctor:
-    """Say what works on this machine, and how to install what is missing."""
+    """Say what works on this machine, and how to install what is missing.
+
+    The exit status is 1 where something that is installed does not work (BROKEN), else 0: what is
+    absent is no fault.
+    """
 
     def run(self) -> None:
-        """Print the machine, then what of every extra is there, by importing it."""
-        from tumortrack.live.spec import extensions
-
+        """Print the machine, then what of every extra is there, by importing it. Raises
+        TumortrackError: something that is installed does not work."""
         say(f"tumortrack {version('tumortrack')}, Python {platform.python_version()}")
         say(f"cores: {available_cores()}, {platform.machine()}, {platform.system()}")
         free = shutil.disk_usage(Path.cwd()).free / 2**30
         say(f"free disk here: {free:.1f} GiB" + (" - little" if free < 2 else ""))
-        for (name, extra), purpose in PURPOSES.items():
-            say(part(name, extra, purpose))
-        if find_spec("rclpy"):
-            say("ok       rclpy: ROS 2 through your own ROS")
-        for one in extensions():
-            state, fault = ("BROKEN  ", f": {one.fault}") if one.fault else ("ok      ", "")
-            say(f"{state} {one.what} {one.kind} of the package {one.package}{fault}")
-        try:
-            from tumortrack.registration.kernels import carry
-
-            say(f"ok       compiled kernels are kept in {carry.stats.cache_path}")
-        except Exception as error:  # Numba's own, where no folder can be written to
-            say(f"BROKEN   compiled kernels: {error}; set NUMBA_CACHE_DIR to a writable folder")
+        broken = 0
+        for line in _findings():
+            say(line)
+            broken += line.startswith("BROKEN")
 
         import torch
 
@@ -82,22 +88,71 @@ class Doctor:
             say(f"CUDA: {torch.cuda.get_device_name()}")
         else:
             say("CUDA: none; everything runs on the CPU")
+        if broken:
+            raise TumortrackError(
+                f"{broken} of what is installed here does not work: see BROKEN above. All else can "
+                "be used."
+            )
 
 
-def part(name: str, extra: str, purpose: str) -> str:
-    """A distribution, or one of its extras: whether all that it needs is there and works."""
+def _findings() -> Iterator[str]:
+    """Lines that begin with ok, absent or BROKEN."""
+    for (name, extra), purpose in PURPOSES.items():
+        yield from part(name, extra, purpose)
+    if find_spec("rclpy"):
+        yield "ok       rclpy: ROS 2 through your own ROS"
+    yield from _plug_ins()
+    try:
+        from tumortrack.registration.kernels import carry
+
+        yield f"ok       compiled kernels are kept in {carry.stats.cache_path}"
+    except Exception as error:  # Numba's own, where no folder can be written to
+        yield f"BROKEN   compiled kernels: {error}; set NUMBA_CACHE_DIR to a writable folder"
+
+
+def _plug_ins() -> Iterator[str]:
+    """What other packages add; each is imported. Commands that work are in ``--help``."""
+    from tumortrack.live import spec
+    from tumortrack.simulate.deform import installed
+
+    added = [(f"{one.what} {one.kind}", one.package, one.fault) for one in spec.extensions()]
+    added += [(f"deformation {d.name}", d.package, d.fault) for d in installed.extensions()]
+    for point in entry_points(group="tumortrack.commands"):
+        try:
+            point.load()
+        except Exception as error:  # a foreign package raises anything
+            added.append((f"command {point.name}", point.value, str(error)))
+    for what, package, fault in added:
+        state, why = ("BROKEN  ", f": {fault}") if fault else ("ok      ", "")
+        yield f"{state} {what} of the package {package}{why}"
+
+
+def part(name: str, extra: str, purpose: str) -> Iterator[str]:
+    """A distribution, or one of its extras: whether all that it needs is there and works. What is
+    wrong with a package that serves a part of it alone stands in a line of its own."""
     what = f"{name}[{extra}]" if extra else name
     install = f"{sys.executable} -m pip install '{what}'"
     try:
         needed = [one for one in map(Requirement, requires(name) or ()) if _belongs(one, extra)]
     except PackageNotFoundError:
-        return f"absent   {what}: {purpose}; {install}"
-    if faults := [fault for one in needed if (fault := _fault(one))]:
-        absent = extra and all(fault.endswith(_ABSENT) for fault in faults)
+        yield f"absent   {what}: {purpose}; {install}"
+        return
+    faults = {one.name: fault for one in needed if (fault := _fault(one))}
+    works = [one.name for one in needed if one.name not in faults]
+    alone = {name: fault for name, fault in faults.items() if name in _PARTS} if works else {}
+    if rest := [fault for name, fault in faults.items() if name not in alone]:
+        absent = extra and all(fault.endswith(_ABSENT) for fault in rest)
         state = "absent  " if absent else "BROKEN  "
-        return f"{state} {what}: {purpose}; {', '.join(faults)}; {install}"
-    found = ", ".join(f"{one.name} {version(one.name)}" for one in needed)
-    return f"ok       {what}: {purpose}; {found}"
+        yield f"{state} {what}: {purpose}; {', '.join(rest)}; {install}"
+    else:
+        there = ", ".join(f"{name} {version(name)}" for name in works)
+        yield f"ok       {what}: {purpose}{', but for what follows' if alone else ''}; {there}"
+    for package, fault in alone.items():
+        library, cure = _SYSTEM.get(package, ("", ""))
+        if not (library and library in fault):
+            library, cure = "", install
+        absent = bool(library) or fault.endswith(_ABSENT)
+        yield f"{'absent  ' if absent else 'BROKEN  '} {_PARTS[package]}: {fault}; {cure}"
 
 
 def _belongs(needed: Requirement, extra: str) -> bool:
@@ -119,5 +174,5 @@ def _fault(needed: Requirement) -> str:
     try:
         import_module(_MODULES.get(needed.name, needed.name.replace("-", "_")))
     except Exception as error:  # whatever a broken installation raises is the finding
-        return f"{needed.name} {found}: {error}{_CURES.get(needed.name, '')}"
+        return f"{needed.name} {found}: {error}"
     return ""

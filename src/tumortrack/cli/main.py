@@ -24,7 +24,7 @@ from tumortrack.cli.plan import Plan
 from tumortrack.cli.resect import Resect
 from tumortrack.cli.track import Track
 from tumortrack.cli.training import Train
-from tumortrack.core.errors import InputError, StorageError, TumortrackError
+from tumortrack.core.errors import InputError, PackageError, StorageError, TumortrackError
 
 
 @runtime_checkable
@@ -107,7 +107,16 @@ def _commands(chosen: str) -> dict[str, Callable[..., Command]]:
         return {**ours}
     others = sorted(entry_points(group="tumortrack.commands"), key=lambda point: point.name)
     others = [point for point in others if point.name == chosen] or others
-    return {**ours, **{point.name: point.load() for point in others}}
+    commands: dict[str, Callable[..., Command]] = {**ours}
+    for point in others:
+        try:
+            commands[point.name] = point.load()
+        except Exception as error:  # a foreign package raises anything
+            fault = f"the command {point.name} ({point.value}) cannot be imported: {error}"
+            if point.name == chosen:
+                raise PackageError(f"{fault}. Repair or uninstall its package.") from error
+            print(f"note: {fault}", file=sys.stderr)
+    return commands
 
 
 def _parse(arguments: list[str]) -> Command:

@@ -11,6 +11,7 @@ from tyro.conf import Positional
 
 from tumortrack.cli.console import Device, keep_loaded, progress_bar, say
 from tumortrack.core import store
+from tumortrack.core.config import check_seed
 from tumortrack.core.errors import InputError
 
 if TYPE_CHECKING:
@@ -50,8 +51,7 @@ class Margins:
             raise InputError("--confidence: give shares from 0.5 to 0.99, as 0.9 0.95.")
         if not 0.5 <= self.widest <= 20:
             raise InputError(f"--widest {self.widest:g} is not allowed; choose 0.5 to 20 mm.")
-        if self.seed < 0:
-            raise InputError(f"--seed {self.seed} must be 0 or more.")
+        check_seed(self.seed)
         if not self.scenes:
             raise InputError("give folders of scenes: tumortrack margins MODEL SCENES.")
         read_model_manifest(self.model)

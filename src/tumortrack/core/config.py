@@ -30,6 +30,15 @@ class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
                 raise InputError(f"{what} {name} is {said}; allowed: {low:g} to {high:g}.")
 
 
+_LARGEST_SEED = 2**32 - 1  # what the generators of all libraries take
+
+
+def check_seed(seed: int) -> None:
+    """InputError for a number that is not allowed as a seed of random numbers."""
+    if not 0 <= seed <= _LARGEST_SEED:
+        raise InputError(f"the seed is {seed}; allowed: whole numbers from 0 to {_LARGEST_SEED}.")
+
+
 C = TypeVar("C", bound=msgspec.Struct)
 
 

@@ -20,6 +20,10 @@ class ArtifactError(InputError):
     """A case, model or run folder is missing, damaged, or of another kind or schema."""
 
 
+class PackageError(InputError):
+    """An installed package that is asked for is broken."""
+
+
 class NoEstimate(TumortrackError):
     """The input is well formed but allows no answer (too few points, no organ)."""
 

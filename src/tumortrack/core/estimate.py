@@ -9,7 +9,7 @@ from typing import Any, Literal, Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float
 
-from tumortrack.core.config import Config
+from tumortrack.core.config import Config, check_seed
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import Points
 from tumortrack.core.organ import KIDNEY, Organ
@@ -58,8 +58,7 @@ class Following(Config, frozen=True, kw_only=True):
     seed: int = 0
 
     def __post_init__(self) -> None:
-        if self.seed < 0:
-            raise InputError(f"the seed is {self.seed}; it must be 0 or more.")
+        check_seed(self.seed)
         if not 0 <= self.smoothing_s <= 5:
             raise InputError(f"smoothing is {self.smoothing_s:g} s; allowed: 0 (off) to 5 s.")
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import logging
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,8 @@ from tumortrack.core.types import Anatomy, Mesh
 
 SUFFIXES = (".ply", ".stl", ".obj")
 _LARGEST_FILE = 512 * 2**20  # bytes
+# trimesh logs tracebacks of what it leaves out (normals, textures), which is not needed here.
+_SILENT = logging.NullHandler()
 _SPACE, _STL_HEADER = b"SPACE=LPS", 80
 
 
@@ -25,9 +28,11 @@ def read_mesh(path: Path) -> Mesh:
     if path.suffix.lower() not in SUFFIXES:
         raise InputError(f"{path}: unknown mesh type. Allowed: {', '.join(SUFFIXES)}.")
     content = read_file(path, _LARGEST_FILE, "Reduce the mesh first.")
+    logging.getLogger("trimesh").addHandler(_SILENT)
     try:  # from memory: no other file that it names, as of a texture, is looked for
-        kind = path.suffix.lower().removeprefix(".")
-        loaded = trimesh.load_mesh(io.BytesIO(content), file_type=kind, process=False)
+        loaded = trimesh.load_mesh(
+            io.BytesIO(content), path.suffix.lower()[1:], process=False, skip_materials=True
+        )
         vertices, faces = np.asarray(loaded.vertices), np.asarray(loaded.faces)
     except Exception as error:  # trimesh raises anything on a damaged file
         raise InputError(f"{path} cannot be read as a mesh: {error}.") from error

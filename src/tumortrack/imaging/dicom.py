@@ -7,7 +7,10 @@ readers only warn of a missing slice and stretch the patient.
 from __future__ import annotations
 
 import os
+import tempfile
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -100,16 +103,30 @@ def read_dicom(folder: Path, series: str | None = None) -> RawVolume:
     found = find_series(folder, series)
     sitk.ProcessObject.SetGlobalWarningDisplay(False)
     reader = sitk.ImageSeriesReader()
-    reader.SetFileNames([str(file) for file in found.files])
     reader.SetOutputPixelType(sitk.sitkFloat32)
     try:
-        array = sitk.GetArrayFromImage(reader.Execute()).transpose(2, 1, 0)
+        with _readable_names(found.files) as names:
+            reader.SetFileNames(names)
+            array = sitk.GetArrayFromImage(reader.Execute()).transpose(2, 1, 0)
     except RuntimeError as error:
         last = str(error).strip().splitlines()[-1]
         raise InputError(f"{folder}: the slices' pixels cannot be decoded: {last}.") from error
     if array.shape != found.shape:
         raise InputError(f"{folder}: the pixels are {array.shape}, the tags say {found.shape}.")
     return RawVolume(array, found.lps_from_index, found.notes, found.patient)
+
+
+@contextmanager
+def _readable_names(files: tuple[Path, ...]) -> Iterator[list[str]]:
+    """The files' names for SimpleITK, which takes UTF-8 only: links, where one has another name."""
+    names = [str(file) for file in files]
+    if all(name.isprintable() for name in names):  # bytes that are no UTF-8 are not
+        yield names
+        return
+    with tempfile.TemporaryDirectory() as links:
+        for number, file in enumerate(files):
+            Path(links, str(number)).symlink_to(file.absolute())
+        yield [str(Path(links, str(number))) for number in range(len(files))]
 
 
 def _patient(folder: Path, groups: list[list[_Slice]], slices: list[_Slice]) -> Patient:
@@ -142,8 +159,6 @@ def _check_tags(folder: Path, slices: list[_Slice]) -> None:
         }
         if found := [fault for fault, there in faults.items() if there]:
             raise InputError(f"{one.path}: {found[0]}. {_AGAIN}")
-        if (name := str(one.path)).encode(errors="replace") != os.fsencode(name):
-            raise InputError(f"{name!a}: this name is no UTF-8. Rename the files.")
 
 
 def _groups(folder: Path) -> tuple[list[list[_Slice]], tuple[str, ...]]:

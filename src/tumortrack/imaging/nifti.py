@@ -102,11 +102,13 @@ def _read(path: Path, stream: Any, compressed: bool) -> grid.RawVolume:
         )
     lps_from_index = _lps_from_index(path, header)
     grid.check_affine(path, lps_from_index)
-    if not np.isfinite(stated).all():
+    # Both NaN: not scaled, as nibabel keeps the header of an image whose scale it has applied.
+    if not (np.isfinite(stated).all() or np.isnan(stated).all()):
         raise InputError(f"{path}: its numbers' slope or intercept is not finite. Export it again.")
     stream.seek(int(offset))
     data = _voxels(path, stream, math.prod(shape) * dtype.itemsize, compressed)
     array = np.frombuffer(data, dtype).reshape(shape, order="F")
+    array = array.astype(dtype.newbyteorder("="), copy=False)
     scale = np.float64(slope or 1.0), np.float64(intercept or 0.0)
     return grid.RawVolume(apply_read_scaling(array, *scale), lps_from_index)
 

@@ -141,8 +141,8 @@ POSES = Registry[PosesConfig](
 
 
 def extensions() -> list[Extension]:
-    """Every source and sink that installed packages offer."""
-    return [*SOURCES.extensions(), *SINKS.extensions()]
+    """Every source, sink and source of a camera's pose that installed packages offer."""
+    return [*SOURCES.extensions(), *SINKS.extensions(), *POSES.extensions()]
 
 
 def _package_of(entry: EntryPoint) -> str:

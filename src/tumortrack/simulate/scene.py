@@ -18,7 +18,7 @@ from jaxtyping import Float32, Float64, Num, UInt8
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
-from tumortrack.core.config import Config
+from tumortrack.core.config import Config, check_seed
 from tumortrack.core.errors import InputError, NoEstimate, TumortrackError
 from tumortrack.core.geometry import rigid, rotation_onto, transform_points
 from tumortrack.core.types import Anatomy, DepthFrame, Mesh, SensorCloud
@@ -122,10 +122,9 @@ class SceneRecipe:
     index: int
 
     def __post_init__(self) -> None:
-        if self.seed < 0 or self.index < 0:
-            raise InputError(
-                f"seed {self.seed} and index {self.index} of a scene must be 0 or more."
-            )
+        check_seed(self.seed)
+        if self.index < 0:
+            raise InputError(f"the index of a scene is {self.index}; it must be 0 or more.")
 
     def generator(self, attempt: int) -> np.random.Generator:
         return np.random.default_rng([self.seed, STREAMS.index(self.stream), self.index, attempt])

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Float64, UInt8
 
+from tumortrack.core.config import check_seed
 from tumortrack.core.errors import InputError
 from tumortrack.core.mesh_files import read_anatomy, write_anatomy
 from tumortrack.core.organ import KIDNEY, Organ, is_tumor, organ_entry, organ_in
@@ -193,9 +194,8 @@ def _united(folder: Path, anatomy: Anatomy) -> Anatomy:
 def draw_targets(anatomy_ct: Anatomy, seed: int) -> InnerPoints:
     """``TARGETS`` points spread evenly inside each part: half of them in the parenchyma, the others
     shared by the tumors (all in the organ where it has none). A tumor that others cover and a
-    negative seed raise InputError."""
-    if seed < 0:
-        raise InputError(f"seed {seed} must be 0 or more.")
+    seed that is not allowed raise InputError."""
+    check_seed(seed)
     rng = np.random.default_rng([seed, 1000])
     n_tumors = len(anatomy_ct.tumors)
     inside = TARGETS // 2 if n_tumors else TARGETS

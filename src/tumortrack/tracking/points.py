@@ -28,6 +28,7 @@ from tumortrack.core.store import read_file
 
 FAR_MM = 100.0  # from the organ's box: such a point is hardly meant
 _NEAR_MM = 20.0  # a point about the organ, where another reading of the file is weighed
+_FARTHEST_MM = 1e7  # of any scanner's origin
 _MOST_BYTES = 64 * 2**20
 _NAMINGS: dict[tuple[str, str, str], tuple[int, int, int]] = {
     ("ct_x", "ct_y", "ct_z"): (1, 1, 1),
@@ -208,8 +209,11 @@ def _numbers_of(texts: list[str], where: str) -> tuple[float, float, float]:
         x, y, z = (float(text) for text in texts)
     except ValueError as error:
         raise InputError(f"{where}: {shown!r} is no point: it takes x, y, z as numbers.") from error
-    if not np.isfinite([x, y, z]).all():
-        raise InputError(f"{where}: {shown!r} has NaN or infinity; remove the point.")
+    if not np.abs([x, y, z]).max() < _FARTHEST_MM:  # nor NaN
+        raise InputError(
+            f"{where}: {shown!r} is NaN, infinite or more than {_FARTHEST_MM / 1e6:g} km away. "
+            "Correct or remove the point."
+        )
     return x, y, z
 
 

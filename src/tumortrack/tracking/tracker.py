@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
-from tumortrack.core.config import Config, to_builtins
+from tumortrack.core.config import Config, check_seed, to_builtins
 from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.estimate import Estimate, Following
 from tumortrack.core.geometry import HERE, Affine, transform_points
@@ -78,11 +78,10 @@ class Tracker:
         Raises:
             NoEstimate: too few points, no organ found in them, they do not show this model's, or
                 the camera sees through where it would lie.
-            InputError: the cloud is in metres; the seed is negative; more than one look, where
+            InputError: the cloud is in metres; the seed is not allowed; more than one look, where
                 the model knows no motion.
         """
-        if seed < 0:
-            raise InputError(f"the seed is {seed}; it must be 0 or more.")
+        check_seed(seed)
         with _of_several(others):
             estimate = self._locator.locate(cloud, grid, seed, others)
             return self._judged(estimate, cloud, seen or cloud, False, others)

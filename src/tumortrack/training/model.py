@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from tumortrack.core import store
 from tumortrack.core.config import from_builtins, to_builtins
-from tumortrack.core.errors import ArtifactError, InputError
+from tumortrack.core.errors import ArtifactError, InputError, PackageError
 from tumortrack.core.organ import Organ
 from tumortrack.core.types import part_names
 from tumortrack.models.config import NetworkConfig, RegistrationHeadConfig, TrainConfig
@@ -83,11 +83,12 @@ def load_model(folder: Path, device: str = "auto", with_margins: bool = True) ->
         )
         model.patient  # noqa: B018 - nonsense is told here
         return model
-    except ArtifactError:
+    except (ArtifactError, PackageError):
         raise
     except InputError as error:
         raise ArtifactError(
-            f"{error} The model was trained by another version of tumortrack; train it again."
+            f"{error} The model was trained by another version of tumortrack, or with a package "
+            "that is not installed here. Install that package, or train the model again."
         ) from error
     except (KeyError, TypeError, ValueError, RuntimeError, OSError) as error:
         raise ArtifactError(

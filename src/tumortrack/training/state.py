@@ -23,7 +23,7 @@ from safetensors.torch import save
 from torch import Tensor
 
 from tumortrack.core import store
-from tumortrack.core.config import to_builtins
+from tumortrack.core.config import check_seed, to_builtins
 from tumortrack.core.errors import ArtifactError, InputError, TumortrackError
 from tumortrack.core.organ import organ_entry
 from tumortrack.core.patient import NOBODY, Patient
@@ -93,7 +93,7 @@ class TrainingRun(Run):
     patient: Patient = NOBODY  # whose organ it is
 
     def __post_init__(self) -> None:
-        check_run(self, seed=0, steps=0, workers=0)
+        check_run(self, steps=0, workers=0)
         if self.minutes is not None and not 0 <= self.minutes < float("inf"):
             raise InputError(f"minutes is {self.minutes}; it must be 0 or more.")
         if self.start is not None:
@@ -121,7 +121,8 @@ class TrainingRun(Run):
 
 
 def check_run(run: Run, **smallest: int) -> None:
-    """Refuse numbers smaller than these, and impossible times between checkpoints."""
+    """Refuse numbers smaller than these, and impossible seeds and times between checkpoints."""
+    check_seed(run.seed)
     for name, least in smallest.items():
         value = getattr(run, name)
         if value is not None and value < least:

@@ -69,7 +69,7 @@ class Pretraining(Run):
     minutes = None  # steps alone decide
 
     def __post_init__(self) -> None:
-        check_run(self, anatomies=1, steps=1, seed=0, workers=0)
+        check_run(self, anatomies=1, steps=1, workers=0)
 
     @property
     def end(self) -> int:

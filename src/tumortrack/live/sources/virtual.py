@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
 from tumortrack.core import store
-from tumortrack.core.errors import InputError
+from tumortrack.core.config import check_seed
 from tumortrack.core.patient import Patient, patient_in
 from tumortrack.live.values import Observation, SourceConfig, SourceLost
 from tumortrack.sense.noise import Sensor
@@ -50,8 +50,7 @@ class VirtualSourceConfig(SourceConfig, frozen=True, kw_only=True, tag="virtual"
 
     def __post_init__(self) -> None:
         self.check_between("virtual:", fps=(0.1, 1000))
-        if self.seed < 0:
-            raise InputError(f"virtual: seed is {self.seed}; it must be 0 or more.")
+        check_seed(self.seed)
 
     def patient(self) -> Patient:
         return patient_in(store.read_manifest(self.case, "case").get("patient"), str(self.case))

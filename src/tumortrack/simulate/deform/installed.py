@@ -5,24 +5,27 @@ A package adds one with an entry point of the group ``tumortrack.deformations``:
     [project.entry-points."tumortrack.deformations"]
     twist = "my_package.twist:TwistConfig"
 
-``TwistConfig`` is a ``core.config.Config`` with a ``tag`` of its own and
+``TwistConfig`` is a ``core.config.Config`` whose ``tag`` is the entry point's name, with
 ``sample(view, rng) -> Deformation`` (``base``). A field ``body: BodyConfig`` asks for the organ's
-elastic body in the view. Foreign packages are imported when a configuration is first read.
+elastic body in the view. Foreign packages are imported when a configuration is first read. One that
+is broken is refused, with the reason, only where a configuration names it.
 """
 
 from functools import reduce
 from importlib.metadata import EntryPoint, entry_points
 from operator import or_
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import msgspec
 
 from tumortrack.core.config import Config
-from tumortrack.core.errors import InputError
+from tumortrack.core.errors import PackageError
 from tumortrack.simulate.deform.drag import DragConfig
 from tumortrack.simulate.deform.elastic import ElasticConfig
 from tumortrack.simulate.deform.stretch import StretchConfig
 
 GROUP = "tumortrack.deformations"
-_OURS = (DragConfig, StretchConfig, ElasticConfig)
+_OURS: dict[str, Any] = {"drag": DragConfig, "stretch": StretchConfig, "elastic": ElasticConfig}
 
 if TYPE_CHECKING:
     LinkConfig = DragConfig | StretchConfig | ElasticConfig
@@ -32,31 +35,58 @@ else:
         """``LinkConfig``: the deformations that may stand in a chain."""
         if name != "LinkConfig":
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-        known: dict[str, Any] = {"chain": None}
-        known |= {kind.__struct_config__.tag: kind for kind in _OURS}
-        for point in sorted(entry_points(group=GROUP), key=lambda point: point.name):
-            kind = _loaded(point)
-            if known.setdefault(kind.__struct_config__.tag, kind) is not kind:
-                raise _broken(point, f"its tag {kind.__struct_config__.tag!r} is taken")
-        globals()[name] = union = reduce(or_, filter(None, known.values()))
+        known = {one.name: one.config for one in extensions()} | _OURS
+        globals()[name] = union = reduce(or_, known.values())
         return union
 
 
-def _loaded(point: EntryPoint) -> type[Config]:
-    try:
-        kind = point.load()
-    except Exception as error:
-        raise _broken(point, f"{type(error).__name__}: {error}") from error
-    if not (isinstance(kind, type) and issubclass(kind, Config) and kind.__struct_config__.tag):
-        raise _broken(point, "it is no tumortrack.core.config.Config with a tag")
-    if not callable(getattr(kind, "sample", None)):
-        raise _broken(point, "it has no method sample(view, rng)")
-    return kind
+class Extension(NamedTuple):
+    """A deformation of another package; ``fault``: why it cannot be used, empty if it can."""
+
+    name: str
+    package: str
+    fault: str
+    config: type[msgspec.Struct]
 
 
-def _broken(point: EntryPoint, why: str) -> InputError:
+def extensions() -> list[Extension]:
+    """Deformations that installed packages offer; each is imported."""
+    points = sorted(entry_points(group=GROUP), key=lambda point: point.name)
+    names = [point.name for point in points]
+    return [_loaded(point, names.count(point.name) > 1) for point in points]
+
+
+def _loaded(point: EntryPoint, twice: bool) -> Extension:
     package = point.dist.name if point.dist else "an installed package"
-    return InputError(
-        f"the deformation {point.name!r} of {package} ({point.value}) cannot be used: {why}. "
-        f"Update {package} or uninstall it."
+    try:
+        config = point.load()
+        fault = _fault(config, point.name, twice)
+    except Exception as error:  # a foreign package raises anything
+        fault = f"{type(error).__name__}: {error}"
+    if not fault:
+        return Extension(point.name, package, "", config)
+
+    def refuse(self: object) -> None:
+        raise PackageError(
+            f"the deformation {point.name!r} of {package} ({point.value}) cannot be used: {fault}. "
+            f"Update {package} or uninstall it."
+        )
+
+    refused = msgspec.defstruct(
+        "Refused", [], tag=point.name, frozen=True, namespace={"__post_init__": refuse}
     )
+    return Extension(point.name, package, fault, refused)
+
+
+def _fault(config: Any, name: str, twice: bool) -> str:
+    if name in {**_OURS, "chain": None}:
+        return f"{name!r} is built in, and cannot be replaced"
+    if twice:
+        return f"two packages offer {name!r}"
+    if not (isinstance(config, type) and issubclass(config, Config)):
+        return "it is not a tumortrack.core.config.Config"
+    if config.__struct_config__.tag != name:
+        return (
+            f"its tag is {config.__struct_config__.tag!r}; it must be {name!r}, as its entry point"
+        )
+    return "" if callable(getattr(config, "sample", None)) else "it has no method sample(view, rng)"
