@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float32
 
+from tumortrack.core.causes import Cause, Likely
 from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.types import DepthFrame, SensorCloud
@@ -15,7 +16,8 @@ FEWEST_POINTS = 200  # fewer do not determine an organ's shape and pose
 _FARTHEST_MM = 20_000.0  # beyond any depth camera
 _MOST_FAR = 0.01  # of a cloud's points: more are no flaws of single ones
 _LONGEST_M = 0.6  # of an organ; in inches no organ's side is shorter
-_THINNEST_MM = 1.0  # standard deviation along the second axis; an organ's is more than 10
+# Standard deviation along the second axis; an organ's is more than 10 mm, and half of the first.
+_THINNEST_MM, _THINNEST = 1.0, 0.1
 
 
 class CloudConfig(Config, frozen=True, kw_only=True):
@@ -142,7 +144,8 @@ def check_cloud(cloud: SensorCloud) -> None:
         )
     some = points_mm[:: max(1, len(points_mm) // 2000)]
     inner = some[((some >= low) & (some <= high)).all(axis=1)].astype(float)
-    if np.linalg.eigvalsh(np.cov(inner.T))[1] < _THINNEST_MM**2:
+    _, second, first = np.linalg.eigvalsh(np.cov(inner.T))
+    if second < min(_THINNEST_MM**2, _THINNEST**2 * first):
         raise NoEstimate(
             "the points of the cloud lie on one line; an organ has extent along two axes at least. "
             "Give the whole surface that the camera sees."
@@ -150,7 +153,8 @@ def check_cloud(cloud: SensorCloud) -> None:
     if not (points_mm[:, 2] > 0).any():
         raise NoEstimate(
             "no point of the cloud lies before the camera (z > 0). The camera frame has x right, "
-            "y down, z forward; turn the cloud into that frame."
+            "y down, z forward; turn the cloud into that frame.",
+            (Likely(Cause.FRAME),),
         )
 
 
