@@ -169,7 +169,7 @@ def test_check_cloud_accepts_organs_near_and_far_and_explains_units():
     check_cloud(SensorCloud(points + np.float32([0, 0, 400])))
     with pytest.raises(InputError, match="metres: give --unit m"):
         check_cloud(SensorCloud(points / 1000))
-    with pytest.raises(InputError, match=r"inches: multiply its numbers by 25\.4"):
+    with pytest.raises(InputError, match=r"inches: multiply it by 25\.4"):
         check_cloud(SensorCloud((points - np.float32([0, 0, 20])) / np.float32(25.4)))
     with pytest.raises(InputError, match="leave out --unit m"):
         check_cloud(SensorCloud(points * 1000))

@@ -47,7 +47,9 @@ def doubted(estimate, seen, **report):
     }
     sure = {**estimate.report, "parts": parts, "fit_cost": COST, "size": EXACT, **report}
     found = judged(replace(estimate, report=sure), seen)
-    assert found.report["quality"] == {"verdict": found.quality, "reason": found.reason}
+    said = found.report["quality"]
+    assert (said["verdict"], said["reason"]) == (found.quality, found.reason)
+    assert bool(said["check"]) == (found.quality == "poor")
     return found
 
 

@@ -52,10 +52,7 @@ _WORDS = {
     Cause.HIDDEN: ("about {percent:.0f} % of the organ's near side hidden", ""),
     Cause.ANOTHER_PATIENT: ("another patient's organ, or the other side's", "check both"),
     Cause.DEFORMED: ("an organ deformed as hardly any in training", ""),
-    Cause.POSES: (
-        "wrong poses of the views, or an organ that moved between them",
-        "check the poses",
-    ),
+    Cause.POSES: ("wrong poses of the views, or an organ that moved", "check the poses"),
     Cause.VIEW: ("", ""),
 }
 _POINTS = 400  # of a trial
@@ -70,7 +67,9 @@ _FLAT, _ROUND = 0.04, 0.02
 _BESIDE_MM, _MANY, _FITS_WITHOUT = 10.0, 0.03, 0.85
 _NOT_THIS = "fit", "seen_through"  # checks that speak against this organ in this place
 _HELPED_BY_A_VIEW = Cause.HIDDEN, Cause.ANOTHER_PATIENT, Cause.VIEW
-_HIDDEN, _LITTLE = 0.15, 0.8  # share of the near side; spread per that of the near side
+# Shares of the near side, and spread per that of the near side. Other kidneys that are laid wrong
+# leave up to 0.3 of it without points, or spread as widely.
+_HIDDEN, _MUCH, _LITTLE = 0.15, 0.3, 0.8
 
 
 def likely_causes(
@@ -173,10 +172,10 @@ def _shown(model: Model, points: Points, laid: _Laid) -> list[Likely]:
     near = near_side(organ)
     beside = float((cKDTree(organ.vertices_mm).query(points)[0] > _BESIDE_MM).mean())
     hidden = float(unseen(near, points).mean()) if len(near) else 0.0
-    little = len(near) > 0 and spread_mm(points) < _LITTLE * spread_mm(near)
+    much = hidden > _MUCH and spread_mm(points) < _LITTLE * spread_mm(near)
     if check == "strays" or (beside > _MANY and laid.without_strays < _FITS_WITHOUT):
         found.append(Likely(Cause.BACKGROUND, beside))
-    if hidden > _HIDDEN and (little or check not in _NOT_THIS):
+    if check == "unseen" or (hidden > _HIDDEN and check not in _NOT_THIS) or much:
         found.append(Likely(Cause.HIDDEN, hidden))
     if check in _NOT_THIS:
         other = Cause.OBJECT if check == "seen_through" else Cause.DEFORMED
