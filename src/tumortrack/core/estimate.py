@@ -21,8 +21,8 @@ LARGEST_GRID = 400
 Quality = Literal["good", "poor", "none"]  # none: there is no estimate
 # An answer with a tumor's centre farther off has failed: the plan's usual margin, all of it.
 FAR_MM = 5.0
-# What people read where it is good: that word would say more than is known.
-NO_CHECK_FAILED, UNVERIFIED = "fit: no check failed", "its place is not verified"
+# What people read where it is good: that word alone would say more than is known.
+NO_CHECK_FAILED, UNVERIFIED = "good: no check failed", "its place is not verified"
 
 
 @runtime_checkable
