@@ -100,8 +100,8 @@ def test_what_was_done_to_a_cloud_is_named_first(tracker, points, how):
         assert causes[0].number == 2.0
     if cause is Cause.HIDDEN:
         assert 0.3 < causes[0].number < 0.7
-    if causes[0].fit is not None:
-        assert causes[0].fit < 1.0
+    tried = [one.fit for one in causes if one.fit is not None]
+    assert not tried or min(tried) < 1.0
 
 
 def test_metres_are_refused_as_such(tracker, points):

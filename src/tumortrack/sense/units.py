@@ -65,8 +65,8 @@ def likely_unit(lengths_mm: Float[np.ndarray, ...], range_mm: tuple[float, float
 def unit_advice(content: DepthFrame | SensorCloud, near_mm: float, far_mm: float) -> str:
     """What to do about the unit, as a clause, where hardly any depth lies between near and far but
     in another unit many would; else nothing."""
-    if isinstance(content, DepthFrame):
-        unit = likely_unit(content.depth_mm, (near_mm, far_mm))
-        return unit.of_depth if unit else ""
-    unit = likely_unit(content.points_mm[:, 2], (near_mm, far_mm))
-    return unit.of_cloud if unit else ""
+    z_mm = content.depth_mm if isinstance(content, DepthFrame) else content.points_mm[:, 2]
+    unit = likely_unit(z_mm, (near_mm, far_mm))
+    if unit is None:
+        return ""
+    return unit.of_depth if isinstance(content, DepthFrame) else unit.of_cloud

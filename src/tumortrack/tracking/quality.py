@@ -95,20 +95,14 @@ def judged(
             f"the camera sees through {100 * by_depth:.0f} % of where the organ would lie"
         )
     failed = _misplaced(estimate) or _misfit(estimate, told > _TOLD and not strictly)
-    failed = failed or _doubt(estimate)
+    failed, where = failed or _doubt(estimate), "of where the organ lies"
     if by_image:
         estimate.report["in_sight"] = by_image[0][2]
     if through > doubtful:
         estimate.report["doubted_in_sight"] = estimate.report.get("in_sight", 0.0)
-        failed = (
-            "seen_through",
-            f"the camera sees through {100 * through:.0f} % of where the organ lies",
-        )
+        failed = "seen_through", f"the camera sees through {100 * through:.0f} % {where}"
     elif unseen > _UNSEEN and failed is None:
-        failed = (
-            "unseen",
-            f"over {100 * unseen:.0f} % of where the organ lies the cloud has no points",
-        )
+        failed = "unseen", f"over {100 * unseen:.0f} % {where} the cloud has no points"
     if failed is not None:
         return doubted(estimate, failed[1], failed[0])
     estimate.report["quality"] = {"verdict": "good", "reason": "", "check": ""}
@@ -171,11 +165,8 @@ def _misfit(estimate: Estimate, told: bool) -> _Failed:
         return "strays", f"{share:.0f} % of the points do not lie on the organ's surface"
     now, most = (cost["without_strays"], FIT_FACTOR) if told else (cost["now"], 1.0)
     if now > most * cost["usual"]:
-        times = now / cost["usual"]
-        return "fit", (
-            "the organ's surface fits the points worse than in most validation scenes "
-            f"({times:.1f} times the usual cost)"
-        )
+        worse = "the organ's surface fits the points worse than in most validation scenes"
+        return "fit", f"{worse} ({now / cost['usual']:.1f} times the usual cost)"
     return None
 
 

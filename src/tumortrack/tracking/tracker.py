@@ -40,9 +40,8 @@ _TURNED_OVER_S = 30.0
 # Causes are sought so often at most, for each check that fails: that takes the time of some frames.
 _SOUGHT_S = 1.0
 _OF_POSES = "none", "poses", "fit", "strays", "seen_through"  # checks, where views are several
-Sought = dict[
-    str, tuple[Likely, ...]
-]  # the causes found, by the check that failed; none: no answer
+# The causes found, by the check that failed; of no estimate: by none.
+Sought = dict[str, tuple[Likely, ...]]
 
 
 _LOCATORS: dict[type[Model], Callable[[Any], RegistrationLocator | OccupancyLocator]] = {
@@ -93,7 +92,8 @@ class Tracker:
             raise InputError(f"the seed is {seed}; it must be 0 or more.")
         with self._explaining(cloud, others, None):
             estimate = self._locator.locate(cloud, grid, seed, others)
-            return self._judged(estimate, cloud, seen or cloud, False, others)
+            estimate = self._judged(estimate, cloud, seen or cloud, False, others)
+        return self._explained(estimate, cloud, others, None)
 
     def follow(
         self,
@@ -113,7 +113,8 @@ class Tracker:
         strictly = how.either_side if last is None else last.quality != "good" or not _unusual(last)
         with self._explaining(cloud, others, sought):
             estimate = self._locator.follow(cloud, last, how, others)
-            return self._judged(estimate, cloud, seen or cloud, strictly, others, last, sought)
+            estimate = self._judged(estimate, cloud, seen or cloud, strictly, others, last)
+        return self._explained(estimate, cloud, others, sought)
 
     def _judged(
         self,
@@ -123,7 +124,6 @@ class Tracker:
         strictly: bool,
         others: Sequence[Look] = (),
         last: Estimate | None = None,
-        sought: Sought | None = None,
     ) -> Estimate:
         start = time.perf_counter()
         estimate = judged(estimate, seen, strictly, others)
@@ -133,12 +133,6 @@ class Tracker:
             estimate = doubted(estimate, self._weakness)
         # Margins are calibrated on single looks.
         estimate = with_margin(estimate, cloud, None if others else self.model.margins)
-        if estimate.quality == "poor" and not self._weakness:
-            check = estimate.report["quality"]["check"]
-            causes = self._causes(cloud, others, sought, check, estimate)
-            reason = estimate.reason + words(causes, where_to_look(estimate, cloud, others))
-            estimate = replace(doubted(estimate, reason, check), causes=causes)
-        estimate.report["causes"] = [one.entry() for one in estimate.causes]
         estimate = replace(estimate, patient=self._patient, organ=self._organ)
         estimate.report["organ"] = organ_entry(self._organ)
         estimate.report["patient"] = to_builtins(self._patient)
@@ -147,14 +141,33 @@ class Tracker:
         seconds["total"] += seconds["judge"]
         return estimate
 
+    def _explained(
+        self,
+        estimate: Estimate,
+        cloud: SensorCloud,
+        others: Sequence[Look],
+        sought: Sought | None,
+    ) -> Estimate:
+        """With the likely causes of a poor one, and what to do."""
+        start, seconds = time.perf_counter(), estimate.report["timings"]
+        if estimate.quality == "poor" and not self._weakness:
+            check = estimate.report["quality"]["check"]
+            causes = self._causes(cloud, others, sought, estimate)
+            reason = estimate.reason + words(causes, where_to_look(estimate, cloud, others))
+            estimate = replace(doubted(estimate, reason, check), causes=causes)
+        estimate.report["causes"] = [one.entry() for one in estimate.causes]
+        seconds["explain"] = time.perf_counter() - start
+        seconds["total"] += seconds["explain"]
+        return estimate
+
     def _causes(
         self,
         cloud: SensorCloud,
         others: Sequence[Look],
         sought: Sought | None,
-        check: str,
         estimate: Estimate | None,
     ) -> tuple[Likely, ...]:
+        check = "none" if estimate is None else estimate.report["quality"]["check"]
         if others and check in _OF_POSES:
             return (Likely(Cause.POSES),)
         sought = {} if sought is None else sought
@@ -170,7 +183,7 @@ class Tracker:
         try:
             yield
         except NotThisOrgan as error:
-            causes = self._causes(cloud, others, sought, "none", None)
+            causes = self._causes(cloud, others, sought, None)
             raise NotThisOrgan(f"{error}{words(causes, '')}.", causes) from error
 
     def warm(self) -> None:
