@@ -34,6 +34,7 @@ def main(out: Path, steps: int) -> None:
 
     (scene,) = tt.simulate_scenes(case, seed=1)
     estimate = tt.Tracker(model).locate(scene.cloud, grid=48)
+    print(f"{estimate.quality}: {estimate.reason or 'no check failed; its place is not verified'}")
     for name, part in estimate.report["parts"].items():
         x, y, z = part["center_mm"]
         print(f"{name}: {part['volume_ml']:.1f} ml at ({x:.1f}, {y:.1f}, {z:.1f}) mm")

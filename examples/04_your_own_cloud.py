@@ -18,7 +18,8 @@ def main(out: Path, model_folder: Path, cloud_file: Path) -> None:
     try:
         estimate = tracker.locate(cloud, grid=48, seed=0)
     except tt.errors.NoEstimate as error:  # said aloud, never a made-up answer
-        sys.exit(f"nothing found: {error}")
+        sys.exit(f"none: {error}")
+    print(f"{estimate.quality}: {estimate.reason or 'no check failed; its place is not verified'}")
     for name, mesh in estimate.meshes.items():
         x, y, z = mesh.box_mm.mean(0)
         print(f"{name}: {mesh.volume_mm3 / 1000:.1f} ml at ({x:.1f}, {y:.1f}, {z:.1f}) mm")

@@ -23,6 +23,7 @@ def main(out: Path, model_folder: Path) -> None:
     motion = estimate.motion
     if motion is None:  # models of the presets quick and paper know no correspondence
         sys.exit(f"{model_folder} says what is where, but not which point of the CT lies there.")
+    print(f"{estimate.quality}: {estimate.reason or 'no check failed; its place is not verified'}")
 
     # LPS in, camera frame out, mm. ``std_mm``: one standard deviation along any axis.
     for part, truth in zip(case.anatomy.parts, scene.reference.parts, strict=True):

@@ -21,7 +21,7 @@ class PrintingSink:
     def publish(self, result: Any) -> None:
         placed = result.transformed
         if placed is None:
-            print(f"no estimate: {result.reason}")  # never the last answer again
+            print(f"none: {result.reason}")  # never the last answer again
             return
         self.estimates += 1
         middle, off_mm = placed.meshes["tumor_1"].box_mm.mean(0), np.nan

@@ -378,7 +378,7 @@ def test_an_estimate_is_sent_in_metres_in_the_published_frame():
     lines = meshes["quality"].text.splitlines()
     assert max(map(len, lines)) <= 44  # RViz breaks none
     assert " ".join(lines) == (
-        "fit: no check failed; its place is not verified; no margin is stated: no margin is known "
+        "good: no check failed; its place is not verified; no margin is stated: no margin is known "
         "for this model (tumortrack margins)"
     )
     spot = meshes["quality"].pose.position
@@ -409,7 +409,7 @@ def test_without_an_estimate_every_topic_says_so():
         point = out[f"{name}/center"].point
         assert np.isnan([point.x, point.y, point.z]).all()
     (status,) = out["diagnostics"].status
-    assert (status.level, status.message) == (2, "no estimate: the drape hides it")
+    assert (status.level, status.message) == (2, "none, no estimate: the drape hides it")
 
 
 def test_a_part_that_was_not_found_is_deleted_and_meshes_may_wait():

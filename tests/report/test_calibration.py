@@ -293,7 +293,7 @@ def test_an_estimate_beyond_a_limit_is_poor_and_says_which():
     far = judged(1.2, whole)
     assert (far.quality, far.report["margin"]["stated"]) == ("poor", [])
     assert far.reason == "rarity is 1.2; margins are known up to 1"
-    assert far.report["quality"] == {"verdict": "poor", "reason": far.reason}
+    assert far.report["quality"] == {"verdict": "poor", "reason": far.reason, "check": "other"}
     end = SensorCloud(organ[organ[:, 0] < np.quantile(organ[:, 0], 0.2)].astype(np.float32))
     assert "unseen is 0." in judged(0.9, end).reason  # worked out here: an image was judged
     before = judged(0.9, whole, "poor")

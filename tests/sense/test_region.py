@@ -298,3 +298,14 @@ def test_the_hand_is_what_a_pick_on_it_gives():
     found = points(scene.frame, picked_mm=there)
     kinds = working_truth(scene, found.taken.shape)[found.taken == 0]
     assert (kinds == HAND).mean() > 0.9
+
+
+def test_where_the_range_takes_all_the_unit_is_named():
+    frame = dome()
+    steps = DepthFrame(frame.depth_mm / 10, SMALL)  # of 1 mm, read as 0.1
+    for away, said in ((steps, "times 10 they would"), (SensorCloud(deproject(steps)), "centim")):
+        with pytest.raises(NoEstimate, match=f"mm.: .*{said}"):
+            organ_points(away, RegionConfig(), Hints(), np.random.default_rng(0))
+    away = DepthFrame(frame.depth_mm + 90, SMALL)
+    with pytest.raises(NoEstimate, match="move the camera"):
+        organ_points(away, RegionConfig(), Hints(), np.random.default_rng(0))

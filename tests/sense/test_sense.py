@@ -20,6 +20,7 @@ from tumortrack.sense.cloud import (
 from tumortrack.sense.clutter import ClutterConfig, add_clutter
 from tumortrack.sense.kernels import seen_pixels
 from tumortrack.sense.noise import CLEAN, D405_NOISE, NoiseConfig, add_noise
+from tumortrack.sense.units import Unit, likely_unit
 
 
 def rows(points):
@@ -166,15 +167,37 @@ def test_check_cloud_accepts_organs_near_and_far_and_explains_units():
     points = deproject(dome())[:2000]
     check_cloud(SensorCloud(points))
     check_cloud(SensorCloud(points + np.float32([0, 0, 400])))
-    with pytest.raises(InputError, match="--unit m"):
+    with pytest.raises(InputError, match="metres: give --unit m"):
         check_cloud(SensorCloud(points / 1000))
-    with pytest.raises(InputError, match="Leave out --unit m"):
+    with pytest.raises(InputError, match=r"inches: multiply it by 25\.4"):
+        check_cloud(SensorCloud((points - np.float32([0, 0, 20])) / np.float32(25.4)))
+    with pytest.raises(InputError, match="leave out --unit m"):
         check_cloud(SensorCloud(points * 1000))
     with pytest.raises(NoEstimate, match="199"):
         check_cloud(SensorCloud(points[:199]))
     check_cloud(SensorCloud(points[:200]))
     with pytest.raises(NoEstimate, match="before the camera"):
         check_cloud(SensorCloud(points * np.float32([1, -1, -1])))
+
+
+@pytest.mark.parametrize("unit", list(Unit))
+def test_the_unit_of_depths_out_of_range_is_named(unit):
+    frame = dome()
+    away = DepthFrame(frame.depth_mm / np.float32(unit.value), SMALL)
+    assert likely_unit(away.depth_mm, (110, 150)) is unit
+    assert likely_unit(frame.depth_mm, (110, 150)) is None
+    assert likely_unit(frame.depth_mm * 3, (110, 150)) is None
+    assert likely_unit(wall(np.nan).depth_mm, (110, 150)) is None
+    with pytest.raises(NoEstimate, match=rf"needed: times {unit.value:g} they would"):
+        cloud_from_depth(away, CloudConfig(), np.random.default_rng(0))
+    cloud = SensorCloud(deproject(dome()) / np.float32(unit.value))
+    with pytest.raises(NoEstimate, match=f"needed: {unit.of_cloud}"):
+        crop_cloud(cloud, 110, 150)
+
+
+def test_depths_out_of_range_in_any_unit_ask_for_another_place_or_range():
+    with pytest.raises(NoEstimate, match="needed: move the camera"):
+        cloud_from_depth(wall(300), CloudConfig(), np.random.default_rng(0))
 
 
 # noise

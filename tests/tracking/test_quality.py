@@ -47,7 +47,9 @@ def doubted(estimate, seen, **report):
     }
     sure = {**estimate.report, "parts": parts, "fit_cost": COST, "size": EXACT, **report}
     found = judged(replace(estimate, report=sure), seen)
-    assert found.report["quality"] == {"verdict": found.quality, "reason": found.reason}
+    said = found.report["quality"]
+    assert (said["verdict"], said["reason"]) == (found.quality, found.reason)
+    assert bool(said["check"]) == (found.quality == "poor")
     return found
 
 
@@ -272,7 +274,8 @@ def test_locate_says_its_verdict_and_plan_heeds_it(tmp_path, phantom_case, clini
     run, cloud = tmp_path / "run", tmp_path / "scenes" / "0000" / "cloud.ply"
     said = succeeded(tumortrack("locate", clinic_model, cloud, run, "--device", "cpu"))
     quality = store.read_json(run / "report.json")["quality"]
-    assert ("no check failed; its place is not verified" in said) == (quality["verdict"] == "good")
+    good = "good: no check failed; its place is not verified" in said
+    assert good == (quality["verdict"] == "good")
     assert ("POOR: " in said) == (quality["verdict"] == "poor")
     manifest = store.read_json(run / store.MANIFEST)
     for verdict, reason in (("good", ""), ("poor", "the organ hides")):

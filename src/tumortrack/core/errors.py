@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from tumortrack.core.causes import Likely
+
 
 class TumortrackError(Exception):
     """Base of every error raised on purpose: the command line prints its text as one line and exits
@@ -25,9 +27,18 @@ class PackageError(InputError):
 
 
 class NoEstimate(TumortrackError):
-    """The input is well formed but allows no answer (too few points, no organ)."""
+    """The input is well formed but allows no answer (too few points, no organ). ``causes``:
+    the likeliest first, where they were looked for."""
 
     exit_code = 3
+
+    def __init__(self, text: str, causes: tuple[Likely, ...] = ()) -> None:
+        super().__init__(text)
+        self.causes = causes
+
+
+class NotThisOrgan(NoEstimate):
+    """The points cannot be the model's organ, in mm in the camera's frame."""
 
 
 class NoPlan(TumortrackError):

@@ -9,6 +9,7 @@ from typing import Any, Literal, Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float
 
+from tumortrack.core.causes import Likely
 from tumortrack.core.config import Config, check_seed
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import Points
@@ -20,8 +21,8 @@ LARGEST_GRID = 400
 Quality = Literal["good", "poor", "none"]  # none: there is no estimate
 # An answer with a tumor's centre farther off has failed: the plan's usual margin, all of it.
 FAR_MM = 5.0
-# What people read where it is good: that word would say more than is known.
-NO_CHECK_FAILED, UNVERIFIED = "fit: no check failed", "its place is not verified"
+# What people read where it is good: that word alone would say more than is known.
+NO_CHECK_FAILED, UNVERIFIED = "good: no check failed", "its place is not verified"
 
 
 @runtime_checkable
@@ -75,6 +76,7 @@ class Estimate:
         motion: where every point of the CT is, if the method knows that; ``unsmoothed``: before the
             mean over past frames: the next frame's search starts from it.
         quality: ``good`` or ``poor``, and the ``reason``: see ``tracking.quality.judged``.
+        causes: of a poor one, the likeliest first: see ``tracking.causes``.
         patient: whose organ the model is of; that this one lies there nothing verifies.
         organ: which organ that is.
         structures: what else of the CT moves with it, by name; empty without a motion.
@@ -88,6 +90,7 @@ class Estimate:
     unsmoothed: Motion | None = None
     quality: Quality = "poor"
     reason: str = "it was not judged"
+    causes: tuple[Likely, ...] = ()
     patient: Patient = NOBODY
     organ: Organ = KIDNEY
     structures: Mapping[str, Mesh] = field(default_factory=dict)

@@ -261,12 +261,12 @@ class TrackingResult:
     def describe(self) -> str:
         """How good the estimate is, in words for people, or why there is none."""
         if self.estimate is None:
-            return f"no estimate: {self.reason}"
+            return f"none, no estimate: {self.reason}"
         by = self.cameras and f"; {self.cameras}"
         if self.quality == "good":
             margins = margin_words(self.estimate.report.get("margin"))
             return f"{NO_CHECK_FAILED}; {UNVERIFIED}; {margins}{by}"
-        return f"{self.quality} estimate: {self.warning}{by}"
+        return f"{self.quality}: {self.warning}{by}"
 
 
 @runtime_checkable

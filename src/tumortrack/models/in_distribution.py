@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from tumortrack.core.config import Config
-from tumortrack.core.errors import NoEstimate
+from tumortrack.core.errors import NotThisOrgan
 from tumortrack.core.geometry import Points
 
 Distances = Float[np.ndarray, " n"]
@@ -65,7 +65,7 @@ def fit_mm(distances_mm: Distances) -> float:
 def check_in_distribution(
     known: InDistributionRange, points_mm: Points, distances_mm: Distances, registered: bool = False
 ) -> None:
-    """NoEstimate for a cloud that cannot be the organ's: its points spread over much more or less
+    """NotThisOrgan for a cloud that cannot be the organ's: its points spread over much more or less
     than in any validation scene, or a fifth of them (half, where the surface was ``registered``)
     lie much farther from the estimated surface."""
     spread = spread_mm(points_mm)
@@ -73,8 +73,7 @@ def check_in_distribution(
     if not low <= spread <= high:
         raise _refusal(
             f"four fifths of its points lie within {spread:.0f} mm of their middle, in this "
-            f"model's scenes within {low:.0f} to {high:.0f} mm",
-            "the unit",
+            f"model's scenes within {low:.0f} to {high:.0f} mm"
         )
     limit = max(known.fit_mm * FIT_FACTOR, _SMALLEST_LIMIT_MM)
     which, fit = "a fifth", fit_mm(distances_mm)
@@ -88,8 +87,8 @@ def check_in_distribution(
 
 
 def check_likely(mahalanobis_2: float) -> None:
-    """NoEstimate for what only an implausible deformation of the organ explains: a state's squared
-    Mahalanobis distance, in units of the library's mean, is too large."""
+    """NotThisOrgan for what only an implausible deformation explains: a state's squared Mahalanobis
+    distance, in units of the library's mean, is too large."""
     if mahalanobis_2 > _LARGEST_MAHALANOBIS_2:
         raise _refusal(
             f"only a deformation {mahalanobis_2:.1f} times as rare as usual would fit it, where "
@@ -97,10 +96,5 @@ def check_likely(mahalanobis_2: float) -> None:
         )
 
 
-def _refusal(
-    why: str, check: str = "that the model is of this patient and the frame is the camera's"
-) -> NoEstimate:
-    return NoEstimate(
-        f"the cloud does not show this model's organ: {why}. Remove the background (--range NEAR "
-        f"FAR), and check {check}."
-    )
+def _refusal(why: str) -> NotThisOrgan:
+    return NotThisOrgan(f"the cloud does not show this model's organ: {why}")

@@ -5,15 +5,19 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float32
 
+from tumortrack.core.causes import Cause, Likely
 from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.types import DepthFrame, SensorCloud
 from tumortrack.sense.camera import deproject_pixels
+from tumortrack.sense.units import Unit, unit_advice
 
 FEWEST_POINTS = 200  # fewer do not determine an organ's shape and pose
 _FARTHEST_MM = 20_000.0  # beyond any depth camera
 _MOST_FAR = 0.01  # of a cloud's points: more are no flaws of single ones
-_THINNEST_MM = 1.0  # standard deviation along the second axis; an organ's is more than 10
+_LONGEST_M = 0.6  # of an organ; in inches no organ's side is shorter
+# Standard deviation along the second axis; an organ's is more than 10 mm, and half of the first.
+_THINNEST_MM, _THINNEST = 1.0, 0.1
 
 
 class CloudConfig(Config, frozen=True, kw_only=True):
@@ -44,7 +48,7 @@ def cloud_from_depth(
     depth_mm = frame.depth_mm.ravel()
     index = np.flatnonzero((depth_mm > config.near_mm) & (depth_mm < config.far_mm))
     if len(index) < FEWEST_POINTS:
-        raise NoEstimate(_too_few(len(index), depth_mm, config.near_mm, config.far_mm))
+        raise NoEstimate(_too_few(len(index), frame, config.near_mm, config.far_mm))
     chosen = index[draw_some(len(index), config.n_points, rng)]
     points_mm = deproject_pixels(chosen, depth_mm[chosen].astype(np.float64), frame.intrinsics)
     return SensorCloud(points_mm, frame.stamp_ns)
@@ -67,7 +71,7 @@ def crop_cloud(cloud: SensorCloud, near_mm: float, far_mm: float) -> SensorCloud
     z = cloud.points_mm[:, 2]
     inside = (z > near_mm) & (z < far_mm)
     if inside.sum() < FEWEST_POINTS:
-        raise NoEstimate(_too_few(int(inside.sum()), z, near_mm, far_mm))
+        raise NoEstimate(_too_few(int(inside.sum()), cloud, near_mm, far_mm))
     return SensorCloud(cloud.points_mm[inside], cloud.stamp_ns)
 
 
@@ -122,14 +126,15 @@ def check_cloud(cloud: SensorCloud) -> None:
     extent_mm = float((high - low).max())
     # A D405 sees nothing nearer than 40 mm, and an organ is larger than 5 mm.
     if abs(middle[2]) < 5 and extent_mm < 5:
+        unit = Unit.METRE if extent_mm < _LONGEST_M else Unit.INCH
         raise InputError(
             f"the cloud is {extent_mm:.3g} wide and {middle[2]:.3g} away, which in mm is no organ: "
-            "it looks like metres. Give --unit m (millimetres are expected)."
+            f"{unit.of_cloud} (millimetres are expected)."
         )
     if abs(middle[2]) > _FARTHEST_MM:
         raise InputError(
-            f"the cloud is {middle[2]:.4g} mm away, beyond any depth camera: its numbers look like "
-            "millimetres read as metres. Leave out --unit m."
+            f"the cloud is {middle[2]:.4g} mm away, beyond any depth camera: "
+            f"{Unit.MICROMETRE.of_cloud}."
         )
     farthest_mm = float(np.abs(ordered[:, [0, -1]]).max())
     if farthest_mm > _FARTHEST_MM:
@@ -139,7 +144,8 @@ def check_cloud(cloud: SensorCloud) -> None:
         )
     some = points_mm[:: max(1, len(points_mm) // 2000)]
     inner = some[((some >= low) & (some <= high)).all(axis=1)].astype(float)
-    if np.linalg.eigvalsh(np.cov(inner.T))[1] < _THINNEST_MM**2:
+    _, second, first = np.linalg.eigvalsh(np.cov(inner.T))
+    if second < min(_THINNEST_MM**2, _THINNEST**2 * first):
         raise NoEstimate(
             "the points of the cloud lie on one line; an organ has extent along two axes at least. "
             "Give the whole surface that the camera sees."
@@ -147,7 +153,8 @@ def check_cloud(cloud: SensorCloud) -> None:
     if not (points_mm[:, 2] > 0).any():
         raise NoEstimate(
             "no point of the cloud lies before the camera (z > 0). The camera frame has x right, "
-            "y down, z forward; turn the cloud into that frame."
+            "y down, z forward; turn the cloud into that frame.",
+            (Likely(Cause.FRAME),),
         )
 
 
@@ -164,14 +171,16 @@ def _check_range(near_mm: float, far_mm: float) -> None:
         )
 
 
-def _too_few(count: int, depth_mm: np.ndarray, near_mm: float, far_mm: float) -> str:
+def _too_few(count: int, content: DepthFrame | SensorCloud, near_mm: float, far_mm: float) -> str:
+    depth_mm = content.depth_mm if isinstance(content, DepthFrame) else content.points_mm[:, 2]
     seen = depth_mm[np.isfinite(depth_mm)]
     where = (
         f"the {len(seen)} depths seen run from {seen.min():.1f} to {seen.max():.1f} mm"
         if len(seen)
         else "the sensor had no return at all"
     )
+    do = unit_advice(content, near_mm, far_mm) or "move the camera, or choose another depth range"
     return (
         f"only {count} points lie between {near_mm:g} and {far_mm:g} mm ({where}); at least "
-        f"{FEWEST_POINTS} are needed. Move the camera, or choose another depth range."
+        f"{FEWEST_POINTS} are needed: {do}."
     )

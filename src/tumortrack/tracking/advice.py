@@ -1,27 +1,18 @@
-"""What to do about a poor estimate: one clause, mostly where to look from."""
+"""From where to look instead, where an estimate is poor."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy.spatial import cKDTree
 
 from tumortrack.core.estimate import Estimate
-from tumortrack.core.geometry import transform_points, triangles_of
-from tumortrack.core.types import Look, SensorCloud
+from tumortrack.core.geometry import Points, transform_points, triangles_of
+from tumortrack.core.types import Look, Mesh, SensorCloud
 from tumortrack.registration.motion import ElasticMotion
 
-# Where another view alone would not help: words of the reason, and what does.
-_INSTEAD = {
-    "sees through": "make sure that this is the organ (a click, --box), or look from another side",
-    "the camera's scale": "calibrate it",
-    "do not lie on the organ": "free the organ of what lies on it and beside it",
-}
-# The same of several views.
-_AMONG_VIEWS = "its pose", "sees through", "do not lie on the organ", "fits the points worse"
-CHECK_POSES = "check the poses, or the organ moved between the views"
 _MOST = 2000  # of the organ's faces, or vertices: they tell enough
 _FACING = 0.3  # cosine to the line of sight: flatter surfaces return little
 _NEAR_MM = 8.0  # of an observed point: seen
@@ -29,7 +20,7 @@ _HIDDEN = 0.1  # share of what faces the camera
 _ASIDE = 0.3  # sine to the line of sight: a direction that is no more aside is none
 
 
-def what_to_do(estimate: Estimate, cloud: SensorCloud, others: Sequence[Look] = ()) -> str:
+def where_to_look(estimate: Estimate, cloud: SensorCloud, others: Sequence[Look] = ()) -> str:
     """Towards which side of the organ the camera should look, and why there.
 
     Where a tenth of what faces the camera is among no view's points: there. Where another fit is
@@ -40,27 +31,31 @@ def what_to_do(estimate: Estimate, cloud: SensorCloud, others: Sequence[Look] = 
         cloud: the organ's points, camera frame, in which it was located.
         others: more looks at it; the sides are those of the first camera's picture.
     """
-    if "looks" in estimate.report and any(one in estimate.reason for one in _AMONG_VIEWS):
-        return CHECK_POSES
-    for words, advice in _INSTEAD.items():
-        if words in estimate.reason:
-            return advice
-    mesh = next(iter(estimate.meshes.values()))
-    faces = mesh.faces[:: len(mesh.faces) // _MOST + 1]
-    middles, normals = triangles_of(mesh.vertices_mm, faces)
-    sight = middles / np.linalg.norm(middles, axis=1, keepdims=True)
-    facing = middles[-(normals * sight).sum(1) > _FACING * np.linalg.norm(normals, axis=1)]
-    centre = middles.mean(0)
+    organ = next(iter(estimate.meshes.values()))
+    facing, centre = near_side(organ), organ.vertices_mm.mean(0)
     more = [transform_points(one.camera_from_look, one.cloud.points_mm) for one in others]
     points_mm = np.concatenate([cloud.points_mm, *more])
     whose = "the first camera's" if more else "the camera's"
     if len(facing) and len(points_mm):
-        hidden = cKDTree(points_mm).query(facing)[0] > _NEAR_MM
+        hidden = unseen(facing, points_mm)
         towards = facing[hidden].mean(0) - centre if hidden.mean() > _HIDDEN else np.zeros(3)
         if where := _side(towards, centre, whose):
             return f"free the view of the organ's side towards {where}, or look from there"
     where = _side(_unsure(estimate, centre), centre, whose)
     return f"look more from {where or 'another side'}, by about 30 degrees"
+
+
+def near_side(organ: Mesh) -> Float[np.ndarray, "n 3"]:
+    """Places on the side of its surface that faces the camera, evenly over its triangles."""
+    faces = organ.faces[:: len(organ.faces) // _MOST + 1]
+    middles, normals = triangles_of(organ.vertices_mm, faces)
+    sight = middles / np.linalg.norm(middles, axis=1, keepdims=True)
+    return middles[-(normals * sight).sum(1) > _FACING * np.linalg.norm(normals, axis=1)]
+
+
+def unseen(places_mm: Points, points_mm: Float[np.ndarray, "_ 3"]) -> Bool[np.ndarray, " n"]:
+    """Which of the places no point is near."""
+    return cKDTree(points_mm).query(places_mm)[0] > _NEAR_MM
 
 
 def _unsure(estimate: Estimate, centre: Float[np.ndarray, " 3"]) -> Float[np.ndarray, " 3"]:

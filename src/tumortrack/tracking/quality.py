@@ -8,8 +8,9 @@ from dataclasses import replace
 import numpy as np
 from scipy.ndimage import binary_dilation, distance_transform_edt
 
-from tumortrack.core.errors import NoEstimate
-from tumortrack.core.estimate import Estimate, Quality
+from tumortrack.core.causes import Check
+from tumortrack.core.errors import NotThisOrgan
+from tumortrack.core.estimate import Estimate
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import DepthFrame, Intrinsics, Look, Mesh, SensorCloud
 from tumortrack.models.in_distribution import FIT_FACTOR, RIVAL_COST
@@ -47,6 +48,7 @@ _MOST_POINTS = 20_000  # of a cloud that tell enough: a frame must not wait for 
 # lies there: an organ upside down reaches so far beyond the points that it fits.
 _UNSEEN = 0.1
 _NEAR_MM = 6.0  # of a point, or twice the points' usual distance: seen
+_Failed = tuple[Check, str] | None
 
 
 def judged(
@@ -56,11 +58,12 @@ def judged(
     others: Sequence[Look] = (),
 ) -> Estimate:
     """The estimate with its ``quality``, ``good`` or ``poor``, and the ``reason`` in words; also in
-    its report, with the shares of the organ that are seen through and, of a cloud, not seen.
+    its report, with the check that failed and the shares of the organ that are seen through and, of
+    a cloud, not seen.
 
     Poor is an estimate that fits the points worse than usual in validation, through which the
     camera sees, that lies where a cloud has no points, that lacks a tumor, or that says itself that
-    a tumor's place is unsure. Good means no more than that none holds. Raises NoEstimate: a depth
+    a tumor's place is unsure. Good means no more than that none holds. Raises NotThisOrgan: a depth
     image sees through so much of it that the organ cannot lie there. Clouds refuse nothing: they
     may be joined from several views.
 
@@ -88,23 +91,22 @@ def judged(
     estimate.report["seen_through"] = through
     doubtful, impossible = _LIMITS if estimate.motion is not None else _ROUGH_LIMITS
     if by_depth > impossible:
-        raise NoEstimate(
-            f"the camera sees through {100 * by_depth:.0f} % of where the organ would lie: what "
-            "was taken for it is something else, or lies as no organ in training did. Choose the "
-            "organ (a click, a --box), or look from another side."
+        raise NotThisOrgan(
+            f"the camera sees through {100 * by_depth:.0f} % of where the organ would lie"
         )
-    reason = _misplaced(estimate) or _misfit(estimate, told > _TOLD and not strictly)
-    reason = reason or _doubt(estimate)
+    failed = _misplaced(estimate) or _misfit(estimate, told > _TOLD and not strictly)
+    failed, where = failed or _doubt(estimate), "of where the organ lies"
     if by_image:
         estimate.report["in_sight"] = by_image[0][2]
     if through > doubtful:
         estimate.report["doubted_in_sight"] = estimate.report.get("in_sight", 0.0)
-        reason = f"the camera sees through {100 * through:.0f} % of where the organ lies"
-    elif unseen > _UNSEEN and not reason:
-        reason = f"over {100 * unseen:.0f} % of where the organ lies the cloud has no points"
-    quality: Quality = "poor" if reason else "good"
-    estimate.report["quality"] = {"verdict": quality, "reason": reason}
-    return replace(estimate, quality=quality, reason=reason)
+        failed = "seen_through", f"the camera sees through {100 * through:.0f} % {where}"
+    elif unseen > _UNSEEN and failed is None:
+        failed = "unseen", f"over {100 * unseen:.0f} % {where} the cloud has no points"
+    if failed is not None:
+        return doubted(estimate, failed[1], failed[0])
+    estimate.report["quality"] = {"verdict": "good", "reason": "", "check": ""}
+    return replace(estimate, quality="good", reason="")
 
 
 def unless_hidden(estimate: Estimate, last: Estimate) -> Estimate:
@@ -135,56 +137,57 @@ def with_margin(estimate: Estimate, cloud: SensorCloud, margins: ModelMargins | 
     return estimate
 
 
-def doubted(estimate: Estimate, reason: str) -> Estimate:
-    """The same estimate, poor for this reason."""
-    estimate.report["quality"] = {"verdict": "poor", "reason": reason}
+def doubted(estimate: Estimate, reason: str, check: Check = "other") -> Estimate:
+    """The same estimate, poor for this reason: this check failed."""
+    estimate.report["quality"] = {"verdict": "poor", "reason": reason, "check": check}
     return replace(estimate, quality="poor", reason=reason)
 
 
-def _misplaced(estimate: Estimate) -> str:
+def _misplaced(estimate: Estimate) -> _Failed:
     """Whether a camera was found too far from where its pose says."""
     looks = estimate.report.get("looks", {"shift_mm": (), "turn_degrees": ()})
     most_mm, most_degrees = _FARTHEST * CAMERA_STD[0], np.rad2deg(_FARTHEST * CAMERA_STD[-1])
     errors = zip(looks["shift_mm"], looks["turn_degrees"], strict=True)
     for number, (shift_mm, degrees) in enumerate(errors, start=1):
         if shift_mm > most_mm or degrees > most_degrees:
-            return (
-                f"view {number} shows the organ {shift_mm:.1f} mm and {degrees:.1f} degrees from "
-                "where its pose has it"
-            )
-    return ""
+            off = f"{shift_mm:.1f} mm and {degrees:.1f} degrees"
+            return "poses", f"view {number} shows the organ {off} from where its pose has it"
+    return None
 
 
-def _misfit(estimate: Estimate, told: bool) -> str:
+def _misfit(estimate: Estimate, told: bool) -> _Failed:
     """What the fit says against it; ``told``: a wrong place would be seen through."""
     cost = estimate.report.get("fit_cost")
     if cost is None:
-        return ""
+        return None
     if told and cost["strays"] > _MOST_STRAYS:
-        return f"{100 * cost['strays']:.0f} % of the points do not lie on the organ's surface"
+        share = 100 * cost["strays"]
+        return "strays", f"{share:.0f} % of the points do not lie on the organ's surface"
     now, most = (cost["without_strays"], FIT_FACTOR) if told else (cost["now"], 1.0)
     if now > most * cost["usual"]:
-        return "the organ's surface fits the points worse than in most validation scenes"
-    return ""
+        worse = "the organ's surface fits the points worse than in most validation scenes"
+        return "fit", f"{worse} ({now / cost['usual']:.1f} times the usual cost)"
+    return None
 
 
-def _doubt(estimate: Estimate) -> str:
+def _doubt(estimate: Estimate) -> _Failed:
     """What else the estimate itself says against it."""
     size = estimate.report.get("size")
     if size is not None and size["gain"] > RIVAL_COST:
-        return f"an organ {size['times']:.2f} times as large fits better: check the camera's scale"
+        return "size", f"an organ {size['times']:.2f} times as large fits better"
     for other in estimate.report.get("fit_cost", {}).get("others", ()):
         name, apart_mm = max(other["apart_mm"].items(), key=lambda item: item[1])
         if apart_mm > _UNSURE_MM:
-            return f"{name} may as well lie {apart_mm:.1f} mm away: the points fit there too"
+            return "place", f"{name} may as well lie {apart_mm:.1f} mm away, which fits too"
     for name, part in estimate.report["parts"].items():
         if not part["found"]:
-            return f"{name} was not found"
+            return "place", f"{name} was not found"
         if part.get("center_std_mm", 0.0) > _UNSURE_MM:
-            return f"the place of {name} is unsure by {part['center_std_mm']:.1f} mm"
+            return "place", f"the place of {name} is unsure by {part['center_std_mm']:.1f} mm"
         if part["probability"] is not None and part["probability"] < _UNSURE:
-            return f"the points of {name} have a probability of {part['probability']:.2f}"
-    return ""
+            share = part["probability"]
+            return "place", f"the points of {name} have a probability of {share:.2f}"
+    return None
 
 
 def seen_through(organ: Mesh, frame: DepthFrame) -> tuple[float, float, float]:

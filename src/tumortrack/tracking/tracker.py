@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
+from tumortrack.core.causes import Cause, Likely
 from tumortrack.core.config import Config, check_seed, to_builtins
-from tumortrack.core.errors import InputError, NoEstimate
+from tumortrack.core.errors import InputError, NotThisOrgan
 from tumortrack.core.estimate import Estimate, Following
 from tumortrack.core.geometry import HERE, Affine, transform_points
 from tumortrack.core.organ import organ_entry
@@ -28,13 +29,19 @@ from tumortrack.registration.model import RegistrationModel
 from tumortrack.registration.motion import ElasticMotion
 from tumortrack.sense.cloud import CloudConfig
 from tumortrack.sense.region import RegionConfig
-from tumortrack.tracking.advice import CHECK_POSES, what_to_do
+from tumortrack.tracking.advice import where_to_look
+from tumortrack.tracking.causes import likely_causes, words
 from tumortrack.tracking.quality import doubted, judged, unless_hidden, with_margin
 
 _ALONE = Following()
 # So long after it was found good the organ is also looked for with its other side up. In first
 # looks of strangers that called 18 of 46 kidneys of others, or mirrored, good; none without it.
 _TURNED_OVER_S = 30.0
+# Causes are sought so often at most, for each check that fails: that takes the time of some frames.
+_SOUGHT_S = 1.0
+_OF_POSES = "none", "poses", "fit", "strays", "seen_through"  # checks, where views are several
+# The causes found, by the check that failed; of no estimate: by none.
+Sought = dict[str, tuple[Likely, ...]]
 
 
 _LOCATORS: dict[type[Model], Callable[[Any], RegistrationLocator | OccupancyLocator]] = {
@@ -82,9 +89,10 @@ class Tracker:
                 the model knows no motion.
         """
         check_seed(seed)
-        with _of_several(others):
+        with self._explaining(cloud, others, None):
             estimate = self._locator.locate(cloud, grid, seed, others)
-            return self._judged(estimate, cloud, seen or cloud, False, others)
+            estimate = self._judged(estimate, cloud, seen or cloud, False, others)
+        return self._explained(estimate, cloud, others, None)
 
     def follow(
         self,
@@ -93,16 +101,19 @@ class Tracker:
         how: Following = _ALONE,
         seen: DepthFrame | SensorCloud | None = None,
         others: Sequence[Look] = (),
+        sought: Sought | None = None,
     ) -> Estimate:
         """The same, fast, for one frame of many: no volume, and a search that starts at the
         ``last`` estimate, if there is one a moment old. Models that know no motion smooth nothing.
+        ``sought``: causes of a moment ago, which are not sought again; those found are added.
         Raises NoEstimate: as ``locate``; InputError: the cloud is in metres; more than one look, as
         ``locate``."""
         # What fits worse all of a sudden may be something else that was put there.
         strictly = how.either_side if last is None else last.quality != "good" or not _unusual(last)
-        with _of_several(others):
+        with self._explaining(cloud, others, sought):
             estimate = self._locator.follow(cloud, last, how, others)
-            return self._judged(estimate, cloud, seen or cloud, strictly, others, last)
+            estimate = self._judged(estimate, cloud, seen or cloud, strictly, others, last)
+        return self._explained(estimate, cloud, others, sought)
 
     def _judged(
         self,
@@ -121,9 +132,6 @@ class Tracker:
             estimate = doubted(estimate, self._weakness)
         # Margins are calibrated on single looks.
         estimate = with_margin(estimate, cloud, None if others else self.model.margins)
-        if estimate.quality == "poor" and not self._weakness:
-            advice = what_to_do(estimate, cloud, others)
-            estimate = doubted(estimate, f"{estimate.reason}; {advice}")
         estimate = replace(estimate, patient=self._patient, organ=self._organ)
         estimate.report["organ"] = organ_entry(self._organ)
         estimate.report["patient"] = to_builtins(self._patient)
@@ -132,19 +140,54 @@ class Tracker:
         seconds["total"] += seconds["judge"]
         return estimate
 
+    def _explained(
+        self,
+        estimate: Estimate,
+        cloud: SensorCloud,
+        others: Sequence[Look],
+        sought: Sought | None,
+    ) -> Estimate:
+        """With the likely causes of a poor one, and what to do."""
+        start, seconds = time.perf_counter(), estimate.report["timings"]
+        if estimate.quality == "poor" and not self._weakness:
+            check = estimate.report["quality"]["check"]
+            causes = self._causes(cloud, others, sought, estimate)
+            reason = estimate.reason + words(causes, where_to_look(estimate, cloud, others))
+            estimate = replace(doubted(estimate, reason, check), causes=causes)
+        estimate.report["causes"] = [one.entry() for one in estimate.causes]
+        seconds["explain"] = time.perf_counter() - start
+        seconds["total"] += seconds["explain"]
+        return estimate
+
+    def _causes(
+        self,
+        cloud: SensorCloud,
+        others: Sequence[Look],
+        sought: Sought | None,
+        estimate: Estimate | None,
+    ) -> tuple[Likely, ...]:
+        check = "none" if estimate is None else estimate.report["quality"]["check"]
+        if others and check in _OF_POSES:
+            return (Likely(Cause.POSES),)
+        sought = {} if sought is None else sought
+        if check not in sought:
+            sought[check] = likely_causes(self.model, cloud, estimate)
+        return sought[check]
+
+    @contextmanager
+    def _explaining(
+        self, cloud: SensorCloud, others: Sequence[Look], sought: Sought | None
+    ) -> Iterator[None]:
+        """Adds its likely causes to what is not this organ."""
+        try:
+            yield
+        except NotThisOrgan as error:
+            causes = self._causes(cloud, others, sought, None)
+            raise NotThisOrgan(f"{error}{words(causes, '')}.", causes) from error
+
     def warm(self) -> None:
         """Load and compile what ``follow`` needs, which its first call would otherwise wait for."""
         self._locator.warm()
-
-
-@contextmanager
-def _of_several(others: Sequence[Look]) -> Iterator[None]:
-    try:
-        yield
-    except NoEstimate as error:
-        if not others:
-            raise
-        raise NoEstimate(f"{error} Of several views: {CHECK_POSES}.") from error
 
 
 def _unusual(estimate: Estimate) -> bool:
@@ -184,6 +227,7 @@ class Follower:
         self._last: Estimate | None = None
         self._scanned_ns, self._rests = 0, False
         self._good_ns: int | None = None
+        self._sought_ns, self._sought = 0, Sought()
 
     def warm(self) -> None:
         """See ``Tracker.warm``."""
@@ -230,7 +274,9 @@ class Follower:
         since_ns = np.inf if self._good_ns is None else cloud.stamp_ns - self._good_ns
         turned = bool(0 <= since_ns <= _TURNED_OVER_S * 1e9)
         how = Following(thorough=thorough, either_side=turned, smoothing_s=smoothing_s, seed=seed)
-        self._last = self._tracker.follow(cloud, last, how, seen, others)
+        if not 0 <= (cloud.stamp_ns - self._sought_ns) * 1e-9 < _SOUGHT_S:
+            self._sought_ns, self._sought = cloud.stamp_ns, {}
+        self._last = self._tracker.follow(cloud, last, how, seen, others, self._sought)
         if self._last.quality == "good":
             self._good_ns = cloud.stamp_ns
         return self._last

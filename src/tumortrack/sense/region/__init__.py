@@ -20,6 +20,7 @@ from tumortrack.sense.region.picture import RegionConfig, keep_inside
 from tumortrack.sense.region.pieces import remove_flying
 from tumortrack.sense.region.plane import remove_plane
 from tumortrack.sense.region.taught import colours_of
+from tumortrack.sense.units import unit_advice
 
 __all__ = ["Hints", "Region", "RegionConfig", "organ_points"]
 
@@ -87,11 +88,12 @@ def organ_points(
     left = picture.left(picture.taken)
     if len(left) < FEWEST_POINTS:
         took = ", ".join(f"{name} {n}" for name, n in counts.items() if n and name != "organ")
+        near, far = config.crop.near_mm, config.crop.far_mm
+        do = "move the camera, widen what took most, or switch that step off"
         raise NoEstimate(
             f"only {len(left)} points are left for the organ; at least {FEWEST_POINTS} are needed. "
-            f"Of {picture.taken.size} pixels went to: {took or 'nothing'} (range "
-            f"{config.crop.near_mm:g}..{config.crop.far_mm:g} mm). Move the camera, widen what "
-            "took most, or switch that step off." + (doubt and f" Also, {doubt}.")
+            f"Of {picture.taken.size} pixels went to: {took or 'nothing'} (range {near:g}..{far:g} "
+            f"mm): {unit_advice(content, near, far) or do}." + (doubt and f" Also, {doubt}.")
         )
     drawn = rng.choice(left, min(len(left), config.crop.n_points), replace=False)
     cloud = SensorCloud(picture.points(drawn), content.stamp_ns)

@@ -1,0 +1,29 @@
+"""What can be behind a poor estimate, or none, and what says so."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+from typing import Any, Literal
+
+# Which check an estimate failed; other: of a moment, a margin or the model.
+Check = Literal["poses", "fit", "strays", "seen_through", "unseen", "size", "place", "other"]
+Cause = Enum(
+    "Cause",
+    "UNIT FRAME MIRRORED SCALE OBJECT BACKGROUND HIDDEN ANOTHER_PATIENT DEFORMED POSES VIEW",
+)
+
+
+@dataclass(frozen=True)
+class Likely:
+    """A cause. ``number``: the factor of UNIT and SCALE, the share of BACKGROUND and HIDDEN.
+    ``fit``: what the cloud costs freed of it, in the model's usual cost; None: that was not tried.
+    """
+
+    cause: Cause
+    number: float | None = None
+    fit: float | None = None
+
+    def entry(self) -> dict[str, Any]:
+        """JSON, for a report."""
+        return {"cause": self.cause.name.lower(), "number": self.number, "fit": self.fit}

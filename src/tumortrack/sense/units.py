@@ -1,0 +1,72 @@
+"""The unit that numbers taken for millimetres are probably in."""
+
+from __future__ import annotations
+
+from enum import Enum
+
+import numpy as np
+from jaxtyping import Float
+
+from tumortrack.core.types import DepthFrame, SensorCloud
+
+_SHARE = 0.1  # of the lengths: an organ may be that little of a depth image
+_MOST = 20_000  # of them tell enough
+
+
+class Unit(Enum):
+    """How many mm one is, of what is often taken for mm: also by a depth image's step, 1 mm read
+    as 0.1 being ``CENTIMETRE``, and mm read as metres ``MICROMETRE``."""
+
+    METRE = 1000.0
+    INCH = 25.4
+    CENTIMETRE = 10.0
+    TENTH = 0.1
+    MICROMETRE = 0.001
+
+    @property
+    def of_cloud(self) -> str:
+        """What to do with a cloud in this unit, as a clause."""
+        return _OF_CLOUD[self]
+
+    @property
+    def of_depth(self) -> str:
+        """What to do with a depth image whose depths are out by this factor, as a clause."""
+        return (
+            f"times {self.value:g} they would lie there; check what one step of the depth image is "
+            "(depth_unit_mm in the intrinsics file; 0.1 mm where the file does not say)"
+        )
+
+
+_OF_CLOUD = {
+    Unit.METRE: "it looks like metres: give --unit m",
+    Unit.INCH: "it looks like inches: multiply it by 25.4",
+    Unit.CENTIMETRE: "it looks like centimetres, or steps of 1 mm read as 0.1: multiply it by 10",
+    Unit.TENTH: "it looks like tenths of a millimetre: divide it by 10",
+    Unit.MICROMETRE: "it looks like millimetres read as metres: leave out --unit m",
+}
+
+
+def likely_unit(lengths_mm: Float[np.ndarray, ...], range_mm: tuple[float, float]) -> Unit | None:
+    """The unit in which most of some lengths (depths, say), which were taken for mm, lie in the
+    range where they should. None: a tenth of them lie there as they are, or in no unit. Lengths
+    that are not finite do not count."""
+    lengths = lengths_mm[np.isfinite(lengths_mm)]
+    lengths = lengths[:: len(lengths) // _MOST + 1]
+
+    def share(factor: float) -> float:
+        return float(np.mean((lengths > range_mm[0] / factor) & (lengths < range_mm[1] / factor)))
+
+    if not len(lengths) or share(1.0) >= _SHARE:
+        return None
+    best = max(Unit, key=lambda unit: share(unit.value))
+    return best if share(best.value) >= _SHARE else None
+
+
+def unit_advice(content: DepthFrame | SensorCloud, near_mm: float, far_mm: float) -> str:
+    """What to do about the unit, as a clause, where hardly any depth lies between near and far but
+    in another unit many would; else nothing."""
+    z_mm = content.depth_mm if isinstance(content, DepthFrame) else content.points_mm[:, 2]
+    unit = likely_unit(z_mm, (near_mm, far_mm))
+    if unit is None:
+        return ""
+    return unit.of_depth if isinstance(content, DepthFrame) else unit.of_cloud
