@@ -32,9 +32,14 @@ def say_notes(notes: Iterable[str]) -> None:
 
 @contextmanager
 def progress_bar(what: str, total: int) -> Iterator[Callable[[], None]]:
-    """A bar with rate and time left; yields a function that advances it by one."""
+    """A bar with the time it takes and has left, without a terminal a line now and then; yields a
+    function that advances it by one."""
     from rich import progress
 
+    if not console.is_terminal:
+        with live_line(what) as show:
+            yield _counting(what, total, show)
+        return
     columns = (
         progress.TextColumn("{task.description}"),
         *(progress.BarColumn(), progress.MofNCompleteColumn()),
@@ -43,6 +48,19 @@ def progress_bar(what: str, total: int) -> Iterator[Callable[[], None]]:
     with progress.Progress(*columns, console=console, transient=True) as bar:
         task = bar.add_task(what, total=total)
         yield lambda: bar.advance(task)
+
+
+def _counting(what: str, total: int, show: Callable[[str], None]) -> Callable[[], None]:
+    """Says after each of ``total`` steps how long the others take."""
+    done, begun_s = 0, time.monotonic()
+
+    def advance() -> None:
+        nonlocal done
+        done += 1
+        left_s = (time.monotonic() - begun_s) * (total - done) / done
+        show(f"{what}: {done} of {total}, about {left_s:.0f} s left")
+
+    return advance
 
 
 @contextmanager

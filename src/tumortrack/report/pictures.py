@@ -185,7 +185,7 @@ def qc_picture(
     title = f"Prepared case over its {what}{more}" + (f": {whose}" if whose else "")
     figure.suptitle(title, x=0.015, ha="left", fontweight="bold", parse_math=False)
     handles = [
-        Patch(facecolor=color, label=f"{name.replace('_', ' ')} {part.volume_mm3 / 1000:.1f} ml")
+        Patch(facecolor=color, label=f"{name.replace('_', ' ')} {part.volume_ml:.1f} ml")
         for color, name, part in zip(colors, anatomy.names, anatomy.parts, strict=True)
     ]
     drawing.show_legend(figure, handles, 6, (0.99, 0.995))
