@@ -51,14 +51,19 @@ def progress_bar(what: str, total: int) -> Iterator[Callable[[], None]]:
 
 
 def _counting(what: str, total: int, show: Callable[[str], None]) -> Callable[[], None]:
-    """Says after each of ``total`` steps how long the others take."""
-    done, begun_s = 0, time.monotonic()
+    """Says after each of ``total`` steps how long the others take, but for the first, in which much
+    may be compiled."""
+    done, first_s = 0, 0.0
 
     def advance() -> None:
-        nonlocal done
-        done += 1
-        left_s = (time.monotonic() - begun_s) * (total - done) / done
-        show(f"{what}: {done} of {total}, about {left_s:.0f} s left")
+        nonlocal done, first_s
+        done, now_s = done + 1, time.monotonic()
+        if done == 1:
+            first_s = now_s
+            show(f"{what}: 1 of {total}")
+        else:
+            left_s = (now_s - first_s) * (total - done) / (done - 1)
+            show(f"{what}: {done} of {total}, about {left_s:.0f} s left")
 
     return advance
 

@@ -17,7 +17,7 @@ from PIL import Image
 from trimesh.intersections import mesh_plane
 
 from tumortrack.core import colours
-from tumortrack.core.estimate import NO_CHECK_FAILED, Estimate
+from tumortrack.core.estimate import NO_CHECK_FAILED, UNVERIFIED, Estimate
 from tumortrack.core.organ import is_tumor
 from tumortrack.core.patient import patient_in
 from tumortrack.core.store import write_atomically
@@ -32,6 +32,7 @@ from tumortrack.report.summary import (
     measures,
     number,
     part_rows,
+    scene_note,
     verdict_counts,
     words,
     worst_center,
@@ -47,7 +48,7 @@ _COLUMNS = {
     "surface_mm": "surface off in the mean, mm",
     "iou": "overlap (IoU, 0 to 1)",
 }
-_SHOWN_POINTS, _AROUND_MM = 4000, 20.0  # of the cloud: those so near the organ
+_SHOWN_POINTS, _AROUND_MM = 2000, 12.0  # of the cloud: those so near the organ
 
 
 def page_scene(scene: Scene, estimate: Estimate | None, picture: Path) -> dict[str, Any]:
@@ -160,32 +161,10 @@ def _base64(content: bytes) -> str:
 
 def _about(entry: dict[str, Any]) -> dict[str, Any]:
     """A scene's name, verdict and reason, and its errors in a few words."""
-    reason = entry["reason"] if entry["quality"] != "good" else NO_CHECK_FAILED
+    good = f"{NO_CHECK_FAILED}; {UNVERIFIED}"
+    reason = good if entry["quality"] == "good" else entry["reason"]
     said = {"name": entry["name"], "verdict": entry["quality"], "reason": reason}
     return {**said, "note": scene_note(entry)}
-
-
-def scene_note(entry: dict[str, Any]) -> str:
-    """A scene's errors in a few words, with names and units."""
-    if entry["quality"] == "none":
-        return "no estimate, so there is nothing to measure"
-    far_mm, part = worst_center(entry)
-    far = f"{far_mm:.1f} mm" if np.isfinite(far_mm) else "not found"
-    notes = [f"{words(part)} is farthest off: centre {far}"]
-    if errors := entry.get("tre_mm"):
-        notes.append(target_text(errors))
-    notes.append(f"overlap with the truth (mIoU, 1 is perfect) {entry['miou']:.2f}")
-    if entry["failed"]:
-        notes.append(f"FAILED: {entry['failed']}")
-    return "; ".join(notes)
-
-
-def target_text(errors: dict[str, Any]) -> str:
-    """A scene's target errors in a few words."""
-    return (
-        f"target error {errors['mean']:.1f} mm (mean of {errors['count']}, "
-        f"largest {errors['max']:.1f} mm)"
-    )
 
 
 def _typical_and_worst(entries: list[dict[str, Any]]) -> dict[str, int]:
@@ -197,7 +176,7 @@ def _typical_and_worst(entries: list[dict[str, Any]]) -> dict[str, int]:
 
 
 def _verdict_colours() -> str:
-    pairs = zip(VERDICTS, (colours.GOOD, colours.POOR, colours.NONE), strict=True)
+    pairs = colours.VERDICTS.items()
     return " ".join(f".{verdict} {{ --verdict: {colours.css(c)}; }}" for verdict, c in pairs)
 
 

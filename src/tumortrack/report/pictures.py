@@ -1,7 +1,7 @@
 """Pictures that a surgeon can read: the estimate over the truth, and a prepared case.
 
-Orange is what was estimated, blue is the truth (a pair that every colour vision tells apart).
-Nothing needs a display.
+Parts have the viewer's colours (``core.colours``); the truth is a dark blue outline. Nothing needs
+a display.
 """
 
 from __future__ import annotations
@@ -16,13 +16,15 @@ from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from tumortrack.core.estimate import Estimate
+from tumortrack.core import colours
+from tumortrack.core.estimate import NO_CHECK_FAILED, UNVERIFIED, Estimate
 from tumortrack.core.geometry import DIRECTIONS_LPS, transform_points
 from tumortrack.core.organ import is_tumor, organ_name
 from tumortrack.core.types import Anatomy, LabelVolume, Mesh, Volume
 from tumortrack.report import drawing
-from tumortrack.report.drawing import CENTRED, ESTIMATED, OBSERVED, ORGAN, TRUE
-from tumortrack.report.renderer import RGB, Body, Frame, ParallelView
+from tumortrack.report.drawing import CENTRED, OBSERVED, ORGAN, TRUE
+from tumortrack.report.renderer import RGB, Body, Frame, ParallelView, rgb
+from tumortrack.report.summary import scene_note, words
 from tumortrack.simulate.scene_folder import Scene
 
 FROM_CAMERA = ParallelView("seen from the camera", (1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
@@ -39,9 +41,7 @@ PLANES = (
     ParallelView("coronal", (1.0, 0.0, 0.0), (0.0, 0.0, -1.0)),
     ParallelView("sagittal", (0.0, 1.0, 0.0), (0.0, 0.0, -1.0)),
 )
-# On grey, apart in every colour vision: organ light orange, tumors yellow, sky blue, green, purple.
-_ORGAN_LINE = (1.0, 0.62, 0.45)
-_TUMOR_COLORS = ((0.97, 0.88, 0.22), (0.34, 0.71, 0.91), (0.56, 0.93, 0.56), (0.85, 0.55, 0.75))
+_ORGAN_LINE = (1.0, 0.62, 0.45)  # the organ's colour, lighter: a thin line on grey
 _SOFT_TISSUE_HU = (-160.0, 240.0)
 _MARGIN_MM, _ASPECT = 18.0, 1.22
 _MOST_ROWS = 6  # tumors with slices of their own
@@ -62,8 +62,8 @@ def scene_picture(
     shown = estimate.meshes if estimate else {}
     slices = [(name, view) for name in scene.reference.names[1:] for view in _SLICES]
     rows = -(-len(slices) // 4)
-    height_in = 5.1 + 4.05 * rows
-    top, bottom = 1 - 0.85 / height_in, 0.15 / height_in
+    height_in = 5.4 + 4.05 * rows
+    top, bottom = 1 - 1.15 / height_in, 0.15 / height_in
     figure = drawing.new_figure(14.0, height_in, top=top, bottom=bottom)
     outer = figure.add_gridspec(2, 1, height_ratios=[4.1, 3.95 * max(rows, 0.01)], hspace=0.13)
     above = outer[0].subgridspec(1, 2, wspace=0.04)
@@ -82,12 +82,16 @@ def scene_picture(
             else "not found"
         )
         axes.set_title(f"{what}\n{found}", fontsize=9.5)
-    failed = "" if entry["failed"] is None else f"\n{textwrap.shorten(entry['failed'], 130)}"
-    errors = entry.get("tre_mm")
-    targets = f"   target error {errors['mean']:.1f} mm" if errors else ""
-    headline = f"{entry['name']}   mIoU {entry['miou']:.2f}{targets}{failed}"
-    figure.suptitle(headline, x=0.02, ha="left", fontsize=13, fontweight="bold")
-    drawing.show_legend(figure, scene_legend(scene.reference.kind.words), 4, (0.985, 0.995))
+    style: dict[str, Any] = {"ha": "left", "va": "top", "fontsize": 11, "parse_math": False}
+    said = f"{NO_CHECK_FAILED}; {UNVERIFIED}" if entry["quality"] == "good" else entry["reason"]
+    verdict = textwrap.shorten(f"{entry['quality'].upper()}: {said}", 150)
+    color = rgb(colours.VERDICTS[entry["quality"]])
+    lines = [(entry["name"], "black"), (verdict, color), (scene_note(entry), "black")]
+    for n, (text, shade) in enumerate(lines):
+        bold = "bold" if n < 2 else "normal"
+        figure.text(0.02, 1 - (0.1 + 0.22 * n) / height_in, text, color=shade, weight=bold, **style)
+    handles = scene_legend(scene.reference.kind.words, scene.reference.names[1:])
+    drawing.show_legend(figure, handles, 6, (0.985, 0.995))
     drawing.save(figure, path)
 
 
@@ -100,7 +104,7 @@ def draw_solid_view(
     frame = view.frame_around(np.concatenate(everything), 6.0).widened(1.7)
     name = organ_name(shown)
     organ = [] if name is None else [Body(shown.pop(name), ORGAN, 0.36)]
-    tumors = [Body(mesh, ESTIMATED) for mesh in shown.values()]
+    tumors = [Body(mesh, tumor_color(part)) for part, mesh in shown.items()]
     drawing.show_bodies(axes, view, [*tumors, *organ], frame)
     flat = view.project(scene.cloud.points_mm.astype(float))
     axes.scatter(flat[:, 0], flat[:, 1], s=2.5, color=OBSERVED, alpha=0.55, linewidths=0, zorder=3)
@@ -121,7 +125,7 @@ def _draw_slice(
     around = [meshes[name].vertices_mm for meshes in (truth, shown) if name in meshes]
     frame = view.frame_around(np.concatenate(around), 12.0).widened(1.0)
     for part, mesh in shown.items():
-        color, width = (ESTIMATED, 2.4) if is_tumor(part) else (ORGAN, 1.4)
+        color, width = (tumor_color(part), 2.4) if is_tumor(part) else (ORGAN, 1.4)
         drawing.tint(axes, drawing.section_mask(mesh, view, frame, through_mm), frame, color)
         lines = drawing.section(mesh, view, through_mm)
         drawing.draw_lines(axes, lines, color=color, linewidth=width, zorder=3)
@@ -135,10 +139,15 @@ def _draw_slice(
     drawing.finish_view(axes, frame, _CAMERA_AXES[view])
 
 
-def scene_legend(organ: str = "kidney") -> list[Any]:
-    """Handles of what ``draw_solid_view`` shows."""
+def tumor_color(name: str) -> RGB:
+    """Of tumor_1, tumor_2, ..."""
+    return rgb(colours.part_colour(int(name.split("_")[1]) + 1))
+
+
+def scene_legend(organ: str = "kidney", tumors: tuple[str, ...] = ("tumor_1",)) -> list[Any]:
+    """Handles of what ``draw_solid_view`` shows; of many tumors the first four."""
     return [
-        Patch(facecolor=ESTIMATED, label="estimated tumor"),
+        *(Patch(facecolor=tumor_color(t), label=f"estimated {words(t)}") for t in tumors[:4]),
         Patch(facecolor=(*ORGAN, 0.5), label=f"estimated {organ}"),
         Line2D([], [], color=TRUE, linewidth=2, label="truth (outline)"),
         Line2D([], [], color=OBSERVED, marker=".", linestyle="", label="observed point"),
@@ -266,5 +275,4 @@ def _write_letters(axes: Axes, view: ParallelView, color: str) -> None:
 
 def _part_colors(anatomy: Anatomy) -> list[RGB]:
     """Of the organ and of each tumor."""
-    few = len(_TUMOR_COLORS)
-    return [_ORGAN_LINE, *(_TUMOR_COLORS[n % few] for n in range(len(anatomy.tumors)))]
+    return [_ORGAN_LINE, *map(tumor_color, anatomy.names[1:])]

@@ -46,8 +46,8 @@ def evaluate_scenes(
 ) -> dict[str, Any]:
     """Evaluate ``locate`` on every scene of a folder.
 
-    Writes OUT/scenes/NAME.png, OUT/index.html and, last, OUT/report.json; a report that lies there
-    is replaced (``place.check_place`` says whether it may be), and nothing of this one stays where it
+    Writes OUT/scenes/NAME.png, OUT/index.html and, last, OUT/report.json. A report that lies there
+    is replaced: ``place.check_place`` says whether it may be. Nothing of this one stays where it
     does not come to its end. Raises InputError: no scenes, or a scene that cannot be read;
     StorageError: the disk refused.
 

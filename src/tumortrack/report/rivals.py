@@ -26,7 +26,7 @@ from tumortrack.registration.model import RegistrationModel
 from tumortrack.registration.motion import ElasticMotion
 from tumortrack.registration.rest_shape import RestShape
 from tumortrack.report import metrics
-from tumortrack.report.summary import RIVALS
+from tumortrack.report.summary import RIVALS, judged_parts
 from tumortrack.sense.cloud import thin_cloud
 from tumortrack.simulate.scene_folder import Scene, Targets
 
@@ -44,9 +44,9 @@ class Rivals:
     rest: RestShape
 
     def __call__(self, scene: Scene) -> dict[str, Any]:
-        """By rival, ``parts`` with surface and centre distances and, where the scene has targets,
-        ``tre_mm``, as ``report.protocol`` states them of an estimate, and ``camera_from_ct``
-        (JSON); or ``not_available``, the reason in words."""
+        """By rival (JSON): ``parts`` (tumors; without one, the organ) with surface and centre
+        distances, ``tre_mm`` where the scene has targets, both as ``report.protocol`` states them
+        of an estimate, and ``camera_from_ct``; or ``not_available``, the reason in words."""
         try:
             pose, by = best_rigid_pose(self.rest.anatomy_ct, scene)
         except InputError as error:
@@ -60,7 +60,8 @@ class Rivals:
     def _errors(self, camera_from_ct: Affine, scene: Scene) -> dict[str, Any]:
         anatomy, rows = self.rest.anatomy_ct, {}
         pairs = zip(anatomy.parts, scene.reference.parts, strict=True)
-        for name, (part, true) in zip(anatomy.names, pairs, strict=True):
+        judged = judged_parts(dict(zip(anatomy.names, pairs, strict=True)))
+        for name, (part, true) in judged.items():
             placed = part.moved(transform_points(camera_from_ct, part.vertices_mm))
             rows[name] = metrics.part_distances(placed, true)
         errors: dict[str, Any] = {"camera_from_ct": camera_from_ct.tolist(), "parts": rows}

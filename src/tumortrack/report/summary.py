@@ -15,7 +15,7 @@ from tumortrack.report.metrics import SurfaceDistances
 DISTANCES = (*(field.name for field in fields(SurfaceDistances)), "center_mm")
 TARGET_ERRORS = ("mean", "rms", "median", "p95")
 VERDICTS = ("good", "poor", "none")
-RIVALS = {"best_rigid_pose": "best rigid pose", "rigid_fit": "rigid fit from the best pose"}
+RIVALS = {"best_rigid_pose": "best rigid pose", "rigid_fit": "rigid fit"}
 MEANING = {
     "best_rigid_pose": "an oracle: the undeformed organ, laid on the true one as well as a rigid "
     "motion can",
@@ -98,19 +98,19 @@ def _pooled(entries: list[Entry]) -> dict[str, Any]:
     """Errors of answers by method, over those scenes that have an answer of it."""
     group: dict[str, Any] = {"scenes": len(entries)}
     for method in METHODS:
-        answers = [(e["name"], e if method == "estimate" else _rival(e, method)) for e in entries]
-        answers = [(scene, answer) for scene, answer in answers if "parts" in answer]
+        answers = [(entry, _answer(entry, method)) for entry in entries]
+        answers = [(entry, answer) for entry, answer in answers if "parts" in answer]
         if not answers:
             continue
         group[method] = {"scenes": len(answers)}
         for key in ("center_mm", "hausdorff_mm"):
             rows = [
-                (row.get(key, np.inf), scene, part)
-                for scene, answer in answers
-                for part, row in judged_parts(answer["parts"]).items()
+                (row.get(key, np.inf), entry["name"], part)
+                for entry, answer in answers
+                for part, row in answer["parts"].items()
             ]
             group[method][key] = _spread([row[0] for row in rows], max(rows))
-        known = [(scene, a["tre_mm"], list(a["parts"])) for scene, a in answers if a.get("tre_mm")]
+        known = [(e["name"], a["tre_mm"], list(e["parts"])) for e, a in answers if a.get("tre_mm")]
         if known:
             values = [mm for _, errors, _ in known for mm in errors["each"]]
             scene, errors, names = max(known, key=lambda one: one[1]["max"])
@@ -120,8 +120,11 @@ def _pooled(entries: list[Entry]) -> dict[str, Any]:
     return group
 
 
-def _rival(entry: Entry, name: str) -> dict[str, Any]:
-    return dict(entry.get("rivals", {}).get(name, {}))
+def _answer(entry: Entry, method: str) -> dict[str, Any]:
+    """The parts that are judged, and errors of targets."""
+    if method == "estimate":
+        return {**entry, "parts": judged_parts(entry["parts"])}
+    return dict(entry.get("rivals", {}).get(method, {}))
 
 
 def _spread(values: list[float], worst: tuple[float, str, str]) -> dict[str, Any]:
@@ -265,3 +268,26 @@ def scene_lines(entries: list[Entry]) -> list[str]:
             said = "; ".join(dict.fromkeys(reasons))
             lines.append(f"{entry['name']}: {entry['quality']}: {said}")
     return lines
+
+
+def scene_note(entry: dict[str, Any]) -> str:
+    """A scene's errors in a few words, with names and units."""
+    if entry["quality"] == "none":
+        return "no estimate, so there is nothing to measure"
+    far_mm, part = worst_center(entry)
+    far = f"{far_mm:.1f} mm" if np.isfinite(far_mm) else "not found"
+    notes = [f"{words(part)} is farthest off: centre {far}"]
+    if errors := entry.get("tre_mm"):
+        notes.append(target_text(errors))
+    notes.append(f"overlap with the truth (mIoU, 1 is perfect) {entry['miou']:.2f}")
+    if entry["failed"]:
+        notes.append(f"FAILED: {entry['failed']}")
+    return "; ".join(notes)
+
+
+def target_text(errors: dict[str, Any]) -> str:
+    """A scene's target errors in a few words."""
+    return (
+        f"target error {errors['mean']:.1f} mm (mean of {errors['count']}, "
+        f"largest {errors['max']:.1f} mm)"
+    )
