@@ -69,7 +69,8 @@ class Demo:
             unseen(scenes=dragged, configuration=(3, 6), squeeze=True).write("dragged-")
         say("5/5 locating kidney and tumors in each from one depth image")
         evaluate = Evaluate(model=out / "model", variants=out / "dataset", report=out, grid=128)
-        first = evaluate.write()["scenes"][0]  # beside the case, the model and the scenes
+        report = evaluate.write()  # beside the case, the model and the scenes
+        first = report["scenes"][0]
         if "seconds" in first:  # located
             to_first_s = made_s + first["seconds"]
             say(f"labels to first estimate: {to_first_s:.0f} s, from the CT, with training.")

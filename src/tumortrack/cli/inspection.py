@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from tyro.conf import Positional
 
@@ -52,8 +53,7 @@ def describe(path: Path) -> list[str]:
         return [f"{path}: {len(list_scenes(path))} scenes; `tumortrack evaluate` reads them."]
     report = path / "report.json" if path.is_dir() else path
     if report.name == "report.json" and report.is_file():
-        summary = store.read_json(report).get("summary", {})
-        return [f"{path}: an evaluation report.", *(f"  {k}: {v}" for k, v in summary.items())]
+        return [f"{path}: an evaluation report.", *_evaluation(store.read_json(report))]
     from tumortrack.sense.files import CLOUD_SUFFIXES, read_cloud
 
     if path.suffix.lower() in CLOUD_SUFFIXES:
@@ -65,6 +65,16 @@ def describe(path: Path) -> list[str]:
         f"{path} is no case, model, run, scene, report or cloud of tumortrack's. "
         "Volumes and label maps go to `tumortrack prepare`."
     )
+
+
+def _evaluation(report: dict[str, Any]) -> list[str]:
+    """In sentences; of a report that an earlier version wrote, nothing."""
+    from tumortrack.report.summary import headlines, scene_lines
+
+    if "errors" not in report.get("summary", {}):
+        return ["  Written by another version; `tumortrack evaluate` makes it again."]
+    lines = (*headlines(report["summary"]), *scene_lines(report["scenes"]))
+    return [f"  {line}" for line in lines]
 
 
 def _artifact(folder: Path) -> list[str]:

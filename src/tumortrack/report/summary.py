@@ -215,12 +215,13 @@ def summary_tables(report: dict[str, Any]) -> list[Table]:
     """For the terminal: errors by verdict and method, then medians by part."""
     summary = report["summary"]
     errors = Table(title="errors in mm: median / 95 % within / worst, over all scenes and tumors")
-    errors.add_column("answers")
-    for head in ("scenes", *MEASURES.values()):
-        errors.add_column(head, justify="right")
+    errors.add_column("answers", no_wrap=True)
+    errors.add_column("method")
+    for head in MEASURES.values():
+        errors.add_column(head, justify="right", no_wrap=True)
     for verdict, method, group in error_rows(summary):
         cells = [triple(group.get(key)) for key in MEASURES]
-        errors.add_row(f"{verdict}: {METHODS[method]}", str(group["scenes"]), *cells)
+        errors.add_row(verdict, METHODS[method], *cells)
     table = Table(title=f"medians over scenes; mIoU {summary['miou']:.3f} (overlap, 1: perfect)")
     table.add_column("part")
     for head in ("found", "HD mm", "one-sided", "HD95", "surface", "centre", "IoU", "worst HD mm"):
