@@ -341,6 +341,7 @@ def evaluate(
     locate: Tracker | Callable[[SensorCloud], Estimate],
     scenes: StrPath | Sequence[Scene],
     report: StrPath | None = None,
+    overwrite: bool = False,
 ) -> dict[str, Any]:
     """Locate in every scene and compare with the truth.
 
@@ -348,23 +349,31 @@ def evaluate(
         locate: a tracker, or any function from an observed cloud to an estimate.
         scenes: folder of scene folders, or scenes.
         report: folder for report.json, index.html and pictures (scenes of a folder only).
+        overwrite: replace an earlier report there.
 
     Returns:
         The report: per scene and part Hausdorff distances, surface and centre distance (mm), IoU,
-        target errors; ``summary`` has medians. docs/conventions.md defines each.
+        target errors, and for a tracker of a `clinic` model those of the best rigid pose and of a
+        rigid fit; ``summary`` has medians, and the worst with its scene. docs/conventions.md
+        defines each.
 
     Raises:
-        InputError: no scenes, or a scene that cannot be read.
+        InputError: no scenes, or a scene that cannot be read; the folder exists and ``overwrite``
+            is False.
     """
     from tumortrack.report import protocol
+    from tumortrack.report.place import check_place
+    from tumortrack.report.rivals import rivals_of
 
     call: Any = getattr(locate, "locate", None) or locate
+    rivals = rivals_of(getattr(locate, "model", None))
     if isinstance(scenes, str | Path):
         if report is None:
             raise InputError("evaluating a folder of scenes writes a report: say where.")
-        return protocol.evaluate_scenes(call, Path(scenes), Path(report))
+        check_place(Path(report), overwrite)
+        return protocol.evaluate_scenes(call, Path(scenes), Path(report), rivals=rivals)
     named = ((f"{n:04d}", scene) for n, scene in enumerate(scenes))
-    entries = [protocol.evaluate_scene(call, scene, name)[0] for name, scene in named]
+    entries = [protocol.evaluate_scene(call, scene, name, rivals)[0] for name, scene in named]
     return {"scenes": entries, "summary": protocol.summarise(entries)}
 
 

@@ -13,7 +13,7 @@ from live_objects import ball
 # A name or a parameter that goes or changes its meaning breaks users' scripts: think twice.
 SIGNATURES = {
     "estimate_from_surfaces": "surfaces grid=160",
-    "evaluate": "locate scenes report=None",
+    "evaluate": "locate scenes report=None overwrite=False",
     "find_organ": "content model=None range_mm=None box_mm=None mask=None picked_mm=None "
     "picture=None taught=None seed=0",
     "load_case": "folder",

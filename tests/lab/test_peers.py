@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 from render_objects import ellipsoid
 from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.geometry import rigid, rotation_onto, transform_points
+from tumortrack.core.rigid_fit import fit_over_volume, matched_vertices
 from tumortrack.core.types import Anatomy, Mesh, SensorCloud
 from tumortrack.report.protocol import compare
 from tumortrack.sense.render import Visibility
@@ -18,8 +19,6 @@ from tumortrack_lab.peers.base import (
     Rigid,
     RigidBound,
     estimate_of,
-    fit_over_volume,
-    matched_vertices,
     rigid_carry,
 )  # fmt: skip
 from tumortrack_lab.peers.elastic import (

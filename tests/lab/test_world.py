@@ -16,11 +16,11 @@ from scipy.spatial.transform import Rotation
 from tumortrack.core import store
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import transform_points
+from tumortrack.core.rigid_fit import kabsch
 from tumortrack.core.types import Anatomy, Mesh
 from tumortrack.sense.camera import d405
 from tumortrack.simulate.scene_folder import read_scene
 from tumortrack.tracking.tracker import Tracker
-from tumortrack_lab.peers.base import kabsch
 from tumortrack_lab.tets import TetMesh, tetrahedralise
 from tumortrack_lab.twin.equilibrium import Rod, settle
 from tumortrack_lab.twin.solid import NeoHookeanSolid

@@ -1,14 +1,16 @@
 """The protocol, its pictures and its page, on synthetic ellipsoids."""
 
+import itertools
 import json
 import re
+import shutil
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import trimesh
 
-from tumortrack.core.colours import part_colour
+from tumortrack.core.colours import TUMORS, css, part_colour
 from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.estimate import Estimate
 from tumortrack.core.types import (
@@ -32,8 +34,10 @@ from tumortrack.report.pictures import (
     qc_picture,
     slice_volume,
 )
-from tumortrack.report.protocol import evaluate_scenes, failure, summarise, summary_table
+from tumortrack.report.place import check_place
+from tumortrack.report.protocol import evaluate_scenes, failure
 from tumortrack.report.renderer import Body, Frame, ParallelView, rgb
+from tumortrack.report.summary import headlines, scene_lines, summarise, summary_tables
 from tumortrack.simulate.scene_folder import Scene
 
 
@@ -115,10 +119,13 @@ def test_the_registrations_share_stands_beside_the_error(tmp_path):
     replace(scene(), meta=stated).write(tmp_path / "scenes" / "one")
     locate = Scripted(estimate_of(anatomy((3, 0, 0))))
     report = evaluate_scenes(locate, tmp_path / "scenes", tmp_path / "out")
-    assert "<th>registration mm</th>" in (tmp_path / "out" / "index.html").read_text()
+    assert (
+        "<th>expected error of the truth itself, mm</th>"
+        in (tmp_path / "out" / "index.html").read_text()
+    )
     other = {**report["scenes"][0], "registration_mm": {"kidney": 0.2, "tumor_1": 0.4}}
     report["summary"] = summarise([report["scenes"][0], other])
-    table = summary_table(report)
+    table = summary_tables(report)[-1]
     assert [str(cell) for cell in table.columns[-1].cells] == ["0.20", "0.35"]
 
 
@@ -152,6 +159,8 @@ def test_what_was_not_found_counts_as_failed(evaluated):
 
 
 def test_a_part_that_is_missed_never_helps():
+    numbers = itertools.count()
+
     def entry(hausdorff_mm):
         found = hausdorff_mm is not None
         part = {"found": found, "iou": 0.5 if found else 0.0}
@@ -159,7 +168,8 @@ def test_a_part_that_is_missed_never_helps():
             part |= dict.fromkeys(
                 ("hausdorff_mm", "hausdorff_one_sided_mm", "hausdorff_95_mm", "surface_mm",
                  "center_mm"), hausdorff_mm)  # fmt: skip
-        return {"parts": {"tumor_1": part}, "miou": part["iou"],
+        return {"name": f"scene {next(numbers)}", "quality": "good", "parts": {"tumor_1": part},
+                "miou": part["iou"],
                 "failed": None if found else "not found: tumor_1"}  # fmt: skip
 
     full = summarise([entry(h) for h in (2.0, 4.0, 9.0)])
@@ -190,7 +200,15 @@ def test_an_answer_that_is_far_off_has_failed_however_it_is_called(tmp_path):
     }
     counts = {"scenes": 3, "good": 2, "poor": 1, "failed": 2, "far": 2, "far_good": 1}
     assert {name: report["summary"][name] for name in counts} == counts
-    assert "2 failed (2 far off, 1 of them called good)" in summary_table(report).title
+    first, good, poor = headlines(report["summary"])
+    assert first.startswith("3 scenes: 2 good, 1 poor, 0 none. 2 failed: 0 without an answer")
+    assert "2 with a tumor's centre over 5 mm off (1 of them called good)" in first
+    assert "worst 5.1 mm (tumor 1 of far)" in good  # never mixed with the poor ones
+    assert "worst 30.0 mm (tumor 1 of poor)" in poor
+    assert scene_lines(report["scenes"]) == [
+        "far: good: far off: the centre of tumor_1 by 5.1 mm",
+        "poor: poor: it was not judged; far off: the centre of tumor_1 by 30.0 mm",
+    ]
     assert failure({"kidney": {"found": True, "center_mm": 5.1}}).endswith("kidney by 5.1 mm")
     exophytic = {"kidney": {"found": True, "center_mm": 6.0},
                  "tumor_1": {"found": True, "center_mm": 4.0}}  # fmt: skip
@@ -201,18 +219,46 @@ def test_table_shows_every_part(evaluated):
     from rich.console import Console
 
     console = Console(width=120, record=True, file=open("/dev/null", "w"))  # noqa: SIM115
-    console.print(summary_table(evaluated[1]))
+    for table in summary_tables(evaluated[1]):
+        console.print(table)
     text = console.export_text()
-    assert "4 scenes, 2 failed (0 far off" in text
     assert re.search(r"kidney\D+3/4\D+2\.0", text)
-    assert re.search(r"tumor_1\D+2/4\s+│\s+none", text)
+    assert re.search(r"tumor_1\D+2/4\s+│\s+not found", text)
+    assert re.search(r"poor\s+│\s+estimate\s+│.*3\.0 / not found / not found", text)
+
+
+def test_the_worst_of_a_part_is_no_median(evaluated):
+    """Kidneys 3, 1 and 0 mm off, one not found; of those found the worst is 3 mm."""
+    kidney = evaluated[1]["summary"]["kidney"]
+    assert kidney["worst"]["center_mm"] == {"mm": None, "scene": "scene_3"}
+    found = summarise(evaluated[1]["scenes"][:3])["kidney"]
+    assert found["worst"]["center_mm"] == {"mm": pytest.approx(3, abs=1e-3), "scene": "scene_0"}
+    assert found["p95"]["center_mm"] == pytest.approx(3, abs=1e-3)
+
+
+def test_only_a_report_is_replaced(evaluated, tmp_path):
+    """A user's own page stays, whatever is asked for."""
+    mine = tmp_path / "mine"
+    mine.mkdir()
+    check_place(mine, overwrite=True)
+    (mine / "index.html").write_text("my page")
+    with pytest.raises(InputError, match="exists already"):
+        check_place(mine, overwrite=False)
+    with pytest.raises(InputError, match="no report of `evaluate`"):
+        check_place(mine, overwrite=True)
+    out = tmp_path / "report"
+    shutil.copytree(evaluated[0], out)
+    check_place(out, overwrite=True)
+    (out / "scenes" / "holiday.png").touch()
+    with pytest.raises(InputError, match=r"also holds holiday\.png"):
+        check_place(out, overwrite=True)
 
 
 def test_errors_that_are_ours_are_not_hidden(tmp_path):
     scene().write(tmp_path / "scenes" / "a")
     with pytest.raises(ZeroDivisionError):
         evaluate_scenes(Scripted(ZeroDivisionError()), tmp_path / "scenes", tmp_path / "out")
-    assert not (tmp_path / "out" / "report.json").exists()
+    assert not (tmp_path / "out").exists()  # so that the next command can start
     with pytest.raises(InputError, match="holds no scenes"):
         evaluate_scenes(Scripted(), tmp_path / "scenes" / "a", tmp_path / "out")
 
@@ -225,10 +271,10 @@ def test_every_scene_has_a_readable_picture(evaluated):
         assert picture.shape[0] > 600
         assert picture.shape[1] > 1000
         flat = picture[..., :3].reshape(-1, 3)
-        orange = (np.abs(flat - [0.9, 0.55, 0.0]) < 0.1).all(1).sum()
+        green = (np.abs(flat - np.array(TUMORS[0]) / 255) < 0.1).all(1).sum()
         blue = (np.abs(flat - [0.0, 90 / 255, 160 / 255]) < 0.05).all(1).sum()
         assert blue > 1000  # truth in every scene
-        assert (orange > 1000) == (n < 2)  # estimated tumors only where there are some
+        assert (green > 1000) == (n < 2)  # estimated tumors only where there are some
 
 
 def test_page_is_whole_and_fetches_nothing(evaluated):
@@ -240,11 +286,18 @@ def test_page_is_whole_and_fetches_nothing(evaluated):
     assert "@" + "DATA@" not in page
     start = page.index('<script id="data" type="application/json">') + 42
     data = json.loads(page[start : page.index("</script>", start)])
-    assert [s["name"] for s in data] == [f"scene_{n}" for n in range(4)]
-    assert data[3]["note"].endswith("no &lt;organ&gt; in view")
-    kinds = [[layer["kind"] for layer in s["layers"]] for s in data]
-    assert kinds[0] == ["points", "mesh", "mesh", "truth", "wire"]
-    assert kinds[3] == ["points", "truth", "wire"]
+    scenes = data["scenes"]
+    assert [s["name"] for s in scenes] == [f"scene_{n}" for n in range(4)]
+    assert [s["verdict"] for s in scenes] == ["poor", "poor", "poor", "none"]
+    assert scenes[3]["reason"] == "no <organ> in view"  # shown as text, never as HTML
+    assert "no &lt;organ&gt; in view" in page[:start]
+    assert "no <organ>" not in page[:start]
+    # Of the answers: off by 3 mm, by 1 mm, and without its tumor.
+    assert (data["typical"], data["worst"]) == (0, 2)
+    kinds = [[layer["kind"] for layer in s["layers"]] for s in scenes]
+    assert kinds[0] == ["points", "surface", "surface", "outline", "outline"]
+    assert kinds[3] == ["points", "outline", "outline"]
+    assert scenes[0]["layers"][2]["color"] == css(TUMORS[0])
 
 
 def test_thinned_meshes_keep_shape():

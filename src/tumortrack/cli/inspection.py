@@ -85,7 +85,15 @@ def _words(content: Content, sentences: Iterable[str | list[str]]) -> Iterator[s
 
 
 def _evaluation(report: Content) -> list[str]:
-    return ["an evaluation report", *(f"{k}: {v}" for k, v in report["summary"].items())]
+    from tumortrack.report.summary import headlines, scene_lines
+
+    if "errors" not in report["summary"]:
+        return ["an evaluation report of another version; `tumortrack evaluate` makes it again"]
+    return [
+        "an evaluation report",
+        *headlines(dict(report["summary"])),
+        *scene_lines(report["scenes"]),
+    ]
 
 
 def _json(path: Path) -> list[str]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from tyro.conf import Positional, UseAppendAction
 
@@ -244,6 +244,7 @@ class Evaluate:
         grid: voxels along the longest side of the labelled volume.
         seed: of the random points and queries.
         device: auto takes CUDA if there is a GPU.
+        overwrite: replace REPORT if it exists.
     """
 
     model: Positional[Path]
@@ -252,20 +253,27 @@ class Evaluate:
     grid: int = 160
     seed: int = 0
     device: Device = "auto"
+    overwrite: bool = False
 
     def run(self) -> None:
+        from tumortrack.report.place import check_place
+
+        _check_grid(self.grid)
+        check_place(self.report, self.overwrite)
+        self.write()
+
+    def write(self) -> dict[str, Any]:
+        """The report, whatever lies in its place."""
         from tumortrack.models.folder import read_model_manifest
         from tumortrack.simulate.scene_folder import list_scenes
 
-        _check_grid(self.grid)
-        if (self.report / store.MANIFEST).exists():
-            raise InputError(
-                f"{self.report} is a case, model or run; choose another REPORT folder."
-            )
         read_model_manifest(self.model)
         folders = list_scenes(self.variants)  # report what is wrong before PyTorch's seconds
+        say(f"comparing {self.model} with the truth of {len(folders)} scenes; loading it ...")
 
-        from tumortrack.report.protocol import evaluate_scenes, summary_table
+        from tumortrack.report.protocol import evaluate_scenes
+        from tumortrack.report.rivals import rivals_of
+        from tumortrack.report.summary import headlines, scene_lines, summary_tables
         from tumortrack.tracking.tracker import Tracker
         from tumortrack.training.model import load_model
 
@@ -281,12 +289,19 @@ class Evaluate:
             "grid": self.grid,
             "seed": self.seed,
         }
-        tracker = Tracker(model)
+        locate = partial(Tracker(model).locate, grid=self.grid, seed=self.seed)
+        rivals = rivals_of(model)
         with progress_bar("evaluate", len(folders)) as advance:
-            locate = partial(tracker.locate, grid=self.grid, seed=self.seed)
-            result = evaluate_scenes(locate, self.variants, self.report, advance, about)
-        console.print(summary_table(result))
-        say(f"written to {self.report / 'report.json'}; look at {self.report / 'index.html'}.")
+            out = self.report
+            result = evaluate_scenes(locate, self.variants, out, advance, about, rivals)
+        for table in summary_tables(result):
+            console.print(table)
+        for line in (*scene_lines(result["scenes"]), *headlines(result["summary"])):
+            say(line)
+        if rivals is None:
+            say(result["rivals"]["not_available"])
+        say(f"written to {out / 'report.json'}; look at {out / 'index.html'}.")
+        return result
 
 
 def check_case(model: Model, folders: list[Path]) -> None:

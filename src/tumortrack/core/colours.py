@@ -32,6 +32,7 @@ PICKED: Colour = (255, 80, 200)
 GOOD: Colour = (88, 100, 114)  # no green: it would say that it is safe to cut
 POOR: Colour = (210, 140, 0)
 NONE: Colour = (205, 20, 30)
+VERDICTS = {"good": GOOD, "poor": POOR, "none": NONE}
 STALE: Colour = (110, 60, 160)
 ARMS: Colour = (45, 95, 165)
 TO_CUT: Colour = (0, 120, 240)

@@ -109,6 +109,11 @@ class Mesh:
 
         return float(signed_volume(self.vertices_mm, self.faces))
 
+    @property
+    def volume_ml(self) -> float:
+        """The volume that people are told: of the closed surface, in millilitres."""
+        return self.volume_mm3 / 1000
+
     @cached_property
     def box_mm(self) -> Float64[np.ndarray, "2 3"]:
         """Axis-aligned bounding box: lower and upper corner."""

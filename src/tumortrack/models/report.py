@@ -95,7 +95,7 @@ def describe_parts(
         mesh, mine = meshes[name], slice(1, None) if n == 0 else n + 1
         points = int(counts[mine].sum())
         parts[name] |= {
-            "volume_ml": mesh.volume_mm3 / 1000,
+            "volume_ml": mesh.volume_ml,
             "center_mm": mesh.box_mm.mean(0).tolist(),
             "box_mm": mesh.box_mm.tolist(),
             "points": points,

@@ -7,15 +7,15 @@ in HD95 and directed distances because they leave that open.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 
 from tumortrack.core.errors import InputError
-from tumortrack.core.estimate import Motion
-from tumortrack.core.geometry import transform_points
+from tumortrack.core.geometry import Points, transform_points
 from tumortrack.core.types import Anatomy, CameraLabels, Mesh
 from tumortrack.imaging.raster import expand, label_grid
 from tumortrack.simulate.occupancy import contains
@@ -139,21 +139,31 @@ def outward_miss(estimate: Mesh, reference: Mesh) -> float:
     return float(distance_to_surface(outside, estimate).max()) if len(outside) else 0.0
 
 
-def target_errors(motion: Motion, targets: Targets) -> dict[str, float]:
-    """Target registration error: how far from their true places the motion carries the targets;
-    ``mean``, ``rms``, ``median``, ``p95`` and ``max`` in mm, and ``count`` (of targets).
+def part_distances(estimate: Mesh, reference: Mesh) -> dict[str, float]:
+    """Of two surfaces, by name: ``SurfaceDistances`` and ``center_mm``."""
+    distances = asdict(surface_distances(estimate, reference))
+    return {**distances, "center_mm": box_center_distance(estimate, reference)}
+
+
+def target_errors(carried_mm: Points, targets: Targets) -> dict[str, Any]:
+    """Target registration error: how far the targets, as carried to the camera frame, lie from
+    their true places; ``mean``, ``rms``, ``median``, ``p95`` and ``max`` in mm, ``count`` (of
+    targets), ``each``: every target's (mm, in their order), and ``max_label``: the label of the one
+    that is farthest off.
 
     Source: Fitzpatrick & West 2001, "The distribution of target registration error in rigid-body
     point-based registration", doi 10.1109/42.952729.
     """
-    error = np.linalg.norm(motion.carry(targets.points_ct) - targets.points_mm, axis=1)
+    error = np.linalg.norm(carried_mm - targets.points_mm, axis=1)
     return {
         "mean": float(error.mean()),
         "rms": float(np.sqrt((error**2).mean())),
         "median": float(np.median(error)),
         "p95": float(np.percentile(error, 95)),
         "max": float(error.max()),
+        "max_label": int(targets.labels[error.argmax()]),
         "count": len(error),
+        "each": error.round(2).tolist(),
     }
 
 

@@ -11,45 +11,67 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import trimesh
 from jaxtyping import Float
 from PIL import Image
+from trimesh.intersections import mesh_plane
 
-from tumortrack.core.colours import OBSERVED, ORGAN_PART, TRUTH, TUMORS
-from tumortrack.core.estimate import Estimate
+from tumortrack.core import colours
+from tumortrack.core.estimate import NO_CHECK_FAILED, UNVERIFIED, Estimate
 from tumortrack.core.organ import is_tumor
 from tumortrack.core.patient import patient_in
 from tumortrack.core.store import write_atomically
 from tumortrack.core.types import Mesh
+from tumortrack.report.summary import (
+    MEASURES,
+    METHODS,
+    RIVALS,
+    VERDICTS,
+    error_rows,
+    failures,
+    measures,
+    number,
+    part_rows,
+    scene_note,
+    verdict_counts,
+    words,
+    worst_center,
+)
 from tumortrack.simulate.scene_folder import Scene
 
 _ORGAN_CELL_MM, _TUMOR_CELL_MM = 2.5, 2.0
 _COLUMNS = {
-    "hausdorff_mm": "Hausdorff mm",
-    "hausdorff_one_sided_mm": "one-sided mm",
-    "hausdorff_95_mm": "HD95 mm",
-    "surface_mm": "mean surface mm",
-    "center_mm": "centre mm",
-    "iou": "IoU",
+    "center_mm": "centre off, mm",
+    "hausdorff_mm": "surface off at most (Hausdorff), mm",
+    "hausdorff_95_mm": "95 % of the surface within, mm",
+    "hausdorff_one_sided_mm": "one-sided Hausdorff, mm",
+    "surface_mm": "surface off in the mean, mm",
+    "iou": "overlap (IoU, 0 to 1)",
 }
-_SHOWN_POINTS = 4000
+_SHOWN_POINTS, _AROUND_MM = 2000, 12.0  # of the cloud: those so near the organ
 
 
-def page_scene(name: str, scene: Scene, estimate: Estimate | None, picture: Path) -> dict[str, Any]:
-    """What the page shows of a scene, small (JSON types): ``layers``, thinned meshes, and
-    ``picture``, the PNG that ``scene_picture`` wrote, compressed."""
-    points_mm = scene.cloud.points_mm
-    step = -(-len(points_mm) // _SHOWN_POINTS)
-    layers = [{"kind": "points", "name": "observed points", "v": _packed(points_mm[::step])}]
+def page_scene(scene: Scene, estimate: Estimate | None, picture: Path) -> dict[str, Any]:
+    """What the page shows of a scene, small (JSON types): ``layers``, thinned meshes, ``box``,
+    around organ and tumors, and ``picture``, the PNG that ``scene_picture`` wrote, compressed."""
     shown = estimate.meshes if estimate else {}
+    meshes = [*scene.reference.parts, *shown.values()]
+    lower = np.min([mesh.box_mm[0] for mesh in meshes], axis=0) - _AROUND_MM
+    upper = np.max([mesh.box_mm[1] for mesh in meshes], axis=0) + _AROUND_MM
+    points_mm = scene.cloud.points_mm
+    points_mm = points_mm[((points_mm > lower) & (points_mm < upper)).all(1)]
+    step = max(1, -(-len(points_mm) // _SHOWN_POINTS))
+    points = {"kind": "points", "name": "observed points", "v": _packed(points_mm[::step])}
+    layers = [{**points, "color": colours.css(colours.SEEN)}]
     for part, mesh in shown.items():
-        layers.append(_layer("mesh", f"{part} (estimate)", part, mesh))
+        layers.append(_surface(part, mesh, _color(part, scene)))
     for part, mesh in zip(scene.reference.names, scene.reference.parts, strict=True):
-        kind = "wire" if is_tumor(part) else "truth"
-        layers.append(_layer(kind, f"{part} (truth)", part, mesh))
+        layers.append(_outline(part, mesh))
     webp = io.BytesIO()
     with Image.open(picture) as image:
         image.convert("RGB").save(webp, "WEBP", quality=82)
-    return {"name": name, "layers": layers, "picture": _base64(webp.getvalue())}
+    box = [lower.round(1).tolist(), upper.round(1).tolist()]
+    return {"layers": layers, "box": box, "picture": _base64(webp.getvalue())}
 
 
 def write_page(report: dict[str, Any], scenes: list[dict[str, Any]], path: Path) -> None:
@@ -59,19 +81,31 @@ def write_page(report: dict[str, Any], scenes: list[dict[str, Any]], path: Path)
     """
     from plotly.offline import get_plotlyjs
 
-    data = [
-        {**scene, "rows": _table(entry["parts"]), "note": html.escape(_note(entry))}
-        for entry, scene in zip(report["scenes"], scenes, strict=True)
-    ]
+    entries, summary = report["scenes"], report["summary"]
+    data = {
+        "scenes": [
+            {**scene, **_about(entry), "rows": _part_table(entry["parts"])}
+            for entry, scene in zip(entries, scenes, strict=True)
+        ],
+        **_typical_and_worst(entries),
+    }
     embedded = json.dumps(data, allow_nan=False).replace("</", "<\\/")
     # The texts that are long or hold braces go in by position, never through a formatter.
     page = resources.files("tumortrack.report").joinpath("page.html").read_text("utf-8")
-    page = page.replace("@SUMMARY@", _table(part_rows(report["summary"])))
-    whose = f"{patient_in(report.get('patient'), 'report')}. "
-    page = page.replace("@COUNTS@", html.escape(whose + _counts(report["summary"])))
-    page = page.replace("@RULE@", html.escape(report["rule"]))
-    shades = {"truth": TRUTH, "points": OBSERVED, "organ": ORGAN_PART, "tumors": TUMORS}
-    page = page.replace("@COLOURS@", json.dumps(shades))
+    texts = {
+        "WHOSE": html.escape(str(patient_in(report.get("patient"), "report"))),
+        "SCENES": html.escape(verdict_counts(summary)),
+        "VERDICTS": _verdicts(summary),
+        "FAILED": html.escape(failures(summary)),
+        "ERRORS": _error_table(summary),
+        "RIVALS": _rivals(report),
+        "TABLE": _scene_table(entries),
+        "SUMMARY": _part_table(part_rows(summary)),
+        "RULE": html.escape(report["rule"]),
+        "VERDICT_COLOURS": _verdict_colours(),
+    }
+    for name, text in texts.items():
+        page = page.replace(f"@{name}@", text)
     head, script = page.split("@PLOTLY@")
     middle, tail = script.split("@DATA@")
     text = "".join((head, get_plotlyjs(), middle, embedded, tail))
@@ -95,11 +129,25 @@ def thinned(mesh: Mesh, cell_mm: float) -> Mesh:
     return Mesh(np.stack(means, axis=1), faces[times[kind.reshape(-1)] % 2 == 1])
 
 
-def _layer(kind: str, name: str, part: str, mesh: Mesh) -> dict[str, Any]:
+def _color(part: str, scene: Scene) -> str:
+    label = scene.reference.names.index(part) + 1 if part in scene.reference.names else 1
+    return colours.css(colours.part_colour(label))
+
+
+def _surface(part: str, mesh: Mesh, color: str) -> dict[str, Any]:
     small = thinned(mesh, _TUMOR_CELL_MM if is_tumor(part) else _ORGAN_CELL_MM)
-    about = {"kind": kind, "part": part, "name": name.replace("_", " ")}
     faces = _base64(small.faces.astype("<u4").tobytes())
-    return {**about, "v": _packed(small.vertices_mm), "f": faces}
+    about = {"kind": "surface", "name": f"{words(part)}, estimated", "color": color}
+    return {**about, "tumor": is_tumor(part), "v": _packed(small.vertices_mm), "f": faces}
+
+
+def _outline(part: str, mesh: Mesh) -> dict[str, Any]:
+    """The true surface cut by three planes through its middle: pairs of points, a line each."""
+    solid = trimesh.Trimesh(mesh.vertices_mm, mesh.faces, process=False)
+    cuts = [mesh_plane(solid, axis, mesh.box_mm.mean(0)) for axis in np.eye(3)]
+    lines = np.concatenate(cuts).reshape(-1, 3)
+    about = {"kind": "outline", "name": f"{words(part)}, true (cuts)", "tumor": is_tumor(part)}
+    return {**about, "v": _packed(lines)}
 
 
 def _packed(points_mm: Float[np.ndarray, "n 3"]) -> str:
@@ -111,60 +159,118 @@ def _base64(content: bytes) -> str:
     return base64.b64encode(content).decode()
 
 
-def counts(summary: dict[str, Any]) -> str:
-    """How many scenes there are, and how many answers are what, in words."""
-    far = f"{summary['far']} far off, {summary['far_good']} of them called good"
-    answers = f"{summary['good']} good, {summary['poor']} poor"
-    return f"{summary['scenes']} scenes, {summary['failed']} failed ({far}), {answers}"
+def _about(entry: dict[str, Any]) -> dict[str, Any]:
+    """A scene's name, verdict and reason, and its errors in a few words."""
+    good = f"{NO_CHECK_FAILED}; {UNVERIFIED}"
+    reason = good if entry["quality"] == "good" else entry["reason"]
+    said = {"name": entry["name"], "verdict": entry["quality"], "reason": reason}
+    return {**said, "note": scene_note(entry)}
 
 
-def _counts(summary: dict[str, Any]) -> str:
-    text = f"{counts(summary)}. Median mIoU {summary['miou']:.3f}."
-    if not (errors := summary.get("tre_mm")):
-        return text
-    mean, p95, largest = (number(errors[key]) for key in ("mean", "p95", "max"))
-    return (
-        f"{text} Target registration error, medians over {errors['scenes']} scenes: mean {mean} "
-        f"mm, 95th percentile {p95} mm, largest {largest} mm."
-    )
+def _typical_and_worst(entries: list[dict[str, Any]]) -> dict[str, int]:
+    """Places of the scene whose tumors are as far off as in the median answer, and of that whose
+    are farthest; without an answer the first."""
+    far = [(worst_center(entry)[0], n) for n, entry in enumerate(entries)]
+    answers = sorted(one for one in far if entries[one[1]]["quality"] != "none") or far[:1]
+    return {"typical": answers[(len(answers) - 1) // 2][1], "worst": answers[-1][1]}
 
 
-def _note(entry: dict[str, Any]) -> str:
-    took = f", located in {entry['seconds']:.2f} s" if "seconds" in entry else ""
-    failed = "" if entry["failed"] is None else f", FAILED: {entry['failed']}"
-    errors = entry.get("tre_mm")
-    targets = "" if not errors else f", {target_text(errors)}"
-    return f"mIoU {entry['miou']:.3f}{targets}{took}{failed}"
+def _verdict_colours() -> str:
+    pairs = colours.VERDICTS.items()
+    return " ".join(f".{verdict} {{ --verdict: {colours.css(c)}; }}" for verdict, c in pairs)
 
 
-def target_text(errors: dict[str, Any]) -> str:
-    """A scene's target errors in a few words."""
-    return (
-        f"target error {errors['mean']:.1f} mm (mean of {errors['count']}, "
-        f"largest {errors['max']:.1f} mm)"
-    )
+def _verdicts(summary: dict[str, Any]) -> str:
+    """A card for each verdict: how many, and how far off their tumors are."""
+    cards = []
+    for verdict in VERDICTS:
+        group = summary["errors"].get(verdict, {}).get("estimate", {})
+        lines = [html.escape(line) for line in measures(group)]
+        meaning = "no estimate: nothing was shown" if verdict == "none" else "no such answer"
+        body = "".join(f"<p>{line}</p>" for line in lines) or f"<p>{meaning}</p>"
+        head = f"<b>{summary[verdict]}</b> {verdict}"
+        cards.append(f'<div class="card {verdict}"><h3>{head}</h3>{body}</div>')
+    return "".join(cards)
 
 
-def part_rows(summary: dict[str, Any]) -> dict[str, dict[str, Any]]:
-    """What the summary says of parts, by name."""
-    return {k: row for k, row in summary.items() if isinstance(row, dict) and "found" in row}
+def _rivals(report: dict[str, Any]) -> str:
+    meaning = report["rivals"]
+    if "not_available" in meaning:
+        return html.escape(meaning["not_available"])
+    said = [f"{RIVALS[name].capitalize()}: {meaning[name]}." for name in RIVALS]
+    left = {e["name"]: r["not_available"] for e in report["scenes"]
+            for r in e["rivals"].values() if "not_available" in r}  # fmt: skip
+    said += [f"Not available of {name}: {why}." for name, why in left.items()]
+    return html.escape(" ".join(said))
 
 
-def _table(parts: dict[str, dict[str, Any]]) -> str:
-    """Of a scene's parts, or the summary's."""
+def _error_table(summary: dict[str, Any]) -> str:
+    """By verdict and method: median, 95 % and worst, pooled over scenes, tumors and targets."""
+    head = ["answers", "method", "scenes"]
+    for measure in MEASURES.values():
+        head += [f"{measure}: median, mm", "95 % within, mm", "worst, mm"]
+    rows = []
+    for verdict, method, group in error_rows(summary):
+        cells = [verdict, METHODS[method], str(group["scenes"])]
+        for key in MEASURES:
+            spread = group.get(key)
+            cells += [number(spread[k], 1) for k in ("median", "p95")] if spread else ["", ""]
+            where = f" ({words(spread['part'])} of {spread['scene']})" if spread else ""
+            cells.append(number(spread["worst"], 1) + where if spread else "")
+        rows.append(cells)
+    return _table(head, rows)
+
+
+def _scene_table(entries: list[dict[str, Any]]) -> str:
+    """One row a scene; its name opens it."""
+    head = ["scene", "verdict", "reason", "tumor or organ farthest off", "centre off, mm"]
+    head += [f"{name}: centre off, mm" for name in RIVALS.values()]
+    head += ["targets: mean, mm", "largest, mm"]
+    rows = []
+    for entry in entries:
+        far_mm, part = worst_center(entry)
+        rivals = [entry.get("rivals", {}).get(name, {}) for name in RIVALS]
+        centers = [row["parts"][part]["center_mm"] if "parts" in row else None for row in rivals]
+        errors = entry.get("tre_mm") or {}
+        far = [number(far_mm if np.isfinite(far_mm) else None, 1)]
+        others = [number(mm, 1) if mm is not None else "-" for mm in centers]
+        targets = [number(errors[key], 1) if errors else "-" for key in ("mean", "max")]
+        about = [entry["name"], entry["quality"], entry["reason"] or "-", words(part)]
+        rows.append([*about, *far, *others, *targets])
+    return _table(head, rows)
+
+
+def _part_table(parts: dict[str, dict[str, Any]]) -> str:
+    """Of a scene's parts, or the summary's: medians, with the worst Hausdorff distance."""
     columns = dict(_COLUMNS)
     if any("registration_mm" in part for part in parts.values()):
-        columns["registration_mm"] = "registration mm"
-    head = "".join(f"<th>{title}</th>" for title in ("part", "found", *columns.values()))
+        columns["registration_mm"] = "expected error of the truth itself, mm"
+    over_scenes = any("worst" in part for part in parts.values())
+    head = ["part", "found", *columns.values(), *(["worst Hausdorff, mm"] if over_scenes else [])]
     rows = []
     for name, part in parts.items():
         found = "yes" if part["found"] else "no"
-        found = f"{part['found']}/{part['scenes']}" if "scenes" in part else found
-        cells = "".join(f"<td>{number(part.get(key))}</td>" for key in columns)
-        label = html.escape(name.replace("_", " "))
-        rows.append(f"<tr><th>{label}</th><td>{found}</td>{cells}</tr>")
-    return f"<table><thead><tr>{head}</tr></thead><tbody>{''.join(rows)}</tbody></table>"
+        found = f"{part['found']} of {part['scenes']}" if over_scenes else found
+        cells = [
+            words(name),
+            found,
+            *(number(part[key]) if key in part else "-" for key in columns),
+        ]
+        if over_scenes:
+            worst = part["worst"]["hausdorff_mm"]
+            cells.append(f"{number(worst['mm'])} ({worst['scene']})")
+        rows.append(cells)
+    return _table(head, rows)
 
 
-def number(value: float | None, digits: int = 2) -> str:
-    return "none" if value is None else f"{value:.{digits}f}"
+def _table(head: list[str], rows: list[list[str]]) -> str:
+    """In a box that scrolls where the page is too narrow; the first cell names the row."""
+    titles = "".join(f"<th>{html.escape(title)}</th>" for title in head)
+    body = "".join(
+        f"<tr><th>{html.escape(first)}</th>"
+        + "".join(f"<td>{html.escape(cell)}</td>" for cell in cells)
+        + "</tr>"
+        for first, *cells in rows
+    )
+    table = f"<table><thead><tr>{titles}</tr></thead><tbody>{body}</tbody></table>"
+    return f'<div class="scroll">{table}</div>'

@@ -17,13 +17,14 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from tumortrack.core.colours import name_colour
-from tumortrack.core.estimate import Estimate
+from tumortrack.core.estimate import NO_CHECK_FAILED, UNVERIFIED, Estimate
 from tumortrack.core.geometry import DIRECTIONS_LPS, transform_points
 from tumortrack.core.organ import is_tumor, organ_name
 from tumortrack.core.types import Anatomy, LabelVolume, Mesh, Volume
 from tumortrack.report import drawing
 from tumortrack.report.drawing import CENTRED, OBSERVED, ORGAN, TRUE
 from tumortrack.report.renderer import RGB, Body, Frame, ParallelView, rgb
+from tumortrack.report.summary import scene_note
 from tumortrack.simulate.scene_folder import Scene
 
 FROM_CAMERA = ParallelView("seen from the camera", (1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
@@ -79,13 +80,12 @@ def scene_picture(
             else "not found"
         )
         drawing.title_axes(axes, f"{what}\n{found}", 9.5)
-    failed = [f"FAILED: {entry['failed']}"] if entry["failed"] else []
-    poor = [f"POOR ESTIMATE: {entry['reason']}"] if entry.get("quality") == "poor" else []
-    errors = entry.get("tre_mm")
-    targets = f"   target error {errors['mean']:.1f} mm" if errors else ""
-    headline = f"{entry['name']}   mIoU {entry['miou']:.2f}{targets}"
+    good = entry["quality"] == "good"
+    reason = f"{NO_CHECK_FAILED}; {UNVERIFIED}" if good else entry["reason"]
+    verdict = f"{entry['quality'].upper()}: {reason}"
+    title = f"{entry['name']}   {verdict}" if good else entry["name"]
     handles = scene_legend(*scene.reference.names)
-    drawing.add_words(figure, headline, [*failed, *poor], (), handles)
+    drawing.add_words(figure, title, [] if good else [verdict], [scene_note(entry)], handles)
     drawing.save(figure, path)
 
 
@@ -190,7 +190,7 @@ def qc_picture(
     more = f" (slices through the {_MOST_ROWS} largest of {len(order)} tumors)" if dropped else ""
     title = f"Prepared case over its {what}{more}" + (f": {whose}" if whose else "")
     handles = [
-        Patch(facecolor=color, label=f"{name.replace('_', ' ')} {part.volume_mm3 / 1000:.1f} ml")
+        Patch(facecolor=color, label=f"{name.replace('_', ' ')} {part.volume_ml:.1f} ml")
         for color, name, part in zip(colors, anatomy.names, anatomy.parts, strict=True)
     ]
     drawing.add_words(figure, title, warnings, (), handles)

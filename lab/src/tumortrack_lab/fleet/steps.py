@@ -229,11 +229,11 @@ def evaluate(inputs: Inputs, options: Given, out: Path, cores: int) -> None:
     """rows.json: what is said of every scene, and how far it is off, beside the best rigid pose."""
     from dataclasses import replace
 
+    from tumortrack.core.rigid_fit import matched_vertices
     from tumortrack.imaging.case import load_case
     from tumortrack.simulate.scene_folder import read_scene
     from tumortrack.tracking.tracker import Tracker
     from tumortrack.training.model import load_model
-    from tumortrack_lab.peers.base import matched_vertices
     from tumortrack_lab.real.judging import judge
     from tumortrack_lab.world.scenes import simplified
 

@@ -14,6 +14,7 @@ import pandas as pd
 
 from tumortrack.core.errors import NoEstimate
 from tumortrack.core.geometry import transform_points
+from tumortrack.core.rigid_fit import fit_over_volume
 from tumortrack.core.types import Anatomy, DepthFrame, Mesh
 from tumortrack.report.metrics import outward_miss, surface_distances
 from tumortrack.sense.camera import d405
@@ -25,7 +26,6 @@ from tumortrack.simulate.deform.base import Deformation
 from tumortrack.simulate.scene import PoseConfig, SceneConfig, sample_pose
 from tumortrack.simulate.scene_folder import Scene, Targets
 from tumortrack.tracking.tracker import Tracker
-from tumortrack_lab.peers.base import fit_over_volume
 
 CAMERA = d405(424, 240)  # as training's
 # As no training scene of `clinic` is.

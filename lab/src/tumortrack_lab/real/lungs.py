@@ -27,8 +27,8 @@ from scipy.spatial.transform import Rotation
 
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import Points, rigid, transform_points
+from tumortrack.core.rigid_fit import fit_over_volume
 from tumortrack.core.types import Mesh
-from tumortrack_lab.peers.base import fit_over_volume
 
 # Of the images by patient, mm: along rows and columns; slices are 2.5 mm apart.
 IN_PLANE_MM = (0.97, 1.16, 1.15, 1.13, 1.10, 0.97, 0.97, 0.97, 0.97, 0.97)

@@ -16,6 +16,7 @@ from scipy.stats import binomtest, spearmanr
 from tumortrack.core import store
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import transform_points
+from tumortrack.core.rigid_fit import kabsch
 from tumortrack.models.margins import METHOD, ModelMargins
 from tumortrack.report.calibration import WIDEST_MM, answered, margins_of
 from tumortrack.report.calibration_table import Row, read_table
@@ -23,7 +24,6 @@ from tumortrack.report.drawing import new_figure, save
 from tumortrack.report.pictures import FROM_CAMERA, FROM_SIDE, draw_solid_view, scene_legend
 from tumortrack.simulate.scene_folder import Scene, read_scene
 from tumortrack.tracking.tracker import Tracker
-from tumortrack_lab.peers.base import kabsch
 from tumortrack_lab.study.document import table
 
 STATED = (0.9, 0.95)

@@ -18,8 +18,8 @@ import numpy as np
 from jaxtyping import Float64
 
 from tumortrack.core.geometry import rigid, transform_points, unit
+from tumortrack.core.rigid_fit import kabsch
 from tumortrack.core.types import Mesh
-from tumortrack_lab.peers.base import kabsch
 from tumortrack_lab.tets import find
 from tumortrack_lab.twin.equilibrium import Nodes, Points, Rod
 from tumortrack_lab.twin.occluders import rod_mesh

@@ -20,8 +20,8 @@ from tumortrack.core import store
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import rigid, transform_points, unit
 from tumortrack.core.mesh_files import read_anatomy
+from tumortrack.core.rigid_fit import kabsch, matched_vertices
 from tumortrack.simulate.scene_folder import InnerPoints, list_scenes, read_targets
-from tumortrack_lab.peers.base import kabsch, matched_vertices
 from tumortrack_lab.twin.equilibrium import Points
 from tumortrack_lab.world.organ import Generator, Organ
 from tumortrack_lab.world.paths import Cover, LoadPath, Transform, turned

@@ -1,0 +1,66 @@
+"""The rigid motion that lays points, or a whole body, on others best, by known correspondence."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float, Float64
+
+from tumortrack.core.errors import InputError
+from tumortrack.core.geometry import Affine, Points, rigid, transform_points
+from tumortrack.core.types import Mesh
+
+# Barycentric points of a tetrahedron that integrate quadratics exactly (Keast 1986, 4 points).
+_NEAR, _FAR = 0.1381966011250105, 0.5854101966249685
+
+
+def kabsch(source_mm: Points, target_mm: Points, weights: Float[np.ndarray, " n"]) -> Affine:
+    """The rigid transform that carries source points to target points best, in weighted squares
+    (Kabsch 1976, doi 10.1107/S0567739476001873)."""
+    share = weights / weights.sum()
+    source_centre, target_centre = share @ source_mm, share @ target_mm
+    spread = (source_mm - source_centre).T @ (share[:, None] * (target_mm - target_centre))
+    u, _, vt = np.linalg.svd(spread)
+    mirror = np.diag([1.0, 1.0, np.sign(np.linalg.det(vt.T @ u.T))])
+    rotation = vt.T @ mirror @ u.T
+    return rigid(rotation, target_centre - rotation @ source_centre)
+
+
+def matched_vertices(rest: Mesh, moved: Mesh) -> Float64[np.ndarray, "_ 3"]:
+    """Where each vertex of ``rest`` lies in ``moved``, the same triangles in the same order: read
+    meshes lose the order of their vertices (equal ones are merged), but never that of their
+    triangles. Raises InputError: ``moved`` has other triangles."""
+    vertex = np.full(len(rest.vertices_mm), -1)
+    same = rest.faces.shape == moved.faces.shape
+    if same:
+        vertex[rest.faces.reshape(-1)] = moved.faces.reshape(-1)
+        same = bool((vertex[rest.faces] == moved.faces).all() and (vertex >= 0).all())
+    if not same:
+        raise InputError(
+            "the rigid bound needs a scene made from this case: its organ must have the "
+            "same triangles as the case's. Make scenes with this case, or leave the bound out."
+        )
+    return moved.vertices_mm[vertex]
+
+
+def fit_over_volume(source: Mesh, target: Mesh) -> tuple[Affine, float]:
+    """``target_from_source`` with the least squared displacement over the source's volume, and the
+    root mean square displacement that it leaves, mm. Exact for a displacement that is linear in
+    each tetrahedron of a triangle and the vertices' mean."""
+    from_mm, weights = _volume_points(source, source)
+    to_mm, _ = _volume_points(source, target)
+    transform = kabsch(from_mm, to_mm, weights)
+    left2 = ((transform_points(transform, from_mm) - to_mm) ** 2).sum(1)
+    return transform, float(np.sqrt(max(np.average(left2, weights=weights), 0.0)))
+
+
+def _volume_points(
+    rest: Mesh, moved: Mesh
+) -> tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, " n"]]:
+    """Quadrature points carried along with ``moved``; their signed weights from ``rest``."""
+    corners = rest.vertices_mm[rest.faces] - rest.vertices_mm.mean(0)
+    volume = np.einsum("ij,ij->i", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) / 6
+    apex = np.broadcast_to(moved.vertices_mm.mean(0), (len(volume), 1, 3))
+    tetrahedra = np.concatenate([apex, moved.vertices_mm[moved.faces]], axis=1)
+    shares = np.full((4, 4), _NEAR) + (_FAR - _NEAR) * np.eye(4)
+    points = np.einsum("qc,tcx->tqx", shares, tetrahedra).reshape(-1, 3)
+    return points, np.repeat(volume / 4, 4)

@@ -1,0 +1,49 @@
+"""The folder of an evaluation's report: what may be replaced there, and what belongs to it."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from pathlib import Path
+
+from tumortrack.core.errors import InputError
+from tumortrack.core.store import read_json, writing
+
+_OURS = {"scenes", "index.html", "report.json"}
+
+
+def check_place(out: Path, overwrite: bool) -> None:
+    """InputError for a place where something lies that must stay: ``overwrite`` replaces an empty
+    folder or an earlier report in which nothing else lies."""
+    if not out.exists():
+        return
+    if not overwrite:
+        raise InputError(f"{out} exists already. Choose another path, or give --overwrite.")
+    if not out.is_dir():
+        raise InputError(f"{out} is a file; --overwrite replaces only a report's folder.")
+    if not (inside := {path.name for path in out.iterdir()}):
+        return
+    report = read_json(out / "report.json") if "report.json" in inside else {}
+    if not ({"rule", "tumortrack", "summary"} <= report.keys()):
+        raise InputError(
+            f"{out} is no report of `evaluate`, so --overwrite does not replace it. Choose another "
+            "path, or move the folder away yourself."
+        )
+    pictures = {f"{entry['name']}.png" for entry in report["scenes"]}
+    drawn = {path.name for path in (out / "scenes").glob("*")}
+    if strays := sorted((inside - _OURS) | (drawn - pictures)):
+        raise InputError(
+            f"{out} also holds {', '.join(strays[:3])}, which no report has; --overwrite would "
+            "lose it. Move it away first, or choose another path."
+        )
+
+
+def clear(out: Path) -> None:
+    """Take away what lies there of a report, and the folders if nothing else is in them."""
+    with writing(out):
+        for path in ((out / name) for name in ("report.json", "index.html")):
+            path.unlink(missing_ok=True)  # never an old table beside new pictures
+        for picture in (out / "scenes").glob("*.png"):
+            picture.unlink()
+    for folder in (out / "scenes", out):
+        with suppress(OSError):
+            folder.rmdir()

@@ -1,0 +1,153 @@
+"""What rigid registration would have answered in a scene, beside what was estimated.
+
+``best_rigid_pose``: an oracle. It knows the truth and may not deform the organ: no rigid method can
+do better in its norm, the squared displacement.
+``rigid_fit``: the organ of the CT, undeformed, laid on the same points as the estimate by robust
+point-to-plane least squares, from the best rigid pose: the best that a user of rigid registration
+could hope for.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import product
+from typing import Any
+
+import numpy as np
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from tumortrack.core.errors import InputError
+from tumortrack.core.geometry import Affine, rigid, transform_points
+from tumortrack.core.rigid_fit import fit_over_volume, kabsch, matched_vertices
+from tumortrack.core.types import Anatomy, Mesh, SensorCloud
+from tumortrack.models.model import Model
+from tumortrack.registration.model import RegistrationModel
+from tumortrack.registration.motion import ElasticMotion
+from tumortrack.registration.rest_shape import RestShape
+from tumortrack.report import metrics
+from tumortrack.report.summary import RIVALS, judged_parts
+from tumortrack.sense.cloud import thin_cloud
+from tumortrack.simulate.scene_folder import Scene, Targets
+
+_POINTS = 1000  # of the cloud: as many as the estimate uses
+_WIDTH_MM = 5.0  # of the robust kernel: as wide as that of the elastic fit begins
+_STEPS, _ENOUGH = 60, 1e-3  # mm and rad: a step that moves less is the last
+_FEWEST_TARGETS = 10
+_TURNS = tuple(np.diag([a, b, a * b]) for a, b in product((1.0, -1.0), repeat=2))
+
+
+@dataclass(frozen=True, eq=False)
+class Rivals:
+    """Rigid answers to scenes of one organ, whose shape at rest a model knows."""
+
+    rest: RestShape
+
+    def __call__(self, scene: Scene) -> dict[str, Any]:
+        """By rival (JSON): ``parts`` (tumors; without one, the organ) with surface and centre
+        distances, ``tre_mm`` where the scene has targets, both as ``report.protocol`` states them
+        of an estimate, and ``camera_from_ct``; or ``not_available``, the reason in words."""
+        try:
+            pose, by = best_rigid_pose(self.rest.anatomy_ct, scene)
+        except InputError as error:
+            return {name: {"not_available": str(error)} for name in RIVALS}
+        fitted = rigid_fit(self.rest, scene.cloud, pose)
+        return {
+            "best_rigid_pose": {"by": by, **self._errors(pose, scene)},
+            "rigid_fit": self._errors(fitted, scene),
+        }
+
+    def _errors(self, camera_from_ct: Affine, scene: Scene) -> dict[str, Any]:
+        anatomy, rows = self.rest.anatomy_ct, {}
+        pairs = zip(anatomy.parts, scene.reference.parts, strict=True)
+        judged = judged_parts(dict(zip(anatomy.names, pairs, strict=True)))
+        for name, (part, true) in judged.items():
+            placed = part.moved(transform_points(camera_from_ct, part.vertices_mm))
+            rows[name] = metrics.part_distances(placed, true)
+        errors: dict[str, Any] = {"camera_from_ct": camera_from_ct.tolist(), "parts": rows}
+        if scene.targets is not None:
+            carried = transform_points(camera_from_ct, scene.targets.points_ct)
+            errors["tre_mm"] = metrics.target_errors(carried, scene.targets)
+        return errors
+
+
+def rivals_of(model: Model | None) -> Rivals | None:
+    """None for a model that does not keep the organ at rest, and without one."""
+    return Rivals(model.shape) if isinstance(model, RegistrationModel) else None
+
+
+def best_rigid_pose(rest: Anatomy, scene: Scene) -> tuple[Affine, str]:
+    """``camera_from_ct`` with which the undeformed organ lies on the true one best, and what that
+    rests on: the true surface's own triangles, where they are the case's; else the targets, whose
+    place in the CT the scene states; else the nearest points of organ and tumors. Raises
+    InputError: the scene has other parts than the case."""
+    true = scene.reference
+    if true.names != rest.names:
+        raise InputError(
+            f"the scene has {', '.join(true.names)}, but the model's case {', '.join(rest.names)}"
+        )
+    try:
+        matched = rest.organ.moved(matched_vertices(rest.organ, true.organ))
+    except InputError:  # another program's surface, or a second CT's
+        if scene.targets is not None and len(scene.targets.labels) >= _FEWEST_TARGETS:
+            return _on_targets(scene.targets), "targets"
+        return _on_surfaces(rest.parts, true.parts), "surfaces"
+    return fit_over_volume(rest.organ, matched)[0], "triangles"
+
+
+def _on_targets(targets: Targets) -> Affine:
+    return kabsch(targets.points_ct, targets.points_mm, np.ones(len(targets.labels)))
+
+
+def _on_surfaces(rest: tuple[Mesh, ...], true: tuple[Mesh, ...]) -> Affine:
+    """By iterated closest points, part on part, from all four ways in which principal axes agree;
+    the one that leaves the least mean squared distance."""
+    from_mm = [part.spread_mm() for part in rest]
+    onto_mm = [part.spread_mm() for part in true]
+    trees = [cKDTree(points) for points in onto_mm]
+    source, ends = np.concatenate(from_mm), np.cumsum([len(points) for points in from_mm])[:-1]
+    (centre, axes), (true_centre, true_axes) = _principal(from_mm[0]), _principal(onto_mm[0])
+
+    def descend(pose: Affine) -> tuple[float, Affine]:
+        left2 = np.inf
+        while True:
+            placed = transform_points(pose, source)
+            pairs = zip(trees, onto_mm, np.split(placed, ends), strict=True)
+            nearest = np.concatenate([onto[tree.query(at)[1]] for tree, onto, at in pairs])
+            before, left2 = left2, float(((nearest - placed) ** 2).sum(1).mean())
+            if left2 > before - 1e-5:
+                return left2, pose
+            pose = kabsch(source, nearest, np.ones(len(source)))
+
+    turns = [true_axes.T @ turn @ axes for turn in _TURNS]
+    found = [descend(rigid(turn, true_centre - turn @ centre)) for turn in turns]
+    return min(found, key=lambda one: one[0])[1]
+
+
+def _principal(points_mm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Middle of the points, and their principal axes as rows of a rotation."""
+    middle = points_mm.mean(0)
+    axes = np.linalg.svd(points_mm - middle, full_matrices=False)[2]
+    return middle, axes * [[1.0], [1.0], [np.linalg.det(axes)]]
+
+
+def rigid_fit(rest: RestShape, cloud: SensorCloud, camera_from_ct: Affine) -> Affine:
+    """The rigid motion near a start that lays the organ at rest on a cloud: Gauss-Newton on the
+    points' distances to its surface, under Geman and McClure's robust kernel."""
+    points_mm = thin_cloud(cloud, _POINTS, np.random.default_rng(0)).points_mm
+    body, rotation = rest.body, camera_from_ct[:3, :3]
+    centre_mm = transform_points(camera_from_ct, body.center_ct[None])[0]
+    motion = ElasticMotion(rest, rotation, centre_mm, np.zeros(len(body.mean)))
+    for _ in range(_STEPS):
+        rows = motion.residual_rows(points_mm).astype(float)
+        slopes, distances = rows[:, :6], rows[:, -1]
+        weighed = slopes * (1 / (1 + (distances / _WIDTH_MM) ** 2) ** 2)[:, None]
+        change = np.linalg.lstsq(weighed.T @ slopes, -(weighed.T @ distances), rcond=None)[0]
+        motion = replace(
+            motion,
+            rotation=motion.rotation @ Rotation.from_rotvec(change[3:]).as_matrix(),
+            centre_mm=motion.centre_mm + motion.rotation @ change[:3],
+        )
+        if np.abs(change).max() < _ENOUGH:
+            break
+    return motion.camera_from_ct

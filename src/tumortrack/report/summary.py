@@ -1,0 +1,294 @@
+"""Entries of scenes, summarised: medians beside the worst, good answers apart from poor ones."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+from typing import Any
+
+import numpy as np
+from rich.table import Table
+
+from tumortrack.core.estimate import FAR_MM
+from tumortrack.core.organ import is_tumor
+from tumortrack.report.metrics import SurfaceDistances
+
+DISTANCES = (*(field.name for field in fields(SurfaceDistances)), "center_mm")
+TARGET_ERRORS = ("mean", "rms", "median", "p95")
+VERDICTS = ("good", "poor", "none")
+RIVALS = {"best_rigid_pose": "best rigid pose", "rigid_fit": "rigid fit"}
+MEANING = {
+    "best_rigid_pose": "an oracle: the undeformed organ, laid on the true one as well as a rigid "
+    "motion can",
+    "rigid_fit": "the undeformed organ, laid on the same points by point-to-plane least squares, "
+    "started at the best rigid pose",
+}
+METHODS = {"estimate": "estimate", **RIVALS}
+# Of the two that a surgeon asks for; the third is of targets, where a scene has some.
+MEASURES = {"center_mm": "centre", "hausdorff_mm": "surface", "target_mm": "targets"}
+
+Entry = dict[str, Any]
+
+
+def summarise(entries: list[Entry]) -> dict[str, Any]:
+    """All that is said of scenes together; docs/conventions.md lists it.
+
+    By part medians over scenes, and ``worst`` and ``p95`` over scenes; ``errors``: of ``all``
+    answers, and of the ``good`` and the ``poor`` ones, those of the estimate and of its rivals,
+    pooled over scenes, tumors and targets, each worst one with its scene and part. A part that was
+    not found is infinitely far: null.
+    """
+    summary: dict[str, Any] = {}
+    for name in dict.fromkeys(part for entry in entries for part in entry["parts"]):
+        rows = {entry["name"]: entry["parts"][name] for entry in entries if name in entry["parts"]}
+        summary[name] = _of_part(rows)
+        shares = [e["registration_mm"].get(name) for e in entries if "registration_mm" in e]
+        if shares and None not in shares:
+            summary[name]["registration_mm"] = float(np.sqrt(np.mean(np.square(shares))))
+    errors = [entry["tre_mm"] for entry in entries if "tre_mm" in entry]
+    if any(errors):
+        medians = {
+            key: _median([(e or {}).get(key, np.inf) for e in errors]) for key in TARGET_ERRORS
+        }
+        summary["tre_mm"] = {**medians, "scenes": len(errors)}
+    summary["miou"] = _median([entry["miou"] for entry in entries])
+    summary["miou_mean"] = float(np.mean([entry["miou"] for entry in entries]))
+    groups = {v: [e for e in entries if e["quality"] == v] for v in VERDICTS}
+    summary |= {verdict: len(group) for verdict, group in groups.items()}
+    failed = [entry for entry in entries if entry["failed"] is not None]
+    far = [entry for entry in failed if entry["failed"].startswith("far off")]
+    summary["failed"], summary["far"] = len(failed), len(far)
+    summary["far_good"] = sum(entry["quality"] == "good" for entry in far)
+    summary["scenes"] = len(entries)
+    answers = {"all": groups["good"] + groups["poor"], **groups}
+    answers.pop("none")
+    summary["errors"] = {name: _pooled(group) for name, group in answers.items() if group}
+    return summary
+
+
+def worst_center(entry: Entry) -> tuple[float, str]:
+    """How far the centre of the tumor (without one: of the organ) that is farthest off lies from
+    its true place, mm, and which it is; infinite where it was not found."""
+    parts = judged_parts(entry["parts"])
+    return max((row.get("center_mm", np.inf), name) for name, row in parts.items())
+
+
+def judged_parts(parts: dict[str, Any]) -> dict[str, Any]:
+    """The tumors; without one, the organ."""
+    return dict(list(parts.items())[1:]) or parts
+
+
+def _of_part(rows: dict[str, Any]) -> dict[str, Any]:
+    """``rows``: by scene."""
+    far = {key: [row.get(key, np.inf) for row in rows.values()] for key in DISTANCES}
+    names = list(rows)
+    return {
+        **{key: _median(values) for key, values in far.items()},
+        "iou": _median([row["iou"] for row in rows.values()]),
+        "found": sum(row["found"] for row in rows.values()),
+        "scenes": len(rows),
+        "p95": {key: _p95(values) for key, values in far.items()},
+        "worst": {
+            key: {"mm": _finite(max(values)), "scene": names[int(np.argmax(values))]}
+            for key, values in far.items()
+        },
+    }
+
+
+def _pooled(entries: list[Entry]) -> dict[str, Any]:
+    """Errors of answers by method, over those scenes that have an answer of it."""
+    group: dict[str, Any] = {"scenes": len(entries)}
+    for method in METHODS:
+        answers = [(entry, _answer(entry, method)) for entry in entries]
+        answers = [(entry, answer) for entry, answer in answers if "parts" in answer]
+        if not answers:
+            continue
+        group[method] = {"scenes": len(answers)}
+        for key in ("center_mm", "hausdorff_mm"):
+            rows = [
+                (row.get(key, np.inf), entry["name"], part)
+                for entry, answer in answers
+                for part, row in answer["parts"].items()
+            ]
+            group[method][key] = _spread([row[0] for row in rows], max(rows))
+        known = [(e["name"], a["tre_mm"], list(e["parts"])) for e, a in answers if a.get("tre_mm")]
+        if known:
+            values = [mm for _, errors, _ in known for mm in errors["each"]]
+            scene, errors, names = max(known, key=lambda one: one[1]["max"])
+            label = errors["max_label"]
+            part = names[label - 1] if label <= len(names) else f"label {label}"
+            group[method]["target_mm"] = _spread(values, (errors["max"], scene, part))
+    return group
+
+
+def _answer(entry: Entry, method: str) -> dict[str, Any]:
+    """The parts that are judged, and errors of targets."""
+    if method == "estimate":
+        return {**entry, "parts": judged_parts(entry["parts"])}
+    return dict(entry.get("rivals", {}).get(method, {}))
+
+
+def _spread(values: list[float], worst: tuple[float, str, str]) -> dict[str, Any]:
+    """Median, 95th percentile, and the worst (mm, scene, part) with where it is."""
+    about = {"count": len(values), "median": _median(values), "p95": _p95(values)}
+    return {**about, "worst": _finite(worst[0]), "scene": worst[1], "part": worst[2]}
+
+
+def _median(values: list[float]) -> float | None:
+    """The median, None where it is infinite (more than half the scenes without the part)."""
+    ordered = np.sort(np.array(values, float))
+    low, high = ordered[(len(ordered) - 1) // 2], ordered[len(ordered) // 2]
+    return float((low + high) / 2) if np.isfinite(high) else None
+
+
+def _p95(values: list[float]) -> float | None:
+    """The smallest value that 95 % of them do not exceed."""
+    return _finite(float(np.percentile(np.array(values, float), 95, method="inverted_cdf")))
+
+
+def _finite(value: float) -> float | None:
+    return value if np.isfinite(value) else None
+
+
+# --- in words ---
+
+
+def number(value: float | None, digits: int = 2) -> str:
+    """``not found``: a part that was not found is infinitely far."""
+    return "not found" if value is None else f"{value:.{digits}f}"
+
+
+def words(part: str) -> str:
+    return part.replace("_", " ")
+
+
+def verdict_counts(summary: dict[str, Any]) -> str:
+    """How many answers are what."""
+    n = summary["scenes"]
+    scenes = f"{n} scene{'s' * (n != 1)}"
+    return f"{scenes}: {summary['good']} good, {summary['poor']} poor, {summary['none']} none"
+
+
+def failures(summary: dict[str, Any]) -> str:
+    """How many scenes failed, and of what."""
+    missed = summary["failed"] - summary["far"]
+    return (
+        f"{summary['failed']} failed: {missed} without an answer or a part, {summary['far']} with "
+        f"a tumor's centre over {FAR_MM:g} mm off ({summary['far_good']} of them called good)"
+    )
+
+
+def spread_words(spread: dict[str, Any]) -> str:
+    """Of one error: median, 95 % and the worst, and where that is."""
+    median, p95, worst = (number(spread[key], 1) for key in ("median", "p95", "worst"))
+    where = f"{words(spread['part'])} of {spread['scene']}"
+    return f"median {median} mm, 95 % within {p95} mm, worst {worst} mm ({where})"
+
+
+def headlines(summary: dict[str, Any]) -> list[str]:
+    """What a reader must know first: verdicts, then errors of good and of poor answers and of the
+    rivals, pooled over all scenes, tumors and targets."""
+    lines = [f"{verdict_counts(summary)}. {failures(summary)}."]
+    groups = summary.get("errors", {})
+    for verdict in ("good", "poor"):
+        if verdict in groups:
+            lines += [f"{verdict}: {line}" for line in measures(groups[verdict]["estimate"])]
+    for rival, name in RIVALS.items():
+        if rival in groups.get("all", {}):
+            lines += [f"{name}: {line}" for line in measures(groups["all"][rival])]
+    return lines
+
+
+def measures(group: dict[str, Any]) -> list[str]:
+    """Errors of centres and targets, a line each; of an empty group none."""
+    lines = []
+    if "center_mm" in group:
+        spread = group["center_mm"]
+        part = "tumor" if is_tumor(spread["part"]) else "organ"
+        lines.append(f"{part} centre off: {spread_words(spread)}")
+    if "target_mm" in group:
+        spread = group["target_mm"]
+        lines.append(f"error of {spread['count']} targets: {spread_words(spread)}")
+    return lines
+
+
+def summary_tables(report: dict[str, Any]) -> list[Table]:
+    """For the terminal: errors by verdict and method, then medians by part."""
+    summary = report["summary"]
+    errors = Table(title="errors in mm: median / 95 % within / worst, over all scenes and tumors")
+    errors.add_column("answers", no_wrap=True)
+    errors.add_column("method")
+    for head in MEASURES.values():
+        errors.add_column(head, justify="right", no_wrap=True)
+    for verdict, method, group in error_rows(summary):
+        cells = [triple(group.get(key)) for key in MEASURES]
+        errors.add_row(verdict, METHODS[method], *cells)
+    table = Table(title=f"medians over scenes; mIoU {summary['miou']:.3f} (overlap, 1: perfect)")
+    table.add_column("part")
+    for head in ("found", "HD mm", "one-sided", "HD95", "surface", "centre", "IoU", "worst HD mm"):
+        table.add_column(head, justify="right")
+    rows = part_rows(summary)
+    if registered := any("registration_mm" in part for part in rows.values()):
+        table.add_column("± mm", justify="right")
+        table.caption = "± mm: the expected error of the truth, by its registration"
+    for name, part in rows.items():
+        numbers = [number(part[key], 1 if key != "surface_mm" else 2) for key in DISTANCES]
+        share = [number(part.get("registration_mm"))] if registered else []
+        found, worst = f"{part['found']}/{part['scenes']}", part["worst"]["hausdorff_mm"]["mm"]
+        table.add_row(name, found, *numbers, number(part["iou"]), number(worst, 1), *share)
+    return [*([errors] if errors.rows else []), table]
+
+
+def triple(spread: dict[str, Any] | None) -> str:
+    """Median / 95 % / worst."""
+    if spread is None:
+        return ""
+    return " / ".join(number(spread[key], 1) for key in ("median", "p95", "worst"))
+
+
+def error_rows(summary: dict[str, Any]) -> list[tuple[str, str, dict[str, Any]]]:
+    """Verdict, method and errors: what the table of errors has, in its order."""
+    return [
+        (verdict, method, group[method])
+        for verdict, group in summary.get("errors", {}).items()
+        for method in METHODS
+        if method in group
+    ]
+
+
+def part_rows(summary: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    """What the summary says of parts, by name."""
+    return {k: row for k, row in summary.items() if isinstance(row, dict) and "found" in row}
+
+
+def scene_lines(entries: list[Entry]) -> list[str]:
+    """The scenes without a good answer, and the good ones that failed, with the reason."""
+    lines = []
+    for entry in entries:
+        reasons = [r for r in (entry["reason"], entry["failed"]) if r]
+        if entry["quality"] != "good" or entry["failed"]:
+            said = "; ".join(dict.fromkeys(reasons))
+            lines.append(f"{entry['name']}: {entry['quality']}: {said}")
+    return lines
+
+
+def scene_note(entry: dict[str, Any]) -> str:
+    """A scene's errors in a few words, with names and units."""
+    if entry["quality"] == "none":
+        return "no estimate, so there is nothing to measure"
+    far_mm, part = worst_center(entry)
+    far = f"{far_mm:.1f} mm" if np.isfinite(far_mm) else "not found"
+    notes = [f"{words(part)} is farthest off: centre {far}"]
+    if errors := entry.get("tre_mm"):
+        notes.append(target_text(errors))
+    notes.append(f"overlap with the truth (mIoU, 1 is perfect) {entry['miou']:.2f}")
+    if entry["failed"]:
+        notes.append(f"FAILED: {entry['failed']}")
+    return "; ".join(notes)
+
+
+def target_text(errors: dict[str, Any]) -> str:
+    """A scene's target errors in a few words."""
+    return (
+        f"target error {errors['mean']:.1f} mm (mean of {errors['count']}, "
+        f"largest {errors['max']:.1f} mm)"
+    )
