@@ -77,7 +77,7 @@ def add_words(
     """Write what a figure says, whole: over its axes each warning in a red box with a sign, then
     the title and the legend; under them lines. The figure becomes taller by the room that they
     need. Call it once, when all axes are there."""
-    over = [*_paragraphs(figure, [f"{SIGN} WARNING: {text}" for text in warnings], _WARNING)]
+    over: list[Text | Legend] = [*_paragraphs(figure, [f"{SIGN} WARNING: {text}" for text in warnings], _WARNING)]
     over += _paragraphs(figure, [title], {"fontsize": 13, "fontweight": "bold"})
     over += [_legend(figure, handles)] if handles else []
     under = [*_paragraphs(figure, below, {"fontsize": 10.5})]
@@ -113,7 +113,7 @@ def _paragraphs(figure: Figure, texts: Sequence[str], style: dict[str, Any]) -> 
 
 def _legend(figure: Figure, handles: Sequence[Any]) -> Legend:
     """Without a frame, in as few rows as the figure's width allows."""
-    style = {"loc": "upper left", "frameon": False, "fontsize": 9.5, "borderpad": 0}
+    style: dict[str, Any] = {"loc": "upper left", "frameon": False, "fontsize": 9.5, "borderpad": 0}
     style |= {"borderaxespad": 0, "columnspacing": 1.4, "handlelength": 1.6}
     for columns in range(len(handles), 0, -1):
         legend = figure.legend(handles=list(handles), ncols=columns, **style)
