@@ -246,7 +246,7 @@ def test_a_whole_procedure_on_an_organ_that_keeps_still():
     assert tuple(seen) == (*STATES, DONE)
     log = world.operation.summary()["log"]
     assert [entry["state"] for entry in log] == [*STATES, DONE]
-    assert 6.8 < log[-1]["at_s"] < 7.6  # seven stages of a second, and a soft start
+    assert 7.8 < log[-1]["at_s"] < 8.6  # eight stages of a second, and a soft start
 
 
 NO_ESTIMATE = {"estimate": None, "reason": "no frame for 0.6 s", "quality": "none"}
@@ -521,7 +521,7 @@ def test_a_stored_plan_is_carried_out_without_looking():
         assert got.estimate is None
         states.add(got.workcell.state)
     assert states == {*STATES, DONE}
-    assert now_s == pytest.approx(7 / 4, abs=0.3)
+    assert now_s == pytest.approx(8 / 4, abs=0.3)
 
 
 def test_what_is_cut_already_is_told_from_what_is_not():

@@ -286,11 +286,7 @@ class _Procedure:
                 time.sleep(max(0.0, started + (sequence + 1) / _FPS - time.monotonic()))
         content = {
             "patient": to_builtins(stored.patient),
-            "plan": {
-                "tumor": stored.plan.tumor,
-                "method": stored.plan.method,
-                "warnings": stored.plan.warnings,
-            },
+            "plan": {name: getattr(stored.plan, name) for name in ("tumor", "method", "warnings")},
             "frame": frames.frame_id,
             "resection": operation.summary(),
             "sinks": {sink.name: sink.summary() for sink in sinks},

@@ -77,11 +77,15 @@ def add_words(
     """Write what a figure says, whole: over its axes each warning in a red box with a sign, then
     the title and the legend; under them lines. The figure becomes taller by the room that they
     need. Call it once, when all axes are there."""
-    over: list[Text | Legend] = [*_paragraphs(figure, [f"{SIGN} WARNING: {text}" for text in warnings], _WARNING)]
+    told = [f"{SIGN} WARNING: {text}" for text in warnings]
+    over: list[Text | Legend] = [*_paragraphs(figure, told, _WARNING)]
     over += _paragraphs(figure, [title], {"fontsize": 13, "fontweight": "bold"})
     over += [_legend(figure, handles)] if handles else []
-    under = [*_paragraphs(figure, below, {"fontsize": 10.5})]
-    above_in, below_in = (_stacked_in(figure, artists) for artists in (over, under))
+    under: list[Text | Legend] = [*_paragraphs(figure, below, {"fontsize": 10.5})]
+    above_in, below_in = (
+        sum(_height_in(figure, artist) for artist in artists) + _EDGE_IN * bool(artists)
+        for artists in (over, under)
+    )
     pars, old_in = figure.subplotpars, figure.get_figheight()
     axes_in = pars.bottom * old_in + below_in, pars.top * old_in + below_in
     new_in = old_in + above_in + below_in
@@ -99,22 +103,23 @@ def add_words(
 
 def _paragraphs(figure: Figure, texts: Sequence[str], style: dict[str, Any]) -> Iterator[Text]:
     """Wrapped to the figure's width."""
-    canvas = cast(FigureCanvasAgg, figure.canvas)
+    renderer = cast(FigureCanvasAgg, figure.canvas).get_renderer()
     font = FontProperties(size=style["fontsize"], weight=style.get("fontweight"))
     room = (figure.get_figwidth() - 3 * _EDGE_IN) * figure.dpi
 
     def length_of(text: str) -> float:
-        return canvas.get_renderer().get_text_width_height_descent(text, font, False)[0]
+        return renderer.get_text_width_height_descent(text, font, False)[0]
 
     for text in texts:
-        lines = "\n".join(wrapped(text, room, length_of))
-        yield figure.text(0, 0, lines, va="top", linespacing=1.25, parse_math=False, **style)
+        lines = wrapped(text, room, length_of)
+        style = {"va": "top", "linespacing": 1.25, "parse_math": False, **style}
+        yield figure.text(0, 0, "\n".join(lines), **style)
 
 
 def _legend(figure: Figure, handles: Sequence[Any]) -> Legend:
     """Without a frame, in as few rows as the figure's width allows."""
-    style: dict[str, Any] = {"loc": "upper left", "frameon": False, "fontsize": 9.5, "borderpad": 0}
-    style |= {"borderaxespad": 0, "columnspacing": 1.4, "handlelength": 1.6}
+    style: dict[str, Any] = {"loc": "upper left", "frameon": False, "fontsize": 9.5}
+    style |= {"borderpad": 0, "borderaxespad": 0, "columnspacing": 1.4, "handlelength": 1.6}
     for columns in range(len(handles), 0, -1):
         legend = figure.legend(handles=list(handles), ncols=columns, **style)
         width_in = legend.get_window_extent().width / figure.dpi
@@ -128,24 +133,6 @@ def _height_in(figure: Figure, artist: Text | Legend) -> float:
     """With the space under it."""
     boxed = isinstance(artist, Text) and artist.get_bbox_patch() is not None
     return artist.get_window_extent().height / figure.dpi + (0.2 if boxed else 0.1)
-
-
-def _stacked_in(figure: Figure, artists: Sequence[Text | Legend]) -> float:
-    heights_in = [_height_in(figure, artist) for artist in artists]
-    return sum(heights_in) + _EDGE_IN if artists else 0.0
-
-
-def title_axes(axes: Axes, text: str, size: float = 11.0) -> None:
-    """A title over axes, wrapped to their width; the room for its lines is the caller's."""
-    figure = cast(Figure, axes.figure)
-    title = axes.set_title("", fontsize=size, parse_math=False)
-    room = axes.get_position().width * figure.bbox.width
-
-    def length_of(part: str) -> float:
-        title.set_text(part)
-        return title.get_window_extent().width
-
-    title.set_text("\n".join(wrapped(text, room, length_of)))
 
 
 def show_legend(

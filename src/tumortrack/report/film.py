@@ -131,12 +131,9 @@ class _FramePainter:
     """Draws frame by frame; viewpoints, organ and letters stay the same."""
 
     def __init__(
-        self,
-        frames: list[Workcell],
-        located: Located,
-        size: tuple[int, int],
+        self, frames: list[Workcell], located: Located, size: tuple[int, int],
         plan: ResectionPlan | None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self._frames, self._size = frames, size
         self._organ = [
             Body(mesh, rgb(part_colour(label)), _ORGAN_OPACITY if label == ORGAN else 1.0)
@@ -164,12 +161,11 @@ class _FramePainter:
 
     def _words(self, cell: Workcell) -> list[Paragraph]:
         """What stands over a frame, the weightiest first."""
-        halted = [Paragraph(f"halted: {cell.halted}", NONE)] if cell.halted else []
         return [
             Paragraph(_PLAYBACK, WHITE, ARMS),
             *(Paragraph(f"{SIGN} WARNING: {text}", WHITE, NONE) for text in self._warnings),
             Paragraph(cell.state + _MEANING.get(cell.state, ""), BACKGROUND, large=True),
-            *halted,
+            *([Paragraph(f"halted: {cell.halted}", NONE)] if cell.halted else []),
             Paragraph(self._whose, BACKGROUND),
         ]
 
@@ -250,14 +246,10 @@ def words_strip(
     """All the words, wrapped, under each other on white: as wide as the scene of this size, and as
     high as they need; and each line's box (left, top, right, bottom), pixels."""
     file = f"{matplotlib.get_data_path()}/fonts/ttf/DejaVuSans.ttf"
-    shares = {True: (20, 15), False: (30, 11)}  # of the scene's height, and the least, pixels
-    fonts = {
-        large: ImageFont.truetype(file, max(least, size[1] // share))
-        for large, (share, least) in shares.items()
-    }
     lines, y = [], 6
     for paragraph in paragraphs:
-        font = fonts[paragraph.large]
+        share, least = (20, 15) if paragraph.large else (30, 11)  # of the height; pixels
+        font = ImageFont.truetype(file, max(least, size[1] // share))
         for text in wrapped(paragraph.text, size[0] - 24, font.getlength):
             lines.append((paragraph, text, font, y))
             y += round(1.35 * font.size)

@@ -74,12 +74,12 @@ def scene_picture(
         what = f"{name.replace('_', ' ')}: {_SLICES[view]}"
         part = entry["parts"][name]
         found = (
-            f"Hausdorff {part['hausdorff_mm']:.1f} mm, centre {part['center_mm']:.1f} mm, "
+            f"Hausdorff {part['hausdorff_mm']:.1f} mm\ncentre {part['center_mm']:.1f} mm, "
             f"IoU {part['iou']:.2f}"
             if part["found"]
             else "not found"
         )
-        drawing.title_axes(axes, f"{what}\n{found}", 9.5)
+        axes.set_title(f"{what}\n{found}", fontsize=9.5)
     good = entry["quality"] == "good"
     reason = f"{NO_CHECK_FAILED}; {UNVERIFIED}" if good else entry["reason"]
     verdict = f"{entry['quality'].upper()}: {reason}"
@@ -108,7 +108,7 @@ def draw_solid_view(
         u, v = view.project(mesh.box_mm.mean(0)[None])[0, :2]
         axes.text(u, v, name.split("_")[-1], fontweight="bold", **CENTRED)
     drawing.finish_view(axes, frame, _CAMERA_AXES[view])
-    drawing.title_axes(axes, view.name)
+    axes.set_title(view.name, fontsize=11)
 
 
 def _draw_slice(

@@ -23,16 +23,7 @@ from tumortrack.plan.arms.cutting import Surroundings, level_poses
 from tumortrack.plan.arms.kinematics import level_pose, yaw_of
 from tumortrack.plan.arms.paths import connect, follow, out_of_reach
 from tumortrack.plan.arms.trajectory import TrajectoryBuilder, along, first_hit, together
-from tumortrack.plan.motions import (
-    ARMS,
-    CUTTER,
-    HOLDER,
-    JOINTS,
-    LIFT,
-    RELEASE,
-    Joints,
-    Motions,
-)
+from tumortrack.plan.motions import ARMS, CUTTER, HOLDER, JOINTS, LIFT, RELEASE, Joints, Motions
 from tumortrack.plan.operation import Planned, ResectionProgress
 from tumortrack.plan.resection import plan_resection
 from tumortrack.plan.values import Located, ResectionConfig, ResectionPlan
