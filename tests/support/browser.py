@@ -153,7 +153,7 @@ class Browser:
                 b => b.innerText.includes({json.dumps(text)}));
             says.sort((a, b) => a.innerText.length - b.innerText.length);
             for (const b of says) {{
-                b.scrollIntoView(); const r = b.getBoundingClientRect();
+                b.scrollIntoView({{block: 'nearest'}}); const r = b.getBoundingClientRect();
                 return [r.x + r.width / 2, r.y + r.height / 2]; }} }})()"""
         place = self.call("Runtime.evaluate", expression=script, returnByValue=True)["result"]
         assert "value" in place, f"no button says {text!r}"

@@ -57,7 +57,7 @@ _PAGE = Template(files(__package__).joinpath("status.html").read_text("utf-8")).
 # popover it lies above all, where the panel has been dimmed too.
 _SILENCE = (
     '<div class="tumortrack-silence" onanimationend="this.popover = \'manual\'; '
-    f'this.showPopover()"><div>STALE<small>tumortrack has been silent for {SILENCE_S} s, or its '
+    f'this.showPopover()"><div>◆ STALE<small>tumortrack has been silent for {SILENCE_S} s, or its '
     "panel was closed; what is said here is old</small></div></div>"
 )
 
