@@ -367,12 +367,19 @@ def evaluate(
     from tumortrack.report.summary import summarise
 
     call: Any = getattr(locate, "locate", None) or locate
+    if not callable(call):
+        raise InputError(
+            f"evaluate takes a tracker or a function, not {type(locate).__name__}: "
+            "evaluate(Tracker(load_model(FOLDER)), scenes)."
+        )
     rivals = rivals_of(getattr(locate, "model", None))
     if isinstance(scenes, str | Path):
         if report is None:
             raise InputError("evaluating a folder of scenes writes a report: say where.")
         check_place(Path(report), overwrite)
         return protocol.evaluate_scenes(call, Path(scenes), Path(report), rivals=rivals)
+    if not scenes:
+        raise InputError("there are no scenes to evaluate: simulate_scenes(case, 20) makes some.")
     named = ((f"{n:04d}", scene) for n, scene in enumerate(scenes))
     entries = [protocol.evaluate_scene(call, scene, name, rivals)[0] for name, scene in named]
     return {"scenes": entries, "summary": summarise(entries)}

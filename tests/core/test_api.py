@@ -81,3 +81,34 @@ def test_surfaces_become_an_estimate_that_compares_as_equal():
     counted = np.bincount(made.volume.labels.reshape(-1))[1:] * voxel_ml
     assert counted.sum() == pytest.approx(organ.volume_mm3 / 1000, rel=0.02)
     assert counted[1] == pytest.approx(tumor.volume_mm3 / 1000, rel=0.05)
+
+
+WRONG = """
+import numpy as np
+import tumortrack as tt
+from tumortrack.core.errors import InputError
+
+unmade = object.__new__(tt.Tracker)  # it looks at the cloud before the model
+for call in (
+    lambda: tt.Tracker("MODEL"),
+    lambda: unmade.locate(np.zeros((2000, 3), np.float32)),
+    lambda: tt.evaluate(print, []),
+    lambda: tt.evaluate("MODEL", [1]),
+):
+    try:
+        call()
+    except InputError as error:
+        print(error)
+"""
+
+
+def test_other_types_are_refused_with_the_call_that_makes_the_right_ones():
+    # In a process of its own, where no test's checks of types come first.
+    done = subprocess.run(
+        [sys.executable, "-c", WRONG], capture_output=True, text=True, check=False
+    )
+    tracker, locate, none, function = done.stdout.splitlines()
+    assert tracker.endswith("not str: Tracker(load_model(FOLDER)).")
+    assert "not ndarray: read_cloud(FILE)" in locate
+    assert none.startswith("there are no scenes to evaluate")
+    assert "a tracker or a function, not str" in function

@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+import re
 import warnings
 
 import numpy as np
@@ -250,3 +251,19 @@ def test_damaged_slices_give_a_whole_volume_a_note_or_an_input_error(tmp_path, s
         warnings.simplefilter("error")  # no other program's warning on the user's terminal
         raw = read_raw(folder)
         assert raw.array.shape == hu.shape or raw.notes  # a slice never goes without a word
+
+
+def test_swapped_labels_a_misspelt_name_and_a_lost_geometry_are_noted(tmp_path):
+    index = np.indices((70, 70, 70)) - 35
+    labels = ((index**2).sum(0) < 30**2).astype(np.uint8)
+    labels[(index[0] > 24) & (labels > 0)] = 2  # a cap
+    write_nifti(tmp_path / "l.nii.gz", labels, np.diag([-1.0, -1, 1, 1]), "sform")  # RAS: identity
+    right = prepare(tmp_path / "l.nii.gz", PrepareOptions(name="liver")).report["notes"]
+    assert not [note for note in right if "swapped" in note or "not an organ" in note]
+    assert [note for note in right if "the affine is the identity" in note]
+    swapped = PrepareOptions(name="livr", organ=2, tumor=1)
+    notes = prepare(tmp_path / "l.nii.gz", swapped).report["notes"]
+    assert [note for note in notes if re.match(r"tumor_1 takes 9\d% of the organ", note)]
+    assert [note for note in notes if "did you mean --name liver?" in note]
+    termed = PrepareOptions(name="livr", term=("10200004", "Liver"))
+    assert not [n for n in prepare(tmp_path / "l.nii.gz", termed).report["notes"] if "known" in n]

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable
+from difflib import get_close_matches
 from typing import Any
 
 from tumortrack.core.config import Config, from_builtins, to_builtins
@@ -70,6 +71,17 @@ class Organ(Config, frozen=True):
     def snomed(self) -> tuple[str, str]:
         """Code and meaning."""
         return self.term or _TERMS.get(self.name, _UNNAMED)
+
+    def doubts(self) -> list[str]:
+        """A note on a name that is not known here and has no term: perhaps it is misspelt."""
+        if self.term or self.name in _TERMS:
+            return []
+        near = get_close_matches(self.name, _TERMS, 1)
+        meant = f"did you mean --name {near[0]}? If not, " if near else ""
+        return [
+            f"{self.name!r} is not an organ that is known here: {meant}give its SNOMED code with "
+            "--term CODE MEANING, or it is a plain Organ in segmentations"
+        ]
 
     @property
     def words(self) -> str:

@@ -46,13 +46,15 @@ def sha256_of(path: Path) -> str:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
-def read_file(path: Path, most_bytes: int, advice: str = "This is no file of ours.") -> bytes:
+def read_file(
+    path: Path, most_bytes: int, advice: str = "tumortrack writes no such file."
+) -> bytes:
     """The content of a regular file: a pipe or a device may have no end. InputError where it is
     missing, none, or larger than ``most_bytes``, which is told before anything is read."""
     try:
         found = path.stat()
         if not stat.S_ISREG(found.st_mode):
-            raise InputError(f"{path} is no regular file (but a folder, a pipe or a device).")
+            raise InputError(f"{path} is not a regular file (but a folder, a pipe or a device).")
         if found.st_size > most_bytes:
             raise InputError(f"{path} is larger than {most_bytes >> 20} MiB. {advice}")
         with path.open("rb") as stream:
@@ -138,8 +140,8 @@ def check_place(path: Path, kind: str, overwrite: bool | None) -> None:
     files = manifest.get("files")
     if manifest.get("kind") != kind or "tumortrack" not in manifest or not isinstance(files, dict):
         raise InputError(
-            f"{path} is no {kind} of tumortrack's, so --overwrite does not replace it. Choose "
-            "another path, or move the folder away yourself."
+            f"{path} is not a {kind} that tumortrack wrote, so --overwrite does not replace it. "
+            "Choose another path, or move the folder away yourself."
         )
     known = (MANIFEST, *files)
     if strays := [n for n in sorted(inside) if n not in known and not n.startswith(".")]:

@@ -85,8 +85,10 @@ def load_case(folder: Path) -> Case:
         for name in said.structures:
             check_name(name, "a structure", "--structure")
     except (InputError, msgspec.ValidationError) as error:
-        where, reason = folder / store.MANIFEST, str(error).rstrip(".")
-        raise ArtifactError(f"{where} is no case's: {reason}. Run prepare again.") from error
+        reason = str(error).rstrip(".")
+        raise ArtifactError(
+            f"{folder} is not a case folder: {reason}. Make one with `tumortrack prepare`."
+        ) from error
     structures = {name: read_mesh(folder / f"{name}.ply") for name in said.structures}
     anatomy = replace(read_anatomy(folder, said.organ), structures=structures)
     if (found := list(anatomy.names)) != said.parts:

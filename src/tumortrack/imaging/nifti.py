@@ -40,6 +40,10 @@ _MM, _SCANNER = 2, 1
 _EQUAL_STEPS = 0.01  # of sform and qform, relatively
 _LONGEST_HEADER = 540  # bytes: NIfTI-2's
 _MAX_OFFSET = 16 * 2**20  # bytes of header and extensions before the voxels
+_NO_GEOMETRY = (
+    "the affine is the identity, as programs write it that lost the geometry: voxels of 1 mm, the "
+    "first axis to the patient's right. Check size and side in qc.png, or export it again"
+)
 _MOST_BEHIND = 16 * 2**20  # bytes after the voxels
 # nibabel would log what it mends in a header: errors here name what is wrong.
 _UNSAID = logging.Logger("nibabel", logging.CRITICAL)
@@ -110,7 +114,8 @@ def _read(path: Path, stream: Any, compressed: bool) -> grid.RawVolume:
     array = np.frombuffer(data, dtype).reshape(shape, order="F")
     array = array.astype(dtype.newbyteorder("="), copy=False)
     scale = np.float64(slope or 1.0), np.float64(intercept or 0.0)
-    return grid.RawVolume(apply_read_scaling(array, *scale), lps_from_index)
+    notes = (_NO_GEOMETRY,) if np.array_equal(lps_from_index, RAS_FROM_LPS) else ()
+    return grid.RawVolume(apply_read_scaling(array, *scale), lps_from_index, notes)
 
 
 def _voxels(path: Path, stream: Any, n_bytes: int, compressed: bool) -> bytes:

@@ -14,7 +14,7 @@ from tumortrack.core.geometry import direction_lps, spacing_mm
 from tumortrack.core.mesh_files import SUFFIXES
 from tumortrack.core.organ import Organ
 from tumortrack.core.patient import UNKNOWN, Patient, Side
-from tumortrack.core.types import ORGAN, Anatomy, LabelVolume, Mesh, Volume
+from tumortrack.core.types import FIRST_TUMOR, ORGAN, Anatomy, LabelVolume, Mesh, Volume
 from tumortrack.imaging.case import Case
 from tumortrack.imaging.grid import grown_box, voxel_ml
 from tumortrack.imaging.hu_windows import ORGAN_HU, TUMOR_HU, segment_ct
@@ -33,6 +33,7 @@ from tumortrack.imaging.volume import is_label_map, labels_of, read_raw, volume_
 # Options that only one kind of input uses.
 _OF_CT, OF_LABELS = ("organ_hu", "tumor_hu"), ("labels", "organ", "tumor")
 _LEAST_ORGAN_OUTSIDE = 0.02  # of the outer surface
+_LARGEST_SHARE = 0.6  # of an organ that a tumor takes without a note; our choice
 _MOST_CHANGE_PERCENT = 1.0  # of a part's volume, by smoothing; more is noted
 
 
@@ -110,6 +111,7 @@ def prepare(input: Path, options: PrepareOptions | None = None) -> Case:
         is_meshes = any(p.suffix.lower() in SUFFIXES for p in inside)
         case = _from_meshes(input, options) if is_meshes else _from_volume(input, options)
         _check_organ_outside(case.labels)
+        case.report["notes"].extend([*_large_tumors(case), *options.kind.doubts()])
         case = _with_structures(case, options)
         source_sha256 = store.sha256_of(input)
     except OSError as error:
@@ -154,6 +156,18 @@ def _check_organ_outside(labels: LabelVolume) -> None:
             f"tumors make up {1 - share:.0%} of the outer surface: they enclose the organ. Check "
             "which part is the organ and which the tumor, and that all have one frame and unit."
         )
+
+
+def _large_tumors(case: Case) -> list[str]:
+    """Notes on tumors that take most of the organ: perhaps the two label numbers are swapped."""
+    voxels = np.bincount(case.labels.labels.reshape(-1))
+    shares = voxels[FIRST_TUMOR:] / voxels[ORGAN:].sum()
+    return [
+        f"{name} takes {share:.0%} of the organ: are the labels of organ and tumor swapped "
+        "(--organ and --tumor, or the meshes' names)? Look at qc.png"
+        for name, share in zip(case.anatomy.names[1:], shares, strict=True)
+        if share > _LARGEST_SHARE
+    ]
 
 
 def refuse_unused(what: str, options: PrepareOptions, *unused: str) -> None:

@@ -159,7 +159,8 @@ class Loop:
             if now_s >= ends_s:
                 return
             if now_s - fresh_s > self._config.give_up_s:
-                trouble = f": {source_worker.trouble}".rstrip(": .")
+                trouble = (source_worker.trouble or "").rstrip(".")
+                trouble = f": {trouble}" if trouble else ""
                 raise SourceLost(
                     f"no frame for {now_s - fresh_s:.0f} s{trouble}. Look at the camera or the "
                     "topic, then start again."

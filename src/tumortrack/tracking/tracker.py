@@ -57,6 +57,10 @@ class Tracker:
     """
 
     def __init__(self, model: Model) -> None:
+        if type(model) not in _LOCATORS:
+            raise InputError(
+                f"Tracker takes a model, not {type(model).__name__}: Tracker(load_model(FOLDER))."
+            )
         keep_small_blocks()
         self.model, self._patient, self._organ = model, model.patient, model.organ
         self._weakness = weakness_of(model.provenance)
@@ -89,6 +93,11 @@ class Tracker:
                 the model knows no motion.
         """
         check_seed(seed)
+        if not isinstance(cloud, SensorCloud):
+            raise InputError(
+                f"locate takes a SensorCloud, not {type(cloud).__name__}: read_cloud(FILE), or "
+                "SensorCloud(points_mm) of an n x 3 array in the camera frame."
+            )
         with self._explaining(cloud, others, None):
             estimate = self._locator.locate(cloud, grid, seed, others)
             estimate = self._judged(estimate, cloud, seen or cloud, False, others)
