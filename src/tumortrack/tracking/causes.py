@@ -52,7 +52,7 @@ _WORDS = {
     Cause.HIDDEN: ("about {percent:.0f} % of the organ's near side hidden", ""),
     Cause.ANOTHER_PATIENT: ("another patient's organ, or the other side's", "check both"),
     Cause.DEFORMED: ("an organ deformed as hardly any in training", ""),
-    Cause.POSES: ("wrong poses of the views, or an organ that moved", "check the poses"),
+    Cause.POSES: ("wrong poses, or the organ moved between the views", "check the poses"),
     Cause.VIEW: ("", ""),
 }
 _POINTS = 400  # of a trial

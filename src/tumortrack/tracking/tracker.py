@@ -40,8 +40,6 @@ _TURNED_OVER_S = 30.0
 # Causes are sought so often at most, for each check that fails: that takes the time of some frames.
 _SOUGHT_S = 1.0
 _OF_POSES = "none", "poses", "fit", "strays", "seen_through"  # checks, where views are several
-# The causes found, by the check that failed; of no estimate: by none.
-Sought = dict[str, tuple[Likely, ...]]
 
 
 _LOCATORS: dict[type[Model], Callable[[Any], RegistrationLocator | OccupancyLocator]] = {
@@ -102,19 +100,17 @@ class Tracker:
         how: Following = _ALONE,
         seen: DepthFrame | SensorCloud | None = None,
         others: Sequence[Look] = (),
-        sought: Sought | None = None,
     ) -> Estimate:
         """The same, fast, for one frame of many: no volume, and a search that starts at the
         ``last`` estimate, if there is one a moment old. Models that know no motion smooth nothing.
-        ``sought``: causes of a moment ago, which are not sought again; those found are added.
         Raises NoEstimate: as ``locate``; InputError: the cloud is in metres; more than one look, as
         ``locate``."""
         # What fits worse all of a sudden may be something else that was put there.
         strictly = how.either_side if last is None else last.quality != "good" or not _unusual(last)
-        with self._explaining(cloud, others, sought):
+        with self._explaining(cloud, others, how.sought):
             estimate = self._locator.follow(cloud, last, how, others)
             estimate = self._judged(estimate, cloud, seen or cloud, strictly, others, last)
-        return self._explained(estimate, cloud, others, sought)
+        return self._explained(estimate, cloud, others, how.sought)
 
     def _judged(
         self,
@@ -146,7 +142,7 @@ class Tracker:
         estimate: Estimate,
         cloud: SensorCloud,
         others: Sequence[Look],
-        sought: Sought | None,
+        sought: dict[str, tuple[Likely, ...]] | None,
     ) -> Estimate:
         """With the likely causes of a poor one, and what to do."""
         start, seconds = time.perf_counter(), estimate.report["timings"]
@@ -164,7 +160,7 @@ class Tracker:
         self,
         cloud: SensorCloud,
         others: Sequence[Look],
-        sought: Sought | None,
+        sought: dict[str, tuple[Likely, ...]] | None,
         estimate: Estimate | None,
     ) -> tuple[Likely, ...]:
         check = "none" if estimate is None else estimate.report["quality"]["check"]
@@ -177,7 +173,10 @@ class Tracker:
 
     @contextmanager
     def _explaining(
-        self, cloud: SensorCloud, others: Sequence[Look], sought: Sought | None
+        self,
+        cloud: SensorCloud,
+        others: Sequence[Look],
+        sought: dict[str, tuple[Likely, ...]] | None,
     ) -> Iterator[None]:
         """Adds its likely causes to what is not this organ."""
         try:
@@ -228,7 +227,7 @@ class Follower:
         self._last: Estimate | None = None
         self._scanned_ns, self._rests = 0, False
         self._good_ns: int | None = None
-        self._sought_ns, self._sought = 0, Sought()
+        self._sought_ns, self._sought = 0, dict[str, tuple[Likely, ...]]()
 
     def warm(self) -> None:
         """See ``Tracker.warm``."""
@@ -274,10 +273,16 @@ class Follower:
         smoothing_s, seed = self._config.smoothing_s, self._config.seed
         since_ns = np.inf if self._good_ns is None else cloud.stamp_ns - self._good_ns
         turned = bool(0 <= since_ns <= _TURNED_OVER_S * 1e9)
-        how = Following(thorough=thorough, either_side=turned, smoothing_s=smoothing_s, seed=seed)
         if not 0 <= (cloud.stamp_ns - self._sought_ns) * 1e-9 < _SOUGHT_S:
             self._sought_ns, self._sought = cloud.stamp_ns, {}
-        self._last = self._tracker.follow(cloud, last, how, seen, others, self._sought)
+        how = Following(
+            thorough=thorough,
+            either_side=turned,
+            smoothing_s=smoothing_s,
+            seed=seed,
+            sought=self._sought,
+        )
+        self._last = self._tracker.follow(cloud, last, how, seen, others)
         if self._last.quality == "good":
             self._good_ns = cloud.stamp_ns
         return self._last
