@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
-from tumortrack.core.causes import Cause, Likely
+from tumortrack.core.causes import Cause, Likely, Sought
 from tumortrack.core.config import Config, to_builtins
 from tumortrack.core.errors import InputError, NotThisOrgan
 from tumortrack.core.estimate import Estimate, Following
@@ -138,11 +138,7 @@ class Tracker:
         return estimate
 
     def _explained(
-        self,
-        estimate: Estimate,
-        cloud: SensorCloud,
-        others: Sequence[Look],
-        sought: dict[str, tuple[Likely, ...]] | None,
+        self, estimate: Estimate, cloud: SensorCloud, others: Sequence[Look], sought: Sought | None
     ) -> Estimate:
         """With the likely causes of a poor one, and what to do."""
         start, seconds = time.perf_counter(), estimate.report["timings"]
@@ -160,7 +156,7 @@ class Tracker:
         self,
         cloud: SensorCloud,
         others: Sequence[Look],
-        sought: dict[str, tuple[Likely, ...]] | None,
+        sought: Sought | None,
         estimate: Estimate | None,
     ) -> tuple[Likely, ...]:
         check = "none" if estimate is None else estimate.report["quality"]["check"]
@@ -173,10 +169,7 @@ class Tracker:
 
     @contextmanager
     def _explaining(
-        self,
-        cloud: SensorCloud,
-        others: Sequence[Look],
-        sought: dict[str, tuple[Likely, ...]] | None,
+        self, cloud: SensorCloud, others: Sequence[Look], sought: Sought | None
     ) -> Iterator[None]:
         """Adds its likely causes to what is not this organ."""
         try:
@@ -227,7 +220,7 @@ class Follower:
         self._last: Estimate | None = None
         self._scanned_ns, self._rests = 0, False
         self._good_ns: int | None = None
-        self._sought_ns, self._sought = 0, dict[str, tuple[Likely, ...]]()
+        self._sought_ns, self._sought = 0, Sought()
 
     def warm(self) -> None:
         """See ``Tracker.warm``."""
@@ -270,7 +263,6 @@ class Follower:
         thorough = (cloud.stamp_ns - self._scanned_ns) * 1e-9 >= self._config.rescan_s
         if last is None or thorough:
             self._scanned_ns = cloud.stamp_ns
-        smoothing_s, seed = self._config.smoothing_s, self._config.seed
         since_ns = np.inf if self._good_ns is None else cloud.stamp_ns - self._good_ns
         turned = bool(0 <= since_ns <= _TURNED_OVER_S * 1e9)
         if not 0 <= (cloud.stamp_ns - self._sought_ns) * 1e-9 < _SOUGHT_S:
@@ -278,8 +270,8 @@ class Follower:
         how = Following(
             thorough=thorough,
             either_side=turned,
-            smoothing_s=smoothing_s,
-            seed=seed,
+            smoothing_s=self._config.smoothing_s,
+            seed=self._config.seed,
             sought=self._sought,
         )
         self._last = self._tracker.follow(cloud, last, how, seen, others)
