@@ -52,7 +52,7 @@ _WORDS = {
     Cause.HIDDEN: ("about {percent:.0f} % of the organ's near side hidden", ""),
     Cause.ANOTHER_PATIENT: ("another patient's organ, or the other side's", "check both"),
     Cause.DEFORMED: ("an organ deformed as hardly any in training", ""),
-    Cause.POSES: ("wrong poses of the views, or an organ that moved", "check the poses"),
+    Cause.POSES: ("wrong poses, or the organ moved between the views", "check the poses"),
     Cause.VIEW: ("", ""),
 }
 _POINTS = 400  # of a trial
@@ -73,7 +73,7 @@ _HIDDEN, _MUCH, _LITTLE = 0.15, 0.3, 0.8
 
 
 def likely_causes(
-    model: Model, cloud: SensorCloud, estimate: Estimate | None = None
+    model: Model, cloud: SensorCloud, estimate: Estimate | None
 ) -> tuple[Likely, ...]:
     """The causes that something speaks for, the likeliest first; at least one.
 
@@ -98,11 +98,10 @@ def words(causes: tuple[Likely, ...], view: str) -> str:
     """The two likeliest causes, and what to do about the first; ``view``: from where to look, which
     helps where nothing else is known to."""
     parts = []
-    for one in causes[:2]:
-        number = one.number or 0.0
-        unit = Unit(number).of_cloud if one.cause is Cause.UNIT else ""
+    for cause, number in ((one.cause, one.number or 0.0) for one in causes[:2]):
+        unit = Unit(number).of_cloud if cause is Cause.UNIT else ""
         given = {"number": number, "percent": 100 * number, "unit": unit}
-        parts.append([text.format(**given) for text in _WORDS[one.cause]])
+        parts.append([text.format(**given) for text in _WORDS[cause]])
     what = ", else ".join(what for what, _ in parts if what)
     looking = view if causes[0].cause in _HELPED_BY_A_VIEW else ""
     do = ", or ".join(text for text in (parts[0][1], looking) if text)

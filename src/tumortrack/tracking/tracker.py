@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
-from tumortrack.core.causes import Cause, Likely
+from tumortrack.core.causes import Cause, Likely, Sought
 from tumortrack.core.config import Config, check_seed, to_builtins
 from tumortrack.core.errors import InputError, NotThisOrgan
 from tumortrack.core.estimate import Estimate, Following
@@ -40,8 +40,6 @@ _TURNED_OVER_S = 30.0
 # Causes are sought so often at most, for each check that fails: that takes the time of some frames.
 _SOUGHT_S = 1.0
 _OF_POSES = "none", "poses", "fit", "strays", "seen_through"  # checks, where views are several
-# The causes found, by the check that failed; of no estimate: by none.
-Sought = dict[str, tuple[Likely, ...]]
 
 
 _LOCATORS: dict[type[Model], Callable[[Any], RegistrationLocator | OccupancyLocator]] = {
@@ -110,19 +108,17 @@ class Tracker:
         how: Following = _ALONE,
         seen: DepthFrame | SensorCloud | None = None,
         others: Sequence[Look] = (),
-        sought: Sought | None = None,
     ) -> Estimate:
         """The same, fast, for one frame of many: no volume, and a search that starts at the
         ``last`` estimate, if there is one a moment old. Models that know no motion smooth nothing.
-        ``sought``: causes of a moment ago, which are not sought again; those found are added.
         Raises NoEstimate: as ``locate``; InputError: the cloud is in metres; more than one look, as
         ``locate``."""
         # What fits worse all of a sudden may be something else that was put there.
         strictly = how.either_side if last is None else last.quality != "good" or not _unusual(last)
-        with self._explaining(cloud, others, sought):
+        with self._explaining(cloud, others, how.sought):
             estimate = self._locator.follow(cloud, last, how, others)
             estimate = self._judged(estimate, cloud, seen or cloud, strictly, others, last)
-        return self._explained(estimate, cloud, others, sought)
+        return self._explained(estimate, cloud, others, how.sought)
 
     def _judged(
         self,
@@ -150,11 +146,7 @@ class Tracker:
         return estimate
 
     def _explained(
-        self,
-        estimate: Estimate,
-        cloud: SensorCloud,
-        others: Sequence[Look],
-        sought: Sought | None,
+        self, estimate: Estimate, cloud: SensorCloud, others: Sequence[Look], sought: Sought | None
     ) -> Estimate:
         """With the likely causes of a poor one, and what to do."""
         start, seconds = time.perf_counter(), estimate.report["timings"]
@@ -279,13 +271,18 @@ class Follower:
         thorough = (cloud.stamp_ns - self._scanned_ns) * 1e-9 >= self._config.rescan_s
         if last is None or thorough:
             self._scanned_ns = cloud.stamp_ns
-        smoothing_s, seed = self._config.smoothing_s, self._config.seed
         since_ns = np.inf if self._good_ns is None else cloud.stamp_ns - self._good_ns
         turned = bool(0 <= since_ns <= _TURNED_OVER_S * 1e9)
-        how = Following(thorough=thorough, either_side=turned, smoothing_s=smoothing_s, seed=seed)
         if not 0 <= (cloud.stamp_ns - self._sought_ns) * 1e-9 < _SOUGHT_S:
             self._sought_ns, self._sought = cloud.stamp_ns, {}
-        self._last = self._tracker.follow(cloud, last, how, seen, others, self._sought)
+        how = Following(
+            thorough=thorough,
+            either_side=turned,
+            smoothing_s=self._config.smoothing_s,
+            seed=self._config.seed,
+            sought=self._sought,
+        )
+        self._last = self._tracker.follow(cloud, last, how, seen, others)
         if self._last.quality == "good":
             self._good_ns = cloud.stamp_ns
         return self._last
