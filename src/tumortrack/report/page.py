@@ -186,8 +186,8 @@ def _verdicts(summary: dict[str, Any]) -> str:
     for verdict in VERDICTS:
         group = summary["errors"].get(verdict, {}).get("estimate", {})
         lines = [html.escape(line) for line in measures(group)]
-        meaning = "no estimate: nothing was shown" if verdict == "none" else "no such answer"
-        body = "".join(f"<p>{line}</p>" for line in lines) or f"<p>{meaning}</p>"
+        meaning = "no estimate, so nothing to measure" if summary[verdict] else "no scene"
+        body = "".join(f"<p>{line}</p>" for line in lines or [meaning])
         head = f"<b>{summary[verdict]}</b> {verdict}"
         cards.append(f'<div class="card {verdict}"><h3>{head}</h3>{body}</div>')
     return "".join(cards)
