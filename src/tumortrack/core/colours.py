@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import UInt8
 
+from tumortrack.core.organ import is_tumor
+
 Colour = tuple[int, int, int]
 
 ORGAN_PART: Colour = (185, 102, 83)
@@ -29,6 +31,11 @@ _SWEEPS = ((0, 120, 240), (90, 60, 220), (205, 0, 130))
 def part_colour(label: int) -> Colour:
     """Of label 1, 2, 3, ...: the organ, then the tumors, over again after the fifth."""
     return ORGAN_PART if label == 1 else TUMORS[(label - 2) % len(TUMORS)]
+
+
+def named_colour(part: str) -> Colour:
+    """Of kidney (or the organ's other name), tumor_1, tumor_2, ..."""
+    return part_colour(int(part.removeprefix("tumor_")) + 1) if is_tumor(part) else ORGAN_PART
 
 
 def structure_colour(number: int) -> Colour:

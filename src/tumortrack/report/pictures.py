@@ -95,6 +95,10 @@ def scene_picture(
     drawing.save(figure, path)
 
 
+def color_of(part: str) -> RGB:
+    return rgb(colours.named_colour(part))
+
+
 def draw_solid_view(
     axes: Axes, scene: Scene, estimate: Estimate | None, view: ParallelView
 ) -> None:
@@ -104,7 +108,7 @@ def draw_solid_view(
     frame = view.frame_around(np.concatenate(everything), 6.0).widened(1.7)
     name = organ_name(shown)
     organ = [] if name is None else [Body(shown.pop(name), ORGAN, 0.36)]
-    tumors = [Body(mesh, tumor_color(part)) for part, mesh in shown.items()]
+    tumors = [Body(mesh, color_of(part)) for part, mesh in shown.items()]
     drawing.show_bodies(axes, view, [*tumors, *organ], frame)
     flat = view.project(scene.cloud.points_mm.astype(float))
     axes.scatter(flat[:, 0], flat[:, 1], s=2.5, color=OBSERVED, alpha=0.55, linewidths=0, zorder=3)
@@ -125,7 +129,7 @@ def _draw_slice(
     around = [meshes[name].vertices_mm for meshes in (truth, shown) if name in meshes]
     frame = view.frame_around(np.concatenate(around), 12.0).widened(1.0)
     for part, mesh in shown.items():
-        color, width = (tumor_color(part), 2.4) if is_tumor(part) else (ORGAN, 1.4)
+        color, width = color_of(part), 2.4 if is_tumor(part) else 1.4
         drawing.tint(axes, drawing.section_mask(mesh, view, frame, through_mm), frame, color)
         lines = drawing.section(mesh, view, through_mm)
         drawing.draw_lines(axes, lines, color=color, linewidth=width, zorder=3)
@@ -139,15 +143,10 @@ def _draw_slice(
     drawing.finish_view(axes, frame, _CAMERA_AXES[view])
 
 
-def tumor_color(name: str) -> RGB:
-    """Of tumor_1, tumor_2, ..."""
-    return rgb(colours.part_colour(int(name.split("_")[1]) + 1))
-
-
 def scene_legend(organ: str = "kidney", tumors: tuple[str, ...] = ("tumor_1",)) -> list[Any]:
     """Handles of what ``draw_solid_view`` shows; of many tumors the first four."""
     return [
-        *(Patch(facecolor=tumor_color(t), label=f"estimated {words(t)}") for t in tumors[:4]),
+        *(Patch(facecolor=color_of(t), label=f"estimated {words(t)}") for t in tumors[:4]),
         Patch(facecolor=(*ORGAN, 0.5), label=f"estimated {organ}"),
         Line2D([], [], color=TRUE, linewidth=2, label="truth (outline)"),
         Line2D([], [], color=OBSERVED, marker=".", linestyle="", label="observed point"),
@@ -275,4 +274,4 @@ def _write_letters(axes: Axes, view: ParallelView, color: str) -> None:
 
 def _part_colors(anatomy: Anatomy) -> list[RGB]:
     """Of the organ and of each tumor."""
-    return [_ORGAN_LINE, *map(tumor_color, anatomy.names[1:])]
+    return [_ORGAN_LINE, *map(color_of, anatomy.names[1:])]

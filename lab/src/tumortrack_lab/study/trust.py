@@ -225,7 +225,8 @@ def worst_picture(found: pd.DataFrame, tables: Sequence[Table], count: int, path
         lines.append([str(number), f"{state.organ}, {Path(state['row'].scene).name}",
                       f"{state.miss:.1f}", f"{state[f'mm {STATED[-1]}']:.1f}", state.hidden,
                       _moved_words(estimate.motion, scene)])  # fmt: skip
-    drawing.legend(handles=scene_legend(), ncols=4, loc="upper right", frameon=False)
+    legend = scene_legend(tumors=scene.reference.names[1:])
+    drawing.legend(handles=legend, ncols=6, loc="upper right", frameon=False)
     save(drawing, path)
     head = ["", "scene", "off, mm", "95 % radius, mm", "hidden", "what happened"]
     return table(head, lines, left=len(head))
