@@ -364,6 +364,7 @@ def evaluate(
     from tumortrack.report import protocol
     from tumortrack.report.place import check_place
     from tumortrack.report.rivals import rivals_of
+    from tumortrack.report.summary import summarise
 
     call: Any = getattr(locate, "locate", None) or locate
     rivals = rivals_of(getattr(locate, "model", None))
@@ -374,7 +375,7 @@ def evaluate(
         return protocol.evaluate_scenes(call, Path(scenes), Path(report), rivals=rivals)
     named = ((f"{n:04d}", scene) for n, scene in enumerate(scenes))
     entries = [protocol.evaluate_scene(call, scene, name, rivals)[0] for name, scene in named]
-    return {"scenes": entries, "summary": protocol.summarise(entries)}
+    return {"scenes": entries, "summary": summarise(entries)}
 
 
 def track(

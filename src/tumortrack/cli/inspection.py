@@ -68,12 +68,15 @@ def describe(path: Path) -> list[str]:
 
 
 def _evaluation(report: dict[str, Any]) -> list[str]:
-    """In sentences; of a report that an earlier version wrote, nothing."""
+    """In sentences."""
     from tumortrack.report.summary import headlines, scene_lines
 
-    if "errors" not in report.get("summary", {}):
-        return ["  Written by another version; `tumortrack evaluate` makes it again."]
-    lines = (*headlines(report["summary"]), *scene_lines(report["scenes"]))
+    try:
+        lines = [*headlines(report["summary"]), *scene_lines(report["scenes"])]
+    except (KeyError, TypeError, AttributeError):
+        lines = [
+            "Another version wrote it, or another program; `tumortrack evaluate` makes it again."
+        ]
     return [f"  {line}" for line in lines]
 
 

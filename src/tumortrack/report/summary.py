@@ -188,7 +188,7 @@ def headlines(summary: dict[str, Any]) -> list[str]:
     """What a reader must know first: verdicts, then errors of good and of poor answers and of the
     rivals, pooled over all scenes, tumors and targets."""
     lines = [f"{verdict_counts(summary)}. {failures(summary)}."]
-    groups = summary.get("errors", {})
+    groups = summary["errors"]
     for verdict in ("good", "poor"):
         if verdict in groups:
             lines += [f"{verdict}: {line}" for line in measures(groups[verdict]["estimate"])]
