@@ -330,7 +330,9 @@ def test_simulated_scenes_are_evaluated_against_their_truth(work, out, scenes, e
     assert summary["tumor_1"]["hausdorff_mm"] >= summary["tumor_1"]["hausdorff_one_sided_mm"] > 0
     assert (evaluated / "index.html").stat().st_size > 10_000
     kept = sorted(out.iterdir())
-    assert "REPORT" in refusal(tumortrack("evaluate", work / "model", scenes, out))
+    assert "exists already" in refusal(tumortrack("evaluate", work / "model", scenes, out))
+    again = tumortrack("evaluate", work / "model", scenes, out, "--overwrite")
+    assert "no report of `evaluate`" in refusal(again)
     assert sorted(out.iterdir()) == kept
 
 

@@ -87,13 +87,14 @@ def _words(content: Content, sentences: Iterable[str | list[str]]) -> Iterator[s
 def _evaluation(report: Content) -> list[str]:
     from tumortrack.report.summary import headlines, scene_lines
 
-    if "errors" not in report["summary"]:
-        return ["an evaluation report of another version; `tumortrack evaluate` makes it again"]
-    return [
-        "an evaluation report",
-        *headlines(dict(report["summary"])),
-        *scene_lines(report["scenes"]),
-    ]
+    try:
+        lines = [*headlines(dict(report["summary"])), *scene_lines(report["scenes"])]
+    except (KeyError, TypeError, AttributeError):
+        return [
+            "an evaluation report",
+            "Another version wrote it, or another program; `tumortrack evaluate` makes it again",
+        ]
+    return ["an evaluation report", *lines]
 
 
 def _json(path: Path) -> list[str]:

@@ -64,7 +64,7 @@ def page_scene(scene: Scene, estimate: Estimate | None, picture: Path) -> dict[s
     points = {"kind": "points", "name": "observed points", "v": _packed(points_mm[::step])}
     layers = [{**points, "color": colours.css(colours.SEEN)}]
     for part, mesh in shown.items():
-        layers.append(_surface(part, mesh, _color(part, scene)))
+        layers.append(_surface(part, mesh))
     for part, mesh in zip(scene.reference.names, scene.reference.parts, strict=True):
         layers.append(_outline(part, mesh))
     webp = io.BytesIO()
@@ -129,14 +129,10 @@ def thinned(mesh: Mesh, cell_mm: float) -> Mesh:
     return Mesh(np.stack(means, axis=1), faces[times[kind.reshape(-1)] % 2 == 1])
 
 
-def _color(part: str, scene: Scene) -> str:
-    label = scene.reference.names.index(part) + 1 if part in scene.reference.names else 1
-    return colours.css(colours.part_colour(label))
-
-
-def _surface(part: str, mesh: Mesh, color: str) -> dict[str, Any]:
+def _surface(part: str, mesh: Mesh) -> dict[str, Any]:
     small = thinned(mesh, _TUMOR_CELL_MM if is_tumor(part) else _ORGAN_CELL_MM)
     faces = _base64(small.faces.astype("<u4").tobytes())
+    color = colours.css(colours.name_colour(part))
     about = {"kind": "surface", "name": f"{words(part)}, estimated", "color": color}
     return {**about, "tumor": is_tumor(part), "v": _packed(small.vertices_mm), "f": faces}
 
@@ -186,8 +182,8 @@ def _verdicts(summary: dict[str, Any]) -> str:
     for verdict in VERDICTS:
         group = summary["errors"].get(verdict, {}).get("estimate", {})
         lines = [html.escape(line) for line in measures(group)]
-        meaning = "no estimate: nothing was shown" if verdict == "none" else "no such answer"
-        body = "".join(f"<p>{line}</p>" for line in lines) or f"<p>{meaning}</p>"
+        meaning = "no estimate, so nothing to measure" if summary[verdict] else "no scene"
+        body = "".join(f"<p>{line}</p>" for line in lines or [meaning])
         head = f"<b>{summary[verdict]}</b> {verdict}"
         cards.append(f'<div class="card {verdict}"><h3>{head}</h3>{body}</div>')
     return "".join(cards)
@@ -251,11 +247,8 @@ def _part_table(parts: dict[str, dict[str, Any]]) -> str:
     for name, part in parts.items():
         found = "yes" if part["found"] else "no"
         found = f"{part['found']} of {part['scenes']}" if over_scenes else found
-        cells = [
-            words(name),
-            found,
-            *(number(part[key]) if key in part else "-" for key in columns),
-        ]
+        cells = [number(part[key]) if key in part else "-" for key in columns]
+        cells = [words(name), found, *cells]
         if over_scenes:
             worst = part["worst"]["hausdorff_mm"]
             cells.append(f"{number(worst['mm'])} ({worst['scene']})")

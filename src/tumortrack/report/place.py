@@ -23,12 +23,13 @@ def check_place(out: Path, overwrite: bool) -> None:
     if not (inside := {path.name for path in out.iterdir()}):
         return
     report = read_json(out / "report.json") if "report.json" in inside else {}
-    if not ({"rule", "tumortrack", "summary"} <= report.keys()):
+    if not ({"rule", "summary", "scenes"} <= report.keys()):
         raise InputError(
             f"{out} is no report of `evaluate`, so --overwrite does not replace it. Choose another "
             "path, or move the folder away yourself."
         )
-    pictures = {f"{entry['name']}.png" for entry in report["scenes"]}
+    entries = [entry for entry in report["scenes"] if isinstance(entry, dict)]
+    pictures = {f"{entry.get('name')}.png" for entry in entries}
     drawn = {path.name for path in (out / "scenes").glob("*")}
     if strays := sorted((inside - _OURS) | (drawn - pictures)):
         raise InputError(

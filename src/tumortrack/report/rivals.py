@@ -34,6 +34,7 @@ _POINTS = 1000  # of the cloud: as many as the estimate uses
 _WIDTH_MM = 5.0  # of the robust kernel: as wide as that of the elastic fit begins
 _STEPS, _ENOUGH = 60, 1e-3  # mm and rad: a step that moves less is the last
 _FEWEST_TARGETS = 10
+_SOURCE_POINTS = 4000  # of the surfaces that are laid on the true ones
 _TURNS = tuple(np.diag([a, b, a * b]) for a, b in product((1.0, -1.0), repeat=2))
 
 
@@ -102,26 +103,28 @@ def _on_targets(targets: Targets) -> Affine:
 def _on_surfaces(rest: tuple[Mesh, ...], true: tuple[Mesh, ...]) -> Affine:
     """By iterated closest points, part on part, from all four ways in which principal axes agree;
     the one that leaves the least mean squared distance."""
-    from_mm = [part.spread_mm() for part in rest]
-    onto_mm = [part.spread_mm() for part in true]
+    from_mm, onto_mm = ([part.spread_mm() for part in parts] for parts in (rest, true))
     trees = [cKDTree(points) for points in onto_mm]
-    source, ends = np.concatenate(from_mm), np.cumsum([len(points) for points in from_mm])[:-1]
-    (centre, axes), (true_centre, true_axes) = _principal(from_mm[0]), _principal(onto_mm[0])
+    step = max(1, sum(map(len, from_mm)) // _SOURCE_POINTS)
+    thin = [points[::step] for points in from_mm]
 
-    def descend(pose: Affine) -> tuple[float, Affine]:
-        left2 = np.inf
+    def descend(pose: Affine, source: list[np.ndarray]) -> tuple[float, Affine]:
+        left2, everything = np.inf, np.concatenate(source)
         while True:
-            placed = transform_points(pose, source)
-            pairs = zip(trees, onto_mm, np.split(placed, ends), strict=True)
+            placed = [transform_points(pose, points) for points in source]
+            pairs = zip(trees, onto_mm, placed, strict=True)
             nearest = np.concatenate([onto[tree.query(at)[1]] for tree, onto, at in pairs])
-            before, left2 = left2, float(((nearest - placed) ** 2).sum(1).mean())
-            if left2 > before - 1e-5:
+            before = left2
+            left2 = float(((nearest - np.concatenate(placed)) ** 2).sum(1).mean())
+            if left2 > before * (1 - 1e-3):
                 return left2, pose
-            pose = kabsch(source, nearest, np.ones(len(source)))
+            pose = kabsch(everything, nearest, np.ones(len(everything)))
 
+    (centre, axes), (true_centre, true_axes) = _principal(from_mm[0]), _principal(onto_mm[0])
     turns = [true_axes.T @ turn @ axes for turn in _TURNS]
-    found = [descend(rigid(turn, true_centre - turn @ centre)) for turn in turns]
-    return min(found, key=lambda one: one[0])[1]
+    few = [points[::8] for points in thin]
+    found = [descend(rigid(turn, true_centre - turn @ centre), few) for turn in turns]
+    return descend(min(found, key=lambda one: one[0])[1], thin)[1]
 
 
 def _principal(points_mm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

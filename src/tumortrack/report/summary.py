@@ -188,7 +188,7 @@ def headlines(summary: dict[str, Any]) -> list[str]:
     """What a reader must know first: verdicts, then errors of good and of poor answers and of the
     rivals, pooled over all scenes, tumors and targets."""
     lines = [f"{verdict_counts(summary)}. {failures(summary)}."]
-    groups = summary.get("errors", {})
+    groups = summary["errors"]
     for verdict in ("good", "poor"):
         if verdict in groups:
             lines += [f"{verdict}: {line}" for line in measures(groups[verdict]["estimate"])]
@@ -222,9 +222,11 @@ def summary_tables(report: dict[str, Any]) -> list[Table]:
     for verdict, method, group in error_rows(summary):
         cells = [triple(group.get(key)) for key in MEASURES]
         errors.add_row(verdict, METHODS[method], *cells)
+    if "best_rigid_pose" in summary.get("errors", {}).get("all", {}):
+        errors.caption = "; ".join(f"{RIVALS[name]}: {text}" for name, text in MEANING.items())
     table = Table(title=f"medians over scenes; mIoU {summary['miou']:.3f} (overlap, 1: perfect)")
     table.add_column("part")
-    for head in ("found", "HD mm", "one-sided", "HD95", "surface", "centre", "IoU", "worst HD mm"):
+    for head in ("found", "HD mm", "1-sided", "HD95", "surface", "centre", "IoU", "worst HD mm"):
         table.add_column(head, justify="right")
     rows = part_rows(summary)
     if registered := any("registration_mm" in part for part in rows.values()):
