@@ -20,8 +20,16 @@ LARGEST_GRID = 400
 Quality = Literal["good", "poor", "none"]  # none: there is no estimate
 # An answer with a tumor's centre farther off has failed: the plan's usual margin, all of it.
 FAR_MM = 5.0
-# What people read where it is good: that word would say more than is known.
-NO_CHECK_FAILED, UNVERIFIED = "fit: no check failed", "its place is not verified"
+# What people read where it is good: that word alone would say more than is known.
+NO_CHECK_FAILED, UNVERIFIED = "good: no check failed", "its place is not verified"
+
+
+def verdict_words(verdict: Quality, reason: str) -> str:
+    """A sentence that begins with the verdict; ``reason``: why it is not good."""
+    if verdict == "good":
+        return f"{NO_CHECK_FAILED}; {UNVERIFIED}."
+    said = f"{verdict}: {reason.rstrip('.')}."
+    return f"{said} Do not rely on it." if verdict == "poor" else said
 
 
 @runtime_checkable

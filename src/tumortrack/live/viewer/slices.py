@@ -12,7 +12,7 @@ from jaxtyping import Float, Float32, Float64, UInt8
 from tumortrack.core.colours import Colour
 from tumortrack.core.errors import InputError
 from tumortrack.core.estimate import Motion
-from tumortrack.core.geometry import spacing_mm, transform_points
+from tumortrack.core.geometry import plane_section, spacing_mm, transform_points
 from tumortrack.core.organ import organ_name
 from tumortrack.core.types import Mesh
 from tumortrack.imaging.case import Case, load_case
@@ -50,11 +50,8 @@ class SlicePlane:
 
     def section(self, mesh: Mesh) -> Float64[np.ndarray, "m 2 2"]:
         """Where a surface crosses the plane, as segments; (column, row) in mm from the centre."""
-        from trimesh import Trimesh
-        from trimesh.intersections import mesh_plane
-
-        solid = Trimesh(mesh.vertices_mm, mesh.faces, process=False)
-        lines = mesh_plane(solid, np.cross(self.across, self.down), self.centre_mm)
+        normal = np.cross(self.across, self.down)
+        lines = plane_section(mesh.vertices_mm, mesh.faces, normal, self.centre_mm)
         return (lines - self.centre_mm) @ np.stack([self.across, self.down], axis=1)
 
 
@@ -103,15 +100,25 @@ def slice_picture(
     """The CT in a plane before the camera, over it the outlines of surfaces (camera frame) in
     their colour and width (pixels), a bar of 10 mm, and ``note`` in the corner. None where
     ``motion`` knows no way back."""
-    from PIL import Image, ImageDraw
-
     sampled = pixels // _COARSER
     points_ct = motion.back(plane.points(sampled))
     if points_ct is None:
         return None
-    grey = Image.fromarray(ct.grey(points_ct).reshape(sampled, sampled))
+    return outlined(ct.grey(points_ct).reshape(sampled, sampled), plane, outlines, pixels, note)
+
+
+def outlined(
+    picture: UInt8[np.ndarray, "s s *rgb"],
+    plane: SlicePlane,
+    outlines: Iterable[tuple[Mesh, Colour, int]],
+    pixels: int,
+    note: str = "",
+) -> UInt8[np.ndarray, "h w 3"]:
+    """What lies in the plane, with outlines, bar and note as of ``slice_picture``."""
+    from PIL import Image, ImageDraw
+
     fine = _FINER * pixels  # lines are drawn finer and then shrunk, so that they are smooth
-    image = grey.resize((fine, fine), Image.Resampling.BILINEAR).convert("RGB")
+    image = Image.fromarray(picture).resize((fine, fine), Image.Resampling.BILINEAR).convert("RGB")
     draw = ImageDraw.Draw(image)
     per_mm = fine / plane.side_mm
     for mesh, colour, width in outlines:
