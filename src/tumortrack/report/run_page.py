@@ -296,8 +296,8 @@ def _dots(picture: np.ndarray, places: Float[np.ndarray, "n 2"], colour: colours
 def _write_picture(path: Path, verdict: Quality, lines: list[str], panels: list[Panel]) -> None:
     """Verdict, what is said of it, and the panels in rows; no line is cut."""
     room = _ACROSS - 2 * _EDGE
-    head = _wrapped(lines[0], 36, room)
-    below = [row for line in lines[1:] for row in _wrapped(line, 24, room)]
+    head = wrapped(lines[0], 36, room)
+    below = [row for line in lines[1:] for row in wrapped(line, 24, room)]
     images = [
         (caption, image.resize((round(image.width * _ROW / image.height), _ROW)))
         for caption, image in panels
@@ -317,12 +317,12 @@ def _write_picture(path: Path, verdict: Quality, lines: list[str], panels: list[
         draw.text((_EDGE, 44 + 46 * len(head) + 32 * n), row, fill="black", font_size=24)
     for (caption, image), (left, top) in zip(images, places, strict=True):
         picture.paste(image, (left, top))
-        for n, row in enumerate(_wrapped(caption, 20, image.width)):
+        for n, row in enumerate(wrapped(caption, 20, image.width)):
             draw.text((left, top + _ROW + 4 + 26 * n), row, fill="black", font_size=20)
     write_atomically(path, _png(picture))
 
 
-def _wrapped(text: str, size: int, room: float) -> list[str]:
+def wrapped(text: str, size: int, room: float) -> list[str]:
     """The text in lines that fit; a word that does not is broken."""
     font, lines = ImageFont.load_default(size), [""]
     for word in text.split():
