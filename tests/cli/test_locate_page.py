@@ -19,7 +19,7 @@ from tumortrack.sense.camera import d405
 from tumortrack.sense.cloud import check_depth_unit
 from tumortrack.sense.files import depth_png, intrinsics_json, read_mask
 
-HAND = Props(tilt_degrees=20, waves_mm=3, hand=True, up=(0, -1, 0), distance_mm=(115, 135))
+HAND = Props(tilt_degrees=20, waves_mm=3, hand=True, up=(0.0, -1.0, 0.0), distance_mm=(115, 135))
 
 
 @cache

@@ -9,7 +9,7 @@ from importlib.metadata import EntryPoint
 import numpy as np
 import pytest
 
-from stories import answered, COMMAND, cloud_by_rays, environment, looking_down
+from stories import COMMAND, cloud_by_rays, environment, looking_down
 from tumortrack.cli import main
 from tumortrack.imaging.case import load_case
 from tumortrack.sense.ply import write_cloud_ply

@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from live_objects import small_setting
-from stories import answered, refusal, succeeded, tumortrack
+from stories import answered, refusal, tumortrack
 from tumortrack.core import store
 from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.geometry import rigid, transform_points
