@@ -26,8 +26,9 @@ if TYPE_CHECKING:
     from tumortrack.training import presets as presets
 
 _NAMES = {  # by the module that has them
-    "api": "estimate_from_surfaces evaluate find_organ load_case load_model plan_resection prepare "
-    "read_cloud save_estimate scan_phantom simulate_scenes teach track train",
+    "api": "estimate_from_surfaces evaluate find_organ load_case load_estimate load_model "
+    "plan_resection prepare read_cloud read_depth save_estimate scan_phantom simulate_scenes teach "
+    "track train",
     "core": "errors",
     "core.estimate": "Estimate",
     "core.types": "DepthFrame Intrinsics Look SensorCloud",

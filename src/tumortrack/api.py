@@ -254,6 +254,22 @@ def read_cloud(path: StrPath, unit: Literal["mm", "m"] = "mm") -> SensorCloud:
     return cloud
 
 
+def read_depth(path: StrPath, intrinsics: StrPath, unit_mm: float | None = None) -> DepthFrame:
+    """A depth image: 16-bit PNG or TIFF, or a TIFF of floats; 0 is no return.
+
+    Args:
+        intrinsics: JSON with width, height, fx, fy, cx, cy in pixels.
+        unit_mm: of one step. Default: what that file says (depth_unit_mm), else 0.1 (a D405's), of
+            floats 1000 (metres). Many cameras have 1.
+
+    Raises:
+        InputError: missing, damaged, of another kind or size.
+    """
+    from tumortrack.sense import files
+
+    return files.read_depth(Path(path), Path(intrinsics), unit_mm)[0]
+
+
 def find_organ(
     content: DepthFrame | SensorCloud,
     *,
@@ -311,17 +327,45 @@ def teach(
     return taught.teach([taught.look(frame, picture, *pixel) for pixel in pixels])
 
 
-def save_estimate(estimate: Estimate, folder: StrPath, overwrite: bool = False) -> None:
-    """Write what `tumortrack locate` writes: points, labelled volume, surfaces and report; camera
-    frame, mm.
+def save_estimate(
+    estimate: Estimate,
+    folder: StrPath,
+    overwrite: bool = False,
+    *,
+    cloud: SensorCloud | None = None,
+    seen: DepthFrame | SensorCloud | None = None,
+) -> None:
+    """Write what `tumortrack locate` writes: points, labelled volume, surfaces, report, and a page
+    to look at (index.html, picture.png); camera frame, mm.
+
+    Args:
+        cloud: the organ's points, in which it was located, for the page.
+        seen: all that the camera saw, likewise.
 
     Raises:
         InputError: the folder exists and ``overwrite`` is False.
         StorageError: the disk refused.
     """
+    from functools import partial
+
+    from tumortrack.report.run_page import Seen, write_run_page
     from tumortrack.tracking.files import write_estimate
 
-    write_estimate(Path(folder), estimate, overwrite)
+    shown = Seen(cloud, seen)
+    add = partial(write_run_page, report=estimate.report, estimate=estimate, seen=shown)
+    write_estimate(Path(folder), estimate, overwrite, add=add)
+
+
+def load_estimate(folder: StrPath) -> Estimate:
+    """Read a folder that ``save_estimate`` or `tumortrack locate` wrote; its ``motion`` is None:
+    only the model knows that.
+
+    Raises:
+        ArtifactError: no such folder, damaged or changed, or nothing was located in it.
+    """
+    from tumortrack.tracking.files import read_estimate
+
+    return read_estimate(Path(folder))
 
 
 def estimate_from_surfaces(surfaces: Mapping[str, Mesh], grid: int = 160) -> Estimate:

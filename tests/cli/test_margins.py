@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from stories import refusal, succeeded, tumortrack
+from stories import answered, refusal, succeeded, tumortrack
 from tumortrack.core import store
 from tumortrack.core.mesh_files import read_mesh
 from tumortrack.report.metrics import outward_miss
@@ -34,8 +34,8 @@ def test_margins_are_found_stated_and_planned_with(clinic_model, scenes, tmp_pat
     model, table = tmp_path / "model", tmp_path / "model" / "margins.jsonl"
     shutil.copytree(clinic_model, model)
     cloud, run = list_scenes(scenes)[3] / "cloud.ply", tmp_path / "run"
-    said = succeeded(tumortrack("locate", model, cloud, tmp_path / "before", "--device", "cpu"))
-    assert "no margin is stated: no margin is known for this model" in said
+    said = answered(tumortrack("locate", model, cloud, tmp_path / "before", "--device", "cpu"))
+    assert "no margin: the model was not calibrated" in said
     assert "give folders of scenes" in refusal(tumortrack("margins", model))
     calibrate = ("margins", model, scenes, "--device", "cpu", "--confidence")
     assert "from 0.5 to 0.99" in refusal(tumortrack(*calibrate, 95))
@@ -54,7 +54,7 @@ def test_margins_are_found_stated_and_planned_with(clinic_model, scenes, tmp_pat
     rows = [json.loads(line) for line in located.splitlines()[1:]]
     clouds = [Path(row["scene"]) / "cloud.ply" for row in rows if not row["doubt"]]
     for good in clouds:
-        said = succeeded(tumortrack("locate", model, good, run, "--overwrite"))
+        said = answered(tumortrack("locate", model, good, run, "--overwrite"))
         if store.read_json(run / "report.json")["margin"]["stated"]:
             break
     radii = store.read_json(run / "report.json")["margin"]["stated"]

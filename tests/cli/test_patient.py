@@ -7,7 +7,7 @@ import shutil
 
 import pytest
 
-from stories import cloud_by_rays, looking_down, refusal, succeeded, tumortrack
+from stories import answered, cloud_by_rays, looking_down, refusal, succeeded, tumortrack
 from tumortrack.core import store
 from tumortrack.core.patient import Patient
 from tumortrack.imaging.case import load_case
@@ -25,7 +25,7 @@ def run(phantom_case, clinic_model, tmp_path_factory):
     case = load_case(phantom_case)
     write_cloud_ply(folder / "cloud.ply", cloud_by_rays(case, looking_down(case)))
     command = ("locate", clinic_model, folder / "cloud.ply", folder / "run", "--grid", 32)
-    said = succeeded(tumortrack(*command, "--patient", "P1", "--side", "right"))
+    said = answered(tumortrack(*command, "--patient", "P1", "--side", "right"))
     assert "patient P1, right side" in said
     return folder / "run"
 
@@ -97,4 +97,4 @@ def test_folders_that_say_nothing_know_nobody_and_serve_nobody_in_particular(
         line = refusal(tumortrack(*command, "--patient", "P1"))
         assert "is of patient unknown, side unknown; you stated patient P1" in line
         assert "prepare --patient ID --side" in line
-        assert "patient unknown, side unknown" in succeeded(tumortrack(*command))
+        assert "patient unknown, side unknown" in answered(tumortrack(*command))

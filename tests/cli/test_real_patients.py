@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stories import refusal, succeeded, tumortrack
+from stories import answered, refusal, succeeded, tumortrack
 from tumortrack.core.mesh_files import read_mesh
 from tumortrack.imaging.case import load_case
 from tumortrack.imaging.volume import read_labels
@@ -38,7 +38,7 @@ def locates_its_organ(case: Path, folder: Path) -> None:
     succeeded(tumortrack("train", case, folder / "model", "--steps", STEPS, "--workers", 0))
     succeeded(tumortrack("simulate", case, folder / "scenes", "--scenes", 1))
     cloud = folder / "scenes" / "0000" / "cloud.ply"
-    succeeded(tumortrack("locate", folder / "model", cloud, folder / "out", "--grid", 48))
+    answered(tumortrack("locate", folder / "model", cloud, folder / "out", "--grid", 48))
     kidney = json.loads((folder / "out" / "report.json").read_text())["parts"]["kidney"]
     truth = read_mesh(cloud.with_name("kidney.ply")).box_mm.mean(0)
     assert np.linalg.norm(np.array(kidney["center_mm"]) - truth) < 25

@@ -80,7 +80,7 @@ def test_an_answer_needs_none_of_the_slow_libraries(slim_model, tmp_path):
     file = tmp_path / "cloud.ply"
     write_cloud_ply(file, surface[surface[:, 2] < np.median(surface[:, 2])].astype(np.float32))
     done, imported = answered("locate", slim_model, file, tmp_path / "out", "--grid", 32)
-    assert done.returncode == 0, done.stderr[-2000:]
+    assert done.returncode in (0, 4), done.stderr[-2000:]
     assert (tmp_path / "out" / "labels.nii.gz").exists()
     assert "written to" in done.stdout.splitlines()[-1]  # though the process ends at once
     assert "torch" in imported

@@ -17,12 +17,14 @@ SIGNATURES = {
     "find_organ": "content model=None range_mm=None box_mm=None mask=None picked_mm=None "
     "picture=None taught=None seed=0",
     "load_case": "folder",
+    "load_estimate": "folder",
     "load_model": "folder device='auto'",
     "plan_resection": "located picture=None stand_mm=None accept_poor=False accept_budget=False "
     "confidence=None options",
     "prepare": "source folder=None overwrite=False segment=None options",
     "read_cloud": "path unit='mm'",
-    "save_estimate": "estimate folder overwrite=False",
+    "read_depth": "path intrinsics unit_mm=None",
+    "save_estimate": "estimate folder overwrite=False cloud=None seen=None",
     "scan_phantom": "folder seed=1",
     "simulate_scenes": "case count=1 seed=0 elastic=True noise=True",
     "teach": "frame picture organ beside",

@@ -378,8 +378,8 @@ def test_an_estimate_is_sent_in_metres_in_the_published_frame():
     lines = meshes["quality"].text.splitlines()
     assert max(map(len, lines)) <= 44  # RViz breaks none
     assert " ".join(lines) == (
-        "good: no check failed; its place is not verified; no margin is stated: no margin is known "
-        "for this model (tumortrack margins)"
+        "good: no check failed; its place is not verified; no margin: the model was not calibrated "
+        "(tumortrack margins)"
     )
     spot = meshes["quality"].pose.position
     here_mm = [1000 * spot.x, 1000 * spot.y, 1000 * spot.z, 1]

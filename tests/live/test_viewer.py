@@ -289,7 +289,7 @@ def test_the_shell_is_the_stated_margin_and_without_one_there_is_none(sinks, clo
     sink.publish(update)
     assert drawn(sink, "tumor_1")
     assert not drawn(sink, "margin_tumor_1")
-    assert "no margin is stated" in sink._panel.stage.content
+    assert "no margin: " in sink._panel.stage.content
     radii = [
         {"confidence": 0.9, "mm": {"tumor_1": 2.0}},
         {"confidence": 0.95, "mm": {"tumor_1": 3}},

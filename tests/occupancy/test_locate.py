@@ -12,7 +12,7 @@ import pytest
 import torch
 import trimesh
 
-from stories import cloud_by_rays, looking_down, refusal, succeeded, tumortrack
+from stories import answered, cloud_by_rays, looking_down, refusal, succeeded, tumortrack
 from tumortrack.cli.inspection import describe
 from tumortrack.cli.locate import check_case
 from tumortrack.core import store
@@ -58,7 +58,7 @@ def out(work: Path, seen: tuple[np.ndarray, np.ndarray]) -> Path:
     points, _ = seen
     trimesh.PointCloud(points).export(work / "cloud.ply")
     out = work / "out"
-    said = succeeded(tumortrack("locate", work / "model", work / "cloud.ply", out, "--grid", 96))
+    said = answered(tumortrack("locate", work / "model", work / "cloud.ply", out, "--grid", 96))
     assert "tumor_2" in said
     return out
 
@@ -356,7 +356,8 @@ def test_depth_images_take_the_range_the_model_was_trained_for(work, scenes):
     assert "--intrinsics" in refusal(tumortrack(*depth))
     depth += ["--intrinsics", scene / "intrinsics.json", "--grid", 48]
     assert "depth_unit_mm" in refusal(tumortrack(*depth, "--unit", "m"))
-    succeeded(tumortrack(*depth))
+    said = answered(tumortrack(*depth))
+    assert "in steps of 0.1 mm (stated in intrinsics.json)" in said
     found = json.loads((work / "depth" / "report.json").read_text())["parts"]["tumor_1"]
     truth = read_mesh(scene / "tumor_1.ply").box_mm.mean(0)
     assert np.linalg.norm(np.array(found["center_mm"]) - truth) < 12

@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from live_objects import small_setting
-from stories import refusal, succeeded, tumortrack
+from stories import answered, refusal, tumortrack
 from tumortrack.core import store
 from tumortrack.core.causes import Cause
 from tumortrack.core.errors import InputError, NoEstimate
@@ -297,7 +297,7 @@ def test_the_command_takes_several_views(slim_model, tmp_path):
     assert "320 x 180" in other
     thrice = refusal(tumortrack(*command, right, out, *options, *second, *second))
     assert "--intrinsics is given 3 times for 2 views" in thrice
-    said = succeeded(tumortrack(*command, right, out, *options, *second))
+    said = answered(tumortrack(*command, right, out, *options, *second))
     assert f"written to {out}" in said
     report = json.loads((out / "report.json").read_text())
     looks = report["looks"]

@@ -12,7 +12,7 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from elastic_objects import CENTER, UP
-from stories import succeeded, tumortrack
+from stories import answered, succeeded, tumortrack
 from tumortrack.core.errors import ArtifactError, InputError, NoEstimate
 from tumortrack.core.estimate import Motion
 from tumortrack.core.types import SensorCloud
@@ -192,7 +192,7 @@ def test_the_command_says_where_points_of_the_ct_are(slim_model, stages, estimat
     (tmp_path / "asked.csv").write_text("\n".join(["name,x,y,z", *lines, ""]))
     out = tmp_path / "out"
     command = ["locate", slim_model, tmp_path / "cloud.ply", out, "--grid", 48, "--seed", 3]
-    said = succeeded(tumortrack(*command, "--map", tmp_path / "asked.csv", "--device", "cpu"))
+    said = answered(tumortrack(*command, "--map", tmp_path / "asked.csv", "--device", "cpu"))
     assert "3 points of the CT" in said
     rows = list(csv.DictReader((out / "points.csv").open()))
     assert [row["name"] for row in rows] == ["p0", "p1", "p2"]

@@ -300,4 +300,4 @@ def test_an_estimate_beyond_a_limit_is_poor_and_says_which():
     assert before.report["margin"] == {"stated": [], "reason": "a poor estimate has no margin"}
     without = with_margin(dataclasses.replace(small_estimate(), quality="good"), whole, None)
     assert without.quality == "good"
-    assert without.report["margin"]["reason"].startswith("no margin is known")
+    assert without.report["margin"]["reason"].startswith("the model was not calibrated")

@@ -91,7 +91,7 @@ def full_disk_locate(base: Path, folder: Path) -> Row:
     with small_disk(folder / "disk", "size=100k") as disk:
         code, line = said(command(*locating(base, disk / "run")))
         left = inside(disk)
-    return f"exit {code}: {line}; left behind: {left or 'nothing'}", code == 4 and not left
+    return f"exit {code}: {line}; left behind: {left or 'nothing'}", code == 2 and not left
 
 
 def full_disk_train(base: Path, folder: Path) -> Row:
@@ -99,7 +99,7 @@ def full_disk_train(base: Path, folder: Path) -> Row:
     with small_disk(folder / "disk", "size=2m") as disk:
         code, line = said(command(*training(base, disk / "model")))
         whole = (disk / "model" / "manifest.json").exists()
-    return f"exit {code}: {line}", code == 4 and not whole
+    return f"exit {code}: {line}", code == 2 and not whole
 
 
 def full_disk_record(base: Path, folder: Path) -> Row:
@@ -124,7 +124,7 @@ def read_only_home(base: Path, folder: Path) -> Row:
         environ = {"HOME": str(home), "XDG_CACHE_HOME": str(home / "c"), "MPLCONFIGDIR": ""}
         environ |= {"NUMBA_CACHE_DIR": str(home / "numba"), "XDG_CONFIG_HOME": str(home)}
         code, line = said(command(*locating(base, folder / "run"), environ=environ))
-    return f"exit {code}: {line}", code == 0
+    return f"exit {code}: {line}", code in (0, 4)  # 4: located, and poor
 
 
 def clock_set_back(base: Path, folder: Path) -> Row:
@@ -169,7 +169,7 @@ def _all_of(base: Path, folder: Path, **how: object) -> Row:
         )
     ]
     text = "; ".join(f"exit {code}: {line}" for code, line in ends)
-    return text, all(code == 0 for code, _ in ends) and len(stamps_of(folder / "tape")) > 10
+    return text, all(code in (0, 4) for code, _ in ends) and len(stamps_of(folder / "tape")) > 10
 
 
 def two_trainings(base: Path, folder: Path) -> Row:

@@ -43,6 +43,12 @@ def succeeded(done: subprocess.CompletedProcess[str]) -> str:
     return done.stdout
 
 
+def answered(done: subprocess.CompletedProcess[str]) -> str:
+    """The output of a `locate` that found something, be it poor."""
+    assert done.returncode in (0, 4), done.stdout + done.stderr
+    return done.stdout
+
+
 def refusal(done: subprocess.CompletedProcess[str]) -> str:
     """The one line of a command that must have refused, without a traceback."""
     assert done.returncode not in (0, 1), done.stdout + done.stderr

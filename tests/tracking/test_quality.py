@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from elastic_objects import UP
-from stories import refusal, succeeded, tumortrack
+from stories import answered, refusal, succeeded, tumortrack
 from tumortrack.core import store
 from tumortrack.core.errors import NoEstimate
 from tumortrack.core.types import DepthFrame, Mesh, SensorCloud
@@ -272,11 +272,13 @@ def test_train_and_inspect_say_what_speaks_against_a_model(phantom_case, clinic_
 def test_locate_says_its_verdict_and_plan_heeds_it(tmp_path, phantom_case, clinic_model):
     succeeded(tumortrack("simulate", phantom_case, tmp_path / "scenes", "--scenes", 1))
     run, cloud = tmp_path / "run", tmp_path / "scenes" / "0000" / "cloud.ply"
-    said = succeeded(tumortrack("locate", clinic_model, cloud, run, "--device", "cpu"))
-    quality = store.read_json(run / "report.json")["quality"]
-    good = "good: no check failed; its place is not verified" in said
-    assert good == (quality["verdict"] == "good")
-    assert ("POOR: " in said) == (quality["verdict"] == "poor")
+    done = tumortrack("locate", clinic_model, cloud, run, "--device", "cpu")
+    said, quality = answered(done), store.read_json(run / "report.json")["quality"]
+    assert done.returncode == {"good": 0, "poor": 4}[quality["verdict"]]
+    assert said.startswith(f"{quality['verdict']}: ")
+    assert ("no check failed; its place is not verified" in said) == (quality["verdict"] == "good")
+    page = (run / "index.html").read_text()
+    assert f"<h1>{quality['verdict'].upper()}</h1>" in page
     manifest = store.read_json(run / store.MANIFEST)
     for verdict, reason in (("good", ""), ("poor", "the organ hides")):
         report = store.read_json(run / "report.json")

@@ -112,6 +112,7 @@ class Export:
     patient: str | None = None
 
     def run(self) -> None:
+        from tumortrack.tracking.files import read_report
         from tumortrack.tracking.slicer_scene import Scene
 
         if self.dicom is None and (self.series, self.patient) != (None, None):
@@ -129,8 +130,7 @@ class Export:
         notes: tuple[str, ...] = ()
         with store.new_folder(self.out) as aside:
             if is_run:
-                store.read_manifest(self.case, "run")
-                scene.add_run(self.case, store.read_json(self.case / "report.json"))
+                scene.add_run(self.case, read_report(self.case))
             else:
                 notes = self._export_case(aside, scene)
             scene.write(aside / "scene.mrb")
@@ -172,8 +172,9 @@ class Export:
 
     def _report_of(self, run: Path) -> dict[str, Any]:
         """Raises InputError: it was located with another case's model, or without a motion."""
-        store.read_manifest(run, "run")
-        report = store.read_json(run / "report.json")
+        from tumortrack.tracking.files import read_report
+
+        report = read_report(run)
         if report.get("model", {}).get("case_sha256") != store.sha256_of(
             self.case / store.MANIFEST
         ):

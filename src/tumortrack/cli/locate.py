@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -10,42 +11,57 @@ from typing import TYPE_CHECKING, Any, Literal
 from tyro.conf import Positional, UseAppendAction
 
 from tumortrack.cli.console import Device, console, keep_loaded, progress_bar, say, say_notes
-from tumortrack.cli.stated import StatedPatient
+from tumortrack.cli.finding import FindingOrgan, View, read_view
 from tumortrack.core import store
 from tumortrack.core.config import to_builtins
-from tumortrack.core.errors import InputError
+from tumortrack.core.errors import InputError, NoEstimate
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from tumortrack.core.estimate import Estimate
     from tumortrack.core.geometry import Affine
-    from tumortrack.core.types import DepthFrame, SensorCloud
+    from tumortrack.core.types import Anatomy, DepthFrame, Look, SensorCloud
+    from tumortrack.live.viewer.slices import CarriedCt
     from tumortrack.models.model import Model
-    from tumortrack.sense.cloud import CloudConfig
+    from tumortrack.sense.region import Hints
     from tumortrack.tracking.points import PointTable
+
+# Exit statuses; what cannot be used is 2.
+VERDICTS = {"good": 0, "poor": 4, "none": NoEstimate.exit_code}
+_ASK = "Say where the organ is: --at COLUMN ROW, --box or --mask"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Locate(StatedPatient):
+class Locate(FindingOrgan):
     """Locate organ and tumors in one cloud or depth image, or in several of the organ at rest.
+
+    In a depth image the organ is found among table, drapes, instruments and hands, as `track` does
+    it; a cloud is taken for the organ alone, unless --box is given. OUT/index.html shows the
+    answer. Exit status: 0 good; 4 poor (all is written); 3 no estimate (OUT says why); 2 an error.
 
     Attributes:
         model: folder that `train` wrote.
-        cloud: .ply, .pcd or .npz in the camera frame, or a depth .png (with --intrinsics). Several
-            views of an organ that does not move in between (CLOUD CLOUD ... OUT) need --poses; the
-            answer is in the first one's frame.
+        cloud: .ply, .pcd or .npz in the camera frame, or a depth image (with --intrinsics): 16-bit
+            PNG or TIFF, or a TIFF of floats. Several views of an organ that does not move in
+            between (CLOUD CLOUD ... OUT) need --poses; the answer is in the first one's frame.
         out: folder to write.
         more: with several views: the paths that follow; the last one is OUT.
         poses: JSON with fixed_from_camera (4 x 4 rows for each view, in their order), unit (mm or
             m) and frame_id: where the camera was, in a robot's base, say.
+        at: COLUMN ROW of a pixel of the depth image that shows the organ, from 0 at the upper left.
+        mask: image of the depth image's size, 0 where the organ is not.
         grid: voxels along the longest side of the labelled volume, up to 400.
         seed: of the random points and queries.
-        range: keep depths between NEAR and FAR mm. By default a cloud is used as it is, and a depth
-            image is cropped to the range that the model was trained for.
-        unit: of the cloud's numbers.
+        unit: of a cloud's numbers.
+        depth_unit: of a depth image: mm a step. Default: what the intrinsics file says
+            (depth_unit_mm), else 0.1 (a D405's), of floats 1000 (metres). Many cameras have 1.
         intrinsics: JSON with width, height, fx, fy, cx, cy in pixels: once for all views, or again
             and again, once for each in their order.
         map: points of the CT whose present places to write (OUT/points.csv): a .csv with columns
             x,y,z (LPS, mm), or 3D Slicer's .mrk.json or .fcsv. Needs a model of preset clinic.
+        case: the model's case, whose CT the page's slices then show where it lies now (preset
+            clinic); a second or two longer.
         device: auto takes CUDA if there is a GPU.
         overwrite: replace OUT if it exists.
     """
@@ -55,16 +71,22 @@ class Locate(StatedPatient):
     out: Positional[Path]
     more: Positional[tuple[Path, ...]] = ()
     poses: Path | None = None
+    at: tuple[int, int] | None = None
+    mask: Path | None = None
     grid: int = 160
     seed: int = 0
-    range: tuple[float, float] | None = None
     unit: Literal["mm", "m"] = "mm"
+    depth_unit: float | None = None
     intrinsics: UseAppendAction[tuple[Path, ...]] = ()
     map: Path | None = None
+    case: Path | None = None
     device: Device = "auto"
     overwrite: bool = False
 
-    def run(self) -> None:
+    def run(self) -> int:
+        """Its exit status, by the verdict."""
+        from tumortrack.tracking.files import has_no_estimate
+
         _check_grid(self.grid)
         paths = [self.cloud, self.out, *self.more]
         clouds, out = paths[:-1], paths[-1]
@@ -73,64 +95,118 @@ class Locate(StatedPatient):
                 f"{self.model} stands where the model belongs, and {self.cloud} where the cloud. "
                 f"The order is: tumortrack locate {self.cloud} {self.model} {self.out}"
             )
-        store.check_place(out, "run", self.overwrite)
+        overwrite = self.overwrite or has_no_estimate(out)
+        store.check_place(out, "run", overwrite)
         points = self._points()
         frame_id, fixed_from_camera = self._poses(len(clouds))
-        views = list(map(self._read, clouds, self._cameras(len(clouds))))
+        views = [
+            read_view(path, self.unit, camera, self.depth_unit)
+            for path, camera in zip(clouds, self._cameras(len(clouds)), strict=True)
+        ]
+        hints = views[0].hints(self.at, self.mask)
         # What is wrong so far was reported before PyTorch's seconds.
-        notes = tuple(note for _, mine in views for note in mine)
 
-        import numpy as np
-
-        from tumortrack.core.types import Look
-        from tumortrack.registration.kernels import carry
-        from tumortrack.tracking.files import write_estimate
+        from tumortrack.report.run_page import PAGE, Seen, write_run_page
+        from tumortrack.tracking.files import write_estimate, write_no_estimate
         from tumortrack.tracking.points import check_near_organ
         from tumortrack.tracking.tracker import Tracker
         from tumortrack.training.model import load_model
 
         keep_loaded()
         model = load_model(self.model, self.device)
-        say(str(model.patient))
         tracker = Tracker(model)
+        notes = [note for view in views for note in view.notes]
         if points is not None:
             assert tracker.anatomy_ct is not None  # a model with a shape
             box_mm = tracker.anatomy_ct.organ.box_mm
-            far = check_near_organ(points.points_ct, box_mm, str(self.map))
-            notes = (*notes, *points.notes, *far)
-        crop = model.config.scene.cloud
-        first, *others = [(self._cropped(seen, crop), seen) for seen, _ in views]
-        looks = [
-            Look(*one, np.linalg.inv(fixed_from_camera[0]) @ pose)
-            for one, pose in zip(others, fixed_from_camera[1:], strict=True)
-        ]
-        estimate = tracker.locate(first[0], self.grid, self.seed, first[1], looks)
+            notes += [*points.notes, *check_near_organ(points.points_ct, box_mm, str(self.map))]
+        about: dict[str, Any] = {
+            "notes": notes,
+            "input": [],
+            "model": model.provenance,
+            "model_sha256": store.sha256_of(self.model / store.MANIFEST),
+            "cloud_sha256": store.sha256_of(self.cloud),
+        }
+        seen, organs = Seen(content=views[0].content, ct=self._ct(model, tracker.anatomy_ct)), []
+        try:
+            for view in views:
+                organ, done, taken = self._organ(view, model, hints)
+                organs.append(organ)
+                about["input"].append(done)
+                if view is views[0]:
+                    seen = replace(seen, cloud=organ, taken=taken)
+            looks = looks_at(organs, [view.content for view in views], fixed_from_camera)
+            estimate = tracker.locate(organs[0], self.grid, self.seed, views[0].content, looks)
+        except NoEstimate as error:
+            report = {**self._nothing(str(error), views[0], model), **about}
+            add = partial(write_run_page, report=report, estimate=None, seen=seen)
+            write_no_estimate(out, report, overwrite, add)
+            reason = report["quality"]["reason"]
+            raise NoEstimate(f"none: {reason} What was seen: {out / PAGE}") from error
+        report = estimate.report
+        report.update(about)
         if self.poses is not None:
-            estimate.report["looks"] |= {
+            report["looks"] |= {
                 "frame_id": frame_id,
                 "fixed_from_camera": fixed_from_camera[0].tolist(),
                 "poses_sha256": store.sha256_of(self.poses),
                 "clouds_sha256": [store.sha256_of(path) for path in clouds],
             }
         if points is not None and self.map is not None:
-            estimate.report["map"] = {
-                "points": len(points.points_ct),
-                "from": "lps",
-                "to": "camera",
-                "sha256": store.sha256_of(self.map),
-            }
-        estimate.report.update(
-            notes=list(notes),
-            model=model.provenance,
-            model_sha256=store.sha256_of(self.model / store.MANIFEST),
-            cloud_sha256=store.sha256_of(self.cloud),
-        )
-        write_estimate(out, estimate, self.overwrite, points)
-        say_notes(notes)
+            digest, count = store.sha256_of(self.map), len(points.points_ct)
+            report["map"] = {"points": count, "from": "lps", "to": "camera", "sha256": digest}
+        add = partial(write_run_page, report=report, estimate=estimate, seen=seen)
+        write_estimate(out, estimate, overwrite, points, add)
         _say_found(estimate, points, out)
-        seconds = estimate.report["timings"]["total"]
-        compiled = ", with compiling, once on this machine" if carry.stats.cache_misses else ""
-        say(f"written to {out} (camera frame, mm) in {seconds:.2f} s{compiled}.")
+        return VERDICTS[estimate.quality]
+
+    def _organ(
+        self, view: View, model: Model, hints: Hints
+    ) -> tuple[SensorCloud, dict[str, Any], np.ndarray | None]:
+        """See ``View.organ``."""
+        from tumortrack.core.types import SensorCloud
+
+        if isinstance(view.content, SensorCloud) and self.box is None:
+            return *view.alone(self.range), None
+        given = {
+            "--box": self.box,
+            f"--at {' '.join(map(str, self.at or ()))}": self.at,
+            f"--mask {self.mask}": self.mask,
+            "--whole": self.whole,
+        }
+        by = " and ".join(name for name, value in given.items() if value)
+        by = by or "shape, size and place alone"
+        return view.organ(self.region(model), hints, by, self.seed)
+
+    def _nothing(self, reason: str, view: View, model: Model) -> dict[str, Any]:
+        """The report's head, where there is no estimate."""
+        from tumortrack.models.report import report_head
+
+        if view.unit is not None:
+            reason = f"{reason.rstrip('.')}. {_ASK}."
+        return {
+            **report_head(view.content.stamp_ns),
+            "seed": self.seed,
+            "patient": to_builtins(model.patient),
+            "quality": {"verdict": "none", "reason": reason},
+        }
+
+    def _ct(self, model: Model, anatomy_ct: Anatomy | None) -> CarriedCt | None:
+        """The CT of --case, if it has one."""
+        if self.case is None:
+            return None
+        from tumortrack.imaging.case import load_case
+        from tumortrack.live.viewer.slices import CarriedCt
+
+        case = load_case(self.case)
+        same = store.sha256_of(self.case / store.MANIFEST) == model.provenance.get("case_sha256")
+        if not same or anatomy_ct is None:
+            raise InputError(
+                f"--case {self.case} shows nothing here: "
+                + ("the model knows no motion; train one of the preset clinic."
+                   if same else "the model was trained for another case. Give that one.")
+            )  # fmt: skip
+        return None if case.ct is None else CarriedCt(case)
 
     def _points(self) -> PointTable | None:
         """The points of --map; what is wrong with them or the model is said before a wait."""
@@ -172,54 +248,38 @@ class Locate(StatedPatient):
             )
         return given if len(given) == views else given * views
 
-    def _read(
-        self, path: Path, intrinsics: Path | None
-    ) -> tuple[SensorCloud | DepthFrame, tuple[str, ...]]:
-        """What a file holds, and notes."""
-        from tumortrack.sense.cloud import check_cloud
-        from tumortrack.sense.files import read_cloud, read_depth_png
 
-        if path.suffix.lower() == ".png":
-            if intrinsics is None:
-                raise InputError(f"{path} is a depth image: give --intrinsics FILE.json with it.")
-            if self.unit != "mm":
-                raise InputError(
-                    "--unit is for clouds; a depth image's unit stands in its intrinsics file as "
-                    "depth_unit_mm (mm per step)."
-                )
-            return read_depth_png(path, intrinsics), ()
-        if intrinsics is not None:
-            raise InputError(f"--intrinsics is for depth images (.png); {path} is a cloud.")
-        cloud, notes = read_cloud(path, self.unit)
-        check_cloud(cloud)  # before the crop, which would only say that nothing lies in range
-        return cloud, notes
+def looks_at(
+    organs: Sequence[SensorCloud],
+    seen: Sequence[SensorCloud | DepthFrame],
+    fixed_from_camera: Sequence[Affine],
+) -> list[Look]:
+    """All views but the first, whose frame is the answer's."""
+    import numpy as np
 
-    def _cropped(self, seen: SensorCloud | DepthFrame, trained: CloudConfig) -> SensorCloud:
-        import numpy as np
+    from tumortrack.core.types import Look
 
-        from tumortrack.core.types import SensorCloud
-        from tumortrack.sense.cloud import CloudConfig, cloud_from_depth, crop_cloud
-
-        near, far = self.range or (trained.near_mm, trained.far_mm)
-        if isinstance(seen, SensorCloud):
-            return crop_cloud(seen, near, far) if self.range else seen
-        crop = CloudConfig(near_mm=near, far_mm=far, n_points=trained.n_points)
-        return cloud_from_depth(seen, crop, np.random.default_rng(self.seed))
+    return [
+        Look(organ, content, np.linalg.inv(fixed_from_camera[0]) @ pose)
+        for organ, content, pose in list(
+            zip(organs, seen, fixed_from_camera or [np.eye(4)], strict=True)
+        )[1:]
+    ]
 
 
 def _say_found(estimate: Estimate, points: PointTable | None, out: Path) -> None:
-    """What is where, and how far that is to be trusted."""
-    from tumortrack.core.estimate import NO_CHECK_FAILED, UNVERIFIED
+    """How far it is to be trusted, and what is where."""
+    from tumortrack.core.estimate import verdict_words
     from tumortrack.models.margins import margin_words, stated_radius
+    from tumortrack.registration.kernels import carry
+    from tumortrack.report.run_page import PAGE, part_rows, row_words
 
-    margin = estimate.report.get("margin", {})
-    for name, part in estimate.report["parts"].items():
-        said = "not found"
-        if part["found"]:
-            x, y, z = part["center_mm"]
-            said = f"{part['volume_ml']:.1f} ml, centre ({x:.1f}, {y:.1f}, {z:.1f}) mm"
-            said += f", {radius.words}" if (radius := stated_radius(margin, name)) else ""
-        say(f"{name}: {said}")
+    report = estimate.report
+    margin = report.get("margin", {})
+    say(verdict_words(estimate.quality, estimate.reason))
+    say(str(estimate.patient))
+    for row in part_rows(report):
+        say(row_words(row))
     if points is not None:
         radius = stated_radius(margin, "map")
         said = f"; {radius.words} for all of them" if radius else ""
@@ -227,10 +287,12 @@ def _say_found(estimate: Estimate, points: PointTable | None, out: Path) -> None
         say(f"{len(points.points_ct)} points of the CT: their places are in {file}{said}")
     if not margin.get("stated"):
         say(margin_words(margin))
-    if estimate.quality == "good":
-        say(f"{NO_CHECK_FAILED}; {UNVERIFIED}.")
-    else:
-        say(f"POOR: {estimate.reason}. Do not rely on it.")
+    for view in report["input"]:
+        say(view["words"])
+    say_notes(report["notes"])
+    seconds = report["timings"]["total"]
+    compiled = ", with compiling, once on this machine" if carry.stats.cache_misses else ""
+    say(f"written to {out} (camera frame, mm) in {seconds:.2f} s{compiled}; look at {out / PAGE}.")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -17,21 +17,23 @@ from tumortrack.cli.cases import Export, Prepare, Simulate
 from tumortrack.cli.demo import Demo
 from tumortrack.cli.doctor import Doctor
 from tumortrack.cli.inspection import Inspect
-from tumortrack.cli.locate import Evaluate, Locate
+from tumortrack.cli.locate import VERDICTS, Evaluate, Locate
 from tumortrack.cli.margins import Margins
 from tumortrack.cli.models import Compile, Onnx
 from tumortrack.cli.plan import Plan
 from tumortrack.cli.resect import Resect
 from tumortrack.cli.track import Track
 from tumortrack.cli.training import Train
-from tumortrack.core.errors import InputError, PackageError, StorageError, TumortrackError
+from tumortrack.core.errors import InputError, PackageError, TumortrackError
 
 
 @runtime_checkable
 class Command(Protocol):
     """The parsed options of a command."""
 
-    def run(self) -> None: ...
+    def run(self) -> int | None:
+        """None, or an exit status."""
+        ...
 
 
 _COMMANDS: tuple[type[Command], ...] = (
@@ -57,10 +59,11 @@ def main() -> None:
     # PyTorch and its kin make objects by the hundred thousand that live to the end: to look through
     # them for garbage again and again is a tenth of the time of their import.
     gc.set_threshold(_OBJECTS_A_COLLECTION)
-    if code := run(sys.argv[1:]):
+    code = run(sys.argv[1:])
+    if sys.argv[1:2] == _LEFT_AT_ONCE and code in VERDICTS.values():
+        leave(code)
+    if code:
         sys.exit(code)
-    if sys.argv[1:2] == _LEFT_AT_ONCE:
-        leave()
 
 
 def run(arguments: list[str]) -> int:
@@ -69,7 +72,7 @@ def run(arguments: list[str]) -> int:
         print(f"tumortrack {tumortrack.__version__}")
         return 0
     try:
-        _parse(arguments).run()
+        code = _parse(arguments).run() or 0
         sys.stdout.flush()
     except TumortrackError as error:
         print(f"tumortrack: {error}", file=sys.stderr)
@@ -87,16 +90,16 @@ def run(arguments: list[str]) -> int:
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         where = "standard output or the disk" if full else error.filename
         print(f"tumortrack: {where}: {error.strerror}.", file=sys.stderr)
-        return StorageError.exit_code if full else InputError.exit_code
-    return 0
+        return InputError.exit_code
+    return code
 
 
-def leave() -> NoReturn:
+def leave(code: int = 0) -> NoReturn:
     """End the process at once, when everything is written: taking apart what was loaded, object by
     object, takes a fifth of a second. Functions registered for Python's end are not called."""
     if sys.stderr is not None:  # as after 2>&-
         sys.stderr.flush()
-    os._exit(0)
+    os._exit(code)
 
 
 def _commands(chosen: str) -> dict[str, Callable[..., Command]]:

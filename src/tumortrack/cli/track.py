@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 from tyro.conf import Positional
 
 from tumortrack.cli.console import Device, console, keep_loaded, say
-from tumortrack.cli.stated import StatedPatient
+from tumortrack.cli.finding import FindingOrgan
 from tumortrack.core import store
 from tumortrack.core.errors import InputError, StorageError
 
@@ -50,21 +50,15 @@ class Arms:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Following(StatedPatient):
+class Following(FindingOrgan):
     """Options of commands that follow an organ.
 
     Attributes:
-        range: keep depths between NEAR and FAR mm (default: those that the model has learned).
-        box: keep what lies in a box: two opposite corners X Y Z X Y Z, camera frame, mm.
-        whole: what is in range and box is the organ alone; do not look for it among other things.
         intrinsics: JSON with the camera's width, height, fx, fy, cx, cy in pixels, instead of what
             the source says, and perhaps a correction of depths, as `calibrate camera` writes it.
         device: auto takes CUDA if there is a GPU.
     """
 
-    range: tuple[float, float] | None = None
-    box: tuple[float, float, float, float, float, float] | None = None
-    whole: bool = False
     intrinsics: Path | None = None
     device: Device = "auto"
 
@@ -227,15 +221,13 @@ class Track(Following):
     def _loop_config(self, model: Model) -> LoopConfig:
         from tumortrack.live.loop import LoopConfig
         from tumortrack.sense.files import read_camera
-        from tumortrack.tracking.tracker import FollowerConfig, region_for
+        from tumortrack.tracking.tracker import FollowerConfig
 
-        box = None if self.box is None else (self.box[:3], self.box[3:])
-        region = region_for(model, range_mm=self.range, box_mm=box, whole=self.whole)
         follower = FollowerConfig(rescan_s=self.rescan, smoothing_s=self.smoothing, seed=self.seed)
         intrinsics, correction = read_camera(self.intrinsics)
         first_s = max(self.seconds, _OPENING_S, 2 * self.stale)
         return LoopConfig(
-            region=region,
+            region=self.region(model),
             follower=follower,
             intrinsics=intrinsics,
             correction=correction,

@@ -56,4 +56,4 @@ class Aborted(TumortrackError):
 class StorageError(TumortrackError):
     """The disk refused a write; what was there before is still whole."""
 
-    exit_code = 4
+    exit_code = 2

@@ -25,6 +25,14 @@ FAR_MM = 5.0
 NO_CHECK_FAILED, UNVERIFIED = "good: no check failed", "its place is not verified"
 
 
+def verdict_words(verdict: Quality, reason: str) -> str:
+    """A sentence that begins with the verdict; ``reason``: why it is not good."""
+    if verdict == "good":
+        return f"{NO_CHECK_FAILED}; {UNVERIFIED}."
+    said = f"{verdict}: {reason.rstrip('.')}."
+    return f"{said} Do not rely on it." if verdict == "poor" else said
+
+
 @runtime_checkable
 class Motion(Protocol):
     """One frame's correspondence: undeformed CT (LPS, mm) <-> camera frame (mm). It takes any

@@ -139,3 +139,17 @@ def spread_over(
     from trimesh.remesh import subdivide_to_size  # slow to import
 
     return subdivide_to_size(vertices, coarse, longest_mm)[0]
+
+
+def plane_section(
+    vertices: Points, faces: Faces, normal: Vector, through: Vector
+) -> Float[np.ndarray, "m 2 3"]:
+    """Where triangles cross the plane through a point: a segment of each that does."""
+    height = (vertices - through) @ normal
+    above = height[faces] > 0
+    faces = faces[above.any(axis=1) & ~above.all(axis=1)]
+    start, end = vertices[faces], vertices[np.roll(faces, -1, axis=1)]
+    here, there = height[faces], height[np.roll(faces, -1, axis=1)]
+    crosses = (here > 0) != (there > 0)  # two edges of each
+    share = here[crosses] / (here - there)[crosses]
+    return (start[crosses] + share[:, None] * (end - start)[crosses]).reshape(-1, 2, 3)

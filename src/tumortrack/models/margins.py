@@ -20,7 +20,7 @@ from tumortrack.core.errors import ArtifactError, InputError
 METHOD = 3
 NAME = "margins.json"
 Kind = Literal["tumor", "organ", "map"]
-UNKNOWN = "no margin is known for this model (tumortrack margins)"
+UNKNOWN = "the model was not calibrated (tumortrack margins)"
 
 
 class Radius(Config, frozen=True):
@@ -252,7 +252,7 @@ def margin_words(said: dict[str, Any] | None) -> str:
     """The tumors' margins for people, or that there are none."""
     stated = (said or {}).get("stated")
     if not stated:
-        return f"no margin is stated: {(said or {}).get('reason', UNKNOWN)}"
+        return f"no margin: {(said or {}).get('reason', UNKNOWN)}"
     radii = {name: mm for name, mm in stated[-1]["mm"].items() if name.startswith("tumor_")}
     sizes = ", ".join(f"{name} {mm:.1f} mm" for name, mm in radii.items())
     return f"{100 * stated[-1]['confidence']:g} % margin: {sizes}"

@@ -48,7 +48,7 @@ class Frame:
     ) -> dict[str, Any]:
         """report.json. ``distances_mm``: of the observed points from the estimated surface."""
         return {
-            **_head(self.cloud.stamp_ns),
+            **report_head(self.cloud.stamp_ns),
             "seed": self.seed,
             "points": len(self.cloud.points_mm),
             **more,
@@ -61,7 +61,8 @@ class Frame:
         }
 
 
-def _head(stamp_ns: int) -> dict[str, Any]:
+def report_head(stamp_ns: int) -> dict[str, Any]:
+    """What every report begins with."""
     about = {"tumortrack": tumortrack.__version__, "units": "mm", "frame": "camera"}
     return {**about, "stamp_ns": stamp_ns}
 
@@ -119,5 +120,5 @@ def estimate_of(
     points_mm = transform_points(camera_from_index, index)
     inside = OccupancyCloud(points_mm, labels.reshape(-1)[voxels], np.ones(len(voxels)), stamp_ns)
     parts = describe_parts(tuple(meshes), meshes, inside)
-    about = {**_head(stamp_ns), "voxel_mm": float(camera_from_index[0, 0]), "parts": parts}
+    about = {**report_head(stamp_ns), "voxel_mm": float(camera_from_index[0, 0]), "parts": parts}
     return Estimate(inside, CameraLabels(labels, camera_from_index), meshes, {**about, **report})

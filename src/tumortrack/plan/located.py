@@ -17,11 +17,11 @@ from tumortrack.core.geometry import rigid
 from tumortrack.core.mesh_files import read_mesh
 from tumortrack.core.organ import KIDNEY, is_tumor, organ_first, organ_name
 from tumortrack.core.patient import NOBODY, Patient
-from tumortrack.core.store import read_json, read_manifest
+from tumortrack.core.store import MANIFEST, read_json
 from tumortrack.core.types import ORGAN, Mesh, OccupancyCloud
 from tumortrack.plan.values import POOR_ESTIMATE, Located, name_of, organ_surface
 from tumortrack.sense.ply import parse_ply_properties
-from tumortrack.tracking.files import MARGIN
+from tumortrack.tracking.files import MARGIN, read_report
 
 STAND_MM = 120.0  # the organ's lowest point over the table, where it is not known
 
@@ -91,10 +91,10 @@ class _Report(msgspec.Struct):
 def read_run(folder: Path) -> Located:
     """What `locate` wrote, camera frame; a surface's uncertainty is that of the nearest points.
     Raises ArtifactError: no such run, damaged, or without its cloud."""
-    manifest = read_manifest(folder, "run")
+    stored, manifest = read_report(folder), read_json(folder / MANIFEST)
     path = folder / "occupancy.ply"
     try:
-        report = msgspec.convert(read_json(folder / "report.json"), _Report)
+        report = msgspec.convert(stored, _Report)
         content = path.read_bytes()
         table = parse_ply_properties(content, str(path), ("x", "y", "z", "label", "probability"))
     except (OSError, InputError, msgspec.ValidationError) as error:

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
-import trimesh
 from jaxtyping import Bool, Float
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -18,9 +17,9 @@ from matplotlib.figure import Figure
 from matplotlib.font_manager import FontProperties
 from matplotlib.legend import Legend
 from matplotlib.text import Text
-from trimesh.intersections import mesh_plane
 
 from tumortrack.core import colours
+from tumortrack.core.geometry import plane_section
 from tumortrack.core.store import write_atomically
 from tumortrack.core.types import FIRST_TUMOR, Mesh
 from tumortrack.imaging.raster import voxelise
@@ -154,8 +153,7 @@ def section(
     mesh: Mesh, view: ParallelView, through_mm: Float[np.ndarray, " 3"]
 ) -> Float[np.ndarray, "n 2 2"]:
     """Outline of a mesh in the view's plane through a point: segments as (right, down) mm."""
-    solid = trimesh.Trimesh(mesh.vertices_mm, mesh.faces, process=False)
-    ends_mm = mesh_plane(solid, view.axes[2], through_mm)
+    ends_mm = plane_section(mesh.vertices_mm, mesh.faces, view.axes[2], through_mm)
     return view.project(ends_mm.reshape(-1, 3))[:, :2].reshape(-1, 2, 2)
 
 

@@ -11,12 +11,11 @@ from dataclasses import dataclass
 from weakref import WeakKeyDictionary
 
 import numpy as np
-import trimesh
 from jaxtyping import Float, Float32, UInt8
 from PIL import Image
 
 from tumortrack.core.colours import Colour
-from tumortrack.core.geometry import transform_points
+from tumortrack.core.geometry import transform_points, triangles_of
 from tumortrack.core.types import Mesh
 from tumortrack.report.renderer_kernels import Triangles, nearest, shade
 
@@ -239,12 +238,21 @@ def corner_normals(mesh: Mesh) -> Float32[np.ndarray, "f 3 3"]:
     beyond a crease."""
     if (known := _NORMALS.get(mesh)) is not None:
         return known
-    joined = trimesh.Trimesh(mesh.vertices_mm, mesh.faces)  # corners at the same place are one
-    smooth = trimesh.graph.smooth_shade(joined, _CREASE_RAD, facet_minarea=None)
-    alone = [np.arange(len(mesh.faces))]  # where no face has a neighbour
-    order = smooth.metadata.get("original_components", alone)
-    normals = np.empty((len(mesh.faces), 3, 3), np.float32)
-    normals[np.concatenate(order)] = smooth.vertex_normals[smooth.faces]
+    place = np.unique(mesh.vertices_mm, axis=0, return_inverse=True)[1].reshape(-1)[mesh.faces]
+    corner, face = place.ravel(), np.repeat(np.arange(len(mesh.faces)), 3)
+    weighted = triangles_of(mesh.vertices_mm, mesh.faces)[1]
+    facing = weighted / np.maximum(np.linalg.norm(weighted, axis=1, keepdims=True), 1e-12)
+    # Each corner beside every face about the same place.
+    order, count = np.argsort(corner, kind="stable"), np.bincount(corner)
+    mine = np.repeat(np.arange(len(corner)), count[corner])
+    first = (np.cumsum(count) - count)[corner]
+    step = np.arange(len(mine)) - np.repeat(np.cumsum(count[corner]) - count[corner], count[corner])
+    beside = face[order][first[mine] + step]
+    smooth = (facing[beside] * facing[face[mine]]).sum(1) > np.cos(_CREASE_RAD)
+    each = [np.bincount(mine, smooth * weighted[beside, n], len(corner)) for n in range(3)]
+    normals = np.stack(each, axis=1).reshape(-1, 3, 3)
+    normals /= np.maximum(np.linalg.norm(normals, axis=2, keepdims=True), 1e-12)
+    normals = normals.astype(np.float32)
     _NORMALS[mesh] = normals
     return normals
 

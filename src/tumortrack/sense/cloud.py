@@ -14,6 +14,9 @@ from tumortrack.sense.units import Unit, unit_advice
 
 FEWEST_POINTS = 200  # fewer do not determine an organ's shape and pose
 _FARTHEST_MM = 20_000.0  # beyond any depth camera
+_NEAREST_MM = 40.0  # a D405, the nearest of all, sees nothing nearer
+# mm: of the D405; of other depth cameras; whole mm; floats in metres.
+_DEPTH_UNITS_MM = (0.1, 0.125, 0.25, 1.0, 1000.0)
 _MOST_FAR = 0.01  # of a cloud's points: more are no flaws of single ones
 _LONGEST_M = 0.6  # of an organ; in inches no organ's side is shorter
 # Standard deviation along the second axis; an organ's is more than 10 mm, and half of the first.
@@ -156,6 +159,41 @@ def check_cloud(cloud: SensorCloud) -> None:
             "y down, z forward; turn the cloud into that frame.",
             (Likely(Cause.FRAME),),
         )
+
+
+def check_depth_unit(frame: DepthFrame, unit_mm: float, near_mm: float, far_mm: float) -> None:
+    """Question the unit of a depth image, mm a step, where it cannot be right: too much is nearer
+    than any camera sees; or next to nothing lies in the range, and with another unit it does.
+
+    Raises:
+        InputError: as above; it names the unit that fits.
+    """
+    seen = frame.depth_mm[np.isfinite(frame.depth_mm)]
+    if not len(seen):
+        return
+
+    def in_range(unit: float) -> int:
+        depth_mm = seen * (unit / unit_mm)
+        return int(((depth_mm > near_mm) & (depth_mm < far_mm)).sum())
+
+    low, high = np.quantile(seen, (0.05, 0.95))
+    likely = max(_DEPTH_UNITS_MM, key=in_range)
+    fits = in_range(likely) >= FEWEST_POINTS and likely != unit_mm
+    impossible = low < _NEAREST_MM
+    if not impossible and (in_range(unit_mm) >= FEWEST_POINTS or not fits):
+        return
+    what = f"with {unit_mm:g} mm a step most depths run from {low:.4g} to {high:.4g} mm, "
+    what += "nearer than any depth camera sees" if impossible else (
+        f"and hardly any lies between {near_mm:g} and {far_mm:g} mm"
+    )  # fmt: skip
+    if not fits:
+        raise InputError(f"{what}. Say how many mm a step of this image is (--depth-unit).")
+    low, high = (value * likely / unit_mm for value in (low, high))
+    move = "" if impossible else ". If the unit is right, move the camera, or give --range"
+    raise InputError(
+        f"{what}. Did you mean {likely:g} mm a step ({low:.4g} to {high:.4g} mm)? Give "
+        f"--depth-unit {likely:g}{move}."
+    )
 
 
 def draw_some(available: int, wanted: int, rng: np.random.Generator) -> np.ndarray:

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Bool, Float32
 
 from tumortrack.core.config import Config, from_builtins
 from tumortrack.core.errors import InputError
@@ -27,6 +27,7 @@ from tumortrack.sense.cloud import seen_points
 from tumortrack.sense.ply import parse_ply_properties
 
 CLOUD_SUFFIXES = (".ply", ".pcd", ".npz")
+DEPTH_SUFFIXES = (".png", ".tif", ".tiff")
 DEPTH_UNIT_MM = 0.1  # the D405's default
 LARGEST_FILE = 256 * 2**20  # bytes, also of what a compressed file unpacks to
 _PINHOLE_KEYS = ("width", "height", "fx", "fy", "cx", "cy")
@@ -265,35 +266,65 @@ def intrinsics_json(intrinsics: Intrinsics) -> dict[str, Any]:
 
 
 def read_depth_png(path: Path, intrinsics_path: Path) -> DepthFrame:
-    """A 16-bit depth image; 0 is no return. One step is what the intrinsics file states, else 0.1
-    mm; then what that file states as correction.
+    """What ``read_depth`` reads, alone."""
+    return read_depth(path, intrinsics_path)[0]
+
+
+def read_depth(
+    path: Path, intrinsics_path: Path, unit_mm: float | None = None
+) -> tuple[DepthFrame, float]:
+    """A depth image as a 16-bit PNG or TIFF, or a TIFF of floats, and its unit: the mm of one step.
+
+    0, and what is no finite number, is no return. The unit is ``unit_mm``, else what the intrinsics
+    file states as depth_unit_mm, else 0.1 for whole numbers, and 1000 (metres) for floats; then
+    comes what that file states as correction. ``cloud.check_depth_unit`` tells whether it can be.
 
     Raises:
-        InputError: not a single-channel 16-bit PNG, or of another size than the intrinsics.
+        InputError: no such image, of another size than the intrinsics, or a unit that is none.
     """
+    intrinsics, data = _camera(intrinsics_path)
+    steps, mode = _image(path, (intrinsics.width, intrinsics.height))
+    if not mode.startswith(("I", "F")):
+        raise InputError(
+            f"{path} has pixels of the kind {mode}; a depth image must be 16-bit grey, or floats "
+            "in a TIFF."
+        )
+    default = DEPTH_UNIT_MM if mode.startswith("I") else 1000.0
+    stated = data.get("depth_unit_mm", default) if unit_mm is None else unit_mm
+    unit_mm = _numbers(stated, "depth_unit_mm", intrinsics_path)[0]
+    if not 0 < unit_mm <= 1000:
+        raise InputError(f"depth_unit_mm is {unit_mm}; it must lie in 0..1000 mm per step.")
+    with np.errstate(over="ignore"):
+        depth_mm = steps.astype(np.float32) * np.float32(unit_mm)
+    depth_mm[~(np.isfinite(depth_mm) & (depth_mm > 0))] = np.nan
+    return DepthFrame(_correction(data, intrinsics_path).corrected(depth_mm), intrinsics), unit_mm
+
+
+def read_mask(path: Path, size: tuple[int, int]) -> Bool[np.ndarray, "h w"]:
+    """True where an image (PNG, TIFF or BMP) is not 0; transparency does not count. InputError: no
+    such image, or not of this width and height."""
+    values, _ = _image(path, size)
+    return np.not_equal(values, 0).reshape(*values.shape[:2], -1).any(axis=2)
+
+
+def _image(path: Path, size: tuple[int, int]) -> tuple[np.ndarray, str]:
+    """An image's values without its transparency, and Pillow's name of its kind."""
     from PIL import Image
 
-    intrinsics, data = _camera(intrinsics_path)
-    stated = data.get("depth_unit_mm", DEPTH_UNIT_MM)
-    unit_mm = _numbers(stated, "depth_unit_mm", intrinsics_path)[0]
-    if not 0 < unit_mm <= 100:
-        raise InputError(f"depth_unit_mm is {unit_mm}; it must lie in 0..100 mm per step.")
     try:
-        image = Image.open(io.BytesIO(read_file(path, LARGEST_FILE)), formats=["PNG"])
-        size, mode = image.size, image.mode  # from the header: nothing is decoded yet
-        good = size == (intrinsics.width, intrinsics.height) and mode.startswith("I")
-        steps = np.asarray(image, dtype=np.float32) if good else None
+        content = io.BytesIO(read_file(path, LARGEST_FILE))
+        image = Image.open(content, formats=["PNG", "TIFF", "BMP"])
+        if image.size == size:  # from the header: nothing was decoded before
+            opaque = image.convert("RGB") if image.mode in ("RGBA", "LA", "PA") else image
+            return np.asarray(opaque), image.mode
     except InputError:
         raise
     except Exception as error:  # Pillow raises anything on a damaged file
-        raise InputError(f"{path} cannot be read as a PNG image: {error}.") from error
-    if steps is None:
-        raise InputError(
-            f"{path} is {size[0]} x {size[1]}, mode {mode}; it must be 16-bit grey and "
-            f"{intrinsics.width} x {intrinsics.height}, as {intrinsics_path} says."
-        )
-    depth_mm = np.where(steps > 0, steps * np.float32(unit_mm), np.float32(np.nan))
-    return DepthFrame(_correction(data, intrinsics_path).corrected(depth_mm), intrinsics)
+        raise InputError(f"{path} cannot be read as a PNG or TIFF image: {error}.") from error
+    raise InputError(
+        f"{path} is {image.width} x {image.height}; it must be {size[0]} x {size[1]}, as the "
+        "intrinsics say."
+    )
 
 
 def depth_png(frame: DepthFrame, compress_level: int = 6) -> bytes:

@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from tumortrack.core import store
-from tumortrack.core.errors import InputError
-from tumortrack.core.estimate import Estimate
-from tumortrack.core.mesh_files import write_mesh
-from tumortrack.core.organ import is_tumor
-from tumortrack.imaging.nifti import write_nifti
+from tumortrack.core.errors import ArtifactError, InputError
+from tumortrack.core.estimate import Estimate, Quality
+from tumortrack.core.geometry import RAS_FROM_LPS
+from tumortrack.core.mesh_files import read_mesh, write_mesh
+from tumortrack.core.organ import is_tumor, organ_in
+from tumortrack.core.patient import patient_in
+from tumortrack.core.types import CameraLabels, OccupancyCloud
+from tumortrack.imaging.nifti import read_nifti, write_nifti
 from tumortrack.imaging.segmentation_files import segments, write_seg_nrrd
 from tumortrack.models.margins import stated_radius
-from tumortrack.sense.ply import write_cloud_ply
+from tumortrack.sense.ply import parse_ply_properties, write_cloud_ply
 from tumortrack.tracking.points import PointTable, camera_table
 from tumortrack.tracking.shells import exact_margin
 
@@ -22,13 +27,18 @@ MARGIN = "_margin"  # ends the names of shells
 
 
 def write_estimate(
-    folder: Path, estimate: Estimate, overwrite: bool = False, points: PointTable | None = None
+    folder: Path,
+    estimate: Estimate,
+    overwrite: bool = False,
+    points: PointTable | None = None,
+    add: Callable[[Path], None] = lambda folder: None,
 ) -> None:
     """occupancy.ply (points with label and probability and, where the estimate knows the way back,
     their place in the CT), labels.nii.gz (voxel -> camera frame, mm), labels.seg.nrrd (the same for
     3D Slicer), kidney.ply (or of the organ's name), tumor_1.ply, ..., structures and report.json;
     tumor_1_margin.ply, ..., the shells of the highest confidence, where margins are stated;
-    points.csv, the given ``points`` of the CT and where they are now; all or nothing.
+    points.csv, the given ``points`` of the CT and where they are now; and what ``add`` writes into
+    the folder that it is called with; all or nothing.
 
     Raises InputError: the folder exists and ``overwrite`` is False; points without a motion; an
     estimate without a volume;
@@ -57,8 +67,71 @@ def write_estimate(
         if points is not None:
             table = camera_table(points, estimate.motion)
             store.write_atomically(aside / "points.csv", table)
-        store.write_json(aside / "report.json", estimate.report)
-        store.seal(aside, "run", {"report": "report.json"}, frame="camera")
+        add(aside)
+        _seal(aside, estimate.report, estimate.quality)
+
+
+def write_no_estimate(
+    folder: Path, report: dict[str, Any], overwrite: bool, add: Callable[[Path], None]
+) -> None:
+    """The folder of a cloud in which nothing was located: report.json, whose ``quality`` says why,
+    and what ``add`` writes into it. Raises as ``write_estimate``."""
+    with store.new_folder(folder, overwrite) as aside:
+        add(aside)
+        _seal(aside, report, "none")
+
+
+def _seal(folder: Path, report: dict[str, Any], verdict: Quality) -> None:
+    store.write_json(folder / "report.json", report)
+    store.seal(folder, "run", {"report": "report.json", "verdict": verdict}, frame="camera")
+
+
+def has_no_estimate(folder: Path) -> bool:
+    """Whether a run's folder says only that nothing was located; the next run may replace it."""
+    path = folder / store.MANIFEST
+    return path.is_file() and store.read_json(path).get("verdict") == "none"
+
+
+def read_report(folder: Path) -> dict[str, Any]:
+    """report.json of a run's folder. Raises ArtifactError: no such folder, or damaged; or nothing
+    was located in it."""
+    store.read_manifest(folder, "run")
+    report = store.read_json(folder / "report.json")
+    if has_no_estimate(folder):
+        reason = str(report["quality"]["reason"]).rstrip(".")
+        raise ArtifactError(f"{folder} has no estimate: {reason}. Locate again.")
+    return report
+
+
+def read_estimate(folder: Path) -> Estimate:
+    """What ``write_estimate`` wrote, all but its motion, which is the model's to know. Raises
+    ArtifactError: no such folder, damaged, or nothing was located in it."""
+    report, path = read_report(folder), folder / "occupancy.ply"
+    try:
+        parts, quality, structures = (
+            report["parts"],
+            report["quality"],
+            report.get("structures", ()),
+        )
+        names = [name for name, part in parts.items() if part["found"]]
+        table = parse_ply_properties(
+            path.read_bytes(), str(path), ("x", "y", "z", "label", "probability")
+        )
+        volume = read_nifti(folder / "labels.nii.gz")
+        meshes = {name: read_mesh(folder / f"{name}.ply") for name in (*names, *structures)}
+        return Estimate(
+            OccupancyCloud(table[:, :3], table[:, 3], table[:, 4], report["stamp_ns"]),
+            CameraLabels(volume.array, RAS_FROM_LPS @ volume.lps_from_index),
+            {name: meshes[name] for name in names},
+            report,
+            quality=quality["verdict"],
+            reason=quality["reason"],
+            patient=patient_in(report.get("patient"), str(folder)),
+            organ=organ_in(report.get("organ"), str(folder)),
+            structures={name: meshes[name] for name in structures},
+        )
+    except (KeyError, TypeError, OSError, InputError) as error:
+        raise ArtifactError(f"{folder} is no whole run: {error}. Locate again.") from error
 
 
 def _places_in_ct(estimate: Estimate) -> dict[str, np.ndarray]:

@@ -12,7 +12,7 @@ from jaxtyping import Float, Float32, Float64, UInt8
 from tumortrack.core.colours import Colour, label_colours
 from tumortrack.core.errors import InputError
 from tumortrack.core.estimate import Motion
-from tumortrack.core.geometry import spacing_mm, transform_points
+from tumortrack.core.geometry import plane_section, spacing_mm, transform_points
 from tumortrack.core.organ import organ_name
 from tumortrack.core.types import Mesh
 from tumortrack.imaging.case import Case, load_case
@@ -51,18 +51,9 @@ class SlicePlane:
 
     def section(self, mesh: Mesh) -> Float64[np.ndarray, "m 2 2"]:
         """Where a surface crosses the plane, as segments; (column, row) in mm from the centre."""
-        height_mm = (mesh.vertices_mm - self.centre_mm) @ np.cross(self.across, self.down)
-        above = height_mm[mesh.faces] > 0
-        # Not trimesh: its surfaces refer to themselves, and fill the memory until they are
-        # collected, a megabyte a slice.
-        cut = above.any(1) & ~above.all(1)
-        faces, above = mesh.faces[cut], above[cut]
-        alone = np.where(above.sum(1) == 1, above.argmax(1), above.argmin(1))  # on its side
-        corners = np.take_along_axis(faces, (alone[:, None] + np.arange(3)) % 3, axis=1)
-        places_mm, heights = mesh.vertices_mm[corners] - self.centre_mm, height_mm[corners]
-        share = heights[:, :1] / (heights[:, :1] - heights[:, 1:])
-        ends_mm = places_mm[:, :1] + share[..., None] * (places_mm[:, 1:] - places_mm[:, :1])
-        return ends_mm @ np.stack([self.across, self.down], axis=1)
+        normal = np.cross(self.across, self.down)
+        lines = plane_section(mesh.vertices_mm, mesh.faces, normal, self.centre_mm)
+        return (lines - self.centre_mm) @ np.stack([self.across, self.down], axis=1)
 
 
 class CarriedCt:
@@ -118,15 +109,27 @@ def slice_picture(
     """The CT in a plane before the camera, over it the outlines of surfaces (camera frame) in
     their colour and width (pixels), a bar of 10 mm, and ``note`` in the corner. None where
     ``motion`` knows no way back."""
-    from PIL import Image, ImageDraw
-
     sampled = pixels // _COARSER
     points_ct = motion.back(plane.points(sampled))
     if points_ct is None:
         return None
-    coarse = Image.fromarray(ct.picture(points_ct).reshape(sampled, sampled, 3))
+    return outlined(
+        ct.picture(points_ct).reshape(sampled, sampled, 3), plane, outlines, pixels, note
+    )
+
+
+def outlined(
+    picture: UInt8[np.ndarray, "s s *rgb"],
+    plane: SlicePlane,
+    outlines: Iterable[tuple[Mesh, Colour, int]],
+    pixels: int,
+    note: str = "",
+) -> UInt8[np.ndarray, "h w 3"]:
+    """What lies in the plane, with outlines, bar and note as of ``slice_picture``."""
+    from PIL import Image, ImageDraw
+
     fine = _FINER * pixels  # lines are drawn finer and then shrunk, so that they are smooth
-    image = coarse.resize((fine, fine), Image.Resampling.BILINEAR)
+    image = Image.fromarray(picture).resize((fine, fine), Image.Resampling.BILINEAR).convert("RGB")
     draw = ImageDraw.Draw(image)
     per_mm = fine / plane.side_mm
     for mesh, colour, width in outlines:

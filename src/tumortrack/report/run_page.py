@@ -1,0 +1,352 @@
+"""What `locate` found, to look at: a picture and a page that loads nothing from anywhere.
+
+Without matplotlib, whose import would take as long as all of this.
+"""
+
+from __future__ import annotations
+
+import base64
+import html
+import io
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, UInt8
+from PIL import Image, ImageDraw, ImageFont
+
+from tumortrack.core import colours
+from tumortrack.core.estimate import Estimate, Quality, verdict_words
+from tumortrack.core.geometry import transform_points
+from tumortrack.core.organ import is_tumor
+from tumortrack.core.patient import patient_in
+from tumortrack.core.store import write_atomically
+from tumortrack.core.types import DepthFrame, SensorCloud
+from tumortrack.live.viewer.slices import ORIENTATIONS, CarriedCt, outlined, plane_through
+from tumortrack.models.margins import margin_words, stated_radius
+from tumortrack.report.renderer import Body, ParallelView, render, rgb
+from tumortrack.sense.camera import deproject
+
+PAGE, PICTURE = "index.html", "picture.png"
+_WIDE, _ASPECT = 640, 1.25  # pixels of a view
+_SLICE = 480
+_ROW, _ACROSS, _EDGE = 375, 2200, 24  # pixels of the picture: a row's height, all across, borders
+_MOST_POINTS = 6000
+_MOST_TUMORS = 6  # with slices
+_NEAR_MM = 1.0  # points so near to a slice are shown in it
+_BAR_MM = 20.0
+_STATE_COLOURS = {"good": colours.GOOD, "poor": colours.POOR, "none": colours.NONE}
+_TITLES = {"good": "GOOD", "poor": "POOR", "none": "NONE: no estimate"}
+Panel = tuple[str, Image.Image]  # a caption and what it says
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """What a run's page shows besides the estimate.
+
+    Attributes:
+        cloud: the organ's points, in which it was located.
+        content: all that the camera saw.
+        taken: of a depth image, as of ``sense.region.Region``: 0 where it was taken for the organ.
+        ct: for slices of the CT where it lies now; None: slices show labels.
+    """
+
+    cloud: SensorCloud | None = None
+    content: DepthFrame | SensorCloud | None = None
+    taken: UInt8[np.ndarray, "h w"] | None = None
+    ct: CarriedCt | None = None
+
+
+def write_run_page(
+    folder: Path, report: dict[str, Any], estimate: Estimate | None, seen: Seen
+) -> None:
+    """index.html and picture.png; without an estimate what the camera saw, and why there is none.
+
+    ``report``: as in report.json. Raises StorageError: the disk refused.
+    """
+    verdict: Quality = "none" if estimate is None else estimate.quality
+    views = list(_views(estimate, seen))
+    slices = [] if estimate is None else list(_slices(estimate, seen))
+    reason = report["quality"]["reason"] if estimate is None else estimate.reason
+    words = verdict_words(verdict, reason)
+    lines, rows = list(_lines(report)), part_rows(report) if estimate else []
+    _write_picture(
+        folder / PICTURE, verdict, [words, *lines, *map(row_words, rows)], views + slices
+    )
+    page = resources.files("tumortrack.report").joinpath("run_page.html").read_text("utf-8")
+    cells = {
+        "@COLOUR@": colours.css(_STATE_COLOURS[verdict]),
+        "@TEXT@": colours.css(_text_colour(verdict)),
+        "@VERDICT@": _TITLES[verdict],
+        "@WORDS@": html.escape(_sentence(words.partition(": ")[2])),
+        "@LINES@": "".join(f"<p>{html.escape(line)}</p>" for line in lines),
+        "@TABLE@": _table(rows) if rows else "",
+        "@PANELS@": "".join(map(_figures, (views, slices))),
+    }
+    page = re.sub("@[A-Z]+@", lambda name: cells[name[0]], page)
+    write_atomically(folder / PAGE, page.encode())
+
+
+def _figures(panels: list[Panel]) -> str:
+    figures = "".join(
+        f'<figure><img alt="{html.escape(caption)}" src="data:image/png;base64,'
+        f'{base64.b64encode(_png(image)).decode()}"><figcaption>{html.escape(caption)}'
+        "</figcaption></figure>"
+        for caption, image in panels
+    )
+    return f'<section class="panels">{figures}</section>' if panels else ""
+
+
+def part_rows(report: dict[str, Any]) -> list[dict[str, str]]:
+    """Of each part: its name, centre, standard deviation, volume and margin, in words with units;
+    empty where that is not known."""
+    rows = []
+    for name, part in report["parts"].items():
+        row = {"part": name, "centre": "not found", "std": "", "volume": "", "margin": ""}
+        if part["found"]:
+            x, y, z = part["center_mm"]
+            row |= {"centre": f"({x:.1f}, {y:.1f}, {z:.1f}) mm"}
+            row |= {"volume": f"{part['volume_ml']:.1f} ml"}
+            if "center_std_mm" in part:
+                row |= {"std": f"{part['center_std_mm']:.1f} mm"}
+            if radius := stated_radius(report.get("margin"), name):
+                row |= {"margin": radius.words}
+        rows.append(row)
+    return rows
+
+
+def row_words(row: dict[str, str]) -> str:
+    """A part's row as one line."""
+    std = row["std"] and f"standard deviation {row['std']}"
+    said = (f"centre {row['centre']}", std, row["volume"], row["margin"])
+    return f"{row['part']}: {', '.join(filter(None, said)).replace('centre not', 'not')}"
+
+
+def _lines(report: dict[str, Any]) -> Iterator[str]:
+    """What is said below the verdict."""
+    patient = _sentence(str(patient_in(report.get("patient"), "report")))
+    yield f"{patient}. Camera frame: x right, y down, z away."
+    if "parts" in report and not report.get("margin", {}).get("stated"):
+        yield f"{_sentence(margin_words(report.get('margin')))}."
+    yield from (view["words"] for view in report.get("input", ()))
+    yield from (f"Note: {note}" for note in report.get("notes", ()))
+
+
+def _sentence(words: str) -> str:
+    return words[:1].upper() + words[1:]
+
+
+def _table(rows: list[dict[str, str]]) -> str:
+    titles = {
+        **{"part": "", "centre": "centre (x, y, z)", "std": "1 standard deviation"},
+        **{"volume": "volume", "margin": "margin"},
+    }
+    shown = {key: title for key, title in titles.items() if any(row[key] for row in rows)}
+    head = "".join(f"<th>{title}</th>" for title in shown.values())
+    body = ""
+    for number, row in enumerate(rows):
+        dot = f'<i style="background:{colours.css(colours.part_colour(number + 1))}"></i>'
+        name = f"<th>{dot}{html.escape(row['part'].replace('_', ' '))}</th>"
+        body += f"<tr>{name}" + "".join(
+            f'<td data-title="{title}">{html.escape(row[key])}</td>'
+            for key, title in shown.items()
+            if key != "part"
+        )
+    return f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
+
+
+def _views(estimate: Estimate | None, seen: Seen) -> Iterator[Panel]:
+    """The camera's picture, and three views."""
+    if isinstance(seen.content, DepthFrame):
+        taken = "; tinted: taken for the organ" if seen.taken is not None else ""
+        size = f"{seen.content.intrinsics.width} x {seen.content.intrinsics.height} pixels"
+        yield (
+            f"depth image, {size}, near is bright{taken}",
+            _depth_picture(seen.content, seen.taken),
+        )
+    points_mm = _thinned(seen.cloud if estimate and seen.cloud else seen.content)
+    for name, (right, down) in ORIENTATIONS.items():
+        if estimate is not None or len(points_mm):
+            view = ParallelView(name, right, down)  # type: ignore[arg-type]
+            yield name, _view(view, estimate, points_mm)
+
+
+def _slices(estimate: Estimate, seen: Seen) -> Iterator[Panel]:
+    """Two through each tumor."""
+    of_ct = seen.ct is not None and estimate.motion is not None
+    what = "CT at its present place" if of_ct else "section"
+    tumors = [name for name in estimate.meshes if is_tumor(name)]
+    for part in tumors[:_MOST_TUMORS]:
+        for orientation in list(ORIENTATIONS)[:2]:
+            caption = f"{part.replace('_', ' ')}: {what}, {orientation}"
+            yield caption, _slice(estimate, seen, part, orientation)
+
+
+def _thinned(content: DepthFrame | SensorCloud | None) -> Float[np.ndarray, "n 3"]:
+    """Some of its points, but for the farthest."""
+    if content is None:
+        return np.zeros((0, 3))
+    all_mm = content.points_mm if isinstance(content, SensorCloud) else deproject(content)
+    some = all_mm[:: len(all_mm) // _MOST_POINTS + 1].astype(float)
+    if not len(some):
+        return some
+    low, high = np.quantile(some, (0.01, 0.99), axis=0)
+    room = 0.2 * (high - low) + 1
+    return some[((some >= low - room) & (some <= high + room)).all(axis=1)]
+
+
+def _view(
+    view: ParallelView, estimate: Estimate | None, points_mm: Float[np.ndarray, "n 3"]
+) -> Image.Image:
+    """Surfaces, the organ's translucent, under the points."""
+    meshes = {} if estimate is None else estimate.meshes
+    shown = [points_mm, *(mesh.vertices_mm for mesh in meshes.values())]
+    frame = view.frame_around(np.concatenate(shown), 6.0).widened(_ASPECT)
+    pixel_mm = (frame.right - frame.left) / _WIDE
+    bodies = [
+        Body(mesh, rgb(_colour_of(name)), 1.0 if is_tumor(name) else 0.36)
+        for name, mesh in meshes.items()
+    ]
+    width, height = frame.size(pixel_mm)
+    picture = np.full((height, width, 3), 255, np.uint8)
+    if bodies:
+        picture = render(bodies, view.viewpoint(frame, pixel_mm), (width, height)).copy()
+    corner = np.array([frame.left, frame.top])
+    _dots(picture, (view.project(points_mm)[:, :2] - corner) / pixel_mm, colours.SEEN)
+    image = Image.fromarray(picture)
+    draw = ImageDraw.Draw(image)
+    style: dict[str, Any] = {"anchor": "mm", "font_size": 26, "stroke_width": 3}
+    for name, mesh in meshes.items():
+        if is_tumor(name):
+            at = (view.project(mesh.box_mm.mean(0)[None])[0, :2] - corner) / pixel_mm
+            number = name.removeprefix("tumor_")
+            draw.text(tuple(at.tolist()), number, "black", stroke_fill="white", **style)
+    foot, long = height - 20, _BAR_MM / pixel_mm
+    draw.line((20, foot, 20 + long, foot), fill="black", width=4)
+    draw.text((20, foot - 26), f"{_BAR_MM:g} mm", fill="black", font_size=18)
+    return image
+
+
+def _slice(estimate: Estimate, seen: Seen, part: str, orientation: str) -> Image.Image:
+    """The CT as it lies now, else the labels, through a part's middle, with all outlines."""
+    plane = plane_through(estimate.meshes, part, orientation)
+    assert plane is not None  # there is an organ, and this part
+    half = _SLICE // 2
+    places_mm, back = plane.points(half), None
+    if seen.ct is not None and estimate.motion is not None:
+        back = estimate.motion.back(places_mm)
+    if seen.ct is not None and back is not None:
+        picture = np.repeat(seen.ct.grey(back)[:, None], 3, axis=1)
+    else:
+        picture = _labelled(estimate, places_mm)
+    lines = [(mesh, _colour_of(name), 3) for name, mesh in estimate.meshes.items()]
+    image = outlined(picture.reshape(half, half, 3), plane, lines, _SLICE).copy()
+    if seen.cloud is not None:
+        away = seen.cloud.points_mm.astype(float) - plane.centre_mm
+        near = away[np.abs(away @ np.cross(plane.across, plane.down)) < _NEAR_MM]
+        flat = near @ np.stack([plane.across, plane.down], axis=1)
+        _dots(image, (flat / plane.side_mm + 0.5) * _SLICE, (255, 255, 255))
+    return Image.fromarray(image)
+
+
+def _labelled(estimate: Estimate, places_mm: Float[np.ndarray, "n 3"]) -> UInt8[np.ndarray, "n 3"]:
+    """Dim colours of the labels at places before the camera; dark where there are none."""
+    picture = np.full((len(places_mm), 3), 20, np.uint8)
+    if (volume := estimate.volume) is not None:
+        at = np.rint(transform_points(np.linalg.inv(volume.camera_from_index), places_mm))
+        inside = ((at >= 0) & (at < volume.labels.shape)).all(axis=1)
+        labels = volume.labels[tuple(at[inside].astype(int).T)]
+        tints = colours.label_colours(labels) // 2
+        picture[inside] = np.where(labels[:, None] > 0, tints, np.uint8(20))
+    return picture
+
+
+def _depth_picture(frame: DepthFrame, taken: np.ndarray | None) -> Image.Image:
+    """Near is bright, no return is black; what was ``taken`` for the organ has its colour."""
+    every = 1 if taken is None else max(round(frame.depth_mm.shape[0] / taken.shape[0]), 1)
+    depth_mm = frame.depth_mm[::every, ::every]
+    known = np.isfinite(depth_mm)
+    grey = np.zeros(depth_mm.shape)
+    if known.any():
+        low, high = np.quantile(depth_mm[known], (0.01, 0.95))
+        share = np.clip((depth_mm[known] - low) / max(high - low, 1.0), 0, 1)
+        grey[known] = 235 - 190 * share
+    picture = np.repeat(grey[..., None], 3, axis=2)
+    if taken is not None:
+        organ = known & (taken[: grey.shape[0], : grey.shape[1]] == 0)
+        picture[organ] = 0.5 * picture[organ] + 0.5 * np.array(colours.part_colour(1))
+    image = Image.fromarray(picture.astype(np.uint8))
+    return image.resize((_WIDE, round(_WIDE * image.height / image.width)))
+
+
+def _dots(picture: np.ndarray, places: Float[np.ndarray, "n 2"], colour: colours.Colour) -> None:
+    """Paint dots of 2 x 2 pixels at (column, row)."""
+    height, width = picture.shape[:2]
+    for right in (0, 1):
+        for down in (0, 1):
+            column, row = (np.floor(places).astype(int) + (right, down)).T
+            inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+            picture[row[inside], column[inside]] = colour
+
+
+def _write_picture(path: Path, verdict: Quality, lines: list[str], panels: list[Panel]) -> None:
+    """Verdict, what is said of it, and the panels in rows; no line is cut."""
+    room = _ACROSS - 2 * _EDGE
+    head = wrapped(lines[0], 36, room)
+    below = [row for line in lines[1:] for row in wrapped(line, 24, room)]
+    images = [
+        (caption, image.resize((round(image.width * _ROW / image.height), _ROW)))
+        for caption, image in panels
+    ]
+    places, x, y = [], _EDGE, 60 + 46 * len(head) + 32 * len(below)
+    for _, image in images:
+        if x > _EDGE and x + image.width > _ACROSS - _EDGE:
+            x, y = _EDGE, y + _ROW + 64
+        places.append((x, y))
+        x += image.width + 16
+    picture = Image.new("RGB", (_ACROSS, y + (_ROW + 64 if images else 0)), "white")
+    draw = ImageDraw.Draw(picture)
+    draw.rectangle((0, 0, _ACROSS, 32 + 46 * len(head)), fill=_STATE_COLOURS[verdict])
+    for n, row in enumerate(head):
+        draw.text((_EDGE, 14 + 46 * n), row, fill=_text_colour(verdict), font_size=36)
+    for n, row in enumerate(below):
+        draw.text((_EDGE, 44 + 46 * len(head) + 32 * n), row, fill="black", font_size=24)
+    for (caption, image), (left, top) in zip(images, places, strict=True):
+        picture.paste(image, (left, top))
+        for n, row in enumerate(wrapped(caption, 20, image.width)):
+            draw.text((left, top + _ROW + 4 + 26 * n), row, fill="black", font_size=20)
+    write_atomically(path, _png(picture))
+
+
+def wrapped(text: str, size: int, room: float) -> list[str]:
+    """The text in lines that fit; a word that does not is broken."""
+    font, lines = ImageFont.load_default(size), [""]
+    for word in text.split():
+        if font.getlength(f"{lines[-1]} {word}".strip()) > room and lines[-1]:
+            lines.append("")
+        lines[-1] = f"{lines[-1]} {word}".strip()
+        while font.getlength(lines[-1]) > room:
+            fits = next(n for n in range(len(lines[-1]), 0, -1)
+                        if n == 1 or font.getlength(lines[-1][:n]) <= room)  # fmt: skip
+            lines[-1:] = [lines[-1][:fits], lines[-1][fits:]]
+    return lines
+
+
+def _colour_of(name: str) -> colours.Colour:
+    return colours.part_colour(1 + int(name.removeprefix("tumor_")) if is_tumor(name) else 1)
+
+
+def _text_colour(verdict: Quality) -> colours.Colour:
+    """White, or near black where white could not be read on the verdict's colour."""
+    red, green, blue = _STATE_COLOURS[verdict]
+    return (20, 20, 20) if 0.3 * red + 0.6 * green + 0.1 * blue > 130 else (255, 255, 255)
+
+
+def _png(image: Image.Image) -> bytes:
+    stream = io.BytesIO()
+    image.save(stream, format="PNG", compress_level=4)
+    return stream.getvalue()

@@ -1,0 +1,154 @@
+"""`locate` on a raw depth image: table, drape and a hand in it; and the page that it writes."""
+
+import json
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image, ImageFont
+
+import tumortrack as tt
+from live_objects import ball
+from region_objects import ORGAN, Props, make_scene
+from stories import answered, refusal, tumortrack
+from tumortrack.core.geometry import plane_section
+from tumortrack.imaging.case import load_case
+from tumortrack.report.run_page import PAGE, PICTURE, Seen, wrapped, write_run_page
+from tumortrack.sense.camera import d405
+from tumortrack.sense.cloud import check_depth_unit
+from tumortrack.sense.files import depth_png, intrinsics_json, read_mask
+
+HAND = Props(tilt_degrees=20, waves_mm=3, hand=True, up=(0.0, -1.0, 0.0), distance_mm=(115, 135))
+
+
+@cache
+def scene(case_folder: Path):
+    organ = load_case(case_folder).anatomy.organ
+    return make_scene(organ, HAND, np.random.default_rng(3), d405(424, 240))
+
+
+@pytest.fixture
+def raw(tmp_path, phantom_case):
+    """A folder with the image in steps of 0.1 mm, of 1 mm and in metres; what is the organ; and a
+    camera's file that says nothing of a unit."""
+    seen = scene(phantom_case)
+    camera = intrinsics_json(seen.frame.intrinsics)
+    del camera["depth_unit_mm"]
+    (tmp_path / "camera.json").write_text(json.dumps(camera))
+    (tmp_path / "depth.png").write_bytes(depth_png(seen.frame))
+    depth_mm = np.nan_to_num(seen.frame.depth_mm)
+    Image.fromarray(np.rint(depth_mm).astype(np.uint16)).save(tmp_path / "mm.png")
+    Image.fromarray((depth_mm / 1000).astype(np.float32)).save(tmp_path / "m.tif")
+    Image.fromarray((seen.what == ORGAN).astype(np.uint8)).save(tmp_path / "mask.png")
+    return tmp_path
+
+
+def test_the_organ_is_found_in_a_raw_depth_image(raw, clinic_model, phantom_case):
+    def locate(image, *options):
+        command = ("locate", clinic_model, raw / image, raw / "run", "--grid", 32, "--overwrite")
+        return tumortrack(*command, "--intrinsics", raw / "camera.json", *options)
+
+    said = answered(done := locate("depth.png"))
+    report = json.loads((raw / "run" / "report.json").read_text())
+    assert said.startswith(f"{report['quality']['verdict']}: ")
+    assert done.returncode == {"good": 0, "poor": 4}[report["quality"]["verdict"]]
+    (view,) = report["input"]
+    there = int((scene(phantom_case).what == ORGAN).sum())
+    assert there > 5000
+    assert abs(view["organ"] - there) < 0.1 * there
+    assert view["of"] > 4 * there
+    assert view["pixels"]["plane"] > there
+    assert f"{view['organ']} of {view['of']} pixels with a return were taken" in said
+    assert "in steps of 0.1 mm (the default)" in said
+    assert str(raw / "run" / PAGE) in said.splitlines()[-1]
+    page = (raw / "run" / PAGE).read_text()
+    assert "http" not in page
+    assert f"<h1>{report['quality']['verdict'].upper()}</h1>" in page
+    assert "No margin: the model was not calibrated" in page
+    assert f"{report['parts']['tumor_1']['center_std_mm']:.1f} mm" in page
+    with Image.open(raw / "run" / PICTURE) as picture:
+        assert picture.width == 2200
+
+    assert "Did you mean 1 mm a step" in refusal(done := locate("mm.png"))
+    assert "--depth-unit 1" in done.stderr
+    assert done.returncode == 2
+    assert "in metres (the default)" in answered(locate("m.tif"))
+    by_mask = answered(locate("mm.png", "--depth-unit", 1, "--mask", raw / "mask.png"))
+    assert "by --mask" in by_mask
+    again = tt.load_estimate(raw / "run")
+    assert again.meshes["kidney"].volume_mm3 > 1e5
+    assert again.volume.labels.max() == 3
+
+
+def test_without_an_estimate_there_is_a_page_that_says_why(raw, clinic_model):
+    command = ("locate", clinic_model, raw / "depth.png", raw / "run", "--grid", 32)
+    command = (*command, "--intrinsics", raw / "camera.json")
+    line = refusal(done := tumortrack(*command, "--at", 5, 5))
+    assert done.returncode == 3
+    assert "none: no piece of the scene lies within" in line
+    assert "--box" in line
+    assert "NONE: no estimate" in (raw / "run" / PAGE).read_text()
+    assert {path.name for path in (raw / "run").iterdir()} == {
+        *(PAGE, PICTURE, "manifest.json", "report.json")
+    }
+    for reader in (("plan", raw / "run"), ("export", raw / "run")):
+        assert "has no estimate: no piece" in refusal(tumortrack(*reader, raw / "new"))
+    answered(tumortrack(*command))  # takes its place
+    assert (raw / "run" / "kidney.ply").exists()
+    assert "exists already" in refusal(tumortrack(*command))
+    assert "outside the depth image" in refusal(tumortrack(*command, "--overwrite", "--at", 424, 0))
+
+
+def test_a_unit_is_questioned_only_where_it_cannot_be_right():
+    camera = tt.Intrinsics(40, 30, 40.0, 40.0, 20.0, 15.0)
+
+    def check(depth_mm, unit_mm):
+        frame = tt.DepthFrame(np.full((30, 40), depth_mm, np.float32), camera)
+        check_depth_unit(frame, unit_mm, 110.0, 150.0)
+
+    check(130.0, 0.1)
+    check(130.0, 1.0)
+    check(700.0, 0.1)  # far away, and no unit would bring it near
+    for depth_mm, unit_mm, words in (
+        (13.0, 0.1, "Did you mean 1 mm a step"),
+        (1300.0, 1.0, "Give --depth-unit 0.1"),
+        (130_000.0, 1000.0, "Did you mean 1 mm a step"),
+        (1.0, 0.1, "Say how many mm a step"),
+    ):
+        with pytest.raises(tt.errors.InputError, match=words):
+            check(depth_mm, unit_mm)
+
+
+@pytest.mark.parametrize("mode", ["L", "1", "RGB", "RGBA", "P"])
+def test_a_mask_is_what_is_not_zero(tmp_path, mode):
+    grey = np.zeros((6, 8), np.uint8)
+    grey[2:4, 3:5] = 255
+    Image.fromarray(grey).convert(mode).save(tmp_path / "mask.png")
+    assert (read_mask(tmp_path / "mask.png", (8, 6)) == (grey > 0)).all()
+    with pytest.raises(tt.errors.InputError, match="8 x 6; it must be 9 x 6"):
+        read_mask(tmp_path / "mask.png", (9, 6))
+
+
+def test_a_section_of_a_ball_is_a_circle():
+    mesh = ball((0.0, 0.0, 150.0), 30.0)
+    lines = plane_section(
+        mesh.vertices_mm, mesh.faces, np.array([0.0, 0.0, 1.0]), np.array([0.0, 0.0, 168.0])
+    )
+    np.testing.assert_allclose(lines[..., 2], 168.0)
+    assert np.linalg.norm(lines[..., :2], axis=2) == pytest.approx(24.0, rel=0.03)
+    length = np.linalg.norm(lines[:, 0] - lines[:, 1], axis=1).sum()
+    assert length == pytest.approx(2 * np.pi * 24.0, rel=0.02)
+
+
+def test_no_word_of_a_warning_is_cut(tmp_path):
+    reason = "the place of tumor_1 is unsure " * 20 + "x" * 400
+    rows = wrapped(reason, 24, 500.0)
+    assert "".join(rows).replace(" ", "") == reason.replace(" ", "")
+    font = ImageFont.load_default(24)
+    assert max(map(font.getlength, rows)) <= 500
+    report = {"quality": {"verdict": "none", "reason": f"{reason} <b> @TABLE@"}}
+    write_run_page(tmp_path, report, None, Seen())
+    page = (tmp_path / PAGE).read_text()
+    assert "x" * 400 in page
+    assert "&lt;b&gt; @TABLE@" in page
