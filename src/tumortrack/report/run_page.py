@@ -240,7 +240,7 @@ def _slice(estimate: Estimate, seen: Seen, part: str, orientation: str) -> Image
     if seen.ct is not None and estimate.motion is not None:
         back = estimate.motion.back(places_mm)
     if seen.ct is not None and back is not None:
-        picture = np.repeat(seen.ct.grey(back)[:, None], 3, axis=1)
+        picture = seen.ct.picture(back)
     else:
         picture = _labelled(estimate, places_mm)
     lines = [(mesh, _colour_of(name), 3) for name, mesh in estimate.meshes.items()]
