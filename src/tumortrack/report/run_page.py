@@ -270,12 +270,12 @@ def _depth_picture(frame: DepthFrame, taken: np.ndarray | None) -> Image.Image:
     every = 1 if taken is None else max(round(frame.depth_mm.shape[0] / taken.shape[0]), 1)
     depth_mm = frame.depth_mm[::every, ::every]
     known = np.isfinite(depth_mm)
-    grey = np.zeros(depth_mm.shape)
+    grey: np.ndarray = np.zeros(depth_mm.shape)
     if known.any():
         low, high = np.quantile(depth_mm[known], (0.01, 0.95))
         share = np.clip((depth_mm[known] - low) / max(high - low, 1.0), 0, 1)
         grey[known] = 235 - 190 * share
-    picture = np.repeat(grey[..., None], 3, axis=2)
+    picture: np.ndarray = np.repeat(grey[..., None], 3, axis=2)
     if taken is not None:
         organ = known & (taken[: grey.shape[0], : grey.shape[1]] == 0)
         picture[organ] = 0.5 * picture[organ] + 0.5 * np.array(colours.part_colour(1))
