@@ -79,7 +79,8 @@ class View:
         from tumortrack.sense.cloud import check_depth_unit
         from tumortrack.sense.region import organ_points
 
-        what, about = f"{self.path.name}: ", {"file": self.path.name, "hint": by}
+        what = f"{self.path.name}: "
+        about: dict[str, Any] = {"file": self.path.name, "hint": by}
         if self.unit is not None and isinstance(self.content, DepthFrame):
             unit_mm, said_by = self.unit
             crop = region.crop
