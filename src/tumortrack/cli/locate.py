@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 # Exit statuses; what cannot be used is 2.
 VERDICTS = {"good": 0, "poor": 4, "none": NoEstimate.exit_code}
-_ASK = "Say where the organ is: --at COLUMN ROW, --box or --mask"
+_ASK = "say where the organ is: --at COLUMN ROW, --box or --mask"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -143,6 +143,8 @@ class Locate(FindingOrgan):
             write_no_estimate(out, report, overwrite, add)
             reason = report["quality"]["reason"]
             raise NoEstimate(f"none: {reason} What was seen: {out / PAGE}") from error
+        if estimate.quality == "poor" and views[0].unit is not None:
+            notes.append(f"if that is not the organ, or not all of it: {_ASK}; --whole takes all.")
         report = estimate.report
         report.update(about)
         if self.poses is not None:
@@ -183,7 +185,7 @@ class Locate(FindingOrgan):
         from tumortrack.models.report import report_head
 
         if view.unit is not None:
-            reason = f"{reason.rstrip('.')}. {_ASK}."
+            reason = f"{reason.rstrip('.')}; {_ASK}."
         return {
             **report_head(view.content.stamp_ns),
             "seed": self.seed,

@@ -249,12 +249,9 @@ def corner_normals(mesh: Mesh) -> Float32[np.ndarray, "f 3 3"]:
     step = np.arange(len(mine)) - np.repeat(np.cumsum(count[corner]) - count[corner], count[corner])
     beside = face[order][first[mine] + step]
     smooth = (facing[beside] * facing[face[mine]]).sum(1) > np.cos(_CREASE_RAD)
-    each: list[np.ndarray] = [
-        np.bincount(mine, smooth * weighted[beside, n], len(corner)) for n in range(3)
-    ]
-    normals: np.ndarray = np.stack(each, axis=1).reshape(-1, 3, 3)
-    normals /= np.maximum(np.linalg.norm(normals, axis=2, keepdims=True), 1e-12)
-    normals = normals.astype(np.float32)
+    each = [np.bincount(mine, smooth * weighted[beside, n], len(corner)) for n in range(3)]
+    summed = np.stack(each, axis=1).reshape(-1, 3, 3).astype(np.float32)
+    normals = summed / np.maximum(np.linalg.norm(summed, axis=2, keepdims=True), 1e-12)
     _NORMALS[mesh] = normals
     return normals
 

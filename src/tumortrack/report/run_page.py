@@ -265,19 +265,19 @@ def _labelled(estimate: Estimate, places_mm: Float[np.ndarray, "n 3"]) -> UInt8[
     return picture
 
 
-def _depth_picture(frame: DepthFrame, taken: np.ndarray | None) -> Image.Image:
+def _depth_picture(frame: DepthFrame, taken: UInt8[np.ndarray, "h w"] | None) -> Image.Image:
     """Near is bright, no return is black; what was ``taken`` for the organ has its colour."""
     every = 1 if taken is None else max(round(frame.depth_mm.shape[0] / taken.shape[0]), 1)
     depth_mm = frame.depth_mm[::every, ::every]
-    known = np.isfinite(depth_mm)
-    grey: np.ndarray = np.zeros(depth_mm.shape)
+    (height, width), known = depth_mm.shape, np.isfinite(depth_mm)
+    grey = np.zeros((height, width))
     if known.any():
         low, high = np.quantile(depth_mm[known], (0.01, 0.95))
         share = np.clip((depth_mm[known] - low) / max(high - low, 1.0), 0, 1)
         grey[known] = 235 - 190 * share
     picture: np.ndarray = np.repeat(grey[..., None], 3, axis=2)
     if taken is not None:
-        organ = known & (taken[: grey.shape[0], : grey.shape[1]] == 0)
+        organ = known & (taken[:height, :width] == 0)
         picture[organ] = 0.5 * picture[organ] + 0.5 * np.array(colours.part_colour(1))
     image = Image.fromarray(picture.astype(np.uint8))
     return image.resize((_WIDE, round(_WIDE * image.height / image.width)))
