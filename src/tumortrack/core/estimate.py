@@ -22,13 +22,13 @@ Quality = Literal["good", "poor", "none"]  # none: there is no estimate
 # An answer with a tumor's centre farther off has failed: the plan's usual margin, all of it.
 FAR_MM = 5.0
 # What people read where it is good: that word alone would say more than is known.
-NO_CHECK_FAILED, UNVERIFIED = "good: no check failed", "its place is not verified"
+NO_CHECK_FAILED, UNVERIFIED = "no check failed", "its place is not verified"
 
 
 def verdict_words(verdict: Quality, reason: str) -> str:
     """A sentence that begins with the verdict; ``reason``: why it is not good."""
     if verdict == "good":
-        return f"{NO_CHECK_FAILED}; {UNVERIFIED}."
+        return f"good: {NO_CHECK_FAILED}; {UNVERIFIED}."
     said = f"{verdict}: {reason.rstrip('.')}."
     return f"{said} Do not rely on it." if verdict == "poor" else said
 

@@ -265,7 +265,7 @@ class TrackingResult:
         by = self.cameras and f"; {self.cameras}"
         if self.quality == "good":
             margins = margin_words(self.estimate.report.get("margin"))
-            return f"{NO_CHECK_FAILED}; {UNVERIFIED}; {margins}{by}"
+            return f"good: {NO_CHECK_FAILED}; {UNVERIFIED}; {margins}{by}"
         return f"{self.quality}: {self.warning}{by}"
 
 
