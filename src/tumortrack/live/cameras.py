@@ -108,6 +108,11 @@ class Cameras:
         return sum(worker.dropped for worker in self.workers)
 
     @property
+    def opening(self) -> bool:
+        """Whether one of them is being opened for the first time."""
+        return any(worker.opening for worker in self.workers)
+
+    @property
     def opened(self) -> int:
         return sum(worker.opened for worker in self.workers)
 

@@ -34,6 +34,7 @@ from tumortrack.sense.files import DepthCorrection
 from tumortrack.sense.region import Hints, RegionConfig, organ_points
 from tumortrack.tracking.tracker import Follower, FollowerConfig, Tracker
 
+_OPENING_S = 60.0  # so long a source may take to be opened
 _QUIET = 0.8  # of stale_s: silence is said while what is shown still holds
 SURE_AFTER = 3  # good estimates in a row after doubt: single frames of something else may pass
 
@@ -133,7 +134,7 @@ class Loop:
                 self._publish(self._without_frame("tracking has ended"), sink_workers)
 
     def _results(self, source_worker: Cameras) -> Iterator[TrackingResult]:
-        fresh_s = time.monotonic()
+        began_s = fresh_s = time.monotonic()
         quiet_s = _QUIET * self._config.stale_s
         ends_s, told_s = math.inf, fresh_s  # by when what is shown came to be
         while not self._stop.is_set():
@@ -158,6 +159,8 @@ class Loop:
                 yield self._without_frame(silence if got is None else str(got))
             if now_s >= ends_s:
                 return
+            if source_worker.opening and now_s - began_s < _OPENING_S:
+                fresh_s = now_s  # it may load libraries first, on a machine with much to do
             if now_s - fresh_s > self._config.give_up_s:
                 trouble = (source_worker.trouble or "").rstrip(".")
                 trouble = f": {trouble}" if trouble else ""

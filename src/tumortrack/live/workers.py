@@ -54,6 +54,7 @@ class SourceWorker:
         self.failure: Exception | None = None
         self.defects: list[str] = []
         self.opened = 0
+        self.opening = True  # until the first try has ended, well or not
         self._thread = threading.Thread(target=self._run, name="source", daemon=True)
         self._thread.start()
 
@@ -115,6 +116,7 @@ class SourceWorker:
                 self.ended = True
             except Exception as error:
                 self._note(error)
+            self.opening = False
             if not self._over:
                 self._stop.wait(_AGAIN_S)
         with self._lock:
@@ -135,6 +137,7 @@ class SourceWorker:
         source = self._open()
         self._source = source
         self.opened += 1
+        self.opening = False
         self.trouble = ""
         try:
             came = time.monotonic()

@@ -66,6 +66,7 @@ _FLAT, _ROUND = 0.04, 0.02
 # From the surface; share of the points; times the usual cost without them: other kidneys have 0.9.
 _BESIDE_MM, _MANY, _FITS_WITHOUT = 10.0, 0.03, 0.85
 _NOT_THIS = "fit", "seen_through"  # checks that speak against this organ in this place
+_GUESSED = (Cause.ANOTHER_PATIENT,)
 _HELPED_BY_A_VIEW = Cause.HIDDEN, Cause.ANOTHER_PATIENT, Cause.VIEW
 # Shares of the near side, and spread per that of the near side. Other kidneys that are laid wrong
 # leave up to 0.3 of it without points, or spread as widely.
@@ -102,10 +103,12 @@ def words(causes: tuple[Likely, ...], view: str) -> str:
         unit = Unit(number).of_cloud if cause is Cause.UNIT else ""
         given = {"number": number, "percent": 100 * number, "unit": unit}
         parts.append([text.format(**given) for text in _WORDS[cause]])
-    what = ", else ".join(what for what, _ in parts if what)
+    # Nothing but a bad fit speaks for another patient: the right organ, bent far, looks the same.
+    sure, link = ("perhaps", ", or ") if causes[0].cause in _GUESSED else ("most likely", ", else ")
+    what = link.join(what for what, _ in parts if what)
     looking = view if causes[0].cause in _HELPED_BY_A_VIEW else ""
     do = ", or ".join(text for text in (parts[0][1], looking) if text)
-    return f"{': most likely ' * bool(what)}{what}{'; ' * bool(do)}{do}"
+    return f"{f': {sure} ' if what else ''}{what}{'; ' * bool(do)}{do}"
 
 
 class _Laid(NamedTuple):
