@@ -49,7 +49,7 @@ $(TOOLS): requirements/tools.txt
 	.tools/bin/$(PIP) --require-hashes -r requirements/tools.txt
 	touch $@
 
-demo: $(TRACKER)  ## install the tracker, then CT -> tumors located in unseen deformed scenes (ARGS="--scenes 2")
+demo: $(TRACKER)  ## install the tracker, then CT -> tumors located in unseen deformed scenes (ARGS="--scenes 2": two of them)
 	$(BIN)/tumortrack demo $(ARGS)
 
 check: setup  ## lint, types, import order, licences
@@ -71,7 +71,7 @@ site: setup  ## the documentation's site, strictly: build/site/index.html (`.ven
 test: check site kernels pytest  ## check, then all tests (those of Chromium and Fast DDS after `make debian`)
 
 quick: setup  ## the quickest tests of the tracker (a minute)
-	OMP_NUM_THREADS=1 $(BIN)/pytest -q -n 2 -m 'not slow' tests/core tests/phantom tests/sense/test_render.py
+	OMP_NUM_THREADS=1 $(BIN)/pytest -q -n 2 -m 'not slow' tests/core tests/sense/test_render.py
 
 pythons:  ## a fresh clone with every Python here: install, short demo, doctor, quick tests (ARGS=/usr/bin/python3)
 	tools/pythons.sh $(ARGS)

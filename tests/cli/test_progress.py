@@ -28,3 +28,17 @@ def test_fast_work_is_told_by_its_rate(monkeypatch, capsys):
             clock.sleep(0.1)
             advance()
     assert "drawing: 150 of 1000 | 10.0 a second | 1:25 left" in capsys.readouterr().out
+
+
+def test_a_slow_first_step_tells_no_rate(monkeypatch, capsys):
+    """It may have compiled: 38 s for one of ten scenes are no reason to say six minutes."""
+    clock = Clock()
+    monkeypatch.setattr(console, "time", clock)
+    with console.progress_bar("simulate", 10) as advance:
+        clock.sleep(38.0)
+        advance()
+        assert capsys.readouterr().out.splitlines()[-1] == "simulate: 1 of 10"
+        for _ in range(8):
+            clock.sleep(2.0)
+            advance()
+    assert "9 of 10 | 2.0 s each | 0:02 left" in capsys.readouterr().out

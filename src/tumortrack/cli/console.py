@@ -40,14 +40,18 @@ def say_notes(notes: Iterable[str]) -> None:
 def progress_bar(what: str, total: int) -> Iterator[Callable[[], None]]:
     """A line of what is done, how fast, and of the time left; yields a function to call as each of
     ``total`` is done. Begin it before what takes seconds to load."""
-    done, began_s = 0, time.monotonic()
+    done, first_s = 0, 0.0
 
     with live_line(f"{what}: 0 of {total} ...") as show:
 
         def advance() -> None:
-            nonlocal done
+            nonlocal done, first_s
             done += 1
-            each_s = (time.monotonic() - began_s) / done
+            if done == 1:  # what it needed may have been loaded and compiled: it tells no rate
+                first_s = time.monotonic()
+                show(f"{what}: 1 of {total}")
+                return
+            each_s = (time.monotonic() - first_s) / (done - 1)
             minutes, seconds = divmod(round(each_s * (total - done)), 60)
             rate = f"{1 / each_s:.1f} a second" if each_s < 1 else f"{each_s:.1f} s each"
             show(f"{what}: {done} of {total} | {rate} | {minutes}:{seconds:02d} left")
