@@ -209,7 +209,7 @@ def test_a_table_goes_on_where_it_was_killed(tmp_path):
     ):
         pass
     (tmp_path / "none").write_text("[1]\n{}\n")
-    with pytest.raises(InputError, match="is no table"), open_table(tmp_path / "none", head):
+    with pytest.raises(InputError, match="is not a table"), open_table(tmp_path / "none", head):
         pass
 
 

@@ -106,7 +106,7 @@ class Onnx:
         if not (out.is_file() and self.overwrite):
             store.check_place(out, "ONNX", self.overwrite)
         if not out.parent.is_dir():
-            raise InputError(f"{out.parent} is no folder; make it first.")
+            raise InputError(f"{out.parent} is not a folder; make it first.")
         read_model_manifest(self.model)
         if find_spec("onnx") is None:  # reported before PyTorch's seconds
             raise InputError("writing ONNX needs the package onnx: pip install 'tumortrack[onnx]'.")

@@ -128,7 +128,7 @@ class FilePoses(CameraPoses):
             stamps_ns = np.array([int(row[0]) for row in rows])
             numbers = np.array([row[2:] for row in rows], float).reshape(len(rows), 7)
         except (ValueError, OverflowError) as error:
-            raise InputError(f"{path} is no table of poses ({COLUMNS}): {error}.") from error
+            raise InputError(f"{path} is not a table of poses ({COLUMNS}): {error}.") from error
         names = {row[1].strip() for row in rows}
         lengths = np.linalg.norm(numbers[:, 3:], axis=1)
         faults = {
@@ -140,7 +140,7 @@ class FilePoses(CameraPoses):
             "qw, qx, qy, qz must have length 1": (np.abs(lengths - 1) < _NOT_UNIT).all(),
         }
         if wrong := [what for what, met in faults.items() if not met]:
-            raise InputError(f"{path} is no table of poses: {wrong[0]}.")
+            raise InputError(f"{path} is not a table of poses: {wrong[0]}.")
         (self.frame_id,), self._poses = names, PoseBuffer()
         turns = Rotation.from_quat(numbers[:, 3:], scalar_first=True).as_matrix()
         for stamp_ns, turn, shift in zip(stamps_ns.tolist(), turns, numbers[:, :3], strict=True):

@@ -100,7 +100,7 @@ def read_run(folder: Path) -> Located:
     except (OSError, InputError, msgspec.ValidationError) as error:
         reason = str(error).rstrip(".")
         raise ArtifactError(
-            f"{folder} is no run that can be planned on: {reason}. Locate again."
+            f"{folder} is not a run that can be planned on: {reason}. Locate again."
         ) from error
     doubt = "" if report.quality.verdict == "good" else report.quality.reason or "unknown"
     cloud = OccupancyCloud(table[:, :3], table[:, 3], table[:, 4])

@@ -91,7 +91,7 @@ def _parsed(content: bytes, path: Path) -> tuple[dict[str, Any], list[Row]]:
         head, *lines = [json.loads(line) for line in content.splitlines()]
         return dict(head), [from_builtins(line, Row, str(path)) for line in lines]
     except (ValueError, TypeError) as error:
-        raise InputError(f"{path} is no table of `tumortrack margins`: {error}.") from error
+        raise InputError(f"{path} is not a table of `tumortrack margins`: {error}.") from error
 
 
 def head_of(model_sha256: str, seed: int) -> dict[str, Any]:

@@ -107,13 +107,13 @@ def read_scene(folder: Path) -> Scene:
     its volume is united with it. Raises InputError: no such folder, no cloud or organ, a file
     that cannot be read, surfaces that are open or not in mm."""
     if not folder.is_dir():
-        raise InputError(f"{folder} is no scene folder (it does not exist).")
+        raise InputError(f"{folder} is not a scene folder (it does not exist).")
     meta = read_json(folder / "meta.json") if (folder / "meta.json").exists() else {}
     kind = organ_of_folder(folder, meta)
     for name in ("cloud.ply", f"{kind.name}.ply"):
         if not (folder / name).is_file():
             raise InputError(
-                f"{folder} is no scene: it lacks {name}. A scene holds cloud.ply, kidney.ply (or "
+                f"{folder} is not a scene: it lacks {name}. A scene holds cloud.ply, kidney.ply (or "
                 "of another organ's name) and tumor_1.ply, tumor_2.ply, ... in the camera frame, "
                 "in mm."
             )
@@ -152,7 +152,7 @@ def list_scenes(folder: Path) -> list[Path]:
     """The scene folders (those with a cloud.ply or a surface) in a folder, by name; InputError
     where there is none."""
     if not folder.is_dir():
-        raise InputError(f"{folder} does not exist or is no folder.")
+        raise InputError(f"{folder} does not exist or is not a folder.")
     found = (path for path in folder.iterdir() if any(path.glob("*.ply")))
     scenes = sorted(path for path in found if not path.name.startswith("."))
     if not scenes:
@@ -241,5 +241,5 @@ def read_targets(path: Path) -> Targets:
         if not np.isin(labels, np.arange(1, 256)).all():
             raise ValueError("labels must be 1 (organ), 2, 3, ... (tumors)")
     except (TypeError, ValueError, OverflowError) as error:
-        raise InputError(f"{path} has a row that is no target: {error}.") from error
+        raise InputError(f"{path} has a row that is not a target: {error}.") from error
     return Targets(table[:, 1:4], table[:, 4:], labels.astype(np.uint8))

@@ -112,7 +112,7 @@ def _parts(stated: list[str], organ: Organ) -> tuple[str, ...]:
 def _query_box(stated: list[list[float]]) -> np.ndarray:
     box_mm = np.array(stated, float).reshape(2, 3)
     if not ((box_mm[0] < box_mm[1]).all() and (np.abs(box_mm) < _LARGEST_BOX_MM).all()):
-        raise InputError(f"query_box_mm {stated} is no box about an organ.")
+        raise InputError(f"query_box_mm {stated} is not a box about an organ.")
     return box_mm
 
 

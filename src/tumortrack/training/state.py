@@ -196,7 +196,7 @@ class Diverged(TumortrackError):
 
     def __init__(self, step: int) -> None:
         super().__init__(
-            f"training diverged at step {step}: the loss is no finite number. The last checkpoint "
+            f"training diverged at step {step}: the loss is not finite. The last checkpoint "
             "is from before; a smaller learning rate or another seed may go through."
         )
 

@@ -29,7 +29,7 @@ def states_in(recording: Path, kit: Kit) -> dict[str, Recorded | Path]:
     folder with one for each state, of depth images or scene folders. Raises InputError: none, or
     it says itself that it is of another kit."""
     if not recording.is_dir():
-        raise InputError(f"{recording} is no folder. Give one that `tumortrack record` wrote.")
+        raise InputError(f"{recording} is not a folder. Give one that `tumortrack record` wrote.")
     if any(recording.glob("*.mcap")):
         recorded = read_recorded(recording)
         check_kit(recorded, kit)
