@@ -72,7 +72,7 @@ def test_a_case_that_names_no_organ_or_a_strange_one_is_refused(tmp_path):
     manifest = json.loads(path.read_text())
     del manifest["organ"]
     path.write_text(json.dumps(manifest))
-    with pytest.raises(ArtifactError, match=r"`organ`.*Run prepare again"):
+    with pytest.raises(ArtifactError, match=r"`organ`.*Make one with `tumortrack prepare`"):
         load_case(tmp_path)
     path.write_text(json.dumps({**manifest, "organ": {"name": "../../x"}}))
     with pytest.raises(ArtifactError, match="--name"):

@@ -158,7 +158,7 @@ def test_a_kit_is_known_and_only_a_kit_is_replaced(kit, capsys):
     case = str(kit.parent / "case")
     for arguments, said in (
         ([str(kit)], "exists already"),
-        ([case, "--overwrite"], "is no kit"),
+        ([case, "--overwrite"], "is not a kit"),
         ([str(kit / "x"), "--states", "D4"], "no such state"),
         ([str(kit / "x"), "--bed", "100", "100", "100"], "larger --bed"),
         ([str(kit / "x"), "--bead-mm", "40"], "bead_mm is 40"),
