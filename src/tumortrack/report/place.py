@@ -25,8 +25,8 @@ def check_place(out: Path, overwrite: bool) -> None:
     report = read_json(out / "report.json") if "report.json" in inside else {}
     if not ({"rule", "summary", "scenes"} <= report.keys()):
         raise InputError(
-            f"{out} is not a report of `evaluate`, so --overwrite does not replace it. Choose another "
-            "path, or move the folder away yourself."
+            f"{out} is not a report of `evaluate`, so --overwrite does not replace it. Choose "
+            "another path, or move the folder away yourself."
         )
     entries = [entry for entry in report["scenes"] if isinstance(entry, dict)]
     pictures = {f"{entry.get('name')}.png" for entry in entries}

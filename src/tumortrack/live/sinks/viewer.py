@@ -75,7 +75,7 @@ class ViewerSinkConfig(SinkConfig, frozen=True, kw_only=True, tag="viewer"):
         if not 0 < self.hz <= 60:
             raise InputError(f"viewer: hz={self.hz:g}; allowed are more than 0 and up to 60.")
         if self.case and not Path(self.case).is_dir():
-            raise InputError(f"viewer: case={self.case} is not a folder; give what `prepare` wrote.")
+            raise InputError(f"viewer: case={self.case} is not a folder that `prepare` wrote.")
 
     def open(self, context: SinkContext) -> ViewerSink:
         """The page, ready for visitors. Raises InputError where the port is taken, viser is
