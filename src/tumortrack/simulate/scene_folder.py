@@ -114,8 +114,8 @@ def read_scene(folder: Path) -> Scene:
         if not (folder / name).is_file():
             raise InputError(
                 f"{folder} is not a scene: it lacks {name}. A scene holds cloud.ply, kidney.ply "
-                "(or of another organ's name) and tumor_1.ply, tumor_2.ply, ... in the camera frame, "
-                "in mm."
+                "(or of another organ's name) and tumor_1.ply, tumor_2.ply, ... in the camera "
+                "frame, in mm."
             )
     reference = read_anatomy(folder, kind)
     _check_parts(folder, reference)
