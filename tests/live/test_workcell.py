@@ -95,7 +95,7 @@ def test_arms_are_told_of_without_an_estimate_and_why_they_stand():
     below -= out["workcell"].markers[-1].pose.position.z  # its first line is at the same height
     assert below == pytest.approx((0.025 + 0.012) / 2 * len(more))
     assert (first, " ".join(more)) == (
-        "sweep 1, halted: the tumor moved by 6 mm", f"no estimate: {REASON}"
+        "sweep 1, halted: the tumor moved by 6 mm", f"none, no estimate: {REASON}"
     )  # fmt: skip
     estimate, arms = out["diagnostics"].status
     assert (estimate.level, arms.level, arms.name) == (2, 1, "tumortrack: arms")
