@@ -116,7 +116,7 @@ def test_a_scene(failed: str, drawn: list[Figure], tmp_path: Path) -> None:
         "failed": failed, "quality": "poor", "reason": WARNINGS[0],
     }  # fmt: skip
     scene_picture(scene(), estimate_of(anatomy()), entry, tmp_path / "scene.png")
-    check(drawn[0], (f"FAILED: {failed}", f"POOR ESTIMATE: {WARNINGS[0]}"))
+    check(drawn[0], (f"FAILED: {failed}", f"POOR: {WARNINGS[0]}"))
 
 
 def test_a_prepared_case(drawn: list[Figure], tmp_path: Path) -> None:

@@ -197,7 +197,7 @@ def test_files_that_are_none_are_refused(tmp_path):
             read_points(tmp_path / name)
     with pytest.raises(InputError, match="does not exist"):
         read_points(tmp_path / "none.csv")
-    with pytest.raises(InputError, match="no regular file"):
+    with pytest.raises(InputError, match="not a regular file"):
         read_points(tmp_path)
 
 

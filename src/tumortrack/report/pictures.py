@@ -85,7 +85,11 @@ def scene_picture(
     verdict = f"{entry['quality'].upper()}: {reason}"
     title = f"{entry['name']}   {verdict}" if good else entry["name"]
     handles = scene_legend(*scene.reference.names)
-    drawing.add_words(figure, title, [] if good else [verdict], [scene_note(entry)], handles)
+    failed = entry["failed"]
+    told = failed is None or entry["quality"] == "none"  # then it is the reason
+    warnings = [] if told else [f"FAILED: {failed}"]
+    warnings += [] if good else [verdict]
+    drawing.add_words(figure, title, warnings, [scene_note(entry)], handles)
     drawing.save(figure, path)
 
 
