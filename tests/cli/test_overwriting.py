@@ -91,7 +91,7 @@ def test_options_that_messages_name_are_options_of_some_command(capsys, monkeypa
 def test_a_table_of_margins_is_not_made_of_somebodys_notes(tmp_path):
     notes = tmp_path / "notes.txt"
     notes.write_text("first line\nno end of line")
-    with pytest.raises(InputError, match="no table"), open_table(notes, head_of("sha", 0)):
+    with pytest.raises(InputError, match="not a table"), open_table(notes, head_of("sha", 0)):
         pass
     assert notes.read_text() == "first line\nno end of line"
 

@@ -336,7 +336,7 @@ def test_simulated_scenes_are_evaluated_against_their_truth(work, out, scenes, e
     kept = sorted(out.iterdir())
     assert "exists already" in refusal(tumortrack("evaluate", work / "model", scenes, out))
     again = tumortrack("evaluate", work / "model", scenes, out, "--overwrite")
-    assert "no report of `evaluate`" in refusal(again)
+    assert "is not a report of `evaluate`" in refusal(again)
     assert sorted(out.iterdir()) == kept
 
 

@@ -103,7 +103,7 @@ def _figures(panels: list[Panel]) -> str:
 
 def part_rows(report: dict[str, Any]) -> list[dict[str, str]]:
     """Of each part: its name, centre, standard deviation, volume and margin, in words with units;
-    empty where that is not known."""
+    empty where that is not known, and the deviation where the answer is poor."""
     rows = []
     for name, part in report["parts"].items():
         row = {"part": name, "centre": "not found", "std": "", "volume": "", "margin": ""}
@@ -111,7 +111,8 @@ def part_rows(report: dict[str, Any]) -> list[dict[str, str]]:
             x, y, z = part["center_mm"]
             row |= {"centre": f"({x:.1f}, {y:.1f}, {z:.1f}) mm"}
             row |= {"volume": f"{part['volume_ml']:.1f} ml"}
-            if "center_std_mm" in part:
+            # Of a poor one it would be read as how wrong it may be, which nobody knows.
+            if "center_std_mm" in part and report["quality"]["verdict"] == "good":
                 row |= {"std": f"{part['center_std_mm']:.1f} mm"}
             if radius := stated_radius(report.get("margin"), name):
                 row |= {"margin": radius.words}
