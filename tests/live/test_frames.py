@@ -47,6 +47,7 @@ class Frames(SourceWorker):
     def __init__(self, frames=(), latency_from="taking"):
         self._left = list(frames)
         self.latency_from, self.trouble, self.ended, self.failure = latency_from, "", False, None
+        self.opening = False
         self._passed, self._source = 0, None
 
     def take(self, timeout_s):

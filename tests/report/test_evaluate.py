@@ -244,7 +244,7 @@ def test_only_a_report_is_replaced(evaluated, tmp_path):
     (mine / "index.html").write_text("my page")
     with pytest.raises(InputError, match="exists already"):
         check_place(mine, overwrite=False)
-    with pytest.raises(InputError, match="no report of `evaluate`"):
+    with pytest.raises(InputError, match="is not a report of `evaluate`"):
         check_place(mine, overwrite=True)
     out = tmp_path / "report"
     shutil.copytree(evaluated[0], out)
