@@ -207,7 +207,7 @@ def test_the_command_says_where_points_of_the_ct_are(slim_model, stages, estimat
     assert report["map"]["points"] == 3
     rigid = np.array(report["motion"]["camera_from_ct"])
     np.testing.assert_allclose(rigid[:3, :3] @ rigid[:3, :3].T, np.eye(3), atol=1e-6)
-    again = succeeded(
+    again = answered(
         tumortrack(*command, "--map", out / "points.csv", "--device", "cpu", "--overwrite")
     )
     assert "give way" in again
