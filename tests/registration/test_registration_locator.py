@@ -12,7 +12,7 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from elastic_objects import CENTER, UP
-from stories import answered, succeeded, tumortrack
+from stories import answered, tumortrack
 from tumortrack.core.errors import ArtifactError, InputError, NoEstimate
 from tumortrack.core.estimate import Motion
 from tumortrack.core.types import SensorCloud
