@@ -95,6 +95,26 @@ def test_a_command_ends_well_where_nobody_reads_its_errors():
     assert done.stdout == b"1\n"
 
 
+@pytest.mark.parametrize("status", [0, 4])
+def test_the_exit_status_is_the_commands_where_nobody_reads_on(status):
+    """`locate ... | head -1` ended with 1, whatever the verdict."""
+    program = f"""if True:
+        import sys
+        from tumortrack.cli import console, main
+        class Command:
+            def run(self):
+                for _ in range(3):
+                    console.say("a line")
+                    sys.stdout.flush()
+                return {status}
+        main._parse = lambda arguments: Command()
+        sys.exit(main.run(["any"]))
+    """
+    process = subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE)
+    process.stdout.close()
+    assert process.wait(300) == status
+
+
 def test_a_broken_command_of_another_package_stops_no_other(monkeypatch, tmp_path, capsys):
     broken = EntryPoint("broken", "nowhere.at_all:Command", "tumortrack.commands")
     monkeypatch.setattr(main, "entry_points", lambda group: (broken,))

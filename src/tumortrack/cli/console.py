@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import gc
+import os
+import sys
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -16,8 +18,16 @@ Device = Literal["auto", "cpu", "cuda"]
 
 _EVERY_S = 15.0  # between lines where there is no terminal
 
+
+class _Console(Console):
+    def on_broken_pipe(self) -> None:
+        """Nobody reads on (`| head`): the command goes on silently, to its own exit status."""
+        self.quiet = True
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
 # Of one training's processes the first alone speaks.
-console = Console(soft_wrap=True, highlight=False, quiet=is_follower())
+console = _Console(soft_wrap=True, highlight=False, quiet=is_follower())
 
 
 def say(text: str) -> None:

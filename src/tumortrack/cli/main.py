@@ -71,6 +71,7 @@ def run(arguments: list[str]) -> int:
     if arguments == ["--version"]:
         print(f"tumortrack {tumortrack.__version__}")
         return 0
+    code = 1
     try:
         code = _parse(arguments).run() or 0
         sys.stdout.flush()
@@ -82,7 +83,6 @@ def run(arguments: list[str]) -> int:
         return 130
     except BrokenPipeError:  # `tumortrack inspect X | head`
         sys.stderr.close()
-        return 1
     except OSError as error:  # of the file system, not of ours: a name too long, no permission
         if error.filename is None and error.errno != errno.ENOSPC:
             raise
