@@ -28,6 +28,3 @@ class Likely:
         """JSON, for a report."""
         return {"cause": self.cause.name.lower(), "number": self.number, "fit": self.fit}
 
-
-# Causes found, by the check that failed; of no estimate: by none.
-Sought = dict[str, tuple[Likely, ...]]

@@ -9,7 +9,7 @@ from typing import Any, Literal, Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float
 
-from tumortrack.core.causes import Likely, Sought
+from tumortrack.core.causes import Likely
 from tumortrack.core.config import Config, check_seed
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import Points
@@ -59,14 +59,12 @@ class Following(Config, frozen=True, kw_only=True):
     """How one frame of many is located. ``thorough``: also search without the last estimate, and
     keep the better fit: a search near the last answer alone would keep its error. ``either_side``:
     somebody may have turned the organ over. ``smoothing_s``: time constant of the mean over past
-    estimates; 0: none. ``sought``: likely causes of a moment ago, which are not sought again;
-    those found are added."""
+    estimates; 0: none."""
 
     thorough: bool = False
     either_side: bool = False
     smoothing_s: float = 0.0
     seed: int = 0
-    sought: Sought | None = None
 
     def __post_init__(self) -> None:
         check_seed(self.seed)

@@ -68,7 +68,7 @@ _BESIDE_MM, _MANY, _FITS_WITHOUT = 10.0, 0.03, 0.85
 _NOT_THIS = "fit", "seen_through"  # checks that speak against this organ in this place
 _GUESSED = (Cause.ANOTHER_PATIENT,)
 _HELPED_BY_A_VIEW = Cause.HIDDEN, Cause.ANOTHER_PATIENT, Cause.VIEW
-# Shares of the near side, and spread per that of the near side. Other kidneys that are laid wrong
+# Shares of the near side, and spread per that of the near side. Other kidneys that are fitted wrong
 # leave up to 0.3 of it without points, or spread as widely.
 _HIDDEN, _MUCH, _LITTLE = 0.15, 0.3, 0.8
 
@@ -83,15 +83,15 @@ def likely_causes(
         estimate: the poor one; None: there is none.
     """
     points = thin_cloud(cloud, _POINTS, np.random.default_rng(0)).points_mm.astype(float)
-    laid = _fit(model, points) if estimate is None else _laid_by(estimate)
-    suspicious = laid.check in ("size", "strays", "seen_through") or laid.cost > _FITS
+    fitted = _fit(model, points) if estimate is None else _fitted_by(estimate)
+    suspicious = fitted.check in ("size", "strays", "seen_through") or fitted.cost > _FITS
     found = [Likely(Cause.OBJECT)] if suspicious and _flat_or_round(points) else []
     if not found and (suspicious or _aside(points, _OUTSIDE)):
-        found = _tried(model, points, laid.cost)
-    if laid.check == "size" and estimate is not None and not found:
+        found = _tried(model, points, fitted.cost)
+    if fitted.check == "size" and estimate is not None and not found:
         found.append(Likely(Cause.SCALE, 1 / estimate.report["size"]["times"]))
     if not found:
-        found = _shown(model, points, laid) or [Likely(Cause.VIEW)]
+        found = _shown(model, points, fitted) or [Likely(Cause.VIEW)]
     return tuple(found)
 
 
@@ -111,7 +111,7 @@ def words(causes: tuple[Likely, ...], view: str) -> str:
     return f"{f': {sure} ' if what else ''}{what}{'; ' * bool(do)}{do}"
 
 
-class _Laid(NamedTuple):
+class _Fitted(NamedTuple):
     """The organ on the points: its surface, the check that failed, and the cost in usual ones, also
     without strays. No surface: it was not tried, since nothing so small or large is an organ."""
 
@@ -121,26 +121,26 @@ class _Laid(NamedTuple):
     without_strays: float = math.inf
 
 
-def _laid_by(estimate: Estimate) -> _Laid:
+def _fitted_by(estimate: Estimate) -> _Fitted:
     organ, report = next(iter(estimate.meshes.values())), estimate.report
     cost = report.get("fit_cost", {"now": 0.0, "without_strays": 0.0, "usual": 1.0})
     costs = cost["now"] / cost["usual"], cost["without_strays"] / cost["usual"]
-    return _Laid(organ, report["quality"]["check"], *costs)
+    return _Fitted(organ, report["quality"]["check"], *costs)
 
 
-def _fit(model: Model, points: Points) -> _Laid:
+def _fit(model: Model, points: Points) -> _Fitted:
     """By the network and one refinement, on few points."""
     least, most = model.in_distribution.spread_mm
     if not isinstance(model, RegistrationModel) or not least <= spread_mm(points) <= most:
-        return _Laid()
+        return _Fitted()
     with suppress(NoEstimate):  # the network places it nowhere
         starts = model.registration().propose(points)
         fits = [refine(model.shape, points, one, model.config.refine) for one in starts]
         best, usual = min(fits, key=lambda fit: fit.cost), model.calibration.usual_cost
         organ = model.shape.anatomy_ct.organ
         there = organ.moved(best.motion.carry(organ.vertices_mm))
-        return _Laid(there, "fit", best.cost / usual, best.cost_without_strays / usual)
-    return _Laid()
+        return _Fitted(there, "fit", best.cost / usual, best.cost_without_strays / usual)
+    return _Fitted()
 
 
 def _tried(model: Model, points: Points, now: float) -> list[Likely]:
@@ -160,9 +160,9 @@ def _tried(model: Model, points: Points, now: float) -> list[Likely]:
     return found + [replace(tries[n][0], fit=cost) for cost, n in costs if cost < most]
 
 
-def _shown(model: Model, points: Points, laid: _Laid) -> list[Likely]:
+def _shown(model: Model, points: Points, fitted: _Fitted) -> list[Likely]:
     """By what the points show of the organ, and beside it."""
-    organ, check, found = laid.organ, laid.check, list[Likely]()
+    organ, check, found = fitted.organ, fitted.check, list[Likely]()
     if organ is None:
         (least, most), spread = model.in_distribution.spread_mm, spread_mm(points)
         if unit := likely_unit(np.array([spread]), (least, most)):
@@ -175,7 +175,7 @@ def _shown(model: Model, points: Points, laid: _Laid) -> list[Likely]:
     beside = float((cKDTree(organ.vertices_mm).query(points)[0] > _BESIDE_MM).mean())
     hidden = float(unseen(near, points).mean()) if len(near) else 0.0
     much = hidden > _MUCH and spread_mm(points) < _LITTLE * spread_mm(near)
-    if check == "strays" or (beside > _MANY and laid.without_strays < _FITS_WITHOUT):
+    if check == "strays" or (beside > _MANY and fitted.without_strays < _FITS_WITHOUT):
         found.append(Likely(Cause.BACKGROUND, beside))
     if check == "unseen" or (hidden > _HIDDEN and check not in _NOT_THIS) or much:
         found.append(Likely(Cause.HIDDEN, hidden))
