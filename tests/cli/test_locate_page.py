@@ -14,7 +14,8 @@ from region_objects import ORGAN, Props, make_scene
 from stories import answered, refusal, tumortrack
 from tumortrack.core.geometry import plane_section
 from tumortrack.imaging.case import load_case
-from tumortrack.report.run_page import PAGE, PICTURE, Seen, wrapped, write_run_page
+from tumortrack.report.run_page import PAGE, PICTURE, Seen, write_run_page
+from tumortrack.report.wrapping import wrapped
 from tumortrack.sense.camera import d405
 from tumortrack.sense.cloud import check_depth_unit
 from tumortrack.sense.files import depth_png, intrinsics_json, read_mask
@@ -144,7 +145,7 @@ def test_a_section_of_a_ball_is_a_circle():
 
 def test_no_word_of_a_warning_is_cut(tmp_path):
     reason = "the place of tumor_1 is unsure " * 20 + "x" * 400
-    rows = wrapped(reason, 24, 500.0)
+    rows = wrapped(reason, 500.0, ImageFont.load_default(24).getlength)
     assert "".join(rows).replace(" ", "") == reason.replace(" ", "")
     font = ImageFont.load_default(24)
     assert max(map(font.getlength, rows)) <= 500

@@ -21,11 +21,12 @@ from tumortrack.core.types import LabelVolume
 from tumortrack.live.values import Workcell
 from tumortrack.plan.values import OVER_BUDGET, POOR_ESTIMATE, UNGUARDED, Located, ResectionPlan
 from tumortrack.report import drawing
-from tumortrack.report.drawing import SIGN, wrapped
+from tumortrack.report.drawing import SIGN
 from tumortrack.report.film import Paragraph, film, words_strip
 from tumortrack.report.metrics import label_grid
 from tumortrack.report.pictures import qc_picture, scene_picture
 from tumortrack.report.plan_pictures import plan_figure
+from tumortrack.report.wrapping import wrapped
 
 WARNINGS = (
     f"{POOR_ESTIMATE}: only 12% of the organ's surface is seen, and 3 of 1000 points lie farther "

@@ -82,7 +82,7 @@ class Prepare:
             both = "both (--patient ID --side left|right): real arms need them"
             say_notes([f"state {both if kind.in_pairs else '--patient ID: real arms need it'}"])
         for name, part in zip(case.anatomy.names, case.anatomy.parts, strict=True):
-            say(f"{name}: {part.volume_mm3 / 1000:.1f} ml")
+            say(f"{name}: {part.volume_ml:.1f} ml")
         say(f"case written to {self.case}; look at {self.case / 'qc.png'} before you rely on it.")
 
 

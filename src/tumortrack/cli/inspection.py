@@ -211,7 +211,7 @@ def _scene(folder: Path) -> list[str]:
 
     scene = read_scene(folder)
     parts = zip(scene.reference.names, scene.reference.parts, strict=True)
-    volumes = ", ".join(f"{name} {part.volume_mm3 / 1000:.1f} ml" for name, part in parts)
+    volumes = ", ".join(f"{name} {part.volume_ml:.1f} ml" for name, part in parts)
     targets = f", {len(scene.targets.labels)} targets" if scene.targets else ""
     return [f"a scene with {len(scene.cloud.points_mm)} points; truth: {volumes}{targets}"]
 
@@ -275,7 +275,7 @@ def _points(path: Path) -> list[str]:
         return [f"a depth image of {size} pixels, nearly all at {near:.0f} to {far:.0f} mm"]
     if _is_mesh(path):
         mesh = read_mesh(path)
-        return [f"a mesh, {_size(mesh.box_mm)}; {mesh.volume_mm3 / 1000:.1f} ml if it is closed"]
+        return [f"a mesh, {_size(mesh.box_mm)}; {mesh.volume_ml:.1f} ml if it is closed"]
     if path.suffix.lower() not in CLOUD_SUFFIXES:
         return []
     cloud, notes = read_cloud(path)

@@ -27,4 +27,3 @@ class Likely:
     def entry(self) -> dict[str, Any]:
         """JSON, for a report."""
         return {"cause": self.cause.name.lower(), "number": self.number, "fit": self.fit}
-

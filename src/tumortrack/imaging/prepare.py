@@ -242,7 +242,7 @@ def _from_meshes(folder: Path, options: PrepareOptions) -> Case:
     refuse_unused(f"{folder} holds meshes", options, *unused)
     anatomy, notes = read_mesh_folder(folder, options.unit, options.kind)
     labels = label_meshes(anatomy)
-    mesh_ml = [part.volume_mm3 / 1000 for part in anatomy.parts]
+    mesh_ml = [part.volume_ml for part in anatomy.parts]
     measured = _measured(labels, anatomy, {"names": list(anatomy.names), "mesh_ml": mesh_ml})
     patient = Patient(options.patient or UNKNOWN, options.stated_side)
     report = {"kind": "meshes", "notes": notes, **measured}

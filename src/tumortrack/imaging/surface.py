@@ -55,7 +55,7 @@ def surfaces(
         if not mask.any():
             raise InputError(f"the labels have no voxel of {name}; number the tumors without gap.")
         mesh = surface_of(name, mask, affine, step)
-        ml, mesh_ml = float(mask.sum()) * voxel_ml(affine), mesh.volume_mm3 / 1000
+        ml, mesh_ml = float(mask.sum()) * voxel_ml(affine), mesh.volume_ml
         distance = _boundary_distance(mesh, mask, affine)
         p95 = np.percentile(distance, 95)
         rows.append((ml, mesh_ml, 100 * (mesh_ml / ml - 1), distance.mean(), p95, distance.max()))

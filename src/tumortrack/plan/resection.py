@@ -184,8 +184,8 @@ def _kept_away(
 def _volumes_ml(located: Located, label: int, taken: np.ndarray) -> dict[str, float]:
     """Of closed surfaces, as `locate` states them; how much of the parenchyma comes away is counted
     among its points, which lie evenly in it."""
-    organ_ml = located.organ.volume_mm3 / 1000
-    tumors_ml = {n: located.meshes[name_of(n)].volume_mm3 / 1000 for n in located.tumors}
+    organ_ml = located.organ.volume_ml
+    tumors_ml = {n: located.meshes[name_of(n)].volume_ml for n in located.tumors}
     parenchyma_ml = organ_ml - sum(tumors_ml.values())
     healthy_ml = parenchyma_ml * float(taken[located.labels == ORGAN].mean())
     with_it_ml = [

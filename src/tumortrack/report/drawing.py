@@ -4,7 +4,7 @@ sections of meshes, scale bars."""
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, cast
 
@@ -24,6 +24,7 @@ from tumortrack.core.store import write_atomically
 from tumortrack.core.types import FIRST_TUMOR, Mesh
 from tumortrack.imaging.raster import voxelise
 from tumortrack.report.renderer import RGB, Body, Frame, ParallelView, rgb
+from tumortrack.report.wrapping import wrapped
 
 ORGAN = rgb(colours.ORGAN_PART)
 ESTIMATED = rgb(colours.part_colour(FIRST_TUMOR))  # of one tumor, or a curve
@@ -44,26 +45,6 @@ def new_figure(width_in: float, height_in: float, **borders: float) -> Figure:
     FigureCanvasAgg(figure)
     figure.subplots_adjust(**{"left": 0.02, "right": 0.98, "top": 0.9, "bottom": 0.03} | borders)
     return figure
-
-
-def wrapped(text: str, width: float, length_of: Callable[[str], float]) -> list[str]:
-    """The text in lines no longer than ``width`` (in the unit of ``length_of``), broken between
-    words, and within a word that is longer. Nothing is left out."""
-    lines = []
-    for paragraph in text.splitlines() or [""]:
-        line = ""
-        for word in paragraph.split():
-            if line and length_of(f"{line} {word}") > width:
-                lines.append(line)
-                line = ""
-            line = f"{line} {word}" if line else word
-            while len(line) > 1 and length_of(line) > width:
-                fits = (n for n in range(len(line) - 1, 1, -1) if length_of(line[:n]) <= width)
-                fit = next(fits, 1)
-                lines.append(line[:fit])
-                line = line[fit:]
-        lines.append(line)
-    return lines
 
 
 def add_words(

@@ -28,9 +28,10 @@ from tumortrack.live.values import Polyline, Workcell
 from tumortrack.plan.motions import LIFT, RELEASE, Motions
 from tumortrack.plan.resection import inside
 from tumortrack.plan.values import Located, ResectionPlan
-from tumortrack.report.drawing import SIGN, wrapped
+from tumortrack.report.drawing import SIGN
 from tumortrack.report.plan_pictures import organ_surfaces, parted
 from tumortrack.report.renderer import Body, Viewpoint, render, rgb
+from tumortrack.report.wrapping import wrapped
 
 FPS = 10  # a GIF counts hundredths of a second
 _FROM = np.array([-0.36, -0.8, 0.48])  # where the viewer is: to the left, in front, above

@@ -11,13 +11,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import trimesh
 from jaxtyping import Float
 from PIL import Image
-from trimesh.intersections import mesh_plane
 
 from tumortrack.core import colours
 from tumortrack.core.estimate import NO_CHECK_FAILED, UNVERIFIED, Estimate
+from tumortrack.core.geometry import plane_section
 from tumortrack.core.organ import is_tumor
 from tumortrack.core.patient import patient_in
 from tumortrack.core.store import write_atomically
@@ -139,8 +138,8 @@ def _surface(part: str, mesh: Mesh) -> dict[str, Any]:
 
 def _outline(part: str, mesh: Mesh) -> dict[str, Any]:
     """The true surface cut by three planes through its middle: pairs of points, a line each."""
-    solid = trimesh.Trimesh(mesh.vertices_mm, mesh.faces, process=False)
-    cuts = [mesh_plane(solid, axis, mesh.box_mm.mean(0)) for axis in np.eye(3)]
+    middle_mm = mesh.box_mm.mean(0)
+    cuts = [plane_section(mesh.vertices_mm, mesh.faces, axis, middle_mm) for axis in np.eye(3)]
     lines = np.concatenate(cuts).reshape(-1, 3)
     about = {"kind": "outline", "name": f"{words(part)}, true (cuts)", "tumor": is_tumor(part)}
     return {**about, "v": _packed(lines)}
@@ -164,8 +163,8 @@ def _about(entry: dict[str, Any]) -> dict[str, Any]:
 
 
 def _typical_and_worst(entries: list[dict[str, Any]]) -> dict[str, int]:
-    """Places of the scene whose tumors are as far off as in the median answer, and of that whose
-    are farthest; without an answer the first."""
+    """Places of the scene whose farthest tumor is as far off as in the median scene, and of the
+    scene where it is farthest; without an answer the first."""
     far = [(worst_center(entry)[0], n) for n, entry in enumerate(entries)]
     answers = sorted(one for one in far if entries[one[1]]["quality"] != "none") or far[:1]
     return {"typical": answers[(len(answers) - 1) // 2][1], "worst": answers[-1][1]}

@@ -29,6 +29,7 @@ from tumortrack.core.types import DepthFrame, SensorCloud
 from tumortrack.live.viewer.slices import ORIENTATIONS, CarriedCt, outlined, plane_through
 from tumortrack.models.margins import margin_words, stated_radius
 from tumortrack.report.renderer import Body, ParallelView, render, rgb
+from tumortrack.report.wrapping import wrapped
 from tumortrack.sense.camera import deproject
 
 PAGE, PICTURE = "index.html", "picture.png"
@@ -39,7 +40,6 @@ _MOST_POINTS = 6000
 _MOST_TUMORS = 6  # with slices
 _NEAR_MM = 1.0  # points so near to a slice are shown in it
 _BAR_MM = 20.0
-_STATE_COLOURS = {"good": colours.GOOD, "poor": colours.POOR, "none": colours.NONE}
 _TITLES = {"good": "GOOD", "poor": "POOR", "none": "NONE: no estimate"}
 Panel = tuple[str, Image.Image]  # a caption and what it says
 
@@ -79,7 +79,7 @@ def write_run_page(
     )
     page = resources.files("tumortrack.report").joinpath("run_page.html").read_text("utf-8")
     cells = {
-        "@COLOUR@": colours.css(_STATE_COLOURS[verdict]),
+        "@COLOUR@": colours.css(colours.VERDICTS[verdict]),
         "@TEXT@": colours.css(_text_colour(verdict)),
         "@VERDICT@": _TITLES[verdict],
         "@WORDS@": html.escape(_sentence(words.partition(": ")[2])),
@@ -209,7 +209,7 @@ def _view(
     frame = view.frame_around(np.concatenate(shown), 6.0).widened(_ASPECT)
     pixel_mm = (frame.right - frame.left) / _WIDE
     bodies = [
-        Body(mesh, rgb(_colour_of(name)), 1.0 if is_tumor(name) else 0.36)
+        Body(mesh, rgb(colours.name_colour(name)), 1.0 if is_tumor(name) else 0.36)
         for name, mesh in meshes.items()
     ]
     width, height = frame.size(pixel_mm)
@@ -244,7 +244,7 @@ def _slice(estimate: Estimate, seen: Seen, part: str, orientation: str) -> Image
         picture = seen.ct.picture(back)
     else:
         picture = _labelled(estimate, places_mm)
-    lines = [(mesh, _colour_of(name), 3) for name, mesh in estimate.meshes.items()]
+    lines = [(mesh, colours.name_colour(name), 3) for name, mesh in estimate.meshes.items()]
     image = outlined(picture.reshape(half, half, 3), plane, lines, _SLICE).copy()
     if seen.cloud is not None:
         away = seen.cloud.points_mm.astype(float) - plane.centre_mm
@@ -297,8 +297,8 @@ def _dots(picture: np.ndarray, places: Float[np.ndarray, "n 2"], colour: colours
 def _write_picture(path: Path, verdict: Quality, lines: list[str], panels: list[Panel]) -> None:
     """Verdict, what is said of it, and the panels in rows; no line is cut."""
     room = _ACROSS - 2 * _EDGE
-    head = wrapped(lines[0], 36, room)
-    below = [row for line in lines[1:] for row in wrapped(line, 24, room)]
+    head = _lines_of(lines[0], 36, room)
+    below = [row for line in lines[1:] for row in _lines_of(line, 24, room)]
     images = [
         (caption, image.resize((round(image.width * _ROW / image.height), _ROW)))
         for caption, image in panels
@@ -311,39 +311,25 @@ def _write_picture(path: Path, verdict: Quality, lines: list[str], panels: list[
         x += image.width + 16
     picture = Image.new("RGB", (_ACROSS, y + (_ROW + 64 if images else 0)), "white")
     draw = ImageDraw.Draw(picture)
-    draw.rectangle((0, 0, _ACROSS, 32 + 46 * len(head)), fill=_STATE_COLOURS[verdict])
+    draw.rectangle((0, 0, _ACROSS, 32 + 46 * len(head)), fill=colours.VERDICTS[verdict])
     for n, row in enumerate(head):
         draw.text((_EDGE, 14 + 46 * n), row, fill=_text_colour(verdict), font_size=36)
     for n, row in enumerate(below):
         draw.text((_EDGE, 44 + 46 * len(head) + 32 * n), row, fill="black", font_size=24)
     for (caption, image), (left, top) in zip(images, places, strict=True):
         picture.paste(image, (left, top))
-        for n, row in enumerate(wrapped(caption, 20, image.width)):
+        for n, row in enumerate(_lines_of(caption, 20, image.width)):
             draw.text((left, top + _ROW + 4 + 26 * n), row, fill="black", font_size=20)
     write_atomically(path, _png(picture))
 
 
-def wrapped(text: str, size: int, room: float) -> list[str]:
-    """The text in lines that fit; a word that does not is broken."""
-    font, lines = ImageFont.load_default(size), [""]
-    for word in text.split():
-        if font.getlength(f"{lines[-1]} {word}".strip()) > room and lines[-1]:
-            lines.append("")
-        lines[-1] = f"{lines[-1]} {word}".strip()
-        while font.getlength(lines[-1]) > room:
-            fits = next(n for n in range(len(lines[-1]), 0, -1)
-                        if n == 1 or font.getlength(lines[-1][:n]) <= room)  # fmt: skip
-            lines[-1:] = [lines[-1][:fits], lines[-1][fits:]]
-    return lines
-
-
-def _colour_of(name: str) -> colours.Colour:
-    return colours.part_colour(1 + int(name.removeprefix("tumor_")) if is_tumor(name) else 1)
+def _lines_of(text: str, size: int, room: float) -> list[str]:
+    return wrapped(text, room, ImageFont.load_default(size).getlength)
 
 
 def _text_colour(verdict: Quality) -> colours.Colour:
     """White, or near black where white could not be read on the verdict's colour."""
-    red, green, blue = _STATE_COLOURS[verdict]
+    red, green, blue = colours.VERDICTS[verdict]
     return (20, 20, 20) if 0.3 * red + 0.6 * green + 0.1 * blue > 130 else (255, 255, 255)
 
 
