@@ -55,8 +55,8 @@ def acme(tmp_path, monkeypatch):
 @pytest.mark.usefixtures("acme")
 def test_it_says_what_is_missing_unsupported_or_broken_and_what_to_type():
     def line(*about):
-        (said,) = part(*about)
-        return said
+        ((state, text),) = part(*about)
+        return f"{state:8} {text}"
 
     assert line("acme", "", "all").startswith("ok       acme: all; numpy ")
     command = f"{sys.executable} -m pip install 'acme[far]'"

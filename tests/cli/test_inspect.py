@@ -67,8 +67,13 @@ def say(path: Path) -> str:
 @pytest.mark.parametrize(
     ("content", "words"),
     [
-        (RUN, ("a report of `locate`", "verdict: poor", "kidney: 180.1 ml", "(1.0, -2.0, 150.0) mm",
-               "is 0.8 mm", "tumor_1: not found", "a poor estimate has no margin")),
+        (RUN, ("a report of `locate`", "verdict: poor", 
+               "kidney: centre (1.0, -2.0, 150.0) mm, 180.1 ml", "tumor_1: not found",
+               "a poor estimate has no margin")),
+        ({**RUN, "quality": {"verdict": "good", "reason": ""}},
+         ("verdict: good", "kidney: centre (1.0, -2.0, 150.0) mm, standard deviation 0.8 mm")),
+        ({"quality": {"verdict": "none", "reason": "only 3 points are left"}, "input": []},
+         ("a report of `locate`", "verdict: none", "because only 3 points are left")),
         (TRACK, ("200 updates in 10.0 s, 20.0 a second: 75% good, 15% poor, 10% none",
                  "no estimate in 15 of 200: no organ", "latency 16.0 ms (median; 95 %: 30.0 ms)",
                  "tumor_1: centre off by 1.2 mm", "to viewer: 199 delivered, 1 missed")),
@@ -196,3 +201,12 @@ def test_every_sentence_of_the_table_is_one(tmp_path):
         assert {"name"} < kind.keys() <= {"name", "keys", "file", "sentences"}
         for sentence in kind.get("sentences", ()):
             assert isinstance(sentence, str) or len(sentence) == 2
+
+
+def test_a_folder_of_nothing_known_is_said_to_be_that(tmp_path):
+    (tmp_path / "notes").mkdir()
+    (tmp_path / "notes" / "todo.txt").write_text("buy milk")
+    with pytest.raises(InputError, match="nothing that inspect knows"):
+        describe(tmp_path)
+    with pytest.raises(InputError, match="nothing that inspect knows"):
+        describe(tmp_path / "notes")

@@ -263,7 +263,7 @@ def test_swapped_labels_a_misspelt_name_and_a_lost_geometry_are_noted(tmp_path):
     assert [note for note in right if "the affine is the identity" in note]
     swapped = PrepareOptions(name="livr", organ=2, tumor=1)
     notes = prepare(tmp_path / "l.nii.gz", swapped).report["notes"]
-    assert [note for note in notes if re.match(r"tumor_1 takes 9\d% of the organ", note)]
+    assert [note for note in notes if re.match(r"tumor_1 takes 9\d% of organ and tumors", note)]
     assert [note for note in notes if "did you mean --name liver?" in note]
     termed = PrepareOptions(name="livr", term=("10200004", "Liver"))
     assert not [n for n in prepare(tmp_path / "l.nii.gz", termed).report["notes"] if "known" in n]

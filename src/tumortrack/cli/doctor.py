@@ -11,6 +11,7 @@ from importlib import import_module
 from importlib.metadata import PackageNotFoundError, entry_points, requires, version
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Literal
 
 from packaging.requirements import Requirement
 
@@ -50,6 +51,7 @@ _PARTS = {
     "highdicom": "DICOM segmentations",
 }
 _ABSENT = " is not installed"
+Finding = tuple[Literal["ok", "absent", "BROKEN"], str]  # the state of a part, and what is said
 # Libraries of the system that pip cannot bring.
 _SYSTEM = {"pyrealsense2": ("libusb", "apt-get install libusb-1.0-0")}
 
@@ -70,9 +72,9 @@ class Doctor:
         free = shutil.disk_usage(Path.cwd()).free / 2**30
         say(f"free disk here: {free:.1f} GiB" + (" - little" if free < 2 else ""))
         broken = 0
-        for line in _findings():
-            say(line)
-            broken += line.startswith("BROKEN")
+        for state, text in _findings():
+            say(f"{state:8} {text}")
+            broken += state == "BROKEN"
 
         import torch
 
@@ -95,22 +97,22 @@ class Doctor:
             )
 
 
-def _findings() -> Iterator[str]:
-    """Lines that begin with ok, absent or BROKEN."""
+def _findings() -> Iterator[Finding]:
+    """What is there, what is not, and what is and does not work."""
     for (name, extra), purpose in PURPOSES.items():
         yield from part(name, extra, purpose)
     if find_spec("rclpy"):
-        yield "ok       rclpy: ROS 2 through your own ROS"
+        yield "ok", "rclpy: ROS 2 through your own ROS"
     yield from _plug_ins()
     try:
         from tumortrack.registration.kernels import carry
 
-        yield f"ok       compiled kernels are kept in {carry.stats.cache_path}"
+        yield "ok", f"compiled kernels are kept in {carry.stats.cache_path}"
     except Exception as error:  # Numba's own, where no folder can be written to
-        yield f"BROKEN   compiled kernels: {error}; set NUMBA_CACHE_DIR to a writable folder"
+        yield "BROKEN", f"compiled kernels: {error}; set NUMBA_CACHE_DIR to a writable folder"
 
 
-def _plug_ins() -> Iterator[str]:
+def _plug_ins() -> Iterator[Finding]:
     """What other packages add; each is imported. Commands that work are in ``--help``."""
     from tumortrack.live import spec
     from tumortrack.simulate.deform import installed
@@ -123,11 +125,11 @@ def _plug_ins() -> Iterator[str]:
         except Exception as error:  # a foreign package raises anything
             added.append((f"command {point.name}", point.value, str(error)))
     for what, package, fault in added:
-        state, why = ("BROKEN  ", f": {fault}") if fault else ("ok      ", "")
-        yield f"{state} {what} of the package {package}{why}"
+        text = f"{what} of the package {package}"
+        yield ("BROKEN", f"{text}: {fault}") if fault else ("ok", text)
 
 
-def part(name: str, extra: str, purpose: str) -> Iterator[str]:
+def part(name: str, extra: str, purpose: str) -> Iterator[Finding]:
     """A distribution, or one of its extras: whether all that it needs is there and works. What is
     wrong with a package that serves a part of it alone stands in a line of its own."""
     what = f"{name}[{extra}]" if extra else name
@@ -135,24 +137,23 @@ def part(name: str, extra: str, purpose: str) -> Iterator[str]:
     try:
         needed = [one for one in map(Requirement, requires(name) or ()) if _belongs(one, extra)]
     except PackageNotFoundError:
-        yield f"absent   {what}: {purpose}; {install}"
+        yield "absent", f"{what}: {purpose}; {install}"
         return
     faults = {one.name: fault for one in needed if (fault := _fault(one))}
     works = [one.name for one in needed if one.name not in faults]
     alone = {name: fault for name, fault in faults.items() if name in _PARTS} if works else {}
     if rest := [fault for name, fault in faults.items() if name not in alone]:
         absent = extra and all(fault.endswith(_ABSENT) for fault in rest)
-        state = "absent  " if absent else "BROKEN  "
-        yield f"{state} {what}: {purpose}; {', '.join(rest)}; {install}"
+        yield "absent" if absent else "BROKEN", f"{what}: {purpose}; {', '.join(rest)}; {install}"
     else:
         there = ", ".join(f"{name} {version(name)}" for name in works)
-        yield f"ok       {what}: {purpose}{', but for what follows' if alone else ''}; {there}"
+        yield "ok", f"{what}: {purpose}{', but for what follows' if alone else ''}; {there}"
     for package, fault in alone.items():
         library, cure = _SYSTEM.get(package, ("", ""))
         if not (library and library in fault):
             library, cure = "", install
         absent = bool(library) or fault.endswith(_ABSENT)
-        yield f"{'absent  ' if absent else 'BROKEN  '} {_PARTS[package]}: {fault}; {cure}"
+        yield "absent" if absent else "BROKEN", f"{_PARTS[package]}: {fault}; {cure}"
 
 
 def _belongs(needed: Requirement, extra: str) -> bool:

@@ -128,9 +128,11 @@ def _with_figures(content: Content, folder: Path) -> Content:
         figures = {"does": does, "trained": training_words(about), "weakness": weakness_of(about)}
         figures["part_names"] = ", ".join(content["parts"])
         figures["margins"] = described(margins) if margins else [UNKNOWN]
-    elif "quality" in content:
+    elif content.keys() >= {"quality", "parts"}:
+        from tumortrack.report.run_page import part_rows, row_words
+
         figures["margin_words"] = margin_words(content.get("margin"))
-        figures["missing"] = [name for name, p in content["parts"].items() if not p["found"]]
+        figures["rows"] = [row_words(row) for row in part_rows(dict(content))]
     elif "updates" in content:
         counts = *content["estimates"].values(), content["no_estimate"]
         figures["share"] = [count / max(sum(counts), 1) for count in counts]
@@ -166,6 +168,7 @@ def _sealed_scenes(folder: Path, scenes: Mapping[str, str]) -> Iterable[str]:
 
 
 def _folder(path: Path) -> Iterable[str]:
+    from tumortrack.imaging.dicom import NoSeries
     from tumortrack.live.recording.bags import bag_files
     from tumortrack.live.recording.folders import folder_frames
 
@@ -190,7 +193,9 @@ def _folder(path: Path) -> Iterable[str]:
     with suppress(InputError):
         frames = len(folder_frames(path, 30.0, "mm"))
         return [f"{frames} frames, a file each; `track` plays them from recording:{path}"]
-    return _volume(path) if inside else []
+    with suppress(NoSeries):
+        return list(_volume(path))
+    return []
 
 
 def _file(path: Path) -> Iterable[str]:

@@ -331,7 +331,10 @@ class _Procedure:
                     show(f"frame {n} of {len(times_s)}, about {left_s:.0f} s left")
 
             film(frames(), as_located(self.stored), path, progress=advance, plan=self.stored.plan)
-        say(f"written to {path}: {self.motions.seconds:.0f} s in {len(times_s) / FPS:.0f}.")
+        length_s = len(times_s) / FPS
+        say(
+            f"written to {path}: {self.motions.seconds:.0f} s of motion, shown in {length_s:.0f} s."
+        )
 
     def _operation(self, **live: Any) -> operations.Operation:
         from tumortrack.plan.operation import Operation, Planned

@@ -48,6 +48,10 @@ class _Slice:
     laterality: str  # L, R or something else
 
 
+class NoSeries(InputError):
+    """A folder without slices."""
+
+
 @dataclass(frozen=True, eq=False)
 class Series:
     """The slices of one series, in order along the slice normal, and how they lie.
@@ -187,7 +191,7 @@ def _groups(folder: Path) -> tuple[list[list[_Slice]], tuple[str, ...]]:
             "each, or NIfTI."
         )
     if not found:
-        raise InputError(
+        raise NoSeries(
             f"{folder} holds no DICOM image with a position. Give the folder that holds the CT's "
             "slices themselves."
         )

@@ -163,7 +163,7 @@ def _large_tumors(case: Case) -> list[str]:
     voxels = np.bincount(case.labels.labels.reshape(-1))
     shares = voxels[FIRST_TUMOR:] / voxels[ORGAN:].sum()
     return [
-        f"{name} takes {share:.0%} of the organ: are the labels of organ and tumor swapped "
+        f"{name} takes {share:.0%} of organ and tumors together: are their labels swapped "
         "(--organ and --tumor, or the meshes' names)? Look at qc.png"
         for name, share in zip(case.anatomy.names[1:], shares, strict=True)
         if share > _LARGEST_SHARE

@@ -226,7 +226,16 @@ def summary_tables(report: dict[str, Any]) -> list[Table]:
         errors.caption = "; ".join(f"{RIVALS[name]}: {text}" for name, text in MEANING.items())
     table = Table(title=f"medians over scenes; mIoU {summary['miou']:.3f} (overlap, 1: perfect)")
     table.add_column("part")
-    for head in ("found", "HD mm", "1-sided", "HD95", "surface", "centre", "IoU", "worst HD mm"):
+    for head in (
+        "found",
+        "HD mm",
+        "1-sided mm",
+        "HD95 mm",
+        "surface mm",
+        "centre mm",
+        "IoU",
+        "worst HD mm",
+    ):
         table.add_column(head, justify="right")
     rows = part_rows(summary)
     if registered := any("registration_mm" in part for part in rows.values()):

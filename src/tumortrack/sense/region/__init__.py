@@ -89,7 +89,7 @@ def organ_points(
     if len(left) < FEWEST_POINTS:
         took = ", ".join(f"{name} {n}" for name, n in counts.items() if n and name != "organ")
         near, far = config.crop.near_mm, config.crop.far_mm
-        do = "move the camera, widen what took most, or switch that step off"
+        do = "move the camera until the organ is in view and in range, or say where it is"
         raise NoEstimate(
             f"only {len(left)} points are left for the organ; at least {FEWEST_POINTS} are needed. "
             f"Of {picture.taken.size} pixels went to: {took or 'nothing'} (range {near:g}..{far:g} "
