@@ -13,8 +13,8 @@ import torch
 import trimesh
 
 from stories import answered, cloud_by_rays, looking_down, refusal, succeeded, tumortrack
+from tumortrack.cli.evaluate import check_case
 from tumortrack.cli.inspection import describe
-from tumortrack.cli.locate import check_case
 from tumortrack.core import store
 from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.estimate import Following

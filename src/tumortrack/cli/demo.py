@@ -11,7 +11,7 @@ from pathlib import Path
 import tumortrack
 from tumortrack.cli.cases import Prepare, Simulate
 from tumortrack.cli.console import say
-from tumortrack.cli.locate import Evaluate
+from tumortrack.cli.evaluate import Evaluate
 from tumortrack.cli.training import Train
 from tumortrack.core import store
 from tumortrack.core.errors import InputError

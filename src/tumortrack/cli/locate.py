@@ -1,4 +1,4 @@
-"""A model on clouds: `locate` and `evaluate`."""
+"""A model on clouds: `locate`."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from tyro.conf import Positional, UseAppendAction
 
-from tumortrack.cli.console import Device, console, keep_loaded, progress_bar, say, say_notes
-from tumortrack.cli.finding import FindingOrgan, View, read_view
+from tumortrack.cli.console import Device, keep_loaded, say, say_notes
+from tumortrack.cli.finding import FindingOrgan
 from tumortrack.core import store
 from tumortrack.core.config import to_builtins
 from tumortrack.core.errors import InputError, NoEstimate
@@ -19,6 +19,7 @@ from tumortrack.core.errors import InputError, NoEstimate
 if TYPE_CHECKING:
     import numpy as np
 
+    from tumortrack.cli.views import View
     from tumortrack.core.estimate import Estimate
     from tumortrack.core.geometry import Affine
     from tumortrack.core.types import Anatomy, DepthFrame, Look, SensorCloud
@@ -87,7 +88,7 @@ class Locate(FindingOrgan):
         """Its exit status, by the verdict."""
         from tumortrack.tracking.files import has_no_estimate
 
-        _check_grid(self.grid)
+        check_grid(self.grid)
         paths = [self.cloud, self.out, *self.more]
         clouds, out = paths[:-1], paths[-1]
         if self.model.is_file() and (self.cloud / store.MANIFEST).is_file():
@@ -99,29 +100,20 @@ class Locate(FindingOrgan):
         store.check_place(out, "run", overwrite)
         points = self._points()
         frame_id, fixed_from_camera = self._poses(len(clouds))
-        views = [
-            read_view(path, self.unit, camera, self.depth_unit)
-            for path, camera in zip(clouds, self._cameras(len(clouds)), strict=True)
-        ]
+        views = self._views(clouds)
         hints = views[0].hints(self.at, self.mask)
         # What is wrong so far was reported before PyTorch's seconds.
 
         from tumortrack.report.run_page import PAGE, Seen, write_run_page
         from tumortrack.tracking.files import write_estimate, write_no_estimate
-        from tumortrack.tracking.points import check_near_organ
         from tumortrack.tracking.tracker import Tracker
         from tumortrack.training.model import load_model
 
         keep_loaded()
         model = load_model(self.model, self.device)
         tracker = Tracker(model)
-        notes = [note for view in views for note in view.notes]
-        if points is not None:
-            assert tracker.anatomy_ct is not None  # a model with a shape
-            box_mm = tracker.anatomy_ct.organ.box_mm
-            notes += [*points.notes, *check_near_organ(points.points_ct, box_mm, str(self.map))]
         about: dict[str, Any] = {
-            "notes": notes,
+            "notes": self._notes(views, points, tracker.anatomy_ct),
             "input": [],
             "model": model.provenance,
             "model_sha256": store.sha256_of(self.model / store.MANIFEST),
@@ -144,7 +136,8 @@ class Locate(FindingOrgan):
             reason = report["quality"]["reason"]
             raise NoEstimate(f"none: {reason} What was seen: {out / PAGE}") from error
         if estimate.quality == "poor" and views[0].unit is not None:
-            notes.append(f"if that is not the organ, or not all of it: {_ASK}; --whole takes all.")
+            doubt = f"if that is not the organ, or not all of it: {_ASK}; --whole takes all."
+            about["notes"].append(doubt)
         report = estimate.report
         report.update(about)
         if self.poses is not None:
@@ -161,6 +154,27 @@ class Locate(FindingOrgan):
         write_estimate(out, estimate, overwrite, points, add)
         _say_found(estimate, points, out)
         return VERDICTS[estimate.quality]
+
+    def _views(self, clouds: list[Path]) -> list[View]:
+        from tumortrack.cli.views import read_view
+
+        return [
+            read_view(path, self.unit, camera, self.depth_unit)
+            for path, camera in zip(clouds, self._cameras(len(clouds)), strict=True)
+        ]
+
+    def _notes(
+        self, views: list[View], points: PointTable | None, anatomy_ct: Anatomy | None
+    ) -> list[str]:
+        """What was dropped in reading, and which points of --map lie far from the organ."""
+        from tumortrack.tracking.points import check_near_organ
+
+        notes = [note for view in views for note in view.notes]
+        if points is not None:
+            assert anatomy_ct is not None  # a model with a shape
+            box_mm = anatomy_ct.organ.box_mm
+            notes += [*points.notes, *check_near_organ(points.points_ct, box_mm, str(self.map))]
+        return notes
 
     def _organ(
         self, view: View, model: Model, hints: Hints
@@ -297,93 +311,7 @@ def _say_found(estimate: Estimate, points: PointTable | None, out: Path) -> None
     say(f"written to {out} (camera frame, mm) in {seconds:.2f} s{compiled}; look at {out / PAGE}.")
 
 
-@dataclass(frozen=True, kw_only=True)
-class Evaluate:
-    """Locate in every scene of a folder and compare with the truth.
-
-    Attributes:
-        model: folder that `train` wrote.
-        variants: folder of scene folders.
-        report: folder to write: report.json, index.html, pictures.
-        grid: voxels along the longest side of the labelled volume.
-        seed: of the random points and queries.
-        device: auto takes CUDA if there is a GPU.
-        overwrite: replace REPORT if it exists.
-    """
-
-    model: Positional[Path]
-    variants: Positional[Path]
-    report: Positional[Path]
-    grid: int = 160
-    seed: int = 0
-    device: Device = "auto"
-    overwrite: bool = False
-
-    def run(self) -> None:
-        from tumortrack.report.place import check_place
-
-        _check_grid(self.grid)
-        check_place(self.report, self.overwrite)
-        self.write()
-
-    def write(self) -> dict[str, Any]:
-        """The report, whatever lies in its place."""
-        from tumortrack.models.folder import read_model_manifest
-        from tumortrack.simulate.scene_folder import list_scenes
-
-        read_model_manifest(self.model)
-        folders = list_scenes(self.variants)  # report what is wrong before PyTorch's seconds
-        say(f"comparing {self.model} with the truth of {len(folders)} scenes; loading it ...")
-
-        from tumortrack.report.protocol import evaluate_scenes
-        from tumortrack.report.rivals import rivals_of
-        from tumortrack.report.summary import headlines, scene_lines, summary_tables
-        from tumortrack.tracking.tracker import Tracker
-        from tumortrack.training.model import load_model
-
-        keep_loaded()
-        model = load_model(self.model, self.device)
-        check_case(model, folders)
-        say(str(model.patient))
-        about = {
-            "patient": to_builtins(model.patient),
-            "model": model.provenance,
-            "model_sha256": store.sha256_of(self.model / store.MANIFEST),
-            "scenes_folder": str(self.variants),
-            "grid": self.grid,
-            "seed": self.seed,
-        }
-        locate = partial(Tracker(model).locate, grid=self.grid, seed=self.seed)
-        rivals = rivals_of(model)
-        with progress_bar("evaluate", len(folders)) as advance:
-            out = self.report
-            result = evaluate_scenes(locate, self.variants, out, advance, about, rivals)
-        for table in summary_tables(result):
-            console.print(table)
-        for line in (*scene_lines(result["scenes"]), *headlines(result["summary"])):
-            say(line)
-        if rivals is None:
-            say(result["rivals"]["not_available"])
-        say(f"written to {out / 'report.json'}; look at {out / 'index.html'}.")
-        return result
-
-
-def check_case(model: Model, folders: list[Path]) -> None:
-    """Raises InputError for a scene that `simulate` made of another case than the model's. Scenes
-    of other programs do not say which case they show; they pass."""
-    wanted = model.provenance.get("case_sha256")
-    for folder in folders:
-        path = folder / "meta.json"
-        stated = store.read_json(path).get("case_sha256") if path.is_file() else None
-        if wanted is not None and stated is not None and stated != wanted:
-            raise InputError(
-                f"{folder} shows another case than the one this model was trained for, so the "
-                "figures would mean nothing. Make scenes of the model's own case with: "
-                "tumortrack simulate CASE DATASET."
-            )
-
-
-def _check_grid(grid: int) -> None:
+def check_grid(grid: int) -> None:
     from tumortrack.core.estimate import LARGEST_GRID
 
     if not 8 <= grid <= LARGEST_GRID:

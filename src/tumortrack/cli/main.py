@@ -16,8 +16,9 @@ import tumortrack
 from tumortrack.cli.cases import Export, Prepare, Simulate
 from tumortrack.cli.demo import Demo
 from tumortrack.cli.doctor import Doctor
+from tumortrack.cli.evaluate import Evaluate
 from tumortrack.cli.inspection import Inspect
-from tumortrack.cli.locate import VERDICTS, Evaluate, Locate
+from tumortrack.cli.locate import VERDICTS, Locate
 from tumortrack.cli.margins import Margins
 from tumortrack.cli.models import Compile, Onnx
 from tumortrack.cli.plan import Plan

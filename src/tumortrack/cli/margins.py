@@ -95,7 +95,7 @@ class Margins:
         if not left:
             return [done[scene] for scene in states]
         with progress_bar("locating", len(left)) as advance:
-            from tumortrack.cli.locate import check_case
+            from tumortrack.cli.evaluate import check_case
             from tumortrack.report.calibration import row_of
             from tumortrack.simulate.scene_folder import read_scene
             from tumortrack.tracking.tracker import Tracker

@@ -14,13 +14,6 @@ from tumortrack.cli.console import Device, keep_loaded, live_line, say, say_note
 from tumortrack.core import store
 from tumortrack.core.errors import InputError
 from tumortrack.core.process import is_follower
-from tumortrack.models.folder import (
-    check_trainable,
-    is_finished,
-    read_model_manifest,
-    training_words,
-    weakness_of,
-)
 
 if TYPE_CHECKING:
     from tumortrack.training.train import TrainingStatus
@@ -65,6 +58,7 @@ class Train:
 
     def run(self) -> None:
         from tumortrack.imaging.case import load_case
+        from tumortrack.models import folder
 
         if self.minutes is not None and not self.minutes >= 0:
             raise InputError(f"--minutes {self.minutes} must be 0 or more.")
@@ -75,7 +69,7 @@ class Train:
         if self.workers is not None and self.workers < 0:
             raise InputError(f"--workers {self.workers} must be 0 or more.")
         case = load_case(self.case)  # report what is wrong so far before PyTorch's seconds
-        check_trainable(self.model)
+        folder.check_trainable(self.model)
         say("starting ...")
 
         from tumortrack.training.model import start_of
@@ -93,8 +87,8 @@ class Train:
             device=self.device, workers=self.workers, checkpoint_every_s=self.checkpoint_every,
             start=start_of(config.network, self.start), patient=case.patient,
         )  # fmt: skip
-        if is_finished(self.model):
-            done = read_model_manifest(self.model)["provenance"]
+        if folder.is_finished(self.model):
+            done = folder.read_model_manifest(self.model)["provenance"]
             if differ := run.differences(done.get("decided_by", {})):
                 raise InputError(
                     f"{self.model} holds a finished model ({done['steps']} steps, seed "
@@ -102,14 +96,14 @@ class Train:
                     "finished training is not extended: choose another MODEL folder."
                 )
             say(f"{self.model} is trained already ({done['steps']} steps).")
-            say_notes(filter(None, [weakness_of(done)]))
+            say_notes(filter(None, [folder.weakness_of(done)]))
             return
         with training_screen() as show:
             about = train(run, self.model, show).provenance
-        say(f"model written to {self.model}: {training_words(about)}.")
+        say(f"model written to {self.model}: {folder.training_words(about)}.")
         few = bool(self.minutes) and about["steps"] < config.schedule.warmup_steps
         hint = "so few steps teach nearly nothing; train longer, or on a machine with less to do"
-        say_notes(filter(None, [hint if few else "", weakness_of(about)]))
+        say_notes(filter(None, [hint if few else "", folder.weakness_of(about)]))
 
 
 @contextmanager

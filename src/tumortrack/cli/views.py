@@ -1,0 +1,131 @@
+"""The views that `locate` reads, and the organ in them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from tumortrack.core.errors import InputError
+from tumortrack.core.store import read_json
+from tumortrack.core.types import DepthFrame, SensorCloud
+from tumortrack.sense.camera import deproject_pixels
+from tumortrack.sense.cloud import check_cloud, check_depth_unit, crop_cloud
+from tumortrack.sense.files import DEPTH_SUFFIXES, read_cloud, read_depth, read_mask
+from tumortrack.sense.region import Hints, RegionConfig, organ_points
+
+_NEAR = range(-3, 4)  # pixels from the one that was pointed at
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """What a file of `locate` holds; ``unit``: of a depth image, the mm of one step and who says
+    so; ``notes``: on what was dropped."""
+
+    path: Path
+    content: SensorCloud | DepthFrame
+    notes: tuple[str, ...] = ()
+    unit: tuple[float, str] | None = None
+
+    def hints(self, at: tuple[int, int] | None, mask: Path | None) -> Hints:
+        """A pixel on the organ, and an image that is 0 where it is not. Raises InputError: no such
+        pixel, no return there, no such image, or this is a cloud."""
+        if at is None and mask is None:
+            return Hints()
+        if isinstance(self.content, SensorCloud):
+            raise InputError(f"--at and --mask are for depth images; {self.path} is a cloud.")
+        camera = self.content.intrinsics
+        inside = None if mask is None else read_mask(mask, (camera.width, camera.height))
+        return Hints(inside, None if at is None else _picked_mm(self.content, *at))
+
+    def organ(
+        self, region: RegionConfig, hints: Hints, by: str, seed: int
+    ) -> tuple[SensorCloud, dict[str, Any], UInt8[np.ndarray, "h w"] | None]:
+        """The organ's points; what was done, for the report, with ``words`` for people; and what
+        became of each pixel (``sense.region.Region``). ``by``: the hints in words.
+
+        Raises NoEstimate: nothing can be the organ; InputError: the depth's unit cannot be right.
+        """
+        what = f"{self.path.name}: "
+        about: dict[str, Any] = {"file": self.path.name, "hint": by}
+        if self.unit is not None and isinstance(self.content, DepthFrame):
+            unit_mm, said_by = self.unit
+            crop = region.crop
+            check_depth_unit(self.content, unit_mm, crop.near_mm, crop.far_mm)
+            about["depth_unit_mm"] = unit_mm
+            unit = "in metres" if unit_mm == 1000 else f"in steps of {unit_mm:g} mm"
+            what += f"depth {unit} ({said_by}); "
+        found = organ_points(self.content, region, hints, np.random.default_rng(seed))
+        counts = {name: n for name, n in found.counts.items() if n}
+        of = sum(n for name, n in counts.items() if name != "no return")
+        rest = ", ".join(f"{name} {n}" for name, n in counts.items()
+                         if name not in ("organ", "no return"))  # fmt: skip
+        what += f"{counts['organ']} of {of} pixels with a return were taken for the organ, by {by}"
+        about |= {"organ": counts["organ"], "of": of, "pixels": counts}
+        about["words"] = f"{what}{f' (others: {rest})' if rest else ''}."
+        return found.cloud, about, found.taken
+
+    def alone(self, range_mm: tuple[float, float] | None) -> tuple[SensorCloud, dict[str, Any]]:
+        """The same of a cloud that shows the organ alone. Raises NoEstimate: too few points."""
+        assert isinstance(self.content, SensorCloud)
+        cloud = crop_cloud(self.content, *range_mm) if range_mm else self.content
+        kept, of = len(cloud.points_mm), len(self.content.points_mm)
+        by = "--range" if range_mm else ""
+        words = f"{self.path.name}: {kept} of {of} points were taken for the organ"
+        words += f", by {by}." if by else ": a cloud is taken for the organ alone."
+        return cloud, {"file": self.path.name, "hint": by, "organ": kept, "of": of, "words": words}
+
+
+def read_view(
+    path: Path, unit: Literal["mm", "m"], intrinsics: Path | None, depth_unit_mm: float | None
+) -> View:
+    """A cloud, or a depth image with its intrinsics. Raises InputError: it cannot be read, or an
+    option is of the other kind."""
+    if path.suffix.lower() in DEPTH_SUFFIXES:
+        if intrinsics is None:
+            raise InputError(f"{path} is a depth image: give --intrinsics FILE.json with it.")
+        if unit != "mm":
+            raise InputError(
+                "--unit is for clouds; of a depth image give --depth-unit, the mm of one step, or "
+                "have it in the intrinsics file as depth_unit_mm."
+            )
+        frame, unit_mm = read_depth(path, intrinsics, depth_unit_mm)
+        stated = "depth_unit_mm" in read_json(intrinsics)
+        said_by = f"stated in {intrinsics.name}" if stated else "the default"
+        return View(
+            path, frame, unit=(unit_mm, said_by if depth_unit_mm is None else "--depth-unit")
+        )
+    if intrinsics is not None or depth_unit_mm is not None:
+        option = "--intrinsics" if intrinsics is not None else "--depth-unit"
+        raise InputError(
+            f"{option} is for depth images ({', '.join(DEPTH_SUFFIXES)}); {path} is a cloud."
+        )
+    cloud, notes = read_cloud(path, unit)
+    check_cloud(cloud)  # before the crop, which would only say that nothing lies in range
+    return View(path, cloud, notes)
+
+
+def _picked_mm(frame: DepthFrame, column: int, row: int) -> Float[np.ndarray, " 3"]:
+    """Where a pixel's surface is; where it has no return, that of a neighbour. InputError: no such
+    pixel, or no return."""
+    camera = frame.intrinsics
+    if not (0 <= column < camera.width and 0 <= row < camera.height):
+        raise InputError(
+            f"--at {column} {row} is outside the depth image; COLUMN is 0 to {camera.width - 1}, "
+            f"ROW 0 to {camera.height - 1}."
+        )
+    around = [(column + x, row + y) for x in _NEAR for y in _NEAR]
+    around.sort(key=lambda at: (at[0] - column) ** 2 + (at[1] - row) ** 2)
+    index = np.array([y * camera.width + x for x, y in around
+                      if 0 <= x < camera.width and 0 <= y < camera.height])  # fmt: skip
+    depth_mm = frame.depth_mm.ravel()[index].astype(float)
+    index, depth_mm = index[np.isfinite(depth_mm)], depth_mm[np.isfinite(depth_mm)]
+    if not len(index):
+        raise InputError(
+            f"--at {column} {row}: the depth image has no return there. Give a pixel on the organ "
+            "that has one."
+        )
+    return deproject_pixels(index[:1], depth_mm[:1], camera)[0].astype(float)
