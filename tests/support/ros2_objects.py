@@ -27,7 +27,11 @@ from tumortrack.live.values import Observation, Source
 
 HERE = Path(__file__).parent
 N_TOPICS = 3 + len(PARTS)
-DOMAIN = str(1 + secrets.randbelow(100))  # ports of domains beyond reach into the ephemeral ones
+# Each of a run's workers has domains of its own; which, is drawn, for another run may be under way.
+# Ports of domains beyond 100 reach into the ephemeral ones.
+_WORKERS = 8
+_WORKER = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw")) % _WORKERS
+DOMAIN = str(1 + _WORKER + _WORKERS * secrets.randbelow(100 // _WORKERS))
 
 
 @contextmanager
