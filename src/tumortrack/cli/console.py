@@ -36,7 +36,7 @@ def say(text: str) -> None:
 
 
 def warn(warnings: Iterable[str]) -> None:
-    """A line each, whole, that stands out: in red where there are colours, and by its word."""
+    """A line each, in full, that begins with WARNING, in red where the terminal has colours."""
     for text in warnings:
         console.print(f"WARNING: {text}", style="bold red", markup=False)
 

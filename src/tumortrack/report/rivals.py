@@ -2,7 +2,7 @@
 
 ``best_rigid_pose``: an oracle. It knows the truth and may not deform the organ: no rigid method can
 do better in its norm, the squared displacement.
-``rigid_fit``: the organ of the CT, undeformed, laid on the same points as the estimate by robust
+``rigid_fit``: the organ of the CT, undeformed, fitted to the same points as the estimate by robust
 point-to-plane least squares, from the best rigid pose: the best that a user of rigid registration
 could hope for.
 """
@@ -34,7 +34,7 @@ _POINTS = 1000  # of the cloud: as many as the estimate uses
 _WIDTH_MM = 5.0  # of the robust kernel: as wide as that of the elastic fit begins
 _STEPS, _ENOUGH = 60, 1e-3  # mm and rad: a step that moves less is the last
 _FEWEST_TARGETS = 10
-_SOURCE_POINTS = 4000  # of the surfaces that are laid on the true ones
+_SOURCE_POINTS = 4000  # of the surfaces that are fitted to the true ones
 _TURNS = tuple(np.diag([a, b, a * b]) for a, b in product((1.0, -1.0), repeat=2))
 
 

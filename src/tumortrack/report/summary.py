@@ -17,9 +17,9 @@ TARGET_ERRORS = ("mean", "rms", "median", "p95")
 VERDICTS = ("good", "poor", "none")
 RIVALS = {"best_rigid_pose": "best rigid pose", "rigid_fit": "rigid fit"}
 MEANING = {
-    "best_rigid_pose": "an oracle: the undeformed organ, laid on the true one as well as a rigid "
-    "motion can",
-    "rigid_fit": "the undeformed organ, laid on the same points by point-to-plane least squares, "
+    "best_rigid_pose": "an oracle: the undeformed organ, moved onto the true one as well as rigid "
+    "motion allows",
+    "rigid_fit": "the undeformed organ, fitted to the same points by point-to-plane least squares, "
     "started at the best rigid pose",
 }
 METHODS = {"estimate": "estimate", **RIVALS}

@@ -1,7 +1,7 @@
 """Closed-form inverse kinematics of Universal Robots' arms: all branches of one flange pose.
 
 The approach is that of Hawkins 2013, 'Analytic inverse kinematics for the Universal Robots
-UR-5/UR-10 arms' (Georgia Institute of Technology); the formulae are derived anew. Axes 2, 3 and 4
+UR-5/UR-10 arms' (Georgia Institute of Technology); no code was copied. Axes 2, 3 and 4
 are parallel; their common direction is called the side. It depends on joint 1 alone. The side in
 the flange's frame gives joints 5 and 6. Joints 2 to 4 then move a chain in the plane across it.
 """
