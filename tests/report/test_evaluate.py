@@ -227,6 +227,19 @@ def test_table_shows_every_part(evaluated):
     assert re.search(r"poor\s+│\s+estimate\s+│.*3\.0 / not found / not found", text)
 
 
+def test_no_word_of_the_tables_is_cut_on_a_terminal_of_80_columns(evaluated):
+    from rich.console import Console
+
+    found = {**evaluated[1], "summary": summarise(evaluated[1]["scenes"][:1])}
+    console = Console(width=80, record=True, file=open("/dev/null", "w"))  # noqa: SIM115
+    for table in summary_tables(found):
+        console.print(table)
+    text = console.export_text()
+    assert "worst HD" in text
+    assert "tumor_1" in text
+    assert "…" not in text
+
+
 def test_the_worst_of_a_part_is_no_median(evaluated):
     """Kidneys 3, 1 and 0 mm off, one not found; of those found the worst is 3 mm."""
     kidney = evaluated[1]["summary"]["kidney"]

@@ -224,18 +224,10 @@ def summary_tables(report: dict[str, Any]) -> list[Table]:
         errors.add_row(verdict, METHODS[method], *cells)
     if "best_rigid_pose" in summary.get("errors", {}).get("all", {}):
         errors.caption = "; ".join(f"{RIVALS[name]}: {text}" for name, text in MEANING.items())
-    table = Table(title=f"medians over scenes; mIoU {summary['miou']:.3f} (overlap, 1: perfect)")
+    overlap = f"mIoU {summary['miou']:.3f} (overlap, 1: perfect)"
+    table = Table(title=f"medians over scenes, distances in mm; {overlap}")
     table.add_column("part")
-    for head in (
-        "found",
-        "HD mm",
-        "1-sided mm",
-        "HD95 mm",
-        "surface mm",
-        "centre mm",
-        "IoU",
-        "worst HD mm",
-    ):
+    for head in ("found", "HD", "1-sided", "HD95", "surface", "centre", "IoU", "worst HD"):
         table.add_column(head, justify="right")
     rows = part_rows(summary)
     if registered := any("registration_mm" in part for part in rows.values()):
