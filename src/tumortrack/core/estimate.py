@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol, runtime_checkable
 
+import msgspec
 import numpy as np
 from jaxtyping import Float
 
@@ -59,12 +60,14 @@ class Following(Config, frozen=True, kw_only=True):
     """How one frame of many is located. ``thorough``: also search without the last estimate, and
     keep the better fit: a search near the last answer alone would keep its error. ``either_side``:
     somebody may have turned the organ over. ``smoothing_s``: time constant of the mean over past
-    estimates; 0: none."""
+    estimates; 0: none. ``known``: causes found a moment ago, by the check that failed (of no
+    estimate: ``none``), which are not looked for again."""
 
     thorough: bool = False
     either_side: bool = False
     smoothing_s: float = 0.0
     seed: int = 0
+    known: dict[str, tuple[Likely, ...]] = msgspec.field(default_factory=dict)
 
     def __post_init__(self) -> None:
         check_seed(self.seed)

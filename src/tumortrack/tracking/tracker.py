@@ -13,7 +13,7 @@ from jaxtyping import Float64
 
 from tumortrack.core.causes import Cause, Likely
 from tumortrack.core.config import Config, check_seed, to_builtins
-from tumortrack.core.errors import InputError, NotThisOrgan
+from tumortrack.core.errors import InputError, NoEstimate, NotThisOrgan
 from tumortrack.core.estimate import Estimate, Following
 from tumortrack.core.geometry import HERE, Affine, transform_points
 from tumortrack.core.organ import organ_entry
@@ -39,7 +39,6 @@ _ALONE = Following()
 _TURNED_OVER_S = 30.0
 # Causes are sought so often at most, for each check that fails: that takes the time of some frames.
 _SOUGHT_S = 1.0
-_Known = dict[str, tuple[Likely, ...]]  # causes, by the check that failed; of no estimate: "none"
 _OF_POSES = "none", "poses", "fit", "strays", "seen_through"  # checks, where views are several
 
 
@@ -97,10 +96,10 @@ class Tracker:
                 f"locate takes a SensorCloud, not {type(cloud).__name__}: read_cloud(FILE), or "
                 "SensorCloud(points_mm) of an n x 3 array in the camera frame."
             )
-        with self._explaining(cloud, others, {}):
+        with self._explaining(cloud, others, _ALONE):
             estimate = self._locator.locate(cloud, grid, seed, others)
             estimate = self._judged(estimate, cloud, seen or cloud, False, others)
-        return self._explained(estimate, cloud, others, {})
+        return self._explained(estimate, cloud, others, _ALONE)
 
     def follow(
         self,
@@ -109,20 +108,17 @@ class Tracker:
         how: Following = _ALONE,
         seen: DepthFrame | SensorCloud | None = None,
         others: Sequence[Look] = (),
-        known: _Known | None = None,
     ) -> Estimate:
         """The same, fast, for one frame of many: no volume, and a search that starts at the
         ``last`` estimate, if there is one a moment old. Models that know no motion smooth nothing.
-        ``known``: causes of a moment ago, which are not looked for again; new ones are added.
         Raises NoEstimate: as ``locate``; InputError: the cloud is in metres; more than one look, as
         ``locate``."""
-        known = {} if known is None else known
         # What fits worse all of a sudden may be something else that was put there.
         strictly = how.either_side if last is None else last.quality != "good" or not _unusual(last)
-        with self._explaining(cloud, others, known):
+        with self._explaining(cloud, others, how):
             estimate = self._locator.follow(cloud, last, how, others)
             estimate = self._judged(estimate, cloud, seen or cloud, strictly, others, last)
-        return self._explained(estimate, cloud, others, known)
+        return self._explained(estimate, cloud, others, how)
 
     def _judged(
         self,
@@ -150,13 +146,13 @@ class Tracker:
         return estimate
 
     def _explained(
-        self, estimate: Estimate, cloud: SensorCloud, others: Sequence[Look], known: _Known
+        self, estimate: Estimate, cloud: SensorCloud, others: Sequence[Look], how: Following
     ) -> Estimate:
         """With the likely causes of a poor one, and what to do."""
         start, seconds = time.perf_counter(), estimate.report["timings"]
         if estimate.quality == "poor" and not self._weakness:
             check = estimate.report["quality"]["check"]
-            causes = self._causes(cloud, others, known, estimate)
+            causes = self._causes(cloud, others, how, estimate)
             reason = estimate.reason + words(causes, where_to_look(estimate, cloud, others))
             estimate = replace(doubted(estimate, reason, check), causes=causes)
         estimate.report["causes"] = [one.entry() for one in estimate.causes]
@@ -168,25 +164,23 @@ class Tracker:
         self,
         cloud: SensorCloud,
         others: Sequence[Look],
-        known: _Known,
+        how: Following,
         estimate: Estimate | None,
     ) -> tuple[Likely, ...]:
         check = "none" if estimate is None else estimate.report["quality"]["check"]
         if others and check in _OF_POSES:
             return (Likely(Cause.POSES),)
-        if check not in known:
-            known[check] = likely_causes(self.model, cloud, estimate)
-        return known[check]
+        return how.known.get(check) or likely_causes(self.model, cloud, estimate)
 
     @contextmanager
     def _explaining(
-        self, cloud: SensorCloud, others: Sequence[Look], known: _Known
+        self, cloud: SensorCloud, others: Sequence[Look], how: Following
     ) -> Iterator[None]:
         """Adds its likely causes to what is not this organ."""
         try:
             yield
         except NotThisOrgan as error:
-            causes = self._causes(cloud, others, known, None)
+            causes = self._causes(cloud, others, how, None)
             raise NotThisOrgan(f"{error}{words(causes, '')}.", causes) from error
 
     def warm(self) -> None:
@@ -231,7 +225,7 @@ class Follower:
         self._last: Estimate | None = None
         self._scanned_ns, self._rests = 0, False
         self._good_ns: int | None = None
-        self._known_ns, self._known = 0, _Known()
+        self._known_ns, self._known = 0, dict[str, tuple[Likely, ...]]()
 
     def warm(self) -> None:
         """See ``Tracker.warm``."""
@@ -276,11 +270,23 @@ class Follower:
             self._scanned_ns = cloud.stamp_ns
         since_ns = np.inf if self._good_ns is None else cloud.stamp_ns - self._good_ns
         turned = bool(0 <= since_ns <= _TURNED_OVER_S * 1e9)
-        smoothing_s, seed = self._config.smoothing_s, self._config.seed
-        how = Following(thorough=thorough, either_side=turned, smoothing_s=smoothing_s, seed=seed)
         if not 0 <= (cloud.stamp_ns - self._known_ns) * 1e-9 < _SOUGHT_S:
             self._known_ns, self._known = cloud.stamp_ns, {}
-        self._last = self._tracker.follow(cloud, last, how, seen, others, self._known)
+        how = Following(
+            thorough=thorough,
+            either_side=turned,
+            smoothing_s=self._config.smoothing_s,
+            seed=self._config.seed,
+            known=self._known,
+        )
+        try:
+            self._last = self._tracker.follow(cloud, last, how, seen, others)
+        except NoEstimate as error:
+            self._known = {**self._known, "none": error.causes} if error.causes else self._known
+            raise
+        if causes := self._last.causes:
+            check = self._last.report["quality"]["check"]
+            self._known = {**self._known, check: causes}
         if self._last.quality == "good":
             self._good_ns = cloud.stamp_ns
         return self._last
