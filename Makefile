@@ -5,7 +5,7 @@ TRACKER := .venv/.tracker
 SETUP := .venv/.installed
 TOOLS := .tools/.installed
 PIP := pip install --quiet --disable-pip-version-check --no-compile --no-deps
-# Whatever the environment says: without kept bytecode every start compiles PyTorch anew, for 4 s.
+# Whatever the environment says: without kept bytecode every start compiles what it imports anew.
 unexport PYTHONDONTWRITEBYTECODE
 
 # uv fetches and unpacks side by side, in a fraction of pip's time. It reads the certificates that the system trusts, but not pip's
@@ -17,29 +17,29 @@ define INSTALL
 endef
 
 .DEFAULT_GOAL := help
-.PHONY: help setup debian kernels demo test quick pythons pytest test-hard check pretrained attack fuzz crash replay bench soak wheel lock licences audit results real minutes world sequences trust rehearsal population scaling site pictures clean
+.PHONY: help setup debian kernels demo test quick pythons pytest test-hard check attack fuzz crash replay bench soak wheel lock licences audit results real world sequences trust rehearsal population scaling site pictures clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 10
 
-setup: $(SETUP)  ## install everything into .venv: tracker, laboratory, experiment, what tests and the site need
+setup: $(SETUP)  ## install everything into .venv: tracker, PyTorch, laboratory, experiment, what tests and the site need
 
-# PyTorch's CPU build is taken where pip knows of it, else PyPI's, which on x86-64 needs CUDA's packages.
-$(TRACKER): pyproject.toml requirements/core.txt requirements/cuda.txt requirements/torch-cpu.txt requirements/uv.txt
+$(TRACKER): pyproject.toml requirements/core.txt requirements/uv.txt
 	@$(PYTHON) -c 'import sys; sys.exit(not (3, 11) <= sys.version_info < (3, 15) and "tumortrack needs Python 3.11 to 3.14, and this is " + sys.version.split()[0] + "; give make PYTHON=python3.12, or another of these")'
 	@$(PYTHON) -c 'import ensurepip, venv' || { echo "$(PYTHON) cannot make environments; on Debian and Ubuntu: apt-get install python3-venv" >&2; exit 1; }
 	$(PYTHON) -m venv --clear .venv
-	@$(BIN)/$(PIP) --require-hashes -r requirements/torch-cpu.txt 2>/dev/null || echo "PyTorch: PyPI's build"
 	@$(BIN)/$(PIP) --require-hashes -r requirements/uv.txt
 	@$(call INSTALL,requirements/core.txt)
-	@if $(BIN)/python -c 'from importlib.metadata import requires; print(requires("torch"))' | grep -q nvidia; then \
-	echo "PyTorch's CUDA packages: some 3 GB"; $(call INSTALL,requirements/cuda.txt); fi
 	$(BIN)/$(PIP) --no-build-isolation -e .
 	$(BIN)/python -I -m pip check  # -I: what PYTHONPATH names, as ROS sets it, is none of ours
 	@touch $@
 
-$(SETUP): $(TRACKER) lab/pyproject.toml experiment/pyproject.toml requirements/rest.txt
+# PyTorch's CPU build is taken where pip knows of it, else PyPI's, which on x86-64 needs CUDA's packages.
+$(SETUP): $(TRACKER) lab/pyproject.toml experiment/pyproject.toml requirements/rest.txt requirements/cuda.txt requirements/torch-cpu.txt
+	@$(BIN)/$(PIP) --require-hashes -r requirements/torch-cpu.txt 2>/dev/null || echo "PyTorch: PyPI's build"
 	@$(call INSTALL,requirements/rest.txt)
+	@if $(BIN)/python -c 'from importlib.metadata import requires; print(requires("torch"))' | grep -q nvidia; then \
+	echo "PyTorch's CUDA packages: some 3 GB"; $(call INSTALL,requirements/cuda.txt); fi
 	$(BIN)/$(PIP) --no-build-isolation -e experiment -e lab
 	$(BIN)/python -I -m pip check
 	@touch $@
@@ -49,7 +49,7 @@ $(TOOLS): requirements/tools.txt
 	.tools/bin/$(PIP) --require-hashes -r requirements/tools.txt
 	touch $@
 
-demo: $(TRACKER)  ## install the tracker, then CT -> tumors located in unseen deformed scenes (ARGS="--scenes 2": two of them)
+demo: $(TRACKER)  ## install the tracker (without PyTorch), then CT -> tumors located in unseen deformed scenes (ARGS="--scenes 2": two of them)
 	$(BIN)/tumortrack demo $(ARGS)
 
 check: setup  ## lint, types, import order, licences
@@ -78,10 +78,6 @@ pythons:  ## a fresh clone with every Python here: install, short demo, doctor, 
 
 pytest: setup  ## the tests alone
 	OMP_NUM_THREADS=1 $(BIN)/pytest -n 4 --dist loadfile --no-loadscope-reorder
-
-pretrained: setup  ## the weights of random kidneys that the package ships (ARGS="--anatomies N --steps N")
-	$(BIN)/tumortrack pretrain runs/kidneys $(ARGS)
-	cp runs/kidneys/manifest.json runs/kidneys/weights.safetensors src/tumortrack/models/kidneys/
 
 attack: setup  ## hostile files and calls: each must end in one clear line (3 minutes; ARGS=NAME ...: these)
 	$(BIN)/python tests/support/attacks.py runs/attacks $(ARGS)
@@ -113,9 +109,6 @@ results: setup  ## the tables of docs/results.md (hours; ARGS="--case NAME=FOLDE
 real: setup  ## real kidneys, breathing lungs, silicone: ARGS='DATA', a folder of your copies (hours)
 	$(BIN)/python lab/scripts/real.py $(ARGS)
 
-minutes: setup  ## a model after 0, 100 and 400 steps and a whole training (ARGS="NAME=CASE ...")
-	$(BIN)/python lab/scripts/minutes.py $(ARGS)
-
 world: setup  ## scenes of wider physics, noise and views, and how a model does in them (ARGS="CASE OUT --model MODEL")
 	$(BIN)/python lab/scripts/world.py $(ARGS)
 
@@ -136,7 +129,7 @@ rehearsal: setup  ## the experiment on a bench that does not exist, by all its c
 
 pictures: demo debian  ## the pictures in docs/images that the demo shows (docs/pictures.md has the others; 10 minutes)
 	cp runs/demo/scenes/dragged-0002.png docs/images/demo.png
-	$(BIN)/tumortrack locate runs/demo/model runs/demo/dataset/dragged-0002/cloud.ply runs/pictures/run --overwrite
+	$(BIN)/tumortrack locate runs/demo/case runs/demo/dataset/dragged-0002/cloud.ply runs/pictures/run --overwrite
 	$(BIN)/tumortrack plan runs/pictures/run runs/pictures/plan --margin 9 --overwrite
 	cp runs/pictures/plan/plan.png docs/images/plan.png
 	$(BIN)/tumortrack resect runs/pictures/plan --film docs/images/resection.gif

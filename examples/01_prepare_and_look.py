@@ -14,7 +14,7 @@ def main(out: Path) -> None:
     ct_folder = tt.scan_phantom(out / "ct_dicom")
 
     # A phantom lies with its front to the camera; say ``up`` for another direction. The folder
-    # appears whole or not at all.
+    # appears whole or not at all. As the last step the case gets the model that locates it.
     case = tt.prepare(ct_folder, out / "case", up="anterior", overwrite=True)
     for note in case.report["notes"]:
         print("note:", note)

@@ -1,6 +1,6 @@
 """Kidney and tumors in a cloud from any program: camera frame (x right, y down, z forward), mm.
 
-Run after 02 and 03: python examples/04_your_own_cloud.py [FOLDER] [MODEL] [CLOUD]
+Run after 02: python examples/04_your_own_cloud.py [FOLDER] [CASE] [CLOUD]
 """
 
 import sys
@@ -9,12 +9,12 @@ from pathlib import Path
 import tumortrack as tt
 
 
-def main(out: Path, model_folder: Path, cloud_file: Path) -> None:
+def main(out: Path, case_folder: Path, cloud_file: Path) -> None:
     cloud = tt.read_cloud(cloud_file, unit="mm")  # .ply, .pcd or .npz; "m" converts
     print(f"{len(cloud.points_mm)} points")
     # The cloud must show the organ alone; ``tt.find_organ`` frees it of table and instruments.
 
-    tracker = tt.Tracker(tt.load_model(model_folder))  # once; then one call per cloud
+    tracker = tt.Tracker(tt.load_case(case_folder))  # once; then one call per cloud
     try:
         estimate = tracker.locate(cloud, grid=48, seed=0)
     except tt.errors.NoEstimate as error:  # said aloud, never a made-up answer
@@ -32,6 +32,6 @@ if __name__ == "__main__":
     folder = given[0] if given else Path("runs/examples")
     main(
         folder,
-        given[1] if len(given) > 1 else folder / "model_60",
+        given[1] if len(given) > 1 else folder / "case",
         given[2] if len(given) > 2 else folder / "scenes" / "dragged" / "cloud.ply",
     )

@@ -1,7 +1,7 @@
 """Points of the CT, such as a vessel or a planned cut, and where they are before the camera now.
 
-Run after 01 to 03: python examples/05_where_is_this_point_now.py [FOLDER] [MODEL]
-From the command line: tumortrack locate MODEL CLOUD OUT --map points.csv
+Run after 01: python examples/05_where_is_this_point_now.py [FOLDER]
+From the command line: tumortrack locate CASE CLOUD OUT --map points.csv
 """
 
 import sys
@@ -16,13 +16,12 @@ def place(point_mm: np.ndarray) -> str:
     return "(" + ", ".join(f"{value:.1f}" for value in point_mm) + ")"
 
 
-def main(out: Path, model_folder: Path) -> None:
+def main(out: Path) -> None:
     case = tt.load_case(out / "case")
     (scene,) = tt.simulate_scenes(case, seed=3, elastic=False)
-    estimate = tt.Tracker(tt.load_model(model_folder)).locate(scene.cloud, grid=48, seed=0)
+    estimate = tt.Tracker(case).locate(scene.cloud, grid=48, seed=0)
     motion = estimate.motion
-    if motion is None:  # models of the presets quick and paper know no correspondence
-        sys.exit(f"{model_folder} says what is where, but not which point of the CT lies there.")
+    assert motion is not None  # only the paper's networks know none
     print(f"{estimate.quality}: {estimate.reason or 'no check failed; its place is not verified'}")
 
     # LPS in, camera frame out, mm. ``std_mm``: one standard deviation along any axis.
@@ -45,6 +44,4 @@ def main(out: Path, model_folder: Path) -> None:
 
 
 if __name__ == "__main__":
-    given = [Path(argument) for argument in sys.argv[1:]]
-    folder = given[0] if given else Path("runs/examples")
-    main(folder, given[1] if len(given) > 1 else folder / "model_60")
+    main(Path(sys.argv[1] if len(sys.argv) > 1 else "runs/examples"))

@@ -1,7 +1,7 @@
 """A live loop from Python: a case in motion, followed, and a sink of one's own that hears of it.
 
-Run after 01 to 03: python examples/06_follow_a_moving_organ.py [FOLDER] [MODEL] [FRAMES]
-From the command line: tumortrack track MODEL virtual:CASE viewer
+Run after 01: python examples/06_follow_a_moving_organ.py [FOLDER] [FRAMES]
+From the command line: tumortrack track CASE virtual:CASE viewer
 """
 
 import sys
@@ -36,8 +36,8 @@ class PrintingSink:
         print("that was all")
 
 
-def main(out: Path, model_folder: Path, frames: int) -> None:
-    tracker, sink = tt.Tracker(tt.load_model(model_folder)), PrintingSink()
+def main(out: Path, frames: int) -> None:
+    tracker, sink = tt.Tracker(tt.load_case(out / "case")), PrintingSink()
     # Everything that the camera sees goes in; the organ is found in it.
     report = tt.track(
         tracker,
@@ -49,10 +49,7 @@ def main(out: Path, model_folder: Path, frames: int) -> None:
 
 
 if __name__ == "__main__":
-    given = sys.argv[1:]
-    folder = Path(given[0]) if given else Path("runs/examples")
     main(
-        folder,
-        Path(given[1]) if len(given) > 1 else folder / "model_60",
-        int(given[2]) if len(given) > 2 else 30,
+        Path(sys.argv[1] if len(sys.argv) > 1 else "runs/examples"),
+        int(sys.argv[2]) if len(sys.argv) > 2 else 30,
     )

@@ -33,11 +33,11 @@ CHECKED = [
 jaxtyping.install_import_hook(CHECKED, "checking.check_annotations")
 
 
-# What needs a model is slow: it may be the one that trains it.
-TRAINED = {"clinic_model", "quick_model", "learnt_model", "slim_model"}
+# What needs a model is slow: it may be the one that makes it.
+MODELS = {"clinic_model", "quick_model", "learnt_model", "slim_model"}
 
 # The longest files first: with few workers none is left alone with one at the end. Two of the
-# first three train no `clinic` model: else each worker would compile its kernels for itself.
+# first three make no `clinic` model: else each worker would compile its kernels for itself.
 SLOWEST = (
     "test_soak.py",
     "test_locate.py",
@@ -59,7 +59,7 @@ SLOWEST = (
 @pytest.hookimpl(tryfirst=True)  # before -m chooses
 def pytest_collection_modifyitems(items):
     for item in items:
-        if TRAINED.intersection(item.fixturenames):
+        if MODELS.intersection(item.fixturenames):
             item.add_marker(pytest.mark.slow)
     order = {name: n for n, name in enumerate(SLOWEST)}
     items.sort(key=lambda item: order.get(item.path.name, len(order)))
@@ -113,10 +113,10 @@ def phantom_case(once) -> Path:
 
 @pytest.fixture(scope="session")
 def clinic_model(once, phantom_case) -> Path:
-    """A model folder of the phantom: the preset clinic, trained for seconds."""
-    from stories import trained
+    """A model folder of the phantom: the preset clinic."""
+    from stories import write_clinic
 
-    return once("clinic_model", lambda model: trained(phantom_case, model, "clinic"))
+    return once("clinic_model", lambda model: write_clinic(phantom_case, model))
 
 
 @pytest.fixture(scope="session")
@@ -124,7 +124,7 @@ def quick_model(once, phantom_case) -> Path:
     """A model folder of the phantom: the preset quick, trained for seconds."""
     from stories import trained
 
-    return once("quick_model", lambda model: trained(phantom_case, model, "quick"))
+    return once("quick_model", lambda model: trained(phantom_case, model))
 
 
 @pytest.fixture(scope="session")
@@ -138,7 +138,7 @@ def learnt_model(once, phantom_case) -> Path:
 
 @pytest.fixture(scope="session")
 def slim_model(once) -> Path:
-    """A model folder of the elastic objects' organ: a slim clinic, trained for seconds."""
-    from warp_objects import train_slim
+    """A model folder of the elastic objects' organ: a slim clinic."""
+    from warp_objects import write_slim
 
-    return once("slim_model", train_slim)
+    return once("slim_model", write_slim)

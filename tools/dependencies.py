@@ -62,7 +62,8 @@ def lock(upgrade: list[str]) -> None:
     folders = (ROOT, ROOT / "lab", ROOT / "experiment")
     everything = "".join(f"-e {folder}[{_extras(folder)}]\n" for folder in folders)
     resolved = _resolved(everything, "".join(_locks().values()), upgrade)
-    core = pinned(_resolved(f"-e {ROOT}\n", resolved, []))  # keeps what is resolved
+    build = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["build-system"]["requires"]
+    core = pinned(_resolved("\n".join([f"-e {ROOT}", *build]), resolved, []))  # as resolved
     files: dict[str, list[str]] = {name: [] for name in _ABOUT}
     for name, text in pinned(resolved).items():
         rest = "core" if name in core else _APART.get(name, "rest")
@@ -117,7 +118,7 @@ def _resolved(wanted: str, kept: str, upgrade: list[str]) -> str:
 
 _ABOUT = {
     "core": "The tracker alone, by hash: what `make demo` installs.",
-    "rest": "All else that `make setup` installs: extras, experiment, laboratory, tests, site.",
+    "rest": "All else that `make setup` installs: PyTorch, extras, experiment, lab, tests, site.",
     "cuda": "What PyPI's PyTorch for Linux needs besides; its CPU build does not.",
     "ur": "For real arms: pip install --require-hashes --no-deps -r requirements/ur.txt",
 }

@@ -48,7 +48,7 @@ for version in $(printf '%s\n' "${!pythons[@]}" | sort -V); do
       "${as[@]}" "${clean[@]}" "$@" >"$home/log" 2>&1 || { tail -40 "$home/log"; echo "FAILED: $name, Python $version"; exit 1; }
       echo "$name: $((SECONDS - began)) s; $(tail -1 "$home/log")"
     }
-    step demo make --silent demo "PYTHON=$python" ARGS="--minutes 0 --scenes 1"
+    step demo make --silent demo "PYTHON=$python" ARGS="--scenes 1"
     step doctor .venv/bin/tumortrack doctor
     step setup make --silent setup "PYTHON=$python"
     step tests make --silent quick "PYTHON=$python"

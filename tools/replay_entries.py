@@ -23,27 +23,29 @@ from tumortrack.imaging.case import Case, load_case, save_case
 from tumortrack.imaging.surface import surfaces
 from tumortrack.live.sources.virtual import VirtualSourceConfig
 from tumortrack.occupancy.inference import Inference
+from tumortrack.occupancy.presets import paper as paper_config
+from tumortrack.occupancy.presets import quick as quick_config
+from tumortrack.occupancy.training.task import OccupancyTask
+from tumortrack.occupancy.training.train import TrainingRun, train
 from tumortrack.phantom.digital import PhantomParameters, phantom_labels
+from tumortrack.registration.looks import Looks
 from tumortrack.sense.cloud import CloudConfig
 from tumortrack.sense.files import read_cloud
 from tumortrack.sense.region import Hints, RegionConfig, organ_points
 from tumortrack.simulate.scene import SceneStream
 from tumortrack.simulate.scene_folder import draw_targets
+from tumortrack.tracking.model_files import load_model
 from tumortrack.tracking.tracker import Follower, FollowerConfig, Tracker
-from tumortrack.training.model import load_model
-from tumortrack.training.presets import PRESETS
-from tumortrack.training.task import task_of
-from tumortrack.training.train import TrainingRun, train
-from tumortrack_lab.pretraining.pretrain import KidneyStream, Pretraining, pretraining
 from tumortrack_lab.twin.dataset import StateCache, TwinRun
 from tumortrack_lab.twin.views import VIEWS, ViewConfig, make_scene
 
 Entries = Iterable[tuple[str, object]]
 COMMANDS = (
-    *("demo", "prepare", "export", "train", "pretrain", "locate", "track", "plan", "resect"),
+    *("demo", "prepare", "export", "train", "locate", "track", "plan", "resect"),
     *("simulate", "twin", "evaluate", "bench", "compile", "onnx", "inspect", "doctor"),
 )
-STEPS = {"clinic": 60, "quick": 100}
+STEPS = 100  # of `quick`
+TRAINED = {"quick": quick_config, "paper": paper_config}
 CPU, CLOUD = ("--device", "cpu"), Path("scenes/drag/0000/cloud.ply")
 
 
@@ -101,17 +103,17 @@ def case() -> Case:
 
 
 def of_case(preset: str, **changes: Any) -> TrainingRun:
-    config = msgspec.structs.replace(PRESETS[preset](case().anatomy, "limited"), **changes)
+    config = msgspec.structs.replace(TRAINED[preset](case().anatomy), **changes)
     return TrainingRun(case().anatomy, case().up_lps, "", config, steps=3, device="cpu", workers=0)
 
 
 @cache
 def model(preset: str) -> Path:
-    """A model folder after few steps."""
+    """A model folder; of a network after few steps."""
     if preset == "paper":  # the thousands of scenes that it prepares take minutes
         train(of_case("paper", batch_size=4, validation_pairs=4), Path(preset), lambda status: None)
     elif case():
-        steps = ("--steps", STEPS[preset], "--seed", 0, "--workers", 0)
+        steps = ("--steps", STEPS, "--seed", 0, "--workers", 0) if preset == "quick" else ()
         command("train", "case", preset, "--preset", preset, *steps, *CPU)
     return Path(preset)
 
@@ -131,29 +133,23 @@ def help() -> Entries:
 def scene() -> Entries:
     yield from under("case", files("case")) if case() else ()
     yield from under("test", files("scenes"))
-    for preset in PRESETS:
+    for preset in TRAINED:
         about = of_case(preset, batch_size=2)
-        course, config = task_of(about, torch.device("cpu")), about.config.scene
-        given = (about.anatomy_ct, about.up_lps, config, course.points, 0, "train", 2)
-        stream = SceneStream(*given, course.body)  # type: ignore[arg-type]
+        task, config = OccupancyTask(about, torch.device("cpu")), about.config.scene
+        given = (about.anatomy_ct, about.up_lps, config, task.points, 0, "train", 2)
+        stream = SceneStream(*given, task.body)  # type: ignore[arg-type]
         for index in (0, 7):
-            yield from under(f"{preset}/{index}", batch(stream.batch(index)))
-
-
-def batch(made: Any) -> Entries:
-    return fields(made, "clouds_mm points_mm labels camera_from_ct")
-
-
-def pretrain() -> Entries:
-    config = msgspec.structs.replace(pretraining(), batch_size=2)
-    kidneys = KidneyStream(Pretraining(config, anatomies=1, steps=1))
-    yield from under("scene", batch(kidneys.batch(1)))
-    command("pretrain", "start", "--anatomies", 1, "--steps", 3, "--workers", 0, *CPU)
-    yield from under("weights", files("start", "*"))
+            made = stream.batch(index)
+            named = fields(made, "clouds_mm points_mm labels camera_from_ct")
+            yield from under(f"{preset}/{index}", named)
 
 
 def clinic() -> Entries:
-    yield from under("weights", files(model("clinic"), "*"))
+    yield from under("model", files(model("clinic"), "*"))
+    registration: Any = load_model(Path("clinic")).registration  # type: ignore[attr-defined]
+    looks = Looks.of([read_cloud(Path("scenes/elastic/0000/cloud.ply"))[0].points_mm])
+    for number, start in enumerate(registration.search.starts(looks)):
+        yield from under(f"search/{number}", fields(start, "rotation centre_mm"))
     yield from located()
     depth, camera = (f"scenes/elastic/0001/{name}" for name in ("depth.png", "intrinsics.json"))
     yield from ran("depth", "locate", "clinic", depth, "depth", "--intrinsics", camera, *CPU)
@@ -167,7 +163,7 @@ def clinic() -> Entries:
 def watched(config: FollowerConfig) -> Entries:
     """Frames of the virtual camera, the organ found among instruments and background."""
     source = VirtualSourceConfig(case=Path("case"), seed=1).open()
-    follower = Follower(Tracker(load_model(model("clinic"), "cpu")), config)
+    follower = Follower(Tracker(load_model(model("clinic"))), config)
     region_config = RegionConfig(crop=CloudConfig(near_mm=75, far_mm=340))
     for frame in range(3):
         seen = source.at(0.5 + 0.1 * frame, frame * 10**8)
@@ -238,4 +234,4 @@ def twin(states: Path, recording: bool) -> Entries:
     yield from files("twin")
 
 
-SECTIONS = {made.__name__: made for made in (help, scene, pretrain, clinic, plan, quick, paper)}
+SECTIONS = {made.__name__: made for made in (help, scene, clinic, plan, quick, paper)}

@@ -19,13 +19,12 @@ import pandas as pd
 import tyro
 
 from tumortrack import api
-from tumortrack.cli.console import say
+from tumortrack.cli.console import model_folder, say
 from tumortrack.core import store
 from tumortrack.core.errors import InputError
 from tumortrack.core.mesh_files import read_mesh, write_mesh
 from tumortrack.core.types import Mesh
 from tumortrack.imaging.case import Case, load_case
-from tumortrack.models.folder import is_finished
 from tumortrack.tracking.tracker import Tracker
 from tumortrack_lab.real import kidneys, lungs, silicone
 from tumortrack_lab.real.judging import DRAGGED, by_tumor, judge, quantiles, scene_of
@@ -47,54 +46,41 @@ class Options(scripts.KeptOptions):
     parts: tuple[Part, ...] = get_args(Part)
     """Which tables to make."""
     kidneys: tuple[int, ...] = tuple(row["case"] for row in kidneys.frozen())
-    """Which of the frozen list get a model, by case number; all are prepared and checked."""
-    trained: tuple[str, ...] = ()
-    """More organs for the lungs' deformations, each NAME=FOLDER with case/ and model/ in it."""
-    steps: int = 500
-    """Of each training."""
+    """Which of the frozen list are located, by case number; all are prepared and checked."""
+    organs: tuple[str, ...] = ()
+    """More organs for the lungs' deformations, each NAME=CASE."""
     scenes: int = 10
     """Dragged scenes of each kidney."""
     seed: int = 0
-    """Of trainings, scenes and places in the lungs."""
+    """Of scenes and places in the lungs."""
     out: Path = Path("runs/real")
     document: Path = Path("docs/real.md")
 
 
 @dataclass(frozen=True, eq=False)
 class Organ:
-    """A prepared case and a model of it, trained when it is first asked for."""
+    """A prepared case, with its model."""
 
     name: str
-    case_folder: Path
-    model_folder: Path
+    folder: Path
     options: Options
 
     @property
     def case(self) -> Case:
-        return load_case(self.case_folder)
-
-    def train(self) -> None:
-        if not is_finished(self.model_folder):
-            say(f"{self.name}: training")
-            options = self.options
-            api.train(
-                self.case_folder, self.model_folder, steps=options.steps, seed=options.seed,
-                device="cpu", workers=0,
-            )  # fmt: skip
+        return load_case(self.folder)
 
     def by_kind(self, rows: list[dict]) -> list[dict]:
         """The rows, and of each tumor its kind."""
         return kidneys.with_kinds(rows, self.case.anatomy)
 
     def tracker(self) -> Tracker:
-        return Tracker(api.load_model(self.model_folder, "cpu"))
+        return Tracker(api.load_model(self.folder))
 
     def about(self) -> dict:
         """What rows depend on."""
-        self.train()
         return {
-            "case": store.sha256_of(self.case_folder / store.MANIFEST),
-            "model": store.sha256_of(self.model_folder / store.MANIFEST),
+            "case": store.sha256_of(self.folder / store.MANIFEST),
+            "model": store.sha256_of(model_folder(self.folder) / store.MANIFEST),
             "seed": self.options.seed,
         }
 
@@ -109,13 +95,13 @@ def main(options: Options) -> None:
     if {"kidneys", "lungs"} & {*options.parts}:
         folders = kidneys.check(options.data, options.out / "cases", rows)
     chosen = [
-        Organ(name, folders[name], options.out / "models" / name, options)
+        Organ(name, folders[name], options)
         for name in map(kidneys.name_of, options.kidneys)
         if name in folders
     ]
     more = [
-        Organ(name, folder / "case", folder / "model", options)
-        for name, folder in named_folders(options.trained, folders).items()
+        Organ(name, folder, options)
+        for name, folder in named_folders(options.organs, folders).items()
     ]
     made = {
         "kidneys": lambda: kidneys_block(rows, chosen),
@@ -177,7 +163,6 @@ def lungs_block(organs: list[Organ], options: Options) -> str:
     field = cache(lambda patient: lungs.Field(pairs[patient]))
     rows = []
     for organ in organs:
-        organ.train()
         for patient in lungs.PATIENTS:
             rows += organ.by_kind(_breathed(organ, patient, field, options))
     both = pd.DataFrame(rows)
@@ -320,7 +305,7 @@ def _bent(
         write_mesh(folder / "meshes" / "kidney.ply", silicone.closed(*rest))
         up = ",".join(map(str, silicone.UP))
         api.prepare(folder / "meshes", folder / "case", up=up, patient=name)
-    organ = Organ(name, folder / "case", folder / "model", options)
+    organ = Organ(name, folder / "case", options)
     about = organ.about() | {what: store.sha256_of(path) for what, path in files.items()}
 
     def measure() -> list[dict]:

@@ -29,7 +29,7 @@ class Options:
     case: tyro.conf.Positional[Path]
     """Folder that `tumortrack prepare` wrote."""
     model: tyro.conf.Positional[Path]
-    """Folder that `tumortrack train` wrote."""
+    """Its model, or the case again."""
     out: tyro.conf.Positional[Path]
     """Everything goes here."""
     mishaps: bool = True

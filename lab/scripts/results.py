@@ -2,34 +2,27 @@
 
     make results                 (hours; go on with the same command after an interruption)
 
-Scenes, models and measurements are kept under --out; what is there already is not made again.
+Scenes and measurements are kept under --out; what is there already is not made again.
 """
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import product
 from pathlib import Path
 from typing import Any, Literal, get_args
-
-os.environ.setdefault("GOMP_SPINCOUNT", "1000")
 
 from tumortrack.cli.console import say
 from tumortrack.core.errors import TumortrackError
 from tumortrack.phantom.digital import PhantomParameters
-from tumortrack.training.train import TrainingStatus
 from tumortrack_lab.study import goals, scripts, tables
 from tumortrack_lab.study.measure import measured
 from tumortrack_lab.study.methods import (
-    CLINIC,
     Method,
     StudyCase,
-    Trainer,
+    clinic,
     named_folders,
     peer,
     phantom_case,
@@ -39,7 +32,6 @@ from tumortrack_lab.study.methods import (
 from tumortrack_lab.study.tumor_sites import tumor_sites_of
 from tumortrack_lab.twin.views import VARIANTS
 
-EVERY_S = 15.0  # between lines of progress
 PHANTOMS = {"phantom": PhantomParameters(), "second_phantom": second_phantom()}
 VIEW = "noise"
 Section = Literal["accuracy", "goals"]
@@ -62,39 +54,28 @@ class Options(scripts.KeptOptions):
     """More organs than the two phantoms, each NAME=FOLDER (of `tumortrack prepare`)."""
     sections: tuple[Section, ...] = get_args(Section)
     """Which blocks to make."""
-    models: tuple[str, ...] = (CLINIC,)
-    """In accuracy: clinic, and M_lim and M_full (quick)."""
     peers: tuple[str, ...] = (goals.RIGID, "rigid", "elastic")
-    """Beside them in accuracy (docs/peers.md)."""
-    clinic_steps: int = 6_000
-    """Of training clinic (the preset's)."""
-    steps: int = 12_000
-    """Of training the others."""
+    """Beside clinic in accuracy (docs/peers.md)."""
     seeds: tuple[int, ...] = (0, 1, 2)
-    """Of training the phantoms' models: of network, scenes and elastic body."""
-    case_seeds: tuple[int, ...] | None = None
-    """Of training --case (the same as the phantoms')."""
+    """Of models: of elastic body and calibration."""
     variants: tuple[str, ...] = tuple(VARIANTS)
     """States and turns of the twin."""
     grid: int = 160
     """Voxels along the longest side (the paper's: 400)."""
-    device: str = "auto"
-    """Of networks: auto, cpu or cuda."""
     out: Path = Path("runs/results")
     document: Path = Path("docs/results.md")
 
 
 def main(options: Options) -> None:
-    """Scenes, models, measurements, blocks, in this order and section by section."""
+    """Scenes, measurements, blocks, in this order and section by section."""
     writer = options.begin("results", *options.sections)
-    cases, trainer = list(cases_of(options)), Trainer(options.out / "models", options.device)
-    trainer = trainer._replace(report=lines())
+    cases = list(cases_of(options))
     for section in options.sections:
         say(f"== {section}")
         rows: Rows = []
         for case in cases:
             make_scenes(case, options.variants)
-            for method in methods_of(section, case, options, trainer):
+            for method in methods_of(section, case, options):
                 say(f"{case.name}: {method.name}, seed {method.seed}")
                 about = case, method, options.variants, VIEW, options.grid, options.out / "rows"
                 rows += measured(*about)
@@ -118,15 +99,10 @@ def make_scenes(case: StudyCase, variants: tuple[str, ...]) -> None:
         raise TumortrackError(f"the scenes of {case.name} could not be made (see above).")
 
 
-def methods_of(
-    section: Section, case: StudyCase, options: Options, trainer: Trainer
-) -> Iterator[Method]:
+def methods_of(section: Section, case: StudyCase, options: Options) -> Iterator[Method]:
     """One after the other, so that one model is held at a time."""
-    seeds = options.seeds if case.name in PHANTOMS else options.case_seeds or options.seeds
-    models = (CLINIC,) if section == "goals" else options.models
-    for name, seed in product(models, seeds):
-        steps = options.clinic_steps if name == CLINIC else options.steps
-        yield trainer.model(case, name, seed, steps)
+    for seed in options.seeds:
+        yield clinic(case, seed)
     for name in options.peers if section == "accuracy" else (goals.RIGID,):
         yield peer(name, case)
 
@@ -142,19 +118,6 @@ def texts_of(section: Section, rows: Rows, cases: list[StudyCase]) -> list[str]:
         mine = frame[frame.case == name]
         texts += [f"#### {name}", tables.sites_text(name, own), tables.accuracy(mine, own)]
     return texts
-
-
-def lines() -> Callable[[str, TrainingStatus], None]:
-    """A training's progress with the seconds left, a line now and then."""
-    last_s = -EVERY_S
-
-    def line(name: str, now: TrainingStatus) -> None:
-        nonlocal last_s
-        if now.step == now.end or time.monotonic() - last_s >= EVERY_S:
-            say(f"{name}: step {now.step}/{now.end}, {now.seconds_left / 60:.1f} minutes left")
-            last_s = time.monotonic()
-
-    return line
 
 
 if __name__ == "__main__":

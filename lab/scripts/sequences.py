@@ -19,7 +19,7 @@ import pandas as pd
 import tyro
 
 from tumortrack import api
-from tumortrack.cli.console import say
+from tumortrack.cli.console import model_folder, say
 from tumortrack.core import store
 from tumortrack.core.config import to_builtins
 from tumortrack.core.errors import InputError, TumortrackError
@@ -54,7 +54,7 @@ class Options:
     seed: int = 0
     """Of everything."""
     model: Path | None = None
-    """Follow with it (folder that `tumortrack train` wrote)."""
+    """Follow with it (a case has one)."""
     methods: tuple[str, ...] = ("track", "first-look")
     """How; see tumortrack_lab.world.following."""
     others: tuple[Path, ...] = ()
@@ -89,7 +89,7 @@ def main(options: Options) -> None:
     folders = [options.out / f"{kind}-{number:03d}" for kind, number in wanted]
     films = [read_film(folder) for folder in folders if folder.exists()]
     if options.model is not None:
-        _follow(options, options.model, films)
+        _follow(options, model_folder(options.model), films)
 
 
 def _opened(options: Options, config: FilmConfig) -> tuple[World, Callable[[], list[State]]]:
@@ -107,7 +107,7 @@ def _opened(options: Options, config: FilmConfig) -> tuple[World, Callable[[], l
 
 
 def _follow(options: Options, model: Path, films: list[Film]) -> None:
-    tracker, sha256 = Tracker(api.load_model(model, "cpu")), store.sha256_of(model / store.MANIFEST)
+    tracker, sha256 = Tracker(api.load_model(model)), store.sha256_of(model / store.MANIFEST)
     about = {"model_sha256": sha256, "version": ""}
     sites = tumor_sites_of(films[0].rest)
     for done, film in enumerate(films, start=1):

@@ -22,7 +22,7 @@ from typing import Annotated
 
 import tyro
 
-from tumortrack.cli.console import say
+from tumortrack.cli.console import model_folder, say
 from tumortrack.core import store
 from tumortrack.core.config import to_builtins
 from tumortrack.core.errors import InputError, TumortrackError
@@ -63,7 +63,7 @@ class Options:
     draws: int = 1
     """How often each of these."""
     model: Path | None = None
-    """Measure it (folder that `tumortrack train` wrote)."""
+    """Measure it (a case has one)."""
     plans: Path | None = None
     """Instead: plan on the estimates of this one, which was calibrated on other states, and cut."""
     beside: tuple[Path, ...] = ()
@@ -106,7 +106,8 @@ def main(options: Options) -> None:
             f"{done}/{len(todo)} {name}: {left_min:.0f} min left, {each_s:.1f} s of one core a "
             f"scene, {len(failures)} failed"
         )
-    if (model := options.plans or options.model) is not None:
+    if (given := options.plans or options.model) is not None:
+        model = model_folder(given)
         made = [name for name in scenes if (options.out / name).exists()]
         text = (_plans if options.plans else _estimates)(options, world, model, made)
         print(text)

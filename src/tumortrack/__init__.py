@@ -1,11 +1,10 @@
 """tumortrack: an organ and its tumors, located from one depth image of one side.
 
     import tumortrack as tt
-    estimate = tt.Tracker(tt.load_model("MODEL")).locate(tt.read_cloud("cloud.ply"))
+    estimate = tt.Tracker(tt.load_case("CASE")).locate(tt.read_cloud("cloud.ply"))
 
 Millimetres everywhere; a transform is named ``b_from_a``. See docs/conventions.md. Each name is
-loaded when it is first used: importing this package imports neither torch nor any other heavy
-library.
+loaded when it is first used: importing this package imports no heavy library.
 """
 
 from __future__ import annotations
@@ -22,8 +21,8 @@ if TYPE_CHECKING:
     from tumortrack.core.types import Look as Look
     from tumortrack.core.types import SensorCloud as SensorCloud
     from tumortrack.imaging.case import Case as Case
+    from tumortrack.tracking import presets as presets
     from tumortrack.tracking.tracker import Tracker as Tracker
-    from tumortrack.training import presets as presets
 
 _NAMES = {  # by the module that has them
     "api": "estimate_from_surfaces evaluate find_organ load_case load_estimate load_model "
@@ -34,7 +33,7 @@ _NAMES = {  # by the module that has them
     "core.types": "DepthFrame Intrinsics Look SensorCloud",
     "imaging.case": "Case",
     "tracking.tracker": "Tracker",
-    "training": "presets",
+    "tracking": "presets",
 }
 _HOMES = {name: home for home, names in _NAMES.items() for name in names.split()}
 

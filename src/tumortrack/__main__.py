@@ -1,4 +1,4 @@
-"""`python -m tumortrack`, and with it `torchrun -m tumortrack`."""
+"""`python -m tumortrack`."""
 
 from tumortrack.cli.main import main
 

@@ -28,14 +28,15 @@ from tumortrack.imaging.case import load_case as read_case
 if TYPE_CHECKING:
     from tumortrack.live.values import SinkContext, TrackingResult
     from tumortrack.live.workers import SinkWorker
-    from tumortrack.models.config import TrainConfig
+    from tumortrack.models.config import RegistrationConfig
     from tumortrack.models.model import Model
+    from tumortrack.occupancy.config import TrainConfig
+    from tumortrack.occupancy.training.train import TrainingStatus
     from tumortrack.plan.values import ResectionPlan
     from tumortrack.sense.region.taught import Taught
     from tumortrack.simulate.scene import SceneConfig
     from tumortrack.simulate.scene_folder import Scene
     from tumortrack.tracking.tracker import Tracker
-    from tumortrack.training.train import TrainingStatus
 
 StrPath = str | Path
 Device = Literal["auto", "cpu", "cuda"]
@@ -66,6 +67,7 @@ def prepare(
     *,
     overwrite: bool = False,
     segment: str | None = None,
+    progress: Callable[[int, int], None] | None = None,
     **options: Any,
 ) -> Case:
     """A case from a DICOM folder, a CT volume, a label map or a folder of meshes.
@@ -75,9 +77,11 @@ def prepare(
         overwrite: replace a case that lies there.
         segment: of a CT: what segments it, as ``prepare --segment``; its label map is kept beside
             ``folder`` (FOLDER.labels.nii.gz).
+        progress: of making the case's model, as its last step: steps done, of how many.
         options: fields of ``imaging.prepare.PrepareOptions``: ``name``, ``term``,
             ``structure``, ``organ_hu``, ``tumor_hu``, ``labels``, ``side``, ``organ``,
-            ``tumor``, ``up``, ``series``, ``unit``, ``min_tumor_ml``, ``patient``.
+            ``tumor``, ``up``, ``rotations``, ``tilt``, ``sensor``, ``series``,
+            ``unit``, ``min_tumor_ml``, ``patient``.
 
     Returns:
         The case: anatomy as closed surfaces, labels and CT; CT frame, mm.
@@ -88,6 +92,7 @@ def prepare(
     """
     from tumortrack.imaging import prepare as preparing
     from tumortrack.imaging.case import KIND, save_case
+    from tumortrack.tracking.model_files import case_model
 
     known = preparing.PrepareOptions.__dataclass_fields__
     if unknown := sorted(set(options) - set(known)):
@@ -114,6 +119,8 @@ def prepare(
             about = str(case.patient), warnings
             qc_picture(case.labels, case.ct, case.anatomy, aside / "qc.png", *about)
             save_case(case, aside)
+        case = load_case(folder)
+        case_model(case, progress=progress)
     return case
 
 
@@ -178,64 +185,71 @@ def train(
     folder: StrPath,
     *,
     preset: Literal["clinic", "quick", "paper"] = "clinic",
-    config: TrainConfig | None = None,
+    config: TrainConfig | RegistrationConfig | None = None,
     minutes: float | None = None,
     steps: int | None = None,
     seed: int = 0,
     device: Device = "auto",
     workers: int | None = None,
-    start: StrPath | None = None,
     report: Callable[[TrainingStatus], None] | None = None,
 ) -> Model:
-    """Train a model for a case; the same call resumes after Ctrl-C or a crash.
+    """A model of its own folder. The default preset, ``clinic``, has nothing to learn: a case holds
+    its model. For ``quick`` and ``paper`` the same call resumes after Ctrl-C or a crash.
 
     Args:
         case: folder that ``prepare`` wrote.
         folder: the model's, to write.
         preset: ``clinic`` registers the organ of the CT, ``quick`` and ``paper`` label points.
-        config: a changed preset instead: ``msgspec.structs.replace(presets.clinic(anatomy), ...)``.
-        minutes: of training, from the end of its first step (default: to the preset's end); 0:
-            learn nothing, take what training starts from.
+        config: a changed preset instead: ``msgspec.structs.replace(presets.quick(anatomy), ...)``.
+        minutes: of training, from the end of its first step (default: to the preset's end).
         steps: likewise; give at most one of the two.
         workers: processes that make scenes (default: as the machine allows).
-        start: folder that `pretrain` wrote, or ``none`` (default: the package's, for ``clinic``).
         report: called every few seconds.
 
     Raises:
         InputError: an option is not allowed, a part is too small to be learnt.
+        PackageError: ``quick`` and ``paper``, without PyTorch.
         ArtifactError: no case, or ``folder`` holds another run.
         StorageError: the disk is full; the last checkpoint is whole.
     """
-    from tumortrack.training import train as training
-    from tumortrack.training.model import start_of
-    from tumortrack.training.presets import PRESETS
+    from tumortrack.models.config import RegistrationConfig
+    from tumortrack.models.folder import KIND, save_model
+    from tumortrack.tracking.model_files import make_model
+    from tumortrack.tracking.presets import PRESETS, occupancy
 
     if minutes is not None and steps is not None:
         raise InputError("minutes and steps both say when to stop; give one of them.")
     if preset not in PRESETS:
         raise InputError(f"there is no preset {preset!r}; allowed: {', '.join(PRESETS)}.")
     of = load_case(case)
-    config = config or PRESETS[preset](of.anatomy, "limited")
+    if isinstance(config, RegistrationConfig) or (config is None and preset == "clinic"):
+        store.check_place(Path(folder), KIND, True)
+        model = make_model(of, config, seed)
+        with store.new_folder(Path(folder), overwrite=True) as aside:
+            save_model(model, aside)
+        return model
+    training = occupancy("training.train")
     run = training.TrainingRun(
-        anatomy_ct=of.anatomy, up_lps=of.up_lps,
-        case_sha256=store.sha256_of(Path(case) / store.MANIFEST),
-        config=config, patient=of.patient, seed=seed, steps=steps, minutes=minutes,
-        device=device, workers=workers,
-        start=start_of(config.network, None if start is None else Path(start)),
+        anatomy_ct=of.anatomy, up_lps=of.up_lps, case_sha256=of.sha256,
+        config=config or PRESETS[preset](of.anatomy, "limited"), patient=of.patient,
+        seed=seed, steps=steps, minutes=minutes, device=device, workers=workers,
     )  # fmt: skip
-    return training.train(run, Path(folder), report or (lambda status: None))
+    made: Model = training.train(run, Path(folder), report or (lambda status: None))
+    return made
 
 
 def load_model(folder: StrPath, device: Device = "auto") -> Model:
-    """Read a folder that ``train`` wrote; ``Tracker(model)`` locates with it.
+    """Read a folder that ``train`` wrote, or the model of a case; ``Tracker(model)`` locates with
+    it.
 
     Raises:
         ArtifactError: missing, unfinished, of another schema, damaged or changed.
         InputError: CUDA was asked for and is not available.
+        PackageError: it has a network, and PyTorch is not installed.
     """
-    from tumortrack.training import model
+    from tumortrack.tracking import model_files
 
-    return model.load_model(Path(folder), device)
+    return model_files.load_model(Path(folder), device)
 
 
 def read_cloud(path: StrPath, unit: Literal["mm", "m"] = "mm") -> SensorCloud:

@@ -10,9 +10,10 @@ import pytest
 import trimesh
 import tyro
 
-from stories import refusal, succeeded, tumortrack
+from stories import refusal, tumortrack
 from tumortrack.cli.cases import Prepare
 from tumortrack.cli.demo import Demo
+from tumortrack.cli.main import run
 from tumortrack.cli.training import Train
 from tumortrack.core.errors import InputError
 from tumortrack.imaging.prepare import PrepareOptions, prepare
@@ -124,17 +125,6 @@ def test_prepare_refuses(make, tmp_path):
     assert sorted(tmp_path.rglob("*")) == before
 
 
-def test_an_existing_case_is_kept_unless_told(tmp_path):
-    source = _nifti(tmp_path / "ball.nii", _ball(), np.eye(4))
-    succeeded(tumortrack("prepare", source, tmp_path / "case"))
-    before = (tmp_path / "case" / "manifest.json").read_bytes()
-    assert "--overwrite" in refusal(tumortrack("prepare", source, tmp_path / "case"))
-    assert (tmp_path / "case" / "manifest.json").read_bytes() == before
-    succeeded(tumortrack("prepare", source, tmp_path / "case", "--up", "left", "--overwrite"))
-    assert (tmp_path / "case" / "manifest.json").read_bytes() != before
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["ball.nii", "case"]
-
-
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
@@ -146,12 +136,32 @@ def test_an_existing_case_is_kept_unless_told(tmp_path):
         (["--organ", "2", "--tumor", "0"], "--organ, --tumor means nothing"),
         (["--unit", "m"], "--unit means nothing"),
         (["--series", "1"], "--series means nothing"),
+        (["--tilt", "61"], "tilt is 61 degrees; allowed: 0 to 60"),
+        (["--tilt", "-1"], "allowed: 0 to 60"),
+        (["--tilt", "nan"], "allowed: 0 to 60"),
     ],
 )
 def test_options_out_of_range_say_what_is_allowed(arguments, words, tmp_path):
     source = _nifti(tmp_path / "ball.nii", 1000 * _ball().astype(np.int16) - 900, np.eye(4))
     assert words in refusal(tumortrack("prepare", source, tmp_path / "case", *arguments))
     assert not (tmp_path / "case").exists()
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "others"),
+    [("--rotations", "any", "('limited', "), ("--sensor", "kinect", "('d405', ")],
+)
+@pytest.mark.usefixtures("unchecked")
+def test_a_choice_that_is_none_says_what_is_one(option, value, others, tmp_path):
+    source = _nifti(tmp_path / "ball.nii", _ball(), np.eye(4))
+    done = tumortrack("prepare", source, tmp_path / "case", option, value)
+    assert done.returncode == 2
+    assert option in done.stderr
+    assert value in done.stderr
+    assert others in done.stderr
+    name = option.removeprefix("--")
+    with pytest.raises(InputError, match=f"{name} '{value}' is not allowed"):
+        PrepareOptions(**{name: value})
 
 
 def test_options_of_other_inputs_are_refused(tmp_path):
@@ -183,6 +193,23 @@ def test_an_unreadable_input_is_named_and_no_folder_stays(tmp_path, monkeypatch)
     with pytest.raises(InputError, match=r"ball\.nii cannot be read: Permission denied"):
         Prepare(input=source, case=tmp_path / "new" / "dir" / "case").run()
     assert sorted(p.name for p in tmp_path.iterdir()) == ["ball.nii"]
+
+
+@pytest.mark.parametrize(
+    "arguments", [["demo", "--preset", "quick"], ["train", "--preset", "paper"]]
+)
+def test_without_pytorch_the_papers_method_names_its_extra(
+    arguments, phantom_case, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.setattr("tumortrack.tracking.presets.find_spec", lambda name: None)
+    out = str(tmp_path / "out")
+    places = ["--out", out] if arguments[0] == "demo" else [str(phantom_case), out]
+    assert run([*arguments, *places]) == 2
+    said = capsys.readouterr()
+    assert said.err.count("\n") == 1
+    assert "pip install 'tumortrack[occupancy]'" in said.err
+    assert said.out == ""
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_train_wants_one_end(tmp_path):

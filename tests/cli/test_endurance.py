@@ -24,7 +24,7 @@ def test_damaged_input_is_read_or_refused(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["locating", "recording"])
+@pytest.mark.parametrize("kind", ["making", "locating", "recording"])
 def test_killed_commands_leave_what_is_whole(kind, tmp_path, phantom_case, clinic_model):
     base = tmp_path / "base"
     base.mkdir()

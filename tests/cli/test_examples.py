@@ -26,7 +26,7 @@ def story(tmp_path_factory):
     """The folder that all examples wrote into, and what each of them said."""
     out = tmp_path_factory.mktemp("examples")
     said = {}
-    for file in EXAMPLES:  # as `python FILE FOLDER`, without loading PyTorch seven times
+    for file in EXAMPLES:  # as `python FILE FOLDER`, without loading the package seven times
         with (
             pytest.MonkeyPatch.context() as patch,
             contextlib.chdir(out),
@@ -52,6 +52,12 @@ def test_a_resection_is_planned(story):
         assert (out / f"plan_{method}.png").stat().st_size > 50_000
 
 
+def test_nothing_has_to_be_trained(story):
+    """The verdict, then the three parts, in the third."""
+    _, said = story
+    assert re.fullmatch(r"(good|poor): .+\n(\w+: [\d.]+ ml at \(.+\) mm\n){3}", said["03"])
+
+
 def test_examples_use_the_public_names_alone():
     for file in EXAMPLES:
         imports = re.findall(r"^\s*(?:from|import) (tumortrack\S*).*", file.read_text(), re.M)
@@ -62,7 +68,7 @@ def test_a_moving_organ_is_followed(story):
     _, said = story
     heard = [float(x) for x in re.findall(r"off by ([0-9.]+) mm; ", said["06"])]
     assert len(heard) >= 10
-    assert 0.01 < np.median(heard) < 15  # a model of 60 steps
+    assert 0.01 < np.median(heard) < 3
     assert "that was all" in said["06"]
     assert "latency p50" in said["06"]
 
@@ -90,7 +96,7 @@ def test_the_scene_is_deformed_and_pictured(story):
 
 
 def test_the_cloud_gives_surfaces_in_its_own_frame(story):
-    out, said = story
+    out, _ = story
     report = json.loads((out / "located" / "report.json").read_text())
     assert report["frame"] == "camera"
     assert report["parts"]["kidney"]["found"]
@@ -98,12 +104,11 @@ def test_the_cloud_gives_surfaces_in_its_own_frame(story):
     assert kidney.volume_mm3 / 1000 == pytest.approx(
         report["parts"]["kidney"]["volume_ml"], rel=1e-3
     )
-    # Even after 60 steps the organ lies on its cloud, with the volume that it has in the CT.
+    # The organ lies on its cloud, with the volume that it has in the CT.
     cloud = read_scene(out / "scenes" / "dragged").cloud.points_mm
-    assert np.median(surface_distance(kidney, cloud)) < 3
+    assert np.median(surface_distance(kidney, cloud)) < 1
     true_mm3 = load_case(out / "case").anatomy.organ.volume_mm3
     assert kidney.volume_mm3 == pytest.approx(true_mm3, rel=0.04)
-    assert "step 60" in said["03"]
 
 
 def test_points_of_the_ct_have_a_place_now_and_back(story):
@@ -117,7 +122,7 @@ def test_points_of_the_ct_have_a_place_now_and_back(story):
     assert len(parts) == 3
     for line in parts:
         assert line[6] > 0  # the standard deviation
-        assert line[-1] < 15  # mm off; the deformations are none that training showed
+        assert line[-1] < 5  # mm off; the deformations are none of an elastic body
     # The organ's first triangle, by carrying it and as example 04 wrote the surface.
     written = read_mesh(out / "located" / "kidney.ply")
     for place, mesh in ((parts[0][:3], organ), (parts[0][3:6], written)):

@@ -58,7 +58,7 @@ def test_a_page_does_what_it_says(page, desk, phantom_case, capsys, monkeypatch)
     with contextlib.chdir(desk):
         for program, *arguments in found:
             assert program == "tumortrack"
-            poor = (0, 4) if arguments[0] == "locate" else (0,)  # trained for seconds
+            poor = (0, 4) if arguments[0] == "locate" else (0,)
             assert run(arguments) in poor, (arguments, capsys.readouterr().err)
     for left in LEFT[page.stem]:
         assert (desk / left).stat().st_size > 0

@@ -19,7 +19,7 @@ COUNT = 26  # 7 tested states without a gross miss show 50 %; two fifths are tes
 
 @pytest.fixture(scope="module")
 def scenes(once, phantom_case):
-    """Scenes that training never showed, a state each, with targets."""
+    """Scenes, a state each, with targets."""
 
     def make(folder):
         succeeded(tumortrack("simulate", phantom_case, folder, "--scenes", COUNT, "--elastic"))
@@ -30,14 +30,17 @@ def scenes(once, phantom_case):
     return once("margin_scenes", make)
 
 
-def test_margins_are_found_stated_and_planned_with(clinic_model, scenes, tmp_path):
-    model, table = tmp_path / "model", tmp_path / "model" / "margins.jsonl"
+def test_margins_are_found_stated_and_planned_with(phantom_case, clinic_model, scenes, tmp_path):
+    """Of a case: they are kept beside its model."""
+    case, model = tmp_path / "case", tmp_path / "case" / "model"
+    shutil.copytree(phantom_case, case)
     shutil.copytree(clinic_model, model)
+    table = model / "margins.jsonl"
     cloud, run = list_scenes(scenes)[3] / "cloud.ply", tmp_path / "run"
-    said = answered(tumortrack("locate", model, cloud, tmp_path / "before", "--device", "cpu"))
+    said = answered(tumortrack("locate", case, cloud, tmp_path / "before", "--device", "cpu"))
     assert "no margin: the model was not calibrated" in said
-    assert "give folders of scenes" in refusal(tumortrack("margins", model))
-    calibrate = ("margins", model, scenes, "--device", "cpu", "--confidence")
+    assert "give folders of scenes" in refusal(tumortrack("margins", case))
+    calibrate = ("margins", case, scenes, "--device", "cpu", "--confidence")
     assert "from 0.5 to 0.99" in refusal(tumortrack(*calibrate, 95))
     said = refusal(tumortrack(*calibrate, 0.95))
     assert f"{COUNT} scenes given, a state each; about 180 are needed" in said
@@ -54,7 +57,7 @@ def test_margins_are_found_stated_and_planned_with(clinic_model, scenes, tmp_pat
     rows = [json.loads(line) for line in located.splitlines()[1:]]
     clouds = [Path(row["scene"]) / "cloud.ply" for row in rows if not row["doubt"]]
     for good in clouds:
-        said = answered(tumortrack("locate", model, good, run, "--overwrite"))
+        said = answered(tumortrack("locate", case, good, run, "--overwrite"))
         if store.read_json(run / "report.json")["margin"]["stated"]:
             break
     radii = store.read_json(run / "report.json")["margin"]["stated"]
@@ -83,7 +86,8 @@ def test_margins_are_found_stated_and_planned_with(clinic_model, scenes, tmp_pat
     finally:
         meta.write_bytes(written)
     manifest = store.read_json(model / store.MANIFEST)
-    store.write_json(model / store.MANIFEST, {**manifest, "query_box_mm": [[-90] * 3, [90] * 3]})
-    said = refusal(tumortrack("locate", model, cloud, tmp_path / "after"))
+    trust = {**manifest["trust"], "std_scale": 1.0}
+    store.write_json(model / store.MANIFEST, {**manifest, "trust": trust})
+    said = refusal(tumortrack("locate", case, cloud, tmp_path / "after"))
     assert "margins.json is of another model, or this one was changed" in said
     assert "begun with another model_sha256" in refusal(tumortrack(*calibrate, 0.5))

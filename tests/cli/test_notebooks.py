@@ -1,6 +1,7 @@
 """The notebooks run as a reader runs them, and are kept without outputs."""
 
 import os
+import shutil
 from pathlib import Path
 
 import nbformat
@@ -28,12 +29,10 @@ def test_they_are_kept_without_outputs():
 
 
 @pytest.fixture(scope="module")
-def ran(tmp_path_factory, phantom_case, clinic_model):
-    """What each notebook's cells print: one kernel for all, emptied in between, so that PyTorch is
-    loaded once."""
+def ran(tmp_path_factory, phantom_case):
+    """What each notebook's cells print: one kernel for all, emptied in between."""
     folder = tmp_path_factory.mktemp("notebooks")
-    (folder / "case").symlink_to(phantom_case)
-    (folder / "model").symlink_to(clinic_model)
+    shutil.copytree(phantom_case, folder / "case")
     notebooks = [nbformat.read(file, 4) for file in FILES]
     forget = nbformat.v4.new_code_cell("%reset -f")
     joined = nbformat.v4.new_notebook()
@@ -46,7 +45,7 @@ def ran(tmp_path_factory, phantom_case, clinic_model):
 def test_a_tumor_is_located(ran):
     assert "kidney: 1" in printed(ran[0])  # ml
     off = [line for line in printed(ran[0]).splitlines() if line.startswith("tumor_1: centre off")]
-    assert 0 < float(off[0].split()[4]) < 15  # a model of 20 steps
+    assert 0 < float(off[0].split()[4]) < 5
     assert any("image/png" in o.data for cell in ran[0] for o in cell.outputs if "data" in o)
 
 
@@ -57,7 +56,7 @@ def test_estimates_stand_beside_the_best_rigid_pose(ran):
     assert (std > 0).all()
     assert (rigid > 0).any()  # the scenes are deformed
     assert rigid.max() < 5  # mildly
-    assert np.median(off) < 15  # a model of 20 steps
+    assert np.median(off) < 5
     assert "a ball: no estimate" in printed(ran[1]) or "a ball: poor" in printed(ran[1])
 
 

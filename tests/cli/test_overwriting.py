@@ -30,7 +30,6 @@ COMMANDS = {
     "plan": "NONE OUT",
     "onnx": "NONE OUT.onnx",
     "demo": "--out OUT",
-    "pretrain": "OUT --steps 1",
     "twin": "CASE OUT",
     "bench": "--out OUT.json",
     "fleet": "LIST OUT --serial",

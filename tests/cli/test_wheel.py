@@ -59,12 +59,13 @@ def test_commands_and_an_example_run_from_the_wheel(environment, tmp_path):
     assert "--minutes" in run(*command, "demo", "--help", env=clean)
     assert run(*command, "--version", env=clean) == f"tumortrack {version('tumortrack')}\n"
     said = run(*command, "doctor", env=clean)
-    assert re.search(r"ok       tumortrack: .* torch \d", said)
+    assert re.search(r"ok       tumortrack: .* numba \d", said)
+    assert re.search(r"ok       tumortrack\[occupancy\]: .* torch \d", said)
     assert "BROKEN" not in said
     listed = run(*command, "--help", env=clean)
     assert "locate" in listed
     assert "twin" not in listed  # the laboratory's
-    for name, package in (("pretrain", "tumortrack-lab"), ("record", "tumortrack-experiment")):
+    for name, package in (("twin", "tumortrack-lab"), ("record", "tumortrack-experiment")):
         without = subprocess.run([*command, name], capture_output=True, text=True, env=clean)
         assert without.returncode == 2
         assert f"tumortrack: the command {name} belongs to {package}" in without.stderr
@@ -78,7 +79,7 @@ def test_the_wheel_holds_the_package_alone(wheel):
     tops = {name.split("/")[0] for name in names}
     assert {top.split("-")[0] for top in tops} == {"tumortrack"}
     assert "tumortrack/py.typed" in names
-    assert "tumortrack/models/kidneys/weights.safetensors" in names
+    assert not any(name.endswith(".safetensors") for name in names)  # nothing is learnt
     assert any(name.endswith("LICENSE") for name in names)
 
 

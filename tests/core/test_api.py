@@ -21,7 +21,7 @@ SIGNATURES = {
     "load_model": "folder device='auto'",
     "plan_resection": "located picture=None stand_mm=None accept_poor=False accept_budget=False "
     "confidence=None options",
-    "prepare": "source folder=None overwrite=False segment=None options",
+    "prepare": "source folder=None overwrite=False segment=None progress=None options",
     "read_cloud": "path unit='mm'",
     "read_depth": "path intrinsics unit_mm=None",
     "save_estimate": "estimate folder overwrite=False cloud=None seen=None",
@@ -30,7 +30,7 @@ SIGNATURES = {
     "teach": "frame picture organ beside",
     "track": "tracker source sinks=() until=None seconds=0.0 range_mm=None",
     "train": "case folder preset='clinic' config=None minutes=None steps=None seed=0 "
-    "device='auto' workers=None start=None report=None",
+    "device='auto' workers=None report=None",
 }
 VALUES = {"Case", "DepthFrame", "Estimate", "Intrinsics", "Look", "SensorCloud", "Tracker"}
 MODULES = {"errors", "presets"}
@@ -110,7 +110,7 @@ def test_other_types_are_refused_with_the_call_that_makes_the_right_ones():
         [sys.executable, "-c", WRONG], capture_output=True, text=True, check=False
     )
     tracker, locate, none, function = done.stdout.splitlines()
-    assert tracker.endswith("not str: Tracker(load_model(FOLDER)).")
+    assert tracker.endswith("not str: Tracker(load_case(FOLDER)).")
     assert "not ndarray: read_cloud(FILE)" in locate
     assert none.startswith("there are no scenes to evaluate")
     assert "a tracker or a function, not str" in function

@@ -12,7 +12,7 @@ from tumortrack.core import store
 from tumortrack.core.mesh_files import write_anatomy
 from tumortrack.core.types import Anatomy
 from tumortrack.imaging.symmetry import ALIKE_MM, alike, half_turns, warning
-from tumortrack_lab.pretraining.kidneys import random_anatomy
+from tumortrack_lab.world.kidneys import random_anatomy
 
 # Of the ellipsoid's tumor, 8 mm and 20 mm from the middle along two of its axes: half a turn about
 # the third moves it by twice its distance, about one of them by twice the other's.

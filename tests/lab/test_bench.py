@@ -2,7 +2,7 @@
 
 import json
 import sys
-from pathlib import Path
+from collections.abc import Iterator
 
 import numpy as np
 import pytest
@@ -11,27 +11,22 @@ import torch
 from clock import Clock
 from stories import tumortrack
 from tumortrack.core.errors import InputError, TumortrackError
-from tumortrack.core.types import Anatomy, Mesh
-from tumortrack.models.config import MlpDecoderConfig, NetworkConfig
-from tumortrack.models.encoders.pointnet2 import PointNet2Config, SetAbstraction
-from tumortrack.models.normalisation import CloudBox
-from tumortrack.occupancy.network import MlpDecoder, OccupancyNetwork
-from tumortrack.training.presets import PRESETS, quick_network
+from tumortrack.occupancy.config import MlpDecoderConfig, NetworkConfig
+from tumortrack.occupancy.encoders.pointnet2 import PointNet2Config, SetAbstraction
+from tumortrack.occupancy.network import OccupancyNetwork
+from tumortrack.occupancy.normalisation import CloudBox
+from tumortrack.occupancy.presets import quick_network
 from tumortrack_lab.bench import rows as interleaving
 from tumortrack_lab.bench import run as running
 from tumortrack_lab.bench import subject as subject_module
-from tumortrack_lab.bench.machine import forget_peak, peak_bytes
 from tumortrack_lab.bench.naive import NaiveOccupancy, flowed
-from tumortrack_lab.bench.occupancy import module_flops
-from tumortrack_lab.bench.report import BLOCKS, GOALS, draw_growth, goals_table, write_bench
+from tumortrack_lab.bench.report import BLOCKS, GOALS, goals_table, write_bench
 from tumortrack_lab.bench.rows import (
     BenchResult,
     BenchRow,
     InterleavedTiming,
-    Peaks,
-    Point,
     Uncounted,
-    Work,
+    Workload,
     interleaved,
     timing_of,
 )
@@ -39,10 +34,6 @@ from tumortrack_lab.bench.run import GROUPS, Task, TaskMessage, carry_out, tasks
 from tumortrack_lab.bench.subject import BenchSubject
 from tumortrack_lab.cli.bench import Bench
 from tumortrack_lab.study.document import closing, opening
-
-PAPER_DECODER = MlpDecoderConfig(
-    n_classes=4, width=512, hidden_layers=8, skip_layer=5, norm_layers=(5, 8)
-)
 
 
 def timing(median_s: float) -> InterleavedTiming:
@@ -69,29 +60,6 @@ def test_turns_are_fair_and_what_is_not_counted_is_left_out(monkeypatch) -> None
     assert 3 <= slow_s.turns <= 6
     for one in (slow_s, fast_s):
         assert one.best_s <= one.low_s <= one.median_s <= one.high_s
-
-
-def test_arithmetic_is_that_of_the_layers() -> None:
-    decoder = MlpDecoder(PAPER_DECODER, latent_size=1024).eval()
-    for layer in decoder.layers:
-        layer.fold()
-    terms = decoder.prepare(torch.zeros(1, 1024))
-    # The latent's share is made once: a query costs 3 -> 512, six times 512 -> 512, [512, 3] -> 512
-    # and 512 -> 4, each product an addition and a multiplication.
-    by_hand = 2 * (3 * 512 + 6 * 512 * 512 + 515 * 512 + 512 * 4)
-    assert module_flops(lambda: decoder(terms, torch.zeros(1, 10, 3))) == 10 * by_hand
-    beside = 2 * 512 * 1024 * 2  # the latent beside every query, at both layers that see it
-    assert by_hand == 3_680_256
-    assert beside / by_hand == pytest.approx(0.57, abs=0.01)
-    assert module_flops(lambda: decoder.prepare(torch.zeros(1, 1024))) == beside
-
-
-def test_floors_follow_from_the_rates() -> None:
-    peaks = Peaks(threads=1, gemm={"fp32": 1e9, "bf16": 4e9}, triad=2e9)
-    assert peaks.least_s(Work(flops=4e9, bytes=1.0, precision="bf16")) == (1.0, 5e-10)
-    assert peaks.least_s(Work(flops=1.0, bytes=4e9)) == (1e-9, 2.0)
-    # Not offered: fp32.
-    assert peaks.least_s(Work(flops=3e9, bytes=0.0, precision="int8")) == (3.0, 0.0)
 
 
 def normed_network() -> NetworkConfig:
@@ -141,16 +109,6 @@ def test_the_naive_flow_is_the_flow() -> None:
     np.testing.assert_allclose(flowed(body, states[0], points), moved, atol=0.1)
 
 
-def test_peak_memory_is_seen() -> None:
-    before = forget_peak()
-    if before is None:
-        pytest.skip("this system does not tell")
-    np.ones(2**24)  # 128 MiB, at once freed again; the system's own count is not exact
-    held = peak_bytes()
-    assert held is not None
-    assert 0.95 * 2**27 < held - before < 1.5 * 2**27
-
-
 def some_bench() -> BenchResult:
     row = BenchRow(
         name="frame",
@@ -160,24 +118,13 @@ def some_bench() -> BenchResult:
         ours=timing(0.04),
         naive=timing(1.2),
         naive_is="plain",
-        work=Work(flops=1.5e11, bytes=1e6, precision="bf16"),
         agreement=0.99941,
     )
     follow = BenchRow(
         name="tracking frame", what="clinic", threads=2, item="frame", ours=timing(0.006)
     )
-    points = tuple(
-        Point(curve=curve, what=what, size=size, seconds=size * 1e-4, peak_bytes=size * 10**6)
-        for curve in ("queries", "batch")
-        for what in ("clinic", "quick")
-        for size in (1, 10)
-    )
-    peaks = (Peaks(threads=2, gemm={"fp32": 1e11, "bf16": 5e12}, triad=4e10),)
     machine = {"processor": "a processor", "GPU": "none at hand", "date": "2026-01-02"}
-    rows = (row, follow)
-    return BenchResult(
-        machine=machine, command="the command", peaks=peaks, rows=rows, points=points
-    )
+    return BenchResult(machine=machine, command="the command", rows=(row, follow))
 
 
 def test_goals_are_judged_by_what_was_measured() -> None:
@@ -202,61 +149,35 @@ def test_a_document_is_filled_and_the_rest_of_it_stays(tmp_path) -> None:
     assert text.endswith("after")
     assert "old" not in text
     assert "| frame | paper | 2 | 40.0 ms a frame |" in text
-    assert "| 150 GFLOP | 1.00 MB | bf16 | 75.0 % |" in text
-    assert (document.parent / "images" / "growth.png").stat().st_size > 10_000
-    assert {path.name for path in written} >= {"bench.json", "bench_curves.json", "growth.png"}
-    assert len(json.loads((tmp_path / "bench_curves.json").read_text())["points"]) == 8
-    draw_growth(some_bench().points[:4], tmp_path / "one.png")  # a single curve is a picture too
-
-
-def small_subject(folder: Path) -> BenchSubject:
-    """The bench's subject with a ball and a tumor in place of the phantom."""
-    import trimesh
-
-    def ball(radius_mm: float, x_mm: float) -> Mesh:
-        sphere = trimesh.creation.icosphere(2, radius_mm)
-        return Mesh(sphere.vertices + [x_mm, 0, 0], sphere.faces)
-
-    subject = BenchSubject({}, folder)
-    subject.__dict__["anatomy"] = Anatomy((ball(30.0, 0.0), ball(8.0, 10.0)))
-    return subject
+    assert written == [tmp_path / "bench.json", document]
 
 
 def test_a_large_network_to_measure_is_saved_and_read_again(tmp_path, monkeypatch):
-    for name in ("_SETTLED", "_PER_SIDE"):
-        monkeypatch.setattr(subject_module, name, 1 if name == "_SETTLED" else 8)
-    monkeypatch.setitem(subject_module._STEPS, "paper", 1)
-    subject = BenchSubject({"paper": PRESETS["paper"]}, tmp_path)
-    subject.train("paper", lambda _: None)
-    assert subject.trained("paper")
+    for name, small in (("_SETTLED", 1), ("_PER_SIDE", 8), ("_STEPS", 1)):
+        monkeypatch.setattr(subject_module, name, small)
+    subject = BenchSubject(tmp_path)
+    subject.make("paper", lambda *_: None)
+    assert subject.has("paper")
     assert subject.model("paper").provenance["steps"] == 1
 
 
-def test_a_process_measures_a_part(tmp_path) -> None:
-    parts = (("machine",), ("peaks",), ("group", "generator"))
-    task = Task(threads=1, folder=str(tmp_path), parts=parts, quick=True)
+def test_a_process_measures_a_part(tmp_path, monkeypatch) -> None:
+    def workloads(subject: BenchSubject, budget_s: float) -> Iterator[Workload]:
+        yield Workload("part", "", "sum", lambda: sum(range(99)), lambda: sum(range(9999)))
+
+    monkeypatch.setattr(running, "resolve_name", lambda name: workloads)
+    task = Task(threads=1, folder="", parts=(("machine",), ("group", "planning")), quick=True)
     messages: list[TaskMessage] = []
-    carry_out(task, small_subject(tmp_path), messages.append)
+    carry_out(task, BenchSubject(tmp_path), messages.append)
     (row,) = [one.row for one in messages if one.row is not None]
     ours, naive = row.ours, row.naive
     assert naive is not None
-    assert 1e-5 < ours.best_s <= ours.low_s <= ours.median_s <= ours.high_s
-    assert ours.median_s < naive.median_s
+    assert ours.best_s <= ours.low_s <= ours.median_s <= ours.high_s < naive.median_s
     assert row.ratio == naive.median_s / ours.median_s
     assert row.per_s == 1 / ours.median_s
-    assert row.work is not None
-    # 18 drags of 2,000 points and 162 vertices, 640 triangles' front half, a quarter of the image.
-    by_hand = 16 * 18 * 2162 + 60 * 160 + 2 * 20 * 424 * 240 / 4
-    assert row.work.flops == by_hand
-    (peaks,) = [one.peaks for one in messages if one.peaks is not None]
-    assert peaks.triad > 1e7  # a thousandth of what any machine reaches, however loaded
-    assert peaks.gemm["fp32"] > 1e7
     (machine,) = [one.machine for one in messages if one.machine is not None]
     assert int(machine["cores"]) >= 1
-    assert [one.begins for one in messages if one.begins] == [
-        "the machine's own rates, one core",
-        "generator, one core",
-    ]
+    assert [one.begins for one in messages if one.begins] == ["planning, one core"]
 
 
 WORKER = """
@@ -274,50 +195,45 @@ for group in (name for kind, *names in parts for name in names):
     if group == "planning":
         row["naive"] = {**time, "median_s": 4.0}
     print(json.dumps({"row": row}))
-if ("group", "encoder") in parts:
-    sys.exit("the encoder is broken")
+if ("group", "tracking") in parts:
+    sys.exit("tracking is broken")
 """
 
 
 def test_the_command_gathers_what_processes_find(tmp_path, monkeypatch, capfd) -> None:
     monkeypatch.setattr(running, "WORKER", [sys.executable, "-c", WORKER])
     out = tmp_path / "new" / "found.json"
-    Bench(only=("generator", "planning"), quick=True, out=out).run()
+    Bench(only=("training", "planning"), quick=True, out=out).run()
     found = json.loads(out.read_text())
-    assert [row["name"] for row in found["rows"]] == ["generator", "planning"]
+    assert [row["name"] for row in found["rows"]] == ["planning", "training"]
     assert found["machine"] == {"date": "today"}
-    assert found["command"] == "tumortrack bench --only generator planning --quick"
+    assert found["command"] == "tumortrack bench --only training planning --quick"
     shown = capfd.readouterr().out
     assert "something; about" in shown  # and so many seconds left
-    assert shown.index("  generator") < shown.index("  planning") < shown.index("written to")
+    assert shown.index("  planning") < shown.index("  training") < shown.index("written to")
     first, second = (line for line in shown.splitlines() if "2.00 s a pair" in line)
-    assert "naive" not in first  # each as soon as it was measured
-    assert first.endswith(" left")
-    assert "; naive 4.00 s, 2.00 x; about " in second
-    with pytest.raises(TumortrackError, match="the encoder is broken"):
-        Bench(only=("encoder",), out=tmp_path / "none.json").run()
+    assert "; naive 4.00 s, 2.00 x; about " in first  # each as soon as it was measured
+    assert "naive" not in second
+    assert second.endswith(" left")
+    with pytest.raises(TumortrackError, match="tracking is broken"):
+        Bench(only=("tracking",), out=tmp_path / "none.json").run()
     assert not (tmp_path / "none.json").exists()
 
 
-def test_each_process_has_its_own_threads_and_only_needed_models_are_trained(tmp_path) -> None:
+def test_each_process_has_its_own_threads_and_only_needed_models_are_made(tmp_path) -> None:
     common = Task(threads=1, folder=str(tmp_path))
-    groups = ("generator", "frame", "tracking")
-    first, one, two, *curves = tasks_of(common, groups, ("grid",), cores=4)
-    trained = tuple(("train", preset) for preset in ("clinic", "paper", "quick"))
-    assert (first.threads, first.parts) == (2, (("machine",), *trained))
-    assert (one.threads, one.parts[1:]) == (1, tuple(("group", name) for name in groups))
-    assert (two.threads, two.parts[1:]) == (2, tuple(("group", name) for name in groups[1:]))
-    assert one.parts[0] == two.parts[0] == ("peaks",)
-    every = [(("curve", "grid", preset),) for preset in ("clinic", "quick", "paper")]
-    assert [task.parts for task in curves] == every
-    (alone,) = tasks_of(common, ("generator",), (), cores=1)
-    assert alone.parts == (("machine",), ("peaks",), ("group", "generator"))
+    groups = ("planning", "frame", "tracking")
+    first, one, two = tasks_of(common, groups, cores=4)
+    made = ("make", "clinic"), ("make", "paper")
+    assert (first.threads, first.parts) == (2, (("machine",), *made))
+    assert (one.threads, one.parts) == (1, tuple(("group", name) for name in groups))
+    assert (two.threads, two.parts) == (2, tuple(("group", name) for name in groups[1:]))
+    (alone,) = tasks_of(common, ("planning",), cores=1)
+    assert alone.parts == (("machine",), ("group", "planning"))
 
 
 def test_what_cannot_be_measured_is_refused(tmp_path) -> None:
     assert "nonsense" in tumortrack("bench", "--only", "nonsense").stderr
-    with pytest.raises(InputError, match="belong together"):
-        Bench(model=tmp_path).run()
     with pytest.raises(InputError, match="cannot be read"):
         Bench(document=tmp_path / "none.md").run()
     (tmp_path / "bare.md").write_text("no markers")

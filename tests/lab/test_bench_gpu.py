@@ -1,22 +1,18 @@
 """The bench: calls that take seconds, and what only a GPU is asked for."""
 
 import shutil
-from functools import partial
 
 import pytest
 
 from clock import Clock
-from tumortrack.training.presets import PRESETS, quick
-from tumortrack_lab.bench import curves, occupancy, rows, training
+from tumortrack_lab.bench import occupancy, rows, training
 from tumortrack_lab.bench import subject as subjects
 from tumortrack_lab.bench.report import goals_table
 from tumortrack_lab.bench.rows import (
-    DECODER,
-    ENCODER,
     EVERY,
+    FIRST_LOOK,
     FRAME,
-    GENERATOR,
-    STEP,
+    SEARCH,
     TRACKING,
     TRAINING,
     VOLUME,
@@ -69,76 +65,39 @@ def test_goals_of_a_gpu_are_judged_where_there_is_one() -> None:
     assert sum("not measured in this run |  |" in line for line in lines) == len(lines) - 1 == 2
 
 
-def test_rows_of_a_gpu_are_measured_on_any_device(quick_model, tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr(training, "LABELLING", ("quick",))
-    for name, small in (("GRID", 24), ("SLAB", 99), ("QUERIES", 999)):
+@pytest.fixture
+def subject(quick_model, tmp_path, monkeypatch) -> BenchSubject:
+    """In small, with a small network in place of the paper's."""
+    for name, small in (("GRID", 24), ("SLAB", 99), ("QUERIES", 999), ("IN_ONE_PIECE", 500)):
         monkeypatch.setattr(occupancy, name, small)
-    presets = {"quick": lambda anatomy: quick(anatomy, "limited")}
-    subject = BenchSubject(presets, tmp_path)
-    shutil.copytree(quick_model, tmp_path / "quick")
-    every = training.on_device(subject, "cpu", 0.5)
+    shutil.copytree(quick_model, tmp_path / "paper")
+    return BenchSubject(tmp_path)
+
+
+def test_rows_of_a_gpu_are_measured_on_any_device(subject) -> None:
+    every = training.on_device(subject, "cpu", 0.5, "quick")
     found = {row.name: row for workload in every for row in workload.rows(1, 0.5)}
     assert set(found) == {FRAME, EVERY, VOLUME, TRAINING}
-    assert all(row.device == "cpu" and row.what == "quick" for row in found.values())
+    assert all(row.device == "cpu" for row in found.values())
     assert found[TRAINING].per_s > 0
 
 
 @pytest.mark.slow
-def test_every_workload_becomes_a_row(quick_model, clinic_model, tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr(subjects, "LABELLING", ("quick",))
-    monkeypatch.setattr(subjects, "PRESETS", ("clinic", "quick"))
-    small = {"GRID": 24, "SLAB": 99, "QUERIES": 999, "DECODED": (100, 200), "IN_ONE_PIECE": 100}
-    for name, value in small.items():
-        monkeypatch.setattr(occupancy, name, value)
-    monkeypatch.setattr(training, "_SAMPLES", {"clinic": 2, "quick": 2})
-    presets = {name: partial(PRESETS[name], rotations="limited") for name in ("clinic", "quick")}
-    for name, folder in (("clinic", clinic_model), ("quick", quick_model)):
-        shutil.copytree(folder, tmp_path / name)
-    subject = BenchSubject(presets, tmp_path)
+def test_every_workload_becomes_a_row(subject, clinic_model, tmp_path) -> None:
+    shutil.copytree(clinic_model, tmp_path / "clinic")
     rows = [
         row
-        for source in (
-            subjects.encoders,
-            subjects.decoders,
-            subjects.frames,
-            subjects.tracking,
-            subjects.volumes,
-            training.elastic,
-            training.steps,
-        )
+        for source in (subjects.frames, subjects.tracking, subjects.volumes)
         for workload in source(subject, 0.01)
         for row in workload.rows(1, 0.01)
     ]
     found = [(row.name, row.what) for row in rows]
-    both = [(name, what) for name in (TRACKING, VOLUME) for what in ("clinic", "quick")]
-    assert found == [
-        (ENCODER, "quick"),
-        (ENCODER, "clinic"),
-        (DECODER, "quick, 100 queries"),
-        (DECODER, "quick, 200 queries"),
-        (FRAME, "clinic"),
-        (FRAME, "quick"),
-        (EVERY, "quick"),
-        *both,
-        (GENERATOR, "elastic"),
-        (GENERATOR, "clinic"),
-        (STEP, "clinic"),
-        (STEP, "quick"),
-    ]
+    both = [(name, what) for name in (TRACKING, VOLUME) for what in ("clinic", "paper")]
+    looks = [(name, "clinic") for name in (SEARCH, FIRST_LOOK, FRAME)]
+    assert found == [*looks, (FRAME, "paper"), (EVERY, "paper"), *both]
     by_name = dict(zip(found, rows, strict=True))
-    one, two = (by_name[DECODER, f"quick, {count} queries"] for count in (100, 200))
-    assert one.naive is not None
-    assert two.naive == one.naive.times(2.0)  # timed once, scaled
-    assert by_name[TRACKING, "quick"].naive == by_name[FRAME, "quick"].naive
+    times = [by_name[name, "clinic"].ours.best_s for name in (SEARCH, FIRST_LOOK, FRAME)]
+    assert times[0] < times[1]
+    assert by_name[TRACKING, "paper"].naive == by_name[FRAME, "paper"].naive
     assert by_name[VOLUME, "clinic"].agreement > 0.95
     assert by_name[FRAME, "clinic"].agreement > 0.95
-    uncounted = by_name[GENERATOR, "clinic"]  # sensor errors and occlusion have no such figure
-    assert all(row.work for row in rows if row.name != TRACKING and row != uncounted)
-    assert all(row.naive is not None for row in rows if row != by_name[ENCODER, "clinic"])
-    for name in ("_QUERIES", "_POINTS", "_GRIDS", "_BATCHES"):
-        monkeypatch.setattr(curves, name, (20, 40))
-    for curve in ("queries", "points", "grid", "batch"):
-        for preset in presets:
-            points = list(curves.points_of(subject, curve, preset))
-            assert [point.size for point in points] == [20, 40]
-            assert all(point.seconds > 0 for point in points)

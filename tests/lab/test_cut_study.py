@@ -222,8 +222,8 @@ def test_tables_say_what_was_removed_and_why_not(case, tmp_path):
     best = lines["truth", "5 mm"]
     assert "| 1 of 1 | 1 of 1 | 1 of 1 | 100.0 | 100.0 | 0.00 |" in best
     assert "| 1 of 1 | 1 of 1 | 0 of 1 |" in lines["clinic", "5 mm"]
-    assert "| 0 of 1 | 0 of 0 | 0 of 0 | – |" in lines["slim network, limited turns", "5 mm"]
-    assert "1 x slim network, limited turns, 5 mm: the cloud shows no organ" in text
+    assert "| 0 of 1 | 0 of 0 | 0 of 0 | – |" in lines["M_lim", "5 mm"]
+    assert "1 x M_lim, 5 mm: the cloud shows no organ" in text
 
 
 def test_shares_are_never_rounded_up_to_all(case):

@@ -8,7 +8,6 @@ import signal
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-import msgspec
 import numpy as np
 import pandas as pd
 import pytest
@@ -20,16 +19,15 @@ from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.geometry import rigid
 from tumortrack.core.types import Anatomy, Mesh, SensorCloud
 from tumortrack.simulate.deform import DragConfig
-from tumortrack.simulate.occupancy import OccupancyConfig
 from tumortrack.simulate.scene import SceneConfig, SceneRecipe, Simulator
 from tumortrack.simulate.scene_folder import Scene
-from tumortrack.training.presets import PRESETS, quick
+from tumortrack.tracking.model_files import load_model
 from tumortrack_lab.peers.base import Fit, OneWay, estimate_of, rigid_carry
 from tumortrack_lab.study import tables, tumor_sites
 from tumortrack_lab.study.document import ReportWriter, closing, fill, opening, table
 from tumortrack_lab.study.goals import goal_table
 from tumortrack_lab.study.measure import measured
-from tumortrack_lab.study.methods import Method, StudyCase, Trainer, peer, study_case
+from tumortrack_lab.study.methods import Method, StudyCase, peer, study_case
 from tumortrack_lab.study.tables import tidy
 
 ROOT = Path(__file__).parents[2]
@@ -80,7 +78,7 @@ class Shifted:
 
     @property
     def method(self):
-        return Method("M_lim", {"shift_mm": self.shift_mm}, self._locate, self.seed)
+        return Method("rigid", {"shift_mm": self.shift_mm}, self._locate, self.seed)
 
     def _locate(self, scene, grid):
         self.calls += 1
@@ -141,7 +139,7 @@ def test_known_errors_reach_the_table(case, tmp_path):
     written = tables.accuracy(tidy(found), tumor_sites.tumor_sites_of(anatomy()))
     rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in written.splitlines()]
     deep = "tumor 1, endophytic: centre"
-    assert rows[0] == ["state", "figure", "slim network, limited turns"]
+    assert rows[0] == ["state", "figure", "rigid registration, many starts"]
     assert rows[2] == ["deformed", "scenes x seeds", "2 x 3"]
     assert [row[2] for row in rows if row[1] == deep] == [
         "2.0 / 3.0 / 3.0 / 3.0",  # neither seeds nor scenes are averaged
@@ -216,50 +214,13 @@ def test_the_document_has_a_place_for_every_section():
     assert fill(document, {name: "x" for name in names}).count("\nx\n<!-- /results:") == len(names)
 
 
-@pytest.mark.parametrize(
-    "name", ["results", "soak", "real", "world", "sequences", "trust", "minutes"]
-)
+@pytest.mark.parametrize("name", ["results", "soak", "real", "world", "sequences", "trust"])
 def test_scripts_are_imported_and_say_what_they_do(name, monkeypatch, capsys):
     monkeypatch.setattr("sys.argv", [f"{name}.py", "--help"])
     with pytest.raises(SystemExit) as stopped:
         runpy.run_path(str(ROOT / "lab" / "scripts" / f"{name}.py"), run_name="__main__")
     assert stopped.value.code == 0
     assert "usage:" in capsys.readouterr().out
-
-
-def test_short_trainings_are_counted_by_scene_and_their_errors_by_tumor():
-    table_of = runpy.run_path(str(ROOT / "lab" / "scripts" / "minutes.py"))["tables"]
-
-    def look(organ, verdict, *errors_mm):
-        tumors = [{"middle_mm": mm, "rigid_middle_mm": 9.0, "kind": "between"} for mm in errors_mm]
-        known = {"organ": organ, "length": "0", "source": "states"}
-        known["training_s"] = {"a": 10.0, "b": 14.0}[organ]
-        return {**known, "verdict": verdict, "tumors": tumors}
-
-    rows = [look("a", "good", 1.0, 4.0), look("a", "poor", 7.0), look("b", "good", 2.0, 1.0)]
-    rows += [{**look("b", "refused", 0.0), "tumors": [{"rigid_middle_mm": 9.0, "kind": "between"}]}]
-    found = table_of(rows)
-    errors = "1.5 / 3.4 / 3.7 / 4.0"
-    assert (
-        f"| 0, states | 12 | 4 | 2 | 1 | 1 | 25.0% | 0.0% | 2.0 / 5.8 / 6.4 / 7.0 | {errors}"
-        in found
-    )
-    assert "| 0, a | 10 | 2 | 1 | 1 | 0 | 50.0% |" in found
-    assert "| 0, between | 12 | 4 | 2 | 1 | 1 |" in found
-
-
-def tiny(anatomy_ct, rotations):
-    """The quick preset, with hardly any validation and few labelled points."""
-    config = quick(anatomy_ct, rotations)
-    occupancy = OccupancyConfig(per_side=16, pool=2000)
-    return msgspec.structs.replace(
-        config,
-        scene=msgspec.structs.replace(config.scene, occupancy=occupancy),
-        validation_pairs=2,
-        validation_points=64,
-        validate_every=100,
-        batch_size=4,
-    )
 
 
 @pytest.fixture(scope="module")
@@ -277,21 +238,25 @@ def phantom(tmp_path_factory):
 
 
 @pytest.mark.slow
-def test_end_to_end_twice_gives_the_same_document(phantom, tmp_path, monkeypatch):
-    monkeypatch.setitem(PRESETS, "quick", tiny)
+def test_end_to_end_twice_gives_the_same_document(phantom, clinic_model, tmp_path, monkeypatch):
     document = tmp_path / "results.md"
     document.write_text(f"mine\n{opening('accuracy')}\n{closing('accuracy')}\nyours\n")
-    script, trained = runpy.run_path(str(RESULTS)), []
-    trainer = Trainer(tmp_path / "models", "cpu", 0, lambda name, _: trained.append(name))
+    script, made = runpy.run_path(str(RESULTS)), []
+
+    def make(case, seed):
+        made.append(seed)
+        return load_model(clinic_model)
+
+    monkeypatch.setattr("tumortrack_lab.study.methods.make_model", make)
     options = script["Options"](
-        models=("M_lim",), peers=("rigid_bound",), steps=2, seeds=(0,), grid=24,
-        variants=("D0", "D1"), document=document, out=tmp_path,
+        peers=("rigid_bound",), seeds=(7,), grid=24, variants=("D0", "D1"), document=document,
+        out=tmp_path,
     )  # fmt: skip
     writer = ReportWriter(document, "make results")
 
     def run():
         rows = []
-        for method in script["methods_of"]("accuracy", phantom, options, trainer):
+        for method in script["methods_of"]("accuracy", phantom, options):
             about = method, options.variants, "noise", options.grid, tmp_path / "rows"
             rows += measured(phantom, *about)
         texts = script["texts_of"]("accuracy", rows, [phantom])
@@ -299,16 +264,13 @@ def test_end_to_end_twice_gives_the_same_document(phantom, tmp_path, monkeypatch
         return document.read_text()
 
     first = run()
-    assert set(trained) == {"phantom M_lim seed 0"}
+    assert made == [7]
     assert first.startswith("mine\n")
     assert first.endswith("yours\n")
-    for words in ("Models: 1 of 2 steps", "(oracle)"):
+    for words in ("models by seed 0, 7", "(oracle)"):
         assert words in first
-    trained.clear()
     assert run() == first
-    assert not trained
-    with pytest.raises(InputError, match="clinic, M_lim, M_full"):
-        trainer.model(phantom, "clinical", 0, 2)
+    assert made == [7]
     with pytest.raises(InputError, match="rigid_bound, rigid"):
         peer("rigidly", phantom)
 

@@ -30,8 +30,8 @@ from tumortrack.live.workers import SinkWorker, SourceWorker
 from tumortrack.sense.camera import deproject_pixels
 from tumortrack.sense.cloud import CloudConfig
 from tumortrack.sense.region import RegionConfig
+from tumortrack.tracking.model_files import load_model
 from tumortrack.tracking.tracker import Tracker
-from tumortrack.training.model import load_model
 from warp_objects import ANATOMY
 
 REGION = RegionConfig(crop=CloudConfig(near_mm=60.0, far_mm=400.0))

@@ -71,7 +71,7 @@ def test_a_moving_case_is_followed_and_the_report_says_how_well(world, tmp_path)
     assert "latency from stamp to published estimate: p50" in said
     found = told(report)
     assert sum(found["estimates"].values()) >= 3
-    assert found["center_error_mm"]["kidney"]["p50"] < 6  # trained for seconds
+    assert found["center_error_mm"]["kidney"]["p50"] < 3
     assert found["center_error_mm"]["kidney"]["p50"] > 0.05
     assert found["latency_ms"]["p50"] > 0
     assert found["latency_from"] == "stamp"

@@ -434,7 +434,7 @@ def test_case_gives_slices_and_an_exact_margin_that_moves_along(sinks, clock, tm
         save_case(replace(case, patient=Patient("P2")), folder)
     with pytest.raises(InputError, match=r"is of patient P2, .* the model of patient P1"):
         sinks(replace(setting, patient=Patient("P1")), case=str(tmp_path / "other"))
-    with pytest.raises(InputError, match="is not the case that the model was trained on"):
+    with pytest.raises(InputError, match="is not the case that the model is of"):
         sinks(replace(setting, anatomy_ct=small_anatomy()), case=str(tmp_path / "case"))
     with pytest.raises(InputError, match="have no motion"):
         sinks(replace(setting, anatomy_ct=None), case=str(tmp_path / "case"))

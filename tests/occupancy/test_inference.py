@@ -9,13 +9,13 @@ import torch
 from torch import Tensor
 
 from tumortrack.cli.models import Compile
-from tumortrack.models.config import MlpDecoderConfig, NetworkConfig
-from tumortrack.models.normalisation import CloudBox
+from tumortrack.occupancy.config import MlpDecoderConfig, NetworkConfig
 from tumortrack.occupancy.inference import Inference, can_pack, fastest
 from tumortrack.occupancy.locator import OccupancyLocator
 from tumortrack.occupancy.network import OccupancyNetwork
-from tumortrack.training.model import load_model
-from tumortrack.training.presets import quick_network
+from tumortrack.occupancy.normalisation import CloudBox
+from tumortrack.occupancy.presets import quick_network
+from tumortrack.tracking.model_files import load_model
 
 CPU = torch.device("cpu")
 QUERIES = 6000  # no whole number of chunks

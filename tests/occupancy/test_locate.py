@@ -23,8 +23,8 @@ from tumortrack.core.mesh_files import read_mesh
 from tumortrack.core.types import Anatomy, SensorCloud
 from tumortrack.imaging.case import load_case
 from tumortrack.occupancy.inference import can_pack, fastest
+from tumortrack.tracking.model_files import load_model
 from tumortrack.tracking.tracker import Follower, FollowerConfig, Tracker
-from tumortrack.training.model import load_model
 
 pytestmark = pytest.mark.slow
 

@@ -7,20 +7,20 @@ import torch
 
 from tumortrack.core.config import from_builtins, to_builtins
 from tumortrack.core.errors import InputError
-from tumortrack.models import sampling
-from tumortrack.models.config import MlpDecoderConfig, NetworkConfig
-from tumortrack.models.encoders.pointnet2 import PointNet2Config, SetAbstraction, _Level
-from tumortrack.models.layers import greatest_above_zero
-from tumortrack.models.normalisation import (
+from tumortrack.occupancy import sampling
+from tumortrack.occupancy.config import MlpDecoderConfig, NetworkConfig
+from tumortrack.occupancy.encoders.pointnet2 import PointNet2Config, SetAbstraction, _Level
+from tumortrack.occupancy.layers import greatest_above_zero
+from tumortrack.occupancy.network import MlpDecoder, OccupancyNetwork, octave_features
+from tumortrack.occupancy.normalisation import (
     Aligned,
     CloudBox,
     alignment,
     turned,
     without_strays,
 )
-from tumortrack.models.sampling import ball_query, farthest_points, strided_points, take
-from tumortrack.occupancy.network import MlpDecoder, OccupancyNetwork, octave_features
-from tumortrack.training.presets import paper_network, quick_network
+from tumortrack.occupancy.presets import paper_network, quick_network
+from tumortrack.occupancy.sampling import ball_query, farthest_points, strided_points, take
 
 
 def slim_paper() -> NetworkConfig:

@@ -7,12 +7,12 @@ import onnxruntime
 import pytest
 import torch
 
-from tumortrack.models.config import MlpDecoderConfig, NetworkConfig
-from tumortrack.models.encoders.pointnet2 import PointNet2Config, SetAbstraction
-from tumortrack.models.model import onnx_bytes
-from tumortrack.models.normalisation import Aligned
+from tumortrack.occupancy.config import MlpDecoderConfig, NetworkConfig
+from tumortrack.occupancy.encoders.pointnet2 import PointNet2Config, SetAbstraction
+from tumortrack.occupancy.model import onnx_bytes
 from tumortrack.occupancy.network import OccupancyNetwork
-from tumortrack.training.model import load_model
+from tumortrack.occupancy.normalisation import Aligned
+from tumortrack.tracking.model_files import load_model
 
 
 def answers(content: bytes, **inputs: np.ndarray) -> list[np.ndarray]:
@@ -67,14 +67,3 @@ def test_an_occupancy_network_gives_the_same_logits(occupancy, cloud, count):
     assert right.std() > 0.01
     np.testing.assert_allclose(logits, right, atol=1e-3)
     assert (logits.argmax(2) == right.argmax(2)).mean() >= 0.999
-
-
-def test_a_network_that_places_the_organ_gives_the_same_placements(clinic_model, cloud):
-    model = load_model(clinic_model, "cpu")
-    found = answers(onnx_bytes(model), cloud_mm=cloud)
-    with torch.inference_mode():
-        hypotheses = model.network.flip_hypotheses(torch.from_numpy(cloud))
-    names = ("rotation", "centre_mm", "coefficients", "right_way")
-    for name, value in zip(names, found, strict=True):
-        right = getattr(hypotheses, name).numpy()
-        np.testing.assert_allclose(value, right, atol=1e-3)

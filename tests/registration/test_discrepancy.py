@@ -16,9 +16,8 @@ from tumortrack.registration import discrepancy_kernels as kernels
 from tumortrack.registration.discrepancy import AMPLITUDES_MM, LENGTH_MM, NOISES_MM, _grouped, judge
 from tumortrack.registration.gauss_newton import RegistrationResult, posterior, refine
 from tumortrack.registration.looks import Looks
-from tumortrack.registration.registration import best_of
 from tumortrack.sense.noise import CalibrationConfig
-from warp_objects import ANATOMY, nudged, placed, shape
+from warp_objects import ANATOMY, method, nudged, placed, shape
 
 CONFIG = GaussNewtonConfig()
 VERTICES = ANATOMY.organ.vertices_mm
@@ -135,7 +134,7 @@ def fit(motion, cost):
 def test_two_minima_widen_the_covariance_by_their_distance():
     motion = replace(placed(), covariance=1e-4 * np.eye(26))
     away = replace(motion, centre_mm=motion.centre_mm + [0, 6.0, 0])
-    best = best_of([fit(away, 12.0), fit(motion, 10.0)])
+    best = method().best_of([fit(away, 12.0), fit(motion, 10.0)])
     share = math.exp(-1) / (1 + math.exp(-1))
     assert best.cost == 10
     assert [rival.cost for rival in best.rivals] == [12.0]
@@ -148,11 +147,11 @@ def test_neither_the_same_minimum_nor_an_unlikely_one_is_a_rival():
     motion = replace(placed(), covariance=0.01 * np.eye(26))
     same = replace(motion, centre_mm=motion.centre_mm + [0, 0.1, 0])
     away = replace(motion, centre_mm=motion.centre_mm + [0, 6.0, 0])
-    assert best_of([fit(motion, 10.0), fit(same, 10.5)]).rivals == ()
-    assert best_of([fit(motion, 10.0), fit(away, 10.1 + RIVAL_COST)]).rivals == ()
-    first = best_of([fit(motion, 10.0), fit(away, 11.0)])
-    assert len(best_of([first, fit(away, 11.5)]).rivals) == 1  # the same one again
-    turned = best_of([first, fit(away, 9.0)])  # one of them won after all
+    assert method().best_of([fit(motion, 10.0), fit(same, 10.5)]).rivals == ()
+    assert method().best_of([fit(motion, 10.0), fit(away, 10.1 + RIVAL_COST)]).rivals == ()
+    first = method().best_of([fit(motion, 10.0), fit(away, 11.0)])
+    assert len(method().best_of([first, fit(away, 11.5)]).rivals) == 1  # the same one again
+    turned = method().best_of([first, fit(away, 9.0)])  # one of them won after all
     assert [rival.cost for rival in turned.rivals] == [10.0]
 
 

@@ -26,10 +26,19 @@ from tumortrack.registration import registration
 from tumortrack.registration.gauss_newton import GaussNewton, _prior, refine
 from tumortrack.registration.kernels import Flow, Pose, look_up, probabilities
 from tumortrack.registration.locator import RegistrationLocator, nearest_lookup
-from tumortrack.registration.registration import Registration
 from tumortrack.simulate.elastic.flow import BLOCK, LatticeField, steps_for
-from tumortrack.training.model import load_model
-from warp_objects import ANATOMY, PLACE_MM, TURNED, nudged, placed, residual_rows, shape, with_slope
+from tumortrack.tracking.model_files import load_model
+from warp_objects import (
+    ANATOMY,
+    PLACE_MM,
+    TURNED,
+    method,
+    nudged,
+    placed,
+    residual_rows,
+    shape,
+    with_slope,
+)
 
 
 def about(count, seed=0, reach=1.6):
@@ -211,18 +220,18 @@ def test_a_descent_goes_on_where_it_was_stopped():
     assert start.centre_mm[2] == nudged(placed(), [3, -2, 5], [0, 0, 0]).centre_mm[2]
 
 
-def test_the_best_of_many_starts_wins_wherever_it_stands(unchecked):
+def test_the_best_of_many_starts_wins_wherever_it_stands():
     points = placed().carry(ANATOMY.organ.vertices_mm[::3])
     near = nudged(placed(), [3, -2, 5], [0.1, -0.05, 0.1])
     far = [nudged(placed(), [0, 0, 30.0 * n], [0, 0, 1.0 * n]) for n in (1, 2, 3)]
     alone = refine(shape(), points, near, GaussNewtonConfig())
     for starts in ([near, *far], [*far, near]):
-        fit = Registration(None, shape(), GaussNewtonConfig()).best_fit(points, starts)
+        fit = method().best_fit(points, starts)
         # A little less where a start beside it ends nearer to the minimum.
         assert 0.97 * alone.cost < fit.cost <= alone.cost
 
 
-def test_starts_that_are_far_behind_are_given_up(monkeypatch, unchecked):
+def test_starts_that_are_far_behind_are_given_up(monkeypatch):
     gone = []
 
     class Noted(GaussNewton):
@@ -235,7 +244,7 @@ def test_starts_that_are_far_behind_are_given_up(monkeypatch, unchecked):
     near = nudged(placed(), [3, -2, 5], [0.1, -0.05, 0.1])
     far = nudged(placed(), [60, 0, 60], [0, 0, 1.0])
     steady = GaussNewtonConfig(enough_mm=0)  # never settles
-    Registration(None, shape(), steady).best_fit(points, [far, near])
+    method(steady).best_fit(points, [far, near])
     most = {}
     for descent, steps in gone[:3]:  # the two hypotheses; the rest begins beside the better one
         most[descent] = max(steps, most.get(descent, 0))

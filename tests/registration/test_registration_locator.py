@@ -1,4 +1,4 @@
-"""A warp model at work: trained for seconds, saved, asked, refused, questioned about points."""
+"""A registration model at work: made in seconds, saved, asked, refused, questioned about points."""
 
 from __future__ import annotations
 
@@ -16,12 +16,13 @@ from stories import answered, tumortrack
 from tumortrack.core.errors import ArtifactError, InputError, NoEstimate
 from tumortrack.core.estimate import Motion
 from tumortrack.core.types import SensorCloud
+from tumortrack.models.folder import save_model
 from tumortrack.sense.ply import write_cloud_ply
 from tumortrack.simulate.occupancy import labels_of, surface_distance
 from tumortrack.simulate.scene import SceneRecipe, Simulator, body_for
 from tumortrack.simulate.scene_folder import draw_targets
+from tumortrack.tracking.model_files import load_model
 from tumortrack.tracking.tracker import Tracker
-from tumortrack.training.model import load_model, save_model
 from warp_objects import ANATOMY, shape, slim_clinic
 
 
@@ -37,7 +38,7 @@ def tracker(model):
 
 @pytest.fixture(scope="module")
 def stages():
-    """Scenes that training never showed, of a body with other states."""
+    """Scenes that no model was calibrated on, of a body with other states."""
     config = slim_clinic().scene
     simulator = Simulator(ANATOMY, UP, config, body_for(ANATOMY, UP, config, 77))
     return [simulator.render(SceneRecipe(5, "test", index)) for index in range(8)]

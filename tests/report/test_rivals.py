@@ -12,7 +12,7 @@ from tumortrack.core.geometry import rigid, transform_points
 from tumortrack.core.types import Anatomy, Mesh, SensorCloud
 from tumortrack.report.rivals import Rivals, best_rigid_pose, rigid_fit, rivals_of
 from tumortrack.simulate.scene_folder import Scene, Targets
-from tumortrack.training.model import load_model
+from tumortrack.tracking.model_files import load_model
 
 TURN = Rotation.from_euler("xyz", [35, -50, 110], degrees=True).as_matrix()
 CAMERA_FROM_CT = rigid(TURN, np.array([12.0, -7.0, 140.0]))

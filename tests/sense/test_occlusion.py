@@ -11,6 +11,7 @@ from render_objects import anatomy
 from tumortrack.core.config import from_builtins, to_builtins
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import DepthFrame
+from tumortrack.occupancy.presets import paper, quick
 from tumortrack.sense import kernels
 from tumortrack.sense.clutter import ClutterConfig
 from tumortrack.sense.noise import D405_NOISE, CalibrationConfig, miscalibrate
@@ -18,7 +19,6 @@ from tumortrack.sense.occlusion import OcclusionConfig, occlude
 from tumortrack.simulate import scene as scene_module
 from tumortrack.simulate.occupancy import OccupancyConfig, OccupancyPool
 from tumortrack.simulate.scene import SceneConfig, SceneRecipe, SceneStream, Simulator
-from tumortrack.training.presets import paper, quick
 
 HIDING = OcclusionConfig(scenes=1.0, largest_share=0.6)
 ANATOMY = anatomy(3)

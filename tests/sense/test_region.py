@@ -28,7 +28,7 @@ from tumortrack.core.types import DepthFrame, SensorCloud
 from tumortrack.sense.camera import d405, deproject, deproject_pixels, project
 from tumortrack.sense.cloud import CloudConfig
 from tumortrack.sense.region import Hints, RegionConfig, organ_points
-from tumortrack_lab.pretraining.kidneys import random_anatomy
+from tumortrack_lab.world.kidneys import random_anatomy
 
 WIDE = CloudConfig(near_mm=60.0, far_mm=400.0)
 EVERY = CloudConfig(near_mm=60.0, far_mm=400.0, n_points=10**6)

@@ -19,11 +19,10 @@ from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import DepthFrame
 from tumortrack.imaging.case import load_case
-from tumortrack.models.config import TrainConfig
 from tumortrack.sense.noise import D405_NOISE, STEREO_NOISE, NoiseConfig, add_noise, stereo_noise
 from tumortrack.sense.stereo import StereoRig, read_calibration
+from tumortrack.tracking import presets
 from tumortrack.tracking.tracker import Tracker, region_for
-from tumortrack.training import presets
 
 
 @pytest.fixture(scope="module")
@@ -202,8 +201,8 @@ def test_a_preset_s_scenes_can_be_those_of_stereo(phantom_case):
     anatomy = load_case(phantom_case).anatomy
     clinic = presets.clinic(anatomy)
     assert presets.seen_by(clinic, "d405") == clinic
-    stereo: TrainConfig = presets.seen_by(clinic, "stereo")
+    stereo = presets.seen_by(clinic, "stereo")
     assert stereo.scene.noise == STEREO_NOISE != D405_NOISE
     assert msgspec.structs.replace(stereo.scene, noise=D405_NOISE) == clinic.scene
-    with pytest.raises(InputError, match="preset clinic"):
+    with pytest.raises(InputError, match="preset quick"):
         presets.seen_by(presets.paper(anatomy), "stereo")

@@ -19,7 +19,7 @@ from tumortrack.sense.camera import deproject
 from tumortrack.sense.cloud import CloudConfig
 from tumortrack.sense.region import Hints, RegionConfig, organ_points
 from tumortrack.sense.region.taught import look, teach
-from tumortrack_lab.pretraining.kidneys import random_anatomy
+from tumortrack_lab.world.kidneys import random_anatomy
 
 CONFIG = RegionConfig(crop=CloudConfig(near_mm=60.0, far_mm=400.0))
 RED, YELLOW, GREEN = (168, 82, 70), (222, 188, 112), (62, 108, 102)

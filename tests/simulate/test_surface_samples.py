@@ -12,7 +12,6 @@ from tumortrack.simulate.occupancy import (
     OccupancyConfig,
     OccupancyPool,
     labels_of,
-    organ_pool,
     surface_distance,
 )
 
@@ -118,10 +117,6 @@ def test_even_points_measure_volume(pool):
     assert (labels > 0).mean() == pytest.approx(volumes[0] / box, rel=0.05)
     for label in (2, 3):
         assert (labels == label).mean() == pytest.approx(volumes[label - 1] / box, rel=0.25)
-    alone, _ = organ_pool(ANATOMY, SMALL, seed=4).draw_evenly(np.random.default_rng(0), 10_000)
-    np.testing.assert_array_equal(
-        pool.parts[0].draw_evenly(np.random.default_rng(0), 10_000)[0], alone
-    )
 
 
 def test_pools_and_draws_replay():

@@ -29,13 +29,17 @@ def resealed(folder: Path, source: Path, change: Callable[[Path], object]) -> Pa
     return copy
 
 
-def with_model(change: Callable[[Path], object]) -> Attack:
+def with_model(change: Callable[[Path], object], name: str = "model") -> Attack:
     def make(folder: Path, base: Path) -> Made:
-        model = resealed(folder, base / "model", change)
+        model = resealed(folder, base / name, change)
         cloud = base / "scenes" / "0000" / "cloud.ply"
         return ["locate", model, cloud, folder / "out", "--device", "cpu"]
 
     return make
+
+
+def with_network(change: Callable[[Path], object]) -> Attack:
+    return with_model(change, "network")
 
 
 def weights(fill: float) -> Callable[[Path], object]:
@@ -58,37 +62,50 @@ def manifest(**changes: object) -> Callable[[Path], object]:
 
 
 ATTACKS |= {
-    "model_weights_nan": with_model(weights(np.nan)),
-    "model_weights_1e30": with_model(weights(1e30)),
-    "model_weights_1e5": with_model(weights(1e5)),
-    "model_weights_minus_1e3": with_model(weights(-1e3)),
+    "model_weights_nan": with_network(weights(np.nan)),
+    "model_weights_1e30": with_network(weights(1e30)),
+    "model_weights_1e5": with_network(weights(1e5)),
+    "model_weights_minus_1e3": with_network(weights(-1e3)),
+    "model_weights_header_of_2_60": with_network(
+        lambda model: (model / "weights.safetensors").write_bytes(struct.pack("<Q", 2**60) + b"{}")
+    ),
+    "model_weights_empty": with_network(
+        lambda model: (model / "weights.safetensors").write_bytes(b"")
+    ),
+    "model_box_nan": with_network(manifest(query_box_mm=[[float("nan")] * 3, [1.0] * 3])),
+    "model_box_of_a_kilometre": with_network(manifest(query_box_mm=[[-1e6] * 3, [1e6] * 3])),
+    "model_of_endless_width": with_network(
+        lambda model: _set(model, 3 * 10**4, "network", "decoder", "width")
+    ),
+    "model_shape_nan": with_model(lambda model: _spoil(model / "shape.safetensors", np.nan)),
     "model_shape_1e30": with_model(lambda model: _spoil(model / "shape.safetensors", 1e30)),
     "model_shape_cut": with_model(lambda model: _cut(model / "shape.safetensors")),
     "model_parts_swapped": with_model(manifest(parts=["tumor_1", "kidney", "tumor_2"])),
     "model_of_endless_parts": with_model(manifest(parts=[f"tumor_{n}" for n in range(10**5)])),
-    "model_box_nan": with_model(manifest(query_box_mm=[[float("nan")] * 3, [1.0] * 3])),
-    "model_box_of_a_kilometre": with_model(manifest(query_box_mm=[[-1e6] * 3, [1e6] * 3])),
     "model_of_endless_steps": with_model(lambda model: _set(model, 10**12, "refine", "steps")),
-    "model_of_endless_width": with_model(
-        lambda model: _set(model, 3 * 10**4, "network", "decoder", "width")
-    ),
     "model_of_endless_points": with_model(
         lambda model: _set(model, 10**10, "scene", "cloud", "n_points")
     ),
-    "model_weights_header_of_2_60": with_model(
-        lambda model: (model / "weights.safetensors").write_bytes(struct.pack("<Q", 2**60) + b"{}")
+    "model_of_endless_tilts": with_model(
+        lambda model: _set(model, 1e300, "scene", "pose", "tilt_deg")
     ),
-    "model_weights_empty": with_model(
-        lambda model: (model / "weights.safetensors").write_bytes(b"")
-    ),
-    "model_shape_nan": with_model(lambda model: _spoil(model / "shape.safetensors", np.nan)),
     "model_of_schema_999": with_model(manifest(schema=999)),
     "model_config_null": with_model(manifest(config=None)),
-    "model_is_a_case": lambda folder, base: [
-        *("locate", base / "case", base / "scenes" / "0000" / "cloud.ply", folder / "out")
-    ],
+    "model_up_nan": with_model(lambda model: _say(model, up_lps=[float("nan")] * 3)),
     "case_is_a_model": lambda folder, base: ["export", base / "model", folder / "out"],
 }
+
+
+@attack
+def _case_with_a_damaged_model(folder: Path, base: Path) -> Made:
+    """The model in the case was cut short after it was made."""
+    import shutil
+
+    case = folder / "case"
+    shutil.copytree(base / "case", case)
+    shutil.copytree(base / "model", case / "model")
+    _cut(case / "model" / "shape.safetensors")
+    return ["locate", case, base / "scenes" / "0000" / "cloud.ply", folder / "out"]
 
 
 def _cut(path: Path) -> None:
@@ -102,6 +119,13 @@ def _set(model: Path, value: object, *keys: str) -> None:
     for key in keys[:-1]:
         inner = inner[key]
     inner[keys[-1]] = value
+    path.write_text(json.dumps(whole))
+
+
+def _say(model: Path, **provenance: object) -> None:
+    path = model / "manifest.json"
+    whole = json.loads(path.read_text())
+    whole["provenance"] |= provenance
     path.write_text(json.dumps(whole))
 
 

@@ -43,14 +43,16 @@ class Outcome:
 
 
 def make_base(folder: Path) -> None:
-    """What attacks start from: a case of the phantom, a model, scenes, a run and a plan of it."""
+    """What attacks start from: a case of the phantom, both kinds of model, scenes, a run and a plan
+    of it."""
     from stories import write_phantom_case
 
     write_phantom_case(folder / "case")
     here = {"case": folder / "case", "model": folder / "model", "scenes": folder / "scenes"}
-    preset = ("--preset", "clinic", "--steps", 60, "--workers", 0, "--device", "cpu", "--seed", 0)
+    quick = ("--preset", "quick", "--steps", 12, "--workers", 0, "--device", "cpu")
     for arguments in (
-        ("train", here["case"], here["model"], *preset),
+        ("train", here["case"], here["model"]),
+        ("train", here["case"], folder / "network", *quick),
         ("simulate", here["case"], here["scenes"], "--scenes", 1),
         ("locate", here["model"], here["scenes"] / "0000" / "cloud.ply", folder / "run"),
         ("plan", folder / "run", folder / "plan", "--accept-poor", "--accept-budget"),

@@ -2,7 +2,8 @@
 
 python tests/support/crashes.py FOLDER [--times 20] [--seed 0] [--only NAME]    (`make crash`)
 
-A killed training goes on to the weights of one that was never killed. A killed recording can be
+A killed training goes on to the weights of one that was never killed. A case whose first model was
+being made is whole, and gets its model by the same command. A killed recording can be
 read to its last second. After a killed `locate` there is the old run or the new one,
 never a part, and the same command works. Nothing else stays in the folder.
 """
@@ -70,7 +71,7 @@ def training(base: Path, folder: Path, times: int, rng: np.random.Generator) -> 
     """Killed again and again until it ended, the next likewise, ``times`` times in all."""
     from tumortrack.core.store import sha256_of
 
-    options = ["--preset", "clinic", "--steps", 300, "--seed", 1, "--workers", 0, "--device", "cpu"]
+    options = ["--preset", "quick", "--steps", 100, "--seed", 1, "--workers", 0, "--device", "cpu"]
     takes_s, fault = whole(["train", base / "case", folder / "undisturbed", *options])
     if fault:
         return fault
@@ -82,14 +83,32 @@ def training(base: Path, folder: Path, times: int, rng: np.random.Generator) -> 
             kills += 1
         if not (folder / names[-1] / "manifest.json").exists():
             _, fault = whole(command)
-        for weights in ("weights.safetensors", "shape.safetensors"):
-            if fault:
-                return fault
-            if sha256_of(folder / names[-1] / weights) != sha256_of(
-                folder / "undisturbed" / weights
-            ):
-                return f"other {weights} after {kills} kills"
+        if fault:
+            return fault
+        ours, theirs = (folder / n / "weights.safetensors" for n in (names[-1], "undisturbed"))
+        if sha256_of(ours) != sha256_of(theirs):
+            return f"other weights after {kills} kills"
     return strays(folder, "undisturbed", *names)
+
+
+def making(base: Path, folder: Path, times: int, rng: np.random.Generator) -> str:
+    """The first command that needs a case's model, killed while it makes it."""
+    from tumortrack.core.store import read_manifest
+
+    case = folder / "case"
+    shutil.copytree(base / "case", case, ignore=shutil.ignore_patterns("model"))
+    there = {path.name for path in case.iterdir()} | {"model"}
+    takes_s, fault = whole(["compile", case])
+    for _ in range(times):
+        if fault:
+            return fault
+        shutil.rmtree(case / "model")
+        killed(["compile", case], rng.uniform(0.3, 1.1) * takes_s)
+        read_manifest(case, "case")  # whole
+        if (case / "model").exists():
+            read_manifest(case / "model", "model")
+        _, fault = whole(["compile", case])
+    return fault or strays(case, *there) or strays(folder, "case")
 
 
 def locating(base: Path, folder: Path, times: int, rng: np.random.Generator) -> str:
@@ -166,7 +185,7 @@ def stamps_of(tape: Path) -> list[int]:
     return stamps
 
 
-KINDS = {each.__name__: each for each in (training, locating, recording)}
+KINDS = {each.__name__: each for each in (training, making, locating, recording)}
 
 
 def make_bases(folder: Path) -> Path:

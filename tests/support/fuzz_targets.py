@@ -238,7 +238,7 @@ def _configurations() -> dict[str, Target]:
     from tumortrack.plan.arms.config import CellConfig
     from tumortrack.plan.values import ResectionConfig
     from tumortrack.sense.files import read_poses
-    from tumortrack.training.presets import PRESETS
+    from tumortrack.tracking.presets import PRESETS
     from warp_objects import ANATOMY
 
     def written(kind: type, value: object) -> Target:
@@ -251,7 +251,7 @@ def _configurations() -> dict[str, Target]:
     frame = {"frame_id": "base_link", "unit": "m", "robot_from_camera": turn}
     marker = {**frame, "camera_from_marker": turn, "robot_from_marker": turn}
     del marker["robot_from_camera"]
-    clinic = PRESETS["clinic"](ANATOMY)
+    clinic, quick = (PRESETS[name](ANATOMY) for name in ("clinic", "quick"))
     poses = {"fixed_from_camera": [turn, turn], "unit": "m", "frame_id": "base_link"}
     return {
         "poses": ([json.dumps(poses).encode()], of_file(".json", lambda path: read_poses(path, 2))),
@@ -261,7 +261,8 @@ def _configurations() -> dict[str, Target]:
         ),
         "cell": written(CellConfig, CellConfig()),
         "resection": written(ResectionConfig, ResectionConfig()),
-        "training": written(type(clinic), clinic),
+        "registration": written(type(clinic), clinic),
+        "training": written(type(quick), quick),
     }
 
 
@@ -385,12 +386,12 @@ def _experiment() -> dict[str, Target]:
 
 
 def of_base(base: Path) -> dict[str, Target]:
-    """Case, scene, model, run and plan, as ``attacks.make_base`` makes them."""
+    """Case, scene, both kinds of model, run and plan, as ``attacks.make_base`` makes them."""
     from tumortrack.imaging.case import load_case
     from tumortrack.plan.files import read_plan
     from tumortrack.plan.located import read_run
     from tumortrack.simulate.scene_folder import read_scene
-    from tumortrack.training.model import load_model
+    from tumortrack.tracking.model_files import load_model
 
     scene = base / "scenes" / "0000"
     members: list[tuple[Path, str, Callable[[Path], object]]] = [
@@ -400,7 +401,8 @@ def of_base(base: Path) -> dict[str, Target]:
         (base / "run", "occupancy.ply", read_run),
         *((base / "plan", name, read_plan) for name in ("plan.json", "motions.safetensors")),
         *(
-            (base / "model", name, lambda folder: load_model(folder, "cpu"))
+            (base / kind, name, lambda folder: load_model(folder, "cpu"))
+            for kind in ("model", "network")
             for name in ("manifest.json", "weights.safetensors", "shape.safetensors")
         ),
     ]

@@ -90,7 +90,7 @@ def small_update(
         observation=Observation(frame, stamp_ns + 2_000_000),
         organ=organ,
         published_frame=frames or PublishedFrame(),
-        seconds={"organ": 0.002, "encode": 0.003},
+        seconds={"organ": 0.002, "search": 0.003},
         latency_ms=12.5,
     )
 

@@ -12,9 +12,11 @@ import numpy as np
 import warm
 from tumortrack.core import store
 from tumortrack.core.patient import Patient
-from tumortrack.imaging.case import Case, save_case
+from tumortrack.imaging.case import Case, load_case, save_case
 from tumortrack.imaging.surface import surfaces
+from tumortrack.models.folder import save_model
 from tumortrack.phantom.digital import PhantomParameters, phantom_labels
+from tumortrack.tracking.model_files import make_model
 
 COMMAND = [sys.executable, "-m", "tumortrack.cli.main"]
 
@@ -69,27 +71,32 @@ def write_phantom_case(folder: Path) -> Case:
     return case
 
 
-STEPS = {"clinic": 20, "quick": 12}
+STEPS = 12
 
 
-def train_command(case: Path, model: Path, preset: str = "quick") -> list[object]:
-    """A training of seconds, with the same weights whatever number of cores there is."""
-    options = ["--preset", preset, "--steps", STEPS[preset], "--workers", 1, "--device", "cpu"]
+def train_command(case: Path, model: Path) -> list[object]:
+    """A `quick` training of seconds, with the same weights whatever number of cores there is."""
+    options = ["--preset", "quick", "--steps", STEPS, "--workers", 1, "--device", "cpu"]
     return ["train", case, model, *options]
 
 
-def trained(case: Path, model: Path, preset: str) -> None:
-    """Write a model folder."""
-    succeeded(tumortrack(*train_command(case, model, preset)))
+def trained(case: Path, model: Path) -> None:
+    """Write a model folder of a `quick`."""
+    succeeded(tumortrack(*train_command(case, model)))
+
+
+def write_clinic(case: Path, model: Path) -> None:
+    """Write a model folder of the preset clinic."""
+    model.mkdir()
+    save_model(make_model(load_case(case)), model)
 
 
 def train_learnt(case_folder: Path, model: Path) -> None:
     """Write a model folder of a ``quick`` with small pictures, trained for a minute."""
     from msgspec.structs import replace
 
-    from tumortrack.imaging.case import load_case
-    from tumortrack.training.presets import quick
-    from tumortrack.training.train import TrainingRun, train
+    from tumortrack.occupancy.presets import quick
+    from tumortrack.occupancy.training.train import TrainingRun, train
 
     case = load_case(case_folder)
     preset = quick(case.anatomy)

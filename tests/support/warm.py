@@ -21,10 +21,11 @@ PRELOADED = (
     "scipy.spatial.transform",
     "skimage.measure",
     "tumortrack.cli.main",
-    "tumortrack.training.presets",
+    "tumortrack.tracking.presets",
+    "tumortrack.registration.build",
     "tumortrack.report.protocol",
     "tumortrack.imaging.case",
-    "tumortrack.training.train",
+    "tumortrack.occupancy.training.train",
     "tumortrack.simulate.scene",
     "tumortrack.tracking.tracker",
 )

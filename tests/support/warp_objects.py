@@ -1,30 +1,29 @@
-"""The elastic objects' organ as a `clinic` model knows it, and a training of seconds."""
+"""The elastic objects' organ as a `clinic` model knows it, and a model made in seconds."""
 
 from __future__ import annotations
 
 from functools import cache
 from pathlib import Path
 
-import msgspec
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from elastic_objects import SMALL, UP, organ
 from tumortrack.core.types import Anatomy
-from tumortrack.models.config import NetworkConfig, TrainConfig
+from tumortrack.models.config import GaussNewtonConfig, RegistrationConfig
+from tumortrack.models.folder import save_model
 from tumortrack.registration import kernels
+from tumortrack.registration.build import build_model
 from tumortrack.registration.motion import ElasticMotion
+from tumortrack.registration.registration import Registration
 from tumortrack.registration.rest_shape import RestShape, shape_of
+from tumortrack.registration.search import PosePrior
 from tumortrack.simulate.deform import ElasticConfig
 from tumortrack.simulate.elastic.body import build_body
 from tumortrack.simulate.elastic.flow import BLOCK, block, steps_for
-from tumortrack.simulate.occupancy import OccupancyConfig
 from tumortrack.simulate.scene import SceneConfig
-from tumortrack.training.presets import clinic, clinic_network
-from tumortrack.training.train import TrainingRun, train
 
 ANATOMY: Anatomy = organ()
-SCALE_MM = 48.0  # half the organ's length
 TURNED = Rotation.from_euler("xyz", [95, 10, 35], degrees=True).as_matrix()
 PLACE_MM = np.array([8.0, -5.0, 170.0])
 
@@ -76,30 +75,19 @@ def with_slope(field, points) -> tuple[np.ndarray, np.ndarray]:
     return found[:, 0], found[:, 1:]
 
 
-def slim_network() -> NetworkConfig:
-    return clinic_network(SMALL.modes, SCALE_MM)
+def method(config: GaussNewtonConfig | None = None, tilt_degrees: float = 30.0) -> Registration:
+    """The registration of this organ."""
+    prior = PosePrior(np.array(UP), tilt_degrees)
+    return Registration(shape(), config or GaussNewtonConfig(), prior)
 
 
-def slim_clinic() -> TrainConfig:
-    """The preset clinic with a small body and clean, small pictures: learns in seconds."""
-    scene = SceneConfig(
-        width=212,
-        height=120,
-        deform=(ElasticConfig(body=SMALL),),
-        occupancy=OccupancyConfig(per_side=16, pool=4000),
-    )
-    return msgspec.structs.replace(
-        clinic(ANATOMY),
-        scene=scene,
-        network=slim_network(),
-        batch_size=16,
-        validation_pairs=16,
-        validation_points=512,
-        validate_every=1000,
-    )
+def slim_clinic() -> RegistrationConfig:
+    """A small body and clean, small pictures: a model is made in seconds."""
+    scene = SceneConfig(width=212, height=120, deform=(ElasticConfig(body=SMALL),))
+    return RegistrationConfig(scene=scene, scenes=24, searched=12)
 
 
-def train_slim(folder: Path, checkpoint_every_s: float = 30.0) -> None:
+def write_slim(folder: Path) -> None:
     """Write a model folder of the slim clinic."""
-    setting = {"steps": 80, "workers": 0, "device": "cpu", "checkpoint_every_s": checkpoint_every_s}
-    train(TrainingRun(ANATOMY, UP, "no digest", slim_clinic(), **setting), folder, lambda _: None)
+    folder.mkdir()
+    save_model(build_model(ANATOMY, UP, slim_clinic()), folder)

@@ -20,8 +20,8 @@ from tumortrack.simulate.deform import DragConfig
 from tumortrack.simulate.scene import SceneRecipe, Simulator
 from tumortrack.tracking import tracker as tracking
 from tumortrack.tracking.causes import words
+from tumortrack.tracking.model_files import load_model
 from tumortrack.tracking.tracker import Follower, FollowerConfig, Tracker
-from tumortrack.training.model import load_model
 
 BASE_MM, TILT = [450.0, -120.0, 260.0], Rotation.from_euler("xz", [165, 40], degrees=True)
 SPOILT = {

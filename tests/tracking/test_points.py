@@ -19,15 +19,15 @@ from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.estimate import Estimate, Motion
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import Anatomy, CameraLabels, Mesh, OccupancyCloud
+from tumortrack.models.folder import save_model
 from tumortrack.models.in_distribution import InDistributionRange
 from tumortrack.occupancy.model import OccupancyModel
 from tumortrack.occupancy.network import OccupancyNetwork
+from tumortrack.occupancy.presets import quick
 from tumortrack.sense.files import read_cloud
 from tumortrack.sense.ply import write_cloud_ply
 from tumortrack.tracking.files import write_estimate
 from tumortrack.tracking.points import camera_table, check_near_organ, read_points
-from tumortrack.training.model import save_model
-from tumortrack.training.presets import quick
 from tumortrack_lab.peers.base import OneWay
 
 MIDDLE = np.array([60.0, 40.0, -300.0])
@@ -370,7 +370,7 @@ def test_a_model_without_correspondences_refuses_before_any_work(model, tmp_path
     line = refusal(
         tumortrack("locate", model, "no_cloud.ply", tmp_path / "out", "--map", "no_points.csv")
     )
-    assert "--preset clinic" in line
+    assert "give CASE in place of MODEL" in line
     assert not (tmp_path / "out").exists()
 
 

@@ -172,6 +172,7 @@ def test_what_does_not_fit_is_refused(folders: tuple[Path, Path], tmp_path: Path
     for file in case_of["files"]:
         (other / file).write_bytes((case / file).read_bytes())
     keys = ("organ", "structures", "parts", "up_lps", "patient")
+    keys += ("rotations", "tilt_degrees", "sensor")
     store.seal(other, "case", {**{k: case_of[k] for k in keys}, "report": {"notes": []}}, "lps")
     with pytest.raises(InputError, match="give its case"):
         Export(case=other, out=out, located=run).run()

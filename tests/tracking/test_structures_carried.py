@@ -14,8 +14,8 @@ from tumortrack.live.sinks.openigtlink import OpenIgtLinkSinkConfig
 from tumortrack.plan.located import read_run
 from tumortrack.registration.rest_shape import RestShape
 from tumortrack.tracking.files import write_estimate
+from tumortrack.tracking.model_files import load_model
 from tumortrack.tracking.tracker import Tracker
-from tumortrack.training.model import load_model
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tyro.conf import Positional, UseAppendAction, arg
 
-from tumortrack.cli.console import live_line, progress_bar, say, say_notes
+from tumortrack.cli.console import progress_bar, progress_of, say, say_notes
 from tumortrack.core import store
 from tumortrack.core.errors import InputError
 
@@ -39,6 +39,11 @@ class Prepare:
         organ: label number of the organ.
         tumor: label number of the tumors; default: every label from 2 up. 0: none.
         up: patient direction that faces the camera: anterior, left, ... or "x,y,z" in LPS.
+        rotations: how the organ may lie then: turned about the line of sight and tilted by up to
+            TILT, or in any way (full). What is excluded here is never the answer.
+        tilt: degrees, about each axis across the line of sight.
+        sensor: the camera that will see it: a RealSense D405, or a stereo endoscope, whose depth
+            is matched.
         series: which DICOM series, if the folder holds several (UID or number in the list).
         unit: of mesh files.
         min_tumor_ml: smaller tumors are reported and dropped.
@@ -60,6 +65,9 @@ class Prepare:
     organ: int = 1
     tumor: int | None = None
     up: str = "anterior"
+    rotations: Literal["limited", "full"] = "limited"
+    tilt: float = 30.0
+    sensor: Literal["d405", "stereo"] = "d405"
     series: str | None = None
     unit: Literal["mm", "m"] | None = None
     min_tumor_ml: float = 0.2
@@ -67,14 +75,15 @@ class Prepare:
     overwrite: bool = False
 
     def run(self) -> None:
-        with live_line(f"reading {self.input}, making surfaces ..."):
+        with progress_of("the case's model", f"reading {self.input}, making surfaces ...") as made:
             from tumortrack import api
             from tumortrack.imaging.prepare import PrepareOptions
 
             options = {field.name: getattr(self, field.name) for field in fields(PrepareOptions)}
             case = api.prepare(
-                self.input, self.case, overwrite=self.overwrite, segment=self.segment, **options
-            )
+                self.input, self.case, overwrite=self.overwrite, segment=self.segment,
+                progress=made, **options,
+            )  # fmt: skip
         say_notes(case.report.get("notes", []))
         say(str(case.patient))
         kind = case.anatomy.kind

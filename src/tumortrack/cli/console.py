@@ -8,11 +8,10 @@ import sys
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Literal
 
 from rich.console import Console
-
-from tumortrack.core.process import is_follower
 
 Device = Literal["auto", "cpu", "cuda"]
 
@@ -26,8 +25,7 @@ class _Console(Console):
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
-# Of one training's processes the first alone speaks.
-console = _Console(soft_wrap=True, highlight=False, quiet=is_follower())
+console = _Console(soft_wrap=True, highlight=False)
 
 
 def say(text: str) -> None:
@@ -50,23 +48,54 @@ def say_notes(notes: Iterable[str]) -> None:
 def progress_bar(what: str, total: int) -> Iterator[Callable[[], None]]:
     """A line of what is done, how fast, and of the time left; yields a function to call as each of
     ``total`` is done. Begin it before what takes seconds to load."""
-    done, first_s = 0, 0.0
+    done = 0
 
-    with live_line(f"{what}: 0 of {total} ...") as show:
+    with progress_of(what, f"{what}: 0 of {total} ...") as show:
 
         def advance() -> None:
-            nonlocal done, first_s
+            nonlocal done
             done += 1
+            show(done, total)
+
+        yield advance
+
+
+@contextmanager
+def progress_of(what: str, first: str = "") -> Iterator[Callable[[int, int], None]]:
+    """The same for a function that is told how many are done, and of how many."""
+    first_s = 0.0
+
+    with live_line(first or f"{what} ...") as line:
+
+        def show(done: int, total: int) -> None:
+            nonlocal first_s
             if done == 1:  # what it needed may have been loaded and compiled: it tells no rate
                 first_s = time.monotonic()
-                show(f"{what}: 1 of {total}")
+                line(f"{what}: 1 of {total}")
                 return
             each_s = (time.monotonic() - first_s) / (done - 1)
             minutes, seconds = divmod(round(each_s * (total - done)), 60)
             rate = f"{1 / each_s:.1f} a second" if each_s < 1 else f"{each_s:.1f} s each"
-            show(f"{what}: {done} of {total} | {rate} | {minutes}:{seconds:02d} left")
+            line(f"{what}: {done} of {total} | {rate} | {minutes}:{seconds:02d} left")
 
-        yield advance
+        yield show
+
+
+def model_folder(given: Path) -> Path:
+    """The folder of a model that a command was given; of a case the one that it holds, made now
+    where there is none. Raises as ``load_case`` and ``case_model`` do."""
+    from tumortrack.imaging.case import Case, holds_case, load_case
+    from tumortrack.models.folder import is_model_of
+
+    if not holds_case(given):
+        return given
+    kept = given / Case.MODEL
+    if not is_model_of(kept, given):
+        with progress_of("making the case's model, once") as progress:
+            from tumortrack.tracking.model_files import case_model
+
+            case_model(load_case(given), progress=progress)
+    return kept
 
 
 @contextmanager

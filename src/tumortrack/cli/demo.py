@@ -7,6 +7,7 @@ import time
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any, Literal
 
 import tumortrack
 from tumortrack.cli.cases import Prepare, Simulate
@@ -14,11 +15,14 @@ from tumortrack.cli.console import say
 from tumortrack.cli.evaluate import Evaluate
 from tumortrack.cli.training import Train
 from tumortrack.core import store
-from tumortrack.core.errors import InputError
+from tumortrack.core.errors import InputError, NoEstimate, NoPlan
 
 _CT_SEED, _SCENE_SEED = 1, 2
 _MARKER = "demo.json"  # says that what lies beside it is a demo's and may be replaced
-_MINE = ("ct_dicom", "case", "model", "dataset", "scenes", "report.json", "index.html")
+_MINE = (
+    "ct_dicom", "case", "model", "dataset", "scenes", "report.json", "index.html", "paper",
+)  # fmt: skip
+_VOLUME = 400  # voxels along each axis, as the paper has
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,54 +31,91 @@ class Demo:
 
     Attributes:
         out: folder for everything the demo makes; what an earlier demo left there is replaced.
-        minutes: of training, once kernels are compiled (half a minute, once on a machine).
         scenes: unseen deformed scenes to locate tumors in.
+        preset: quick and paper train the paper's network on the same CT as well, evaluate it on the
+            same scenes (OUT/paper), and plan a resection on its labelled volume of 400 x 400 x 400.
+        minutes: of that training, once kernels are compiled.
     """
 
     out: Path = Path("runs/demo")
-    minutes: float = 0.5
     scenes: int = 20
+    preset: Literal["clinic", "quick", "paper"] = "clinic"
+    minutes: float = 3.0
 
     def run(self) -> None:
         from tumortrack.phantom import dicom, digital, scanner
 
-        if not 0 <= self.minutes < float("inf"):
-            raise InputError(f"--minutes {self.minutes:g} must be 0 or more.")
+        if not 0 < self.minutes < float("inf"):
+            raise InputError(f"--minutes {self.minutes:g} must be more than 0.")
+        if self.preset != "clinic":
+            from tumortrack.tracking.presets import occupancy
+
+            occupancy("training.train")  # what is missing is said first
         if self.scenes < 1:
             raise InputError(f"--scenes {self.scenes} must be at least 1.")
         out = self.out
         _clear(out)
-        say("1/5 scanning the built-in kidney phantom (virtual CT, DICOM)")
+        say("1/4 scanning the built-in kidney phantom (virtual CT, DICOM)")
         phantom = digital.PhantomParameters()
         labels = digital.phantom_labels(phantom)
         ct = scanner.scan(labels, scanner.ScannerParameters(), _CT_SEED)
         dicom.write_dicom_series(ct, out / "ct_dicom", side=phantom.side)
-        say("2/5 segmenting the CT, making surfaces")
+        say("2/4 segmenting the CT, making surfaces and an elastic body")
         began = time.perf_counter()
         Prepare(input=out / "ct_dicom", case=out / "case").run()
-        say(f"3/5 training for {self.minutes:g} minutes, once its kernels are compiled")
-        Train(case=out / "case", model=out / "model", minutes=self.minutes).run()
         made_s = time.perf_counter() - began
         dragged, elastic = self.scenes // 2, self.scenes - self.scenes // 2
         say(
-            f"4/5 simulating {self.scenes} unseen scenes: {elastic} deformed as an elastic body, "
-            f"{dragged} dragged, squeezed and bent as no training scene is"
+            f"3/4 simulating {self.scenes} unseen scenes: {elastic} deformed as an elastic body, "
+            f"{dragged} dragged, squeezed and bent as the elastic body cannot be"
         )
-        # Elastic ones are of states that training did not draw from. Training shows no drags; these
-        # are of two of the paper's configurations, the one it trains with and the one with the most
-        # drags, and squeezed and bent as a whole.
+        # Elastic ones are of another body's states. Drags are what no body does: of two of the
+        # paper's configurations, the one it trains with and the one with the most drags, and
+        # squeezed and bent as a whole.
         unseen = partial(Simulate, case=out / "case", dataset=out / "dataset", seed=_SCENE_SEED)
         unseen(scenes=elastic, elastic=True).write("elastic-")
         if dragged:
             unseen(scenes=dragged, configuration=(3, 6), squeeze=True).write("dragged-")
-        say("5/5 locating kidney and tumors in each from one depth image")
-        evaluate = Evaluate(model=out / "model", variants=out / "dataset", report=out, grid=128)
-        report = evaluate.write()  # beside the case, the model and the scenes
+        say("4/4 locating kidney and tumors in each from one depth image")
+        evaluate = Evaluate(model=out / "case", variants=out / "dataset", report=out, grid=128)
+        report = evaluate.write()  # beside the case and the scenes
         first = report["scenes"][0]
         if "seconds" in first:  # located
             to_first_s = made_s + first["seconds"]
-            say(f"labels to first estimate: {to_first_s:.0f} s, from the CT, with training.")
+            say(f"labels to first estimate: {to_first_s:.0f} s, from the CT.")
+        if self.preset != "clinic":
+            self._show_paper(report)
         say(f"open {out / 'index.html'} in a browser: estimate over truth, in 3-D, scene by scene.")
+
+    def _show_paper(self, ours: dict[str, Any]) -> None:
+        """The paper's chain on the same CT and scenes, beside the default method's answers."""
+        from tumortrack.cli.locate import Locate
+        from tumortrack.cli.plan import Plan
+        from tumortrack.report.summary import headlines
+
+        out, paper = self.out, self.out / "paper"
+        say(f"the paper's method, preset {self.preset}: training for {self.minutes:g} minutes")
+        Train(
+            case=out / "case", model=out / "model", preset=self.preset, minutes=self.minutes
+        ).run()
+        report = Evaluate(
+            model=out / "model", variants=out / "dataset", report=paper, grid=128
+        ).write()
+        scene = sorted((out / "dataset").iterdir())[0]
+        say(f"labelled volume of {_VOLUME} voxels along each axis of {scene.name}, and a plan")
+        run = paper / "run"
+        try:
+            Locate(model=out / "model", cloud=scene / "cloud.ply", out=run, grid=_VOLUME).run()
+            Plan(
+                run_folder=run, plan=paper / "plan", method="published", arms=False,
+                accept_poor=True, accept_budget=True,
+            ).run()  # fmt: skip
+        except (NoEstimate, NoPlan) as error:  # after so short a training
+            say(f"no plan: {error}")
+        for name, found in (("default method", ours), (f"the paper's, {self.preset}", report)):
+            say(f"{name}:")
+            for line in headlines(found["summary"]):
+                say(f"  {line}")
 
 
 def _clear(out: Path) -> None:

@@ -21,12 +21,13 @@ from tumortrack.core.process import available_cores
 
 # What each distribution and its extras are for; "" is what it always needs.
 PURPOSES = {
-    ("tumortrack", ""): "cases, training, locating, planning",
+    ("tumortrack", ""): "cases, locating, planning",
     ("tumortrack", "live"): "cameras, ROS 2, the web viewer, 3D Slicer, DICOM segmentations",
     ("tumortrack", "stereo"): "depth from two pictures",
     ("tumortrack", "arms"): "motions of two arms",
     ("tumortrack", "ur"): "a real arm of Universal Robots",
     ("tumortrack", "pcd"): ".pcd clouds",
+    ("tumortrack", "occupancy"): "the paper's method: networks and their training",
     ("tumortrack", "onnx"): "networks as ONNX files",
     ("tumortrack", "tensorboard"): "training curves",
     ("tumortrack-experiment", ""): "phantoms, calibrations, recordings",
@@ -76,25 +77,29 @@ class Doctor:
             say(f"{state:8} {text}")
             broken += state == "BROKEN"
 
-        import torch
-
-        from tumortrack.models.hardware import has_fast_bfloat16
-
-        has = torch.cpu.get_capabilities()
-        names = {"AVX2": "avx2", "AVX-512": "avx512_f", "AMX": "amx_tile"}
-        units = [f"{'' if has.get(flag) else 'no '}{unit}" for unit, flag in names.items()]
-        fast = has_fast_bfloat16(torch.device("cpu"))
-        bf16 = "in hardware, used" if fast else "not in hardware; fp32 is used (slower)"
-        say(f"CPU: {', '.join(units)}; bf16: {bf16}")
-        if torch.cuda.is_available():
-            say(f"CUDA: {torch.cuda.get_device_name()}")
-        else:
-            say("CUDA: none; everything runs on the CPU")
+        if find_spec("torch"):
+            _say_processors()
         if broken:
             raise TumortrackError(
                 f"{broken} of what is installed here does not work: see BROKEN above. All else can "
                 "be used."
             )
+
+
+def _say_processors() -> None:
+    """What networks can use."""
+    import torch
+
+    from tumortrack.occupancy.hardware import has_fast_bfloat16
+
+    has = torch.cpu.get_capabilities()
+    names = {"AVX2": "avx2", "AVX-512": "avx512_f", "AMX": "amx_tile"}
+    units = [f"{'' if has.get(flag) else 'no '}{unit}" for unit, flag in names.items()]
+    fast = has_fast_bfloat16(torch.device("cpu"))
+    bf16 = "in hardware, used" if fast else "not in hardware; fp32 is used (slower)"
+    say(f"CPU: {', '.join(units)}; bf16: {bf16}")
+    cuda = torch.cuda.get_device_name() if torch.cuda.is_available() else "none"
+    say(f"CUDA: {cuda}{'' if torch.cuda.is_available() else '; everything runs on the CPU'}")
 
 
 def _findings() -> Iterator[Finding]:
@@ -135,7 +140,7 @@ def part(name: str, extra: str, purpose: str) -> Iterator[Finding]:
     what = f"{name}[{extra}]" if extra else name
     install = f"{sys.executable} -m pip install '{what}'"
     try:
-        needed = [one for one in map(Requirement, requires(name) or ()) if _belongs(one, extra)]
+        needed = list(_needed(name, extra))
     except PackageNotFoundError:
         yield "absent", f"{what}: {purpose}; {install}"
         return
@@ -154,6 +159,18 @@ def part(name: str, extra: str, purpose: str) -> Iterator[Finding]:
             library, cure = "", install
         absent = bool(library) or fault.endswith(_ABSENT)
         yield "absent" if absent else "BROKEN", f"{_PARTS[package]}: {fault}; {cure}"
+
+
+def _needed(name: str, extra: str) -> Iterator[Requirement]:
+    """What it asks for on this machine; of another extra of its own, what that asks for."""
+    for one in map(Requirement, requires(name) or ()):
+        if not _belongs(one, extra):
+            continue
+        if one.name == name:
+            for other in one.extras:
+                yield from _needed(name, other)
+        else:
+            yield one
 
 
 def _belongs(needed: Requirement, extra: str) -> bool:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from tyro.conf import Positional
 
-from tumortrack.cli.console import Device, console, keep_loaded, progress_bar, say
+from tumortrack.cli.console import Device, console, keep_loaded, model_folder, progress_bar, say
 from tumortrack.cli.locate import check_grid
 from tumortrack.core import store
 from tumortrack.core.config import to_builtins
@@ -24,7 +24,7 @@ class Evaluate:
     """Locate in every scene of a folder and compare with the truth.
 
     Attributes:
-        model: folder that `train` wrote.
+        model: a case, or a folder that `train` wrote.
         variants: folder of scene folders.
         report: folder to write: report.json, index.html, pictures.
         grid: voxels along the longest side of the labelled volume.
@@ -53,24 +53,25 @@ class Evaluate:
         from tumortrack.models.folder import read_model_manifest
         from tumortrack.simulate.scene_folder import list_scenes
 
-        read_model_manifest(self.model)
-        folders = list_scenes(self.variants)  # report what is wrong before PyTorch's seconds
+        folder = model_folder(self.model)
+        read_model_manifest(folder)
+        folders = list_scenes(self.variants)
         say(f"comparing {self.model} with the truth of {len(folders)} scenes; loading it ...")
 
         from tumortrack.report.protocol import evaluate_scenes
         from tumortrack.report.rivals import rivals_of
         from tumortrack.report.summary import headlines, scene_lines, summary_tables
+        from tumortrack.tracking.model_files import load_model
         from tumortrack.tracking.tracker import Tracker
-        from tumortrack.training.model import load_model
 
         keep_loaded()
-        model = load_model(self.model, self.device)
+        model = load_model(folder, self.device)
         check_case(model, folders)
         say(str(model.patient))
         about = {
             "patient": to_builtins(model.patient),
             "model": model.provenance,
-            "model_sha256": store.sha256_of(self.model / store.MANIFEST),
+            "model_sha256": store.sha256_of(folder / store.MANIFEST),
             "scenes_folder": str(self.variants),
             "grid": self.grid,
             "seed": self.seed,
@@ -99,7 +100,7 @@ def check_case(model: Model, folders: list[Path]) -> None:
         stated = store.read_json(path).get("case_sha256") if path.is_file() else None
         if wanted is not None and stated is not None and stated != wanted:
             raise InputError(
-                f"{folder} shows another case than the one this model was trained for, so the "
+                f"{folder} shows another case than the one that this model is of, so the "
                 "figures would mean nothing. Make scenes of the model's own case with: "
                 "tumortrack simulate CASE DATASET."
             )

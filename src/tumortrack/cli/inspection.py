@@ -25,6 +25,10 @@ _TOLD_BY = {  # of a kind of folder, by another file than its manifest
     "hand-eye calibration": "calibration.json",
 }
 
+_METHODS = {  # by whether they have a network
+    False: "lays the organ of the CT on the points; `locate --map` says where points of the CT are",
+    True: "labels points; it does not know which point of the CT lies where (no `--map`)",
+}
 _KNOWN = (
     "folders that commands write (cases, models, runs, plans, scenes, recordings, evaluations, "
     "fleets, kits, calibrations), their reports, calibration and intrinsics files, clouds, depth "
@@ -115,20 +119,17 @@ def _kinds() -> Iterable[dict[str, Any]]:
 
 def _with_figures(content: Content, folder: Path) -> Content:
     """With what follows from a file's entries."""
-    from tumortrack.cli.margins import described
-    from tumortrack.models.folder import training_words, weakness_of
-    from tumortrack.models.margins import UNKNOWN, margin_words, read_margins
-
     figures: dict[str, Any] = {}
-    if "query_box_mm" in content:
-        about, margins = content["provenance"], read_margins(folder)
-        does = "labels points; it does not know which point of the CT lies where (no `--map`)"
-        if content["config"]["network"]["decoder"]["type"] == "warp":
-            does = "places the organ of the CT; `locate --map` says where points of the CT are"
-        figures = {"does": does, "trained": training_words(about), "weakness": weakness_of(about)}
+    if "up_lps" in content:  # a case
+        figures = {"lies": _poses(content["rotations"], content["tilt_degrees"])}
+        figures |= _of_the_cases_model(folder)
+    elif "familiar" in content:  # a model
+        pose = content["config"]["scene"]["pose"]
+        figures = {"lies": _poses(pose["rotations"], pose["tilt_deg"])}
+        figures |= {"does": _METHODS["network" in content["config"]], **_of_model(content, folder)}
         figures["part_names"] = ", ".join(content["parts"])
-        figures["margins"] = described(margins) if margins else [UNKNOWN]
     elif content.keys() >= {"quality", "parts"}:
+        from tumortrack.models.margins import margin_words
         from tumortrack.report.run_page import part_rows, row_words
 
         figures["margin_words"] = margin_words(content.get("margin"))
@@ -140,13 +141,45 @@ def _with_figures(content: Content, folder: Path) -> Content:
     return {**content, **figures}
 
 
+def _poses(rotations: str, tilt_degrees: float) -> str:
+    """How the organ may lie."""
+    if rotations == "full":
+        return "in any way"
+    return f"turned about the line of sight, and tilted by up to {tilt_degrees:g} degrees"
+
+
+def _of_the_cases_model(case: Path) -> Content:
+    """Raises ArtifactError: it is damaged."""
+    from tumortrack.imaging.case import Case
+    from tumortrack.models.folder import is_model_of, read_model_manifest
+
+    folder = case / Case.MODEL
+    if not is_model_of(folder, case):
+        return {"known": "none yet; the first command that needs one makes it"}
+    return _of_model(read_model_manifest(folder), folder)
+
+
+def _of_model(manifest: Content, folder: Path) -> Content:
+    """How good a model is."""
+    from tumortrack.cli.margins import described
+    from tumortrack.models.folder import training_words, weakness_of
+    from tumortrack.models.margins import UNKNOWN, read_margins
+
+    about, margins = manifest["provenance"], read_margins(folder)
+    trained = "trained for " * ("network" in manifest["config"])
+    return {
+        "known": trained + training_words(about),
+        "weakness": weakness_of(about),
+        "margins": described(margins) if margins else [UNKNOWN],
+    }
+
+
 def _artifact(folder: Path) -> Iterable[str]:
     """Of a folder with a manifest; of other distributions' kinds, what is a word or a number."""
     kind = str(store.read_json(folder / store.MANIFEST).get("kind"))
     manifest = store.read_manifest(folder, kind)
-    name = {"pretrained": "pretrained weights"}.get(kind, f"a {kind}")  # where it is no noun
     yield (
-        f"{name} (tumortrack {manifest['tumortrack']}; {manifest['units']}, {manifest['frame']} "
+        f"a {kind} (tumortrack {manifest['tumortrack']}; {manifest['units']}, {manifest['frame']} "
         "frame); all files are as they were written"
     )
     if isinstance(manifest.get("scenes"), dict):

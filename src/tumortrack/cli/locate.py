@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from tyro.conf import Positional, UseAppendAction
 
-from tumortrack.cli.console import Device, keep_loaded, say, say_notes
+from tumortrack.cli.console import Device, keep_loaded, model_folder, say, say_notes
 from tumortrack.cli.finding import FindingOrgan
 from tumortrack.core import store
 from tumortrack.core.config import to_builtins
@@ -42,7 +42,7 @@ class Locate(FindingOrgan):
     answer. Exit status: 0 good; 4 poor (all is written); 3 no estimate (OUT says why); 2 an error.
 
     Attributes:
-        model: folder that `train` wrote.
+        model: a case, or a folder that `train` wrote.
         cloud: .ply, .pcd or .npz in the camera frame, or a depth image (with --intrinsics): 16-bit
             PNG or TIFF, or a TIFF of floats. Several views of an organ that does not move in
             between (CLOUD CLOUD ... OUT) need --poses; the answer is in the first one's frame.
@@ -98,25 +98,25 @@ class Locate(FindingOrgan):
             )
         overwrite = self.overwrite or has_no_estimate(out)
         store.check_place(out, "run", overwrite)
-        points = self._points()
+        folder = model_folder(self.model)
+        points = self._points(folder)
         frame_id, fixed_from_camera = self._poses(len(clouds))
         views = self._views(clouds)
         hints = views[0].hints(self.at, self.mask)
-        # What is wrong so far was reported before PyTorch's seconds.
 
         from tumortrack.report.run_page import PAGE, Seen, write_run_page
         from tumortrack.tracking.files import write_estimate, write_no_estimate
+        from tumortrack.tracking.model_files import load_model
         from tumortrack.tracking.tracker import Tracker
-        from tumortrack.training.model import load_model
 
         keep_loaded()
-        model = load_model(self.model, self.device)
+        model = load_model(folder, self.device)
         tracker = Tracker(model)
         about: dict[str, Any] = {
             "notes": self._notes(views, points, tracker.anatomy_ct),
             "input": [],
             "model": model.provenance,
-            "model_sha256": store.sha256_of(self.model / store.MANIFEST),
+            "model_sha256": store.sha256_of(folder / store.MANIFEST),
             "cloud_sha256": store.sha256_of(self.cloud),
         }
         seen, organs = Seen(content=views[0].content, ct=self._ct(model, tracker.anatomy_ct)), []
@@ -219,25 +219,24 @@ class Locate(FindingOrgan):
         if not same or anatomy_ct is None:
             raise InputError(
                 f"--case {self.case} shows nothing here: "
-                + ("the model knows no motion; train one of the preset clinic."
-                   if same else "the model was trained for another case. Give that one.")
+                + ("the model knows no motion; give the case itself in its place."
+                   if same else "the model is of another case. Give that one.")
             )  # fmt: skip
         return None if case.ct is None else CarriedCt(case)
 
-    def _points(self) -> PointTable | None:
+    def _points(self, folder: Path) -> PointTable | None:
         """The points of --map; what is wrong with them or the model is said before a wait."""
         from tumortrack.models.folder import has_shape, patient_of, read_model_manifest
         from tumortrack.tracking.points import read_points
 
-        manifest = read_model_manifest(self.model)
-        patient_of(manifest, self.model).check_is(self.stated, str(self.model))
+        manifest = read_model_manifest(folder)
+        patient_of(manifest, folder).check_is(self.stated, str(self.model))
         if self.map is None:
             return None
         if not has_shape(manifest):
             raise InputError(
                 f"--map: {self.model} says what is where, but not which point of the CT lies "
-                "there. A model of the preset clinic knows: tumortrack train CASE MODEL --preset "
-                "clinic."
+                "there. The case itself knows: give CASE in place of MODEL."
             )
         return read_points(self.map)
 

@@ -7,24 +7,13 @@ import gc
 import os
 import sys
 from collections.abc import Callable
+from importlib import import_module
 from importlib.metadata import entry_points
 from typing import NoReturn, Protocol, runtime_checkable
 
 import tyro
 
 import tumortrack
-from tumortrack.cli.cases import Export, Prepare, Simulate
-from tumortrack.cli.demo import Demo
-from tumortrack.cli.doctor import Doctor
-from tumortrack.cli.evaluate import Evaluate
-from tumortrack.cli.inspection import Inspect
-from tumortrack.cli.locate import VERDICTS, Locate
-from tumortrack.cli.margins import Margins
-from tumortrack.cli.models import Compile, Onnx
-from tumortrack.cli.plan import Plan
-from tumortrack.cli.resect import Resect
-from tumortrack.cli.track import Track
-from tumortrack.cli.training import Train
 from tumortrack.core.errors import InputError, PackageError, TumortrackError
 
 
@@ -37,17 +26,20 @@ class Command(Protocol):
         ...
 
 
-_COMMANDS: tuple[type[Command], ...] = (
-    *(Demo, Prepare, Export, Train, Locate, Track, Plan, Resect),
-    *(Simulate, Evaluate, Margins, Compile, Onnx, Inspect, Doctor),
-)
+_MODULES = {  # of ours, in the order of --help; only the chosen one is imported
+    "demo": "demo", "prepare": "cases", "export": "cases", "train": "training",
+    "locate": "locate", "track": "track", "plan": "plan", "resect": "resect",
+    "simulate": "cases", "evaluate": "evaluate", "margins": "margins", "compile": "models",
+    "onnx": "models", "inspect": "inspection", "doctor": "doctor",
+}  # fmt: skip
 # Whose they are: where that is not installed, they are no typing errors.
 _OF_OTHERS = {
-    **dict.fromkeys(("pretrain", "twin", "bench", "fleet"), "tumortrack-lab"),
+    **dict.fromkeys(("twin", "bench", "fleet"), "tumortrack-lab"),
     **dict.fromkeys(("phantom-kit", "calibrate", "record", "reference"), "tumortrack-experiment"),
 }
 _OBJECTS_A_COLLECTION = 20_000
 _LEFT_AT_ONCE = ["locate"]  # holds nothing open in the end, and is waited for
+_ANSWERS = (0, 3, 4)  # its exit statuses where OUT is written
 
 
 def main() -> None:
@@ -61,7 +53,7 @@ def main() -> None:
     # them for garbage again and again is a tenth of the time of their import.
     gc.set_threshold(_OBJECTS_A_COLLECTION)
     code = run(sys.argv[1:])
-    if sys.argv[1:2] == _LEFT_AT_ONCE and code in VERDICTS.values():
+    if sys.argv[1:2] == _LEFT_AT_ONCE and code in _ANSWERS:
         leave(code)
     if code:
         sys.exit(code)
@@ -106,12 +98,11 @@ def leave(code: int = 0) -> NoReturn:
 def _commands(chosen: str) -> dict[str, Callable[..., Command]]:
     """Ours, and behind them other installed packages' (entry points of ``tumortrack.commands``):
     the chosen one, or all where there is none of that name."""
-    ours = {command.__name__.lower(): command for command in _COMMANDS}
-    if chosen in ours:
-        return {**ours}
+    if chosen in _MODULES:
+        return {chosen: _ours(chosen)}
     others = sorted(entry_points(group="tumortrack.commands"), key=lambda point: point.name)
     others = [point for point in others if point.name == chosen] or others
-    commands: dict[str, Callable[..., Command]] = {**ours}
+    commands = {name: _ours(name) for name in _MODULES}
     for point in others:
         try:
             commands[point.name] = point.load()
@@ -121,6 +112,13 @@ def _commands(chosen: str) -> dict[str, Callable[..., Command]]:
                 raise PackageError(f"{fault}. Repair or uninstall its package.") from error
             print(f"note: {fault}", file=sys.stderr)
     return commands
+
+
+def _ours(name: str) -> Callable[..., Command]:
+    command: Callable[..., Command] = getattr(
+        import_module(f"tumortrack.cli.{_MODULES[name]}"), name.capitalize()
+    )
+    return command
 
 
 def _parse(arguments: list[str]) -> Command:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from tyro.conf import Positional
 
-from tumortrack.cli.console import Device, keep_loaded, progress_bar, say
+from tumortrack.cli.console import Device, keep_loaded, model_folder, progress_bar, say
 from tumortrack.core import store
 from tumortrack.core.config import check_seed
 from tumortrack.core.errors import InputError
@@ -25,7 +25,7 @@ class Margins:
     """Calibrate a model: the margin that its tumors lie in, in 95 of 100 cases like the scenes.
 
     Attributes:
-        model: folder that `train` wrote; the margins are kept in it.
+        model: a case, or a folder that `train` wrote; the margins are kept in it.
         scenes: folders of scene folders whose truth is known.
         confidence: the shares of cases in which the margins are to hold.
         widest: answers that miss by more mm than this are to be kept out.
@@ -54,33 +54,34 @@ class Margins:
         check_seed(self.seed)
         if not self.scenes:
             raise InputError("give folders of scenes: tumortrack margins MODEL SCENES.")
-        read_model_manifest(self.model)
-        margins = self._calibrated()
-        path = keep_margins(self.model, margins)
+        folder = model_folder(self.model)
+        read_model_manifest(folder)
+        margins = self._calibrated(folder)
+        path = keep_margins(folder, margins)
         for line in described(margins):
             say(line)
         say(f"written to {path}; `locate`, `track` and `plan` state them from now on.")
 
-    def _calibrated(self) -> ModelMargins:
+    def _calibrated(self, folder: Path) -> ModelMargins:
         from tumortrack.report import calibration, calibration_table
 
-        listed = calibration.list_states(self.scenes, self.seed)  # before PyTorch's seconds
+        listed = calibration.list_states(self.scenes, self.seed)
         highest = max(self.confidence)
         if len(listed) < (needed := calibration.least_states(highest)):
             raise InputError(
                 f"{len(listed)} scenes given, a state each; about {needed} are needed for margins "
                 f"that hold in {100 * highest:g} % of cases. Give more, or a lower --confidence."
             )
-        digest = store.sha256_of(self.model / store.MANIFEST)
-        table = self.out or self.model / "margins.jsonl"
+        digest = store.sha256_of(folder / store.MANIFEST)
+        table = self.out or folder / "margins.jsonl"
         head = calibration_table.head_of(digest, self.seed)
         with calibration_table.open_table(table, head) as (known, add):
-            rows = self._located(listed, known, add)
+            rows = self._located(folder, listed, known, add)
         of = store.sha256_of(table)
         return calibration.margins_of(rows, of, self.confidence, self.widest, self.seed)
 
     def _located(
-        self, listed: list[Listed], known: list[Row], add: Callable[[Row], None]
+        self, folder: Path, listed: list[Listed], known: list[Row], add: Callable[[Row], None]
     ) -> list[Row]:
         """A row for every state; those that are known are not located again."""
         states = {str(one.folder.resolve()): one for one in listed}
@@ -98,11 +99,11 @@ class Margins:
             from tumortrack.cli.evaluate import check_case
             from tumortrack.report.calibration import row_of
             from tumortrack.simulate.scene_folder import read_scene
+            from tumortrack.tracking.model_files import load_model
             from tumortrack.tracking.tracker import Tracker
-            from tumortrack.training.model import load_model
 
             keep_loaded()
-            model = load_model(self.model, self.device, with_margins=False)
+            model = load_model(folder, self.device, with_margins=False)
             check_case(model, [one.folder for one in left])
             tracker = Tracker(model)
             for one in left:

@@ -6,7 +6,6 @@ from contextlib import suppress
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
 from tyro.conf import Positional
@@ -27,8 +26,8 @@ class Compile:
     """Compile what this machine needs, before the first patient or frame would wait for it.
 
     Attributes:
-        model: folder that `train` wrote; nothing is written into it. Without one, what a new
-            patient's model needs is compiled as well, on the built-in phantom.
+        model: a case, or a folder that `train` wrote. Without one, what a new patient's model needs
+            is compiled as well, on the built-in phantom.
         device: auto takes CUDA if there is a GPU.
     """
 
@@ -40,24 +39,13 @@ class Compile:
         shown their own."""
         say("compiling ...")
 
-        import numpy as np
-        import torch
-
         from tumortrack.core.types import SensorCloud
-        from tumortrack.occupancy.sparse import sparse_margins
+        from tumortrack.tracking.model_files import load_model
         from tumortrack.tracking.tracker import Tracker
-        from tumortrack.training.model import load_model
 
-        def ball(points_mm: np.ndarray) -> torch.Tensor:
-            """Logits of a ball in the grid's middle."""
-            inside = 5.0 - np.linalg.norm(points_mm - _GRID / 4, axis=1)
-            return torch.from_numpy(np.column_stack([-inside, inside]).astype(np.float32))
-
-        model = load_model(self.model, self.device) if self.model else _phantom_model(self.device)
-        tracker = Tracker(model)
+        given = None if self.model is None else load_model(self.model, self.device)
+        tracker = Tracker(given or _phantom_model())
         tracker.warm()
-        grid = np.diag([0.5, 0.5, 0.5, 1.0])
-        sparse_margins(ball, grid, (_GRID, _GRID, _GRID), start_mm=2.0)
         if tracker.anatomy_ct is not None:
             organ = tracker.anatomy_ct.organ.vertices_mm
             cloud = SensorCloud(organ - organ.mean(0) + [0, 0, 150])
@@ -66,20 +54,15 @@ class Compile:
         say("kernels: compiled and kept for every model of this machine.")
 
 
-def _phantom_model(device: Device) -> Model:
-    """Of the built-in phantom, made as `train --minutes 0` makes one; none of it stays."""
+def _phantom_model() -> Model:
+    """Of the built-in phantom; none of it stays."""
     from tumortrack.imaging.surface import surfaces
     from tumortrack.phantom.digital import PhantomParameters, phantom_labels
-    from tumortrack.training.model import start_of
-    from tumortrack.training.presets import clinic
-    from tumortrack.training.train import TrainingRun, train
+    from tumortrack.registration.build import build_model
+    from tumortrack.tracking.presets import clinic
 
     anatomy = surfaces(phantom_labels(PhantomParameters(), _VOXEL_MM))[0]
-    config = clinic(anatomy)
-    start = start_of(config.network, None)
-    run = TrainingRun(anatomy, _UP_LPS, "none", config, steps=0, device=device, start=start)
-    with TemporaryDirectory() as folder:
-        return train(run, Path(folder), lambda _: None)
+    return build_model(anatomy, _UP_LPS, clinic(anatomy))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,9 +70,9 @@ class Onnx:
     """Write a model's network as an ONNX file, for other programs.
 
     Attributes:
-        model: folder that `train` wrote.
-        out: file to write, .onnx: clouds and queries in, logits out (quick, paper); clouds in,
-            placements out (clinic). docs/method.md says what they mean.
+        model: folder that `train --preset quick` or `paper` wrote.
+        out: file to write, .onnx: clouds and queries in, logits out. docs/method.md says what
+            they mean.
         overwrite: replace OUT if it exists.
     """
 
@@ -98,7 +81,8 @@ class Onnx:
     overwrite: bool = False
 
     def run(self) -> None:
-        from tumortrack.models.folder import read_model_manifest
+        from tumortrack.imaging.case import holds_case
+        from tumortrack.models.folder import has_shape, read_model_manifest
 
         out = self.out
         if out.suffix != ".onnx":
@@ -107,15 +91,19 @@ class Onnx:
             store.check_place(out, "ONNX", self.overwrite)
         if not out.parent.is_dir():
             raise InputError(f"{out.parent} is not a folder; make it first.")
-        read_model_manifest(self.model)
+        if holds_case(self.model) or has_shape(read_model_manifest(self.model)):
+            raise InputError(
+                f"{self.model} has no network; models of `train --preset quick` or paper have one."
+            )
         if find_spec("onnx") is None:  # reported before PyTorch's seconds
             raise InputError("writing ONNX needs the package onnx: pip install 'tumortrack[onnx]'.")
 
-        from tumortrack.models.model import onnx_bytes
-        from tumortrack.training.model import load_model
+        from tumortrack.tracking.model_files import load_model
+        from tumortrack.tracking.presets import occupancy
 
+        write = occupancy("model").onnx_bytes
         model = load_model(self.model, "cpu")
-        content = onnx_bytes(model)
+        content = write(model)
         store.write_atomically(out, content)
         points = model.config.scene.cloud.n_points
         say(f"written to {out} ({len(content) / 2**20:.1f} MB): clouds of {points} points, mm.")

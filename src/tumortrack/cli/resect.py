@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 from tyro.conf import Positional
 
 from tumortrack.cli import track
-from tumortrack.cli.console import live_line, say, warn
+from tumortrack.cli.console import live_line, model_folder, say, warn
 from tumortrack.cli.plan import check_arms_installed
 from tumortrack.core import store
 from tumortrack.core.config import to_builtins
@@ -133,7 +133,7 @@ class Resect(track.Following):
             f"a source that shows the present ({', '.join(_LIVE)}; not {source})": (
                 live is None or live.shows_the_present
             ),
-            f"a model that says which case it was trained for ({model} does not)": (
+            f"a model that says which case it is of ({model} does not)": (
                 live is None or live.case
             ),
             "a plan that says which case it was made on (locate and plan again)": (
@@ -390,14 +390,15 @@ def _live_of(model: Path, source: str, stored: PlanFolder) -> _Live:
     from tumortrack.live.spec import SOURCES
     from tumortrack.models.folder import patient_of
 
-    manifest = store.read_json(model / store.MANIFEST) if model.is_dir() else {}
+    folder = model_folder(model)
+    manifest = store.read_json(folder / store.MANIFEST) if folder.is_dir() else {}
     case = str(manifest.get("provenance", {}).get("case_sha256") or "")
     whose = patient_of(manifest, model)
     if whose.differs(stored.patient):  # it would find another tumor, or none
         raise InputError(f"{model} is of {whose}, the plan of {stored.patient}.")
     if stored.case_sha256 and case and case != stored.case_sha256:  # likewise
         raise InputError(
-            f"{model} was trained for another case than the one that was planned on. Give a model "
+            f"{model} is of another case than the one that was planned on. Give a model "
             "of that case, or plan on what this model locates."
         )
     return _Live(model, case, whose, source, SOURCES.parse(source))

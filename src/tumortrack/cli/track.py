@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from tyro.conf import Positional
 
-from tumortrack.cli.console import Device, console, keep_loaded, say
+from tumortrack.cli.console import Device, console, keep_loaded, model_folder, say
 from tumortrack.cli.finding import FindingOrgan
 from tumortrack.core import store
 from tumortrack.core.errors import InputError, StorageError
@@ -74,7 +74,7 @@ class Track(Following):
     docs/live.md has examples.
 
     Attributes:
-        model: folder that `train` wrote.
+        model: a case, or a folder that `train` wrote.
         source: where frames come from.
         sinks: where estimates go; any number.
         frame: JSON file that says where the camera is; results are then in the robot's frame.
@@ -128,8 +128,8 @@ class Track(Following):
 
         setup = self._cameras() if arms is None else arms.setup  # what executes was checked
         frames, named = setup.published, api.named_sinks(self.sinks)
-        manifest = read_model_manifest(self.model)  # what is wrong, before PyTorch's seconds
-        patient = patient_of(manifest, self.model)
+        folder = model_folder(self.model)
+        patient = patient_of(read_model_manifest(folder), folder)
         patient.check_is(self.stated, str(self.model))
         for text, source_config in setup.sources.items():
             source_config.patient().check_shown(patient, text)
@@ -146,10 +146,10 @@ class Track(Following):
 
         if arms is None:
             keep_loaded()
-        model = api.load_model(self.model, self.device)
+        model = api.load_model(folder, self.device)
         tracker = Tracker(model)
         if setup.still and tracker.anatomy_ct is None:
-            raise InputError("--views needs a model that knows a motion: preset clinic.")
+            raise InputError("--views needs a model that knows a motion: give the case itself.")
         config = self._loop_config(model)
         context = SinkContext(
             model.parts,
@@ -175,7 +175,7 @@ class Track(Following):
         about = {
             "patient": to_builtins(model.patient),
             "model": model.provenance,
-            "model_sha256": store.sha256_of(self.model / store.MANIFEST),
+            "model_sha256": store.sha256_of(folder / store.MANIFEST),
             "source": self.source,
             "sinks": list(self.sinks),
             "config": to_builtins(config),

@@ -153,3 +153,13 @@ def plane_section(
     crosses = (here > 0) != (there > 0)  # two edges of each
     share = here[crosses] / (here - there)[crosses]
     return (start[crosses] + share[:, None] * (end - start)[crosses]).reshape(-1, 2, 3)
+
+
+def std_of(covariance: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, " n"]:
+    """One standard deviation along any axis: the root of the mean over three of them."""
+    return np.sqrt(np.trace(covariance, axis1=1, axis2=2) / 3)
+
+
+def largest_std_of(covariance: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, " n"]:
+    """One standard deviation along the axis where it is largest."""
+    return np.sqrt(np.linalg.eigvalsh(covariance)[:, -1])

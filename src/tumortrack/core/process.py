@@ -20,11 +20,6 @@ _Item = TypeVar("_Item")
 _Made = TypeVar("_Made")
 
 
-def is_follower() -> bool:
-    """Whether torchrun started this process as another than the first, which alone reports."""
-    return "TORCHELASTIC_RUN_ID" in os.environ and os.environ.get("RANK", "0") != "0"
-
-
 def available_cores(cgroups: Path = _CGROUPS) -> int:
     """Cores for this process by its affinity mask and its container's quota: 1 or more."""
     affinity = getattr(os, "sched_getaffinity", None)  # Linux only

@@ -22,11 +22,10 @@ from typing import Any
 import tumortrack
 from tumortrack.core.errors import ArtifactError, InputError, StorageError
 
-SCHEMA = 2  # raise it with every change of what a folder holds or its numbers rest on
+SCHEMA = 3  # raise it with every change of what a folder holds or its numbers rest on
 _MADE_BY = {  # by kind
     "case": "prepare INPUT CASE",
     "twin": "twin CASE SCENES",
-    "pretrained": "pretrain OUT",
     "model": "train CASE MODEL",
     "run": "locate MODEL CLOUD OUT",
     "plan": "plan RUN PLAN",
@@ -133,22 +132,34 @@ def check_place(path: Path, kind: str, overwrite: bool | None) -> None:
         advice = "." if overwrite is None else ", or give --overwrite."
         raise InputError(f"{path} exists already. Choose another path{advice}")
     if not path.is_dir():
-        raise InputError(f"{path} is a file; --overwrite replaces only a {kind} folder.")
+        raise InputError(f"{path} is a file; only a {kind} folder is replaced.")
     if not (inside := [p.name for p in path.iterdir()]):
         return
     manifest = read_json(path / MANIFEST) if MANIFEST in inside else {}
     files = manifest.get("files")
     if manifest.get("kind") != kind or "tumortrack" not in manifest or not isinstance(files, dict):
         raise InputError(
-            f"{path} is not a {kind} that tumortrack wrote, so --overwrite does not replace it. "
+            f"{path} is not a {kind} that tumortrack wrote, so it is not replaced. "
             "Choose another path, or move the folder away yourself."
         )
-    known = (MANIFEST, *files)
-    if strays := [n for n in sorted(inside) if n not in known and not n.startswith(".")]:
+    if strays := _strays(path, manifest):
         raise InputError(
-            f"{path} also holds {', '.join(strays[:3])}, which no {kind} has; --overwrite would "
-            "lose it. Move it away first, or choose another path."
+            f"{path} also holds {', '.join(strays[:3])}, which would be lost. Move it away first, "
+            "or choose another path."
         )
+
+
+def _strays(folder: Path, manifest: dict[str, Any]) -> list[str]:
+    """What lies in an artifact, and in the artifacts that it may hold, beside what was written."""
+    files, folders = manifest.get("files", {}), manifest.get("folders", ())
+    found = []
+    for path in sorted(folder.iterdir()):
+        if path.name in folders and (path / MANIFEST).is_file():
+            inner = _strays(path, read_json(path / MANIFEST))
+            found += [f"{path.name}/{name}" for name in inner]
+        elif path.name not in (MANIFEST, *files) and not path.name.startswith("."):
+            found.append(path.name)
+    return found
 
 
 @contextmanager

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar, Literal
 
 import msgspec
 
@@ -32,7 +32,14 @@ class Case:
         report: JSON types: volumes, smoothing, what was dropped, notes, source, options.
         ct: the CT on the labels' crop, where the input was one.
         patient: whose organ it is, as far as it is known.
+        rotations, tilt_degrees: how it may lie before the camera: any way (``full``), or turned
+            about the line of sight and tilted up to so much about the axes across it.
+        sensor: the camera that will see it.
+        folder: where it was read from, or written.
+        sha256: of its manifest there.
     """
+
+    MODEL: ClassVar[str] = "model"  # sub-folder
 
     anatomy: Anatomy
     labels: LabelVolume
@@ -40,6 +47,11 @@ class Case:
     report: dict[str, Any] = field(default_factory=dict)
     ct: Volume | None = None
     patient: Patient = NOBODY
+    rotations: Literal["limited", "full"] = "limited"
+    tilt_degrees: float = 30.0
+    sensor: Literal["d405", "stereo"] = "d405"
+    folder: Path | None = None
+    sha256: str = ""
 
 
 class _Manifest(msgspec.Struct):
@@ -50,6 +62,9 @@ class _Manifest(msgspec.Struct):
     parts: list[str]
     up_lps: tuple[float, float, float]
     patient: Patient
+    rotations: Literal["limited", "full"]
+    tilt_degrees: float
+    sensor: Literal["d405", "stereo"]
     report: dict[str, Any]
 
 
@@ -72,9 +87,19 @@ def save_case(case: Case, folder: Path) -> None:
         "parts": list(case.anatomy.names),
         "up_lps": [float(x) for x in case.up_lps],
         "patient": to_builtins(case.patient),
+        "rotations": case.rotations,
+        "tilt_degrees": case.tilt_degrees,
+        "sensor": case.sensor,
+        "folders": [case.MODEL],
         "report": case.report,
     }
     store.seal(folder, KIND, content, frame="lps")
+
+
+def holds_case(folder: Path) -> bool:
+    """Whether a folder holds a case."""
+    path = folder / store.MANIFEST
+    return path.is_file() and store.read_json(path).get("kind") == KIND
 
 
 def load_case(folder: Path) -> Case:
@@ -95,4 +120,6 @@ def load_case(folder: Path) -> Case:
         raise ArtifactError(f"{folder} lacks parts: {said.parts} expected, {found} found.")
     labels, ct = read_labels(folder / "labels.nii.gz"), folder / "ct.nii.gz"
     volume = read_volume(ct) if ct.exists() else None
-    return Case(anatomy, labels, said.up_lps, said.report, volume, said.patient)
+    lies = said.rotations, said.tilt_degrees, said.sensor
+    where = folder, store.sha256_of(folder / store.MANIFEST)
+    return Case(anatomy, labels, said.up_lps, said.report, volume, said.patient, *lies, *where)

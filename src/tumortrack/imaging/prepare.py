@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, Literal, cast
 
 import numpy as np
 
@@ -34,6 +34,7 @@ from tumortrack.imaging.volume import is_label_map, labels_of, read_raw, volume_
 _OF_CT, OF_LABELS = ("organ_hu", "tumor_hu"), ("labels", "organ", "tumor")
 _LEAST_ORGAN_OUTSIDE = 0.02  # of the outer surface
 _LARGEST_SHARE = 0.6  # of an organ that a tumor takes without a note; our choice
+_MOST_TILTED = 60.0  # degrees: two such tilts add up to 85, and more is another side
 _MOST_CHANGE_PERCENT = 1.0  # of a part's volume, by smoothing; more is noted
 
 
@@ -48,6 +49,10 @@ class PrepareOptions:
             take (None: the tumor-bearing one); of a CT by HU windows or meshes, which one it is.
         organ, tumor: label numbers; tumor None takes every label from 2 up, 0 none.
         up: the patient direction that faces the camera: a name, or three numbers in LPS.
+        rotations: how the organ may lie then: ``limited``, turned about the line of sight and
+            tilted, or ``full``, in any way.
+        tilt: up to so many degrees about each axis across the line of sight.
+        sensor: the camera that will see it: ``d405`` or ``stereo`` (an endoscope's pictures).
         series: UID or number of one DICOM series among several.
         unit: of meshes, ``mm`` or ``m``; None: mm, and metres are refused with an explanation.
         min_tumor_ml: smaller tumors are reported and dropped.
@@ -65,6 +70,9 @@ class PrepareOptions:
     organ: int = ORGAN
     tumor: int | None = None
     up: str = "anterior"
+    rotations: Literal["limited", "full"] = "limited"
+    tilt: float = 30.0
+    sensor: Literal["d405", "stereo"] = "d405"
     series: str | None = None
     unit: str | None = None
     min_tumor_ml: float = MIN_TUMOR_ML
@@ -83,6 +91,15 @@ class PrepareOptions:
         self.kind.check_side(self.side)
         stated_structures(self.structure, self.name)
         direction_lps(self.up)
+        if self.rotations not in ("limited", "full"):
+            raise InputError(f"rotations {self.rotations!r} is not allowed: limited or full.")
+        if not 0 <= self.tilt <= _MOST_TILTED:
+            raise InputError(
+                f"tilt is {self.tilt:g} degrees; allowed: 0 to {_MOST_TILTED:g}. An organ that may "
+                "lie in any way has rotations full."
+            )
+        if self.sensor not in ("d405", "stereo"):
+            raise InputError(f"sensor {self.sensor!r} is not allowed: d405 or stereo.")
         if self.unit not in (None, "mm", "m"):
             raise InputError(f"unit {self.unit!r} is not allowed: mm or m.")
         if self.patient is not None:
@@ -125,7 +142,13 @@ def prepare(input: Path, options: PrepareOptions | None = None) -> Case:
         "turns": [{k: v for k, v in asdict(one).items() if k != "ct_from_ct"} for one in turns],
     }
     origin |= {"half_turn": looks, "notes": [*notes, said] if said else notes}
-    return replace(case, report={**case.report, **origin})
+    return replace(
+        case,
+        report={**case.report, **origin},
+        rotations=options.rotations,
+        tilt_degrees=options.tilt,
+        sensor=options.sensor,
+    )
 
 
 def _with_structures(case: Case, options: PrepareOptions) -> Case:

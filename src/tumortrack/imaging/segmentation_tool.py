@@ -189,8 +189,6 @@ def _totalsegmentator(task: str, organ: str) -> Tool:
 
 
 def _nnunet(model: Path, organ: str) -> Tool:
-    import torch
-
     program = _program("nnUNetv2_predict_from_modelfolder", "nnunetv2")
     dataset = _json(model / "dataset.json", "nnunet")
     folds = sorted(file.parent for file in model.glob("fold_*/checkpoint_final.pth"))
@@ -203,13 +201,22 @@ def _nnunet(model: Path, organ: str) -> Tool:
     if len(channels) != 1 or ending != ".nii.gz":
         raise InputError(f"{model} takes {channels} as {ending}; what we have is one CT, .nii.gz.")
     chosen = _chosen(dataset.get("labels", {}), organ, model)
-    device = "cuda" if torch.cuda.is_available() else "cpu"
+    device = "cuda" if _has_gpu() else "cpu"
     command = (
         *(program, "-i", "in", "-o", "out", "-m", str(model), "-device", device),
         *("-npp", "1", "-nps", "1", "-f", *(fold.name.removeprefix("fold_") for fold in folds)),
     )
     weights = (model / "dataset.json", model / "plans.json", *folds)
     return Tool("nnU-Net", "nnunetv2", weights, (command,), _of_one_map(chosen))
+
+
+def _has_gpu() -> bool:
+    """As PyTorch says, where nnU-Net brought it into this environment; else by the driver."""
+    if find_spec("torch") is None:
+        return shutil.which("nvidia-smi") is not None
+    import torch
+
+    return torch.cuda.is_available()
 
 
 def _monai(bundle: Path, organ: str) -> Tool:

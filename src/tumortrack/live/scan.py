@@ -24,7 +24,7 @@ class Scan:
 
     def __init__(self, tracker: Tracker) -> None:
         if tracker.anatomy_ct is None:
-            raise InputError("a scan needs a model that knows a motion: preset clinic.")
+            raise InputError("a scan needs a model that knows a motion: give the case itself.")
         self._tracker, self.told = tracker, ""
         self._looks: list[tuple[CameraView, SensorCloud, Float64[np.ndarray, " 3"]]] = []
 

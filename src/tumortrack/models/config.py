@@ -1,62 +1,9 @@
-"""A network and its training as frozen values: every preset is one ``TrainConfig``."""
+"""How an organ is located by its elastic body, as frozen values."""
 
 from __future__ import annotations
 
-from typing import Literal
-
 from tumortrack.core.config import Config
-from tumortrack.core.errors import InputError
-from tumortrack.models.encoders import EncoderConfig
-from tumortrack.models.normalisation import Aligned, CloudBox
-from tumortrack.simulate.coarse import CoarseConfig
 from tumortrack.simulate.scene import SceneConfig
-
-_WIDEST = 4096  # of a layer: far beyond use, and a layer's weights still have room
-
-
-class MlpDecoderConfig(Config, frozen=True, tag="mlp"):
-    """``hidden_layers`` of ``width`` with ReLU, then one linear layer to the classes' logits.
-    ``skip_layer``: this hidden layer (counted from 1) sees [latent, query] again; None: no skip.
-    ``norm_layers``: hidden layers (from 1) with batch norm between linear part and ReLU.
-    ``octaves``: k of sin and cos(2^k pi q) that join each raw coordinate q; () for raw alone."""
-
-    n_classes: int
-    width: int
-    hidden_layers: int
-    skip_layer: int | None = None
-    norm_layers: tuple[int, ...] = ()
-    octaves: tuple[int, ...] = ()
-
-    def __post_init__(self) -> None:
-        self.check_between("decoder", width=(1, _WIDEST), hidden_layers=(1, 32))
-        allowed = range(1, self.hidden_layers + 1)
-        named = (*self.norm_layers, *(() if self.skip_layer is None else (self.skip_layer,)))
-        if self.n_classes < 2 or not set(named) <= set(allowed):
-            raise InputError(
-                f"decoder: layers {named} must lie in 1..{self.hidden_layers}, and there must be "
-                "at least 2 classes."
-            )
-
-
-class RegistrationHeadConfig(Config, frozen=True, tag="warp"):
-    """Two hidden layers of ``width``, then a rotation, a centre, ``modes`` coefficients and whether
-    the cloud lies the right way round. The loss compares the positions of ``points`` points."""
-
-    modes: int
-    width: int = 256
-    points: int = 96
-
-    def __post_init__(self) -> None:
-        sizes = (1, _WIDEST)
-        self.check_between("warp", modes=sizes, width=sizes, points=(1, 10**6))
-
-
-class NetworkConfig(Config, frozen=True):
-    """A network as data; which method it serves follows from the kind of its decoder."""
-
-    encoder: EncoderConfig
-    decoder: MlpDecoderConfig | RegistrationHeadConfig
-    normalisation: CloudBox | Aligned
 
 
 class GaussNewtonConfig(Config, frozen=True):
@@ -91,33 +38,20 @@ class GaussNewtonConfig(Config, frozen=True):
         )
 
 
-class Schedule(Config, frozen=True):
-    """Learning rate. ``decay``: linear warm-up, then constant, then cosine to zero over the last
-    ``tail`` of the steps; ``exponential``: times ``gamma`` after each ``epoch_pairs`` samples."""
+class RegistrationConfig(Config, frozen=True):
+    """Everything that decides a model that registers an elastic body, apart from case and seed.
 
-    kind: Literal["decay", "exponential"] = "decay"
-    learning_rate: float = 2e-3
-    warmup_steps: int = 100
-    tail: float = 0.5
-    gamma: float = 0.99
-    epoch_pairs: int = 31_000
+    Attributes:
+        scene: what is seen of the organ: how it may lie, its states, the camera and its errors.
+        refine: how the body is fitted to a cloud.
+        scenes: simulated ones on whose right fits the usual cost is calibrated; of them the organ
+            is ``searched`` for in so many, on which standard deviations are.
+    """
 
-
-class TrainConfig(Config, frozen=True):
-    """Everything that decides the weights, apart from case, seed and number of steps; ``refine``
-    is how an elastic body is fitted to the cloud, in validation and in use."""
-
-    network: NetworkConfig
     scene: SceneConfig
-    schedule: Schedule
-    batch_size: int
-    steps: int  # the preset's end
-    drop_points: float = 0.0  # each batch loses a random fraction, up to this, of what is encoded
-    ema: float = 0.999  # 0: the plain weights are kept
-    training_pairs: int = 0  # 0: endless; else scenes repeat after so many
-    validation_pairs: int = 64
-    validation_points: int = 2048
-    validate_every: int = 250  # steps
     refine: GaussNewtonConfig = GaussNewtonConfig()
-    coarse: CoarseConfig | None = None  # training scenes; those of validation stay as they are
-    steps_from_start: int | None = None  # the preset's end with a head start; None: ``steps``
+    scenes: int = 96
+    searched: int = 32
+
+    def __post_init__(self) -> None:
+        self.check_between("calibration", scenes=(1, 10_000), searched=(1, self.scenes))

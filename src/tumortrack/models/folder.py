@@ -1,16 +1,20 @@
-"""Whether a folder holds a model; without PyTorch, whose import takes a second."""
+"""Model folders: what both methods write and read."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from tumortrack.core import store
+from tumortrack.core.config import to_builtins
 from tumortrack.core.errors import ArtifactError
 from tumortrack.core.estimate import FAR_MM
 from tumortrack.core.organ import Organ, organ_in
 from tumortrack.core.patient import Patient, patient_in
+
+if TYPE_CHECKING:
+    from tumortrack.models.model import Model
 
 KIND = "model"
 SHAPE = "shape.safetensors"
@@ -24,6 +28,15 @@ _MOST_FAR = 0.1
 def is_finished(folder: Path) -> bool:
     """Whether the folder holds a finished model (rather than a training under way)."""
     return (folder / store.MANIFEST).is_file()
+
+
+def is_model_of(folder: Path, case: Path) -> bool:
+    """Whether the folder holds a finished model of the case in another folder."""
+    if not is_finished(folder):
+        return False
+    about = store.read_json(folder / store.MANIFEST).get("provenance")
+    digest = store.sha256_of(case / store.MANIFEST)
+    return isinstance(about, dict) and about.get("case_sha256") == digest
 
 
 def check_trainable(folder: Path) -> None:
@@ -62,6 +75,20 @@ def read_tensors(
     return tensors
 
 
+def save_model(model: Model, folder: Path) -> None:
+    """Write a model into an existing folder, the manifest last."""
+    for name, data in model.files().items():
+        store.write_atomically(folder / name, data)
+    content = {
+        "parts": list(model.parts),
+        **model.entries(),
+        "familiar": to_builtins(model.in_distribution),
+        "provenance": model.provenance,
+        "config": to_builtins(model.config),
+    }
+    store.seal(folder, KIND, content, frame="camera")
+
+
 def patient_of(manifest: dict[str, Any], folder: Path) -> Patient:
     """Whose organ a model was trained for; InputError where its manifest says nonsense."""
     return patient_in(manifest.get("provenance", {}).get("patient"), str(folder))
@@ -78,27 +105,27 @@ def weakness_of(provenance: dict[str, Any]) -> str:
     far, half_turn_mm = provenance.get("validation_far"), provenance.get("half_turn_mm")
     if isinstance(far, float) and far > _MOST_FAR:
         return (
-            f"the model is badly trained: {100 * far:.0f} % of its validation scenes were over "
-            f"{FAR_MM:g} mm off; train longer (tumortrack train --steps)"
+            f"{100 * far:.0f} % of the simulated scenes on which this model was checked were over "
+            f"{FAR_MM:g} mm off: this organ's surface does not tell how it lies"
         )
     if isinstance(half_turn_mm, float):
         return (
             f"the organ looks much the same after half a turn (surfaces {half_turn_mm:.1f} mm "
-            "apart), and this method can't try both ways; train with --preset clinic"
+            "apart), and this method can't try both ways; use the case itself, without a network"
         )
     return ""
 
 
 def training_words(provenance: dict[str, Any]) -> str:
-    """How long a model was trained, and how far off it is on its validation scenes."""
+    """How far off a model is on scenes with a known truth, and how long it was trained."""
+    if "validation_tre_mm" in provenance:
+        return (
+            f"on simulated scenes points inside are {provenance['validation_tre_mm']:.1f} mm off "
+            f"(median), {provenance['validation_far']:.0%} of scenes over {FAR_MM:g} mm"
+        )
     steps, seconds = provenance["steps"], provenance.get("training_s")  # a fleet's have none
     words = f"{steps} step{'s' * (steps != 1)}"
     words += "" if seconds is None else f" in {seconds:.0f} s"
-    if "validation_tre_mm" in provenance:
-        return (
-            f"{words}; in validation points inside are {provenance['validation_tre_mm']:.1f} mm "
-            f"off (median), {provenance['validation_far']:.0%} of scenes over {FAR_MM:g} mm"
-        )
     return f"{words}; validation mIoU {provenance['validation_miou']:.3f}"
 
 

@@ -1,4 +1,4 @@
-"""Kernels of encoders, compiled on a CPU: farthest points, balls, maxima, strays, height maps."""
+"""Kernels of points and encoders, compiled on a CPU: farthest points, balls, maxima, strays."""
 
 from __future__ import annotations
 
@@ -119,28 +119,3 @@ def near(points, reach, out):  # type: ignore[no-untyped-def]
                     total[axis] += out[b, p, axis]
             for axis in range(3):
                 middle[axis] = total[axis] / n
-
-
-@numba.njit(cache=True, nogil=True)
-def spread(places, heights, weight, height):  # type: ignore[no-untyped-def]
-    """Spread each point over the four pixels about it, bilinearly: add the fractions to ``weight``
-    and fraction times height to ``height`` (B, rows, columns). ``places`` (B, N, 2) are columns and
-    rows; float32."""
-    one = np.float32(1)
-    rows, columns = weight.shape[1:]
-    for b in range(len(places)):
-        for p in range(places.shape[1]):
-            x, y = places[b, p, 0], places[b, p, 1]
-            left, upper = np.floor(x), np.floor(y)
-            along, down = x - left, y - upper
-            for below in range(2):
-                row = int(upper) + below
-                if not 0 <= row < rows:
-                    continue
-                part = down if below else one - down
-                for right in range(2):
-                    column = int(left) + right
-                    if 0 <= column < columns:
-                        fraction = part * (along if right else one - along)
-                        weight[b, row, column] += fraction
-                        height[b, row, column] += fraction * heights[b, p]

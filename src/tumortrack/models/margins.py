@@ -17,7 +17,7 @@ from tumortrack.core.errors import ArtifactError, InputError
 
 # Raise it with every change by which the same cloud gives another estimate, or another figure of
 # those in ``measured``: margins that were found before are then refused.
-METHOD = 3
+METHOD = 4
 NAME = "margins.json"
 Kind = Literal["tumor", "organ", "map"]
 UNKNOWN = "the model was not calibrated (tumortrack margins)"

@@ -8,7 +8,6 @@ from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
-import torch
 from jaxtyping import Float
 
 import tumortrack
@@ -31,7 +30,6 @@ class Frame:
         check_cloud(cloud)
         self.model, self.cloud, self.seed, self.rng = model, cloud, seed, rng
         self.points_mm = thin_cloud(cloud, model.config.scene.cloud.n_points, rng).points_mm
-        self.device = next(model.network.parameters()).device
         self.seconds: dict[str, float] = {}
 
     @contextmanager
@@ -39,8 +37,7 @@ class Frame:
         """Time a ``with`` block."""
         start = time.perf_counter()
         yield
-        if self.device.type == "cuda":  # kernels run asynchronously
-            torch.cuda.synchronize(self.device)
+        self.model.synchronise()
         self.seconds[name] = time.perf_counter() - start
 
     def report(

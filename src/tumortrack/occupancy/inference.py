@@ -17,8 +17,8 @@ import torch
 from jaxtyping import Float32
 from torch import Tensor, nn
 
-from tumortrack.models.hardware import has_fast_bfloat16
-from tumortrack.models.layers import Layer
+from tumortrack.occupancy.hardware import has_fast_bfloat16
+from tumortrack.occupancy.layers import Layer
 from tumortrack.occupancy.network import Latent, MlpDecoder, OccupancyNetwork, octave_features
 
 # Queries at once and core: their activations (2 MB at 512 channels) stay near it. With 1,024 or

@@ -112,6 +112,7 @@ class _Frame(Frame):
 
     def __init__(self, locator: OccupancyLocator, cloud: SensorCloud, seed: int, rng: Rng) -> None:
         super().__init__(locator.model, cloud, seed, rng)
+        self._box_mm = locator.model.query_box_mm
         self._inference = locator.inference
         with self.stage("encode"):
             self._latent = self._inference.encode(self.points_mm)
@@ -121,7 +122,7 @@ class _Frame(Frame):
 
     def coarse_box(self) -> volume.Box:
         """Where the organ is, by coarse random queries."""
-        lower, upper = self.model.query_box_mm + np.median(self.cloud.points_mm, axis=0)
+        lower, upper = self._box_mm + np.median(self.cloud.points_mm, axis=0)
         points = self.rng.uniform(lower, upper, (COARSE_QUERIES, 3)).astype(np.float32)
         with self.stage("coarse"):
             inside = points[self.logits_at(points).argmax(-1).cpu().numpy() > 0]

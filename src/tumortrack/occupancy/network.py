@@ -9,16 +9,15 @@ from __future__ import annotations
 import copy
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from tumortrack.core.errors import InputError
-from tumortrack.models.config import MlpDecoderConfig, NetworkConfig
-from tumortrack.models.layers import Layer, Norm
-from tumortrack.models.model import Network, OnnxParts
-from tumortrack.models.normalisation import normalised, turned
+from tumortrack.occupancy.config import MlpDecoderConfig, NetworkConfig
+from tumortrack.occupancy.layers import Layer, Norm
+from tumortrack.occupancy.normalisation import normalised, turned
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,14 +98,12 @@ def octave_features(queries: Tensor, octaves: tuple[int, ...]) -> Tensor:
     return torch.cat([queries, torch.sin(angles), torch.cos(angles)], dim=-1)
 
 
-class OccupancyNetwork(Network):
+class OccupancyNetwork(nn.Module):
     """Labels of query points from one cloud (the paper, section "Localization")."""
 
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__()
         self.config = config
-        if not isinstance(config.decoder, MlpDecoderConfig):
-            raise InputError("an occupancy network needs a decoder of queries, such as `mlp`.")
         self.encoder = config.encoder.build()
         self.decoder = MlpDecoder(config.decoder, config.encoder.latent_size)
 
@@ -125,15 +122,14 @@ class OccupancyNetwork(Network):
         """Both at once: (B, N, 3) and (B, Q, 3) -> logits (B, Q, classes)."""
         return self.query(self.encode(points_mm), queries_mm)
 
-    def loss(self, *scenes: Tensor, first: int = 0) -> Tensor:
-        """Cross-entropy of the points' labels, all points equal (the paper). Neither the poses nor
-        the first cloud's number in the batch are used."""
-        clouds_mm, points_mm, labels, _ = scenes
+    def loss(self, clouds_mm: Tensor, points_mm: Tensor, labels: Tensor) -> Tensor:
+        """Cross-entropy of the points' labels, all points equal (the paper)."""
         logits = self(clouds_mm, points_mm)
         return functional.cross_entropy(logits.float().flatten(0, 1), labels.long().flatten())
 
-    def onnx_parts(self, cloud_mm: Tensor) -> OnnxParts:
-        """See ``Network``: clouds and queries in, logits out."""
+    def onnx_parts(self, cloud_mm: Tensor) -> tuple[nn.Module, tuple[Tensor, ...], dict[str, Any]]:
+        """What to trace for an ONNX file of clouds like this one, (1, N, 3), on which inputs, and
+        the names for ``torch.onnx.export``: clouds and queries in, logits out."""
         free = {"queries_mm": {1: "queries"}, "logits": {1: "queries"}}
         names = {"input_names": ["cloud_mm", "queries_mm"], "output_names": ["logits"]}
         return self.folded().cpu(), (cloud_mm, cloud_mm[:, :7]), {**names, "dynamic_axes": free}

@@ -18,12 +18,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 from jaxtyping import Float32, Float64, Int64
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
-from tumortrack.models.sampling import farthest_points
+from tumortrack.models.kernels import farthest
 from tumortrack.registration import discrepancy_kernels as kernels
 
 # Of the process. 15 and 30 mm rank and cover the errors of training's and the twin's scenes alike.
@@ -122,8 +121,12 @@ def judge(
 
 def _grouped(points_ct: Float64[np.ndarray, "n 3"]) -> Int64[np.ndarray, " n"]:
     """The number of each point's group: of the nearest of some that lie far apart."""
-    points = torch.from_numpy(points_ct.astype(np.float32))[None]
-    chosen = farthest_points(points, min(_GROUPS, len(points_ct)))[0].numpy()
+    points = np.ascontiguousarray(points_ct.T[None], np.float32)
+    away = points[0] - points[0].mean(axis=1, keepdims=True)
+    first = np.array([(away**2).sum(axis=0).argmax()])
+    chosen = np.empty((1, min(_GROUPS, len(points_ct))), np.int64)
+    farthest(points, first, chosen)
+    chosen = chosen[0]
     nearest = cKDTree(points_ct[chosen]).query(points_ct)[1]
     return np.unique(nearest, return_inverse=True)[1]  # where points coincide some have none
 

@@ -39,8 +39,9 @@ class RegistrationResult:
     """A motion, its cost (robust data term and prior), and the residuals (signed distances, mm).
     ``strays``: share of the points that lie farther off than ``discrepancy.FARTHEST`` widths;
     ``cost_without_strays``: if all lay as the others do. ``moved``: shift (mm) and turn (rad) from
-    where the prior has the pose. ``rivals``: other minima that explain the points nearly as well
-    (see ``registration.best_of``)."""
+    where the prior has the pose. ``rivals``: other minima that explain the points nearly as well;
+    ``beyond``: one that explains them better, in a pose that is excluded (see
+    ``registration.Registration.best_of``)."""
 
     motion: ElasticMotion
     cost: float
@@ -50,6 +51,12 @@ class RegistrationResult:
     steps: int
     moved: Float64[np.ndarray, " 6"]
     rivals: tuple[RegistrationResult, ...] = ()
+    beyond: RegistrationResult | None = None
+
+    @property
+    def others(self) -> tuple[RegistrationResult, ...]:
+        """Rivals, and what lies beyond."""
+        return self.rivals if self.beyond is None else (*self.rivals, self.beyond)
 
 
 def refine(

@@ -77,7 +77,7 @@ def descend(problem, state, first, last):  # type: ignore[no-untyped-def]
         cost = _equations(problem, state, _width(problem, 0), (rows, columns))
     for step in range(first, last):
         change = np.linalg.solve(state.curvature, state.gradient)
-        _turn(state.rotation, state.centre_mm, change)
+        turn(state.rotation, state.centre_mm, change)
         state.moved[:] -= change[:POSE]
         state.coefficients[:] -= change[POSE:]
         cost = _equations(problem, state, _width(problem, step + 1), (rows, columns))
@@ -181,7 +181,7 @@ def _add_products(columns, count, sums):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def _turn(rotation, centre, change):  # type: ignore[no-untyped-def]
+def turn(rotation, centre, change):  # type: ignore[no-untyped-def]
     """Move a pose by ``-change`` in the organ's axes: rotation times the rotation vector's matrix
     (Rodrigues), centre along the axes of before."""
     before, axis = rotation.copy(), -change[3:POSE]

@@ -23,13 +23,14 @@ from tumortrack.registration.gauss_newton import RegistrationResult, posterior, 
 from tumortrack.registration.looks import Looks
 from tumortrack.registration.model import RegistrationModel
 from tumortrack.registration.motion import ElasticMotion, blend
-from tumortrack.registration.registration import best_laid
+from tumortrack.registration.search import PosePrior, apart_mm
 
 QUERIES = 40_000  # as many as the paper asks
 CARRIED = 20_000  # points of the undeformed organ that live estimates carry along
 _SAMPLES = 256  # places where the uncertainty is computed; other points take the nearest's
 _FIELD_MM = 0.3  # error of the distance fields and surfaces themselves
 _MOVED_MM = 2.5  # between live frames: what moves farther is found again from the start
+_JUMP_MM = 10.0  # from one frame to the next: then it may have come to lie any way
 _BEHIND_MM = 2.0  # a smoothed motion that lags by more starts again
 
 
@@ -82,7 +83,8 @@ class RegistrationLocator:
 
     def __init__(self, model: RegistrationModel) -> None:
         self._model, self._shape, self._calibration = model, model.shape, model.calibration
-        self._registration = model.registration()
+        self._registration = known = model.registration
+        self._turned_over = replace(known, prior=replace(known.prior, either_side=True))
         self._near = msgspec.structs.replace(model.config.refine, first_mm=_MOVED_MM)
         anatomy = model.shape.anatomy_ct
         self.anatomy_ct: Anatomy | None = anatomy
@@ -103,7 +105,7 @@ class RegistrationLocator:
         """See ``tracking.tracker.Tracker.locate``."""
         frame = Frame(self._model, cloud, seed, np.random.default_rng(seed))
         looks = self._looks(frame, others)
-        fit, looks = self._registration.register(looks, 0.0, frame.stage)
+        fit, looks = self._registration.register(looks, None, frame.stage)
         size, placed = self._size(looks, fit), self._checked(looks, fit, frame)
         organ = placed.meshes[self._model.parts[0]]
         with frame.stage("fine"):
@@ -112,7 +114,9 @@ class RegistrationLocator:
             camera_from_index, shape = grid_over(organ.vertices_mm, grid)
             labels = label_grid(Anatomy(tuple(placed.meshes.values())), camera_from_index, shape)
         voxel_mm = float(camera_from_index[0, 0])
-        report = self._report(frame, placed, inside, size=size, voxel_mm=voxel_mm)
+        report = self._report(
+            frame, placed, inside, self._registration.prior, size=size, voxel_mm=voxel_mm
+        )
         self._add_looks(report, looks, fit, others)
         volume = CameraLabels(labels, camera_from_index)
         made = Estimate(inside, volume, placed.meshes, report, placed.motion)
@@ -132,11 +136,19 @@ class RegistrationLocator:
             with frame.stage("follow"):
                 starts = [start, *(rival for rival, _ in start.rivals)]
                 found += [self._registration.follow(looks, one, self._near) for one in starts]
-        if not found or how.thorough or min(fit.cost for fit, _ in found) > usual:
-            enough = 0.0 if not found else usual if how.thorough else np.inf
-            method = replace(self._registration, either_side=how.either_side)
-            found.append(method.register(looks, enough, frame.stage))
-        fit, looks = best_laid(found)
+        method = self._turned_over if how.either_side else self._registration
+        best, doubted = method.best_laid(found) if found else None, True
+        if best is not None and isinstance(start, ElasticMotion):
+            motion = best[0].motion
+            doubted = best[0].cost > usual or apart_mm(motion, start) > _JUMP_MM
+            # From one frame to the next nobody turns an organ over.
+            if not doubted and not self._registration.prior.excludes(motion.rotation):
+                method = self._registration
+                best = method.best_laid(found)
+        if doubted or how.thorough:
+            best = method.register(looks, best, frame.stage, again=not doubted)
+        assert best is not None
+        fit, looks = best
         size, unsmoothed, lag_s = self._size(looks, fit), fit.motion, 0.0
         if last is not None and isinstance(last.motion, ElasticMotion) and how.smoothing_s > 0:
             past_s = (cloud.stamp_ns - last.cloud.stamp_ns) * 1e-9
@@ -150,7 +162,7 @@ class RegistrationLocator:
         with frame.stage("carry"):
             inside = self._carry(placed, cloud.stamp_ns)
         smoothing = {"time_s": how.smoothing_s, "lag_ms": 1000 * lag_s}
-        report = self._report(frame, placed, inside, size=size, smoothing=smoothing)
+        report = self._report(frame, placed, inside, method.prior, size=size, smoothing=smoothing)
         self._add_looks(report, looks, fit, others)
         made = Estimate(inside, None, placed.meshes, report, placed.motion, unsmoothed)
         return replace(made, structures=placed.structures)
@@ -180,9 +192,9 @@ class RegistrationLocator:
         rest = ElasticMotion(self._shape, np.eye(3), np.array([0.0, 0.0, 150.0]), body.mean)
         cloud = SensorCloud(rest.carry(organ.vertices_mm))
         points = Frame(self._model, cloud, 0, np.random.default_rng(0)).points_mm
-        self._registration.propose(points)
-        fit = self._registration.best_fit(points, [rest])
-        self._carry(self._moved(Looks.of([points]), fit), 0)
+        looks = Looks.of([points])
+        fit = self._registration.best_fit(points, [*self._registration.search.starts(looks), rest])
+        self._carry(self._moved(looks, fit), 0)
 
     def _size(self, looks: Looks, fit: RegistrationResult) -> dict[str, float]:
         times, gain = size_of(fit, looks, self._registration.config)
@@ -220,7 +232,12 @@ class RegistrationLocator:
         return _Registered(fit, motion, surfaces, known_mm2[:count], known_mm2[count:], structures)
 
     def _report(
-        self, frame: Frame, placed: _Registered, inside: OccupancyCloud, **more: Any
+        self,
+        frame: Frame,
+        placed: _Registered,
+        inside: OccupancyCloud,
+        prior: PosePrior,
+        **more: Any,
     ) -> dict[str, Any]:
         fit, motion, process = placed.fit, placed.motion, placed.motion.discrepancy
         if placed.structures:
@@ -240,6 +257,7 @@ class RegistrationLocator:
         usual = self._calibration.usual_cost
         costs = {"now": fit.cost, "without_strays": fit.cost_without_strays, "usual": usual}
         more["fit_cost"] = {**costs, "strays": fit.strays, "others": others}
+        more["fit_cost"]["beyond"] = _beyond(fit, prior)
         more["motion"] = {
             "camera_from_ct": motion.camera_from_ct.tolist(),
             "coefficients": motion.coefficients.tolist(),
@@ -291,3 +309,13 @@ class RegistrationLocator:
         mine = points_ct.take(inside, 0)  # much faster than by a mask
         sample = kernels.look_up(*self._nearest_sample, mine)
         return inside, _OrganPoints(mine, labels[inside], margin_mm[inside], sample)
+
+
+def _beyond(fit: RegistrationResult, prior: PosePrior) -> dict[str, float] | None:
+    """A pose on the other side that explains the points as well, or better in one that is excluded;
+    or that was found all the same."""
+    other = fit if prior.excludes(fit.motion.rotation) else fit.beyond
+    if other is None:
+        return None
+    tilt_degrees = float(prior.tilt_degrees_of(other.motion.rotation))
+    return {"less": fit.cost - other.cost, "tilt_degrees": tilt_degrees}

@@ -11,7 +11,7 @@ from jaxtyping import Float32, Float64
 from scipy.spatial.transform import Rotation
 
 from tumortrack.core.errors import InputError
-from tumortrack.core.geometry import Points, rigid
+from tumortrack.core.geometry import Points, largest_std_of, rigid, std_of
 from tumortrack.core.process import parallel_for
 from tumortrack.registration import kernels
 from tumortrack.registration.discrepancy import Discrepancy, products
@@ -72,12 +72,12 @@ class ElasticMotion:
     def std_mm(self, points_ct: Points, /) -> Float64[np.ndarray, " n"] | None:
         """One standard deviation along any axis, mm: the root of the mean over three of them."""
         covariance = self.covariance_mm2(points_ct)
-        return None if covariance is None else np.sqrt(np.trace(covariance, axis1=1, axis2=2) / 3)
+        return None if covariance is None else std_of(covariance)
 
     def largest_std_mm(self, points_ct: Points, /) -> Float64[np.ndarray, " n"] | None:
         """One standard deviation along the axis that is least sure, mm."""
         covariance = self.covariance_mm2(points_ct)
-        return None if covariance is None else np.sqrt(np.linalg.eigvalsh(covariance)[:, -1])
+        return None if covariance is None else largest_std_of(covariance)
 
     def covariance_mm2(self, points_ct: Points, /) -> Float64[np.ndarray, "n 3 3"] | None:
         """Of the places to which ``carry`` takes points, in the camera's axes: of pose and state to

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -12,7 +12,6 @@ from tumortrack.core.errors import InputError
 from tumortrack.core.organ import KIDNEY, Organ, check_name
 from tumortrack.core.process import parallel_for
 from tumortrack.core.types import Anatomy, Mesh
-from tumortrack.imaging.symmetry import alike, half_turns
 from tumortrack.registration.kernels import DistanceField, mark
 from tumortrack.simulate.elastic.body import ElasticBody
 from tumortrack.simulate.occupancy import contains, surface_distance
@@ -41,30 +40,21 @@ def distance_of(mesh: Mesh) -> DistanceField:
 
 @dataclass(frozen=True, eq=False)
 class RestShape:
-    """The organ at rest (CT frame, LPS mm): ``distances`` has one field per part; ``half_turns``
-    are motions of the CT after which the organ looks much the same, mostly none."""
+    """The organ at rest (CT frame, LPS mm): ``distances`` has one field per part."""
 
     anatomy_ct: Anatomy
     body: ElasticBody
     distances: tuple[DistanceField, ...]
-    half_turns: Float64[np.ndarray, "t 4 4"]
 
     @cached_property
-    def long_axis(self) -> Float64[np.ndarray, " 3"]:
-        """The organ's longest principal direction, towards its slimmer, farther reaching end."""
-        return long_axis_of(self.anatomy_ct.organ)
+    def long_axis_mm(self) -> Float64[np.ndarray, " 3"]:
+        """The organ's longest principal direction, as long as the organ."""
+        return long_axis_mm(self.anatomy_ct.organ)
 
     @cached_property
     def middles_ct(self) -> Float64[np.ndarray, "parts 3"]:
         """Of each part's box."""
         return np.array([part.box_mm.mean(0) for part in self.anatomy_ct.parts])
-
-    @cached_property
-    def stiff(self) -> RestShape:
-        """The same with the body's first mode alone."""
-        body = self.body
-        modes, states = body.modes[..., :1].copy(), body.states[:, :1].copy()
-        return replace(self, body=replace(body, modes=modes, states=states))
 
     def labels_at(
         self, points_ct: Float32[np.ndarray, "n 3"]
@@ -90,7 +80,7 @@ class RestShape:
         for name, mesh in self.anatomy_ct.structures.items():
             arrays[f"{_STRUCTURE}{name}.{_VERTICES}"] = mesh.vertices_mm
             arrays[f"{_STRUCTURE}{name}.faces"] = mesh.faces
-        return {**arrays, "half_turns": self.half_turns}
+        return arrays
 
     @classmethod
     def from_arrays(
@@ -117,21 +107,17 @@ class RestShape:
                     check_name(name, "a structure", "--structure")
                     faces = arrays[f"{_STRUCTURE}{name}.faces"]
                     structures[name] = Mesh(arrays[key], faces)
-            turns = arrays["half_turns"]
         except KeyError as error:
-            raise InputError(f"the organ's shape lacks {error}; train the model again.") from error
+            raise InputError(f"the organ's shape lacks {error}; make the model again.") from error
         anatomy_ct = Anatomy(tuple(parts), kind, structures)
-        if turns.shape[1:] != (4, 4) or not np.isfinite(turns).all():
-            raise InputError("the organ's half turns are damaged; train the model again.")
-        return cls(anatomy_ct, ElasticBody.from_arrays(body), tuple(fields), turns)
+        return cls(anatomy_ct, ElasticBody.from_arrays(body), tuple(fields))
 
 
-def long_axis_of(organ: Mesh) -> Float64[np.ndarray, " 3"]:
-    """The longest principal direction of a surface's vertices, in which their third moment is
-    positive: a rule that means the same in every patient, however the CT's axes lie."""
+def long_axis_mm(organ: Mesh) -> Float64[np.ndarray, " 3"]:
+    """The longest principal direction of a surface's vertices, as long as the organ; either way."""
     spread = organ.vertices_mm - organ.vertices_mm.mean(0)
     axis = np.linalg.svd(spread, full_matrices=False)[2][0]
-    return axis if ((spread @ axis) ** 3).sum() >= 0 else -axis
+    return axis * np.ptp(spread @ axis)
 
 
 def shape_of(
@@ -140,8 +126,7 @@ def shape_of(
     """The shape of an anatomy with its body; a second or two, unless its parts' distances are
     known."""
     distances = distances or distances_of(anatomy_ct)
-    turns = np.array([one.ct_from_ct for one in alike(half_turns(anatomy_ct))])
-    return RestShape(anatomy_ct, body, distances, turns.reshape(-1, 4, 4))
+    return RestShape(anatomy_ct, body, distances)
 
 
 def distances_of(anatomy_ct: Anatomy) -> tuple[DistanceField, ...]:

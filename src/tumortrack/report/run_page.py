@@ -24,11 +24,12 @@ from tumortrack.core.estimate import Estimate, Quality, verdict_words
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.organ import is_tumor
 from tumortrack.core.patient import patient_in
+from tumortrack.core.process import parallel_map
 from tumortrack.core.store import write_atomically
 from tumortrack.core.types import DepthFrame, SensorCloud
 from tumortrack.live.viewer.slices import ORIENTATIONS, CarriedCt, outlined, plane_through
 from tumortrack.models.margins import margin_words, stated_radius
-from tumortrack.report.renderer import Body, ParallelView, render, rgb
+from tumortrack.report.renderer import Body, ParallelView, corner_normals, render, rgb
 from tumortrack.report.wrapping import wrapped
 from tumortrack.sense.camera import deproject
 
@@ -74,9 +75,10 @@ def write_run_page(
     reason = report["quality"]["reason"] if estimate is None else estimate.reason
     words = verdict_words(verdict, reason)
     lines, rows = list(_lines(report)), part_rows(report) if estimate else []
-    _write_picture(
-        folder / PICTURE, verdict, [words, *lines, *map(row_words, rows)], views + slices
-    )
+    picture = _picture(verdict, [words, *lines, *map(row_words, rows)], views + slices)
+    whole, *pngs = parallel_map(_png, [picture, *(image for _, image in views + slices)])
+    write_atomically(folder / PICTURE, whole)
+    figures = list(zip([caption for caption, _ in views + slices], pngs, strict=True))
     page = resources.files("tumortrack.report").joinpath("run_page.html").read_text("utf-8")
     cells = {
         "@COLOUR@": colours.css(colours.VERDICTS[verdict]),
@@ -85,18 +87,18 @@ def write_run_page(
         "@WORDS@": html.escape(_sentence(words.partition(": ")[2])),
         "@LINES@": "".join(f"<p>{html.escape(line)}</p>" for line in lines),
         "@TABLE@": _table(rows) if rows else "",
-        "@PANELS@": "".join(map(_figures, (views, slices))),
+        "@PANELS@": _figures(figures[: len(views)]) + _figures(figures[len(views) :]),
     }
     page = re.sub("@[A-Z]+@", lambda name: cells[name[0]], page)
     write_atomically(folder / PAGE, page.encode())
 
 
-def _figures(panels: list[Panel]) -> str:
+def _figures(panels: list[tuple[str, bytes]]) -> str:
     figures = "".join(
         f'<figure><img alt="{html.escape(caption)}" src="data:image/png;base64,'
-        f'{base64.b64encode(_png(image)).decode()}"><figcaption>{html.escape(caption)}'
+        f'{base64.b64encode(png).decode()}"><figcaption>{html.escape(caption)}'
         "</figcaption></figure>"
-        for caption, image in panels
+        for caption, png in panels
     )
     return f'<section class="panels">{figures}</section>' if panels else ""
 
@@ -170,10 +172,13 @@ def _views(estimate: Estimate | None, seen: Seen) -> Iterator[Panel]:
             _depth_picture(seen.content, seen.taken),
         )
     points_mm = _thinned(seen.cloud if estimate and seen.cloud else seen.content)
-    for name, (right, down) in ORIENTATIONS.items():
-        if estimate is not None or len(points_mm):
-            view = ParallelView(name, right, down)  # type: ignore[arg-type]
-            yield name, _view(view, estimate, points_mm)
+    if estimate is None and not len(points_mm):
+        return
+    for mesh in () if estimate is None else estimate.meshes.values():
+        corner_normals(mesh)  # kept, for all views
+    views = [ParallelView(name, *axes) for name, axes in ORIENTATIONS.items()]  # type: ignore[arg-type]
+    images = parallel_map(lambda view: _view(view, estimate, points_mm), views)
+    yield from zip(ORIENTATIONS, images, strict=True)
 
 
 def _slices(estimate: Estimate, seen: Seen) -> Iterator[Panel]:
@@ -294,7 +299,7 @@ def _dots(picture: np.ndarray, places: Float[np.ndarray, "n 2"], colour: colours
             picture[row[inside], column[inside]] = colour
 
 
-def _write_picture(path: Path, verdict: Quality, lines: list[str], panels: list[Panel]) -> None:
+def _picture(verdict: Quality, lines: list[str], panels: list[Panel]) -> Image.Image:
     """Verdict, what is said of it, and the panels in rows; no line is cut."""
     room = _ACROSS - 2 * _EDGE
     head = _lines_of(lines[0], 36, room)
@@ -320,7 +325,7 @@ def _write_picture(path: Path, verdict: Quality, lines: list[str], panels: list[
         picture.paste(image, (left, top))
         for n, row in enumerate(_lines_of(caption, 20, image.width)):
             draw.text((left, top + _ROW + 4 + 26 * n), row, fill="black", font_size=20)
-    write_atomically(path, _png(picture))
+    return picture
 
 
 def _lines_of(text: str, size: int, room: float) -> list[str]:

@@ -37,16 +37,6 @@ class OccupancyConfig(Config, frozen=True):
 
 
 @dataclass(frozen=True, eq=False)
-class FixedPoints:
-    """The same points in every scene, to learn where each of them goes; they have no labels."""
-
-    points_ct: Float32[np.ndarray, "n 3"]
-
-    def draw(self, rng: np.random.Generator) -> tuple[Points, Labels]:
-        return self.points_ct, np.zeros(len(self.points_ct), np.uint8)
-
-
-@dataclass(frozen=True, eq=False)
 class PartPool:
     """Points around one part, in random order, so that neighbours are a random draw, without its
     cost: CT frame, distance to its surface, inside it or not, label."""
@@ -116,15 +106,6 @@ class OccupancyPool:
             np.concatenate([*(p.points_ct[c] for p, c in chosen), self.far_points_ct[far]]),
             np.concatenate([*(p.labels[c] for p, c in chosen), self.far_labels[far]]),
         )
-
-
-PointSource = FixedPoints | OccupancyPool  # of the labelled points of scenes
-
-
-def organ_pool(anatomy_ct: Anatomy, config: OccupancyConfig, seed: int) -> PartPool:
-    """The first part of an ``OccupancyPool`` alone."""
-    rng = np.random.default_rng([seed, _POOL])
-    return _part_pool(anatomy_ct, anatomy_ct.organ, config, rng)
 
 
 def _following(first: int, count: int, n: int) -> Int64[np.ndarray, " count"]:

@@ -8,7 +8,7 @@ and evaluate the exponential of a drag differently.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import Any, Literal, NamedTuple
 
@@ -31,18 +31,16 @@ from tumortrack.sense.render import Visibility, render_depth
 from tumortrack.simulate.deform import (
     ChainConfig,
     DragConfig,
-    ElasticConfig,
     installed,
     links_of,
 )
 from tumortrack.simulate.deform.base import Deformation, Points, View
 from tumortrack.simulate.elastic.body import BodyConfig, ElasticBody, build_body, times_kidney
-from tumortrack.simulate.occupancy import OccupancyConfig, PointSource
+from tumortrack.simulate.occupancy import OccupancyConfig, OccupancyPool
 
 STREAMS = ("train", "validation", "test")
 _FARTHEST_MM = 500.0  # that depth cameras for near things are specified for
 _ATTEMPTS = 20  # draws of a recipe until one shows enough of the organ
-_STATE = 0x57A7E
 
 
 class PoseConfig(Config, frozen=True):
@@ -57,6 +55,9 @@ class PoseConfig(Config, frozen=True):
     tilt_deg: float = 15.0
     nearest_mm: tuple[float, float] = (110.0, 125.0)  # depth of the organ's nearest point
     sideways_mm: float = 15.0  # the organ's centre may lie this far off the camera's axis
+
+    def __post_init__(self) -> None:
+        self.check_between("pose", tilt_deg=(0, 180))
 
 
 class SceneConfig(Config, frozen=True):
@@ -82,7 +83,6 @@ class SceneConfig(Config, frozen=True):
     occlusion: OcclusionConfig = OcclusionConfig()
     calibration: CalibrationConfig = CalibrationConfig()
     cloud_points: tuple[int, int] | None = None
-    views: int = 1  # recipes in a row that show the same state, where all deformations are elastic
 
     def seen_whole(self, anatomy_ct: Anatomy) -> SceneConfig:
         """The same, with an organ that is larger than a kidney, for which the distances are meant,
@@ -100,11 +100,6 @@ class SceneConfig(Config, frozen=True):
         )
 
     def __post_init__(self) -> None:
-        if self.views > 1 and not all(isinstance(one, ElasticConfig) for one in self.deform):
-            raise InputError(
-                f"views is {self.views}, but only elastic states can be seen from several sides; "
-                "the configuration has other deformations."
-            )
         fewest, most = self.cloud_points or (FEWEST_POINTS, FEWEST_POINTS)
         if not FEWEST_POINTS <= fewest <= most:
             raise InputError(
@@ -129,11 +124,6 @@ class SceneRecipe:
     def generator(self, attempt: int) -> np.random.Generator:
         return np.random.default_rng([self.seed, STREAMS.index(self.stream), self.index, attempt])
 
-    def state(self, views: int) -> np.random.Generator:
-        """The generator of the state that so many recipes in a row share."""
-        number = self.index // views
-        return np.random.default_rng([self.seed, STREAMS.index(self.stream), number, 0, _STATE])
-
 
 @dataclass(frozen=True, eq=False)
 class RenderedScene:
@@ -150,27 +140,6 @@ class RenderedScene:
 
 
 @dataclass(eq=False)
-class _SharedState:
-    """A deformation that several scenes show, and where it took the points that it was given: the
-    organ's vertices and the labelled points are the same arrays in all of them."""
-
-    number: tuple[str, int, int]  # stream, seed, number of the state
-    deformation: Deformation
-    moved: list[tuple[Points, Points]] = field(default_factory=list)
-
-    def apply(self, points_ct: Points) -> Points:
-        for given, there in self.moved:
-            if given is points_ct:
-                return there
-        there = self.deformation.apply(points_ct)
-        self.moved.append((points_ct, there))
-        return there
-
-    def record(self) -> dict[str, Any]:
-        return self.deformation.record()
-
-
-@dataclass(eq=False)
 class Simulator:
     """Makes the scenes of one anatomy (CT frame, LPS mm); ``body`` where the configuration has
     elastic deformations (``body_for`` builds it)."""
@@ -181,7 +150,6 @@ class Simulator:
     body: ElasticBody | None = None
 
     def __post_init__(self) -> None:
-        self._shared: _SharedState | None = None
         self._intrinsics = d405(self.config.width, self.config.height)
         self._visibility = Visibility(self.anatomy_ct.organ)
         vertices = self.anatomy_ct.organ.vertices_mm
@@ -189,7 +157,7 @@ class Simulator:
         self._hull_ct = Mesh(corners, np.empty((0, 3)))
 
     def pair(
-        self, recipe: SceneRecipe, pool: PointSource
+        self, recipe: SceneRecipe, pool: OccupancyPool
     ) -> tuple[RenderedScene, Float32[np.ndarray, "n 3"], UInt8[np.ndarray, " n"]]:
         """The scene, and its labelled points, camera frame."""
         scene, rng = self._render(recipe)
@@ -213,7 +181,8 @@ class Simulator:
             nearest_mm = config.free_nearest_mm if free else config.pose.nearest_mm
             placed = self._hull_ct, self.up_lps, nearest_mm
             camera_from_ct = sample_pose(config.pose, *placed, rng)
-            deformation = self._deformation(recipe, camera_from_ct, rng)
+            model = config.deform[rng.integers(len(config.deform))]
+            deformation = model.sample(self._view(camera_from_ct), rng)
             vertices = transform_points(camera_from_ct, deformation.apply(organ.vertices_mm))
             frame = render_depth(vertices, organ.faces, self._intrinsics)
             frame = add_clutter(frame, config.clutter, rng)
@@ -229,25 +198,6 @@ class Simulator:
             f"{recipe}: no pose in {_ATTEMPTS} shows enough of the organ; check the camera's range "
             "and the distances in the scene configuration."
         )
-
-    def _deformation(
-        self,
-        recipe: SceneRecipe,
-        camera_from_ct: Float64[np.ndarray, "4 4"],
-        rng: np.random.Generator,
-    ) -> Deformation:
-        """Drawn from ``rng``; or the state that the recipes beside this one show as well."""
-        views = self.config.views
-        number = recipe.stream, recipe.seed, recipe.index // views
-        if self._shared is not None and self._shared.number == number:
-            return self._shared
-        drawing = rng if views == 1 else recipe.state(views)
-        model = self.config.deform[drawing.integers(len(self.config.deform))]
-        drawn = model.sample(self._view(camera_from_ct), drawing)
-        if views == 1:
-            return drawn
-        self._shared = _SharedState(number, drawn)
-        return self._shared
 
     def _crop(self, free: bool, rng: np.random.Generator) -> CloudConfig:
         """The depth range and number of points of this scene's cloud."""
@@ -317,7 +267,6 @@ class Batch(NamedTuple):
     clouds_mm: Float32[np.ndarray, "b n 3"]
     points_mm: Float32[np.ndarray, "b q 3"]
     labels: UInt8[np.ndarray, "b q"]
-    camera_from_ct: Float32[np.ndarray, "b 4 4"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -328,7 +277,7 @@ class SceneStream:
     anatomy_ct: Anatomy
     up_lps: tuple[float, float, float]
     config: SceneConfig
-    pool: PointSource
+    pool: OccupancyPool
     seed: int
     stream: Literal["train", "validation", "test"]
     batch_size: int
@@ -350,7 +299,7 @@ class SceneStream:
             recipe = SceneRecipe(self.seed, self.stream, number)
             scene, points_mm, labels = self.simulator.pair(recipe, self.pool)
             cloud_mm = refill(scene.cloud.points_mm, n)
-            rows.append((cloud_mm, points_mm, labels, scene.camera_from_ct.astype(np.float32)))
+            rows.append((cloud_mm, points_mm, labels))
         return Batch(*map(np.stack, zip(*rows, strict=True)))
 
 

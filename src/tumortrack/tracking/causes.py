@@ -8,7 +8,6 @@ how much of the organ the points show, how far beside it they lie, and how flat 
 from __future__ import annotations
 
 import math
-from contextlib import suppress
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -16,13 +15,13 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from tumortrack.core.causes import Cause, Check, Likely
-from tumortrack.core.errors import NoEstimate
 from tumortrack.core.estimate import Estimate
 from tumortrack.core.geometry import Points, rotation_onto
 from tumortrack.core.types import Mesh, SensorCloud
 from tumortrack.models.in_distribution import spread_mm
 from tumortrack.models.model import Model
 from tumortrack.registration.gauss_newton import refine
+from tumortrack.registration.looks import Looks
 from tumortrack.registration.model import RegistrationModel
 from tumortrack.sense.cloud import thin_cloud
 from tumortrack.sense.units import Unit, likely_unit
@@ -58,6 +57,7 @@ _WORDS = {
 _POINTS = 400  # of a trial
 _FITS, _BETTER = 1.0, 0.6  # times the usual cost, and the present one: right trials have 0.1 to 0.5
 _WIDER = 0.5, 0.75, 1.33, 2.0  # x and y, by a wrong focal length
+_TRIED = 2  # starts of the search
 _ASIDE, _OUTSIDE = 0.64, 0.5  # cosine to z: farther than a D405 sees, than any usual camera
 _FACING = 0.5  # cosine to the camera of the side that bulges
 _TURNED_MM = 170.0  # away, about where training has organs
@@ -129,18 +129,16 @@ def _fitted_by(estimate: Estimate) -> _Fitted:
 
 
 def _fit(model: Model, points: Points) -> _Fitted:
-    """By the network and one refinement, on few points."""
+    """By a search and a few refinements, on few points."""
     least, most = model.in_distribution.spread_mm
     if not isinstance(model, RegistrationModel) or not least <= spread_mm(points) <= most:
         return _Fitted()
-    with suppress(NoEstimate):  # the network places it nowhere
-        starts = model.registration().propose(points)
-        fits = [refine(model.shape, points, one, model.config.refine) for one in starts]
-        best, usual = min(fits, key=lambda fit: fit.cost), model.calibration.usual_cost
-        organ = model.shape.anatomy_ct.organ
-        there = organ.moved(best.motion.carry(organ.vertices_mm))
-        return _Fitted(there, "fit", best.cost / usual, best.cost_without_strays / usual)
-    return _Fitted()
+    starts = model.registration.search.starts(Looks.of([points]))[:_TRIED]
+    fits = [refine(model.shape, points, one, model.config.refine) for one in starts]
+    best, usual = min(fits, key=lambda fit: fit.cost), model.calibration.usual_cost
+    organ = model.shape.anatomy_ct.organ
+    there = organ.moved(best.motion.carry(organ.vertices_mm))
+    return _Fitted(there, "fit", best.cost / usual, best.cost_without_strays / usual)
 
 
 def _tried(model: Model, points: Points, now: float) -> list[Likely]:

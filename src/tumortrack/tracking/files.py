@@ -11,7 +11,7 @@ import numpy as np
 from tumortrack.core import store
 from tumortrack.core.errors import ArtifactError, InputError
 from tumortrack.core.estimate import Estimate, Quality
-from tumortrack.core.geometry import RAS_FROM_LPS
+from tumortrack.core.geometry import RAS_FROM_LPS, largest_std_of, std_of
 from tumortrack.core.mesh_files import read_mesh, write_mesh
 from tumortrack.core.organ import is_tumor, organ_in
 from tumortrack.core.patient import patient_in
@@ -143,7 +143,7 @@ def _places_in_ct(estimate: Estimate) -> dict[str, np.ndarray]:
     if points_ct is None:
         return {}
     places = {f"ct_{axis}": points_ct[:, n].astype(np.float32) for n, axis in enumerate("xyz")}
-    for name in ("std_mm", "largest_std_mm"):
-        if (deviations := getattr(estimate.motion, name)(points_ct)) is not None:
-            places[name] = deviations.astype(np.float32)
+    if (covariance := estimate.motion.covariance_mm2(points_ct)) is not None:
+        places["std_mm"] = std_of(covariance).astype(np.float32)
+        places["largest_std_mm"] = largest_std_of(covariance).astype(np.float32)
     return places

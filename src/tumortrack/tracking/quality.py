@@ -39,6 +39,7 @@ _THROUGH_MM = 6.0  # behind the estimated surface: what is seen there lies behin
 _TOLD, _RIM = 0.5, 2
 _MOST_STRAYS = 0.5  # of the points: no robust estimate bears more (the breakdown point)
 _FARTHEST = 3.0  # standard deviations of where cameras are
+_FAR_TILTED, _UPSIDE_DOWN = 60.0, 110.0  # degrees
 _UNSURE = 0.6  # mean probability of a tumor's points
 _PIXEL_MM = 1.5  # of the picture that a cloud is compared in
 _MOST_PIXELS = 1024  # along a side
@@ -175,7 +176,10 @@ def _doubt(estimate: Estimate) -> _Failed:
     size = estimate.report.get("size")
     if size is not None and size["gain"] > RIVAL_COST:
         return "size", f"an organ {size['times']:.2f} times as large fits better"
-    for other in estimate.report.get("fit_cost", {}).get("others", ()):
+    cost = estimate.report.get("fit_cost", {})
+    if beyond := cost.get("beyond"):
+        return "place", _other_side(beyond["tilt_degrees"])
+    for other in cost.get("others", ()):
         name, apart_mm = max(other["apart_mm"].items(), key=lambda item: item[1])
         if apart_mm > _UNSURE_MM:
             return "place", f"{name} may as well lie {apart_mm:.1f} mm away, which fits too"
@@ -188,6 +192,16 @@ def _doubt(estimate: Estimate) -> _Failed:
             share = part["probability"]
             return "place", f"the points of {name} have a probability of {share:.2f}"
     return None
+
+
+def _other_side(tilt_degrees: float) -> str:
+    """``tilt_degrees``: in which the organ fits, against what is allowed or was found."""
+    fits = f"it fits the points as well tilted by {tilt_degrees:.0f} degrees"
+    if tilt_degrees > _UPSIDE_DOWN:
+        return f"the organ may lie upside down: {fits}"
+    if tilt_degrees > _FAR_TILTED:
+        return f"the organ may be tilted farther than stated: {fits}"
+    return f"the organ may not have been turned over: {fits}"
 
 
 def seen_through(organ: Mesh, frame: DepthFrame) -> tuple[float, float, float]:

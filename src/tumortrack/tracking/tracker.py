@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from typing import Any
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float64
@@ -19,10 +19,9 @@ from tumortrack.core.geometry import HERE, Affine, transform_points
 from tumortrack.core.organ import organ_entry
 from tumortrack.core.process import keep_small_blocks
 from tumortrack.core.types import Anatomy, DepthFrame, Look, SensorCloud
+from tumortrack.imaging.case import Case
 from tumortrack.models.folder import weakness_of
 from tumortrack.models.model import Model
-from tumortrack.occupancy.locator import OccupancyLocator
-from tumortrack.occupancy.model import OccupancyModel
 from tumortrack.registration.locator import RegistrationLocator
 from tumortrack.registration.looks import seen_from_first
 from tumortrack.registration.model import RegistrationModel
@@ -31,6 +30,8 @@ from tumortrack.sense.cloud import CloudConfig
 from tumortrack.sense.region import RegionConfig
 from tumortrack.tracking.advice import where_to_look
 from tumortrack.tracking.causes import likely_causes, words
+from tumortrack.tracking.model_files import case_model
+from tumortrack.tracking.presets import occupancy
 from tumortrack.tracking.quality import doubted, judged, unless_hidden, with_margin
 
 _ALONE = Following()
@@ -42,27 +43,45 @@ _SOUGHT_S = 1.0
 _OF_POSES = "none", "poses", "fit", "strays", "seen_through"  # checks, where views are several
 
 
-_LOCATORS: dict[type[Model], Callable[[Any], RegistrationLocator | OccupancyLocator]] = {
-    RegistrationModel: RegistrationLocator,
-    OccupancyModel: OccupancyLocator,
-}
+@runtime_checkable
+class Locator(Protocol):
+    """What a method has to offer."""
+
+    anatomy_ct: Anatomy | None
+
+    def locate(
+        self, cloud: SensorCloud, grid: int, seed: int, others: Sequence[Look] = ()
+    ) -> Estimate:
+        """See ``Tracker.locate``."""
+
+    def follow(
+        self, cloud: SensorCloud, last: Estimate | None, how: Following, others: Sequence[Look] = ()
+    ) -> Estimate:
+        """See ``Tracker.follow``."""
+
+    def warm(self) -> None:
+        """See ``Tracker.warm``."""
 
 
 class Tracker:
-    """Locates the organ and tumors of one model in sensor clouds (camera frame, mm).
+    """Locates the organ and tumors of one case, or of a model, in sensor clouds (camera frame, mm).
+    A case that has no model yet gets one first, which takes some seconds.
 
     A process that has one keeps what memory a frame frees for the next one.
     """
 
-    def __init__(self, model: Model) -> None:
-        if type(model) not in _LOCATORS:
+    def __init__(self, model: Model | Case) -> None:
+        if isinstance(model, Case):
+            model = case_model(model)
+        if not isinstance(model, Model):
             raise InputError(
-                f"Tracker takes a model, not {type(model).__name__}: Tracker(load_model(FOLDER))."
+                f"Tracker takes a case or a model, not {type(model).__name__}: "
+                "Tracker(load_case(FOLDER))."
             )
         keep_small_blocks()
         self.model, self._patient, self._organ = model, model.patient, model.organ
         self._weakness = weakness_of(model.provenance)
-        self._locator = _LOCATORS[type(model)](model)
+        self._locator = _locator(model)
 
     @property
     def anatomy_ct(self) -> Anatomy | None:
@@ -188,6 +207,13 @@ class Tracker:
         self._locator.warm()
 
 
+def _locator(model: Model) -> Locator:
+    if isinstance(model, RegistrationModel):
+        return RegistrationLocator(model)
+    made: Locator = occupancy("locator").OccupancyLocator(model)
+    return made
+
+
 def _unusual(estimate: Estimate) -> bool:
     """Whether it fits worse than usual."""
     cost = estimate.report.get("fit_cost")
@@ -219,7 +245,7 @@ class Follower:
         if config.smoothing_s > 0 and tracker.anatomy_ct is None:
             raise InputError(
                 "smoothing needs a motion, which models of the presets quick and paper do not "
-                "know. Train with --preset clinic, or leave smoothing out."
+                "know. Give the case itself, or leave smoothing out."
             )
         self._tracker, self._config = tracker, config
         self._last: Estimate | None = None

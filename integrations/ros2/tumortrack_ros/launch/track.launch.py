@@ -1,4 +1,4 @@
-"""ros2 launch tumortrack_ros track.launch.py model:=MODEL source:=ros2:/camera/... [rviz:=true]"""
+"""ros2 launch tumortrack_ros track.launch.py model:=CASE source:=ros2:/camera/... [rviz:=true]"""
 
 from ament_index_python.packages import get_package_share_directory
 from launch import LaunchDescription

@@ -16,7 +16,7 @@ class Option(NamedTuple):
 REQUIRED = ("model", "source")
 OPTIONS = {
     "executable": Option("tumortrack", "the command, with its folder if it is not on the PATH"),
-    "model": Option("", "folder of the trained model"),
+    "model": Option("", "a case, or the folder of a model"),
     "source": Option("", "where frames come from, such as ros2:/camera/depth/image_rect_raw"),
     "sinks": Option(["ros2:/tumortrack"], "where results go; also moveit, viewer"),
     "frame": Option("", "JSON file that says where the camera is"),

@@ -13,37 +13,21 @@ from tumortrack.core.errors import TumortrackError
 from tumortrack.imaging.nifti import write_nifti
 from tumortrack.phantom.digital import PhantomParameters, phantom_labels
 from tumortrack.sense.ply import write_cloud_ply
-from tumortrack_lab.bench.rows import (
-    BEFORE_TORCH,
-    COMMAND,
-    LARGE,
-    PATIENT,
-    PEAK,
-    PRESETS,
-    Workload,
-    timing_of,
-)
+from tumortrack_lab.bench.rows import COMMAND, LARGE, PATIENT, PEAK, PRESETS, Workload, timing_of
 from tumortrack_lab.bench.subject import BenchSubject
 
 _GRIDS = {COMMAND: 160, LARGE: 400}
 _FEWEST = 3
-# Runs the command line; notes when torch is first asked for, and the process's peak memory (what
-# the system tells of ended children counts the memory of the parent that they were born of).
-# Written out, so that nothing of ours is imported before the command line is.
+# Runs the command line; notes the process's peak memory (what the system tells of ended children
+# counts the memory of the parent that they were born of).
 _PROBE = """
-import importlib.abc, os, sys, time
-report, leave = open(sys.argv.pop(), "w"), os._exit
-class Watch(importlib.abc.MetaPathFinder):
-    def find_spec(self, name, path=None, target=None):
-        if name == "torch":
-            sys.meta_path.remove(self)
-            print("torch", time.monotonic(), file=report, flush=True)
+import os, sys
+report, leave = sys.argv.pop(), os._exit
 def tell_and_leave(code):
     if os.path.exists("/proc/self/status"):
-        print(*(line for line in open("/proc/self/status") if "VmHWM" in line), file=report)
-    report.close()
+        lines = [line for line in open("/proc/self/status") if "VmHWM" in line]
+        open(report, "w").writelines(lines)
     leave(code)
-sys.meta_path.insert(0, Watch())
 os._exit = tell_and_leave  # which is how `locate` ends
 from tumortrack.cli.main import main
 main()
@@ -53,9 +37,9 @@ main()
 def workloads(subject: BenchSubject, budget_s: float) -> Iterator[Workload]:
     """From the start of the process to its end, all files written; there is no naive form."""
     with tempfile.TemporaryDirectory() as folder:
+        cloud, out = Path(folder) / "cloud.ply", Path(folder) / "out"
+        write_cloud_ply(cloud, subject.cloud.points_mm)
         for preset in PRESETS:
-            cloud, out = Path(folder) / f"{preset}.ply", Path(folder) / "out"
-            write_cloud_ply(cloud, subject.cloud(preset).points_mm)
             words = ["locate", subject.model_folder(preset), cloud, out, "--overwrite"]
             arguments = [*map(str, words), "--device", "cpu"]
             run_command(arguments)  # into the disk's cache
@@ -64,23 +48,17 @@ def workloads(subject: BenchSubject, budget_s: float) -> Iterator[Workload]:
 
 
 def patient(subject: BenchSubject, budget_s: float) -> Iterator[Workload]:
-    """A new patient's labels to the first estimate: `prepare`, `train --minutes 0` and `locate`, a
-    process each."""
+    """A new patient's labels to the first estimate: `prepare` and `locate`, a process each."""
     with tempfile.TemporaryDirectory() as folder:
         labels, cloud = Path(folder) / "labels.nii.gz", Path(folder) / "cloud.ply"
         made = phantom_labels(PhantomParameters(), voxel_mm=1.0)
         write_nifti(labels, made.labels, made.lps_from_index, lps=True)
-        write_cloud_ply(cloud, subject.cloud("clinic").points_mm)
+        write_cloud_ply(cloud, subject.cloud.points_mm)
         runs: list[list[float]] = []
         begun = time.perf_counter()
         while len(runs) <= _FEWEST or time.perf_counter() - begun < budget_s:
-            aside = Path(folder) / str(len(runs))
-            case, model, out = aside / "case", aside / "model", aside / "out"
-            steps = (
-                ("prepare", labels, case),
-                ("train", case, model, "--minutes", 0, "--device", "cpu"),
-                ("locate", model, cloud, out, "--device", "cpu"),
-            )
+            case, out = (Path(folder) / f"{name}-{len(runs)}" for name in ("case", "out"))
+            steps = ("prepare", labels, case), ("locate", case, cloud, out)
             runs.append([run_command([*map(str, step)])[0] for step in steps])
         each = [timing_of([*seconds]).median_s for seconds in zip(*runs[1:], strict=True)]
         note = " s, ".join(f"{what[0]} {s:.1f}" for what, s in zip(steps, each, strict=True))
@@ -89,36 +67,30 @@ def patient(subject: BenchSubject, budget_s: float) -> Iterator[Workload]:
 
 
 def _workload(name: str, preset: str, arguments: list[str], budget_s: float) -> Workload:
-    runs: list[tuple[float, float, int]] = []
+    runs: list[tuple[float, int]] = []
     begun = time.perf_counter()
     while len(runs) < _FEWEST or (
         (time.perf_counter() - begun) * (len(runs) + 1) / len(runs) < budget_s
     ):
         runs.append(run_command(arguments))
-    seconds, before, peaks = zip(*runs, strict=True)
-    before_s, peak = timing_of([*before]).median_s, max(peaks)
-    facts = {
-        "others": {BEFORE_TORCH: before_s, PEAK: peak},
-        "note": f"{before_s:.2f} s before torch is imported, {peak / 2**30:.2f} GiB at most",
-    }
+    seconds, peaks = zip(*runs, strict=True)
+    facts = {"others": {PEAK: max(peaks)}, "note": f"{max(peaks) / 2**30:.2f} GiB at most"}
     return Workload(name, preset, "run", timing_of([*seconds]), facts=lambda: facts)
 
 
-def run_command(arguments: list[str]) -> tuple[float, float, int]:
-    """Run `tumortrack` with these arguments in a process of its own: seconds in all and before
-    torch was imported, peak memory in bytes (0: the system does not say). Raises TumortrackError:
-    the command failed, the message says its last words."""
-    with tempfile.TemporaryDirectory() as folder:
-        report = Path(folder) / "imported.txt"
+def run_command(arguments: list[str]) -> tuple[float, int]:
+    """Run `tumortrack` with these arguments in a process of its own: seconds, and peak memory in
+    bytes (0: the system does not say). Raises TumortrackError: the command failed, the message says
+    its last words."""
+    with tempfile.NamedTemporaryFile("r") as report:
         start = time.monotonic()
         done = subprocess.run(
-            [sys.executable, "-c", _PROBE, *arguments, str(report)],
+            [sys.executable, "-c", _PROBE, *arguments, report.name],
             stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=False,
         )  # fmt: skip
         seconds = time.monotonic() - start
         if done.returncode not in (0, 4):  # 4: `locate` answered, and calls it poor
             words = done.stdout.strip().splitlines()[-1:] or ["nothing was said"]
             raise TumortrackError(f"`tumortrack {' '.join(arguments)}` failed: {words[0]}")
-        found = dict(line.split()[:2] for line in report.read_text().splitlines() if line)
-    before_s = float(found["torch"]) - start if "torch" in found else seconds
-    return seconds, before_s, 1024 * int(found.get("VmHWM:", 0))
+        peak = report.read().split()  # VmHWM: so many kB
+    return seconds, 1024 * int(peak[1]) if peak else 0

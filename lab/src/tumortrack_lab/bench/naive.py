@@ -6,9 +6,7 @@ latent joined to every query, everything in one piece. Of a network it takes sin
 configuration and nothing else, so that it is also an independent reference. Source: the forms of
 github.com/yanx27/Pointnet_Pointnet2_pytorch and of Mescheder et al., CVPR 2019.
 
-A training pair: NumPy, a ray for each pixel, inside tests. A registration frame by the same method
-as ours, with nearest vertices by a tree and SciPy: the placements both ways round, each fitted to
-the end, the better one kept, every query tested against the surfaces.
+An elastic body's flow by SciPy.
 """
 
 from __future__ import annotations
@@ -18,18 +16,14 @@ from typing import Any
 
 import numpy as np
 import torch
-import trimesh
 from scipy.ndimage import map_coordinates
-from scipy.spatial import cKDTree
-from scipy.spatial.transform import Rotation
 from torch import Tensor
 from torch.nn import functional
 
-from tumortrack.core.geometry import transform_points
-from tumortrack.core.types import Anatomy
-from tumortrack.models.config import MlpDecoderConfig
-from tumortrack.models.encoders.pointnet2 import PointNet2Config
-from tumortrack.models.normalisation import (
+from tumortrack.occupancy.config import MlpDecoderConfig
+from tumortrack.occupancy.encoders.pointnet2 import PointNet2Config
+from tumortrack.occupancy.network import Latent, OccupancyNetwork, octave_features
+from tumortrack.occupancy.normalisation import (
     Aligned,
     CloudBox,
     alignment,
@@ -37,16 +31,9 @@ from tumortrack.models.normalisation import (
     turned,
     without_strays,
 )
-from tumortrack.occupancy.network import Latent, OccupancyNetwork, octave_features
-from tumortrack.registration.model import RegistrationModel
-from tumortrack.simulate.deform.drag import Drags
-from tumortrack.simulate.deform.elastic import ElasticDeformation
 from tumortrack.simulate.elastic.body import ElasticBody
-from tumortrack.simulate.occupancy import labels_of
-from tumortrack.simulate.scene import RenderedScene
 
 FLOW_STEPS = 12
-_Fit = tuple[float, np.ndarray, np.ndarray, np.ndarray]  # cost, rotation, centre, coefficients
 
 
 class NaiveOccupancy:
@@ -144,35 +131,6 @@ def _square(offsets: Tensor) -> Tensor:
     return x * x + y * y + z * z
 
 
-def plain_pair(anatomy_ct: Anatomy, stage: RenderedScene, labels: int) -> np.ndarray:
-    """All surfaces deformed, a ray a pixel through a tree that is built anew, and random points
-    labelled by inside tests on the deformed surfaces."""
-    parts = [part.moved(_carried(stage, part.vertices_mm)) for part in anatomy_ct.parts]
-    k = stage.frame.intrinsics
-    u, v = np.meshgrid(np.arange(k.width), np.arange(k.height))
-    rays = np.stack([(u - k.cx) / k.fx, (v - k.cy) / k.fy, np.ones_like(u)], -1).reshape(-1, 3)
-    mesh = trimesh.Trimesh(parts[0].vertices_mm, parts[0].faces, process=False)
-    mesh.ray.intersects_location(np.zeros_like(rays), rays, multiple_hits=False)
-    lower, upper = parts[0].box_mm
-    points = np.random.default_rng(0).uniform(lower, upper, (labels, 3)).astype(np.float32)
-    return labels_of(Anatomy(tuple(parts)), points)
-
-
-def _carried(stage: RenderedScene, points_ct: np.ndarray) -> np.ndarray:
-    deformation, moved = stage.deformation, points_ct.copy()
-    if isinstance(deformation, ElasticDeformation):
-        moved = flowed(deformation.body, deformation.coefficients, points_ct)
-    else:
-        assert isinstance(deformation, Drags)
-        drags = zip(
-            deformation.centres_ct, deformation.shifts_mm, deformation.sigmas_mm, strict=True
-        )
-        for centre, shift, sigma in drags:
-            square = ((moved - centre) ** 2).sum(1)
-            moved += np.exp(-0.5 * square / sigma**2)[:, None] * shift
-    return transform_points(stage.camera_from_ct, moved)
-
-
 def flowed(body: ElasticBody, coefficients: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Points (n, 3) of the CT frame after one unit of time in a body's velocity: midpoint rule,
     SciPy's interpolation."""
@@ -188,76 +146,3 @@ def sampled(body: ElasticBody, fields: np.ndarray, points: np.ndarray) -> np.nda
     """Fields (f, i, j, k) on a body's lattice at points (n, 3) -> (n, f)."""
     place = (points - body.origin_mm).T / body.spacing_mm
     return np.stack([map_coordinates(f, place, order=1, mode="nearest") for f in fields], 1)
-
-
-class NaiveRegistration:
-    """Places the organ of one model in clouds (camera frame, mm)."""
-
-    def __init__(self, model: RegistrationModel) -> None:
-        self._network, self._config = model.network, model.config.refine
-        self._anatomy, self.body = model.shape.anatomy_ct, model.shape.body
-        organ = self._anatomy.organ
-        self._vertices = organ.vertices_mm
-        mesh = trimesh.Trimesh(organ.vertices_mm, organ.faces, process=False)
-        self._normals = np.array(mesh.vertex_normals)
-        self._tree = cKDTree(organ.vertices_mm)
-        modes = np.moveaxis(self.body.modes, (3, 4), (0, 1))
-        self._modes = modes.reshape(-1, *modes.shape[2:])
-
-    def labels(self, points_mm: np.ndarray, queries_mm: np.ndarray) -> np.ndarray:
-        """A cloud (n, 3) -> labels of queries (q, 3)."""
-        with torch.inference_mode():
-            found = self._network.flip_hypotheses(torch.tensor(points_mm)[None])
-        parts = (found.rotation, found.centre_mm, found.coefficients)
-        starts = zip(*(part.double().numpy() for part in parts), strict=True)
-        fits = (self._refined(points_mm, *start) for start in starts)
-        _, rotation, centre, coefficients = min(fits, key=lambda fit: fit[0])
-        moved = (queries_mm - centre) @ rotation + self.body.center_ct
-        return self.labels_where(flowed(self.body, -coefficients, moved))
-
-    def labels_where(self, motion_back: np.ndarray) -> np.ndarray:
-        """Of places in the CT (n, 3): inside tests on its surfaces."""
-        return labels_of(self._anatomy, motion_back.astype(np.float32))
-
-    def _refined(
-        self, points: np.ndarray, rotation: np.ndarray, centre: np.ndarray, state: np.ndarray
-    ) -> _Fit:
-        config, body = self._config, self.body
-        modes = len(body.mean)
-        prior = np.zeros((6 + modes, 6 + modes))
-        prior[:3, :3] = np.eye(3) / config.shift_mm**2
-        prior[3:6, 3:6] = np.eye(3) / config.turn_rad**2
-        prior[6:, 6:] = body.precision
-        weight = min(config.n_effective / len(points), 1.0) / config.sigma_mm**2
-        moved, cost = np.zeros(6), np.inf
-        for step in range(config.steps):
-            width = max(config.last_mm, config.first_mm * config.narrowing**step)
-            distance, rows = self._residuals(points, rotation, centre, state)
-            pull = 1 / (1 + (distance / width) ** 2) ** 2
-            off = np.concatenate([moved, state - body.mean])
-            curvature = weight * rows.T @ (pull[:, None] * rows) + prior
-            change = -np.linalg.solve(curvature, weight * rows.T @ (pull * distance) + prior @ off)
-            square = (distance / config.last_mm) ** 2
-            cost = weight * config.last_mm**2 * float((square / (1 + square)).sum())
-            cost += float(off @ prior @ off)
-            centre = centre + rotation @ change[:3]
-            rotation = rotation @ Rotation.from_rotvec(change[3:6]).as_matrix()
-            state, moved = state + change[6:], moved + change[:6]
-            if width == config.last_mm and np.abs(change).max() < config.enough_mm:
-                break
-        return cost, rotation, centre, state
-
-    def _residuals(
-        self, points: np.ndarray, rotation: np.ndarray, centre: np.ndarray, state: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        body = self.body
-        offset = (points - centre) @ rotation
-        rest = offset + body.center_ct
-        back = flowed(body, -state, rest)
-        nearest = self._tree.query(back)[1]
-        outwards = self._normals[nearest]
-        distance = ((back - self._vertices[nearest]) * outwards).sum(1)
-        modes = sampled(body, self._modes, flowed(body, -0.5 * state, rest))
-        modes = modes.reshape(len(points), 3, -1)
-        by_modes = -np.einsum("nd,ndm->nm", outwards, modes)
-        return distance, np.concatenate([-outwards, -np.cross(offset, outwards), by_modes], axis=1)

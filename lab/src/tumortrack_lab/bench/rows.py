@@ -1,5 +1,5 @@
-"""Workloads, timed in turns, and the rows that become of them: what was done, how long it took,
-what it has to take at least. Versions take turns, so that what else the machine does meets all.
+"""Workloads, timed in turns, and the rows that become of them: what was done, and how long it took.
+Versions take turns, so that what else the machine does meets all.
 """
 
 from __future__ import annotations
@@ -8,7 +8,7 @@ import math
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -19,16 +19,14 @@ _FEWEST, _MOST = 3, 25  # rounds
 _LEAST_S = 0.01  # that a turn lasts: shorter calls are repeated within it
 _LONG_S = 0.5  # a first call that takes longer is warm enough
 _LONGER_S = 1.0  # and one that takes longer still is a turn: what it loaded is little beside it
-PRESETS = ("clinic", "quick", "paper")
+PRESETS = "clinic", "paper"  # whose models are measured
 # What rows are called.
-GENERATOR, ENCODER, DECODER = "generator", "encoder", "decoder"
+SEARCH, FIRST_LOOK = "search", "search and refinement"
 FRAME, EVERY, TRACKING = "frame", "frame, every query asked", "tracking frame"
 PATIENT = "labels to first estimate"
 VOLUME, COMMAND, LARGE = "400^3 labels", "`locate` command", "`locate --grid 400` command"
-PLAN, MOTIONS, STEP, TRAINING = "plan", "motions", "training step", "training, generator included"
-BEFORE_TORCH, PEAK = "seconds before torch is imported", "peak bytes"  # among ``others``
-
-Precision = Literal["fp32", "bf16", "int8"]
+PLAN, MOTIONS, TRAINING = "plan", "motions", "training, generator included"
+PEAK = "peak bytes"  # among ``others``
 
 
 @dataclass(frozen=True)
@@ -56,9 +54,9 @@ class InterleavedTiming(Config, frozen=True):
         return InterleavedTiming(**seconds, turns=self.turns)
 
 
-def interleaved(*versions: Call, budget_s: float, fewest: int = _FEWEST) -> list[InterleavedTiming]:
+def interleaved(*versions: Call, budget_s: float) -> list[InterleavedTiming]:
     """Seconds a call of each version. Every version is called before (compiled, cached, warm);
-    then all take turns until ``budget_s`` is spent, between ``fewest`` and 25 times each. A first
+    then all take turns until ``budget_s`` is spent, between 3 and 25 times each. A first
     call that took more than a second counts as a turn: a median of three bears a cold one. Where
     time is up, those that have had the fewest turns leave the last to the others."""
     begun = time.perf_counter()
@@ -71,10 +69,10 @@ def interleaved(*versions: Call, budget_s: float, fewest: int = _FEWEST) -> list
     for done in range(_MOST):
         past_s = time.perf_counter() - begun
         up = past_s * (done + 1) / max(done, 1) > budget_s
-        if up and min(map(len, seconds)) >= fewest:
+        if up and min(map(len, seconds)) >= _FEWEST:
             break
         for times, version, repeat in zip(seconds, versions, repeats, strict=True):
-            if not (up and len(times) >= fewest):
+            if not (up and len(times) >= _FEWEST):
                 times.append(_turn(version, repeat)[1] / repeat)
     return [timing_of(times) for times in seconds]
 
@@ -96,14 +94,6 @@ def timing_of(seconds: list[float]) -> InterleavedTiming:
     )
 
 
-class Work(Config, frozen=True):
-    """What cannot be left out of one call: arithmetic, and bytes that have to be moved once."""
-
-    flops: float
-    bytes: float
-    precision: Precision = "fp32"
-
-
 class BenchRow(Config, frozen=True):
     """One measured part.
 
@@ -119,7 +109,6 @@ class BenchRow(Config, frozen=True):
     ours: InterleavedTiming
     naive: InterleavedTiming | None = None
     naive_is: str = ""
-    work: Work | None = None
     per_call: int = 1
     agreement: float | None = None
     others: dict[str, float] = msgspec.field(default_factory=dict)
@@ -141,7 +130,7 @@ class BenchRow(Config, frozen=True):
 class Workload:
     """What becomes a row: our form and the naive one, each a call or what it took.
 
-    ``calls``: how many items one call of ours makes; ``naive_share``: how many times the naive
+    ``naive_share``: how many times the naive
     form's part the whole work is; ``facts``: the row's other fields, asked for once it is timed;
     ``beside``: other forms of ours, timed in the same turns and beside the same naive form.
     ``naive`` holds the seconds once they are known.
@@ -153,7 +142,6 @@ class Workload:
     ours: Call | InterleavedTiming
     naive: Call | InterleavedTiming | None = None
     naive_is: str = ""
-    calls: int = 1
     naive_share: float = 1.0
     facts: Callable[[], dict[str, Any]] = dict
     beside: tuple[Workload, ...] = ()
@@ -167,37 +155,11 @@ class Workload:
         self.naive = known = timed.get(self.naive, self.naive)
         naive = None if known is None else known.times(self.naive_share)
         for form in forms:
-            ours = timed.get(form.ours, form.ours).times(1 / form.calls)
+            ours = timed.get(form.ours, form.ours)
             yield BenchRow(
                 name=form.name, what=form.what, threads=threads, item=form.item, ours=ours,
                 naive=naive, naive_is=self.naive_is, **form.facts(),
             )  # fmt: skip
-
-
-class Peaks(Config, frozen=True):
-    """What the machine reaches with so many threads: matrix products by precision (FLOP/s; absent:
-    not offered) and memory (bytes/s)."""
-
-    threads: int
-    gemm: dict[str, float]
-    triad: float
-
-    def least_s(self, work: Work) -> tuple[float, float]:
-        """The arithmetic at the measured rate (single precision's where the other is not offered)
-        and the bytes at the measured bandwidth; whichever takes longer is the floor."""
-        rate = self.gemm.get(work.precision, self.gemm["fp32"])
-        return work.flops / rate, work.bytes / self.triad
-
-
-class Point(Config, frozen=True):
-    """A point of a curve: time of one call and the process's peak memory meanwhile."""
-
-    curve: str  # against what: queries, points, ...
-    what: str
-    size: int
-    seconds: float
-    peak_bytes: int | None
-    working_bytes: int | None = None  # of the peak, what was not held before the call
 
 
 class BenchResult(Config, frozen=True):
@@ -205,11 +167,4 @@ class BenchResult(Config, frozen=True):
 
     machine: dict[str, str]
     command: str
-    peaks: tuple[Peaks, ...] = ()
     rows: tuple[BenchRow, ...] = ()
-    points: tuple[Point, ...] = ()
-
-    def peaks_for(self, row: BenchRow) -> Peaks | None:
-        """Of as many threads as the row was measured with; none for other devices."""
-        fitting = (peaks for peaks in self.peaks if peaks.threads == row.threads)
-        return next(fitting, None) if row.device == "cpu" else None

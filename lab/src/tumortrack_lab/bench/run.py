@@ -21,10 +21,9 @@ import msgspec
 
 from tumortrack.core.config import Config, from_builtins
 from tumortrack.core.errors import TumortrackError
-from tumortrack_lab.bench.rows import PRESETS, BenchResult, BenchRow, Peaks, Point
+from tumortrack_lab.bench.rows import PRESETS, BenchResult, BenchRow
 
 if TYPE_CHECKING:  # with PyTorch, whose threads are settled when it is imported
-    from tumortrack.training.train import TrainingStatus
     from tumortrack_lab.bench.subject import BenchSubject
 
 WORKER = [sys.executable, "-m", "tumortrack_lab.bench.run"]
@@ -33,7 +32,7 @@ WORKER = [sys.executable, "-m", "tumortrack_lab.bench.run"]
 class Group(NamedTuple):
     """Workloads measured together: module of this package and function that yields them; numbers
     of threads; how many there are, and for how long each is measured (about; in a hurry); presets
-    whose trained models they need."""
+    whose models they need."""
 
     source: str
     threads: tuple[int, ...]
@@ -45,36 +44,23 @@ class Group(NamedTuple):
 
 # Training comes last: it tells the C library to keep freed memory, which stays so.
 GROUPS: dict[str, Group] = {
-    "generator": Group("training:drags", (1,), 1, 3.0, 0.7),
-    "elastic-generator": Group("training:elastic", (1,), 1, 3.0, 0.7, ("clinic",)),
-    "encoder": Group("subject:encoders", (1,), 9, 1.4, 0.5, PRESETS),
-    "decoder": Group("subject:decoders", (1,), 24, 1.5, 0.5, PRESETS),
-    "frame": Group("subject:frames", (1, 2), 9, 4.0, 1.4, PRESETS),
-    "tracking": Group("subject:tracking", (1, 2), 9, 3.0, 0.7, PRESETS),
-    "volume": Group("subject:volumes", (1, 2), 9, 6.0, 2.0, PRESETS),
-    "command": Group("command:workloads", (2,), 18, 4.2, 1.0, PRESETS),
+    "frame": Group("subject:frames", (1, 2), 8, 4.0, 1.4, PRESETS),
+    "tracking": Group("subject:tracking", (1, 2), 6, 3.0, 0.7, PRESETS),
+    "volume": Group("subject:volumes", (1, 2), 6, 6.0, 2.0, PRESETS),
+    "command": Group("command:workloads", (2,), 12, 4.2, 1.0, PRESETS),
     "patient": Group("command:patient", (2,), 1, 40.0, 20.0),
     "planning": Group("planning:workloads", (1,), 3, 3.0, 0.7),
-    "training": Group("training:steps", (1,), 3, 5.0, 1.0, ("clinic",)),
-    "whole-training": Group("training:whole", (2,), 1, 20.0, 12.0),
-    "gpu": Group("training:on_gpu", (2,), 18, 10.0, 3.4, PRESETS),
-}
-# Curves, and of which presets: each in a process of its own, whose memory so is its own.
-CURVES = {
-    **dict.fromkeys(("queries", "points"), PRESETS),
-    "tumors": ("clinic",),
-    **dict.fromkeys(("grid", "batch"), PRESETS),
+    "training": Group("training:whole", (2,), 1, 20.0, 12.0),
+    "gpu": Group("training:on_gpu", (2,), 9, 10.0, 3.4, ("paper",)),
 }
 
 
 class Task(Config, frozen=True):
-    """What one process does, part by part: describe the ``machine``, ``train`` a preset, measure
-    the machine's ``peaks``, a ``group`` of rows, a ``curve`` (and of which preset). ``folder``: of
-    trained models; ``given``: a user's own model and cloud, which are then measured instead."""
+    """What one process does, part by part: describe the ``machine``, ``make`` a preset's model,
+    measure a ``group`` of rows. ``folder``: of models."""
 
     threads: int
     folder: str
-    given: tuple[str, str] | None = None
     quick: bool = False
     parts: tuple[tuple[str, ...], ...] = ()
 
@@ -85,7 +71,7 @@ class Task(Config, frozen=True):
         """On a machine of two cores, roughly."""
         if part[0] == "group":
             return 2 * GROUPS[part[1]].rows * self.budget_s(part[1])
-        return {"machine": 0.0, "train": 60.0, "peaks": 5.0, "curve": 20.0}[part[0]]
+        return {"machine": 0.0, "make": 40.0}[part[0]]
 
 
 class TaskMessage(Config, frozen=True):
@@ -96,24 +82,21 @@ class TaskMessage(Config, frozen=True):
     expected_s: tuple[float, float] = (0.0, 0.0)
     under_way: str | None = None
     machine: dict[str, str] | None = None
-    peaks: Peaks | None = None
     row: BenchRow | None = None
-    point: Point | None = None
 
 
-def tasks_of(common: Task, groups: Sequence[str], curves: Sequence[str], cores: int) -> list[Task]:
-    """What all have in common, as tasks: first the trainings with all cores, then one core, two
-    threads, the curves."""
+def tasks_of(common: Task, groups: Sequence[str], cores: int) -> list[Task]:
+    """What all have in common, as tasks: first the models, then one core, two threads."""
     needed = {preset for name in groups for preset in GROUPS[name].needs}
-    needed |= set(PRESETS if curves else ())
     work: list[tuple[int, list[tuple[str, ...]]]] = []
-    if needed and common.given is None:
-        work.append((min(cores, 2), [("train", preset) for preset in sorted(needed)]))
+    if needed:
+        work.append((min(cores, 2), [("make", preset) for preset in sorted(needed)]))
     for threads in (1, 2):
-        mine = [("group", name) for name in groups if threads in GROUPS[name].threads]
+        mine: list[tuple[str, ...]] = [
+            ("group", name) for name in groups if threads in GROUPS[name].threads
+        ]
         if mine and threads <= cores:
-            work.append((threads, [("peaks",), *mine]))
-    work += [(1, [("curve", curve, of)]) for curve in curves for of in CURVES[curve]]
+            work.append((threads, mine))
     work[0][1].insert(0, ("machine",))
     return [
         msgspec.structs.replace(common, threads=threads, parts=tuple(parts))
@@ -152,16 +135,14 @@ def measure(
     how long all will still take, ``show`` with each row once it is measured, and that time. Raises
     TumortrackError: one of them failed."""
     machine: dict[str, str] = {}
-    found: dict[str, list] = {"peaks": [], "row": [], "point": []}
+    rows: list[BenchRow] = []
     expected_s = [sum(map(task.expected_s, task.parts)) for task in tasks]
     pace = _Pace(sum(expected_s))
     for number, task in enumerate(tasks, start=1):
         for message in listen(task):
             machine = message.machine or machine
-            for kind, results in found.items():
-                if (result := getattr(message, kind)) is not None:
-                    results.append(result)
             if message.row is not None:
+                rows.append(message.row)
                 show(message.row, pace.left)
             if message.under_way is not None:
                 report(message.under_way)
@@ -169,8 +150,7 @@ def measure(
                 part_s, later_s = message.expected_s
                 pace.begin_part(part_s, later_s + sum(expected_s[number:]))
                 report(f"{message.begins}; {pace.left}")
-    peaks, rows, points = map(tuple, found.values())
-    return BenchResult(machine=machine, command=command, peaks=peaks, rows=rows, points=points)
+    return BenchResult(machine=machine, command=command, rows=tuple(rows))
 
 
 def listen(task: Task) -> Iterator[TaskMessage]:
@@ -206,45 +186,28 @@ def carry_out(task: Task, subject: BenchSubject, tell: Callable[[TaskMessage], N
 
     threads = {1: "one core"}.get(task.threads, f"{task.threads} threads")
     words = {
-        "train": "training a `{}` network to measure",
-        "peaks": f"the machine's own rates, {threads}",
+        "make": "making a model of `{}` to measure",
         "group": f"{{}}, {threads}",
-        "curve": "growth with {}, {}",
     }
 
-    def under_way(now: TrainingStatus) -> None:
-        tell(TaskMessage(under_way=f"  step {now.step} of {now.end}"))
+    def under_way(done: int, of: int) -> None:
+        tell(TaskMessage(under_way=f"  step {done} of {of}"))
 
     for number, (kind, *of) in enumerate(task.parts):
         if kind == "machine":
             tell(TaskMessage(machine=describe_machine()))
             continue
-        if kind == "train" and subject.trained(*of):
+        if kind == "make" and subject.has(*of):
             continue
         part_s, *later_s = map(task.expected_s, task.parts[number:])
         tell(TaskMessage(begins=words[kind].format(*of), expected_s=(part_s, sum(later_s))))
-        if kind == "train":
-            subject.train(of[0], under_way)
+        if kind == "make":
+            subject.make(of[0], under_way)
             continue
-        for message in _measured(task, subject, kind, of):
-            tell(message)
-
-
-def _measured(
-    task: Task, subject: BenchSubject, kind: str, of: Sequence[str]
-) -> Iterator[TaskMessage]:
-    from tumortrack_lab.bench.curves import points_of
-    from tumortrack_lab.bench.machine import measure_peaks
-
-    if kind == "peaks":
-        yield TaskMessage(peaks=measure_peaks(task.threads, 1.0 if task.quick else 3.0))
-    elif kind == "curve":
-        yield from (TaskMessage(point=point) for point in points_of(subject, *of))
-    else:
         workloads = resolve_name(f"tumortrack_lab.bench.{GROUPS[of[0]].source}")
         for workload in workloads(subject, task.budget_s(*of)):
             for row in workload.rows(task.threads, task.budget_s(*of)):
-                yield TaskMessage(row=row)
+                tell(TaskMessage(row=row))
 
 
 def _work(task_json: str) -> None:
@@ -252,14 +215,12 @@ def _work(task_json: str) -> None:
     task = from_builtins(msgspec.json.decode(task_json), Task, "the bench's task")
     if hasattr(os, "sched_setaffinity"):  # Linux alone has it; before libraries start threads
         os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[: task.threads])
-    from tumortrack.training.presets import PRESETS as CONFIGURATIONS
     from tumortrack_lab.bench.subject import BenchSubject
 
-    given = task.given and (Path(task.given[0]), Path(task.given[1]))
-    subject = BenchSubject(CONFIGURATIONS, Path(task.folder), given)
-    carry_out(
-        task, subject, lambda message: print(msgspec.json.encode(message).decode(), flush=True)
-    )
+    def tell(message: TaskMessage) -> None:
+        print(msgspec.json.encode(message).decode(), flush=True)
+
+    carry_out(task, BenchSubject(Path(task.folder)), tell)
 
 
 if __name__ == "__main__":

@@ -2,7 +2,6 @@
 
 from tumortrack_lab.cli.bench import Bench
 from tumortrack_lab.cli.fleet import Fleet
-from tumortrack_lab.cli.pretrain import Pretrain
 from tumortrack_lab.cli.twin import Twin
 
-bench, fleet, pretrain, twin = Bench, Fleet, Pretrain, Twin
+bench, fleet, twin = Bench, Fleet, Twin

@@ -1,4 +1,4 @@
-"""`tumortrack fleet`: a list of patients -> a model, margins and an evaluation of each."""
+"""`tumortrack fleet`: a list of patients -> a case, margins and an evaluation of each."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class Fleet:
-    """Prepare, train and evaluate many patients, on this machine or many; the same command resumes.
+    """Prepare and evaluate many patients, on this machine or many; the same command resumes.
 
     Attributes:
         list: CSV table of patients (docs/fleet.md).

@@ -1,4 +1,4 @@
-"""A prepared case in numbers: what no model should be trained for, and what a person should see."""
+"""A prepared case in numbers: what nothing should be located with, and what a person should see."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tumortrack.core.patient import UNKNOWN
 from tumortrack.core.types import Mesh
 from tumortrack.imaging.case import Case
 from tumortrack.imaging.volume import read_raw
-from tumortrack.registration.rest_shape import long_axis_of
+from tumortrack.registration.rest_shape import long_axis_mm
 from tumortrack.report.metrics import distance_to_surface
 from tumortrack_lab.real.kidneys import ORGAN_ML, TUMOR_ML, kind_of, outer_share
 
@@ -68,7 +68,7 @@ def described(case: Case) -> dict[str, Any]:
 
 def _placed(tumor: Mesh, organ: Mesh) -> dict[str, Any]:
     middle = tumor.vertices_mm.mean(0)
-    axis = unit(long_axis_of(organ))
+    axis = unit(long_axis_mm(organ))
     axis = axis * (1 if axis[2] >= 0 else -1)  # up, in LPS
     along = organ.vertices_mm @ axis
     share = float((middle @ axis - along.min()) / np.ptp(along))
@@ -84,7 +84,7 @@ def _placed(tumor: Mesh, organ: Mesh) -> dict[str, Any]:
 
 
 def failures(found: dict[str, Any], cut_off: bool) -> list[str]:
-    """What no model should be trained for."""
+    """What nothing should be located with."""
     low, high = _ORGAN_AT_ALL_ML[found["organ"] == KIDNEY.name]
     reasons = {
         "organ or tumor reach the border of the volume: they are cut off": cut_off,

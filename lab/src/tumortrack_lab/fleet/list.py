@@ -19,7 +19,6 @@ from tumortrack_lab.fleet.task import File
 
 _LARGEST = 64 * 2**20  # bytes
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
-NOTHING = Path("none")  # to start a training from
 MISSING = "missing"  # instead of a sha256: no file has it
 
 
@@ -48,12 +47,13 @@ _OF_PREPARE: dict[str, Callable[[str], Any]] = {
     "organ_name": str,
     "side": str, "up": _up, "patient": str, "organ": int, "tumor": int, "series": str,
     "unit": str, "min_tumor_ml": float, "organ_hu": _window, "tumor_hu": _window,
+    "rotations": str, "tilt": float, "sensor": str,
 }  # fmt: skip
 _OF_CHAIN: dict[str, Callable[[str], Any]] = {
-    "steps": _at_least(0), "seed": _at_least(0), "margin_states": _at_least(1),
-    "test_states": _at_least(1), "views": _at_least(1),
+    "seed": _at_least(0), "margin_states": _at_least(1), "test_states": _at_least(1),
+    "views": _at_least(1),
 }  # fmt: skip
-COLUMNS = ("name", "input", *_OF_PREPARE, "start", *_OF_CHAIN)
+COLUMNS = ("name", "input", *_OF_PREPARE, *_OF_CHAIN)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,9 +63,7 @@ class Patient:
     Attributes:
         source: what `prepare` takes.
         prepare: its options.
-        start: folder that `pretrain` wrote, or ``NOTHING``; None: the package's.
-        steps: of training.
-        seed: of training and states.
+        seed: of states.
         margin_states: states of the twin that margins are found with.
         test_states: others, on which the model is evaluated.
         views: of each of these.
@@ -74,8 +72,6 @@ class Patient:
     name: str
     source: Path
     prepare: dict[str, Any] = field(default_factory=dict)
-    start: Path | None = None
-    steps: int = 200
     seed: int = 0
     margin_states: int = 14
     test_states: int = 14
@@ -139,13 +135,11 @@ def _patient(head: list[str], cells: list[str], folder: Path) -> Patient:
         raise InputError(f"{name} has no input")
     parsed: dict[str, Any] = {}
     for column, cell in given.items():
-        parse = {**_OF_PREPARE, **_OF_CHAIN, "start": Path}[column]
+        parse = {**_OF_PREPARE, **_OF_CHAIN}[column]
         try:
             parsed[column] = parse(cell)
         except ValueError as error:
             raise InputError(f"{column} {cell!r} is not allowed: {error}") from error
-    if parsed.get("start", NOTHING) != NOTHING:
-        parsed["start"] = folder / parsed["start"]
     prepare = {key: parsed.pop(key) for key in _OF_PREPARE if key in parsed}
     if "organ_name" in prepare:  # `name` is the row's
         prepare["name"] = prepare.pop("organ_name")

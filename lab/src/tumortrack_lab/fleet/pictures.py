@@ -22,15 +22,15 @@ def thumbnail(source: Path, out: Path) -> None:
 
 
 def worst_picture(
-    model: Path, groups: Sequence[Path], rows: Sequence[dict[str, Any]], out: Path
+    case: Path, groups: Sequence[Path], rows: Sequence[dict[str, Any]], out: Path
 ) -> None:
     """The answer that is farthest off, good ones first, over the truth; without any answer the
     first scene's truth. Nothing is drawn where there is no scene."""
     from tumortrack.report.pictures import scene_picture
     from tumortrack.report.protocol import evaluate_scene
     from tumortrack.simulate.scene_folder import read_scene
+    from tumortrack.tracking.model_files import load_model
     from tumortrack.tracking.tracker import Tracker
-    from tumortrack.training.model import load_model
 
     def far(row: dict[str, Any]) -> tuple[int, float]:
         errors = [tumor.get("middle_mm", -np.inf) for tumor in row["tumors"]]
@@ -40,7 +40,7 @@ def worst_picture(
         return
     name = max(rows, key=far)["scene"]
     [folder] = [group / name for group in groups if (group / name).is_dir()]
-    scene, tracker = read_scene(folder), Tracker(load_model(model, "cpu"))
+    scene, tracker = read_scene(folder), Tracker(load_model(case))
     entry, estimate = evaluate_scene(
         lambda cloud: tracker.locate(cloud, seen=scene.depth), scene, name
     )

@@ -160,7 +160,8 @@ def _pictures(name: str, outcome: Outcome, held: Store, out: Path) -> None:
                     write_atomically(out / place, picture.read_bytes())
             return
         with suppress(DamagedError):  # it was not prepared
-            thumbnail(held.get(task.inputs["case"].key) / "qc.png", out / f"{name}.webp")
+            if (picture := held.get(task.inputs["case"].key) / "qc.png").exists():
+                thumbnail(picture, out / f"{name}.webp")
 
 
 def _page(

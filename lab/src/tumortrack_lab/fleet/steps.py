@@ -1,25 +1,22 @@
-"""What is done for one patient: prepare -> check -> train -> states of the twin -> margins and
-evaluation -> summary.
+"""What is done for one patient: prepare -> check -> states of the twin -> margins and evaluation ->
+summary.
 
 Each function is a ``Work``: it calls what the commands call, and writes the same bits wherever and
-whenever it runs: on one core, trained by steps, and without times, paths and file names, which
-model folders and tables of margins state elsewhere. Costs are the engine's to keep.
+whenever it runs: on one core, and without times, paths and file names, which tables of margins
+state elsewhere. Costs are the engine's to keep.
 """
 
 from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterator, Mapping
-from functools import cache
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
 from tumortrack.core import store
 from tumortrack.core.errors import InputError, TumortrackError
-from tumortrack.models.folder import WEIGHTS
 from tumortrack_lab.fleet import checks
-from tumortrack_lab.fleet.list import NOTHING, Patient, hashed
+from tumortrack_lab.fleet.list import Patient, hashed
 from tumortrack_lab.fleet.task import File, Needs, Task
 
 # Eight families of physics have the wider world; cut organs are none that is still to be located.
@@ -46,7 +43,7 @@ def chain(patient: Patient) -> dict[str, Task]:
     ) -> Task:
         needs = Needs(memory_mb=memory_mb)
         kind = name.rstrip("0123456789-")
-        steps[name] = Task(patient.name, kind, 1, work, dict(options), inputs, needs)
+        steps[name] = Task(patient.name, kind, 2, work, dict(options), inputs, needs)
         return steps[name]
 
     kind = "" if patient.source.is_dir() else "".join(patient.source.suffixes[-2:])
@@ -55,13 +52,6 @@ def chain(patient: Patient) -> dict[str, Task]:
     series = {"series": patient.prepare.get("series")}
     checked = add("check", check, series, {"case": case, "source": source}, 2000)
     after = {"case": case, "check": checked}
-    lesson: dict[str, Any] = {"steps": patient.steps, "seed": patient.seed, "start": "its own"}
-    begun: dict[str, Task | File] = {}
-    if patient.start in (None, NOTHING):
-        lesson["start"] = _shipped() if patient.start is None else str(NOTHING)
-    else:
-        begun["start"] = hashed(patient.start)
-    model = add("train", train, lesson, {**after, **begun}, 2500)
     groups: dict[str, dict[str, Task | File]] = {"margins": {}, "test": {}}
     drawn = hashlib.sha256(f"{source.sha256} {patient.seed}".encode()).hexdigest()
     counts = {"margins": (0, patient.margin_states, 1)}
@@ -74,27 +64,22 @@ def chain(patient: Patient) -> dict[str, Task]:
             }  # fmt: skip
             name = f"states-{kind}-{len(groups[kind])}"
             groups[kind][f"states_{len(groups[kind]):04d}"] = add(name, states, here, after, 1500)
-    known = {"case": case, "model": model}
-    margin = add("margins", margins, {"seed": patient.seed}, {**known, **groups["margins"]}, 1500)
-    judged = add("evaluate", evaluate, {}, {**known, **groups["test"]}, 1500)
-    found = {**known, "check": checked, "margins": margin, "evaluate": judged}
+    known = {"case": case, **groups["margins"]}
+    margin = add("margins", margins, {"seed": patient.seed}, known, 1500)
+    judged = add("evaluate", evaluate, {}, {"case": case, **groups["test"]}, 1500)
+    found = {**after, "margins": margin, "evaluate": judged}
     add("summary", summary, {}, {**found, **groups["test"]}, 1500)
     return steps
 
 
-@cache
-def _shipped() -> str:
-    """sha256 of the weights that the package's trainings start from."""
-    return store.sha256_of(Path(str(files("tumortrack.models"))) / "kidneys" / WEIGHTS)
-
-
 def prepare(inputs: Inputs, options: Given, out: Path, cores: int) -> None:
-    """A case, as `tumortrack prepare` makes it; its source has no name."""
+    """A case with its model, as `tumortrack prepare` makes it; its source has no name."""
     from dataclasses import replace
 
     from tumortrack.imaging import prepare as preparing
-    from tumortrack.imaging.case import save_case
+    from tumortrack.imaging.case import load_case, save_case
     from tumortrack.report.pictures import qc_picture
+    from tumortrack.tracking.model_files import case_model
 
     given: dict[str, Any] = {
         key: tuple(value) if isinstance(value, list) else value for key, value in options.items()
@@ -104,11 +89,12 @@ def prepare(inputs: Inputs, options: Given, out: Path, cores: int) -> None:
     case = replace(case, report={**case.report, "source": "input"})
     qc_picture(case.labels, case.ct, case.anatomy, out / "qc.png", str(case.patient))
     save_case(case, out)
+    case_model(load_case(out))
 
 
 def check(inputs: Inputs, options: Given, out: Path, cores: int) -> None:
     """check.json: the anatomy in numbers, and ``doubts``: what a person should look at. Raises
-    InputError: what no model should be trained for."""
+    InputError: what nothing should be located with."""
     from tumortrack.imaging.case import load_case
 
     case = load_case(inputs["case"])
@@ -117,27 +103,6 @@ def check(inputs: Inputs, options: Given, out: Path, cores: int) -> None:
     if failures := checks.failures(found, cut):
         raise InputError(f"the quality check failed: {'; '.join(failures)}. Look at qc.png.")
     store.write_json(out / "check.json", {**found, "doubts": checks.doubts(case, found)})
-
-
-def train(inputs: Inputs, options: Given, out: Path, cores: int) -> None:
-    """A model folder of the preset clinic, without its times and what only resuming needs."""
-    import shutil
-
-    from tumortrack import api
-    from tumortrack.training.train import Interrupted
-
-    start: Any = inputs.get("start", options["start"])
-    try:
-        api.train(
-            inputs["case"], out, steps=options["steps"], seed=options["seed"], device="cpu",
-            workers=0, start=None if start == _shipped() else start,
-        )  # fmt: skip
-    except Interrupted as error:  # which says nothing of the patient
-        raise KeyboardInterrupt from error
-    shutil.rmtree(out / "training", ignore_errors=True)  # none, without a step
-    manifest = store.read_json(out / store.MANIFEST)
-    del manifest["provenance"]["training_s"]
-    store.write_json(out / store.MANIFEST, manifest)
 
 
 def states(inputs: Inputs, options: Given, out: Path, cores: int) -> None:
@@ -186,14 +151,16 @@ def margins(inputs: Inputs, options: Given, out: Path, cores: int) -> None:
     import msgspec
     import numpy as np
 
+    from tumortrack.imaging.case import Case
     from tumortrack.models.margins import NAME, write_sealed
     from tumortrack.report import calibration, calibration_table
     from tumortrack.simulate.scene_folder import read_scene
+    from tumortrack.tracking.model_files import load_model
     from tumortrack.tracking.tracker import Tracker
-    from tumortrack.training.model import load_model
 
-    seed, digest = options["seed"], store.sha256_of(inputs["model"] / store.MANIFEST)
-    tracker, rows = Tracker(load_model(inputs["model"], "cpu")), []
+    model = inputs["case"] / Case.MODEL
+    seed, digest = options["seed"], store.sha256_of(model / store.MANIFEST)
+    tracker, rows = Tracker(load_model(model)), []
     groups = [folder for name, folder in inputs.items() if name.startswith("states_")]
     listed = calibration.list_states([folder for folder in groups if _scenes(folder)], seed)
     for one in sorted(listed, key=lambda one: one.folder.name):
@@ -232,13 +199,13 @@ def evaluate(inputs: Inputs, options: Given, out: Path, cores: int) -> None:
     from tumortrack.core.rigid_fit import matched_vertices
     from tumortrack.imaging.case import load_case
     from tumortrack.simulate.scene_folder import read_scene
+    from tumortrack.tracking.model_files import load_model
     from tumortrack.tracking.tracker import Tracker
-    from tumortrack.training.model import load_model
     from tumortrack_lab.real.judging import judge
     from tumortrack_lab.world.scenes import simplified
 
     anatomy = simplified(load_case(inputs["case"]).anatomy)
-    tracker, rows = Tracker(load_model(inputs["model"], "cpu")), []
+    tracker, rows = Tracker(load_model(inputs["case"])), []
     failures: dict[str, str] = {}
     for folder in _groups(inputs):
         failures |= store.read_json(folder / "failures.json")
@@ -260,18 +227,18 @@ def evaluate(inputs: Inputs, options: Given, out: Path, cores: int) -> None:
 def summary(inputs: Inputs, options: Given, out: Path, cores: int) -> None:
     """summary.json: all that the fleet's tables hold of the patient; case.webp and, of the worst
     answer, worst.webp."""
+    from tumortrack.imaging.case import Case
     from tumortrack_lab.fleet.pictures import thumbnail, worst_picture
 
     checked = store.read_json(inputs["check"] / "check.json")
     result = store.read_json(inputs["margins"] / "result.json")
     judged = store.read_json(inputs["evaluate"] / "rows.json")
-    model = store.read_json(inputs["model"] / store.MANIFEST)["provenance"]
-    trained = {key: v for key, v in model.items() if key.startswith("validation_")}
-    trained["steps"] = model["steps"]
-    content = {"check": checked, "margins": result, "model": trained, **judged}
+    made = store.read_json(inputs["case"] / Case.MODEL / store.MANIFEST)["provenance"]
+    model = {key: value for key, value in made.items() if key.startswith("validation_")}
+    content = {"check": checked, "margins": result, "model": model, **judged}
     store.write_json(out / "summary.json", content)
     thumbnail(inputs["case"] / "qc.png", out / "case.webp")
-    worst_picture(inputs["model"], list(_groups(inputs)), judged["rows"], out / "worst.webp")
+    worst_picture(inputs["case"], list(_groups(inputs)), judged["rows"], out / "worst.webp")
 
 
 def _groups(inputs: Inputs) -> Iterator[Path]:

@@ -24,10 +24,10 @@ from tumortrack.live.values import Controls, PublishedFrame, SinkContext, Source
 from tumortrack.live.workers import SinkWorker, SourceWorker
 from tumortrack.simulate.player import ScenePlayer, ScenePlayerConfig
 from tumortrack.tracking.tracker import Tracker, region_for
-from tumortrack_lab.pretraining.kidneys import random_anatomy
 from tumortrack_lab.soak.faults import FAULTS, Fault, FaultyCamera, FaultySink, Schedule, Tapes
 from tumortrack_lab.soak.judge import Judge
 from tumortrack_lab.soak.table import document, memory_marks
+from tumortrack_lab.world.kidneys import random_anatomy
 
 _GROWN_MB = 20.0
 _OTHERS = range(11, 19)  # seeds of other kidneys
@@ -45,7 +45,7 @@ class SoakConfig:
     """Track while everything round it goes wrong.
 
     Attributes:
-        model: folder that `train` wrote.
+        model: of the case, or the case again.
         case: folder that `prepare` wrote.
         stale_s: older frames are refused, s; faults last 3 to 6 times as long.
         wrong_mm: a part so far off is wrong.
@@ -69,7 +69,7 @@ class SoakConfig:
 def soak(config: SoakConfig, folder: Path) -> tuple[str, list[str]]:
     """The tables (Markdown), and what was wrong; tapes go to the folder."""
     seconds = 60 * config.minutes
-    model = api.load_model(config.model, "cpu")
+    model = api.load_model(config.model)
     tracker = Tracker(model)
     context = SinkContext(model.parts, PublishedFrame(), tracker.anatomy_ct, Controls())
     region = region_for(model)

@@ -10,6 +10,7 @@ from typing import Any
 
 from tumortrack.core import store
 from tumortrack.core.estimate import Estimate
+from tumortrack.core.process import available_cores
 from tumortrack.report.protocol import evaluate_scene
 from tumortrack.simulate.scene_folder import read_scene
 from tumortrack_lab.bench.machine import cpu_name
@@ -38,7 +39,7 @@ def measured(
 
     def measure() -> list[dict[str, Any]]:
         known = {"case": case.name, "method": method.name, "seed": method.seed, "view": view}
-        known |= {"grid": grid, **method.about}
+        known |= {"grid": grid}
         rows = []
         for variant in variants:
             made = one(case, method, variant, view, grid)
@@ -51,10 +52,8 @@ def measured(
 
 
 def _machine() -> dict[str, Any]:
-    import torch
-
     return {
-        "on": f"{cpu_name()} (PyTorch on {torch.get_num_threads()})",
+        "on": f"{cpu_name()} ({available_cores()} cores)",
         "when": time.strftime("%Y-%m-%d", time.gmtime()),
         "load": round(os.getloadavg()[0], 1) if hasattr(os, "getloadavg") else None,
     }

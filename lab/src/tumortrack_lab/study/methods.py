@@ -1,17 +1,16 @@
-"""What can be measured: cases with their scenes; trained models and peers, as methods that locate.
+"""What can be measured: cases with their scenes; models and peers, as methods that locate.
 
-Nothing heavy is made or loaded before a measurement needs it. Models are trained by a preset's
-rules for a fixed number of steps, and kept.
+Nothing heavy is made or loaded before a measurement needs it.
 """
 
 from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any
 
 import tumortrack
 import tumortrack_lab.peers
@@ -23,23 +22,17 @@ from tumortrack.core.patient import Patient
 from tumortrack.core.types import Anatomy
 from tumortrack.imaging.case import Case, load_case, save_case
 from tumortrack.imaging.surface import surfaces
-from tumortrack.models.folder import is_finished
+from tumortrack.models.margins import METHOD
 from tumortrack.phantom.digital import PhantomParameters, TumorParameters, phantom_labels
 from tumortrack.simulate.scene_folder import Scene
+from tumortrack.tracking.model_files import make_model
 from tumortrack.tracking.tracker import Tracker
-from tumortrack.training.model import load_model
-from tumortrack.training.presets import PRESETS
-from tumortrack.training.train import TrainingRun, TrainingStatus, train
 from tumortrack_lab.peers.base import OneWay, estimate_of
 from tumortrack_lab.peers.kinds import peer_kinds
 
 _UP_LPS = (0.0, -1.0, 0.0)
 _VOXEL_MM = 0.8  # of the phantoms' labels
 CLINIC = "clinic"
-# Preset and rotations of each model; `quick` stands for the paper's two, of which it is neither.
-MODELS: dict[str, tuple[str, Literal["limited", "full"]]] = {
-    CLINIC: ("clinic", "limited"), "M_lim": ("quick", "limited"), "M_full": ("quick", "full"),
-}  # fmt: skip
 
 
 def second_phantom() -> PhantomParameters:
@@ -111,30 +104,22 @@ def named_folders(texts: Iterable[str], taken: Iterable[str]) -> dict[str, Path]
 class Method:
     """One way to locate, for one patient.
 
-    ``identity``: everything else that decides the answers (JSON). ``about``: what a reader wants to
-    know besides (JSON). ``locate(scene, grid)``: the anatomy in a scene; ``grid``: voxels along the
-    longest side of the volume. Raises NoEstimate: nothing can be said of the scene; InputError: the
-    cloud cannot be used.
+    ``identity``: everything else that decides the answers (JSON). ``locate(scene, grid)``: the
+    anatomy in a scene; ``grid``: voxels along the longest side of the volume. Raises NoEstimate:
+    nothing can be said of the scene; InputError: the cloud cannot be used.
     """
 
     name: str
     identity: dict[str, Any]
     locate: Callable[[Scene, int], Estimate]
     seed: int = 0
-    about: dict[str, Any] = field(default_factory=dict)
 
 
-def network(name: str, folder: Path, device: str = "auto") -> Method:
-    """A trained model under a name such as M_lim."""
-    origin = store.read_json(folder / store.MANIFEST)["provenance"]
-    tracker = cache(lambda: Tracker(load_model(folder, device)))
-    return Method(
-        name,
-        {"model_sha256": store.sha256_of(folder / store.MANIFEST)},
-        lambda scene, grid: tracker().locate(scene.cloud, grid),
-        origin["seed"],
-        {key: origin[key] for key in ("steps", "training_s", "device")},
-    )
+def clinic(case: StudyCase, seed: int) -> Method:
+    """The default method with a model by this seed, made when it is first asked."""
+    tracker = cache(lambda: Tracker(make_model(load_case(case.folder), seed=seed)))
+    identity = {"tumortrack": tumortrack.__version__, "method": METHOD}
+    return Method(CLINIC, identity, lambda s, grid: tracker().locate(s.cloud, grid), seed)
 
 
 def peer(name: str, case: StudyCase) -> Method:
@@ -163,43 +148,3 @@ def peer(name: str, case: StudyCase) -> Method:
 def code_sha256(paths: Iterable[Path]) -> str:
     """Of files of code: after a change of it, what it measures is measured anew."""
     return hashlib.sha256(b"\0".join(path.read_bytes() for path in sorted(paths))).hexdigest()
-
-
-class Trainer(NamedTuple):
-    """Trains what is not trained yet, or was killed. Steps decide the end, not minutes: a loaded
-    machine gives the same model, only later."""
-
-    folder: Path
-    device: str = "auto"
-    workers: int | None = None
-    report: Callable[[str, TrainingStatus], None] = lambda *_: None
-
-    def model(self, case: StudyCase, name: str, seed: int, steps: int) -> Method:
-        """The model under FOLDER/CASE/NAME-seed-steps. Raises InputError: no such model;
-        ArtifactError: what lies there belongs to another case or configuration; StorageError: the
-        disk refused; Interrupted: Ctrl-C, the state is saved."""
-        import torch
-
-        if name not in MODELS:
-            raise InputError(f"model {name!r} is unknown. Allowed: {', '.join(MODELS)}.")
-        preset, rotations = MODELS[name]
-        folder = self.folder / case.name / f"{name}-seed{seed}-{steps}steps"
-        run = TrainingRun(
-            anatomy_ct=case.anatomy_ct,
-            up_lps=case.up_lps,
-            case_sha256=store.sha256_of(case.folder / store.MANIFEST),
-            patient=load_case(case.folder).patient,
-            config=PRESETS[preset](case.anatomy_ct, rotations),
-            seed=seed,
-            steps=steps,
-            device=self.device,  # type: ignore[arg-type]
-            workers=self.workers,
-        )
-        # A finished model of another run is refused by training, with a clear text.
-        about = store.read_json(folder / store.MANIFEST) if is_finished(folder) else {}
-        if run.differences(about.get("provenance", {}).get("decided_by", {})):
-            threads = torch.get_num_threads()
-            label = f"{case.name} {name} seed {seed}"
-            train(run, folder, lambda status: self.report(label, status))
-            torch.set_num_threads(threads)  # training leaves some cores to its workers
-        return network(name, folder, self.device)

@@ -30,8 +30,8 @@ from tumortrack.plan.located import of_estimate
 from tumortrack.plan.values import Located, ResectionConfig, ResectionPlan
 from tumortrack.registration.locator import QUERIES
 from tumortrack.simulate.scene_folder import Scene, read_scene
+from tumortrack.tracking.model_files import load_model
 from tumortrack.tracking.tracker import Tracker
-from tumortrack.training.model import load_model
 from tumortrack_lab.cut import VOXEL_MM, cut
 from tumortrack_lab.peers.base import Fit, estimate_of
 from tumortrack_lab.study.document import table
@@ -119,7 +119,7 @@ def calibrated(folder: Path) -> Method:
     InputError: it has none."""
     if read_margins(folder) is None:
         raise InputError(f"{folder} has no margins; calibrate it first (tumortrack margins).")
-    tracker = cache(lambda: Tracker(load_model(folder, "cpu")))
+    tracker = cache(lambda: Tracker(load_model(folder)))
     identity = {name: store.sha256_of(folder / name) for name in (store.MANIFEST, NAME)}
     return Method("calibrated", identity, lambda s, n: tracker().locate(s.cloud, n, 0, s.depth))
 

@@ -20,8 +20,6 @@ ORGAN = "kidney"  # its rows stand for their scenes
 _DISTANCES = ["hausdorff_mm", "center_mm", "target_mm"]
 _NAMES = ["case", "method", "variant", "part"]
 METHODS = {
-    "M_lim": "slim network, limited turns",  # `quick`: not the paper's network, nor
-    "M_full": "slim network, any turn",  # as many scenes as often as the paper's saw
     "rigid_bound": "best rigid pose (oracle)",
     "rigid": "rigid registration, many starts",
     "elastic": "linear-elastic surface fit",
@@ -121,22 +119,15 @@ def sites_text(case: str, sites: Sites) -> str:
 
 
 def caption(rows: list[dict[str, Any]], command: str) -> str:
-    """What stands below a block: of what, how trained, where and when."""
+    """What stands below a block: of what, where and when."""
     frame = pd.DataFrame(rows)
     count = len(frame.drop_duplicates(["case", "method", "seed", "variant"]))
-    loads, training = frame.load.dropna(), EMPTY
-    if "steps" in frame:
-        models = frame.dropna(subset="steps").drop_duplicates(["case", "method", "seed"])
-        minutes = models.training_s / 60
-        training = (
-            f"Models: {len(models)} of {_listed(f'{n:,.0f}' for n in models.steps)} steps, seed "
-            f"{_listed(models.seed)}, trained on {_listed(models.device)} in {minutes.min():.1f} "
-            f"to {minutes.max():.1f} minutes each by the clock on the wall. "
-        )
+    loads, seeds = frame.load.dropna(), _listed(frame.seed)
     return (
         f"`{command}`: {count} measurements (view: {_listed(frame.view)}), volumes of "
-        f"{_listed(frame.grid, '{}³')} voxels at most. {training}Measured on {_listed(frame.on)}, "
-        f"{_listed(frame.when)}, load average {loads.min():.1f} to {loads.max():.1f}."
+        f"{_listed(frame.grid, '{}³')} voxels at most, models by seed {seeds}. Measured on "
+        f"{_listed(frame.on)}, {_listed(frame.when)}, load average {loads.min():.1f} to "
+        f"{loads.max():.1f}."
     )
 
 

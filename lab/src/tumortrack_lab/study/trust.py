@@ -203,7 +203,7 @@ def reliability_picture(kinds: dict[str, pd.DataFrame], path: Path) -> None:
 def worst_picture(found: pd.DataFrame, tables: Sequence[Table], count: int, path: Path) -> str:
     """The accepted answers that are farthest off, drawn over the truth, a row each; and in words
     what happened: a Markdown table."""
-    from tumortrack.training.model import load_model
+    from tumortrack.tracking.model_files import load_model
 
     taken = found[found.accepted.astype(bool)].nlargest(count, "miss")
     models, trackers = {table.organ: table.model for table in tables}, {}

@@ -16,8 +16,8 @@ from tumortrack.core.estimate import FAR_MM
 from tumortrack.core.types import Anatomy
 from tumortrack.models.margins import METHOD
 from tumortrack.simulate.scene_folder import Scene, read_scene
+from tumortrack.tracking.model_files import load_model
 from tumortrack.tracking.tracker import Tracker
-from tumortrack.training.model import load_model
 from tumortrack_lab.real.judging import by_tumor, judge, quantiles
 from tumortrack_lab.study.document import table
 from tumortrack_lab.study.trust import BANDS, band_of

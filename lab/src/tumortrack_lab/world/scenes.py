@@ -18,11 +18,11 @@ from tumortrack.core.types import Anatomy, Mesh, SensorCloud
 from tumortrack.imaging.case import Case, load_case
 from tumortrack.imaging.meshes import mesh_of, solid_of
 from tumortrack.simulate.scene_folder import InnerPoints, Scene, Targets, draw_targets
-from tumortrack_lab.pretraining.kidneys import random_anatomy
 from tumortrack_lab.tets import TetMesh, tetrahedralise
 from tumortrack_lab.twin.apparatus import bench_from_ct, moved
 from tumortrack_lab.world import segmentation
 from tumortrack_lab.world.families import FAMILIES, Deformed, solve
+from tumortrack_lab.world.kidneys import random_anatomy
 from tumortrack_lab.world.organ import Organ
 from tumortrack_lab.world.views import View, look, lump, organ_cloud
 

@@ -159,18 +159,18 @@ def load_ct(case: str, context: SinkContext) -> CarriedCt:
     if context.anatomy_ct is None:
         raise InputError(
             "viewer: case= shows the CT at the present position, which this model cannot: its "
-            "estimates have no motion. Leave it out, or train with a preset that warps."
+            "estimates have no motion. Leave it out, or give the case itself in MODEL's place."
         )
     if context.patient.differs(loaded.patient):
         raise InputError(
             f"viewer: {case} is of {loaded.patient}, the model of {context.patient}. Give the case "
-            "that the model was trained on."
+            "that the model is of."
         )
     apart = np.abs(loaded.anatomy.organ.box_mm - context.anatomy_ct.organ.box_mm).max()
     if apart > _SAME_ORGAN_MM:
         raise InputError(
-            f"viewer: {case} is not the case that the model was trained on: the organs' boxes in "
-            f"the CT differ by {apart:.1f} mm. Give that case."
+            f"viewer: {case} is not the case that the model is of: the organs' boxes in the CT "
+            f"differ by {apart:.1f} mm. Give that case."
         )
     return CarriedCt(loaded)
 

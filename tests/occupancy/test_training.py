@@ -24,20 +24,18 @@ from tumortrack.core.errors import ArtifactError, InputError
 from tumortrack.core.process import available_cores
 from tumortrack.core.types import Anatomy
 from tumortrack.imaging.case import load_case
-from tumortrack.models.config import RegistrationHeadConfig, TrainConfig
-from tumortrack.models.normalisation import CloudBox
-from tumortrack.training import train as training_loop
-from tumortrack.training.model import load_model
-from tumortrack.training.presets import clinic, paper, quick
-from tumortrack.training.scenes import Scenes
-from tumortrack.training.state import (
+from tumortrack.occupancy.config import TrainConfig
+from tumortrack.occupancy.normalisation import CloudBox
+from tumortrack.occupancy.presets import paper, quick
+from tumortrack.occupancy.training import train as training_loop
+from tumortrack.occupancy.training.state import (
     Diverged,
     TrainingProgress,
     TrainingState,
     learning_rate,
     settle_end,
 )
-from tumortrack.training.train import (
+from tumortrack.occupancy.training.train import (
     TrainingClock,
     TrainingRun,
     divide_cores,
@@ -45,7 +43,7 @@ from tumortrack.training.train import (
     train,
     work_folder,
 )
-from warp_objects import train_slim
+from tumortrack.tracking.model_files import load_model
 
 
 @pytest.fixture
@@ -83,15 +81,6 @@ def test_a_killed_run_ends_with_the_weights_of_one_that_was_not(case, quick_mode
     succeeded(tumortrack(*command))
     assert same_files(model, quick_model, "weights.safetensors")
     assert not (model / "shape.safetensors").exists()
-
-
-@pytest.mark.slow
-def test_a_killed_warp_ends_with_the_weights_and_shape_of_one_that_was_not(slim_model, tmp_path):
-    model = tmp_path / "killed"
-    train = "import sys, pathlib, warp_objects as w; w.train_slim(pathlib.Path(sys.argv[1]), 0.0)"
-    kill_at_first_checkpoint([sys.executable, "-c", train, model], model)
-    train_slim(model)
-    assert same_files(model, slim_model, "weights.safetensors", "shape.safetensors")
 
 
 @pytest.mark.slow
@@ -162,11 +151,11 @@ def test_a_script_need_not_guard_its_main_part(case, tmp_path):
 @pytest.mark.slow
 def test_the_model_says_what_it_was_made_from(case, quick_model):
     about = load_model(quick_model).provenance
-    assert about["steps"] == STEPS["quick"]
+    assert about["steps"] == STEPS
     assert about["seed"] == 0
     lines = (quick_model / "training" / "history.jsonl").read_text().splitlines()
     last = json.loads(lines[-1])
-    assert last["step"] == STEPS["quick"]
+    assert last["step"] == STEPS
     assert last["samples_per_s"] > 0
     assert 0 < last["learning_rate"] < 1e-3  # the schedule has nearly ended
     assert list((quick_model / "training" / "tensorboard").iterdir())
@@ -174,11 +163,10 @@ def test_the_model_says_what_it_was_made_from(case, quick_model):
     assert "trained already" in succeeded(again)
     more = [*train_command(case, quick_model), "--seed", 1]
     message = refusal(tumortrack(*more))
-    assert "(12 steps, seed 0), whose command differs" in message
+    assert "(seed 0), whose command differs" in message
     assert "from this one in --seed (0 there, 1 here). A finished" in message
-    other = ["train", case, quick_model, "--steps", STEPS["quick"]]  # the default is clinic
-    message = refusal(tumortrack(*other))
-    assert "in --preset, --rotations, --sensor or the version, and in --start. A" in message
+    other = [*train_command(case, quick_model), "--rotations", "full"]
+    assert "in --preset, --rotations, --sensor or the version. A" in refusal(tumortrack(*other))
 
 
 def test_a_changed_weights_file_or_schema_is_refused(quick_model, tmp_path):
@@ -216,8 +204,8 @@ HISTORY_ON_A_FULL_DISK = """
 import resource, sys
 from pathlib import Path
 from tumortrack.core.errors import InputError, StorageError
-from tumortrack.training.state import TrainingProgress
-from tumortrack.training.train import history
+from tumortrack.occupancy.training.state import TrainingProgress
+from tumortrack.occupancy.training.train import history
 
 folder, mode = Path(sys.argv[1]), sys.argv[2]
 import torch.utils.tensorboard  # its own caches are not the point
@@ -270,8 +258,7 @@ def a_run(case: Path, **changes: object) -> TrainingRun:
         ({"checkpoint_every_s": -1.0}, "--checkpoint-every is -1"),
         ({"minutes": float("nan")}, "minutes is nan"),
         ({"workers": -1}, "workers is -1"),
-        ({"steps": -1}, "steps is -1"),
-        ({"steps": 0}, "starts from nothing"),
+        ({"steps": 0}, "steps is 0"),
     ],
 )
 def test_impossible_runs_are_refused(case, changes, words):
@@ -300,7 +287,7 @@ def test_two_trainings_in_one_folder_are_refused_and_a_dead_ones_lock_is_not(tmp
     assert (work / "something").exists()
     hold = (
         "import sys, os, signal; from pathlib import Path;"
-        "from tumortrack.training.train import work_folder\n"
+        "from tumortrack.occupancy.training.train import work_folder\n"
         "with work_folder(Path(sys.argv[1])): os.kill(os.getpid(), signal.SIGKILL)"
     )
     assert subprocess.run([sys.executable, "-c", hold, str(model)]).returncode == -signal.SIGKILL
@@ -311,14 +298,13 @@ def test_two_trainings_in_one_folder_are_refused_and_a_dead_ones_lock_is_not(tmp
 
 def test_a_diverged_run_stops_and_keeps_the_checkpoint_before(case, tmp_path):
     state = TrainingState(a_run(case), torch.device("cpu"))
-    poses = torch.eye(4).expand(2, 4, 4)
-    batch = (torch.randn(2, 300, 3) * 30, torch.randn(2, 50, 3) * 30, torch.zeros(2, 50), poses)
+    batch = (torch.randn(2, 300, 3) * 30, torch.randn(2, 50, 3) * 30, torch.zeros(2, 50))
     assert state.step(batch) > 0
     state.save(tmp_path)
     before = (tmp_path / "checkpoint.safetensors").read_bytes()
-    clouds, points, labels, _ = batch
+    clouds, points, labels = batch
     with pytest.raises(Diverged, match="diverged at step 1"):
-        state.step((clouds, points * float("inf"), labels, poses))
+        state.step((clouds, points * float("inf"), labels))
     with torch.no_grad():
         next(iter(state.network.parameters())).fill_(float("nan"))
     with pytest.raises(Diverged):
@@ -365,7 +351,7 @@ def test_the_network_gets_the_cores_that_workers_and_openmp_leave(
 ):
     before = torch.get_num_threads()
     monkeypatch.setenv("OMP_NUM_THREADS", granted)
-    monkeypatch.setattr("tumortrack.training.train.available_cores", lambda: 6)
+    monkeypatch.setattr("tumortrack.occupancy.training.train.available_cores", lambda: 6)
     assert divide_cores(torch.device("cpu"), workers) == workers
     try:
         assert torch.get_num_threads() == threads
@@ -380,7 +366,7 @@ def test_a_case_is_needed_to_train(tmp_path):
 
 def test_presets_survive_json_and_refuse_unknown_keys(case):
     anatomy = load_case(case).anatomy
-    for preset in (clinic, paper, quick):
+    for preset in (paper, quick):
         config = preset(anatomy)
         data = to_builtins(config)
         assert from_builtins(data, TrainConfig, "here") == config
@@ -389,8 +375,6 @@ def test_presets_survive_json_and_refuse_unknown_keys(case):
     assert paper(anatomy).steps == 155_000
     assert paper(anatomy).scene.clutter.scenes == 0
     assert quick(anatomy).scene.clutter.scenes == 0.5
-    decoders = [preset(anatomy).network.decoder for preset in (clinic, paper, quick)]
-    assert [isinstance(one, RegistrationHeadConfig) for one in decoders] == [True, False, False]
     assert isinstance(paper(anatomy).network.normalisation, CloudBox)
     assert paper(anatomy).scene.cloud.n_points == 1000
 
@@ -436,8 +420,7 @@ def test_minutes_are_of_training_whatever_its_start_takes(case, tmp_path, monkey
         return 1.0
 
     monkeypatch.setattr(state, "step", step)
-    scenes = Scenes((() for _ in range(10_000)), "nobody")
-    run_steps(state, scenes, tmp_path, statuses.append)
+    run_steps(state, (() for _ in range(10_000)), tmp_path, statuses.append)
     assert state.progress.step == pytest.approx(300, abs=3)
     assert state.progress.elapsed_s == pytest.approx(30, abs=0.3)
     assert statuses[0].samples_per_s == pytest.approx(10 * config.batch_size, rel=0.1)

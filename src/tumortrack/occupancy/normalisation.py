@@ -9,7 +9,7 @@ from torch import Tensor
 from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError
 from tumortrack.models import kernels
-from tumortrack.models.sampling import compiled, take
+from tumortrack.occupancy.sampling import compiled, take
 
 
 class CloudBox(Config, frozen=True, tag="cloud-box"):

@@ -1,4 +1,4 @@
-"""Random kidneys with random tumors, as many as wanted: what pretraining learns from.
+"""Random kidneys with random tumors, as many as wanted: organs of others, and for tests.
 
 Each is the built-in phantom's implicit surface with parameters of its own, turned at random in the
 CT and seen from a random side. Nothing in them comes from a patient.

@@ -16,7 +16,7 @@ from torch.autograd.function import once_differentiable
 from torch.nn import functional
 
 from tumortrack.models import kernels
-from tumortrack.models.sampling import traced
+from tumortrack.occupancy.sampling import traced
 
 Norm = Literal["none", "batch"]
 _INTEGER = {torch.bfloat16: torch.int16, torch.float32: torch.int32}  # of the same size

@@ -9,8 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
@@ -28,55 +27,17 @@ from tumortrack.core.errors import ArtifactError, InputError, TumortrackError
 from tumortrack.core.organ import organ_entry
 from tumortrack.core.patient import NOBODY, Patient
 from tumortrack.core.types import Anatomy
-from tumortrack.models.config import TrainConfig
-from tumortrack.models.hardware import has_fast_bfloat16
-from tumortrack.models.model import Network
-from tumortrack.training.distributed import ProcessGroup
-from tumortrack.training.model import PretrainedWeights, model_class
-from tumortrack.training.scenes import Tensors
+from tumortrack.occupancy.config import TrainConfig
+from tumortrack.occupancy.hardware import has_fast_bfloat16
+from tumortrack.occupancy.network import OccupancyNetwork
+from tumortrack.occupancy.training.scenes import Tensors
 
 _FILE = "checkpoint.safetensors"
 _FLOOR = 0.01  # of the peak learning rate, at the end of the tail
 
 
-class Run(ABC):
-    """What the training loop has to know of a run; ``steps`` or ``minutes`` settle its end."""
-
-    config: TrainConfig
-    seed: int
-    steps: int | None
-    minutes: float | None
-    checkpoint_every_s: float
-
-    @property
-    @abstractmethod
-    def end(self) -> int | None:
-        """The last step; None where minutes settle it on the way."""
-
-    @property
-    def decided_by(self) -> dict[str, Any]:
-        """All that decides the weights, by the options that say it (long ones as a sha256), so that
-        a resumed run is the same run."""
-        config = json.dumps([store.SCHEMA, to_builtins(self.config)], sort_keys=True).encode()
-        rules = "--preset, --rotations, --sensor or the version"
-        found = {rules: hashlib.sha256(config).hexdigest()}
-        return {**found, "--seed": self.seed, "--steps": self.steps}
-
-    def differences(self, kept: Mapping[str, Any]) -> str:
-        """What the run that was ``decided_by`` these was given differently; empty: it is this
-        one."""
-        found = []
-        for name, here in self.decided_by.items():
-            there = kept.get(name)
-            values = ["not given" if value is None else str(value) for value in (there, here)]
-            hashed = isinstance(there or here, str)
-            if there != here:
-                found += [name if hashed else f"{name} ({values[0]} there, {values[1]} here)"]
-        return ", and in ".join(found)
-
-
 @dataclass(frozen=True)
-class TrainingRun(Run):
+class TrainingRun:
     """What to train, on what, for how long: to the end of ``steps``, or about ``minutes``."""
 
     anatomy_ct: Anatomy
@@ -89,48 +50,52 @@ class TrainingRun(Run):
     device: Literal["auto", "cpu", "cuda"] = "auto"
     workers: int | None = None  # processes that make scenes; None: as the machine allows
     checkpoint_every_s: float = 30.0
-    start: PretrainedWeights | None = None  # of a registration network
     patient: Patient = NOBODY  # whose organ it is
 
     def __post_init__(self) -> None:
-        check_run(self, steps=0, workers=0)
-        if self.minutes is not None and not 0 <= self.minutes < float("inf"):
-            raise InputError(f"minutes is {self.minutes}; it must be 0 or more.")
-        if self.start is not None:
-            self.start.check(self.config.network)
-        elif 0 in (self.steps, self.minutes):
+        check_seed(self.seed)
+        for name, least in (("steps", 1), ("workers", 0)):
+            value = getattr(self, name)
+            if value is not None and value < least:
+                raise InputError(f"{name} is {value}; it must be at least {least}.")
+        if not 0 <= self.checkpoint_every_s < float("inf"):
             raise InputError(
-                "no minutes and no steps leave a model as it starts, and this one starts from "
-                "nothing. Give minutes or steps, or the preset clinic with its head start."
+                f"--checkpoint-every is {self.checkpoint_every_s}; give seconds, 0 or more."
             )
+        if self.minutes is not None and not 0 < self.minutes < float("inf"):
+            raise InputError(f"minutes is {self.minutes}; it must be more than 0.")
 
     @property
     def end(self) -> int | None:
+        """The last step; None where minutes settle it on the way."""
         if self.steps is not None:
             return self.steps
-        if self.minutes is not None:
-            return None if self.minutes else 0
-        short = None if self.start is None else self.config.steps_from_start
-        return self.config.steps if short is None else short
+        return None if self.minutes is not None else self.config.steps
 
     @property
     def decided_by(self) -> dict[str, Any]:
-        start = None if self.start is None else self.start.sha256
-        options = {"CASE": self.case_sha256, "--minutes": self.minutes, "--start": start}
-        return {**super().decided_by, **options}
+        """All that decides the weights, by the options that say it (long ones as a sha256), so that
+        a resumed run is the same run."""
+        config = json.dumps([store.SCHEMA, to_builtins(self.config)], sort_keys=True).encode()
+        return {
+            "--preset, --rotations, --sensor or the version": hashlib.sha256(config).hexdigest(),
+            "--seed": self.seed,
+            "--steps": self.steps,
+            "CASE": self.case_sha256,
+            "--minutes": self.minutes,
+        }
 
-
-def check_run(run: Run, **smallest: int) -> None:
-    """Refuse numbers smaller than these, and impossible seeds and times between checkpoints."""
-    check_seed(run.seed)
-    for name, least in smallest.items():
-        value = getattr(run, name)
-        if value is not None and value < least:
-            raise InputError(f"{name} is {value}; it must be at least {least}.")
-    if not 0 <= run.checkpoint_every_s < float("inf"):
-        raise InputError(
-            f"--checkpoint-every is {run.checkpoint_every_s}; give seconds, 0 or more."
-        )
+    def differences(self, kept: Mapping[str, Any]) -> str:
+        """What the run that was ``decided_by`` these was given differently; empty: it is this
+        one."""
+        found = []
+        for name, here in self.decided_by.items():
+            there = kept.get(name)
+            values = ["not given" if value is None else str(value) for value in (there, here)]
+            hashed = isinstance(there or here, str)
+            if there != here:
+                found += [name if hashed else f"{name} ({values[0]} there, {values[1]} here)"]
+        return ", and in ".join(found)
 
 
 @dataclass
@@ -147,7 +112,7 @@ def provenance(
     run: TrainingRun, progress: TrainingProgress, device: torch.device
 ) -> dict[str, Any]:
     """What a model's manifest says of its training."""
-    about = {
+    return {
         "seed": run.seed,
         "steps": progress.step,
         "training_s": round(progress.elapsed_s, 1),
@@ -160,7 +125,6 @@ def provenance(
         "patient": to_builtins(run.patient),
         "organ": organ_entry(run.anatomy_ct.kind),
     }
-    return about if run.start is None else {**about, "start_sha256": run.start.sha256}
 
 
 def settle_end(config: TrainConfig, progress: TrainingProgress, minutes: float | None) -> bool:
@@ -204,15 +168,13 @@ class Diverged(TumortrackError):
 class TrainingState:
     """All that changes while training, and nothing else."""
 
-    def __init__(self, run: Run, device: torch.device, group: ProcessGroup | None = None) -> None:
+    def __init__(self, run: TrainingRun, device: torch.device) -> None:
         self.run, self._device = run, device
-        self.group = group or ProcessGroup(device)
         self._bf16 = has_fast_bfloat16(device)
         network = run.config.network
         torch.manual_seed(run.seed)
-        new_network = model_class(network).new_network
-        self.network = new_network(network).to(device)
-        self.average = new_network(network).to(device).eval().requires_grad_(False)
+        self.network = OccupancyNetwork(network).to(device)
+        self.average = OccupancyNetwork(network).to(device).eval().requires_grad_(False)
         self.average.load_state_dict(self.network.state_dict())
         self.progress = TrainingProgress(end=run.end)
         self._best: dict[str, Tensor] = {}
@@ -227,11 +189,6 @@ class TrainingState:
             config.schedule.learning_rate,
             fused=True,  # a twentieth of the quick step on a CPU
         )
-
-    def initialize(self, initialize: Callable[[Any], None]) -> None:
-        """Give both networks what does not have to be learnt."""
-        initialize(self.network)
-        initialize(self.average)
 
     def resume(self, work: Path) -> None:
         """Restore the last checkpoint, if there is one; ArtifactError where it is damaged or of
@@ -291,21 +248,20 @@ class TrainingState:
         store.write_atomically(work / _FILE, save(tensors, metadata))
 
     def step(self, batch: Tensors) -> float:
-        """One optimizer step on this process's part of the batch; returns the whole batch's loss.
-        Where that is not finite the weights stay as they were, and Diverged is raised."""
+        """One optimizer step; returns the batch's loss. Where that is not finite the weights stay
+        as they were, and Diverged is raised."""
         progress = self.progress
-        clouds, points, labels, poses = (part.to(self._device, non_blocking=True) for part in batch)
+        clouds, points, labels = (part.to(self._device, non_blocking=True) for part in batch)
         clouds = clouds[:, : self.points_kept(clouds.shape[1])]
         self.learning_rate = learning_rate(self.run.config, progress)
         for group in self.optimizer.param_groups:
             group["lr"] = self.learning_rate
         self.network.train()
         with torch.autocast(self._device.type, torch.bfloat16, enabled=self._bf16):
-            first = self.group.rank * len(clouds)  # in the whole batch
-            loss = self.network.loss(clouds, points, labels, poses, first=first)
+            loss = self.network.loss(clouds, points, labels)
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()
-        value = float(self.group.mean(self.network.parameters(), loss.detach()))
+        value = float(loss.detach())
         if not math.isfinite(value):
             raise Diverged(progress.step)
         self.optimizer.step()
@@ -336,7 +292,7 @@ class TrainingState:
             self.progress.best_miou = miou
             self._best = {k: v.clone() for k, v in self.average.state_dict().items()}
 
-    def best_network(self) -> Network:
+    def best_network(self) -> OccupancyNetwork:
         """The averaged weights of the best validation."""
         self.average.load_state_dict(self._best)
         return self.average

@@ -9,8 +9,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from tumortrack.core.config import Config
-from tumortrack.models.layers import Layer, Norm, greatest, greatest_above_zero, stack
-from tumortrack.models.sampling import ball_query, farthest_points, strided_points, take, traced
+from tumortrack.occupancy.layers import Layer, Norm, greatest, greatest_above_zero, stack
+from tumortrack.occupancy.sampling import ball_query, farthest_points, strided_points, take, traced
 
 _AT_ONCE = 128  # centres
 

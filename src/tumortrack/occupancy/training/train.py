@@ -3,7 +3,6 @@ Ctrl-C, the history.
 
 Data are addressed by step, the only randomness is drawn from (seed, step), and the state is one
 atomic file: a run that is killed and started again ends with the weights of one that was not.
-Where torchrun started several processes each runs this loop with its part of the batch.
 """
 
 from __future__ import annotations
@@ -12,9 +11,9 @@ import json
 import os
 import signal
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from contextlib import ExitStack, closing, contextmanager, suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TypeVar
@@ -24,21 +23,19 @@ import torch
 from tumortrack.core.errors import InputError, StorageError, TumortrackError
 from tumortrack.core.process import available_cores, keep_freed_memory
 from tumortrack.core.store import write_atomically, writing
-from tumortrack.models.folder import check_trainable
-from tumortrack.models.model import Model
-from tumortrack.simulate.coarse import coarsened
-from tumortrack.simulate.scene import SceneStream
-from tumortrack.training.distributed import ProcessGroup, process_group
-from tumortrack.training.model import load_model, save_model
-from tumortrack.training.scenes import Scenes, batches
-from tumortrack.training.state import (
+from tumortrack.models.folder import check_trainable, save_model
+from tumortrack.occupancy.hardware import choose_device
+from tumortrack.occupancy.model import OccupancyModel
+from tumortrack.occupancy.training.scenes import Tensors, batches
+from tumortrack.occupancy.training.state import (
     TrainingProgress,
     TrainingRun,
     TrainingState,
     provenance,
     settle_end,
 )
-from tumortrack.training.task import TrainingTask, task_of
+from tumortrack.occupancy.training.task import OccupancyTask
+from tumortrack.simulate.scene import SceneStream
 
 __all__ = ["Interrupted", "TrainingRun", "TrainingStatus", "train"]
 
@@ -67,7 +64,6 @@ class TrainingStatus:
     loss: float
     miou: float | None  # of the last validation
     waiting: float = 0.0  # fraction of the time that was spent waiting for scenes
-    tre_mm: float | None = None  # of the last validation, where the method knows a motion
 
 
 class Interrupted(TumortrackError):
@@ -85,7 +81,7 @@ class Interrupted(TumortrackError):
 Report = Callable[[TrainingStatus], None]
 
 
-def train(run: TrainingRun, folder: Path, report: Report) -> Model:
+def train(run: TrainingRun, folder: Path, report: Report) -> OccupancyModel:
     """Train until the end, resuming what lies in ``folder``; leaves a model folder.
 
     Raises:
@@ -94,83 +90,66 @@ def train(run: TrainingRun, folder: Path, report: Report) -> Model:
         StorageError: the disk is full; the last checkpoint is whole.
         Diverged: the loss is not finite any more; the last checkpoint is from before.
         Interrupted: Ctrl-C; a checkpoint is written.
-        ProcessLost: another process of this training has ended.
     """
-    with process_group(run.device) as group:
-        with work_folder(folder, group.is_main) as work:
-            trained = _train(run, work, group, report)
-        group.all_reduce(0.0, False)  # the folder is written
-        return trained or load_model(folder, run.device)
-
-
-def _train(run: TrainingRun, work: Path, group: ProcessGroup, report: Report) -> Model | None:
-    """The model, in the main process."""
-    config, device = run.config, group.device
-    workers = divide_cores(device, run.workers, group.on_machine)
-    TrainingState(run, device, group).resume(work)  # another run's: refused before the long part
-    task = task_of(run, device)
-    state = TrainingState(run, device, group)
-    state.initialize(task.initialize)
-    state.resume(work)
-    end = config.steps if state.progress.end is None else state.progress.end
-    if end == 0:
-        state.keep_if_best(task.miou(state.average))
-    else:
-        steps = range(state.progress.step, end)
-        scenes = _scenes(run, task, group.local_batches(steps), group, workers)
-        run_steps(state, scenes, work, report, task)
-    if not group.is_main:
-        return None
-    origin = {**provenance(run, state.progress, device), "scenes": scenes.maker if end else "none"}
-    model = task.model(state.best_network(), origin)
-    save_model(model, work.parent)
-    return model
+    config, device = run.config, choose_device(run.device)
+    with work_folder(folder) as work:
+        workers = divide_cores(device, run.workers)
+        TrainingState(run, device).resume(work)  # another run's: refused before the long part
+        task = OccupancyTask(run, device)
+        state = TrainingState(run, device)
+        state.resume(work)
+        end = config.steps if state.progress.end is None else state.progress.end
+        run_steps(
+            state, _scenes(run, task, range(state.progress.step, end), workers), work, report, task
+        )
+        origin = {**provenance(run, state.progress, device), "scenes": f"{workers} processes"}
+        model = task.model(state.best_network(), origin)
+        save_model(model, folder)
+        return model
 
 
 def _scenes(
-    run: TrainingRun, task: TrainingTask, steps: range, group: ProcessGroup, workers: int
-) -> Scenes:
-    """Of these steps, this process's share."""
+    run: TrainingRun, task: OccupancyTask, steps: range, workers: int
+) -> Generator[Tensors, None, None]:
+    """The batches of these steps."""
     config = run.config
-    anatomy_ct, scene = coarsened(run.anatomy_ct, config.scene, config.coarse)
-    about = anatomy_ct, run.up_lps, scene, task.points, run.seed
-    stream = SceneStream(*about, "train", group.local_size(config.batch_size), task.body)
-    period = config.training_pairs // config.batch_size * group.size
-    made = batches(stream.batch, steps, period, workers, group.device)
-    return Scenes(made, f"{workers} processes")
+    about = run.anatomy_ct, run.up_lps, config.scene, task.points, run.seed
+    stream = SceneStream(*about, "train", config.batch_size, task.body)
+    period = config.training_pairs // config.batch_size
+    device = choose_device(run.device)
+    return batches(stream.batch, steps, period, workers, device)
 
 
 def run_steps(
     state: TrainingState,
-    scenes: Scenes,
+    scenes: Generator[Tensors, None, None],
     work: Path,
     report: Report,
-    task: TrainingTask | None = None,
+    task: OccupancyTask | None = None,
 ) -> None:
-    """All steps to the end; the main process writes checkpoints into ``work``, reports and, with a
-    ``task``, validates. Raises as ``train``."""
-    run, group, progress = state.run, state.group, state.progress
-    clock, miou, tre_mm = TrainingClock(progress), None, None
+    """All steps to the end, with checkpoints in ``work``; with a ``task``, validated. Raises as
+    ``train``."""
+    run, progress = state.run, state.progress
+    clock, miou = TrainingClock(progress), None
     with ExitStack() as stack:
-        validates = task is not None and group.is_main
-        write = stack.enter_context(history(work, progress)) if validates else None
+        write = None if task is None else stack.enter_context(history(work, progress))
         stopped = stack.enter_context(ctrl_c())
-        for batch in clock.timed(stack.enter_context(closing(scenes.batches))):
+        for batch in clock.timed(stack.enter_context(closing(scenes))):
             loss = state.step(batch)
             clock.count_step()
-            progress.elapsed_s, stop = group.all_reduce(clock.elapsed(), stopped())
+            progress.elapsed_s, stop = clock.elapsed(), stopped()
             settled = settle_end(run.config, progress, run.minutes)
             done = progress.step == progress.end
             if task and write and (done or progress.step % run.config.validate_every == 0):
-                miou, tre_mm = task.miou(state.average), task.tre_mm(state.average)
+                miou = task.miou(state.average)
                 state.keep_if_best(miou)
                 speed = clock.rate() * run.config.batch_size
                 write(loss, miou, speed, state.learning_rate, clock.waiting())
             due = done or settled or stop
-            if group.is_main and (due or clock.due("checkpoint", run.checkpoint_every_s)):
+            if due or clock.due("checkpoint", run.checkpoint_every_s):
                 state.save(work)
-            if group.is_main and (done or clock.due("report", REPORT_EVERY_S)):
-                report(replace(_status(state, clock, loss, miou), tre_mm=tre_mm))
+            if done or clock.due("report", REPORT_EVERY_S):
+                report(_status(state, clock, loss, miou))
             if done:
                 break
             if stop:
@@ -189,16 +168,13 @@ def _status(
 
 
 @contextmanager
-def work_folder(folder: Path, writes: bool = True) -> Iterator[Path]:
-    """MODEL/training, locked while in use, if this process writes; removed again if nothing was
-    written into it. The lock is the operating system's and ends with its process, however that
-    ends. InputError where another process trains in it, StorageError where it cannot be made."""
+def work_folder(folder: Path) -> Iterator[Path]:
+    """MODEL/training, locked while in use; removed again if nothing was written into it. The lock
+    is the operating system's and ends with its process, however that ends. InputError where another
+    process trains in it, StorageError where it cannot be made."""
     import fcntl
 
     work = folder / "training"
-    if not writes:
-        yield work
-        return
     check_trainable(folder)
     with writing(work):
         work.mkdir(parents=True, exist_ok=True)
@@ -221,14 +197,14 @@ def work_folder(folder: Path, writes: bool = True) -> Iterator[Path]:
                     folder.rmdir()
 
 
-def divide_cores(device: torch.device, workers: int | None, sharing: int = 1) -> int:
+def divide_cores(device: torch.device, workers: int | None) -> int:
     """How many processes make scenes, and set the network's number of threads: on a CPU it gets the
     cores that the workers leave, half of them at least, within OMP_NUM_THREADS.
 
     Without ``workers`` they are as many as there are cores, sixteen at most: their priority is low
-    (see ``scenes``). ``sharing`` processes of one training share the machine.
+    (see ``scenes``).
     """
-    cores = available_cores() // sharing
+    cores = available_cores()
     if workers is None:
         workers = max(1, min(_MOST, cores))
     if device.type == "cpu":
@@ -297,11 +273,6 @@ def ctrl_c() -> Iterator[Callable[[], bool]]:
     }
     try:
         yield lambda: bool(received)
-    except BaseException:
-        if "TORCHELASTIC_RUN_ID" in os.environ:
-            # torchrun ends the processes that are left; this one's message comes first.
-            before[signal.SIGTERM] = signal.SIG_IGN
-        raise
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)

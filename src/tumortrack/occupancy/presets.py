@@ -1,31 +1,21 @@
-"""Named training configurations: Python values of a case."""
+"""The paper's network and training, and a slim one: Python values of a case."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Literal
 
-import msgspec
-
-from tumortrack.core.errors import InputError
 from tumortrack.core.types import Anatomy
-from tumortrack.models.config import (
+from tumortrack.occupancy.config import (
     MlpDecoderConfig,
     NetworkConfig,
-    RegistrationHeadConfig,
     Schedule,
     TrainConfig,
 )
-from tumortrack.models.encoders.heightmap import HeightMapConfig
-from tumortrack.models.encoders.pointnet2 import PointNet2Config, SetAbstraction
-from tumortrack.models.normalisation import Aligned, CloudBox
-from tumortrack.registration.canonical_frame import half_length_mm
-from tumortrack.registration.rest_shape import long_axis_of
+from tumortrack.occupancy.encoders.pointnet2 import PointNet2Config, SetAbstraction
+from tumortrack.occupancy.normalisation import Aligned, CloudBox
 from tumortrack.sense.clutter import ClutterConfig
-from tumortrack.sense.noise import CLEAN, D405_NOISE, SENSORS, CalibrationConfig, Sensor
-from tumortrack.sense.occlusion import OcclusionConfig
-from tumortrack.simulate.coarse import CoarseConfig
-from tumortrack.simulate.deform import ChainConfig, DragConfig, ElasticConfig, StretchConfig
+from tumortrack.sense.noise import D405_NOISE
+from tumortrack.simulate.deform import ChainConfig, DragConfig, StretchConfig
 from tumortrack.simulate.deform.drag import CONFIGURATIONS
 from tumortrack.simulate.occupancy import OccupancyConfig
 from tumortrack.simulate.scene import PoseConfig, SceneConfig
@@ -69,43 +59,6 @@ def quick(anatomy: Anatomy, rotations: Rotations = "limited") -> TrainConfig:
         batch_size=16,
         steps=12_000,
         drop_points=0.6,
-    )
-
-
-def clinic(anatomy: Anatomy, rotations: Rotations = "limited") -> TrainConfig:
-    """The default: registration of the organ's elastic body, learnt in minutes from scenes with
-    sensor errors, occlusion and background."""
-    elastic = ElasticConfig()
-    half_mm = half_length_mm(anatomy.organ, long_axis_of(anatomy.organ))
-    config = clinic_rules(elastic, elastic.body.modes, half_mm, rotations)
-    return msgspec.structs.replace(config, scene=config.scene.seen_whole(anatomy))
-
-
-def clinic_rules(
-    elastic: ElasticConfig, modes: int, scale_mm: float, rotations: Rotations
-) -> TrainConfig:
-    """Scenes and network of ``clinic`` for an elastic body, modes of which the network tells the
-    state, and half of the organ's length, mm."""
-    return TrainConfig(
-        network=clinic_network(modes, scale_mm),
-        scene=SceneConfig(
-            pose=PoseConfig(rotations=rotations, tilt_deg=30.0),
-            deform=(elastic,),
-            clutter=ClutterConfig(scenes=0.5, largest_share=0.15),
-            noise=D405_NOISE,
-            occlusion=OcclusionConfig(scenes=0.6, largest_share=0.6, left_in=0.15),
-            calibration=CalibrationConfig(offset_mm=2.0, scale=0.01),
-            cloud_points=(500, 5000),
-            free_range=0.6,
-            free_nearest_mm=(80.0, 300.0),
-        ),
-        schedule=Schedule(learning_rate=1.5e-3),
-        batch_size=32,
-        steps=6_000,
-        steps_from_start=400,  # more have the same tails (docs/training.md)
-        drop_points=0.6,
-        validate_every=500,
-        coarse=CoarseConfig(),
     )
 
 
@@ -158,35 +111,3 @@ def quick_network(n_classes: int, scale_mm: float) -> NetworkConfig:
         ),
         normalisation=Aligned(scale_mm=scale_mm, reach=1.35),
     )
-
-
-def clinic_network(modes: int, scale_mm: float) -> NetworkConfig:
-    """Height map to registration: learns in minutes, runs in milliseconds (docs/results.md has the
-    comparison with the other encoders and decoders). ``modes``: of the organ's body."""
-    return NetworkConfig(
-        encoder=HeightMapConfig(),
-        decoder=RegistrationHeadConfig(modes=modes),
-        normalisation=Aligned(scale_mm=scale_mm, reach=1.35),
-    )
-
-
-PRESETS: dict[str, Callable[[Anatomy, Rotations], TrainConfig]] = {
-    "clinic": clinic,
-    "quick": quick,
-    "paper": paper,
-}
-
-
-def seen_by(config: TrainConfig, sensor: Sensor) -> TrainConfig:
-    """The same preset for scenes as another sensor sees them. Raises InputError: its scenes have no
-    noise of a sensor."""
-    noise = config.scene.noise
-    if noise == SENSORS[sensor] or (noise == CLEAN and sensor == "d405"):
-        return config
-    if noise == CLEAN:
-        raise InputError(
-            f"--sensor {sensor}: scenes of this preset have no sensor's noise. Leave it out, or "
-            "choose the preset clinic."
-        )
-    scene = msgspec.structs.replace(config.scene, noise=SENSORS[sensor])
-    return msgspec.structs.replace(config, scene=scene)

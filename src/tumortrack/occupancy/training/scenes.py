@@ -9,7 +9,6 @@ import signal
 import sys
 from collections.abc import Callable, Generator, Iterator
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass
 from multiprocessing import resource_tracker
 from typing import Any
 
@@ -22,17 +21,8 @@ from tumortrack.simulate.scene import Batch
 _LOWER_PRIORITY = 10  # of the workers
 _AHEAD = 4  # batches that each worker makes before they are asked for
 
-# clouds_mm (b, n, 3), points_mm (b, q, 3), labels (b, q), camera_from_ct (b, 4, 4)
-Tensors = tuple[Tensor, Tensor, Tensor, Tensor]
-
-
-@dataclass(frozen=True)
-class Scenes:
-    """Batches in the order of their steps, and who makes them. Close the generator to end its
-    processes."""
-
-    batches: Generator[Tensors, None, None]
-    maker: str
+# clouds_mm (b, n, 3), points_mm (b, q, 3), labels (b, q)
+Tensors = tuple[Tensor, Tensor, Tensor]
 
 
 def batches(

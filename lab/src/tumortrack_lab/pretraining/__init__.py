@@ -1,1 +1,0 @@
-"""A head start for every patient: one network taught on random kidneys."""

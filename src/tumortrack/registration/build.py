@@ -1,0 +1,152 @@
+"""Make a model of one organ: its elastic body, and what its fits can be trusted with.
+
+Nothing is learnt. Scenes are simulated whose truth is known; from them follow what a right fit
+costs, by how much its standard deviations are off, and how far its points spread.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float64
+
+from tumortrack.core.config import check_seed
+from tumortrack.core.errors import InputError
+from tumortrack.core.estimate import FAR_MM
+from tumortrack.core.process import parallel_map
+from tumortrack.core.types import Anatomy
+from tumortrack.models.config import RegistrationConfig
+from tumortrack.models.in_distribution import InDistributionRange, fit_mm, spread_mm
+from tumortrack.registration.gauss_newton import RegistrationResult, posterior, refine
+from tumortrack.registration.looks import Looks
+from tumortrack.registration.model import (
+    RegistrationModel,
+    UncertaintyCalibration,
+    pose_prior,
+)
+from tumortrack.registration.motion import ElasticMotion
+from tumortrack.registration.registration import Registration
+from tumortrack.registration.rest_shape import distances_of, shape_of
+from tumortrack.sense.cloud import thin_cloud
+from tumortrack.simulate.scene import SceneRecipe, Simulator, body_for
+from tumortrack.simulate.scene_folder import draw_targets
+
+_USUAL = 90  # per cent of the right fits cost no more than the usual cost
+# Of all errors lie within this radius if each axis errs normally by 1; the others, a tenth, may
+# come from fits that are wrong altogether.
+_COVERED, _RADIUS = 0.9, 2.5
+Up = tuple[float, float, float]
+Progress = Callable[[int, int], None]  # what is done, of how much
+
+
+@dataclass(frozen=True, eq=False)
+class _Scene:
+    """What a camera sees of a known state (camera frame, mm), where inner points are, and the
+    undeformed organ in its place."""
+
+    looks: Looks
+    inner_mm: Float64[np.ndarray, "m 3"]
+    place: ElasticMotion
+
+    def off_mm(self, motion: ElasticMotion, inner_ct: Float64[np.ndarray, "m 3"]) -> float:
+        """How far off a motion has the inner points, in the mean."""
+        return float(np.linalg.norm(motion.carry(inner_ct) - self.inner_mm, axis=1).mean())
+
+
+def build_model(
+    anatomy_ct: Anatomy,
+    up_lps: Up,
+    config: RegistrationConfig,
+    seed: int = 0,
+    about: dict[str, Any] | None = None,
+    progress: Progress = lambda done, of: None,
+) -> RegistrationModel:
+    """A model of this organ, in seconds; the same arguments give the same model on one machine.
+
+    Args:
+        about: more of its provenance.
+        progress: called with how many steps are done, and of how many.
+
+    Raises:
+        InputError: deformations that are not elastic, numbers that make no body, or a seed that is
+            not allowed.
+    """
+    check_seed(seed)
+    steps = 2 + config.scenes + config.searched
+    with ThreadPoolExecutor(1) as beside:  # the body takes as long
+        distances = beside.submit(distances_of, anatomy_ct)
+        body = body_for(anatomy_ct, up_lps, config.scene, seed)
+        if body is None:
+            raise InputError(
+                "an elastic body is registered with elastic deformations; the scene configuration "
+                "has none."
+            )
+        progress(1, steps)
+        rest = shape_of(anatomy_ct, body, distances.result())
+    progress(2, steps)
+    inner_ct = draw_targets(anatomy_ct, seed).points_ct
+    simulator, scenes = Simulator(anatomy_ct, up_lps, config.scene, body), []
+    for index in range(config.scenes):
+        recipe = SceneRecipe(seed, "validation", index)
+        made = simulator.render(recipe)
+        cloud = thin_cloud(made.cloud, config.scene.cloud.n_points, recipe.generator(999))
+        turn, shift_mm = made.camera_from_ct[:3, :3], made.camera_from_ct[:3, 3]
+        place = ElasticMotion(rest, turn.copy(), turn @ body.center_ct + shift_mm, body.mean)
+        inner_mm = made.carry(inner_ct).astype(float)
+        scenes.append(_Scene(Looks.of([cloud.points_mm]), inner_mm, place))
+        progress(3 + index, steps)
+    registration = Registration(rest, config.refine, pose_prior(config.scene.pose, up_lps))
+    nearby = parallel_map(
+        lambda one: refine(rest, one.looks.points_mm, one.place, config.refine), scenes
+    )
+    pairs = list(zip(scenes, nearby, strict=True))
+    right = [fit.cost for one, fit in pairs if one.off_mm(fit.motion, inner_ct) <= FAR_MM]
+    usual_cost = float(np.percentile(right or [fit.cost for fit in nearby], _USUAL))
+    fits = []
+    for index, one in enumerate(scenes[: config.searched]):
+        fits.append(registration.register(one.looks)[0])
+        progress(3 + config.scenes + index, steps)
+    std_scale, checked = _judged(scenes, fits, config, inner_ct)
+    spreads = [spread_mm(one.looks.points_mm) for one in scenes]
+    fits_mm = [fit_mm(np.abs(fit.distances_mm)) for fit in fits]
+    known = InDistributionRange(
+        spread_mm=(min(spreads), max(spreads)), fit_mm=float(np.percentile(fits_mm, 95))
+    )
+    return RegistrationModel(
+        config=config,
+        parts=anatomy_ct.names,
+        in_distribution=known,
+        provenance={"seed": seed, "up_lps": list(up_lps), **(about or {}), **checked},
+        shape=rest,
+        calibration=UncertaintyCalibration(std_scale=std_scale, usual_cost=usual_cost),
+    )
+
+
+def _judged(
+    scenes: list[_Scene],
+    fits: list[RegistrationResult],
+    config: RegistrationConfig,
+    inner_ct: Float64[np.ndarray, "m 3"],
+) -> tuple[float, dict[str, float]]:
+    """By how much standard deviations have to be larger; how far off the answers were."""
+    errors, nearest, ratios = [], [], []
+    for one, fit in zip(scenes, fits, strict=False):
+        motion = posterior(fit.motion, one.looks, config.refine)
+        known_mm2 = replace(motion, calibration=config.scene.calibration).covariance_mm2(inner_ct)
+        assert known_mm2 is not None
+        away = fit.motion.carry(inner_ct) - one.inner_mm
+        errors.append(one.off_mm(fit.motion, inner_ct))
+        others = [one.off_mm(rival.motion, inner_ct) for rival in fit.rivals]
+        nearest.append(min([errors[-1], *others]))
+        solved = np.linalg.solve(known_mm2, away[..., None])[..., 0]
+        ratios.append(np.sqrt((solved * away).sum(1)))
+    std_scale = float(np.quantile(np.concatenate(ratios), _COVERED)) / _RADIUS
+    far = float(np.mean(np.array(nearest) > FAR_MM))  # no rival is right
+    return std_scale, {
+        "validation_tre_mm": round(float(np.median(errors)), 3),
+        "validation_far": far,
+    }

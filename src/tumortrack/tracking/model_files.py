@@ -1,0 +1,140 @@
+"""Model folders of both methods, and the model that every case holds."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from tumortrack.core import store
+from tumortrack.core.config import from_builtins, to_builtins
+from tumortrack.core.errors import ArtifactError, InputError, PackageError, StorageError
+from tumortrack.core.organ import Organ, organ_entry
+from tumortrack.core.types import part_names
+from tumortrack.imaging.case import Case, holds_case, load_case
+from tumortrack.models.folder import (
+    KIND,
+    is_model_of,
+    organ_of,
+    read_model_manifest,
+    save_model,
+)
+from tumortrack.models.in_distribution import InDistributionRange
+from tumortrack.models.margins import read_margins
+from tumortrack.models.model import Model
+from tumortrack.registration.model import RegistrationModel
+from tumortrack.tracking.presets import clinic, occupancy, seen_by
+
+if TYPE_CHECKING:
+    from tumortrack.models.config import RegistrationConfig
+
+Progress = Callable[[int, int], None]
+
+
+def load_model(
+    folder: Path, device: str = "auto", with_margins: bool = True, progress: Progress | None = None
+) -> Model:
+    """Read a model folder, or the model of a case folder, which is made where it has none yet.
+
+    Args:
+        device: of a network.
+        with_margins: and its margins, where it was calibrated.
+        progress: as of ``case_model``.
+
+    Raises:
+        ArtifactError: missing, of another schema, damaged, or changed since; its margins are
+            another model's, or of another version of the method.
+        InputError: CUDA is requested where there is none.
+        PackageError: a network, and PyTorch is not installed.
+    """
+    if holds_case(folder):
+        return case_model(load_case(folder), with_margins, progress)
+    manifest = read_model_manifest(folder)
+    try:
+        known = {
+            "parts": _parts(manifest["parts"], organ_of(manifest, folder)),
+            "in_distribution": from_builtins(
+                manifest["familiar"], InDistributionRange, f"{folder}: familiar"
+            ),
+            "provenance": dict(manifest["provenance"]),
+            "margins": read_margins(folder) if with_margins else None,
+        }
+        model: Model
+        if "network" in manifest["config"]:
+            kind = occupancy("model").OccupancyModel
+            model = kind.from_folder(folder, manifest, device=device, **known)
+        else:
+            model = RegistrationModel.from_folder(folder, manifest, **known)
+        model.patient  # noqa: B018 - nonsense is told here
+        return model
+    except (ArtifactError, PackageError):
+        raise
+    except InputError as error:
+        raise ArtifactError(
+            f"{error} The model was made by another version of tumortrack, or with a package "
+            "that is not installed here. Install that package, or make the model again."
+        ) from error
+    except (KeyError, TypeError, ValueError, RuntimeError, OSError) as error:
+        raise ArtifactError(
+            f"{folder} is not a whole model of this version: {error}. Make it again."
+        ) from error
+
+
+def case_model(case: Case, with_margins: bool = True, progress: Progress | None = None) -> Model:
+    """The model of a case: the one in its folder, or, where that has none of this case, a new one,
+    which is kept there. ``progress``: of making one.
+
+    Raises:
+        StorageError: it cannot be kept.
+        InputError: what lies in its place would be lost.
+        ArtifactError: as of ``load_model``.
+    """
+    if case.folder is None:
+        return make_model(case, progress=progress)
+    kept = case.folder / case.MODEL
+    if is_model_of(kept, case.folder):
+        return load_model(kept, with_margins=with_margins)
+    if not os.access(case.folder, os.W_OK):
+        raise StorageError(
+            f"{case.folder} holds no model yet, and none can be written there. Copy the case to "
+            f"where it can, or make a model elsewhere: tumortrack train {case.folder} MODEL"
+        )
+    if another := kept.exists():
+        store.check_place(kept, KIND, True)
+    model = make_model(case, progress=progress)
+    try:
+        with store.new_folder(kept, overwrite=another or None) as aside:
+            save_model(model, aside)
+    except InputError:
+        if not is_model_of(kept, case.folder):  # by another process, which was faster
+            raise
+    return model
+
+
+def make_model(
+    case: Case,
+    config: RegistrationConfig | None = None,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> RegistrationModel:
+    """The model of the default method, by what the case says of poses and camera; some seconds.
+    Raises InputError: deformations of ``config`` that are not elastic."""
+    from tumortrack.registration.build import build_model
+
+    if config is None:
+        poses = case.rotations, case.tilt_degrees
+        config = seen_by(clinic(case.anatomy, *poses), case.sensor)
+    about = {
+        "case_sha256": case.sha256,
+        "patient": to_builtins(case.patient),
+        "organ": organ_entry(case.anatomy.kind),
+    }
+    more = {} if progress is None else {"progress": progress}
+    return build_model(case.anatomy, case.up_lps, config, seed, about, **more)
+
+
+def _parts(stated: list[str], organ: Organ) -> tuple[str, ...]:
+    if not stated or tuple(stated) != part_names(len(stated), organ.name):
+        raise InputError(f"parts {stated} are not {organ.name}, tumor_1, tumor_2, ...")
+    return tuple(stated)

@@ -1,0 +1,213 @@
+"""A case in a model's place: its model is made once, kept in it, and costs nobody a file."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from stories import answered, cloud_by_rays, looking_down, refusal, succeeded, tumortrack
+from tumortrack import api
+from tumortrack.cli.inspection import describe
+from tumortrack.cli.main import run
+from tumortrack.core import store
+from tumortrack.core.errors import StorageError
+from tumortrack.imaging.case import load_case
+from tumortrack.sense.ply import write_cloud_ply
+from tumortrack.tracking import model_files
+
+MAKING = "making the case's model, once"
+LAYS = "it lays the organ of the CT on the points"
+
+
+@pytest.fixture(scope="module")
+def cloud(tmp_path_factory, phantom_case):
+    case, file = load_case(phantom_case), tmp_path_factory.mktemp("seen") / "cloud.ply"
+    write_cloud_ply(file, cloud_by_rays(case, looking_down(case)).astype(np.float32))
+    return file
+
+
+@pytest.fixture
+def case(tmp_path, phantom_case):
+    """Without a model."""
+    return Path(shutil.copytree(phantom_case, tmp_path / "case"))
+
+
+@pytest.fixture
+def ready(monkeypatch, clinic_model):
+    """Models are made at once. What is told of progress."""
+    model, told = model_files.load_model(clinic_model), []
+
+    def make(case, config=None, seed=0, progress=None):
+        told.append(case)
+        return replace(model, provenance={**model.provenance, "case_sha256": case.sha256})
+
+    monkeypatch.setattr(model_files, "make_model", make)
+    return told
+
+
+def ended(folder: Path) -> list[str]:
+    """What is there, and nothing half written."""
+    names = sorted(path.name for path in folder.iterdir())
+    assert not [name for name in names if name.endswith((".part", ".old"))]
+    return names
+
+
+@pytest.mark.slow
+def test_the_first_command_makes_it_and_all_others_take_it(case, cloud, tmp_path):
+    assert "its model: none yet" in "\n".join(describe(case))
+    run_folder, model = tmp_path / "run", case / "model"
+    assert MAKING in answered(tumortrack("locate", case, cloud, run_folder, "--grid", 32))
+    made = store.sha256_of(model)
+    report = store.read_json(run_folder / "report.json")
+    assert report["model_sha256"] == store.sha256_of(model / store.MANIFEST)
+    assert report["model"]["case_sha256"] == store.sha256_of(case / store.MANIFEST)
+    scenes, source = tmp_path / "scenes", f"virtual:{case}?fps=5"
+    succeeded(tumortrack("simulate", case, scenes, "--scenes", 1))
+    tracked = tmp_path / "track.json"
+    for command in (
+        ("evaluate", case, scenes, tmp_path / "report", "--grid", 32),
+        ("track", case, source, "--seconds", 5, "--stale", 5, "--report", tracked),
+        ("compile", case),
+    ):
+        assert MAKING not in succeeded(tumortrack(*command))
+    found = store.read_json(tracked)
+    assert found["estimates"]["good"] > 0
+    assert found["model"]["case_sha256"] == report["model"]["case_sha256"]
+    assert "about 180 are needed" in refusal(tumortrack("margins", case, scenes))
+    assert store.sha256_of(model) == made
+    of_case, of_model = ("\n".join(describe(folder)) for folder in (case, model))
+    for said in (of_case, of_model):
+        assert "on simulated scenes points inside are " in said
+        assert "the organ lies turned about" in said or "it lies turned about" in said
+        assert "tilted by up to 30 degrees" in said
+        assert "not calibrated" in said
+        assert "train" not in said
+        assert "step" not in said
+    assert LAYS in of_model
+
+
+def test_a_case_has_no_network_to_write(case, tmp_path):
+    said = refusal(tumortrack("onnx", case, tmp_path / "out.onnx"))
+    assert f"{case} has no network" in said
+    assert ended(tmp_path) == ["case"]
+
+
+@pytest.mark.parametrize("at", ["make_model", "save_model"])
+@pytest.mark.slow
+def test_an_interrupted_making_leaves_nothing(at, ready, case, cloud, tmp_path, monkeypatch):
+    before = store.sha256_of(case)
+
+    def stop(_model: object, folder: Path | None = None, **_: object) -> None:
+        if folder is not None:
+            (folder / "shape.safetensors").write_bytes(b"half")
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(model_files, at, stop)
+        assert run(["locate", str(case), str(cloud), str(tmp_path / "run")]) == 130
+        assert store.sha256_of(case) == before
+        assert ended(case) == sorted(path.name for path in case.iterdir())
+        new = tmp_path / "new"
+        with pytest.raises(KeyboardInterrupt):
+            api.prepare(case / "labels.nii.gz", new)
+    assert "model" not in ended(new)  # but for which it is whole
+    assert ended(tmp_path) == ["case", "new"]
+    assert api.load_model(new).provenance["case_sha256"] == load_case(new).sha256
+    assert "model" in ended(new)
+
+
+def test_a_case_that_cannot_be_written_to_says_so_at_once(case, monkeypatch, capsys):
+    monkeypatch.setattr(model_files.os, "access", lambda *_: False)
+    with pytest.raises(StorageError, match="holds no model yet, and none can be written there"):
+        model_files.case_model(load_case(case))
+    assert run(["compile", str(case)]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+    assert "model" not in ended(case)
+
+
+@pytest.mark.slow
+def test_another_cases_model_is_replaced_and_a_strangers_file_is_not(ready, case, clinic_model):
+    """As after a copy of one case's folder over another's."""
+    kept = case / "model"
+    shutil.copytree(clinic_model, kept)
+    manifest = store.read_json(kept / store.MANIFEST)
+    manifest["provenance"]["case_sha256"] = "another"
+    store.write_json(kept / store.MANIFEST, manifest)
+    assert "its model: none yet" in "\n".join(describe(case))
+    (kept / "notes.txt").write_text("dear")
+    with pytest.raises(api.InputError, match=r"also holds notes\.txt, which would be lost"):
+        api.load_model(case)
+    assert ready == []
+    (kept / "notes.txt").unlink()
+    assert api.load_model(case).provenance["case_sha256"] == load_case(case).sha256
+    assert api.load_model(case).provenance["case_sha256"] == load_case(case).sha256
+    assert len(ready) == 1
+
+
+@pytest.mark.slow
+def test_a_case_is_replaced_with_its_model_and_with_nothing_else(ready, case, tmp_path, capsys):
+    new = tmp_path / "new"
+    command = ["prepare", str(case / "labels.nii.gz"), str(new)]
+    assert run(command) == 0
+    before = (new / "manifest.json").read_bytes()
+    assert run(command) == 2
+    assert "--overwrite" in capsys.readouterr().err
+    for stranger in (new / "notes.txt", new / "model" / "margins.json"):
+        stranger.write_text("dear")
+        assert run([*command, "--overwrite"]) == 2
+        name = str(stranger.relative_to(new))
+        assert f"{new} also holds {name}, which would be lost" in capsys.readouterr().err
+        stranger.unlink()
+    assert (new / "manifest.json").read_bytes() == before
+    wider = ["--tilt", "40", "--rotations", "limited", "--sensor", "stereo", "--overwrite"]
+    assert run([*command, *wider]) == 0
+    assert (new / "manifest.json").read_bytes() != before
+    assert "model" in ended(new)
+    said = "\n".join(describe(new))
+    assert "before the camera (stereo) it lies turned" in said
+    assert "tilted by up to 40 degrees" in said
+    assert run([*command, "--rotations", "full", "--overwrite"]) == 0
+    assert "before the camera (d405) it lies in any way" in "\n".join(describe(new))
+    assert ended(tmp_path) == ["case", "new"]
+    assert len(ready) == 3
+
+
+@pytest.mark.slow
+def test_train_says_that_nothing_needs_to_be_learnt(ready, case, tmp_path, capsys):
+    model, command = tmp_path / "model", ["train", str(case), str(tmp_path / "model")]
+    for _ in range(2):  # a model is replaced
+        assert run(command) == 0
+        (line,) = [x for x in capsys.readouterr().out.splitlines() if "learnt" in x]
+        assert line.startswith("nothing needs to be learnt: the case itself can stand")
+        assert ended(model) == ["manifest.json", "shape.safetensors"]
+    assert ended(case) == sorted(path.name for path in case.iterdir() if path.name != "model")
+    (model / "margins.json").write_text("{}")
+    for folder in (model, tmp_path / "mine", tmp_path / "begun"):
+        (folder / "training").mkdir(parents=True, exist_ok=folder == model)
+        (folder / "training" / "dear.txt").write_text("dear")
+    (tmp_path / "mine" / "training").rename(tmp_path / "mine" / "notes")
+    made = len(ready)
+    for folder, words in (
+        (model, "also holds margins.json, training, which would be lost"),
+        (tmp_path / "mine", "exists already. Choose another path."),
+        (tmp_path / "begun", "is not a model that tumortrack wrote"),
+    ):
+        before = store.sha256_of(folder)
+        assert run(["train", str(case), str(folder)]) == 2
+        said = capsys.readouterr().err
+        assert words in said
+        assert "--overwrite" not in said
+        assert store.sha256_of(folder) == before
+    assert len(ready) == made  # refused at once
+
+
+def test_what_is_gone_is_an_unknown_option(case, tmp_path):
+    done = tumortrack("train", case, tmp_path / "model", "--start", "none")
+    assert done.returncode == 2
+    assert "--start" in done.stderr
+    assert "Traceback" not in done.stderr
+    assert ended(tmp_path) == ["case"]

@@ -1,0 +1,106 @@
+"""A model of an organ: the same each time, sane, and kept in its case."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+
+from elastic_objects import SMALL, UP
+from tumortrack.core import store
+from tumortrack.core.errors import ArtifactError, InputError
+from tumortrack.core.types import SensorCloud
+from tumortrack.imaging.case import Case, load_case, save_case
+from tumortrack.registration.build import build_model
+from tumortrack.registration.presets import clinic
+from tumortrack.simulate.deform import DragConfig, ElasticConfig
+from tumortrack.tracking import model_files
+from tumortrack.tracking.model_files import case_model, load_model, make_model
+from tumortrack.tracking.tracker import Tracker
+from warp_objects import ANATOMY, slim_clinic
+
+
+def test_the_same_arguments_give_the_same_model_and_it_is_sane(slim_model):
+    kept, told = load_model(slim_model), []
+    again = build_model(ANATOMY, UP, slim_clinic(), progress=lambda *done: told.append(done))
+    assert again.calibration == kept.calibration
+    assert again.in_distribution == kept.in_distribution
+    arrays = kept.shape.to_arrays()
+    for name, array in again.shape.to_arrays().items():
+        np.testing.assert_array_equal(array, arrays[name], err_msg=name)
+    other = build_model(ANATOMY, UP, slim_clinic(), seed=1)
+    assert other.calibration != again.calibration
+    for model in (again, other):
+        assert 0.2 < model.calibration.std_scale < 5
+        assert 1 < model.calibration.usual_cost < 300
+        assert 0 < model.provenance["validation_tre_mm"] < 45  # the ellipsoid lies either way round
+        assert model.provenance["validation_far"] < 0.5
+    assert [done for done, _ in told] == [*range(1, told[0][1] + 1)]
+
+
+def test_what_is_not_elastic_has_no_model():
+    scene = msgspec.structs.replace(slim_clinic().scene, deform=(DragConfig(),))
+    with pytest.raises(InputError, match="elastic deformations"):
+        build_model(ANATOMY, UP, msgspec.structs.replace(slim_clinic(), scene=scene))
+
+
+@pytest.fixture
+def made(monkeypatch) -> list[Case]:
+    """The cases whose models are made, quickly."""
+
+    def slim(anatomy, *poses):
+        config = clinic(anatomy, *poses)
+        scene = msgspec.structs.replace(
+            config.scene, width=212, height=120, deform=(ElasticConfig(body=SMALL),)
+        )
+        return msgspec.structs.replace(config, scene=scene, scenes=6, searched=3)
+
+    cases: list[Case] = []
+
+    def noted(case, **given):
+        cases.append(case)
+        return make_model(case, **given)
+
+    monkeypatch.setattr(model_files, "clinic", slim)
+    monkeypatch.setattr(model_files, "make_model", noted)
+    return cases
+
+
+def test_a_case_keeps_its_model_until_it_changes(phantom_case: Path, made, tmp_path):
+    folder = tmp_path / "case"
+    shutil.copytree(phantom_case, folder, ignore=shutil.ignore_patterns(Case.MODEL))
+    case = load_case(folder)
+    first = case_model(case)
+    assert (folder / "model" / store.MANIFEST).is_file()
+    assert first.provenance["case_sha256"] == case.sha256
+    assert first.patient == case.patient
+    for again in (case_model(load_case(folder)), load_model(folder), Tracker(case).model):
+        assert again.calibration == first.calibration
+    assert len(made) == 1
+    anyhow = replace(case, rotations="full", sensor="stereo")
+    save_case(anyhow, folder)
+    changed = load_model(folder)
+    assert len(made) == 2
+    assert changed.registration.prior.anyhow
+    assert not first.registration.prior.anyhow
+    assert changed.config.scene.noise != first.config.scene.noise
+    assert case_model(load_case(folder)).calibration == changed.calibration
+    assert len(made) == 2
+    (folder / "model" / "shape.safetensors").unlink()
+    with pytest.raises(ArtifactError, match=r"shape\.safetensors"):
+        load_model(folder)
+
+
+def test_a_case_that_lies_nowhere_has_a_model_all_the_same(phantom_case, made):
+    tracker = Tracker(replace(load_case(phantom_case), folder=None))
+    assert len(made) == 1
+    organ = tracker.anatomy_ct.organ
+    places = (organ.vertices_mm - organ.box_mm.mean(0))[:, [0, 2, 1]] * [1, -1, 1] + [0, 0, 160]
+    near = places[places[:, 2] < np.median(places[:, 2])]
+    found = tracker.locate(SensorCloud(near.astype(np.float32)), grid=16)
+    rigid = found.motion.carry(organ.vertices_mm)
+    assert np.linalg.norm(rigid - places, axis=1).mean() < 3

@@ -1,0 +1,231 @@
+"""The search: its kernel, what is allowed, and poses that are found from nothing."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import msgspec
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from elastic_objects import CENTER, RADII, SMALL, UP
+from pose_objects import OVER, PLACE_MM, lying, seen
+from tumortrack.core.estimate import Following
+from tumortrack.core.geometry import rigid
+from tumortrack.core.types import Anatomy, SensorCloud
+from tumortrack.imaging.case import load_case
+from tumortrack.models.config import GaussNewtonConfig
+from tumortrack.models.in_distribution import RIVAL_COST
+from tumortrack.registration.looks import Looks
+from tumortrack.registration.registration import Registration
+from tumortrack.registration.rest_shape import shape_of
+from tumortrack.registration.search import APART_MM, PosePrior, Search, apart_mm
+from tumortrack.registration.search_kernels import RigidProblem, descend_rigidly
+from tumortrack.simulate.elastic.body import build_body
+from tumortrack.tracking.model_files import load_model
+from tumortrack.tracking.tracker import Tracker
+from warp_objects import ANATOMY, TURNED, placed, shape, with_slope
+from warp_objects import PLACE_MM as ELLIPSOID_MM
+
+UP_CT = np.array(UP)
+LIMITED, ANYHOW = PosePrior(UP_CT, 30.0), PosePrior(UP_CT, 180.0)
+
+
+@pytest.fixture(scope="module")
+def rest(phantom_case):
+    """The phantom, with a body that is quickly made."""
+    anatomy = load_case(phantom_case).anatomy
+    return shape_of(anatomy, build_body(anatomy, UP, SMALL, 3))
+
+
+def over(motion):
+    """The same place, the other side up."""
+    return replace(motion, rotation=OVER.as_matrix() @ motion.rotation)
+
+
+def tumors_off_mm(motion, truth):
+    vertices = np.concatenate([one.vertices_mm for one in truth.shape.anatomy_ct.tumors])
+    return np.linalg.norm(motion.carry(vertices) - truth.carry(vertices), axis=1).mean()
+
+
+# --- the kernel ---
+
+
+def plainly_descended(problem, rotation, centre):
+    """``descend_rigidly`` of one start, as arrays of all points in double precision."""
+
+    def rows():
+        offsets = (problem.points - centre) @ rotation
+        off, slope = with_slope(
+            shape().distances[0], (offsets + problem.center_ct).astype(np.float32)
+        )
+        return off.astype(float), np.column_stack([-slope, -np.cross(offsets, slope)])
+
+    for width in problem.widths_mm:
+        off, slopes = rows()
+        weight = 1 / (1 + (off / width) ** 2) ** 2
+        curvature = (slopes.T * weight) @ slopes / len(off) + np.diag(problem.damping)
+        change = np.linalg.solve(curvature, slopes.T @ (weight * off) / len(off))
+        for part, most in ((slice(0, 3), 25.0), (slice(3, 6), 0.5)):
+            change[part] *= min(1.0, most / np.linalg.norm(change[part]))
+        centre = centre - rotation @ change[:3]
+        rotation = rotation @ Rotation.from_rotvec(-change[3:]).as_matrix()
+    square = (rows()[0] / problem.last_mm) ** 2
+    return rotation, centre, (square / (1 + square)).mean()
+
+
+def test_a_descent_is_that_of_plain_arithmetic():
+    points = placed(share=0.0).carry(ANATOMY.organ.vertices_mm[::25]).astype(np.float32)
+    problem = RigidProblem(
+        shape().distances[0], shape().body.center_ct, points,
+        np.array([10.0, 6.0, 3.0]), 3.0, np.repeat([0.02**2, 1.0], 3),
+    )  # fmt: skip
+    turns = Rotation.from_rotvec([[0.1, -0.2, 0.1], [0.0, 0.0, 1.5], [0.8, 0.3, -0.4]]).as_matrix()
+    rotations = np.ascontiguousarray(TURNED @ turns)
+    centres, costs = ELLIPSOID_MM + [[5.0, -3, 8], [0, 30, 0], [-60, 0, 40]], np.empty(3)
+    expected = [
+        plainly_descended(problem, *start) for start in zip(rotations, centres, strict=True)
+    ]
+    descend_rigidly(problem, rotations, centres, costs)
+    for n, (rotation, centre, cost) in enumerate(expected):
+        np.testing.assert_allclose(rotations[n], rotation, atol=2e-3)
+        np.testing.assert_allclose(centres[n], centre, atol=0.05)
+        assert costs[n] == pytest.approx(cost, rel=0.01, abs=1e-3)
+    np.testing.assert_allclose(rotations @ rotations.transpose(0, 2, 1), [np.eye(3)] * 3, atol=1e-9)
+    assert costs[0] < 0.1 * costs[2]
+
+
+# --- what is allowed ---
+
+
+def test_what_is_allowed_costs_nothing_and_what_is_not_the_more_the_farther():
+    facing = Rotation.align_vectors([[0.0, 0, -1]], [UP_CT])[0]
+    tilts = np.array([0.0, 29.0, 42.0, 50.0, 60.0, 90.0, 180.0])
+    rotations = (Rotation.from_euler("y", tilts[:, None], degrees=True) * facing).as_matrix()
+    np.testing.assert_allclose(LIMITED.tilt_degrees_of(rotations), tilts, atol=1e-5)
+    costs = LIMITED.cost(rotations)
+    assert (costs[:3] == 0).all()
+    assert (np.diff(costs[2:]) > 0).all()
+    np.testing.assert_array_equal(LIMITED.excludes(rotations), costs > RIVAL_COST)
+    assert LIMITED.excludes(rotations[-1])
+    turned = Rotation.from_euler("z", 77, degrees=True).as_matrix() @ rotations
+    np.testing.assert_allclose(LIMITED.cost(turned), costs, atol=1e-9)  # about the line of sight
+    assert (ANYHOW.cost(Rotation.random(50, random_state=0).as_matrix()) == 0).all()
+    either = replace(LIMITED, either_side=True)
+    np.testing.assert_allclose(either.cost(OVER.as_matrix() @ rotations), either.cost(rotations))
+    np.testing.assert_allclose(either.cost(rotations), LIMITED.cost(rotations) * (tilts <= 90))
+
+
+# --- poses ---
+
+
+@pytest.mark.parametrize(
+    ("turn_degrees", "tilt_degrees", "hidden"),
+    [
+        *((turn, (15.0, -20.0), 0.0) for turn in (0, 50, 95, 170, 260, 311)),
+        *((turn, (10.0, 10.0), 0.4) for turn in (20, 140, 250)),
+    ],
+)
+def test_a_pose_is_found_from_nothing(rest, turn_degrees, tilt_degrees, hidden):
+    truth = lying(rest, turn_degrees, tilt_degrees)
+    looks, search = Looks.of([seen(truth, hidden)]), Search(rest, LIMITED)
+    first, *others = starts = search.starts(looks)
+    assert apart_mm(first, truth) < 2.5
+    assert min(apart_mm(one, first) for one in others) > APART_MM
+    assert LIMITED.excludes(starts[-1].rotation)  # the other side up was tried
+    fit, _ = Registration(rest, GaussNewtonConfig(), LIMITED).register(looks)
+    assert tumors_off_mm(fit.motion, truth) < 0.7
+    assert fit.beyond is None
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_any_rotation_is_found_where_all_are_allowed(rest, seed):
+    anyhow = Rotation.random(random_state=seed).as_matrix()
+    truth = replace(lying(rest, 0), rotation=anyhow)
+    looks = Looks.of([seen(truth)])
+    assert apart_mm(Search(rest, ANYHOW).starts(looks)[0], truth) < 2.5
+    fit, _ = Registration(rest, GaussNewtonConfig(), ANYHOW).register(looks)
+    assert tumors_off_mm(fit.motion, truth) < 0.7
+
+
+@pytest.mark.parametrize("degrees", [(50.0,), (50.0, -50.0)])
+def test_several_looks_are_searched_as_one(rest, degrees):
+    truth, poses = lying(rest, 140, (10.0, 5.0)), []
+    for angle in degrees:
+        turn = Rotation.from_euler("y", angle, degrees=True).as_matrix()
+        poses.append(rigid(turn, PLACE_MM - turn @ PLACE_MM))
+    clouds = [seen(truth, 0.4), *(seen(truth, 0.0, pose) for pose in poses)]
+    looks = Looks.of(clouds, poses)
+    assert apart_mm(Search(rest, LIMITED).starts(looks)[0], truth) < 2.5
+    fit, _ = Registration(rest, GaussNewtonConfig(), LIMITED).register(looks)
+    assert tumors_off_mm(fit.motion, truth) < 0.7
+
+
+def test_the_same_points_give_the_same_starts(rest):
+    looks = Looks.of([seen(lying(rest, 95, (15.0, -20.0)))])
+    one, again = (Search(rest, LIMITED).starts(looks) for _ in range(2))
+    for start, other in zip(one, again, strict=True):
+        np.testing.assert_array_equal(start.rotation, other.rotation)
+        np.testing.assert_array_equal(start.centre_mm, other.centre_mm)
+
+
+# --- the other side up ---
+
+
+@pytest.fixture(scope="module")
+def model(clinic_model):
+    return load_model(clinic_model)
+
+
+@pytest.mark.parametrize("turn_degrees", [0, 100, 200])
+def test_an_organ_that_lies_upside_down_is_told_and_found_where_that_is_allowed(
+    model, turn_degrees
+):
+    truth = over(lying(model.shape, turn_degrees))
+    cloud = SensorCloud(seen(truth))
+    tracker = Tracker(model)
+    found = tracker.locate(cloud, grid=16)
+    beyond = found.report["fit_cost"]["beyond"]
+    assert beyond["less"] > RIVAL_COST
+    assert beyond["tilt_degrees"] == pytest.approx(180, abs=3)
+    assert found.quality == "poor"
+    assert tumors_off_mm(found.motion, truth) > 20
+    assert tracker.locate(SensorCloud(seen(over(truth))), grid=16).quality == "good"
+    scene = model.config.scene
+    pose = msgspec.structs.replace(scene.pose, rotations="full")
+    scene = msgspec.structs.replace(scene, pose=pose)
+    anyhow = replace(model, config=msgspec.structs.replace(model.config, scene=scene))
+    for right in (
+        Tracker(anyhow).locate(cloud, grid=16),
+        tracker.follow(cloud, how=Following(either_side=True)),  # it was seen a moment ago
+    ):
+        assert right.report["fit_cost"]["beyond"] is None
+        assert (right.quality, right.reason) == ("good", "")
+        assert tumors_off_mm(right.motion, truth) < 1.5
+
+
+def test_an_organ_nearly_the_same_from_below_may_lie_upside_down(slim_model):
+    """A bent ellipsoid: the wrong side fits as well as usual, and the other one better."""
+
+    def bent(mesh):
+        bend_mm = 2 * ((mesh.vertices_mm[:, 2] - CENTER[2]) / RADII[2]) ** 2
+        return mesh.moved(mesh.vertices_mm + np.outer(bend_mm, [0.0, 1.0, 0.0]))
+
+    banana = Anatomy(tuple(bent(part) for part in ANATOMY.parts))
+    known = load_model(slim_model)
+    trained = {**known.provenance, "validation_far": 0.0}
+    noisy = msgspec.structs.replace(known.calibration, usual_cost=20.0)  # its scenes have no noise
+    bowed = shape_of(banana, build_body(banana, UP, SMALL, 3))
+    tracker = Tracker(replace(known, shape=bowed, provenance=trained, calibration=noisy))
+    upright = lying(bowed, 30)
+    found, right = (
+        tracker.locate(SensorCloud(seen(one)), grid=16) for one in (over(upright), upright)
+    )
+    cost = found.report["fit_cost"]
+    assert cost["now"] < cost["usual"]
+    assert cost["beyond"]["less"] > 0
+    assert found.quality == "poor"
+    assert "the organ may lie upside down: it fits the points as well tilted" in found.reason
+    assert right.report["fit_cost"]["beyond"] is None
+    assert "upside down" not in right.reason
