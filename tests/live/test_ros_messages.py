@@ -393,7 +393,7 @@ def test_an_estimate_is_sent_in_metres_in_the_published_frame():
     np.testing.assert_allclose([point.x, point.y, point.z], expected[:3])
     (status,) = out["diagnostics"].status
     said = {v.key: v.value for v in status.values}
-    assert (status.level, said["latency_ms"], said["encode_ms"]) == (0, "12.500", "3.000")
+    assert (status.level, said["latency_ms"], said["search_ms"]) == (0, "12.500", "3.000")
     assert said["points"] == "80"
     assert (said["patient"], said["side"]) == ("P1", "left")
 
