@@ -209,12 +209,11 @@ def train(
     Raises:
         InputError: an option is not allowed, a part is too small to be learnt.
         PackageError: ``quick`` and ``paper``, without PyTorch.
-        ArtifactError: no case, or ``folder`` holds another run.
+        InputError, ArtifactError: no case, or ``folder`` holds another model or run.
         StorageError: the disk is full; the last checkpoint is whole.
     """
     from tumortrack.models.config import RegistrationConfig
-    from tumortrack.models.folder import KIND, save_model
-    from tumortrack.tracking.model_files import make_model
+    from tumortrack.tracking.model_files import write_model
     from tumortrack.tracking.presets import PRESETS, occupancy
 
     if minutes is not None and steps is not None:
@@ -223,11 +222,7 @@ def train(
         raise InputError(f"there is no preset {preset!r}; allowed: {', '.join(PRESETS)}.")
     of = load_case(case)
     if isinstance(config, RegistrationConfig) or (config is None and preset == "clinic"):
-        store.check_place(Path(folder), KIND, True)
-        model = make_model(of, config, seed)
-        with store.new_folder(Path(folder), overwrite=True) as aside:
-            save_model(model, aside)
-        return model
+        return write_model(of, Path(folder), config, seed)
     training = occupancy("training.train")
     run = training.TrainingRun(
         anatomy_ct=of.anatomy, up_lps=of.up_lps, case_sha256=of.sha256,

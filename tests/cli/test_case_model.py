@@ -179,12 +179,15 @@ def test_a_case_is_replaced_with_its_model_and_with_nothing_else(ready, case, tm
 @pytest.mark.slow
 def test_train_says_that_nothing_needs_to_be_learnt(ready, case, tmp_path, capsys):
     model, command = tmp_path / "model", ["train", str(case), str(tmp_path / "model")]
-    for _ in range(2):  # a model is replaced
+    for _ in range(2):  # the second time it is there
         assert run(command) == 0
         (line,) = [x for x in capsys.readouterr().out.splitlines() if "learnt" in x]
         assert line.startswith("nothing needs to be learnt: the case itself can stand")
         assert ended(model) == ["manifest.json", "shape.safetensors"]
     assert ended(case) == sorted(path.name for path in case.iterdir() if path.name != "model")
+    for option in (("--rotations", "full"), ("--seed", "1")):
+        assert run([*command, *option]) == 2
+        assert "another case, or with another seed or other options" in capsys.readouterr().err
     (model / "margins.json").write_text("{}")
     for folder in (model, tmp_path / "mine", tmp_path / "begun"):
         (folder / "training").mkdir(parents=True, exist_ok=folder == model)

@@ -62,7 +62,7 @@ def progress_bar(what: str, total: int) -> Iterator[Callable[[], None]]:
 
 @contextmanager
 def progress_of(what: str, first: str = "") -> Iterator[Callable[[int, int], None]]:
-    """The same for a function that is told how many are done, and of how many."""
+    """The same for a function that gets how many are done, and of how many."""
     first_s = 0.0
 
     with live_line(first or f"{what} ...") as line:

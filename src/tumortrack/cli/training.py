@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Literal
 from tyro.conf import Positional
 
 from tumortrack.cli.console import Device, keep_loaded, live_line, progress_of, say, say_notes
-from tumortrack.core import store
 from tumortrack.core.errors import InputError
 
 if TYPE_CHECKING:
@@ -78,17 +77,14 @@ class Train:
     def _make(self, case: Case) -> None:
         """A model of the default method."""
         from tumortrack.models import folder
-        from tumortrack.tracking.model_files import make_model
+        from tumortrack.tracking.model_files import write_model
 
-        store.check_place(self.model, folder.KIND, True)
         rotations, sensor = self.rotations or case.rotations, self.sensor or case.sensor
         case = replace(case, rotations=rotations, sensor=sensor)
         say("nothing needs to be learnt: the case itself can stand wherever a MODEL is asked for.")
         with progress_of("making the model") as progress:
-            made = make_model(case, seed=self.seed, progress=progress)
-        with store.new_folder(self.model, overwrite=True) as aside:
-            folder.save_model(made, aside)
-        say(f"model written to {self.model}: {folder.training_words(made.provenance)}.")
+            made = write_model(case, self.model, seed=self.seed, progress=progress)
+        say(f"{self.model} holds the model: {folder.training_words(made.provenance)}.")
         say_notes(filter(None, [folder.weakness_of(made.provenance)]))
 
     def _train(self, case: Case) -> None:

@@ -15,6 +15,7 @@ from tumortrack.core.types import part_names
 from tumortrack.imaging.case import Case, holds_case, load_case
 from tumortrack.models.folder import (
     KIND,
+    is_finished,
     is_model_of,
     organ_of,
     read_model_manifest,
@@ -32,15 +33,12 @@ if TYPE_CHECKING:
 Progress = Callable[[int, int], None]
 
 
-def load_model(
-    folder: Path, device: str = "auto", with_margins: bool = True, progress: Progress | None = None
-) -> Model:
+def load_model(folder: Path, device: str = "auto", with_margins: bool = True) -> Model:
     """Read a model folder, or the model of a case folder, which is made where it has none yet.
 
     Args:
         device: of a network.
         with_margins: and its margins, where it was calibrated.
-        progress: as of ``case_model``.
 
     Raises:
         ArtifactError: missing, of another schema, damaged, or changed since; its margins are
@@ -49,7 +47,7 @@ def load_model(
         PackageError: a network, and PyTorch is not installed.
     """
     if holds_case(folder):
-        return case_model(load_case(folder), with_margins, progress)
+        return case_model(load_case(folder), with_margins)
     manifest = read_model_manifest(folder)
     try:
         known = {
@@ -112,6 +110,32 @@ def case_model(case: Case, with_margins: bool = True, progress: Progress | None 
     return model
 
 
+def write_model(
+    case: Case,
+    folder: Path,
+    config: RegistrationConfig | None = None,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> Model:
+    """``make_model``, into a folder of its own. The same model that lies there already is read.
+    Raises InputError: another one, or something else, would be lost."""
+    config = config or _config_of(case)
+    store.check_place(folder, KIND, True)
+    if is_finished(folder):
+        manifest = read_model_manifest(folder)
+        about = manifest["provenance"].get("case_sha256"), manifest["provenance"].get("seed")
+        if about != (case.sha256, seed) or manifest["config"] != to_builtins(config):
+            raise InputError(
+                f"{folder} holds a model of another case, or with another seed or other options. "
+                "Choose another MODEL folder."
+            )
+        return load_model(folder)
+    model = make_model(case, config, seed, progress)
+    with store.new_folder(folder, overwrite=True) as aside:
+        save_model(model, aside)
+    return model
+
+
 def make_model(
     case: Case,
     config: RegistrationConfig | None = None,
@@ -122,9 +146,7 @@ def make_model(
     Raises InputError: deformations of ``config`` that are not elastic."""
     from tumortrack.registration.build import build_model
 
-    if config is None:
-        poses = case.rotations, case.tilt_degrees
-        config = seen_by(clinic(case.anatomy, *poses), case.sensor)
+    config = config or _config_of(case)
     about = {
         "case_sha256": case.sha256,
         "patient": to_builtins(case.patient),
@@ -132,6 +154,10 @@ def make_model(
     }
     more = {} if progress is None else {"progress": progress}
     return build_model(case.anatomy, case.up_lps, config, seed, about, **more)
+
+
+def _config_of(case: Case) -> RegistrationConfig:
+    return seen_by(clinic(case.anatomy, case.rotations, case.tilt_degrees), case.sensor)
 
 
 def _parts(stated: list[str], organ: Organ) -> tuple[str, ...]:
