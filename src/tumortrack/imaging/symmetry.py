@@ -66,8 +66,8 @@ def half_turns(anatomy: Anatomy) -> list[HalfTurn]:
 def _laid_on_itself(
     points: Points, normals: Points, tree: cKDTree, turn_rad: Float64[np.ndarray, " 3"]
 ) -> tuple[Float64[np.ndarray, "4 4"], Float64[np.ndarray, " m"]]:
-    """Some of a surface's points, turned about their middle by a rotation vector, then laid on the
-    surface: the motion, and how far off (mm) they are left."""
+    """Some of a surface's points, turned about their middle by a rotation vector, then fitted to
+    the surface: the motion, and how far off (mm) they are left."""
     middle = points.mean(0)
     turn = Rotation.from_rotvec(turn_rad).as_matrix()
     way = rigid(turn, middle - turn @ middle)

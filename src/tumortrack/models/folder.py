@@ -19,9 +19,8 @@ if TYPE_CHECKING:
 KIND = "model"
 SHAPE = "shape.safetensors"
 WEIGHTS = "weights.safetensors"
-# Of validation scenes. Networks of the demo's phantom and of an ellipsoid after 1 to 20 steps had
-# 0.02 to 0.08, and of 120 answers the 17 that were over 5 mm off were all called poor for other
-# reasons. Beyond nothing was measured.
+# Of the simulated scenes on which a model was checked. Fifteen patients' kidneys had 0 to 0.06, a
+# liver of 1.7 l 0.16 and a ball with bumps 0.22: what is seen of these does not say how they lie.
 _MOST_FAR = 0.1
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Model:
+class Model(ABC):
     """What locates one patient's organ. ``provenance``: seeds, steps, hashes; ``margins``: None
     where it was not calibrated."""
 
@@ -37,22 +38,23 @@ class Model:
         """Which organ it is made for."""
         return organ_in(self.provenance.get("organ"), "provenance")
 
+    @abstractmethod
     def files(self) -> dict[str, bytes]:
         """Files of a model folder, by name."""
-        raise NotImplementedError
 
     def entries(self) -> dict[str, Any]:
         """Entries of the manifest that only this kind has."""
         return {}
 
+    @abstractmethod
     def synchronise(self) -> None:
         """Wait for what runs beside; for clocks."""
 
     @classmethod
+    @abstractmethod
     def from_folder(cls: type[M], folder: Path, manifest: dict[str, Any], **known: Any) -> M:
         """The model of a folder whose fields ``known`` are read already; InputError, KeyError,
         ValueError, RuntimeError or OSError where the folder lacks something."""
-        raise NotImplementedError
 
 
 M = TypeVar("M", bound=Model)

@@ -258,6 +258,11 @@ class RegistrationLocator:
         costs = {"now": fit.cost, "without_strays": fit.cost_without_strays, "usual": usual}
         more["fit_cost"] = {**costs, "strays": fit.strays, "others": others}
         more["fit_cost"]["beyond"] = _beyond(fit, prior)
+        more["poses"] = {  # that were allowed
+            "up_lps": prior.up_ct.tolist(),
+            "tilt_degrees": prior.tilt_degrees,
+            "either_side": prior.either_side,
+        }
         more["motion"] = {
             "camera_from_ct": motion.camera_from_ct.tolist(),
             "coefficients": motion.coefficients.tolist(),

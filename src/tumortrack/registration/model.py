@@ -55,6 +55,9 @@ class RegistrationModel(Model):
     def entries(self) -> dict[str, Any]:
         return {"trust": to_builtins(self.calibration)}
 
+    def synchronise(self) -> None:
+        """Nothing runs beside."""
+
     @classmethod
     def from_folder(cls, folder: Path, manifest: dict[str, Any], **known: Any) -> RegistrationModel:
         config = from_builtins(manifest["config"], RegistrationConfig, f"{folder}: config")

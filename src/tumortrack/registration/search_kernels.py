@@ -1,4 +1,4 @@
-"""Kernel of the search: a rigid body laid on a few points from many starts, in one compiled call.
+"""Kernel of the search: a rigid body fitted to a few points from many starts, in one compiled call.
 
 See ``gauss_newton`` for what is minimised; here without an elastic state and without a prior.
 """
