@@ -1,6 +1,7 @@
 """Where to cut a tumor out of an organ that lies on the table.
 
 Run after 01: python examples/07_plan_a_resection.py [FOLDER]
+Needs `pip install tumortrack-resection` (`make setup` has it).
 From the command line, with the motions of two arms: tumortrack plan RUN PLAN --margin 9
 """
 
@@ -10,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 import tumortrack as tt
+from tumortrack_resection import plan_resection
 
 CAMERA_FROM_LPS = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # supine, seen from above
 
@@ -21,18 +23,18 @@ def main(out: Path) -> None:
     seen = tt.estimate_from_surfaces(dict(zip(anatomy.names, turned, strict=True)))
 
     try:  # a tumor that lies wholly inside has no contour to cut along
-        tt.plan_resection(seen, tumor="tumor_1")
+        plan_resection(seen, tumor="tumor_1")
     except tt.errors.NoPlan as error:
         print("no plan:", error)
 
     try:  # nothing is known of this estimate's errors: 8 mm are assumed, and 5 don't cover them
-        tt.plan_resection(seen)
+        plan_resection(seen)
     except tt.errors.NoPlan as error:
         print("no plan:", error)
 
     for method in ("published", "margin"):
         picture = out / f"plan_{method}.png"
-        plan = tt.plan_resection(seen, method=method, picture=picture, accept_budget=True)
+        plan = plan_resection(seen, method=method, picture=picture, accept_budget=True)
         length = sum(stroke.length_mm for stroke in plan.cuts)
         print(
             f"{method}: {plan.tumor}, {len(plan.cuts)} strokes in {plan.sweeps} sweeps, "

@@ -26,7 +26,7 @@ from packaging.utils import canonicalize_name
 ROOT = Path(__file__).parents[1]
 LOCKS = ROOT / "requirements"
 TABLE = ROOT / "docs" / "dependencies.md"
-OWN = ("tumortrack", "tumortrack-lab", "tumortrack-experiment")
+OWN = ("tumortrack", "tumortrack-resection", "tumortrack-lab", "tumortrack-experiment")
 _APART = {"ur-rtde": "ur"}  # in a file of its own: `make setup` leaves it out
 
 # Licences that ask for no more than to be named, and those that bind only changes of the package
@@ -59,7 +59,7 @@ STATED = {
 
 def lock(upgrade: list[str]) -> None:
     """Resolve everything for every platform, and keep what is pinned unless told to upgrade."""
-    folders = (ROOT, ROOT / "lab", ROOT / "experiment")
+    folders = (ROOT, ROOT / "resection", ROOT / "lab", ROOT / "experiment")
     everything = "".join(f"-e {folder}[{_extras(folder)}]\n" for folder in folders)
     resolved = _resolved(everything, "".join(_locks().values()), upgrade)
     build = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["build-system"]["requires"]
@@ -118,7 +118,7 @@ def _resolved(wanted: str, kept: str, upgrade: list[str]) -> str:
 
 _ABOUT = {
     "core": "The tracker alone, by hash: what `make demo` installs.",
-    "rest": "All else that `make setup` installs: PyTorch, extras, experiment, lab, tests, site.",
+    "rest": "All else that `make setup` installs: PyTorch, extras, laboratory, tests, site.",
     "cuda": "What PyPI's PyTorch for Linux needs besides; its CPU build does not.",
     "ur": "For real arms: pip install --require-hashes --no-deps -r requirements/ur.txt",
 }

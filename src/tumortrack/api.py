@@ -32,7 +32,6 @@ if TYPE_CHECKING:
     from tumortrack.models.model import Model
     from tumortrack.occupancy.config import TrainConfig
     from tumortrack.occupancy.training.train import TrainingStatus
-    from tumortrack.plan.values import ResectionPlan
     from tumortrack.sense.region.taught import Taught
     from tumortrack.simulate.scene import SceneConfig
     from tumortrack.simulate.scene_folder import Scene
@@ -529,62 +528,3 @@ def open_sinks(sinks: Mapping[str, Any], context: SinkContext) -> Iterator[list[
             workers.append(SinkWorker(name, opened, waiting(sink)))
             stack.callback(workers[-1].close)
         yield workers
-
-
-def plan_resection(
-    located: StrPath | Estimate,
-    *,
-    picture: StrPath | None = None,
-    stand_mm: float | None = None,
-    accept_poor: bool = False,
-    accept_budget: bool = False,
-    confidence: float | None = None,
-    **options: Any,
-) -> ResectionPlan:
-    """Where to cut a tumor out; nothing moves. `tumortrack plan` also plans the arms' motions.
-
-    Args:
-        located: a folder that `tumortrack locate` wrote, or an estimate; camera frame, mm. The
-            camera is taken to look straight down on the table.
-        picture: PNG file to draw the plan into.
-        stand_mm: height of the organ's lowest point over the table.
-        accept_poor: plan on a poor estimate; the plan's notes say so.
-        accept_budget: plan though the margin does not cover the errors that are to be expected
-            (docs/resection.md); the plan's notes say so.
-        confidence: the margin is of healthy tissue, beyond all errors, with the tumor's place as
-            sure as this, which the model's margins must state (docs/trust.md).
-        options: fields of ``plan.values.ResectionConfig``: ``tumor``, ``method`` (``margin`` or
-            ``published``), ``margin_mm``, ``sigmas`` and others.
-
-    Returns:
-        The plan: cuts, layers, grasp point; table frame, mm, z up.
-
-    Raises:
-        NoPlan: nothing to cut, or not as asked, or the margin is less than the errors; says why.
-        InputError: a poor estimate; no such tumor, or an option that is not allowed.
-    """
-    from dataclasses import replace
-    from functools import partial
-
-    from tumortrack.core.config import from_builtins
-    from tumortrack.plan import budget
-    from tumortrack.plan import located as places
-    from tumortrack.plan.values import ResectionConfig
-
-    config = from_builtins(options, ResectionConfig, "plan_resection")
-    if isinstance(located, Estimate):
-        seen = places.of_estimate(located)
-    else:
-        seen = places.read_run(Path(located))
-    stand_mm = places.STAND_MM if stand_mm is None else stand_mm
-    seen = seen.moved(places.table_under(seen.meshes, stand_mm))
-    notes = places.notes_of_doubt(seen.doubt, accept_poor)
-    budget_of = partial(budget.planned_budget, located=seen, confidence=confidence)
-    plan, _, errors = budget.plan_within(seen, config, budget_of, confidence is not None)
-    plan = replace(plan, notes=(*notes, *plan.notes))
-    plan = budget.heeded(plan, errors, accept_budget)
-    if picture is not None:
-        from tumortrack.report.plan_pictures import draw_plan
-
-        draw_plan(plan, seen, Path(picture))
-    return plan

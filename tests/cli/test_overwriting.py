@@ -15,7 +15,12 @@ from tumortrack.core.errors import InputError
 from tumortrack.report.calibration_table import head_of, open_table
 
 ROOT = Path(__file__).parents[2]
-PACKAGES = ("src/tumortrack", "lab/src/tumortrack_lab", "experiment/src/tumortrack_experiment")
+PACKAGES = (
+    "src/tumortrack",
+    "resection/src/tumortrack_resection",
+    "lab/src/tumortrack_lab",
+    "experiment/src/tumortrack_experiment",
+)
 OPTION = re.compile(r"--[a-z][a-z-]+")
 # Options of other programs that messages name.
 OTHERS = {"--device-cgroup-rule", "--user", "--upgrade"}

@@ -11,8 +11,8 @@ from stories import answered, cloud_by_rays, looking_down, refusal, succeeded, t
 from tumortrack.core import store
 from tumortrack.core.patient import Patient
 from tumortrack.imaging.case import load_case
-from tumortrack.plan.files import read_plan
 from tumortrack.sense.ply import write_cloud_ply
+from tumortrack_resection.files import read_plan
 
 P1 = {"id": "P1", "side": "right"}  # of ``phantom_case``
 OTHERS = (("--patient", "P2"), ("--side", "left"), ("--patient", "P1", "--side", "left"))

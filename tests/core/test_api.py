@@ -19,8 +19,6 @@ SIGNATURES = {
     "load_case": "folder",
     "load_estimate": "folder",
     "load_model": "folder device='auto'",
-    "plan_resection": "located picture=None stand_mm=None accept_poor=False accept_budget=False "
-    "confidence=None options",
     "prepare": "source folder=None overwrite=False segment=None progress=None options",
     "read_cloud": "path unit='mm'",
     "read_depth": "path intrinsics unit_mm=None",

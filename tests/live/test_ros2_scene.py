@@ -4,7 +4,6 @@ trajectories, and a package for their workspace."""
 from __future__ import annotations
 
 import io
-import json
 import struct
 import sys
 import xml.etree.ElementTree as ET
@@ -34,8 +33,6 @@ from tumortrack.live.ros.tf import TRANSFORMS, pose_of
 from tumortrack.live.sinks.moveit import SCENE, coarser, widened_hull
 from tumortrack.live.spec import SINKS
 from tumortrack.live.values import PublishedFrame, TrackingResult
-from tumortrack.plan.files import ros_trajectories
-from tumortrack.plan.motions import JOINTS, Motions, MotionStage
 
 MESSAGES = Messages()
 QUARTER = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
@@ -185,32 +182,6 @@ def test_moveit_s_types_are_those_that_a_second_library_makes():
     cdr = bytes(MESSAGES.to_bytes(scene))
     type_ = idl_type(SCENE)
     assert type_.deserialize(cdr).serialize(use_version_2=False)[: len(cdr)] == cdr
-
-
-def test_a_plan_s_motions_are_trajectories_of_all_joints():
-    times = np.array([0.0, 0.5, 1.25])
-    joints = np.zeros((3, 12))
-    joints[1:, 0], joints[:, 7] = [0.25, 1.0], 0.5
-    still = MotionStage("hold", np.zeros(1), joints[:1], np.zeros(1, bool))
-    moving = MotionStage("approach", times, joints, np.zeros(3, bool))
-    written = json.loads(ros_trajectories(Motions((still, moving)), "table"))
-    (stage,) = written["stages"]
-    said = stage["trajectory"]["joint_trajectory"]
-    points = [{**one, "positions": np.array(one["positions"]),
-               "velocities": np.array(one["velocities"])} for one in said["points"]]  # fmt: skip
-    message = MESSAGES.make(
-        "moveit_msgs/msg/RobotTrajectory", joint_trajectory={**said, "points": points}
-    )
-    again = MESSAGES.from_bytes(MESSAGES.to_bytes(message), "moveit_msgs/msg/RobotTrajectory")
-    trajectory = again.joint_trajectory
-    assert (stage["name"], stage["seconds"]) == ("approach", 1.25)
-    assert trajectory.joint_names == list(JOINTS)
-    assert trajectory.header.frame_id == "table"
-    np.testing.assert_allclose([one.positions for one in trajectory.points], joints, atol=1e-6)
-    starts = [one.time_from_start.sec + 1e-9 * one.time_from_start.nanosec
-              for one in trajectory.points]  # fmt: skip
-    np.testing.assert_allclose(starts, times)
-    assert [one.velocities[0] for one in trajectory.points] == [0, pytest.approx(0.7), 0]
 
 
 def test_obstacles_arrive_of_good_estimates_and_cameras_are_kept_for_latecomers():

@@ -235,10 +235,10 @@ def _configurations() -> dict[str, Target]:
     from tumortrack.core.config import from_builtins, to_builtins
     from tumortrack.core.store import read_json
     from tumortrack.live.calibration_file import read_frames
-    from tumortrack.plan.arms.config import CellConfig
-    from tumortrack.plan.values import ResectionConfig
     from tumortrack.sense.files import read_poses
     from tumortrack.tracking.presets import PRESETS
+    from tumortrack_resection.arms.config import CellConfig
+    from tumortrack_resection.values import ResectionConfig
     from warp_objects import ANATOMY
 
     def written(kind: type, value: object) -> Target:
@@ -388,10 +388,10 @@ def _experiment() -> dict[str, Target]:
 def of_base(base: Path) -> dict[str, Target]:
     """Case, scene, both kinds of model, run and plan, as ``attacks.make_base`` makes them."""
     from tumortrack.imaging.case import load_case
-    from tumortrack.plan.files import read_plan
-    from tumortrack.plan.located import read_run
     from tumortrack.simulate.scene_folder import read_scene
     from tumortrack.tracking.model_files import load_model
+    from tumortrack_resection.files import read_plan
+    from tumortrack_resection.located import read_run
 
     scene = base / "scenes" / "0000"
     members: list[tuple[Path, str, Callable[[Path], object]]] = [

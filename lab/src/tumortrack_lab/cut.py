@@ -16,8 +16,8 @@ from jaxtyping import Bool, Float, Int, UInt8
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import ORGAN, Anatomy
 from tumortrack.imaging.raster import expand, label_grid
-from tumortrack.plan.values import Cut, CutLayer, ResectionPlan
 from tumortrack.report.metrics import distance_to_surface
+from tumortrack_resection.values import Cut, CutLayer, ResectionPlan
 
 Flat = Float[np.ndarray, "_ 2"]
 Points = Float[np.ndarray, "_ 3"]

@@ -13,6 +13,7 @@ import tumortrack
 from tumortrack.cli.cases import Prepare, Simulate
 from tumortrack.cli.console import say
 from tumortrack.cli.evaluate import Evaluate
+from tumortrack.cli.main import command
 from tumortrack.cli.training import Train
 from tumortrack.core import store
 from tumortrack.core.errors import InputError, NoEstimate, NoPlan
@@ -51,6 +52,7 @@ class Demo:
             from tumortrack.tracking.presets import occupancy
 
             occupancy("training.train")  # what is missing is said first
+            command("plan")
         if self.scenes < 1:
             raise InputError(f"--scenes {self.scenes} must be at least 1.")
         out = self.out
@@ -90,7 +92,6 @@ class Demo:
     def _show_paper(self, ours: dict[str, Any]) -> None:
         """The paper's chain on the same CT and scenes, beside the default method's answers."""
         from tumortrack.cli.locate import Locate
-        from tumortrack.cli.plan import Plan
         from tumortrack.report.summary import headlines
 
         out, paper = self.out, self.out / "paper"
@@ -106,7 +107,7 @@ class Demo:
         run = paper / "run"
         try:
             Locate(model=out / "model", cloud=scene / "cloud.ply", out=run, grid=_VOLUME).run()
-            Plan(
+            command("plan")(
                 run_folder=run, plan=paper / "plan", method="published", arms=False,
                 accept_poor=True, accept_budget=True,
             ).run()  # fmt: skip

@@ -21,15 +21,17 @@ from tumortrack.core.process import available_cores
 
 # What each distribution and its extras are for; "" is what it always needs.
 PURPOSES = {
-    ("tumortrack", ""): "cases, locating, planning",
+    ("tumortrack", ""): "cases, locating, tracking",
     ("tumortrack", "live"): "cameras, ROS 2, the web viewer, 3D Slicer, DICOM segmentations",
     ("tumortrack", "stereo"): "depth from two pictures",
-    ("tumortrack", "arms"): "motions of two arms",
-    ("tumortrack", "ur"): "a real arm of Universal Robots",
+    ("tumortrack", "ur"): "a camera that an arm of Universal Robots holds",
     ("tumortrack", "pcd"): ".pcd clouds",
     ("tumortrack", "occupancy"): "the paper's method: networks and their training",
     ("tumortrack", "onnx"): "networks as ONNX files",
     ("tumortrack", "tensorboard"): "training curves",
+    ("tumortrack-resection", ""): "plans of a resection",
+    ("tumortrack-resection", "arms"): "motions of two arms",
+    ("tumortrack-resection", "ur"): "a real arm of Universal Robots",
     ("tumortrack-experiment", ""): "phantoms, calibrations, recordings",
     ("tumortrack-lab", ""): "digital twin, studies, benchmarks",
     ("tumortrack-lab", "fleet"): "many patients on many machines",

@@ -28,12 +28,13 @@ class Command(Protocol):
 
 _MODULES = {  # of ours, in the order of --help; only the chosen one is imported
     "demo": "demo", "prepare": "cases", "export": "cases", "train": "training",
-    "locate": "locate", "track": "track", "plan": "plan", "resect": "resect",
-    "simulate": "cases", "evaluate": "evaluate", "margins": "margins", "compile": "models",
-    "onnx": "models", "inspect": "inspection", "doctor": "doctor",
+    "locate": "locate", "track": "track", "simulate": "cases",
+    "evaluate": "evaluate", "margins": "margins", "compile": "models", "onnx": "models",
+    "inspect": "inspection", "doctor": "doctor",
 }  # fmt: skip
 # Whose they are: where that is not installed, they are no typing errors.
 _OF_OTHERS = {
+    **dict.fromkeys(("plan", "resect"), "tumortrack-resection"),
     **dict.fromkeys(("twin", "bench", "fleet"), "tumortrack-lab"),
     **dict.fromkeys(("phantom-kit", "calibrate", "record", "reference"), "tumortrack-experiment"),
 }
@@ -95,6 +96,17 @@ def leave(code: int = 0) -> NoReturn:
     os._exit(code)
 
 
+def command(name: str) -> Callable[..., Command]:
+    """One command, ours or an installed package's. Raises InputError: its package is missing."""
+    if name not in (found := _commands(name)):
+        package = _OF_OTHERS[name]
+        raise InputError(
+            f"the command {name} belongs to {package}, which is not installed here: "
+            f"pip install {package}"
+        )
+    return found[name]
+
+
 def _commands(chosen: str) -> dict[str, Callable[..., Command]]:
     """Ours, and behind them other installed packages' (entry points of ``tumortrack.commands``):
     the chosen one, or all where there is none of that name."""
@@ -124,16 +136,10 @@ def _ours(name: str) -> Callable[..., Command]:
 def _parse(arguments: list[str]) -> Command:
     """Only the chosen command's options are made; all of them take several times as long."""
     commands = _commands(arguments[0] if arguments else "")
-    if arguments and (command := commands.get(arguments[0])) is not None:
+    if arguments and arguments[0] in (*commands, *_OF_OTHERS):
         named = (tyro.conf.PositionalMetavarFromFieldName,)  # MODEL CLOUD OUT, not PATH PATH PATH
         prog = f"tumortrack {arguments[0]}"
-        return tyro.cli(command, prog=prog, args=arguments[1:], config=named)
-    if arguments and arguments[0] in _OF_OTHERS:
-        package = _OF_OTHERS[arguments[0]]
-        raise InputError(
-            f"the command {arguments[0]} belongs to {package}, which is not installed here: "
-            f"pip install {package}"
-        )
+        return tyro.cli(command(arguments[0]), prog=prog, args=arguments[1:], config=named)
     return tyro.extras.subcommand_cli_from_dict(
         commands,
         prog="tumortrack",

@@ -23,10 +23,9 @@ from tumortrack.core.errors import InputError, StorageError
 if TYPE_CHECKING:
     from tumortrack.live.cameras import Cameras, CameraSetup
     from tumortrack.live.loop import Loop, LoopConfig
-    from tumortrack.live.values import TrackingResult
+    from tumortrack.live.values import ArmsController, TrackingResult
     from tumortrack.live.workers import SinkWorker
     from tumortrack.models.model import Model
-    from tumortrack.plan.operation import Operation
 
 _SAY_S, _SAY_PLAIN_S = 1.0, 5.0  # between two lines of state: on a terminal, in a file
 STOPPED = "stopped by the user"  # why arms stand
@@ -42,7 +41,7 @@ class Arms:
     the report; ``tip_mm``: as of ``SinkContext``; ``ur``: there are sinks of real arms, connected
     or not."""
 
-    operation: Operation
+    operation: ArmsController
     setup: CameraSetup
     about: dict[str, Any]
     tip_mm: Any

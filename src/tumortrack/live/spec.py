@@ -123,7 +123,6 @@ SINKS = Registry[SinkConfig](
         "ros2": f"{_LIVE}.sinks.ros:Ros2SinkConfig",
         "moveit": f"{_LIVE}.sinks.moveit:MoveItSinkConfig",
         "openigtlink": f"{_LIVE}.sinks.openigtlink:OpenIgtLinkSinkConfig",
-        "ur": f"{_LIVE}.sinks.ur:UrSinkConfig",
     },
 )
 

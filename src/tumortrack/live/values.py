@@ -13,7 +13,7 @@ from abc import abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, ClassVar, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, UInt8
@@ -285,6 +285,10 @@ class ArmsController(Protocol):
 
     def abort(self, reason: str) -> None:
         """Stop the arms for good."""
+        ...
+
+    def summary(self) -> dict[str, Any]:
+        """What they did, for a run's report."""
         ...
 
 

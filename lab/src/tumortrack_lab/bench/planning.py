@@ -14,13 +14,13 @@ from skimage.measure import find_contours
 from tumortrack.core.geometry import rigid
 from tumortrack.core.types import Anatomy
 from tumortrack.imaging.raster import label_grid
-from tumortrack.plan.located import STAND_MM
-from tumortrack.plan.outline import common, evenly, grown
-from tumortrack.plan.resection import plan_resection
-from tumortrack.plan.values import Located, ResectionConfig
 from tumortrack_lab.bench.rows import MOTIONS, PLAN, Workload
 from tumortrack_lab.bench.subject import BenchSubject
 from tumortrack_lab.twin.apparatus import moved
+from tumortrack_resection.located import STAND_MM
+from tumortrack_resection.outline import common, evenly, grown
+from tumortrack_resection.resection import plan_resection
+from tumortrack_resection.values import Located, ResectionConfig
 
 _VOXEL_MM = 0.5
 _POINTS = 40_000
@@ -71,9 +71,9 @@ def workloads(subject: BenchSubject, _: float) -> Iterator[Workload]:
         yield Workload(PLAN, what, "plan", call, partial(naive, seen), naive_is)
     if find_spec("pinocchio") is None:  # the extra `arms`
         return
-    from tumortrack.plan.arms.cell import ArmCell
-    from tumortrack.plan.arms.config import CellConfig
-    from tumortrack.plan.arms.procedure import plan_motions
+    from tumortrack_resection.arms.cell import ArmCell
+    from tumortrack_resection.arms.config import CellConfig
+    from tumortrack_resection.arms.procedure import plan_motions
 
     organ = seen.organ
     cell, plan = ArmCell(CellConfig(), organ), plan_resection(seen, ours)

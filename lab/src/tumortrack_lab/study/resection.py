@@ -18,6 +18,7 @@ import pandas as pd
 
 import tumortrack
 import tumortrack_lab.cut
+import tumortrack_resection
 from tumortrack.core import store
 from tumortrack.core.config import Config, to_builtins
 from tumortrack.core.errors import InputError, NoEstimate, NoPlan
@@ -25,9 +26,6 @@ from tumortrack.core.estimate import Estimate
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import Anatomy, OccupancyCloud
 from tumortrack.models.margins import NAME, read_margins
-from tumortrack.plan.budget import ErrorBudget, plan_within, planned_budget
-from tumortrack.plan.located import of_estimate
-from tumortrack.plan.values import Located, ResectionConfig, ResectionPlan
 from tumortrack.registration.locator import QUERIES
 from tumortrack.simulate.scene_folder import Scene, read_scene
 from tumortrack.tracking.model_files import load_model
@@ -40,6 +38,9 @@ from tumortrack_lab.study.tables import EMPTY, NOTHING, groups, label_of, names,
 from tumortrack_lab.study.trust import share_words
 from tumortrack_lab.study.tumor_sites import tumor_sites_of
 from tumortrack_lab.twin.apparatus import moved
+from tumortrack_resection.budget import ErrorBudget, plan_within, planned_budget
+from tumortrack_resection.located import of_estimate
+from tumortrack_resection.values import Located, ResectionConfig, ResectionPlan
 
 TRUTH = "truth"
 _FINE = 256  # voxels along the true organ: its points' labels err by 0.2 mm
@@ -153,7 +154,7 @@ def scattered(estimate: Estimate) -> Estimate:
 
 def cutting() -> dict[str, Any]:
     """What else decides a measurement whose estimate is planned on and cut."""
-    planning = (Path(tumortrack.__file__).parent / "plan").glob("*.py")
+    planning = Path(tumortrack_resection.__file__).parent.glob("*.py")
     code = code_sha256([*planning, Path(tumortrack_lab.cut.__file__)])
     planners = [to_builtins(planner) for planner in PLANNERS]
     return {"cutting": {"planners": planners, "voxel_mm": VOXEL_MM, "code_sha256": code}}

@@ -1,0 +1,145 @@
+"""Runs every test with array shapes checked: jaxtyping's annotations are executed by beartype."""
+
+import fcntl
+import os
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import jaxtyping
+import pytest
+
+# Ray reads these once, when whatever test imports it first: its clusters of these tests ask for a
+# token, which other users of the machine do not have.
+os.environ |= {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": "0123456789abcdef" * 4}
+ROOT = Path(__file__).parent
+PACKAGES = (
+    ROOT / "src" / "tumortrack",
+    ROOT / "resection" / "src" / "tumortrack_resection",
+    ROOT / "lab" / "src" / "tumortrack_lab",
+    ROOT / "experiment" / "src" / "tumortrack_experiment",
+)
+
+# Left out: modules with numba kernels (numba compiles the plain function); core.types, whose
+# constructors convert and check shapes themselves, always; and packages' __init__.py, with whom
+# all below them would be hooked.
+CHECKED = [
+    ".".join(path.relative_to(package.parent).with_suffix("").parts)
+    for package in PACKAGES
+    for path in sorted(package.rglob("*.py"))
+    if path.name not in ("__init__.py", "__main__.py")
+    and path != PACKAGES[0] / "core" / "types.py"
+    and not re.search("import numba|^@n?jit", path.read_text(encoding="utf-8"), re.M)
+]
+jaxtyping.install_import_hook(CHECKED, "checking.check_annotations")
+
+
+# What needs a model is slow: it may be the one that makes it.
+MODELS = {"clinic_model", "quick_model", "learnt_model", "slim_model"}
+
+# The longest files first: with few workers none is left alone with one at the end. Two of the
+# first three make no `clinic` model: else each worker would compile its kernels for itself.
+SLOWEST = (
+    "test_soak.py",
+    "test_locate.py",
+    "test_attacks.py",
+    "test_training.py",
+    "test_real_patients.py",
+    "test_examples.py",
+    "test_resect.py",
+    "test_gauss_newton.py",
+    "test_registration.py",
+    "test_track.py",
+    "test_demo.py",
+    "test_bench_gpu.py",
+    "test_margins.py",
+    "test_twin_physics.py",
+)
+
+
+@pytest.hookimpl(tryfirst=True)  # before -m chooses
+def pytest_collection_modifyitems(items):
+    for item in items:
+        if MODELS.intersection(item.fixturenames):
+            item.add_marker(pytest.mark.slow)
+    order = {name: n for n, name in enumerate(SLOWEST)}
+    items.sort(key=lambda item: order.get(item.path.name, len(order)))
+
+
+@pytest.fixture
+def unchecked(monkeypatch):
+    """As in use: annotations are not executed, so that a function's own refusal is met."""
+    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)
+
+
+@pytest.fixture(scope="session")
+def shared_data():
+    """Real patients' anatomy beside the checkout; tests that need it skip where it is absent."""
+    folder = ROOT.parent / "shared" / "data"
+    if not folder.is_dir():
+        pytest.skip(f"real data not found at {folder}")
+    return folder
+
+
+# What several files need is made once in a run, whatever the number of workers. Not to be altered.
+
+Once = Callable[[str, Callable[[Path], object]], Path]
+
+
+@pytest.fixture(scope="session")
+def once(tmp_path_factory: pytest.TempPathFactory) -> Once:
+    """``once(name, make)``: the folder that the first worker who asks has ``make`` write."""
+    own = tmp_path_factory.getbasetemp()
+    shared = (own.parent if "PYTEST_XDIST_WORKER" in os.environ else own) / "shared"
+    shared.mkdir(exist_ok=True)
+
+    def made(name: str, make: Callable[[Path], object]) -> Path:
+        with (shared / f"{name}.lock").open("w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)  # another worker may be making it
+            if not (shared / f"{name}.made").exists():
+                make(shared / name)
+                (shared / f"{name}.made").touch()
+        return shared / name
+
+    return made
+
+
+@pytest.fixture(scope="session")
+def phantom_case(once) -> Path:
+    """The built-in phantom on coarse voxels, as a case folder."""
+    from stories import write_phantom_case
+
+    return once("phantom_case", write_phantom_case)
+
+
+@pytest.fixture(scope="session")
+def clinic_model(once, phantom_case) -> Path:
+    """A model folder of the phantom: the preset clinic."""
+    from stories import write_clinic
+
+    return once("clinic_model", lambda model: write_clinic(phantom_case, model))
+
+
+@pytest.fixture(scope="session")
+def quick_model(once, phantom_case) -> Path:
+    """A model folder of the phantom: the preset quick, trained for seconds."""
+    from stories import trained
+
+    return once("quick_model", lambda model: trained(phantom_case, model))
+
+
+@pytest.fixture(scope="session")
+def learnt_model(once, phantom_case) -> Path:
+    """A model folder of the phantom: a ``quick`` that has learnt enough to be right by millimetres
+    and sure of its labels."""
+    from stories import train_learnt
+
+    return once("learnt_model", lambda model: train_learnt(phantom_case, model))
+
+
+@pytest.fixture(scope="session")
+def slim_model(once) -> Path:
+    """A model folder of the elastic objects' organ: a slim clinic."""
+    from warp_objects import write_slim
+
+    return once("slim_model", write_slim)

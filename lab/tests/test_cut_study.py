@@ -1,0 +1,232 @@
+"""Plans made on estimates cut the truth: kept, and what the tables say of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+import trimesh
+
+from tumortrack.core import store
+from tumortrack.core.errors import InputError, NoEstimate
+from tumortrack.core.geometry import rigid, transform_points
+from tumortrack.core.types import Anatomy, Mesh, SensorCloud
+from tumortrack.imaging.meshes import mesh_of, solid_of
+from tumortrack.simulate.scene_folder import Scene
+from tumortrack_lab.cut import cut
+from tumortrack_lab.peers.base import Fit, estimate_of, rigid_carry
+from tumortrack_lab.study.measure import measured
+from tumortrack_lab.study.methods import Method, StudyCase
+from tumortrack_lab.study.resection import (
+    PLANNERS,
+    Planner,
+    cut_one,
+    cutting,
+    scattered,
+    tables_of,
+    tidy_plans,
+    truth,
+)
+from tumortrack_lab.study.tables import groups
+from tumortrack_resection.located import of_estimate
+from tumortrack_resection.resection import plan_resection
+from tumortrack_resection.values import ResectionConfig
+
+CAMERA_FROM_TABLE = rigid(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 150.0]))
+OURS = Planner()
+
+
+def ball(radius_mm, center_mm, semi_axes=(1, 1, 1)):
+    solid = trimesh.creation.icosphere(4, radius_mm)
+    return Mesh(solid.vertices * np.array(semi_axes) + np.array(center_mm), solid.faces)
+
+
+def kidney():
+    """Table frame: one tumor of 8 mm, half sunk into the top; one of 4 mm, deep inside."""
+    organ, tumor = ball(1, (0, 0, 30), (32, 20, 16)), ball(8, (0, 0, 46))
+    whole = mesh_of(solid_of(organ, "organ") + solid_of(tumor, "tumor"))
+    return Anatomy((whole, tumor, ball(4, (-20, 0, 27))))
+
+
+def moved(anatomy, b_from_a):
+    parts = (part.moved(transform_points(b_from_a, part.vertices_mm)) for part in anatomy.parts)
+    return Anatomy(tuple(parts))
+
+
+def located_as_it_is(anatomy):
+    estimate = scattered(estimate_of(Fit(lambda points: points), anatomy))
+    return of_estimate(estimate, unsure=False)
+
+
+def test_a_plan_on_the_truth_takes_the_tumor_with_the_margin_that_was_asked_for():
+    truth = kidney()
+    for margin_mm in (3.0, 7.0):
+        config = ResectionConfig(tumor="tumor_1", margin_mm=margin_mm)
+        result = cut(truth, plan_resection(located_as_it_is(truth), config))
+        assert result.detached
+        assert result.removed_share == 1.0
+        assert margin_mm - 0.5 < result.margin_mm < margin_mm + 1.0
+        assert result.hurt == ()
+
+
+def test_the_papers_plan_on_the_truth_passes_right_below_the_tumor():
+    """Its second sweep is the lower face of the tumor's bounding box."""
+    truth, config = kidney(), ResectionConfig(method="published", tumor="tumor_1")
+    result = cut(truth, plan_resection(located_as_it_is(truth), config))
+    assert result.detached
+    assert result.removed_share > 0.99
+    assert result.margin_mm == pytest.approx(0.0, abs=0.6)
+
+
+def shifted(shift_mm=0.0, std_mm=None, nothing=False, name="clinic", calls=None):
+    """Answers the truth, shifted along the table's x, and says how sure it is if it is told."""
+
+    def locate(scene, grid):
+        if calls is not None:
+            calls.append("asked")
+        if nothing:
+            raise NoEstimate("the cloud shows no organ")
+        carry = rigid_carry(rigid(np.eye(3), np.array([shift_mm, 0.0, 0.0])))
+        estimate = scattered(estimate_of(Fit(carry), scene.reference, grid=grid))
+        return replace(estimate, motion=None if std_mm is None else Sure(std_mm))
+
+    return Method(name, {"shift_mm": shift_mm}, locate)
+
+
+@dataclass(frozen=True)
+class Sure:
+    std: float
+
+    def carry(self, points_ct, /):
+        return points_ct
+
+    def back(self, points_camera, /):
+        return points_camera
+
+    def std_mm(self, points_ct, /):
+        return np.full(len(points_ct), self.std)
+
+    largest_std_mm = std_mm
+
+    def covariance_mm2(self, points_ct, /):
+        return self.std**2 * np.tile(np.eye(3), (len(points_ct), 1, 1))
+
+
+@pytest.fixture(scope="module")
+def case(tmp_path_factory):
+    root = tmp_path_factory.mktemp("cutting")
+    (root / "case").mkdir()
+    store.write_json(root / "case" / store.MANIFEST, {"kind": "case"})
+    truth = moved(kidney(), CAMERA_FROM_TABLE)
+    cloud = SensorCloud(truth.organ.vertices_mm[truth.organ.vertices_mm[:, 2] < 120])
+    for variant in ("D0", "D1"):
+        meta = {"camera_from_bench": CAMERA_FROM_TABLE.tolist()}
+        Scene(cloud, truth, None, meta).write(root / "scenes" / f"{variant}-noise")
+    Scene(cloud, truth).write(root / "scenes" / "G1-noise")
+    return StudyCase("balls", root / "case", root / "scenes", kidney(), (0.0, 0.0, 1.0))
+
+
+def cuts(case, method, variant="D0"):
+    """What each planner's plan did, for the one exophytic tumor."""
+    rows = cut_one(case, method, variant, "noise", 64)
+    assert {row["tumor"] for row in rows} == {"tumor_1"}
+    return {row["planner"]: row for row in rows}
+
+
+def test_an_estimate_that_is_off_costs_as_much_margin(case):
+    here = cuts(case, shifted())
+    off = cuts(case, shifted(shift_mm=3.0))
+    assert here[OURS.name]["removed_share"] == off[OURS.name]["removed_share"] == 1.0
+    assert here[OURS.name]["margin_mm"] == pytest.approx(5.0, abs=0.4)
+    assert off[OURS.name]["margin_mm"] == pytest.approx(5.0 - 3.0, abs=0.5)
+    far = cuts(case, shifted(shift_mm=8.0))
+    assert far[OURS.name]["margin_mm"] == pytest.approx(5.0 - 8.0, abs=0.6)
+    assert far[OURS.name]["removed_share"] < 0.97
+    assert far[OURS.name]["left_ml"] > 0.1
+
+
+def test_the_margin_grows_by_what_the_estimate_is_unsure_of(case):
+    plans = cuts(case, shifted(std_mm=0.5))
+    assert list(plans) == [planner.name for planner in PLANNERS]
+    wider = Planner(sigmas=2.0)
+    gained = plans[wider.name]["margin_mm"] - plans[OURS.name]["margin_mm"]
+    assert gained == pytest.approx(1.0, abs=0.3)
+    assert plans[wider.name]["healthy_ml"] > plans[OURS.name]["healthy_ml"] + 0.2
+    without = cuts(case, shifted())
+    assert list(without) == [OURS.name]
+
+
+def test_a_stated_margin_pays_for_an_estimate_that_is_as_far_off(case):
+    """3 mm of it, with 2 mm of hand-eye, 3 of tool and 2 of motion as nobody states them."""
+    off, radius_mm = shifted(shift_mm=3.0, std_mm=0.5), 3.0
+    stated = {"stated": [{"confidence": 0.95, "mm": {"tumor_1": radius_mm}}], "reason": ""}
+
+    def locate(scene, grid):
+        estimate = off.locate(scene, grid)
+        return replace(estimate, quality="good", report={**estimate.report, "margin": stated})
+
+    rows = cut_one(case, replace(off, locate=locate), "D0", "noise", 64)
+    assert all(row["good"] for row in rows)
+    plain_mm, _, radius, everything, thin = (row["margin_mm"] for row in rows)
+    assert [row["planner"] for row in rows] == [planner.name for planner in PLANNERS]
+    assert plain_mm == pytest.approx(5.0 - 3.0, abs=0.5)
+    assert radius - plain_mm == pytest.approx(radius_mm, abs=0.3)
+    assert everything - plain_mm == pytest.approx(
+        2.0 + np.hypot(radius_mm, np.hypot(2, 3)), abs=0.3
+    )
+    assert everything - thin == pytest.approx(4.0, abs=0.3)
+    text = tables_of([{"case": "balls", "method": "calibrated", **row} for row in rows])
+    kept = {line.split("|")[2].strip(): line for line in text.splitlines() if " mm" in line}
+    assert "| 0.0 (0.0 to 97.5) | 0 | 0 |" in kept["5 mm"]
+    assert "| 100.0 (2.5 to 100.0) | 0 | 0 |" in kept["5 mm + 95 % radius"]
+    silent = cut_one(case, off, "D0", "noise", 64)
+    assert [row.get("refused", "").partition(":")[0] for row in silent[2:]] == [
+        "the estimate states no 95 % margin of tumor_1"
+    ] * 3
+
+
+def test_plans_are_measured_once_and_apart_from_accuracy(case, tmp_path):
+    calls = []
+    about = case, shifted(calls=calls), ("D0", "D1"), "noise", 64, tmp_path
+    first = measured(*about, cut_one, **cutting())
+    assert len(calls) == 2
+    assert measured(*about, cut_one, **cutting()) == first
+    assert len(calls) == 2
+    measured(*about, cut_one, cutting="by other rules")
+    assert len(calls) == 4
+
+
+def test_a_scene_without_a_table_is_refused(case):
+    with pytest.raises(InputError, match="where its table is"):
+        cut_one(case, truth(), "G1", "noise", 64)
+
+
+def test_tables_say_what_was_removed_and_why_not(case, tmp_path):
+    methods = (truth(), shifted(shift_mm=8.0), shifted(nothing=True, name="M_lim"))
+    found = [
+        row
+        for method in methods
+        for row in measured(case, method, ("D0",), "noise", 64, tmp_path, cut_one, **cutting())
+    ]
+    assert [group for group, _ in groups(tidy_plans(found), "method", "planner")] == [
+        (name, planner.name)
+        for name in ("clinic", "M_lim", "truth")
+        for planner in (PLANNERS if name == "M_lim" else (OURS,))
+    ]
+    text = tables_of(found)
+    lines = {
+        tuple(cell.strip() for cell in line.split("|")[1:3]): line for line in text.split("\n")
+    }
+    assert text.startswith("All cases:")
+    best = lines["truth", "5 mm"]
+    assert "| 1 of 1 | 1 of 1 | 1 of 1 | 100.0 | 100.0 | 0.00 |" in best
+    assert "| 1 of 1 | 1 of 1 | 0 of 1 |" in lines["clinic", "5 mm"]
+    assert "| 0 of 1 | 0 of 0 | 0 of 0 | – |" in lines["M_lim", "5 mm"]
+    assert "1 x M_lim, 5 mm: the cloud shows no organ" in text
+
+
+def test_shares_are_never_rounded_up_to_all(case):
+    known = {"case": "balls", "method": "truth"}
+    (row,) = [r for r in cut_one(case, truth(), "D0", "noise", 64) if r["planner"] == OURS.name]
+    assert "| 99.9 | 99.9 |" in tables_of([{**known, **row, "removed_share": 0.99996}])

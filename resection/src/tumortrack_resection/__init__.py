@@ -1,0 +1,24 @@
+"""From a tumor that tumortrack located to a resection that two arms carry out.
+
+    from tumortrack_resection import plan_resection
+    plan = plan_resection("RUN")  # a folder that `tumortrack locate` wrote
+
+Millimetres; the table's frame has z up. Commands: `tumortrack plan`, `tumortrack resect`.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from tumortrack_resection.api import plan_resection as plan_resection
+
+__all__ = ["plan_resection"]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    from tumortrack_resection import api
+
+    return getattr(api, name)

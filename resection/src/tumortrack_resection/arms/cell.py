@@ -1,0 +1,284 @@
+"""The workcell for kinematics and collision checking, and the group of its joints that moves."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Callable, Collection
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import product
+from typing import Any
+
+import coal
+import numpy as np
+import pinocchio as pin
+from jaxtyping import Float64
+
+from tumortrack.core.errors import NoPlan
+from tumortrack.core.types import Mesh
+from tumortrack.live.values import RigidShape
+from tumortrack_resection.arms import body
+from tumortrack_resection.arms.config import CellConfig
+from tumortrack_resection.arms.inverse_kinematics import inverse_kinematics
+from tumortrack_resection.arms.kinematics import ArmModel, Pose, nearest_turn
+from tumortrack_resection.motions import ARMS, CUTTER, HOLDER, Joints
+
+ORGAN = "organ"
+TOOLS = {CUTTER: ("bracket", "pencil", "electrode"), HOLDER: ("rod", "cup")}
+TOUCHES = {CUTTER: "cutter/electrode", HOLDER: "holder/cup"}  # what of a tool may touch the organ
+CollidingPair = tuple[str, str]
+_THICK_MM = 10.0  # of what a tool is made of, about its own axis
+
+
+class ArmCell:
+    """Both arms with their tools over the table, and the organ once it is known.
+
+    Values do not change after construction, but the buffers of pinocchio do: one thread at a time.
+    ``model`` and ``solids`` are pinocchio's, in metres.
+    """
+
+    def __init__(self, config: CellConfig | None = None, organ: Mesh | None = None) -> None:
+        self.config = config or CellConfig()
+        self.organ = organ
+        self.home_rad: Joints = np.array(self.config.home_rad)
+        self.limits_rad, self.speeds_rad_s = self.config.limits_rad, self.config.speeds_rad_s
+        text = body.cell_urdf(self.config)
+        self.model = pin.buildModelFromXML(text)
+        self.solids = pin.buildGeomFromUrdfString(self.model, text, pin.GeometryType.COLLISION)
+        self._data = self.model.createData()
+        names = _solid_names(self.solids, body.cell_parts(self.config))
+        if organ is not None:
+            surface = _bounding_volumes(organ)
+            self.solids.addGeometryObject(pin.GeometryObject(ORGAN, 0, pin.SE3.Identity(), surface))
+            names.append(ORGAN)
+        index = {name: n for n, name in enumerate(names)}
+        self._pairs = [pair for pair in _pairs() if index.keys() >= set(pair)]
+        for one, other in self._pairs:
+            self.solids.addCollisionPair(pin.CollisionPair(index[one], index[other]))
+        self._states: dict[tuple[Any, ...], Any] = {}
+
+    def levers_mm(self, start_rad: Joints, goal_rad: Joints) -> Joints:
+        """On the straight segment between two configurations, no point of an arm or its tool moves
+        farther than this per radian of each of its joints."""
+        levers: list[float] = []
+        for arm, elbow in zip(ARMS, (2, 8), strict=True):
+            model, tool = self.config.model(arm), self.config.flange_from_tip(arm)[:3, 3]
+            upper, lower = np.abs(model.a_mm[1:3])
+            d4, d5, d6 = model.d_mm[3:]
+            ahead = float(np.hypot(*tool[:2])) + _THICK_MM
+            hand = float(np.hypot(ahead, tool[2] + d6))
+            wrist = hand + d5
+            # The arm is longest where its elbow is straightest.
+            ends = np.array([start_rad[elbow], goal_rad[elbow]])
+            bent = 0.0 if ends[0] * ends[1] <= 0 else float(np.abs(ends).min())
+            stretched = np.sqrt(upper**2 + lower**2 + 2 * upper * lower * np.cos(bent))
+            shoulder = max(np.hypot(stretched, d4) + wrist, np.hypot(upper, d4) + 2 * d5)
+            levers += [shoulder, shoulder, np.hypot(lower, d4) + wrist, wrist, hand, ahead]
+        return np.array(levers)
+
+    def tips(self, joints_rad: Joints) -> dict[str, Pose]:
+        """``table_from_tip`` (mm) of ``cutter`` and ``holder``: z up; the instrument points along
+        its x."""
+        places = self._frames(joints_rad, [f"{arm}_tip" for arm in ARMS])
+        return dict(zip(ARMS, places.values(), strict=True))
+
+    @cached_property
+    def _surfaces(self) -> list[tuple[body.Part, Mesh]]:
+        return body.display_surfaces(self.config)
+
+    def shapes(self, joints_rad: Joints) -> tuple[RigidShape, ...]:
+        """Everything as surfaces in the table frame, and a bead at each tip (``cutter/tip``); the
+        organ is not among them."""
+        places = self._frames(joints_rad, {part.link for part, _ in self._surfaces})
+        return tuple(
+            RigidShape(part.whose, mesh, places[part.link], part.colour)
+            for part, mesh in self._surfaces
+        )
+
+    def _frames(self, joints_rad: np.ndarray, names: Collection[str]) -> dict[str, Pose]:
+        """``table_from_frame`` (mm) of links by their names, by forward kinematics."""
+        pin.framesForwardKinematics(self.model, self._data, joints_rad)
+        places = {}
+        for name in names:
+            places[name] = self._data.oMf[self.model.getFrameId(name)].homogeneous.copy()
+            places[name][:3, 3] *= 1000
+        return places
+
+    def collisions(
+        self, joints_rad: Joints, touching: Collection[str] = (), moving: str | None = None
+    ) -> CollidingPair | None:
+        """Names of the first pair that comes nearer than its clearance, or None.
+
+        Args:
+            touching: arms whose electrode or cup may be on or in the organ now.
+            moving: the arm that moves, if the rest is known to be free; None: test everything.
+        """
+        state = self._state(tuple(sorted(touching)), moving)
+        pin.updateGeometryPlacements(self.model, self._data, self.solids, state, joints_rad)
+        if not pin.computeCollisions(self.solids, state, True):
+            return None
+        # It stops at the first; results beyond that are of earlier calls.
+        results = zip(self._pairs, state.activeCollisionPairs, state.collisionResults, strict=True)
+        return next(pair for pair, active, one in results if active and one.isCollision())
+
+    def _state(self, touching: tuple[str, ...], moving: str | None) -> Any:
+        """Collision buffers in which only the pairs that matter are active."""
+        if (touching, moving) not in self._states:
+            state, ends = pin.GeometryData(self.solids), {TOUCHES[arm] for arm in touching}
+            for n, pair in enumerate(self._pairs):
+                still = moving is not None and not any(moving in name for name in pair)
+                if still or (ORGAN in pair and ends & set(pair)):
+                    state.deactivateCollisionPair(n)
+                margin_mm = self._margin_mm(pair, touching)
+                state.collisionRequests[n].security_margin = margin_mm / 1000
+            self._states[touching, moving] = state
+        return self._states[touching, moving]
+
+    def _margin_mm(self, pair: CollidingPair, touching: tuple[str, ...]) -> float:
+        """How near these two may come."""
+        if ORGAN in pair or (body.STAND in pair and TOUCHES[CUTTER] in pair):
+            return self.config.organ_clearance_mm
+        tools = pair[0] == TOUCHES[CUTTER] and pair[1].removeprefix("holder/") in TOOLS[HOLDER]
+        return self.config.contact_mm if tools and len(touching) == 2 else self.config.clearance_mm
+
+
+def tip_places(
+    config: CellConfig,
+) -> Callable[[str, Float64[np.ndarray, " 6"]], Float64[np.ndarray, " 3"]]:
+    """Where an arm's tip is by its six joints: table frame, mm. Each arm may be asked in a thread
+    of its own."""
+    cells = {arm: ArmCell(config) for arm in ARMS}
+
+    def tip_mm(arm: str, own_rad: Float64[np.ndarray, " 6"]) -> Float64[np.ndarray, " 3"]:
+        joints_rad = cells[arm].home_rad.copy()
+        joints_rad[6 * ARMS.index(arm) :][:6] = own_rad
+        return cells[arm].tips(joints_rad)[arm][:3, 3]
+
+    return tip_mm
+
+
+class Blocked(NoPlan):
+    """This motion is impossible; perhaps another is not. The text says where and why; ``pair``:
+    what would collide, if that is the reason."""
+
+    def __init__(self, text: str, pair: CollidingPair | None = None) -> None:
+        super().__init__(text)
+        self.pair = pair
+
+    @classmethod
+    def by(cls, pair: CollidingPair, where: str = "") -> Blocked:
+        return cls(f"{pair[0]} would meet {pair[1]}{where}", pair)
+
+
+@dataclass(frozen=True, eq=False)
+class PlanningGroup:
+    """The joints that move while the others stand still.
+
+    Attributes:
+        arm: cutter or holder; None: both move.
+        joints_rad: where both are (12,).
+        touching: arms that may touch the organ with their electrode or cup.
+    """
+
+    cell: ArmCell
+    arm: str | None
+    joints_rad: Joints
+    touching: Collection[str] = ()
+
+    @cached_property
+    def own(self) -> slice:
+        """The moving joints among the twelve."""
+        first = 6 * ARMS.index(self.arm or CUTTER)
+        return slice(first, first + 6 if self.arm else 6 * len(ARMS))
+
+    @property
+    def current_rad(self) -> Float64[np.ndarray, " d"]:
+        """The moving joints now."""
+        return self.joints_rad[self.own]
+
+    @property
+    def limits_rad(self) -> Float64[np.ndarray, " d"]:
+        return self.cell.limits_rad[self.own]
+
+    @property
+    def model(self) -> ArmModel:
+        """The type of the moving arm."""
+        return self.cell.config.model(str(self.arm))
+
+    def all_joints(self, own_rad: Float64[np.ndarray, " d"]) -> Joints:
+        """All twelve joints, the moving ones being these."""
+        joints = self.joints_rad.copy()
+        joints[self.own] = own_rad
+        return joints
+
+    def inverse_kinematics(self, table_from_tip: Pose) -> Float64[np.ndarray, "k 6"]:
+        """All branches that bring the moving arm's tip to a pose, collisions not regarded, each
+        joint turned to be near where it is."""
+        base_from_table, tip_from_flange = self._frames
+        flange = base_from_table @ table_from_tip @ tip_from_flange
+        return nearest_turn(self.model, inverse_kinematics(self.model, flange), self.current_rad)
+
+    @cached_property
+    def _frames(self) -> tuple[Pose, Pose]:
+        """``base_from_table`` and ``tip_from_flange``, mm."""
+        config, arm = self.cell.config, str(self.arm)
+        poses = config.base(arm).table_from_base, config.flange_from_tip(arm)
+        return np.linalg.inv(poses[0]), np.linalg.inv(poses[1])
+
+    def collides(self, own_rad: Float64[np.ndarray, " d"]) -> CollidingPair | None:
+        """What comes nearer than allowed to what."""
+        return self.cell.collisions(self.all_joints(own_rad), self.touching, self.arm)
+
+    def segment_collides(
+        self, start_rad: np.ndarray, goal_rad: np.ndarray, spacing: float = 1.0
+    ) -> CollidingPair | None:
+        """The same between two free configurations, on the straight segment in joint space.
+
+        With ``spacing`` 1 no point of an arm moves by more than twice the least clearance in one
+        step, so that what is free of collisions with that clearance at both ends is free between.
+        """
+        least_mm = self.cell.config.least_clearance_mm(self.touching)
+        levers_mm = self.cell.levers_mm(self.all_joints(start_rad), self.all_joints(goal_rad))
+        moved_mm = float(np.abs(goal_rad - start_rad) @ levers_mm[self.own])
+        n = int(np.ceil(moved_mm / (2 * least_mm * spacing)))
+        # From the middle outward: what blocks is rarely near the ends.
+        for k in sorted(range(1, n), key=lambda k: abs(2 * k - n)):
+            if pair := self.collides(start_rad + (goal_rad - start_rad) * (k / n)):
+                return pair
+        return None
+
+
+def _solid_names(solids: Any, parts: tuple[body.Part, ...]) -> list[str]:
+    """Our names in pinocchio's order, which is that of each link's collision elements."""
+    by_link: dict[str, list[str]] = defaultdict(list)
+    for part in parts:
+        if part.use != "picture":
+            by_link[part.link].append(part.whose)
+    return [by_link[solid.name.rsplit("_", 1)[0]].pop(0) for solid in solids.geometryObjects]
+
+
+def _pairs() -> list[CollidingPair]:
+    """All that could ever meet. Links next to each other are left out, and of an arm with itself
+    what its joints' offsets keep apart."""
+    moving = {arm: [f"{arm}/{name}" for name in (*body.LINKS[2:], *TOOLS[arm])] for arm in ARMS}
+    pairs = list(product(moving[CUTTER], moving[HOLDER]))
+    for arm, other in (ARMS, ARMS[::-1]):
+        own = moving[arm]
+        pairs += product(own, [f"{other}/{name}" for name in (body.PEDESTAL, *body.LINKS[:2])])
+        pairs += product(own[1:], (f"{arm}/{body.PEDESTAL}",))
+        pairs += product(own, (body.TABLE, body.STAND, body.CAMERA))
+        pairs += product(own[1:], (ORGAN,))
+        pairs += product(own[1:], [f"{arm}/{name}" for name in body.LINKS[:2]])
+        pairs += product(own[2:], own[:1])  # the upper arm
+        pairs += product(own[4:], own[1:2])  # the forearm
+    return pairs
+
+
+def _bounding_volumes(organ: Mesh) -> Any:
+    """The organ's surface as coal's tree of boxes, metres."""
+    surface = coal.BVHModelOBBRSS()
+    surface.beginModel(len(organ.faces), len(organ.vertices_mm))
+    surface.addVertices(np.array(organ.vertices_mm / 1000))
+    surface.addTriangles(np.array(organ.faces, dtype=np.int64))
+    surface.endModel()
+    return surface

@@ -1,0 +1,226 @@
+"""From paths to trajectories: as fast as joints may turn and accelerate, and no faster than asked.
+
+Pham and Pham 2018, 'A new approach to time-optimal path parameterization based on reachability
+analysis' (toppra), DOI 10.1109/TRO.2018.2819195; Berscheid and Kroeger 2021, 'Jerk-limited
+real-time trajectory generation with arbitrary target states' (ruckig), arXiv:2105.04830.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Collection
+from typing import Any
+
+import msgspec
+import numpy as np
+from jaxtyping import Float64
+
+from tumortrack.core.types import Mesh
+from tumortrack_resection.arms.cell import ArmCell, Blocked, PlanningGroup
+from tumortrack_resection.arms.config import CellConfig
+from tumortrack_resection.arms.kinematics import ACCELERATION_RAD_S2, JERK_RAD_S3, Pose
+from tumortrack_resection.arms.paths import arc_lengths, follow
+from tumortrack_resection.motions import ARMS, CUTTER, HOLDER, Joints, Motions, MotionStage
+
+_STEP_S = 0.02  # between two samples; straight segments between them stay within 0.05 mm
+_TIP_SPEED_UP_S = 0.2  # until a tip has its speed
+_GRID = 80
+_FINER = (1.0, 1.7, 2.9, 4.3)  # grids that are tried, in points of the first
+_CRAWL, _CRAWL_S = 2.0, 3.0  # a motion longer than so many times the least, and so much, crawls
+_SLACK = 0.97  # of the acceleration: toppra keeps its limits at grid points only
+_THERE_RAD = 1e-6  # a thousandth of a millimetre at the tip: no motion to be timed
+
+# Who may touch the organ, but in sweeps, lift and release, where both may
+_TOUCHING: dict[str, tuple[str, ...]] = {
+    "approach": (),
+    "grasp": (HOLDER,),
+    "hold": (HOLDER,),
+    "home": (),
+}
+_OVER = 1.05  # tip speeds: toppra keeps them at grid points only
+
+Timed = tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, "n d"]]
+
+
+class TrajectoryBuilder:
+    """Where both arms are by now (``joints_rad``), and how they came there, stage by stage.
+
+    What is added to a copy (``copy.copy``) is not in the original.
+    """
+
+    def __init__(self, cell: ArmCell, start_rad: Joints, rng: np.random.Generator) -> None:
+        self.cell, self.joints_rad, self.rng = cell, start_rad, rng
+        self.stages: tuple[MotionStage, ...] = ()
+        self._pieces: tuple[tuple[np.ndarray, np.ndarray, bool], ...] = ()
+
+    def group(self, arm: str | None, touching: Collection[str] = ()) -> PlanningGroup:
+        """This arm (None: both) moves from here."""
+        return PlanningGroup(self.cell, arm, self.joints_rad, touching)
+
+    def tip(self, arm: str) -> Pose:
+        """``table_from_tip`` now, mm."""
+        return self.cell.tips(self.joints_rad)[arm]
+
+    def go(
+        self,
+        arm: str,
+        path_rad: Float64[np.ndarray, "m 6"],
+        tip_mm_s: float | None = None,
+        cutting: bool = False,
+    ) -> None:
+        """One arm along a path that begins where it is; its tip no faster than ``tip_mm_s``."""
+        if np.ptp(path_rad, axis=0).max() < _THERE_RAD:
+            return
+        group = self.group(arm)
+        tips: np.ndarray | None = None
+        if tip_mm_s is not None:
+            everything = map(group.all_joints, path_rad)
+            tips = np.array([self.cell.tips(joints)[arm][:3, 3] for joints in everything])
+        times, own = along(path_rad, self.cell.speeds_rad_s[group.own], tips, tip_mm_s or 0.0)
+        joints = np.repeat(self.joints_rad[None], len(times), axis=0)
+        joints[:, group.own] = own
+        self.add((times, joints), cutting)
+
+    def follow(self, arm: str, poses: Float64[np.ndarray, "n 4 4"], tip_mm_s: float) -> None:
+        """One arm's tip along poses that begin where it is, on or in the organ or not. Raises
+        Blocked: as ``paths.follow``."""
+        self.go(arm, follow(self.group(arm, (CUTTER, HOLDER)), poses), tip_mm_s)
+
+    def wait(self, seconds: float) -> None:
+        self.add((np.array([0.0, seconds]), np.repeat(self.joints_rad[None], 2, axis=0)))
+
+    def add(self, timed: Timed, cutting: bool = False) -> None:
+        """All twelve joints (n, 12) over time, from where they are."""
+        times, joints = timed
+        joints[0] = self.joints_rad
+        self._pieces += ((times, joints, cutting),)
+        self.joints_rad = joints[-1]
+
+    def close(self, name: str) -> None:
+        """What was added since the last stage is the stage of this name."""
+        pieces = self._pieces
+        times = [np.zeros(1)]
+        joints = [pieces[0][1][:1] if pieces else self.joints_rad[None]]
+        cutting = [np.array([bool(pieces) and pieces[0][2]])]
+        for piece_times, piece_joints, cuts in pieces:
+            cutting[-1][-1] |= cuts  # a corner between lead-in and cut is on the cut
+            times.append(times[-1][-1] + piece_times[1:])
+            joints.append(piece_joints[1:])
+            cutting.append(np.full(len(piece_times) - 1, cuts))
+        arrays = (np.concatenate(parts) for parts in (times, joints, cutting))
+        self.stages += (MotionStage(name, *arrays),)
+        self._pieces = ()
+
+
+def along(
+    path_rad: Float64[np.ndarray, "m d"],
+    speeds_rad_s: Float64[np.ndarray, " d"],
+    tip_mm: Float64[np.ndarray, "m 3"] | None = None,
+    tip_mm_s: float = 0.0,
+) -> Timed:
+    """Times from 0 and joints (n, d) along a path, at rest at both ends. Raises Blocked: no such
+    motion (the path has a kink that can't be taken).
+
+    Args:
+        tip_mm: where the tip is at each point; its speed stays below ``tip_mm_s``.
+    """
+    import toppra
+    from toppra import constraint
+
+    logging.getLogger("toppra").setLevel(logging.ERROR)
+    width = path_rad.shape[1]
+    acceleration = np.full(width, _SLACK * ACCELERATION_RAD_S2)
+    knots = arc_lengths(path_rad if tip_mm is None else tip_mm)
+    if tip_mm is not None:
+        # The tip's arc length is one more joint, with limits of its own.
+        path_rad = np.column_stack([path_rad, knots])
+        speeds_rad_s = np.append(speeds_rad_s, tip_mm_s)
+        acceleration = np.append(acceleration, tip_mm_s / _TIP_SPEED_UP_S)
+    keep = np.r_[True, np.diff(knots) > 1e-9 * knots[-1]]
+    curve = toppra.SplineInterpolator(knots[keep], path_rad[keep])
+    limits = [
+        constraint.JointVelocityConstraint(np.column_stack([-speeds_rad_s, speeds_rad_s])),
+        constraint.JointAccelerationConstraint(np.column_stack([-acceleration, acceleration])),
+    ]
+    # No motion is shorter: each step at its slowest joint's full speed. On some grids toppra crawls
+    # through a place for minutes; another grid does not share it.
+    least_s = float((np.abs(np.diff(path_rad, axis=0)) / speeds_rad_s).max(axis=1).sum())
+    best: Any = None
+    for finer in _FINER:
+        grid = np.linspace(0, knots[-1], round(finer * max(_GRID, keep.sum())))
+        solver = toppra.algorithm.TOPPRA(limits, curve, grid, parametrizer="ParametrizeConstAccel")
+        found = solver.compute_trajectory(0, 0)
+        if found is not None and (best is None or found.duration < best.duration):
+            best = found
+        if best is not None and best.duration < _CRAWL * least_s + _CRAWL_S:
+            break
+    if best is None:
+        raise Blocked("a path can't be gone within the joints' limits")
+    times = _samples(best.duration)
+    return times, best(times)[:, :width]
+
+
+def together(
+    start_rad: Float64[np.ndarray, " d"],
+    goal_rad: Float64[np.ndarray, " d"],
+    speeds_rad_s: Float64[np.ndarray, " d"],
+) -> Timed:
+    """Every joint leaves at the same time and arrives at the same time, on the straight segment.
+    Raises Blocked: no such motion."""
+    import ruckig
+
+    # One joint that goes from 0 to 1, as slowly as the slowest of them needs: so all are on the
+    # straight segment that was tested, which synchronised ends alone would not mean.
+    turns = np.maximum(np.abs(goal_rad - start_rad), 1e-9)
+    longest = float(turns.max())
+    wish = ruckig.InputParameter(1)
+    wish.current_position, wish.target_position = [0.0], [1.0]
+    wish.max_velocity = [float((speeds_rad_s / turns).min())]
+    wish.max_acceleration = [ACCELERATION_RAD_S2 / longest]
+    wish.max_jerk = [JERK_RAD_S3 / longest]
+    found = ruckig.Trajectory(1)
+    outcome = ruckig.Ruckig(1).calculate(wish, found)
+    if outcome not in (ruckig.Result.Working, ruckig.Result.Finished):
+        raise Blocked(f"no synchronous motion ({outcome})")
+    times = _samples(found.duration)
+    share = np.array([found.at_time(time)[0] for time in times]).reshape(-1, 1)
+    return times, start_rad + share * (goal_rad - start_rad)
+
+
+def first_hit(motions: Motions, config: CellConfig, organ: Mesh, begun: bool = False) -> str:
+    """What would meet what, and when, if these motions were carried out; empty: nothing.
+
+    Tested as densely as the planner tests, with half of its clearances: between the places that it
+    tests, its own motions come nearer than the whole ones. An electrode or cup may touch the organ
+    only where its tip is as slow as it is planned there. ``begun``: the arms do not come from home;
+    both tools may be at the organ in the first stage, too.
+    """
+    halves = {
+        name: max(getattr(config, name) / 2, 0.5)
+        for name in ("clearance_mm", "organ_clearance_mm", "contact_mm")
+    }
+    cell = ArmCell(msgspec.structs.replace(config, **halves), organ)
+    slow_mm_s = _OVER * np.array([config.cutting_mm_s, config.grasping_mm_s])
+    levers_mm = cell.levers_mm(np.zeros(len(cell.home_rad)), np.zeros(len(cell.home_rad)))
+    for number, stage in enumerate(motions.stages):
+        touching = ARMS if begun and not number else _TOUCHING.get(stage.name, ARMS)
+        turns = np.abs(np.diff(stage.joints_rad, axis=0)) @ levers_mm
+        moved_mm = np.concatenate([[0.0], np.cumsum(turns)])  # at most, of any point
+        steps = int(np.ceil(moved_mm[-1] / (2 * cell.config.least_clearance_mm(touching))))
+        at_mm = np.linspace(0, moved_mm[-1], steps + 1)
+        joints = np.stack([np.interp(at_mm, moved_mm, one) for one in stage.joints_rad.T], axis=1)
+        times_s = np.interp(at_mm, moved_mm, stage.times_s)
+        tips = np.array([[cell.tips(one)[arm][:3, 3] for arm in ARMS] for one in joints])
+        speeds = np.linalg.norm(np.diff(tips, axis=0), axis=2) / np.diff(times_s)[:, None]
+        edge = np.full((1, len(ARMS)), np.inf)
+        slow = np.minimum(np.r_[edge, speeds], np.r_[speeds, edge]) <= slow_mm_s
+        slow |= steps == 0
+        for one, time_s, both in zip(joints, times_s, slow, strict=True):
+            now = [arm for arm, is_slow in zip(ARMS, both, strict=True) if is_slow]
+            if pair := cell.collisions(one, [arm for arm in touching if arm in now]):
+                return f"{pair[0]} would meet {pair[1]} {time_s:.1f} s after {stage.name} begins"
+    return ""
+
+
+def _samples(seconds: float) -> Float64[np.ndarray, " n"]:
+    return np.linspace(0, seconds, int(np.ceil(seconds / _STEP_S)) + 1)

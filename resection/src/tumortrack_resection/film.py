@@ -1,0 +1,329 @@
+"""A film of what the arms do: an animated GIF, drawn without a display.
+
+MP4 is not offered: no encoder among the Python packages comes under a permissive licence.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import replace
+from itertools import groupby
+from pathlib import Path
+from typing import NamedTuple
+
+import matplotlib
+import numpy as np
+import shapely
+from jaxtyping import Float, Float64, UInt8
+from PIL import Image, ImageDraw, ImageFont
+from trimesh.creation import sweep_polygon
+
+from tumortrack.core.colours import ARMS, BACKGROUND, NONE, WHITE, Colour, part_colour
+from tumortrack.core.errors import InputError
+from tumortrack.core.geometry import transform_points
+from tumortrack.core.store import write_atomically
+from tumortrack.core.types import ORGAN, Mesh
+from tumortrack.live.values import Polyline, Workcell
+from tumortrack.report.drawing import SIGN
+from tumortrack.report.renderer import Body, Viewpoint, render, rgb
+from tumortrack.report.wrapping import wrapped
+from tumortrack_resection.motions import LIFT, RELEASE, Motions
+from tumortrack_resection.pictures import organ_surfaces, parted
+from tumortrack_resection.resection import inside
+from tumortrack_resection.values import Located, ResectionPlan
+
+FPS = 10  # a GIF counts hundredths of a second
+_FROM = np.array([-0.36, -0.8, 0.48])  # where the viewer is: to the left, in front, above
+_CLOSE_FROM = np.array([-0.36, -0.72, 0.6])
+_AWAY = 2.6  # the viewer's distance in radii of what is seen: a natural perspective
+_CLOSE = 0.47, 0.42  # the close-up's share of width and height, in the lower right corner
+_ARMS = 0.97, 0.62  # and that of the arms, above it
+_CLOSE_MM = 40.0  # the close-up cuts away what is nearer to the viewer than the organ by this
+_ORGAN_OPACITY = 0.42
+_FRAME = (90, 96, 106)
+_BACKDROP = rgb((238, 241, 244))
+_LEAST_PIXELS = 2.0  # width of a line
+_COLOURS = 255  # and one for what did not change
+_SAMPLES = 8  # frames from which the colours are chosen
+_LOOKED_AT, _EVERY = 40, 3  # frames, and every which vertex, that the viewpoint is chosen from
+_LEAST_FRAMES = 2  # of a stage
+_LAST_S = 1.5  # the last picture stays
+_PLAYBACK = "PLAYBACK of a stored plan, SIMULATED: nothing is tracked"
+_MEANING = {
+    LIFT: ": the holder lifts the piece out",
+    RELEASE: ": a person takes the piece from the cup",
+}
+
+
+def film(
+    frames: Iterable[Workcell],
+    located: Located,
+    path: Path,
+    size: tuple[int, int] = (640, 480),
+    progress: Callable[[], None] = lambda: None,
+    plan: ResectionPlan | None = None,
+) -> None:
+    """Write the frames as an animated GIF that begins again when it has ended.
+
+    Over every frame stand, whole, that it is a playback, simulated; the plan's warnings; the state
+    and why the arms halt; the patient. Once the holder lifts, the piece goes with it, and after the
+    release it is gone.
+
+    Seen obliquely from the front: whatever has a slash in its name (an arm's parts) is in the
+    picture in all frames; in the corner the organ from near by. The same frames give the same
+    bytes; frames that look the same are one that lasts longer. Raises InputError: no frame, nothing
+    in them, or another kind of file; StorageError: the disk refused.
+
+    Args:
+        frames, located: table frame, mm; ``FPS`` frames a second.
+        path: ``.gif``, written atomically.
+        size: of the scene, pixels; the words come on top.
+        plan: what is carried out: its warnings and its piece; None: the organ stays whole.
+        progress: called after each frame.
+    """
+    if path.suffix.lower() != ".gif":
+        raise InputError(f"{path}: a film is an animated GIF; give a name that ends in .gif.")
+    if not (cells := list(frames)):
+        raise InputError("there is no frame to film: the arms did nothing.")
+    painter = _FramePainter(cells, located, size, plan)
+    chosen = np.linspace(0, len(cells) - 1, min(_SAMPLES, len(cells))).astype(int).tolist()
+    some = [np.asarray(painter.picture(n))[::2, ::2] for n in chosen]
+    sheet, plain = Image.fromarray(np.concatenate(some)), Image.Dither.NONE
+    palette = sheet.quantize(_COLOURS, Image.Quantize.MEDIANCUT, kmeans=2, dither=plain)
+
+    def indexed() -> Iterator[Image.Image]:
+        for n in range(len(cells)):
+            yield painter.picture(n).quantize(palette=palette, dither=plain)
+            progress()
+
+    pictures = indexed()
+    each_ms = round(1000 / FPS)
+    buffer = io.BytesIO()
+    next(pictures).save(
+        buffer,
+        format="GIF",
+        save_all=True,
+        append_images=pictures,
+        duration=[each_ms] * (len(cells) - 1) + [each_ms + round(1000 * _LAST_S)],
+        loop=0,
+        palette=bytes(palette.getpalette() or ()),
+        transparency=_COLOURS,
+        disposal=1,
+        optimize=True,
+    )
+    write_atomically(path, buffer.getvalue())
+
+
+def moments_s(motions: Motions, frames: int) -> Float64[np.ndarray, " n"]:
+    """Times since the beginning, about so many, that show every stage: a stage gets frames by the
+    square root of its duration, for sweeps take minutes and the grasp seconds; the end is among
+    them."""
+    seconds = np.array([stage.seconds for stage in motions.stages])
+    share = np.sqrt(seconds) / max(float(np.sqrt(seconds).sum()), 1e-9)
+    counts = np.maximum(np.rint(frames * share).astype(int), _LEAST_FRAMES)
+    starts = np.cumsum(seconds) - seconds
+    stages = zip(starts, seconds, counts.tolist(), strict=True)
+    each = [start + length * np.arange(n) / n for start, length, n in stages]
+    return np.append(np.concatenate(each), seconds.sum())
+
+
+class _FramePainter:
+    """Draws frame by frame; viewpoints, organ and letters stay the same."""
+
+    def __init__(
+        self, frames: list[Workcell], located: Located, size: tuple[int, int],
+        plan: ResectionPlan | None,
+    ) -> None:  # fmt: skip
+        self._frames, self._size = frames, size
+        self._organ = [
+            Body(mesh, rgb(part_colour(label)), _ORGAN_OPACITY if label == ORGAN else 1.0)
+            for label, mesh in sorted(organ_surfaces(located).items())
+        ]
+        self._close_size = round(_CLOSE[0] * size[0]), round(_CLOSE[1] * size[1])
+        self._far = _viewpoint_of(_reach(frames), _FROM, size, _ARMS)
+        organ_mm = self._organ[0].mesh.vertices_mm
+        radius = float(np.linalg.norm(organ_mm - self._organ[0].mesh.box_mm.mean(0), axis=1).max())
+        near = _viewpoint_of(organ_mm, _CLOSE_FROM, self._close_size)
+        target = near.place_mm + near.distance_mm * near.axes[2]
+        place, before_mm = target + 10 * (near.place_mm - target), radius + _CLOSE_MM
+        self._near = Viewpoint.towards(target, place, near.width_mm, True, before_mm)
+        flat = self._far.project(organ_mm, size)[:, :2]
+        self._spot = (*(flat.min(0) - 4).round().tolist(), *(flat.max(0) + 4).round().tolist())
+        self._tubes: dict[tuple[int, float], tuple[Polyline, Mesh]] = {}
+        self._warnings = () if plan is None else plan.warnings
+        self._whose = str(located.patient)
+        told = {(cell.state, cell.halted): cell for cell in frames}
+        self._room = max(words_strip(self._words(cell), size)[0].height for cell in told.values())
+        self._lifted_from = next((n for n, c in enumerate(frames) if c.state == LIFT), len(frames))
+        self._stays, self._goes = self._organ, list[Body]()
+        if plan is not None and self._lifted_from < len(frames):
+            self._stays, self._goes = _divided(located, plan)
+
+    def _words(self, cell: Workcell) -> list[Paragraph]:
+        """What stands over a frame, the weightiest first."""
+        return [
+            Paragraph(_PLAYBACK, WHITE, ARMS),
+            *(Paragraph(f"{SIGN} WARNING: {text}", WHITE, NONE) for text in self._warnings),
+            Paragraph(cell.state + _MEANING.get(cell.state, ""), BACKGROUND, large=True),
+            *([Paragraph(f"halted: {cell.halted}", NONE)] if cell.halted else []),
+            Paragraph(self._whose, BACKGROUND),
+        ]
+
+    def _bodies(self, n: int) -> list[Body]:
+        """Organ, tumors and the piece, which goes where the holder does."""
+        if n < self._lifted_from:
+            return self._organ
+        before, now = (_holder(self._frames[k]) for k in (max(self._lifted_from - 1, 0), n))
+        gone = all(cell.state not in (LIFT, RELEASE) for cell in self._frames[n:])
+        if gone or before is None or now is None:
+            return self._stays
+        moved = now @ np.linalg.inv(before)
+        return [*self._stays, *(replace(body, world_from_mesh=moved) for body in self._goes)]
+
+    def picture(self, n: int) -> Image.Image:
+        """Frame n, in full colour."""
+        cell = self._frames[n]
+        scene = Image.fromarray(self._shown(n, self._far, self._size))
+        close = Image.fromarray(self._shown(n, self._near, self._close_size))
+        left, top = (whole - part - 8 for whole, part in zip(self._size, close.size, strict=True))
+        top -= 10
+        scene.paste(close, (left, top))
+        draw = ImageDraw.Draw(scene)
+        draw.rectangle(self._spot, outline=_FRAME)  # what is shown from near
+        draw.rectangle((left - 1, top - 1, left + close.width, top + close.height), outline=_FRAME)
+        self._draw_progress(draw, n)
+        out = Image.new("RGB", (self._size[0], self._room + self._size[1]), WHITE)
+        out.paste(words_strip(self._words(cell), self._size)[0], (0, 0))
+        out.paste(scene, (0, self._room))
+        return out
+
+    def _shown(
+        self, n: int, viewpoint: Viewpoint, size: tuple[int, int]
+    ) -> UInt8[np.ndarray, "h w 3"]:
+        cell = self._frames[n]
+        shapes = [
+            Body(s.mesh, rgb(s.colour), s.opacity, s.published_from_shape) for s in cell.shapes
+        ]
+        least_mm = _LEAST_PIXELS * viewpoint.width_mm / size[0]
+        lines = [
+            Body(self._tube(line, max(line.width_mm, least_mm)), rgb(line.colour))
+            for line in cell.drawn_lines
+        ]
+        return render(shapes + lines + self._bodies(n), viewpoint, size, _BACKDROP)
+
+    def _tube(self, line: Polyline, width_mm: float) -> Mesh:
+        key = id(line.points_mm), width_mm  # the line is kept, so its points' id stays theirs
+        if key not in self._tubes:
+            self._tubes[key] = line, tube(line.points_mm, width_mm / 2)
+        return self._tubes[key][1]
+
+    def _draw_progress(self, draw: ImageDraw.ImageDraw, n: int) -> None:
+        """A bar of all states, filled as far as the procedure is; red where the arms stand."""
+        cell, (width, height) = self._frames[n], self._size
+        done = 0
+        for state, group in groupby(self._frames, lambda one: one.state):
+            first, done = done, done + len(list(group))
+            x = [8 + (width - 16) * k / len(self._frames) for k in (first, min(done, n + 1), done)]
+            box = height - 11, height - 6
+            draw.rectangle((x[0], box[0], max(x[2] - 2, x[0]), box[1]), fill=(205, 209, 214))
+            if n >= first:
+                colour = NONE if cell.halted and state == cell.state else (60, 110, 190)
+                draw.rectangle((x[0], box[0], max(x[1] - 2, x[0]), box[1]), fill=colour)
+
+
+class Paragraph(NamedTuple):
+    """Words of one colour, on another where that is given."""
+
+    text: str
+    ink: Colour
+    paper: Colour | None = None
+    large: bool = False
+
+
+def words_strip(
+    paragraphs: Sequence[Paragraph], size: tuple[int, int]
+) -> tuple[Image.Image, list[tuple[float, float, float, float]]]:
+    """All the words, wrapped, under each other on white: as wide as the scene of this size, and as
+    high as they need; and each line's box (left, top, right, bottom), pixels."""
+    file = f"{matplotlib.get_data_path()}/fonts/ttf/DejaVuSans.ttf"
+    lines, y = [], 6
+    for paragraph in paragraphs:
+        share, least = (20, 15) if paragraph.large else (30, 11)  # of the height; pixels
+        font = ImageFont.truetype(file, max(least, size[1] // share))
+        for text in wrapped(paragraph.text, size[0] - 24, font.getlength):
+            lines.append((paragraph, text, font, y))
+            y += round(1.35 * font.size)
+        y += 6
+    strip = Image.new("RGB", (size[0], y), WHITE)
+    draw, boxes = ImageDraw.Draw(strip), []
+    for paragraph, _, font, top in lines:  # first, so that none covers a word
+        if paragraph.paper is not None:
+            around = 6, top - 2, size[0] - 7, top + round(1.35 * font.size) + 1
+            draw.rectangle(around, fill=paragraph.paper)
+    for paragraph, text, font, top in lines:
+        draw.text((12, top), text, fill=paragraph.ink, font=font)
+        boxes.append(draw.textbbox((12, top), text, font=font))
+    return strip, boxes
+
+
+def _divided(located: Located, plan: ResectionPlan) -> tuple[list[Body], list[Body]]:
+    """What stays, and what comes away."""
+    surfaces = organ_surfaces(located)
+    piece, rest = parted(surfaces.pop(ORGAN), plan.layers)
+    shade = rgb(part_colour(ORGAN))
+    halves = [Body(rest, shade, _ORGAN_OPACITY)], [Body(piece, shade, _ORGAN_OPACITY)]
+    for label, mesh in surfaces.items():
+        goes = label == plan.label or bool(inside(plan.layers, mesh.box_mm.mean(0)[None])[0])
+        halves[goes].append(Body(mesh, rgb(part_colour(label))))
+    return halves
+
+
+def _holder(cell: Workcell) -> Float64[np.ndarray, "4 4"] | None:
+    """Where the holder's cup is."""
+    places = (s.published_from_shape for s in cell.shapes if s.name == "holder/cup")
+    return next(places, None)
+
+
+def _reach(frames: list[Workcell]) -> Float[np.ndarray, "n 3"]:
+    """Points of all parts of arms in frames of all stages; of everything, where there are none."""
+    some = frames[:: max(1, len(frames) // _LOOKED_AT)]
+    shapes = [shape for cell in some for shape in cell.shapes]
+    if not shapes:
+        raise InputError("the frames show no arms and no table: nothing to film.")
+    points = [
+        transform_points(shape.published_from_shape, shape.mesh.vertices_mm[::_EVERY])
+        for shape in [shape for shape in shapes if "/" in shape.name] or shapes
+    ]
+    return np.concatenate(points)
+
+
+def _viewpoint_of(
+    points_mm: Float[np.ndarray, "n 3"],
+    direction: Float[np.ndarray, " 3"],
+    size: tuple[int, int],
+    share: tuple[float, float] = (0.9, 0.9),
+) -> Viewpoint:
+    """In this direction, all points as large as can be in the picture's uppermost ``share``."""
+    target = (points_mm.min(0) + points_mm.max(0)) / 2
+    radius = float(np.linalg.norm(points_mm - target, axis=1).max())
+    away = _AWAY * radius * direction / np.linalg.norm(direction)
+    viewpoint = Viewpoint.towards(target, target + away, 2 * radius)
+    room = np.array(size) * share
+    middle = np.array([size[0] / 2, (room[1] + (1 - max(share)) * size[1]) / 2])
+    for _ in range(6):  # moved and widened until it fits
+        flat = viewpoint.project(points_mm, size)[:, :2]
+        low, high = flat.min(0), flat.max(0)
+        off = ((low + high) / 2 - middle) * viewpoint.width_mm / size[0]
+        target = target + off @ viewpoint.axes[:2]
+        width = viewpoint.width_mm * float(((high - low) / room).max())
+        viewpoint = Viewpoint.towards(target, target + away, width)
+    return viewpoint
+
+
+def tube(points_mm: Float[np.ndarray, "n 3"], radius_mm: float, sides: int = 6) -> Mesh:
+    """A polyline as a thin closed tube; its joints are mitred."""
+    turn = 2 * np.pi * np.arange(sides) / sides
+    ring = shapely.Polygon(radius_mm * np.stack([np.cos(turn), np.sin(turn)], axis=1))
+    solid = sweep_polygon(ring, points_mm)
+    return Mesh(solid.vertices, solid.faces)

@@ -1,0 +1,109 @@
+"""The error budget of the moment: what the errors are beside the live loop, update for update."""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import Any
+
+import msgspec
+import numpy as np
+from jaxtyping import Float64
+
+from tumortrack.core.config import to_builtins
+from tumortrack.core.types import Mesh
+from tumortrack.live.values import TrackingResult
+from tumortrack.models.margins import stated_radius
+from tumortrack_resection.budget import ErrorBudget
+
+_SPEED_S = 0.3  # that a speed is taken over: estimates jitter from frame to frame
+_GAP_S = 0.5  # a place so old says nothing of the speed
+_EVERY = 8  # of a tumor's vertices, whose deviation is looked at
+
+
+class LiveBudget:
+    """Adds up the errors of every update.
+
+    Args:
+        planned: of the plan. Where the margin did not cover those, and a person accepted that, the
+            errors are added up, and nothing follows from them.
+        servo_s: the arms come so much later than they are told.
+
+    Attributes:
+        now: of the last estimate; ``worst``: the one that left the least of the margin and did not
+            make the arms halt.
+    """
+
+    def __init__(self, planned: ErrorBudget, servo_s: float = 0.0) -> None:
+        self._planned, self._servo_s = planned, servo_s
+        self.now: ErrorBudget | None = None
+        self.worst: ErrorBudget | None = None
+        # Of the tumor's middle, by stamps
+        self._places: deque[tuple[int, Float64[np.ndarray, " 3"]]] = deque()
+
+    def add_up(
+        self, update: TrackingResult, part: str, tumor: Mesh, motion_mm: float, margin_mm: float
+    ) -> tuple[str, bool]:
+        """Why the arms must stand, empty if they need not, and whether a new plan would help.
+
+        Args:
+            update: with an estimate.
+            part: the tumor's name; ``tumor``: its surface, table frame.
+            motion_mm: how far that is from where it was planned, at most.
+            margin_mm: the least distance of the planned cut from it.
+        """
+        estimate = update.estimate
+        assert estimate is not None
+        late_ms = max(update.latency_ms or 0.0, 0.0)  # a camera's clock may be ahead
+        late_ms += estimate.report.get("smoothing", {}).get("lag_ms", 0.0)
+        said = estimate.report.get("margin")
+        stated = stated_radius(said, part, self._planned.confidence or None)
+        std_mm, motion = None, estimate.motion
+        if stated is None and motion is not None:
+            places = motion.back(estimate.meshes[part].vertices_mm[::_EVERY])
+            std_mm = None if places is None else motion.largest_std_mm(places)
+        self.now = now = self._planned.seen(
+            std_mm,
+            stated,
+            margin_mm=margin_mm,
+            motion_mm=motion_mm,
+            lag_mm=self._speed_mm_s(update.stamp_ns, tumor) * (late_ms / 1000 + self._servo_s),
+        )
+        if self._planned.left_mm < 0:
+            return "", False
+        if self._planned.confidence > now.confidence:
+            sure = f"{100 * self._planned.confidence:g} %"
+            return f"the estimate states no {sure} margin, with which it was planned", False
+        if now.left_mm >= 0:
+            return "", False
+        return now.words, msgspec.structs.replace(now, motion_mm=0.0).left_mm >= 0
+
+    def went_on(self) -> None:
+        """The arms may move on the last estimate."""
+        if self.now is not None and (self.worst is None or self.now.left_mm < self.worst.left_mm):
+            self.worst = self.now
+
+    def forget(self) -> None:
+        """There is no estimate."""
+        self.now = None
+
+    def summary(self) -> dict[str, Any]:
+        """For the report: as planned, and at its worst."""
+        budgets = {"planned": self._planned, "worst": self.worst}
+        return {
+            name: {**to_builtins(one), "sum_mm": one.sum_mm, "left_mm": one.left_mm}
+            for name, one in budgets.items()
+            if one is not None
+        }
+
+    def _speed_mm_s(self, stamp_ns: int, tumor: Mesh) -> float:
+        """Of the tumor's middle, over the last moments; 0 where it was not seen before."""
+        places = self._places
+        if places and not 0 < stamp_ns - places[-1][0] <= 1e9 * _GAP_S:
+            places.clear()
+        places.append((stamp_ns, tumor.vertices_mm.mean(0)))
+        while len(places) > 2 and places[-1][0] - places[1][0] >= 1e9 * _SPEED_S:
+            places.popleft()
+        (first_ns, first_mm), (last_ns, last_mm) = places[0], places[-1]
+        if last_ns == first_ns:
+            return 0.0
+        return float(np.linalg.norm(last_mm - first_mm)) / (1e-9 * (last_ns - first_ns))

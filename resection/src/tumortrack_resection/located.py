@@ -1,0 +1,143 @@
+"""What the planner sees: an estimate, or the folder that `locate` wrote; and the table's frame."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+from jaxtyping import Float64
+from scipy.spatial import cKDTree
+
+from tumortrack.core.errors import ArtifactError, InputError
+from tumortrack.core.estimate import Estimate
+from tumortrack.core.geometry import rigid
+from tumortrack.core.mesh_files import read_mesh
+from tumortrack.core.organ import KIDNEY, is_tumor, organ_first, organ_name
+from tumortrack.core.patient import NOBODY, Patient
+from tumortrack.core.store import MANIFEST, read_json
+from tumortrack.core.types import ORGAN, Mesh, OccupancyCloud
+from tumortrack.sense.ply import parse_ply_properties
+from tumortrack.tracking.files import MARGIN, read_report
+from tumortrack_resection.values import POOR_ESTIMATE, Located, name_of, organ_surface
+
+STAND_MM = 120.0  # the organ's lowest point over the table, where it is not known
+
+
+def table_under(meshes: Mapping[str, Mesh], stand_mm: float) -> Float64[np.ndarray, "4 4"]:
+    """``table_from_camera`` of a camera that looks straight down on the organ (its surface in the
+    camera's frame), whose lowest point stands ``stand_mm`` over the table.
+
+    x goes to the right in the picture, y to its top, z towards the camera; the origin lies on the
+    table below the organ's middle. NoPlan: there is no organ.
+    """
+    low, high = organ_surface(meshes).box_mm
+    x, y, _ = (low + high) / 2
+    return rigid(np.diag([1.0, -1.0, -1.0]), np.array([-x, y, high[2] + stand_mm]))
+
+
+def of_estimate(estimate: Estimate, unsure: bool = True) -> Located:
+    """What planning needs of it, camera frame. ``unsure``: with the tumors' deviations."""
+    deviations, motion = {}, estimate.motion if unsure else None
+    for name, mesh in estimate.meshes.items():
+        if motion is None or not is_tumor(name):
+            continue
+        places = motion.back(mesh.vertices_mm)
+        if places is not None and (std_mm := motion.largest_std_mm(places)) is not None:
+            deviations[name] = std_mm
+    return Located(
+        estimate.cloud.points_mm,
+        estimate.cloud.labels,
+        estimate.meshes,
+        deviations,
+        stamp_ns=estimate.cloud.stamp_ns,
+        patient=estimate.patient,
+        margin=estimate.report.get("margin"),
+        structures=estimate.structures,
+        doubt="" if estimate.quality == "good" else estimate.reason or "unknown",
+    )
+
+
+def notes_of_doubt(doubt: str, accept_poor: bool) -> tuple[str, ...]:
+    """What a plan says of the estimate it is made on. InputError: that is poor, and nobody said
+    that it is to be planned on all the same."""
+    if not doubt:
+        return ()
+    if not accept_poor:
+        raise InputError(
+            f"the estimate is poor: {doubt}. Locate again with a better view; only for a plan that "
+            "nobody carries out, accept it (--accept-poor, accept_poor=True)."
+        )
+    return (f"{POOR_ESTIMATE}: {doubt}.",)
+
+
+class _Quality(msgspec.Struct):
+    verdict: str
+    reason: str = ""
+
+
+class _Report(msgspec.Struct):
+    """What planning needs of a run's report.json."""
+
+    quality: _Quality
+    patient: Patient = NOBODY
+    stamp_ns: int = 0
+    structures: tuple[str, ...] = ()
+    margin: dict[str, Any] | None = None
+
+
+def read_run(folder: Path) -> Located:
+    """What `locate` wrote, camera frame; a surface's uncertainty is that of the nearest points.
+    Raises ArtifactError: no such run, damaged, or without its cloud."""
+    stored, manifest = read_report(folder), read_json(folder / MANIFEST)
+    path = folder / "occupancy.ply"
+    try:
+        report = msgspec.convert(stored, _Report)
+        content = path.read_bytes()
+        table = parse_ply_properties(content, str(path), ("x", "y", "z", "label", "probability"))
+    except (OSError, InputError, msgspec.ValidationError) as error:
+        reason = str(error).rstrip(".")
+        raise ArtifactError(
+            f"{folder} is not a run that can be planned on: {reason}. Locate again."
+        ) from error
+    doubt = "" if report.quality.verdict == "good" else report.quality.reason or "unknown"
+    cloud = OccupancyCloud(table[:, :3], table[:, 3], table[:, 4])
+    surfaces = {Path(file).stem for file in manifest["files"] if file.endswith(".ply")}
+    surfaces = {name for name in surfaces if not name.endswith(MARGIN)}
+    meshes = {
+        name: read_mesh(folder / f"{name}.ply") for name in organ_first(surfaces - {path.stem})
+    }
+    structures = {name: meshes.pop(name) for name in list(meshes) if name in report.structures}
+    organ = organ_name(meshes) or KIDNEY.name
+    found = [
+        organ if label == ORGAN else name_of(label) for label in np.unique(cloud.labels) if label
+    ]
+    lacking = [name for name in found if name not in meshes]
+    if lacking:
+        raise ArtifactError(
+            f"{folder} has points of {', '.join(lacking)} and no {lacking[0]}.ply; locate again."
+        )
+    try:
+        std_mm = parse_ply_properties(content, str(path), ("largest_std_mm",))[:, 0]
+    except InputError:  # of the methods that do not know it
+        deviations = {}
+    else:
+        nearest = cKDTree(cloud.points_mm)
+        deviations = {
+            name: std_mm[nearest.query(mesh.vertices_mm)[1]]
+            for name, mesh in meshes.items()
+            if is_tumor(name)
+        }
+    return Located(
+        cloud.points_mm,
+        cloud.labels,
+        meshes,
+        deviations,
+        stamp_ns=report.stamp_ns,
+        patient=report.patient,
+        margin=report.margin,
+        structures=structures,
+        doubt=doubt,
+    )

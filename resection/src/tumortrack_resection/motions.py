@@ -1,0 +1,191 @@
+"""What both arms do, in stages, as joint angles over time; and the state machine that executes it.
+
+The execution can be halted smoothly at any moment, and it has no clock of its own.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float64
+
+from tumortrack.core.errors import InputError
+from tumortrack_resection.ur_sink import UR_JOINTS
+
+CUTTER, HOLDER = "cutter", "holder"  # UR10e with the instrument, UR5 with the vacuum grasper
+ARMS = (CUTTER, HOLDER)
+Joints = Float64[np.ndarray, " 12"]  # radians, in the order of ``JOINTS``
+JOINTS = tuple(f"{arm}_{joint}" for arm in ARMS for joint in UR_JOINTS)
+DONE, ABORTED = "done", "aborted"
+LIFT, RELEASE = "lift", "release"
+_BRAKE_RAD_S2 = 4.0  # of the fastest joint, where arms are halted in the middle of a motion
+_SHORTEST_BRAKE_S = 0.1
+_COME_UP_S = 0.3  # three times what servoing looks ahead; the way in to a cut takes longer
+
+
+@dataclass(frozen=True, eq=False)
+class MotionStage:
+    """One state of the procedure: approach, grasp, hold, sweep 1, sweep 2, ..., lift,
+    release, home.
+
+    Attributes:
+        times_s: rising from 0; one entry where nothing moves.
+        joints_rad: of all twelve joints in the order of ``JOINTS``; between two times they change
+            linearly.
+        cutting: True at the times at which the instrument's tip is on a cut (n,).
+    """
+
+    name: str
+    times_s: Float64[np.ndarray, " n"]
+    joints_rad: Float64[np.ndarray, "n 12"]
+    cutting: np.ndarray
+
+    def __post_init__(self) -> None:
+        n = len(self.times_s)
+        if not (n and self.joints_rad.shape == (n, len(JOINTS)) and self.cutting.shape == (n,)):
+            raise InputError(f"stage {self.name}: times, joints and cutting must match.")
+        if self.times_s[0] != 0 or (np.diff(self.times_s) <= 0).any():
+            raise InputError(f"stage {self.name}: times must rise from 0.")
+
+    @property
+    def seconds(self) -> float:
+        return float(self.times_s[-1])
+
+    @property
+    def sweep(self) -> int:
+        """The number of the sweep that this stage is, from 1; 0: it is none."""
+        return int(self.name.removeprefix("sweep ")) if self.name.startswith("sweep ") else 0
+
+    def at(self, time_s: float) -> Joints:
+        """Joint angles so long after the stage began."""
+        return np.array([np.interp(time_s, self.times_s, joint) for joint in self.joints_rad.T])
+
+
+@dataclass(frozen=True, eq=False)
+class Motions:
+    """The stages in their order, each beginning where the one before ended."""
+
+    stages: tuple[MotionStage, ...]
+
+    @property
+    def seconds(self) -> float:
+        return sum(stage.seconds for stage in self.stages)
+
+
+class Execution:
+    """Executes motions. ``step`` lets time go by; ``halt`` has the arms slow down and stand, on
+    their path, and ``go`` lets them go on; ``abort`` is a halt for good.
+
+    ``state`` is the name of the stage, ``done`` or ``aborted``; ``halted`` is why the arms stand or
+    slow down, empty where they don't.
+    """
+
+    def __init__(self, motions: Motions) -> None:
+        self._motions = motions
+        self._number, self._time_s = 0, 0.0
+        self._speed = 0.0  # of the motions' own time, 0..1
+        self.halted, self._aborted = "", False
+
+    @property
+    def state(self) -> str:
+        if self._aborted:
+            return ABORTED
+        return DONE if self._over else self._stage.name
+
+    @property
+    def ended(self) -> bool:
+        """Nothing will move any more."""
+        return self._over or (self._aborted and self.still)
+
+    @property
+    def still(self) -> bool:
+        return self._speed == 0.0 or self._over
+
+    @property
+    def sweep(self) -> int:
+        """Number of the sweep under way; 0 before the first, and one more than there are after the
+        last."""
+        past = max(stage.sweep for stage in self._motions.stages[: self._number + 1])
+        after = self._over or not self._stage.sweep
+        return past + 1 if past and after else past
+
+    @property
+    def holds(self) -> bool:
+        """The holder has been at the grasp point: the state is hold or later."""
+        names = [stage.name for stage in self._motions.stages]
+        return "hold" not in names or self._number >= names.index("hold")
+
+    @property
+    def cutting(self) -> bool:
+        """The instrument is on a cut, and has been for so long that an arm has come up with it."""
+        times_s, since_s = self._stage.times_s, self._time_s - _COME_UP_S
+        first = int(np.searchsorted(times_s, since_s, side="right")) - 1
+        last = int(np.searchsorted(times_s, self._time_s, side="left"))
+        return first >= 0 and not self._over and bool(self._stage.cutting[first : last + 1].all())
+
+    @property
+    def joints_rad(self) -> Joints:
+        return self._stage.at(self._time_s)
+
+    def go(self) -> None:
+        """Take up the motion again, or begin."""
+        if not self._aborted:
+            self.halted = ""
+
+    def halt(self, reason: str) -> None:
+        """Slow down and stand."""
+        if not reason:
+            raise InputError("a halt needs its reason.")
+        if not self._aborted:
+            self.halted = reason
+
+    def abort(self, reason: str) -> None:
+        """Slow down and stand, and never go on; no effect once everything has ended."""
+        if not self._over:
+            self.halt(reason)
+            self._aborted = True
+
+    def replace(self, motions: Motions) -> None:
+        """Go on with other motions; InputError where they do not begin where the arms stand now, or
+        the arms are moving."""
+        if not self.still:
+            raise InputError("motions can be replaced only while the arms stand.")
+        off = np.abs(motions.stages[0].joints_rad[0] - self.joints_rad).max()
+        if off > 1e-6:
+            raise InputError(f"the new motions begin {off:.2g} rad from where the arms are.")
+        self._motions, self._number, self._time_s = motions, 0, 0.0
+
+    def step(self, seconds: float) -> None:
+        """Let so much time go by."""
+        if not seconds >= 0:
+            raise InputError(f"time goes forward; {seconds:g} s does not.")
+        while seconds > 0 and not self._over:
+            change = min(seconds, 0.02)  # the speed changes in steps as short as that
+            seconds -= change
+            wanted, before = 0.0 if self.halted else 1.0, self._speed
+            most = change / self._brake_s()
+            self._speed += float(np.clip(wanted - before, -most, most))
+            self._time_s += change * (before + self._speed) / 2
+            while not self._over and self._time_s >= (length_s := self._stage.seconds):
+                self._number += 1
+                self._time_s = length_s if self._over else self._time_s - length_s
+
+    def _brake_s(self) -> float:
+        """Time in which the motion comes to rest without more than the brake's acceleration."""
+        stage = self._stage
+        here = int(np.searchsorted(stage.times_s, self._time_s, side="right"))
+        around = slice(max(0, here - 3), here + 3)
+        times, joints = stage.times_s[around], stage.joints_rad[around]
+        if len(times) < 2:
+            return _SHORTEST_BRAKE_S
+        speed = np.abs(np.diff(joints, axis=0) / np.diff(times)[:, None]).max()
+        return max(_SHORTEST_BRAKE_S, float(speed) / _BRAKE_RAD_S2)
+
+    @property
+    def _over(self) -> bool:
+        return self._number >= len(self._motions.stages)
+
+    @property
+    def _stage(self) -> MotionStage:
+        return self._motions.stages[min(self._number, len(self._motions.stages) - 1)]

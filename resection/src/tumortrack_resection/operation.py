@@ -1,0 +1,334 @@
+"""A plan carried out beside the live loop: halted by every doubt, replanned where the tumor moved.
+
+No torch here, and no clock but the updates' own arrival: ``act`` is called with every update.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Callable, Mapping
+from concurrent.futures import Future
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float64
+from scipy.spatial import cKDTree
+
+from tumortrack.core.colours import CUT, NOW, TO_CUT
+from tumortrack.core.config import Config
+from tumortrack.core.errors import InputError, TumortrackError
+from tumortrack.core.types import Mesh
+from tumortrack.live.values import Polyline, RigidShape, TrackingResult, Workcell
+from tumortrack_resection.budget import MOVED_MM, kept_mm
+from tumortrack_resection.live_budget import LiveBudget
+from tumortrack_resection.motions import ABORTED, JOINTS, Execution, Joints, Motions
+from tumortrack_resection.values import Located, ResectionPlan
+
+_SAME_MM = 0.2  # of heights
+_OTHERS = 2.0  # other parts may have moved so many times as far as the tumor
+_COMPARED = 500  # points of surfaces whose triangles differ
+CUT_NOTE = "cut: estimates are of the intact organ"
+_BLIND_S = 0.2  # without an update for longer, the arms halt by themselves
+
+
+class OperationConfig(Config, frozen=True, kw_only=True):
+    """When the arms halt and when it is replanned.
+
+    Attributes:
+        moved_mm: the tumor has moved if its surface is so far from where it was planned (root mean
+            square).
+        settled_mm, settled_s: it is replanned once the tumor has moved no more than that for so
+            long; until then the arms wait.
+        replan_cut: it is planned anew on the intact organ's model even after the first sweep has
+            begun; otherwise the arms stand then.
+        speed: of the arms' time.
+    """
+
+    moved_mm: float = MOVED_MM
+    settled_mm: float = 0.7
+    settled_s: float = 0.5
+    replan_cut: bool = False
+    speed: float = 1.0
+
+    def __post_init__(self) -> None:
+        for name in ("moved_mm", "settled_mm", "settled_s"):
+            if not 0 < getattr(self, name) <= 100:
+                raise InputError(f"{name} is {getattr(self, name):g}; allowed: over 0 to 100.")
+        if not 0 < self.speed <= 20:
+            raise InputError(f"speed is {self.speed:g}; allowed: more than 0, up to 20.")
+
+
+@dataclass(frozen=True, eq=False)
+class Planned:
+    """A plan, the surfaces it was made for (table frame), and the motions."""
+
+    plan: ResectionPlan
+    meshes: Mapping[str, Mesh]
+    motions: Motions
+
+    @cached_property
+    def kept_mm(self) -> float:
+        """The least distance between the cut and the tumor's surface: the margin as planned."""
+        return kept_mm(self.plan.layers, self.meshes[self.plan.tumor].spread_mm())
+
+
+@dataclass(frozen=True)
+class ResectionProgress:
+    """How far a plan was carried out: whether the grasper holds, and the height of the last
+    finished sweep over the tumor's lowest point (None: none is finished)."""
+
+    holds: bool = False
+    done_mm: float | None = None
+
+    def first_sweep(self, planned: ResectionPlan, tumor: Mesh) -> int | None:
+        """The sweep with which another plan goes on: the first that lies beyond what is finished,
+        in the order in which it cuts, and never past the last; None: from the approach.
+
+        Sweeps are not the same from plan to plan, so they are matched by their height.
+        """
+        if not self.holds:
+            return None
+        if self.done_mm is None:
+            return 1
+        done_mm = float(tumor.box_mm[0, 2]) + self.done_mm
+        onward = 1 if planned.cuts[-1].height_mm > planned.cuts[0].height_mm else -1
+        left = [c.sweep for c in planned.cuts if onward * (c.height_mm - done_mm) > _SAME_MM]
+        return min(left, default=planned.sweeps)
+
+
+# The estimate to plan on, the arms' joints, and how far they came
+Replan = Callable[[TrackingResult, Joints, ResectionProgress], "Future[Planned]"]
+Locate = Callable[[TrackingResult], Located]
+Draw = Callable[[Joints], tuple[RigidShape, ...]]
+
+
+class Operation:
+    """``live.values.ArmsController``: arms that act on estimates.
+
+    Args:
+        planned: what to begin with.
+        draw: the arms, table and tools as shapes, for twelve joint angles.
+        locate: an update's estimate in the table's frame; None: a stored plan is carried out
+            without regard to estimates.
+        replan: begins a new plan in another process, so that the loop goes on meanwhile.
+        budget: adds up the errors of every update; None: they are not looked at.
+
+    Attributes:
+        planned: what is carried out now.
+        still_life: shapes that are shown all the time.
+        log: states and when they began. ``halts``: how often each reason halted the arms.
+    """
+
+    def __init__(
+        self,
+        planned: Planned,
+        config: OperationConfig,
+        draw: Draw,
+        locate: Locate | None = None,
+        replan: Replan | None = None,
+        budget: LiveBudget | None = None,
+    ) -> None:
+        self.planned, self._config = planned, config
+        self._warnings = planned.plan.warnings  # of another plan too: the budget stays accepted
+        self._draw, self._locate, self._replan = draw, locate, replan
+        self._budget = budget
+        self._execution = Execution(planned.motions)
+        self._last_s: float | None = None
+        self._first_s = 0.0
+        self._settled: tuple[Mesh, float] | None = None  # where the tumor is, and since when
+        self._work: Future[Planned] | None = None
+        self._cut = False  # whether the first sweep has begun, of whatever plan
+        self.still_life: tuple[RigidShape, ...] = ()
+        self.log: list[dict[str, Any]] = []
+        self.halts: Counter[str] = Counter()
+        self._counted = ""  # the reason, without its numbers, that ``halts`` has counted
+
+    @property
+    def ended(self) -> bool:
+        return self._execution.ended
+
+    @property
+    def progress(self) -> ResectionProgress:
+        """How far it came."""
+        plan, sweep = self.planned.plan, self._execution.sweep
+        done = [cut.height_mm for cut in plan.cuts if cut.sweep < sweep]
+        if not (self._execution.holds and done):
+            return ResectionProgress(self._execution.holds)
+        return ResectionProgress(
+            True, done[-1] - float(self.planned.meshes[plan.tumor].box_mm[0, 2])
+        )
+
+    def act(self, update: TrackingResult, now_s: float | None = None) -> TrackingResult:
+        """The update with what the arms do now. ``now_s``: a steady clock's time."""
+        now_s = time.monotonic() if now_s is None else now_s
+        self._advance(now_s)
+        self._decide(update, now_s)
+        if not self.log or self.log[-1]["state"] != self._execution.state:
+            self._log(now_s)
+        halted = "".join(c for c in self._execution.halted if not (c.isdigit() or c == "."))
+        if halted and halted != self._counted:
+            self.halts[halted] += 1
+        self._counted = halted
+        return replace(update, workcell=self.workcell())
+
+    def abort(self, reason: str) -> None:
+        """Stop for good, from whatever state."""
+        self._execution.abort(reason)
+
+    def workcell(self) -> Workcell:
+        """State, joints and drawing of the arms."""
+        execution, plan = self._execution, self.planned.plan
+        joints, sweep = execution.joints_rad, execution.sweep
+        lines = []
+        for number, cut in enumerate(plan.cuts, start=1):
+            colour = CUT if cut.sweep < sweep else NOW if cut.sweep == sweep else TO_CUT
+            lines.append(Polyline(f"cut/{number}", cut.path_mm, colour, 0.8))
+        above = plan.grasp_mm + np.array([[0.0, 0.0, 40.0], [0.0, 0.0, 0.0]])
+        lines.append(Polyline("grasp", above, (90, 200, 255), 0.8))
+        named = dict(zip(JOINTS, joints.tolist(), strict=True))
+        shapes = (*self.still_life, *self._draw(joints))
+        state = f"{execution.state} ({self._note})" if self._note else execution.state
+        now = None if self._budget is None else self._budget.now
+        left_mm = None if now is None else now.left_mm
+        cutting = execution.cutting
+        return Workcell(state, execution.halted, named, shapes, tuple(lines), left_mm, cutting)
+
+    @property
+    def _note(self) -> str:
+        """What is wrong with the plan, and with all estimates by now."""
+        heads = [warning.split(":")[0].rstrip(".") for warning in self._warnings]
+        return "; ".join([*heads, *([CUT_NOTE] if self._cut and self._locate is not None else [])])
+
+    def summary(self) -> dict[str, Any]:
+        """For the report: states and when they began, halts, new plans."""
+        return {
+            "state": self._execution.state,
+            "note": self._note,
+            "halted": self._execution.halted,
+            "halts": dict(self.halts.most_common()),
+            "log": self.log,
+            **({} if self._budget is None else {"budget": self._budget.summary()}),
+        }
+
+    def _advance(self, now_s: float) -> None:
+        """Let the time since the last update go by."""
+        if self._last_s is None:
+            self._last_s = self._first_s = now_s
+        passed_s, speed = max(0.0, now_s - self._last_s), self._config.speed
+        self._last_s = now_s
+        self._execution.step(min(passed_s, _BLIND_S) * speed)
+        if passed_s > _BLIND_S:
+            self._execution.halt("no word from the loop")
+            self._execution.step((passed_s - _BLIND_S) * speed)
+        self._cut |= self._execution.sweep > 0
+
+    def _decide(self, update: TrackingResult, now_s: float) -> None:
+        """Go on, or halt and why."""
+        execution = self._execution
+        if self._budget is not None:
+            self._budget.forget()
+        if self._work is not None:
+            self._take_work(self._work, now_s)
+        over = execution.ended or execution.state == ABORTED
+        if self._locate is None or over or execution.sweep > self.planned.plan.sweeps:
+            execution.go()  # nothing is compared, nothing moves any more, or all is cut
+        elif update.estimate is None:
+            self._halt_in_doubt(f"no estimate: {update.reason}")
+        elif update.quality != "good":
+            self._halt_in_doubt(f"{update.quality} estimate: {update.warning}")
+        elif self._work is not None:
+            execution.halt("planning anew")
+        else:
+            self._compare(update, self._locate(update), now_s)
+
+    def _halt_in_doubt(self, reason: str) -> None:
+        """Halt where it is not known where the tumor is."""
+        self._settled = None
+        self._execution.halt(reason)
+
+    def _compare(self, update: TrackingResult, located: Located, now_s: float) -> None:
+        """Go on where everything lies as planned; else halt, and replan once it has settled."""
+        execution, config = self._execution, self._config
+        name = self.planned.plan.tumor
+        for part in (name, *self.planned.meshes):
+            if part not in located.meshes:
+                self._halt_in_doubt(f"{part} was not found")
+                return
+        tumor = located.meshes[name]
+        reason, plan_anew = self._objection(update, located)
+        if not reason:
+            self._settled = None
+            execution.go()
+            if self._budget is not None:
+                self._budget.went_on()
+            return
+        if not plan_anew:
+            self._halt_in_doubt(reason)
+            return
+        if self._cut and not config.replan_cut:
+            execution.halt(f"{reason} ({CUT_NOTE}; --replan-cut plans on them anyway)")
+            return
+        execution.halt(reason)
+        if self._settled is None or apart_mm(tumor, self._settled[0]) > config.settled_mm:
+            self._settled = (tumor, now_s)
+        elif now_s - self._settled[1] >= config.settled_s and execution.still:
+            self._settled = None
+            if self._replan is not None:
+                self._work = self._replan(update, execution.joints_rad, self.progress)
+
+    def _objection(self, update: TrackingResult, located: Located) -> tuple[str, bool]:
+        """Why the arms must stand, empty if they need not, and whether a new plan would help."""
+        name, far, over = self.planned.plan.tumor, [], ("", False)
+        for part, mesh in self.planned.meshes.items():
+            off_mm = apart_mm(located.meshes[part], mesh)
+            if off_mm > self._config.moved_mm * (1.0 if part == name else _OTHERS):
+                far.append((part == name, off_mm, part))
+        if self._budget is not None:
+            tumor, kept = located.meshes[name], self.planned.kept_mm
+            motion_mm = float(_distances_mm(tumor, self.planned.meshes[name]).max())
+            over = self._budget.add_up(update, name, tumor, motion_mm, kept)
+        if far:
+            _, off_mm, part = max(far)  # the tumor, or else what moved farthest
+            return f"{part} has moved by {off_mm:.1f} mm", True
+        return over
+
+    def _take_work(self, work: Future[Planned], now_s: float) -> None:
+        """The new plan, if it is ready; where there is none, stop for good."""
+        execution = self._execution
+        if execution.state == ABORTED:
+            self._work = None
+            work.cancel()
+            return
+        if not work.done():
+            return
+        self._work = None
+        failure = work.exception()
+        if failure is None:
+            self.planned = work.result()
+            execution.replace(self.planned.motions)
+            self._log(now_s, event="planned anew")
+        elif isinstance(failure, TumortrackError):
+            execution.abort(f"no new plan: {failure}")
+        else:  # a defect of the planner must stop the arms, and be reported
+            execution.abort(f"internal error, {type(failure).__name__}: {failure}")
+
+    def _log(self, now_s: float, **event: str) -> None:
+        at_s = round(now_s - self._first_s, 3)
+        self.log.append({"state": self._execution.state, "at_s": at_s, **event})
+
+
+def apart_mm(a: Mesh, b: Mesh) -> float:
+    """How far a surface has moved, root mean square: of its vertices where both have the same
+    triangles, else between the surfaces, for which sliding along itself is no motion."""
+    return float(np.sqrt((_distances_mm(a, b) ** 2).mean()))
+
+
+def _distances_mm(a: Mesh, b: Mesh) -> Float64[np.ndarray, " n"]:
+    if np.array_equal(a.faces, b.faces):
+        return np.sqrt(((a.vertices_mm - b.vertices_mm) ** 2).sum(axis=1))
+    pairs = (a.vertices_mm, b.vertices_mm), (b.vertices_mm, a.vertices_mm)
+    apart = [cKDTree(to).query(of[:: max(1, len(of) // _COMPARED)])[0] for of, to in pairs]
+    return np.concatenate(apart)

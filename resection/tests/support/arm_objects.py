@@ -1,0 +1,125 @@
+"""A kidney-like ellipsoid with a tumor at its side, and a plan to cut it out in two sweeps."""
+
+import msgspec
+import numpy as np
+
+from tumortrack.core.types import Mesh
+from tumortrack_resection.arms.cell import ArmCell
+from tumortrack_resection.values import Cut, CutLayer, ResectionPlan
+
+HALF_MM = np.array([55.0, 30.0, 25.0])
+STAND_MM = 120.0
+TUMOR_MM = 12.0  # radius
+
+
+def organ(shift_mm=(0.0, 0.0, 0.0), angle_rad=0.6):
+    """The ellipsoid united with the tumor, lowest point on the stand."""
+    import manifold3d
+
+    body = manifold3d.Manifold.sphere(1.0, 48).scale(HALF_MM.tolist())
+    tumor = manifold3d.Manifold.sphere(TUMOR_MM, 32).translate(_tumor(angle_rad).tolist())
+    both = (body + tumor).translate([0.0, 0.0, STAND_MM + HALF_MM[2]]).to_mesh64()
+    return Mesh(both.vert_properties[:, :3] + np.array(shift_mm), both.tri_verts)
+
+
+def _tumor(angle_rad):
+    return np.array([np.cos(angle_rad), np.sin(angle_rad), 0.1]) * HALF_MM
+
+
+def plan(shift_mm=(0.0, 0.0, 0.0), angle_rad=0.6, radius_mm=17.0, step_mm=1.5):
+    """Closed contours around the tumor at its middle and at its underside."""
+    centre = _tumor(angle_rad) + [0.0, 0.0, STAND_MM + HALF_MM[2]] + np.array(shift_mm)
+    angles = np.linspace(0, 2 * np.pi, int(2 * np.pi * radius_mm / step_mm) + 1) + angle_rad
+    ring = centre[:2] + radius_mm * np.stack([np.cos(angles), np.sin(angles)], 1)
+    low, top = centre[2] - TUMOR_MM, centre[2] + TUMOR_MM
+    cuts = tuple(
+        Cut(n, np.column_stack([ring, np.full(len(ring), height)]))
+        for n, height in ((1, centre[2]), (2, low))
+    )
+    layers = (CutLayer(centre[2], np.inf, (ring[:-1],)), CutLayer(low, centre[2], (ring[:-1],)))
+    grasp = np.append(centre[:2], top)
+    return ResectionPlan("published", "tumor_1", 2, grasp, cuts, layers, 5.0, {}, 0.5)
+
+
+def bare(cell):
+    """The same workcell without clearances: only what touches collides."""
+    config = msgspec.structs.replace(cell.config)
+    for name in ("clearance_mm", "organ_clearance_mm", "contact_mm"):
+        msgspec.structs.force_setattr(config, name, 0.0)
+    return ArmCell(config, cell.organ)
+
+
+def nearest_mm(cell, joints_rad):
+    """The least distance of any pair that is checked, mm (negative: how deep)."""
+    import pinocchio as pin
+
+    data, state = cell.model.createData(), pin.GeometryData(cell.solids)
+    pin.updateGeometryPlacements(cell.model, data, cell.solids, state, joints_rad)
+    n = pin.computeDistances(cell.solids, state)
+    return 1000 * state.distanceResults[n].min_distance
+
+
+def flange_pose(model, joints_rad):
+    """``base_from_flange`` (..., 4, 4), mm, of joints (..., 6), by the plain product of the six
+    Denavit-Hartenberg transforms.
+
+    Independent of every library: what the others are checked against.
+    """
+    base_from_flange = np.eye(4)
+    joints = np.moveaxis(np.asarray(joints_rad), -1, 0)
+    for theta, a, d, alpha in zip(joints, model.a_mm, model.d_mm, model.alpha_rad, strict=True):
+        (ct, st), (ca, sa) = (np.cos(theta), np.sin(theta)), (np.cos(alpha), np.sin(alpha))
+        step = np.zeros((*theta.shape, 4, 4))
+        step[..., 0, :] = np.stack([ct, -st * ca, st * sa, a * ct], -1)
+        step[..., 1, :] = np.stack([st, ct * ca, -ct * sa, a * st], -1)
+        step[..., 2:, :] = [[0.0, sa, ca, d], [0.0, 0.0, 0.0, 1.0]]
+        base_from_flange = base_from_flange @ step
+    return base_from_flange
+
+
+# A way between two strokes (milliradians) on which toppra, on its first grid, creeps for minutes.
+CREEPING_MRAD = np.array([
+    -490, -2077, 2569, -2063, -1571, -2061,
+    -507, -2109, 2580, -2041, -1571, -2078,
+    -521, -2135, 2588, -2024, -1571, -2092,
+    -532, -2158, 2596, -2009, -1571, -2103,
+    -543, -2179, 2602, -1995, -1571, -2114,
+    -554, -2200, 2609, -1981, -1571, -2126,
+    -565, -2218, 2614, -1967, -1571, -2140,
+    -575, -2230, 2614, -1955, -1571, -2161,
+    -581, -2229, 2605, -1948, -1571, -2190,
+    -583, -2211, 2586, -1946, -1571, -2230,
+    -581, -2176, 2556, -1950, -1571, -2281,
+    -576, -2130, 2518, -1958, -1571, -2339,
+    -570, -2077, 2475, -1969, -1571, -2403,
+    -562, -2020, 2430, -1981, -1571, -2468,
+    -555, -1964, 2385, -1993, -1571, -2533,
+    -547, -1907, 2341, -2004, -1571, -2598,
+    -540, -1851, 2296, -2016, -1571, -2664,
+    -532, -1794, 2251, -2028, -1571, -2729,
+    -525, -1738, 2207, -2040, -1571, -2794,
+    -518, -1681, 2162, -2051, -1571, -2859,
+    -510, -1625, 2117, -2063, -1571, -2925,
+    -503, -1568, 2072, -2075, -1571, -2990,
+    -495, -1512, 2028, -2087, -1571, -3055,
+    -488, -1455, 1983, -2098, -1571, -3121,
+    -480, -1399, 1938, -2110, -1571, -3186,
+    -473, -1343, 1894, -2122, -1571, -3251,
+    -465, -1286, 1849, -2134, -1571, -3316,
+    -458, -1230, 1804, -2145, -1571, -3382,
+    -451, -1173, 1759, -2157, -1571, -3447,
+    -443, -1117, 1715, -2169, -1571, -3512,
+    -436, -1060, 1670, -2181, -1571, -3577,
+    -428, -1006, 1627, -2192, -1571, -3640,
+    -421, -957, 1589, -2203, -1571, -3696,
+    -414, -917, 1559, -2212, -1571, -3742,
+    -407, -890, 1539, -2220, -1571, -3773,
+    -401, -875, 1531, -2227, -1571, -3789,
+    -395, -870, 1531, -2231, -1571, -3795,
+    -389, -871, 1535, -2235, -1571, -3793,
+    -384, -874, 1542, -2238, -1571, -3788,
+    -379, -878, 1549, -2242, -1571, -3782,
+    -373, -882, 1556, -2245, -1571, -3777,
+    -367, -886, 1565, -2249, -1571, -3771,
+    -359, -892, 1575, -2254, -1571, -3763,
+]).reshape(-1, 6)  # fmt: skip

@@ -1,0 +1,68 @@
+"""Organs and tumors whose plans are known: an ellipsoid with a half-sunk sphere."""
+
+import numpy as np
+import trimesh
+
+from tumortrack.core.types import Mesh
+from tumortrack.imaging.meshes import mesh_of, solid_of
+from tumortrack_resection.values import Located
+
+HALF_MM = np.array([55.0, 30.0, 25.0])  # of the organ's axes
+MIDDLE_MM = np.array([0.0, 0.0, 145.0])  # its lowest point is 120 mm over the table
+TUMOR_MM, RADIUS_MM = np.array([10.0, -27.0, 148.0]), 12.0  # bulges out of the organ's side
+
+
+def sphere(middle_mm, radius_mm, finer=4):
+    ball = trimesh.creation.icosphere(finer, 1.0)
+    return Mesh(ball.vertices * radius_mm + middle_mm, ball.faces)
+
+
+def organ_with(*tumors):
+    """The union of the ellipsoid and its tumors."""
+    whole = solid_of(sphere(MIDDLE_MM, HALF_MM), "organ")
+    for tumor in tumors:
+        whole += solid_of(tumor, "tumor")
+    return mesh_of(whole)
+
+
+def located(*tumors, n=40_000, seed=0, std_mm=None):
+    """As an estimate in the table's frame: points evenly in the organ, labelled."""
+    if not tumors:
+        tumors = (sphere(TUMOR_MM, RADIUS_MM),)
+    organ = organ_with(*tumors)
+    rng = np.random.default_rng(seed)
+    points = rng.uniform(*organ.box_mm, (n, 3))
+    labels = (((points - MIDDLE_MM) / HALF_MM) ** 2).sum(1) < 1
+    labels = labels.astype(np.uint8)
+    for label, tumor in enumerate(tumors, start=2):
+        middle = tumor.box_mm.mean(0)
+        radius = np.ptp(tumor.box_mm[:, 0]) / 2
+        labels[np.linalg.norm(points - middle, axis=1) < radius] = label
+    inside = labels > 0
+    named = {f"tumor_{k}": tumor for k, tumor in enumerate(tumors, start=1)}
+    deviations = {} if std_mm is None else {
+        name: np.full(len(mesh.vertices_mm), std_mm) for name, mesh in named.items()
+    }  # fmt: skip
+    return Located(points[inside], labels[inside], {"kidney": organ, **named}, deviations)
+
+
+class Deviating:
+    """A motion that leaves points where they are, everywhere as unsure along z as the tests say."""
+
+    def __init__(self, deviation_mm=0.5):
+        self.deviation_mm = deviation_mm
+
+    def carry(self, points):
+        return points
+
+    def back(self, points):
+        return points
+
+    def std_mm(self, points):
+        return self.largest_std_mm(points) / np.sqrt(3)
+
+    def largest_std_mm(self, points):
+        return np.full(len(points), self.deviation_mm)
+
+    def covariance_mm2(self, points):
+        return self.deviation_mm**2 * np.tile(np.diag([0.0, 0.0, 1.0]), (len(points), 1, 1))

@@ -1,0 +1,557 @@
+"""Arms in time: halts and aborts from every state, and what estimates make them do."""
+
+from __future__ import annotations
+
+import threading
+from concurrent.futures import ThreadPoolExecutor, wait
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from clock import PATIENCE_S
+from live_objects import small_update
+from plan_objects import MIDDLE_MM, RADIUS_MM, TUMOR_MM, Deviating, located, sphere
+from tumortrack.core.errors import InputError, NoPlan
+from tumortrack.live.values import TrackingResult
+from tumortrack_resection.budget import ErrorBudget
+from tumortrack_resection.live_budget import LiveBudget
+from tumortrack_resection.motions import ABORTED, DONE, JOINTS, Execution, Motions, MotionStage
+from tumortrack_resection.operation import (
+    CUT_NOTE,
+    Operation,
+    OperationConfig,
+    Planned,
+    ResectionProgress,
+)
+from tumortrack_resection.resection import plan_resection
+from tumortrack_resection.values import OVER_BUDGET, POOR_ESTIMATE, ResectionConfig
+
+STATES = ("approach", "grasp", "hold", "sweep 1", "sweep 2", "lift", "release", "home")
+FRAME_S = 1 / 30
+GOOD = replace(small_update(), quality="good")
+SEEN = located(n=8_000)
+PLAN = plan_resection(SEEN, ResectionConfig(method="published"))
+
+
+def motions(states=STATES, first=None):
+    """Each stage turns every joint by 0.2 rad in a second, ``hold`` and ``release`` stand."""
+    here = np.zeros(len(JOINTS)) if first is None else first
+    stages = []
+    for number, name in enumerate(states):
+        turn = 0.0 if name in ("hold", "release") else 0.2 * (-1) ** number
+        times = np.linspace(0, 1, 11)
+        way = here + turn * np.sin(np.pi / 2 * times)[:, None] * np.linspace(0.3, 1, len(JOINTS))
+        stages.append(MotionStage(name, times, way, np.full(11, name.startswith("sweep"))))
+        here = way[-1]
+    return Motions(tuple(stages))
+
+
+def run_until(execution, state):
+    while execution.state != state:
+        execution.step(0.01)
+        assert execution.state != DONE or state == DONE
+
+
+def test_the_stages_follow_each_other_in_their_time():
+    execution, seen = Execution(motions()), []
+    for _ in range(2000):
+        if not seen or seen[-1] != execution.state:
+            seen.append(execution.state)
+        if execution.state == DONE:
+            break
+        execution.step(0.01)
+    assert tuple(seen) == (*STATES, DONE)
+    assert execution.ended
+    assert execution.joints_rad == pytest.approx(motions().stages[-1].joints_rad[-1])
+
+
+@pytest.mark.parametrize("state", STATES)
+def test_an_abort_stops_the_arms_smoothly_from_every_state_and_for_good(state):
+    execution = Execution(motions())
+    run_until(execution, state)
+    execution.step(0.3)
+    joints = [execution.joints_rad]
+    execution.abort("the surgeon said so")
+    assert execution.state == ABORTED
+    for _ in range(200):
+        execution.step(0.005)
+        joints.append(execution.joints_rad)
+    joints = np.array(joints)
+    assert execution.ended
+    assert execution.halted == "the surgeon said so"
+    assert np.abs(joints[-1] - joints[-60]).max() == 0  # stands
+    speed = np.diff(joints, axis=0) / 0.005
+    assert np.abs(np.diff(speed, axis=0)).max() / 0.005 < 4.6  # braked, not thrown
+    execution.go()
+    execution.step(1.0)
+    assert execution.state == ABORTED
+    assert np.array_equal(execution.joints_rad, joints[-1])
+
+
+def test_a_cut_is_one_once_an_arm_has_had_the_time_to_come_up_with_it():
+    execution, cutting = Execution(motions()), []
+    while execution.state != DONE:
+        cutting.append((execution.state, execution.cutting))
+        execution.step(0.01)
+    for state in STATES:
+        found = [is_cut for name, is_cut in cutting if name == state]
+        first = found.index(True) if any(found) else len(found)
+        assert all(found[first:])
+        # All of these sweeps is cut: but for their first 0.3 s, by the samples 0.1 s apart.
+        assert (25 <= first <= 42) == state.startswith("sweep")
+    assert not execution.cutting
+
+
+@given(st.lists(st.tuples(st.booleans(), st.floats(0, 0.7)), min_size=1, max_size=30))
+@settings(max_examples=60, deadline=None)
+def test_halts_only_delay(orders):
+    """Whatever the halts, arms stay on their way, never turn back, and come to the same end."""
+    straight = motions(("approach", "sweep 1"))
+    execution = Execution(straight)
+    before = execution.joints_rad
+    for go, seconds in orders:
+        execution.go() if go else execution.halt("a doubt")
+        execution.step(seconds)
+        after = execution.joints_rad
+        stage = straight.stages[0 if execution.state == "approach" else 1]
+        way = stage.joints_rad
+        assert (after >= way.min(0) - 1e-12).all()
+        assert (after <= way.max(0) + 1e-12).all()
+        if execution.state == "approach":
+            assert (after >= before - 1e-12).all()
+        before = after
+    execution.go()
+    execution.step(10.0)
+    assert execution.state == DONE
+    assert execution.joints_rad == pytest.approx(straight.stages[-1].joints_rad[-1])
+
+
+def test_a_halt_needs_its_reason_and_new_motions_begin_where_the_arms_are():
+    execution = Execution(motions())
+    with pytest.raises(InputError, match="reason"):
+        execution.halt("")
+    with pytest.raises(InputError, match="goes forward"):
+        execution.step(-0.1)
+    execution.step(0.5)
+    with pytest.raises(InputError, match="while the arms stand"):
+        execution.replace(motions())
+    execution.halt("planning")
+    execution.step(2.0)
+    with pytest.raises(InputError, match="rad from where the arms are"):
+        execution.replace(motions())
+    execution.replace(motions(("sweep 2", "home"), first=execution.joints_rad))
+    execution.go()
+    execution.step(0.5)
+    assert execution.state == "sweep 2"
+    assert execution.sweep == 2
+    assert execution.holds
+
+
+@pytest.mark.parametrize(
+    ("kind", "bad"),
+    [
+        ("times, joints and cutting", (np.zeros(3), np.zeros((2, 12)), np.zeros(3, bool))),
+        ("times must rise", (np.array([0, 1, 1.0]), np.zeros((3, 12)), np.zeros(3, bool))),
+    ],
+)
+def test_a_stage_that_is_none_is_refused(kind, bad, unchecked):
+    with pytest.raises(InputError, match=kind):
+        MotionStage("grasp", *bad)
+
+
+def plain(cell):
+    """The state without its note."""
+    return cell.state.partition(" (")[0]
+
+
+class World:
+    """An organ that the tests move, an operation on it, and a clock."""
+
+    def __init__(self, replan=None, config=None, plan=PLAN, budget=None):
+        self.seen = SEEN
+        self.planned = Planned(plan, self.seen.meshes, motions())
+        self.calls = []
+        self.made = replan or self.replan
+        self.pool = ThreadPoolExecutor(1)
+        self.waits, self.plans = True, []
+        self.operation = Operation(
+            self.planned,
+            config or OperationConfig(settled_s=0.2),
+            lambda joints: (),
+            self.locate,
+            self.begin,
+            budget,
+        )
+        self.now_s = 100.0
+        self.shift = np.zeros(3)
+
+    def locate(self, update):
+        meshes = {
+            name: mesh.moved(mesh.vertices_mm + self.shift)
+            for name, mesh in self.seen.meshes.items()
+        }
+        return replace(self.seen, points_mm=self.seen.points_mm + self.shift, meshes=meshes)
+
+    def begin(self, update, joints_rad, progress):
+        self.plans.append(self.pool.submit(self.made, self.locate(update), joints_rad, progress))
+        return self.plans[-1]
+
+    def replan(self, seen, joints_rad, progress):
+        before = self.planned.plan
+        config = ResectionConfig(method=before.method, margin_mm=before.margin_mm)
+        plan = plan_resection(seen, config)
+        sweep = progress.first_sweep(plan, seen.meshes["tumor_1"])
+        self.calls.append((seen.meshes["tumor_1"].box_mm.mean(0), sweep))
+        states = STATES if sweep is None else STATES[STATES.index(f"sweep {sweep}") :]
+        return Planned(plan, seen.meshes, motions(states, joints_rad))
+
+    def frame(self, seconds=FRAME_S, **changes):
+        """One frame later; returns what sinks get of the arms."""
+        self.now_s += seconds
+        if self.waits:  # in the world's time, planning takes no longer than a frame
+            wait(self.plans)
+        update = replace(GOOD, **changes)
+        return self.operation.act(update, self.now_s).workcell
+
+    @property
+    def joints_rad(self):
+        return np.array(list(self.operation.workcell().joints_rad.values()))
+
+    def frames(self, n, **changes):
+        for _ in range(n):
+            cell = self.frame(**changes)
+        return cell
+
+    def until(self, state, most=600, **changes):
+        for _ in range(most):
+            cell = self.frame(**changes)
+            if plain(cell) == state:
+                return cell
+        raise AssertionError(f"never {state}, but {cell.state}: {cell.halted}")
+
+
+def test_a_whole_procedure_on_an_organ_that_keeps_still():
+    world = World()
+    seen = []
+    while not world.operation.ended:
+        cell = world.frame()
+        if not seen or seen[-1] != plain(cell):
+            seen.append(plain(cell))
+        assert cell.halted == ""
+        assert set(cell.joints_rad) == set(JOINTS)
+    assert tuple(seen) == (*STATES, DONE)
+    log = world.operation.summary()["log"]
+    assert [entry["state"] for entry in log] == [*STATES, DONE]
+    assert 7.8 < log[-1]["at_s"] < 8.6  # eight stages of a second, and a soft start
+
+
+NO_ESTIMATE = {"estimate": None, "reason": "no frame for 0.6 s", "quality": "none"}
+
+
+@pytest.mark.parametrize("state", [s for s in STATES if s not in ("lift", "release", "home")])
+@pytest.mark.parametrize(
+    ("doubt", "said"),
+    [
+        (NO_ESTIMATE, "no estimate: no frame for"),
+        ({"quality": "poor", "warning": "the camera sees through it"}, "poor estimate: the camera"),
+    ],
+    ids=["stale", "flagged"],
+)
+def test_every_doubt_halts_the_arms_and_they_go_on_after_it(state, doubt, said):
+    world = World()
+    world.until(state)
+    cell = world.frames(15, **doubt)
+    assert cell.halted.startswith(said)
+    still = world.frame(**doubt)
+    assert still.joints_rad == cell.joints_rad
+    assert plain(still) == state
+    world.until(DONE)
+
+
+def test_without_a_word_from_the_loop_the_arms_halt_by_themselves():
+    world = World()
+    world.until("approach")
+    world.frame()
+    before = world.joints_rad
+    world.frame(seconds=5.0)  # the loop hung
+    moved = np.abs(world.joints_rad - before).max()
+    assert 0 < moved < 0.2 * 0.5  # rad: no more than 0.2 s and the brake's way of 0.2 rad/s ...
+    assert world.operation.summary()["state"] == "approach"
+
+
+def test_a_tumor_that_moved_is_planned_anew_once_it_has_settled():
+    world = World()
+    world.until("approach")
+    world.shift = np.array([6.0, 2.0, 0.0])
+    cell = world.frames(3)
+    assert cell.halted == "tumor_1 has moved by 6.3 mm"
+    for _ in range(200):
+        cell = world.frame()
+        if world.calls and not cell.halted:
+            break
+    assert world.calls[0][0] == pytest.approx(TUMOR_MM + world.shift, abs=0.1)
+    assert world.calls[0][1] is None  # not held yet: from the approach
+    assert world.operation.planned.plan.grasp_mm == pytest.approx(
+        world.planned.plan.grasp_mm + world.shift, abs=0.5
+    )
+    world.until(DONE)
+    assert len(world.calls) == 1
+    assert any(entry.get("event") == "planned anew" for entry in world.operation.log)
+
+
+def test_a_tumor_that_moves_in_the_second_sweep_is_held_and_cut_on_from_there():
+    world = World(config=OperationConfig(settled_s=0.2, replan_cut=True))
+    world.until("sweep 2")
+    world.frames(10)
+    world.shift = np.array([0.0, 0.0, 4.0])
+    for _ in range(300):
+        world.frame()
+        if world.calls:
+            break
+    assert world.calls[0][1] == 2
+    world.until(DONE)
+
+
+def test_after_the_first_sweep_began_results_are_marked_and_nothing_is_planned_unasked():
+    world = World()
+    assert "intact" not in world.until("hold").state
+    assert world.operation.summary()["note"] == ""
+    assert world.until("sweep 1").state == f"sweep 1 ({CUT_NOTE})"
+    world.shift = np.array([0.0, 0.0, 4.0])
+    cell = world.frames(200)
+    assert cell.halted.startswith(f"tumor_1 has moved by 4.0 mm ({CUT_NOTE}; --replan-cut")
+    assert plain(cell) == "sweep 1"
+    assert not world.calls
+    world.shift = np.zeros(3)
+    world.until(DONE)
+    assert world.operation.summary()["note"] == CUT_NOTE
+
+
+@pytest.mark.parametrize("part", ["kidney", "tumor_1"])
+def test_a_part_that_is_not_found_halts_the_arms(part):
+    world = World()
+    world.until("approach")
+    whole = world.seen
+    left = {name: mesh for name, mesh in whole.meshes.items() if name != part}
+    world.seen = replace(whole, meshes=left)
+    cell = world.frames(10)
+    assert cell.halted == f"{part} was not found"
+    assert world.frame().joints_rad == cell.joints_rad
+    world.seen = whole
+    world.until(DONE)
+
+
+def tilted(degrees):
+    turn = Rotation.from_euler("y", degrees, degrees=True).as_matrix()
+    seen = located(n=8_000)
+    move = lambda points: (points - MIDDLE_MM) @ turn.T + MIDDLE_MM + [0, 0, 4.0]  # noqa: E731
+    meshes = {name: mesh.moved(move(mesh.vertices_mm)) for name, mesh in seen.meshes.items()}
+    return replace(seen, points_mm=move(seen.points_mm), meshes=meshes)
+
+
+@pytest.mark.parametrize("order", ["down", "up"])
+@pytest.mark.parametrize("degrees", [-25, 0, 25])
+def test_what_is_not_cut_yet_is_cut_in_whatever_sweeps_the_new_plan_has(degrees, order):
+    """Plans of the same tumor that lies otherwise have other numbers of layers."""
+    config = ResectionConfig(layer_mm=3.0, order=order)
+    first, second = (
+        plan_resection(located(n=8_000), config),
+        plan_resection(tilted(degrees), config),
+    )
+    before = located(n=8_000).meshes["tumor_1"].box_mm[0, 2]
+    tumor = tilted(degrees).meshes["tumor_1"]
+    after = tumor.box_mm[0, 2]
+    if degrees:
+        assert first.sweeps != second.sweeps
+    for sweep in range(1, first.sweeps + 1):
+        done = [cut.height_mm - before for cut in first.cuts if cut.sweep < sweep]
+        progress = ResectionProgress(True, done[-1] if done else None)
+        begin = progress.first_sweep(second, tumor)
+        assert 1 <= begin <= second.sweeps
+        skipped = [cut.height_mm - after for cut in second.cuts if cut.sweep < begin]
+        if done and order == "down":  # nothing deeper than what is done is left out
+            assert all(height >= min(done) - 0.21 for height in skipped)
+        elif done:  # and nothing higher
+            assert all(height <= max(done) + 0.21 for height in skipped)
+        else:
+            assert not skipped
+    assert ResectionProgress().first_sweep(second, tumor) is None
+
+
+def test_after_the_last_sweep_no_estimate_is_needed_any_more():
+    world = World()
+    world.until("lift")
+    assert world.frame(**NO_ESTIMATE).halted == ""
+    world.until(DONE, **NO_ESTIMATE)
+
+
+def test_another_part_that_moved_far_halts_the_arms_too():
+    world = World()
+    world.until("approach")
+    kidney = world.seen.meshes["kidney"]
+    world.seen = replace(
+        world.seen,
+        meshes={**world.seen.meshes, "kidney": kidney.moved(kidney.vertices_mm + [0, 0, 5.0])},
+    )
+    assert world.frames(2).halted == "kidney has moved by 5.0 mm"
+
+
+def test_a_tumor_that_keeps_moving_is_waited_for_and_its_return_is_enough():
+    world = World()
+    world.until("approach")
+    for n in range(60):  # it breathes: never at rest, and away from the plan
+        world.shift = np.array([0.0, 0.0, 6.0 + 3.0 * np.sin(0.6 * n)])
+        cell = world.frame()
+    assert cell.halted.startswith("tumor_1 has moved by")
+    assert not world.calls
+    world.shift = np.zeros(3)
+    assert world.frames(2).halted == ""
+    world.until(DONE)
+
+
+def budgeted(margin_mm, deviation_mm=0.5):
+    """A world whose arms heed an error budget, and how unsure its estimates are."""
+    plan = plan_resection(SEEN, ResectionConfig(margin_mm=margin_mm))
+    unsure = Deviating(deviation_mm)
+    planned = ErrorBudget(margin_mm=margin_mm, tracking_mm=4.2, hand_eye_mm=1.0, tool_mm=2.0)
+    world = World(plan=plan, budget=LiveBudget(planned))
+    changes = {"estimate": replace(GOOD.estimate, motion=unsure), "latency_ms": 50.0}
+    return world, unsure, changes
+
+
+def test_arms_stand_while_the_errors_exceed_the_margin_and_go_on_when_they_shrink():
+    world, unsure, changes = budgeted(10.0)
+    cell = world.until("grasp", **changes)
+    assert cell.left_mm == pytest.approx(world.planned.kept_mm - np.hypot(4.2, np.sqrt(5)))
+    unsure.deviation_mm = 4.0
+    cell = world.frames(15, **changes)
+    assert cell.halted.startswith("12.2 mm of error, most of it tracking (12.0), against a margin")
+    assert cell.left_mm < 0
+    assert world.frame(**changes).joints_rad == cell.joints_rad
+    assert not world.plans  # a new plan would not help
+    unsure.deviation_mm = 1.5
+    assert world.frames(2, **changes).halted == ""
+    world.until(DONE, **changes)
+    found = world.operation.summary()["budget"]
+    assert found["planned"]["sum_mm"] == pytest.approx(np.hypot(4.2, np.sqrt(5)))
+    assert found["worst"]["tracking_mm"] == 4.5  # of those on which the arms went on
+    assert found["worst"]["left_mm"] > 0
+    (halt,) = world.operation.halts
+    assert halt == " mm of error, most of it tracking (), against a margin of  mm"
+
+
+def test_less_motion_than_allowed_can_be_too_much_and_is_planned_anew():
+    world, _, changes = budgeted(5.6)
+    world.until("approach", **changes)
+    world.shift = np.array([1.5, 0.0, 0.0])  # 2 mm are allowed
+    cell = world.frames(3, **changes)
+    assert cell.halted.startswith("6.3 mm of error, most of it tracking (4.2)")
+    for _ in range(200):
+        cell = world.frame(**changes)
+        if world.calls and not cell.halted:
+            break
+    assert world.calls[0][0] == pytest.approx(TUMOR_MM + world.shift, abs=0.1)
+    assert cell.left_mm > 0
+
+
+def test_after_the_last_sweep_the_tumor_may_go():
+    world = World()
+    world.until("lift")
+    world.shift = np.array([0.0, 0.0, 60.0])  # the grasper carries it away
+    assert world.frame().halted == ""
+    world.until(DONE)
+
+
+def test_where_no_new_plan_can_be_made_the_arms_stop_for_good_and_say_why():
+    def refuses(seen, joints_rad, progress):
+        raise NoPlan("the holder can't reach it")
+
+    world = World(refuses)
+    world.until("hold")
+    world.shift = np.array([9.0, 0.0, 0.0])
+    cell = None
+    for _ in range(300):
+        cell = world.frame()
+        if cell.state == ABORTED:
+            break
+    assert cell.state == ABORTED
+    assert cell.halted == "no new plan: the holder can't reach it"
+    assert world.operation.ended
+
+
+def test_while_it_is_planned_the_loop_goes_on():
+    gate = threading.Event()
+
+    def slow(seen, joints_rad, progress):
+        gate.wait(PATIENCE_S)
+        raise NoPlan("never mind")
+
+    world = World(slow)
+    world.waits = False
+    world.until("grasp")
+    world.shift = np.array([9.0, 0.0, 0.0])
+    try:
+        cells = [world.frame() for _ in range(40)]  # which would end in "never mind"
+        assert cells[-1].halted == "planning anew"
+    finally:
+        gate.set()
+
+
+def test_an_abort_by_the_user_is_final():
+    world = World()
+    world.until("sweep 1")
+    world.operation.abort("aborted by the user")
+    cell = world.frames(30)
+    assert plain(cell) == ABORTED
+    assert cell.halted == "aborted by the user"
+    assert world.operation.ended
+
+
+def test_a_stored_plan_is_carried_out_without_looking():
+    world = World()
+    operation = Operation(world.planned, OperationConfig(speed=4.0), lambda joints: ())
+    update, now_s, states = TrackingResult(0, 0, reason="nothing is tracked"), 0.0, set()
+    while not operation.ended:
+        now_s += FRAME_S
+        got = operation.act(update, now_s)
+        assert got.estimate is None
+        states.add(got.workcell.state)
+    assert states == {*STATES, DONE}
+    assert now_s == pytest.approx(8 / 4, abs=0.3)
+
+
+def test_what_is_cut_already_is_told_from_what_is_not():
+    world = World()
+    cell = world.until("sweep 2")
+    colours = {line.name: line.colour for line in cell.lines if line.name.startswith("cut/")}
+    assert len(colours) == len(world.planned.plan.cuts) == 2
+    assert colours["cut/1"] != colours["cut/2"]
+    assert np.array_equal(cell.lines[0].points_mm, world.planned.plan.cuts[0].path_mm)
+
+
+def test_surfaces_of_other_triangles_are_compared_by_their_distance():
+    from tumortrack_resection.operation import apart_mm
+
+    a, b = sphere(TUMOR_MM, RADIUS_MM), sphere(TUMOR_MM + [3.0, 4.0, 0.0], RADIUS_MM, finer=3)
+    assert 2.0 < apart_mm(a, b) < 5.0  # between the surfaces, some of which slide
+    assert apart_mm(a, sphere(TUMOR_MM, RADIUS_MM, finer=3)) < 0.7
+    assert apart_mm(a, a.moved(a.vertices_mm + [0, 0, 2.0])) == pytest.approx(2.0)
+
+
+@pytest.mark.parametrize("bad", [{"moved_mm": 0}, {"speed": 50}, {"settled_s": -1}])
+def test_nonsense_is_refused(bad):
+    with pytest.raises(InputError, match="allowed"):
+        OperationConfig(**bad)
+
+
+def test_the_plans_warnings_go_with_every_state():
+    notes = (f"{POOR_ESTIMATE}: too little is seen.", "a note", f"{OVER_BUDGET}: 9 mm of error.")
+    world = World(plan=replace(PLAN, notes=notes))
+    for cell in (world.frame(), world.frames(200), world.frames(3)):
+        assert f"({POOR_ESTIMATE}; {OVER_BUDGET}" in cell.state
+    assert "a note" not in world.frame().state
+    assert OVER_BUDGET in world.operation.summary()["note"]
