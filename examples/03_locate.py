@@ -31,10 +31,10 @@ def main(out: Path, steps: int) -> None:
 
 def tell(estimate: tt.Estimate) -> None:
     print(f"{estimate.quality}: {estimate.reason or 'no check failed; its place is not verified'}")
-    for name, part in estimate.report["parts"].items():
-        if part["found"]:
-            x, y, z = part["center_mm"]
-            print(f"{name}: {part['volume_ml']:.1f} ml at ({x:.1f}, {y:.1f}, {z:.1f}) mm")
+    for name, part in estimate.report.parts.items():
+        if part.center_mm is not None:
+            x, y, z = part.center_mm
+            print(f"{name}: {part.volume_ml:.1f} ml at ({x:.1f}, {y:.1f}, {z:.1f}) mm")
 
 
 if __name__ == "__main__":

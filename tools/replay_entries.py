@@ -34,6 +34,7 @@ from tumortrack.sense.files import read_cloud
 from tumortrack.sense.region import Hints, RegionConfig, organ_points
 from tumortrack.simulate.scene import SceneStream
 from tumortrack.simulate.scene_folder import draw_targets
+from tumortrack.tracking.files import report_entry
 from tumortrack.tracking.model_files import load_model
 from tumortrack.tracking.tracker import Follower, FollowerConfig, Tracker
 from tumortrack_lab.twin.dataset import StateCache, TwinRun
@@ -177,7 +178,7 @@ def watched(config: FollowerConfig) -> Entries:
 def followed(follower: Follower, cloud: SensorCloud) -> Entries:
     estimate = follower.locate(cloud)
     yield from fields(estimate.cloud, "points_mm labels probability")
-    yield "report", estimate.report
+    yield "report", report_entry(estimate)
     for name, mesh in estimate.meshes.items():
         yield from under(name, fields(mesh, "vertices_mm faces"))
 

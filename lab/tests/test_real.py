@@ -13,6 +13,7 @@ from scipy.io import savemat
 from scipy.spatial.transform import Rotation
 
 from live_objects import small_anatomy
+from reports import report_of
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import transform_points, triangles_of
 from tumortrack.core.types import Anatomy, Mesh
@@ -214,7 +215,8 @@ def test_the_carried_curve_is_held_against_the_traced_one(monkeypatch):
         carry=lambda points: transform_points(there, points),
         std_mm=lambda points: np.full(len(points), 0.5),
     )
-    report = {"fit_cost": {"now": 3.0, "usual": 2.0}}
+    cost = {"now": 3.0, "without_strays": 3.0, "usual": 2.0, "strays": 0.0}
+    report = report_of(fit_cost=cost)
     estimate = SimpleNamespace(motion=motion, quality="good", reason="", report=report)
     at = np.linspace(5, 55, 500)
     rest = np.column_stack([at, np.full(500, 45.0), np.zeros(500)])

@@ -16,6 +16,7 @@ from PIL import Image
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from reports import report_of
 from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import Anatomy, Mesh
@@ -149,7 +150,9 @@ def off_by(film, shift_mm: float, lost: set[int], doubted: set[int]):
         motion = OneWay(lambda points: true[tree.query(points)[1]].astype(float))
         quality = "poor" if n in doubted else "good"
         parts = {"tumor_1": {"center_std_mm": 0.5, "surface_std_mm": 0.7}}
-        return SimpleNamespace(quality=quality, reason="", motion=motion, report={"parts": parts})
+        return SimpleNamespace(
+            quality=quality, reason="", motion=motion, report=report_of(parts=parts)
+        )
 
     return locate
 

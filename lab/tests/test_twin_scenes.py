@@ -22,6 +22,7 @@ from tumortrack.core import store
 from tumortrack.core.errors import ArtifactError, InputError
 from tumortrack.core.estimate import Estimate
 from tumortrack.core.geometry import rigid, transform_points
+from tumortrack.core.report import FitReport
 from tumortrack.core.types import CameraLabels, LabelVolume
 from tumortrack.imaging.case import Case, save_case
 from tumortrack.report.metrics import label_grid
@@ -365,7 +366,7 @@ def test_the_protocol_reads_the_scenes(made, tmp_path):
         from tumortrack.core.types import OccupancyCloud
 
         points = OccupancyCloud(cloud.points_mm[:5], np.ones(5), np.ones(5))
-        return Estimate(points, CameraLabels(labels, camera_from_index), meshes, {})
+        return Estimate(points, CameraLabels(labels, camera_from_index), meshes, FitReport())
 
     report = evaluate_scenes(locate, scenes, tmp_path / "report")
     assert report["summary"]["scenes"] == 1

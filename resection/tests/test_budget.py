@@ -15,7 +15,9 @@ from msgspec.structs import replace as with_terms
 
 from live_objects import small_estimate, small_update
 from plan_objects import RADIUS_MM, TUMOR_MM, Deviating, located, sphere
+from reports import reporting
 from tumortrack.core.errors import InputError, NoPlan
+from tumortrack.core.report import MarginReport, StatedMargin
 from tumortrack.live.calibration_file import read_frames
 from tumortrack_resection.budget import (
     HAND_EYE_MM,
@@ -24,7 +26,7 @@ from tumortrack_resection.budget import (
     TOOL_MM,
     UNKNOWN_TRACKING_MM,
     ErrorBudget,
-    heeded,
+    checked_against,
     kept_mm,
     kept_words,
     plan_within,
@@ -75,10 +77,10 @@ def test_two_millimetres_of_motion_and_3_6_of_tracking_do_not_go_into_a_margin_o
     plan = plan_resection(located(), ResectionConfig())
     over = budget(tracking_mm=3.6, motion_mm=2)
     with pytest.raises(NoPlan, match=r"5\.6 mm of error, most of it tracking \(3\.6\).* 5\.0 mm"):
-        heeded(plan, over, accept=False)
-    accepted = heeded(plan, over, accept=True)
+        checked_against(plan, over, accept=False)
+    accepted = checked_against(plan, over, accept=True)
     assert accepted.notes[-1].startswith(f"{OVER_BUDGET}: 5.6 mm of error")
-    fits = heeded(plan, with_terms(over, margin_mm=6.0), accept=False)
+    fits = checked_against(plan, with_terms(over, margin_mm=6.0), accept=False)
     assert fits.notes[-1] == "0.4 mm of the margin are left after 5.6 mm of error."
 
 
@@ -153,7 +155,7 @@ def test_a_calibration_states_its_error_at_the_tumor(tmp_path):
 
 def update(number, latency_ms=100.0, smoothing_ms=0.0, std_mm=0.5):
     estimate = replace(small_estimate(), motion=Deviating(std_mm))
-    estimate.report["smoothing"] = {"lag_ms": smoothing_ms}
+    estimate = reporting(estimate, smoothing={"lag_ms": smoothing_ms})
     stamp_ns = small_update().stamp_ns + number * 33_000_000
     return replace(small_update(), stamp_ns=stamp_ns, estimate=estimate, latency_ms=latency_ms)
 
@@ -209,9 +211,9 @@ def test_a_new_plan_helps_where_the_motion_alone_is_too_much():
 
 def stating(**mm):
     """Located, by an estimate that states these margins with 90 and 95 %."""
-    said = [{"confidence": 0.9, "mm": {name: r - 1 for name, r in mm.items()}}]
-    said.append({"confidence": 0.95, "mm": mm})
-    return replace(located(std_mm=0.2), margin={"stated": said, "reason": ""})
+    less = {name: radius_mm - 1 for name, radius_mm in mm.items()}
+    said = (StatedMargin(confidence=0.9, mm=less), StatedMargin(confidence=0.95, mm=mm))
+    return replace(located(std_mm=0.2), margin=MarginReport(stated=said))
 
 
 def test_a_calibrated_margin_is_the_tracking_term():
@@ -258,10 +260,10 @@ def test_live_the_margin_of_the_moment_counts():
     live = LiveBudget(budget(20.0, confidence=0.9))
     of = update(0, std_mm=0.1)
     said = stating(tumor_1=6.0).margin
-    of.estimate.report["margin"] = said
+    of = replace(of, estimate=of.estimate.reporting(margin=said))
     assert live.add_up(of, "tumor_1", sphere(TUMOR_MM, RADIUS_MM), 0.0, 20.0) == ("", False)
     assert (live.now.tracking_mm, live.now.confidence) == (5.0, 0.9)
-    of.estimate.report["margin"] = {"stated": [], "reason": "poor"}
+    of = replace(of, estimate=of.estimate.reporting(margin=MarginReport(reason="poor")))
     why, _ = live.add_up(of, "tumor_1", sphere(TUMOR_MM, RADIUS_MM), 0.0, 20.0)
     assert why == "the estimate states no 90 % margin, with which it was planned"
     assert (live.now.tracking_mm, live.now.confidence) == (LEAST_TRACKING_MM, 0)

@@ -8,6 +8,7 @@ import pty
 import shutil
 import signal
 import subprocess
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from PIL import Image
 from safetensors import safe_open
 
 from plan_objects import Deviating, located
+from reports import report_of
 from stories import (
     COMMAND,
     answered,
@@ -29,6 +31,7 @@ from tumortrack.core import store
 from tumortrack.core.config import to_builtins
 from tumortrack.core.errors import NoPlan
 from tumortrack.core.estimate import Estimate
+from tumortrack.core.patient import Patient
 from tumortrack.core.types import CameraLabels, OccupancyCloud
 from tumortrack.imaging.case import load_case
 from tumortrack.sense.ply import parse_ply_properties, write_cloud_ply
@@ -57,13 +60,16 @@ def write_run(folder, motion=None):
     cloud = OccupancyCloud(points, seen.labels, np.ones(len(points)))
     volume = CameraLabels(np.ones((3, 3, 3), np.uint8), np.eye(4))
     parts = {
-        name: {"label": label, "found": True, "volume_ml": mesh.volume_mm3 / 1000}
-        for label, (name, mesh) in enumerate(camera.items(), start=1)
+        name: {
+            "volume_ml": mesh.volume_ml,
+            "center_mm": mesh.box_mm.mean(0).tolist(),
+            "box_mm": mesh.box_mm.tolist(),
+        }
+        for name, mesh in camera.items()
     }
-    quality = {"verdict": "good", "reason": ""}
-    report = {"units": "mm", "parts": parts, "model": {"case_sha256": CASE}, "quality": quality}
-    report["patient"] = WHOSE
-    write_estimate(folder, Estimate(cloud, volume, camera, report, motion))
+    estimate = Estimate(cloud, volume, camera, report_of(parts=parts), motion, finding=None)
+    estimate = replace(estimate, patient=Patient(**WHOSE))
+    write_estimate(folder, estimate, about={"model": {"case_sha256": CASE}})
     return seen
 
 

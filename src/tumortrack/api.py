@@ -356,11 +356,12 @@ def save_estimate(
     """
     from functools import partial
 
-    from tumortrack.report.run_page import Seen, write_run_page
-    from tumortrack.tracking.files import write_estimate
+    from tumortrack.report.run_page import write_run_page
+    from tumortrack.report.seen import Seen
+    from tumortrack.tracking.files import report_entry, write_estimate
 
     shown = Seen(cloud, seen)
-    add = partial(write_run_page, report=estimate.report, estimate=estimate, seen=shown)
+    add = partial(write_run_page, report=report_entry(estimate), estimate=estimate, seen=shown)
     write_estimate(Path(folder), estimate, overwrite, add=add)
 
 
@@ -386,7 +387,7 @@ def estimate_from_surfaces(surfaces: Mapping[str, Mesh], grid: int = 160) -> Est
 
     from tumortrack.models.report import estimate_of
 
-    return replace(estimate_of(dict(surfaces), grid), quality="good", reason="")
+    return replace(estimate_of(dict(surfaces), grid), finding=None)
 
 
 def evaluate(

@@ -12,9 +12,12 @@ import tumortrack as tt
 from live_objects import ball
 from region_objects import ORGAN, Props, make_scene
 from stories import answered, refusal, tumortrack
+from tumortrack.cli.main import run
+from tumortrack.core.errors import StorageError
 from tumortrack.core.geometry import plane_section
 from tumortrack.imaging.case import load_case
-from tumortrack.report.run_page import PAGE, PICTURE, Seen, write_run_page
+from tumortrack.report.run_page import PICTURE, write_run_page
+from tumortrack.report.seen import PAGE, Seen
 from tumortrack.report.wrapping import wrapped
 from tumortrack.sense.camera import d405
 from tumortrack.sense.cloud import check_depth_unit
@@ -72,6 +75,11 @@ def test_the_organ_is_found_in_a_raw_depth_image(raw, clinic_model, phantom_case
     with Image.open(raw / "run" / PICTURE) as picture:
         assert picture.width == 2200
 
+    printed = json.loads(answered(locate("depth.png", "--json")))
+    written = json.loads((raw / "run" / "report.json").read_text())
+    assert printed == written
+    assert printed["parts"]["kidney"]["center_mm"] == report["parts"]["kidney"]["center_mm"]
+
     assert "Did you mean 1 mm a step" in refusal(done := locate("mm.png"))
     assert "--depth-unit 1" in done.stderr
     assert done.returncode == 2
@@ -100,6 +108,26 @@ def test_without_an_estimate_there_is_a_page_that_says_why(raw, clinic_model):
     assert (raw / "run" / "kidney.ply").exists()
     assert "exists already" in refusal(tumortrack(*command))
     assert "outside the depth image" in refusal(tumortrack(*command, "--overwrite", "--at", 424, 0))
+
+
+def test_the_verdict_is_said_before_anything_is_written(raw, clinic_model, monkeypatch, capsys):
+    said = []
+
+    def full(*_):
+        said.append(capsys.readouterr().out)
+        raise StorageError("the disk is full.")
+
+    monkeypatch.setattr("tumortrack.tracking.files.write_estimate", full)
+    command = ("locate", clinic_model, raw / "depth.png", raw / "run")
+    command = (*command, "--intrinsics", raw / "camera.json")
+    assert run([str(part) for part in command]) == StorageError.exit_code == 2
+    assert said[0].startswith("good: ")
+    assert "tumor_1: centre" in said[0]
+    assert "written" not in said[0]
+    after = capsys.readouterr()
+    assert after.out == ""
+    assert "the disk is full" in after.err
+    assert not (raw / "run").exists()
 
 
 def test_a_unit_is_questioned_only_where_it_cannot_be_right():

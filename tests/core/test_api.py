@@ -75,9 +75,9 @@ def test_surfaces_become_an_estimate_that_compares_as_equal():
     organ = ball((0.0, 0.0, 150.0), 30.0)
     tumor = ball((20.0, 0.0, 150.0), 8.0)
     made = tt.estimate_from_surfaces({"kidney": organ, "tumor_1": tumor}, grid=80)
-    inside = made.report["parts"]
-    assert inside["kidney"]["volume_ml"] == pytest.approx(organ.volume_mm3 / 1000)
-    voxel_ml = made.report["voxel_mm"] ** 3 / 1000
+    inside = made.report.parts
+    assert inside["kidney"].volume_ml == pytest.approx(organ.volume_mm3 / 1000)
+    voxel_ml = made.report.voxel_mm**3 / 1000
     counted = np.bincount(made.volume.labels.reshape(-1))[1:] * voxel_ml
     assert counted.sum() == pytest.approx(organ.volume_mm3 / 1000, rel=0.02)
     assert counted[1] == pytest.approx(tumor.volume_mm3 / 1000, rel=0.05)

@@ -74,8 +74,7 @@ class Located(Tracker):
     def follow(self, cloud, last=None, how=None, seen=None, others=()):
         self.asked.append((last, others))
         estimate = small_estimate(cloud.stamp_ns)
-        estimate.report["timings"] = {}
-        return replace(estimate, quality="good", reason="")
+        return replace(estimate, finding=None)
 
 
 def played(sources, places, published=None, tracker=None):
@@ -119,7 +118,7 @@ def test_frames_of_about_one_moment_go_together():
     np.testing.assert_allclose(look.camera_from_look, ASIDE, atol=1e-9)
     assert look.seen.stamp_ns == STAMP_NS + 40 * MS
     assert [view.number for view in told[1].views] == [1, 2]
-    assert told[1].estimate.report["cameras"] == [1, 2]
+    assert told[1].estimate.report.cameras == (1, 2)
     assert report["cameras"]["1"] == 4
     assert report["cameras"]["2"] >= 3
 

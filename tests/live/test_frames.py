@@ -10,6 +10,7 @@ import pytest
 
 from clock import Clock, until
 from live_objects import CAMERA, STAMP_NS, small_estimate, small_frame, small_setting, small_update
+from reports import poor
 from tumortrack.core.errors import NoEstimate
 from tumortrack.live.frames import FrameCheck
 from tumortrack.live.loop import Loop, LoopConfig
@@ -35,10 +36,7 @@ class Located(Tracker):
         if verdict == "none":
             raise NoEstimate("it does not look like this organ")
         estimate = small_estimate(cloud.stamp_ns)
-        estimate.report["timings"] = {}
-        return replace(
-            estimate, quality=verdict, reason="" if verdict == "good" else "it is doubtful"
-        )
+        return replace(estimate, finding=None if verdict == "good" else poor("it is doubtful"))
 
 
 class Frames(SourceWorker):

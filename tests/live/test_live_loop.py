@@ -14,8 +14,9 @@ import pytest
 from clock import PATIENCE_S, Clock, until
 from elastic_objects import UP
 from live_objects import small_frame
+from reports import poor
 from tumortrack.core.errors import InputError, NoEstimate, StorageError
-from tumortrack.core.estimate import Following
+from tumortrack.core.estimate import FollowOptions
 from tumortrack.core.types import DepthFrame, Intrinsics, SensorCloud
 from tumortrack.live.loop import Loop, LoopConfig, summary
 from tumortrack.live.values import (
@@ -141,7 +142,7 @@ def test_following_is_no_worse_than_locating_alone(tracker, stages):
             off = np.linalg.norm(found.motion.carry(targets) - truth, axis=1)
             errors[name].append(off.mean())
         assert last.volume is None
-        assert "follow" in last.report["timings"]
+        assert "follow" in last.report.timings
     # Single scenes are up to 0.5 mm worse (few iterations a frame) or 0.9 better.
     assert np.median(np.subtract(errors["follow"], errors["alone"])) < 0.2
     assert np.median(errors["follow"]) < 4
@@ -178,7 +179,7 @@ def test_smoothing_halves_jitter_and_says_its_lag(tracker, stages):
     jumps = [np.linalg.norm(np.diff(c, axis=0), axis=1).mean() for c in (rough, smooth)]
     assert jumps[1] < 0.5 * jumps[0]
     # A mean over 0.15 s lags what moves steadily by 0.15 s less half a frame.
-    assert last.report["smoothing"]["lag_ms"] == pytest.approx(150 - 16.5, abs=1.0)
+    assert last.report.smoothing.lag_ms == pytest.approx(150 - 16.5, abs=1.0)
 
 
 def test_the_lag_of_smoothing_is_what_it_says(tracker, stages):
@@ -189,13 +190,13 @@ def test_the_lag_of_smoothing_is_what_it_says(tracker, stages):
     for cloud in clouds:
         now, behind = plain.locate(cloud), smooth.locate(cloud)
     behind_mm = (now.motion.centre_mm - behind.motion.centre_mm)[0]
-    lag_frames = behind.report["smoothing"]["lag_ms"] / 33
+    lag_frames = behind.report.smoothing.lag_ms / 33
     assert behind_mm == pytest.approx(0.5 * lag_frames, rel=0.15)
 
 
 def test_smoothing_is_refused_where_it_cannot_be():
     with pytest.raises(InputError, match=r"0 \(off\) to 5 s"):
-        Following(smoothing_s=-1)
+        FollowOptions(smoothing_s=-1)
     with pytest.raises(InputError, match="more than 0"):
         FollowerConfig(rescan_s=0)
 
@@ -280,7 +281,7 @@ def test_garbage_and_defects_are_said_and_survived(tracker, stages, monkeypatch)
 
 def test_a_defect_is_kept_for_the_report(tracker, stages):
     class Broken(Tracker):
-        def follow(self, cloud, last=None, how=Following(), seen=None, others=()):  # noqa: B008
+        def follow(self, cloud, last=None, how=FollowOptions(), seen=None, others=()):  # noqa: B008
             if cloud.stamp_ns == clouds[1].stamp_ns:
                 raise ZeroDivisionError("a defect")
             return super().follow(cloud, last, how, seen)
@@ -323,7 +324,7 @@ def test_stale_frames_are_refused(tracker, stages, clock):
 
 def test_an_answer_that_comes_too_late_is_none_and_yet_a_start(tracker, stages, clock):
     class Slow(Tracker):
-        def follow(self, cloud, last=None, how=Following(), seen=None, others=()):  # noqa: B008
+        def follow(self, cloud, last=None, how=FollowOptions(), seen=None, others=()):  # noqa: B008
             helped.append(last is not None)
             clock.sleep(21 if len(helped) == 1 else 0)
             return super().follow(cloud, last, how, seen)
@@ -345,10 +346,10 @@ def test_an_answer_that_comes_too_late_is_none_and_yet_a_start(tracker, stages, 
 
 def test_only_an_organ_found_good_a_moment_ago_may_have_been_turned_over(tracker, stages):
     class Watched(Tracker):
-        def follow(self, cloud, last=None, how=Following(), seen=None, others=()):  # noqa: B008
+        def follow(self, cloud, last=None, how=FollowOptions(), seen=None, others=()):  # noqa: B008
             asked.append(how.either_side)
             found = super().follow(cloud, last, how, seen, others)
-            return replace(found, quality=verdicts.pop(0))
+            return replace(found, finding=None if verdicts.pop(0) == "good" else poor("hidden"))
 
     asked, verdicts = [], ["poor", "good", "poor", "poor", "poor", "poor"]
     follower = Follower(Watched(tracker.model), FollowerConfig())
@@ -369,7 +370,7 @@ def test_smoothing_never_lags_by_much(tracker, stages):
     found = follower.locate(jumped)
     alone = tracker.follow(jumped)
     assert np.linalg.norm(found.motion.centre_mm - alone.motion.centre_mm) < 2.5
-    assert found.report["smoothing"]["lag_ms"] == 0
+    assert found.report.smoothing.lag_ms == 0
 
 
 def test_a_pick_moves_along_and_is_forgotten_when_lost(tracker, stages, clock):
@@ -494,7 +495,7 @@ def test_a_click_makes_the_loop_look_anew(tracker, stages):
     loop.run(reader, outlets, click)
     reader.close()
     outlets[0].close()
-    stages_run = [set(u.estimate.report["timings"]) for u in sink.updates]
+    stages_run = [set(u.estimate.report.timings) for u in sink.updates]
     assert "search" in stages_run[1]  # looked for as in a first frame
     assert "follow" in stages_run[2]
 

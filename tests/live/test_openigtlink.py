@@ -14,6 +14,7 @@ from igtl_objects import Heard, hear, hear_all, polydata_by_the_book
 from igtl_reader import IgtlStatus, unpack_polydata, unpack_status, unpack_transform
 from live_objects import STAMP_NS, empty_update, small_anatomy, small_setting, small_update
 from motions import Wave
+from reports import NOWHERE, reporting
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import rigid
 from tumortrack.live.igtl.message import Message, pack
@@ -96,8 +97,8 @@ def test_the_organs_pose_carries_the_ct(opened) -> None:
     camera_from_ct = rigid(turn, np.array([1.0, 2, 130]))
     update = small_update()
     assert update.estimate is not None
-    report = {**update.estimate.report, "motion": {"camera_from_ct": camera_from_ct.tolist()}}
-    update = replace(update, estimate=replace(update.estimate, report=report))
+    motion = {**NOWHERE, "camera_from_ct": camera_from_ct.tolist()}
+    update = replace(update, estimate=reporting(update.estimate, motion=motion))
     sink = open_sink(replace(small_setting(), anatomy_ct=small_anatomy()))
     sock = open_receiver(sink)
     sink.publish(update)
@@ -172,10 +173,8 @@ def test_margins_and_deviations_come_with_the_tumors(opened) -> None:
     update = small_update()
     assert update.estimate is not None
     stated = {"stated": [{"confidence": 0.95, "mm": {"tumor_1": 5.0}}]}
-    parts = update.estimate.report["parts"] | {}
-    parts["tumor_1"] = parts["tumor_1"] | {"center_std_mm": 1.26}
-    report = {**update.estimate.report, "margin": stated, "parts": parts}
-    sure = replace(update.estimate, report=report, motion=Wave(sure=True))
+    sure = reporting(update.estimate, margin=stated, parts={"tumor_1": {"center_std_mm": 1.26}})
+    sure = replace(sure, motion=Wave(sure=True))
     sink.publish(replace(update, estimate=sure))
     heard = hear_all(sock, ALL + 2)  # the margin, and ct
     shell = polydata_by_the_book(heard["POLYDATA", "tumor_1_margin"].content)["points"]

@@ -19,6 +19,7 @@ import needs
 import tumortrack
 from clock import until
 from live_objects import PARTS, ball, empty_update, small_setting, small_update
+from reports import NOWHERE, reporting
 from ros2_objects import own_graph
 from tumortrack.cli.track import Track
 from tumortrack.core.errors import InputError
@@ -47,13 +48,13 @@ def sent(results: ResultMessages, update: TrackingResult) -> dict:
 def estimate_with(update: TrackingResult, meshes: dict[str, Mesh], **report: object) -> Estimate:
     known = update.estimate
     assert known is not None
-    return Estimate(known.cloud, None, {**known.meshes, **meshes}, {**known.report, **report})
+    return reporting(replace(known, meshes={**known.meshes, **meshes}), **report)
 
 
 def test_each_part_has_a_frame_turned_as_the_organ_is():
     update = small_update(frames=PLACED)
     turned = rigid(np.diag([1.0, -1, -1]), np.zeros(3))
-    motion = {"camera_from_ct": turned.tolist()}
+    motion = {**NOWHERE, "camera_from_ct": turned.tolist()}
     known = estimate_with(update, {"artery": ball((1, 2, 130), 3)}, motion=motion)
     update = replace(update, estimate=known)
     frames = sent(ResultMessages(MESSAGES, small_setting(), namespace="/or_2"), update)["/tf"]

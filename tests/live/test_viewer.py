@@ -16,6 +16,7 @@ from scipy.stats import chi2
 
 from clock import Clock, until
 from live_objects import PARTS, ball, empty_update, small_anatomy, small_setting, small_update
+from reports import reporting
 from tumortrack.core.colours import TUMORS, part_colour
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import rigid, transform_points
@@ -294,9 +295,9 @@ def test_the_shell_is_the_stated_margin_and_without_one_there_is_none(sinks, clo
         {"confidence": 0.9, "mm": {"tumor_1": 2.0}},
         {"confidence": 0.95, "mm": {"tumor_1": 3}},
     ]
-    report = {**update.estimate.report, "margin": {"stated": radii, "reason": ""}}
+    sure = reporting(update.estimate, margin={"stated": radii, "reason": ""})
     clock.sleep(1 / 60)
-    sink.publish(replace(update, estimate=replace(update.estimate, report=report)))
+    sink.publish(replace(update, estimate=sure))
     tumor, shell = (nodes(f"/estimate/{n}").vertices for n in ("tumor_1", "margin_tumor_1"))
     off_mm = np.linalg.norm(shell - tumor, axis=1)
     assert off_mm == pytest.approx(3.0, abs=1e-3)
@@ -313,11 +314,9 @@ def test_an_ellipsoid_is_the_covariances_and_shown_when_asked_for(sinks, clock):
     axes = Rotation.from_rotvec([0.3, -0.5, 0.9]).as_matrix()
     std_mm = np.array([2.5, 0.8, 0.3])
     told = {"center_axes": axes.tolist(), "center_axes_std_mm": std_mm.tolist()}
-    tumor = {**update.estimate.report["parts"]["tumor_1"], **told}
-    parts = {**update.estimate.report["parts"], "tumor_1": tumor}
-    report = {**update.estimate.report, "parts": parts}
     sink = sinks(setting, hz=60)
-    sink.publish(replace(update, estimate=replace(update.estimate, report=report)))
+    sure = reporting(update.estimate, parts={"tumor_1": told})
+    sink.publish(replace(update, estimate=sure))
     assert not drawn(sink, "ellipsoid_tumor_1")
     node = sink._server.scene.get_handle_by_name("/estimate/ellipsoid_tumor_1")
     assert len(node.vertices) == 3  # nothing is computed, nor sent, until it is asked for
@@ -393,15 +392,19 @@ def test_part_that_was_not_found_is_not_shown(sinks, clock):
     assert drawn(sink, "tumor_2")
 
 
-def test_estimate_that_cannot_be_shown_hides_the_one_before(sinks, clock):
+def test_estimate_that_cannot_be_shown_hides_the_one_before(sinks, clock, monkeypatch):
     sink = sinks(hz=60)
     update = small_update(0)
     assert update.estimate is not None
     sink.publish(update)
-    broken = replace(update.estimate, report={"parts": {"kidney": {"found": True}}})
+
+    def refuse(result):
+        raise ValueError("no such shape")
+
+    monkeypatch.setattr(sink._scene, "show", refuse)
     clock.sleep(1 / 60)
-    with pytest.raises(KeyError):
-        sink.publish(replace(update, sequence=1, estimate=broken))
+    with pytest.raises(ValueError, match="no such shape"):
+        sink.publish(replace(update, sequence=1))
     assert not drawn(sink, "kidney")
     beat = sink._counter
     until(lambda: sink._counter > beat, "the watch's next word")
@@ -427,9 +430,9 @@ def test_case_gives_slices_and_an_exact_margin_that_moves_along(sinks, clock, tm
     sink.publish(empty_update())
     assert not sink._panel.slice.visible
 
-    assert "patient unknown, side unknown" in sink._panel.whose.content
+    assert "patient unknown, side unknown" in sink._panel.patient.content
     known = sinks(replace(setting, patient=Patient("P1", "left")), case=str(tmp_path / "case"))
-    assert "patient P1, left side" in known._panel.whose.content
+    assert "patient P1, left side" in known._panel.patient.content
     with new_folder(tmp_path / "other") as folder:
         save_case(replace(case, patient=Patient("P2")), folder)
     with pytest.raises(InputError, match=r"is of patient P2, .* the model of patient P1"):
@@ -538,9 +541,8 @@ def test_status_says_why_and_no_old_numbers():
     assert "3.2 s" in stale.stage()
     sure = small_update()
     assert sure.estimate is not None
-    part = {**sure.estimate.report["parts"]["tumor_1"], "center_std_mm": 1.84}
-    parts = {**sure.estimate.report["parts"], "tumor_1": part}
-    sure = replace(sure, estimate=replace(sure.estimate, report={"parts": parts}))
+    stated = reporting(sure.estimate, parts={"tumor_1": {"center_std_mm": 1.84}})
+    sure = replace(sure, estimate=stated)
     good = StatusPanel("good", sure, 0.1, 8, parts=PARTS).numbers()
     assert "standard deviation of place" in good
     assert "tumor 1</td><td>0.9 ml</td><td>1.8 mm</td>" in good

@@ -17,7 +17,7 @@ from tumortrack.cli.evaluate import check_case
 from tumortrack.cli.inspection import describe
 from tumortrack.core import store
 from tumortrack.core.errors import InputError, NoEstimate
-from tumortrack.core.estimate import Following
+from tumortrack.core.estimate import FollowOptions
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.mesh_files import read_mesh
 from tumortrack.core.types import Anatomy, SensorCloud
@@ -86,7 +86,7 @@ def test_a_moving_organ_is_followed_by_labels(tracker, seen):
     for n in range(4):
         cloud = SensorCloud(points + np.float32([0.8 * n, 0, 0]), 10**9 * (n + 1) // 10 + 1)
         estimate = follower.locate(cloud)
-        assert ("coarse" in estimate.report["timings"]) == (n == 0)
+        assert ("coarse" in estimate.report.timings) == (n == 0)
     assert estimate.volume is None
     # On lattices of the same step: that of `locate` is coarser, which alone moved the middle by
     # 1.09 mm. Measured here: 0.06 to 0.34 mm, after 200 and after 400 steps of training.
@@ -98,7 +98,7 @@ def test_a_moving_organ_is_followed_by_labels(tracker, seen):
     with pytest.raises(NoEstimate):
         follower.locate(gone)
     assert follower.last_box_mm(gone.stamp_ns) is None
-    assert "coarse" in follower.locate(cloud).report["timings"]
+    assert "coarse" in follower.locate(cloud).report.timings
 
 
 @pytest.mark.parametrize("jump_mm", [40.0, 300.0])
@@ -108,7 +108,7 @@ def test_an_organ_that_jumps_is_found_in_the_same_frame(tracker, seen, jump_mm):
     last = tracker.follow(SensorCloud(points, 1))
     jumped = SensorCloud(points + np.float32([jump_mm, 0, 0]), 2)
     estimate = tracker.follow(jumped, last)
-    assert "coarse" in estimate.report["timings"]
+    assert "coarse" in estimate.report.timings
     for name, mesh in tracker.follow(jumped).meshes.items():
         off = np.abs(mesh.box_mm - estimate.meshes[name].box_mm).max()
         assert off < 1.0
@@ -131,7 +131,7 @@ def test_a_part_that_vanishes_and_returns_is_seen_at_once(tracker, seen, monkeyp
     assert "tumor_1" not in hidden.meshes
     monkeypatch.undo()
     again = tracker.follow(SensorCloud(points, 3), hidden)
-    assert "coarse" not in again.report["timings"]
+    assert "coarse" not in again.report.timings
     assert "tumor_1" in first.meshes
     for name, mesh in tracker.follow(SensorCloud(points, 3)).meshes.items():  # found anew
         assert np.abs(again.meshes[name].box_mm - mesh.box_mm).max() < 1.0
@@ -145,7 +145,7 @@ def test_following_does_not_gather_memory(tracker, seen):
     points = seen[0].astype(np.float32)
     for n in range(90):
         cloud = SensorCloud(rng.permutation(points)[: 600 + 4 * n], n)
-        last = tracker.follow(cloud, last, Following(thorough=n % 30 == 0))
+        last = tracker.follow(cloud, last, FollowOptions(thorough=n % 30 == 0))
         pages.append(int(STATM.read_text().split()[1]))
     grown_mb = (np.median(pages[-10:]) - np.median(pages[30:40])) * 4096 / 1e6
     assert grown_mb < 30  # a kernel for every number of questions would be 100
@@ -223,9 +223,9 @@ def test_the_answer_does_not_hang_on_the_arithmetic(tracker, seen, monkeypatch, 
     forced = Tracker(tracker.model).locate(SensorCloud(points), grid=32).report
     usual = tracker.locate(SensorCloud(points), grid=32).report
     for name in tracker.model.parts:
-        apart = np.subtract(forced["parts"][name]["center_mm"], usual["parts"][name]["center_mm"])
+        apart = np.subtract(forced.parts[name].center_mm, usual.parts[name].center_mm)
         assert np.linalg.norm(apart) < 1.0
-    assert forced["fit_mm"]["median"] == pytest.approx(usual["fit_mm"]["median"], abs=0.2)
+    assert forced.fit_mm.median == pytest.approx(usual.fit_mm.median, abs=0.2)
 
 
 def test_a_negative_seed_is_refused(tracker, seen, work):
@@ -271,24 +271,24 @@ def test_an_organ_deformed_as_never_in_training_is_not_refused(tracker, work, di
     for spin in (0.0, 130.0):
         points = cloud_by_rays(bent_case, looking_down(bent_case, spin_degrees=spin), step=0.012)
         report = tracker.locate(SensorCloud(points), grid=32).report
-        assert all(part["found"] for part in report["parts"].values())
-        assert 0 < report["fit_mm"]["median"] < report["fit_mm"]["p95"] < 15
+        assert all(part.found for part in report.parts.values())
+        assert 0 < report.fit_mm.median < report.fit_mm.p95 < 15
 
 
 @pytest.mark.parametrize(("share", "allowed_mm"), [(0.03, 2.5), (0.1, 6.0)])
 def test_background_points_move_the_answer_little(tracker, seen, share, allowed_mm):
     points, _ = seen
     rng = np.random.default_rng(5)
-    clean = tracker.locate(SensorCloud(points), grid=32).report["parts"]
+    clean = tracker.locate(SensorCloud(points), grid=32).report.parts
     low, high = points.min(0), points.max(0)
     middle, size = (low + high) / 2, high - low
     count = round(share / (1 - share) * len(points))
     table = rng.uniform(middle - size, middle + size, (count, 3))
     table[:, 2] = high[2] + 10 + 0.15 * (table[:, 0] - middle[0])
     with_table = SensorCloud(np.concatenate([points, table]))
-    spoiled = tracker.locate(with_table, grid=32).report["parts"]
+    spoiled = tracker.locate(with_table, grid=32).report.parts
     for name in clean:
-        apart = np.subtract(spoiled[name]["center_mm"], clean[name]["center_mm"])
+        apart = np.subtract(spoiled[name].center_mm, clean[name].center_mm)
         assert np.linalg.norm(apart) < allowed_mm
 
 

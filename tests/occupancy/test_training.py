@@ -32,8 +32,8 @@ from tumortrack.occupancy.training.state import (
     Diverged,
     TrainingProgress,
     TrainingState,
+    fix_last_step,
     learning_rate,
-    settle_end,
 )
 from tumortrack.occupancy.training.train import (
     TrainingClock,
@@ -398,12 +398,12 @@ def test_minutes_fix_the_last_step_once(case):
     config = quick(load_case(case).anatomy)
     head = 1 - config.schedule.tail
     progress = TrainingProgress(step=300, elapsed_s=head * 60 - 1)
-    assert not settle_end(config, progress, 1.0)
+    assert not fix_last_step(config, progress, 1.0)
     progress.elapsed_s = head * 60 + 1
-    assert settle_end(config, progress, 1.0)
+    assert fix_last_step(config, progress, 1.0)
     assert progress.end == round(300 / head)
     progress.elapsed_s = 1e6
-    assert not settle_end(config, progress, 1.0)
+    assert not fix_last_step(config, progress, 1.0)
 
 
 @pytest.mark.parametrize("compiling_s", [1.0, 300.0])

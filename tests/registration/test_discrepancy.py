@@ -13,7 +13,13 @@ from elastic_objects import CENTER, RADII
 from tumortrack.models.config import GaussNewtonConfig
 from tumortrack.models.in_distribution import RIVAL_COST
 from tumortrack.registration import discrepancy_kernels as kernels
-from tumortrack.registration.discrepancy import AMPLITUDES_MM, LENGTH_MM, NOISES_MM, _grouped, judge
+from tumortrack.registration.discrepancy import (
+    AMPLITUDES_MM,
+    LENGTH_MM,
+    NOISES_MM,
+    _grouped,
+    fit_discrepancy,
+)
 from tumortrack.registration.gauss_newton import RegistrationResult, posterior, refine
 from tumortrack.registration.looks import Looks
 from tumortrack.sense.noise import CalibrationConfig
@@ -73,7 +79,7 @@ def test_the_covariance_is_that_of_a_plain_gaussian_process():
     bump = 2 * np.exp(-(np.linalg.norm(places - places[0], axis=1) ** 2) / (2 * 15**2))
     rows = np.column_stack([slopes, bump * normals[:, 2]]).astype(np.float32)
     prior, effects = np.diag(rng.uniform(0.2, 2.0, 12)), rng.normal(size=(20, 3, 12))
-    covariance, process = judge(rows, places, prior, np.zeros(12), 100.0)
+    covariance, process = fit_discrepancy(rows, places, prior, np.zeros(12), 100.0)
     assert process.amplitude_mm > 0
     found = process.widened(effects, covariance, points.astype(np.float32))
 
@@ -134,7 +140,7 @@ def fit(motion, cost):
 def test_two_minima_widen_the_covariance_by_their_distance():
     motion = replace(placed(), covariance=1e-4 * np.eye(26))
     away = replace(motion, centre_mm=motion.centre_mm + [0, 6.0, 0])
-    best = method().best_of([fit(away, 12.0), fit(motion, 10.0)])
+    best = method().likeliest([fit(away, 12.0), fit(motion, 10.0)])
     share = math.exp(-1) / (1 + math.exp(-1))
     assert best.cost == 10
     assert [rival.cost for rival in best.rivals] == [12.0]
@@ -147,11 +153,11 @@ def test_neither_the_same_minimum_nor_an_unlikely_one_is_a_rival():
     motion = replace(placed(), covariance=0.01 * np.eye(26))
     same = replace(motion, centre_mm=motion.centre_mm + [0, 0.1, 0])
     away = replace(motion, centre_mm=motion.centre_mm + [0, 6.0, 0])
-    assert method().best_of([fit(motion, 10.0), fit(same, 10.5)]).rivals == ()
-    assert method().best_of([fit(motion, 10.0), fit(away, 10.1 + RIVAL_COST)]).rivals == ()
-    first = method().best_of([fit(motion, 10.0), fit(away, 11.0)])
-    assert len(method().best_of([first, fit(away, 11.5)]).rivals) == 1  # the same one again
-    turned = method().best_of([first, fit(away, 9.0)])  # one of them won after all
+    assert method().likeliest([fit(motion, 10.0), fit(same, 10.5)]).rivals == ()
+    assert method().likeliest([fit(motion, 10.0), fit(away, 10.1 + RIVAL_COST)]).rivals == ()
+    first = method().likeliest([fit(motion, 10.0), fit(away, 11.0)])
+    assert len(method().likeliest([first, fit(away, 11.5)]).rivals) == 1  # the same one again
+    turned = method().likeliest([first, fit(away, 9.0)])  # one of them won after all
     assert [rival.cost for rival in turned.rivals] == [10.0]
 
 

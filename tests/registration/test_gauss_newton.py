@@ -16,7 +16,7 @@ from scipy.special import ndtr
 
 from covering import cover
 from elastic_objects import CENTER, RADII
-from tumortrack.core.estimate import Following
+from tumortrack.core.estimate import FollowOptions
 from tumortrack.core.process import parallel_for, parallel_map
 from tumortrack.core.types import Mesh, SensorCloud
 from tumortrack.imaging.raster import label_grid, winding_numbers
@@ -402,10 +402,10 @@ def test_frames_leave_no_memory_behind(slim_model, unchecked):
     tracemalloc.start()
     for frame in range(120):
         cloud = (seen + rng.normal(0, 0.2, 3)).astype(np.float32)
-        last = locator.follow(SensorCloud(cloud, frame), last, Following())
+        last = locator.follow(SensorCloud(cloud, frame), last, FollowOptions())
         sizes.append(tracemalloc.get_traced_memory()[0])
     tracemalloc.stop()
-    assert "follow" in last.report["timings"]
+    assert "follow" in last.report.timings
     # A leak shows in every stretch of twenty frames; what another thread holds for a moment, or
     # something loaded once, in twenty stretches at most.
     grown = np.subtract(sizes[60:], sizes[40:-20])

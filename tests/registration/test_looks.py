@@ -23,7 +23,7 @@ from tumortrack.live.views import ViewsLocator
 from tumortrack.models.config import GaussNewtonConfig
 from tumortrack.occupancy.locator import OccupancyLocator
 from tumortrack.registration import looks as module
-from tumortrack.registration.discrepancy import judge
+from tumortrack.registration.discrepancy import fit_discrepancy
 from tumortrack.registration.gauss_newton import posterior, refine
 from tumortrack.registration.looks import CAMERA_STD, Looks, seen_from_first
 from tumortrack.registration.search import PosePrior, Search
@@ -110,8 +110,8 @@ def test_two_looks_see_more_than_one(tracker):
         errors.append([off_mm(one, truth), off_mm(two, truth)])
         stated.append(replace(two.motion, rivals=()).std_mm(INNER).mean())
         assert two.quality == "good"
-        assert "not of several" in two.report["margin"]["reason"]
-        assert two.report["points"] == len(first.cloud.points_mm) + len(second.cloud.points_mm)
+        assert "not of several" in two.report.margin.reason
+        assert two.report.points == len(first.cloud.points_mm) + len(second.cloud.points_mm)
     one, two = np.median(errors, axis=0)
     assert two < 0.8 * one
     assert all(
@@ -127,18 +127,18 @@ def test_a_camera_that_stands_elsewhere_is_corrected(tracker, monkeypatch):
     found = located(tracker, first, wrong)
     apart = np.linalg.norm(exact.motion.carry(INNER) - found.motion.carry(INNER), axis=1)
     assert apart.max() < 1.0
-    looks = found.report["looks"]
-    assert looks["shift_mm"][0] == looks["turn_degrees"][0] == 0
-    assert looks["shift_mm"][1] == pytest.approx(np.linalg.norm(SHIFT_MM), abs=0.6)
+    looks = found.report.looks
+    assert looks.shift_mm[0] == looks.turn_degrees[0] == 0
+    assert looks.shift_mm[1] == pytest.approx(np.linalg.norm(SHIFT_MM), abs=0.6)
     near, stated = np.linalg.inv(real), around(60)
-    for pose, least, most in ((looks["camera_from_look"][1], 0, 0.7), (stated, 1, 3)):
+    for pose, least, most in ((looks.camera_from_look[1], 0, 0.7), (stated, 1, 3)):
         there = transform_points(near @ pose, PLACE_MM[None])[0]
         assert least < np.linalg.norm(there - PLACE_MM) < most
     assert found.quality == "good"
     monkeypatch.setattr(module, "CAMERA_STD", CAMERA_STD * 1e-4)
     trusting = located(tracker, first, wrong)
-    assert trusting.report["looks"]["shift_mm"][1] < 0.01
-    assert trusting.report["fit_cost"]["now"] > 1.5 * found.report["fit_cost"]["now"]
+    assert trusting.report.looks.shift_mm[1] < 0.01
+    assert trusting.report.fit_cost.now > 1.5 * found.report.fit_cost.now
     assert trusting.quality == "poor"
     bent = np.linalg.norm(exact.motion.carry(INNER) - trusting.motion.carry(INNER), axis=1)
     assert bent.mean() > 2 * apart.mean()
@@ -152,7 +152,7 @@ def test_the_order_of_looks_does_not_matter(tracker):
         into = np.linalg.inv(poses[order[0]])
         views = [Look(points_of(frames[n]), frames[n], into @ poses[n]) for n in order]
         estimate = located(tracker, *views)
-        assert np.allclose(estimate.report["looks"]["camera_from_look"][0], np.eye(4))
+        assert np.allclose(estimate.report.looks.camera_from_look[0], np.eye(4))
         found.append(transform_points(poses[order[0]], estimate.motion.carry(INNER)))
     for other in found[1:]:
         assert np.linalg.norm(other - found[0], axis=1).max() < 0.8
@@ -172,7 +172,7 @@ def test_one_look_is_what_it_was(tracker):
     prior[6:, 6:] = body.covariance
     off = np.concatenate([np.zeros(6), body.mean - motion.coefficients])
     rows, rest_ct = motion.residual_rows(points), motion.back(points)
-    covariance, process = judge(rows, rest_ct, prior, off, config.last_mm)
+    covariance, process = fit_discrepancy(rows, rest_ct, prior, off, config.last_mm)
     judged = posterior(motion, looks, config)
     np.testing.assert_array_equal(judged.covariance, covariance)
     np.testing.assert_array_equal(judged.discrepancy.cross, process.cross)
@@ -321,11 +321,11 @@ def test_an_organ_is_followed_by_several_cameras_and_by_one_that_goes_round(trac
         way = np.linalg.inv(lead) @ before
         estimate = follower.locate(here, views[0].seen, views[1:], way)
         found.append(transform_points(lead, estimate.motion.carry(INNER)))
-        assert ("follow" in estimate.report["timings"]) == (n > 0)
-        assert ("refine" in estimate.report["timings"]) == (n == 0)
+        assert ("follow" in estimate.report.timings) == (n > 0)
+        assert ("refine" in estimate.report.timings) == (n == 0)
         box_mm = follower.last_box_mm(here.stamp_ns, lead)
         assert np.allclose(box_mm.mean(0), found[-1].mean(0), atol=6)
-        assert len(estimate.report["looks"]["shift_mm"]) == 2 if len(degrees) == 2 else True
+        assert len(estimate.report.looks.shift_mm) == 2 if len(degrees) == 2 else True
     for other in found:
         assert np.linalg.norm(other - REST.carry(INNER), axis=1).mean() < 1.0
 
@@ -359,14 +359,14 @@ def test_a_scan_takes_three_looks_from_apart_and_says_what_each_added(tracker):
     assert found is not None
     there = transform_points(around(50), found.motion.carry(INNER))
     assert np.linalg.norm(there - REST.carry(INNER), axis=1).mean() < 1.0
-    stated = [f"{mm:.1f} mm" for mm in found.report["scan"]["center_std_mm"]]
+    stated = [f"{mm:.1f} mm" for mm in found.report.scan.center_std_mm]
     assert f"standard deviation of {', then '.join(stated)}, with one to 3 looks" in scan.told
-    parts = found.report["parts"]  # of all looks
-    assert stated[-1] == f"{max(parts[n]['center_std_mm'] for n in parts if n != 'kidney'):.1f} mm"
+    parts = found.report.parts  # of all looks
+    assert stated[-1] == f"{max(parts[n].center_std_mm for n in parts if n != 'kidney'):.1f} mm"
     follower = Follower(tracker, FollowerConfig(rescan_s=100.0))
     follower.begin(found)  # the answer took long: the organ rests
     cloud = seen(50, 12.0)[1]
-    assert "follow" in follower.locate(cloud).report["timings"]
+    assert "follow" in follower.locate(cloud).report.timings
     views = ViewsLocator(follower, small_setting(), RegionConfig(), 1.0, 0)
     views.scan = Scan(tracker)
     for degrees, stamp_s in ((-50, 7.5), (0, 8.0)):

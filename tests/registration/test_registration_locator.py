@@ -98,14 +98,14 @@ def test_meshes_are_the_cts_carried_along(estimate):
         np.testing.assert_allclose(
             estimate.motion.back(mesh.vertices_mm), part.vertices_mm, atol=0.05
         )
-        told = estimate.report["parts"][name]
-        assert told["volume_ml"] == pytest.approx(part.volume_mm3 / 1000, rel=0.15)
-        assert 0 < told["center_std_mm"] < 30
-        axes, along = np.array(told["center_axes"]), np.array(told["center_axes_std_mm"])
+        told = estimate.report.parts[name]
+        assert told.volume_ml == pytest.approx(part.volume_mm3 / 1000, rel=0.15)
+        assert 0 < told.center_std_mm < 30
+        axes, along = np.array(told.center_axes), np.array(told.center_axes_std_mm)
         np.testing.assert_allclose(axes @ axes.T, np.eye(3), atol=1e-9)
         assert along[0] > 1.05 * along[2] > 0
-        assert np.sqrt((along**2).mean()) == pytest.approx(told["center_std_mm"])
-        part = estimate.motion.shape.anatomy_ct.parts[told["label"] - 1]
+        assert np.sqrt((along**2).mean()) == pytest.approx(told.center_std_mm)
+        part = estimate.motion.shape.anatomy_ct.parts[told.label - 1]
         known = estimate.motion.covariance_mm2(part.box_mm.mean(0)[None])[0]
         np.testing.assert_allclose(axes @ known @ axes.T, np.diag(along**2), atol=1e-4)
 
@@ -222,7 +222,7 @@ def test_clouds_of_an_organ_as_never_seen_are_answered(tracker, stages):
     rng = np.random.default_rng(2)
     for points in (half, cloud + rng.normal(0, 1.5, cloud.shape)):
         found = tracker.locate(SensorCloud(points.astype(np.float32)), grid=16)
-        assert all(part["found"] for part in found.report["parts"].values())
+        assert all(part.found for part in found.report.parts.values())
     certain, part = (  # an ellipsoid fits the other way round too
         replace(tracker.locate(SensorCloud(points), grid=16).motion, rivals=())
         for points in (cloud, half)

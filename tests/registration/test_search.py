@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from elastic_objects import CENTER, RADII, SMALL, UP
 from pose_objects import OVER, PLACE_MM, lying, seen
-from tumortrack.core.estimate import Following
+from tumortrack.core.estimate import FollowOptions
 from tumortrack.core.geometry import rigid
 from tumortrack.core.types import Anatomy, SensorCloud
 from tumortrack.imaging.case import load_case
@@ -186,9 +186,9 @@ def test_an_organ_that_lies_upside_down_is_told_and_found_where_that_is_allowed(
     cloud = SensorCloud(seen(truth))
     tracker = Tracker(model)
     found = tracker.locate(cloud, grid=16)
-    beyond = found.report["fit_cost"]["beyond"]
-    assert beyond["less"] > RIVAL_COST
-    assert beyond["tilt_degrees"] == pytest.approx(180, abs=3)
+    beyond = found.report.fit_cost.beyond
+    assert beyond.less > RIVAL_COST
+    assert beyond.tilt_degrees == pytest.approx(180, abs=3)
     assert found.quality == "poor"
     assert tumors_off_mm(found.motion, truth) > 20
     assert tracker.locate(SensorCloud(seen(over(truth))), grid=16).quality == "good"
@@ -198,9 +198,9 @@ def test_an_organ_that_lies_upside_down_is_told_and_found_where_that_is_allowed(
     anyhow = replace(model, config=msgspec.structs.replace(model.config, scene=scene))
     for right in (
         Tracker(anyhow).locate(cloud, grid=16),
-        tracker.follow(cloud, how=Following(either_side=True)),  # it was seen a moment ago
+        tracker.follow(cloud, how=FollowOptions(either_side=True)),  # it was seen a moment ago
     ):
-        assert right.report["fit_cost"]["beyond"] is None
+        assert right.report.fit_cost.beyond is None
         assert (right.quality, right.reason) == ("good", "")
         assert tumors_off_mm(right.motion, truth) < 1.5
 
@@ -222,10 +222,10 @@ def test_an_organ_nearly_the_same_from_below_may_lie_upside_down(slim_model):
     found, right = (
         tracker.locate(SensorCloud(seen(one)), grid=16) for one in (over(upright), upright)
     )
-    cost = found.report["fit_cost"]
-    assert cost["now"] < cost["usual"]
-    assert cost["beyond"]["less"] > 0
+    cost = found.report.fit_cost
+    assert cost.now < cost.usual
+    assert cost.beyond.less > 0
     assert found.quality == "poor"
     assert "the organ may lie upside down: it fits the points as well tilted" in found.reason
-    assert right.report["fit_cost"]["beyond"] is None
+    assert right.report.fit_cost.beyond is None
     assert "upside down" not in right.reason

@@ -10,8 +10,10 @@ import pytest
 from msgspec.structs import replace
 
 from live_objects import CAMERA, ball, small_anatomy, small_estimate
+from reports import NOWHERE, poor, report_of, reporting
 from tumortrack.core import store
 from tumortrack.core.errors import ArtifactError, InputError
+from tumortrack.core.report import MarginReport
 from tumortrack.core.types import SensorCloud
 from tumortrack.models import margins as stored
 from tumortrack.models.margins import ModelMargins, stated_margin, stated_radius
@@ -240,7 +242,8 @@ def test_stored_margins_are_refused_where_anything_differs(tmp_path, monkeypatch
 def test_an_estimate_states_its_margins_or_why_it_has_none():
     margins = margins_of(drawn(np.random.default_rng(2), 60), "", (0.8, 0.9), 20.0)
     parts = {"kidney": {"surface_std_mm": 2.0}, "tumor_1": {"surface_std_mm": 1.0}}
-    said = stated_margin({"parts": parts}, margins, good=True)
+    report = report_of(parts=parts)
+    said = stated_margin(report, margins, good=True)
     radius = margins.shells[1].radii["tumor"]
     assert stated_radius(said, "tumor_1").mm == radius.at(1.0, {})
     assert stated_radius(said, "tumor_1").words == f"90 % margin {radius.at(1.0, {}):.1f} mm"
@@ -248,10 +251,10 @@ def test_an_estimate_states_its_margins_or_why_it_has_none():
     assert stated_radius(said, "tumor_1", 0.8).mm < radius.at(1.0, {})
     assert stated_radius(said, "tumor_1", 0.95) is None
     assert stated_radius(said, "map") is None  # no scene had targets
-    assert stated_margin({"parts": parts}, None, good=True)["stated"] == []
-    assert stated_margin({"parts": parts}, margins, good=False)["stated"] == []
-    smoothed = {"parts": parts, "smoothing": {"time_s": 0.2}}
-    assert "smoothed" in stated_margin(smoothed, margins, good=True)["reason"]
+    assert stated_margin(report, None, good=True).stated == ()
+    assert stated_margin(report, margins, good=False).stated == ()
+    smoothed = report_of(parts=parts, smoothing={"time_s": 0.2})
+    assert "smoothed" in stated_margin(smoothed, margins, good=True).reason
 
 
 def test_one_scene_of_each_state_counts(tmp_path):
@@ -278,26 +281,25 @@ def test_one_scene_of_each_state_counts(tmp_path):
 def test_an_estimate_beyond_a_limit_is_poor_and_says_which():
     margins = margins_of(drawn(np.random.default_rng(2), 60), "", (0.8, 0.9), 20.0)
     rare = replace(margins, limits={"rarity": 1.0, "unseen": 0.5})
-    shell = {"surface_std_mm": 1.0}
 
-    def judged(rarity, cloud, quality="good"):
-        estimate = dataclasses.replace(small_estimate(), quality=quality, reason="")
-        parts = {name: {**part, **shell} for name, part in estimate.report["parts"].items()}
-        report = {**estimate.report, "parts": parts, "motion": {"rarity": rarity}}
-        return with_margin(dataclasses.replace(estimate, report=report), cloud, rare)
+    def judged(rarity, cloud, finding=None):
+        estimate = dataclasses.replace(small_estimate(), finding=finding)
+        parts = {name: {"surface_std_mm": 1.0} for name in estimate.report.parts}
+        estimate = reporting(estimate, parts=parts, motion={**NOWHERE, "rarity": rarity})
+        return with_margin(estimate, cloud, rare)
 
     organ = small_estimate().meshes["kidney"].vertices_mm
     whole = SensorCloud(organ.astype(np.float32))
     fine = judged(0.9, whole)
-    assert (fine.quality, len(fine.report["margin"]["stated"])) == ("good", 2)
+    assert (fine.quality, len(fine.report.margin.stated)) == ("good", 2)
     far = judged(1.2, whole)
-    assert (far.quality, far.report["margin"]["stated"]) == ("poor", [])
+    assert (far.quality, far.report.margin.stated) == ("poor", ())
     assert far.reason == "rarity is 1.2; margins are known up to 1"
-    assert far.report["quality"] == {"verdict": "poor", "reason": far.reason, "check": "other"}
+    assert far.finding.values == {"figure": "rarity", "value": 1.2, "limit": 1.0}
     end = SensorCloud(organ[organ[:, 0] < np.quantile(organ[:, 0], 0.2)].astype(np.float32))
     assert "unseen is 0." in judged(0.9, end).reason  # worked out here: an image was judged
-    before = judged(0.9, whole, "poor")
-    assert before.report["margin"] == {"stated": [], "reason": "a poor estimate has no margin"}
-    without = with_margin(dataclasses.replace(small_estimate(), quality="good"), whole, None)
+    before = judged(0.9, whole, poor("it is hidden"))
+    assert before.report.margin == MarginReport(reason="a poor estimate has no margin")
+    without = with_margin(dataclasses.replace(small_estimate(), finding=None), whole, None)
     assert without.quality == "good"
-    assert without.report["margin"]["reason"].startswith("the model was not calibrated")
+    assert without.report.margin.reason.startswith("the model was not calibrated")

@@ -13,6 +13,7 @@ import trimesh
 from tumortrack.core.colours import TUMORS, css, part_colour
 from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.estimate import Estimate
+from tumortrack.core.report import FitReport
 from tumortrack.core.types import (
     Anatomy,
     CameraLabels,
@@ -67,7 +68,7 @@ def estimate_of(parts, without=()):
         OccupancyCloud(points, labels[labels > 0], np.ones(len(points))),
         CameraLabels(labels, camera_from_index),
         {n: m for n, m in zip(parts.names, parts.parts, strict=True) if n not in without},
-        {"timings": {"search": 0.002}},
+        FitReport(timings={"search": 0.002}),
     )
 
 
@@ -189,7 +190,7 @@ def test_an_answer_that_is_far_off_has_failed_however_it_is_called(tmp_path):
         scene().write(tmp_path / "scenes" / name)
     answers = {name: estimate_of(anatomy((x, 0, 0))) for name, x in shifts_mm.items()}
     for name in ("near", "far"):
-        answers[name] = replace(answers[name], quality="good", reason="")
+        answers[name] = replace(answers[name], finding=None)
     locate = Scripted(*(answers[name] for name in sorted(answers)))
     report = evaluate_scenes(locate, tmp_path / "scenes", tmp_path / "out")
     failed = {entry["name"]: entry["failed"] for entry in report["scenes"]}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import trimesh
 
+from reports import report_of
 from tumortrack.core.estimate import Estimate
 from tumortrack.core.patient import Patient
 from tumortrack.core.types import (
@@ -64,8 +65,8 @@ def small_estimate(stamp_ns: int = STAMP_NS, n: int = 500) -> Estimate:
         }
         for label, (name, mesh) in enumerate(zip(PARTS, anatomy.parts, strict=True), start=1)
     }
-    report = {"units": "mm", "frame": "camera", "stamp_ns": stamp_ns, "parts": parts}
-    return Estimate(cloud, None, dict(zip(PARTS, anatomy.parts, strict=True)), report)
+    meshes = dict(zip(PARTS, anatomy.parts, strict=True))
+    return Estimate(cloud, None, meshes, report_of(parts=parts))
 
 
 def small_frame(stamp_ns: int = STAMP_NS) -> DepthFrame:

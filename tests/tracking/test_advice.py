@@ -7,6 +7,7 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
+from reports import report_of
 from tumortrack.core.estimate import Estimate
 from tumortrack.core.geometry import rigid, transform_points
 from tumortrack.core.types import Look, Mesh, OccupancyCloud, SensorCloud
@@ -37,7 +38,7 @@ def estimate(axis, tumor_mm=(0.0, 0.0, 0.0), motion=None) -> Estimate:
     tumor = {"center_axes": axes.tolist(), "center_axes_std_mm": [4.0, 1.0, 1.0]}
     inside = OccupancyCloud(CENTRE[None], np.ones(1), np.ones(1))
     meshes = {"kidney": ORGAN, "tumor_1": ball(8.0, CENTRE + tumor_mm)}
-    return Estimate(inside, None, meshes, {"parts": {"kidney": {}, "tumor_1": tumor}}, motion)
+    return Estimate(inside, None, meshes, report_of(parts={"kidney": {}, "tumor_1": tumor}), motion)
 
 
 def seen(towards=None) -> SensorCloud:

@@ -20,6 +20,7 @@ from tumortrack.simulate.deform import DragConfig
 from tumortrack.simulate.scene import SceneRecipe, Simulator
 from tumortrack.tracking import tracker as tracking
 from tumortrack.tracking.causes import words
+from tumortrack.tracking.files import report_entry
 from tumortrack.tracking.model_files import load_model
 from tumortrack.tracking.tracker import Follower, FollowerConfig, Tracker
 
@@ -78,7 +79,9 @@ def answer(tracker: Tracker, points: np.ndarray) -> tuple[str, str, tuple[Likely
         found = tracker.locate(SensorCloud(points.astype(np.float32)), grid=16)
     except NoEstimate as refused:
         return "none", str(refused), refused.causes
-    assert json.loads(json.dumps(found.report["causes"])) == [one.entry() for one in found.causes]
+    assert json.loads(json.dumps(report_entry(found)["causes"])) == [
+        one.entry() for one in found.causes
+    ]
     return found.quality, found.reason, found.causes
 
 

@@ -12,6 +12,7 @@ import pytest
 import trimesh
 
 from motions import CAMERA_FROM_CT, Wave
+from reports import report_of
 from stories import refusal, tumortrack
 from tumortrack.cli.locate import Locate
 from tumortrack.core import store
@@ -57,7 +58,7 @@ def located(motion=None):
         OccupancyCloud(points_mm, np.array([1, 2]), np.array([0.9, 0.8])),
         volume,
         {"kidney": ball(30, [0, 0, 100])},
-        {"parts": parts, "timings": {"total": 0.1}},
+        report_of(parts=parts, timings={"total": 0.1}),
         motion,
     )
 

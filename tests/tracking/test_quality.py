@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 
+import msgspec
 import numpy as np
 import pytest
 
 from elastic_objects import UP
+from reports import reporting
 from stories import answered, refusal, succeeded, tumortrack
 from tumortrack.core import store
 from tumortrack.core.errors import NoEstimate
@@ -18,8 +19,9 @@ from tumortrack.registration.motion import ElasticMotion
 from tumortrack.sense.camera import d405
 from tumortrack.sense.render import render_depth
 from tumortrack.simulate.scene import SceneRecipe, Simulator, body_for
+from tumortrack.tracking.files import report_entry
 from tumortrack.tracking.model_files import load_model
-from tumortrack.tracking.quality import cloud_shares, judged, seen_through, unless_hidden
+from tumortrack.tracking.quality import cloud_shares, doubt_if_hidden, judged, seen_through
 from tumortrack.tracking.tracker import Follower, FollowerConfig, Tracker
 from warp_objects import ANATOMY, PLACE_MM, TURNED, slim_clinic
 
@@ -41,16 +43,17 @@ def stages():
 
 def doubted(estimate, seen, **report):
     """A judgement in which only what is given speaks against the estimate."""
-    parts = {
-        name: {**part, "probability": 0.9, "center_std_mm": 1.0}
-        for name, part in estimate.report["parts"].items()
-    }
-    sure = {**estimate.report, "parts": parts, "fit_cost": COST, "size": EXACT, **report}
-    found = judged(replace(estimate, report=sure), seen)
-    said = found.report["quality"]
+    sure = {"fit_cost": COST, "size": EXACT, "parts": sure_parts(estimate), **report}
+    found = judged(reporting(estimate, **sure), seen)
+    said = report_entry(found)["quality"]
     assert (said["verdict"], said["reason"]) == (found.quality, found.reason)
-    assert bool(said["check"]) == (found.quality == "poor")
+    assert bool(said["check"]) == (found.quality == "poor") == (said["finding"] is not None)
     return found
+
+
+def sure_parts(estimate):
+    parts = msgspec.to_builtins(estimate.report.parts)
+    return {n: {**part, "probability": 0.9, "center_std_mm": 1.0} for n, part in parts.items()}
 
 
 def seen_side(organ: Mesh, spacing: int = 1) -> np.ndarray:
@@ -71,7 +74,7 @@ def test_a_worse_fit_is_flagged(tracker, stages):
     worse = doubted(estimate, cloud, fit_cost=COST | {"now": 2.1})
     assert worse.quality == "poor"
     assert "worse than in most" in worse.reason
-    parts = json.loads(json.dumps(good.report["parts"]))
+    parts = sure_parts(good)
     parts["tumor_1"]["center_std_mm"] = 3.4
     assert "tumor_1 is unsure by 3.4 mm" in doubted(estimate, cloud, parts=parts).reason
     for gain, verdict in ((9.1, "good"), (9.3, "poor")):
@@ -98,10 +101,10 @@ def test_strays_are_no_part_of_the_fit_that_is_judged(tracker, stages):
     found = tracker.follow(spoiled)
     away = found.motion.centre_mm - clean.motion.centre_mm  # an ellipsoid may lie both ways round
     assert np.linalg.norm(away) < 2
-    cost, before = (one.report["fit_cost"] for one in (found, clean))
-    assert 0.15 < cost["strays"] < 0.35  # the others lie near the surface
-    assert cost["now"] > before["now"] + 0.8 * 300 * cost["strays"]
-    assert cost["without_strays"] < 0.3 * cost["now"]  # what lies within 2 mm still counts
+    cost, before = (one.report.fit_cost for one in (found, clean))
+    assert 0.15 < cost.strays < 0.35  # the others lie near the surface
+    assert cost.now > before.now + 0.8 * 300 * cost.strays
+    assert cost.without_strays < 0.3 * cost.now  # what lies within 2 mm still counts
 
 
 def test_what_fits_worse_all_of_a_sudden_is_poor(tracker, stages):
@@ -115,11 +118,11 @@ def test_what_fits_worse_all_of_a_sudden_is_poor(tracker, stages):
     anywhere = low + (high - low) * rng.uniform(-0.1, 1.1, points.shape)
     spoiled = SensorCloud(np.where(rng.random((len(points), 1)) < 0.35, anywhere, points))
     first = tracker.follow(spoiled, seen=table)
-    cost = first.report["fit_cost"]
-    assert cost["now"] > cost["usual"]
+    cost = first.report.fit_cost
+    assert cost.now > cost.usual
     worse = "worse than in most"
     assert worse not in first.reason  # the ellipsoid's half turn is another matter
-    first, clean = (replace(one, quality="good") for one in (first, clean))
+    first, clean = (replace(one, finding=None) for one in (first, clean))
     assert worse not in tracker.follow(spoiled, first, seen=table).reason
     sudden = tracker.follow(spoiled, clean, seen=table)
     assert worse in sudden.reason
@@ -145,12 +148,12 @@ def test_following_goes_on_to_say_that_another_place_fits_as_well(tracker, known
             start = replace(lies(0, np.eye(3)), rivals=rivals)
             monkeypatch.setattr(follower, "_last", replace(found[0], unsmoothed=start))
     for one in found[1:]:
-        others = one.report["fit_cost"]["others"]
+        others = one.report.fit_cost.others
         assert len(others) == known
         assert ("tumor_1 may as well lie" in one.reason) == known
         if known:
             assert one.quality == "poor"
-            assert others[0]["apart_mm"]["tumor_1"] == pytest.approx(40.0, abs=1.5)
+            assert others[0].apart_mm["tumor_1"] == pytest.approx(40.0, abs=1.5)
 
 
 def test_an_organ_that_the_camera_sees_through_is_refused(tracker, stages):
@@ -179,7 +182,7 @@ def test_an_organ_that_the_camera_sees_through_is_refused(tracker, stages):
         if expected == "poor":
             found = doubted(estimate, holed)
             assert found.quality == "poor"
-            assert found.report["seen_through"] == pytest.approx(share, abs=0.02)
+            assert found.report.seen_through == pytest.approx(share, abs=0.02)
         else:
             with pytest.raises(NoEstimate, match="sees through 3"):
                 doubted(estimate, holed)
@@ -194,14 +197,14 @@ def test_an_organ_that_the_camera_sees_through_is_refused(tracker, stages):
     before = doubted(estimate, DepthFrame(depth_mm, camera))
     covered, free = doubted(estimate, by_hand), doubted(estimate, table)
     assert (before.quality, covered.quality) == ("poor", "good")
-    still = unless_hidden(covered, before)
+    still = doubt_if_hidden(covered, before)
     assert still.quality == "poor"
     assert "what showed that is hidden" in still.reason
-    assert unless_hidden(doubted(estimate, by_hand), still).quality == "poor"
-    assert unless_hidden(free, still).quality == "good"
+    assert doubt_if_hidden(doubted(estimate, by_hand), still).quality == "poor"
+    assert doubt_if_hidden(free, still).quality == "good"
     aside = {name: mesh.moved(mesh.vertices_mm + 12.0) for name, mesh in estimate.meshes.items()}
     elsewhere = replace(before, meshes=aside)
-    assert unless_hidden(doubted(estimate, by_hand), elsewhere).quality == "good"
+    assert doubt_if_hidden(doubted(estimate, by_hand), elsewhere).quality == "good"
 
 
 @pytest.mark.parametrize("spacing", [1, 5, 40])
@@ -245,11 +248,10 @@ def test_an_organ_that_looks_the_same_after_half_a_turn_is_in_doubt(slim_model, 
         estimate = Tracker(trained).follow(stage.cloud)
         assert estimate.quality == "poor"
         doubt, _, advice = estimate.reason.partition("; ")
-        assert estimate.report["quality"]["reason"] == estimate.reason
         if "may as well" in doubt:
             assert "tumor_1 may as well lie" in doubt
             assert "look" in advice
-        away_mm = max(one["apart_mm"]["tumor_1"] for one in estimate.report["fit_cost"]["others"])
+        away_mm = max(one.apart_mm["tumor_1"] for one in estimate.report.fit_cost.others)
         assert away_mm > 10  # of 16, 40 and 43 mm that the half-turns move it
 
 
@@ -259,8 +261,8 @@ def test_a_model_that_was_mostly_wrong_says_so_in_every_estimate(slim_model, sta
     found = Tracker(bad).follow(stages[0].cloud)
     assert found.quality == "poor"
     assert "40 % of the simulated scenes on which this model was checked" in found.reason
-    assert found.report["quality"]["reason"] == found.reason
-    assert found.report["margin"]["stated"] == []
+    assert found.finding.kind == "model"
+    assert found.report.margin.stated == ()
     assert weakness_of({"validation_far": 0.1}) == weakness_of({}) == ""
     assert "without a network" in weakness_of({"half_turn_mm": 0.4})
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -13,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from imaging_objects import kidney_labels
 from live_objects import small_estimate
+from reports import NOWHERE, reporting
 from tumortrack.cli.cases import Export
 from tumortrack.core import store
 from tumortrack.core.errors import InputError
@@ -35,19 +37,17 @@ def folders(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     ct = Volume(np.where(labels.labels > 0, 100, -100).astype(np.float32), labels.lps_from_index)
     (top / "case").mkdir()
     save_case(Case(surfaces(labels)[0], labels, (0.0, -1.0, 0.0), ct=ct), top / "case")
-    found = small_estimate()
-    parts = found.report["parts"]
-    parts["tumor_1"]["center_std_mm"] = 1.26
-    found.report.update(
-        model={"case_sha256": store.sha256_of(top / "case" / store.MANIFEST)},
-        quality={"verdict": "good", "reason": ""},
-        motion={"camera_from_ct": CAMERA_FROM_CT.tolist()},
+    found = reporting(
+        replace(small_estimate(), finding=None),
+        parts={"tumor_1": {"center_std_mm": 1.26}},
+        motion={**NOWHERE, "camera_from_ct": CAMERA_FROM_CT.tolist()},
         margin={"stated": [{"confidence": 0.95, "mm": {"tumor_1": 5.0}}]},
     )
     volume = CameraLabels(np.ones((4, 4, 4), np.uint8), np.eye(4))
-    estimate = type(found)(found.cloud, volume, found.meshes, found.report, motion=Shift())
+    estimate = replace(found, volume=volume, motion=Shift())
     table = PointTable(np.array([[1.0, 2, 3]]), ("label", "ct_x", "ct_y", "ct_z"), (tuple("A123"),))
-    write_estimate(top / "run", estimate, points=table)
+    about = {"model": {"case_sha256": store.sha256_of(top / "case" / store.MANIFEST)}}
+    write_estimate(top / "run", estimate, points=table, about=about)
     return top / "case", top / "run"
 
 

@@ -48,8 +48,8 @@ def test_it_moves_as_the_motion_says(carried):
     there = estimate.motion.carry(sheet.vertices_mm)
     assert estimate.structures["cut"].vertices_mm == pytest.approx(there, abs=1e-4)
     assert np.linalg.norm(there - sheet.vertices_mm, axis=1).min() > 10
-    assert set(estimate.meshes) == set(estimate.report["parts"])
-    assert estimate.report["structures"] == ["cut"]
+    assert set(estimate.meshes) == set(estimate.report.parts)
+    assert estimate.report.structures == ("cut",)
 
 
 def test_it_is_written_and_read_as_what_it_is(carried, tmp_path):

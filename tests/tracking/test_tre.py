@@ -12,8 +12,9 @@ import trimesh
 from motions import Wave
 from stories import succeeded, tumortrack, write_phantom_case
 from tumortrack.core.errors import InputError, NoEstimate
-from tumortrack.core.estimate import Estimate, Following
+from tumortrack.core.estimate import Estimate, FollowOptions
 from tumortrack.core.geometry import transform_points
+from tumortrack.core.report import FitReport
 from tumortrack.core.types import (
     Anatomy,
     CameraLabels,
@@ -65,7 +66,7 @@ def estimate(motion):
     points_mm = np.argwhere(labels) + camera_from_index[:3, 3]
     meshes = dict(zip(truth().names, truth().parts, strict=True))
     cloud = OccupancyCloud(points_mm, labels[labels > 0], np.ones(len(points_mm)))
-    return Estimate(cloud, CameraLabels(labels, camera_from_index), meshes, {}, motion)
+    return Estimate(cloud, CameraLabels(labels, camera_from_index), meshes, FitReport(), motion)
 
 
 def shifted(distance_mm):
@@ -110,7 +111,7 @@ def test_a_seed_of_more_than_32_bits_is_refused(seed):
     for use in (
         lambda: draw_targets(anatomy_ct(), seed),
         lambda: SceneRecipe(seed, "test", 0),
-        lambda: Following(seed=seed),
+        lambda: FollowOptions(seed=seed),
         lambda: VirtualSourceConfig(case=Path("case"), seed=seed),
     ):
         with pytest.raises(InputError, match=allowed):

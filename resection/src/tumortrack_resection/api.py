@@ -57,7 +57,7 @@ def plan_resection(
     budget_of = partial(budget.planned_budget, located=seen, confidence=confidence)
     plan, _, errors = budget.plan_within(seen, config, budget_of, confidence is not None)
     plan = replace(plan, notes=(*notes, *plan.notes))
-    plan = budget.heeded(plan, errors, accept_budget)
+    plan = budget.checked_against(plan, errors, accept_budget)
     if picture is not None:
         from tumortrack_resection.pictures import draw_plan
 

@@ -176,7 +176,7 @@ def widened(config: ResectionConfig, budget: ErrorBudget) -> ResectionConfig:
     return msgspec.structs.replace(config, margin_mm=wide_mm)
 
 
-def heeded(plan: ResectionPlan, budget: ErrorBudget, accept: bool) -> ResectionPlan:
+def checked_against(plan: ResectionPlan, budget: ErrorBudget, accept: bool) -> ResectionPlan:
     """The plan with a note on its budget. NoPlan: the margin doesn't cover the errors, and nobody
     said that it is to be planned all the same."""
     words = f"{budget.left_mm:.1f} mm of the margin are left after {budget.sum_mm:.1f} mm of error"

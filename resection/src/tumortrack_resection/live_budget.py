@@ -54,9 +54,9 @@ class LiveBudget:
         estimate = update.estimate
         assert estimate is not None
         late_ms = max(update.latency_ms or 0.0, 0.0)  # a camera's clock may be ahead
-        late_ms += estimate.report.get("smoothing", {}).get("lag_ms", 0.0)
-        said = estimate.report.get("margin")
-        stated = stated_radius(said, part, self._planned.confidence or None)
+        smoothing = estimate.report.smoothing
+        late_ms += 0.0 if smoothing is None else smoothing.lag_ms
+        stated = stated_radius(estimate.report.margin, part, self._planned.confidence or None)
         std_mm, motion = None, estimate.motion
         if stated is None and motion is not None:
             places = motion.back(estimate.meshes[part].vertices_mm[::_EVERY])

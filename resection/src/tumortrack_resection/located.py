@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import msgspec
 import numpy as np
@@ -17,6 +16,7 @@ from tumortrack.core.geometry import rigid
 from tumortrack.core.mesh_files import read_mesh
 from tumortrack.core.organ import KIDNEY, is_tumor, organ_first, organ_name
 from tumortrack.core.patient import NOBODY, Patient
+from tumortrack.core.report import MarginReport
 from tumortrack.core.store import MANIFEST, read_json
 from tumortrack.core.types import ORGAN, Mesh, OccupancyCloud
 from tumortrack.sense.ply import parse_ply_properties
@@ -54,7 +54,7 @@ def of_estimate(estimate: Estimate, unsure: bool = True) -> Located:
         deviations,
         stamp_ns=estimate.cloud.stamp_ns,
         patient=estimate.patient,
-        margin=estimate.report.get("margin"),
+        margin=estimate.report.margin,
         structures=estimate.structures,
         doubt="" if estimate.quality == "good" else estimate.reason or "unknown",
     )
@@ -85,7 +85,7 @@ class _Report(msgspec.Struct):
     patient: Patient = NOBODY
     stamp_ns: int = 0
     structures: tuple[str, ...] = ()
-    margin: dict[str, Any] | None = None
+    margin: MarginReport | None = None
 
 
 def read_run(folder: Path) -> Located:

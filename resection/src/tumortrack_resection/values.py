@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from typing import Literal
 
 import msgspec
 import numpy as np
@@ -19,6 +19,7 @@ from tumortrack.core.errors import InputError, NoPlan
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.organ import organ_name
 from tumortrack.core.patient import NOBODY, Patient
+from tumortrack.core.report import MarginReport
 from tumortrack.core.types import FIRST_TUMOR, Mesh
 
 Method = Literal["published", "margin"]
@@ -109,7 +110,7 @@ class Located:
     std_mm: dict[str, Float64[np.ndarray, " v"]] = field(default_factory=dict)
     stamp_ns: int = 0
     patient: Patient = NOBODY
-    margin: dict[str, Any] | None = None
+    margin: MarginReport | None = None
     structures: Mapping[str, Mesh] = field(default_factory=dict)
     doubt: str = ""
 

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import gc
+import json
 import os
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from rich.console import Console
 
@@ -31,6 +32,11 @@ console = _Console(soft_wrap=True, highlight=False)
 def say(text: str) -> None:
     """One line, as it is."""
     console.print(text, markup=False)
+
+
+def say_json(content: Mapping[str, Any]) -> None:
+    """For programs: JSON with indentation, nothing else."""
+    print(json.dumps(content, indent=1, allow_nan=False))
 
 
 def warn(warnings: Iterable[str]) -> None:

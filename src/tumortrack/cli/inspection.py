@@ -129,11 +129,15 @@ def _with_figures(content: Content, folder: Path) -> Content:
         figures |= {"does": _METHODS["network" in content["config"]], **_of_model(content, folder)}
         figures["part_names"] = ", ".join(content["parts"])
     elif content.keys() >= {"quality", "parts"}:
-        from tumortrack.models.margins import margin_words
-        from tumortrack.report.run_page import part_rows, row_words
+        import msgspec
 
-        figures["margin_words"] = margin_words(content.get("margin"))
-        figures["rows"] = [row_words(row) for row in part_rows(dict(content))]
+        from tumortrack.core.report import FitReport
+        from tumortrack.models.margins import margin_words
+        from tumortrack.report.seen import part_rows, row_words
+
+        report, good = msgspec.convert(content, FitReport), content["quality"]["verdict"] == "good"
+        figures["margin_words"] = margin_words(report.margin)
+        figures["rows"] = [row_words(row) for row in part_rows(report, good)]
     elif "updates" in content:
         counts = *content["estimates"].values(), content["no_estimate"]
         figures["share"] = [count / max(sum(counts), 1) for count in counts]

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from tyro.conf import Positional, UseAppendAction
 
-from tumortrack.cli.console import Device, keep_loaded, model_folder, say, say_notes
+from tumortrack.cli.console import Device, keep_loaded, model_folder, say, say_json, say_notes
 from tumortrack.cli.finding import FindingOrgan
 from tumortrack.core import store
 from tumortrack.core.config import to_builtins
@@ -64,6 +64,7 @@ class Locate(FindingOrgan):
         case: the model's case, whose CT the page's slices then show where it lies now (preset
             clinic); a second or two longer.
         device: auto takes CUDA if there is a GPU.
+        json: print the report (OUT/report.json) instead of sentences.
         overwrite: replace OUT if it exists.
     """
 
@@ -82,6 +83,7 @@ class Locate(FindingOrgan):
     map: Path | None = None
     case: Path | None = None
     device: Device = "auto"
+    json: bool = False
     overwrite: bool = False
 
     def run(self) -> int:
@@ -104,8 +106,7 @@ class Locate(FindingOrgan):
         views = self._views(clouds)
         hints = views[0].hints(self.at, self.mask)
 
-        from tumortrack.report.run_page import PAGE, Seen, write_run_page
-        from tumortrack.tracking.files import write_estimate, write_no_estimate
+        from tumortrack.report.seen import PAGE, Seen
         from tumortrack.tracking.model_files import load_model
         from tumortrack.tracking.tracker import Tracker
 
@@ -130,30 +131,57 @@ class Locate(FindingOrgan):
             looks = looks_at(organs, [view.content for view in views], fixed_from_camera)
             estimate = tracker.locate(organs[0], self.grid, self.seed, views[0].content, looks)
         except NoEstimate as error:
+            from tumortrack.report.run_page import write_run_page
+            from tumortrack.tracking.files import write_no_estimate
+
             report = {**self._nothing(str(error), views[0], model), **about}
             add = partial(write_run_page, report=report, estimate=None, seen=seen)
             write_no_estimate(out, report, overwrite, add)
+            if self.json:
+                say_json(report)
             reason = report["quality"]["reason"]
             raise NoEstimate(f"none: {reason} What was seen: {out / PAGE}") from error
         if estimate.quality == "poor" and views[0].unit is not None:
             doubt = f"if that is not the organ, or not all of it: {_ASK}; --whole takes all."
             about["notes"].append(doubt)
-        report = estimate.report
-        report.update(about)
-        if self.poses is not None:
-            report["looks"] |= {
+        about |= self._about_files(estimate, clouds, frame_id, fixed_from_camera, points)
+        if not self.json:
+            _say_found(estimate, about)
+        # What writing alone needs is loaded after the verdict, for which somebody waits.
+        from tumortrack.report.run_page import write_run_page
+        from tumortrack.tracking.files import report_entry, write_estimate
+
+        report = {**report_entry(estimate), **about}
+        add = partial(write_run_page, report=report, estimate=estimate, seen=seen)
+        write_estimate(out, estimate, overwrite, points, add, about)
+        if self.json:
+            say_json(report)
+        else:
+            _say_written(estimate, points, out)
+        return VERDICTS[estimate.quality]
+
+    def _about_files(
+        self,
+        estimate: Estimate,
+        clouds: list[Path],
+        frame_id: str,
+        fixed_from_camera: tuple[Affine, ...],
+        points: PointTable | None,
+    ) -> dict[str, Any]:
+        """Of --poses and --map, for the report."""
+        about: dict[str, Any] = {}
+        if self.poses is not None and estimate.report.looks is not None:
+            about["looks"] = {
+                **to_builtins(estimate.report.looks),
                 "frame_id": frame_id,
                 "fixed_from_camera": fixed_from_camera[0].tolist(),
                 "poses_sha256": store.sha256_of(self.poses),
                 "clouds_sha256": [store.sha256_of(path) for path in clouds],
             }
-        if points is not None and self.map is not None:
+        if self.map is not None and points is not None:
             digest, count = store.sha256_of(self.map), len(points.points_ct)
-            report["map"] = {"points": count, "from": "lps", "to": "camera", "sha256": digest}
-        add = partial(write_run_page, report=report, estimate=estimate, seen=seen)
-        write_estimate(out, estimate, overwrite, points, add)
-        _say_found(estimate, points, out)
-        return VERDICTS[estimate.quality]
+            about["map"] = {"points": count, "from": "lps", "to": "camera", "sha256": digest}
+        return about
 
     def _views(self, clouds: list[Path]) -> list[View]:
         from tumortrack.cli.views import read_view
@@ -282,30 +310,35 @@ def looks_at(
     ]
 
 
-def _say_found(estimate: Estimate, points: PointTable | None, out: Path) -> None:
+def _say_found(estimate: Estimate, about: dict[str, Any]) -> None:
     """How far it is to be trusted, and what is where."""
     from tumortrack.core.estimate import verdict_words
-    from tumortrack.models.margins import margin_words, stated_radius
-    from tumortrack.registration.kernels import carry
-    from tumortrack.report.run_page import PAGE, part_rows, row_words
+    from tumortrack.models.margins import margin_words
+    from tumortrack.report.seen import part_rows, row_words
 
-    report = estimate.report
-    margin = report.get("margin", {})
+    report, margin = estimate.report, estimate.report.margin
     say(verdict_words(estimate.quality, estimate.reason))
     say(str(estimate.patient))
-    for row in part_rows(report):
+    for row in part_rows(report, estimate.quality == "good"):
         say(row_words(row))
+    if margin is None or not margin.stated:
+        say(margin_words(margin))
+    for view in about["input"]:
+        say(view["words"])
+    say_notes(about["notes"])
+
+
+def _say_written(estimate: Estimate, points: PointTable | None, out: Path) -> None:
+    from tumortrack.models.margins import stated_radius
+    from tumortrack.registration.kernels import carry
+    from tumortrack.report.seen import PAGE
+
     if points is not None:
-        radius = stated_radius(margin, "map")
+        radius = stated_radius(estimate.report.margin, "map")
         said = f"; {radius.words} for all of them" if radius else ""
         file = out / "points.csv"
         say(f"{len(points.points_ct)} points of the CT: their places are in {file}{said}")
-    if not margin.get("stated"):
-        say(margin_words(margin))
-    for view in report["input"]:
-        say(view["words"])
-    say_notes(report["notes"])
-    seconds = report["timings"]["total"]
+    seconds = estimate.report.timings["total"]
     compiled = ", with compiling, once on this machine" if carry.stats.cache_misses else ""
     say(f"written to {out} (camera frame, mm) in {seconds:.2f} s{compiled}; look at {out / PAGE}.")
 

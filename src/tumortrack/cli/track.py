@@ -49,7 +49,7 @@ class Arms:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Following(FindingOrgan):
+class FollowingOptions(FindingOrgan):
     """Options of commands that follow an organ.
 
     Attributes:
@@ -63,7 +63,7 @@ class Following(FindingOrgan):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Track(Following):
+class Track(FollowingOptions):
     """Follow organ and tumors live, from a camera to viewers, recordings and robots.
 
     Sources and sinks are written kind:target?option=value&option=value. Sources: virtual:CASE,

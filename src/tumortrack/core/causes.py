@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import Enum
-from typing import Any, Literal
+from typing import Any
 
-# Which check an estimate failed; other: of a moment, a margin or the model.
-Check = Literal["poses", "fit", "strays", "seen_through", "unseen", "size", "place", "other"]
 Cause = Enum(
     "Cause",
     "UNIT FRAME MIRRORED SCALE OBJECT BACKGROUND HIDDEN ANOTHER_PATIENT DEFORMED POSES VIEW",

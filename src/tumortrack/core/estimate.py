@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal, Protocol, runtime_checkable
 
 import msgspec
@@ -16,6 +16,7 @@ from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import Points
 from tumortrack.core.organ import KIDNEY, Organ
 from tumortrack.core.patient import NOBODY, Patient
+from tumortrack.core.report import Finding, FitReport
 from tumortrack.core.types import CameraLabels, Mesh, OccupancyCloud
 
 LARGEST_GRID = 400
@@ -24,6 +25,7 @@ Quality = Literal["good", "poor", "none"]  # none: there is no estimate
 FAR_MM = 5.0
 # What people read where it is good: that word alone would say more than is known.
 NO_CHECK_FAILED, UNVERIFIED = "no check failed", "its place is not verified"
+NOT_JUDGED = Finding("not_judged")
 
 
 def verdict_words(verdict: Quality, reason: str) -> str:
@@ -56,7 +58,7 @@ class Motion(Protocol):
         """The same as a whole covariance, camera frame, mm^2."""
 
 
-class Following(Config, frozen=True, kw_only=True):
+class FollowOptions(Config, frozen=True, kw_only=True):
     """How one frame of many is located. ``thorough``: also search without the last estimate, and
     keep the better fit: a search near the last answer alone would keep its error. ``either_side``:
     somebody may have turned the organ over. ``smoothing_s``: time constant of the mean over past
@@ -83,11 +85,12 @@ class Estimate:
         volume: None where it was not requested (live).
         meshes: the organ's name, tumor_1, ... -> closed surfaces; a part that was not found is
             absent. The organ's surface includes its tumors, as in ``Anatomy``.
-        report: plain JSON: per part volume, centre, box and probability; ``timings`` in seconds.
+        report: its figures: per part volume, centre, box and probability, the fit's cost, ...
         motion: where every point of the CT is, if the method knows that; ``unsmoothed``: before the
             mean over past frames: the next frame's search starts from it.
-        quality: ``good`` or ``poor``, and the ``reason``: see ``tracking.quality.judged``.
+        finding: what speaks against it (see ``tracking.quality.judged``); None: it is good.
         causes: of a poor one, the likeliest first: see ``tracking.causes``.
+        advice: what most likely happened and what to do, in words; follows the finding's.
         patient: whose organ the model is of; that this one lies there nothing verifies.
         organ: which organ that is.
         structures: what else of the CT moves with it, by name; empty without a motion.
@@ -96,12 +99,31 @@ class Estimate:
     cloud: OccupancyCloud
     volume: CameraLabels | None
     meshes: dict[str, Mesh]
-    report: dict[str, Any]
+    report: FitReport
     motion: Motion | None = None
     unsmoothed: Motion | None = None
-    quality: Quality = "poor"
-    reason: str = "it was not judged"
+    finding: Finding | None = NOT_JUDGED
     causes: tuple[Likely, ...] = ()
+    advice: str = ""
     patient: Patient = NOBODY
     organ: Organ = KIDNEY
     structures: Mapping[str, Mesh] = field(default_factory=dict)
+
+    @property
+    def quality(self) -> Quality:
+        """Whether it may be relied on."""
+        return "good" if self.finding is None else "poor"
+
+    @property
+    def reason(self) -> str:
+        """Why it is poor, and what to do, in words; empty: it is good."""
+        return "" if self.finding is None else self.finding.words + self.advice
+
+    @property
+    def organ_mesh(self) -> Mesh:
+        """The organ's surface, tumors included."""
+        return next(iter(self.meshes.values()))
+
+    def reporting(self, **changes: Any) -> Estimate:
+        """The same with these fields of its report."""
+        return replace(self, report=msgspec.structs.replace(self.report, **changes))

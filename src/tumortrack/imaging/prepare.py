@@ -245,11 +245,11 @@ def _from_volume(path: Path, options: PrepareOptions) -> Case:
         if abs(change) > _MOST_CHANGE_PERCENT
     ]
     kind, measured = "label map" if as_labels else "ct", _measured(labels, anatomy, surface)
-    patient = whose(path, stated, options.patient, side)
+    patient = stated_patient(path, stated, options.patient, side)
     return Case(anatomy, labels, up, {"kind": kind, "notes": notes, **measured}, ct, patient)
 
 
-def whose(path: Path, stated: Patient, given: str | None, side: Side) -> Patient:
+def stated_patient(path: Path, stated: Patient, given: str | None, side: Side) -> Patient:
     """Whose organ it is: ``stated`` by the file; ``given`` by the user, instead; on the ``side``
     that was selected or given. InputError where the file says the other side."""
     if stated.differs(Patient(side=side)):

@@ -35,7 +35,7 @@ from tumortrack.imaging.prepare import (
     crop_ct,
     prepare,
     refuse_unused,
-    whose,
+    stated_patient,
 )
 from tumortrack.imaging.volume import read_raw, volume_of
 
@@ -115,7 +115,7 @@ def segmented_case(ct: Path, spec: str, options: PrepareOptions, keep: Path) -> 
     note = f"segmented by {tool.name} {tool.version}, and by nobody else: check it in qc.png"
     notes = [*raw.notes, *case.report["notes"], note]
     report = case.report | {"kind": "segmented ct", "segmentation": about, "notes": notes}
-    patient = whose(ct, raw.patient, options.patient, case.patient.side)
+    patient = stated_patient(ct, raw.patient, options.patient, case.patient.side)
     return replace(case, ct=crop_ct(volume, case.labels), report=report, patient=patient)
 
 

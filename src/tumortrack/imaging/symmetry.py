@@ -49,12 +49,12 @@ def half_turns(anatomy: Anatomy) -> list[HalfTurn]:
     middle, found = points.mean(0), list[HalfTurn]()
     tumors = np.array([tumor.box_mm.mean(0) for tumor in anatomy.tumors]).reshape(-1, 3)
     for axis in np.linalg.svd(points - middle, full_matrices=False)[2]:
-        way, away_mm = _laid_on_itself(points, normals, tree, np.pi * axis)
+        way, away_mm = _symmetric_pose(points, normals, tree, np.pi * axis)
         moved_mm = np.linalg.norm(transform_points(way, tumors) - tumors, axis=1).tolist()
         mean_mm, p90_mm = float(away_mm.mean()), float(np.quantile(away_mm, 0.9))
         quarter = False
         if mean_mm < ALIKE_MM:
-            turned, left_mm = _laid_on_itself(points, normals, tree, np.pi / 2 * axis)
+            turned, left_mm = _symmetric_pose(points, normals, tree, np.pi / 2 * axis)
             # A quarter turn that was undone by laying it on the surface tells nothing.
             angle = Rotation.from_matrix(turned[:3, :3]).magnitude()
             quarter = abs(angle - np.pi / 2) < _STILL_RAD and left_mm.mean() < ALIKE_MM
@@ -63,7 +63,7 @@ def half_turns(anatomy: Anatomy) -> list[HalfTurn]:
     return sorted(found, key=lambda one: one.mean_mm)
 
 
-def _laid_on_itself(
+def _symmetric_pose(
     points: Points, normals: Points, tree: cKDTree, turn_rad: Float64[np.ndarray, " 3"]
 ) -> tuple[Float64[np.ndarray, "4 4"], Float64[np.ndarray, " m"]]:
     """Some of a surface's points, turned about their middle by a rotation vector, then fitted to

@@ -162,7 +162,7 @@ class Cameras:
         views, absent = [CameraView(self._lead + 1, seen, self._places[self._lead])], {}
         for n, place in enumerate(self._places):
             if n != self._lead:
-                got = self._beside(n, seen.stamp_ns)
+                got = self._simultaneous(n, seen.stamp_ns)
                 if isinstance(got, Observation):
                     views.append(CameraView(n + 1, got, place))
                 else:
@@ -177,7 +177,7 @@ class Cameras:
             self._troubles[n] = "" if isinstance(got, Observation) else str(got)
         return got
 
-    def _beside(self, n: int, stamp_ns: int) -> Observation | str:
+    def _simultaneous(self, n: int, stamp_ns: int) -> Observation | str:
         """A camera's frame of about that stamp, or why there is none. It may still be on its way,
         for as long as it may be apart."""
         worker = self.workers[n]

@@ -27,7 +27,7 @@ from tumortrack.live.meter import RunStatistics
 from tumortrack.live.scan import Scan
 from tumortrack.live.stamps import check_age
 from tumortrack.live.values import CameraView, Observation, SourceLost, TrackingResult
-from tumortrack.live.views import Found, ViewsLocator, camera_words, timed
+from tumortrack.live.views import OrganInView, ViewsLocator, camera_words, timed
 from tumortrack.live.workers import SinkWorker, SourceWorker
 from tumortrack.sense.camera import d405
 from tumortrack.sense.files import DepthCorrection
@@ -136,21 +136,21 @@ class Loop:
     def _results(self, source_worker: Cameras) -> Iterator[TrackingResult]:
         began_s = fresh_s = time.monotonic()
         quiet_s = _QUIET * self._config.stale_s
-        ends_s, told_s = math.inf, fresh_s  # by when what is shown came to be
+        ends_s, shown_s = math.inf, fresh_s  # by when what is shown came to be
         while not self._stop.is_set():
-            got = source_worker.take(max(told_s + quiet_s - time.monotonic(), 0.0))
-            now_s = told_s = time.monotonic()
+            got = source_worker.take(max(shown_s + quiet_s - time.monotonic(), 0.0))
+            now_s = shown_s = time.monotonic()
             if isinstance(got, Observation):
                 got = self._calibrated(got)
             if isinstance(got, Observation):
                 fresh_s = now_s
                 if self._config.seconds and ends_s == math.inf:
                     ends_s = now_s + self._config.seconds
-                hurry = source_worker.latency_from != "taking"
-                result = self._answer(got, source_worker.born_ns(got), hurry)
-                told_s = time.monotonic()
-                if hurry and result.estimate is not None and result.latency_ms is not None:
-                    told_s -= result.latency_ms / 1000
+                live_clock = source_worker.latency_from != "taking"
+                result = self._answer(got, source_worker.born_ns(got), live_clock)
+                shown_s = time.monotonic()
+                if live_clock and result.estimate is not None and result.latency_ms is not None:
+                    shown_s -= result.latency_ms / 1000
                 yield result
             elif got is None and source_worker.ended:
                 return
@@ -169,16 +169,16 @@ class Loop:
                     "topic, then start again."
                 )
 
-    def _answer(self, seen: Observation, born_ns: int, hurry: bool) -> TrackingResult:
-        """The result of one frame, which came to be at ``born_ns``. ``hurry``: time goes on while
-        we work, so an answer can come too late."""
+    def _answer(self, seen: Observation, born_ns: int, live_clock: bool) -> TrackingResult:
+        """The result of one frame, which came to be at ``born_ns``. ``live_clock``: time goes
+        on while we work, so an answer can come too late."""
         seconds: dict[str, float] = {}
         organ, estimate, reason, warning = None, None, "", ""
         quality: Quality = "none"
         timely = False
         views: list[CameraView] = []
         absent: dict[int, str] = {}  # cameras that say nothing now, and why
-        found: list[Found] = []
+        found: list[OrganInView] = []
         try:
             # What is simulated has this computer's clock, and so has the moment of arrival.
             other_clock = born_ns == seen.stamp_ns and seen.truth is None
@@ -193,11 +193,11 @@ class Loop:
             organ = found[0][1]
             with timed(seconds, "locate"):
                 estimate = self.views.locate(found)
-            seconds |= {f"locate.{k}": v for k, v in estimate.report["timings"].items()}
+            seconds |= {f"locate.{k}": v for k, v in estimate.report.timings.items()}
             if len(self._cameras.workers) > 1:
-                estimate.report["cameras"] = [view.number for view, _ in found]
+                estimate = estimate.reporting(cameras=tuple(view.number for view, _ in found))
             quality, warning = self._confirmed(estimate, doubt)
-            if hurry and _age_s(born_ns) > self._config.stale_s:
+            if live_clock and _age_s(born_ns) > self._config.stale_s:
                 raise _TooLate(f"the answer came too late: {_age_s(born_ns):.2f} s after the frame")
         except Exception as error:
             estimate, reason, quality, warning = None, str(error), "none", ""

@@ -92,7 +92,7 @@ class RunStatistics:
             self.stages.setdefault(name, Histogram()).add(1000 * stage_s)
         if result.estimate is None:
             return
-        self.cameras.update(map(str, result.estimate.report.get("cameras", ())))
+        self.cameras.update(map(str, result.estimate.report.cameras))
         if result.latency_ms is not None:
             self.latency.add(result.latency_ms)
         if result.observation is None or (truth := result.observation.truth) is None:

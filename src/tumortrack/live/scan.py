@@ -8,7 +8,7 @@ from jaxtyping import Float64
 from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.estimate import Estimate
 from tumortrack.core.geometry import transform_points, unit
-from tumortrack.core.organ import is_tumor
+from tumortrack.core.report import ScanReport
 from tumortrack.core.types import Look, SensorCloud
 from tumortrack.live.values import CameraView
 from tumortrack.tracking.tracker import Tracker
@@ -62,7 +62,7 @@ class Scan:
         if whole.quality != "good":
             raise NoEstimate(f"scan, begun anew: laid together, the looks are poor: {whole.reason}")
         stated_mm = [_least_sure_mm(one) for one in found]
-        whole.report["scan"] = {"center_std_mm": stated_mm}
+        whole = whole.reporting(scan=ScanReport(center_std_mm=tuple(stated_mm)))
         steps = ", then ".join(f"{mm:.1f} mm" for mm in stated_mm)
         self.told = (
             f"scan: the least sure tumor's centre has a standard deviation of {steps}, with one "
@@ -73,6 +73,5 @@ class Scan:
 
 def _least_sure_mm(estimate: Estimate) -> float:
     """One standard deviation of the centre of the tumor, or else the organ, that is least sure."""
-    parts = estimate.report["parts"]
-    names = [name for name in parts if is_tumor(name)] or list(parts)
-    return max(parts[name]["center_std_mm"] for name in names)
+    parts = list((estimate.report.tumors or estimate.report.parts).values())
+    return max(part.center_std_mm or 0.0 for part in parts)

@@ -264,7 +264,7 @@ class TrackingResult:
             return f"none, no estimate: {self.reason}"
         by = self.cameras and f"; {self.cameras}"
         if self.quality == "good":
-            margins = margin_words(self.estimate.report.get("margin"))
+            margins = margin_words(self.estimate.report.margin)
             return f"good: {NO_CHECK_FAILED}; {UNVERIFIED}; {margins}{by}"
         return f"{self.quality}: {self.warning}{by}"
 

@@ -23,7 +23,7 @@ from tumortrack.tracking.tracker import Follower
 
 _PICK_S = 3.0  # without the organ: a pick is forgotten
 
-Found = tuple[CameraView, SensorCloud]  # the organ's points in it
+OrganInView = tuple[CameraView, SensorCloud]  # the organ's points in it
 
 
 class ViewsLocator:
@@ -53,7 +53,7 @@ class ViewsLocator:
 
     def find(
         self, views: list[CameraView], absent: dict[int, str], seconds: dict[str, float]
-    ) -> tuple[list[Found], str]:
+    ) -> tuple[list[OrganInView], str]:
         """The organ in each view, and a doubt about the frames. Where several cameras are, those
         that do not see it become ``absent``, with the reason. Raises NoEstimate: none sees it."""
         self._heed_pick()
@@ -73,7 +73,7 @@ class ViewsLocator:
             raise NoEstimate(camera_words([], absent))
         return found, "; ".join(doubts)
 
-    def locate(self, found: list[Found]) -> Estimate:
+    def locate(self, found: list[OrganInView]) -> Estimate:
         """In the frame of the first view's camera. Raises NoEstimate as ``Follower.locate``."""
         (lead, organ), *more = found
         if self.scan is not None:

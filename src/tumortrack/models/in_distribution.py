@@ -48,7 +48,7 @@ class InDistributionRange(Config, frozen=True):
     fit_mm: float
 
     def __post_init__(self) -> None:
-        self.check_between("familiar", spread_mm=(0.1, 1000), fit_mm=(0, 100))
+        self.check_between("in-distribution range", spread_mm=(0.1, 1000), fit_mm=(0, 100))
 
 
 def spread_mm(points_mm: Points) -> float:

@@ -14,6 +14,8 @@ import msgspec
 from tumortrack.core import store
 from tumortrack.core.config import Config, from_builtins, to_builtins
 from tumortrack.core.errors import ArtifactError, InputError
+from tumortrack.core.organ import is_tumor
+from tumortrack.core.report import Finding, FitReport, MarginReport, StatedMargin
 
 # Raise it with every change by which the same cloud gives another estimate, or another figure of
 # those in ``measured``: margins that were found before are then refused.
@@ -157,25 +159,25 @@ def _digest(content: dict[str, Any]) -> str:
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
-def measured(report: dict[str, Any]) -> dict[str, float]:
+def measured(report: FitReport) -> dict[str, float]:
     """What an estimate's report says of how far it can be trusted; all the larger the worse."""
-    cost, tumors = report.get("fit_cost"), list(report["parts"].values())[1:]
-    unsure = [part["surface_std_mm"] for part in tumors if "surface_std_mm" in part]
+    deviations = [part.surface_std_mm for part in report.tumors.values()]
+    known, cost = [std_mm for std_mm in deviations if std_mm is not None], report.fit_cost
     found = {
-        "fit_cost": cost["now"] / cost["usual"] if cost else None,
-        "rarity": report.get("motion", {}).get("rarity"),
-        "unseen": report.get("unseen"),
-        "seen_through": report.get("seen_through"),
-        "unsure_mm": max(unsure) if unsure else None,
+        "fit_cost": None if cost is None else cost.now / cost.usual,
+        "rarity": None if report.motion is None else report.motion.rarity,
+        "unseen": report.unseen,
+        "seen_through": report.seen_through,
+        "unsure_mm": max(known, default=None),
     }
     return {name: float(value) for name, value in found.items() if value is not None}
 
 
-def figures(report: dict[str, Any], margins: ModelMargins) -> dict[str, float]:
+def figures(report: FitReport, margins: ModelMargins) -> dict[str, float]:
     """What limits are on: ``measured``, and the largest size of a tumor."""
-    tumors = list(report["parts"].values())[1:]
     form = margins.shells[-1].radii["tumor"]
-    return sized(measured(report), [part.get("surface_std_mm") for part in tumors], form)
+    deviations = [part.surface_std_mm for part in report.tumors.values()]
+    return sized(measured(report), deviations, form)
 
 
 def sized(
@@ -188,32 +190,29 @@ def sized(
     return {**found, "size_mm": max(form.size_mm(std_mm, found) for std_mm in known)}
 
 
-def exceeded(limits: dict[str, float], found: dict[str, float]) -> str:
-    """Which limit is exceeded, in words; empty: none."""
+def exceeded(limits: dict[str, float], found: dict[str, float]) -> Finding | None:
+    """Which limit is exceeded."""
     for name, limit in limits.items():
         if not (value := found.get(name, math.inf)) <= limit:
-            return f"{name} is {value:.3g}; margins are known up to {limit:.3g}"
-    return ""
+            return Finding("beyond_margins", {"figure": name, "value": value, "limit": limit})
+    return None
 
 
-def stated_margin(
-    report: dict[str, Any], margins: ModelMargins | None, good: bool
-) -> dict[str, Any]:
-    """The entry ``margin`` of a report: ``stated``, by rising confidence, each with the radii in
-    ``mm`` by part, and ``map`` for any mapped point; or none, and the ``reason``. ``good``: no
-    check failed, and none of the ``limits`` is exceeded."""
-    if "looks" in report:
-        return {"stated": [], "reason": "margins are of single views, not of several"}
+def stated_margin(report: FitReport, margins: ModelMargins | None, good: bool) -> MarginReport:
+    """What the margins say of such an estimate. ``good``: no check failed, and none of the
+    ``limits`` is exceeded."""
+    if report.looks is not None:
+        return MarginReport(reason="margins are of single views, not of several")
     if margins is None:
-        return {"stated": [], "reason": UNKNOWN}
+        return MarginReport(reason=UNKNOWN)
     if not good:
-        return {"stated": [], "reason": "a poor estimate has no margin"}
-    if report.get("smoothing", {}).get("time_s", 0.0) > 0:
-        return {"stated": [], "reason": "margins are of single clouds, not of smoothed motions"}
-    parts, found, stated = report["parts"], measured(report), []
+        return MarginReport(reason="a poor estimate has no margin")
+    if report.smoothing is not None and report.smoothing.time_s > 0:
+        return MarginReport(reason="margins are of single clouds, not of smoothed motions")
+    parts, found, stated = report.parts, measured(report), list[StatedMargin]()
     kinds: dict[str, Kind] = {name: "tumor" for name in parts}
     kinds |= {next(iter(parts)): "organ", "map": "map"}
-    deviations = {name: part.get("surface_std_mm") for name, part in parts.items()}
+    deviations = {name: part.surface_std_mm for name, part in parts.items()}
     deviations["map"] = next(iter(deviations.values()))
     for shells in margins.shells:
         radii = {
@@ -222,8 +221,8 @@ def stated_margin(
             if kind in shells.radii
         }
         known = {name: radius for name, radius in radii.items() if radius is not None}
-        stated.append({"confidence": shells.confidence, "mm": known})
-    return {"stated": stated, "reason": ""}
+        stated.append(StatedMargin(confidence=shells.confidence, mm=known))
+    return MarginReport(stated=tuple(stated))
 
 
 class StatedRadius(msgspec.Struct, frozen=True):
@@ -238,24 +237,23 @@ class StatedRadius(msgspec.Struct, frozen=True):
 
 
 def stated_radius(
-    said: dict[str, Any] | None, name: str, confidence: float | None = None
+    margin: MarginReport | None, name: str, confidence: float | None = None
 ) -> StatedRadius | None:
-    """Of a part, or of ``map``, by the entry ``margin`` of a report, with this or else the highest
-    confidence; None: it states none."""
-    for one in reversed((said or {}).get("stated", [])):
-        if confidence in (None, one["confidence"]) and name in one["mm"]:
-            return StatedRadius(one["confidence"], one["mm"][name])
+    """Of a part, or of ``map``, with this or else the highest confidence; None: none is stated."""
+    for one in reversed(() if margin is None else margin.stated):
+        if confidence in (None, one.confidence) and name in one.mm:
+            return StatedRadius(one.confidence, one.mm[name])
     return None
 
 
-def margin_words(said: dict[str, Any] | None) -> str:
+def margin_words(margin: MarginReport | None) -> str:
     """The tumors' margins for people, or that there are none."""
-    stated = (said or {}).get("stated")
-    if not stated:
-        return f"no margin: {(said or {}).get('reason', UNKNOWN)}"
-    radii = {name: mm for name, mm in stated[-1]["mm"].items() if name.startswith("tumor_")}
+    if margin is None or not margin.stated:
+        return f"no margin: {UNKNOWN if margin is None else margin.reason}"
+    highest = margin.stated[-1]
+    radii = {name: mm for name, mm in highest.mm.items() if is_tumor(name)}
     sizes = ", ".join(f"{name} {mm:.1f} mm" for name, mm in radii.items())
-    return f"{100 * stated[-1]['confidence']:g} % margin: {sizes}"
+    return f"{100 * highest.confidence:g} % margin: {sizes}"
 
 
 def keep_margins(folder: Path, margins: ModelMargins) -> Path:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from jaxtyping import Float
 import tumortrack
 from tumortrack.core.estimate import Estimate
 from tumortrack.core.geometry import Affine, transform_points
+from tumortrack.core.report import FitReport, PartReport, Residuals
 from tumortrack.core.types import Anatomy, CameraLabels, Mesh, OccupancyCloud, SensorCloud
 from tumortrack.imaging.raster import label_grid
 from tumortrack.models.model import Model
@@ -41,21 +43,18 @@ class Frame:
         self.seconds[name] = time.perf_counter() - start
 
     def report(
-        self, distances_mm: Float[np.ndarray, " n"], parts: dict[str, Any], **more: object
-    ) -> dict[str, Any]:
-        """report.json. ``distances_mm``: of the observed points from the estimated surface."""
-        return {
-            **report_head(self.cloud.stamp_ns),
-            "seed": self.seed,
-            "points": len(self.cloud.points_mm),
+        self, distances_mm: Float[np.ndarray, " n"], parts: dict[str, PartReport], **more: Any
+    ) -> FitReport:
+        """``distances_mm``: of the observed points from the estimated surface."""
+        median, p95 = np.percentile(distances_mm, (50, 95)).tolist()
+        return FitReport(
+            seed=self.seed,
+            points=len(self.cloud.points_mm),
+            fit_mm=Residuals(median=median, p95=p95),
+            parts=parts,
+            timings={**self.seconds, "total": sum(self.seconds.values())},
             **more,
-            "fit_mm": {
-                "median": float(np.median(distances_mm)),
-                "p95": float(np.percentile(distances_mm, 95)),
-            },
-            "parts": parts,
-            "timings": {**self.seconds, "total": sum(self.seconds.values())},
-        }
+        )
 
 
 def report_head(stamp_ns: int) -> dict[str, Any]:
@@ -79,35 +78,41 @@ def grid_over(points_mm: np.ndarray, grid: int) -> tuple[Affine, tuple[int, int,
 
 
 def describe_parts(
-    names: tuple[str, ...], meshes: dict[str, Mesh], inside: OccupancyCloud
-) -> dict[str, dict[str, Any]]:
-    """Per part: volume, centre, box and how sure the labels inside it are (JSON types). The
-    organ's numbers are those of the whole organ, tumors included."""
-    parts: dict[str, dict[str, Any]] = {}
+    names: tuple[str, ...],
+    meshes: dict[str, Mesh],
+    inside: OccupancyCloud,
+    deviations: Mapping[str, Mapping[str, Any]] = MappingProxyType({}),
+) -> dict[str, PartReport]:
+    """Per part: volume, centre, box, how sure the labels inside it are, and its ``deviations``
+    (fields of ``PartReport``). The organ's numbers are the whole organ's, tumors included."""
+    parts: dict[str, PartReport] = {}
     counts = np.bincount(inside.labels, minlength=len(names) + 1)
     sums = np.bincount(inside.labels, inside.probability, len(names) + 1)
     for n, name in enumerate(names):
-        parts[name] = {"label": n + 1, "found": name in meshes}
         if name not in meshes:
+            parts[name] = PartReport(label=n + 1, found=False)
             continue
         mesh, mine = meshes[name], slice(1, None) if n == 0 else n + 1
         points = int(counts[mine].sum())
-        parts[name] |= {
-            "volume_ml": mesh.volume_ml,
-            "center_mm": mesh.box_mm.mean(0).tolist(),
-            "box_mm": mesh.box_mm.tolist(),
-            "points": points,
-            "probability": float(sums[mine].sum() / points) if points else None,
-        }
+        parts[name] = PartReport(
+            label=n + 1,
+            found=True,
+            volume_ml=mesh.volume_ml,
+            center_mm=mesh.box_mm.mean(0).tolist(),
+            box_mm=mesh.box_mm.tolist(),
+            points=points,
+            probability=float(sums[mine].sum() / points) if points else None,
+            **deviations.get(name, {}),
+        )
     return parts
 
 
 def estimate_of(
-    meshes: dict[str, Mesh], grid: int = 160, stamp_ns: int = 0, **report: object
+    meshes: dict[str, Mesh], grid: int = 160, stamp_ns: int = 0, **report: Any
 ) -> Estimate:
     """Surfaces of any method (camera frame, mm) as an estimate: labels are voxelised from them,
     ``grid`` voxels along the longest side; points are evenly chosen voxels with probability 1.
-    ``report``: further entries of the estimate's report."""
+    ``report``: further fields of the estimate's report."""
     anatomy = Anatomy(tuple(meshes.values()))
     camera_from_index, shape = grid_over(anatomy.organ.vertices_mm, grid)
     labels = label_grid(anatomy, camera_from_index, shape)
@@ -117,5 +122,5 @@ def estimate_of(
     points_mm = transform_points(camera_from_index, index)
     inside = OccupancyCloud(points_mm, labels.reshape(-1)[voxels], np.ones(len(voxels)), stamp_ns)
     parts = describe_parts(tuple(meshes), meshes, inside)
-    about = {**report_head(stamp_ns), "voxel_mm": float(camera_from_index[0, 0]), "parts": parts}
-    return Estimate(inside, CameraLabels(labels, camera_from_index), meshes, {**about, **report})
+    about = FitReport(voxel_mm=float(camera_from_index[0, 0]), parts=parts, **report)
+    return Estimate(inside, CameraLabels(labels, camera_from_index), meshes, about)

@@ -92,7 +92,7 @@ def filled_up(queries: Tensor) -> Tensor:
     return torch.cat([queries, queries[:, -1:].expand(-1, full - n, -1)], 1) if n else queries
 
 
-def _laid_out(weight: Tensor, rows: int, dtype: torch.dtype) -> Tensor:
+def _memory_layout(weight: Tensor, rows: int, dtype: torch.dtype) -> Tensor:
     """Weights (out, in) laid out for ``rows`` of x at once; any other number works too."""
     held = weight.detach().to(dtype).contiguous()
     out: Tensor = torch.ops.mkldnn._reorder_linear_weight(held, rows)
@@ -111,7 +111,10 @@ class PackedLayer(nn.Module):
     def __init__(self, layer: Layer) -> None:
         super().__init__()
         weight = layer.linear.weight
-        self._weight, self._bias = _laid_out(weight, _ENCODER_ROWS, weight.dtype), layer.linear.bias
+        self._weight, self._bias = (
+            _memory_layout(weight, _ENCODER_ROWS, weight.dtype),
+            layer.linear.bias,
+        )
 
     def forward(self, x: Tensor) -> Tensor:
         return _linear(x.flatten(0, -2), self._weight, self._bias, "relu").view(*x.shape[:-1], -1)
@@ -142,14 +145,14 @@ class PackedDecoder(MlpDecoder):
         n_hidden = 0
         for layer in self.hidden_layers():
             weight, size = layer.linear.weight, self.query_size
-            of_hidden = _laid_out(weight[:, :n_hidden], rows, dtype) if n_hidden else None
+            of_hidden = _memory_layout(weight[:, :n_hidden], rows, dtype) if n_hidden else None
             of_query = None
             if weight.shape[1] > n_hidden:
                 columns = weight[:, n_hidden : n_hidden + size]
-                of_query = _laid_out(torch.cat([columns, columns[:, :3]], 1), rows, dtype)
+                of_query = _memory_layout(torch.cat([columns, columns[:, :3]], 1), rows, dtype)
             self._packed.append((of_hidden, of_query, layer.linear.bias.to(dtype)))
             n_hidden = len(weight)
-        self._output = _laid_out(self.output.weight, rows, dtype), self.output.bias.to(dtype)
+        self._output = _memory_layout(self.output.weight, rows, dtype), self.output.bias.to(dtype)
 
     def cast(self, terms: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
         """``prepare``'s terms as ``forward`` takes them."""

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float32
 
 from tumortrack.core.errors import InputError, NoEstimate
-from tumortrack.core.estimate import Estimate, Following
+from tumortrack.core.estimate import Estimate, FollowOptions
 from tumortrack.core.types import Anatomy, CameraLabels, Look, OccupancyCloud, SensorCloud
 from tumortrack.models.in_distribution import check_in_distribution
 from tumortrack.models.report import Frame, Rng, describe_parts, grid_over
@@ -55,7 +55,11 @@ class OccupancyLocator:
         return frame.estimate(distances_mm, inside, margins, labels, camera_from_index)
 
     def follow(
-        self, cloud: SensorCloud, last: Estimate | None, how: Following, others: Sequence[Look] = ()
+        self,
+        cloud: SensorCloud,
+        last: Estimate | None,
+        how: FollowOptions,
+        others: Sequence[Look] = (),
     ) -> Estimate:
         """See ``tracking.tracker.Tracker.follow``. The enlarged box of the last organ replaces the
         coarse queries, and its lattice is queried only where the organ is (``organ_lattice``).

@@ -78,7 +78,7 @@ def products(
     return (rows.reshape(-1, len(middle)) @ middle).reshape(rows.shape) @ rows.transpose(0, 2, 1)
 
 
-def judge(
+def fit_discrepancy(
     rows: Float32[np.ndarray, "n q"],
     rest_ct: Float64[np.ndarray, "n 3"],
     prior: Float64[np.ndarray, "p p"],

@@ -25,7 +25,7 @@ from scipy.linalg import block_diag
 from tumortrack.core.geometry import Points
 from tumortrack.models.config import GaussNewtonConfig
 from tumortrack.registration import gauss_newton_kernels as kernels
-from tumortrack.registration.discrepancy import FARTHEST, judge
+from tumortrack.registration.discrepancy import FARTHEST, fit_discrepancy
 from tumortrack.registration.kernels import POSE
 from tumortrack.registration.looks import Looks
 from tumortrack.registration.motion import ElasticMotion
@@ -41,7 +41,7 @@ class RegistrationResult:
     ``cost_without_strays``: if all lay as the others do. ``moved``: shift (mm) and turn (rad) from
     where the prior has the pose. ``rivals``: other minima that explain the points nearly as well;
     ``beyond``: one that explains them better, in a pose that is excluded (see
-    ``registration.Registration.best_of``)."""
+    ``registration.Registration.likeliest``)."""
 
     motion: ElasticMotion
     cost: float
@@ -160,7 +160,9 @@ def posterior(motion: ElasticMotion, looks: Looks, config: GaussNewtonConfig) ->
     slopes, distances = rows[:, :-1], rows[:, -1:]
     rows = np.concatenate([slopes, looks.unknown(slopes), distances], axis=1)
     rest_ct = motion.back(looks.points_mm)
-    covariance, process = judge(rows, rest_ct, prior, -np.concatenate(from_mean), config.last_mm)
+    covariance, process = fit_discrepancy(
+        rows, rest_ct, prior, -np.concatenate(from_mean), config.last_mm
+    )
     process = replace(process, cross=process.cross[:unknowns])
     return replace(motion, covariance=covariance[:unknowns, :unknowns], discrepancy=process)
 

@@ -12,7 +12,17 @@ import numpy as np
 from jaxtyping import Float, Float32, Int32, Int64, UInt8
 from scipy.spatial import cKDTree
 
-from tumortrack.core.estimate import Estimate, Following
+from tumortrack.core.estimate import Estimate, FollowOptions
+from tumortrack.core.report import (
+    AllowedPoses,
+    ExcludedFit,
+    FitCost,
+    FitReport,
+    MotionReport,
+    RivalFit,
+    SizeFit,
+    SmoothingReport,
+)
 from tumortrack.core.types import Anatomy, CameraLabels, Look, Mesh, OccupancyCloud, SensorCloud
 from tumortrack.imaging.raster import label_grid
 from tumortrack.models.in_distribution import check_in_distribution, check_likely
@@ -114,16 +124,18 @@ class RegistrationLocator:
             camera_from_index, shape = grid_over(organ.vertices_mm, grid)
             labels = label_grid(Anatomy(tuple(placed.meshes.values())), camera_from_index, shape)
         voxel_mm = float(camera_from_index[0, 0])
-        report = self._report(
-            frame, placed, inside, self._registration.prior, size=size, voxel_mm=voxel_mm
-        )
-        self._add_looks(report, looks, fit, others)
+        prior, more = self._registration.prior, {"size": size, "voxel_mm": voxel_mm}
+        report = self._report(frame, placed, inside, prior, looks, others, **more)
         volume = CameraLabels(labels, camera_from_index)
         made = Estimate(inside, volume, placed.meshes, report, placed.motion)
         return replace(made, structures=placed.structures)
 
     def follow(
-        self, cloud: SensorCloud, last: Estimate | None, how: Following, others: Sequence[Look] = ()
+        self,
+        cloud: SensorCloud,
+        last: Estimate | None,
+        how: FollowOptions,
+        others: Sequence[Look] = (),
     ) -> Estimate:
         """See ``tracking.tracker.Tracker.follow``."""
         rng = np.random.default_rng((how.seed, cloud.stamp_ns))
@@ -137,14 +149,14 @@ class RegistrationLocator:
                 starts = [start, *(rival for rival, _ in start.rivals)]
                 found += [self._registration.follow(looks, one, self._near) for one in starts]
         method = self._turned_over if how.either_side else self._registration
-        best, doubted = method.best_laid(found) if found else None, True
+        best, doubted = method.likeliest_corrected(found) if found else None, True
         if best is not None and isinstance(start, ElasticMotion):
             motion = best[0].motion
             doubted = best[0].cost > usual or apart_mm(motion, start) > _JUMP_MM
             # From one frame to the next nobody turns an organ over.
             if not doubted and not self._registration.prior.excludes(motion.rotation):
                 method = self._registration
-                best = method.best_laid(found)
+                best = method.likeliest_corrected(found)
         if doubted or how.thorough:
             best = method.register(looks, best, frame.stage, again=not doubted)
         assert best is not None
@@ -161,9 +173,9 @@ class RegistrationLocator:
         placed = self._checked(looks, fit, frame)
         with frame.stage("carry"):
             inside = self._carry(placed, cloud.stamp_ns)
-        smoothing = {"time_s": how.smoothing_s, "lag_ms": 1000 * lag_s}
-        report = self._report(frame, placed, inside, method.prior, size=size, smoothing=smoothing)
-        self._add_looks(report, looks, fit, others)
+        smoothing = SmoothingReport(time_s=how.smoothing_s, lag_ms=1000 * lag_s)
+        more = {"size": size, "smoothing": smoothing}
+        report = self._report(frame, placed, inside, method.prior, looks, others, **more)
         made = Estimate(inside, None, placed.meshes, report, placed.motion, unsmoothed)
         return replace(made, structures=placed.structures)
 
@@ -172,19 +184,6 @@ class RegistrationLocator:
         more = [Frame(self._model, one.cloud, frame.seed, frame.rng) for one in others]
         points_mm = [one.points_mm[::every] for one in (frame, *more)]
         return Looks.of(points_mm, [one.camera_from_look for one in others])
-
-    def _add_looks(
-        self, report: dict[str, Any], looks: Looks, fit: RegistrationResult, others: Sequence[Look]
-    ) -> None:
-        """What several looks change in a report."""
-        if not others:
-            return
-        report["looks"] = looks.described()
-        report["points"] += sum(len(one.cloud.points_mm) for one in others)
-        costs, far_mm = report["fit_cost"], FARTHEST * self._registration.config.last_mm
-        costs["usual"] *= looks.count
-        far = np.abs(fit.distances_mm) > far_mm
-        costs["strays"] = max(float(far[looks.look == n].mean()) for n in range(looks.count))
 
     def warm(self) -> None:
         """See ``tracking.tracker.Tracker.warm``."""
@@ -196,9 +195,9 @@ class RegistrationLocator:
         fit = self._registration.best_fit(points, [*self._registration.search.starts(looks), rest])
         self._carry(self._moved(looks, fit), 0)
 
-    def _size(self, looks: Looks, fit: RegistrationResult) -> dict[str, float]:
+    def _size(self, looks: Looks, fit: RegistrationResult) -> SizeFit:
         times, gain = size_of(fit, looks, self._registration.config)
-        return {"times": times, "gain": gain}
+        return SizeFit(times=times, gain=gain)
 
     def _checked(self, looks: Looks, fit: RegistrationResult, frame: Frame) -> _Registered:
         """What a fit says, if it can be this organ's."""
@@ -237,41 +236,65 @@ class RegistrationLocator:
         placed: _Registered,
         inside: OccupancyCloud,
         prior: PosePrior,
+        looks: Looks,
+        others: Sequence[Look],
         **more: Any,
-    ) -> dict[str, Any]:
+    ) -> FitReport:
         fit, motion, process = placed.fit, placed.motion, placed.motion.discrepancy
-        if placed.structures:
-            more["structures"] = list(placed.structures)
-        parts = describe_parts(self._model.parts, placed.meshes, inside)
-        surfaces = np.split(placed.sample_mm2, self._sample_ends)
-        for part, mm2, its_mm2 in zip(parts.values(), placed.middle_mm2, surfaces, strict=True):
-            squares, axes = np.linalg.eigh(mm2)
-            part["center_std_mm"] = float(np.sqrt(squares.mean()))
-            part["center_axes_std_mm"] = np.sqrt(squares[::-1]).tolist()
-            part["center_axes"] = axes.T[::-1].tolist()
-            part["surface_std_mm"] = float(np.sqrt(np.linalg.eigvalsh(its_mm2).max()))
-        others = [
-            {"more": rival.cost - fit.cost, "apart_mm": self._apart_mm(fit.motion, rival.motion)}
-            for rival in fit.rivals
-        ]
-        usual = self._calibration.usual_cost
-        costs = {"now": fit.cost, "without_strays": fit.cost_without_strays, "usual": usual}
-        more["fit_cost"] = {**costs, "strays": fit.strays, "others": others}
-        more["fit_cost"]["beyond"] = _beyond(fit, prior)
-        more["poses"] = {  # that were allowed
-            "up_lps": prior.up_ct.tolist(),
-            "tilt_degrees": prior.tilt_degrees,
-            "either_side": prior.either_side,
-        }
-        more["motion"] = {
-            "camera_from_ct": motion.camera_from_ct.tolist(),
-            "coefficients": motion.coefficients.tolist(),
-            "rarity": motion.rarity,
-            "steps": fit.steps,
-            "discrepancy_mm": None if process is None else process.amplitude_mm,
-            "noise_mm": None if process is None else process.noise_mm,
-        }
-        return frame.report(np.abs(fit.distances_mm), parts, **more)
+        surfaces, deviations = np.split(placed.sample_mm2, self._sample_ends), {}
+        named = zip(self._model.parts, placed.middle_mm2, surfaces, strict=True)
+        for name, middle_mm2, surface_mm2 in named:
+            squares, axes = np.linalg.eigh(middle_mm2)
+            deviations[name] = {
+                "center_std_mm": float(np.sqrt(squares.mean())),
+                "center_axes_std_mm": np.sqrt(squares[::-1]).tolist(),
+                "center_axes": axes.T[::-1].tolist(),
+                "surface_std_mm": float(np.sqrt(np.linalg.eigvalsh(surface_mm2).max())),
+            }
+        parts = describe_parts(self._model.parts, placed.meshes, inside, deviations)
+        poses = AllowedPoses(
+            up_lps=prior.up_ct.tolist(),
+            tilt_degrees=prior.tilt_degrees,
+            either_side=prior.either_side,
+        )
+        about = MotionReport(
+            camera_from_ct=motion.camera_from_ct.tolist(),
+            coefficients=motion.coefficients.tolist(),
+            rarity=motion.rarity,
+            steps=fit.steps,
+            discrepancy_mm=None if process is None else process.amplitude_mm,
+            noise_mm=None if process is None else process.noise_mm,
+        )
+        report = frame.report(
+            np.abs(fit.distances_mm),
+            parts,
+            structures=tuple(placed.structures),
+            fit_cost=self._cost(fit, looks, prior),
+            poses=poses,
+            motion=about,
+            looks=looks.described() if others else None,
+            **more,
+        )
+        points = report.points + sum(len(one.cloud.points_mm) for one in others)
+        return msgspec.structs.replace(report, points=points)
+
+    def _cost(self, fit: RegistrationResult, looks: Looks, prior: PosePrior) -> FitCost:
+        """Of several looks the one with most strays counts."""
+        strays, others = fit.strays, []
+        if looks.count > 1:
+            far = np.abs(fit.distances_mm) > FARTHEST * self._registration.config.last_mm
+            strays = max(float(far[looks.look == n].mean()) for n in range(looks.count))
+        for rival in fit.rivals:
+            apart_mm = self._apart_mm(fit.motion, rival.motion)
+            others.append(RivalFit(more=rival.cost - fit.cost, apart_mm=apart_mm))
+        return FitCost(
+            now=fit.cost,
+            without_strays=fit.cost_without_strays,
+            usual=self._calibration.usual_cost * looks.count,
+            strays=strays,
+            others=tuple(others),
+            beyond=_excluded(fit, prior),
+        )
 
     def _apart_mm(self, motion: ElasticMotion, rival: ElasticMotion) -> dict[str, float]:
         """How far from each other the middles of the parts lie."""
@@ -316,11 +339,11 @@ class RegistrationLocator:
         return inside, _OrganPoints(mine, labels[inside], margin_mm[inside], sample)
 
 
-def _beyond(fit: RegistrationResult, prior: PosePrior) -> dict[str, float] | None:
+def _excluded(fit: RegistrationResult, prior: PosePrior) -> ExcludedFit | None:
     """A pose on the other side that explains the points as well, or better in one that is excluded;
     or that was found all the same."""
     other = fit if prior.excludes(fit.motion.rotation) else fit.beyond
     if other is None:
         return None
     tilt_degrees = float(prior.tilt_degrees_of(other.motion.rotation))
-    return {"less": fit.cost - other.cost, "tilt_degrees": tilt_degrees}
+    return ExcludedFit(less=fit.cost - other.cost, tilt_degrees=tilt_degrees)

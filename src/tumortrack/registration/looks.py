@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import msgspec
 import numpy as np
@@ -17,6 +16,7 @@ from jaxtyping import Float, Float64, Int64
 from scipy.spatial.transform import Rotation
 
 from tumortrack.core.geometry import Affine, Points, rigid, transform_points
+from tumortrack.core.report import LooksReport
 from tumortrack.models.config import GaussNewtonConfig
 from tumortrack.registration.kernels import POSE
 from tumortrack.registration.motion import ElasticMotion
@@ -65,14 +65,14 @@ class Looks:
         """Of the cameras' errors: their squared Mahalanobis distance."""
         return float(((self.shifts / CAMERA_STD) ** 2).sum())
 
-    def described(self) -> dict[str, Any]:
+    def described(self) -> LooksReport:
         """For a report: where the cameras were found, and how far from where they were said to be,
         as the organ's centre shows it."""
-        return {
-            "camera_from_look": [pose.tolist() for pose in self.camera_from_look],
-            "shift_mm": np.linalg.norm(self.shifts[:, :3], axis=1).tolist(),
-            "turn_degrees": np.rad2deg(np.linalg.norm(self.shifts[:, 3:], axis=1)).tolist(),
-        }
+        return LooksReport(
+            camera_from_look=tuple(pose.tolist() for pose in self.camera_from_look),
+            shift_mm=np.linalg.norm(self.shifts[:, :3], axis=1).tolist(),
+            turn_degrees=np.rad2deg(np.linalg.norm(self.shifts[:, 3:], axis=1)).tolist(),
+        )
 
     def weighed(self, config: GaussNewtonConfig) -> GaussNewtonConfig:
         """As much is known of the organ by each look as by one."""

@@ -37,12 +37,12 @@ from tumortrack.registration.rest_shape import RestShape
 from tumortrack.registration.search import APART_MM, PosePrior, Search, apart_mm
 
 Timer = Callable[[str], AbstractContextManager[object]]
-Laid = tuple[RegistrationResult, Looks]  # a fit, with the further cameras where it has them
+CorrectedFit = tuple[RegistrationResult, Looks]  # a fit, with the further cameras where it has them
 
 # Standard deviations to both sides. Of 1,200 first looks at a moving phantom, by the training's own
 # physics, some 4 in 100 were 3 to 7 mm off without such starts, 6 with starts at 3 deviations, and
 # none at 4.5 or 6.
-_BESIDE = 4.5
+_TURNED_STDS = 4.5
 
 # On 840 clouds of four organs (drags, elastic states, the digital twin's) the eventual winner's
 # cost after six steps was at most 2.5 times the least (turned starts: twice). Two thirds of the
@@ -77,10 +77,10 @@ class Registration:
     def register(
         self,
         looks: Looks,
-        known: Laid | None = None,
+        known: CorrectedFit | None = None,
         timed: Timer = nullcontext,
         again: bool = False,
-    ) -> Laid:
+    ) -> CorrectedFit:
         """The whole method for one or several looks at a still organ; and the looks as the further
         cameras are corrected then. ``known``: a fit of these looks, which is kept if it is best;
         ``again``: which there is no reason to doubt, see ``Search.starts``.
@@ -93,13 +93,13 @@ class Registration:
             if looks.count == 1:
                 return fit, looks
             # Each with its own places of the cameras.
-            every = [self._laid(looks, one) for one in (fit, *fit.others)]
-            return self.best_laid(every if known is None else [known, *every])
+            every = [self._correct_cameras(looks, one) for one in (fit, *fit.others)]
+            return self.likeliest_corrected(every if known is None else [known, *every])
 
-    def follow(self, looks: Looks, start: ElasticMotion, config: GaussNewtonConfig) -> Laid:
+    def follow(self, looks: Looks, start: ElasticMotion, config: GaussNewtonConfig) -> CorrectedFit:
         """The fit near a motion, and the looks as the further cameras are corrected then."""
         fit = refine(self.rest, looks.points_mm, start, looks.weighed(config))
-        return self._laid(looks, fit)
+        return self._correct_cameras(looks, fit)
 
     def best_fit(
         self,
@@ -111,16 +111,16 @@ class Registration:
         one that was found before."""
         fits = [] if known is None else [known]
         new = [one for one in starts if all(apart_mm(one, fit.motion) > APART_MM for fit in fits)]
-        fits += self._race(points_mm, [(one, None) for one in new], fits)
-        beside = _beside(min(fits, key=self._unlikely))
-        return self.best_of(fits + self._race(points_mm, beside, fits))
+        fits += self._refine_promising(points_mm, [(one, None) for one in new], fits)
+        turned = _turned_starts(min(fits, key=self._cost_with_prior))
+        return self.likeliest(fits + self._refine_promising(points_mm, turned, fits))
 
-    def best_laid(self, found: list[Laid]) -> Laid:
-        """``best_of`` the fits, and its looks."""
-        looks = min(found, key=lambda laid: self._unlikely(laid[0]))[1]
-        return self.best_of([fit for fit, _ in found]), looks
+    def likeliest_corrected(self, found: list[CorrectedFit]) -> CorrectedFit:
+        """``likeliest`` the fits, and its looks."""
+        looks = min(found, key=lambda one: self._cost_with_prior(one[0]))[1]
+        return self.likeliest([fit for fit, _ in found]), looks
 
-    def best_of(self, fits: list[RegistrationResult]) -> RegistrationResult:
+    def likeliest(self, fits: list[RegistrationResult]) -> RegistrationResult:
         """The likeliest of these fits and their others, by cost and prior of the pose.
 
         Its rivals are those that are less likely by ``RIVAL_COST`` at most and put the middle of a
@@ -130,22 +130,22 @@ class Registration:
         best one that is not: only where that costs far more is it sure that it was.
         """
         every = [one for fit in fits for one in (fit, *fit.others)]
-        first, *others = sorted(every, key=self._unlikely)
-        least, kept = self._unlikely(first), [first]
+        first, *others = sorted(every, key=self._cost_with_prior)
+        least, kept = self._cost_with_prior(first), [first]
         for other in others:
-            if self._unlikely(other) - least > RIVAL_COST:
+            if self._cost_with_prior(other) - least > RIVAL_COST:
                 break
-            if all(_elsewhere(other.motion, one.motion) for one in kept):
+            if all(_is_distinct(other.motion, one.motion) for one in kept):
                 kept.append(other)
-        better = self._on_the_other_side(first, every)
-        odds = [math.exp((least - self._unlikely(one)) / 2) for one in kept]
+        better = self._better_on_other_side(first, every)
+        odds = [math.exp((least - self._cost_with_prior(one)) / 2) for one in kept]
         shares = [one / sum(odds) for one in odds]
         rivals = tuple(zip((one.motion for one in kept[1:]), shares[1:], strict=True))
         rivals += () if better is None else ((better.motion, 0.0),)
         motion = replace(first.motion, rivals=rivals)
         return replace(first, motion=motion, rivals=tuple(kept[1:]), beyond=better)
 
-    def _on_the_other_side(
+    def _better_on_other_side(
         self, first: RegistrationResult, every: list[RegistrationResult]
     ) -> RegistrationResult | None:
         """What speaks against the side on which a fit lies."""
@@ -156,11 +156,11 @@ class Registration:
         most = first.cost * (_TURNED_RATIO if turned else 1.0)
         return best if best is not None and best.cost < most else None
 
-    def _unlikely(self, fit: RegistrationResult) -> float:
+    def _cost_with_prior(self, fit: RegistrationResult) -> float:
         """-2 log of a fit's probability, up to a constant."""
         return fit.cost + float(self.prior.cost(fit.motion.rotation))
 
-    def _laid(self, looks: Looks, fit: RegistrationResult) -> Laid:
+    def _correct_cameras(self, looks: Looks, fit: RegistrationResult) -> CorrectedFit:
         """Further cameras and the motion in turns, from a fit with the cameras as stated."""
         if looks.count == 1:
             return fit, looks
@@ -171,7 +171,7 @@ class Registration:
         costs = fit.cost + looks.cost, fit.cost_without_strays + looks.cost
         return replace(fit, cost=costs[0], cost_without_strays=costs[1]), looks
 
-    def _race(
+    def _refine_promising(
         self,
         points_mm: Points,
         starts: Sequence[tuple[ElasticMotion, Float64[np.ndarray, " 6"] | None]],
@@ -196,7 +196,7 @@ class Registration:
         return [descent.result() for descent in left]
 
 
-def _elsewhere(other: ElasticMotion, motion: ElasticMotion) -> bool:
+def _is_distinct(other: ElasticMotion, motion: ElasticMotion) -> bool:
     """Whether it puts the middle of a part outside the ellipsoid that holds 95 % of the other's
     covariance."""
     bent = np.abs(other.coefficients - motion.coefficients).max()
@@ -209,7 +209,9 @@ def _elsewhere(other: ElasticMotion, motion: ElasticMotion) -> bool:
     return bool((np.linalg.solve(known, away[..., None])[..., 0] * away).sum(1).max() > _WITHIN)
 
 
-def _beside(fit: RegistrationResult) -> list[tuple[ElasticMotion, Float64[np.ndarray, " 6"]]]:
+def _turned_starts(
+    fit: RegistrationResult,
+) -> list[tuple[ElasticMotion, Float64[np.ndarray, " 6"]]]:
     """Turned both ways about each principal axis of the turn's covariance; shift and coefficients
     follow as they are correlated with the turn. With how far each has moved in all."""
     fitted, covariance = fit.motion, fit.motion.covariance
@@ -217,7 +219,7 @@ def _beside(fit: RegistrationResult) -> list[tuple[ElasticMotion, Float64[np.nda
     variances, axes = np.linalg.eigh(covariance[3:6, 3:6])
     starts = []
     for variance, axis in zip(variances, axes.T, strict=True):
-        for far in (_BESIDE, -_BESIDE):
+        for far in (_TURNED_STDS, -_TURNED_STDS):
             # The conditional mean, given a turn by so many deviations about this axis.
             off = covariance[:, 3:6] @ axis * far / math.sqrt(variance)
             start = replace(

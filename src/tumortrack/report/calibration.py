@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from itertools import product
 from operator import itemgetter
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import TYPE_CHECKING, Literal, get_args
 
 import numpy as np
 from jaxtyping import Float
@@ -111,12 +111,11 @@ def row_of(tracker: Tracker, scene: Scene, listed: Listed, seed: int) -> Row:
         return replace(row, doubt=str(error))
     if estimate.quality != "good":
         return replace(row, doubt=estimate.reason)
-    parts: dict[str, Any] = estimate.report["parts"]
     if scene.depth is not None:  # which says nothing of what lies where the cloud has no points
         organ = estimate.meshes[scene.reference.names[0]]
-        estimate.report["unseen"] = cloud_shares(organ, scene.cloud)[1]
+        estimate = estimate.reporting(unseen=cloud_shares(organ, scene.cloud)[1])
     misses: dict[Kind, list[Miss]] = {}
-    unsure = {name: part.get("surface_std_mm") for name, part in parts.items()}
+    unsure = {name: part.surface_std_mm for name, part in estimate.report.parts.items()}
     for n, (name, truth) in enumerate(
         zip(scene.reference.names, scene.reference.parts, strict=True)
     ):

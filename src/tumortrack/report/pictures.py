@@ -153,16 +153,15 @@ def qc_picture(
     ct: Volume | None,
     anatomy: Anatomy,
     path: Path,
-    whose: str = "",
+    patient: str = "",
     warnings: Sequence[str] = (),
 ) -> None:
     """Orthogonal slices with outlines, a row through each tumor, and a 3-D view: is everything
     outlined, and on the right side?
 
     All in the patient's frame (LPS, mm). The labels are shown as grey where there is no CT. Of
-    more than six tumors the six largest have rows. ``whose``: stands in the title; the ``warnings``
-    over it. The PNG is
-    written atomically.
+    more than six tumors the six largest have rows. ``patient``: stands in the title; the
+    ``warnings`` over it. The PNG is written atomically.
     """
     order = sorted(range(len(anatomy.tumors)), key=lambda n: -abs(anatomy.tumors[n].volume_mm3))
     rows = {anatomy.names[n + 1]: anatomy.tumors[n] for n in sorted(order[:_MOST_ROWS])}
@@ -192,7 +191,7 @@ def qc_picture(
     what = "CT" if ct is not None else "label map"
     dropped = len(order) > _MOST_ROWS
     more = f" (slices through the {_MOST_ROWS} largest of {len(order)} tumors)" if dropped else ""
-    title = f"Prepared case over its {what}{more}" + (f": {whose}" if whose else "")
+    title = f"Prepared case over its {what}{more}" + (f": {patient}" if patient else "")
     handles = [
         Patch(facecolor=color, label=f"{name.replace('_', ' ')} {part.volume_ml:.1f} ml")
         for color, name, part in zip(colors, anatomy.names, anatomy.parts, strict=True)

@@ -119,7 +119,7 @@ def evaluate_scene(
         "quality": estimate.quality,
         "reason": estimate.reason,
         "seconds": seconds,
-        "timings": estimate.report.get("timings", {}),
+        "timings": estimate.report.timings,
         "failed": failure(parts),
     }
     if estimate.motion is not None and scene.targets is not None:

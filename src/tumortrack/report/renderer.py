@@ -17,7 +17,7 @@ from PIL import Image
 from tumortrack.core.colours import Colour
 from tumortrack.core.geometry import transform_points, triangles_of
 from tumortrack.core.types import Mesh
-from tumortrack.report.renderer_kernels import Triangles, nearest, shade
+from tumortrack.report.renderer_kernels import Triangles, mean_normals, nearest, shade
 
 _SHARPER = 2  # pixels drawn per pixel shown, each way: smooth edges
 _CREASE_RAD = np.radians(40.0)  # faces that meet at a sharper angle keep their edge
@@ -239,19 +239,13 @@ def corner_normals(mesh: Mesh) -> Float32[np.ndarray, "f 3 3"]:
     if (known := _NORMALS.get(mesh)) is not None:
         return known
     place = np.unique(mesh.vertices_mm, axis=0, return_inverse=True)[1].reshape(-1)[mesh.faces]
-    corner, face = place.ravel(), np.repeat(np.arange(len(mesh.faces)), 3)
+    corner = place.ravel()
     weighted = triangles_of(mesh.vertices_mm, mesh.faces)[1]
     facing = weighted / np.maximum(np.linalg.norm(weighted, axis=1, keepdims=True), 1e-12)
-    # Each corner beside every face about the same place.
-    order, count = np.argsort(corner, kind="stable"), np.bincount(corner)
-    mine = np.repeat(np.arange(len(corner)), count[corner])
-    first = (np.cumsum(count) - count)[corner]
-    step = np.arange(len(mine)) - np.repeat(np.cumsum(count[corner]) - count[corner], count[corner])
-    beside = face[order][first[mine] + step]
-    smooth = (facing[beside] * facing[face[mine]]).sum(1) > np.cos(_CREASE_RAD)
-    each = [np.bincount(mine, smooth * weighted[beside, n], len(corner)) for n in range(3)]
-    summed = np.stack(each, axis=1).reshape(-1, 3, 3).astype(np.float32)
-    normals = summed / np.maximum(np.linalg.norm(summed, axis=2, keepdims=True), 1e-12)
+    # The faces about place p are sharers[first[p] : first[p + 1]].
+    sharers = np.argsort(corner, kind="stable") // 3
+    first = np.append(0, np.cumsum(np.bincount(corner)))
+    normals = mean_normals(corner, sharers, first, weighted, facing, np.cos(_CREASE_RAD))
     _NORMALS[mesh] = normals
     return normals
 

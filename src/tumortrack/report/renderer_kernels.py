@@ -19,6 +19,31 @@ class Triangles(NamedTuple):
 
 
 @numba.njit(cache=True, nogil=True)
+def _dot(one, two):  # type: ignore[no-untyped-def]
+    return one[0] * two[0] + one[1] * two[1] + one[2] * two[2]
+
+
+@numba.njit(cache=True, nogil=True)
+def mean_normals(corner, sharers, first, weighted, facing, cosine):  # type: ignore[no-untyped-def]
+    """Unit normals (f, 3, 3), float32, of faces' corners (3 f,), numbers of places: the mean of the
+    ``weighted`` normals (f, 3) of the faces about the same place, ``sharers[first[p] :
+    first[p + 1]]``, whose unit normals (``facing``) have at least this cosine to its own."""
+    out = np.empty((len(facing), 3, 3), np.float32)
+    for c in range(len(corner)):
+        own, x, y, z = facing[c // 3], 0.0, 0.0, 0.0
+        for n in range(first[corner[c]], first[corner[c] + 1]):
+            beside = sharers[n]
+            if _dot(facing[beside], own) > cosine:
+                x += weighted[beside, 0]
+                y += weighted[beside, 1]
+                z += weighted[beside, 2]
+        long = max(np.sqrt(x * x + y * y + z * z), 1e-12)
+        normal = out[c // 3, c % 3]
+        normal[0], normal[1], normal[2] = x / long, y / long, z / long
+    return out
+
+
+@numba.njit(cache=True, nogil=True)
 def nearest(seen, width, height, limit, perspective):  # type: ignore[no-untyped-def]
     """Greatest nearness up to the limit in each pixel (-inf: nothing) and whose it is (-1).
 
@@ -83,11 +108,6 @@ def _mixed(of, shares):  # type: ignore[no-untyped-def]
     x = a * of[0, 0] + b * of[1, 0] + c * of[2, 0]
     y = a * of[0, 1] + b * of[1, 1] + c * of[2, 1]
     return x, y, a * of[0, 2] + b * of[1, 2] + c * of[2, 2]
-
-
-@numba.njit(cache=True, nogil=True)
-def _dot(one, two):  # type: ignore[no-untyped-def]
-    return one[0] * two[0] + one[1] * two[1] + one[2] * two[2]
 
 
 @numba.njit(cache=True, nogil=True)

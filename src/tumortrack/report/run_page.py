@@ -10,7 +10,6 @@ import html
 import io
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -27,39 +26,24 @@ from tumortrack.core.patient import patient_in
 from tumortrack.core.process import parallel_map
 from tumortrack.core.store import write_atomically
 from tumortrack.core.types import DepthFrame, SensorCloud
-from tumortrack.live.viewer.slices import ORIENTATIONS, CarriedCt, outlined, plane_through
-from tumortrack.models.margins import margin_words, stated_radius
+from tumortrack.live.viewer.slices import ORIENTATIONS, outlined, plane_through
+from tumortrack.models.margins import margin_words
 from tumortrack.report.renderer import Body, ParallelView, corner_normals, render, rgb
+from tumortrack.report.seen import PAGE, Seen, part_rows, row_words
 from tumortrack.report.wrapping import wrapped
 from tumortrack.sense.camera import deproject
 
-PAGE, PICTURE = "index.html", "picture.png"
-_WIDE, _ASPECT = 640, 1.25  # pixels of a view
+PICTURE = "picture.png"
+_WIDE, _ASPECT = 512, 1.25  # pixels of a view
 _SLICE = 480
 _ROW, _ACROSS, _EDGE = 375, 2200, 24  # pixels of the picture: a row's height, all across, borders
+_RLE = 3  # zlib's strategy: flat colours become as small as by a search, in less time
 _MOST_POINTS = 6000
 _MOST_TUMORS = 6  # with slices
 _NEAR_MM = 1.0  # points so near to a slice are shown in it
 _BAR_MM = 20.0
 _TITLES = {"good": "GOOD", "poor": "POOR", "none": "NONE: no estimate"}
 Panel = tuple[str, Image.Image]  # a caption and what it says
-
-
-@dataclass(frozen=True, eq=False)
-class Seen:
-    """What a run's page shows besides the estimate.
-
-    Attributes:
-        cloud: the organ's points, in which it was located.
-        content: all that the camera saw.
-        taken: of a depth image, as of ``sense.region.Region``: 0 where it was taken for the organ.
-        ct: for slices of the CT where it lies now; None: slices show labels.
-    """
-
-    cloud: SensorCloud | None = None
-    content: DepthFrame | SensorCloud | None = None
-    taken: UInt8[np.ndarray, "h w"] | None = None
-    ct: CarriedCt | None = None
 
 
 def write_run_page(
@@ -74,11 +58,11 @@ def write_run_page(
     slices = [] if estimate is None else list(_slices(estimate, seen))
     reason = report["quality"]["reason"] if estimate is None else estimate.reason
     words = verdict_words(verdict, reason)
-    lines, rows = list(_lines(report)), part_rows(report) if estimate else []
+    rows = [] if estimate is None else part_rows(estimate.report, estimate.quality == "good")
+    lines = list(_lines(report, estimate))
     picture = _picture(verdict, [words, *lines, *map(row_words, rows)], views + slices)
-    whole, *pngs = parallel_map(_png, [picture, *(image for _, image in views + slices)])
-    write_atomically(folder / PICTURE, whole)
-    figures = list(zip([caption for caption, _ in views + slices], pngs, strict=True))
+    png = _encoded(picture, "PNG", compress_level=1, compress_type=_RLE)
+    write_atomically(folder / PICTURE, png)
     page = resources.files("tumortrack.report").joinpath("run_page.html").read_text("utf-8")
     cells = {
         "@COLOUR@": colours.css(colours.VERDICTS[verdict]),
@@ -87,54 +71,29 @@ def write_run_page(
         "@WORDS@": html.escape(_sentence(words.partition(": ")[2])),
         "@LINES@": "".join(f"<p>{html.escape(line)}</p>" for line in lines),
         "@TABLE@": _table(rows) if rows else "",
-        "@PANELS@": _figures(figures[: len(views)]) + _figures(figures[len(views) :]),
+        "@PANELS@": _figures(views) + _figures(slices),
     }
     page = re.sub("@[A-Z]+@", lambda name: cells[name[0]], page)
     write_atomically(folder / PAGE, page.encode())
 
 
-def _figures(panels: list[tuple[str, bytes]]) -> str:
-    figures = "".join(
-        f'<figure><img alt="{html.escape(caption)}" src="data:image/png;base64,'
-        f'{base64.b64encode(png).decode()}"><figcaption>{html.escape(caption)}'
-        "</figcaption></figure>"
-        for caption, png in panels
-    )
+def _figures(panels: list[Panel]) -> str:
+    figures = ""
+    for caption, image in panels:
+        said, jpeg = html.escape(caption), _encoded(image, "JPEG", quality=92, subsampling=0)
+        source = f"data:image/jpeg;base64,{base64.b64encode(jpeg).decode()}"
+        figures += f'<figure><img alt="{said}" src="{source}">'
+        figures += f"<figcaption>{said}</figcaption></figure>"
     return f'<section class="panels">{figures}</section>' if panels else ""
 
 
-def part_rows(report: dict[str, Any]) -> list[dict[str, str]]:
-    """Of each part: its name, centre, standard deviation, volume and margin, in words with units;
-    empty where that is not known, and the deviation where the answer is poor."""
-    rows = []
-    for name, part in report["parts"].items():
-        row = {"part": name, "centre": "not found", "std": "", "volume": "", "margin": ""}
-        if part["found"]:
-            x, y, z = part["center_mm"]
-            row |= {"centre": f"({x:.1f}, {y:.1f}, {z:.1f}) mm"}
-            row |= {"volume": f"{part['volume_ml']:.1f} ml"}
-            # Of a poor one it would be read as how wrong it may be, which nobody knows.
-            if "center_std_mm" in part and report["quality"]["verdict"] == "good":
-                row |= {"std": f"{part['center_std_mm']:.1f} mm"}
-            if radius := stated_radius(report.get("margin"), name):
-                row |= {"margin": radius.words}
-        rows.append(row)
-    return rows
-
-
-def row_words(row: dict[str, str]) -> str:
-    """A part's row as one line."""
-    std = row["std"] and f"standard deviation {row['std']}"
-    said = (f"centre {row['centre']}", std, row["volume"], row["margin"])
-    return f"{row['part']}: {', '.join(filter(None, said)).replace('centre not', 'not')}"
-
-
-def _lines(report: dict[str, Any]) -> Iterator[str]:
+def _lines(report: dict[str, Any], estimate: Estimate | None) -> Iterator[str]:
     """What is said below the verdict."""
     patient = _sentence(str(patient_in(report.get("patient"), "report")))
     yield f"{patient}. Camera frame: x right, y down, z away."
-    if "parts" in report and not report.get("margin", {}).get("stated"):
-        yield f"{_sentence(margin_words(report.get('margin')))}."
+    margin = None if estimate is None else estimate.report.margin
+    if estimate is not None and not (margin and margin.stated):
+        yield f"{_sentence(margin_words(margin))}."
     yield from (view["words"] for view in report.get("input", ()))
     yield from (f"Note: {note}" for note in report.get("notes", ()))
 
@@ -185,11 +144,11 @@ def _slices(estimate: Estimate, seen: Seen) -> Iterator[Panel]:
     """Two through each tumor."""
     of_ct = seen.ct is not None and estimate.motion is not None
     what = "CT at its present place" if of_ct else "section"
-    tumors = [name for name in estimate.meshes if is_tumor(name)]
-    for part in tumors[:_MOST_TUMORS]:
-        for orientation in list(ORIENTATIONS)[:2]:
-            caption = f"{part.replace('_', ' ')}: {what}, {orientation}"
-            yield caption, _slice(estimate, seen, part, orientation)
+    tumors = [name for name in estimate.meshes if is_tumor(name)][:_MOST_TUMORS]
+    planes = [(part, way) for part in tumors for way in list(ORIENTATIONS)[:2]]
+    images = parallel_map(lambda plane: _slice(estimate, seen, *plane), planes)
+    for (part, way), image in zip(planes, images, strict=True):
+        yield f"{part.replace('_', ' ')}: {what}, {way}", image
 
 
 def _thinned(content: DepthFrame | SensorCloud | None) -> Float[np.ndarray, "n 3"]:
@@ -225,7 +184,7 @@ def _view(
     _dots(picture, (view.project(points_mm)[:, :2] - corner) / pixel_mm, colours.SEEN)
     image = Image.fromarray(picture)
     draw = ImageDraw.Draw(image)
-    style: dict[str, Any] = {"anchor": "mm", "font_size": 26, "stroke_width": 3}
+    style: dict[str, Any] = {"anchor": "mm", "font_size": 22, "stroke_width": 3}
     for name, mesh in meshes.items():
         if is_tumor(name):
             at = (view.project(mesh.box_mm.mean(0)[None])[0, :2] - corner) / pixel_mm
@@ -233,7 +192,7 @@ def _view(
             draw.text(tuple(at.tolist()), number, "black", stroke_fill="white", **style)
     foot, long = height - 20, _BAR_MM / pixel_mm
     draw.line((20, foot, 20 + long, foot), fill="black", width=4)
-    draw.text((20, foot - 26), f"{_BAR_MM:g} mm", fill="black", font_size=18)
+    draw.text((20, foot - 22), f"{_BAR_MM:g} mm", fill="black", font_size=15)
     return image
 
 
@@ -338,7 +297,7 @@ def _text_colour(verdict: Quality) -> colours.Colour:
     return (20, 20, 20) if 0.3 * red + 0.6 * green + 0.1 * blue > 130 else (255, 255, 255)
 
 
-def _png(image: Image.Image) -> bytes:
+def _encoded(image: Image.Image, kind: str, **how: int) -> bytes:
     stream = io.BytesIO()
-    image.save(stream, format="PNG", compress_level=4)
+    image.save(stream, format=kind, **how)
     return stream.getvalue()

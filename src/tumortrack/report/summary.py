@@ -55,7 +55,7 @@ def summarise(entries: list[Entry]) -> dict[str, Any]:
     groups = {v: [e for e in entries if e["quality"] == v] for v in VERDICTS}
     summary |= {verdict: len(group) for verdict, group in groups.items()}
     failed = [entry for entry in entries if entry["failed"] is not None]
-    far = [entry for entry in failed if entry["failed"].startswith("far off")]
+    far = [e for e in failed if all(part["found"] for part in e["parts"].values())]
     summary["failed"], summary["far"] = len(failed), len(far)
     summary["far_good"] = sum(entry["quality"] == "good" for entry in far)
     summary["scenes"] = len(entries)

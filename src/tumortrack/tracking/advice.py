@@ -31,17 +31,17 @@ def where_to_look(estimate: Estimate, cloud: SensorCloud, others: Sequence[Look]
         cloud: the organ's points, camera frame, in which it was located.
         others: more looks at it; the sides are those of the first camera's picture.
     """
-    organ = next(iter(estimate.meshes.values()))
+    organ = estimate.organ_mesh
     facing, centre = near_side(organ), organ.vertices_mm.mean(0)
     more = [transform_points(one.camera_from_look, one.cloud.points_mm) for one in others]
     points_mm = np.concatenate([cloud.points_mm, *more])
-    whose = "the first camera's" if more else "the camera's"
+    camera = "the first camera's" if more else "the camera's"
     if len(facing) and len(points_mm):
         hidden = unseen(facing, points_mm)
         towards = facing[hidden].mean(0) - centre if hidden.mean() > _HIDDEN else np.zeros(3)
-        if where := _side(towards, centre, whose):
+        if where := _side(towards, centre, camera):
             return f"free the view of the organ's side towards {where}, or look from there"
-    where = _side(_unsure(estimate, centre), centre, whose)
+    where = _side(_unsure(estimate, centre), centre, camera)
     return f"look more from {where or 'another side'}, by about 30 degrees"
 
 
@@ -62,20 +62,23 @@ def _unsure(estimate: Estimate, centre: Float[np.ndarray, " 3"]) -> Float[np.nda
     """The direction, camera frame, from which more would be known."""
     motion = estimate.motion
     if isinstance(motion, ElasticMotion) and motion.rivals:
-        places_mm = next(iter(estimate.meshes.values())).vertices_mm
+        places_mm = estimate.organ_mesh.vertices_mm
         places_mm = places_mm[:: len(places_mm) // _MOST + 1]
         other_mm = motion.rivals[0][0].carry(motion.shape.anatomy_ct.organ.vertices_mm)
         return places_mm[cKDTree(other_mm).query(places_mm)[0].argmax()] - centre
-    tumors = list(estimate.report["parts"].items())[1:]
-    known = [(name, part) for name, part in tumors if "center_axes" in part]
+    known = [
+        (part.center_axes_std_mm[0], name, part.center_axes[0])
+        for name, part in estimate.report.tumors.items()
+        if part.center_axes_std_mm and part.center_axes
+    ]
     if not known:
         return np.zeros(3)
-    name, part = max(known, key=lambda item: item[1]["center_axes_std_mm"][0])
-    axis = np.array(part["center_axes"][0])
+    _, name, least_sure = max(known)
+    axis = np.array(least_sure)
     return axis if (estimate.meshes[name].box_mm.mean(0) - centre) @ axis >= 0 else -axis
 
 
-def _side(direction: Float[np.ndarray, " 3"], centre: Float[np.ndarray, " 3"], whose: str) -> str:
+def _side(direction: Float[np.ndarray, " 3"], centre: Float[np.ndarray, " 3"], camera: str) -> str:
     """A direction in words, as the camera's picture shows it; empty: it lies along the view."""
     sight, length = centre / np.linalg.norm(centre), float(np.linalg.norm(direction))
     x, y, _ = direction - (direction @ sight) * sight
@@ -86,4 +89,4 @@ def _side(direction: Float[np.ndarray, " 3"], centre: Float[np.ndarray, " 3"], w
     told = {axis: value for axis, value in (("y", y), ("x", x)) if abs(value) > long / 2}
     names = " ".join(words[axis][int(value > 0)] for axis, value in told.items())
     axes = ", ".join(f"{'+' if value > 0 else '-'}{axis}" for axis, value in told.items())
-    return f"the {names} ({whose} {axes})"
+    return f"the {names} ({camera} {axes})"

@@ -14,9 +14,10 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial import cKDTree
 
-from tumortrack.core.causes import Cause, Check, Likely
+from tumortrack.core.causes import Cause, Likely
 from tumortrack.core.estimate import Estimate
 from tumortrack.core.geometry import Points, rotation_onto
+from tumortrack.core.report import Check
 from tumortrack.core.types import Mesh, SensorCloud
 from tumortrack.models.in_distribution import spread_mm
 from tumortrack.models.model import Model
@@ -88,8 +89,8 @@ def likely_causes(
     found = [Likely(Cause.OBJECT)] if suspicious and _flat_or_round(points) else []
     if not found and (suspicious or _aside(points, _OUTSIDE)):
         found = _tried(model, points, fitted.cost)
-    if fitted.check == "size" and estimate is not None and not found:
-        found.append(Likely(Cause.SCALE, 1 / estimate.report["size"]["times"]))
+    if estimate is not None and estimate.report.size and fitted.check == "size" and not found:
+        found.append(Likely(Cause.SCALE, 1 / estimate.report.size.times))
     if not found:
         found = _shown(model, points, fitted) or [Likely(Cause.VIEW)]
     return tuple(found)
@@ -122,10 +123,11 @@ class _Fitted(NamedTuple):
 
 
 def _fitted_by(estimate: Estimate) -> _Fitted:
-    organ, report = next(iter(estimate.meshes.values())), estimate.report
-    cost = report.get("fit_cost", {"now": 0.0, "without_strays": 0.0, "usual": 1.0})
-    costs = cost["now"] / cost["usual"], cost["without_strays"] / cost["usual"]
-    return _Fitted(organ, report["quality"]["check"], *costs)
+    check = "other" if estimate.finding is None else estimate.finding.check
+    if (cost := estimate.report.fit_cost) is None:
+        return _Fitted(estimate.organ_mesh, check, 0.0, 0.0)
+    costs = cost.now / cost.usual, cost.without_strays / cost.usual
+    return _Fitted(estimate.organ_mesh, check, *costs)
 
 
 def _fit(model: Model, points: Points) -> _Fitted:

@@ -2,23 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from tumortrack.core import store
+from tumortrack.core.config import to_builtins
 from tumortrack.core.errors import ArtifactError, InputError
 from tumortrack.core.estimate import Estimate, Quality
 from tumortrack.core.geometry import RAS_FROM_LPS, largest_std_of, std_of
 from tumortrack.core.mesh_files import read_mesh, write_mesh
-from tumortrack.core.organ import is_tumor, organ_in
+from tumortrack.core.organ import is_tumor, organ_entry, organ_in
 from tumortrack.core.patient import patient_in
+from tumortrack.core.report import Finding, FitReport
 from tumortrack.core.types import CameraLabels, OccupancyCloud
 from tumortrack.imaging.nifti import read_nifti, write_nifti
 from tumortrack.imaging.segmentation_files import segments, write_seg_nrrd
 from tumortrack.models.margins import stated_radius
+from tumortrack.models.report import report_head
 from tumortrack.sense.ply import parse_ply_properties, write_cloud_ply
 from tumortrack.tracking.points import PointTable, camera_table
 from tumortrack.tracking.shells import exact_margin
@@ -32,13 +38,14 @@ def write_estimate(
     overwrite: bool = False,
     points: PointTable | None = None,
     add: Callable[[Path], None] = lambda folder: None,
+    about: Mapping[str, Any] = MappingProxyType({}),
 ) -> None:
     """occupancy.ply (points with label and probability and, where the estimate knows the way back,
     their place in the CT), labels.nii.gz (voxel -> camera frame, mm), labels.seg.nrrd (the same for
     3D Slicer), kidney.ply (or of the organ's name), tumor_1.ply, ..., structures and report.json;
     tumor_1_margin.ply, ..., the shells of the highest confidence, where margins are stated;
     points.csv, the given ``points`` of the CT and where they are now; and what ``add`` writes into
-    the folder that it is called with; all or nothing.
+    the folder that it is called with; all or nothing. ``about``: further entries of report.json.
 
     Raises InputError: the folder exists and ``overwrite`` is False; points without a motion; an
     estimate without a volume;
@@ -49,17 +56,18 @@ def write_estimate(
             "this estimate is of a live frame and has no labelled volume to write; give one of "
             "`locate`, or keep live ones with the sink recording."
         )
-    with store.new_folder(folder, overwrite) as aside:
+    with store.new_folder(folder, overwrite) as aside, ThreadPoolExecutor(1) as beside:
+        added = beside.submit(add, aside)  # takes about as long as the rest
         values = {"label": cloud.labels, "probability": cloud.probability}
         values |= _places_in_ct(estimate)
         write_cloud_ply(aside / "occupancy.ply", cloud.points_mm, **values)
         labels, way = volume.labels, volume.camera_from_index
         write_nifti(aside / "labels.nii.gz", labels, way, lps=False)
-        parts = segments(estimate.report["parts"], estimate.patient.side, estimate.organ)
+        parts = segments(estimate.report.parts, estimate.patient.side, estimate.organ)
         write_seg_nrrd(aside / "labels.seg.nrrd", labels, way, parts)
         for name, mesh in estimate.meshes.items():
             write_mesh(aside / f"{name}.ply", mesh)
-            margin = stated_radius(estimate.report.get("margin"), name)
+            margin = stated_radius(estimate.report.margin, name)
             if margin is not None and is_tumor(name):
                 write_mesh(aside / f"{name}{MARGIN}.ply", exact_margin(mesh, margin.mm))
         for name, mesh in estimate.structures.items():
@@ -67,8 +75,28 @@ def write_estimate(
         if points is not None:
             table = camera_table(points, estimate.motion)
             store.write_atomically(aside / "points.csv", table)
-        add(aside)
-        _seal(aside, estimate.report, estimate.quality)
+        added.result()
+        _seal(aside, {**report_entry(estimate), **about}, estimate.quality)
+
+
+def report_entry(estimate: Estimate) -> dict[str, Any]:
+    """report.json: what the estimate says of itself, as JSON types."""
+    finding = estimate.finding
+    quality = {
+        "verdict": estimate.quality,
+        "reason": estimate.reason,
+        "check": "" if finding is None else finding.check,
+        "finding": None if finding is None else msgspec.to_builtins(finding),
+        "advice": estimate.advice,
+    }
+    return {
+        **report_head(estimate.cloud.stamp_ns),
+        **msgspec.to_builtins(estimate.report),
+        "quality": quality,
+        "causes": [one.entry() for one in estimate.causes],
+        "organ": organ_entry(estimate.organ),
+        "patient": to_builtins(estimate.patient),
+    }
 
 
 def write_no_estimate(
@@ -106,31 +134,28 @@ def read_report(folder: Path) -> dict[str, Any]:
 def read_estimate(folder: Path) -> Estimate:
     """What ``write_estimate`` wrote, all but its motion, which is the model's to know. Raises
     ArtifactError: no such folder, damaged, or nothing was located in it."""
-    report, path = read_report(folder), folder / "occupancy.ply"
+    stored, path = read_report(folder), folder / "occupancy.ply"
     try:
-        parts, quality, structures = (
-            report["parts"],
-            report["quality"],
-            report.get("structures", ()),
-        )
-        names = [name for name, part in parts.items() if part["found"]]
+        report = msgspec.convert(stored, FitReport)
+        finding = msgspec.convert(stored["quality"]["finding"], Finding | None)
+        names = [name for name, part in report.parts.items() if part.found]
         table = parse_ply_properties(
             path.read_bytes(), str(path), ("x", "y", "z", "label", "probability")
         )
         volume = read_nifti(folder / "labels.nii.gz")
-        meshes = {name: read_mesh(folder / f"{name}.ply") for name in (*names, *structures)}
+        meshes = {name: read_mesh(folder / f"{name}.ply") for name in (*names, *report.structures)}
         return Estimate(
-            OccupancyCloud(table[:, :3], table[:, 3], table[:, 4], report["stamp_ns"]),
+            OccupancyCloud(table[:, :3], table[:, 3], table[:, 4], stored["stamp_ns"]),
             CameraLabels(volume.array, RAS_FROM_LPS @ volume.lps_from_index),
             {name: meshes[name] for name in names},
             report,
-            quality=quality["verdict"],
-            reason=quality["reason"],
-            patient=patient_in(report.get("patient"), str(folder)),
-            organ=organ_in(report.get("organ"), str(folder)),
-            structures={name: meshes[name] for name in structures},
+            finding=finding,
+            advice=stored["quality"]["advice"],
+            patient=patient_in(stored.get("patient"), str(folder)),
+            organ=organ_in(stored.get("organ"), str(folder)),
+            structures={name: meshes[name] for name in report.structures},
         )
-    except (KeyError, TypeError, OSError, InputError) as error:
+    except (KeyError, TypeError, OSError, InputError, msgspec.ValidationError) as error:
         raise ArtifactError(f"{folder} is no whole run: {error}. Locate again.") from error
 
 

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from scipy.ndimage import binary_dilation, distance_transform_edt
 
-from tumortrack.core.causes import Check
 from tumortrack.core.errors import NotThisOrgan
 from tumortrack.core.estimate import Estimate
 from tumortrack.core.geometry import transform_points
+from tumortrack.core.report import Finding, FitReport, Kind, LooksReport
 from tumortrack.core.types import DepthFrame, Intrinsics, Look, Mesh, SensorCloud
 from tumortrack.models.in_distribution import FIT_FACTOR, RIVAL_COST
 from tumortrack.models.margins import ModelMargins, exceeded, figures, stated_margin
@@ -49,7 +50,6 @@ _MOST_POINTS = 20_000  # of a cloud that tell enough: a frame must not wait for 
 # lies there: an organ upside down reaches so far beyond the points that it fits.
 _UNSEEN = 0.1
 _NEAR_MM = 6.0  # of a point, or twice the points' usual distance: seen
-_Failed = tuple[Check, str] | None
 
 
 def judged(
@@ -58,9 +58,8 @@ def judged(
     strictly: bool = False,
     others: Sequence[Look] = (),
 ) -> Estimate:
-    """The estimate with its ``quality``, ``good`` or ``poor``, and the ``reason`` in words; also in
-    its report, with the check that failed and the shares of the organ that are seen through and, of
-    a cloud, not seen.
+    """The estimate with what speaks against it, and in its report the shares of the organ that are
+    seen through, in sight and, of a cloud, not seen.
 
     Poor is an estimate that fits the points worse than usual in validation, through which the
     camera sees, that lies where a cloud has no points, that lacks a tumor, or that says itself that
@@ -73,10 +72,10 @@ def judged(
         strictly: the fit must be no worse than usual, whatever the camera sees round the organ.
         others: more looks at it; the one that says most against the estimate counts.
     """
-    organ = next(iter(estimate.meshes.values()))
-    views, looks = [(organ, seen)], estimate.report.get("looks")
+    organ, looks = estimate.organ_mesh, estimate.report.looks
+    views = [(organ, seen)]
     if looks is not None:
-        before = zip(others, looks["camera_from_look"][1:], strict=True)
+        before = zip(others, looks.camera_from_look[1:], strict=True)
         for one, camera_from_look in before:
             look_from_camera = np.linalg.inv(np.array(camera_from_look))
             there_mm = transform_points(look_from_camera, organ.vertices_mm)
@@ -84,124 +83,112 @@ def judged(
     by_image = [seen_through(there, view) for there, view in views if isinstance(view, DepthFrame)]
     clouds = [cloud_shares(there, view) for there, view in views if isinstance(view, SensorCloud)]
     unseen = max((share for _, share in clouds), default=0.0)
-    if clouds:
-        estimate.report["unseen"] = unseen
     told = min((share for _, share, _ in by_image), default=0.0) if not clouds else 0.0
     by_depth = max((share for share, _, _ in by_image), default=0.0)
     through = max(by_depth, *(share for share, _ in clouds), 0.0)
-    estimate.report["seen_through"] = through
     doubtful, impossible = _LIMITS if estimate.motion is not None else _ROUGH_LIMITS
     if by_depth > impossible:
         raise NotThisOrgan(
             f"the camera sees through {100 * by_depth:.0f} % of where the organ would lie"
         )
-    failed = _misplaced(estimate) or _misfit(estimate, told > _TOLD and not strictly)
-    failed, where = failed or _doubt(estimate), "of where the organ lies"
-    if by_image:
-        estimate.report["in_sight"] = by_image[0][2]
+    report = estimate.report
+    finding = _misplaced(report.looks) or _misfit(report, told > _TOLD and not strictly)
+    finding = finding or _doubt(report)
+    in_sight = by_image[0][2] if by_image else None
     if through > doubtful:
-        estimate.report["doubted_in_sight"] = estimate.report.get("in_sight", 0.0)
-        failed = "seen_through", f"the camera sees through {100 * through:.0f} % {where}"
-    elif unseen > _UNSEEN and failed is None:
-        failed = "unseen", f"over {100 * unseen:.0f} % {where} the cloud has no points"
-    if failed is not None:
-        return doubted(estimate, failed[1], failed[0])
-    estimate.report["quality"] = {"verdict": "good", "reason": "", "check": ""}
-    return replace(estimate, quality="good", reason="")
+        finding = _found("seen_through", percent=100 * through)
+    elif unseen > _UNSEEN and finding is None:
+        finding = _found("unseen", percent=100 * unseen)
+    return replace(estimate, finding=finding).reporting(
+        unseen=unseen if clouds else report.unseen,
+        seen_through=through,
+        in_sight=in_sight,
+        doubted_in_sight=(in_sight or 0.0) if through > doubtful else None,
+    )
 
 
-def unless_hidden(estimate: Estimate, last: Estimate) -> Estimate:
+def doubt_if_hidden(estimate: Estimate, last: Estimate) -> Estimate:
     """The estimate, poor where the camera saw through the ``last`` one, which lay there too, and
     sees less of it now: whatever came before it is no evidence that the organ lies there."""
-    doubted_at = last.report.get("doubted_in_sight", 0.0)
-    report, (now, then) = estimate.report, (next(iter(e.meshes.values())) for e in (estimate, last))
-    if "doubted_in_sight" in report or report.get("in_sight", 1.0) >= _AS_MUCH * doubted_at:
+    doubted_at, report = last.report.doubted_in_sight, estimate.report
+    if doubted_at is None or report.doubted_in_sight is not None:
         return estimate
-    if np.abs(now.box_mm - then.box_mm).max() > _ELSEWHERE_MM:
+    in_sight = 1.0 if report.in_sight is None else report.in_sight
+    moved_mm = np.abs(estimate.organ_mesh.box_mm - last.organ_mesh.box_mm).max()
+    if in_sight >= _AS_MUCH * doubted_at or moved_mm > _ELSEWHERE_MM:
         return estimate
-    report["doubted_in_sight"] = doubted_at
-    reason = "a moment ago the camera saw through where the organ lies; what showed that is hidden"
-    return estimate if estimate.quality == "poor" else doubted(estimate, reason)
+    estimate = estimate.reporting(doubted_in_sight=doubted_at)
+    return replace(estimate, finding=estimate.finding or Finding("hidden_now"))
 
 
 def with_margin(estimate: Estimate, cloud: SensorCloud, margins: ModelMargins | None) -> Estimate:
     """The estimate with what its model's ``margins`` say in its report; where they say nothing of
     such a one it is ``poor``: within the margin, or no answer. ``cloud``: in which it was located.
     """
-    report, organ = estimate.report, next(iter(estimate.meshes.values()))
-    if margins is not None and estimate.quality == "good":
-        if "unseen" not in report:
-            report["unseen"] = cloud_shares(organ, cloud)[1]
-        if reason := exceeded(margins.limits, figures(report, margins)):
-            estimate = doubted(estimate, reason)
-    report["margin"] = stated_margin(report, margins, estimate.quality == "good")
-    return estimate
+    if margins is not None and estimate.finding is None:
+        if estimate.report.unseen is None:
+            estimate = estimate.reporting(unseen=cloud_shares(estimate.organ_mesh, cloud)[1])
+        finding = exceeded(margins.limits, figures(estimate.report, margins))
+        estimate = replace(estimate, finding=finding)
+    margin = stated_margin(estimate.report, margins, estimate.finding is None)
+    return estimate.reporting(margin=margin)
 
 
-def doubted(estimate: Estimate, reason: str, check: Check = "other") -> Estimate:
-    """The same estimate, poor for this reason: this check failed."""
-    estimate.report["quality"] = {"verdict": "poor", "reason": reason, "check": check}
-    return replace(estimate, quality="poor", reason=reason)
+def _found(kind: Kind, **values: Any) -> Finding:
+    return Finding(kind, values)
 
 
-def _misplaced(estimate: Estimate) -> _Failed:
+def _misplaced(looks: LooksReport | None) -> Finding | None:
     """Whether a camera was found too far from where its pose says."""
-    looks = estimate.report.get("looks", {"shift_mm": (), "turn_degrees": ()})
+    if looks is None:
+        return None
     most_mm, most_degrees = _FARTHEST * CAMERA_STD[0], np.rad2deg(_FARTHEST * CAMERA_STD[-1])
-    errors = zip(looks["shift_mm"], looks["turn_degrees"], strict=True)
+    errors = zip(looks.shift_mm, looks.turn_degrees, strict=True)
     for number, (shift_mm, degrees) in enumerate(errors, start=1):
         if shift_mm > most_mm or degrees > most_degrees:
-            off = f"{shift_mm:.1f} mm and {degrees:.1f} degrees"
-            return "poses", f"view {number} shows the organ {off} from where its pose has it"
+            return _found("poses", view=number, shift_mm=shift_mm, degrees=degrees)
     return None
 
 
-def _misfit(estimate: Estimate, told: bool) -> _Failed:
-    """What the fit says against it; ``told``: a wrong place would be seen through."""
-    cost = estimate.report.get("fit_cost")
+def _misfit(report: FitReport, surroundings_seen: bool) -> Finding | None:
+    """What the fit says against it; ``surroundings_seen``: a wrong place would be seen through."""
+    cost = report.fit_cost
     if cost is None:
         return None
-    if told and cost["strays"] > _MOST_STRAYS:
-        share = 100 * cost["strays"]
-        return "strays", f"{share:.0f} % of the points do not lie on the organ's surface"
-    now, most = (cost["without_strays"], FIT_FACTOR) if told else (cost["now"], 1.0)
-    if now > most * cost["usual"]:
-        worse = "the organ's surface fits the points worse than in most validation scenes"
-        return "fit", f"{worse} ({now / cost['usual']:.1f} times the usual cost)"
+    if surroundings_seen and cost.strays > _MOST_STRAYS:
+        return _found("strays", percent=100 * cost.strays)
+    now, most = (cost.without_strays, FIT_FACTOR) if surroundings_seen else (cost.now, 1.0)
+    if now > most * cost.usual:
+        return _found("fit", times=now / cost.usual)
     return None
 
 
-def _doubt(estimate: Estimate) -> _Failed:
+def _doubt(report: FitReport) -> Finding | None:
     """What else the estimate itself says against it."""
-    size = estimate.report.get("size")
-    if size is not None and size["gain"] > RIVAL_COST:
-        return "size", f"an organ {size['times']:.2f} times as large fits better"
-    cost = estimate.report.get("fit_cost", {})
-    if beyond := cost.get("beyond"):
-        return "place", _other_side(beyond["tilt_degrees"])
-    for other in cost.get("others", ()):
-        name, apart_mm = max(other["apart_mm"].items(), key=lambda item: item[1])
+    size, cost = report.size, report.fit_cost
+    if size is not None and size.gain > RIVAL_COST:
+        return _found("size", times=size.times)
+    if cost is not None and cost.beyond is not None:
+        return _found(_other_side(cost.beyond.tilt_degrees), degrees=cost.beyond.tilt_degrees)
+    for other in () if cost is None else cost.others:
+        name, apart_mm = max(other.apart_mm.items(), key=lambda item: item[1])
         if apart_mm > _UNSURE_MM:
-            return "place", f"{name} may as well lie {apart_mm:.1f} mm away, which fits too"
-    for name, part in estimate.report["parts"].items():
-        if not part["found"]:
-            return "place", f"{name} was not found"
-        if part.get("center_std_mm", 0.0) > _UNSURE_MM:
-            return "place", f"the place of {name} is unsure by {part['center_std_mm']:.1f} mm"
-        if part["probability"] is not None and part["probability"] < _UNSURE:
-            share = part["probability"]
-            return "place", f"the points of {name} have a probability of {share:.2f}"
+            return _found("rival", part=name, apart_mm=apart_mm)
+    for name, part in report.parts.items():
+        if not part.found:
+            return _found("missing", part=name)
+        if part.center_std_mm is not None and part.center_std_mm > _UNSURE_MM:
+            return _found("unsure", part=name, std_mm=part.center_std_mm)
+        if part.probability is not None and part.probability < _UNSURE:
+            return _found("improbable", part=name, probability=part.probability)
     return None
 
 
-def _other_side(tilt_degrees: float) -> str:
+def _other_side(tilt_degrees: float) -> Kind:
     """``tilt_degrees``: in which the organ fits, against what is allowed or was found."""
-    fits = f"it fits the points as well tilted by {tilt_degrees:.0f} degrees"
     if tilt_degrees > _UPSIDE_DOWN:
-        return f"the organ may lie upside down: {fits}"
-    if tilt_degrees > _FAR_TILTED:
-        return f"the organ may be tilted farther than stated: {fits}"
-    return f"the organ may not have been turned over: {fits}"
+        return "upside_down"
+    return "tilted" if tilt_degrees > _FAR_TILTED else "not_turned"
 
 
 def seen_through(organ: Mesh, frame: DepthFrame) -> tuple[float, float, float]:

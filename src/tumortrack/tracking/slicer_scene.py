@@ -15,11 +15,13 @@ from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
+import msgspec
 import numpy as np
 
 from tumortrack.core import store
 from tumortrack.core.colours import Colour, part_colour, structure_colour
 from tumortrack.core.geometry import RAS_FROM_LPS
+from tumortrack.core.report import FitReport
 from tumortrack.core.types import FIRST_TUMOR, ORGAN
 from tumortrack.imaging.case import Case
 from tumortrack.models.margins import stated_radius
@@ -34,10 +36,9 @@ _ORGAN_OPACITY, _SHELL_OPACITY = 0.4, 0.25
 _File = tuple[str, str, bytes]  # kind of node that reads it, name, content
 
 
-def centre_label(report: dict[str, Any], name: str, poor: bool) -> str:
+def centre_label(report: FitReport, name: str, poor: bool) -> str:
     """How people read a tumor's centre: its name and, as far as it is known, how sure it is."""
-    radius = stated_radius(report.get("margin"), name)
-    std_mm = report["parts"][name].get("center_std_mm")
+    radius, std_mm = stated_radius(report.margin, name), report.parts[name].center_std_mm
     said = [f"{name} POOR" if poor else name] + ([] if std_mm is None else [f"std {std_mm:.1f} mm"])
     return ", ".join([*said, radius.words if radius else "no margin stated"])
 
@@ -77,19 +78,20 @@ class Scene:
             middles = [(name, mesh.box_mm.mean(0).tolist()) for name, mesh in named]
             self._add_points(CENTRES, middles)
 
-    def add_run(self, folder: Path, report: dict[str, Any]) -> None:
+    def add_run(self, folder: Path, stored: dict[str, Any]) -> None:
         """What `locate` found: segmentation, surfaces, margins, the tumors' centres labelled with
-        how sure they are, and mapped points; camera frame."""
+        how sure they are, and mapped points; camera frame. ``stored``: its report.json."""
+        report, poor = msgspec.convert(stored, FitReport), stored["quality"]["verdict"] != "good"
         voxels = (folder / "labels.seg.nrrd").read_bytes()
         self._add("Segmentation", "located", {}, ("SegmentationStorage", "labels.seg.nrrd", voxels))
-        poor, centres = report.get("quality", {}).get("verdict") != "good", []
-        for name, part in report["parts"].items():
+        centres = []
+        for name, part in report.parts.items():
             for shown in (name, name + MARGIN):
                 if (file := folder / f"{shown}.ply").exists():
-                    self._add_model(shown, part["label"], file.read_bytes())
-            if part["found"] and part["label"] >= FIRST_TUMOR:
-                centres.append((centre_label(report, name, poor), part["center_mm"]))
-        self._add_structures(folder, report.get("structures", ()))
+                    self._add_model(shown, part.label, file.read_bytes())
+            if part.center_mm is not None and part.label >= FIRST_TUMOR:
+                centres.append((centre_label(report, name, poor), list(part.center_mm)))
+        self._add_structures(folder, report.structures)
         self._add_points(CENTRES, centres)
         if (table := folder / "points.csv").exists():
             rows = list(csv.DictReader(io.StringIO(table.read_text())))

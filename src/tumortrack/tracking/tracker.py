@@ -12,12 +12,12 @@ import numpy as np
 from jaxtyping import Float64
 
 from tumortrack.core.causes import Cause, Likely
-from tumortrack.core.config import Config, check_seed, to_builtins
+from tumortrack.core.config import Config, check_seed
 from tumortrack.core.errors import InputError, NoEstimate, NotThisOrgan
-from tumortrack.core.estimate import Estimate, Following
+from tumortrack.core.estimate import Estimate, FollowOptions
 from tumortrack.core.geometry import HERE, Affine, transform_points
-from tumortrack.core.organ import organ_entry
 from tumortrack.core.process import keep_small_blocks
+from tumortrack.core.report import Finding
 from tumortrack.core.types import Anatomy, DepthFrame, Look, SensorCloud
 from tumortrack.imaging.case import Case
 from tumortrack.models.folder import weakness_of
@@ -32,9 +32,9 @@ from tumortrack.tracking.advice import where_to_look
 from tumortrack.tracking.causes import likely_causes, words
 from tumortrack.tracking.model_files import case_model
 from tumortrack.tracking.presets import occupancy
-from tumortrack.tracking.quality import doubted, judged, unless_hidden, with_margin
+from tumortrack.tracking.quality import doubt_if_hidden, judged, with_margin
 
-_ALONE = Following()
+_ALONE = FollowOptions()
 # So long after it was found good the organ is also looked for with its other side up. In first
 # looks of strangers that called 18 of 46 kidneys of others, or mirrored, good; none without it.
 _TURNED_OVER_S = 30.0
@@ -55,7 +55,11 @@ class Locator(Protocol):
         """See ``Tracker.locate``."""
 
     def follow(
-        self, cloud: SensorCloud, last: Estimate | None, how: Following, others: Sequence[Look] = ()
+        self,
+        cloud: SensorCloud,
+        last: Estimate | None,
+        how: FollowOptions,
+        others: Sequence[Look] = (),
     ) -> Estimate:
         """See ``Tracker.follow``."""
 
@@ -124,7 +128,7 @@ class Tracker:
         self,
         cloud: SensorCloud,
         last: Estimate | None = None,
-        how: Following = _ALONE,
+        how: FollowOptions = _ALONE,
         seen: DepthFrame | SensorCloud | None = None,
         others: Sequence[Look] = (),
     ) -> Estimate:
@@ -151,49 +155,40 @@ class Tracker:
         start = time.perf_counter()
         estimate = judged(estimate, seen, strictly, others)
         if last is not None:
-            estimate = unless_hidden(estimate, last)
+            estimate = doubt_if_hidden(estimate, last)
         if self._weakness:
-            estimate = doubted(estimate, self._weakness)
+            estimate = replace(estimate, finding=Finding("model", {"words": self._weakness}))
         # Margins are calibrated on single looks.
         estimate = with_margin(estimate, cloud, None if others else self.model.margins)
         estimate = replace(estimate, patient=self._patient, organ=self._organ)
-        estimate.report["organ"] = organ_entry(self._organ)
-        estimate.report["patient"] = to_builtins(self._patient)
-        seconds = estimate.report["timings"]
-        seconds["judge"] = time.perf_counter() - start
-        seconds["total"] += seconds["judge"]
-        return estimate
+        return _timed(estimate, "judge", start)
 
     def _explained(
-        self, estimate: Estimate, cloud: SensorCloud, others: Sequence[Look], how: Following
+        self, estimate: Estimate, cloud: SensorCloud, others: Sequence[Look], how: FollowOptions
     ) -> Estimate:
         """With the likely causes of a poor one, and what to do."""
-        start, seconds = time.perf_counter(), estimate.report["timings"]
-        if estimate.quality == "poor" and not self._weakness:
-            check = estimate.report["quality"]["check"]
+        start = time.perf_counter()
+        if estimate.finding is not None and not self._weakness:
             causes = self._causes(cloud, others, how, estimate)
-            reason = estimate.reason + words(causes, where_to_look(estimate, cloud, others))
-            estimate = replace(doubted(estimate, reason, check), causes=causes)
-        estimate.report["causes"] = [one.entry() for one in estimate.causes]
-        seconds["explain"] = time.perf_counter() - start
-        seconds["total"] += seconds["explain"]
-        return estimate
+            advice = words(causes, where_to_look(estimate, cloud, others))
+            estimate = replace(estimate, causes=causes, advice=advice)
+        return _timed(estimate, "explain", start)
 
     def _causes(
         self,
         cloud: SensorCloud,
         others: Sequence[Look],
-        how: Following,
+        how: FollowOptions,
         estimate: Estimate | None,
     ) -> tuple[Likely, ...]:
-        check = "none" if estimate is None else estimate.report["quality"]["check"]
+        check = _check_of(estimate)
         if others and check in _OF_POSES:
             return (Likely(Cause.POSES),)
         return how.known.get(check) or likely_causes(self.model, cloud, estimate)
 
     @contextmanager
     def _explaining(
-        self, cloud: SensorCloud, others: Sequence[Look], how: Following
+        self, cloud: SensorCloud, others: Sequence[Look], how: FollowOptions
     ) -> Iterator[None]:
         """Adds its likely causes to what is not this organ."""
         try:
@@ -216,8 +211,22 @@ def _locator(model: Model) -> Locator:
 
 def _unusual(estimate: Estimate) -> bool:
     """Whether it fits worse than usual."""
-    cost = estimate.report.get("fit_cost")
-    return cost is not None and cost["now"] > cost["usual"]
+    cost = estimate.report.fit_cost
+    return cost is not None and cost.now > cost.usual
+
+
+def _timed(estimate: Estimate, stage: str, start_s: float) -> Estimate:
+    """With the seconds that a stage took."""
+    took_s, seconds = time.perf_counter() - start_s, estimate.report.timings
+    total_s = seconds["total"] + took_s
+    return estimate.reporting(timings={**seconds, stage: took_s, "total": total_s})
+
+
+def _check_of(estimate: Estimate | None) -> str:
+    """The check that it failed; ``none``: there is no estimate."""
+    if estimate is None:
+        return "none"
+    return "" if estimate.finding is None else estimate.finding.check
 
 
 class FollowerConfig(Config, frozen=True, kw_only=True):
@@ -234,7 +243,7 @@ class FollowerConfig(Config, frozen=True, kw_only=True):
         for name in ("rescan_s", "forget_s"):
             if not getattr(self, name) > 0:
                 raise InputError(f"{name} is {getattr(self, name):g}; it must be more than 0 s.")
-        Following(smoothing_s=self.smoothing_s, seed=self.seed)  # the same checks
+        FollowOptions(smoothing_s=self.smoothing_s, seed=self.seed)  # the same checks
 
 
 class Follower:
@@ -273,7 +282,7 @@ class Follower:
         last = self._recent(stamp_ns)
         if last is None:
             return None
-        organ = next(iter(last.meshes.values()))
+        organ = last.organ_mesh
         if camera_from_last is not HERE:
             organ = organ.moved(transform_points(camera_from_last, organ.vertices_mm))
         return organ.box_mm
@@ -298,7 +307,7 @@ class Follower:
         turned = bool(0 <= since_ns <= _TURNED_OVER_S * 1e9)
         if not 0 <= (cloud.stamp_ns - self._known_ns) * 1e-9 < _SOUGHT_S:
             self._known_ns, self._known = cloud.stamp_ns, {}
-        how = Following(
+        how = FollowOptions(
             thorough=thorough,
             either_side=turned,
             smoothing_s=self._config.smoothing_s,
@@ -311,8 +320,7 @@ class Follower:
             self._known = {**self._known, "none": error.causes} if error.causes else self._known
             raise
         if causes := self._last.causes:
-            check = self._last.report["quality"]["check"]
-            self._known = {**self._known, check: causes}
+            self._known = {**self._known, _check_of(self._last): causes}
         if self._last.quality == "good":
             self._good_ns = cloud.stamp_ns
         return self._last

@@ -9,7 +9,7 @@ from itertools import cycle
 import numpy as np
 import torch
 
-from tumortrack.core.estimate import Following
+from tumortrack.core.estimate import FollowOptions
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import SensorCloud
 from tumortrack.models.report import grid_over
@@ -44,10 +44,10 @@ class LiveFrames:
         swing = np.array([_MOVES_MM / 2, 0.0, 0.0], np.float32)
         self._tracker = tracker
         self._frames = cycle([SensorCloud(points_mm + swing), SensorCloud(points_mm - swing)])
-        self.last = tracker.follow(next(self._frames), None, Following())
+        self.last = tracker.follow(next(self._frames), None, FollowOptions())
 
     def __call__(self) -> None:
-        self.last = self._tracker.follow(next(self._frames), self.last, Following())
+        self.last = self._tracker.follow(next(self._frames), self.last, FollowOptions())
 
 
 class CountedQueries:

@@ -40,7 +40,7 @@ class RegistrationForms:
 
         def ours() -> Uncounted:
             estimate = self._tracker.locate(self._cloud, _NO_VOLUME, 0)
-            return Uncounted(estimate.report["timings"]["volume"])
+            return Uncounted(estimate.report.timings["volume"])
 
         def facts() -> dict:
             # Of the points inside, at our motion, where inside tests say the same.
@@ -59,7 +59,9 @@ class RegistrationForms:
         ours = occupancy.LiveFrames(self._tracker, self._cloud.points_mm)
 
         def facts() -> dict:
-            steps = ours.last.report["motion"]["steps"]
+            motion = ours.last.report.motion
+            assert motion is not None
+            steps = motion.steps
             note = f"steady state: {steps} refinement steps, points carried, surfaces, report"
             return {"note": note}
 
@@ -69,8 +71,9 @@ class RegistrationForms:
         grid = grid_over(self._anatomy.organ.vertices_mm, occupancy.GRID)
         index, points = occupancy.slab(grid)
         voxels = int(np.prod(grid[1]))
-        motion = self._estimate.report["motion"]
-        camera_from_ct, state = (np.array(motion[k]) for k in ("camera_from_ct", "coefficients"))
+        motion = self._estimate.report.motion
+        assert motion is not None
+        camera_from_ct, state = np.array(motion.camera_from_ct), np.array(motion.coefficients)
 
         def naive() -> np.ndarray:
             rest = (points - camera_from_ct[:3, 3]) @ camera_from_ct[:3, :3]

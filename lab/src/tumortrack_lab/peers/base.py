@@ -82,7 +82,7 @@ def estimate_of(fit: Fit, anatomy_ct: Anatomy, stamp_ns: int = 0, grid: int = 16
         raise InputError("the fit diverged: it carries points to NaN or infinity.")
     pairs = zip(anatomy_ct.names, anatomy_ct.parts, carried, strict=True)
     meshes = {name: part.moved(points_mm) for name, part, points_mm in pairs}
-    return of_surfaces(meshes, grid, stamp_ns, fit=fit.report)
+    return of_surfaces(meshes, grid, stamp_ns, peer=fit.report)
 
 
 class Rigid:

@@ -189,5 +189,7 @@ def located(tracker: Tracker, cloud: SensorCloud) -> tuple[dict[str, Any], Any]:
         looks = Looks.of([frame.points_mm])
         fit, _ = model.registration.register(looks, None, frame.stage)
         return {"verdict": "refused", "reason": str(error), "cost": fit.cost / usual}, fit.motion
-    cost = estimate.report["fit_cost"]["now"] / estimate.report["fit_cost"]["usual"]
+    costs = estimate.report.fit_cost
+    assert costs is not None  # of the default method
+    cost = costs.now / costs.usual
     return {"verdict": estimate.quality, "reason": estimate.reason, "cost": cost}, estimate.motion

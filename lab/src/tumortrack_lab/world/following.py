@@ -7,19 +7,21 @@ camera saw at that moment, and where the cameras are, as a calibration says.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, NamedTuple
 
+import msgspec
 import numpy as np
 from jaxtyping import Float64
 
 from tumortrack.core.errors import NoEstimate
 from tumortrack.core.estimate import Estimate
 from tumortrack.core.geometry import transform_points
+from tumortrack.core.report import Finding
 from tumortrack.core.types import DepthFrame, Look, Mesh, SensorCloud
 from tumortrack.live.loop import SURE_AFTER
 from tumortrack.report.metrics import surface_distances
 from tumortrack.sense.region import Hints, RegionConfig, organ_points
-from tumortrack.tracking.quality import doubted
 from tumortrack.tracking.tracker import Follower, FollowerConfig, Tracker, region_for
 from tumortrack_lab.study.tumor_sites import TumorSite
 from tumortrack_lab.world.films import Film
@@ -58,7 +60,8 @@ def track(tracker: Tracker) -> Locate:
         in_a_row, before = 0, in_a_row
         estimate = follower.locate(cloud, frame)
         in_a_row = before + 1 if estimate.quality == "good" else 0
-        return doubted(estimate, "wait") if 0 < in_a_row < SURE_AFTER else estimate
+        wait = Finding("model", {"words": "wait"})
+        return replace(estimate, finding=wait) if 0 < in_a_row < SURE_AFTER else estimate
 
     return locate
 
@@ -107,8 +110,8 @@ def judge(locate: Locate, film: Film, sites: dict[str, TumorSite]) -> list[dict[
         try:
             estimate = locate(Moment(film.looks(number), poses))
             about |= {"quality": estimate.quality, "reason": estimate.reason}
-            motion, parts = estimate.motion, estimate.report["parts"]
-            about["margin"] = estimate.report.get("margin")
+            motion, parts = estimate.motion, estimate.report.parts
+            about["margin"] = msgspec.to_builtins(estimate.report.margin)
         except NoEstimate as error:
             about |= {"quality": "none", "reason": str(error)}
         if motion is not None:
@@ -125,7 +128,8 @@ def judge(locate: Locate, film: Film, sites: dict[str, TumorSite]) -> list[dict[
                 row["center_mm"] = _center_mm(found.vertices_mm, true)
                 if (number + 1) % every == 0:
                     row["hausdorff_mm"] = surface_distances(found, true, 2.0).hausdorff_mm
-                row |= {key: parts[name].get(key) for key in ("center_std_mm", "surface_std_mm")}
+                stds = ("center_std_mm", "surface_std_mm")
+                row |= {key: getattr(parts[name], key) for key in stds}
             rows.append(row)
     return rows
 

@@ -59,7 +59,7 @@ class Part:
     use: Use = "both"
 
     @property
-    def whose(self) -> str:
+    def name_in_cell(self) -> str:
         """Its name within the cell: ``cutter/forearm``, ``table``."""
         return self.name if self.link == TABLE else f"{self.link.split('_')[0]}/{self.name}"
 

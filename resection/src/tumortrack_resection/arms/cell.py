@@ -91,7 +91,7 @@ class ArmCell:
         organ is not among them."""
         places = self._frames(joints_rad, {part.link for part, _ in self._surfaces})
         return tuple(
-            RigidShape(part.whose, mesh, places[part.link], part.colour)
+            RigidShape(part.name_in_cell, mesh, places[part.link], part.colour)
             for part, mesh in self._surfaces
         )
 
@@ -253,7 +253,7 @@ def _solid_names(solids: Any, parts: tuple[body.Part, ...]) -> list[str]:
     by_link: dict[str, list[str]] = defaultdict(list)
     for part in parts:
         if part.use != "picture":
-            by_link[part.link].append(part.whose)
+            by_link[part.link].append(part.name_in_cell)
     return [by_link[solid.name.rsplit("_", 1)[0]].pop(0) for solid in solids.geometryObjects]
 
 

@@ -219,18 +219,18 @@ def search_bases(
         return cell, plan_motions(plan, cell, organ, seed=seed), ""
     except NoPlan as failure:
         reason = failure
-    for elsewhere in itertools.islice(_elsewhere(plan, config), _MOST_TRIED):
-        cell = ArmCell(elsewhere, organ)
+    for moved in itertools.islice(_reachable_cells(plan, config), _MOST_TRIED):
+        cell = ArmCell(moved, organ)
         if cell.collisions(cell.home_rad) is not None:
             continue
         try:
-            return cell, plan_motions(plan, cell, organ, seed=seed), _note(elsewhere)
+            return cell, plan_motions(plan, cell, organ, seed=seed), _note(moved)
         except NoPlan:
             continue
     raise NoPlan(f"{reason} Other places for the arms round the table were tried in vain.")
 
 
-def _elsewhere(plan: ResectionPlan, config: CellConfig) -> Iterator[CellConfig]:
+def _reachable_cells(plan: ResectionPlan, config: CellConfig) -> Iterator[CellConfig]:
     """Configurations in which both arms reach all they have to, the least change first."""
     # Ends and middles of all strokes
     strokes = np.concatenate([cut.path_mm[[0, len(cut.path_mm) // 2, -1]] for cut in plan.cuts])

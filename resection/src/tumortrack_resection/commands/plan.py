@@ -77,7 +77,7 @@ class Plan(StatedPatient):
     overwrite: bool = False
 
     def run(self) -> None:
-        from tumortrack_resection.budget import heeded, plan_within
+        from tumortrack_resection.budget import checked_against, plan_within
         from tumortrack_resection.files import INVENTED, KIND, PlanFolder, write_plan
         from tumortrack_resection.located import notes_of_doubt, read_run
         from tumortrack_resection.operation import OperationConfig
@@ -102,7 +102,7 @@ class Plan(StatedPatient):
         resection = replace(resection, notes=(*doubts, *resection.notes))
         for line in budget.table():
             say(line)
-        resection = heeded(resection, budget, self.accept_budget)
+        resection = checked_against(resection, budget, self.accept_budget)
         _say_plan(resection, located)
         motions, cell_used, cell_source = None, None, INVENTED
         if self.arms:

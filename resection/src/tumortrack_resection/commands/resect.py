@@ -47,7 +47,7 @@ _LIVE = ("realsense", "ros2")  # sources that show the present
 
 
 @dataclass(frozen=True, kw_only=True)
-class Resect(track.Following):
+class Resect(track.FollowingOptions):
     """Carry a plan out with virtual arms, shown by the same sinks as `track`.
 
     Attributes:
@@ -240,7 +240,7 @@ class _Procedure:
             operation = self._operation(locate=locate, replan=replan, budget=budget)
             setup = CameraSetup(frames, {live.named: live.source})
             about = {"plan_config": to_builtins(self.config)}
-            same = {one.name: getattr(asked, one.name) for one in fields(track.Following)}
+            same = {one.name: getattr(asked, one.name) for one in fields(track.FollowingOptions)}
             track.Track(
                 model=live.model, source=live.named, sinks=asked.sinks, report=asked.report, **same
             ).run(

@@ -130,8 +130,8 @@ class ResultMessages:
         or, where no motion is known, the published frame's."""
         parent, transforms, turn = result.published_frame, [], np.eye(3)
         if result.estimate is not None and result.quality == "good":
-            if (motion := result.estimate.report.get("motion")) is not None:
-                turn = (parent.published_from_camera @ np.array(motion["camera_from_ct"]))[:3, :3]
+            if (motion := result.estimate.report.motion) is not None:
+                turn = (parent.published_from_camera @ np.array(motion.camera_from_ct))[:3, :3]
             for name in result.estimate.meshes:
                 center_mm = result.center_mm(name)
                 assert center_mm is not None

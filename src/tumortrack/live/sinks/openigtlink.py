@@ -17,6 +17,7 @@ from jaxtyping import Float64
 from tumortrack.core.colours import name_colour
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import RAS_FROM_LPS, rigid, transform_points
+from tumortrack.core.report import FitReport
 from tumortrack.core.types import Mesh
 from tumortrack.live.igtl import message as igtl
 from tumortrack.live.igtl.link import Link
@@ -154,9 +155,9 @@ class OpenIgtLinkSink:
 
     def _transforms(self, result: TrackingResult) -> Iterator[_Content]:
         way, tumors = result.published_frame.published_from_camera, self._context.parts[1:]
-        report = {} if result.estimate is None else result.estimate.report
         # The organ's pose without its deformation, where the method knows one.
-        pose = np.array(report["motion"]["camera_from_ct"]) if "motion" in report else None
+        motion = None if result.estimate is None else result.estimate.report.motion
+        pose = None if motion is None else np.array(motion.camera_from_ct)
         places: dict[str, Float64[np.ndarray, "4 4"] | None] = dict.fromkeys(tumors)
         if self._context.anatomy_ct is not None:
             places[CT] = None if pose is None else way @ pose
@@ -175,7 +176,7 @@ class OpenIgtLinkSink:
             yield "TRANSFORM", name, igtl.pack_transform(turned), known
 
     def _centres(self, result: TrackingResult) -> Iterator[_Content]:
-        report = {} if result.estimate is None else result.estimate.report
+        report = FitReport() if result.estimate is None else result.estimate.report
         tumors = self._context.parts[1:]
         places = {n: place for n in tumors if (place := result.center_mm(n)) is not None}
         labels = [centre_label(report, name, result.quality != "good") for name in places]
@@ -214,10 +215,10 @@ class OpenIgtLinkSink:
         self, result: TrackingResult, meshes: dict[str, Mesh], due: bool
     ) -> dict[str, Polydata]:
         """The surfaces of the tumors' stated margins; empty where one is stated no more."""
-        said = {} if result.estimate is None else result.estimate.report.get("margin")
+        margin = None if result.estimate is None else result.estimate.report.margin
         contents: dict[str, Polydata] = {}
         for name in self._context.parts[1:]:
-            mesh, radius, shell = meshes.get(name), stated_radius(said, name), name + MARGIN
+            mesh, radius, shell = meshes.get(name), stated_radius(margin, name), name + MARGIN
             if mesh is None or radius is None:
                 contents |= {shell: _NOTHING} if shell in self._margins else {}
             elif due:

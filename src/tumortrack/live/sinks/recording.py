@@ -19,6 +19,7 @@ from tumortrack.live.recording.mcap import CHUNK_S, STRING, McapBag, camera_mess
 from tumortrack.live.ros.messages import Messages, Outgoing
 from tumortrack.live.ros.results import ResultMessages
 from tumortrack.live.values import CameraView, SinkConfig, SinkContext, TrackingResult
+from tumortrack.tracking.files import report_entry
 
 POSES, STILL = "poses.csv", "poses.json"  # of a camera that moves; of several that stand still
 _ON_FULL_DISK = (
@@ -127,5 +128,5 @@ def _report(result: TrackingResult) -> dict[str, Any]:
         **{name: getattr(result, name) for name in same},
         "organ_points": None if result.organ is None else len(result.organ.points_mm),
         "seconds": dict(result.seconds),
-        "estimate": None if result.estimate is None else result.estimate.report,
+        "estimate": None if result.estimate is None else report_entry(result.estimate),
     }

@@ -77,7 +77,7 @@ class RosSource:
         beside = config.topic.removesuffix(_PACKED).rpartition("/")[0]
         self._info_topic = config.info or f"{beside}/camera_info"
         self._frames: Subscriber | None = None
-        self._beside: list[tuple[str, str, Subscriber]] = []
+        self._companions: list[tuple[str, str, Subscriber]] = []
         self._latest: dict[str, Any] = {}  # by topic: CameraInfo, mask and picture
         self._waiting: bytes | memoryview | None = None  # an image whose CameraInfo is not here yet
         self._passed = 0
@@ -97,7 +97,7 @@ class RosSource:
             left_s = max(0.0, until_s - time.monotonic())
             known = self._frames is not None or self._found(final=not left_s)
             raw = self._newest() if known else None
-            complete = {topic for topic, *_ in self._beside} <= self._latest.keys()
+            complete = {topic for topic, *_ in self._companions} <= self._latest.keys()
             if raw is not None and (complete or not left_s):
                 self._waiting = None
                 return self._observed(raw, time.time_ns())
@@ -135,7 +135,7 @@ class RosSource:
             beside = {self._info_topic: sensors.CAMERA_INFO, mask: sensors.IMAGE}
             beside[picture] = sensors.IMAGE
             # In both ways: some nodes publish it once and keep it for those who come later.
-            self._beside = [
+            self._companions = [
                 (topic, kind, self._bus.subscriber(topic, kind, 1, latched))
                 for latched in (False, True)
                 for topic, kind in ({} if self._kind == sensors.CLOUD else beside).items()
@@ -155,14 +155,14 @@ class RosSource:
 
     def _newest(self) -> bytes | memoryview | None:
         assert self._frames is not None
-        self._take_beside()
+        self._take_companions()
         if came := self._frames.take():
             self._passed += len(came) - 1 + (self._waiting is not None)
             self._waiting = came[-1]
         return self._waiting
 
-    def _take_beside(self) -> None:
-        for topic, kind, subscriber in self._beside:
+    def _take_companions(self) -> None:
+        for topic, kind, subscriber in self._companions:
             for raw in subscriber.take():
                 self._latest[topic] = self._bus.messages.from_bytes(raw, kind)
 
@@ -197,7 +197,7 @@ class RosSource:
             if (left_s := until_s - time.monotonic()) <= 0 or self._closed:
                 break
             self._bus.wait(left_s)
-            self._take_beside()
+            self._take_companions()
         return image and sensors.picture_of(image, frame)
 
     def _mask_for(self, frame: DepthFrame) -> Bool[np.ndarray, "h w"]:

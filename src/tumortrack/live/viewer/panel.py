@@ -16,6 +16,7 @@ from tumortrack.core import colours
 from tumortrack.core.colours import Colour, css, part_colour
 from tumortrack.core.estimate import NO_CHECK_FAILED, UNVERIFIED
 from tumortrack.core.patient import NOBODY
+from tumortrack.core.report import FitReport
 from tumortrack.live.values import Controls, TrackingResult, Workcell
 from tumortrack.live.viewer.look import View
 from tumortrack.live.viewer.scene import DisplayOptions
@@ -150,10 +151,10 @@ class StatusPanel:
         if result is None:
             return ""
         latency = "–" if result.latency_ms is None else f"{result.latency_ms:.0f} ms"
-        report: dict[str, Any] = {}
+        report = FitReport()
         if result.estimate is not None and self.state in ("good", "poor"):
             report = result.estimate.report
-            lag_ms = report.get("smoothing", {}).get("lag_ms", 0.0)
+            lag_ms = 0.0 if report.smoothing is None else report.smoothing.lag_ms
             latency += f" + {lag_ms:.0f} smoothing" if lag_ms >= 0.5 else ""
         parts = "" if self.state == "playback" else self._parts(report)
         return (
@@ -163,28 +164,29 @@ class StatusPanel:
             f"<div>{escape(result.cameras)}</div></div>"
         )
 
-    def _parts(self, report: dict[str, Any]) -> str:
+    def _parts(self, report: FitReport) -> str:
         """A row for each part, with and without an estimate: what is below must not jump. Under a
         failed check the deviation is no longer the place's, and is left out."""
-        said, good = report.get("margin", {}), self.state == "good"
-        stated = said["stated"][-1]["confidence"] if said.get("stated") else None
+        margins, good = report.margin, self.state == "good"
+        stated = margins.stated[-1].confidence if margins and margins.stated else None
         heads = ["", "volume", "standard deviation of place"]
         heads += [f"{100 * stated:g} % margin"] if stated else []
         rows = []
         for label, name in enumerate(self.parts, start=1):
-            part, margin = report.get("parts", {}).get(name, {}), stated_radius(said, name)
-            std_mm = part.get("center_std_mm") if good else None
+            part, margin = report.parts.get(name), stated_radius(margins, name)
+            volume_ml, std_mm = (part.volume_ml, part.center_std_mm) if part else (None, None)
+            std_mm = std_mm if good else None
             cells = [
                 f"<i style='background:{css(part_colour(label))}'></i>"
                 + escape(name.replace("_", " "))
-                + (" (not found)" if part.get("found") is False else ""),
-                f"{part['volume_ml']:.1f} ml" if part.get("found") else "–",
+                + (" (not found)" if part is not None and not part.found else ""),
+                "–" if volume_ml is None else f"{volume_ml:.1f} ml",
                 "–" if std_mm is None else f"{std_mm:.1f} mm",
             ]
             cells += [f"{margin.mm:.1f} mm" if margin else "–"] if stated else []
             rows.append(f"<tr><td>{'</td><td>'.join(cells)}</td></tr>")
         table = f"<table><tr><th>{'</th><th>'.join(heads)}</th></tr>{''.join(rows)}</table>"
-        none = escape(margin_words(said)) if report and not stated else ""
+        none = escape(margin_words(margins)) if report.parts and not stated else ""
         return f"{table}<div class='tumortrack-none'>{none}</div>"
 
 
@@ -208,7 +210,7 @@ def _box(text: str, colour: Colour, why: str = "") -> str:
 class Panel:
     """The elements, shared by all clients; whoever made it says what they do. The result comes
     first, then what shows it, then what changes it. ``slices``: what they show; empty: there are
-    none; ``arms``: with what they do; ``whose``: organ it is, in words."""
+    none; ``arms``: with what they do; ``patient``: in words."""
 
     def __init__(
         self,
@@ -216,14 +218,14 @@ class Panel:
         parts: tuple[str, ...],
         slices: str = "",
         arms: bool = False,
-        whose: str = str(NOBODY),
+        patient: str = str(NOBODY),
     ) -> None:
         gui = server.gui
         gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
         gui.main_panel.dock_right()
         gui.main_panel.set_width(_WIDTH)
-        self.whose = gui.add_html(
-            f"<div class='tumortrack-row tumortrack-whose'><b>{escape(whose)}</b>"
+        self.patient = gui.add_html(
+            f"<div class='tumortrack-row tumortrack-whose'><b>{escape(patient)}</b>"
             "<label><input type='checkbox' id='tumortrack-more'> more</label></div>"
         )
         gui.add_html(_PAGE)  # of one height: what is to be clicked must not jump

@@ -308,8 +308,8 @@ class ViewerScene:
         tumors = {n: m for n, m in placed.meshes.items() if n in self._shells}
         motion = result.estimate.motion
         if self._margin_mm is None:
-            said = result.estimate.report.get("margin")
-            radii = {name: stated_radius(said, name) for name in tumors}
+            margin = result.estimate.report.margin
+            radii = {name: stated_radius(margin, name) for name in tumors}
             return {n: rough_margin(tumors[n], radius.mm) for n, radius in radii.items() if radius}
         if self._margins_ct is None or motion is None:
             return {name: rough_margin(mesh, self._margin_mm) for name, mesh in tumors.items()}
@@ -330,13 +330,13 @@ class ViewerScene:
         """Where the middle of a tumor lies with 95 % probability, if the fit's own covariance were
         all there is to know; published frame. Nothing without a motion."""
         assert result.estimate is not None
-        motion, part = result.estimate.motion, result.estimate.report["parts"].get(name, {})
-        if self._at_rest is None or motion is None or "center_axes" not in part:
+        motion, part = result.estimate.motion, result.estimate.report.parts.get(name)
+        if self._at_rest is None or motion is None or part is None or part.center_axes is None:
             return _NOTHING
         at_rest = dict(zip(self._at_rest.names, self._at_rest.parts, strict=True))[name]
         middle_mm = motion.carry(at_rest.box_mm.mean(0, keepdims=True))
-        radii_mm = _ELLIPSOID * np.array(part["center_axes_std_mm"])
-        places_mm = middle_mm + (self._ball.vertices_mm * radii_mm) @ np.array(part["center_axes"])
+        radii_mm = _ELLIPSOID * np.array(part.center_axes_std_mm)
+        places_mm = middle_mm + (self._ball.vertices_mm * radii_mm) @ np.array(part.center_axes)
         return self._ball.moved(transform_points(self._way, places_mm))
 
     def _bare(self, organ: Mesh) -> Mesh:

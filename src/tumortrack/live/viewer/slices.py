@@ -139,7 +139,7 @@ def outlined(
     draw.line((edge, foot, edge + _BAR_MM * per_mm, foot), fill="white", width=_FINER * 3)
     draw.text((edge, foot - 17 * _FINER), f"{_BAR_MM} mm", fill="white", font_size=12 * _FINER)
     draw.text((fine - edge, foot), note, fill="white", font_size=12 * _FINER, anchor="rb")
-    return np.asarray(image.resize((pixels, pixels), Image.Resampling.BOX))
+    return np.asarray(image.reduce(_FINER))
 
 
 def _sample(

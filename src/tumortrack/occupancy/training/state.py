@@ -127,7 +127,7 @@ def provenance(
     }
 
 
-def settle_end(config: TrainConfig, progress: TrainingProgress, minutes: float | None) -> bool:
+def fix_last_step(config: TrainConfig, progress: TrainingProgress, minutes: float | None) -> bool:
     """With a limit in minutes: fix the last step, from the pace so far, once the schedule's tail
     has to begin; True when that happened now. From then on the schedule depends on steps alone, so
     that a resumed run repeats it."""

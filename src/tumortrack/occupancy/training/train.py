@@ -31,8 +31,8 @@ from tumortrack.occupancy.training.state import (
     TrainingProgress,
     TrainingRun,
     TrainingState,
+    fix_last_step,
     provenance,
-    settle_end,
 )
 from tumortrack.occupancy.training.task import OccupancyTask
 from tumortrack.simulate.scene import SceneStream
@@ -138,7 +138,7 @@ def run_steps(
             loss = state.step(batch)
             clock.count_step()
             progress.elapsed_s, stop = clock.elapsed(), stopped()
-            settled = settle_end(run.config, progress, run.minutes)
+            settled = fix_last_step(run.config, progress, run.minutes)
             done = progress.step == progress.end
             if task and write and (done or progress.step % run.config.validate_every == 0):
                 miou = task.miou(state.average)

@@ -1,0 +1,37 @@
+"""Estimates whose reports say what a test needs."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import msgspec
+
+from tumortrack.core.estimate import Estimate
+from tumortrack.core.report import Finding, FitReport
+
+NOWHERE = {
+    "camera_from_ct": [[1.0, 0, 0, 0], [0, 1.0, 0, 0], [0, 0, 1.0, 0], [0, 0, 0, 1.0]],
+    **{"coefficients": [], "rarity": 0.3, "steps": 4, "discrepancy_mm": None, "noise_mm": None},
+}
+
+
+def report_of(**entries: Any) -> FitReport:
+    """Of entries as in report.json; parts need no label."""
+    parts = entries.get("parts", {}).items()
+    labelled = {n: {"label": k, "found": True, **part} for k, (n, part) in enumerate(parts, 1)}
+    return msgspec.convert({**entries, "parts": labelled}, FitReport)
+
+
+def reporting(estimate: Estimate, **entries: Any) -> Estimate:
+    """The same estimate with these entries in its report; of a part, too."""
+    known = msgspec.to_builtins(estimate.report)
+    parts = known.get("parts", {})
+    for name, part in entries.pop("parts", {}).items():
+        parts[name] = {**parts.get(name, {}), **part}
+    return replace(estimate, report=report_of(**{**known, "parts": parts, **entries}))
+
+
+def poor(words: str) -> Finding:
+    """A reason of a test's own."""
+    return Finding("model", {"words": words})
