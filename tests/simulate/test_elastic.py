@@ -207,7 +207,7 @@ def bed(
     springs = np.clip(-(reduced.patches.normals @ up), 0, 1) * reduced.patches.areas_mm2
     problem.touch(reduced.along(-up), np.zeros(len(springs)), kpa_per_mm * KPA * springs)
     for axis in np.eye(3):
-        problem.tie(reduced.along(axis), 0.0, 1e-3 * KPA * springs)
+        problem.tie(axis, 0.0, 1e-3 * KPA * springs)
     return problem
 
 

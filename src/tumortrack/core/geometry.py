@@ -83,6 +83,16 @@ def rotation_onto(source: Vector, target: Vector) -> Matrix:
     return (np.eye(3) - 2 * np.outer(middle, middle)) @ (np.eye(3) - 2 * np.outer(a, a))
 
 
+def turned_by(vector_rad: Vector) -> Matrix:
+    """The rotation matrix about a vector, by its length in radians (Rodrigues)."""
+    angle = float(np.linalg.norm(vector_rad))
+    if angle == 0:
+        return np.eye(3)
+    x, y, z = vector_rad / angle
+    across = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return np.eye(3) + np.sin(angle) * across + (1 - np.cos(angle)) * across @ across
+
+
 def direction_lps(text: str) -> Direction:
     """A unit vector in LPS from a name (``anterior``) or three numbers (``0,-1,0``); InputError for
     neither a known name nor a non-zero finite 3-vector."""

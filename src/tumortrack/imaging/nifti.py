@@ -192,8 +192,6 @@ def write_nifti(
 
 def _header_of(array: np.ndarray, affine: np.ndarray) -> np.ndarray:
     """Everything but the numbers' type."""
-    from scipy.spatial.transform import Rotation
-
     spacing = spacing_mm(affine)
     turn = affine[:3, :3] / spacing
     handed = 1.0 if np.linalg.det(affine[:3, :3]) > 0 else -1.0
@@ -205,10 +203,21 @@ def _header_of(array: np.ndarray, affine: np.ndarray) -> np.ndarray:
     header["sform_code"], header["srow"] = _SCANNER, affine[:3]
     # A quaternion cannot hold shear; the sform alone is right for every affine.
     if np.allclose(turn.T @ turn, np.eye(3), atol=1e-4):
-        rotation = Rotation.from_matrix(turn * [1, 1, handed])
         header["qform_code"], header["offset"] = _SCANNER, affine[:3, 3]
-        header["quaternion"] = rotation.as_quat(canonical=True)[:3]  # a >= 0 is left out
+        header["quaternion"] = _quaternion(turn * [1, 1, handed])
     return header
+
+
+def _quaternion(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, " 3"]:
+    """b, c and d of a rotation; a, which is left out, is not negative. (Bar-Itzhack 2000,
+    doi 10.2514/2.4654: the eigenvector that has the largest eigenvalue.)"""
+    whole = np.zeros((4, 4))
+    whole[:3, :3] = rotation + rotation.T - np.trace(rotation) * np.eye(3)
+    b, c, d = rotation[2, 1], rotation[0, 2], rotation[1, 0]
+    whole[3] = whole[:, 3] = [b - rotation[1, 2], c - rotation[2, 0], d - rotation[0, 1], 0]
+    whole[3, 3] = np.trace(rotation)
+    bcda = np.linalg.eigh(whole)[1][:, -1]
+    return bcda[:3] if bcda[3] >= 0 else -bcda[:3]
 
 
 def write_volume_nifti(

@@ -158,7 +158,9 @@ def _boundary_distance(mesh: Mesh, mask: np.ndarray, affine: np.ndarray) -> np.n
         low += [s.start for s in box]
         shift = np.insert(raster, axis, 0.5, axis=1)
         points.append((low[:, None] + shift).reshape(-1, 3))
-    tree = cKDTree(transform_points(affine, np.concatenate(points)))
+    # Loose, since points are many and questions few.
+    places = transform_points(affine, np.concatenate(points))
+    tree = cKDTree(places, balanced_tree=False, compact_nodes=False)
     vertices = mesh.vertices_mm[:: max(1, len(mesh.vertices_mm) // 4000)]
     return tree.query(vertices)[0] / float(spacing_mm(affine).max())
 

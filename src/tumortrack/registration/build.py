@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from itertools import count
 from typing import Any
 
 import numpy as np
@@ -106,10 +107,15 @@ def build_model(
     pairs = list(zip(scenes, nearby, strict=True))
     right = [fit.cost for one, fit in pairs if one.off_mm(fit.motion, inner_ct) <= FAR_MM]
     usual_cost = float(np.percentile(right or [fit.cost for fit in nearby], _USUAL))
-    fits = []
-    for index, one in enumerate(scenes[: config.searched]):
-        fits.append(registration.register(one.looks)[0])
-        progress(3 + config.scenes + index, steps)
+    done = count(3 + config.scenes)
+
+    def found(one: _Scene) -> RegistrationResult:
+        fit = registration.register(one.looks)[0]
+        progress(next(done), steps)
+        return fit
+
+    # A scene a thread: the parts of a search wait for each other.
+    fits = parallel_map(found, scenes[: config.searched])
     std_scale, checked = _judged(scenes, fits, config, inner_ct)
     spreads = [spread_mm(one.looks.points_mm) for one in scenes]
     fits_mm = [fit_mm(np.abs(fit.distances_mm)) for fit in fits]

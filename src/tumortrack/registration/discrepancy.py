@@ -19,8 +19,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float32, Float64, Int64
-from scipy.spatial import cKDTree
-from scipy.spatial.distance import cdist
 
 from tumortrack.models.kernels import farthest
 from tumortrack.registration import discrepancy_kernels as kernels
@@ -127,7 +125,7 @@ def _grouped(points_ct: Float64[np.ndarray, "n 3"]) -> Int64[np.ndarray, " n"]:
     chosen = np.empty((1, min(_GROUPS, len(points_ct))), np.int64)
     farthest(points, first, chosen)
     chosen = chosen[0]
-    nearest = cKDTree(points_ct[chosen]).query(points_ct)[1]
+    nearest = _squares_mm2(points_ct, points_ct[chosen]).argmin(axis=1)
     return np.unique(nearest, return_inverse=True)[1]  # where points coincide some have none
 
 
@@ -135,4 +133,12 @@ def _alike(
     a: Float32[np.ndarray, "n 3"] | Float64[np.ndarray, "n 3"], b: Float64[np.ndarray, "m 3"]
 ) -> Float64[np.ndarray, "n m"]:
     """The process's correlation between places."""
-    return np.exp(cdist(a, b, "sqeuclidean") / (-2 * LENGTH_MM**2))
+    return np.exp(_squares_mm2(a, b) / (-2 * LENGTH_MM**2))
+
+
+def _squares_mm2(
+    a: Float32[np.ndarray, "n 3"] | Float64[np.ndarray, "n 3"], b: Float64[np.ndarray, "m 3"]
+) -> Float64[np.ndarray, "n m"]:
+    """Of the distances of each to each."""
+    x, y, z = (np.subtract.outer(a[:, axis].astype(float), b[:, axis]) for axis in range(3))
+    return x * x + y * y + z * z

@@ -20,7 +20,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float, Float64
-from scipy.linalg import block_diag
 
 from tumortrack.core.geometry import Points
 from tumortrack.models.config import GaussNewtonConfig
@@ -155,7 +154,8 @@ def posterior(motion: ElasticMotion, looks: Looks, config: GaussNewtonConfig) ->
     from_mean = np.zeros(POSE), motion.coefficients - body.mean, looks.shifts[1:].ravel()
     pose_std = np.repeat([config.shift_mm, config.turn_rad], 3)
     cameras = np.tile(CAMERA_STD**2, looks.count - 1)
-    prior = block_diag(np.diag(pose_std**2), body.covariance, np.diag(cameras))
+    prior = np.diag(np.concatenate([pose_std**2, body.mean, cameras]))
+    prior[POSE:unknowns, POSE:unknowns] = body.covariance
     rows = motion.residual_rows(looks.points_mm)
     slopes, distances = rows[:, :-1], rows[:, -1:]
     rows = np.concatenate([slopes, looks.unknown(slopes), distances], axis=1)

@@ -73,15 +73,17 @@ def descend(problem, state, first, last):  # type: ignore[no-untyped-def]
     unknowns, cost = len(state.gradient), 0.0
     rows = np.empty((BLOCK, unknowns + 1), np.float32)
     columns = np.zeros((-(-(unknowns + 1) // 4) * 4, _AT_ONCE + _APART), np.float32)
-    if first == 0:
-        cost = _equations(problem, state, _width(problem, 0), (rows, columns))
-    for step in range(first, last):
-        change = np.linalg.solve(state.curvature, state.gradient)
-        turn(state.rotation, state.centre_mm, change)
-        state.moved[:] -= change[:POSE]
-        state.coefficients[:] -= change[POSE:]
+    change = np.zeros(unknowns)
+    # Before step 0 there are equations, and no step. (One place of theirs compiles in half the time
+    # of two.)
+    for step in range(first if first > 0 else -1, last):
+        if step >= 0:
+            change[:] = np.linalg.solve(state.curvature, state.gradient)
+            turn(state.rotation, state.centre_mm, change)
+            state.moved[:] -= change[:POSE]
+            state.coefficients[:] -= change[POSE:]
         cost = _equations(problem, state, _width(problem, step + 1), (rows, columns))
-        small = np.abs(change).max() < problem.enough_mm
+        small = step >= 0 and np.abs(change).max() < problem.enough_mm
         if small and _width(problem, step) == problem.last_mm:
             return step + 1, True, cost
     return last, False, cost

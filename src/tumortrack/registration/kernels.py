@@ -7,10 +7,10 @@ Derivatives by coefficients are to first order: the modes halfway along a point'
 
 from __future__ import annotations
 
+from statistics import NormalDist
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import ndtr
 
 from tumortrack.core.compiled import numba
 from tumortrack.simulate.elastic.flow import BLOCK, add_modes, block, enter, travel
@@ -18,7 +18,7 @@ from tumortrack.simulate.elastic.flow import BLOCK, add_modes, block, enter, tra
 POSE = 6  # unknowns before the coefficients
 NODES_MM = 2.0  # apart, of the lattice for ``look_up``
 _MOST_STD, _PER_STD = 8, 1024  # so wide a table, in such steps, is right to 1e-7
-_NORMAL = ndtr(np.arange(_MOST_STD * _PER_STD + 2) / _PER_STD)  # from 0 standard deviations on
+_NORMAL = np.array([NormalDist().cdf(n / _PER_STD) for n in range(_MOST_STD * _PER_STD + 2)])
 
 
 class Flow(NamedTuple):

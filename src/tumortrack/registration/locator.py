@@ -10,7 +10,6 @@ from typing import Any
 import msgspec
 import numpy as np
 from jaxtyping import Float, Float32, Int32, Int64, UInt8
-from scipy.spatial import cKDTree
 
 from tumortrack.core.estimate import Estimate, FollowOptions
 from tumortrack.core.report import (
@@ -53,8 +52,11 @@ def nearest_lookup(
     lower, upper = places_mm.min(0) - step, places_mm.max(0) + step
     shape = tuple(np.ceil((upper - lower) / step).astype(int) + 1)
     nodes = lower + step * np.indices(shape).reshape(3, -1).T
-    which = cKDTree(places_mm).query(nodes)[1].astype(np.int32)
-    return lower.astype(np.float32), which.reshape(shape)
+    # Half the squared distance, up to what it is for all places; by thousands, for the cache.
+    half = (places_mm**2).sum(1) / 2
+    parts = np.array_split(nodes, len(nodes) // 1000 + 1)
+    which = np.concatenate([(half - some @ places_mm.T).argmin(1) for some in parts])
+    return lower.astype(np.float32), which.astype(np.int32).reshape(shape)
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,9 +13,8 @@ from dataclasses import dataclass, replace
 import msgspec
 import numpy as np
 from jaxtyping import Float, Float64, Int64
-from scipy.spatial.transform import Rotation
 
-from tumortrack.core.geometry import Affine, Points, rigid, transform_points
+from tumortrack.core.geometry import Affine, Points, rigid, transform_points, turned_by
 from tumortrack.core.report import LooksReport
 from tumortrack.models.config import GaussNewtonConfig
 from tumortrack.registration.kernels import POSE
@@ -118,7 +117,7 @@ class Looks:
         points_mm, poses = self.points_mm.copy(), list(self.camera_from_look)
         for n, change in enumerate(changes, start=1):
             # As if the organ moved before this camera alone: then the points move back by it.
-            turned = motion.rotation @ Rotation.from_rotvec(change[3:]).as_matrix()
+            turned = motion.rotation @ turned_by(change[3:])
             centre_mm = motion.centre_mm + motion.rotation @ change[:3]
             turn = motion.rotation @ turned.T
             back = rigid(turn, motion.centre_mm - turn @ centre_mm)

@@ -8,10 +8,9 @@ from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float32, Float64
-from scipy.spatial.transform import Rotation
 
 from tumortrack.core.errors import InputError
-from tumortrack.core.geometry import Points, largest_std_of, rigid, std_of
+from tumortrack.core.geometry import Points, largest_std_of, rigid, std_of, turned_by
 from tumortrack.core.process import parallel_for
 from tumortrack.registration import kernels
 from tumortrack.registration.discrepancy import Discrepancy, products
@@ -153,10 +152,12 @@ def _given(points_mm: Points) -> Float32[np.ndarray, "n 3"]:
 def blend(a: ElasticMotion, b: ElasticMotion, share: float) -> ElasticMotion:
     """Between two motions of one shape: ``share`` 0 is at ``a``, 1 at ``b``, whose covariance it
     keeps."""
+    from scipy.spatial.transform import Rotation
+
     turn = Rotation.from_matrix(a.rotation.T @ b.rotation).as_rotvec()
     return replace(
         b,
-        rotation=a.rotation @ Rotation.from_rotvec(share * turn).as_matrix(),
+        rotation=a.rotation @ turned_by(share * turn),
         centre_mm=(1 - share) * a.centre_mm + share * b.centre_mm,
         coefficients=(1 - share) * a.coefficients + share * b.coefficients,
     )

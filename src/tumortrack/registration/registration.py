@@ -24,9 +24,8 @@ from functools import cached_property
 import msgspec
 import numpy as np
 from jaxtyping import Float64
-from scipy.spatial.transform import Rotation
 
-from tumortrack.core.geometry import Points
+from tumortrack.core.geometry import Points, turned_by
 from tumortrack.core.process import parallel_map
 from tumortrack.models.config import GaussNewtonConfig
 from tumortrack.models.in_distribution import RIVAL_COST
@@ -224,7 +223,7 @@ def _turned_starts(
             off = covariance[:, 3:6] @ axis * far / math.sqrt(variance)
             start = replace(
                 fitted,
-                rotation=fitted.rotation @ Rotation.from_rotvec(off[3:6]).as_matrix(),
+                rotation=fitted.rotation @ turned_by(off[3:6]),
                 centre_mm=fitted.centre_mm + fitted.rotation @ off[:3],
                 coefficients=fitted.coefficients + off[6:],
             )

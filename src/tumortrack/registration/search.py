@@ -12,9 +12,8 @@ from functools import cached_property
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
-from scipy.spatial.transform import Rotation
 
-from tumortrack.core.geometry import Points, rotation_onto, triangles_of, unit
+from tumortrack.core.geometry import Points, rotation_onto, triangles_of, turned_by, unit
 from tumortrack.core.process import parallel_for
 from tumortrack.models.in_distribution import RIVAL_COST
 from tumortrack.registration.looks import Looks
@@ -163,8 +162,8 @@ class Search:
     def _rotations(self) -> Float64[np.ndarray, "s 3 3"]:
         """From the CT to the camera: each side turned towards it, then about the line of sight."""
         facing = [rotation_onto(side, _TOWARDS_CAMERA) for side in self.prior.sides_ct]
-        angles = np.arange(0, 360, _TURN_DEGREES)
-        turns = Rotation.from_euler("z", angles[:, None], degrees=True).as_matrix()
+        angles = np.radians(np.arange(0, 360, _TURN_DEGREES))
+        turns = np.array([turned_by(angle * np.array([0.0, 0.0, 1.0])) for angle in angles])
         return (turns[None] @ np.array(facing)[:, None]).reshape(-1, 3, 3)
 
     @cached_property

@@ -36,8 +36,12 @@ def descend_rigidly(problem, rotations, centres, costs):  # type: ignore[no-unty
     curvature, gradient = np.empty((POSE, POSE)), np.empty(POSE)
     for start in range(len(rotations)):
         rotation, centre = rotations[start], centres[start]
-        for width in problem.widths_mm:
-            _weighed_rows(problem, rotation, centre, np.float32(width), columns)
+        for step in range(len(problem.widths_mm) + 1):  # the last one tells the cost alone
+            whole = step == len(problem.widths_mm)
+            width = problem.last_mm if whole else problem.widths_mm[step]
+            costs[start] = _weighed_rows(problem, rotation, centre, np.float32(width), columns)
+            if whole:
+                break
             _equations(problem, columns, curvature, gradient)
             change = np.linalg.solve(curvature, gradient)
             for part, most in ((0, _MOST_MM), (3, _MOST_RAD)):
@@ -45,8 +49,6 @@ def descend_rigidly(problem, rotations, centres, costs):  # type: ignore[no-unty
                 if size > most:
                     change[part : part + 3] *= most / size
             turn(rotation, centre, change)
-        last = np.float32(problem.last_mm)
-        costs[start] = _weighed_rows(problem, rotation, centre, last, columns)
 
 
 @numba.njit(cache=True, fastmath=True, nogil=True, inline="always")

@@ -11,15 +11,15 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
+from statistics import NormalDist
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import ndtri
 
 from tumortrack.core.compiled import numba
 
 # Quantiles of the normal distribution: a hash's low 14 bits choose one. Scaled to variance 1.
-_QUANTILES = ndtri((np.arange(2**14) + 0.5) / 2**14)
+_QUANTILES = np.array([NormalDist().inv_cdf((n + 0.5) / 2**14) for n in range(2**14)])
 _QUANTILES = (_QUANTILES / _QUANTILES.std()).astype(np.float32)
 _GOLDEN = np.uint64(0x9E3779B97F4A7C15)
 _MIX_1, _MIX_2 = np.uint64(0xBF58476D1CE4E5B9), np.uint64(0x94D049BB133111EB)

@@ -15,8 +15,6 @@ from typing import Any, Literal, NamedTuple
 import msgspec
 import numpy as np
 from jaxtyping import Float32, Float64, Num, UInt8
-from scipy.spatial import ConvexHull
-from scipy.spatial.transform import Rotation
 
 from tumortrack.core.config import Config, check_seed
 from tumortrack.core.errors import InputError, NoEstimate, TumortrackError
@@ -150,6 +148,8 @@ class Simulator:
     body: ElasticBody | None = None
 
     def __post_init__(self) -> None:
+        from scipy.spatial import ConvexHull  # slow to import
+
         self._intrinsics = d405(self.config.width, self.config.height)
         self._visibility = Visibility(self.anatomy_ct.organ)
         vertices = self.anatomy_ct.organ.vertices_mm
@@ -229,6 +229,8 @@ def sample_pose(
 ) -> Float64[np.ndarray, "4 4"]:
     """Draw ``camera_from_ct``; the organ's nearest point gets a depth within ``nearest_mm``."""
     if config.rotations == "full":
+        from scipy.spatial.transform import Rotation
+
         rotation = Rotation.random(rng=rng).as_matrix()
     else:
         spin = rng.uniform(0, 360)

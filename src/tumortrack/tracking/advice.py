@@ -6,7 +6,6 @@ from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.spatial import cKDTree
 
 from tumortrack.core.estimate import Estimate
 from tumortrack.core.geometry import Points, transform_points, triangles_of
@@ -55,7 +54,14 @@ def near_side(organ: Mesh) -> Float[np.ndarray, "n 3"]:
 
 def unseen(places_mm: Points, points_mm: Float[np.ndarray, "_ 3"]) -> Bool[np.ndarray, " n"]:
     """Which of the places no point is near."""
-    return cKDTree(points_mm).query(places_mm)[0] > _NEAR_MM
+    return _nearest_mm(places_mm, points_mm) > _NEAR_MM
+
+
+def _nearest_mm(places_mm: Points, points_mm: Float[np.ndarray, "_ 3"]) -> Float[np.ndarray, " n"]:
+    """How far each place is from the nearest point."""
+    from scipy.spatial import cKDTree  # slow to import
+
+    return np.asarray(cKDTree(points_mm).query(places_mm)[0])
 
 
 def _unsure(estimate: Estimate, centre: Float[np.ndarray, " 3"]) -> Float[np.ndarray, " 3"]:
@@ -65,7 +71,7 @@ def _unsure(estimate: Estimate, centre: Float[np.ndarray, " 3"]) -> Float[np.nda
         places_mm = estimate.organ_mesh.vertices_mm
         places_mm = places_mm[:: len(places_mm) // _MOST + 1]
         other_mm = motion.rivals[0][0].carry(motion.shape.anatomy_ct.organ.vertices_mm)
-        return places_mm[cKDTree(other_mm).query(places_mm)[0].argmax()] - centre
+        return places_mm[_nearest_mm(places_mm, other_mm).argmax()] - centre
     known = [
         (part.center_axes_std_mm[0], name, part.center_axes[0])
         for name, part in estimate.report.tumors.items()

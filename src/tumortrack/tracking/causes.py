@@ -12,7 +12,6 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from tumortrack.core.causes import Cause, Likely
 from tumortrack.core.estimate import Estimate
@@ -171,6 +170,8 @@ def _shown(model: Model, points: Points, fitted: _Fitted) -> list[Likely]:
         large = Likely(Cause.BACKGROUND, float(far.mean()))
         small = Likely(Cause.ANOTHER_PATIENT if spread >= least else Cause.OBJECT)
         return [large if spread > most else small]
+    from scipy.spatial import cKDTree  # slow to import
+
     near = near_side(organ)
     beside = float((cKDTree(organ.vertices_mm).query(points)[0] > _BESIDE_MM).mean())
     hidden = float(unseen(near, points).mean()) if len(near) else 0.0

@@ -7,7 +7,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from scipy.ndimage import binary_dilation, distance_transform_edt
+from jaxtyping import Bool
 
 from tumortrack.core.errors import NotThisOrgan
 from tumortrack.core.estimate import Estimate
@@ -209,7 +209,7 @@ def seen_through(organ: Mesh, frame: DepthFrame) -> tuple[float, float, float]:
         return 0.0, 0.0, 0.0
     picture = np.isfinite(organ_mm)
     in_sight = (seen_mm[both] > organ_mm[both] - _THROUGH_MM).sum() / picture.sum()
-    rim = binary_dilation(picture, iterations=_RIM) & ~picture
+    rim = _within(_RIM, picture) & ~picture
     told = (seen_mm[rim] > organ_mm[picture].min()).sum() / max(rim.sum(), 1)
     through = (seen_mm[both] > organ_mm[both] + _THROUGH_MM).mean()
     return float(through), float(told), float(in_sight)
@@ -239,9 +239,23 @@ def cloud_shares(organ: Mesh, cloud: SensorCloud) -> tuple[float, float]:
     if not on.any():
         return 0.0, 1.0
     through = float((z_mm[on] > surface_mm[on] + _THROUGH_MM).mean())
-    empty = np.ones(organ_mm.shape, bool)
-    empty[row, column] = False
+    filled = np.zeros(organ_mm.shape, bool)
+    filled[row, column] = True
     picture = np.isfinite(organ_mm)
     apart = np.sqrt(picture.sum() / on.sum())  # pixels between neighbours
-    far = distance_transform_edt(empty) > max(_NEAR_MM / _PIXEL_MM, 2 * apart)
-    return through, float(far[picture].mean())
+    near = _within(max(_NEAR_MM / _PIXEL_MM, 2 * apart), filled)
+    return through, float(1 - near[picture].mean())
+
+
+def _within(reach: float, filled: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+    """Which pixels have a filled one within so many pixels' distance. (Row by row: SciPy's
+    distances are slow to import, for which a verdict would wait.)"""
+    room, (height, width) = int(min(reach, np.hypot(*filled.shape))), filled.shape
+    before = np.cumsum(np.pad(filled, ((room, room), (room + 1, room))), axis=1)
+    near = np.zeros(filled.shape, bool)
+    for down in range(-room, room + 1):
+        across = min(int(np.sqrt(reach**2 - down**2)), room)
+        rows = before[room + down : room + down + height]
+        ends = rows[:, room + across + 1 :][:, :width]
+        near |= ends > rows[:, room - across : room - across + width]
+    return near

@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float32, Float64
-from scipy.spatial.transform import Rotation
 
 from tumortrack.core.compiled import numba
 from tumortrack.core.config import Config
@@ -50,6 +49,8 @@ class StretchConfig(Config, frozen=True, tag="stretch"):
 
     def sample(self, view: View, rng: np.random.Generator) -> Stretch:
         """Draw axes uniformly on the sphere, stretch and bend uniformly within their limits."""
+        from scipy.spatial.transform import Rotation  # slow to import
+
         lower, upper = view.anatomy_ct.organ.box_mm
         axes = Rotation.random(rng=rng).as_matrix()
         stretch = rng.uniform(self.thinnest, self.thickest)

@@ -54,10 +54,10 @@ class ReducedProblem:
         near = springs > 0
         self.contacts.append((rows[near], depth_mm[near], springs[near]))
 
-    def tie(self, rows: np.ndarray, target_mm: np.ndarray | float, springs: np.ndarray) -> None:
-        """Springs (N/mm) that hold ``rows @ z`` at a target, both ways."""
-        whole = self.stiffness, self.forces, rows, springs * target_mm, springs
-        self.later.append(lambda: _add_springs(*whole))
+    def tie(self, along: Vector, target_mm: float, springs: Float64[np.ndarray, " p"]) -> None:
+        """Springs (N/mm) that hold the patches at a target along a direction, both ways."""
+        known, loads = (self.stiffness, self.forces), (springs * target_mm, springs)
+        self.later.append(lambda: _add_springs(*known, self.organ.along(along), *loads))
 
     def press(self, outward: Vector, height_mm: float, foot: Float64[np.ndarray, " p"]) -> None:
         """Something hard comes from a unit vector and stops at ``height_mm`` along it, felt by a
@@ -79,7 +79,7 @@ class ReducedProblem:
         patches = self.organ.patches
         springs = _GRIP * patches.areas_mm2 * patches.spot(patches.points_mm[patch], radius_mm)
         for axis, shift in zip(np.eye(3), shift_mm, strict=True):
-            self.tie(self.organ.along(axis), shift, springs)
+            self.tie(axis, float(shift), springs)
 
     def weigh(self, down: Vector, fraction: float) -> None:
         """A fraction of the weight that the tissue bore in the CT is no longer borne."""
@@ -229,15 +229,14 @@ def in_bed(organ: ReducedModel, up: Vector, rng: np.random.Generator) -> Reduced
     patches = organ.patches
     below = np.clip(-(patches.normals @ up), 0, 1) * patches.areas_mm2
     springs = below * KPA * _log_uniform(0.5, 20, rng)
-    down = organ.along(-up)
     if rng.uniform() < 0.6:
-        problem.touch(down, np.zeros(len(down)), springs)
-        problem.tie(down, 0.0, 1e-3 * springs)  # keeps it over the bed
+        problem.touch(organ.along(-up), np.zeros(len(springs)), springs)
+        problem.tie(-up, 0.0, 1e-3 * springs)  # keeps it over the bed
     else:
-        problem.tie(down, 0.0, springs)
+        problem.tie(-up, 0.0, springs)
     grip, one = rng.uniform(0, 0.3), perpendicular(up)
     for aside in (one, np.cross(up, one)):
-        problem.tie(organ.along(aside), 0.0, grip * springs)
+        problem.tie(aside, 0.0, grip * springs)
     return problem
 
 

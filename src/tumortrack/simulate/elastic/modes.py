@@ -17,6 +17,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from tumortrack.core.geometry import triangles_of, unit
+from tumortrack.core.process import parallel_map
 from tumortrack.core.types import Mesh
 from tumortrack.simulate.elastic.finite import LatticeSolid
 
@@ -76,14 +77,17 @@ def modes_of(
 
     forces = np.column_stack([loads, solid.swelling])
     forces = forces - mass * (rigid @ (inverse @ (rigid.T @ forces)))  # inertia balances them
-    responses = np.empty_like(forces[:, :-1])
-    for turn, contrast in enumerate(contrasts):
-        factor = solid.factor(contrast)
-        taken = slice(turn, None, len(contrasts))
-        responses[:, taken] = factor.solve(forces[:, :-1][:, taken])
+    responses = np.empty_like(forces)
+
+    def respond(turn: int) -> None:
+        factor, taken = solid.factor(contrasts[turn]), slice(turn, -1, len(contrasts))
+        responses[:, taken] = factor.solve(forces[:, taken])
         if turn == 0:
-            swelling = without_rigid(factor.solve(forces[:, -1:]))
+            responses[:, -1:] = factor.solve(forces[:, -1:])
+
+    parallel_map(respond, range(len(contrasts)))
     responses = without_rigid(responses)
+    responses, swelling = responses[:, :-1], responses[:, -1:]
     moved = solid.at(patches.points_mm, responses)
     responses /= np.linalg.norm(moved, axis=1).max(0)  # each moves its farthest patch by 1 mm
 
