@@ -100,8 +100,8 @@ test-hard: setup  ## tests on narrow vector units beside two busy processes (ARG
 	trap "kill $$one $$two" EXIT; ONEDNN_MAX_CPU_ISA=AVX2 ATEN_CPU_CAPABILITY=avx2 \
 	NUMBA_CPU_NAME=haswell OMP_NUM_THREADS=1 $(BIN)/pytest $(ARGS)
 
-bench: setup  ## speed of every part beside its naive form; fills docs/performance.md (10 to 13 minutes; ARGS=--quick)
-	$(BIN)/tumortrack bench --curves --document docs/performance.md $(ARGS)
+bench: setup  ## speed of every part beside its naive form; fills docs/performance.md and docs/data/speed*.csv (10 to 13 minutes; ARGS=--quick)
+	$(BIN)/tumortrack bench --document docs/performance.md $(ARGS)
 
 soak: setup  ## an hour of tracking with faults of eleven kinds (ARGS="MODEL CASE --minutes 5"; after make demo)
 	$(BIN)/python lab/scripts/soak.py $(ARGS)
@@ -148,7 +148,7 @@ lock: setup $(TOOLS)  ## pin the dependencies by hash (ARGS=--upgrade: newest; A
 	PATH="$(CURDIR)/.tools/bin:$$PATH" $(BIN)/python tools/dependencies.py lock $(ARGS)
 	PATH="$(CURDIR)/.tools/bin:$$PATH" $(BIN)/python tools/dependencies.py wheels
 
-licences: setup  ## list the dependencies' licences in docs/dependencies.md; fails on one not allowed
+licences: setup  ## list the dependencies' licences in docs/data/dependencies.csv; fails on one not allowed
 	$(BIN)/python tools/dependencies.py table
 	$(BIN)/python tools/dependencies.py licences
 

@@ -3,12 +3,14 @@
 tools/dependencies.py lock [--upgrade]   requirements/*.txt, of pyproject.toml's ranges
 tools/dependencies.py wheels             refuses a pin without a wheel where it is wanted
 tools/dependencies.py licences           refuses a licence that is not allowed
-tools/dependencies.py table              docs/dependencies.md
+tools/dependencies.py table              docs/data/dependencies.csv
 tools/dependencies.py sbom WHEEL         CycloneDX 1.6 beside a wheel: WHEEL.cdx.json
 """
 
 from __future__ import annotations
 
+import csv
+import io
 import itertools
 import json
 import re
@@ -25,7 +27,7 @@ from packaging.utils import canonicalize_name
 
 ROOT = Path(__file__).parents[1]
 LOCKS = ROOT / "requirements"
-TABLE = ROOT / "docs" / "dependencies.md"
+TABLE = ROOT / "docs" / "data" / "dependencies.csv"
 OWN = ("tumortrack", "tumortrack-resection", "tumortrack-lab", "tumortrack-experiment")
 _APART = {"ur-rtde": "ur"}  # in a file of its own: `make setup` leaves it out
 
@@ -213,25 +215,14 @@ def is_allowed(expression: str) -> bool:
 
 
 def table() -> str:
-    rows = [
-        f"| {package.metadata['Name']} | {package.version.split('+')[0]} | {licence(package)} |"
-        for _, package in sorted(everything().items())
-    ]
-    return _TABLE + "\n".join(rows) + "\n"
-
-
-_TABLE = """# Dependencies
-
-What `make setup` installs, and under which licence; made by `make licences`, which fails on one
-that is not allowed. Allowed are licences that ask only for attribution, and those whose terms
-concern changes to the package itself (MPL, EPL) or that it can be replaced (LGPL): packages are
-imported, not copied. GPL, AGPL and packages that state no licence are refused. Not listed are
-CUDA's packages, under NVIDIA's own licence: PyPI's PyTorch for x86-64 Linux asks for them, and
-PyTorch's CPU build does without.
-
-| package | version | licence |
-|---|---|---|
-"""
+    """CSV: package, version, licence."""
+    text = io.StringIO()
+    rows = csv.writer(text, lineterminator="\n")
+    rows.writerow(("package", "version", "licence"))
+    for _, package in sorted(everything().items()):
+        name, version = package.metadata["Name"], package.version.split("+")[0]
+        rows.writerow((name, version, licence(package)))
+    return text.getvalue()
 
 
 def sbom(wheel: Path) -> dict[str, Any]:

@@ -1,16 +1,19 @@
 """What MkDocs asks while it builds the site (`hooks` in mkdocs.yml).
 
 Makes reference/cli.md of the commands' own parsers, takes CONTRIBUTING.md and CHANGELOG.md in as
-pages, and turns links that leave docs/ into plain text: the site must work without the repository.
+pages, turns links that leave docs/ into plain text (the site must work without the repository),
+and shows a table that is a CSV file in docs/data/ where a link to it is a paragraph by itself.
 """
 
 from __future__ import annotations
 
 import argparse
+import csv
 import posixpath
 import re
 import warnings
 from collections.abc import Iterator
+from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +37,7 @@ def on_files(files: Files, config: Any) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
-    """Links into the repository become the text that they stand on."""
+    """Links into the repository become the text that they stand on, links to data its table."""
     for name, taken in TAKEN_IN.items():
         markdown = markdown.replace(f"](../{name}", f"]({taken}")
     here = posixpath.dirname(page.file.src_uri)
@@ -43,7 +46,41 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
         inside = not posixpath.normpath(posixpath.join(here, link[2])).startswith("..")
         return link[0] if inside else link[1]
 
+    def shown(link: re.Match[str]) -> str:
+        path = ROOT / "docs" / posixpath.normpath(posixpath.join(here, link[2]))
+        return data_table(path, link[1], link[2]) if path.exists() else link[0]  # MkDocs tells
+
+    markdown = re.sub(_DATA_LINK, shown, markdown)
     return re.sub(r"(?<!!)\[([^\]]+)\]\((\.\./[^)]*)\)", kept, markdown)
+
+
+# A paragraph that is nothing but a link to docs/data/NAME.csv.
+_DATA_LINK = re.compile(
+    r"(?<![^\n]\n)^\[([^\]]+)\]\(((?:\.\./)*data/[\w.-]+\.csv)\)[ \t]*$(?!\n[^\n])", re.MULTILINE
+)
+
+
+def data_table(path: Path, text: str, link: str) -> str:
+    """A CSV file as a table that opens, and that site.js sorts by the column clicked."""
+    with path.open(encoding="utf-8", newline="") as file:
+        header, *rows = csv.reader(file)
+    head = "".join(f'<th scope="col"><button>{escape(name)}</button></th>' for name in header)
+    body = "\n".join(
+        "<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in row) + "</tr>" for row in rows
+    )
+    summary = "".join(  # of Markdown, a link's text has code at most
+        f"<code>{escape(part)}</code>" if odd % 2 else escape(part)
+        for odd, part in enumerate(text.split("`"))
+    )
+    figures = any(cell[:1].isdigit() for row in rows for cell in row)  # words can be searched for
+    return f"""<details class="data"{" data-search-exclude" * figures}><summary>{summary}</summary>
+<div class="data" tabindex="0"><table class="data">
+<thead><tr>{head}</tr></thead>
+<tbody>
+{body}
+</tbody></table></div>
+<p><a href="{escape(link)}" download>{escape(path.name)}</a></p>
+</details>"""
 
 
 def command_line() -> str:

@@ -5,7 +5,7 @@
 Tasks that only wait show what the engine adds on 1, 2, 4 and 8 workers, on few cores too; tasks
 that compute show the cores. A driver alone, whose tasks are nobody's, shows its own time and
 memory. With --list and --store, what a finished fleet's patients cost is averaged and laid out on
-paper. Both fill their blocks in docs/fleet.md.
+paper. Both fill their blocks in docs/fleet.md, and write tables beside it.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from tumortrack_lab.fleet.store import Store
 from tumortrack_lab.fleet.task import Needs, Task
 from tumortrack_lab.fleet.worker import Job, Report
 from tumortrack_lab.study import scripts
-from tumortrack_lab.study.document import table
+from tumortrack_lab.study.document import ReportWriter, table_of
 from tumortrack_lab.study.scripts import KeptOptions
 
 TASK_S, EACH, DRIVEN = 0.5, 12, 10_000  # a task's length; tasks a worker; tasks of the lone driver
@@ -153,28 +153,21 @@ def on_paper(costs: pd.DataFrame, patients: int, efficiency: float) -> dict[str,
     }
 
 
-def measured_block(rows: list[dict[str, Any]], driver: dict[str, Any]) -> str:
-    lines = [
-        [f"{row['work']}, {row['workers']} workers", f"{row['efficiency']:.1%}",
-         f"{row['overhead_ms']:.0f}", f"{row['load']:.1f}"] for row in rows
-    ]  # fmt: skip
-    head = ["tasks of 0.5 s that", "efficiency", "overhead, ms a task", "load of the machine"]
+def measured_block(rows: list[dict[str, Any]], driver: dict[str, Any], writer: ReportWriter) -> str:
+    frame = pd.DataFrame(rows)[["work", "workers", "efficiency", "overhead_ms", "load"]]
     said = "The driver alone: {ms_a_task:.2f} ms of CPU a task, {grown_mb:.0f} MB more after "
-    return f"{table(head, lines)}\n\n{said.format(**driver)}{DRIVEN:,} tasks."
+    link = writer.data("fleet-scaling", frame.round(3), "Efficiency by workers")
+    return f"{said.format(**driver)}{DRIVEN:,} tasks.\n\n{link}\n\n`{writer.command}`"
 
 
-def paper_block(people: int, costs: pd.DataFrame, efficiency: float, sizes: tuple[int, ...]) -> str:
-    lines = [
-        [step, f"{one.tasks:.3g}", f"{one.cpu_s:.1f} ({one.most_s:.0f})", f"{one.peak_mb:,.0f}",
-         f"{one.mb:.1f}"] for step, one in costs.iterrows()
-    ]  # fmt: skip
-    total = costs.sum()
-    lines.append(["a patient", f"{total.tasks:.3g}", f"{total.cpu_s:.0f}", "", f"{total.mb:.0f}"])
-    head = ["step", "tasks", "CPU seconds, mean (most)", "peak MB", "result, MB"]
-    papers = [on_paper(costs, size, efficiency) for size in sizes]
-    rows = [[what, *(paper[what] for paper in papers)] for what in papers[0]]
-    paper = table(["", *(f"{size:,} patients" for size in sizes)], rows)
-    return f"Means over {people} patients.\n\n{table(head, lines)}\n\n{paper}"
+def paper_block(
+    people: int, costs: pd.DataFrame, papers: pd.DataFrame, writer: ReportWriter
+) -> str:
+    total, rows = costs.sum(), costs.rename_axis("step").reset_index().round(1)
+    said = f"A patient: {total.tasks:.3g} tasks, {total.cpu_s:.0f} CPU seconds, {total.mb:.0f} MB."
+    link = writer.data("fleet-costs", rows, f"Its steps, means over {people} patients")
+    paper = table_of(papers.rename_axis("").reset_index())
+    return f"{said}\n\n{paper}\n\n{link}\n\n`{writer.command}`"
 
 
 def main(config: Scaling) -> None:
@@ -199,14 +192,14 @@ def main(config: Scaling) -> None:
             row["overhead_ms"] = 1000 * (row["seconds"] - EACH * TASK_S) / EACH
             rows.append({**row, "load": load})
             say(f"{work.__name__}, {workers} workers: efficiency {row['efficiency']:.1%}")
-    blocks = {MEASURED: f"{measured_block(rows, driver)}\n\n`{writer.command}`"}
+    blocks = {MEASURED: measured_block(rows, driver, writer)}
     if config.list is not None:
         # Tasks that compute share cores with whatever else runs; the engine's share shows in those
         # that wait.
         worst = min(row["efficiency"] for row in rows if row["work"] == "wait")
         people, costs = costs_of(read_list(config.list), Store(str(config.store)))
-        text = paper_block(people, costs, worst, config.patients)
-        blocks[PAPER] = f"{text}\n\n`{writer.command}`"
+        sizes = {f"{size:,} patients": on_paper(costs, size, worst) for size in config.patients}
+        blocks[PAPER] = paper_block(people, costs, pd.DataFrame(sizes), writer)
     writer.write(blocks)
     say(f"written to {config.document}")
 

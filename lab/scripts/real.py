@@ -1,4 +1,4 @@
-"""More organs and deformations that nature made: the tables of docs/real.md.
+"""More organs and deformations that nature made: the tables of docs/real.md and docs/data/.
 
     make real ARGS='DATA'         (hours; go on with the same command after an interruption)
 
@@ -11,8 +11,9 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cache, partial
+from itertools import product
 from pathlib import Path
-from typing import Annotated, Literal, get_args
+from typing import Annotated, Any, Literal, get_args
 
 import numpy as np
 import pandas as pd
@@ -29,12 +30,11 @@ from tumortrack.tracking.tracker import Tracker
 from tumortrack_lab.real import kidneys, lungs, silicone
 from tumortrack_lab.real.judging import DRAGGED, by_tumor, judge, quantiles, scene_of
 from tumortrack_lab.study import scripts
-from tumortrack_lab.study.document import table
+from tumortrack_lab.study.document import ReportWriter, spread_mm, spread_words, table_of
 from tumortrack_lab.study.methods import named_folders
 
 Part = Literal["kidneys", "lungs", "silicone", "slab"]
 KINDS = (*kidneys.KINDS, "between")  # of tumors
-ERRORS = "median / 90 / 95 / worst, mm"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,20 +94,15 @@ def main(options: Options) -> None:
     folders = {}
     if {"kidneys", "lungs"} & {*options.parts}:
         folders = kidneys.check(options.data, options.out / "cases", rows)
-    chosen = [
-        Organ(name, folders[name], options)
-        for name in map(kidneys.name_of, options.kidneys)
-        if name in folders
-    ]
-    more = [
-        Organ(name, folder, options)
-        for name, folder in named_folders(options.organs, folders).items()
-    ]
+    names = [name for name in map(kidneys.name_of, options.kidneys) if name in folders]
+    chosen = [Organ(name, folders[name], options) for name in names]
+    given = named_folders(options.organs, folders).items()
+    more = [Organ(name, folder, options) for name, folder in given]
     made = {
-        "kidneys": lambda: kidneys_block(rows, chosen),
-        "lungs": lambda: lungs_block([*more, *chosen], options),
-        "silicone": lambda: silicone_block(options),
-        "slab": lambda: slab_block(options),
+        "kidneys": lambda: kidneys_block(rows, chosen, writer),
+        "lungs": lambda: lungs_block([*more, *chosen], options, writer),
+        "silicone": lambda: silicone_block(options, writer),
+        "slab": lambda: slab_block(options, writer),
     }
     for part in options.parts:
         text = made[part]()
@@ -115,21 +110,25 @@ def main(options: Options) -> None:
         say(f"{part}: block written to {options.document}")
 
 
-def kidneys_block(listed: list[dict], organs: list[Organ]) -> str:
-    """The frozen list, and how well the kidneys are found dragged, squeezed and bent."""
-    found = {organ.name: organ.by_kind(_dragged(organ)) for organ in organs}
-    head = ["case", "side", "kind", "tumor's outer share", "kidney, ml", "tumors, ml", "slices, mm"]
-    body = [
-        [
-            kidneys.name_of(row["case"]), row["side"], row["kind"], f"{row['outer_share']:.2f}",
-            f"{row['organ_ml']:.0f}", ", ".join(f"{ml:.1f}" for ml in row["tumors_ml"]),
-            f"{row['spacing_mm'][0]:g}",
-        ]
-        for row in sorted(listed, key=lambda row: row["case"])
-    ]  # fmt: skip
+def kidneys_block(listed: list[dict], organs: list[Organ], writer: ReportWriter) -> str:
+    """How well the kidneys are found dragged, squeezed and bent: by kind, and by kidney."""
+    about = {
+        kidneys.name_of(row["case"]): {
+            "side": row["side"], "kind": row["kind"], "outer share": f"{row['outer_share']:.2f}",
+            "kidney ml": f"{row['organ_ml']:.0f}", "largest tumor ml": f"{row['tumors_ml'][0]:.1f}",
+            "slices mm": f"{row['spacing_mm'][0]:g}",
+        }
+        for row in listed
+    }  # fmt: skip
+    found = dict(sorted((organ.name, organ.by_kind(_dragged(organ))) for organ in organs))
     every = [row for rows in found.values() for row in rows]
-    groups = dict(sorted(found.items())) | {f"all {kind}": _of(kind, every) for kind in KINDS}
-    return "\n\n".join([table(head, body, 3), _table("kidney", groups)])
+    by_kidney = [{"kidney": name, **about[name], **summary(rows)} for name, rows in found.items()]
+    by_kind = [
+        {"kidney": "all", "kind": kind, **summary(mine)}
+        for kind in KINDS
+        if (mine := _of(kind, every))
+    ]
+    return _block(writer, "real-kidneys", by_kidney + by_kind, by_kind, "By kidney and by kind")
 
 
 def _of(kind: str, rows: list[dict]) -> list[dict]:
@@ -154,7 +153,7 @@ def _dragged(organ: Organ) -> list[dict]:
     return scripts.kept(folder / f"{organ.name}.json", about, measure)
 
 
-def lungs_block(organs: list[Organ], options: Options) -> str:
+def lungs_block(organs: list[Organ], options: Options, writer: ReportWriter) -> str:
     """Every organ at a place of every patient's lung."""
     pairs = {
         patient: lungs.read_landmarks(lungs.landmark_file(options.data, patient), patient)
@@ -165,43 +164,38 @@ def lungs_block(organs: list[Organ], options: Options) -> str:
     for organ in organs:
         for patient in lungs.PATIENTS:
             rows += organ.by_kind(_breathed(organ, patient, field, options))
-    both = pd.DataFrame(rows)
-    body = []
+    fields = []
     for patient, given in pairs.items():
         rng = np.random.default_rng([options.seed, patient])
         off_mm = lungs.held_out_mm(given, lungs.SMOOTHING, rng)
-        mine = both[both.patient == patient]
-        body.append([
-            str(patient), f"{len(given.exhaled_mm):,}",
-            f"{np.linalg.norm(given.inhaled_mm - given.exhaled_mm, axis=1).mean():.1f}",
-            f"{np.median(off_mm):.2f}", f"{np.percentile(off_mm, 95):.2f}",
-            *(f"{mine[mine.variant == name].rms_mm.median():.1f}" for name in lungs.VARIANTS),
-            f"{mine.least_stretch.min():.2f} to {mine.most_stretch.max():.2f}",
-            str((mine.verdict == "folded").sum()),
-            f"{mine.scale.min():g}",
-        ])  # fmt: skip
-    head = ["patient", "pairs", "mean motion", "left-out pairs: median", "95 %"]
-    head += [f"rms, {name}" for name in lungs.VARIANTS]
-    head += ["volume by point, least to most", "folded, refused", "smallest scale"]
+        mine = pd.DataFrame([row for row in rows if row["patient"] == patient])
+        moved_mm = np.linalg.norm(given.inhaled_mm - given.exhaled_mm, axis=1)
+        fields.append({
+            "patient": patient, "pairs": len(moved_mm), "mean motion mm": moved_mm.mean(),
+            "left-out pairs median mm": np.median(off_mm),
+            "left-out pairs 95 % mm": np.percentile(off_mm, 95),
+            **{f"rms {name} mm": mine[mine.variant == name].rms_mm.median()
+               for name in lungs.VARIANTS},
+            "least local volume": mine.least_stretch.min(),
+            "most local volume": mine.most_stretch.max(),
+            "folded states": (mine.verdict == "folded").sum(), "smallest scale": mine.scale.min(),
+        })  # fmt: skip
     seen = [row for row in rows if row["verdict"] != "folded"]
-    by_variant = {name: [r for r in seen if r["variant"] == name] for name in lungs.VARIANTS}
-    groups = {
-        f"{name}, {kind}": _of(kind, some) for kind in KINDS for name, some in by_variant.items()
-    }
-    each = {
-        f"{patient}, {name}": [row for row in some if row["patient"] == patient]
-        for patient in pairs
-        for name, some in by_variant.items()
-    }
-    by_organ = {
-        f"{organ.name}, {name}": [row for row in some if row["organ"] == organ.name]
-        for organ in organs
-        for name, some in by_variant.items()
-    }
-    return "\n\n".join([
-        table(head, body), _table("deformation, tumors", groups), _table("organ", by_organ),
-        _table("patient", each),
-    ])  # fmt: skip
+    groups = [("tumors", kind, _of(kind, seen)) for kind in KINDS] + [
+        (by, one, [row for row in seen if row[by] == one])
+        for by in ("organ", "patient")
+        for one in dict.fromkeys(row[by] for row in seen)
+    ]
+    lines = [
+        {"by": by, "of": of, "deformation": name, **summary(mine)}
+        for by, of, some in groups
+        for name in lungs.VARIANTS
+        if (mine := [row for row in some if row["variant"] == name])
+    ]
+    short = [line for line in lines if line["by"] == "tumors"]
+    text = _block(writer, "real-lungs", lines, short, "By kind of tumor, organ and patient")
+    fields = pd.DataFrame(fields).round(2)
+    return f"{text}\n\n{writer.data('real-lungs-fields', fields, 'The displacement fields')}"
 
 
 def _breathed(organ: Organ, patient: int, field, options: Options) -> list[dict]:
@@ -244,41 +238,47 @@ def _states(organ: Organ, patient: int, field: lungs.Field) -> Iterator[dict]:
         say(f"{organ.name} as lung {patient}, {name}: done")
 
 
-def _table(what: str, groups: dict[str, list[dict]]) -> str:
-    """Verdicts and errors by group; errors of what was called good, and of every answer."""
-    head = [
-        what, "scenes", "good", "poor", "refused", f"middle of tumors, {ERRORS}", "best rigid pose",
-        "Hausdorff distance", "best rigid pose", "called good: middle", "error / stated",
-    ]  # fmt: skip
-    body = []
-    for name, rows in groups.items():
-        if not rows:
-            continue
-        lines, verdicts = by_tumor(rows), [row["verdict"] for row in rows]
-        good = lines[lines.verdict == "good"]
-        answered = lines[lines.verdict != "refused"]
-        ratio = answered.middle_mm / answered.std_mm
-        body.append([
-            name, str(len(rows)),
-            *(str(verdicts.count(verdict)) for verdict in ("good", "poor", "refused")),
-            quantiles(answered.middle_mm), quantiles(answered.rigid_middle_mm),
-            quantiles(answered.hausdorff_mm), quantiles(answered.rigid_hausdorff_mm),
-            quantiles(good.middle_mm), quantiles(ratio),
-        ])  # fmt: skip
-    return table(head, body)
+def summary(rows: list[dict]) -> dict[str, Any]:
+    """Verdicts, and errors of every answer and of what was called good."""
+    lines, verdicts = by_tumor(rows), [row["verdict"] for row in rows]
+    answered, good = lines[lines.verdict != "refused"], lines[lines.verdict == "good"]
+    ratio = spread_mm("error / stated", answered.middle_mm / answered.std_mm)
+    return {
+        "scenes": len(rows),
+        **{verdict: verdicts.count(verdict) for verdict in ("good", "poor", "refused")},
+        **spread_mm("centre", answered.middle_mm),
+        **spread_mm("best rigid pose's centre", answered.rigid_middle_mm),
+        **spread_mm("Hausdorff", answered.hausdorff_mm),
+        **spread_mm("best rigid pose's Hausdorff", answered.rigid_hausdorff_mm),
+        **spread_mm("good answers' centre", good.middle_mm),
+        **{name.removesuffix(" mm"): value for name, value in ratio.items()},
+    }
 
 
-def silicone_block(options: Options) -> str:
+def _block(writer: ReportWriter, name: str, rows: list[dict], short: list[dict], what: str) -> str:
+    """The short table, and the link to all rows."""
+    given = pd.DataFrame(short).rename(columns={"kind": "tumors", "of": "tumors"})
+    head = given.columns.intersection(["tumors", "deformation", "scenes", "good"])
+    shown = given[head].assign(**{
+        "centre, mm: median / 95 % / worst": spread_words(given, "centre"),
+        "best rigid pose": spread_words(given, "best rigid pose's centre"),
+    })  # fmt: skip
+    return f"{table_of(shown, 2)}\n\n{writer.data(name, pd.DataFrame(rows), what)}"
+
+
+def silicone_block(options: Options, writer: ReportWriter) -> str:
     """The bent casts: how far the scan lies from the estimated surface, seen and unseen."""
     data = options.data
     top = silicone.read_surface(data, silicone.REST)
     files = {cast: silicone.file(data, name) for cast, name in silicone.BENT.items()}
     scans = {cast: partial(read_mesh, path) for cast, path in files.items()}
     rows = _bent("silicone", (top, silicone.UNDERSIDE_MM), files, scans, options)
-    return _bent_table("cast", rows)
+    return writer.data(
+        "real-silicone", pd.DataFrame(_bent_rows("cast", rows)).round(1), "By cast and view"
+    )
 
 
-def slab_block(options: Options) -> str:
+def slab_block(options: Options, writer: ReportWriter) -> str:
     """The bent slab: the same, and how far the curve on it lies from its trace."""
     data = options.data
     files = {what: silicone.file(data, name) for what, name in silicone.SLAB.items()}
@@ -289,8 +289,12 @@ def slab_block(options: Options) -> str:
     views = dict.fromkeys(("1", "2", "3"), lambda: scan)
     curves = given["flat curve"], given["bent curve"]
     rows = _bent("slab", (top, under_mm), files, views, options, curves)
-    more = {f"error / stated, {where}": f"ratio_{where}_mm" for where in ("seen", "unseen")}
-    return "\n\n".join([_bent_table("view", rows), _bent_table("view", rows, "curve_", more)])
+    lines = [
+        {"distance of": what, **line}
+        for what, of in {"surface": "", "curve": "curve_"}.items()
+        for line in _bent_rows("view", rows, of)
+    ]
+    return writer.data("real-slab", pd.DataFrame(lines).round(1), "Surface and curve by view")
 
 
 def _bent(
@@ -321,27 +325,20 @@ def _bent(
     return scripts.kept(folder / "rows.json", about, measure)
 
 
-def _bent_table(
-    first: str, rows: list[dict], of: str = "", more: dict[str, str] | None = None
-) -> str:
-    """A line a view: what was said of it, and how far the surfaces (or what ``of`` says) lie off;
-    ``more``: columns, and what they show."""
-    columns = {
-        f"{which}{where}, mm": f"{key}{of}{where}_mm"
-        for where in ("seen", "unseen")
-        for which, key in {"": "", "best rigid, ": "rigid_"}.items()
-    } | (more or {})
-    head = [first, "scan seen", "verdict", "cost / usual", "stated deviation, mm", *columns]
-    body = [
-        [
-            row["cast"], f"{row['share']:.0%}", row["verdict"], f"{row['cost']:.1f}",
-            f"{row['std_mm']:.1f}",
-            *(" / ".join(f"{mm:.1f}" for mm in row.get(key, ())) or "–"
-              for key in columns.values()),
-        ]
-        for row in rows
-    ]  # fmt: skip
-    return table(head, body, 3)
+def _bent_rows(first: str, rows: list[dict], of: str = "") -> Iterator[dict]:
+    """A row a view: what was said of it, and how far the surfaces (or what ``of`` says) lie off."""
+    kinds = {"": (of, " mm"), "best rigid pose ": (f"rigid_{of}", " mm")}
+    kinds |= {"error / stated ": ("ratio_", "")} if of else {}
+    for row in rows:
+        line = {
+            first: row["cast"], "scan seen %": round(100 * row["share"]), "verdict": row["verdict"],
+            "cost / usual": row["cost"], "stated deviation mm": row["std_mm"],
+        }  # fmt: skip
+        for where, (words, (key, unit)) in product(("seen", "unseen"), kinds.items()):
+            values = row.get(f"{key}{where}_mm", (None,) * 3)
+            names = (f"{words}{where} {name}{unit}" for name in ("median", "95 %", "worst"))
+            line |= zip(names, values, strict=True)
+        yield line
 
 
 if __name__ == "__main__":

@@ -2,7 +2,8 @@
 
     make rehearsal ARGS='CASE MODEL OUT'      (five minutes; goes on where it was stopped)
 
-All commands run as a laboratory would give them; OUT keeps every file. --document fills its tables.
+All commands run as a laboratory would give them; OUT keeps every file. --document fills its block
+and writes tables beside it.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+import pandas as pd
 import tyro
 
 from tumortrack.cli.console import say
@@ -17,9 +19,14 @@ from tumortrack_lab.rehearsal import tables
 from tumortrack_lab.rehearsal.mishaps import Mishaps
 from tumortrack_lab.rehearsal.run import Rehearsal
 from tumortrack_lab.study import scripts
-from tumortrack_lab.study.document import ReportWriter
+from tumortrack_lab.study.document import ReportWriter, table_of
 
 BLOCK = "rehearsal"
+WORDS = {
+    "errors": "What each step states of its error, and what is true",
+    "states": "Errors of estimates by the second CT and by the truth",
+    "mishaps": "What goes wrong on a bench, and what is said",
+}
 
 
 @dataclass(frozen=True)
@@ -47,16 +54,18 @@ def main(options: Options) -> None:
         writer.check([BLOCK])
     rehearsal = Rehearsal(options.case, options.model, options.out)
     rows, reports = rehearsal.run()
-    blocks = [tables.error_table(rows), tables.evaluation_table(reports)]
+    frames = {"errors": pd.DataFrame(rows), "states": tables.evaluation_rows(reports)}
     if options.mishaps:
-        blocks.append(tables.mishap_table(Mishaps(rehearsal).run()))
-    for block in blocks:
-        say(block)
+        frames["mishaps"] = pd.DataFrame(Mishaps(rehearsal).run())
+    for name, frame in frames.items():
+        frames[name] = frame.round(2).replace("^tumortrack: ", "", regex=True)
+        say(table_of(frames[name]))
     if writer is not None:
         image = writer.image("bench_rehearsal")
         tables.picture(rehearsal, image)
+        links = [writer.data(f"rehearsal-{name}", frames[name], WORDS[name]) for name in frames]
         picture = writer.link(image, "a state before the camera, in the scanner, and compared")
-        writer.write({BLOCK: "\n\n".join([f"`{writer.command}`", *blocks, picture])})
+        writer.write({BLOCK: "\n\n".join([f"`{writer.command}`", *links, picture])})
 
 
 if __name__ == "__main__":

@@ -4,7 +4,7 @@
 
 Writes a folder a sequence into OUT (``tumortrack_lab.world.films``; about 30 s each, and 0.1 s a
 frame and camera). The same command goes on where it was stopped, and --count may grow. With --model
-every method judges every frame; OUT/table.md and press.png also count what --others hold.
+every method judges every frame; the tables OUT/*.csv also count what --others hold.
 """
 
 from __future__ import annotations
@@ -60,7 +60,8 @@ class Options:
     others: tuple[Path, ...] = ()
     """Folders of other organs, followed before, that the table counts in."""
     document: Path | None = None
-    """Its block is replaced by the tables, a plot and a film of this organ's strongest press."""
+    """Its block is replaced by a table, a plot and a film of this organ's strongest press; the
+    other tables go to data/ beside it."""
 
 
 def main(options: Options) -> None:
@@ -118,9 +119,10 @@ def _follow(options: Options, model: Path, films: list[Film]) -> None:
             say(f"{done}/{len(films)} {film.folder.name}, {method}: {errors.median():.1f} mm off")
     rows = [row for out in (options.out, *options.others) for row in tables.rows_in(out)]
     found = pd.DataFrame(rows)
-    text = tables.summary(found)
-    store.write_atomically(options.out / "table.md", text.encode())
-    print(text)
+    made = tables.tables(found)
+    for name, table in made.items():
+        store.write_atomically(options.out / f"{name}.csv", table.to_csv(index=False).encode())
+        print(f"{tables.WORDS[name]}\n{table.to_string(index=False)}\n")
     if options.document is not None:
         writer = ReportWriter(options.document, scripts.make_command("sequences"))
         plot, moving = writer.image("sequences_press"), writer.image("sequences_film")
@@ -129,8 +131,11 @@ def _follow(options: Options, model: Path, films: list[Film]) -> None:
         presses = (film for film in films if film.meta["kind"] == "press")
         press = max(presses, key=lambda film: film.bend_mm.max())
         pictures.show(following.METHODS["track"](tracker), press, moving)
-        links = writer.link(plot, "errors under a press"), writer.link(moving, "a press, followed")
-        writer.write({"sequences": "\n\n".join([f"`{writer.command}`", text, *links])})
+        each = made.items()
+        links = [writer.data(f"sequences_{name}", its, tables.WORDS[name]) for name, its in each]
+        links += writer.link(plot, "errors under a press"), writer.link(moving, "a press, followed")
+        block = [tables.overview(made["errors"]), *links, f"Made by `{writer.command}`."]
+        writer.write({"sequences": "\n\n".join(block)})
 
 
 if __name__ == "__main__":

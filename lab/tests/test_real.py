@@ -8,6 +8,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
+import pandas as pd
 import pytest
 from scipy.io import savemat
 from scipy.spatial.transform import Rotation
@@ -19,8 +20,10 @@ from tumortrack.core.geometry import transform_points, triangles_of
 from tumortrack.core.types import Anatomy, Mesh
 from tumortrack.tracking.tracker import Tracker
 from tumortrack_lab.real import kidneys, lungs, silicone
+from tumortrack_lab.study.document import ReportWriter
 
 SCRIPT = Path(__file__).parents[2] / "lab" / "scripts" / "real.py"
+DATA = Path(__file__).parents[2] / "docs" / "data"
 ORGAN = small_anatomy().organ
 
 
@@ -236,7 +239,7 @@ def test_the_carried_curve_is_held_against_the_traced_one(monkeypatch):
         assert max(row["seen_mm"]) < 0.1
 
 
-def test_a_table_counts_verdicts_and_gives_errors_of_answers_and_of_what_was_called_good():
+def test_a_summary_counts_verdicts_and_gives_errors_of_answers_and_of_what_was_called_good():
     def row(verdict, middle_mm):
         tumor = {"rigid_middle_mm": 2.0, "rigid_hausdorff_mm": 3.0}
         if middle_mm is not None:
@@ -245,10 +248,46 @@ def test_a_table_counts_verdicts_and_gives_errors_of_answers_and_of_what_was_cal
 
     rows = [row("good", 1.0), row("good", 3.0), row("poor", 9.0), row("refused", None)]
     rows.append({"verdict": "folded", "tumors": []})
-    line = runpy.run_path(str(SCRIPT))["_table"]("what", {"all": rows}).splitlines()[2]
-    cells = [cell.strip() for cell in line.strip("|").split("|")]
-    assert cells[:5] == ["all", "5", "2", "1", "1"]
-    assert cells[5] == "3.0 / 7.8 / 8.4 / 9.0"  # linear between 3 and 9
-    assert cells[6] == "2.0 / 2.0 / 2.0 / 2.0"
-    assert cells[9] == "2.0 / 2.8 / 2.9 / 3.0"
-    assert cells[10] == "6.0 / 15.6 / 16.8 / 18.0"
+    found = runpy.run_path(str(SCRIPT))["summary"](rows)
+    assert [*found.values()][:4] == [5, 2, 1, 1]
+    shares = ("median", "90 %", "95 %", "worst")
+    spread = {
+        of: [found[f"{of} {share}{unit}"] for share in shares]
+        for of, unit in {
+            "centre": " mm", "best rigid pose's centre": " mm", "good answers' centre": " mm",
+            "error / stated": "",
+        }.items()
+    }  # fmt: skip
+    assert [*spread.values()] == [
+        ["3.0", "7.8", "8.4", "9.0"],  # linear between 3 and 9
+        ["2.0"] * 4,
+        ["2.0", "2.8", "2.9", "3.0"],
+        ["6.0", "15.6", "16.8", "18.0"],
+    ]
+
+
+def test_the_pages_data_have_the_columns_that_are_written(tmp_path):
+    script = runpy.run_path(str(SCRIPT))
+    errors = dict.fromkeys(("middle_mm", "rigid_middle_mm", "hausdorff_mm"), 2.0)
+    tumor = {**errors, "rigid_hausdorff_mm": 3.0, "std_mm": 4.0}
+    rows = [{"verdict": verdict, "tumors": [tumor]} for verdict in ("good", "poor")]
+    made = {"by": "tumors", "of": "exophytic", "deformation": "as in the lung"}
+    made |= script["summary"](rows)
+    assert (made["scenes"], made["good"], made["error / stated median"]) == (2, 1, "0.5")
+    writer = ReportWriter(tmp_path / "real.md", "make real")
+    text = script["_block"](writer, "real-lungs", [made], [made], "All")
+    ours = "2.0 / 2.0 / 2.0"
+    assert f"| exophytic | as in the lung | 2 | 1 | {ours} | {ours} |" in text
+    assert text.endswith("[All: 1 rows](data/real-lungs.csv)")
+    bent = {"cast": "1", "share": 0.5, "verdict": "poor", "cost": 1.0, "std_mm": 2.0}
+    keys = ("curve_seen_mm", "rigid_curve_seen_mm", "ratio_seen_mm")
+    bent |= {key: [1.0, 2.0, 3.0] for key in keys}
+    lines = [
+        {"distance of": "curve", **row} for row in script["_bent_rows"]("view", [bent], "curve_")
+    ]
+    writer.data("real-slab", pd.DataFrame(lines), "All")
+    for name in ("real-lungs", "real-slab"):
+        kept = pd.read_csv(DATA / f"{name}.csv")
+        assert set(kept) == set(pd.read_csv(tmp_path / "data" / f"{name}.csv"))
+    kidneys_kept = pd.read_csv(DATA / "real-kidneys.csv")
+    assert set(script["summary"](rows)) < set(kidneys_kept)

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from contextlib import closing
+from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 import trimesh
 
@@ -16,11 +18,11 @@ from tumortrack_experiment.kit_file import Bead, Kit, KitPart
 from tumortrack_lab.rehearsal.bench import BEAD_HU, PRINTED_HU, scan_bench, see_bench, set_up
 from tumortrack_lab.rehearsal.camera import BenchSourceConfig
 from tumortrack_lab.rehearsal.hands import BenchErrors, Hands, looking_down
-from tumortrack_lab.rehearsal.mishaps import Mishap
-from tumortrack_lab.rehearsal.run import Row
-from tumortrack_lab.rehearsal.tables import error_table, mishap_table
+from tumortrack_lab.rehearsal.run import STATES
+from tumortrack_lab.rehearsal.tables import evaluation_rows
 from tumortrack_lab.twin.views import EquilibriumState
 
+ROOT = Path(__file__).parents[2]
 ROWS = tuple(map(tuple, np.eye(4).tolist()))
 BEADS_MM = ((30.0, 0.0, 8.0), (-30.0, 5.0, 6.0), (3.0, 25.0, 9.0), (-8.0, -24.0, 7.0))
 
@@ -116,10 +118,13 @@ def test_the_camera_sees_the_nearest_of_all_and_errs_as_it_is_told(kit, state, t
     assert seen.content.intrinsics == hands.believed
 
 
-def test_tables_say_what_is_not_noticed():
-    assert "| hand-eye | 0.36 | 0.04 |" in error_table([Row("hand-eye", 0.36, 0.04)])
-    found = mishap_table(
-        [Mishap("a bead is gone", True, False, "bead 2"), Mishap("x", False, False, "")]
-    )
-    assert "| a bead is gone | named | bead 2 |" in found
-    assert "**not noticed**" in found
+def test_estimates_are_judged_by_the_second_ct_and_by_the_truth():
+    def report(off_mm):
+        parts = {"kidney": {"center_mm": 9.0}, "tumor_1": {"center_mm": off_mm}}
+        return {"scenes": [{"name": s, "quality": "good", "parts": parts} for s in STATES]}
+
+    rows = evaluation_rows({"scenes": report(0.5), "true-scenes": report(0.3)})
+    assert list(rows.state) == list(STATES)
+    assert rows.iloc[0].to_list()[1:] == ["good", "tumor_1", 0.5, 0.3, pytest.approx(0.2)]
+    kept = pd.read_csv(ROOT / "docs" / "data" / "rehearsal-states.csv")
+    assert list(kept) == list(rows)

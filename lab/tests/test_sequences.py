@@ -170,10 +170,11 @@ def test_a_followers_errors_are_judged_as_large_as_they_are(film) -> None:
     assert rows["center_mm"].isna().tolist() == (rows["quality"] == "none").tolist()
     assert (rows["rigid_center_mm"] < rows["bend_mm"] + 0.1).all()
     about = {"method": "track", "organ": "a", "sequence": "push-000", "kind": "push"}
-    text = tables.summary(rows.assign(**about))
-    good = 100 * (len(rows) - 3) / len(rows)
-    assert f"| track | push | 1 | {len(rows)} | {good:.0f} |" in text
-    assert "4.0 [4.0]" in text
+    made = tables.tables(rows.assign(**about))
+    (verdict,) = made["verdicts"].to_dict("records")
+    assert (verdict["sequences"], verdict["frames"]) == (1, len(rows))
+    assert verdict["good, %"] == pytest.approx(100 * (len(rows) - 3) / len(rows), abs=0.05)
+    assert "4.0 [4.0] / " in tables.overview(made["errors"])
     assert tables.longest_s([0.0, 1.0, 2.0, 3.0, 4.0], [True, False, True, True, False]) == 2.0
 
 
@@ -286,30 +287,39 @@ def known_rows(**changes) -> pd.DataFrame:
     return frames
 
 
+def found_of(rows: pd.DataFrame, table: str) -> list:
+    """The table's first row."""
+    made = tables.tables(rows)
+    return made[table].iloc[0].tolist() if table in made else []
+
+
 def test_frames_after_a_jump_are_counted_until_a_first_look_is_no_better() -> None:
-    text = tables.summary(known_rows(center_mm=(2, 4, 6.0)))
-    assert "| elsewhere | 1 | 4 [4] | 0 | 3 | 3 | 0 | 8 |" in text
-    assert "| elsewhere | 1 | 1 [1] | 100 | 0 | 0 | 0 | 8 |" in tables.summary(known_rows())
+    late = found_of(known_rows(center_mm=(2, 4, 6.0)), "jumps")
+    assert late == ["elsewhere", 1, 8, 4, 4, 0, 3, 3, 0]
+    assert found_of(known_rows(), "jumps") == ["elsewhere", 1, 8, 1, 1, 100, 0, 0, 0]
     doubted = known_rows(center_mm=(2, 4, 6.0), quality=(2, 4, "poor"))
-    assert "| elsewhere | 1 | 4 [4] | 0 | 0 | 0 | 0 | 8 |" in tables.summary(doubted)
+    assert found_of(doubted, "jumps") == ["elsewhere", 1, 8, 4, 4, 0, 0, 0, 0]
+    gone = tables.tables(known_rows(hidden_share=(5, 9, 1.0)))["jumps"].iloc[-1]
+    assert gone[["jump", "frames", "good and over 3 mm: track"]].tolist() == ["organ gone", 5, 0]
 
 
 def test_a_wrong_state_kept_for_over_a_second_is_named() -> None:
-    def said(last: int, off_mm: float) -> str:
+    def said(last: int, off_mm: float, table: str) -> list:
         rows = known_rows(center_mm=(2, last, off_mm))
-        return tables.summary(rows.assign(kind="random", sequence="random-000"))
+        rows = rows[rows["method"] == "track"]
+        return found_of(rows.assign(kind="random", sequence="random-000"), table)
 
-    assert "| track | random | 1 | 10 | 100 | 0 | 60.0 | 1.2 | 1 | 0 |" in said(7, 4.0)
-    kept = "track in a random-000, 1.2 s (0.0 s over 5 mm), 4.0 mm off (best rigid pose 0.0), 0 %"
-    assert kept in said(7, 4.0)
-    assert "| track | random | 1 | 10 | 100 | 0 | 50.0 | 1.0 | 0 | 0 |" in said(6, 9.0)
-    assert "Kept over a second: none." in said(6, 9.0)
+    assert said(7, 4.0, "verdicts") == ["track", "random", 1, 10, 100, 0, 60.0, 1.2, 1, 0]
+    assert said(7, 4.0, "kept") == ["track", "a", "random-000", 1.2, 0, 4.0, 0.0, 0]
+    assert said(6, 9.0, "verdicts") == ["track", "random", 1, 10, 100, 0, 50.0, 1.0, 0, 0]
+    assert not said(6, 9.0, "kept")
 
 
 def test_errors_behind_a_hand_are_held_against_the_open_frames() -> None:
     rows = known_rows(hidden_share=(5, 9, 0.4), targets_mm=(5, 9, 1.5))
-    text = tables.summary(rows.assign(kind="hidden", sequence="hidden-000"))
-    assert "| track | 1 | 1.0 [1.0] | 1.5 [1.5] | 1.5 [1.5] | 1.5 | 100 | 0 | 0 of 5 |" in text
+    made = tables.tables(rows.assign(kind="hidden", sequence="hidden-000"))["hidden"]
+    track = made[made["method"] == "track"].iloc[0].tolist()
+    assert track == ["track", 1, 1.0, 1.0, 1.5, 1.5, 1.5, 1.5, 1.5, 100, 0, 0, 5]
 
 
 def test_a_press_is_shown_as_a_small_film(film, tmp_path) -> None:

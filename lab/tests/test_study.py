@@ -211,7 +211,9 @@ def test_blocks_are_replaced_and_the_rest_stays():
 def test_the_document_has_a_place_for_every_section():
     document = (ROOT / "docs" / "results.md").read_text(encoding="utf-8")
     names = [*runpy.run_path(str(RESULTS))["RULES"]]
-    assert fill(document, {name: "x" for name in names}).count("\nx\n<!-- /results:") == len(names)
+    assert fill(document, {name: "x" for name in names}).count("\n\nx\n\n<!-- /results:") == len(
+        names
+    )
 
 
 @pytest.mark.parametrize("name", ["results", "soak", "real", "world", "sequences", "trust"])

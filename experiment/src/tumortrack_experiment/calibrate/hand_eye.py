@@ -4,7 +4,8 @@ One equation holds both: ``fixed_from_moving @ moving_from_camera @ camera_from_
 in all pictures. Eye in hand: fixed is the base, moving the tool. A board on the tool: fixed is the
 tool, moving the base. OpenCV's solvers answer it. Least squares follow on how far robot and board
 disagree, seen from the tool, where the robot errs: on the corners' pixels they were 1.4 to
-1.8 times worse than Park's solver, here they are up to a quarter better (docs/bench.md).
+1.8 times worse than Park's solver, here they are up to a quarter better
+(docs/decisions/050-hand-eye-on-pixels.md).
 """
 
 from __future__ import annotations

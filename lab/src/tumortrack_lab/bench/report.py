@@ -1,8 +1,10 @@
-"""What a run found: tables on a terminal and in a document, goals, JSON."""
+"""What a run found: a table on a terminal, one in a document with CSV beside it, goals, JSON."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import csv
+import io
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -15,16 +17,15 @@ from tumortrack_lab.bench.machine import NO_GPU
 from tumortrack_lab.bench.rows import BenchResult, BenchRow
 from tumortrack_lab.study.document import ReportWriter, table
 
-BLOCKS = ("goals", "machine", "speed")
+BLOCKS = ("speed",)
 _EMPTY = "–"
 _GIB = 2**30
 _SECONDS = {"s": 1.0, "ms": 1e-3, "µs": 1e-6}
 _COUNTS = {"T": 1e12, "G": 1e9, "M": 1e6, "k": 1e3, "": 1.0}
 # Columns, by what ``_cells`` calls them; a terminal's table has other names for some.
-_WHOSE, _NAIVE = ("part", "of", "threads"), ("items a second", "naive", "ratio", "labels equal")
-_SPEED = (*_WHOSE, "tumortrack", "quartiles", *_NAIVE)
-_SHOWN = (*_WHOSE, "took", *_NAIVE)
+_SHOWN = ("part", "of", "threads", "took", "items a second", "naive", "ratio", "labels equal")
 _SHOWN_AS = {"of": "", "took": "tumortrack", "items a second": "per s"}
+_SUMMARY = ("part", "of", "tumortrack", "naive", "ratio", "labels equal")
 
 
 def _digits(value: float) -> str:
@@ -51,7 +52,6 @@ def _cells(row: BenchRow) -> dict[str, str]:
         "threads": f"{row.threads}" if row.device == "cpu" else row.device,
         "took": _text(took),
         "tumortrack": f"{_text(took)} a {row.item}",
-        "quartiles": f"± {50 * (row.ours.high_s - row.ours.low_s) / took:.0f} %",
         "items a second": _text(row.per_s, _COUNTS).strip(),
         "naive": _text(row.naive.median_s) if row.naive else _EMPTY,
         "ratio": _EMPTY if row.ratio is None else f"{_digits(row.ratio)} x",
@@ -77,19 +77,27 @@ def rich_table(bench: BenchResult) -> Table:
     return out
 
 
-def _notes(bench: BenchResult) -> str:
-    """What the naive forms are and what else is to be known of a row."""
-    lines: dict[str, list[str]] = {}
-    for row in bench.rows:
-        naive = f"naive: {row.naive_is}" if row.naive_is else ""
-        if text := "; ".join(filter(None, (naive, row.note))):
-            where = "{part} ({of}, {threads})".format_map(_cells(row))
-            lines.setdefault(text, []).append(where)
-    few = {
-        text: ", ".join(where[:3]) + (f" and {len(where) - 3} more" if len(where) > 3 else "")
-        for text, where in lines.items()
+def _figures(row: BenchRow) -> dict[str, object]:
+    """A row of speed.csv; ms are of one call, quartiles half of their distance."""
+
+    def digits(value: float | None) -> str:
+        return "" if value is None else _digits(value).replace(",", "")
+
+    ours, naive, share = row.ours, row.naive, row.agreement
+    return {
+        "part": row.name,
+        "of": row.what,
+        "threads": row.threads if row.device == "cpu" else row.device,
+        "ms": digits(1e3 * ours.median_s),
+        "quartiles ± %": f"{50 * (ours.high_s - ours.low_s) / ours.median_s:.0f}",
+        "items a second": digits(row.per_s),
+        "naive ms": digits(None if naive is None else 1e3 * naive.median_s),
+        "times faster": digits(row.ratio),
+        "labels equal %": "" if share is None else _agreement(share).removesuffix(" %"),
+        "peak GiB": digits(row.others.get(rows.PEAK, 0.0) / _GIB or None),
+        "naive is": row.naive_is,
+        "note": row.note,
     }
-    return "\n".join(f"- {where}: {text}." for text, where in few.items())
 
 
 class SpeedGoal(NamedTuple):
@@ -118,14 +126,17 @@ class SpeedGoal(NamedTuple):
         return "no GPU was at hand" if none_at_hand else "not measured in this run", None
 
 
-def goals_table(bench: BenchResult) -> str:
-    """Figure, the paper's or the naive value, the goal, measured, met."""
+def goals_of(bench: BenchResult) -> list[dict[str, str]]:
+    """Rows of speed_goals.csv: the paper's or the naive value, the goal, measured, met."""
     met_text = {True: "yes", False: "no", None: ""}
-    body = []
+    found = []
     for goal in GOALS:
         measured, met = goal.verdict(bench)
-        body.append((goal.figure, goal.paper, goal.goal, measured, met_text[met]))
-    return table(("figure", "paper / naive", "goal", "measured here", "met"), body, left=4)
+        found.append({
+            "figure": goal.figure.replace("`", ""), "paper or naive": goal.paper,
+            "goal": goal.goal, "measured here": measured, "met": met_text[met],
+        })  # fmt: skip
+    return found
 
 
 def _within(limit_s: float, faster: float = 0.0) -> Callable[[BenchRow], bool]:
@@ -175,19 +186,32 @@ GOALS = [
 
 
 def write_bench(bench: BenchResult, out: Path, document: Path | None) -> list[Path]:
-    """Write OUT, and where there is a document its blocks; returns what was written. Raises
-    InputError: no such document, or a marker of its blocks is missing; StorageError: the disk
-    refused."""
+    """Write OUT, and where there is a document its block and the tables in data/ beside it; returns
+    what was written. Raises InputError: no such document, or a marker of its block is missing;
+    StorageError: the disk refused."""
     out.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(out, msgspec.json.format(msgspec.json.encode(bench), indent=1))
     if document is None:
         return [out]
-    every = (_cells(row) for row in bench.rows)
-    speed = table(_SPEED, [[cells[key] for key in _SPEED] for cells in every], left=2)
-    caption = f"`{bench.command}`, {bench.machine.get('date', '')}."
-    ReportWriter(document, bench.command).write({
-        "goals": f"{goals_table(bench)}\n\n{caption}",
-        "machine": table(("this machine", ""), [*bench.machine.items()], left=2),
-        "speed": f"{speed}\n\n{_notes(bench)}\n\n{caption}",
-    })  # fmt: skip
-    return [out, document]
+    machine = [{"this machine": key, "": value} for key, value in bench.machine.items()]
+    tables: dict[str, tuple[str, Sequence[dict]]] = {
+        "speed": ("Every row", [_figures(row) for row in bench.rows]),
+        "speed_goals": ("Goals", goals_of(bench)),
+        "speed_machine": ("The machine", machine),
+    }
+    most = max(row.threads for row in bench.rows)
+    cells = [_cells(row) for row in bench.rows if row.threads == most]
+    summary = table(_SUMMARY, [[each[key] for key in _SUMMARY] for each in cells], left=2)
+    caption = f"Medians on {most} threads; `{bench.command}`, {bench.machine.get('date', '')}."
+    folder = document.parent / "data"
+    folder.mkdir(exist_ok=True)
+    text = [summary, caption]
+    for name, (words, found) in tables.items():
+        lines = io.StringIO()
+        writer = csv.DictWriter(lines, [*found[0]], lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(found)
+        write_atomically(folder / f"{name}.csv", lines.getvalue().encode())
+        text.append(f"[{words}: {len(found)} rows](data/{name}.csv)")
+    ReportWriter(document, bench.command).write({"speed": "\n\n".join(text)})
+    return [out, document, *(folder / f"{name}.csv" for name in tables)]

@@ -1,4 +1,4 @@
-"""`tumortrack bench`: how fast every part is here; fills blocks of a document."""
+"""`tumortrack bench`: how fast every part is here; fills a document."""
 
 from __future__ import annotations
 
@@ -22,7 +22,8 @@ class Bench:
         only: which parts; default: all.
         quick: shorter measurements, about a minute in all once there are models (in runs/bench).
         out: JSON file to write.
-        document: Markdown file whose marked blocks are to be filled, such as docs/performance.md.
+        document: Markdown file whose marked block is to be filled, such as docs/performance.md;
+            tables go to data/*.csv beside it.
     """
 
     only: tuple[

@@ -6,46 +6,29 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from tumortrack.imaging.volume import read_volume
 from tumortrack.report.drawing import new_figure, save
 from tumortrack.simulate.scene_folder import read_scene
-from tumortrack_lab.rehearsal.mishaps import Mishap
-from tumortrack_lab.rehearsal.run import STATES, Rehearsal, Row, errors_mm
-from tumortrack_lab.study.document import table
+from tumortrack_lab.rehearsal.run import STATES, Rehearsal, errors_mm
 
 _SHOWN = "D2"
 
 
-def error_table(rows: list[Row]) -> str:
-    """What each step states of its own error, and what it is."""
-    head = ("step", "stated, mm", "true, mm")
-    return table(head, [(row.what, f"{row.stated_mm:.2f}", f"{row.true_mm:.2f}") for row in rows])
-
-
-def evaluation_table(reports: dict[str, dict[str, Any]]) -> str:
+def evaluation_rows(reports: dict[str, dict[str, Any]]) -> pd.DataFrame:
     """Each state's tumors: how far off the estimates are by the second CT, and by the truth."""
     by_ct, by_truth = (errors_mm(reports[name]) for name in ("scenes", "true-scenes"))
     verdicts = {
         scene["name"]: scene.get("quality", "none") for scene in reports["scenes"]["scenes"]
     }
-    head = ("state", "verdict", "tumor", "by the second CT, mm", "by the truth, mm", "apart, mm")
-    rows = [
-        (state, verdicts[state], name, f"{off:.2f}", f"{true:.2f}", f"{off - true:+.2f}")
+    rows = (
+        {"state": state, "verdict": verdicts[state], "tumor": name, "by second CT mm": off,
+         "by truth mm": true, "apart mm": off - true}
         for state in STATES
         for (name, off), true in zip(by_ct[state].items(), by_truth[state].values(), strict=True)
-    ]
-    return table(head, rows, left=3)
-
-
-def mishap_table(mishaps: list[Mishap]) -> str:
-    """What was done, and what the commands said."""
-    rows = [
-        (one.what, "refused" if one.refused else "named" if one.noticed else "**not noticed**",
-         one.said.removeprefix("tumortrack: "))
-        for one in mishaps
-    ]  # fmt: skip
-    return table(("mishap", "", "what is said"), rows, left=3)
+    )  # fmt: skip
+    return pd.DataFrame(rows)
 
 
 def picture(rehearsal: Rehearsal, path: Path) -> None:

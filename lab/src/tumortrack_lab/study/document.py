@@ -1,4 +1,5 @@
-"""Markdown tables, and a document whose marked blocks are replaced while the rest stays."""
+"""Tables in Markdown and as CSV, and a document whose marked blocks are replaced while the rest
+stays."""
 
 from __future__ import annotations
 
@@ -6,8 +7,12 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import pandas as pd
+
 from tumortrack.core import store
 from tumortrack.core.errors import InputError, StorageError
+
+_SPREAD = ("median", "90 %", "95 %", "worst")
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]], left: int = 1) -> str:
@@ -19,6 +24,29 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]], left: int = 1) -> 
         lines.append(row)
     cells = ((cell.replace("|", "\\|") for cell in line) for line in lines)
     return "\n".join(f"| {' | '.join(line)} |" for line in cells)
+
+
+def table_of(frame: pd.DataFrame, left: int = 1) -> str:
+    """A frame as Markdown."""
+    return table(list(frame), frame.astype(str).to_numpy().tolist(), left)
+
+
+def spread_mm(of: str, values: pd.Series) -> dict[str, str]:
+    """Columns of a row: median, 90 %, 95 % and worst of the values that there are, mm."""
+    known, each = (
+        values.dropna().astype(float),
+        dict(zip(_SPREAD, (0.5, 0.9, 0.95, 1), strict=True)),
+    )
+    return {
+        f"{of} {name} mm": f"{known.quantile(share):.1f}" if len(known) else ""
+        for name, share in each.items()
+    }
+
+
+def spread_words(rows: pd.DataFrame, of: str) -> pd.Series:
+    """Of each row with these columns: median / 95 % / worst."""
+    shown = [f"{of} {name} mm" for name in _SPREAD if name != "90 %"]
+    return rows[shown].agg(" / ".join, axis=1).replace(" /  / ", "–")
 
 
 def opening(name: str) -> str:
@@ -42,7 +70,7 @@ def fill(document: str, blocks: dict[str, str]) -> str:
         if closing(name) not in rest:
             raise InputError(f"{closing(name)} stands before {opening(name)}; put it after.")
         after = rest.partition(closing(name))[2]
-        document = f"{before}{opening(name)}\n{text.strip()}\n{closing(name)}{after}"
+        document = f"{before}{opening(name)}\n\n{text.strip()}\n\n{closing(name)}{after}"
     return document
 
 
@@ -67,6 +95,14 @@ class ReportWriter:
             return fill(self.document.read_text(encoding="utf-8"), blocks)
         except OSError as error:
             raise InputError(f"{self.document} cannot be read: {error.strerror}.") from error
+
+    def data(self, name: str, rows: pd.DataFrame, words: str) -> str:
+        """Write data/NAME.csv beside the document; the paragraph that links to it, which the site
+        shows as a table."""
+        path = self.document.parent / "data" / f"{name}.csv"
+        make_folder(path.parent)
+        store.write_atomically(path, rows.to_csv(index=False).encode())
+        return f"[{words}: {len(rows)} rows](data/{path.name})"
 
     def image(self, name: str) -> Path:
         """Where a picture goes; its folder is made."""

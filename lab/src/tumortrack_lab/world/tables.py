@@ -21,6 +21,15 @@ KEPT_S = 1.0  # a wrong state that lasts so long was kept
 _AS_GOOD_MM = 0.5  # more than a first look at the same frame has
 _OPEN, _HIDDEN = 0.05, (0.3, 0.5)  # shares of the organ that something hides
 _FRAME = ["organ", "sequence", "time_s"]
+_OFF = {"centre, mm": "center_mm", "Hausdorff, mm": "hausdorff_mm"}
+# What each table has, for its link.
+WORDS = {
+    "errors": "Errors by state, tumor and method",
+    "verdicts": "Verdicts by method and kind of sequence",
+    "kept": "Wrong states that were called good for over a second",
+    "jumps": "What the follower does after a jump",
+    "hidden": "Errors while 30 to 50 % of the organ is hidden",
+}
 
 
 def rows_in(out: Path) -> list[dict[str, Any]]:
@@ -40,42 +49,47 @@ def rows_in(out: Path) -> list[dict[str, Any]]:
     return rows
 
 
-def summary(rows: pd.DataFrame) -> str:
-    """Markdown: errors by state and site, how far verdicts can be relied on, what jumps and hands
-    do, and which wrong states were kept."""
+def tables(rows: pd.DataFrame) -> dict[str, pd.DataFrame]:
+    """Those of ``WORDS`` that there is anything to say in: medians over organs of the median over
+    frames or sequences, with the worst organ's."""
     one = rows["method"].isin(["track", "first-look"])
     also = rows.merge(rows.loc[~one, ["organ", "sequence"]].drop_duplicates())
     frames = _frames(rows)
-    parts = [_errors(rows[one]), _errors(also), _verdicts(frames)]
-    parts += [_jumps(frames[frames["kind"] == "jump"]), _hiding(frames[frames["kind"] == "hidden"])]
-    return "\n\n".join(filter(None, parts)) + "\n"
+    errors = [*_errors(rows[one], "all"), *_errors(also, "with three cameras")]
+    jumps, hidden = (frames[frames["kind"] == kind] for kind in ("jump", "hidden"))
+    found = [errors, *_verdicts(frames), _jumps(jumps), _hiding(hidden)]
+    made = zip(WORDS, found, strict=True)
+    return {name: pd.DataFrame(its).round(1).convert_dtypes() for name, its in made if its}
 
 
-def _errors(rows: pd.DataFrame) -> str:
+def overview(errors: pd.DataFrame) -> str:
+    """Markdown: of ``errors`` in all sequences, centre / Hausdorff distance of each method."""
+
+    def off(row: pd.Series) -> str:
+        known = (of for of in _OFF if pd.notna(row[of]))
+        return " / ".join(f"{row[of]:.1f} [{row[f'{of}, worst organ']:.1f}]" for of in known)
+
+    rows = errors[errors["sequences"] == "all"]
+    keys, rows = ["state", "tumor", "organs", "frames"], rows.assign(off=rows.apply(off, axis=1))
+    wide = rows.pivot_table("off", keys, "method", "first", sort=False).reset_index()
+    return table(list(wide), wide.astype(str).to_numpy().tolist(), 2)
+
+
+def _errors(rows: pd.DataFrame, sequences: str) -> list[dict[str, Any]]:
     """Of loads that were solved along their paths."""
     rows = rows[rows["kind"].isin(KINDS)]
-    if not len(rows):
-        return ""
-    bound = np.array(list(STATES.values()))
-    state = np.array(list(STATES))[np.searchsorted(bound, rows["bend_mm"])]
+    state = np.array(list(STATES))[np.searchsorted(list(STATES.values()), rows["bend_mm"])]
     rows = rows.assign(state=pd.Categorical(state, list(STATES)))
-    methods = sorted(set(rows["method"]))
-    head = ["state", "tumor", "organs", "frames", "best rigid pose", *methods]
-    body = []
+    found, methods = [], sorted(set(rows["method"]))
     for (severity, site), mine in rows.groupby(["state", "site"], observed=True):
-        each = [mine[mine["method"] == method] for method in methods]
-        count = str(mine["organ"].nunique()), str(len(each[0]))
-        cells = [severity, site, *count, _of_organs(each[0], "rigid_center_mm")]
-        for its in each:
-            both = (_of_organs(its, key) for key in ("center_mm", "hausdorff_mm"))
-            cells.append(" / ".join(both))
-        body.append(cells)
-    return (
-        f"{table(head, body, 2)}\n\nmm: centre / Hausdorff distance; median over organs of the "
-        "median over all frames with an estimate (good or poor) [worst organ]. State: by the "
-        "largest displacement beside the best rigid pose, up to "
-        f"{', '.join(f'{mm:g}' for mm in bound[:-1])} mm, and more."
-    )
+        each = {method: mine[mine["method"] == method] for method in methods}
+        first = each[methods[0]]
+        rigid = first.assign(center_mm=first["rigid_center_mm"], hausdorff_mm=np.nan)
+        about = {"sequences": sequences, "state": severity, "tumor": site}
+        about |= {"organs": mine["organ"].nunique(), "frames": len(first)}
+        for method, its in {"best rigid pose": rigid, **each}.items():
+            found.append({**about, "method": method, **_of_organs(its, _OFF)})
+    return found
 
 
 def _frames(rows: pd.DataFrame) -> pd.DataFrame:
@@ -90,86 +104,80 @@ def _frames(rows: pd.DataFrame) -> pd.DataFrame:
     return frames.assign(wrong=wrong, failed=failed)
 
 
-def _verdicts(frames: pd.DataFrame) -> str:
-    """By method and kind; and by name where a wrong state was called good for over a second."""
-    body, named = [], []
+def _verdicts(frames: pd.DataFrame) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+    """By method and kind; and where a wrong state was called good for over a second."""
+    found, kept = [], []
     for (method, kind), mine in frames.groupby(["method", "kind"]):
         spans = []
         for (organ, name), one in mine.groupby(["organ", "sequence"]):
             times, its = one["time_s"].tolist(), one[one["wrong"]]
             spans.append([longest_s(times, one[key].tolist()) for key in ("wrong", "failed")])
             if spans[-1][0] > KEPT_S:
-                off, rigid = (its[key].median() for key in ("center_mm", "rigid_center_mm"))
-                named.append(
-                    f"{method} in {organ} {name}, {spans[-1][0]:.1f} s ({spans[-1][1]:.1f} s over "
-                    f"5 mm), {off:.1f} mm off (best rigid pose {rigid:.1f}), "
-                    f"{100 * its['hidden_share'].median():.0f} % hidden"
-                )
-        shares = [f"{100 * (mine['quality'] == q).mean():.0f}" for q in ("good", "poor")]
-        kept = [str(int((np.array(spans)[:, n] > KEPT_S).sum())) for n in (0, 1)]
-        cells = [method, kind, str(len(spans)), str(len(mine)), *shares]
-        wrong = f"{100 * mine['wrong'].mean():.1f}", f"{np.max(spans, axis=0)[0]:.1f}"
-        body.append([*cells, *wrong, *kept])
-    head = ["method", "kind", "sequences", "frames", "good, %", "poor, %", "good and over 3 mm, %"]
-    head += ["longest, s", "kept over 1 s", "over 5 mm kept over 1 s"]
-    return (
-        f"{table(head, body, 2)}\n\nOver 3 mm: the centre of any tumor. Longest, kept: good and "
-        "over 3 mm (5 mm) off without a break; sequences. Kept over a second: "
-        f"{'; '.join(named) or 'none'}."
-    )
+                row = {"method": method, "organ": organ, "sequence": name}
+                row |= zip(["over 3 mm, s", "over 5 mm, s"], spans[-1], strict=True)
+                row["centre, mm"] = its["center_mm"].median()
+                row["best rigid pose, mm"] = its["rigid_center_mm"].median()
+                kept.append(row | {"hidden, %": 100 * its["hidden_share"].median()})
+        row = {"method": method, "kind": kind, "sequences": len(spans), "frames": len(mine)}
+        row |= _shares(mine, "good", "poor")
+        row["good and over 3 mm, %"] = 100 * mine["wrong"].mean()
+        row["longest of these, s"] = max(span[0] for span in spans)
+        for n, mm in enumerate((WRONG_MM, FAILED_MM)):
+            row[f"over {mm:g} mm for over 1 s"] = sum(span[n] > KEPT_S for span in spans)
+        found.append(row)
+    return found, kept
 
 
-def _jumps(frames: pd.DataFrame) -> str:
+def _jumps(frames: pd.DataFrame) -> list[dict[str, Any]]:
     """How long after a jump the follower is worse than a first look at the same frames."""
     both = {method: mine.set_index(_FRAME) for method, mine in frames.groupby("method")}
     if not {"track", "first-look"} <= set(both):
-        return ""
-    track, body = both["track"], []
+        return []
+    track, found = both["track"], []
     first = both["first-look"].reindex(track.index)
     near = track["center_mm"] <= first["center_mm"] + _AS_GOOD_MM
     track = track.assign(as_good=near | (first["quality"] == "none"), first=first["wrong"])
-    gone = track["hidden_share"] == 1
+    gone, wrong = track["hidden_share"] == 1, "good and over 3 mm"
     for kind in JUMPS:
         counts, meanwhile = [], 0
         mine = track[(track["jump"] == kind) & ~gone]
         for _, after in mine.groupby(["organ", "sequence", "since_s"]):
-            good = [*after["as_good"], True]
-            counts.append(good.index(True) + 1)
-            meanwhile += int(after["wrong"].iloc[: counts[-1] - 1].sum())
+            counts.append([*after["as_good"], True].index(True) + 1)
+            meanwhile += after["wrong"].iloc[: counts[-1] - 1].sum()
         if counts:
-            within = f"{100 * np.mean(np.array(counts) <= 3):.0f}"
-            cells = [kind, str(len(counts)), f"{np.median(counts):.0f} [{max(counts)}]", within]
-            later = meanwhile, mine["wrong"].sum(), mine["first"].sum(), len(mine)
-            body.append([*cells, *(str(int(count)) for count in later)])
-    head = ["jump", "jumps", "frames until as good as a first look [worst]", "within three, %"]
-    head += ["good and over 3 mm until then", "in all: track", "first look", "of frames"]
-    return (
-        f"{table(head, body)}\n\nAs good: within {_AS_GOOD_MM:g} mm of a first look at the same "
-        f"frame, or that finds nothing. While the organ was gone, {track[gone]['wrong'].sum()} of "
-        f"{gone.sum()} frames were called good."
-    )
+            row = {"jump": kind, "jumps": len(counts), "frames": len(mine)}
+            row |= {"frames until as good as a first look": np.median(counts), "worst": max(counts)}
+            row["within three frames, %"] = 100 * np.mean(np.array(counts) <= 3)
+            row |= {f"{wrong} until then": meanwhile, f"{wrong}: track": mine["wrong"].sum()}
+            found.append(row | {f"{wrong}: first-look": mine["first"].sum()})
+    row = {
+        "jump": "organ gone",
+        "frames": gone.sum(),
+        f"{wrong}: track": track[gone]["wrong"].sum(),
+    }
+    return [*found, row] if gone.any() else found
 
 
-def _hiding(frames: pd.DataFrame) -> str:
+def _hiding(frames: pd.DataFrame) -> list[dict[str, Any]]:
     """Errors while 30 to 50 % of the organ are hidden, against the same sequence's open frames."""
-    body = []
+    rows, times = [], "hidden / open"
     for method, mine in frames.groupby("method"):
         ratios = []
         for (organ, _), one in mine.groupby(["organ", "sequence"]):
-            behind = one[one["hidden_share"].between(*_HIDDEN)]
+            behind = one[one["hidden_share"].between(*_HIDDEN)]["targets_mm"].median()
             bare = one[one["hidden_share"] < _OPEN]["targets_mm"].median()
-            off = behind["targets_mm"].median()
-            ratios.append((organ, bare, off, off / bare))
-        found = pd.DataFrame(ratios, columns=["organ", "open", "behind", "ratio"])
-        cells = [_of_organs(found, key) for key in ("open", "behind", "ratio")]
+            ratios.append((organ, bare, behind, behind / bare))
+        of = ["targets when open, mm", "targets when hidden, mm", times]
+        found = pd.DataFrame(ratios, columns=["organ", *of])
         behind = mine[mine["hidden_share"].between(*_HIDDEN)]
-        shares = [f"{100 * (behind['quality'] == q).mean():.0f}" for q in ("good", "none")]
-        counts = str(len(found)), *cells, f"{found['ratio'].max():.1f}"
-        body.append([method, *counts, *shares, f"{behind['wrong'].sum()} of {len(behind)}"])
-    head = ["method", "sequences", "target error, open, mm", "30-50 % hidden", "times as large"]
-    head += ["worst sequence", "good, %", "none, %", "good and over 3 mm"]
-    said = "Median over organs of the median over sequences [worst organ]; verdicts while hidden."
-    return f"{table(head, body)}\n\n{said}" if body else ""
+        row = {
+            "method": method,
+            "sequences": len(found),
+            **_of_organs(found, dict(zip(of, of, strict=True))),
+        }
+        row |= {f"{times}, worst sequence": found[times].max(), **_shares(behind, "good", "none")}
+        rows.append(row | {"good and over 3 mm": behind["wrong"].sum(), "frames": len(behind)})
+    return rows
 
 
 def longest_s(times_s: list[float], wrong: list[bool]) -> float:
@@ -183,6 +191,14 @@ def longest_s(times_s: list[float], wrong: list[bool]) -> float:
     return longest
 
 
-def _of_organs(rows: pd.DataFrame, key: str) -> str:
-    medians = rows.groupby("organ")[key].median().dropna()
-    return f"{medians.median():.1f} [{medians.max():.1f}]" if len(medians) else "–"
+def _shares(frames: pd.DataFrame, *qualities: str) -> dict[str, float]:
+    return {f"{each}, %": 100 * (frames["quality"] == each).mean() for each in qualities}
+
+
+def _of_organs(rows: pd.DataFrame, columns: dict[str, str]) -> dict[str, float]:
+    """Of each column, under its name: median and largest of the organs' medians."""
+    found: dict[str, float] = {}
+    for name, key in columns.items():
+        medians = rows.groupby("organ")[key].median()
+        found |= {name: medians.median(), f"{name}, worst organ": medians.max()}
+    return found

@@ -2,7 +2,7 @@
 
 Finite elements (``finite``) of the organ respond to random loads; the principal components of the
 responses are its modes (``modes``). In their space the organ takes loads in its bed (``loads``),
-which gives a library of states. See docs/method.md, section "Elastic deformations".
+which gives a library of states. See docs/method.md, section "The elastic body".
 """
 
 from __future__ import annotations
