@@ -23,7 +23,7 @@ from tumortrack.models.config import GaussNewtonConfig
 from tumortrack.registration.gauss_newton import GaussNewton, _prior, refine, size_of
 from tumortrack.registration.looks import Looks
 from tumortrack.registration.motion import ElasticMotion
-from tumortrack.registration.registration import _beside
+from tumortrack.registration.registration import _turned_starts
 from tumortrack.registration.rest_shape import RestShape, distance_of
 from tumortrack.simulate.occupancy import labels_of, surface_distance
 from warp_objects import (
@@ -303,7 +303,7 @@ def test_every_step_lowers_the_cost_and_enough_steps_end():
 def test_starts_beside_a_fit_are_as_unlikely_as_was_asked_and_lead_back_to_it():
     points = surface(placed(), 500)
     fit = refine(shape(), points, START, GaussNewtonConfig())
-    starts = _beside(fit)
+    starts = _turned_starts(fit)
     precision = np.linalg.inv(fit.motion.covariance)
     turns = []
     for start, moved in starts:

@@ -1,4 +1,4 @@
-"""A DICOM series as a volume: pydicom for the tags, GDCM (in SimpleITK) for the pixels.
+"""A DICOM series as a volume: pydicom for tags and pixels, with GDCM for compressed ones.
 
 Slices are sorted by their position along the slice normal, and every gap is checked here:
 readers only warn of a missing slice and stretch the patient.
@@ -7,19 +7,18 @@ readers only warn of a missing slice and stretch the patient.
 from __future__ import annotations
 
 import os
-import tempfile
 import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Float32
 
 from tumortrack.core.errors import InputError
 from tumortrack.core.patient import NOBODY, UNKNOWN, Patient, Side
+from tumortrack.core.process import parallel_map
 from tumortrack.imaging.grid import GZIP_BEST, RawVolume, check_affine, check_size
 
 MIN_SLICES = 10
@@ -102,35 +101,44 @@ def find_series(folder: Path, series: str | None = None) -> Series:
 def read_dicom(folder: Path, series: str | None = None) -> RawVolume:
     """Read one CT series of a folder, chosen as by ``find_series``: rescaled values (HU), float32.
     Raises InputError: see ``find_series``; damaged pixels."""
-    import SimpleITK as sitk  # noqa: N813
-
     found = find_series(folder, series)
-    sitk.ProcessObject.SetGlobalWarningDisplay(False)
-    reader = sitk.ImageSeriesReader()
-    reader.SetOutputPixelType(sitk.sitkFloat32)
+    columns, rows, count = found.shape
+    values = np.empty((count, rows, columns), np.float32)
+
+    def read(number: int) -> None:
+        values[number] = _slice_values(found.files[number], (rows, columns))
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # what is wrong with pixels is said by our own errors
+        parallel_map(read, range(count))
+    return RawVolume(values.transpose(2, 1, 0), found.lps_from_index, found.notes, found.patient)
+
+
+def _slice_values(path: Path, shape: tuple[int, int]) -> Float32[np.ndarray, "rows columns"]:
+    """Rescaled values of one slice."""
+    from pydicom import Dataset
+    from pydicom.pixels import pixel_array
+
+    with suppress(ImportError):  # pydicom then says which package its pixels need
+        import gdcm
+
+        gdcm.Trace.WarningOff()
+        gdcm.Trace.ErrorOff()
     try:
-        with _readable_names(found.files) as names:
-            reader.SetFileNames(names)
-            array = sitk.GetArrayFromImage(reader.Execute()).transpose(2, 1, 0)
-    except RuntimeError as error:
-        last = str(error).strip().splitlines()[-1]
-        raise InputError(f"{folder}: the slices' pixels cannot be decoded: {last}.") from error
-    if array.shape != found.shape:
-        raise InputError(f"{folder}: the pixels are {array.shape}, the tags say {found.shape}.")
-    return RawVolume(array, found.lps_from_index, found.notes, found.patient)
-
-
-@contextmanager
-def _readable_names(files: tuple[Path, ...]) -> Iterator[list[str]]:
-    """The files' names for SimpleITK, which takes UTF-8 only: links, where one has another name."""
-    names = [str(file) for file in files]
-    if all(name.isprintable() for name in names):  # bytes that are no UTF-8 are not
-        yield names
-        return
-    with tempfile.TemporaryDirectory() as links:
-        for number, file in enumerate(files):
-            Path(links, str(number)).symlink_to(file.absolute())
-        yield [str(Path(links, str(number))) for number in range(len(files))]
+        tags = Dataset()  # filled in with those of the image
+        stored = pixel_array(path, ds_out=tags)
+        # What stands in bits beyond those stored, such as overlays, is no part of a number.
+        unused = stored.dtype.itemsize * 8 - int(tags.BitsStored)
+        stored = (stored << unused) >> unused
+        slope, intercept = (tags.get(name) for name in ("RescaleSlope", "RescaleIntercept"))
+    except Exception as error:  # decoders raise anything on damaged pixels
+        said = (str(error).strip() or type(error).__name__).splitlines()[-1].rstrip(".")
+        raise InputError(f"{path}: its pixels cannot be decoded: {said}. {_AGAIN}") from error
+    if stored.shape != shape:
+        raise InputError(f"{path}: its pixels are {stored.shape}, the tags say {shape}. {_AGAIN}")
+    scale = 1.0 if slope is None else float(slope)
+    offset = 0.0 if intercept is None else float(intercept)
+    return (stored * scale + offset).astype(np.float32)
 
 
 def _patient(folder: Path, groups: list[list[_Slice]], slices: list[_Slice]) -> Patient:
