@@ -46,18 +46,20 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
         inside = not posixpath.normpath(posixpath.join(here, link[2])).startswith("..")
         return link[0] if inside else link[1]
 
-    def shown(link: re.Match[str]) -> str:
-        path = ROOT / "docs" / posixpath.normpath(posixpath.join(here, link[2]))
-        return data_table(path, link[1], link[2]) if path.exists() else link[0]  # MkDocs tells
-
-    markdown = re.sub(_DATA_LINK, shown, markdown)
+    lines = markdown.splitlines(keepends=True)
+    for number, line in enumerate(lines):
+        # Alone in its paragraph; headings and comments end one, too.
+        around = (lines[max(number - 1, 0) : number], lines[number + 1 : number + 2])
+        alone = all(not one or one[0].strip()[:1] in ("", "#", "<") for one in around)
+        if alone and (link := _DATA_LINK.fullmatch(line.strip())):
+            path = ROOT / "docs" / posixpath.normpath(posixpath.join(here, link[2]))
+            if path.exists():  # else MkDocs tells
+                lines[number] = "\n" + data_table(path, link[1], link[2]) + "\n"
+    markdown = "".join(lines)
     return re.sub(r"(?<!!)\[([^\]]+)\]\((\.\./[^)]*)\)", kept, markdown)
 
 
-# A paragraph that is nothing but a link to docs/data/NAME.csv.
-_DATA_LINK = re.compile(
-    r"(?<![^\n]\n)^\[([^\]]+)\]\(((?:\.\./)*data/[\w.-]+\.csv)\)[ \t]*$(?!\n[^\n])", re.MULTILINE
-)
+_DATA_LINK = re.compile(r"\[([^\]]+)\]\(((?:\.\./)*data/[\w.-]+\.csv)\)")
 
 
 def data_table(path: Path, text: str, link: str) -> str:

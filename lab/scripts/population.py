@@ -27,15 +27,19 @@ from tumortrack.core.errors import InputError
 from tumortrack.core.store import write_atomically
 from tumortrack.report import drawing
 from tumortrack_lab.fleet.results import LOOK, PATIENTS, SCENES
-from tumortrack_lab.real.judging import quantiles
 from tumortrack_lab.real.kidneys import SET_ASIDE, WHERE
 from tumortrack_lab.study import scripts
-from tumortrack_lab.study.document import ReportWriter, table
+from tumortrack_lab.study.document import ReportWriter, spread_mm, spread_words, table_of
 from tumortrack_lab.study.trust import BANDS, band_of
 
 DEVELOPMENT = (0, 2, 3)
 BLOCK = "population"
-_ERRORS = "median / 90 / 95 % / worst, mm"
+_ERRORS = {
+    "centre": "middle_mm",
+    "best rigid pose's centre": "rigid_middle_mm",
+    "Hausdorff": "hausdorff_mm",
+    "best rigid pose's Hausdorff": "rigid_hausdorff_mm",
+}
 # What errors are shown against: a column, its words, the limits of groups.
 _AGAINST: dict[str, tuple[str, tuple[float, ...]]] = {
     "ml": ("tumor, ml", (0, 4, 14, 33, np.inf)),  # balls of 2, 3 and 4 cm
@@ -62,7 +66,7 @@ class Options:
     fleet: Path | None = None
     """Folder that `tumortrack fleet` wrote."""
     document: Path = Path("docs/population.md")
-    """Its block is replaced."""
+    """Its block is replaced; tables and plot go beside it."""
 
 
 def main(options: Options) -> None:
@@ -77,10 +81,7 @@ def main(options: Options) -> None:
     if options.fleet is not None:
         writer = ReportWriter(options.document, scripts.make_command("population"))
         writer.check([BLOCK])
-        image = writer.image("population")
-        text = block(options.fleet, image)
-        link = writer.link(image, "errors against size, depth, slices and outer share")
-        writer.write({BLOCK: f"{text}\n\n{link}\n\n`{writer.command}`"})
+        writer.write({BLOCK: block(options.fleet, writer)})
         say(f"block written to {options.document}.")
 
 
@@ -96,96 +97,64 @@ def label_maps(data: Path) -> list[Path]:
     return found
 
 
-def block(fleet: Path, image: Path) -> str:
-    """The tables in Markdown; the plot goes into ``image``."""
+def block(fleet: Path, writer: ReportWriter) -> str:
+    """What stands in the document; tables and plot go beside it."""
     people, scenes = (pd.read_parquet(fleet / name) for name in (PATIENTS, SCENES))
     looks = pd.read_csv(fleet / LOOK)
-    if not (people.state == "done").any():
+    done = people[people.state == "done"]
+    if done.empty:
         raise InputError(f"{fleet} has no patient that is done.")
     scenes = scenes.merge(people[["patient", "slice_mm"]], on="patient")
-    draw(scenes, image)
-    return "\n\n".join([_outcome(people, looks), _margins(people), _groups(scenes),
-                        _wrong(scenes), _failed(people), _looks(people, looks)])  # fmt: skip
-
-
-def _outcome(people: pd.DataFrame, looks: pd.DataFrame) -> str:
-    """How many went through, and unattended."""
-    done = people[people.state == "done"]
-    alone = done[~done.patient.isin(looks.patient)]
-    states = ", ".join(f"{count} {state}" for state, count in people.state.value_counts().items())
-    worst = done.loc[done.middle_worst_mm.idxmax()] if done.middle_worst_mm.notna().any() else None
-    said = f"Patients: {len(people)} ({states}). Everything passed unattended, so that nobody "
-    said += f"needs to look: {len(alone)}, {len(alone) / len(people):.0%}. "
-    said += f"Scenes: {int(done.scenes.sum())}, and {int(done.lost.sum())} that could not be made."
-    if worst is not None:
-        said += f" Worst good answer: {worst.patient}, {worst.middle_worst_mm:.1f} mm."
-    return said
-
-
-def _margins(people: pd.DataFrame) -> str:
-    """What so few states say, and whether it held."""
-    done = people[(people.state == "done") & people.within_largest.notna()]
-    if done.empty:
-        return "Margins: no patient has good answers to both kinds of states."
-    return (
-        f"Margins: the largest miss over a patient's margin states, {_ERRORS}: "
-        f"{quantiles(done.largest_miss_mm)}. Another such answer misses by no more in "
-        f"{done.holds_for.mean():.0%} (n / (n + 1), mean); of the scenes evaluated, which are "
-        f"other states, {done.within_largest.mean():.0%} did."
+    draw(scenes, writer.image(BLOCK))
+    rows, alone = grouped(scenes), len(done[~done.patient.isin(looks.patient)])
+    said = (
+        f"{len(people)} patients, {len(done)} done, {alone} with nothing for a person to look at. "
+        f"{int(done.scenes.sum())} scenes; {int(done.lost.sum())} more could not be made. Within "
+        f"the largest miss of a patient's margin states: {done.within_largest.mean():.0%} of good "
+        f"answers, {done.holds_for.mean():.0%} by n / (n + 1)."
     )
+    short = rows[rows.by.isin(["all", "state"])]
+    ours, rigid = (spread_words(short, of) for of in list(_ERRORS)[:2])
+    short = short[["value", "scenes", "good %"]].assign(**{
+        "centre, mm: median / 95 % / worst": ours, "best rigid pose": rigid,
+        "over 5 mm": short["over 5 mm"],
+    })  # fmt: skip
+    links = [
+        writer.data(BLOCK, rows, "By state, hidden surface, tumor and slices"),
+        writer.data(f"{BLOCK}-wrong", wrong(scenes), "Good answers that are over 5 mm off"),
+        writer.data(f"{BLOCK}-look", looks, "What a person should look at"),
+    ]
+    return "\n\n".join([f"`{writer.command}`: {said}", table_of(short), *links])
 
 
-def _groups(scenes: pd.DataFrame) -> str:
-    """Verdicts and errors, by what was done to the organ and how tumors lie."""
-    given: dict[str, pd.Series] = {"all": pd.Series("all", scenes.index), "state": scenes.family}
+def grouped(scenes: pd.DataFrame) -> pd.DataFrame:
+    """Verdicts and errors, by what was done to the organ and how tumors lie; a scene counts once a
+    tumor."""
     bands = pd.Categorical(scenes.hidden_share.map(band_of), BANDS)
-    given["hidden"] = pd.Series(bands, scenes.index)
-    given |= {"kind": scenes.kind, "at": scenes.position}
+    given = {"all": pd.Series("all", scenes.index), "state": scenes.family}
+    given |= {"hidden": pd.Series(bands, scenes.index), "kind": scenes.kind, "at": scenes.position}
     for column, (words, limits) in _AGAINST.items():
         given[words] = pd.cut(scenes[column], limits, right=False)
-    head = ["", "tumors", "scenes", "good, poor, refused", f"centre, {_ERRORS}", "best rigid pose"]
-    head += ["Hausdorff", "best rigid pose", "over 3, 5 mm"]
-    body = []
-    for words, values in given.items():
+    rows = []
+    for by, values in given.items():
         for value, mine in scenes.groupby(values, observed=True):
             good = mine[mine.verdict == "good"]
-            shares = [
-                f"{(mine.verdict == name).mean():.0%}" for name in ("good", "poor", "refused")
-            ]
-            body.append([
-                value if words == "all" else f"{words}: {value}",
-                str(mine.groupby(["patient", "tumor"]).ngroups), str(len(mine)), ", ".join(shares),
-                quantiles(good.middle_mm), quantiles(good.rigid_middle_mm),
-                quantiles(good.hausdorff_mm), quantiles(good.rigid_hausdorff_mm),
-                f"{int(good.over_3_mm.sum())}, {int(good.over_5_mm.sum())}",
-            ])  # fmt: skip
-    return "Errors of answers called good, and of the best rigid pose of the same scenes; a " + (
-        f"scene counts once a tumor.\n\n{table(head, body)}"
-    )
+            row = {"by": by, "value": value, "scenes": len(mine)}
+            row["tumors"] = mine.groupby(["patient", "tumor"]).ngroups
+            for verdict in ("good", "poor", "refused"):
+                row[f"{verdict} %"] = f"{100 * (mine.verdict == verdict).mean():.0f}"
+            for words, column in _ERRORS.items():
+                row |= spread_mm(words, good[column])
+            row |= {f"over {mm} mm": int(good[f"over_{mm}_mm"].sum()) for mm in (3, 5)}
+            rows.append(row)
+    return pd.DataFrame(rows)
 
 
-def _wrong(scenes: pd.DataFrame) -> str:
-    """Every answer called good and over 5 mm off."""
-    wrong = scenes[scenes.over_5_mm.astype(bool)].sort_values("middle_mm", ascending=False)
-    named = [
-        f"{row.patient} {row.scene} {row.tumor} {row.middle_mm:.1f} ({row.rigid_middle_mm:.1f})"
-        for row in wrong.itertuples()
-    ]
-    return f"Called good and over 5 mm off (best rigid pose): {'; '.join(named) or 'none'}."
-
-
-def _failed(people: pd.DataFrame) -> str:
-    failed = people[people.state.isin(["cannot", "failed"])]
-    rows = [[row.patient, row.step, row.reason] for row in failed.itertuples()]
-    head = ["failed", "step", "reason"]
-    return table(head, rows, 3) if rows else "Nobody failed."
-
-
-def _looks(people: pd.DataFrame, looks: pd.DataFrame) -> str:
-    done = looks[looks.patient.isin(people[people.state == "done"].patient)]
-    rows = [[name, "; ".join(mine.reason)] for name, mine in done.groupby("patient")]
-    head = ["for a person's eye", "why"]
-    return table(head, rows, 2) if rows else "Nobody else needs a person's eye."
+def wrong(scenes: pd.DataFrame) -> pd.DataFrame:
+    """Every answer called good and over 5 mm off, the worst first."""
+    shown = {"middle_mm": "centre mm", "rigid_middle_mm": "best rigid pose mm"}
+    some = scenes[scenes.over_5_mm.astype(bool)].sort_values("middle_mm", ascending=False)
+    return some[["patient", "scene", "tumor", *shown]].rename(columns=shown).round(1)
 
 
 def draw(scenes: pd.DataFrame, path: Path) -> None:

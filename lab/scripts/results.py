@@ -12,12 +12,13 @@ import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any
 
 from tumortrack.cli.console import say
 from tumortrack.core.errors import TumortrackError
 from tumortrack.phantom.digital import PhantomParameters
-from tumortrack_lab.study import goals, scripts, tables
+from tumortrack_lab.study import scripts, tables
+from tumortrack_lab.study.document import ReportWriter, table_of
 from tumortrack_lab.study.measure import measured
 from tumortrack_lab.study.methods import (
     Method,
@@ -34,16 +35,7 @@ from tumortrack_lab.twin.views import VARIANTS
 
 PHANTOMS = {"phantom": PhantomParameters(), "second_phantom": second_phantom()}
 VIEW = "noise"
-Section = Literal["accuracy", "goals"]
-Rows = list[dict[str, Any]]
-RULES: dict[Section, str] = {
-    "accuracy": "Distances in mm: median / 90 % / 95 % / worst of all scenes and seeds (nearest "
-    "rank; of mIoU the lowest are the worst). A part that was not found counts as infinitely far. "
-    "HD is symmetric; best rigid pose: an oracle, the undeformed organ laid on the true one, in "
-    "least squares, so a single distance may come out below it. No method can use it. Target "
-    "error: mean over the scene's inner targets, for methods that carry points.",
-    "goals": goals.RULE,
-}
+BLOCK = "accuracy"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,10 +44,8 @@ class Options(scripts.KeptOptions):
 
     case: tuple[str, ...] = ()
     """More organs than the two phantoms, each NAME=FOLDER (of `tumortrack prepare`)."""
-    sections: tuple[Section, ...] = get_args(Section)
-    """Which blocks to make."""
-    peers: tuple[str, ...] = (goals.RIGID, "rigid", "elastic")
-    """Beside clinic in accuracy (docs/peers.md)."""
+    peers: tuple[str, ...] = ("rigid_bound", "rigid", "elastic")
+    """Beside clinic (docs/peers.md)."""
     seeds: tuple[int, ...] = (0, 1, 2)
     """Of models: of elastic body and calibration."""
     variants: tuple[str, ...] = tuple(VARIANTS)
@@ -67,21 +57,17 @@ class Options(scripts.KeptOptions):
 
 
 def main(options: Options) -> None:
-    """Scenes, measurements, blocks, in this order and section by section."""
-    writer = options.begin("results", *options.sections)
+    """Scenes, measurements, the block and its tables, in this order."""
+    writer, rows = options.begin("results", BLOCK), []
     cases = list(cases_of(options))
-    for section in options.sections:
-        say(f"== {section}")
-        rows: Rows = []
-        for case in cases:
-            make_scenes(case, options.variants)
-            for method in methods_of(section, case, options):
-                say(f"{case.name}: {method.name}, seed {method.seed}")
-                about = case, method, options.variants, VIEW, options.grid, options.out / "rows"
-                rows += measured(*about)
-        texts = [*texts_of(section, rows, cases), tables.caption(rows, writer.command)]
-        writer.write({section: "\n\n".join(texts) + f" {RULES[section]}"})
-        say(f"{section}: block written to {options.document}")
+    for case in cases:
+        make_scenes(case, options.variants)
+        for method in methods_of(case, options):
+            say(f"{case.name}: {method.name}, seed {method.seed}")
+            about = case, method, options.variants, VIEW, options.grid, options.out / "rows"
+            rows += measured(*about)
+    writer.write({BLOCK: text_of(rows, cases, writer)})
+    say(f"block written to {options.document}")
 
 
 def cases_of(options: Options) -> Iterator[StudyCase]:
@@ -99,25 +85,19 @@ def make_scenes(case: StudyCase, variants: tuple[str, ...]) -> None:
         raise TumortrackError(f"the scenes of {case.name} could not be made (see above).")
 
 
-def methods_of(section: Section, case: StudyCase, options: Options) -> Iterator[Method]:
+def methods_of(case: StudyCase, options: Options) -> Iterator[Method]:
     """One after the other, so that one model is held at a time."""
-    for seed in options.seeds:
-        yield clinic(case, seed)
-    for name in options.peers if section == "accuracy" else (goals.RIGID,):
-        yield peer(name, case)
+    yield from (clinic(case, seed) for seed in options.seeds)
+    yield from (peer(name, case) for name in options.peers)
 
 
-def texts_of(section: Section, rows: Rows, cases: list[StudyCase]) -> list[str]:
-    """The tables of a section."""
-    frame = tables.tidy(rows)
+def text_of(rows: list[dict[str, Any]], cases: list[StudyCase], writer: ReportWriter) -> str:
+    """The block; the full table goes beside the document."""
     sites = {case.name: tumor_sites_of(case.anatomy_ct) for case in cases}
-    if section == "goals":
-        return [goals.goal_table(frame, sites)]
-    texts = []
-    for name, own in sites.items():
-        mine = frame[frame.case == name]
-        texts += [f"#### {name}", tables.sites_text(name, own), tables.accuracy(mine, own)]
-    return texts
+    accuracy = tables.accuracy(tables.tidy(rows), sites)
+    link = writer.data("results-accuracy", accuracy, "Every organ, state, figure and method")
+    short = table_of(tables.accuracy_summary(accuracy), 3)
+    return "\n\n".join([short, tables.caption(rows, writer.command), link])
 
 
 if __name__ == "__main__":

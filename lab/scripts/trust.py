@@ -2,8 +2,8 @@
 
     make trust ARGS='MODEL/margins.jsonl ...'     (a minute: nothing but the worst cases is located)
 
-Fills the blocks of docs/trust.md, which has the protocol, and draws its pictures. A table that is
-not finished is used as far as it is.
+Fills a block of docs/trust.md, and writes its tables and pictures. A table that is not finished is
+used as far as it is.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ import tyro
 from tumortrack.cli.console import say
 from tumortrack.report.calibration import WIDEST_MM
 from tumortrack_lab.study import scripts, trust
-from tumortrack_lab.study.document import ReportWriter
+from tumortrack_lab.study.document import ReportWriter, table_of
 
-BLOCKS = [f"trust-{name}" for name in ("coverage", "ranks", "reliability", "risk", "worst")]
+BLOCK = "trust"
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class Options:
     tables: tyro.conf.Positional[tuple[Path, ...]]
     """Files that `tumortrack margins` wrote beside the models."""
     document: Path = Path("docs/trust.md")
-    """Its blocks are replaced."""
+    """Its block is replaced; tables and pictures go beside it."""
     worst: int = 6
     """So many of the worst accepted answers are drawn."""
     widest: float = WIDEST_MM
@@ -42,7 +42,7 @@ class Options:
 def main(options: Options) -> None:
     """Calibrate on the others, test on what is left out, and write it down."""
     writer = ReportWriter(options.document, scripts.make_command("trust"))
-    writer.check(BLOCKS)
+    writer.check([BLOCK])
     tables = trust.read_tables(options.tables)
     states = trust.states_of([row for table in tables for row in table.rows])
     fifth = np.random.default_rng(options.seed).permutation(len(states)) % 5 + 1
@@ -52,24 +52,25 @@ def main(options: Options) -> None:
         found[what] = trust.left_out(states, part, options.seed, widest_mm=options.widest)
         say(f"calibrated without each {what}")
     family = found["family"]
-    coverage = [trust.coverage_table(one, f"{what} left out") for what, one in found.items()]
-    tested = family[family.refused == ""]
-    hidden = tested.assign(part=tested.hidden)
-    coverage.append(trust.coverage_table(hidden, "hidden surface, families left out"))
-    picture = writer.image("trust_reliability")
-    trust.reliability_picture(
-        {f"each {what} left out": one for what, one in found.items()}, picture
+    hidden = family[family.refused == ""]
+    coverage = trust.coverage(
+        found | {"family, by hidden surface": hidden.assign(part=hidden.hidden)}
     )
-    reliability = writer.link(picture, "stated confidence against the share found within")
-    picture = writer.image("trust_risk")
-    trust.risk_picture(family, picture)
-    risk = writer.link(picture, "share of answers too far off against the share answered")
-    picture = writer.image("trust_worst")
-    worst = trust.worst_picture(family, tables, options.worst, picture)
-    worst += "\n\n" + writer.link(picture, "the worst accepted answers over the truth")
-    blocks = ["\n\n".join([f"`{writer.command}`", *coverage])]
-    blocks += [trust.ranks_table(family), reliability, risk, worst]
-    writer.write(dict(zip(BLOCKS, blocks, strict=True)))
+    trust.reliability_picture(
+        {f"each {what} left out": one for what, one in found.items()},
+        writer.image("trust_reliability"),
+    )
+    trust.risk_picture(family, writer.image("trust_risk"))
+    worst = trust.worst_picture(family, tables, options.worst, writer.image("trust_worst"))
+    short = ["part", "answers %", "within 95 %", "95 % margin median mm"]
+    texts = [
+        f"`{writer.command}`",
+        table_of(coverage.loc[coverage["left out"] == "family", short]),
+        writer.data("trust-coverage", coverage, "Coverage by what was left out"),
+        writer.data("trust-ranks", trust.ranks(family), "Misses, and what goes with them"),
+        writer.data("trust-worst", worst, "The worst accepted answers"),
+    ]
+    writer.write({BLOCK: "\n\n".join(texts)})
     say(f"written to {options.document}")
 
 

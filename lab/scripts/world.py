@@ -13,6 +13,7 @@ each, and the last with `--beside` the others. `--plans MODEL` cuts tumors out (
 from __future__ import annotations
 
 import time
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache, partial
@@ -20,6 +21,7 @@ from itertools import product
 from pathlib import Path
 from typing import Annotated
 
+import pandas as pd
 import tyro
 
 from tumortrack.cli.console import model_folder, say
@@ -36,6 +38,7 @@ from tumortrack_lab.world import estimates
 from tumortrack_lab.world.families import FAMILIES
 from tumortrack_lab.world.scenes import DISTURBANCES, TETS, World, WorldConfig
 
+Made = tuple[str, dict[str, tuple[str, pd.DataFrame]]]  # a text; tables: by name words and rows
 _ABOUT, _FAILURES = "world.json", "failures.json"
 
 
@@ -69,7 +72,7 @@ class Options:
     beside: tuple[Path, ...] = ()
     """Other organs' scenes that are measured already: they join the tables."""
     document: Path | None = None
-    """Its block of undisturbed or of disturbed scenes is replaced."""
+    """Its block of undisturbed or of disturbed scenes is replaced; tables go beside it."""
 
 
 def main(options: Options) -> None:
@@ -109,21 +112,29 @@ def main(options: Options) -> None:
     if (given := options.plans or options.model) is not None:
         model = model_folder(given)
         made = [name for name in scenes if (options.out / name).exists()]
-        text = (_plans if options.plans else _estimates)(options, world, model, made)
+        text, data = (_plans if options.plans else _estimates)(options, world, model, made)
         print(text)
         if options.document is not None:
-            writer.write({block: f"`{writer.command}`\n\n{text}"})
+            named = [(f"{block}-{name}", *rows) for name, rows in data.items()]
+            links = [writer.data(name, rows, words) for name, words, rows in named]
+            writer.write({block: "\n\n".join([f"`{writer.command}`", text, *links])})
 
 
-def _estimates(options: Options, world: World, model: Path, made: list[str]) -> str:
+def _estimates(options: Options, world: World, model: Path, made: list[str]) -> Made:
     estimates.measure(model, world.anatomy_ct, options.out, made)
     folders = [options.out, *options.beside]
     paths = [path for folder in folders if (path := folder / _FAILURES).exists()]
     lost = [why for path in paths for why in store.read_json(path).values()]
-    return estimates.summary(estimates.read_rows(folders), lost)
+    rows = estimates.read_rows(folders)
+    lines, count = estimates.verdicts(rows), Counter(why.partition(":")[0] for why in lost)
+    said = ", ".join(f"{name} {n}" for name, n in count.most_common())
+    return f"{estimates.summary(lines)}\n\nNot made: {said or 'none'}.", {
+        "verdicts": ("Verdicts and errors", lines),
+        "wrong": ("Good answers that are wrong", estimates.wrong_ones(rows)),
+    }
 
 
-def _plans(options: Options, world: World, model: Path, made: list[str]) -> str:
+def _plans(options: Options, world: World, model: Path, made: list[str]) -> Made:
     """Plans are kept in the scenes' folder, a file a scene and method."""
     case, rows = study_case(options.out.name, options.case, options.out), []
     for name, method in product(made, (resection.calibrated(model), resection.truth())):
@@ -134,8 +145,11 @@ def _plans(options: Options, world: World, model: Path, made: list[str]) -> str:
     good = {row["variant"] for row in rows if row.get("good")}
     for row in rows:
         row["case"] = "an answer" if row["variant"] in good else "no answer"
+    cuts, refused = resection.tables_of(rows)
     said = f"Scenes: {len(made)}, with an answer: {len(good)}."
-    return "\n\n".join([said, resection.tables_of(rows), resection.RULE])
+    return f"{said}\n\n{resection.summary(cuts)}", {
+        "cuts": ("What the cuts did", cuts), "refused": ("Why there was no plan", refused)
+    }  # fmt: skip
 
 
 def _scenes(options: Options, world: World) -> dict[str, Callable[[], Scene]]:

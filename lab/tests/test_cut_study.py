@@ -25,6 +25,7 @@ from tumortrack_lab.study.resection import (
     cut_one,
     cutting,
     scattered,
+    summary,
     tables_of,
     tidy_plans,
     truth,
@@ -177,10 +178,11 @@ def test_a_stated_margin_pays_for_an_estimate_that_is_as_far_off(case):
         2.0 + np.hypot(radius_mm, np.hypot(2, 3)), abs=0.3
     )
     assert everything - thin == pytest.approx(4.0, abs=0.3)
-    text = tables_of([{"case": "balls", "method": "calibrated", **row} for row in rows])
-    kept = {line.split("|")[2].strip(): line for line in text.splitlines() if " mm" in line}
-    assert "| 0.0 (0.0 to 97.5) | 0 | 0 |" in kept["5 mm"]
-    assert "| 100.0 (2.5 to 100.0) | 0 | 0 |" in kept["5 mm + 95 % radius"]
+    cuts, _ = tables_of([{"case": "balls", "method": "calibrated", **row} for row in rows])
+    kept = cuts.set_index("planner")["as asked %"]
+    assert kept["5 mm"] == "0.0 (0.0 to 97.5)"
+    assert kept["5 mm + 95 % radius"] == "100.0 (2.5 to 100.0)"
+    assert not cuts[["cut into it", "into another tumor"]].to_numpy().any()
     silent = cut_one(case, off, "D0", "noise", 64)
     assert [row.get("refused", "").partition(":")[0] for row in silent[2:]] == [
         "the estimate states no 95 % margin of tumor_1"
@@ -215,19 +217,26 @@ def test_tables_say_what_was_removed_and_why_not(case, tmp_path):
         for name in ("clinic", "M_lim", "truth")
         for planner in (PLANNERS if name == "M_lim" else (OURS,))
     ]
-    text = tables_of(found)
-    lines = {
-        tuple(cell.strip() for cell in line.split("|")[1:3]): line for line in text.split("\n")
-    }
-    assert text.startswith("All cases:")
-    best = lines["truth", "5 mm"]
-    assert "| 1 of 1 | 1 of 1 | 1 of 1 | 100.0 | 100.0 | 0.00 |" in best
-    assert "| 1 of 1 | 1 of 1 | 0 of 1 |" in lines["clinic", "5 mm"]
-    assert "| 0 of 1 | 0 of 0 | 0 of 0 | – |" in lines["M_lim", "5 mm"]
-    assert "1 x M_lim, 5 mm: the cloud shows no organ" in text
+    cuts, refused = tables_of(found)
+    known = cuts.set_index(["located by", "planner"]).T
+    counts = ["asked", "plans", "free", "whole"]
+    best = known["truth", "5 mm"]
+    assert list(best[[*counts, "removed worst %", "left worst ml"]]) == [
+        1,
+        1,
+        1,
+        1,
+        "100.0",
+        "0.00",
+    ]
+    assert list(known["clinic", "5 mm"][counts]) == [1, 1, 1, 0]
+    assert list(known["M_lim", "5 mm"][[*counts, "worst mm"]]) == [1, 0, 0, 0, "–"]
+    assert ("M_lim", "5 mm", "the cloud shows no organ", 1) in refused.itertuples(index=False)
+    assert "| truth | 5 mm | 1 | 1 |" in summary(cuts)
 
 
 def test_shares_are_never_rounded_up_to_all(case):
     known = {"case": "balls", "method": "truth"}
     (row,) = [r for r in cut_one(case, truth(), "D0", "noise", 64) if r["planner"] == OURS.name]
-    assert "| 99.9 | 99.9 |" in tables_of([{**known, **row, "removed_share": 0.99996}])
+    cuts, _ = tables_of([{**known, **row, "removed_share": 0.99996}])
+    assert list(cuts[["removed median %", "removed worst %"]].iloc[0]) == ["99.9", "99.9"]

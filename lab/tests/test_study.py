@@ -24,8 +24,15 @@ from tumortrack.simulate.scene_folder import Scene
 from tumortrack.tracking.model_files import load_model
 from tumortrack_lab.peers.base import Fit, OneWay, estimate_of, rigid_carry
 from tumortrack_lab.study import tables, tumor_sites
-from tumortrack_lab.study.document import ReportWriter, closing, fill, opening, table
-from tumortrack_lab.study.goals import goal_table
+from tumortrack_lab.study.document import (
+    ReportWriter,
+    closing,
+    fill,
+    opening,
+    spread_mm,
+    spread_words,
+    table,
+)
 from tumortrack_lab.study.measure import measured
 from tumortrack_lab.study.methods import Method, StudyCase, peer, study_case
 from tumortrack_lab.study.tables import tidy
@@ -33,6 +40,7 @@ from tumortrack_lab.study.tables import tidy
 ROOT = Path(__file__).parents[2]
 RESULTS = ROOT / "lab" / "scripts" / "results.py"
 TURN = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+SPREAD = ["median", "90 %", "95 %", "worst"]
 CAMERA_FROM_CT = rigid(TURN, np.array([3.0, -2, 130]))
 
 
@@ -49,6 +57,10 @@ def anatomy():
 def moved(parts, camera_from_ct):
     carry = rigid_carry(camera_from_ct)
     return Anatomy(tuple(part.moved(carry(part.vertices_mm)) for part in parts.parts))
+
+
+def sites():
+    return {"balls": tumor_sites.tumor_sites_of(anatomy())}
 
 
 @pytest.fixture
@@ -136,24 +148,28 @@ def test_known_errors_reach_the_table(case, tmp_path):
     found = [row for one in seeds for row in rows_of(case, one, tmp_path)]
     turned = rows_of(case, Shifted(shift_mm=9.0, seed=9), tmp_path)
     found += [{**row, "variant": "Rot90"} for row in turned]
-    written = tables.accuracy(tidy(found), tumor_sites.tumor_sites_of(anatomy()))
-    rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in written.splitlines()]
-    deep = "tumor 1, endophytic: centre"
-    assert rows[0] == ["state", "figure", "rigid registration, many starts"]
-    assert rows[2] == ["deformed", "scenes x seeds", "2 x 3"]
-    assert [row[2] for row in rows if row[1] == deep] == [
-        "2.0 / 3.0 / 3.0 / 3.0",  # neither seeds nor scenes are averaged
-        "9.0 / 9.0 / 9.0 / 9.0",
+    rows = tables.accuracy(tidy(found), sites())
+    assert set(rows.method) == {"rigid registration, many starts"}
+    deep = rows[(rows.part == "tumor_1") & (rows.figure == tables.CENTER)]
+    assert deep[["state", "kind", "scenes", "seeds", *SPREAD]].to_numpy().tolist() == [
+        *(
+            ["D1", "endophytic", 1, 3, "2.0", *["3.0"] * 3],
+            ["D2", "endophytic", 1, 3, "2.0", *["3.0"] * 3],
+        ),
+        ["deformed", "endophytic", 2, 3, "2.0", "3.0", "3.0", "3.0"],  # nothing is averaged
+        ["undeformed", "endophytic", 1, 1, "9.0", "9.0", "9.0", "9.0"],
     ]
-    assert [row[2] for row in rows if row[1] == "target error"] == ["–", "–"]  # no targets.csv
+    targets = rows[rows.figure == "target error, mm"]
+    assert set(targets["median"]) == {""}  # no targets.csv
     said = tables.caption(found, "make results")
     assert said.startswith("`make results`: 7 measurements (view: clean), volumes of 24³")
 
 
 def test_shares_are_by_nearest_rank_and_never_in_our_favour():
     values = pd.Series([*range(1, 11), np.inf], dtype=float)
-    assert tables.spread(values) == "6.0 / 10.0 / not found / not found"
-    assert tables.spread(values[:4] / 10, 2, high=True) == "0.25 / 0.10 / 0.10 / 0.10"
+    assert [*tables.spread(values).values()] == ["6.0", "10.0", "not found", "not found"]
+    lowest = tables.spread(values[:4] / 10, 2, high=True)
+    assert [*lowest.values()] == ["0.25", "0.10", "0.10", "0.10"]
 
 
 def test_targets_are_measured_where_a_scene_has_them(case, tmp_path):
@@ -165,18 +181,21 @@ def test_targets_are_measured_where_a_scene_has_them(case, tmp_path):
     path.write_text("\n".join([head, *lines]) + "\n")
     found = rows_of(case, Shifted(shift_mm=3.5), tmp_path)
     assert [row["target_mm"] for row in found] == [pytest.approx(3.5)] * 3 + [None] * 3
-    written = tables.accuracy(tidy(found), tumor_sites.tumor_sites_of(anatomy()))
-    assert "| target error | 3.5 / 3.5 / 3.5 / 3.5 |" in written
+    rows = tables.accuracy(tidy(found), sites())
+    targets = rows[(rows.figure == "target error, mm") & (rows.state == "deformed")]
+    assert targets[SPREAD].to_numpy().tolist() == [["3.5"] * 4]
 
 
 def test_parts_that_were_not_found_follow_the_rule(case, tmp_path):
     stubs = [Shifted(), Shifted(seed=1, without=("tumor_2",)), Shifted(seed=2, nothing=True)]
     frame = tidy([row for one in stubs for row in rows_of(case, one, tmp_path)])
-    written = tables.accuracy(frame, tumor_sites.tumor_sites_of(anatomy()))
-    assert "| scenes with a part not found | 4 |" in written
-    assert "| tumor 2, endophytic: HD | not found / not found / not found / not found |" in written
-    assert "| tumor 1, endophytic: centre | 2.0 / not found" in written
-    assert "0.00 / 0.00 / 0.00 |" in written  # mIoU of what was not found
+    rows = tables.accuracy(frame, sites())
+    rows = rows[rows.state == "deformed"]
+    assert set(rows["scenes with a part not found"]) == {4}
+    figures = rows.set_index(["part", "figure"])[SPREAD].T
+    assert set(figures["tumor_2", tables.HD]) == {"not found"}
+    assert list(figures["tumor_1", tables.CENTER])[:2] == ["2.0", "not found"]
+    assert figures["all", "mIoU"]["worst"] == "0.00"  # of what was not found
 
 
 def test_how_a_tumor_lies():
@@ -208,12 +227,22 @@ def test_blocks_are_replaced_and_the_rest_stays():
         table(["x", "y"], [["1"]])
 
 
-def test_the_document_has_a_place_for_every_section():
-    document = (ROOT / "docs" / "results.md").read_text(encoding="utf-8")
-    names = [*runpy.run_path(str(RESULTS))["RULES"]]
-    assert fill(document, {name: "x" for name in names}).count("\n\nx\n\n<!-- /results:") == len(
-        names
-    )
+@pytest.mark.parametrize("name", ["results", "trust", "population"])
+def test_documents_have_a_place_for_what_scripts_write(name):
+    document = (ROOT / "docs" / f"{name}.md").read_text(encoding="utf-8")
+    block = runpy.run_path(str(ROOT / "lab" / "scripts" / f"{name}.py"))["BLOCK"]
+    assert f"\n\nx\n\n{closing(block)}" in fill(document, {block: "x"})
+
+
+def test_a_table_goes_beside_the_document(tmp_path):
+    errors = {"a": pd.Series([1.0, 2, 3, np.nan]), "b": pd.Series([], dtype=float)}
+    rows = pd.DataFrame([{"who": k, **spread_mm("off", v)} for k, v in errors.items()])
+    link = ReportWriter(tmp_path / "page.md", "make it").data("errors", rows, "All, by who")
+    assert link == "[All, by who: 2 rows](data/errors.csv)"
+    assert (tmp_path / "data" / "errors.csv").read_text().splitlines() == [
+        "who,off median mm,off 90 % mm,off 95 % mm,off worst mm", "a,2.0,2.8,2.9,3.0", "b,,,,",
+    ]  # fmt: skip
+    assert list(spread_words(rows, "off")) == ["2.0 / 2.9 / 3.0", "–"]
 
 
 @pytest.mark.parametrize("name", ["results", "soak", "real", "world", "sequences", "trust"])
@@ -258,52 +287,23 @@ def test_end_to_end_twice_gives_the_same_document(phantom, clinic_model, tmp_pat
 
     def run():
         rows = []
-        for method in script["methods_of"]("accuracy", phantom, options):
+        for method in script["methods_of"](phantom, options):
             about = method, options.variants, "noise", options.grid, tmp_path / "rows"
             rows += measured(phantom, *about)
-        texts = script["texts_of"]("accuracy", rows, [phantom])
-        writer.write({"accuracy": "\n\n".join([*texts, tables.caption(rows, writer.command)])})
+        writer.write({"accuracy": script["text_of"](rows, [phantom], writer)})
         return document.read_text()
 
     first = run()
     assert made == [7]
     assert first.startswith("mine\n")
     assert first.endswith("yours\n")
-    for words in ("models by seed 0, 7", "(oracle)"):
+    for words in (
+        "models by seed 0, 7",
+        "worst: best rigid pose",
+        "(data/results-accuracy.csv)",
+    ):
         assert words in first
     assert run() == first
     assert made == [7]
     with pytest.raises(InputError, match="rigid_bound, rigid"):
         peer("rigidly", phantom)
-
-
-def goal_row(method, variant, hd, case="one", seed=0):
-    """The rows of a scene of a case with one tumor, with what the goals read."""
-    whole = {"case": case, "method": method, "seed": seed, "variant": variant}
-    whole |= {"miou": 0.89999 if hd else 0.0, "failed": not hd, "target_mm": hd}
-    near = {"hausdorff_mm": hd, "center_mm": 0.25 * hd} if hd else {}
-    return [{**whole, "part": "kidney"}, {**whole, "part": "tumor_1", **near}]
-
-
-def test_goals_are_judged_by_the_worst_seed_and_never_rounded_in_our_favour():
-    sites = {
-        "one": {"tumor_1": tumor_sites.TumorSite(0.0, 5.0)},
-        "two": {"tumor_1": tumor_sites.TumorSite(0.5, 0.0)},
-    }
-    found = [*goal_row("clinic", "D1", 1.0), *goal_row("clinic", "D1", 2.0001, seed=1)]
-    found += [*goal_row("clinic", "D2", 2.9999), *goal_row("clinic", "Rot90", 0.1)]
-    found += goal_row("rigid_bound", "D1", 1.994)
-    found += goal_row("clinic", "D1", 1.5, case="two")
-    lines = goal_table(tidy(found), sites).splitlines()
-    assert lines[0] == "| figure | goal | one: clinic / rigid | two: clinic / rigid |"
-    rows = {line.split("|")[1].strip(): line for line in lines}
-    assert "| ≤ 2 | 2.01 (no) / 2.00 | – / – |" in rows["tumor HD, D1, endophytic"]
-    assert "| ≤ 1.5 | – / – | 1.50 (yes) / – |" in rows["tumor HD, D1, exophytic"]
-    assert "| ≤ 3 | 3.00 (yes) / – |" in rows["tumor HD, D2, endophytic"]
-    assert "| ≥ 0.9 | 0.89 (no) / 0.89 |" in rows["mIoU, deformed variants"]
-    assert "| ≤ 2 | 2.50 (no) / 2.00 |" in rows["target error, deformed variants"]
-    assert "| ≤ 2 | 2.01 (no) |" in rows["target error, all variants"].replace(" / 2.00", "")
-
-    lost = [*found, *goal_row("clinic", "D3", None)]
-    worst = next(line for line in goal_table(tidy(lost), sites).splitlines() if "worst" in line)
-    assert "| ≤ 2.5 | not found (no) / " in worst

@@ -53,15 +53,13 @@ def test_a_family_unlike_the_others_is_found_out_by_leaving_it_out(tables, tmp_p
     assert shares["cut"] < 0.5  # calibrated on misses a quarter of its own
     assert (shares.drop("cut") > 0.93).all()
     assert (taken.groupby("part")["mm 0.9"].max() <= taken.groupby("part")["mm 0.95"].max()).all()
-    lines = trust.coverage_table(found, "family").splitlines()
-    assert [line.split(" | ")[0] for line in lines[2:]] == [
-        "| cut", "| plate", "| pull", "| rest", "| all of these",
-    ]  # fmt: skip
+    rows = trust.coverage({"family": found})
+    assert list(rows.part) == ["cut", "plate", "pull", "rest", "all of these"]
+    assert float(rows["within 95 %"][0].split(" (")[0]) == round(100 * shares["cut"], 1)
     organs = trust.left_out(states, states.organ, 0, widest_mm=20.0)
     within = organs[organs.accepted.astype(bool)]["within 0.95"]
     assert within.mean() > 0.93  # the other organ has the same physics
-    ranks = trust.ranks_table(organs).splitlines()[-1].split(" | ")
-    assert float(ranks[-1].strip(" |")) > 0.3
+    assert float(trust.ranks(organs)["95 % radius and miss"].iloc[-1]) > 0.3
     trust.risk_picture(found, tmp_path / "risk.png")
     trust.reliability_picture({"each family left out": found}, tmp_path / "reliability.png")
     assert all((tmp_path / f"{name}.png").stat().st_size > 9000 for name in ("risk", "reliability"))

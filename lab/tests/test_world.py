@@ -290,13 +290,15 @@ def test_estimates_are_held_against_truth_and_rigid_pose_once_and_wrong_ones_nam
     assert rows["shape"][0] < 1.5
     assert rows.rigid[0] < 1.5
     assert list(rows.wrong) == [True, True]
-    text, off = estimates.summary(rows, ["NoEstimate: nothing"]), f"{rows.off[0]:.1f}"
-    assert f"| rest | 1 | 0, 0, 1 | {off} / {off} / {off} / {off} |" in text
-    assert "| nothing | 1 | 0, 0, 1 | – | – | 1 |" in text
-    assert f"| none | laid elsewhere | 1 | organ 0-rest {off} (" in text
-    assert "| nothing | another organ taken for it | 1 | organ 1-rest |" in text
-    assert "Not made: NoEstimate 1." in text
-    assert estimates.summary(rows.assign(wrong=False), []).endswith("Wrong: none.")
+    lines, off = estimates.verdicts(rows), f"{rows.off[0]:.1f}"
+    known = lines.set_index(["by", "value"]).T
+    assert list(known["family", "rest"])[:6] == [1, 0, 0, 1, 1, off]
+    assert list(known["disturbance", "nothing"])[:6] == [1, 0, 0, 1, 1, ""]
+    assert f"| rest | 1 | 1 | 1 | {off} / {off} / {off} |" in estimates.summary(lines)
+    wrong = estimates.wrong_ones(rows)
+    assert list(wrong.wrong) == ["wrong pose", "not this organ"]
+    assert list(wrong.scene) == names
+    assert estimates.wrong_ones(rows.assign(wrong=False)).empty
     monkeypatch.setattr(estimates, "METHOD", -1)
     with pytest.raises(InputError, match="another version"):
         estimates.read_rows([out])

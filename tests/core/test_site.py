@@ -31,12 +31,16 @@ def shown(site, markdown: str, page: str = "decisions/page.md") -> str:
 
 def test_a_link_to_data_alone_in_its_paragraph_becomes_a_table(site):
     text = shown(site, "One.\n\n[Errors of `x`: 2 rows](../data/errors.csv)\n\nTwo.\n")
-    assert text.startswith("One.\n\n<details")
+    assert text.startswith("One.\n\n\n<details")
     assert text.endswith("</details>\n\nTwo.\n")
     assert "<summary>Errors of <code>x</code>: 2 rows</summary>" in text
     assert "<td>b, &lt;c&gt;</td><td>2</td>" in text
     assert '<a href="../data/errors.csv" download>' in text
-    assert shown(site, "[E](data/errors.csv)", "page.md").startswith("<details")
+    assert shown(site, "[E](data/errors.csv)", "page.md").startswith("\n<details")
+    between = shown(site, "<!-- a -->\n[E](data/errors.csv)\n<!-- /a -->\n", "page.md")
+    assert between.startswith("<!-- a -->\n\n<details")
+    assert between.endswith("</details>\n<!-- /a -->\n")
+    assert "<details" in shown(site, "## Head\n[E](data/errors.csv)\n\nWords\n", "page.md")
 
 
 @pytest.mark.parametrize(

@@ -117,7 +117,7 @@ def read_dicom(folder: Path, series: str | None = None) -> RawVolume:
 def _slice_values(path: Path, shape: tuple[int, int]) -> Float32[np.ndarray, "rows columns"]:
     """Rescaled values of one slice."""
     from pydicom import Dataset
-    from pydicom.pixels import pixel_array
+    from pydicom.pixels.utils import pixel_array
 
     with suppress(ImportError):  # pydicom then says which package its pixels need
         import gdcm

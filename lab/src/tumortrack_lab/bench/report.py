@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import csv
-import io
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
 import msgspec
+import pandas as pd
 from rich.table import Table
 
 from tumortrack.core.store import write_atomically
@@ -85,13 +84,13 @@ def _figures(row: BenchRow) -> dict[str, object]:
 
     ours, naive, share = row.ours, row.naive, row.agreement
     return {
-        "part": row.name,
+        "part": row.name.replace("`", ""),
         "of": row.what,
         "threads": row.threads if row.device == "cpu" else row.device,
         "ms": digits(1e3 * ours.median_s),
         "quartiles ± %": f"{50 * (ours.high_s - ours.low_s) / ours.median_s:.0f}",
         "items a second": digits(row.per_s),
-        "naive ms": digits(None if naive is None else 1e3 * naive.median_s),
+        "naive ms": digits(1e3 * naive.median_s if naive else None),
         "times faster": digits(row.ratio),
         "labels equal %": "" if share is None else _agreement(share).removesuffix(" %"),
         "peak GiB": digits(row.others.get(rows.PEAK, 0.0) / _GIB or None),
@@ -193,25 +192,18 @@ def write_bench(bench: BenchResult, out: Path, document: Path | None) -> list[Pa
     write_atomically(out, msgspec.json.format(msgspec.json.encode(bench), indent=1))
     if document is None:
         return [out]
-    machine = [{"this machine": key, "": value} for key, value in bench.machine.items()]
-    tables: dict[str, tuple[str, Sequence[dict]]] = {
-        "speed": ("Every row", [_figures(row) for row in bench.rows]),
-        "speed_goals": ("Goals", goals_of(bench)),
-        "speed_machine": ("The machine", machine),
-    }
+    machine = [{"this machine": key, "value": value} for key, value in bench.machine.items()]
+    tables = (
+        ("speed", [_figures(row) for row in bench.rows], "Every row"),
+        ("speed_goals", goals_of(bench), "Goals"),
+        ("speed_machine", machine, "The machine"),
+    )
     most = max(row.threads for row in bench.rows)
     cells = [_cells(row) for row in bench.rows if row.threads == most]
     summary = table(_SUMMARY, [[each[key] for key in _SUMMARY] for each in cells], left=2)
     caption = f"Medians on {most} threads; `{bench.command}`, {bench.machine.get('date', '')}."
+    writer = ReportWriter(document, bench.command)
+    links = (writer.data(name, pd.DataFrame(found), words) for name, found, words in tables)
+    writer.write({"speed": "\n\n".join((summary, caption, *links))})
     folder = document.parent / "data"
-    folder.mkdir(exist_ok=True)
-    text = [summary, caption]
-    for name, (words, found) in tables.items():
-        lines = io.StringIO()
-        writer = csv.DictWriter(lines, [*found[0]], lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(found)
-        write_atomically(folder / f"{name}.csv", lines.getvalue().encode())
-        text.append(f"[{words}: {len(found)} rows](data/{name}.csv)")
-    ReportWriter(document, bench.command).write({"speed": "\n\n".join(text)})
-    return [out, document, *(folder / f"{name}.csv" for name in tables)]
+    return [out, document, *(folder / f"{name}.csv" for name, *_ in tables)]

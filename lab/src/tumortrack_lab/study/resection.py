@@ -32,9 +32,9 @@ from tumortrack.tracking.model_files import load_model
 from tumortrack.tracking.tracker import Tracker
 from tumortrack_lab.cut import VOXEL_MM, cut
 from tumortrack_lab.peers.base import Fit, estimate_of
-from tumortrack_lab.study.document import table
+from tumortrack_lab.study.document import table_of
 from tumortrack_lab.study.methods import Method, StudyCase, code_sha256
-from tumortrack_lab.study.tables import EMPTY, NOTHING, groups, label_of, names, ordered
+from tumortrack_lab.study.tables import NOTHING, groups, ordered
 from tumortrack_lab.study.trust import share_words
 from tumortrack_lab.study.tumor_sites import tumor_sites_of
 from tumortrack_lab.twin.apparatus import moved
@@ -47,32 +47,8 @@ _FINE = 256  # voxels along the true organ: its points' labels err by 0.2 mm
 MARGIN_MM = 5.0  # the paper's
 SIGMAS = 2.0
 _WHOLE = 0.999  # of a tumor: what is missing is a voxel's rounding
-_HEAD = (
-    "located by", "planner", "plans", "piece comes free", "tumor whole in the piece",
-    "tumor removed, %: median", "worst", "tumor left, ml: worst",
-    "margin kept, mm: median", "worst", "as asked, %", "cuts into it", "into another tumor",
-    "healthy tissue, ml: mean (of the parenchyma)",
-)  # fmt: skip
 _RESULTS = ["detached", "removed_share", "left_ml", "margin_mm", "healthy_ml", "hurt"]
 _NUMBER = re.compile(r"\d+(\.\d+)?")
-RULE = (
-    "Each exophytic tumor (one whose own surface is the organ's over 5 % or more, in the CT) of "
-    "each scene is planned on the estimate, and the plan is carried out on the true organ of that "
-    "scene, as in `tumortrack_lab/cut.py`: voxels of 0.5 mm, severed only where a stroke or a "
-    "level sheet passes. Removed is what comes away within the piece that the strokes enclose: "
-    "what stays, or falls off beside it, is left; a piece that still hangs by 2 mm² of tissue or "
-    f"more has not come free, and nothing of it is removed. Whole: {100 * _WHOLE:g} % or more. "
-    "Margin kept: least distance from the cut's surface within tissue to the true tumor; negative: "
-    "so deep did the cut go into it. Healthy tissue: with the pieces that came free. Numbers are "
-    "of the plans that were made, tumors' shares rounded down. Truth: planned on the true organ, "
-    f"the bound. As asked: the mm before a plus are kept, less the cut's voxels of {VOXEL_MM:g} mm;"
-    f" with Clopper and Pearson's interval of 95 %. “+ {SIGMAS:g} sd”: and {SIGMAS:g} standard "
-    "deviations of the estimate more, at each place of the tumor's surface. “+ 95 % radius”: and "
-    "the tumor's calibrated margin more; “and other errors”: and those of hand-eye, tool and "
-    "motion, none of which is simulated, together as `plan --confidence` adds them. Left out: "
-    "tissue does not move or give way while it is cut, nobody pulls at the piece, the instrument "
-    "takes no tissue with it, and it reaches all of a level sheet below the piece."
-)
 
 
 class Planner(Config, frozen=True):
@@ -212,44 +188,58 @@ def tidy_plans(rows: list[dict[str, Any]]) -> pd.DataFrame:
     return ordered(frame, ["case"])
 
 
-def tables_of(rows: list[dict[str, Any]]) -> str:
-    """Pooled over the cases; each case; and why there was no plan, where there was none."""
+def tables_of(rows: list[dict[str, Any]]) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """What the cuts did, of all cases together and of each; and why there was no plan, where there
+    was none."""
     frame = tidy_plans(rows)
-    texts = ["All cases:", table(_HEAD, _rows(frame), left=2)]
-    if len(names(frame, "case")) > 1:
-        each = [
-            [case if number == 0 else EMPTY, *row]
-            for (case,), mine in groups(frame, "case")
-            for number, row in enumerate(_rows(mine))
-        ]
-        texts += ["Each case:", table(("case", *_HEAD), each, left=3)]
+    parts: list[tuple[str, ...]] = [("all", "method", "planner")]
+    parts += [("", "case", "method", "planner")] if frame.case.nunique() > 1 else []
+    cuts = [
+        {
+            "case": every or name[0],
+            "located by": name[-2],
+            "planner": name[-1],
+            **_cut(plans, name[-1]),
+        }
+        for every, *keys in parts
+        for name, plans in groups(frame, *keys)
+    ]
     refused = Counter(
-        f"{label_of(method)}, {planner}: {_NUMBER.sub('N', reason.partition(': ')[0])}"
+        (method, planner, _NUMBER.sub("N", reason.partition(": ")[0]))
         for (method, planner), plans in groups(frame, "method", "planner")
         for reason in plans.refused.dropna()
     )
-    reasons = " ".join(f"{count} x {why}" for why, count in refused.items())
-    texts.append(f"Refused: {reasons}" if refused else "No plan was refused.")
-    return "\n\n".join(texts)
+    whys = [(*why, count) for why, count in refused.items()]
+    return pd.DataFrame(cuts), pd.DataFrame(whys, columns=["located by", "planner", "why", "plans"])
 
 
-def _rows(frame: pd.DataFrame) -> list[list[str]]:
-    rows = []
-    for (method, planner), plans in groups(frame, "method", "planner"):
-        made = plans[plans.refused.isna()]
-        free, removed = made[made.detached.astype(bool)], 100 * made.removed_share
-        row = [label_of(method), planner, f"{len(made)} of {len(plans)}"]
-        row += [f"{n} of {len(made)}" for n in (len(free), (made.removed_share >= _WHOLE).sum())]
-        row += [_text(share, down=True) for share in (removed.median(), removed.min())]
-        row.append(_text(made.left_ml.max(), digits=2))
-        row += map(_text, (made.margin_mm.median(), made.margin_mm.min()))
-        least_mm = {p.name: p.margin_mm for p in PLANNERS}[planner] - VOXEL_MM
-        row.append(share_words((made.margin_mm >= least_mm).sum(), len(made)))
-        row += [str((made.margin_mm < 0).sum()), str(made.hurt.map(bool).sum())]
-        parenchyma_ml = free.promised_ml.map(itemgetter("parenchyma")).astype(float)
-        part = 100 * (free.healthy_ml / parenchyma_ml).mean()
-        rows.append([*row, f"{_text(free.healthy_ml.mean())} ({_text(part, 0)} %)"])
-    return rows
+def summary(cuts: pd.DataFrame) -> str:
+    """All cases, in Markdown."""
+    shown = ["located by", "planner", "plans", "whole", "margin kept median mm", "worst mm"]
+    shown += ["as asked %", "cut into it", "into another tumor", "healthy tissue mean ml"]
+    return table_of(cuts.loc[cuts.case == "all", shown], 2)
+
+
+def _cut(plans: pd.DataFrame, planner: str) -> dict[str, Any]:
+    """Numbers are of the plans that were made, shares of tumors rounded down; margins are those of
+    the least distance from the cut to the true tumor."""
+    made = plans[plans.refused.isna()]
+    free, removed = made[made.detached.astype(bool)], 100 * made.removed_share
+    least_mm = {p.name: p.margin_mm for p in PLANNERS}[planner] - VOXEL_MM
+    parenchyma_ml = free.promised_ml.map(itemgetter("parenchyma")).astype(float)
+    return {
+        "asked": len(plans), "plans": len(made), "free": len(free),
+        "whole": (made.removed_share >= _WHOLE).sum(),
+        "removed median %": _text(removed.median(), down=True),
+        "removed worst %": _text(removed.min(), down=True),
+        "left worst ml": _text(made.left_ml.max(), digits=2),
+        "margin kept median mm": _text(made.margin_mm.median()),
+        "worst mm": _text(made.margin_mm.min()),
+        "as asked %": share_words((made.margin_mm >= least_mm).sum(), len(made)),
+        "cut into it": (made.margin_mm < 0).sum(), "into another tumor": made.hurt.map(bool).sum(),
+        "healthy tissue mean ml": _text(free.healthy_ml.mean()),
+        "healthy tissue mean %": _text(100 * (free.healthy_ml / parenchyma_ml).mean(), 0),
+    }  # fmt: skip
 
 
 def _text(value: float, digits: int = 1, down: bool = False) -> str:

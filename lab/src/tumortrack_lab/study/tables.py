@@ -1,4 +1,4 @@
-"""Measurements as one tidy table (a row for each scene and part), and Markdown tables of it.
+"""Measurements as one tidy table (a row for each scene and part), and what is said of it.
 
 Accuracy is told by organ, tumor and state: never pooled over organs, and with the worst. In the
 table, and in every figure, infinite means not found. Every number comes from a measurement.
@@ -6,21 +6,21 @@ table, and in every figure, infinite means not found. Every number comes from a 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from tumortrack_lab.study.document import table
 from tumortrack_lab.study.tumor_sites import TumorSite
 
 NOT_FOUND, NOTHING, EMPTY = "not found", "–", ""
+HD, CENTER = "Hausdorff, mm", "centre, mm"
 ORGAN = "kidney"  # its rows stand for their scenes
 _DISTANCES = ["hausdorff_mm", "center_mm", "target_mm"]
 _NAMES = ["case", "method", "variant", "part"]
 METHODS = {
-    "rigid_bound": "best rigid pose (oracle)",
+    "rigid_bound": "best rigid pose",
     "rigid": "rigid registration, many starts",
     "elastic": "linear-elastic surface fit",
 }
@@ -46,11 +46,6 @@ def groups(frame: pd.DataFrame, *keys: str) -> Iterator[tuple[tuple, pd.DataFram
     return iter(frame.groupby(list(keys), observed=True))
 
 
-def names(frame: pd.DataFrame, key: str) -> list[str]:
-    """Distinct values of a column, in the order of the table's."""
-    return [name for (name,), _ in groups(frame, key)]
-
-
 def tumors(frame: pd.DataFrame) -> pd.DataFrame:
     return frame[frame.part != ORGAN]
 
@@ -65,57 +60,51 @@ def is_deformed(frame: pd.DataFrame) -> pd.Series:
     return ~frame.variant.astype(str).str.fullmatch("D0|Rot.*")
 
 
-def label_of(method: str) -> str:
-    return METHODS.get(method, method)
-
-
-def spread(values: pd.Series, digits: int = 1, high: bool = False) -> str:
-    """``median / 90 % / 95 % / worst``: so many are no worse than this (nearest rank); ``high``:
-    the lowest is the worst."""
+def spread(values: pd.Series, digits: int = 1, high: bool = False) -> dict[str, str]:
+    """Median, and so many are no worse than this (nearest rank); ``high``: the lowest is the
+    worst."""
     if values.empty:
-        return NOTHING
+        return {}
     each = np.sort(values)[::-1] if high else np.sort(values)
     ranked = [each[-(-len(each) * percent // 100) - 1] for percent in (90, 95, 100)]
-    figures = (np.median(each), *ranked)
-    return " / ".join(NOT_FOUND if np.isinf(v) else f"{v:.{digits}f}" for v in figures)
+    figures = dict(
+        zip(("median", "90 %", "95 %", "worst"), (np.median(each), *ranked), strict=True)
+    )
+    return {k: NOT_FOUND if np.isinf(v) else f"{v:.{digits}f}" for k, v in figures.items()}
 
 
-def accuracy(frame: pd.DataFrame, sites: Sites) -> str:
-    """One case: a row for each state, tumor and figure, a column for each method; each scene of
-    each seed counts."""
-    rows: list[list[str]] = []
-    for state, mine in (("deformed", is_deformed(frame)), ("undeformed", ~is_deformed(frame))):
-        each = [frame[mine & (frame.method == method)] for method in names(frame, "method")]
-        if not mine.any():
-            continue
-        for number, (figure, cell) in enumerate(_figures(frame, sites).items()):
-            rows.append([EMPTY if number else state, figure, *map(cell, each)])
-    head = ["state", "figure", *map(label_of, names(frame, "method"))]
-    return table(head, rows, left=2)
+def accuracy(frame: pd.DataFrame, sites: dict[str, Sites]) -> pd.DataFrame:
+    """A row for each organ, method, state (all deformed ones, each of them, and the others), part
+    and figure; each scene of each seed counts."""
+    bent, rows = is_deformed(frame), []
+    each = frame[bent].assign(state=frame.variant.astype(str))
+    every = pd.concat([frame.assign(state=np.where(bent, "deformed", "undeformed")), each])
+    for (case, method, state), mine in groups(every, "case", "method", "state"):
+        whole = scenes(mine)
+        about = {"organ": case, "state": state, "method": METHODS.get(method, method)}
+        about |= {"scenes": mine.variant.nunique(), "seeds": mine.seed.nunique()}
+        about |= {"scenes with a part not found": whole.failed.sum()}
+        for (part,), one in groups(tumors(mine), "part"):
+            site = sites[case][part]
+            lies = {"part": part, "kind": site.kind, "cover mm": f"{site.cover_mm:.1f}"}
+            lies["on the surface %"] = f"{100 * site.exposed_share:.0f}"
+            rows.append(about | lies | {"figure": HD} | spread(one.hausdorff_mm))
+            rows.append(about | lies | {"figure": CENTER} | spread(one.center_mm))
+        carried, overlap = spread(whole[whole.carries].target_mm), spread(whole.miou, 2, high=True)
+        rows.append(about | {"part": "organ", "figure": "target error, mm"} | carried)
+        rows.append(about | {"part": "all", "figure": "mIoU"} | overlap)
+    return pd.DataFrame(rows).fillna(EMPTY)
 
 
-def _figures(frame: pd.DataFrame, sites: Sites) -> dict[str, Callable[[pd.DataFrame], str]]:
-    def distance(tumor: str, key: str) -> Callable[[pd.DataFrame], str]:
-        return lambda mine: spread(mine[mine.part == tumor][key])
-
-    figures = {"scenes x seeds": lambda mine: f"{mine.variant.nunique()} x {mine.seed.nunique()}"}
-    for tumor in names(tumors(frame), "part"):
-        for words, key in (("HD", "hausdorff_mm"), ("centre", "center_mm")):
-            figures[f"tumor {sites[tumor].text(tumor)}: {words}"] = distance(tumor, key)
-    return figures | {
-        "target error": lambda mine: spread(scenes(mine[mine.carries]).target_mm),
-        "mIoU": lambda mine: spread(scenes(mine).miou, 2, high=True),
-        "scenes with a part not found": lambda mine: str(scenes(mine).failed.sum()),
-    }
-
-
-def sites_text(case: str, sites: Sites) -> str:
-    each = [
-        f"{name.replace('_', ' ')} is {site.kind} ({100 * site.exposed_share:.0f} % of its surface "
-        f"is the organ's own, least cover {site.cover_mm:.1f} mm)"
-        for name, site in sites.items()
-    ]
-    return f"{case}: " + "; ".join(each) + "."
+def accuracy_summary(rows: pd.DataFrame) -> pd.DataFrame:
+    """A row for each tumor of a deformed organ: clinic beside the best rigid pose."""
+    some = rows[(rows.state == "deformed") & (rows.kind != EMPTY)]
+    some = some.assign(shown=some["median"] + " / " + some["worst"])
+    wide = some.pivot(index=["organ", "part", "kind"], columns=["figure", "method"], values="shown")
+    both = [(f, method) for f in (HD, CENTER) for method in ("clinic", METHODS["rigid_bound"])]
+    wide = wide.reindex(columns=pd.MultiIndex.from_tuples(both)).fillna(NOTHING)
+    wide.columns = [f"{figure}, median / worst: {method}" for figure, method in both]
+    return wide.reset_index()
 
 
 def caption(rows: list[dict[str, Any]], command: str) -> str:

@@ -1,5 +1,5 @@
 """How far margins can be trusted: what tables of `tumortrack margins` say of states, physics and
-organs that no radius rests on. docs/trust.md has the protocol."""
+organs that no radius rests on. docs/trust.md says what came of it."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from tumortrack.report.drawing import new_figure, save
 from tumortrack.report.pictures import FROM_CAMERA, FROM_SIDE, draw_solid_view, scene_legend
 from tumortrack.simulate.scene_folder import Scene, read_scene
 from tumortrack.tracking.tracker import Tracker
-from tumortrack_lab.study.document import table
+from tumortrack_lab.study.document import spread_mm
 
 STATED = (0.9, 0.95)
 _CURVE = tuple(np.round(np.arange(0.5, 0.96, 0.05), 2).tolist())  # of the reliability plot
@@ -119,45 +119,39 @@ def share_words(hits: int, cases: int) -> str:
     return f"{100 * hits / cases:.1f} ({100 * low:.1f} to {100 * high:.1f})"
 
 
-def coverage_table(found: pd.DataFrame, what: str) -> str:
-    """A line a part: answers, and by stated confidence who lies within it and its sizes."""
-    head = [what, "states", "good", "answers, %"]
-    for stated in STATED:
-        head += [f"within {100 * stated:g} %, %", "mm: median / 90 %"]
-    lines = []
-    tested = found[found.refused == ""]
-    for name, mine in [*found.groupby("part", sort=True), ("all of these", tested)]:
-        cells = [str(name), str(len(mine)), str(mine.good.sum())]
-        taken = mine[mine.accepted.astype(bool)]
-        if taken.empty:
-            said = mine.refused.iloc[0]
-            lines.append([*cells, f"none: {said.partition(':')[0]}", *["-"] * (2 * len(STATED))])
-            continue
-        cells.append(f"{100 * len(taken) / len(mine):.0f}")
-        for stated in STATED:
-            cells.append(share_words(int(taken[f"within {stated}"].sum()), len(taken)))
-            middle, most = np.percentile(taken[f"mm {stated}"].astype(float), (50, 90))
-            cells.append(f"{middle:.1f} / {most:.1f}")
-        lines.append(cells)
-    return table(head, lines)
+def coverage(kinds: dict[str, pd.DataFrame]) -> pd.DataFrame:
+    """A row a part of each way of leaving out: answers, and by stated confidence who lies within it
+    and its sizes. Parts without a calibration have no answers, and all of them do not count."""
+    rows = []
+    for what, found in kinds.items():
+        every = ("all of these", found[found.refused == ""])
+        for name, mine in [*found.groupby("part", sort=True), every]:
+            row = {"left out": what, "part": name, "states": len(mine), "good": mine.good.sum()}
+            taken = mine[mine.accepted.astype(bool)]
+            row["answers %"] = f"{100 * len(taken) / len(mine):.0f}" if len(taken) else ""
+            for stated in STATED if len(taken) else ():
+                of, margin = f"{100 * stated:g} %", taken[f"mm {stated}"].astype(float)
+                row[f"within {of}"] = share_words(int(taken[f"within {stated}"].sum()), len(taken))
+                for words, share in (("median", 0.5), ("90 %", 0.9)):
+                    row[f"{of} margin {words} mm"] = f"{margin.quantile(share):.1f}"
+            rows.append(row)
+    return pd.DataFrame(rows).fillna("")
 
 
-def ranks_table(found: pd.DataFrame) -> str:
-    """Rank correlation with the true miss, over good estimates, limits or not: of the standard
-    deviation, and of the 95 % radius by a calibration without the state's part."""
-    lines, good = [], found[found.good]
+def ranks(found: pd.DataFrame) -> pd.DataFrame:
+    """Of good estimates, limits or not: misses, and their rank correlation with the standard
+    deviation, and with the 95 % radius by a calibration without the state's part."""
+    rows, good, radius = [], found[found.good], f"mm {STATED[-1]}"
     for name, mine in [*good.groupby("family"), *good.groupby("organ"), ("all", good)]:
-        known = mine[mine[f"mm {STATED[-1]}"].notna()]
-        cells = [spearmanr(one, known.miss)[0] for one in (known.s, known[f"mm {STATED[-1]}"])]
-        misses = np.percentile(mine.miss, (50, 90, 95, 100))
-        lines.append(
-            [str(name), str(len(mine)), " / ".join(f"{x:.1f}" for x in misses)]
-            + [str((mine.miss > WIDEST_MM).sum()), f"{100 * mine.two.mean():.0f}"]
-            + ["-" if np.isnan(x) else f"{x:.2f}" for x in cells]
-        )
-    head = ["family, organ", "good", "miss, mm: median / 90 / 95 % / worst"]
-    head += [f"over {WIDEST_MM:g} mm", "within two deviations, %"]
-    return table([*head, "deviation and miss", "95 % radius and miss"], lines)
+        known = mine[mine[radius].notna()]
+        row = {"family or organ": name, "good": len(mine), **spread_mm("miss", mine.miss)}
+        row[f"over {WIDEST_MM:g} mm"] = (mine.miss > WIDEST_MM).sum()
+        row["within two deviations %"] = f"{100 * mine.two.mean():.0f}"
+        for words, key in (("deviation", "s"), ("95 % radius", radius)):
+            rank = spearmanr(known[key], known.miss)[0]
+            row[f"{words} and miss"] = "" if np.isnan(rank) else f"{rank:.2f}"
+        rows.append(row)
+    return pd.DataFrame(rows)
 
 
 def risk_picture(found: pd.DataFrame, path: Path) -> None:
@@ -200,16 +194,18 @@ def reliability_picture(kinds: dict[str, pd.DataFrame], path: Path) -> None:
     save(drawing, path)
 
 
-def worst_picture(found: pd.DataFrame, tables: Sequence[Table], count: int, path: Path) -> str:
-    """The accepted answers that are farthest off, drawn over the truth, a row each; and in words
-    what happened: a Markdown table."""
+def worst_picture(
+    found: pd.DataFrame, tables: Sequence[Table], count: int, path: Path
+) -> pd.DataFrame:
+    """The accepted answers that are farthest off, drawn over the truth, a row each; and what
+    happened, as a table."""
     from tumortrack.tracking.model_files import load_model
 
     taken = found[found.accepted.astype(bool)].nlargest(count, "miss")
     models, trackers = {table.organ: table.model for table in tables}, {}
     height = 2.75 * len(taken) + 0.5
     drawing = new_figure(8.4, height)
-    panels, lines = drawing.subplots(len(taken), 2, squeeze=False), []
+    panels, rows = drawing.subplots(len(taken), 2, squeeze=False), []
     drawing.subplots_adjust(
         left=0.045, top=1 - 0.7 / height, bottom=0.1 / height, hspace=0.16, wspace=0.03
     )
@@ -222,19 +218,21 @@ def worst_picture(found: pd.DataFrame, tables: Sequence[Table], count: int, path
         for axes, view in zip(row, (FROM_CAMERA, FROM_SIDE), strict=True):
             draw_solid_view(axes, scene, estimate, view)
         row[0].set_ylabel(f"{number}", fontsize=14, fontweight="bold", rotation=0, labelpad=10)
-        lines.append([str(number), f"{state.organ}, {Path(state['row'].scene).name}",
-                      f"{state.miss:.1f}", f"{state[f'mm {STATED[-1]}']:.1f}", state.hidden,
-                      _moved_words(estimate.motion, scene)])  # fmt: skip
+        rows.append({
+            "row": number, "organ": state.organ, "scene": Path(state["row"].scene).name,
+            "off mm": f"{state.miss:.1f}", "95 % radius mm": f"{state[f'mm {STATED[-1]}']:.1f}",
+            "hidden": state.hidden, **_moved_rigidly(estimate.motion, scene),
+        })  # fmt: skip
     drawing.legend(
         handles=scene_legend(*scene.reference.names), ncols=4, loc="upper right", frameon=False
     )
     save(drawing, path)
-    head = ["", "scene", "off, mm", "95 % radius, mm", "hidden", "what happened"]
-    return table(head, lines, left=len(head))
+    return pd.DataFrame(rows)
 
 
-def _moved_words(motion: Any, scene: Scene) -> str:
-    """How the true organ lies to the estimated one."""
+def _moved_rigidly(motion: Any, scene: Scene) -> dict[str, str]:
+    """How the true organ lies to the estimated one, and what would be left in the mean had it been
+    moved there as it was."""
     assert scene.targets is not None
     there = motion.carry(scene.targets.points_ct)
     best = kabsch(there, scene.targets.points_mm, np.ones(len(there)))
@@ -242,10 +240,11 @@ def _moved_words(motion: Any, scene: Scene) -> str:
     middle = there.mean(0)
     shift = float(np.linalg.norm(transform_points(best, middle[None])[0] - middle))
     left = np.linalg.norm(transform_points(best, there) - scene.targets.points_mm, axis=1).mean()
-    return (
-        f"the organ lies {shift:.1f} mm beside and {degrees:.0f} degrees turned; {left:.1f} mm "
-        "would be left in the mean had it been moved there as it was"
-    )
+    return {
+        "beside mm": f"{shift:.1f}",
+        "turned degrees": f"{degrees:.0f}",
+        "left mm": f"{left:.1f}",
+    }
 
 
 def _finish(axes: Any, title: str) -> None:

@@ -18,8 +18,8 @@ from tumortrack.models.margins import METHOD
 from tumortrack.simulate.scene_folder import Scene, read_scene
 from tumortrack.tracking.model_files import load_model
 from tumortrack.tracking.tracker import Tracker
-from tumortrack_lab.real.judging import by_tumor, judge, quantiles
-from tumortrack_lab.study.document import table
+from tumortrack_lab.real.judging import by_tumor, judge
+from tumortrack_lab.study.document import spread_mm, spread_words, table_of
 from tumortrack_lab.study.trust import BANDS, band_of
 
 _ERRORS = {"middle_mm": "off", "rigid_middle_mm": "rigid", "shape_middle_mm": "shape"}
@@ -67,62 +67,55 @@ def _judged(tracker: Tracker, anatomy_ct: Anatomy, scene: Scene) -> dict[str, An
     return about | judge(tracker, anatomy_ct, scene, scene.depth, surfaces=False)
 
 
-def summary(rows: pd.DataFrame, failures: Sequence[str]) -> str:
-    """The tables in Markdown: undisturbed scenes by family, hidden surface and organ; disturbed
-    ones by disturbance and organ; and every good answer that is wrong."""
+def verdicts(rows: pd.DataFrame) -> pd.DataFrame:
+    """Verdicts and errors of undisturbed scenes by family, hidden surface and organ; of disturbed
+    ones by disturbance and organ."""
     calm = rows.disturbance == "none"
-    parts = [_verdicts(rows[calm], key) for key in ("family", "hidden", "organ") if calm.any()]
-    if not calm.all():
-        parts += [_verdicts(rows[~calm], key) for key in ("disturbance", "organ")]
-        bare = rows[~calm & (rows.hidden_share == 0)]
-        parts.append(_verdicts(bare, "disturbance", ", nothing hidden"))
-    reasons = pd.Series([why.partition(":")[0] for why in failures], dtype=str)
-    lost = ", ".join(f"{name} {count}" for name, count in reasons.value_counts().items())
-    parts.append(
-        "Errors of the tumors' middles, mm: median / 90 % / 95 % / worst, of good answers and of "
-        f"the best rigid pose of the same states. Wrong: called good with a tumor over {FAR_MM:g} "
-        f"mm off, or without this organ. Not made: {lost or 'none'}."
-    )
-    return "\n\n".join([*parts, _wrong(rows)])
+    parts = [("family", rows[calm]), ("hidden", rows[calm]), ("organ", rows[calm])]
+    parts += [("disturbance", rows[~calm]), ("organ", rows[~calm])]
+    parts += [("disturbance, nothing hidden", rows[~calm & (rows.hidden_share == 0)])]
+    lines = []
+    for by, some in parts:
+        key = by.partition(",")[0]
+        each = some.groupby(key, sort=key == "hidden", observed=True)
+        for name, mine in [*each, ("all", some)] if len(some) else ():
+            scenes, good = mine.drop_duplicates(["organ", "scene"]), mine[mine.verdict == "good"]
+            line = {"by": by, "value": name, "scenes": len(scenes)}
+            line |= {v: (scenes.verdict == v).sum() for v in ("refused", "poor", "good")}
+            line["wrong"] = mine[mine.wrong].groupby(["organ", "scene"]).ngroups
+            line |= spread_mm("centre", good.off) | spread_mm("best rigid pose", good.rigid)
+            lines.append(line)
+    return pd.DataFrame(lines)
 
 
-def _verdicts(rows: pd.DataFrame, key: str, of: str = "") -> str:
-    body = []
-    for name, mine in [*rows.groupby(key, sort=key == "hidden", observed=True), ("all", rows)]:
-        scenes, good = mine.drop_duplicates(["organ", "scene"]), mine[mine.verdict == "good"]
-        counts = [str((scenes.verdict == verdict).sum()) for verdict in ("refused", "poor", "good")]
-        errors = quantiles(good.off), quantiles(good.rigid)
-        wrong = mine[mine.wrong].groupby(["organ", "scene"]).ngroups
-        body.append([str(name), str(len(scenes)), ", ".join(counts), *errors, str(wrong)])
-    head = [key + of, "scenes", "refused, poor, good", "good", "best rigid pose", "wrong"]
-    return table(head, body)
+def summary(lines: pd.DataFrame) -> str:
+    """The first part of these in Markdown."""
+    short, by = lines[lines.by == lines.by[0]], lines.by[0]
+    shown = short[["value", "scenes", "good", "wrong"]].rename(columns={"value": by})
+    shown["centre, mm: median / 95 % / worst"] = spread_words(short, "centre")
+    shown["best rigid pose"] = spread_words(short, "best rigid pose")
+    return table_of(shown)
 
 
-def _wrong(rows: pd.DataFrame) -> str:
-    """Every wrong good answer by name, and what is wrong with it: ``laid elsewhere`` if its tumor
-    would be within half of its error, were the estimate moved rigidly onto the truth; else bent
-    ``too little`` or ``wrongly``, as the best rigid pose is farther off or nearer."""
-    if not rows.wrong.any():
-        return "Wrong: none."
+def wrong_ones(rows: pd.DataFrame) -> pd.DataFrame:
+    """Every wrong good answer, and what is wrong with it: ``wrong pose`` if its tumor would be
+    within half of its error, were the estimate moved rigidly onto the truth; else bent ``too
+    little`` or ``wrongly``, as the best rigid pose is farther off or nearer."""
     wrong = rows[rows.wrong].sort_values("off", ascending=False)
     wrong = wrong.drop_duplicates(["organ", "scene"])
     causes = {
-        "another organ taken for it": wrong.off.isna(),
+        "not this organ": wrong.off.isna(),
         "camera out of scale or depth": wrong.disturbance == "scale",
-        "laid elsewhere": wrong["shape"] < wrong.off / 2,
+        "wrong pose": wrong["shape"] < wrong.off / 2,
         "bent too little": wrong.off <= wrong.rigid,
     }
-    wrong["why"] = np.select([*causes.values()], [*causes], "bent wrongly")
-    wrong["name"] = wrong.scene.str.rpartition("-")[0] + [
-        "" if np.isnan(row.off) else f" {row.off:.1f}" for row in wrong.itertuples()
-    ]
-    told = wrong.off.notna() & (wrong.disturbance != "scale")
-    wrong.loc[told, "name"] += [
-        f" ({row.rigid:.1f}, {row.hidden_share:.0%})" for row in wrong[told].itertuples()
-    ]
-    body = []
-    for (kind, why), mine in wrong.groupby(["disturbance", "why"]):
-        named = [f"{organ} {', '.join(some['name'])}" for organ, some in mine.groupby("organ")]
-        body.append([str(kind), str(why), str(len(mine)), "; ".join(named)])
-    head = ["disturbance", "wrong", "scenes", "organ, scene, mm off (best rigid pose, hidden)"]
-    return table(head, body, 4)
+    columns = {
+        "disturbance": wrong.disturbance,
+        "wrong": np.select([*causes.values()], [*causes], "bent wrongly"),
+        "organ": wrong.organ,
+        "scene": wrong.scene,
+        "off mm": wrong.off.round(1),
+        "best rigid pose mm": wrong.rigid.round(1),
+        "hidden %": (100 * wrong.hidden_share).round(),
+    }
+    return pd.DataFrame(columns).sort_values(["disturbance", "wrong"], kind="stable")
