@@ -91,6 +91,7 @@ def report_entry(estimate: Estimate) -> dict[str, Any]:
     }
     return {
         **report_head(estimate.cloud.stamp_ns),
+        **{"seed": estimate.report.seed, "points": estimate.report.points},  # also where they are 0
         **msgspec.to_builtins(estimate.report),
         "quality": quality,
         "causes": [one.entry() for one in estimate.causes],
