@@ -74,12 +74,10 @@ def page_scene(scene: Scene, estimate: Estimate | None, picture: Path) -> dict[s
 
 
 def write_page(report: dict[str, Any], scenes: list[dict[str, Any]], path: Path) -> None:
-    """Write the page, atomically; it holds plotly itself and loads nothing from anywhere.
+    """Write the page, atomically; it loads nothing from anywhere.
 
     ``report``: as ``evaluate_scenes`` returns it; ``scenes``: of ``page_scene``, in its order.
     """
-    from plotly.offline import get_plotlyjs
-
     entries, summary = report["scenes"], report["summary"]
     data = {
         "scenes": [
@@ -90,7 +88,8 @@ def write_page(report: dict[str, Any], scenes: list[dict[str, Any]], path: Path)
     }
     embedded = json.dumps(data, allow_nan=False).replace("</", "<\\/")
     # The texts that are long or hold braces go in by position, never through a formatter.
-    page = resources.files("tumortrack.report").joinpath("page.html").read_text("utf-8")
+    files = resources.files("tumortrack.report")
+    page, view = (files.joinpath(name).read_text("utf-8") for name in ("page.html", "view.js"))
     texts = {
         "WHOSE": html.escape(str(patient_in(report.get("patient"), "report"))),
         "SCENES": html.escape(verdict_counts(summary)),
@@ -105,9 +104,9 @@ def write_page(report: dict[str, Any], scenes: list[dict[str, Any]], path: Path)
     }
     for name, text in texts.items():
         page = page.replace(f"@{name}@", text)
-    head, script = page.split("@PLOTLY@")
+    head, script = page.split("@VIEW@")
     middle, tail = script.split("@DATA@")
-    text = "".join((head, get_plotlyjs(), middle, embedded, tail))
+    text = "".join((head, view, middle, embedded, tail))
     write_atomically(path, text.encode())
 
 
