@@ -65,7 +65,11 @@ def test_commands_and_an_example_run_from_the_wheel(environment, tmp_path):
     listed = run(*command, "--help", env=clean)
     assert "locate" in listed
     assert "twin" not in listed  # the laboratory's
-    for name, package in (("twin", "tumortrack-lab"), ("record", "tumortrack-experiment")):
+    for name, package in (
+        ("plan", "tumortrack-resection"),
+        ("twin", "tumortrack-lab"),
+        ("record", "tumortrack-experiment"),
+    ):
         without = subprocess.run([*command, name], capture_output=True, text=True, env=clean)
         assert without.returncode == 2
         assert f"tumortrack: the command {name} belongs to {package}" in without.stderr
@@ -83,7 +87,7 @@ def test_the_wheel_holds_the_package_alone(wheel):
     assert any(name.endswith("LICENSE") for name in names)
 
 
-@pytest.mark.parametrize("folder", [".", "experiment", "lab"])
+@pytest.mark.parametrize("folder", [".", "resection", "experiment", "lab"])
 def test_a_description_holds_on_pypi_where_links_into_the_repository_lead_nowhere(folder):
     project = tomllib.loads((ROOT / folder / "pyproject.toml").read_text())["project"]
     text = (ROOT / folder / project["readme"]).read_text()

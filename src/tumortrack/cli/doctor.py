@@ -40,6 +40,7 @@ _MODULES = {  # where it is not named as its package
     "opencv-python-headless": "cv2",
     "pillow": "PIL",
     "pin": "pinocchio",
+    "python-gdcm": "gdcm",
     "scikit-fem": "skfem",
     "scikit-image": "skimage",
     "ur_rtde": "rtde_control",
