@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 import trimesh
 
+from browser import Browser, of_first_tumor
+from clock import until
 from tumortrack.core.colours import TUMORS, css, part_colour
 from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.estimate import Estimate
@@ -312,6 +314,61 @@ def test_page_is_whole_and_fetches_nothing(evaluated):
     assert kinds[0] == ["points", "surface", "surface", "outline", "outline"]
     assert kinds[3] == ["points", "outline", "outline"]
     assert scenes[0]["layers"][2]["color"] == css(TUMORS[0])
+
+
+def seen_tumor(browser):
+    """How many pixels of the page's 3-D view show the first tumor, and how far right they are."""
+    script = "document.getElementById('view').scrollIntoView()"
+    browser.call("Runtime.evaluate", expression=script)
+    left, top, width, height = (round(side) for side in browser.box("#view canvas"))
+    _, columns = np.nonzero(of_first_tumor(browser.picture()[top : top + height, left:][:, :width]))
+    return len(columns), columns.mean() if len(columns) else 0.0
+
+
+def chosen(browser):
+    script = "document.getElementById('scene')?.value"
+    return browser.call("Runtime.evaluate", expression=script)["result"].get("value")
+
+
+def test_page_draws_each_part_that_its_legend_shows(evaluated):
+    with Browser(1280, 800) as browser:
+        browser.open((evaluated[0] / "index.html").as_uri())
+        until(lambda: chosen(browser) == "0", "the page")
+        until(lambda: seen_tumor(browser)[0] > 5000, "the tumor in the 3-D view")
+        whole, place = seen_tumor(browser)
+        left, top, width, height = browser.box("#view canvas")
+        middle = {"x": left + width / 2, "y": top + height / 2}
+        mouse = {**middle, "type": "mouseWheel", "deltaX": 0, "deltaY": 400}
+        browser.call("Input.dispatchMouseEvent", **mouse)
+        until(lambda: seen_tumor(browser)[0] < 0.6 * whole, "the view to get smaller")
+        for kind, x in (("mousePressed", 0), ("mouseMoved", 150), ("mouseReleased", 150)):
+            at = {**middle, "x": middle["x"] + x, "type": kind, "button": "left", "buttons": 1}
+            browser.call("Input.dispatchMouseEvent", **at, clickCount=1)
+        until(lambda: abs(seen_tumor(browser)[1] - place) > 5, "the view to turn")
+        reset = "document.querySelector('canvas').dispatchEvent(new MouseEvent('dblclick'))"
+        browser.call("Runtime.evaluate", expression=reset)
+        until(lambda: seen_tumor(browser) == (whole, place), "the view as it was")
+        browser.click_text("next")
+        until(lambda: chosen(browser) == "1", "the next scene")
+        until(lambda: seen_tumor(browser)[0] > 0.9 * whole, "its tumor, at once")
+        browser.click_text("tumor 1, estimated")
+        until(lambda: seen_tumor(browser)[0] < 0.1 * whole, "the tumor to be hidden")
+        browser.click_text("previous")  # who hides a part does not see it in other scenes
+        until(lambda: chosen(browser) == "0", "the scene before")
+        assert seen_tumor(browser)[0] < 0.1 * whole
+        browser.click_text("tumor 1, estimated")
+        until(lambda: seen_tumor(browser)[0] > 0.9 * whole, "the tumor again")
+
+
+def test_without_webgl_the_page_says_so_and_does_all_else(evaluated):
+    with Browser(600, 800) as browser:
+        without = "HTMLCanvasElement.prototype.getContext = () => null"
+        browser.call("Page.addScriptToEvaluateOnNewDocument", source=without)
+        browser.open((evaluated[0] / "index.html").as_uri())
+        until(lambda: "offers no WebGL 2" in browser.text(), "the sentence")
+        until(lambda: chosen(browser) == "0", "the page")
+        browser.click_text("worst")
+        until(lambda: chosen(browser) == "2", "the worst scene")
 
 
 def test_thinned_meshes_keep_shape():

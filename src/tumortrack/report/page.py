@@ -88,8 +88,8 @@ def write_page(report: dict[str, Any], scenes: list[dict[str, Any]], path: Path)
     }
     embedded = json.dumps(data, allow_nan=False).replace("</", "<\\/")
     # The texts that are long or hold braces go in by position, never through a formatter.
-    files = resources.files("tumortrack.report")
-    page, view = (files.joinpath(name).read_text("utf-8") for name in ("page.html", "view.js"))
+    folder = resources.files("tumortrack.report")
+    page = folder.joinpath("page.html").read_text("utf-8")
     texts = {
         "WHOSE": html.escape(str(patient_in(report.get("patient"), "report"))),
         "SCENES": html.escape(verdict_counts(summary)),
@@ -106,8 +106,8 @@ def write_page(report: dict[str, Any], scenes: list[dict[str, Any]], path: Path)
         page = page.replace(f"@{name}@", text)
     head, script = page.split("@VIEW@")
     middle, tail = script.split("@DATA@")
-    text = "".join((head, view, middle, embedded, tail))
-    write_atomically(path, text.encode())
+    view = folder.joinpath("view.js").read_text("utf-8")
+    write_atomically(path, "".join((head, view, middle, embedded, tail)).encode())
 
 
 def thinned(mesh: Mesh, cell_mm: float) -> Mesh:

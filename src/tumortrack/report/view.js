@@ -1,237 +1,286 @@
 "use strict";
-// One scene in 3-D: surfaces, points and thick lines, by WebGL; orthographic, so that the scale bar
-// holds at every depth. Camera frame, mm: x right, y down, z away.
-const BAR_MM = 20, REM = parseFloat(getComputedStyle(document.documentElement).fontSize);
-const FIRST_EYE = [-0.5, -0.55, -1.1]; // from the middle: before the organ, somewhat left and above
+// The 3-D view of a scene: orthographic, in the camera's frame (mm; x right, y down, z away).
+// `makeView(place)` fills that element; `show(layers, box)` of what it returns draws a scene.
 
-const SURFACE = `attribute vec3 place, normal; uniform mat3 turn; uniform vec3 middle, scale;
-varying vec3 facing;
-void main() { facing = turn * normal; gl_Position = vec4(scale * (turn * (place - middle)), 1.0); }`;
-const SHADED = `precision mediump float; uniform vec4 colour; varying vec3 facing;
+const VIEW_BAR_MM = [20, 10, 5, 2, 1];  // the first that takes a third of the width at most
+const VIEW_GROUND = [22 / 255, 24 / 255, 29 / 255];
+const VIEW_MISSING = "This browser offers no WebGL 2, so the 3-D view is missing here; " +
+  "everything else on this page is complete.";
+
+const VIEW_PLACE = `#version 300 es
+precision highp float;
+uniform mat3 turn; uniform vec3 center, scale, shift; uniform vec2 pixel; uniform float size;
+vec4 place(vec3 p) { return vec4(turn * (p - center) * scale + shift, 1); }`;
+const VIEW_MESH = [VIEW_PLACE + `
+in vec3 a, b; out vec3 normal;
+void main() { gl_Position = place(a); normal = turn * b; }`, `#version 300 es
+precision highp float;
+uniform vec4 color; in vec3 normal; out vec4 seen;
 void main() {
-  float light = abs(dot(normalize(facing), vec3(-0.36, 0.48, 0.8)));
-  gl_FragColor = vec4(colour.rgb * (0.5 + 0.5 * light) + 0.12 * pow(light, 16.0), colour.a);
-}`;
-const POINT = `attribute vec3 place; uniform mat3 turn; uniform vec3 middle, scale; uniform float wide;
-void main() { gl_Position = vec4(scale * (turn * (place - middle)), 1.0); gl_PointSize = wide; }`;
-const ROUND = `precision mediump float; uniform vec4 colour;
-void main() { if (length(gl_PointCoord - 0.5) > 0.5) discard; gl_FragColor = colour; }`;
-// A line is two triangles as wide as asked on the screen: wider lines than 1 px are not drawn else.
-const LINE = `attribute vec3 place, other; attribute float side; uniform mat3 turn;
-uniform vec3 middle, scale; uniform vec2 pixel; uniform float wide;
+  vec3 n = normalize(normal) * (gl_FrontFacing ? 1.0 : -1.0);  // z: away from who looks
+  float lit = 0.74 + 0.34 * max(dot(n, vec3(-0.36, 0.62, -0.70)), 0.0);
+  float shine = 0.12 * pow(max(dot(n, vec3(-0.20, 0.34, -0.92)), 0.0), 24.0);
+  float rim = 1.0 - abs(n.z);  // a thin shell looks denser where it is seen edge-on
+  seen = vec4(color.rgb * lit + shine, mix(color.a, 1.0, 0.4 * rim * rim * rim));
+}`];
+const VIEW_PLAIN = `#version 300 es
+precision mediump float;
+uniform vec4 color; out vec4 seen;
+void main() { seen = color; }`;
+const VIEW_POINTS = [VIEW_PLACE + `
+in vec3 a;
+void main() { gl_Position = place(a); gl_PointSize = size; }`, VIEW_PLAIN];
+// A line is a strip of two triangles, `size` pixels wide, as WebGL's own lines are one pixel thin;
+// it is longer by half of that at both ends, so that the lines of a curve join.
+const VIEW_LINES = [VIEW_PLACE + `
+in vec3 a, b;
 void main() {
-  vec3 here = scale * (turn * (place - middle)), there = scale * (turn * (other - middle));
+  vec4 here = place(a), there = place(b);
   vec2 along = (there.xy - here.xy) / pixel;
-  vec2 across = length(along) > 0.0 ? normalize(vec2(-along.y, along.x)) : vec2(0.0);
-  gl_Position = vec4(here.xy + across * side * wide * pixel, here.z - 0.002, 1.0);
-}`;
-const PLAIN = "precision mediump float; uniform vec4 colour; void main() { gl_FragColor = colour; }";
+  along = dot(along, along) > 1e-6 ? normalize(along) : vec2(1, 0);
+  float end = float(gl_VertexID & 1) * 2.0 - 1.0, side = float(gl_VertexID >> 1) * 2.0 - 1.0;
+  gl_Position = end < 0.0 ? here : there;
+  gl_Position.xy += 0.5 * size * pixel * (end * along + side * vec2(-along.y, along.x));
+}`, VIEW_PLAIN];
 
-const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
-const unit = (a) => a.map((x) => x / Math.hypot(...a));
-const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
-
-function turnFrom(eye) { // rows: right, up and towards the eye
-  const towards = unit(eye), right = unit(cross([0, -1, 0], towards));
-  return [right, cross(towards, right), towards];
+function viewBytes(text) {
+  return Uint8Array.from(atob(text), (c) => c.charCodeAt(0)).buffer;
 }
-function turnedBy(rows, axis, angle) { // by Rodrigues' formula, about an axis of the screen
-  const [c, s] = [Math.cos(angle), Math.sin(angle)], out = [[], [], []];
-  for (let n = 0; n < 3; n++) {
-    const column = rows.map((row) => row[n]), side = cross(axis, column), along = dot(axis, column);
-    column.forEach((x, k) => (out[k][n] = x * c + side[k] * s + axis[k] * along * (1 - c)));
-  }
-  return out;
+function viewCross(p, q) {
+  return [p[1] * q[2] - p[2] * q[1], p[2] * q[0] - p[0] * q[2], p[0] * q[1] - p[1] * q[0]];
 }
-function normalsOf(places, faces) {
-  const normals = new Float32Array(places.length);
-  for (let n = 0; n < faces.length; n += 3) {
-    const [a, b, c] = [0, 1, 2].map((k) => places.subarray(3 * faces[n + k], 3 * faces[n + k] + 3));
-    const normal = cross([0, 1, 2].map((k) => b[k] - a[k]), [0, 1, 2].map((k) => c[k] - a[k]));
-    for (let k = 0; k < 9; k++) normals[3 * faces[n + Math.floor(k / 3)] + (k % 3)] += normal[k % 3];
+/** Of each vertex: the sum of its triangles' normals, so that large ones count more. */
+function viewNormals(v, f) {
+  const normals = new Float32Array(v.length);
+  for (let n = 0; n < f.length; n += 3) {
+    const [i, j, k] = [3 * f[n], 3 * f[n + 1], 3 * f[n + 2]];
+    const side = (end) => [0, 1, 2].map((x) => v[end + x] - v[i + x]);
+    viewCross(side(j), side(k)).forEach((area, x) => {
+      for (const corner of [i, j, k]) normals[corner + x] += area;
+    });
   }
   return normals;
 }
-const rgb = (css) => [1, 3, 5].map((n) => parseInt(css.slice(n, n + 2), 16) / 255);
+/** Right, up and away of somebody at (-0.5, -0.55, -1.1), with -y up. */
+function viewStart() {
+  const away = [0.5, 0.55, 1.1], right = [1.1, 0, -0.5], up = viewCross(right, away);
+  const unit = (v) => v.map((x) => x / Math.hypot(...v));
+  return [right, up, away].map(unit);
+}
 
-class SceneView {
-  constructor(host) {
-    host.innerHTML = "<canvas></canvas><div class='legend'></div><div class='scalebar'></div>";
-    [this.canvas, this.legend, this.bar] = host.children;
-    this.hidden = new Set();
-    this.gl = this.canvas.getContext("webgl", { antialias: true });
-    if (!this.gl || !this.gl.getExtension("OES_element_index_uint")) {
-      host.innerHTML = "<p class='nothing'>This browser shows no WebGL, so there is no 3-D view. " +
-        "The views and slices below show the same scene.</p>";
-      this.gl = null;
-      return;
-    }
-    this.programs = { surface: this.program(SURFACE, SHADED), points: this.program(POINT, ROUND),
-                      outline: this.program(LINE, PLAIN) };
-    this.reset();
-    const held = new Map();
-    this.canvas.addEventListener("pointerdown", (event) => {
-      this.canvas.setPointerCapture(event.pointerId);
-      held.set(event.pointerId, [event.clientX, event.clientY]);
-    });
-    this.canvas.addEventListener("pointermove", (event) => this.moved(event, held));
-    for (const end of ["pointerup", "pointercancel"]) {
-      this.canvas.addEventListener(end, (event) => held.delete(event.pointerId));
-    }
-    this.canvas.addEventListener("wheel", (event) => {
-      event.preventDefault();
-      this.zoomBy(Math.exp(-event.deltaY / 500));
-    }, { passive: false });
-    this.canvas.addEventListener("dblclick", () => { this.reset(); this.draw(); });
-    new ResizeObserver(() => this.draw()).observe(host);
+function makeView(place) {
+  place.innerHTML = `<div class="stage"><canvas tabindex="0" role="img"
+    aria-label="3-D view; arrow keys turn it, plus and minus zoom"></canvas>
+    <div class="mm"></div></div>
+    <div class="legend" role="group" aria-label="parts shown"></div>`;
+  const parted = ["canvas", ".mm", ".legend"].map((what) => place.querySelector(what));
+  const [canvas, bar, legend] = parted;
+  const gl = canvas.getContext("webgl2", { alpha: false, antialias: true });
+  if (!gl) {
+    place.innerHTML = `<p class="missing">${VIEW_MISSING}</p>`;
+    return { show() {} };
   }
+  const shown = {}, touches = new Map();  // by name: whether shown; by pointer: where it is
+  let programs, parts = [], scene, turn, zoom, shift, waiting = false;
 
-  reset() { this.turn = turnFrom(FIRST_EYE); this.zoom = 1; }
-  zoomBy(times) { this.zoom = Math.min(20, Math.max(0.2, this.zoom * times)); this.draw(); }
-
-  moved(event, held) { // one pointer turns, two zoom
-    const before = held.get(event.pointerId), now = [event.clientX, event.clientY];
-    if (!before) return;
-    const others = [...held].filter(([id]) => id !== event.pointerId).map(([, place]) => place);
-    held.set(event.pointerId, now);
-    if (others.length) {
-      const far = (place) => Math.hypot(place[0] - others[0][0], place[1] - others[0][1]);
-      this.zoomBy(far(now) / Math.max(1, far(before)));
-      return;
-    }
-    const [x, y] = [now[0] - before[0], now[1] - before[1]];
-    this.turn = turnedBy(turnedBy(this.turn, [0, 1, 0], x / 150), [1, 0, 0], y / 150);
-    this.draw();
-  }
-
-  program(vertex, fragment) {
-    const gl = this.gl, program = gl.createProgram();
-    for (const [kind, source] of [[gl.VERTEX_SHADER, vertex], [gl.FRAGMENT_SHADER, fragment]]) {
+  function program([vertex, fragment]) {
+    const made = gl.createProgram();
+    [[gl.VERTEX_SHADER, vertex], [gl.FRAGMENT_SHADER, fragment]].forEach(([kind, text]) => {
       const shader = gl.createShader(kind);
-      gl.shaderSource(shader, source);
+      gl.shaderSource(shader, text);
       gl.compileShader(shader);
-      gl.attachShader(program, shader);
+      gl.attachShader(made, shader);
+    });
+    ["a", "b"].forEach((name, n) => gl.bindAttribLocation(made, n, name));
+    gl.linkProgram(made);
+    return made;
+  }
+  function buffer(kind, content) {
+    const made = gl.createBuffer();
+    gl.bindBuffer(kind, made);
+    gl.bufferData(kind, content, gl.STATIC_DRAW);
+    return made;
+  }
+  function attribute(n, stride, offset, each) {  // from the buffer that is bound
+    gl.enableVertexAttribArray(n);
+    gl.vertexAttribPointer(n, 3, gl.FLOAT, false, stride, offset);
+    gl.vertexAttribDivisor(n, each);
+  }
+  function part(layer) {
+    const v = new Float32Array(viewBytes(layer.v)), color = layer.color || "#ffffff";
+    const rgb = color.match(/\w\w/g).map((c) => parseInt(c, 16) / 255);
+    const array = gl.createVertexArray();
+    gl.bindVertexArray(array);
+    const buffers = [buffer(gl.ARRAY_BUFFER, v)], made = { layer, color, rgb, array, buffers };
+    if (layer.kind === "outline") {
+      attribute(0, 24, 0, 1);
+      attribute(1, 24, 12, 1);
+      return { ...made, count: v.length / 6 };
     }
-    gl.linkProgram(program);
-    return program;
+    attribute(0, 0, 0, 0);
+    if (layer.kind === "points") return { ...made, count: v.length / 3 };
+    const f = new Uint32Array(viewBytes(layer.f));
+    buffers.push(buffer(gl.ARRAY_BUFFER, viewNormals(v, f)));
+    attribute(1, 0, 0, 0);
+    buffers.push(buffer(gl.ELEMENT_ARRAY_BUFFER, f));
+    return { ...made, count: f.length };
   }
 
-  buffer(content, target = this.gl.ARRAY_BUFFER) {
-    const buffer = this.gl.createBuffer();
-    this.made.push(buffer);
-    this.gl.bindBuffer(target, buffer);
-    this.gl.bufferData(target, content, this.gl.STATIC_DRAW);
-    return buffer;
-  }
-
-  // layers: {kind, name, color, tumor, v: places, f: faces}, in base64; box: [lower, upper].
-  show(layers, [lower, upper]) {
-    if (!this.gl) return;
-    (this.made || []).forEach((buffer) => this.gl.deleteBuffer(buffer));
-    this.made = [];
-    this.middle = lower.map((x, n) => (x + upper[n]) / 2);
-    this.radius = Math.hypot(...upper.map((x, n) => x - lower[n])) / 2;
-    this.parts = layers.map((layer) => this.part(layer));
-    this.legend.replaceChildren(...this.parts.map((part) => this.entry(part)));
-    this.draw();
-  }
-
-  part(layer) {
-    const places = new Float32Array(bytes(layer.v)), surface = layer.kind === "surface";
-    const part = { name: layer.name, kind: layer.kind, colour: rgb(layer.color || "#ffffff"),
-                   opacity: surface ? (layer.tumor ? 0.9 : 0.42) : 1, buffers: {} };
-    if (layer.kind === "outline" && !layer.tumor && !this.told) this.hidden.add(layer.name);
-    if (layer.kind === "outline") this.lines(part, places);
-    else part.buffers.place = [this.buffer(places), 3];
-    part.count = part.count || places.length / 3;
-    if (surface) {
-      const faces = new Uint32Array(bytes(layer.f));
-      part.buffers.normal = [this.buffer(normalsOf(places, faces)), 3];
-      part.faces = this.buffer(faces, this.gl.ELEMENT_ARRAY_BUFFER);
-      part.count = faces.length;
+  function draw() {
+    waiting = false;
+    if (gl.isContextLost() || !scene) return;
+    const rem = parseFloat(getComputedStyle(document.documentElement).fontSize);
+    const wide = canvas.clientWidth, high = canvas.clientHeight, dense = window.devicePixelRatio;
+    const size = [wide, high].map((side) => Math.max(1, Math.round(side * dense)));
+    if (canvas.width !== size[0] || canvas.height !== size[1]) [canvas.width, canvas.height] = size;
+    gl.viewport(0, 0, ...size);
+    gl.clearColor(...VIEW_GROUND, 1);
+    gl.depthMask(true);
+    gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
+    const mm = perMm(), center = [0, 1, 2].map((n) => (scene.box[0][n] + scene.box[1][n]) / 2);
+    const deep = Math.hypot(...[0, 1, 2].map((n) => scene.box[1][n] - scene.box[0][n]));
+    const set = (made, name) => gl.getUniformLocation(made, name);
+    for (const made of Object.values(programs)) {
+      gl.useProgram(made);
+      gl.uniformMatrix3fv(set(made, "turn"), true, turn.flat());
+      gl.uniform3f(set(made, "center"), ...center);
+      gl.uniform3f(set(made, "scale"), (2 * mm) / wide, (2 * mm) / high, 1 / deep);
+      gl.uniform2f(set(made, "pixel"), 2 / size[0], 2 / size[1]);
+      gl.uniform1f(set(made, "size"), Math.max(1.5, (rem / 7) * dense));
     }
-    return part;
-  }
-
-  lines(part, places) { // four corners and two triangles for each pair of places
-    const count = places.length / 6, ends = [0, 0, 1, 1], sides = [1, -1, -1, 1];
-    const [here, there] = [new Float32Array(12 * count), new Float32Array(12 * count)];
-    const side = new Float32Array(4 * count), faces = new Uint32Array(6 * count);
-    for (let n = 0; n < count; n++) {
-      ends.forEach((end, k) => {
-        here.set(places.subarray(6 * n + 3 * end, 6 * n + 3 * end + 3), 12 * n + 3 * k);
-        there.set(places.subarray(6 * n + 3 - 3 * end, 6 * n + 6 - 3 * end), 12 * n + 3 * k);
-        side[4 * n + k] = sides[k];
-      });
-      faces.set([0, 1, 2, 0, 2, 3].map((k) => 4 * n + k), 6 * n);
+    // `lift`: mm nearer than they are: lines and points show on the surface that they lie on, and
+    // a tumor through the organ's thin rim upon it, without speckles.
+    const paint = (which, alpha, lift) => parts.forEach(({ layer, rgb, array, count }) => {
+      if (!shown[layer.name] || !which(layer)) return;
+      const made = programs[layer.kind];
+      gl.useProgram(made);
+      gl.uniform4f(set(made, "color"), ...rgb, alpha);
+      gl.uniform3f(set(made, "shift"), (2 * shift[0]) / wide, (-2 * shift[1]) / high, -lift / deep);
+      gl.bindVertexArray(array);
+      if (layer.kind === "surface") gl.drawElements(gl.TRIANGLES, count, gl.UNSIGNED_INT, 0);
+      else if (layer.kind === "points") gl.drawArrays(gl.POINTS, 0, count);
+      else gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, count);
+    });
+    gl.enable(gl.DEPTH_TEST);
+    gl.blendFunc(gl.SRC_ALPHA, gl.ONE_MINUS_SRC_ALPHA);
+    gl.disable(gl.BLEND);
+    gl.disable(gl.CULL_FACE);
+    paint((layer) => layer.kind !== "surface", 1, 3);
+    gl.enable(gl.BLEND);
+    gl.enable(gl.CULL_FACE);
+    gl.cullFace(gl.BACK);
+    paint((layer) => layer.kind === "surface" && layer.tumor, 0.85, 1.5);
+    gl.depthMask(false);  // what is translucent hides nothing: first its far side
+    for (const [hidden, alpha] of [[gl.FRONT, 0.45], [gl.BACK, 0.3]]) {
+      gl.cullFace(hidden);
+      paint((layer) => layer.kind === "surface" && !layer.tumor, alpha, 0);
     }
-    part.buffers = { place: [this.buffer(here), 3], other: [this.buffer(there), 3], side: [this.buffer(side), 1] };
-    part.faces = this.buffer(faces, this.gl.ELEMENT_ARRAY_BUFFER);
-    part.count = faces.length;
+    const length = VIEW_BAR_MM.find((one) => one * mm < wide / 3) || VIEW_BAR_MM.at(-1);
+    bar.style.width = `${length * mm}px`;
+    bar.textContent = `${length} mm`;
   }
-
-  entry(part) {
+  function redraw() {
+    if (!waiting) requestAnimationFrame(draw);
+    waiting = true;
+  }
+  /** Pixels (of CSS) a mm: at zoom 1 the box as seen first, without its empty corners. */
+  function perMm() {
+    const sides = [0, 1, 2].map((n) => scene.box[1][n] - scene.box[0][n]);
+    const extent = (row) => row.reduce((sum, r, n) => sum + Math.abs(r) * sides[n], 0);
+    const [x, y] = viewStart().map(extent);
+    return zoom * 1.25 * Math.min(canvas.clientWidth / x, canvas.clientHeight / y);
+  }
+  function reset() {
+    [turn, zoom, shift] = [viewStart(), 1, [0, 0]];
+    redraw();
+  }
+  function spin(x, y) {  // pixels: what is near follows the pointer
+    const mix = (p, q, angle) => {
+      const c = Math.cos(angle), s = Math.sin(angle), [a, b] = [turn[p], turn[q]];
+      turn[p] = a.map((one, n) => c * one - s * b[n]);
+      turn[q] = a.map((one, n) => s * one + c * b[n]);
+    };
+    mix(0, 2, x / 150);
+    mix(1, 2, -y / 150);
+    redraw();
+  }
+  function enlarge(by, x = canvas.clientWidth / 2, y = canvas.clientHeight / 2) {  // about (x, y)
+    const old = zoom, from = [x - canvas.clientWidth / 2, y - canvas.clientHeight / 2];
+    zoom = Math.min(20, Math.max(0.3, zoom * by));
+    shift = shift.map((one, n) => from[n] - ((from[n] - one) * zoom) / old);
+    redraw();
+  }
+  function moved(event) {
+    const before = touches.get(event.pointerId), now = [event.offsetX, event.offsetY];
+    if (!before) return;
+    touches.set(event.pointerId, now);
+    const [x, y] = now.map((one, n) => one - before[n]);
+    const other = [...touches].find(([id]) => id !== event.pointerId);
+    if (!other) return spin(x, y);
+    const far = (from) => Math.max(1, Math.hypot(from[0] - other[1][0], from[1] - other[1][1]));
+    shift = [shift[0] + x / 2, shift[1] + y / 2];  // two fingers: moved and pinched
+    enlarge(far(now) / far(before), ...now.map((one, n) => (one + other[1][n]) / 2));
+  }
+  function entry({ layer, color }) {
     const button = document.createElement("button"), swatch = document.createElement("i");
-    swatch.style.background = `rgb(${part.colour.map((x) => 255 * x)})`;
-    button.append(swatch, part.name);
-    button.setAttribute("aria-pressed", !this.hidden.has(part.name));
+    swatch.className = layer.kind;
+    swatch.style.color = color;
+    button.append(swatch, layer.name);
+    button.setAttribute("aria-pressed", shown[layer.name]);
     button.addEventListener("click", () => {
-      this.told = true; // from then on a person says what is hidden, in all scenes
-      if (!this.hidden.delete(part.name)) this.hidden.add(part.name);
-      button.setAttribute("aria-pressed", !this.hidden.has(part.name));
-      this.draw();
+      shown[layer.name] = !shown[layer.name];
+      button.setAttribute("aria-pressed", shown[layer.name]);
+      redraw();
     });
     return button;
   }
-
-  draw() {
-    if (!this.gl || !this.parts) return;
-    const gl = this.gl, ratio = window.devicePixelRatio || 1;
-    const [width, height] = [this.canvas.clientWidth, this.canvas.clientHeight];
-    if (!width || !height) return;
-    [this.canvas.width, this.canvas.height] = [Math.round(width * ratio), Math.round(height * ratio)];
-    gl.viewport(0, 0, this.canvas.width, this.canvas.height);
-    gl.clearColor(0x16 / 255, 0x18 / 255, 0x1d / 255, 1);
-    gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
-    const perMm = (this.zoom * 0.75 * Math.min(width, height)) / this.radius; // pixels of the page
-    this.scale = [(2 * perMm) / width, (2 * perMm) / height, -1 / (4 * this.radius)];
-    this.bar.textContent = `${BAR_MM} mm`;
-    this.bar.style.width = `${BAR_MM * perMm}px`;
-    gl.enable(gl.DEPTH_TEST);
-    gl.enable(gl.BLEND);
-    gl.blendFuncSeparate(gl.SRC_ALPHA, gl.ONE_MINUS_SRC_ALPHA, gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
-    const shown = this.parts.filter((part) => !this.hidden.has(part.name));
-    // What is solid first; then what shines through, its far side before its near one.
-    for (const part of shown.filter((one) => one.opacity > 0.5)) this.drawPart(part, ratio);
-    gl.depthMask(false);
-    gl.enable(gl.CULL_FACE);
-    for (const side of [gl.FRONT, gl.BACK]) {
-      gl.cullFace(side);
-      for (const part of shown.filter((one) => one.opacity <= 0.5)) this.drawPart(part, ratio);
-    }
-    gl.disable(gl.CULL_FACE);
-    gl.depthMask(true);
+  function load() {
+    const kinds = { surface: VIEW_MESH, points: VIEW_POINTS, outline: VIEW_LINES };
+    programs = {};
+    for (const kind in kinds) programs[kind] = program(kinds[kind]);
   }
-
-  drawPart(part, ratio) {
-    const gl = this.gl, program = this.programs[part.kind];
-    const uniform = (name) => gl.getUniformLocation(program, name);
-    gl.useProgram(program);
-    const [a, b, c] = this.turn; // WebGL takes columns
-    gl.uniformMatrix3fv(uniform("turn"), false, [0, 1, 2].flatMap((n) => [a[n], b[n], c[n]]));
-    gl.uniform3fv(uniform("middle"), this.middle);
-    gl.uniform3fv(uniform("scale"), this.scale);
-    gl.uniform4fv(uniform("colour"), [...part.colour, part.opacity]);
-    gl.uniform1f(uniform("wide"), (part.kind === "points" ? REM / 5 : REM / 10) * ratio);
-    gl.uniform2f(uniform("pixel"), 2 / this.canvas.width, 2 / this.canvas.height);
-    for (const [name, [buffer, size]] of Object.entries(part.buffers)) {
-      const at = gl.getAttribLocation(program, name);
-      gl.bindBuffer(gl.ARRAY_BUFFER, buffer);
-      gl.enableVertexAttribArray(at);
-      gl.vertexAttribPointer(at, size, gl.FLOAT, false, 0, 0);
-    }
-    if (!part.faces) return gl.drawArrays(gl.POINTS, 0, part.count);
-    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, part.faces);
-    return gl.drawElements(gl.TRIANGLES, part.count, gl.UNSIGNED_INT, 0);
+  function show(layers, box) {
+    parts.forEach(({ array, buffers }) => {
+      gl.deleteVertexArray(array);
+      buffers.forEach((one) => gl.deleteBuffer(one));
+    });
+    scene = { layers, box };
+    layers.forEach((layer) => { shown[layer.name] ??= layer.kind !== "outline" || layer.tumor; });
+    parts = layers.map(part);
+    legend.replaceChildren(...parts.map(entry));
+    redraw();
   }
+  const keys = { ArrowLeft: [-15, 0], ArrowRight: [15, 0], ArrowUp: [0, -15], ArrowDown: [0, 15] };
+  const listen = (name, what) => canvas.addEventListener(name, what, { passive: false });
+  listen("pointerdown", (event) => {
+    canvas.setPointerCapture(event.pointerId);
+    touches.set(event.pointerId, [event.offsetX, event.offsetY]);
+  });
+  listen("pointermove", moved);
+  for (const name of ["pointerup", "pointercancel"]) {
+    listen(name, (event) => touches.delete(event.pointerId));
+  }
+  listen("wheel", (event) => {
+    event.preventDefault();
+    const step = event.deltaMode === 1 ? 0.04 : 0.0015;  // of a line, of a pixel
+    enlarge(Math.exp(-step * event.deltaY), event.offsetX, event.offsetY);
+  });
+  listen("dblclick", reset);
+  listen("keydown", (event) => {
+    if (event.ctrlKey || event.metaKey || event.altKey) return;  // the browser's own
+    if (event.key in keys) spin(...keys[event.key]);
+    else if ("+=-".includes(event.key)) enlarge(event.key === "-" ? 0.87 : 1.15);
+    else return;
+    event.preventDefault();
+  });
+  listen("webglcontextlost", (event) => event.preventDefault());
+  listen("webglcontextrestored", () => {
+    load();
+    if (scene) show(scene.layers, scene.box);
+  });
+  new ResizeObserver(redraw).observe(canvas);
+  window.addEventListener("resize", redraw);  // also where only the density of pixels changed
+  load();
+  reset();
+  return { show };
 }
