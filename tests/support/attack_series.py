@@ -81,6 +81,7 @@ for name, tag, value, which in (
     ("dicom_intercept_differs", "RescaleIntercept", 0, slice(10, 30)),
     ("dicom_orientation_missing", "ImageOrientationPatient", None, slice(4, 5)),
     ("dicom_orientation_zero", "ImageOrientationPatient", [0.0] * 6, slice(None)),
+    ("dicom_orientation_of_four_numbers", "ImageOrientationPatient", [1.0, 0, 0, 1], slice(None)),
     ("dicom_orientation_turns", "ImageOrientationPatient", [0.0, 1, 0, 1, 0, 0], slice(9, 10)),
     ("dicom_position_missing", "ImagePositionPatient", None, slice(4, 5)),
     ("dicom_position_twice", "ImagePositionPatient", [0.0, 0.0, 20.0], slice(11, 12)),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import shutil
 import tempfile
@@ -93,6 +94,10 @@ def _volumes() -> dict[str, Target]:
 
 
 def _dicom() -> dict[str, Target]:
+    import pydicom
+    from pydicom.encaps import encapsulate, get_frame
+
+    from dicom_objects import packed, write_slices
     from tumortrack.core.types import Volume
     from tumortrack.imaging.dicom import read_dicom
     from tumortrack.phantom.dicom import write_dicom_series
@@ -103,11 +108,33 @@ def _dicom() -> dict[str, Target]:
     first = sorted(series.iterdir())[0]
     content = first.read_bytes()
 
-    def read(changed: bytes) -> object:
-        first.write_bytes(changed)
-        return read_dicom(series)
+    def of_slice(path: Path) -> Read:
+        def read(changed: bytes) -> object:
+            path.write_bytes(changed)
+            return read_dicom(path.parent, "1")
 
-    return {"dicom slice": ([content], read)}
+        return read
+
+    def of_frame(slice_: pydicom.Dataset, read: Read) -> Read:
+        """Of the compressed picture in a slice whose tags are as they were."""
+
+        def read_frame(changed: bytes) -> object:
+            slice_.PixelData = encapsulate([changed.ljust(8, b"\0")])
+            slice_.save_as(stream := io.BytesIO())
+            return read(stream.getvalue())
+
+        return read_frame
+
+    targets: dict[str, Target] = {"dicom slice": ([content], of_slice(first))}
+    hu = np.random.default_rng(0).integers(0, 100, (24, 24, 2)).cumsum(0).astype("<i2")
+    for syntax in ("rle", "jpeg lossless", "jpeg-ls", "jpeg 2000"):
+        paths = write_slices(scratch(), hu, 12)
+        for path in paths:
+            packed(path, syntax)
+        slice_ = pydicom.dcmread(paths[0])
+        frame = get_frame(slice_.PixelData, 0, number_of_frames=1)
+        targets[f"dicom {syntax}"] = ([frame], of_frame(slice_, of_slice(paths[0])))
+    return targets
 
 
 def _meshes() -> dict[str, Target]:

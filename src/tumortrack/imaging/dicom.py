@@ -1,4 +1,4 @@
-"""A DICOM series as a volume: pydicom for tags and pixels, with GDCM for compressed ones.
+"""A DICOM series as a volume; its pixels are read in ``dicom_pixels``.
 
 Slices are sorted by their position along the slice normal, and every gap is checked here:
 readers only warn of a missing slice and stretch the patient.
@@ -8,17 +8,16 @@ from __future__ import annotations
 
 import os
 import warnings
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Float
 
 from tumortrack.core.errors import InputError
 from tumortrack.core.patient import NOBODY, UNKNOWN, Patient, Side
-from tumortrack.core.process import parallel_map
+from tumortrack.imaging.dicom_pixels import read_pixels
 from tumortrack.imaging.grid import GZIP_BEST, RawVolume, check_affine, check_size
 
 MIN_SLICES = 10
@@ -55,12 +54,14 @@ class NoSeries(InputError):
 class Series:
     """The slices of one series, in order along the slice normal, and how they lie.
 
-    ``shape``: columns, rows, slices; ``lps_from_index``: (column, row, slice) -> LPS mm.
+    ``shape``: columns, rows, slices; ``lps_from_index``: (column, row, slice) -> LPS mm; ``scale``:
+    slope and intercept from stored numbers to HU.
     """
 
     files: tuple[Path, ...]
     shape: tuple[int, int, int]
     lps_from_index: Float[np.ndarray, "4 4"]
+    scale: tuple[float, float]
     notes: tuple[str, ...] = ()
     patient: Patient = NOBODY
 
@@ -95,50 +96,15 @@ def find_series(folder: Path, series: str | None = None) -> Series:
     if not first.uid:
         notes += ("the slices have no SeriesInstanceUID: taken as one series",)
     files, patient = tuple(s.path for s in slices), _patient(folder, groups, slices)
-    return Series(files, shape, lps_from_index, notes, patient)
+    return Series(files, shape, lps_from_index, first.scale, notes, patient)
 
 
 def read_dicom(folder: Path, series: str | None = None) -> RawVolume:
     """Read one CT series of a folder, chosen as by ``find_series``: rescaled values (HU), float32.
     Raises InputError: see ``find_series``; damaged pixels."""
     found = find_series(folder, series)
-    columns, rows, count = found.shape
-    values = np.empty((count, rows, columns), np.float32)
-
-    def read(number: int) -> None:
-        values[number] = _slice_values(found.files[number], (rows, columns))
-
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # what is wrong with pixels is said by our own errors
-        parallel_map(read, range(count))
-    return RawVolume(values.transpose(2, 1, 0), found.lps_from_index, found.notes, found.patient)
-
-
-def _slice_values(path: Path, shape: tuple[int, int]) -> Float32[np.ndarray, "rows columns"]:
-    """Rescaled values of one slice."""
-    from pydicom import Dataset
-    from pydicom.pixels.utils import pixel_array
-
-    with suppress(ImportError):  # pydicom then says which package its pixels need
-        import gdcm
-
-        gdcm.Trace.WarningOff()
-        gdcm.Trace.ErrorOff()
-    try:
-        tags = Dataset()  # filled in with those of the image
-        stored = pixel_array(path, ds_out=tags)
-        # What stands in bits beyond those stored, such as overlays, is no part of a number.
-        unused = stored.dtype.itemsize * 8 - int(tags.BitsStored)
-        stored = (stored << unused) >> unused
-        slope, intercept = (tags.get(name) for name in ("RescaleSlope", "RescaleIntercept"))
-    except Exception as error:  # decoders raise anything on damaged pixels
-        said = (str(error).strip() or type(error).__name__).splitlines()[-1].rstrip(".")
-        raise InputError(f"{path}: its pixels cannot be decoded: {said}. {_AGAIN}") from error
-    if stored.shape != shape:
-        raise InputError(f"{path}: its pixels are {stored.shape}, the tags say {shape}. {_AGAIN}")
-    scale = 1.0 if slope is None else float(slope)
-    offset = 0.0 if intercept is None else float(intercept)
-    return (stored * scale + offset).astype(np.float32)
+    array = read_pixels(found.files, found.shape, found.scale)
+    return RawVolume(array, found.lps_from_index, found.notes, found.patient)
 
 
 def _patient(folder: Path, groups: list[list[_Slice]], slices: list[_Slice]) -> Patient:
@@ -254,8 +220,8 @@ def _read_tags(path: Path) -> _Slice | str:
                 modality,
                 shape=(int(tags.Rows), int(tags.Columns)),
                 spacing_mm=(float(tags.PixelSpacing[0]), float(tags.PixelSpacing[1])),
-                position_mm=tuple(float(x) for x in tags.ImagePositionPatient),
-                orientation=tuple(float(x) for x in tags.ImageOrientationPatient),
+                position_mm=_numbers(tags.ImagePositionPatient, 3),
+                orientation=_numbers(tags.ImageOrientationPatient, 6),
                 scale=(
                     1.0 if slope is None else float(slope),
                     0.0 if intercept is None else float(intercept),
@@ -269,6 +235,13 @@ def _read_tags(path: Path) -> _Slice | str:
             if is_dicom and _should_be_slice(tags):
                 raise InputError(f"{path} is cut short or damaged ({error}). {_AGAIN}") from error
             return _NO_SLICE
+
+
+def _numbers(values: Any, count: int) -> tuple[float, ...]:
+    numbers = tuple(float(value) for value in values)
+    if len(numbers) != count:
+        raise ValueError(f"{len(numbers)} numbers where {count} belong")
+    return numbers
 
 
 def _should_be_slice(tags: Any) -> bool:
