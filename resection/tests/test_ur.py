@@ -139,7 +139,9 @@ def test_by_default_nothing_is_connected_and_targets_are_counted(arm):
     sink.publish(working(5, 0.05, halted="the tumor moved"))
     sink.publish(small_update(6))
     sink.close()
-    assert sink.counts == {"would send": 5, "halted": 1, "no arms": 1}
+    counts = dict(sink.counts)
+    counts.pop("silences", None)  # a busy machine may leave 0.2 s between two of these
+    assert counts == {"would send": 5, "halted": 1, "no arms": 1}
     assert arm.opened == arm.told == []
 
 
