@@ -13,7 +13,7 @@ Check = Literal["poses", "fit", "strays", "seen_through", "unseen", "size", "pla
 Kind = Literal[
     "not_judged", "poses", "strays", "fit", "size", "upside_down", "tilted", "not_turned", "rival",
     "missing", "unsure", "improbable", "seen_through", "unseen", "hidden_now", "beyond_margins",
-    "model", "none",
+    "model",
 ]  # fmt: skip
 # The check that each kind of finding belongs to, and its sentence.
 _FINDINGS: dict[Kind, tuple[Check, str]] = {
@@ -59,7 +59,6 @@ _FINDINGS: dict[Kind, tuple[Check, str]] = {
     ),
     "beyond_margins": ("other", "{figure} is {value:.3g}; margins are known up to {limit:.3g}"),
     "model": ("other", "{words}"),
-    "none": ("other", "{words}"),
 }
 
 

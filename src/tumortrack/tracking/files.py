@@ -139,6 +139,10 @@ def read_estimate(folder: Path) -> Estimate:
     try:
         report = msgspec.convert(stored, FitReport)
         finding = msgspec.convert(stored["quality"]["finding"], Finding | None)
+        if (finding is None) != (stored["quality"]["verdict"] == "good"):
+            raise ArtifactError("its verdict and its finding contradict each other")
+        if finding is not None:
+            _ = finding.words  # its numbers are there
         names = [name for name, part in report.parts.items() if part.found]
         table = parse_ply_properties(
             path.read_bytes(), str(path), ("x", "y", "z", "label", "probability")
@@ -156,7 +160,7 @@ def read_estimate(folder: Path) -> Estimate:
             organ=organ_in(stored.get("organ"), str(folder)),
             structures={name: meshes[name] for name in report.structures},
         )
-    except (KeyError, TypeError, OSError, InputError, msgspec.ValidationError) as error:
+    except (KeyError, TypeError, ValueError, OSError, InputError) as error:
         raise ArtifactError(f"{folder} is no whole run: {error}. Locate again.") from error
 
 
