@@ -9,7 +9,6 @@ loaded when it is first used: importing this package imports no heavy library.
 
 from __future__ import annotations
 
-import sys
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
@@ -37,9 +36,6 @@ _NAMES = {  # by the module that has them
     "tracking": "presets",
 }
 _HOMES = {name: home for home, names in _NAMES.items() for name in names.split()}
-
-# GDCM, which pydicom loads, asks for Python 2's module dl: a folder of that name is not it.
-sys.modules.setdefault("dl", None)  # type: ignore[arg-type]
 
 __version__ = "0.2.0"
 __all__ = sorted(_HOMES)

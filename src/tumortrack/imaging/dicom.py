@@ -17,6 +17,7 @@ from jaxtyping import Float
 
 from tumortrack.core.errors import InputError
 from tumortrack.core.patient import NOBODY, UNKNOWN, Patient, Side
+from tumortrack.core.pydicom_library import load_pydicom
 from tumortrack.imaging.dicom_pixels import read_pixels
 from tumortrack.imaging.grid import GZIP_BEST, RawVolume, check_affine, check_size
 
@@ -181,6 +182,7 @@ def _groups(folder: Path) -> tuple[list[list[_Slice]], tuple[str, ...]]:
 
 def _read_tags(path: Path) -> _Slice | str:
     """The tags of one slice, or why the file is none (``_NO_SLICE``, ``_MULTI_FRAME``)."""
+    load_pydicom()
     import pydicom
     from pydicom.filereader import read_dataset, read_file_meta_info
     from pydicom.valuerep import STANDARD_VR

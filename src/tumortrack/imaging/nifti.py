@@ -19,6 +19,7 @@ from jaxtyping import Float, Num
 
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import RAS_FROM_LPS, spacing_mm
+from tumortrack.core.pydicom_library import load_pydicom
 from tumortrack.core.store import write_atomically
 from tumortrack.imaging import grid
 
@@ -65,6 +66,7 @@ def read_nifti(path: Path) -> grid.RawVolume:
 def _read(path: Path, stream: Any, compressed: bool) -> grid.RawVolume:
     """Header, voxels and, of a compressed file, the rest: at its end stands the checksum. Not
     ``nibabel.load``, which reads extensions as long as they say they are, and not to the end."""
+    load_pydicom()
     import nibabel
     from nibabel.volumeutils import apply_read_scaling
 

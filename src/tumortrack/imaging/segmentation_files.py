@@ -175,9 +175,9 @@ def write_dicom_seg(
             from, but their voxels must coincide (axes may be turned or run the other way).
         patient: whose labels these are.
     """
+    found = find_series(folder, series)
     import pydicom
 
-    found = find_series(folder, series)
     if patient.differs(found.patient):
         raise InputError(
             f"{folder} is of {found.patient}, the labels are of {patient}. Give the CT of that "

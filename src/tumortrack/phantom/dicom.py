@@ -11,6 +11,7 @@ import numpy as np
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import spacing_mm
 from tumortrack.core.patient import UNKNOWN, Side
+from tumortrack.core.pydicom_library import load_pydicom
 from tumortrack.core.store import new_folder
 from tumortrack.core.types import Volume
 
@@ -35,6 +36,7 @@ def write_dicom_series(
     sort by ImagePositionPatient. Exposure as in the paper (90 kV, 13.6 mA). ``side``: of the kidney
     (Laterality). Raises InputError: ``folder`` exists; HU not finite or outside -1024..64511;
     sheared voxels; StorageError: the disk refused; no part of the folder is left behind."""
+    load_pydicom()
     from pydicom import dcmwrite
 
     if not ((volume.hu >= _INTERCEPT) & (volume.hu <= _HIGHEST_HU)).all():
