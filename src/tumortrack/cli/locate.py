@@ -10,7 +10,15 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from tyro.conf import Positional, UseAppendAction
 
-from tumortrack.cli.console import Device, keep_loaded, model_folder, say, say_json, say_notes
+from tumortrack.cli.console import (
+    Device,
+    console,
+    keep_loaded,
+    model_folder,
+    say,
+    say_json,
+    say_notes,
+)
 from tumortrack.cli.finding import FindingOrgan
 from tumortrack.core import store
 from tumortrack.core.config import to_builtins
@@ -64,7 +72,7 @@ class Locate(FindingOrgan):
         case: the model's case, whose CT the page's slices then show where it lies now (preset
             clinic); a second or two longer.
         device: auto takes CUDA if there is a GPU.
-        json: print the report (OUT/report.json) instead of sentences.
+        json: print the report (OUT/report.json); sentences go to standard error.
         overwrite: replace OUT if it exists.
     """
 
@@ -91,6 +99,7 @@ class Locate(FindingOrgan):
         from tumortrack.tracking.files import has_no_estimate
 
         check_grid(self.grid)
+        console.stderr = self.json
         paths = [self.cloud, self.out, *self.more]
         clouds, out = paths[:-1], paths[-1]
         if self.model.is_file() and (self.cloud / store.MANIFEST).is_file():
@@ -145,19 +154,17 @@ class Locate(FindingOrgan):
             doubt = f"if that is not the organ, or not all of it: {_ASK}; --whole takes all."
             about["notes"].append(doubt)
         about |= self._about_files(estimate, clouds, frame_id, fixed_from_camera, points)
-        if not self.json:
-            _say_found(estimate, about)
-        # What writing alone needs is loaded after the verdict, for which somebody waits.
+        _say_found(estimate, about)
+        # What writing alone needs is loaded after the verdict, for which the user waits.
         from tumortrack.report.run_page import write_run_page
         from tumortrack.tracking.files import report_entry, write_estimate
 
         report = {**report_entry(estimate), **about}
         add = partial(write_run_page, report=report, estimate=estimate, seen=seen)
         write_estimate(out, estimate, overwrite, points, add, about)
+        _say_written(estimate, points, out)
         if self.json:
             say_json(report)
-        else:
-            _say_written(estimate, points, out)
         return VERDICTS[estimate.quality]
 
     def _about_files(
