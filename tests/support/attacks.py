@@ -119,7 +119,7 @@ def outcome(name: str, folder: Path, base: Path) -> Outcome:
     ]
     before = set(_below(folder))
     # What may end well does the whole work: it compiles, beside whatever else the machine does.
-    allowed_s = (12 if name in FINISH else 1) * SECONDS  # `prepare` makes a model, too
+    allowed_s = (6 if name in FINISH else 1) * SECONDS
     code, output, seconds, megabytes = run(arguments, folder, allowed_s)
     lines = [line for line in output.strip().splitlines() if line.startswith("tumortrack: ")]
     line = lines[-1] if lines else (output.strip().splitlines() or [""])[-1]
