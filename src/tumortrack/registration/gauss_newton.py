@@ -154,7 +154,7 @@ def posterior(motion: ElasticMotion, looks: Looks, config: GaussNewtonConfig) ->
     from_mean = np.zeros(POSE), motion.coefficients - body.mean, looks.shifts[1:].ravel()
     pose_std = np.repeat([config.shift_mm, config.turn_rad], 3)
     cameras = np.tile(CAMERA_STD**2, looks.count - 1)
-    prior = np.diag(np.concatenate([pose_std**2, body.mean, cameras]))
+    prior = np.diag(np.concatenate([pose_std**2, np.zeros(len(body.mean)), cameras]))
     prior[POSE:unknowns, POSE:unknowns] = body.covariance
     rows = motion.residual_rows(looks.points_mm)
     slopes, distances = rows[:, :-1], rows[:, -1:]

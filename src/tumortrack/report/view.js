@@ -61,7 +61,7 @@ function viewNormals(v, f) {
   }
   return normals;
 }
-/** Right, up and away of somebody at (-0.5, -0.55, -1.1), with -y up. */
+/** Right, up and forward of a viewer at (-0.5, -0.55, -1.1), with -y up. */
 function viewStart() {
   const away = [0.5, 0.55, 1.1], right = [1.1, 0, -0.5], up = viewCross(right, away);
   const unit = (v) => v.map((x) => x / Math.hypot(...v));
