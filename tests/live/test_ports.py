@@ -48,6 +48,7 @@ def page(sink: ViewerSink, token: bool = True, **headers: str) -> ClientConnecti
         additional_headers=origin,
         max_size=2**26,
         proxy=None,
+        ping_interval=None,  # a browser's page sends none, and who does is cut off
     )
 
 
