@@ -111,7 +111,8 @@ def block(fleet: Path, writer: ReportWriter) -> str:
         f"{len(people)} patients, {len(done)} done, {alone} with nothing for a person to look at. "
         f"{int(done.scenes.sum())} scenes; {int(done.lost.sum())} more could not be made. Within "
         f"the largest miss of a patient's margin states: {done.within_largest.mean():.0%} of good "
-        f"answers, {done.holds_for.mean():.0%} by n / (n + 1)."
+        "answers; expected of one more among n alike, n / (n + 1): "
+        f"{done.holds_for.mean():.0%}."
     )
     short = rows[rows.by.isin(["all", "state"])]
     ours, rigid = (spread_words(short, of) for of in list(_ERRORS)[:2])
