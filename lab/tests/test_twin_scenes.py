@@ -22,13 +22,13 @@ from tumortrack.core import store
 from tumortrack.core.errors import ArtifactError, InputError
 from tumortrack.core.estimate import Estimate
 from tumortrack.core.geometry import rigid, transform_points
+from tumortrack.core.mesh_query import contains, labels_of
 from tumortrack.core.report import FitReport
 from tumortrack.core.types import CameraLabels, LabelVolume
 from tumortrack.imaging.case import Case, save_case
 from tumortrack.report.metrics import label_grid
 from tumortrack.report.protocol import evaluate_scenes
 from tumortrack.sense.camera import deproject
-from tumortrack.simulate.occupancy import contains, labels_of
 from tumortrack.simulate.scene_folder import draw_targets, list_scenes, read_scene
 from tumortrack_lab.twin import dataset
 from tumortrack_lab.twin.apparatus import State

@@ -12,12 +12,12 @@ from PIL import Image
 from tumortrack.core.colours import sweep_colour
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import rigid
+from tumortrack.core.mesh_query import contains
 from tumortrack.core.patient import Patient
 from tumortrack.core.types import Mesh
 from tumortrack.imaging.meshes import mesh_of, solid_of
 from tumortrack.live.values import Polyline, RigidShape, Workcell
 from tumortrack.report.renderer import Body, Viewpoint, corner_normals, render
-from tumortrack.simulate.occupancy import contains
 from tumortrack_resection.film import film, moments_s, tube
 from tumortrack_resection.motions import Motions, MotionStage
 from tumortrack_resection.pictures import (

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from tumortrack.core.mesh_files import read_mesh
+from tumortrack.core.mesh_query import surface_distance
 from tumortrack.imaging.case import load_case
-from tumortrack.simulate.occupancy import surface_distance
 from tumortrack.simulate.scene_folder import read_scene
 
 pytestmark = pytest.mark.slow

@@ -4,8 +4,8 @@ import numpy as np
 import trimesh
 
 from render_objects import bumpy
+from tumortrack.core.mesh_query import contains
 from tumortrack.core.types import Mesh
-from tumortrack.simulate.occupancy import contains
 
 
 def winding_number(mesh, points):

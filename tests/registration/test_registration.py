@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 from elastic_objects import CENTER, RADII, SMALL
 from tumortrack.core.errors import InputError
 from tumortrack.core.estimate import Motion
+from tumortrack.core.mesh_query import labels_of, surface_distance
 from tumortrack.core.types import Mesh
 from tumortrack.models.config import GaussNewtonConfig
 from tumortrack.registration.gauss_newton import GaussNewton, _prior, refine, size_of
@@ -25,7 +26,6 @@ from tumortrack.registration.looks import Looks
 from tumortrack.registration.motion import ElasticMotion
 from tumortrack.registration.registration import _turned_starts
 from tumortrack.registration.rest_shape import RestShape, distance_of
-from tumortrack.simulate.occupancy import labels_of, surface_distance
 from warp_objects import (
     ANATOMY,
     PLACE_MM,

@@ -15,10 +15,10 @@ from elastic_objects import CENTER, UP
 from stories import answered, tumortrack
 from tumortrack.core.errors import ArtifactError, InputError, NoEstimate
 from tumortrack.core.estimate import Motion
+from tumortrack.core.mesh_query import labels_of, surface_distance
 from tumortrack.core.types import SensorCloud
 from tumortrack.models.folder import save_model
 from tumortrack.sense.ply import write_cloud_ply
-from tumortrack.simulate.occupancy import labels_of, surface_distance
 from tumortrack.simulate.scene import SceneRecipe, Simulator, body_for
 from tumortrack.simulate.scene_folder import draw_targets
 from tumortrack.tracking.model_files import load_model

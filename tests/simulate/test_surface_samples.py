@@ -5,15 +5,11 @@ import pytest
 
 from render_objects import ELLIPSOIDS, anatomy, ellipsoid, sphere, winding_number
 from tumortrack.core.errors import InputError
+from tumortrack.core.mesh_query import labels_of, surface_distance
 from tumortrack.core.types import Anatomy
 from tumortrack.simulate.deform.base import View
 from tumortrack.simulate.deform.drag import CONFIGURATIONS, DragConfig
-from tumortrack.simulate.occupancy import (
-    OccupancyConfig,
-    OccupancyPool,
-    labels_of,
-    surface_distance,
-)
+from tumortrack.simulate.occupancy import OccupancyConfig, OccupancyPool
 
 ANATOMY = anatomy()
 VIEW = View(ANATOMY, lambda points_ct: points_ct[:, 1] < -10)

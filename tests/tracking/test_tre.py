@@ -14,6 +14,7 @@ from stories import succeeded, tumortrack, write_phantom_case
 from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.estimate import Estimate, FollowOptions
 from tumortrack.core.geometry import transform_points
+from tumortrack.core.mesh_query import labels_of
 from tumortrack.core.report import FitReport
 from tumortrack.core.types import (
     Anatomy,
@@ -27,7 +28,6 @@ from tumortrack.live.sources.virtual import VirtualSourceConfig
 from tumortrack.report.metrics import label_grid, target_errors
 from tumortrack.report.protocol import evaluate_scene, evaluate_scenes
 from tumortrack.report.summary import headlines, summarise, target_text
-from tumortrack.simulate.occupancy import labels_of
 from tumortrack.simulate.scene import SceneRecipe
 from tumortrack.simulate.scene_folder import (
     Scene,

@@ -81,8 +81,8 @@ def lattice(surface: Mesh, edge_mm: float) -> TetMesh:
     far as no tetrahedron loses more than four fifths of its volume. Coarser than ``tetrahedralise``
     where the organ is thin, and the same to the last bit whenever it is repeated. Raises
     InputError: nothing could be filled."""
+    from tumortrack.core.mesh_query import contains
     from tumortrack.report.metrics import surface_samples
-    from tumortrack.simulate.occupancy import contains
 
     nodes_mm, tets = _cubic(surface.box_mm, edge_mm)
     tets = tets[contains(surface, nodes_mm[tets].mean(1))]

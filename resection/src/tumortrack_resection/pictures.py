@@ -16,13 +16,13 @@ from matplotlib.patheffects import Normal, Stroke
 
 from tumortrack.core.colours import PIECE, name_colour, part_colour, sweep_colour
 from tumortrack.core.errors import InputError
+from tumortrack.core.mesh_query import contains
 from tumortrack.core.organ import KIDNEY, organ_first, organ_name
 from tumortrack.core.types import ORGAN, Mesh, part_names
 from tumortrack.imaging.meshes import mesh_of, solid_of
 from tumortrack.report import drawing
 from tumortrack.report.drawing import CENTRED
 from tumortrack.report.renderer import RGB, Body, Frame, ParallelView, rgb
-from tumortrack.simulate.occupancy import contains
 from tumortrack_resection.budget import kept_words
 from tumortrack_resection.values import Cut, CutLayer, Located, ResectionPlan
 

@@ -12,10 +12,10 @@ from scipy import ndimage
 
 from tumortrack.core.errors import NoEstimate
 from tumortrack.core.geometry import transform_points
+from tumortrack.core.mesh_query import surface_distance
 from tumortrack.core.types import FIRST_TUMOR, ORGAN, OUTSIDE, Mesh, OccupancyCloud
 from tumortrack.imaging.grid import grown_box, tight_box
 from tumortrack.occupancy.kernels import between
-from tumortrack.simulate.occupancy import surface_distance
 
 AT_ONCE = 2**18  # queries; bounds the memory for any grid
 _SMALLEST_MARGIN = 1e-3  # a surface exactly through a grid point would not be closed

@@ -9,12 +9,12 @@ import numpy as np
 from jaxtyping import Float32, Float64, UInt8
 
 from tumortrack.core.errors import InputError
+from tumortrack.core.mesh_query import contains, surface_distance
 from tumortrack.core.organ import KIDNEY, Organ, check_name
 from tumortrack.core.process import parallel_for
 from tumortrack.core.types import Anatomy, Mesh
 from tumortrack.registration.kernels import DistanceField, mark
 from tumortrack.simulate.elastic.body import ElasticBody
-from tumortrack.simulate.occupancy import contains, surface_distance
 
 _STEPS = 40  # of a distance field, along the part's longest side
 _FINEST_MM, _COARSEST_MM = 0.5, 2.0

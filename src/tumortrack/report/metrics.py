@@ -16,9 +16,9 @@ from scipy.spatial import cKDTree
 
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import Points, transform_points
+from tumortrack.core.mesh_query import contains
 from tumortrack.core.types import Anatomy, CameraLabels, Mesh
 from tumortrack.imaging.raster import expand, label_grid
-from tumortrack.simulate.occupancy import contains
 from tumortrack.simulate.scene_folder import Targets
 
 # Vertices are sampled too, so the maximum misses at most s^2 / (8 R) where a flat piece of size s

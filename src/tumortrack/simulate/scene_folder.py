@@ -20,13 +20,13 @@ from jaxtyping import Float, Float64, UInt8
 from tumortrack.core.config import check_seed
 from tumortrack.core.errors import InputError
 from tumortrack.core.mesh_files import read_anatomy, write_anatomy
+from tumortrack.core.mesh_query import contains, labels_of
 from tumortrack.core.organ import KIDNEY, Organ, is_tumor, organ_entry, organ_in
 from tumortrack.core.store import new_folder, read_json, write_atomically, write_json
 from tumortrack.core.types import Anatomy, DepthFrame, SensorCloud
 from tumortrack.imaging.meshes import mesh_of, solid_of
 from tumortrack.sense.files import depth_png, intrinsics_json, read_cloud, read_depth_png
 from tumortrack.sense.ply import write_cloud_ply
-from tumortrack.simulate.occupancy import contains, labels_of
 
 # Our own scenes state in meta.json that the organ's surface is of all of it, tumors included.
 _UNITED = "organ_includes_tumors"

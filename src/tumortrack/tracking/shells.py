@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from tumortrack.core.mesh_query import contains, surface_distance
 from tumortrack.core.types import Mesh
-from tumortrack.simulate.occupancy import contains, surface_distance
 
 _CELLS = 32  # of the distance field, along the longest side
 _FINEST_MM, _COARSEST_MM = 0.6, 1.5

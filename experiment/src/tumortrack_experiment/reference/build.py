@@ -11,9 +11,9 @@ from tumortrack.cli.console import say, say_notes
 from tumortrack.core import store
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import transform_points
+from tumortrack.core.mesh_query import contains
 from tumortrack.imaging.case import Case
 from tumortrack.imaging.volume import read_volume
-from tumortrack.simulate.occupancy import contains
 from tumortrack.simulate.scene_folder import Scene, Targets
 from tumortrack.tracking.points import read_points
 from tumortrack_experiment.kit_file import Kit, kit_path, read_kit

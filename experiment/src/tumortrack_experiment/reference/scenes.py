@@ -10,12 +10,12 @@ from scipy.spatial.distance import cdist
 
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import Points, transform_points
+from tumortrack.core.mesh_query import labels_of
 from tumortrack.core.types import DepthFrame, Mesh, SensorCloud
 from tumortrack.imaging.case import Case
 from tumortrack.sense.camera import deproject, project
 from tumortrack.sense.cloud import CloudConfig, cloud_from_depth
 from tumortrack.sense.render import render_depth
-from tumortrack.simulate.occupancy import labels_of
 from tumortrack.simulate.scene_folder import Targets
 from tumortrack_experiment.register.beads import fit_rigid
 

@@ -7,12 +7,12 @@ from functools import partial
 
 import numpy as np
 
+from tumortrack.core.mesh_query import labels_of
 from tumortrack.core.types import Anatomy, SensorCloud
 from tumortrack.imaging.raster import label_grid
 from tumortrack.models.report import grid_over
 from tumortrack.registration.looks import Looks
 from tumortrack.registration.model import RegistrationModel
-from tumortrack.simulate.occupancy import labels_of
 from tumortrack.tracking.tracker import Tracker
 from tumortrack_lab.bench import occupancy, rows
 from tumortrack_lab.bench.naive import flowed

@@ -12,8 +12,8 @@ import numpy as np
 from jaxtyping import Float, Float64, Int
 
 from tumortrack.core.compiled import numba
+from tumortrack.core.mesh_query import contains, surface_distance
 from tumortrack.core.types import Mesh
-from tumortrack.simulate.occupancy import contains, surface_distance
 from tumortrack_lab.tets import Embedding, TetMesh
 from tumortrack_lab.twin import equilibrium
 from tumortrack_lab.twin.equilibrium import Nodes, Points

@@ -14,8 +14,8 @@ import numpy as np
 from jaxtyping import Float64
 
 from tumortrack.core.geometry import rotation_onto, triangles_of
+from tumortrack.core.mesh_query import contains
 from tumortrack.core.types import Anatomy, Mesh
-from tumortrack.simulate.occupancy import contains
 
 Kind = Literal["none", "voxel", "slices", "reader"]
 KINDS: tuple[Kind, ...] = get_args(Kind)

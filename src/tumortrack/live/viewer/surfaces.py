@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Int32
 
+from tumortrack.core.mesh_query import surface_distance
 from tumortrack.core.types import Anatomy
-from tumortrack.simulate.occupancy import surface_distance
 
 _SAME_MM = 0.4
 

@@ -21,8 +21,8 @@ from scipy.linalg import cholesky, solve_triangular
 from scipy.ndimage import binary_dilation, distance_transform_edt
 from scipy.sparse import coo_matrix, csr_matrix, diags
 
+from tumortrack.core.mesh_query import contains
 from tumortrack.core.types import Anatomy, Mesh
-from tumortrack.simulate.occupancy import contains
 
 Points = Float[np.ndarray, "p 3"]
 VOID = 1e-2  # stiffness of the medium outside, relative to the organ's
