@@ -1,4 +1,4 @@
-"""Machine code that is kept, and what becomes of it when the program changes."""
+"""The cache of machine code, and what becomes of it when the program changes."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ import pytest
 
 KERNEL = """
 from typing import NamedTuple
-from tumortrack.core.compiled import numba
+from tumortrack.core.compiled import njit
 from {home} import Pair
 
-@numba.njit(cache=True)
+@njit()
 def total(pair):
     return pair.one + pair.other
 """
@@ -27,7 +27,7 @@ class Pair(NamedTuple):
 
 
 def printed(folder, code):
-    """What it prints in a process of its own, which may find machine code; or the error."""
+    """What a new process prints, which may find cached machine code; or its error."""
     environment = {**os.environ, "PYTHONPATH": f"{folder}:{os.environ.get('PYTHONPATH', '')}"}
     environment.pop("NUMBA_CACHE_DIR", None)
     done = subprocess.run(
@@ -59,9 +59,9 @@ def test_a_class_that_moved_and_a_damaged_file_cost_a_compilation_and_no_more(tm
 
 
 TOTAL = """
-from tumortrack.core.compiled import numba
+from tumortrack.core.compiled import njit
 
-@numba.njit(cache=True)
+@njit()
 def total(values):
     total = 0.0
     for value in values:
@@ -77,8 +77,8 @@ def total_of(folder, kind):
 
 
 def test_machine_code_for_other_types_of_arguments_is_not_taken(tmp_path):
-    """As two processes leave it that compile the same function at once: each takes the name that
-    is free, the index is of the one and the code of the other."""
+    """As left by two processes that compile the same function at once: both choose the same file
+    name, and the index is from one, the code from the other."""
     (tmp_path / "kernel.py").write_text(TOTAL.replace("FACTOR", "1"))
     left = {}
     for kind in ("float32", "float64"):
@@ -94,7 +94,7 @@ def test_machine_code_for_other_types_of_arguments_is_not_taken(tmp_path):
 
 
 def test_machine_code_of_older_source_is_not_taken(tmp_path):
-    """As a process leaves it that is killed after it has written the index."""
+    """As left by a process that is killed after writing the index."""
     (tmp_path / "kernel.py").write_text(TOTAL.replace("FACTOR", "1"))
     assert total_of(tmp_path, "float64") == "6.0"
     (code,) = (tmp_path / "__pycache__").glob("*.nbc")
@@ -108,10 +108,10 @@ def test_machine_code_of_older_source_is_not_taken(tmp_path):
 
 @pytest.mark.parametrize(
     ("part", "asked"),
-    [("@numba.njit(cache=True)\ndef part(): return 1.0", "part()"), ("part = 1.0", "part")],
+    [("@njit()\ndef part(): return 1.0", "part()"), ("part = 1.0", "part")],
 )
 def test_machine_code_is_outdated_when_a_part_of_another_module_has_changed(tmp_path, part, asked):
-    before = f"from tumortrack.core.compiled import numba\n\n{part}\n"
+    before = f"from tumortrack.core.compiled import njit\n\n{part}\n"
     (tmp_path / "other.py").write_text(before)
     importing = "from other import part\n" + TOTAL.replace("FACTOR", asked)
     (tmp_path / "kernel.py").write_text(importing)

@@ -175,7 +175,7 @@ def _led_by_coverage(name: str, inputs: int) -> None:
     kernels = [  # numba compiles these as they are written
         ".".join(("tumortrack", *path.relative_to(root).with_suffix("").parts))
         for path in root.rglob("*.py")
-        if "import numba" in path.read_text()
+        if "import njit" in path.read_text()
     ]
     with atheris.instrument_imports(include=["tumortrack"], exclude=kernels):
         seeds, read = targets()[name]

@@ -16,7 +16,7 @@ from numpy.linalg import norm
 from scipy.ndimage import binary_closing, minimum_filter
 from skimage.measure import find_contours
 
-from tumortrack.core.compiled import numba
+from tumortrack.core.compiled import njit
 from tumortrack.core.errors import NoPlan
 from tumortrack.core.geometry import spread_over
 from tumortrack.core.types import Mesh
@@ -219,7 +219,7 @@ def _in_turn(
     return ordered
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _outline_fields(points, margins, levels, first, cell, fields):  # type: ignore[no-untyped-def]
     """Into ``fields`` (k, nx, ny), large where nothing is near: for each of k levels (mm) the
     signed distance (mm, near 0) to the outline of what comes away there.

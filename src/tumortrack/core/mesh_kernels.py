@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from tumortrack.core.compiled import numba
+from tumortrack.core.compiled import njit
 
 
-@numba.njit(cache=True, fastmath=True, nogil=True)
+@njit(fastmath=True, nogil=True)
 def signed_volume(vertices, faces):  # type: ignore[no-untyped-def]
     """Sum over faces (f, 3) of their area seen along z times their height over the first vertex. A
     closed surface's volume, positive where faces turn outward."""
@@ -34,7 +34,7 @@ def contained(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> np
     return inside
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _above(points, vertices, faces, side, starts, grid):  # type: ignore[no-untyped-def]
     """Whether an odd number of faces lies above each point. Points are sorted by the cell of the
     grid that they are in; only those in cells below a face are looked at.
@@ -69,7 +69,7 @@ def _above(points, vertices, faces, side, starts, grid):  # type: ignore[no-unty
     return inside
 
 
-@numba.njit(cache=True, inline="always")
+@njit(inline="always")
 def _left_of(a, b, x, y):  # type: ignore[no-untyped-def]
     """Whether an edge, seen in the plane of x and y, passes the point at its right."""
     if (a[1] > y) == (b[1] > y):

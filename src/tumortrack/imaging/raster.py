@@ -7,7 +7,7 @@ import math
 import numpy as np
 from jaxtyping import Bool, Float, Int, Int16, UInt8
 
-from tumortrack.core.compiled import numba
+from tumortrack.core.compiled import njit
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import Anatomy, Mesh
@@ -90,7 +90,7 @@ def _fill(mesh: Mesh, frame_from_index: np.ndarray, out: np.ndarray, value: int)
     _fill_along_rays(first, behind, sign, value, out[box])
 
 
-@numba.njit(cache=True, nogil=True)  # no fast math: each number is rounded as in ``cover``
+@njit(nogil=True)  # no fast math: each number is rounded as in ``cover``
 def _find_crossings(triangles, shape, first, k, sign):  # type: ignore[no-untyped-def]
     """Where rays along the last axis pass triangles (t, 3, 3), in cells: into ``k`` the first voxel
     behind each crossing, into ``sign`` +1 where a face is entered, -1 where it is left.
@@ -133,7 +133,7 @@ def _find_crossings(triangles, shape, first, k, sign):  # type: ignore[no-untype
                     first[ray + 1] += 1
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _span(tri, i):  # type: ignore[no-untyped-def]
     """Where a triangle begins and ends on the line ``i`` of its first axis."""
     low, high = np.inf, -np.inf
@@ -147,7 +147,7 @@ def _span(tri, i):  # type: ignore[no-untyped-def]
     return low, high
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _fill_along_rays(first, k, sign, value, out):  # type: ignore[no-untyped-def]
     """See ``_fill``; of each ray the crossings in ``k`` and ``sign`` begin at ``first``."""
     for i in range(out.shape[0]):
@@ -163,7 +163,7 @@ def _fill_along_rays(first, k, sign, value, out):  # type: ignore[no-untyped-def
                     out[i, j, k[at] : stop] = value if value != 0 else winding
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _in_order(k, sign, begin, end):  # type: ignore[no-untyped-def]
     """Sort one ray's crossings, a handful, by ``k``."""
     for at in range(begin + 1, end):

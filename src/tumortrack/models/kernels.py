@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from tumortrack.core.compiled import numba
+from tumortrack.core.compiled import njit
 
 _MAXIMUM = {"nnan", "nsz"}  # lets a maximum be taken in lanes; sums stay as they are written
 
 
-@numba.njit(cache=True, nogil=True, fastmath=_MAXIMUM)
+@njit(nogil=True, fastmath=_MAXIMUM)
 def farthest(points, first, chosen):  # type: ignore[no-untyped-def]
     """Farthest points of clouds (B, 3, N), float32, into ``chosen`` (B, k), int64, from the first
     choices (B,) on."""
@@ -33,7 +33,7 @@ def farthest(points, first, chosen):  # type: ignore[no-untyped-def]
                 newest += 1
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def balls(points, centres, radius_2, found):  # type: ignore[no-untyped-def]
     """The first points (B, 3, N) within the root of ``radius_2`` of every centre (B, 3, M), the
     first repeated where they are few, into ``found`` (B, M, k), int64; all others float32."""
@@ -60,7 +60,7 @@ def balls(points, centres, radius_2, found):  # type: ignore[no-untyped-def]
                 row[i] = rest
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def greatest(values, infinity, out, chosen):  # type: ignore[no-untyped-def]
     """The greatest of every K numbers (M, K, C) or zero, NaN greater than all, into ``out`` (M, C);
     which of the K it is, the first one or -1 for zero, into ``chosen``. ``values`` and ``infinity``
@@ -81,7 +81,7 @@ def greatest(values, infinity, out, chosen):  # type: ignore[no-untyped-def]
                 which[c] = number if better else which[c]
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def handed_back(gradient, chosen, out):  # type: ignore[no-untyped-def]
     """Every gradient (M, C) to the one of K that was chosen, zero to the others: ``out``
     (M, K, C) is filled."""
@@ -93,7 +93,7 @@ def handed_back(gradient, chosen, out):  # type: ignore[no-untyped-def]
                 row[c] = gradient[m, c] if chosen[m, c] == number else 0
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def near(points, reach, out):  # type: ignore[no-untyped-def]
     """``network.without_strays`` of clouds (B, N, 3) into ``out``; all float32."""
     n = points.shape[1]

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from tumortrack.core.compiled import numba
+from tumortrack.core.compiled import njit
 
 
-@numba.njit(nogil=True, inline="always")
+@njit(nogil=True, inline="always")
 def _linear(coarse, low, high, n):  # type: ignore[no-untyped-def]
     """Logit ``n`` in the middle of two coarse points, equal along axes where it lies on one."""
     i, j, k = low
@@ -19,7 +19,7 @@ def _linear(coarse, low, high, n):  # type: ignore[no-untyped-def]
     return np.float32(0.125) * (near + far)
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def halved(coarse, fine, first, last):  # type: ignore[no-untyped-def]
     """Logits at half the step, linear between the coarse ones (a, b, c, classes), into ``fine``
     (2a - 1, 2b - 1, 2c - 1, classes), float32; planes ``first`` to ``last``."""
@@ -32,7 +32,7 @@ def halved(coarse, fine, first, last):  # type: ignore[no-untyped-def]
                     fine[i, j, k, n] = _linear(coarse, low, high, n)
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def leading(logits):  # type: ignore[no-untyped-def]
     """The label that leads in every row (n, classes), and by how much."""
     labels, leads = np.empty(len(logits), np.uint8), np.empty(len(logits), np.float32)
@@ -49,7 +49,7 @@ def leading(logits):  # type: ignore[no-untyped-def]
     return labels, leads
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def surprising(coarse, shape, flat, found, limit):  # type: ignore[no-untyped-def]
     """Which points (n,) of the lattice of half the step, flat indices, have another label than
     linear logits let expect, the difference of the two labels' logits being off by more than the
@@ -73,7 +73,7 @@ def surprising(coarse, shape, flat, found, limit):  # type: ignore[no-untyped-de
     return flat[surprises]
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def spread(labels, inside, outside, margins, first, last):  # type: ignore[no-untyped-def]
     """Per part one of two values (bits of half precision) into ``margins`` (parts, i, j, k) by the
     labels (i, j, k); the first part is inside wherever there is one. Planes first to last."""
@@ -87,7 +87,7 @@ def spread(labels, inside, outside, margins, first, last):  # type: ignore[no-un
                     out[k] = inside if mine else outside
 
 
-@numba.njit(nogil=True, inline="always")
+@njit(nogil=True, inline="always")
 def _confident_row(plain, i, j, labels):  # type: ignore[no-untyped-def]
     """The label on which the eight corners of each cell agree, 255 where there is none."""
     i1, j1 = min(i + 1, plain.shape[0] - 1), min(j + 1, plain.shape[1] - 1)
@@ -100,7 +100,7 @@ def _confident_row(plain, i, j, labels):  # type: ignore[no-untyped-def]
             labels[k] = 255
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def filled(coarse, labels, plain, fine, first, last):  # type: ignore[no-untyped-def]
     """The voxels between the points of the last lattice but one, cell by cell, from coarse plane
     ``first`` to ``last``. A cell whose corners agree and all lead by the limit holds no voxel that
@@ -138,7 +138,7 @@ def filled(coarse, labels, plain, fine, first, last):  # type: ignore[no-untyped
     return listed[:count].copy(), expected[:count].copy(), between[:count].copy()
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def neighbours(shape, frontier, known):  # type: ignore[no-untyped-def]
     """The voxels that touch these and are not known yet: flat indices. They are marked as known,
     since the caller queries them next."""
@@ -159,7 +159,7 @@ def neighbours(shape, frontier, known):  # type: ignore[no-untyped-def]
     return found[:count].copy()
 
 
-@numba.njit(nogil=True, inline="always")
+@njit(nogil=True, inline="always")
 def _cell(at, size):  # type: ignore[no-untyped-def]
     """The cell of a coordinate along one axis, and the fraction of the cell up to it."""
     at = min(max(at, np.float32(0)), np.float32(size - 1))
@@ -167,7 +167,7 @@ def _cell(at, size):  # type: ignore[no-untyped-def]
     return low, at - np.float32(low)
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def between(values, place):  # type: ignore[no-untyped-def]
     """Trilinear values (m, n) of a lattice (a, b, c, n) at places (m, 3), in its steps; outside
     those of the nearest border."""

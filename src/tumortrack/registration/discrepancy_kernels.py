@@ -6,10 +6,10 @@ import math
 
 import numpy as np
 
-from tumortrack.core.compiled import numba
+from tumortrack.core.compiled import njit
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def most_likely(explained, alike, per_noise, residuals, tried):  # type: ignore[no-untyped-def]
     """The pair of ``tried`` amplitudes and noises under which residuals (m,) are most likely, if
     they are normal, of covariance ``explained + amplitude^2 alike + noise^2 diag(per_noise)``."""

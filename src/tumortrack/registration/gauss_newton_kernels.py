@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from tumortrack.core.compiled import numba
+from tumortrack.core.compiled import njit
 from tumortrack.registration.kernels import POSE, DistanceField, Flow, Pose, add_rows
 from tumortrack.simulate.elastic.flow import BLOCK, LatticeField, block, combine, steps_of
 
@@ -20,7 +20,7 @@ _AT_ONCE = 256  # points whose rows stay in the cache; also so many are summed i
 _APART = 16  # numbers between rows of sums: rows a power of two apart share a cache's lines
 
 
-@numba.njit(cache=True, fastmath=True, nogil=True, inline="always")
+@njit(fastmath=True, nogil=True, inline="always")
 def rho(r):  # type: ignore[no-untyped-def]
     """The robust kernel, r^2 / (1 + r^2), of a distance in widths. Source: Geman and McClure, Bull.
     ISI 52, 1987."""
@@ -28,7 +28,7 @@ def rho(r):  # type: ignore[no-untyped-def]
     return square / (1.0 + square)
 
 
-@numba.njit(cache=True, fastmath=True, nogil=True, inline="always")
+@njit(fastmath=True, nogil=True, inline="always")
 def root_weight(r):  # type: ignore[no-untyped-def]
     """The root of rho'(r) / (2 r), which is 1 / (1 + r^2): a residual and its derivatives are each
     multiplied by it in a Gauss-Newton step."""
@@ -65,7 +65,7 @@ class State(NamedTuple):
     gradient: np.ndarray  # (p,)
 
 
-@numba.njit(cache=True, fastmath=True, nogil=True)
+@njit(fastmath=True, nogil=True)
 def descend(problem, state, first, last):  # type: ignore[no-untyped-def]
     """Steps ``first`` to ``last`` of a refinement, fewer if it converges: their number, whether it
     has converged, and the last cost. Where ``first`` is not 0, ``state`` is what is left by the
@@ -89,13 +89,13 @@ def descend(problem, state, first, last):  # type: ignore[no-untyped-def]
     return last, False, cost
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _width(problem, step):  # type: ignore[no-untyped-def]
     """The robust kernel's width (mm) after so many steps; a point pulls most at 0.58 of it."""
     return max(problem.last_mm, problem.first_mm * problem.narrowing**step)
 
 
-@numba.njit(cache=True, fastmath=True, nogil=True, inline="always")
+@njit(fastmath=True, nogil=True, inline="always")
 def _equations(problem, state, width, buffers):  # type: ignore[no-untyped-def]
     """Distances, curvature and gradient of the cost at a state into it; the cost."""
     weight, last_mm, precision = problem.weight, problem.last_mm, problem.precision
@@ -122,7 +122,7 @@ def _equations(problem, state, width, buffers):  # type: ignore[no-untyped-def]
     return cost
 
 
-@numba.njit(cache=True, fastmath=True, nogil=True, inline="always")
+@njit(fastmath=True, nogil=True, inline="always")
 def normal_equations(problem, flow, pose, width, buffers, state):  # type: ignore[no-untyped-def]
     """Distances as ``add_rows`` gives them, and the sums over points of ``weight * row * row'`` and
     ``weight * row * distance``, into ``state``; ``weight`` is ``root_weight`` squared. ``flow`` has
@@ -152,7 +152,7 @@ def normal_equations(problem, flow, pose, width, buffers, state):  # type: ignor
         gradient[n] = sums[unknowns, n]
 
 
-@numba.njit(cache=True, fastmath=True, nogil=True, inline="always")
+@njit(fastmath=True, nogil=True, inline="always")
 def _add_products(columns, count, sums):  # type: ignore[no-untyped-def]
     """Add the products of all pairs of columns, over ``count`` points, to the lower triangle of
     ``sums``: eight at a time, so that a number read is used more than once."""
@@ -182,7 +182,7 @@ def _add_products(columns, count, sums):  # type: ignore[no-untyped-def]
             lower[m + 3] += bf
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def turn(rotation, centre, change):  # type: ignore[no-untyped-def]
     """Move a pose by ``-change`` in the organ's axes: rotation times the rotation vector's matrix
     (Rodrigues), centre along the axes of before."""

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from tumortrack.core.compiled import numba
+from tumortrack.core.compiled import njit
 from tumortrack.simulate.elastic.flow import BLOCK, add_modes, block, enter, travel
 
 POSE = 6  # unknowns before the coefficients
@@ -46,7 +46,7 @@ class DistanceField(NamedTuple):
     spacing_mm: float
 
 
-@numba.njit(cache=True, fastmath=True, nogil=True)
+@njit(fastmath=True, nogil=True)
 def carry(flow, pose, points, out):  # type: ignore[no-untyped-def]
     """The pose of where the flow carries points (n, 3), float32, into ``out``, float64."""
     velocity, origin, spacing, steps = flow
@@ -65,7 +65,7 @@ def carry(flow, pose, points, out):  # type: ignore[no-untyped-def]
                 out[first + p, axis] = moved + to[axis]
 
 
-@numba.njit(cache=True, fastmath=True, nogil=True)
+@njit(fastmath=True, nogil=True)
 def back(flow, pose, points, out):  # type: ignore[no-untyped-def]
     """The inverse of ``carry``, if ``flow`` has the opposite velocity."""
     velocity, origin, spacing, steps = flow
@@ -86,7 +86,7 @@ def back(flow, pose, points, out):  # type: ignore[no-untyped-def]
                 out[first + p, axis] = origin[axis] + spacing * places[axis, p]
 
 
-@numba.njit(cache=True, fastmath=True, nogil=True)
+@njit(fastmath=True, nogil=True)
 def effects(flow, modes, center, points, out):  # type: ignore[no-untyped-def]
     """What each unknown does to the place of each point (n, 3), float32, in the organ's axes, into
     ``out`` (n, 3, p), float64."""
@@ -111,7 +111,7 @@ def effects(flow, modes, center, points, out):  # type: ignore[no-untyped-def]
                 effect[POSE:] = row
 
 
-@numba.njit(cache=True, fastmath=True, nogil=True)
+@njit(fastmath=True, nogil=True)
 def residual_rows(modes, field, flow, pose, points, out):  # type: ignore[no-untyped-def]
     """``add_rows`` of any number of points (n, 3), into ``out`` (n, p + 1), float32."""
     buffers = block()
@@ -120,7 +120,7 @@ def residual_rows(modes, field, flow, pose, points, out):  # type: ignore[no-unt
         add_rows(modes, field, flow, pose, some, buffers, out[first : first + BLOCK])
 
 
-@numba.njit(cache=True, fastmath=True, nogil=True, inline="always")
+@njit(fastmath=True, nogil=True, inline="always")
 def add_rows(modes, field, flow, pose, points, buffers, rows):  # type: ignore[no-untyped-def]
     """What each unknown does to the signed distance of one block of points (n, 3; camera frame,
     mm), carried back, to a surface at rest; the distance itself stands in the last column of
@@ -153,7 +153,7 @@ def add_rows(modes, field, flow, pose, points, buffers, rows):  # type: ignore[n
         add_modes(modes, middles[0, p], middles[1, p], middles[2, p], inwards, row[POSE:-1])
 
 
-@numba.njit(cache=True, fastmath=True, nogil=True, inline="always")
+@njit(fastmath=True, nogil=True, inline="always")
 def distance_at(values, origin, spacing, x, y, z):  # type: ignore[no-untyped-def]
     """Distance and its slope along x, y, z at one place (mm), by trilinear interpolation."""
     zero, one, most = np.float32(0), np.float32(1), np.float32(1.001)
@@ -177,7 +177,7 @@ def distance_at(values, origin, spacing, x, y, z):  # type: ignore[no-untyped-de
     return f0 + (f1 - f0) * a, (f1 - f0) * per_cell, by_y * per_cell, by_z * per_cell
 
 
-@numba.njit(cache=True, fastmath=True, nogil=True)
+@njit(fastmath=True, nogil=True)
 def mark(field, label, points, labels, margin):  # type: ignore[no-untyped-def]
     """Give points inside the label, and every point the distance if it is the least so far."""
     values, origin, spacing = field.values_mm, field.origin_mm, np.float32(field.spacing_mm)
@@ -189,7 +189,7 @@ def mark(field, label, points, labels, margin):  # type: ignore[no-untyped-def]
         margin[p] = min(margin[p], abs(distance))
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def probabilities(margins, per_std, which):  # type: ignore[no-untyped-def]
     """That normal errors do not exceed margins (n,), 0 or more; ``per_std[which]`` of them make one
     standard deviation. Float32 (n,)."""
@@ -201,7 +201,7 @@ def probabilities(margins, per_std, which):  # type: ignore[no-untyped-def]
     return out
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def look_up(origin, nearest, points):  # type: ignore[no-untyped-def]
     """Which of some places is nearest to each point: that of the nearest node of a lattice, which
     may be another one where two are about as near; outside as on its border."""

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from tumortrack.core.compiled import numba
+from tumortrack.core.compiled import njit
 from tumortrack.registration.gauss_newton_kernels import rho, root_weight, turn
 from tumortrack.registration.kernels import POSE, DistanceField, distance_at
 
@@ -28,7 +28,7 @@ class RigidProblem(NamedTuple):
     damping: np.ndarray  # (6,), float64
 
 
-@numba.njit(cache=True, fastmath=True, nogil=True)
+@njit(fastmath=True, nogil=True)
 def descend_rigidly(problem, rotations, centres, costs):  # type: ignore[no-untyped-def]
     """Refine each start's rotation (s, 3, 3) and centre (s, 3) in place; the mean ``rho`` of the
     points' distances, by ``last_mm``, into ``costs`` (s,)."""
@@ -51,7 +51,7 @@ def descend_rigidly(problem, rotations, centres, costs):  # type: ignore[no-unty
             turn(rotation, centre, change)
 
 
-@numba.njit(cache=True, fastmath=True, nogil=True, inline="always")
+@njit(fastmath=True, nogil=True, inline="always")
 def _weighed_rows(problem, rotation, centre, width, columns):  # type: ignore[no-untyped-def]
     """What shift and turn do to each point's distance, and the distance last, times ``root_weight``
     (p + 1, n); the mean of ``rho``."""
@@ -77,7 +77,7 @@ def _weighed_rows(problem, rotation, centre, width, columns):  # type: ignore[no
     return cost / len(points)
 
 
-@numba.njit(cache=True, fastmath=True, nogil=True, inline="always")
+@njit(fastmath=True, nogil=True, inline="always")
 def _equations(problem, columns, curvature, gradient):  # type: ignore[no-untyped-def]
     """Curvature and gradient of the mean cost."""
     count = columns.shape[1]

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float32
 
-from tumortrack.core.compiled import numba
+from tumortrack.core.compiled import njit
 
 
 class Triangles(NamedTuple):
@@ -18,12 +18,12 @@ class Triangles(NamedTuple):
     colors: Float32[np.ndarray, "t 3"]
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _dot(one, two):  # type: ignore[no-untyped-def]
     return one[0] * two[0] + one[1] * two[1] + one[2] * two[2]
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def mean_normals(corner, sharers, first, weighted, facing, cosine):  # type: ignore[no-untyped-def]
     """Unit normals (f, 3, 3), float32, of faces' corners (3 f,), numbers of places: the mean of the
     ``weighted`` normals (f, 3) of the faces about the same place, ``sharers[first[p] :
@@ -43,7 +43,7 @@ def mean_normals(corner, sharers, first, weighted, facing, cosine):  # type: ign
     return out
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def nearest(seen, width, height, limit, perspective):  # type: ignore[no-untyped-def]
     """Greatest nearness up to the limit in each pixel (-inf: nothing) and whose it is (-1).
 
@@ -85,7 +85,7 @@ def nearest(seen, width, height, limit, perspective):  # type: ignore[no-untyped
     return near, winner
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _shares(seen, x, y, perspective):  # type: ignore[no-untyped-def]
     """How much of each corner there is in a pixel of a triangle."""
     ua, va, na = seen[0]
@@ -102,7 +102,7 @@ def _shares(seen, x, y, perspective):  # type: ignore[no-untyped-def]
     return a, b, c
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _mixed(of, shares):  # type: ignore[no-untyped-def]
     a, b, c = shares
     x = a * of[0, 0] + b * of[1, 0] + c * of[2, 0]
@@ -110,7 +110,7 @@ def _mixed(of, shares):  # type: ignore[no-untyped-def]
     return x, y, a * of[0, 2] + b * of[1, 2] + c * of[2, 2]
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def shade(picture, winner, seen, triangles, light, eye, opacity):  # type: ignore[no-untyped-def]
     """Lay each pixel's triangle (-1: none) over what is there; a diffuse light, a little gloss.
 

@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from tumortrack.core.compiled import numba
+from tumortrack.core.compiled import njit
 
 # Quantiles of the normal distribution: a hash's low 14 bits choose one. Scaled to variance 1.
 _QUANTILES = np.array([NormalDist().inv_cdf((n + 0.5) / 2**14) for n in range(2**14)])
@@ -30,7 +30,7 @@ _TO_UNIT = 2.0**-32
 _NO_RETURN = np.float32(np.nan)
 _BINS = 1024  # of the histogram in ``take_first``
 
-_jit = numba.njit(cache=True, nogil=True)  # no fast-math: a frame replays on every machine
+_jit = njit(nogil=True)  # no fast-math: a frame replays on every machine
 
 
 class Seen(NamedTuple):
@@ -41,7 +41,7 @@ class Seen(NamedTuple):
     starts: np.ndarray
 
 
-@numba.njit(cache=True, inline="always")
+@njit(inline="always")
 def _bits(key, counter):  # type: ignore[no-untyped-def]
     z = np.uint64(key) + np.uint64(counter + 1) * _GOLDEN
     z = (z ^ (z >> _S30)) * _MIX_1
@@ -102,7 +102,7 @@ def lose_grazing(true_mm, depths_mm, seen, key, grazing, pinhole):  # type: igno
                     depths_mm[i] = np.nan
 
 
-@numba.njit(cache=True, inline="always")
+@njit(inline="always")
 def _slope(before, here, after):  # type: ignore[no-untyped-def]
     if math.isnan(before):
         return np.float32(0) if math.isnan(after) else after - here
@@ -148,7 +148,7 @@ def fly(true_mm, depths_mm, seen, key, flying):  # type: ignore[no-untyped-def]
                     depths_mm[i] = z + (bits >> _S32) * _TO_UNIT * min(gap, flying_mm)
 
 
-@numba.njit(cache=True, inline="always")
+@njit(inline="always")
 def _weights(step):  # type: ignore[no-untyped-def]
     """Linear interpolation scaled so that the variance stays 1 between the nodes too."""
     first, second = np.empty(step, np.float32), np.empty(step, np.float32)

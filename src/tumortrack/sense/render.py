@@ -7,7 +7,7 @@ import math
 import numpy as np
 from jaxtyping import Bool, Float
 
-from tumortrack.core.compiled import numba
+from tumortrack.core.compiled import njit
 from tumortrack.core.types import DepthFrame, Intrinsics, Mesh
 from tumortrack.sense.camera import pinhole_of
 
@@ -31,7 +31,7 @@ def render_depth(
     return DepthFrame(np.divide(1, nearest, depth_mm, where=nearest > 0), intrinsics, stamp_ns)
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _z_buffer(vertices, faces, shape, pinhole):  # type: ignore[no-untyped-def]
     """The greatest 1/z in each pixel (h, w), 0 where nothing is hit."""
     fx, fy, cx, cy = pinhole
@@ -116,7 +116,7 @@ def _across(points: np.ndarray) -> np.ndarray:
     return np.divide(points[:, :2], points[:, 2:], np.full((len(points), 2), np.inf), where=before)
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _hidden(rays, rays_uv, vertices, vertices_uv, faces, columns, tolerance_mm):  # type: ignore[no-untyped-def]
     """Whether a triangle crosses each ray (n, 3), sorted by its first coordinate in the picture,
     nearer to the eye than its end by more than the tolerance (Moeller and Trumbore 1997,

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float64
 from scipy import ndimage
 
-from tumortrack.core.compiled import numba
+from tumortrack.core.compiled import njit
 from tumortrack.core.geometry import perpendicular, triangles_of, unit
 from tumortrack.core.types import Mesh
 from tumortrack.imaging.raster import voxelise
@@ -177,7 +177,7 @@ def _membrane(start: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarra
     return heights
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _relax(h, low, high, factor, sweeps):  # type: ignore[no-untyped-def]
     """Projected successive over-relaxation in place, until nothing moves by a micrometre."""
     ni, nj = h.shape

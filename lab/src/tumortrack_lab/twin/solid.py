@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from jaxtyping import Float, Float64, Int32
 
-from tumortrack.core.compiled import numba
+from tumortrack.core.compiled import njit
 from tumortrack_lab.tets import TetMesh
 
 if TYPE_CHECKING:
@@ -103,7 +103,7 @@ class NeoHookeanSolid:
         return (stiffness + swelling.T @ held @ swelling).tocsr()
 
 
-@numba.njit(cache=True)
+@njit()
 def _deformation(nodes, tet, inner, out):  # type: ignore[no-untyped-def]
     """Fill the deformation gradient, return its determinant."""
     for i in range(3):
@@ -118,7 +118,7 @@ def _deformation(nodes, tet, inner, out):  # type: ignore[no-untyped-def]
     )
 
 
-@numba.njit(cache=True)
+@njit()
 def _neo_hookean(nodes, rest, gradient):  # type: ignore[no-untyped-def]
     """The energy; fills its gradient."""
     tets, inner, volume, node_volume, shear, bulk = rest

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float, Float64, Int
 
-from tumortrack.core.compiled import numba
+from tumortrack.core.compiled import njit
 from tumortrack.core.mesh_query import contains, surface_distance
 from tumortrack.core.types import Mesh
 from tumortrack_lab.tets import Embedding, TetMesh
@@ -276,7 +276,7 @@ class Bed:
         return np.where(over, above, -outside) - self.sunk_mm, normal
 
 
-@numba.njit(cache=True)
+@njit()
 def _spline(values, places, out, slope):  # type: ignore[no-untyped-def]
     """Uniform cubic B-spline with the grid's values as its coefficients, and its gradient."""
     w, d = np.empty((3, 4)), np.empty((3, 4))

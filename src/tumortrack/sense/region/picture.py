@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tumortrack.core.compiled import numba
+from tumortrack.core.compiled import njit
 from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import DepthFrame, SensorCloud
@@ -27,7 +27,7 @@ STEPS = (
     *("colour", "plane", "flying", "thin", "other pieces"),
 )
 
-jit = numba.njit(cache=True, nogil=True)
+jit = njit(nogil=True)
 
 
 class RegionConfig(Config, frozen=True, kw_only=True):

@@ -18,7 +18,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float32
 
-from tumortrack.core.compiled import numba
+from tumortrack.core.compiled import njit
 from tumortrack.core.config import Config
 from tumortrack.core.errors import TumortrackError
 from tumortrack.simulate.deform.base import Points, View
@@ -94,7 +94,7 @@ _T1, _T2, _T3, _T4, _T5, _T6 = (
 
 # Fast math: the last digits (1e-5 mm) may depend on the processor, so that a scene replays bit for
 # bit on the machine that made it, and elsewhere to that precision.
-@numba.njit(cache=True, nogil=True, fastmath=True, inline="always")
+@njit(nogil=True, fastmath=True, inline="always")
 def _exp(x):  # type: ignore[no-untyped-def]
     """For -80 < x <= 0. Unlike the C library's it is vectorized over points."""
     binary = x * _LOG2_E
@@ -105,7 +105,7 @@ def _exp(x):  # type: ignore[no-untyped-def]
     return (np.float32(1.0) + power) * np.int32(exponent).view(np.float32)
 
 
-@numba.njit(cache=True, nogil=True, fastmath=True, inline="always")
+@njit(nogil=True, fastmath=True, inline="always")
 def _carry(points, centres, shifts, sigmas, out):  # type: ignore[no-untyped-def]
     n = len(points)
     x, y, z = np.empty((3, min(n, _BLOCK)), np.float32)
@@ -131,14 +131,14 @@ def _carry(points, centres, shifts, sigmas, out):  # type: ignore[no-untyped-def
 
 # Neither calls the other: whether a call is inlined, which in fast math moves last digits, depends
 # on whether this process compiled them or found them in numba's cache.
-@numba.njit(cache=True, nogil=True, fastmath=True)
+@njit(nogil=True, fastmath=True)
 def _drag(points, centres, shifts, sigmas):  # type: ignore[no-untyped-def]
     out = np.empty_like(points)
     _carry(points, centres, shifts, sigmas, out)
     return out
 
 
-@numba.njit(cache=True, nogil=True, fastmath=True)
+@njit(nogil=True, fastmath=True)
 def _centres(start, shifts, sigmas):  # type: ignore[no-untyped-def]
     """A vertex is dragged from where earlier drags left it."""
     centres = start.copy()

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float32
 
-from tumortrack.core.compiled import numba
+from tumortrack.core.compiled import njit
 
 _PER_SLOPE = 10  # steps, times the field's steepest slope: back within 0.01 mm of the start
 _FEWEST, _MOST = 3, 24
@@ -35,7 +35,7 @@ def steps_for(velocity: Float32[np.ndarray, "i j k 3"], spacing_mm: float) -> in
 
 
 # Fast math: see simulate.deform.drag; here no sum is long enough to matter more.
-@numba.njit(cache=True, fastmath=True, nogil=True)
+@njit(fastmath=True, nogil=True)
 def _steepest(velocity):  # type: ignore[no-untyped-def]
     """Largest difference between neighbouring nodes of a field (i, j, k, 3)."""
     most = np.float32(0)
@@ -51,7 +51,7 @@ def _steepest(velocity):  # type: ignore[no-untyped-def]
     return most
 
 
-@numba.njit(cache=True, fastmath=True, nogil=True)
+@njit(fastmath=True, nogil=True)
 def _apart(a, b):  # type: ignore[no-untyped-def]
     """Largest difference between two rows of numbers."""
     most = np.float32(0)
@@ -61,14 +61,14 @@ def _apart(a, b):  # type: ignore[no-untyped-def]
     return most
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def steps_of(velocity, spacing):  # type: ignore[no-untyped-def]
     """``steps_for``, for kernels."""
     slope = np.float64(_steepest(velocity)) / np.float64(spacing)
     return min(max(math.ceil(_PER_SLOPE * slope), _FEWEST), _MOST)
 
 
-@numba.njit(cache=True, fastmath=True, nogil=True)
+@njit(fastmath=True, nogil=True)
 def combine(modes, coefficients):  # type: ignore[no-untyped-def]
     """``modes @ coefficients``, (..., m) by (m,), float32. BLAS would wake threads that then wait
     busily, in the way of those that move points."""
@@ -82,7 +82,7 @@ def combine(modes, coefficients):  # type: ignore[no-untyped-def]
     return out.reshape(modes.shape[:-1])
 
 
-@numba.njit(cache=True, fastmath=True, nogil=True, error_model="numpy")
+@njit(fastmath=True, nogil=True, error_model="numpy")
 def advance(velocity, places, speeds, count, half, move):  # type: ignore[no-untyped-def]
     """One step of ``count`` points: ``places`` and ``speeds`` (3, BLOCK), in cells and mm per unit
     of time. A place moves by ``move`` times the speed at ``places + half * speeds``.
@@ -119,14 +119,14 @@ def advance(velocity, places, speeds, count, half, move):  # type: ignore[no-unt
             places[axis, p] += move * speed
 
 
-@numba.njit(cache=True, fastmath=True, nogil=True)
+@njit(fastmath=True, nogil=True)
 def block():  # type: ignore[no-untyped-def]
     """Buffers for the places, speeds and places halfway of one block of points."""
     room = np.empty((3, 3, BLOCK), np.float32)
     return room[0], room[1], room[2]
 
 
-@numba.njit(cache=True, fastmath=True, nogil=True)
+@njit(fastmath=True, nogil=True)
 def enter(points, origin, spacing, places):  # type: ignore[no-untyped-def]
     """Write up to ``BLOCK`` points (n, 3), mm, as places in cells."""
     per_cell = np.float32(1) / spacing
@@ -135,7 +135,7 @@ def enter(points, origin, spacing, places):  # type: ignore[no-untyped-def]
             places[axis, p] = (points[p, axis] - origin[axis]) * per_cell
 
 
-@numba.njit(cache=True, fastmath=True, nogil=True)
+@njit(fastmath=True, nogil=True)
 def travel(velocity, spacing, steps, count, places, speeds, middles):  # type: ignore[no-untyped-def]
     """Move ``count`` places of a block for one unit of time; ``middles`` are those halfway.
 
@@ -157,7 +157,7 @@ def travel(velocity, spacing, steps, count, places, speeds, middles):  # type: i
         advance(velocity, places, speeds, count, half, dt)
 
 
-@numba.njit(cache=True, fastmath=True, nogil=True)
+@njit(fastmath=True, nogil=True)
 def follow(field, points, steps):  # type: ignore[no-untyped-def]
     """Where points (n, 3), mm, float32, are after one unit of time in a velocity field; see
     ``travel``."""
@@ -174,7 +174,7 @@ def follow(field, points, steps):  # type: ignore[no-untyped-def]
     return out
 
 
-@numba.njit(cache=True, fastmath=True, nogil=True)
+@njit(fastmath=True, nogil=True)
 def project(field, points, directions):  # type: ignore[no-untyped-def]
     """Trilinear values (n, m) of modes at points (n, 3), mm, each along a direction (n, 3); all
     float32. Beyond the lattice those of its nearest border."""
@@ -190,7 +190,7 @@ def project(field, points, directions):  # type: ignore[no-untyped-def]
     return out
 
 
-@numba.njit(cache=True, fastmath=True, nogil=True, inline="always")
+@njit(fastmath=True, nogil=True, inline="always")
 def add_modes(modes, x, y, z, direction, out):  # type: ignore[no-untyped-def]
     """Add the modes at a place in cells, along a direction (3,), to ``out`` (m,)."""
     zero, one, most = np.float32(0), np.float32(1), np.float32(1.001)

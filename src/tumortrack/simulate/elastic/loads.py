@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
-from tumortrack.core.compiled import numba
+from tumortrack.core.compiled import njit
 from tumortrack.core.geometry import perpendicular, unit
 from tumortrack.core.process import parallel_map
 from tumortrack.simulate.elastic.modes import ReducedModel
@@ -103,7 +103,7 @@ class ReducedProblem:
 
 # Own loops for small matrices: BLAS would wake every thread for each product, which on a busy
 # machine takes many times longer than the product; and most springs are open.
-@numba.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _equilibrium(stiffness, forces, rows, depth, springs):  # type: ignore[no-untyped-def]
     z = np.zeros(len(forces))
     for step in range(_MOST_STEPS):
@@ -128,7 +128,7 @@ def _equilibrium(stiffness, forces, rows, depth, springs):  # type: ignore[no-un
     return z, False
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _add_springs(matrix, right, rows, loads, springs):  # type: ignore[no-untyped-def]
     """matrix += rows' diag(springs) rows, of which the lower triangle is all that ``_solve`` asks
     for, and right += rows' loads, in place."""
@@ -142,7 +142,7 @@ def _add_springs(matrix, right, rows, loads, springs):  # type: ignore[no-untype
                 matrix[a, b] += force * rows[p, b]
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _solve(matrix, right):  # type: ignore[no-untyped-def]
     """right = inverse(matrix) right, by Cholesky; both are overwritten."""
     n = len(right)
