@@ -13,6 +13,7 @@ from elastic_objects import CENTER, RADII
 from tumortrack.models.config import GaussNewtonConfig
 from tumortrack.models.in_distribution import RIVAL_COST
 from tumortrack.registration import discrepancy_kernels as kernels
+from tumortrack.registration.choose import likeliest
 from tumortrack.registration.discrepancy import (
     AMPLITUDES_MM,
     LENGTH_MM,
@@ -20,10 +21,11 @@ from tumortrack.registration.discrepancy import (
     _grouped,
     fit_discrepancy,
 )
-from tumortrack.registration.gauss_newton import RegistrationResult, posterior, refine
+from tumortrack.registration.gauss_newton import RegistrationResult
 from tumortrack.registration.looks import Looks
+from tumortrack.registration.uncertainty import posterior
 from tumortrack.sense.noise import CalibrationConfig
-from warp_objects import ANATOMY, method, nudged, placed, shape
+from warp_objects import ANATOMY, method, nudged, placed, refined
 
 CONFIG = GaussNewtonConfig()
 VERTICES = ANATOMY.organ.vertices_mm
@@ -44,7 +46,7 @@ def seen(bump_mm=0.0, width_mm=12.0):
 
 
 def judged(points):
-    return posterior(refine(shape(), points, START, CONFIG).motion, Looks.of([points]), CONFIG)
+    return posterior(refined(points, START, CONFIG).motion, Looks.of([points]), CONFIG)
 
 
 @pytest.fixture(scope="module")
@@ -77,7 +79,7 @@ def test_the_covariance_is_that_of_a_plain_gaussian_process():
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     slopes = np.column_stack([-normals, rng.normal(size=(60, 9))])
     bump = 2 * np.exp(-(np.linalg.norm(places - places[0], axis=1) ** 2) / (2 * 15**2))
-    rows = np.column_stack([slopes, bump * normals[:, 2]]).astype(np.float32)
+    rows = np.column_stack([slopes, bump * normals[:, 2]])
     prior, effects = np.diag(rng.uniform(0.2, 2.0, 12)), rng.normal(size=(20, 3, 12))
     covariance, process = fit_discrepancy(rows, places, prior, np.zeros(12), 100.0)
     assert process.amplitude_mm > 0
@@ -134,13 +136,18 @@ def test_groups_are_those_of_the_nearest_of_points_that_lie_far_apart():
 
 
 def fit(motion, cost):
-    return RegistrationResult(motion, cost, 0.0, cost, np.zeros(3), 1, np.zeros(6))
+    looks = Looks.of([np.zeros((3, 3))])
+    return RegistrationResult(motion, looks, cost, 0.0, cost, np.zeros(3), 1, np.zeros(6))
+
+
+def best_of(fits):
+    return likeliest(fits, method().prior)
 
 
 def test_two_minima_widen_the_covariance_by_their_distance():
     motion = replace(placed(), covariance=1e-4 * np.eye(26))
     away = replace(motion, centre_mm=motion.centre_mm + [0, 6.0, 0])
-    best = method().likeliest([fit(away, 12.0), fit(motion, 10.0)])
+    best = best_of([fit(away, 12.0), fit(motion, 10.0)])
     share = math.exp(-1) / (1 + math.exp(-1))
     assert best.cost == 10
     assert [rival.cost for rival in best.rivals] == [12.0]
@@ -153,11 +160,11 @@ def test_neither_the_same_minimum_nor_an_unlikely_one_is_a_rival():
     motion = replace(placed(), covariance=0.01 * np.eye(26))
     same = replace(motion, centre_mm=motion.centre_mm + [0, 0.1, 0])
     away = replace(motion, centre_mm=motion.centre_mm + [0, 6.0, 0])
-    assert method().likeliest([fit(motion, 10.0), fit(same, 10.5)]).rivals == ()
-    assert method().likeliest([fit(motion, 10.0), fit(away, 10.1 + RIVAL_COST)]).rivals == ()
-    first = method().likeliest([fit(motion, 10.0), fit(away, 11.0)])
-    assert len(method().likeliest([first, fit(away, 11.5)]).rivals) == 1  # the same one again
-    turned = method().likeliest([first, fit(away, 9.0)])  # one of them won after all
+    assert best_of([fit(motion, 10.0), fit(same, 10.5)]).rivals == ()
+    assert best_of([fit(motion, 10.0), fit(away, 10.1 + RIVAL_COST)]).rivals == ()
+    first = best_of([fit(motion, 10.0), fit(away, 11.0)])
+    assert len(best_of([first, fit(away, 11.5)]).rivals) == 1  # the same one again
+    turned = best_of([first, fit(away, 9.0)])  # one of them won after all
     assert [rival.cost for rival in turned.rivals] == [10.0]
 
 

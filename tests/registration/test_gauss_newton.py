@@ -23,18 +23,21 @@ from tumortrack.imaging.raster import label_grid, winding_numbers
 from tumortrack.models.config import GaussNewtonConfig
 from tumortrack.registration import gauss_newton_kernels as kernels
 from tumortrack.registration import registration
-from tumortrack.registration.gauss_newton import GaussNewton, _prior, refine
+from tumortrack.registration.gauss_newton import GaussNewton, _prior
 from tumortrack.registration.kernels import Flow, Pose, look_up, probabilities
 from tumortrack.registration.locator import RegistrationLocator, nearest_lookup
+from tumortrack.registration.looks import Looks
 from tumortrack.simulate.elastic.flow import BLOCK, LatticeField, steps_for
 from tumortrack.tracking.model_files import load_model
 from warp_objects import (
     ANATOMY,
     PLACE_MM,
     TURNED,
+    descent,
     method,
     nudged,
     placed,
+    refined,
     residual_rows,
     shape,
     with_slope,
@@ -193,7 +196,7 @@ def plainly_refined(points, start, config):
 def test_a_refinement_is_that_of_a_plain_loop(steps):
     config, start = GaussNewtonConfig(steps=steps), nudged(placed(), [3, -2, 5], [0.1, -0.05, 0.1])
     points = placed().carry(ANATOMY.organ.vertices_mm[::3])
-    fit = refine(shape(), points, start, config)
+    fit = refined(points, start, config)
     (rotation, centre, coefficients), cost, gone = plainly_refined(points, start, config)
     assert fit.steps == gone
     assert gone < 20
@@ -207,8 +210,8 @@ def test_a_refinement_is_that_of_a_plain_loop(steps):
 def test_a_descent_goes_on_where_it_was_stopped():
     points = placed().carry(ANATOMY.organ.vertices_mm[::3])
     start = nudged(placed(), [3, -2, 5], [0.1, -0.05, 0.1])
-    whole = refine(shape(), points, start, GaussNewtonConfig())
-    halves = GaussNewton(shape(), points, start, GaussNewtonConfig())
+    whole = refined(points, start)
+    halves = descent(points, start)
     halves.run(2)
     assert halves.cost > 2 * whole.cost
     for steps in (4, 0, 20, 20, 0):
@@ -224,9 +227,9 @@ def test_the_best_of_many_starts_wins_wherever_it_stands():
     points = placed().carry(ANATOMY.organ.vertices_mm[::3])
     near = nudged(placed(), [3, -2, 5], [0.1, -0.05, 0.1])
     far = [nudged(placed(), [0, 0, 30.0 * n], [0, 0, 1.0 * n]) for n in (1, 2, 3)]
-    alone = refine(shape(), points, near, GaussNewtonConfig())
+    alone = refined(points, near)
     for starts in ([near, *far], [*far, near]):
-        fit = method().best_fit(points, starts)
+        fit = method().best_fit(Looks.of([points]), starts)
         # A little less where a start beside it ends nearer to the minimum.
         assert 0.97 * alone.cost < fit.cost <= alone.cost
 
@@ -244,12 +247,12 @@ def test_starts_that_are_far_behind_are_given_up(monkeypatch):
     near = nudged(placed(), [3, -2, 5], [0.1, -0.05, 0.1])
     far = nudged(placed(), [60, 0, 60], [0, 0, 1.0])
     steady = GaussNewtonConfig(enough_mm=0)  # never settles
-    method(steady).best_fit(points, [far, near])
+    method(steady).best_fit(Looks.of([points]), [far, near])
     most = {}
-    for descent, steps in gone[:3]:  # the two hypotheses; the rest begins beside the better one
-        most[descent] = max(steps, most.get(descent, 0))
+    for tried, steps in gone[:3]:  # the two hypotheses; the rest begins beside the better one
+        most[tried] = max(steps, most.get(tried, 0))
     assert sorted(most.values()) == [6, steady.steps]
-    assert min(most, key=lambda descent: descent.cost) is max(most, key=most.__getitem__)
+    assert min(most, key=lambda tried: tried.cost) is max(most, key=most.__getitem__)
 
 
 def test_labels_and_margins_are_those_of_the_distances():

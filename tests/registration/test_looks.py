@@ -24,9 +24,10 @@ from tumortrack.models.config import GaussNewtonConfig
 from tumortrack.occupancy.locator import OccupancyLocator
 from tumortrack.registration import looks as module
 from tumortrack.registration.discrepancy import fit_discrepancy
-from tumortrack.registration.gauss_newton import posterior, refine
+from tumortrack.registration.gauss_newton import refine
 from tumortrack.registration.looks import CAMERA_STD, Looks, seen_from_first
 from tumortrack.registration.search import PosePrior, Search
+from tumortrack.registration.uncertainty import posterior
 from tumortrack.sense.camera import d405
 from tumortrack.sense.files import depth_png, intrinsics_json, read_poses
 from tumortrack.sense.region import RegionConfig
@@ -162,16 +163,16 @@ def test_one_look_is_what_it_was(tracker):
     points = points_of(image(placed(), np.eye(4))).points_mm[::20]
     looks, registration = Looks.of([points]), tracker.model.registration
     assert looks.points_mm is points
-    fit, same = registration.register(looks)
-    assert same is looks
-    alone = registration.best_fit(points, registration.search.starts(looks))
+    fit = registration.register(looks)
+    assert fit.looks is looks
+    alone = registration.best_fit(looks, registration.search.starts(looks))
     np.testing.assert_array_equal(fit.motion.carry(INNER), alone.motion.carry(INNER))
     assert fit.cost == alone.cost
     config, motion, body = registration.config, alone.motion, alone.motion.shape.body
     prior = np.diag([config.shift_mm**2] * 3 + [config.turn_rad**2] * 3 + [0.0] * len(body.mean))
     prior[6:, 6:] = body.covariance
     off = np.concatenate([np.zeros(6), body.mean - motion.coefficients])
-    rows, rest_ct = motion.residual_rows(points), motion.back(points)
+    rows, rest_ct = motion.residual_rows(points).astype(float), motion.back(points)
     covariance, process = fit_discrepancy(rows, rest_ct, prior, off, config.last_mm)
     judged = posterior(motion, looks, config)
     np.testing.assert_array_equal(judged.covariance, covariance)
@@ -184,7 +185,7 @@ def test_a_correction_undoes_a_cameras_error_and_leaves_the_rest():
     seen = [points_of(image(truth, pose)).points_mm[::25] for pose in (np.eye(4), real)]
     looks = Looks.of(seen, [around(60)])
     for _ in range(4):
-        fit = refine(shape(), looks.points_mm, truth, looks.weighed(config))
+        fit = refine(shape(), looks, truth, config)
         looks = looks.corrected(fit.motion, config)
     np.testing.assert_array_equal(looks.points_mm[looks.look == 0], seen[0])
     np.testing.assert_allclose(

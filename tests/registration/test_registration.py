@@ -21,18 +21,21 @@ from tumortrack.core.estimate import Motion
 from tumortrack.core.mesh_query import labels_of, surface_distance
 from tumortrack.core.types import Mesh
 from tumortrack.models.config import GaussNewtonConfig
-from tumortrack.registration.gauss_newton import GaussNewton, _prior, refine, size_of
+from tumortrack.registration.gauss_newton import _prior
 from tumortrack.registration.looks import Looks
 from tumortrack.registration.motion import ElasticMotion
-from tumortrack.registration.registration import _turned_starts
 from tumortrack.registration.rest_shape import RestShape, distance_of
+from tumortrack.registration.search import turned_starts
+from tumortrack.registration.uncertainty import apparent_size
 from warp_objects import (
     ANATOMY,
     PLACE_MM,
     TURNED,
+    descent,
     method,
     nudged,
     placed,
+    refined,
     residual_rows,
     shape,
     with_slope,
@@ -205,13 +208,13 @@ def test_standard_deviations_are_those_of_random_motions():
 
 def test_more_points_make_surer_and_a_seen_side_is_surer_than_a_hidden_one():
     def deviations(points):
-        return refine(shape(), points, START, GaussNewtonConfig()).motion.std_mm(inside(100))
+        return refined(points, START).motion.std_mm(inside(100))
 
     few, more = (deviations(surface(placed(), n)) for n in (60, 300))
     assert np.all(more < few)
     vertices = ORGAN.vertices_mm
     one_end = vertices[vertices[:, 2] > CENTER[2] + 10][::4]
-    spread = refine(shape(), placed().carry(one_end), START, GaussNewtonConfig()).motion
+    spread = refined(placed().carry(one_end), START).motion
     ends = CENTER + np.array([[0, 0, 40.0], [0, 0, -40.0]])
     seen, hidden = spread.std_mm(ends)
     assert hidden > 1.5 * seen
@@ -245,7 +248,7 @@ def test_a_known_pose_and_state_are_found_again():
     truth = placed()
     points = surface(truth, 2500)
     seen, unseen = points[:1200], points[1200:]
-    fit = refine(shape(), seen, START, GaussNewtonConfig())
+    fit = refined(seen, START)
     target = inside(200)
     before = np.linalg.norm(START.carry(target) - truth.carry(target), axis=1)
     after = np.linalg.norm(fit.motion.carry(target) - truth.carry(target), axis=1)
@@ -256,18 +259,18 @@ def test_a_known_pose_and_state_are_found_again():
         off, _ = with_slope(distances, motion.back(unseen).astype(np.float32))
         assert least < np.abs(off).mean() < most
     assert np.abs(fit.motion.coefficients - shape().body.mean).max() > 1
-    exact = refine(shape(), surface(placed(), 1200), placed(), GaussNewtonConfig())
+    exact = refined(surface(placed(), 1200), placed())
     assert np.abs(exact.distances_mm).mean() < 0.15  # and the truth stays
 
 
 def test_a_fifth_of_strays_does_not_matter():
     truth, target = placed(), inside(200)
     points = surface(truth, 1000)
-    clean = refine(shape(), points, START, GaussNewtonConfig())
+    clean = refined(points, START)
     spoiled = points.copy()
     strays = np.random.default_rng(6).permutation(1000)[:200]
     spoiled[strays] = PLACE_MM + np.random.default_rng(7).uniform(-80, 80, (200, 3))
-    fit = refine(shape(), spoiled, START, GaussNewtonConfig())
+    fit = refined(spoiled, START)
     apart = fit.motion.carry(target) - clean.motion.carry(target)
     assert np.linalg.norm(apart, axis=1).mean() < 0.4
     assert np.abs(fit.distances_mm[strays]).mean() > 10
@@ -278,7 +281,8 @@ def test_a_wrong_scale_of_the_camera_shows_in_the_fit(times):
     config = GaussNewtonConfig()
     points = times * surface(placed(), 1000)
     start = dataclasses.replace(START, centre_mm=times * START.centre_mm)
-    found, gain = size_of(refine(shape(), points, start, config), Looks.of([points]), config)
+    fit = refined(points, start, config)
+    found, gain = apparent_size(fit.motion, fit.looks, config)
     assert abs(found - times) < 0.6 * abs(times - 1) + 0.01  # the robust kernel reads too little
     assert (gain > 9.2) == (times != 1)
 
@@ -287,23 +291,23 @@ def test_every_step_lowers_the_cost_and_enough_steps_end():
     points = surface(placed(), 500)
     steady = GaussNewtonConfig(steps=40, first_mm=3.0, last_mm=3.0)
     fits = [
-        refine(shape(), points, START, msgspec.structs.replace(steady, steps=n))
-        for n in (0, 1, 2, 4, 40)
+        refined(points, START, msgspec.structs.replace(steady, steps=n)) for n in (0, 1, 2, 4, 40)
     ]
     costs = [fit.cost for fit in fits]
     assert all(after < before for before, after in pairwise(costs[:4]))
     assert costs[4] <= costs[3] * 1.001
     assert costs[4] < 0.1 * costs[0]
     assert fits[4].steps < 40
-    best = method(steady).best_fit(points, [nudged(placed(), [0, 0, 60], [0, 0, 0]), START])
-    alone = refine(shape(), points, START, steady)
+    starts = [nudged(placed(), [0, 0, 60], [0, 0, 0]), START]
+    best = method(steady).best_fit(Looks.of([points]), starts)
+    alone = refined(points, START, steady)
     assert 0.97 * alone.cost < best.cost <= alone.cost
 
 
 def test_starts_beside_a_fit_are_as_unlikely_as_was_asked_and_lead_back_to_it():
     points = surface(placed(), 500)
-    fit = refine(shape(), points, START, GaussNewtonConfig())
-    starts = _turned_starts(fit)
+    fit = refined(points, START)
+    starts = turned_starts(fit.motion, fit.moved)
     precision = np.linalg.inv(fit.motion.covariance)
     turns = []
     for start, moved in starts:
@@ -313,7 +317,7 @@ def test_starts_beside_a_fit_are_as_unlikely_as_was_asked_and_lead_back_to_it():
         assert np.sqrt(off @ precision @ off) == pytest.approx(4.5)
         np.testing.assert_allclose(moved - fit.moved, off[:6], atol=1e-9)
         turns.append(turn)
-        again = GaussNewton(shape(), points, start, GaussNewtonConfig(), moved)
+        again = descent(points, start, GaussNewtonConfig(), moved)
         again.run(20)
         assert again.cost == pytest.approx(fit.cost, rel=0.03)
     turns = np.array(turns)
@@ -324,7 +328,7 @@ def test_starts_beside_a_fit_are_as_unlikely_as_was_asked_and_lead_back_to_it():
 def test_a_slow_general_optimiser_finds_the_same():
     config = GaussNewtonConfig(steps=60, enough_mm=1e-4)
     points = surface(placed(), 150) + np.random.default_rng(8).normal(0, 0.5, (150, 3))
-    fit = refine(shape(), points, START, config)
+    fit = refined(points, START, config)
     root = np.linalg.cholesky(_prior(shape(), config)).T
     weight = min(config.n_effective / len(points), 1.0) / config.sigma_mm**2
 
@@ -357,12 +361,14 @@ import numpy as np
 from tumortrack.registration.motion import ElasticMotion
 from tumortrack.models.config import GaussNewtonConfig
 from tumortrack.registration.gauss_newton import refine
+from tumortrack.registration.looks import Looks
 from tumortrack.registration.rest_shape import RestShape
 given = dict(np.load(sys.argv[1]))
 points, rotation, centre = (given.pop(name) for name in ("points", "rotation", "centre"))
 shape = RestShape.from_arrays(given, 2)
 start = ElasticMotion(shape, rotation, centre, shape.body.mean)
-print(refine(shape, points, start, GaussNewtonConfig(steps=3)).motion.coefficients.tobytes().hex())
+fit = refine(shape, Looks.of([points]), start, GaussNewtonConfig(steps=3))
+print(fit.motion.coefficients.tobytes().hex())
 """
 
 

@@ -14,6 +14,8 @@ from tumortrack.models.config import GaussNewtonConfig, RegistrationConfig
 from tumortrack.models.folder import save_model
 from tumortrack.registration import kernels
 from tumortrack.registration.build import build_model
+from tumortrack.registration.gauss_newton import GaussNewton, RegistrationResult, refine
+from tumortrack.registration.looks import Looks
 from tumortrack.registration.motion import ElasticMotion
 from tumortrack.registration.registration import Registration
 from tumortrack.registration.rest_shape import RestShape, shape_of
@@ -73,6 +75,16 @@ def with_slope(field, points) -> tuple[np.ndarray, np.ndarray]:
     lattice = field.values_mm, field.origin_mm, np.float32(field.spacing_mm)
     found = np.array([kernels.distance_at(*lattice, *point) for point in points], np.float32)
     return found[:, 0], found[:, 1:]
+
+
+def refined(points_mm, start, config=GaussNewtonConfig()) -> RegistrationResult:  # noqa: B008
+    """The fit of this organ to one camera's points."""
+    return refine(shape(), Looks.of([points_mm]), start, config)
+
+
+def descent(points_mm, start, config=GaussNewtonConfig(), moved=None) -> GaussNewton:  # noqa: B008
+    """The same, before its first step."""
+    return GaussNewton(shape(), Looks.of([points_mm]), start, config, moved)
 
 
 def method(config: GaussNewtonConfig | None = None, tilt_degrees: float = 30.0) -> Registration:

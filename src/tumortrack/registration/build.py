@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import count
 from typing import Any
 
@@ -22,7 +22,7 @@ from tumortrack.core.process import parallel_map
 from tumortrack.core.types import Anatomy
 from tumortrack.models.config import RegistrationConfig
 from tumortrack.models.in_distribution import InDistributionRange, fit_mm, spread_mm
-from tumortrack.registration.gauss_newton import RegistrationResult, posterior, refine
+from tumortrack.registration.gauss_newton import RegistrationResult, refine
 from tumortrack.registration.looks import Looks
 from tumortrack.registration.model import (
     RegistrationModel,
@@ -33,6 +33,7 @@ from tumortrack.registration.motion import ElasticMotion
 from tumortrack.registration.registration import Registration
 from tumortrack.registration.rest_shape import distances_of, shape_of
 from tumortrack.sense.cloud import thin_cloud
+from tumortrack.sense.noise import CalibrationConfig
 from tumortrack.simulate.scene import SceneRecipe, Simulator, body_for
 from tumortrack.simulate.scene_folder import draw_targets
 
@@ -101,22 +102,20 @@ def build_model(
         scenes.append(_Scene(Looks.of([cloud.points_mm]), inner_mm, place))
         progress(3 + index, steps)
     registration = Registration(rest, config.refine, pose_prior(config.scene.pose, up_lps))
-    nearby = parallel_map(
-        lambda one: refine(rest, one.looks.points_mm, one.place, config.refine), scenes
-    )
+    nearby = parallel_map(lambda one: refine(rest, one.looks, one.place, config.refine), scenes)
     pairs = list(zip(scenes, nearby, strict=True))
     right = [fit.cost for one, fit in pairs if one.off_mm(fit.motion, inner_ct) <= FAR_MM]
     usual_cost = float(np.percentile(right or [fit.cost for fit in nearby], _USUAL))
     done = count(3 + config.scenes)
 
     def found(one: _Scene) -> RegistrationResult:
-        fit = registration.register(one.looks)[0]
+        fit = registration.register(one.looks)
         progress(next(done), steps)
         return fit
 
     # A scene a thread: the parts of a search wait for each other.
     fits = parallel_map(found, scenes[: config.searched])
-    std_scale, checked = _judged(scenes, fits, config, inner_ct)
+    std_scale, checked = _judged(registration, scenes, fits, config.scene.calibration, inner_ct)
     spreads = [spread_mm(one.looks.points_mm) for one in scenes]
     fits_mm = [fit_mm(np.abs(fit.distances_mm)) for fit in fits]
     known = InDistributionRange(
@@ -133,16 +132,16 @@ def build_model(
 
 
 def _judged(
+    registration: Registration,
     scenes: list[_Scene],
     fits: list[RegistrationResult],
-    config: RegistrationConfig,
+    calibration: CalibrationConfig,
     inner_ct: Float64[np.ndarray, "m 3"],
 ) -> tuple[float, dict[str, float]]:
     """By how much standard deviations have to be larger; how far off the answers were."""
     errors, nearest, ratios = [], [], []
     for one, fit in zip(scenes, fits, strict=False):
-        motion = posterior(fit.motion, one.looks, config.refine)
-        known_mm2 = replace(motion, calibration=config.scene.calibration).covariance_mm2(inner_ct)
+        known_mm2 = registration.uncertain(fit, calibration).covariance_mm2(inner_ct)
         assert known_mm2 is not None
         away = fit.motion.carry(inner_ct) - one.inner_mm
         errors.append(one.off_mm(fit.motion, inner_ct))

@@ -77,7 +77,7 @@ def products(
 
 
 def fit_discrepancy(
-    rows: Float32[np.ndarray, "n q"],
+    rows: Float64[np.ndarray, "n q"],
     rest_ct: Float64[np.ndarray, "n 3"],
     prior: Float64[np.ndarray, "p p"],
     off: Float64[np.ndarray, " p"],
@@ -95,7 +95,7 @@ def fit_discrepancy(
     least = min(_GROUPS, len(distances))
     nearest_mm = np.partition(distances, least - 1)[least - 1]
     kept = distances <= max(FARTHEST * width_mm, nearest_mm)
-    rows, rest_ct = rows[kept].astype(float), rest_ct[kept]
+    rows, rest_ct = rows[kept], rest_ct[kept]
     weights = 1 / (1 + (rows[:, -1] / width_mm) ** 2) ** 2
     group = _grouped(rest_ct)
     shares = (group == np.arange(group.max() + 1)[:, None]) * weights

@@ -24,15 +24,16 @@ from tumortrack.core.report import (
 )
 from tumortrack.core.types import Anatomy, CameraLabels, Look, Mesh, OccupancyCloud, SensorCloud
 from tumortrack.imaging.raster import label_grid
-from tumortrack.models.in_distribution import check_in_distribution, check_likely
 from tumortrack.models.report import Frame, describe_parts, grid_over
 from tumortrack.registration import kernels
+from tumortrack.registration.choose import likeliest
 from tumortrack.registration.discrepancy import FARTHEST
-from tumortrack.registration.gauss_newton import RegistrationResult, posterior, size_of
+from tumortrack.registration.gauss_newton import RegistrationResult
 from tumortrack.registration.looks import Looks
 from tumortrack.registration.model import RegistrationModel
 from tumortrack.registration.motion import ElasticMotion, blend
 from tumortrack.registration.search import PosePrior, apart_mm
+from tumortrack.registration.uncertainty import apparent_size
 
 QUERIES = 40_000  # as many as the paper asks
 CARRIED = 20_000  # points of the undeformed organ that live estimates carry along
@@ -117,8 +118,8 @@ class RegistrationLocator:
         """See ``tracking.tracker.Tracker.locate``."""
         frame = Frame(self._model, cloud, seed, np.random.default_rng(seed))
         looks = self._looks(frame, others)
-        fit, looks = self._registration.register(looks, None, frame.stage)
-        size, placed = self._size(looks, fit), self._checked(looks, fit, frame)
+        fit = self._registration.register(looks, None, frame.stage)
+        size, placed = self._size(fit), self._checked(fit, frame)
         organ = placed.meshes[self._model.parts[0]]
         with frame.stage("fine"):
             inside = self._drawn(placed, organ, cloud.stamp_ns, frame.rng)
@@ -127,7 +128,7 @@ class RegistrationLocator:
             labels = label_grid(Anatomy(tuple(placed.meshes.values())), camera_from_index, shape)
         voxel_mm = float(camera_from_index[0, 0])
         prior, more = self._registration.prior, {"size": size, "voxel_mm": voxel_mm}
-        report = self._report(frame, placed, inside, prior, looks, others, **more)
+        report = self._report(frame, placed, inside, prior, others, **more)
         volume = CameraLabels(labels, camera_from_index)
         made = Estimate(inside, volume, placed.meshes, report, placed.motion)
         return replace(made, structures=placed.structures)
@@ -151,19 +152,18 @@ class RegistrationLocator:
                 starts = [start, *(rival for rival, _ in start.rivals)]
                 found += [self._registration.follow(looks, one, self._near) for one in starts]
         method = self._turned_over if how.either_side else self._registration
-        best, doubted = method.likeliest_corrected(found) if found else None, True
-        if best is not None and isinstance(start, ElasticMotion):
-            motion = best[0].motion
-            doubted = best[0].cost > usual or apart_mm(motion, start) > _JUMP_MM
+        fit, doubted = likeliest(found, method.prior) if found else None, True
+        if fit is not None and isinstance(start, ElasticMotion):
+            motion = fit.motion
+            doubted = fit.cost > usual or apart_mm(motion, start) > _JUMP_MM
             # From one frame to the next nobody turns an organ over.
             if not doubted and not self._registration.prior.excludes(motion.rotation):
                 method = self._registration
-                best = method.likeliest_corrected(found)
+                fit = likeliest(found, method.prior)
         if doubted or how.thorough:
-            best = method.register(looks, best, frame.stage, again=not doubted)
-        assert best is not None
-        fit, looks = best
-        size, unsmoothed, lag_s = self._size(looks, fit), fit.motion, 0.0
+            fit = method.register(looks, fit, frame.stage, again=not doubted)
+        assert fit is not None
+        size, unsmoothed, lag_s = self._size(fit), fit.motion, 0.0
         if last is not None and isinstance(last.motion, ElasticMotion) and how.smoothing_s > 0:
             past_s = (cloud.stamp_ns - last.cloud.stamp_ns) * 1e-9
             share = -math.expm1(-past_s / how.smoothing_s)
@@ -172,12 +172,12 @@ class RegistrationLocator:
             if np.linalg.norm(behind, axis=1).max() < _BEHIND_MM:
                 fit = replace(fit, motion=smooth)
                 lag_s = past_s * (1 - share) / share  # of what moves steadily
-        placed = self._checked(looks, fit, frame)
+        placed = self._checked(fit, frame)
         with frame.stage("carry"):
             inside = self._carry(placed, cloud.stamp_ns)
         smoothing = SmoothingReport(time_s=how.smoothing_s, lag_ms=1000 * lag_s)
         more = {"size": size, "smoothing": smoothing}
-        report = self._report(frame, placed, inside, method.prior, looks, others, **more)
+        report = self._report(frame, placed, inside, method.prior, others, **more)
         made = Estimate(inside, None, placed.meshes, report, placed.motion, unsmoothed)
         return replace(made, structures=placed.structures)
 
@@ -194,30 +194,22 @@ class RegistrationLocator:
         cloud = SensorCloud(rest.carry(organ.vertices_mm))
         points = Frame(self._model, cloud, 0, np.random.default_rng(0)).points_mm
         looks = Looks.of([points])
-        fit = self._registration.best_fit(points, [*self._registration.search.starts(looks), rest])
-        self._carry(self._moved(looks, fit), 0)
+        fit = self._registration.best_fit(looks, [*self._registration.search.starts(looks), rest])
+        self._carry(self._moved(fit), 0)
 
-    def _size(self, looks: Looks, fit: RegistrationResult) -> SizeFit:
-        times, gain = size_of(fit, looks, self._registration.config)
+    def _size(self, fit: RegistrationResult) -> SizeFit:
+        times, gain = apparent_size(fit.motion, fit.looks, self._registration.config)
         return SizeFit(times=times, gain=gain)
 
-    def _checked(self, looks: Looks, fit: RegistrationResult, frame: Frame) -> _Registered:
+    def _checked(self, fit: RegistrationResult, frame: Frame) -> _Registered:
         """What a fit says, if it can be this organ's."""
-        known, distances_mm = self._model.in_distribution, np.abs(fit.distances_mm)
-        for n in range(looks.count):
-            mine = looks.look == n
-            points, off_mm = looks.points_mm[mine], distances_mm[mine]
-            check_in_distribution(known, points, off_mm, registered=True)
-        check_likely(fit.motion.rarity)
+        self._registration.check(fit, self._model.in_distribution)
         with frame.stage("surfaces"):
-            return self._moved(looks, fit)
+            return self._moved(fit)
 
-    def _moved(self, looks: Looks, fit: RegistrationResult) -> _Registered:
-        motion = replace(
-            posterior(fit.motion, looks, self._registration.config),
-            calibration=self._model.config.scene.calibration,
-            std_scale=self._calibration.std_scale,
-        )
+    def _moved(self, fit: RegistrationResult) -> _Registered:
+        calibration = self._model.config.scene.calibration
+        motion = self._registration.uncertain(fit, calibration, self._calibration.std_scale)
         anatomy = self._shape.anatomy_ct
         moved = motion.carry(self._vertices_ct)
         ends = np.cumsum([len(mesh.vertices_mm) for mesh in self._surfaces])[:-1]
@@ -238,7 +230,6 @@ class RegistrationLocator:
         placed: _Registered,
         inside: OccupancyCloud,
         prior: PosePrior,
-        looks: Looks,
         others: Sequence[Look],
         **more: Any,
     ) -> FitReport:
@@ -271,18 +262,18 @@ class RegistrationLocator:
             np.abs(fit.distances_mm),
             parts,
             structures=tuple(placed.structures),
-            fit_cost=self._cost(fit, looks, prior),
+            fit_cost=self._cost(fit, prior),
             poses=poses,
             motion=about,
-            looks=looks.described() if others else None,
+            looks=fit.looks.described() if others else None,
             **more,
         )
         points = report.points + sum(len(one.cloud.points_mm) for one in others)
         return msgspec.structs.replace(report, points=points)
 
-    def _cost(self, fit: RegistrationResult, looks: Looks, prior: PosePrior) -> FitCost:
+    def _cost(self, fit: RegistrationResult, prior: PosePrior) -> FitCost:
         """Of several looks the one with most strays counts."""
-        strays, others = fit.strays, []
+        looks, strays, others = fit.looks, fit.strays, []
         if looks.count > 1:
             far = np.abs(fit.distances_mm) > FARTHEST * self._registration.config.last_mm
             strays = max(float(far[looks.look == n].mean()) for n in range(looks.count))

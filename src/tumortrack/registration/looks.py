@@ -1,8 +1,8 @@
-"""What one or several cameras see of a still organ, laid together.
+"""Points of a still organ from one or several cameras: where these are, and what their errors do.
 
-A camera's place relative to the first is known by a calibration, which errs. So each further one
+A camera's place relative to the first is known by a calibration, which errs. So each further camera
 has six unknowns of its own, with that error as their prior. They are found in turns with the
-organ's motion, and what is left unsure widens the motion's covariance.
+organ's motion, and what remains uncertain widens the motion's covariance.
 """
 
 from __future__ import annotations
@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-import msgspec
 import numpy as np
 from jaxtyping import Float, Float64, Int64
 
@@ -23,6 +22,34 @@ from tumortrack.sense.noise import CAMERA_STD
 
 
 @dataclass(frozen=True, eq=False)
+class Residuals:
+    """Points at a motion: signed distances to the organ's surface, and what shifts them.
+
+    Attributes:
+        distances_mm: of the points, carried back, to the surface at rest.
+        by_motion: their derivatives by shift, turn and coefficients.
+        by_cameras: by the errors of the further cameras, six each.
+        weights: of their squares in the cost, with the robust kernel's.
+    """
+
+    distances_mm: Float64[np.ndarray, " n"]
+    by_motion: Float64[np.ndarray, "n p"]
+    by_cameras: Float64[np.ndarray, "n q"]
+    weights: Float64[np.ndarray, " n"]
+
+    def cameras_precision(
+        self, covariance: Float64[np.ndarray, "p p"]
+    ) -> tuple[Float64[np.ndarray, "q q"], Float64[np.ndarray, "p q"]]:
+        """Of the cameras' errors, if the organ's motion, which has this covariance where they are
+        known, follows them (Schur complement); and the curvature's block of motion and errors."""
+        weighted = self.weights[:, None] * self.by_cameras
+        across = self.by_motion.T @ weighted
+        prior = np.tile(CAMERA_STD**-2, weighted.shape[1] // POSE)
+        own = self.by_cameras.T @ weighted + np.diag(prior)
+        return own - across.T @ covariance @ across, across
+
+
+@dataclass(frozen=True, eq=False)
 class Looks:
     """Points of the organ in the first camera's frame, mm.
 
@@ -30,7 +57,7 @@ class Looks:
         points_mm: of all looks, one after the other; ``look``: the number of each point's.
         camera_from_look: where each look's camera is, the first one's being the identity.
         shifts: by how much the organ was found to lie elsewhere before each camera (mm, rad; its
-            axes, about its centre): the camera's error, of which points and places are freed.
+            axes, about its centre): the camera's error, which points and places are rid of.
     """
 
     points_mm: Points
@@ -45,8 +72,8 @@ class Looks:
         """Points of each look in its own camera's frame; further ones with where it is."""
         moved = [*points_mm[:1], *map(_moved, camera_from_look, points_mm[1:])]
         numbers = np.repeat(np.arange(len(moved)), [len(points) for points in moved])
-        every = moved[0] if len(moved) == 1 else np.concatenate(moved)
-        return cls(every, numbers, (np.eye(4), *camera_from_look), np.zeros((len(moved), POSE)))
+        together = moved[0] if len(moved) == 1 else np.concatenate(moved)
+        return cls(together, numbers, (np.eye(4), *camera_from_look), np.zeros((len(moved), POSE)))
 
     @property
     def count(self) -> int:
@@ -73,47 +100,30 @@ class Looks:
             turn_degrees=np.rad2deg(np.linalg.norm(self.shifts[:, 3:], axis=1)).tolist(),
         )
 
-    def weighed(self, config: GaussNewtonConfig) -> GaussNewtonConfig:
-        """As much is known of the organ by each look as by one."""
-        return msgspec.structs.replace(config, n_effective=self.count * config.n_effective)
+    def weight(self, config: GaussNewtonConfig) -> float:
+        """Of a point's squared distance in the cost. As much is known of the organ by each look as
+        by one."""
+        n_effective = self.count * config.n_effective
+        return min(n_effective / len(self.points_mm), 1.0) / config.sigma_mm**2
 
-    def unknown(self, rows: Float[np.ndarray, "n p"]) -> Float[np.ndarray, "n q"]:
-        """What the organ's motion before one further camera alone does to distances, which is what
-        that camera's error does: the pose's columns, first in ``rows``, for its points."""
-        flat = [rows[:, :POSE] * (self.look == n)[:, None] for n in range(1, self.count)]
-        return np.concatenate([rows[:, :0], *flat], axis=1)
-
-    def weights(
-        self, distances_mm: Float64[np.ndarray, " n"], config: GaussNewtonConfig
-    ) -> Float64[np.ndarray, " n"]:
-        """Of the points' squared distances, in all looks' cost."""
-        each = min(self.weighed(config).n_effective / len(distances_mm), 1.0) / config.sigma_mm**2
-        return each / (1 + (distances_mm / config.last_mm) ** 2) ** 2
-
-    def precision(
-        self,
-        slopes: Float64[np.ndarray, "n p"],
-        weights: Float64[np.ndarray, " n"],
-        covariance: Float64[np.ndarray, "p p"],
-    ) -> tuple[Float64[np.ndarray, "q q"], Float64[np.ndarray, "p q"]]:
-        """Of the further cameras' errors, if the organ's motion, which has this covariance where
-        they are known, follows them; and the curvature's block of that motion and these errors."""
-        mine = self.unknown(slopes)
-        weighed = weights[:, None] * mine
-        across, prior = slopes.T @ weighed, np.tile(CAMERA_STD**-2, self.count - 1)
-        return mine.T @ weighed + np.diag(prior) - across.T @ covariance @ across, across
+    def residuals(self, motion: ElasticMotion, config: GaussNewtonConfig) -> Residuals:
+        """At a motion. A camera's error does what the organ's motion before it alone would do."""
+        rows = motion.residual_rows(self.points_mm).astype(float)
+        by_motion, distances_mm = rows[:, :-1], rows[:, -1]
+        each = [by_motion[:, :POSE] * (self.look == n)[:, None] for n in range(1, self.count)]
+        by_cameras = np.concatenate([by_motion[:, :0], *each], axis=1)
+        weights = self.weight(config) / (1 + (distances_mm / config.last_mm) ** 2) ** 2
+        return Residuals(distances_mm, by_motion, by_cameras, weights)
 
     def corrected(self, motion: ElasticMotion, config: GaussNewtonConfig) -> Looks:
         """The further cameras, and their points, moved by a Gauss-Newton step of all unknowns from
         where the organ's ``motion`` fits the points best."""
         assert motion.covariance is not None
-        rows = motion.residual_rows(self.points_mm).astype(float)
-        slopes, distances_mm = rows[:, :-1], rows[:, -1]
-        weights, further = self.weights(distances_mm, config), self.shifts[1:]
-        gradient = self.unknown(slopes).T @ (weights * distances_mm)
+        near, further = self.residuals(motion, config), self.shifts[1:]
+        gradient = near.by_cameras.T @ (near.weights * near.distances_mm)
         gradient += (further / CAMERA_STD**2).ravel()
-        known = self.precision(slopes, weights, motion.covariance)[0]
-        changes = -np.linalg.solve(known, gradient).reshape(further.shape)
+        precision, _ = near.cameras_precision(motion.covariance)
+        changes = -np.linalg.solve(precision, gradient).reshape(further.shape)
         points_mm, poses = self.points_mm.copy(), list(self.camera_from_look)
         for n, change in enumerate(changes, start=1):
             # As if the organ moved before this camera alone: then the points move back by it.
@@ -131,7 +141,9 @@ def seen_from_first(motion: ElasticMotion, camera_from_look: Affine) -> ElasticM
     """A motion before another camera, as the first one sees it."""
     turn = camera_from_look[:3, :3]
     centre_mm = turn @ motion.centre_mm + camera_from_look[:3, 3]
-    rivals = tuple((seen_from_first(one, camera_from_look), share) for one, share in motion.rivals)
+    rivals = tuple(
+        (seen_from_first(rival, camera_from_look), share) for rival, share in motion.rivals
+    )
     return replace(motion, rotation=turn @ motion.rotation, centre_mm=centre_mm, rivals=rivals)
 
 

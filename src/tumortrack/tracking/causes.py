@@ -134,8 +134,9 @@ def _fit(model: Model, points: Points) -> _Fitted:
     least, most = model.in_distribution.spread_mm
     if not isinstance(model, RegistrationModel) or not least <= spread_mm(points) <= most:
         return _Fitted()
-    starts = model.registration.search.starts(Looks.of([points]))[:_TRIED]
-    fits = [refine(model.shape, points, one, model.config.refine) for one in starts]
+    looks = Looks.of([points])
+    starts = model.registration.search.starts(looks)[:_TRIED]
+    fits = [refine(model.shape, looks, start, model.config.refine) for start in starts]
     best, usual = min(fits, key=lambda fit: fit.cost), model.calibration.usual_cost
     organ = model.shape.anatomy_ct.organ
     there = organ.moved(best.motion.carry(organ.vertices_mm))

@@ -187,7 +187,7 @@ def located(tracker: Tracker, cloud: SensorCloud) -> tuple[dict[str, Any], Any]:
         frame = Frame(model, cloud, 0, np.random.default_rng(0))
         usual = model.calibration.usual_cost
         looks = Looks.of([frame.points_mm])
-        fit, _ = model.registration.register(looks, None, frame.stage)
+        fit = model.registration.register(looks, None, frame.stage)
         return {"verdict": "refused", "reason": str(error), "cost": fit.cost / usual}, fit.motion
     costs = estimate.report.fit_cost
     assert costs is not None  # of the default method
