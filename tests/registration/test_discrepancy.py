@@ -12,7 +12,7 @@ from scipy.stats import multivariate_normal
 from elastic_objects import CENTER, RADII
 from tumortrack.models.config import GaussNewtonConfig
 from tumortrack.models.in_distribution import RIVAL_COST
-from tumortrack.registration import discrepancy_kernels as kernels
+from tumortrack.registration import kernels
 from tumortrack.registration.choose import likeliest
 from tumortrack.registration.discrepancy import (
     AMPLITUDES_MM,

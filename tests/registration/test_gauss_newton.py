@@ -16,6 +16,7 @@ from scipy.special import ndtr
 
 from covering import cover
 from elastic_objects import CENTER, RADII
+from reports import looked
 from tumortrack.core.estimate import FollowOptions
 from tumortrack.core.process import parallel_for, parallel_map
 from tumortrack.core.types import Mesh, SensorCloud
@@ -24,10 +25,11 @@ from tumortrack.models.config import GaussNewtonConfig
 from tumortrack.registration import gauss_newton_kernels as kernels
 from tumortrack.registration import registration
 from tumortrack.registration.gauss_newton import GaussNewton, _prior
-from tumortrack.registration.kernels import Flow, Pose, look_up, probabilities
+from tumortrack.registration.kernels import look_up, probabilities
 from tumortrack.registration.locator import RegistrationLocator, nearest_lookup
 from tumortrack.registration.looks import Looks
-from tumortrack.simulate.elastic.flow import BLOCK, LatticeField, steps_for
+from tumortrack.registration.motion import ElasticMotion
+from tumortrack.simulate.elastic.flow import BLOCK, steps_for
 from tumortrack.tracking.model_files import load_model
 from warp_objects import (
     ANATOMY,
@@ -38,7 +40,6 @@ from warp_objects import (
     nudged,
     placed,
     refined,
-    residual_rows,
     shape,
     with_slope,
 )
@@ -110,43 +111,25 @@ def test_sums_are_those_of_the_rows_and_rows_those_of_plain_arithmetic(state):
     body, motion = shape().body, placed(state)
     points = motion.carry(ANATOMY.organ.vertices_mm[::5]).astype(np.float32)
     points += np.random.default_rng(1).normal(0, 1.5, points.shape).astype(np.float32)
-    pose = (motion.rotation, motion.centre_mm, 0.9 * motion.coefficients)
-    rows = residual_rows(points, pose).astype(float)
-    unknowns, velocity = rows.shape[1] - 1, body.velocity(-pose[2])
-    left = kernels.State(
-        *pose,
-        np.zeros(6),
-        distances_mm=np.empty(len(points), np.float32),
-        curvature=np.empty((unknowns, unknowns)),
-        gradient=np.empty(unknowns),
-    )
-    lattice = body.origin_mm, np.float32(body.spacing_mm)
-    field = shape().distances[0]
-    kernels.normal_equations(
-        kernels.Problem(
-            LatticeField(body.modes, *lattice),
-            body.center_ct,
-            field,
-            np.eye(2),
-            body.mean,
-            points,
-            *(1.0, 5.0, 1.0, 0.7, 0.02),
-        ),
-        Flow(velocity, *lattice, steps_for(velocity, body.spacing_mm)),
-        Pose(body.center_ct, *pose[:2]),
-        np.float32(2),
-        (np.empty((BLOCK, unknowns + 1), np.float32), np.zeros((28, 300), np.float32)),
-        left,
-    )
-    np.testing.assert_array_equal(left.distances_mm, rows[:, -1])
-    assert np.abs(left.distances_mm).max() > 2
+    motion = replace(motion, coefficients=0.9 * motion.coefficients)
+    rows = motion.residual_rows(points).astype(float)
+    config = GaussNewtonConfig(first_mm=2.0, n_effective=1e6)  # each point weighs one
+    begun, precision = descent(points, motion, config), _prior(shape(), config)
+    begun.run(0)
+    equations = begun._state
+    np.testing.assert_array_equal(equations.distances_mm, rows[:, -1])
+    assert np.abs(equations.distances_mm).max() > 2
     pulled = rows / (1 + (rows[:, -1:] / 2.0) ** 2)
     sums = pulled.T @ pulled
     most = np.abs(sums).max()
-    np.testing.assert_allclose(left.curvature, sums[:-1, :-1], atol=1e-5 * most)
-    np.testing.assert_allclose(left.gradient, sums[:-1, -1], atol=1e-5 * most)
+    np.testing.assert_allclose(equations.curvature, sums[:-1, :-1] + precision, atol=1e-5 * most)
+    from_mean = np.concatenate([np.zeros(6), motion.coefficients - body.mean])
+    np.testing.assert_allclose(
+        equations.gradient, sums[:-1, -1] + precision @ from_mean, atol=1e-5 * most
+    )
 
-    offsets = (points.astype(float) - pose[1]) @ pose[0]
+    velocity, field = body.velocity(-motion.coefficients), shape().distances[0]
+    offsets = (points.astype(float) - motion.centre_mm) @ motion.rotation
     rest, middle = plainly_followed(
         velocity, offsets + body.center_ct, steps_for(velocity, body.spacing_mm)
     )
@@ -175,7 +158,8 @@ def plainly_refined(points, start, config):
     moved, weight = np.zeros(6), min(config.n_effective / len(points), 1) / config.sigma_mm**2
     step, settled = 0, False
     while True:
-        rows = residual_rows(points, (rotation, centre, coefficients)).astype(float)
+        motion = ElasticMotion(shape(), rotation, centre, coefficients)
+        rows = motion.residual_rows(points).astype(float)
         width = max(config.last_mm, config.first_mm * config.narrowing**step)
         pulled = rows[:, :-1] / (1 + (rows[:, -1:] / width) ** 2) ** 2
         off = np.concatenate([moved, coefficients - body.mean])
@@ -405,7 +389,7 @@ def test_frames_leave_no_memory_behind(slim_model, unchecked):
     tracemalloc.start()
     for frame in range(120):
         cloud = (seen + rng.normal(0, 0.2, 3)).astype(np.float32)
-        last = locator.follow(SensorCloud(cloud, frame), last, FollowOptions())
+        last = locator.follow(looked(SensorCloud(cloud, frame)), last, FollowOptions())
         sizes.append(tracemalloc.get_traced_memory()[0])
     tracemalloc.stop()
     assert "follow" in last.report.timings

@@ -17,9 +17,8 @@ from tumortrack.core.causes import Cause
 from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.geometry import rigid, transform_points
 from tumortrack.core.types import DepthFrame, Look, SensorCloud
-from tumortrack.live.scan import Scan
 from tumortrack.live.values import CameraView, Observation
-from tumortrack.live.views import ViewsLocator
+from tumortrack.live.views import Scan, ViewsLocator
 from tumortrack.models.config import GaussNewtonConfig
 from tumortrack.occupancy.locator import OccupancyLocator
 from tumortrack.registration import looks as module
@@ -224,7 +223,7 @@ def test_a_view_that_sees_through_refuses(tracker):
 def test_a_method_that_knows_no_motion_takes_one_look():
     one = view(placed(), around(0))
     with pytest.raises(InputError, match="preset clinic"):
-        OccupancyLocator.locate(None, one.cloud, 16, 0, [one])
+        OccupancyLocator.locate(None, [one, one], 16, 0)
 
 
 # --- files ---
@@ -361,7 +360,7 @@ def test_a_scan_takes_three_looks_from_apart_and_says_what_each_added(tracker):
     there = transform_points(around(50), found.motion.carry(INNER))
     assert np.linalg.norm(there - REST.carry(INNER), axis=1).mean() < 1.0
     stated = [f"{mm:.1f} mm" for mm in found.report.scan.center_std_mm]
-    assert f"standard deviation of {', then '.join(stated)}, with one to 3 looks" in scan.told
+    assert f"standard deviation of {', then '.join(stated)}, with one to 3 looks" in scan.summary
     parts = found.report.parts  # of all looks
     assert stated[-1] == f"{max(parts[n].center_std_mm for n in parts if n != 'kidney'):.1f} mm"
     follower = Follower(tracker, FollowerConfig(rescan_s=100.0))
@@ -374,7 +373,7 @@ def test_a_scan_takes_three_looks_from_apart_and_says_what_each_added(tracker):
         with pytest.raises(NoEstimate):
             views.locate([seen(degrees, stamp_s)])
     views.locate([seen(50, 9.0)])
-    assert views.scanned == scan.told  # what the live page shows from then on
+    assert views.scanned == scan.summary  # what the live page shows from then on
     turned = nudged(REST, [12.0, 0, 0], [0, 0, 0.3])
     scan = Scan(tracker)
     told.clear()

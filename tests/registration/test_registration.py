@@ -36,7 +36,6 @@ from warp_objects import (
     nudged,
     placed,
     refined,
-    residual_rows,
     shape,
     with_slope,
 )
@@ -229,7 +228,8 @@ def test_the_derivatives_are_those_of_the_distances(share, tolerance):
 
     def distances(x):
         rotation = TURNED @ Rotation.from_rotvec(x[3:6]).as_matrix()
-        rows = residual_rows(points, (rotation, PLACE_MM + TURNED @ x[:3], x[6:]))
+        moved = ElasticMotion(shape(), rotation, PLACE_MM + TURNED @ x[:3], x[6:])
+        rows = moved.residual_rows(points)
         return rows[:, -1], rows[:, :-1]
 
     _, rows = distances(state)
@@ -338,7 +338,7 @@ def test_a_slow_general_optimiser_finds_the_same():
         return START.rotation @ turn, centre, x[6:]
 
     def residuals(x):
-        distance = residual_rows(points, moved(x))[:, -1].astype(float)
+        distance = ElasticMotion(shape(), *moved(x)).residual_rows(points)[:, -1].astype(float)
         robust = np.sqrt(weight) * distance / np.sqrt(1 + (distance / config.last_mm) ** 2)
         off = np.concatenate([x[:6], x[6:] - shape().body.mean])
         return np.concatenate([robust, root @ off])

@@ -21,7 +21,6 @@ from tumortrack.registration.looks import Looks
 from tumortrack.registration.registration import Registration
 from tumortrack.registration.rest_shape import shape_of
 from tumortrack.registration.search import APART_MM, PosePrior, Search, apart_mm
-from tumortrack.registration.search_kernels import RigidProblem, descend_rigidly
 from tumortrack.simulate.elastic.body import build_body
 from tumortrack.tracking.model_files import load_model
 from tumortrack.tracking.tracker import Tracker
@@ -52,42 +51,39 @@ def tumors_off_mm(motion, truth):
 # --- the kernel ---
 
 
-def plainly_descended(problem, rotation, centre):
-    """``descend_rigidly`` of one start, as arrays of all points in double precision."""
+def plainly_descended(points, widths_mm, rotation, centre):
+    """``Search.descend`` of one start, as arrays of all points in double precision."""
+    damping = np.diag(np.repeat([0.02**2, 1.0], 3))
 
     def rows():
-        offsets = (problem.points - centre) @ rotation
+        offsets = (points - centre) @ rotation
         off, slope = with_slope(
-            shape().distances[0], (offsets + problem.center_ct).astype(np.float32)
+            shape().distances[0], (offsets + shape().body.center_ct).astype(np.float32)
         )
         return off.astype(float), np.column_stack([-slope, -np.cross(offsets, slope)])
 
-    for width in problem.widths_mm:
+    for width in widths_mm:
         off, slopes = rows()
         weight = 1 / (1 + (off / width) ** 2) ** 2
-        curvature = (slopes.T * weight) @ slopes / len(off) + np.diag(problem.damping)
+        curvature = (slopes.T * weight) @ slopes / len(off) + damping
         change = np.linalg.solve(curvature, slopes.T @ (weight * off) / len(off))
         for part, most in ((slice(0, 3), 25.0), (slice(3, 6), 0.5)):
             change[part] *= min(1.0, most / np.linalg.norm(change[part]))
         centre = centre - rotation @ change[:3]
         rotation = rotation @ Rotation.from_rotvec(-change[3:]).as_matrix()
-    square = (rows()[0] / problem.last_mm) ** 2
+    square = (rows()[0] / 3.0) ** 2
     return rotation, centre, (square / (1 + square)).mean()
 
 
 def test_a_descent_is_that_of_plain_arithmetic():
     points = placed(share=0.0).carry(ANATOMY.organ.vertices_mm[::25]).astype(np.float32)
-    problem = RigidProblem(
-        shape().distances[0], shape().body.center_ct, points,
-        np.array([10.0, 6.0, 3.0]), 3.0, np.repeat([0.02**2, 1.0], 3),
-    )  # fmt: skip
+    widths_mm = np.array([10.0, 6.0, 3.0])
     turns = Rotation.from_rotvec([[0.1, -0.2, 0.1], [0.0, 0.0, 1.5], [0.8, 0.3, -0.4]]).as_matrix()
     rotations = np.ascontiguousarray(TURNED @ turns)
-    centres, costs = ELLIPSOID_MM + [[5.0, -3, 8], [0, 30, 0], [-60, 0, 40]], np.empty(3)
-    expected = [
-        plainly_descended(problem, *start) for start in zip(rotations, centres, strict=True)
-    ]
-    descend_rigidly(problem, rotations, centres, costs)
+    centres = ELLIPSOID_MM + [[5.0, -3, 8], [0, 30, 0], [-60, 0, 40]]
+    starts = zip(rotations, centres, strict=True)
+    expected = [plainly_descended(points, widths_mm, *start) for start in starts]
+    costs = Search(shape(), LIMITED).descend(points, widths_mm, rotations, centres)
     for n, (rotation, centre, cost) in enumerate(expected):
         np.testing.assert_allclose(rotations[n], rotation, atol=2e-3)
         np.testing.assert_allclose(centres[n], centre, atol=0.05)

@@ -10,7 +10,7 @@ import pytest
 from msgspec.structs import replace
 
 from live_objects import CAMERA, ball, small_anatomy, small_estimate
-from reports import NOWHERE, poor, report_of, reporting
+from reports import NOWHERE, looked, poor, report_of, reporting
 from tumortrack.core import store
 from tumortrack.core.errors import ArtifactError, InputError
 from tumortrack.core.report import MarginReport
@@ -140,7 +140,7 @@ class _Known(Tracker):
         pass
 
     def locate(self, cloud, grid, seed, seen=None):
-        return judged(small_estimate(), seen or cloud)
+        return judged(small_estimate(), looked(seen or cloud))
 
 
 def test_a_partly_hidden_organ_is_judged_by_the_image_if_there_is_one(tmp_path):

@@ -1,4 +1,4 @@
-"""Estimates whose reports say what a test needs."""
+"""Estimates whose reports say what a test needs, and looks that they are judged by."""
 
 from __future__ import annotations
 
@@ -6,9 +6,12 @@ from dataclasses import replace
 from typing import Any
 
 import msgspec
+import numpy as np
 
 from tumortrack.core.estimate import Estimate
+from tumortrack.core.geometry import HERE
 from tumortrack.core.report import Finding, FitReport
+from tumortrack.core.types import DepthFrame, Look, SensorCloud
 
 NOWHERE = {
     "camera_from_ct": [[1.0, 0, 0, 0], [0, 1.0, 0, 0], [0, 0, 1.0, 0], [0, 0, 0, 1.0]],
@@ -30,6 +33,12 @@ def reporting(estimate: Estimate, **entries: Any) -> Estimate:
     for name, part in entries.pop("parts", {}).items():
         parts[name] = {**parts.get(name, {}), **part}
     return replace(estimate, report=report_of(**{**known, "parts": parts, **entries}))
+
+
+def looked(seen: DepthFrame | SensorCloud) -> list[Look]:
+    """One look; of a cloud all points are the organ's."""
+    organ = seen if isinstance(seen, SensorCloud) else SensorCloud(np.zeros((1, 3)))
+    return [Look(organ, seen, HERE)]
 
 
 def poor(words: str) -> Finding:

@@ -22,7 +22,6 @@ from tumortrack.registration.rest_shape import RestShape, shape_of
 from tumortrack.registration.search import PosePrior
 from tumortrack.simulate.deform import ElasticConfig
 from tumortrack.simulate.elastic.body import build_body
-from tumortrack.simulate.elastic.flow import BLOCK, block, steps_for
 from tumortrack.simulate.scene import SceneConfig
 
 ANATOMY: Anatomy = organ()
@@ -48,26 +47,6 @@ def nudged(motion, shift_mm, turn_rad):
     return ElasticMotion(
         motion.shape, motion.rotation @ turn, motion.centre_mm + np.array(shift_mm), mean
     )
-
-
-def residual_rows(points_mm, pose) -> np.ndarray:
-    """``kernels.add_rows`` of points at a (rotation, centre_mm, coefficients)."""
-    rotation, centre_mm, coefficients = pose
-    body = shape().body
-    velocity = body.velocity(-coefficients)
-    rows = np.empty((len(points_mm), kernels.POSE + len(coefficients) + 1), np.float32)
-    spacing_mm = np.float32(body.spacing_mm)
-    known = (
-        body.modes,
-        shape().distances[0],
-        kernels.Flow(velocity, body.origin_mm, spacing_mm, steps_for(velocity, body.spacing_mm)),
-        kernels.Pose(body.center_ct, rotation, centre_mm),
-    )
-    points = np.ascontiguousarray(points_mm, np.float32)
-    for first in range(0, len(points), BLOCK):
-        some = slice(first, first + BLOCK)
-        kernels.add_rows(*known, points[some], block(), rows[some])
-    return rows
 
 
 def with_slope(field, points) -> tuple[np.ndarray, np.ndarray]:

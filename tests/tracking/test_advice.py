@@ -7,7 +7,7 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from reports import report_of
+from reports import looked, report_of
 from tumortrack.core.estimate import Estimate
 from tumortrack.core.geometry import rigid, transform_points
 from tumortrack.core.types import Look, Mesh, OccupancyCloud, SensorCloud
@@ -52,7 +52,7 @@ def seen(towards=None) -> SensorCloud:
 
 @pytest.mark.parametrize(("words", "side"), SIDES.items())
 def test_a_hidden_side_is_named(words, side):
-    said = where_to_look(estimate([0, 0, 1]), seen(towards=side))
+    said = where_to_look(estimate([0, 0, 1]), looked(seen(towards=side)))
     assert said == f"free the view of the organ's side towards {words}, or look from there"
 
 
@@ -62,8 +62,8 @@ def test_what_another_camera_saw_is_not_hidden():
     aside = rigid(np.diag([-1.0, 1, -1]), np.array([90.0, 0, 200]))
     there = SensorCloud(transform_points(np.linalg.inv(aside), rest.points_mm.astype(float)))
     unsure = estimate([side[0], side[1], 0], (12 * side[0], 12 * side[1], 0))
-    assert towards in where_to_look(unsure, first)
-    said = where_to_look(unsure, first, [Look(there, there, aside)])
+    assert towards in where_to_look(unsure, looked(first))
+    said = where_to_look(unsure, [*looked(first), Look(there, there, aside)])
     assert said == "look more from the left (the first camera's -x), by about 30 degrees"
 
 
@@ -71,8 +71,9 @@ def test_what_another_camera_saw_is_not_hidden():
 def test_what_is_least_sure_is_looked_at_along_its_axis_from_the_tumors_side(words, side):
     for sign in (1.0, -1.0):  # an axis has two directions
         unsure = estimate([sign * side[0], sign * side[1], 0.0], (12 * side[0], 12 * side[1], 0))
-        assert where_to_look(unsure, seen()) == f"look more from {words}, by about 30 degrees"
-    along = where_to_look(estimate(CENTRE), seen())
+        said = where_to_look(unsure, looked(seen()))
+        assert said == f"look more from {words}, by about 30 degrees"
+    along = where_to_look(estimate(CENTRE), looked(seen()))
     assert along == "look more from another side, by about 30 degrees"
 
 
@@ -86,5 +87,5 @@ def test_another_place_is_looked_at_where_it_differs():
     vertices = fit.carry(ANATOMY.organ.vertices_mm)
     found = estimate([0, 1, 0], motion=fit)
     found.meshes["kidney"] = ANATOMY.organ.moved(vertices)
-    said = where_to_look(found, SensorCloud(vertices))
+    said = where_to_look(found, looked(SensorCloud(vertices)))
     assert said == "look more from the left (the camera's -x), by about 30 degrees"

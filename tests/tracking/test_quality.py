@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from elastic_objects import UP
-from reports import reporting
+from reports import looked, reporting
 from stories import answered, refusal, succeeded, tumortrack
 from tumortrack.core import store
 from tumortrack.core.errors import NoEstimate
@@ -44,7 +44,7 @@ def stages():
 def doubted(estimate, seen, **report):
     """A judgement in which only what is given speaks against the estimate."""
     sure = {"fit_cost": COST, "size": EXACT, "parts": sure_parts(estimate), **report}
-    found = judged(reporting(estimate, **sure), seen)
+    found = judged(reporting(estimate, **sure), looked(seen))
     said = report_entry(found)["quality"]
     assert (said["verdict"], said["reason"]) == (found.quality, found.reason)
     assert bool(said["check"]) == (found.quality == "poor") == (said["finding"] is not None)

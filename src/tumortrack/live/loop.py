@@ -24,10 +24,9 @@ from tumortrack.core.types import DepthFrame, Intrinsics
 from tumortrack.live import values as live
 from tumortrack.live.cameras import Cameras
 from tumortrack.live.meter import RunStatistics
-from tumortrack.live.scan import Scan
 from tumortrack.live.stamps import check_age
 from tumortrack.live.values import CameraView, Observation, SourceLost, TrackingResult
-from tumortrack.live.views import OrganInView, ViewsLocator, camera_words, timed
+from tumortrack.live.views import OrganInView, Scan, ViewsLocator, camera_words, timed
 from tumortrack.live.workers import SinkWorker, SourceWorker
 from tumortrack.sense.camera import d405
 from tumortrack.sense.files import DepthCorrection

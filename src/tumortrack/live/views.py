@@ -1,34 +1,40 @@
-"""From what the cameras saw together to an estimate: the organ in each view, and all of them laid
-together."""
+"""From what the cameras saw together, or one camera in turn, to an estimate: the organ's points in
+each view, and all views fitted as one."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
 import numpy as np
 from jaxtyping import Float64
 
-from tumortrack.core.errors import NoEstimate
+from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.estimate import Estimate
-from tumortrack.core.geometry import HERE, Affine, transform_points
+from tumortrack.core.geometry import HERE, Affine, transform_points, unit
+from tumortrack.core.report import ScanReport
 from tumortrack.core.types import Look, SensorCloud
 from tumortrack.live.frames import FrameCheck
-from tumortrack.live.scan import Scan
 from tumortrack.live.values import CameraView, PublishedFrame, SinkContext
 from tumortrack.sense.region import Hints, RegionConfig, organ_points
 from tumortrack.sense.region.taught import Taught
-from tumortrack.tracking.tracker import Follower
+from tumortrack.tracking.tracker import Follower, Tracker
 
 _PICK_S = 3.0  # without the organ: a pick is forgotten
+
+SCAN_LOOKS, SCAN_WITHIN_S = 3, 5.0
+# A look sees the organ's shift along its own line of sight, within a millimetre or so. What the
+# others leave open sideways is half along the line of a look from 30 degrees aside.
+SCAN_APART_DEG = 30.0
 
 OrganInView = tuple[CameraView, SensorCloud]  # the organ's points in it
 
 
 class ViewsLocator:
-    """Of one run; ``seed``: of the random points. Estimates are in the frame of a camera that may
-    be elsewhere, or another one, in the next frame."""
+    """Locates in the views of one run; ``seed``: of the random points. An estimate is in the frame
+    of its first view's camera, which may be another one, or stand differently, in the next frame.
+    """
 
     def __init__(
         self,
@@ -40,7 +46,7 @@ class ViewsLocator:
     ) -> None:
         self._follower, self._context = follower, context
         self._region, self._frozen_s, self._seed = region, frozen_s, seed
-        self.scan: Scan | None = None  # until it is done, by which the first estimate is made
+        self.scan: Scan | None = None  # makes the first estimate, and is gone then
         self.scanned = ""  # what each of its looks added
         self._published_from_last = context.published_frame.published_from_camera
         self._picked: Float64[np.ndarray, " 3"] | None = None  # by the user, published frame
@@ -79,16 +85,12 @@ class ViewsLocator:
         if self.scan is not None:
             estimate = self.scan.look(lead, organ)
             self._follower.begin(estimate)
-            self.scanned = self.scan.told
+            self.scanned = self.scan.summary
             self.frames.notes.append(self.scanned)
             self.scan, self._published_from_last = None, lead.published_from_camera
             return estimate
-        lead_from_published = np.linalg.inv(lead.published_from_camera)
-        others = [
-            Look(its, view.seen.content, lead_from_published @ view.published_from_camera)
-            for view, its in more
-        ]
         way = self._camera_from_last(lead)
+        others = _further_looks(lead, more)
         estimate = self._follower.locate(organ, lead.seen.content, others, way)
         self._published_from_last = lead.published_from_camera
         self._follow_pick(lead, organ)
@@ -145,6 +147,75 @@ class ViewsLocator:
             points_mm = transform_points(view.published_from_camera, organ.points_mm.astype(float))
             off_mm = np.linalg.norm(points_mm - np.median(points_mm, axis=0), axis=1)
             self._place_mm = points_mm[int(off_mm.argmin())]
+
+
+class Scan:
+    """A first estimate from several looks of a camera that is led round an organ at rest.
+    ``summary``: what each look added, once it is done."""
+
+    def __init__(self, tracker: Tracker) -> None:
+        if tracker.anatomy_ct is None:
+            raise InputError("a scan needs a model that knows a motion: give the case itself.")
+        self._tracker, self.summary = tracker, ""
+        self._views: list[OrganInView] = []
+
+    def look(self, view: CameraView, organ: SensorCloud) -> Estimate:
+        """The estimate from all looks, in the frame of the last one. Raises NoEstimate: there are
+        too few yet, they are too much alike, or they do not show one organ at rest; then it begins
+        anew."""
+        oldest_ns = view.seen.stamp_ns - SCAN_WITHIN_S * 1e9
+        self._views = [known for known in self._views if known[0].seen.stamp_ns >= oldest_ns]
+        cosines = [_towards(view, organ) @ _towards(*known) for known in self._views]
+        angles = np.degrees(np.arccos(np.clip(cosines, -1, 1)))
+        if angles.min(initial=180.0) >= SCAN_APART_DEG:
+            self._views.append((view, organ))
+        if len(self._views) < SCAN_LOOKS:
+            raise NoEstimate(
+                f"scan: {len(self._views)} of {SCAN_LOOKS} looks; lead the camera on round the "
+                f"organ, {SCAN_APART_DEG:g} degrees from each look, all within {SCAN_WITHIN_S:g} s"
+            )
+        *others, (last, cloud) = self._views
+        self._views = []
+        looks = _further_looks(last, others)
+        try:
+            estimates = [
+                self._tracker.follow(cloud, seen=last.seen.content, others=looks[:n])
+                for n in range(SCAN_LOOKS)
+            ]
+        except NoEstimate as error:
+            raise NoEstimate(f"scan, begun anew: {error}") from error
+        whole = estimates[-1]
+        if whole.quality != "good":
+            raise NoEstimate(f"scan, begun anew: laid together, the looks are poor: {whole.reason}")
+        least_sure_mm = [_least_sure_mm(estimate) for estimate in estimates]
+        whole = whole.reporting(scan=ScanReport(center_std_mm=tuple(least_sure_mm)))
+        steps = ", then ".join(f"{mm:.1f} mm" for mm in least_sure_mm)
+        self.summary = (
+            f"scan: the least sure tumor's centre has a standard deviation of {steps}, with one "
+            f"to {SCAN_LOOKS} looks"
+        )
+        return whole
+
+
+def _further_looks(lead: CameraView, views: Sequence[OrganInView]) -> list[Look]:
+    """Views beside that of the camera that leads."""
+    lead_from_published = np.linalg.inv(lead.published_from_camera)
+    return [
+        Look(organ, view.seen.content, lead_from_published @ view.published_from_camera)
+        for view, organ in views
+    ]
+
+
+def _towards(view: CameraView, organ: SensorCloud) -> Float64[np.ndarray, " 3"]:
+    """The direction from the organ to the camera, published frame."""
+    places_mm = transform_points(view.published_from_camera, organ.points_mm.astype(float))
+    return unit(view.published_from_camera[:3, 3] - np.median(places_mm, axis=0))
+
+
+def _least_sure_mm(estimate: Estimate) -> float:
+    """One standard deviation of the centre of the tumor, or else the organ, that is least sure."""
+    parts = list((estimate.report.tumors or estimate.report.parts).values())
+    return max(part.center_std_mm or 0.0 for part in parts)
 
 
 def camera_words(numbers: list[int], absent: dict[int, str]) -> str:

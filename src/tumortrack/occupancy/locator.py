@@ -38,14 +38,11 @@ class OccupancyLocator:
         self.model = model
         self.inference = Inference(model.network)
 
-    def locate(
-        self, cloud: SensorCloud, grid: int, seed: int, others: Sequence[Look] = ()
-    ) -> Estimate:
+    def locate(self, looks: Sequence[Look], grid: int, seed: int) -> Estimate:
         """See ``tracking.tracker.Tracker.locate``. The two passes of queries are those of the
         follow-up (LUDO): 10,000 coarse ones where the organ can be, then labels of 40,000 points
         in the enlarged box of those inside."""
-        _check_one(others)
-        frame = _Frame(self, cloud, seed, np.random.default_rng(seed))
+        frame = _Frame(self, _only_cloud(looks), seed, np.random.default_rng(seed))
         lattice = frame.lattice(frame.coarse_box())
         distances_mm = frame.checked(lattice)
         inside = frame.inside(lattice)
@@ -54,20 +51,14 @@ class OccupancyLocator:
             margins, labels = sparse_margins(frame.logits_at, camera_from_index, shape)
         return frame.estimate(distances_mm, inside, margins, labels, camera_from_index)
 
-    def follow(
-        self,
-        cloud: SensorCloud,
-        last: Estimate | None,
-        how: FollowOptions,
-        others: Sequence[Look] = (),
-    ) -> Estimate:
+    def follow(self, looks: Sequence[Look], last: Estimate | None, how: FollowOptions) -> Estimate:
         """See ``tracking.tracker.Tracker.follow``. The enlarged box of the last organ replaces the
         coarse queries, and its lattice is queried only where the organ is (``organ_lattice``).
         Where this frame's organ reaches the box's border, without a last estimate, or with
         ``thorough``, the organ is searched for as in a first frame, and the lattice queried
         everywhere. The surfaces' grid is twice as fine as the lattice, and queried only about
         surfaces."""
-        _check_one(others)
+        cloud = _only_cloud(looks)
         rng = np.random.default_rng((how.seed, cloud.stamp_ns))
         frame = _Frame(self, cloud, how.seed, rng)
         lattice = None
@@ -98,12 +89,13 @@ class OccupancyLocator:
         volume.part_surfaces(margins, ball.astype(np.uint8), np.eye(4), self.model.parts[:1])
 
 
-def _check_one(others: Sequence[Look]) -> None:
-    if others:
+def _only_cloud(looks: Sequence[Look]) -> SensorCloud:
+    if len(looks) > 1:
         raise InputError(
             "several looks need a model that knows a motion: preset clinic; quick and paper take "
             "one cloud."
         )
+    return looks[0].cloud
 
 
 def steps_over(box: volume.Box) -> int:

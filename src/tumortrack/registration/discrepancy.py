@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int64
 
 from tumortrack.models.kernels import farthest
-from tumortrack.registration import discrepancy_kernels as kernels
+from tumortrack.registration import kernels
 
 # Of the process. 15 and 30 mm rank and cover the errors of training's and the twin's scenes alike.
 LENGTH_MM = 20.0

@@ -1,4 +1,4 @@
-"""Clouds -> estimates with a registered organ: everything is read off the motion."""
+"""Clouds -> estimates: surfaces, labels and a report, all made of the fitted motion."""
 
 from __future__ import annotations
 
@@ -12,22 +12,13 @@ import numpy as np
 from jaxtyping import Float, Float32, Int32, Int64, UInt8
 
 from tumortrack.core.estimate import Estimate, FollowOptions
-from tumortrack.core.report import (
-    AllowedPoses,
-    ExcludedFit,
-    FitCost,
-    FitReport,
-    MotionReport,
-    RivalFit,
-    SizeFit,
-    SmoothingReport,
-)
+from tumortrack.core.report import FitReport, SizeFit, SmoothingReport
 from tumortrack.core.types import Anatomy, CameraLabels, Look, Mesh, OccupancyCloud, SensorCloud
 from tumortrack.imaging.raster import label_grid
 from tumortrack.models.report import Frame, describe_parts, grid_over
 from tumortrack.registration import kernels
+from tumortrack.registration import report as entries
 from tumortrack.registration.choose import likeliest
-from tumortrack.registration.discrepancy import FARTHEST
 from tumortrack.registration.gauss_newton import RegistrationResult
 from tumortrack.registration.looks import Looks
 from tumortrack.registration.model import RegistrationModel
@@ -72,9 +63,9 @@ class _OrganPoints:
 
 
 @dataclass(frozen=True, eq=False)
-class _Registered:
-    """A fit that can be this organ's: its motion, the moved surfaces (camera frame), and the
-    covariance (mm^2) at the samples and at the middle of each part's box."""
+class _Placed:
+    """The organ before the camera: its motion with covariance, the moved surfaces (camera frame),
+    and the covariance (mm^2) at the samples and at the middle of each part's box."""
 
     fit: RegistrationResult
     motion: ElasticMotion
@@ -105,20 +96,18 @@ class RegistrationLocator:
         self._surfaces = (*anatomy.parts, *anatomy.structures.values())
         together = np.concatenate([mesh.vertices_mm for mesh in self._surfaces])
         self._vertices_ct = together.astype(np.float32)
-        few = [_SAMPLES // 2, *[64] * len(anatomy.tumors)]
-        some = [v[:: max(1, len(v) // count)] for v, count in zip(vertices, few, strict=True)]
-        self._samples_ct = np.concatenate(some)
-        self._sample_ends = np.cumsum([len(one) for one in some])[:-1]  # of each part's
+        counts = [_SAMPLES // 2, *[64] * len(anatomy.tumors)]
+        samples = [v[:: max(1, len(v) // count)] for v, count in zip(vertices, counts, strict=True)]
+        self._samples_ct = np.concatenate(samples)
+        self._sample_ends = np.cumsum([len(places) for places in samples])[:-1]  # of each part's
         self._nearest_sample = nearest_lookup(self._samples_ct)
         self._carried: _OrganPoints | None = None
 
-    def locate(
-        self, cloud: SensorCloud, grid: int, seed: int, others: Sequence[Look] = ()
-    ) -> Estimate:
+    def locate(self, looks: Sequence[Look], grid: int, seed: int) -> Estimate:
         """See ``tracking.tracker.Tracker.locate``."""
+        cloud = looks[0].cloud
         frame = Frame(self._model, cloud, seed, np.random.default_rng(seed))
-        looks = self._looks(frame, others)
-        fit = self._registration.register(looks, None, frame.stage)
+        fit = self._registration.register(self._points(frame, looks), None, frame.stage)
         size, placed = self._size(fit), self._checked(fit, frame)
         organ = placed.meshes[self._model.parts[0]]
         with frame.stage("fine"):
@@ -128,64 +117,71 @@ class RegistrationLocator:
             labels = label_grid(Anatomy(tuple(placed.meshes.values())), camera_from_index, shape)
         voxel_mm = float(camera_from_index[0, 0])
         prior, more = self._registration.prior, {"size": size, "voxel_mm": voxel_mm}
-        report = self._report(frame, placed, inside, prior, others, **more)
+        report = self._report(frame, looks, placed, inside, prior, **more)
         volume = CameraLabels(labels, camera_from_index)
         made = Estimate(inside, volume, placed.meshes, report, placed.motion)
         return replace(made, structures=placed.structures)
 
-    def follow(
-        self,
-        cloud: SensorCloud,
-        last: Estimate | None,
-        how: FollowOptions,
-        others: Sequence[Look] = (),
-    ) -> Estimate:
+    def follow(self, looks: Sequence[Look], last: Estimate | None, how: FollowOptions) -> Estimate:
         """See ``tracking.tracker.Tracker.follow``."""
+        cloud = looks[0].cloud
         rng = np.random.default_rng((how.seed, cloud.stamp_ns))
         frame = Frame(self._model, cloud, how.seed, rng)
         # As many points in all as of one look: faster by half, and tumors within 0.05 mm as good.
-        looks = self._looks(frame, others, every=1 + len(others))
-        start = last.unsmoothed if last is not None else None
-        usual, found = self._calibration.usual_cost * looks.count, []
-        if isinstance(start, ElasticMotion):
-            with frame.stage("follow"):
-                starts = [start, *(rival for rival, _ in start.rivals)]
-                found += [self._registration.follow(looks, one, self._near) for one in starts]
-        method = self._turned_over if how.either_side else self._registration
-        fit, doubted = likeliest(found, method.prior) if found else None, True
-        if fit is not None and isinstance(start, ElasticMotion):
-            motion = fit.motion
-            doubted = fit.cost > usual or apart_mm(motion, start) > _JUMP_MM
-            # From one frame to the next nobody turns an organ over.
-            if not doubted and not self._registration.prior.excludes(motion.rotation):
-                method = self._registration
-                fit = likeliest(found, method.prior)
-        if doubted or how.thorough:
-            fit = method.register(looks, fit, frame.stage, again=not doubted)
-        assert fit is not None
-        size, unsmoothed, lag_s = self._size(fit), fit.motion, 0.0
-        if last is not None and isinstance(last.motion, ElasticMotion) and how.smoothing_s > 0:
-            past_s = (cloud.stamp_ns - last.cloud.stamp_ns) * 1e-9
-            share = -math.expm1(-past_s / how.smoothing_s)
-            smooth = blend(last.motion, unsmoothed, share)
-            behind = smooth.carry(self._samples_ct) - unsmoothed.carry(self._samples_ct)
-            if np.linalg.norm(behind, axis=1).max() < _BEHIND_MM:
-                fit = replace(fit, motion=smooth)
-                lag_s = past_s * (1 - share) / share  # of what moves steadily
+        points = self._points(frame, looks, every=len(looks))
+        fit, prior = self._fit_after(last, points, how, frame)
+        size, unsmoothed = self._size(fit), fit.motion
+        fit, lag_s = self._smoothed(fit, last, cloud.stamp_ns, how.smoothing_s)
         placed = self._checked(fit, frame)
         with frame.stage("carry"):
             inside = self._carry(placed, cloud.stamp_ns)
         smoothing = SmoothingReport(time_s=how.smoothing_s, lag_ms=1000 * lag_s)
-        more = {"size": size, "smoothing": smoothing}
-        report = self._report(frame, placed, inside, method.prior, others, **more)
+        report = self._report(frame, looks, placed, inside, prior, size=size, smoothing=smoothing)
         made = Estimate(inside, None, placed.meshes, report, placed.motion, unsmoothed)
         return replace(made, structures=placed.structures)
 
-    def _looks(self, frame: Frame, others: Sequence[Look], every: int = 1) -> Looks:
-        """The first camera's points, and those of further looks."""
-        more = [Frame(self._model, one.cloud, frame.seed, frame.rng) for one in others]
-        points_mm = [one.points_mm[::every] for one in (frame, *more)]
-        return Looks.of(points_mm, [one.camera_from_look for one in others])
+    def _fit_after(
+        self, last: Estimate | None, looks: Looks, how: FollowOptions, frame: Frame
+    ) -> tuple[RegistrationResult, PosePrior]:
+        """The fit near the last motion and its rivals; of a search, where there is no last motion,
+        or that fit is doubtful. And the prior by which it is the likeliest."""
+        method = self._turned_over if how.either_side else self._registration
+        start = None if last is None else last.unsmoothed
+        if not isinstance(start, ElasticMotion):
+            return method.register(looks, None, frame.stage), method.prior
+        with frame.stage("follow"):
+            starts = [start, *(rival for rival, _ in start.rivals)]
+            fits = [self._registration.follow(looks, near, self._near) for near in starts]
+        fit, usual = likeliest(fits, method.prior), self._calibration.usual_cost * looks.count
+        doubtful = fit.cost > usual or apart_mm(fit.motion, start) > _JUMP_MM
+        # From one frame to the next nobody turns an organ over.
+        if not doubtful and not self._registration.prior.excludes(fit.motion.rotation):
+            method = self._registration
+            fit = likeliest(fits, method.prior)
+        if doubtful or how.thorough:
+            fit = method.register(looks, fit, frame.stage, again=not doubtful)
+        return fit, method.prior
+
+    def _smoothed(
+        self, fit: RegistrationResult, last: Estimate | None, stamp_ns: int, smoothing_s: float
+    ) -> tuple[RegistrationResult, float]:
+        """With the mean over past motions, and by how many seconds that lags behind what moves
+        steadily; a mean that lies too far behind is left out."""
+        if last is None or not isinstance(last.motion, ElasticMotion) or smoothing_s <= 0:
+            return fit, 0.0
+        past_s = (stamp_ns - last.cloud.stamp_ns) * 1e-9
+        share = -math.expm1(-past_s / smoothing_s)
+        mean = blend(last.motion, fit.motion, share)
+        behind_mm = mean.carry(self._samples_ct) - fit.motion.carry(self._samples_ct)
+        if np.linalg.norm(behind_mm, axis=1).max() >= _BEHIND_MM:
+            return fit, 0.0
+        return replace(fit, motion=mean), past_s * (1 - share) / share
+
+    def _points(self, frame: Frame, looks: Sequence[Look], every: int = 1) -> Looks:
+        """What the fit takes of all looks; ``frame`` is the first one's."""
+        more = [Frame(self._model, look.cloud, frame.seed, frame.rng) for look in looks[1:]]
+        points_mm = [each.points_mm[::every] for each in (frame, *more)]
+        return Looks.of(points_mm, [look.camera_from_look for look in looks[1:]])
 
     def warm(self) -> None:
         """See ``tracking.tracker.Tracker.warm``."""
@@ -201,13 +197,13 @@ class RegistrationLocator:
         times, gain = apparent_size(fit.motion, fit.looks, self._registration.config)
         return SizeFit(times=times, gain=gain)
 
-    def _checked(self, fit: RegistrationResult, frame: Frame) -> _Registered:
-        """What a fit says, if it can be this organ's."""
+    def _checked(self, fit: RegistrationResult, frame: Frame) -> _Placed:
+        """The organ as a fit has it, if it can be this organ."""
         self._registration.check(fit, self._model.in_distribution)
         with frame.stage("surfaces"):
             return self._moved(fit)
 
-    def _moved(self, fit: RegistrationResult) -> _Registered:
+    def _moved(self, fit: RegistrationResult) -> _Placed:
         calibration = self._model.config.scene.calibration
         motion = self._registration.uncertain(fit, calibration, self._calibration.std_scale)
         anatomy = self._shape.anatomy_ct
@@ -222,81 +218,36 @@ class RegistrationLocator:
         )
         assert known_mm2 is not None
         count = len(self._samples_ct)
-        return _Registered(fit, motion, surfaces, known_mm2[:count], known_mm2[count:], structures)
+        return _Placed(fit, motion, surfaces, known_mm2[:count], known_mm2[count:], structures)
 
     def _report(
         self,
         frame: Frame,
-        placed: _Registered,
+        looks: Sequence[Look],
+        placed: _Placed,
         inside: OccupancyCloud,
         prior: PosePrior,
-        others: Sequence[Look],
         **more: Any,
     ) -> FitReport:
-        fit, motion, process = placed.fit, placed.motion, placed.motion.discrepancy
-        surfaces, deviations = np.split(placed.sample_mm2, self._sample_ends), {}
-        named = zip(self._model.parts, placed.middle_mm2, surfaces, strict=True)
-        for name, middle_mm2, surface_mm2 in named:
-            squares, axes = np.linalg.eigh(middle_mm2)
-            deviations[name] = {
-                "center_std_mm": float(np.sqrt(squares.mean())),
-                "center_axes_std_mm": np.sqrt(squares[::-1]).tolist(),
-                "center_axes": axes.T[::-1].tolist(),
-                "surface_std_mm": float(np.sqrt(np.linalg.eigvalsh(surface_mm2).max())),
-            }
-        parts = describe_parts(self._model.parts, placed.meshes, inside, deviations)
-        poses = AllowedPoses(
-            up_lps=prior.up_ct.tolist(),
-            tilt_degrees=prior.tilt_degrees,
-            either_side=prior.either_side,
-        )
-        about = MotionReport(
-            camera_from_ct=motion.camera_from_ct.tolist(),
-            coefficients=motion.coefficients.tolist(),
-            rarity=motion.rarity,
-            steps=fit.steps,
-            discrepancy_mm=None if process is None else process.amplitude_mm,
-            noise_mm=None if process is None else process.noise_mm,
-        )
+        fit, surfaces_mm2 = placed.fit, np.split(placed.sample_mm2, self._sample_ends)
+        named = zip(self._model.parts, placed.middle_mm2, surfaces_mm2, strict=True)
+        deviations = {name: entries.part_deviations(*covariances) for name, *covariances in named}
+        usual_cost, last_mm = self._calibration.usual_cost, self._registration.config.last_mm
         report = frame.report(
             np.abs(fit.distances_mm),
-            parts,
+            describe_parts(self._model.parts, placed.meshes, inside, deviations),
             structures=tuple(placed.structures),
-            fit_cost=self._cost(fit, prior),
-            poses=poses,
-            motion=about,
-            looks=fit.looks.described() if others else None,
+            fit_cost=entries.cost_entry(fit, prior, usual_cost, last_mm),
+            poses=entries.poses_entry(prior),
+            motion=entries.motion_entry(placed.motion, fit.steps),
+            looks=fit.looks.described() if len(looks) > 1 else None,
             **more,
         )
-        points = report.points + sum(len(one.cloud.points_mm) for one in others)
+        points = sum(len(look.cloud.points_mm) for look in looks)
         return msgspec.structs.replace(report, points=points)
 
-    def _cost(self, fit: RegistrationResult, prior: PosePrior) -> FitCost:
-        """Of several looks the one with most strays counts."""
-        looks, strays, others = fit.looks, fit.strays, []
-        if looks.count > 1:
-            far = np.abs(fit.distances_mm) > FARTHEST * self._registration.config.last_mm
-            strays = max(float(far[looks.look == n].mean()) for n in range(looks.count))
-        for rival in fit.rivals:
-            apart_mm = self._apart_mm(fit.motion, rival.motion)
-            others.append(RivalFit(more=rival.cost - fit.cost, apart_mm=apart_mm))
-        return FitCost(
-            now=fit.cost,
-            without_strays=fit.cost_without_strays,
-            usual=self._calibration.usual_cost * looks.count,
-            strays=strays,
-            others=tuple(others),
-            beyond=_excluded(fit, prior),
-        )
-
-    def _apart_mm(self, motion: ElasticMotion, rival: ElasticMotion) -> dict[str, float]:
-        """How far from each other the middles of the parts lie."""
-        away = rival.carry(self._shape.middles_ct) - motion.carry(self._shape.middles_ct)
-        apart_mm = np.linalg.norm(away, axis=1).tolist()
-        return dict(zip(self._model.parts, apart_mm, strict=True))
-
     def _drawn(
-        self, placed: _Registered, organ: Mesh, stamp_ns: int, rng: np.random.Generator
+        self, placed: _Placed, organ: Mesh, stamp_ns: int, rng: np.random.Generator
     ) -> OccupancyCloud:
         """Random points of the organ's box that lie inside, with label and probability."""
         lower, upper = organ.box_mm
@@ -307,7 +258,7 @@ class RegistrationLocator:
         probability = placed.probability(mine)
         return OccupancyCloud(points.take(inside, 0), mine.labels, probability, stamp_ns)
 
-    def _carry(self, placed: _Registered, stamp_ns: int) -> OccupancyCloud:
+    def _carry(self, placed: _Placed, stamp_ns: int) -> OccupancyCloud:
         """The same points of the organ in every frame: labels stay, places and probabilities are
         new."""
         if self._carried is None:
@@ -330,13 +281,3 @@ class RegistrationLocator:
         mine = points_ct.take(inside, 0)  # much faster than by a mask
         sample = kernels.look_up(*self._nearest_sample, mine)
         return inside, _OrganPoints(mine, labels[inside], margin_mm[inside], sample)
-
-
-def _excluded(fit: RegistrationResult, prior: PosePrior) -> ExcludedFit | None:
-    """A pose on the other side that explains the points as well, or better in one that is excluded;
-    or that was found all the same."""
-    other = fit if prior.excludes(fit.motion.rotation) else fit.beyond
-    if other is None:
-        return None
-    tilt_degrees = float(prior.tilt_degrees_of(other.motion.rotation))
-    return ExcludedFit(less=fit.cost - other.cost, tilt_degrees=tilt_degrees)

@@ -137,7 +137,7 @@ class Search:
         beyond = self.prior.as_stated.excludes(rotations)
         for count, widths_mm, share in _STAGES:
             points_mm = every[:: max(1, len(every) // count)][:count].copy()
-            costs = self._descend(points_mm, widths_mm, rotations, centres)
+            costs = self.descend(points_mm, widths_mm, rotations, centres)
             best = np.concatenate([_least(costs, group, share) for group in (~beyond, beyond)])
             rotations, centres, beyond = rotations[best], centres[best], beyond[best]
         most, others = (_KEPT_AGAIN, 1) if again else (_KEPT, _KEPT_BEYOND)
@@ -156,17 +156,23 @@ class Search:
                 motions.append(motion)
         return motions
 
-    def _descend(
+    def descend(
         self,
         points_mm: Points,
         widths_mm: Float64[np.ndarray, " w"],
         rotations: Rotations,
         centres: Centres,
     ) -> Float64[np.ndarray, " s"]:
-        """Refines poses in place; what they cost then."""
-        shape, costs = self.rest, np.empty(len(rotations))
-        about = shape.distances[0], shape.body.center_ct, points_mm, widths_mm
-        problem = RigidProblem(*about, _COMPARED_MM, _DAMPING)
+        """Refine poses in place, with a robust kernel of these widths in turn; their costs then."""
+        costs = np.empty(len(rotations))
+        problem = RigidProblem(
+            distances=self.rest.distances[0],
+            center_ct=self.rest.body.center_ct,
+            points=points_mm,
+            widths_mm=widths_mm,
+            last_mm=_COMPARED_MM,
+            damping=_DAMPING,
+        )
         parallel_for(
             lambda part: descend_rigidly(problem, rotations[part], centres[part], costs[part]),
             len(rotations),

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 
 from tumortrack.core.estimate import Estimate
 from tumortrack.core.geometry import Points, transform_points, triangles_of
-from tumortrack.core.types import Look, Mesh, SensorCloud
+from tumortrack.core.types import Look, Mesh
 from tumortrack.registration.motion import ElasticMotion
 
 _MOST = 2000  # of the organ's faces, or vertices: they tell enough
@@ -19,22 +19,20 @@ _HIDDEN = 0.1  # share of what faces the camera
 _ASIDE = 0.3  # sine to the line of sight: a direction that is no more aside is none
 
 
-def where_to_look(estimate: Estimate, cloud: SensorCloud, others: Sequence[Look] = ()) -> str:
+def where_to_look(estimate: Estimate, looks: Sequence[Look]) -> str:
     """Towards which side of the organ the camera should look, and why there.
 
     Where a tenth of what faces the camera is among no view's points: there. Where another fit is
     nearly as likely: where its surface lies farthest from this one's. Else along the axis in which
     a tumor's centre is least certain: surfaces hold what lies along their normals.
-
-    Args:
-        cloud: the organ's points, camera frame, in which it was located.
-        others: more looks at it; the sides are those of the first camera's picture.
+    Sides are those of the first look's picture.
     """
     organ = estimate.organ_mesh
     facing, centre = near_side(organ), organ.vertices_mm.mean(0)
-    more = [transform_points(one.camera_from_look, one.cloud.points_mm) for one in others]
-    points_mm = np.concatenate([cloud.points_mm, *more])
-    camera = "the first camera's" if more else "the camera's"
+    points_mm = np.concatenate(
+        [transform_points(look.camera_from_look, look.cloud.points_mm) for look in looks]
+    )
+    camera = "the first camera's" if len(looks) > 1 else "the camera's"
     if len(facing) and len(points_mm):
         hidden = unseen(facing, points_mm)
         towards = facing[hidden].mean(0) - centre if hidden.mean() > _HIDDEN else np.zeros(3)

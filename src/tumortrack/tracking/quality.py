@@ -52,12 +52,7 @@ _UNSEEN = 0.1
 _NEAR_MM = 6.0  # of a point, or twice the points' usual distance: seen
 
 
-def judged(
-    estimate: Estimate,
-    seen: DepthFrame | SensorCloud,
-    strictly: bool = False,
-    others: Sequence[Look] = (),
-) -> Estimate:
+def judged(estimate: Estimate, looks: Sequence[Look], strictly: bool = False) -> Estimate:
     """The estimate with what speaks against it, and in its report the shares of the organ that are
     seen through, in sight and, of a cloud, not seen.
 
@@ -68,18 +63,10 @@ def judged(
     may be joined from several views.
 
     Args:
-        seen: all that the camera saw, not the organ's points alone, where it is known.
+        looks: at it; the one that says most against the estimate counts.
         strictly: the fit must be no worse than usual, whatever the camera sees round the organ.
-        others: more looks at it; the one that says most against the estimate counts.
     """
-    organ, looks = estimate.organ_mesh, estimate.report.looks
-    views = [(organ, seen)]
-    if looks is not None:
-        before = zip(others, looks.camera_from_look[1:], strict=True)
-        for one, camera_from_look in before:
-            look_from_camera = np.linalg.inv(np.array(camera_from_look))
-            there_mm = transform_points(look_from_camera, organ.vertices_mm)
-            views.append((organ.moved(there_mm), one.seen))
+    views = _organ_before_cameras(estimate, looks)
     by_image = [seen_through(there, view) for there, view in views if isinstance(view, DepthFrame)]
     clouds = [cloud_shares(there, view) for there, view in views if isinstance(view, SensorCloud)]
     unseen = max((share for _, share in clouds), default=0.0)
@@ -105,6 +92,20 @@ def judged(
         in_sight=in_sight,
         doubted_in_sight=(in_sight or 0.0) if through > doubtful else None,
     )
+
+
+def _organ_before_cameras(
+    estimate: Estimate, looks: Sequence[Look]
+) -> list[tuple[Mesh, DepthFrame | SensorCloud]]:
+    """The organ in the frame of each camera, as its place was corrected, and all that it saw."""
+    organ, corrected = estimate.organ_mesh, estimate.report.looks
+    views = [(organ, looks[0].seen)]
+    if corrected is not None:
+        for look, pose in zip(looks[1:], corrected.camera_from_look[1:], strict=True):
+            look_from_camera = np.linalg.inv(np.array(pose))
+            there_mm = transform_points(look_from_camera, organ.vertices_mm)
+            views.append((organ.moved(there_mm), look.seen))
+    return views
 
 
 def doubt_if_hidden(estimate: Estimate, last: Estimate) -> Estimate:

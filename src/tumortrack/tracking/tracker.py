@@ -49,19 +49,11 @@ class Locator(Protocol):
 
     anatomy_ct: Anatomy | None
 
-    def locate(
-        self, cloud: SensorCloud, grid: int, seed: int, others: Sequence[Look] = ()
-    ) -> Estimate:
-        """See ``Tracker.locate``."""
+    def locate(self, looks: Sequence[Look], grid: int, seed: int) -> Estimate:
+        """See ``Tracker.locate``; in the frame of the first look's camera."""
 
-    def follow(
-        self,
-        cloud: SensorCloud,
-        last: Estimate | None,
-        how: FollowOptions,
-        others: Sequence[Look] = (),
-    ) -> Estimate:
-        """See ``Tracker.follow``."""
+    def follow(self, looks: Sequence[Look], last: Estimate | None, how: FollowOptions) -> Estimate:
+        """See ``Tracker.follow``; likewise."""
 
     def warm(self) -> None:
         """See ``Tracker.warm``."""
@@ -119,10 +111,11 @@ class Tracker:
                 f"locate takes a SensorCloud, not {type(cloud).__name__}: read_cloud(FILE), or "
                 "SensorCloud(points_mm) of an n x 3 array in the camera frame."
             )
-        with self._explaining(cloud, others, _ALONE):
-            estimate = self._locator.locate(cloud, grid, seed, others)
-            estimate = self._judged(estimate, cloud, seen or cloud, False, others)
-        return self._explained(estimate, cloud, others, _ALONE)
+        looks = Look(cloud, seen or cloud, HERE), *others
+        with self._explaining(looks, _ALONE):
+            estimate = self._locator.locate(looks, grid, seed)
+            estimate = self._judged(estimate, looks, False)
+        return self._explained(estimate, looks, _ALONE)
 
     def follow(
         self,
@@ -138,63 +131,55 @@ class Tracker:
         ``locate``."""
         # What fits worse all of a sudden may be something else that was put there.
         strictly = how.either_side if last is None else last.quality != "good" or not _unusual(last)
-        with self._explaining(cloud, others, how):
-            estimate = self._locator.follow(cloud, last, how, others)
-            estimate = self._judged(estimate, cloud, seen or cloud, strictly, others, last)
-        return self._explained(estimate, cloud, others, how)
+        looks = Look(cloud, seen or cloud, HERE), *others
+        with self._explaining(looks, how):
+            estimate = self._locator.follow(looks, last, how)
+            estimate = self._judged(estimate, looks, strictly, last)
+        return self._explained(estimate, looks, how)
 
     def _judged(
         self,
         estimate: Estimate,
-        cloud: SensorCloud,
-        seen: DepthFrame | SensorCloud,
+        looks: Sequence[Look],
         strictly: bool,
-        others: Sequence[Look] = (),
         last: Estimate | None = None,
     ) -> Estimate:
         start = time.perf_counter()
-        estimate = judged(estimate, seen, strictly, others)
+        estimate = judged(estimate, looks, strictly)
         if last is not None:
             estimate = doubt_if_hidden(estimate, last)
         if self._weakness:
             estimate = replace(estimate, finding=Finding("model", {"words": self._weakness}))
         # Margins are calibrated on single looks.
-        estimate = with_margin(estimate, cloud, None if others else self.model.margins)
+        margins = self.model.margins if len(looks) == 1 else None
+        estimate = with_margin(estimate, looks[0].cloud, margins)
         estimate = replace(estimate, patient=self._patient, organ=self._organ)
         return _timed(estimate, "judge", start)
 
-    def _explained(
-        self, estimate: Estimate, cloud: SensorCloud, others: Sequence[Look], how: FollowOptions
-    ) -> Estimate:
+    def _explained(self, estimate: Estimate, looks: Sequence[Look], how: FollowOptions) -> Estimate:
         """With the likely causes of a poor one, and what to do."""
         start = time.perf_counter()
         if estimate.finding is not None and not self._weakness:
-            causes = self._causes(cloud, others, how, estimate)
-            advice = words(causes, where_to_look(estimate, cloud, others))
+            causes = self._causes(looks, how, estimate)
+            advice = words(causes, where_to_look(estimate, looks))
             estimate = replace(estimate, causes=causes, advice=advice)
         return _timed(estimate, "explain", start)
 
     def _causes(
-        self,
-        cloud: SensorCloud,
-        others: Sequence[Look],
-        how: FollowOptions,
-        estimate: Estimate | None,
+        self, looks: Sequence[Look], how: FollowOptions, estimate: Estimate | None
     ) -> tuple[Likely, ...]:
         check = _check_of(estimate)
-        if others and check in _OF_POSES:
+        if len(looks) > 1 and check in _OF_POSES:
             return (Likely(Cause.POSES),)
-        return how.known.get(check) or likely_causes(self.model, cloud, estimate)
+        return how.known.get(check) or likely_causes(self.model, looks[0].cloud, estimate)
 
     @contextmanager
-    def _explaining(
-        self, cloud: SensorCloud, others: Sequence[Look], how: FollowOptions
-    ) -> Iterator[None]:
+    def _explaining(self, looks: Sequence[Look], how: FollowOptions) -> Iterator[None]:
         """Adds its likely causes to what is not this organ."""
         try:
             yield
         except NotThisOrgan as error:
-            causes = self._causes(cloud, others, how, None)
+            causes = self._causes(looks, how, None)
             raise NotThisOrgan(f"{error}{words(causes, '')}.", causes) from error
 
     def warm(self) -> None:

@@ -1,0 +1,88 @@
+"""What a fit says of itself, as entries of an estimate's report."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from tumortrack.core.report import AllowedPoses, ExcludedFit, FitCost, MotionReport, RivalFit
+from tumortrack.registration.discrepancy import FARTHEST
+from tumortrack.registration.gauss_newton import RegistrationResult
+from tumortrack.registration.motion import ElasticMotion
+from tumortrack.registration.search import PosePrior
+
+
+def cost_entry(
+    fit: RegistrationResult, prior: PosePrior, usual_cost: float, last_mm: float
+) -> FitCost:
+    """``usual_cost``: of one look; ``last_mm``: the robust kernel's last width. Of several looks
+    the one with most strays counts."""
+    looks, strays = fit.looks, fit.strays
+    if looks.count > 1:
+        far = np.abs(fit.distances_mm) > FARTHEST * last_mm
+        strays = max(float(far[looks.look == n].mean()) for n in range(looks.count))
+    rivals = [
+        RivalFit(more=rival.cost - fit.cost, apart_mm=_middles_apart_mm(fit.motion, rival.motion))
+        for rival in fit.rivals
+    ]
+    return FitCost(
+        now=fit.cost,
+        without_strays=fit.cost_without_strays,
+        usual=usual_cost * looks.count,
+        strays=strays,
+        others=tuple(rivals),
+        beyond=_excluded(fit, prior),
+    )
+
+
+def _middles_apart_mm(motion: ElasticMotion, rival: ElasticMotion) -> dict[str, float]:
+    """How far from each other the middles of the parts lie."""
+    middles_ct = motion.shape.middles_ct
+    away = rival.carry(middles_ct) - motion.carry(middles_ct)
+    apart_mm = np.linalg.norm(away, axis=1).tolist()
+    return dict(zip(motion.shape.anatomy_ct.names, apart_mm, strict=True))
+
+
+def _excluded(fit: RegistrationResult, prior: PosePrior) -> ExcludedFit | None:
+    """A pose with the other side up that explains the points as well, or better in one that is
+    excluded; or the fit itself, if it is in one."""
+    other = fit if prior.excludes(fit.motion.rotation) else fit.beyond
+    if other is None:
+        return None
+    tilt_degrees = float(prior.tilt_degrees_of(other.motion.rotation))
+    return ExcludedFit(less=fit.cost - other.cost, tilt_degrees=tilt_degrees)
+
+
+def poses_entry(prior: PosePrior) -> AllowedPoses:
+    return AllowedPoses(
+        up_lps=prior.up_ct.tolist(),
+        tilt_degrees=prior.tilt_degrees,
+        either_side=prior.either_side,
+    )
+
+
+def motion_entry(motion: ElasticMotion, steps: int) -> MotionReport:
+    process = motion.discrepancy
+    return MotionReport(
+        camera_from_ct=motion.camera_from_ct.tolist(),
+        coefficients=motion.coefficients.tolist(),
+        rarity=motion.rarity,
+        steps=steps,
+        discrepancy_mm=None if process is None else process.amplitude_mm,
+        noise_mm=None if process is None else process.noise_mm,
+    )
+
+
+def part_deviations(
+    center_mm2: Float[np.ndarray, "3 3"], surface_mm2: Float[np.ndarray, "n 3 3"]
+) -> dict[str, Any]:
+    """Fields of a ``PartReport``, by the covariances of a part's centre and of places on it."""
+    squares, axes = np.linalg.eigh(center_mm2)
+    return {
+        "center_std_mm": float(np.sqrt(squares.mean())),
+        "center_axes_std_mm": np.sqrt(squares[::-1]).tolist(),
+        "center_axes": axes.T[::-1].tolist(),
+        "surface_std_mm": float(np.sqrt(np.linalg.eigvalsh(surface_mm2).max())),
+    }
