@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from elastic_objects import CENTER, RADII, SMALL, UP
+from elastic_objects import CENTER, RADII, UP
 from pose_objects import OVER, PLACE_MM, lying, seen
 from tumortrack.core.estimate import FollowOptions
 from tumortrack.core.geometry import rigid
@@ -19,12 +19,10 @@ from tumortrack.models.config import GaussNewtonConfig
 from tumortrack.models.in_distribution import RIVAL_COST
 from tumortrack.registration.looks import Looks
 from tumortrack.registration.registration import Registration
-from tumortrack.registration.rest_shape import shape_of
 from tumortrack.registration.search import APART_MM, PosePrior, Search, apart_mm
-from tumortrack.simulate.elastic.body import build_body
 from tumortrack.tracking.model_files import load_model
 from tumortrack.tracking.tracker import Tracker
-from warp_objects import ANATOMY, TURNED, placed, shape, with_slope
+from warp_objects import ANATOMY, TURNED, placed, shape, shape_of, with_slope
 from warp_objects import PLACE_MM as ELLIPSOID_MM
 
 UP_CT = np.array(UP)
@@ -35,7 +33,7 @@ LIMITED, ANYHOW = PosePrior(UP_CT, 30.0), PosePrior(UP_CT, 180.0)
 def rest(phantom_case):
     """The phantom, with a body that is quickly made."""
     anatomy = load_case(phantom_case).anatomy
-    return shape_of(anatomy, build_body(anatomy, UP, SMALL, 3))
+    return shape_of(anatomy)
 
 
 def over(motion):
@@ -212,7 +210,7 @@ def test_an_organ_nearly_the_same_from_below_may_lie_upside_down(slim_model):
     known = load_model(slim_model)
     trained = {**known.provenance, "validation_far": 0.0}
     noisy = msgspec.structs.replace(known.calibration, usual_cost=20.0)  # its scenes have no noise
-    bowed = shape_of(banana, build_body(banana, UP, SMALL, 3))
+    bowed = shape_of(banana)
     tracker = Tracker(replace(known, shape=bowed, provenance=trained, calibration=noisy))
     upright = lying(bowed, 30)
     found, right = (

@@ -18,7 +18,7 @@ from tumortrack.registration.gauss_newton import GaussNewton, RegistrationResult
 from tumortrack.registration.looks import Looks
 from tumortrack.registration.motion import ElasticMotion
 from tumortrack.registration.registration import Registration
-from tumortrack.registration.rest_shape import RestShape, shape_of
+from tumortrack.registration.rest_shape import RestShape, distances_of
 from tumortrack.registration.search import PosePrior
 from tumortrack.simulate.deform import ElasticConfig
 from tumortrack.simulate.elastic.body import build_body
@@ -29,9 +29,14 @@ TURNED = Rotation.from_euler("xyz", [95, 10, 35], degrees=True).as_matrix()
 PLACE_MM = np.array([8.0, -5.0, 170.0])
 
 
+def shape_of(anatomy: Anatomy) -> RestShape:
+    """With a body that is quickly made."""
+    return RestShape(anatomy, build_body(anatomy, UP, SMALL, 3), distances_of(anatomy))
+
+
 @cache
 def shape() -> RestShape:
-    return shape_of(ANATOMY, build_body(ANATOMY, UP, SMALL, 3))
+    return shape_of(ANATOMY)
 
 
 def placed(state: int = 73, share: float = 1.0) -> ElasticMotion:

@@ -1,7 +1,7 @@
-"""Make a model of one organ: its elastic body, and what its fits can be trusted with.
+"""Make a model of one organ: its elastic body, and the calibration of its fits.
 
-Nothing is learnt. Scenes are simulated whose truth is known; from them follow what a right fit
-costs, by how much its standard deviations are off, and how far its points spread.
+Nothing is learnt. On simulated scenes, whose truth is known, it is measured what a right fit costs,
+by which factor its standard deviations are off, and how far its points spread.
 """
 
 from __future__ import annotations
@@ -31,31 +31,31 @@ from tumortrack.registration.model import (
 )
 from tumortrack.registration.motion import ElasticMotion
 from tumortrack.registration.registration import Registration
-from tumortrack.registration.rest_shape import distances_of, shape_of
+from tumortrack.registration.rest_shape import RestShape, distances_of
 from tumortrack.sense.cloud import thin_cloud
 from tumortrack.sense.noise import CalibrationConfig
 from tumortrack.simulate.scene import SceneRecipe, Simulator, body_for
 from tumortrack.simulate.scene_folder import draw_targets
 
 _USUAL = 90  # per cent of the right fits cost no more than the usual cost
-# Of all errors lie within this radius if each axis errs normally by 1; the others, a tenth, may
+# This share of all errors lies within this radius if each axis errs normally by 1; the others may
 # come from fits that are wrong altogether.
 _COVERED, _RADIUS = 0.9, 2.5
 Up = tuple[float, float, float]
-Progress = Callable[[int, int], None]  # what is done, of how much
+Progress = Callable[[int, int], None]  # steps done, of how many
 
 
 @dataclass(frozen=True, eq=False)
 class _Scene:
-    """What a camera sees of a known state (camera frame, mm), where inner points are, and the
-    undeformed organ in its place."""
+    """What a camera sees of a known state (camera frame, mm), the true places of inner points, and
+    the undeformed organ in the true pose."""
 
     looks: Looks
     inner_mm: Float64[np.ndarray, "m 3"]
     place: ElasticMotion
 
     def off_mm(self, motion: ElasticMotion, inner_ct: Float64[np.ndarray, "m 3"]) -> float:
-        """How far off a motion has the inner points, in the mean."""
+        """The mean error of a motion at the inner points."""
         return float(np.linalg.norm(motion.carry(inner_ct) - self.inner_mm, axis=1).mean())
 
 
@@ -79,8 +79,8 @@ def build_model(
     """
     check_seed(seed)
     steps = 2 + config.scenes + config.searched
-    with ThreadPoolExecutor(1) as beside:  # the body takes as long
-        distances = beside.submit(distances_of, anatomy_ct)
+    with ThreadPoolExecutor(1) as pool:  # the body takes as long
+        distances = pool.submit(distances_of, anatomy_ct)
         body = body_for(anatomy_ct, up_lps, config.scene, seed)
         if body is None:
             raise InputError(
@@ -88,66 +88,70 @@ def build_model(
                 "has none."
             )
         progress(1, steps)
-        rest = shape_of(anatomy_ct, body, distances.result())
+        rest = RestShape(anatomy_ct, body, distances.result())
     progress(2, steps)
     inner_ct = draw_targets(anatomy_ct, seed).points_ct
     simulator, scenes = Simulator(anatomy_ct, up_lps, config.scene, body), []
     for index in range(config.scenes):
         recipe = SceneRecipe(seed, "validation", index)
-        made = simulator.render(recipe)
-        cloud = thin_cloud(made.cloud, config.scene.cloud.n_points, recipe.generator(999))
-        turn, shift_mm = made.camera_from_ct[:3, :3], made.camera_from_ct[:3, 3]
+        stage = simulator.render(recipe)
+        cloud = thin_cloud(stage.cloud, config.scene.cloud.n_points, recipe.generator(999))
+        turn, shift_mm = stage.camera_from_ct[:3, :3], stage.camera_from_ct[:3, 3]
         place = ElasticMotion(rest, turn.copy(), turn @ body.center_ct + shift_mm, body.mean)
-        inner_mm = made.carry(inner_ct).astype(float)
+        inner_mm = stage.carry(inner_ct).astype(float)
         scenes.append(_Scene(Looks.of([cloud.points_mm]), inner_mm, place))
         progress(3 + index, steps)
     registration = Registration(rest, config.refine, pose_prior(config.scene.pose, up_lps))
-    nearby = parallel_map(lambda one: refine(rest, one.looks, one.place, config.refine), scenes)
+    nearby = parallel_map(
+        lambda scene: refine(rest, scene.looks, scene.place, config.refine), scenes
+    )
     pairs = list(zip(scenes, nearby, strict=True))
-    right = [fit.cost for one, fit in pairs if one.off_mm(fit.motion, inner_ct) <= FAR_MM]
+    right = [fit.cost for scene, fit in pairs if scene.off_mm(fit.motion, inner_ct) <= FAR_MM]
     usual_cost = float(np.percentile(right or [fit.cost for fit in nearby], _USUAL))
     done = count(3 + config.scenes)
 
-    def found(one: _Scene) -> RegistrationResult:
-        fit = registration.register(one.looks)
+    def located(scene: _Scene) -> RegistrationResult:
+        fit = registration.register(scene.looks)
         progress(next(done), steps)
         return fit
 
     # A scene a thread: the parts of a search wait for each other.
-    fits = parallel_map(found, scenes[: config.searched])
-    std_scale, checked = _judged(registration, scenes, fits, config.scene.calibration, inner_ct)
-    spreads = [spread_mm(one.looks.points_mm) for one in scenes]
+    fits = parallel_map(located, scenes[: config.searched])
+    std_scale, errors = _compared_with_truth(
+        registration, scenes, fits, config.scene.calibration, inner_ct
+    )
+    spreads = [spread_mm(scene.looks.points_mm) for scene in scenes]
     fits_mm = [fit_mm(np.abs(fit.distances_mm)) for fit in fits]
-    known = InDistributionRange(
+    usual = InDistributionRange(
         spread_mm=(min(spreads), max(spreads)), fit_mm=float(np.percentile(fits_mm, 95))
     )
     return RegistrationModel(
         config=config,
         parts=anatomy_ct.names,
-        in_distribution=known,
-        provenance={"seed": seed, "up_lps": list(up_lps), **(about or {}), **checked},
+        in_distribution=usual,
+        provenance={"seed": seed, "up_lps": list(up_lps), **(about or {}), **errors},
         shape=rest,
         calibration=UncertaintyCalibration(std_scale=std_scale, usual_cost=usual_cost),
     )
 
 
-def _judged(
+def _compared_with_truth(
     registration: Registration,
     scenes: list[_Scene],
     fits: list[RegistrationResult],
     calibration: CalibrationConfig,
     inner_ct: Float64[np.ndarray, "m 3"],
 ) -> tuple[float, dict[str, float]]:
-    """By how much standard deviations have to be larger; how far off the answers were."""
+    """The factor for standard deviations, and how far off the answers were."""
     errors, nearest, ratios = [], [], []
-    for one, fit in zip(scenes, fits, strict=False):
-        known_mm2 = registration.uncertain(fit, calibration).covariance_mm2(inner_ct)
-        assert known_mm2 is not None
-        away = fit.motion.carry(inner_ct) - one.inner_mm
-        errors.append(one.off_mm(fit.motion, inner_ct))
-        others = [one.off_mm(rival.motion, inner_ct) for rival in fit.rivals]
+    for scene, fit in zip(scenes, fits, strict=False):
+        covariance_mm2 = registration.uncertain(fit, calibration).covariance_mm2(inner_ct)
+        assert covariance_mm2 is not None
+        away = fit.motion.carry(inner_ct) - scene.inner_mm
+        errors.append(scene.off_mm(fit.motion, inner_ct))
+        others = [scene.off_mm(rival.motion, inner_ct) for rival in fit.rivals]
         nearest.append(min([errors[-1], *others]))
-        solved = np.linalg.solve(known_mm2, away[..., None])[..., 0]
+        solved = np.linalg.solve(covariance_mm2, away[..., None])[..., 0]
         ratios.append(np.sqrt((solved * away).sum(1)))
     std_scale = float(np.quantile(np.concatenate(ratios), _COVERED)) / _RADIUS
     far = float(np.mean(np.array(nearest) > FAR_MM))  # no rival is right

@@ -1,12 +1,12 @@
-"""What the elastic library cannot do: a smooth displacement beside it, judged in each frame.
+"""The elastic library's model error: a smooth displacement beside it, estimated in each frame.
 
-Residuals of neighbours that agree are no noise: the organ is displaced there as no state of the
-library displaces it. A place is therefore taken to lie where pose and state put it, plus a Gaussian
-process: three independent components of one amplitude, correlated over ``LENGTH_MM``. Amplitude and
-noise of a frame are those under which its residuals are most likely. Given the residuals, all of it
-is Gaussian in closed form: sure where the surface is seen, as unsure as the amplitude far from it,
-and pose and state are the less sure the more of the residuals may be discrepancy. Source: Kennedy
-and O'Hagan 2001 (doi 10.1111/1467-9868.00294).
+Spatially correlated residuals are model error, not noise: no state of the library displaces the
+organ as it is displaced there. A place is therefore taken to lie where pose and state put it, plus
+a Gaussian process: three independent components of one amplitude, correlated over ``LENGTH_MM``.
+Amplitude and noise of a frame are those under which its residuals are most likely. Given the
+residuals, the process is Gaussian in closed form: certain where the surface is seen, as uncertain
+as the amplitude far from it; and pose and state are the less certain the more of the residuals may
+be discrepancy. Source: Kennedy and O'Hagan 2001 (doi 10.1111/1467-9868.00294).
 
 Only the covariance is used. The process's mean, added to the motion, moved tumors away from their
 true places in training's scenes (0.5 to 0.6 mm on average, across the line of sight), and changed
@@ -23,11 +23,11 @@ from jaxtyping import Float32, Float64, Int64
 from tumortrack.models.kernels import farthest
 from tumortrack.registration import kernels
 
-# Of the process. 15 and 30 mm rank and cover the errors of training's and the twin's scenes alike.
+# 15 and 30 mm rank and cover the errors of training's and the twin's scenes equally well.
 LENGTH_MM = 20.0
 _GROUPS = 64  # of neighbouring points, some 8 mm apart; 128 see discrepancy where there is none
-# Tried, mm, each twice the last one. Below the least, the distance field errs itself; residuals of
-# several millimetres are those of points that do not belong to the organ.
+# Values that are tried. The distance field itself errs by more than the least; residuals of several
+# millimetres are those of points that do not belong to the organ.
 AMPLITUDES_MM = np.array([0.0, 0.15, 0.3, 0.6, 1.2, 2.4, 4.8])
 NOISES_MM = np.array([0.15, 0.3, 0.6, 1.2, 2.4])  # of one point
 FARTHEST = 2.0  # widths of the robust kernel: what lies beyond weighs less than 1/25

@@ -180,7 +180,7 @@ def distance_at(values, origin, spacing, x, y, z):  # type: ignore[no-untyped-de
 
 @njit(fastmath=True, nogil=True)
 def mark(field, label, points, labels, margin):  # type: ignore[no-untyped-def]
-    """Give points inside the label, and every point the distance if it is the least so far."""
+    """Labels points inside, and lowers each point's margin to its distance from the surface."""
     values, origin, spacing = field.values_mm, field.origin_mm, np.float32(field.spacing_mm)
     for p in range(len(points)):
         x, y, z = points[p, 0], points[p, 1], points[p, 2]
@@ -192,7 +192,7 @@ def mark(field, label, points, labels, margin):  # type: ignore[no-untyped-def]
 
 @njit(nogil=True)
 def probabilities(margins, per_std, which):  # type: ignore[no-untyped-def]
-    """That normal errors do not exceed margins (n,), 0 or more; ``per_std[which]`` of them make one
+    """Of normal errors below margins (n,), 0 or more; ``per_std[which]`` is one over a point's
     standard deviation. Float32 (n,)."""
     out = np.empty(len(margins), np.float32)
     for p in range(len(margins)):
@@ -204,8 +204,8 @@ def probabilities(margins, per_std, which):  # type: ignore[no-untyped-def]
 
 @njit(nogil=True)
 def look_up(origin, nearest, points):  # type: ignore[no-untyped-def]
-    """Which of some places is nearest to each point: that of the nearest node of a lattice, which
-    may be another one where two are about as near; outside as on its border."""
+    """The number of the place nearest to each point: that of the nearest node of a lattice, which
+    may be another where two are about as near; outside the lattice that of its border."""
     step = np.float32(NODES_MM)
     out, zero, half = np.empty(len(points), np.int32), np.float32(0), np.float32(0.5)
     x_last, y_last, z_last = nearest.shape[0] - 1, nearest.shape[1] - 1, nearest.shape[2] - 1

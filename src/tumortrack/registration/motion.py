@@ -1,4 +1,4 @@
-"""Where one frame's organ lies: a pose, an elastic state, and how sure they are."""
+"""Where the organ lies in one frame: a pose, an elastic state, and their uncertainty."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from tumortrack.sense.noise import CALIBRATED, CalibrationConfig
 from tumortrack.simulate.elastic.flow import steps_for
 
 Moved = Float64[np.ndarray, "n 3"]
-_AT_ONCE = 4096  # points: a thread's part
-_FEW = 1024  # as well, where each takes longer
+_AT_ONCE = 4096  # points per thread
+_FEW = 1024  # the same, where each takes longer
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,11 +31,11 @@ class ElasticMotion:
     Attributes:
         rotation, centre_mm: where the organ's axes and centre are before the camera.
         coefficients: of the body's modes; ``covariance``: of shift (mm), turn (rad; both in the
-            CT's axes, about the centre) and coefficients, as ``refine`` left it, if it did.
-        discrepancy: what the body's modes cannot do, where it was judged.
+            CT's axes, about the centre) and coefficients, once fitted.
+        discrepancy: model error beside the modes, where it was estimated.
         rivals: other motions that explain the points nearly as well, each with its share of the
             probability.
-        calibration: the largest errors of the camera's, which no fit can see.
+        calibration: the largest errors of the camera's calibration, which no fit can see.
         std_scale: a factor for its standard deviations, found on validation scenes.
     """
 
@@ -74,7 +74,7 @@ class ElasticMotion:
         return None if covariance is None else std_of(covariance)
 
     def largest_std_mm(self, points_ct: Points, /) -> Float64[np.ndarray, " n"] | None:
-        """One standard deviation along the axis that is least sure, mm."""
+        """One standard deviation along the least certain axis, mm."""
         covariance = self.covariance_mm2(points_ct)
         return None if covariance is None else largest_std_of(covariance)
 
@@ -113,8 +113,8 @@ class ElasticMotion:
         body, points = self.shape.body, np.array(points_camera, np.float32, order="C")
         pose = Pose(body.center_ct, self.rotation, self.centre_mm)
         out = np.empty((len(points), kernels.POSE + len(self.coefficients) + 1), np.float32)
-        known = body.modes, self.shape.distances[0], self._opposite, pose
-        kernels.residual_rows(*known, points, out)
+        distances = self.shape.distances[0]
+        kernels.residual_rows(body.modes, distances, self._opposite, pose, points, out)
         return out
 
     def _moved(self, kernel: Callable[..., None], flow: Flow, points_mm: Points) -> Moved:
@@ -126,7 +126,6 @@ class ElasticMotion:
 
     @cached_property
     def _flow(self) -> Flow:
-        """What the kernels follow."""
         body = self.shape.body
         velocity = body.velocity(self.coefficients)
         steps = steps_for(velocity, body.spacing_mm)

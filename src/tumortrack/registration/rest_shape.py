@@ -1,4 +1,4 @@
-"""What a `clinic` model knows of the organ at rest: surfaces, signed distances, elastic body."""
+"""The organ at rest: surfaces, signed distances to them, elastic body."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from tumortrack.simulate.elastic.body import ElasticBody
 
 _STEPS = 40  # of a distance field, along the part's longest side
 _FINEST_MM, _COARSEST_MM = 0.5, 2.0
-_REACH = 10  # steps about a part; farther out the distance is that of the nearest border
-_AT_ONCE = 4096  # points: a thread's part
+_REACH = 10  # steps around a part; farther out the distance is that of the nearest border
+_AT_ONCE = 4096  # points per thread
 _BODY, _STRUCTURE, _VERTICES = "body.", "structure.", "vertices_mm"
 
 
 def distance_of(mesh: Mesh) -> DistanceField:
-    """Distances to a closed surface, right to a tenth of a millimetre near it."""
+    """Distances to a closed surface, right to 0.1 mm near it."""
     lower, upper = mesh.box_mm
     step = float(np.clip((upper - lower).max() / _STEPS, _FINEST_MM, _COARSEST_MM))
     origin = lower - _REACH * step
@@ -120,15 +120,6 @@ def long_axis_mm(organ: Mesh) -> Float64[np.ndarray, " 3"]:
     return axis * np.ptp(spread @ axis)
 
 
-def shape_of(
-    anatomy_ct: Anatomy, body: ElasticBody, distances: tuple[DistanceField, ...] | None = None
-) -> RestShape:
-    """The shape of an anatomy with its body; a second or two, unless its parts' distances are
-    known."""
-    distances = distances or distances_of(anatomy_ct)
-    return RestShape(anatomy_ct, body, distances)
-
-
 def distances_of(anatomy_ct: Anatomy) -> tuple[DistanceField, ...]:
-    """One field per part."""
+    """One field per part; a second or two."""
     return tuple(map(distance_of, anatomy_ct.parts))
