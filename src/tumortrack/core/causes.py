@@ -1,4 +1,4 @@
-"""What can be behind a poor estimate, or none, and what says so."""
+"""Causes of a poor estimate, or of none."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ Cause = Enum(
 
 @dataclass(frozen=True)
 class Likely:
-    """A cause. ``number``: the factor of UNIT and SCALE, the share of BACKGROUND and HIDDEN.
-    ``fit``: what the cloud costs freed of it, in the model's usual cost; None: that was not tried.
-    """
+    """A likely cause. ``number``: the factor of UNIT and SCALE, the share of BACKGROUND and HIDDEN.
+    ``fit``: cost of the fit without this cause, relative to the model's usual cost; None: not
+    tried."""
 
     cause: Cause
     number: float | None = None

@@ -1,12 +1,11 @@
-"""The colours of everything that is shown: red, green and blue in 0..255.
+"""All colours that are shown: red, green and blue in 0..255.
 
-A part has one colour in every picture, page, viewer, film and export: ``part_colour(label)``, or
-``name_colour("tumor_2")`` where only a name is at hand; ``css`` makes it a page's,
-``report.renderer.rgb`` a drawing's. No module names a colour for a part of its own.
+A part has the same colour in every picture, page, viewer, film and export: ``part_colour(label)``
+or ``name_colour("tumor_2")``. ``css`` converts it for pages, ``report.renderer.rgb`` for drawings.
 
-Tumors have Okabe and Ito's palette (Color Universal Design, 2008, https://jfly.uni-koeln.de/color),
-without what resembles the organ; the organ has 3D Slicer's colour of a kidney.
-``tests/core/test_colours.py`` holds that they differ for every colour vision.
+Tumors have the palette of Okabe and Ito (Color Universal Design, 2008,
+https://jfly.uni-koeln.de/color) without colours like the organ's, which is 3D Slicer's for kidneys.
+``tests/core/test_colours.py`` checks that they differ for every kind of colour vision.
 """
 
 from __future__ import annotations
@@ -23,13 +22,13 @@ TUMORS = ((230, 159, 0), (86, 180, 233), (240, 228, 66), (204, 121, 167), (0, 15
 STRUCTURES = ((214, 40, 40), (70, 110, 220), (245, 225, 170), (150, 110, 60), (60, 170, 160))
 TRUTH: Colour = (0, 90, 160)  # outlines: darker than any tumor
 OBSERVED: Colour = (64, 64, 64)
-PIECE: Colour = (110, 80, 200)  # what a plan takes away
+PIECE: Colour = (110, 80, 200)  # that a plan removes
 SEEN: Colour = (112, 118, 126)
 ORGAN: Colour = (225, 230, 235)
 REGION: Colour = (64, 70, 82)
 PICKED: Colour = (255, 80, 200)
 
-GOOD: Colour = (88, 100, 114)  # no green: it would say that it is safe to cut
+GOOD: Colour = (88, 100, 114)  # not green, which would mean that it is safe to cut
 POOR: Colour = (210, 140, 0)
 NONE: Colour = (205, 20, 30)
 VERDICTS = {"good": GOOD, "poor": POOR, "none": NONE}
@@ -45,17 +44,16 @@ _SWEEPS = ((0, 120, 240), (90, 60, 220), (205, 0, 130))
 
 
 def part_colour(label: int) -> Colour:
-    """Of label 1, 2, 3, ...: the organ, then the tumors, over again after the fifth."""
+    """Of label 1 (organ), 2, 3, ... (tumors); repeats after the fifth tumor."""
     return ORGAN_PART if label == 1 else TUMORS[(label - 2) % len(TUMORS)]
 
 
 def name_colour(name: str) -> Colour:
-    """Of a part by its name: ``tumor_1``, ``tumor_2``, ...; any other is the organ."""
+    """Of a part's name: ``tumor_1``, ``tumor_2``, ...; any other is the organ's."""
     return part_colour(int(name.split("_")[1]) + 1) if is_tumor(name) else ORGAN_PART
 
 
 def structure_colour(number: int) -> Colour:
-    """Of structure 0, 1, 2, ..., over again after the fifth."""
     return STRUCTURES[number % len(STRUCTURES)]
 
 
@@ -68,9 +66,9 @@ def css(colour: Colour) -> str:
 
 
 def sweep_colour(sweep: int, sweeps: int) -> Colour:
-    """Of the cuts of sweep 1, 2, ...: from blue for the first to magenta for the last; none of it
-    is a part's colour."""
-    along = (sweep - 1) / max(sweeps - 1, 1)
-    mixed = [np.interp(along, (0.0, 0.5, 1.0), shades) for shades in zip(*_SWEEPS, strict=True)]
+    """Of the cuts in sweep 1, 2, ...: from blue for the first to magenta for the last; no part has
+    these colours."""
+    share = (sweep - 1) / max(sweeps - 1, 1)
+    mixed = [np.interp(share, (0.0, 0.5, 1.0), shades) for shades in zip(*_SWEEPS, strict=True)]
     red, green, blue = (round(float(value)) for value in mixed)
     return red, green, blue

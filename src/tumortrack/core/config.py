@@ -10,31 +10,32 @@ from tumortrack.core.errors import InputError
 
 
 class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Base of every configuration value. Subclasses that take part in a typed union (one kind, one
-    file) add ``tag=...``."""
+    """Base of every configuration. Members of a typed union (one kind, one file) add
+    ``tag=...``."""
 
     def check_ranges(self, what: str, least: str = "0 (off)", **most: float) -> None:
-        """Refuse each named field that is not in 0..most, by an InputError with this range, its
-        lower end written as ``least``; ``what`` names the configuration."""
+        """InputError for a named field outside 0..most. The message calls the configuration
+        ``what`` and the lower end ``least``."""
         for name, limit in most.items():
             value = getattr(self, name)
             if not 0 <= value <= limit:
                 raise InputError(f"{what} {name} is {value}; allowed: {least} to {limit:g}.")
 
     def check_between(self, what: str, **allowed: tuple[float, float]) -> None:
-        """The same for ranges with a lower end: each named field, or all numbers in it."""
+        """The same for fields, or tuples of numbers, with a lower and an upper end."""
         for name, (low, high) in allowed.items():
             value = getattr(self, name)
-            if not all(low <= one <= high for one in (value if type(value) is tuple else (value,))):
-                said = f"{value:g}" if isinstance(value, float) else value
-                raise InputError(f"{what} {name} is {said}; allowed: {low:g} to {high:g}.")
+            numbers = value if isinstance(value, tuple) else (value,)
+            if not all(low <= number <= high for number in numbers):
+                text = f"{value:g}" if isinstance(value, float) else value
+                raise InputError(f"{what} {name} is {text}; allowed: {low:g} to {high:g}.")
 
 
-_LARGEST_SEED = 2**32 - 1  # what the generators of all libraries take
+_LARGEST_SEED = 2**32 - 1  # that all random generators in use accept
 
 
 def check_seed(seed: int) -> None:
-    """InputError for a number that is not allowed as a seed of random numbers."""
+    """InputError for a seed out of range."""
     if not 0 <= seed <= _LARGEST_SEED:
         raise InputError(f"the seed is {seed}; allowed: whole numbers from 0 to {_LARGEST_SEED}.")
 
@@ -43,13 +44,13 @@ C = TypeVar("C", bound=msgspec.Struct)
 
 
 def to_builtins(config: msgspec.Struct) -> dict[str, Any]:
-    """The configuration as JSON would return it, every key written out."""
+    """The configuration as JSON types, defaults included."""
     return msgspec.json.decode(msgspec.json.encode(config))
 
 
 def from_builtins(data: object, kind: type[C], where: str) -> C:
-    """Rebuild a configuration. An unknown key, wrong type or missing value is an InputError, in
-    which ``where`` names the origin."""
+    """The inverse. Raises InputError, which names ``where`` the data came from: an unknown key, a
+    wrong type or a missing value."""
     try:
         return msgspec.convert(data, kind)
     except msgspec.ValidationError as error:

@@ -1,4 +1,4 @@
-"""The one error tree. A message says what was wrong, what is allowed and what to do."""
+"""All errors. A message says what was wrong, what is allowed and what to do."""
 
 from __future__ import annotations
 
@@ -6,14 +6,14 @@ from tumortrack.core.causes import Likely
 
 
 class TumortrackError(Exception):
-    """Base of every error raised on purpose: the command line prints its text as one line and exits
-    with ``exit_code``. Any other exception is a defect of ours and keeps its traceback."""
+    """Base of errors raised on purpose: the command line prints the message on one line and exits
+    with ``exit_code``. Any other exception is a bug and keeps its traceback."""
 
     exit_code = 1
 
 
 class InputError(TumortrackError):
-    """What the user gave cannot be used: a file, a number, a combination of options."""
+    """Unusable input: a file, a number, a combination of options."""
 
     exit_code = 2
 
@@ -23,12 +23,12 @@ class ArtifactError(InputError):
 
 
 class PackageError(InputError):
-    """An installed package that is asked for is broken."""
+    """A requested package is installed but broken."""
 
 
 class NoEstimate(TumortrackError):
-    """The input is well formed but allows no answer (too few points, no organ). ``causes``:
-    the likeliest first, where they were looked for."""
+    """The input is well formed but gives no answer (too few points, no organ). ``causes``, if they
+    were looked for: the likeliest first."""
 
     exit_code = 3
 
@@ -38,22 +38,22 @@ class NoEstimate(TumortrackError):
 
 
 class NotThisOrgan(NoEstimate):
-    """The points cannot be the model's organ, in mm in the camera's frame."""
+    """The points, in mm in the camera frame, cannot be the model's organ."""
 
 
 class NoPlan(TumortrackError):
-    """What was located cannot be cut out as requested, and why."""
+    """What was located cannot be cut out as requested."""
 
     exit_code = 3
 
 
 class Aborted(TumortrackError):
-    """Arms were stopped for good before they had finished, and why."""
+    """Arms were stopped for good before they had finished."""
 
     exit_code = 3
 
 
 class StorageError(TumortrackError):
-    """The disk refused a write; what was there before is still whole."""
+    """The disk refused a write; what was there before is intact."""
 
     exit_code = 2

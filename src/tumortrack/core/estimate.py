@@ -1,4 +1,4 @@
-"""What is located in one cloud: points, labelled grid, surfaces, motion and numbers."""
+"""The answer for one cloud: points, labelled grid, surfaces, motion and figures."""
 
 from __future__ import annotations
 
@@ -21,49 +21,48 @@ from tumortrack.core.types import CameraLabels, Mesh, OccupancyCloud
 
 LARGEST_GRID = 400
 Quality = Literal["good", "poor", "none"]  # none: there is no estimate
-# An answer with a tumor's centre farther off has failed: the plan's usual margin, all of it.
-FAR_MM = 5.0
-# What people read where it is good: that word alone would say more than is known.
+FAR_MM = 5.0  # an answer with a tumor's centre farther off has failed: a plan's whole usual margin
+# Shown beside "good", which alone would claim more than is known.
 NO_CHECK_FAILED, UNVERIFIED = "no check failed", "its place is not verified"
 NOT_JUDGED = Finding("not_judged")
 
 
 def verdict_words(verdict: Quality, reason: str) -> str:
-    """A sentence that begins with the verdict; ``reason``: why it is not good."""
+    """The verdict as a sentence; ``reason``: why it is not good."""
     if verdict == "good":
         return f"good: {NO_CHECK_FAILED}; {UNVERIFIED}."
-    said = f"{verdict}: {reason.rstrip('.')}."
-    return f"{said} Do not rely on it." if verdict == "poor" else said
+    text = f"{verdict}: {reason.rstrip('.')}."
+    return f"{text} Do not rely on it." if verdict == "poor" else text
 
 
 @runtime_checkable
 class Motion(Protocol):
-    """One frame's correspondence: undeformed CT (LPS, mm) <-> camera frame (mm). It takes any
-    finite points, n x 3, also outside the organ, and returns finite ones; InputError for others."""
+    """One frame's correspondence: undeformed CT (LPS, mm) <-> camera frame (mm). Any finite points,
+    n x 3, are allowed, also outside the organ, and give finite ones; InputError for others."""
 
     def carry(self, points_ct: Points, /) -> Points:
-        """CT points in the camera frame."""
+        """From the CT to the camera frame."""
 
     def back(self, points_camera: Points, /) -> Points | None:
-        """Camera points in the undeformed CT; None if the method knows only ``carry``."""
+        """From the camera frame to the undeformed CT; None if the method has only ``carry``."""
 
     def std_mm(self, points_ct: Points, /) -> Float[np.ndarray, " n"] | None:
-        """Uncertainty of ``carry`` at each point: one standard deviation along any axis, mm; None
-        where the method does not know it."""
+        """Uncertainty of ``carry``: one standard deviation, root mean square of the three axes;
+        None if the method does not know it."""
 
     def largest_std_mm(self, points_ct: Points, /) -> Float[np.ndarray, " n"] | None:
-        """The same along the axis that is least sure."""
+        """The same along the most uncertain direction."""
 
     def covariance_mm2(self, points_ct: Points, /) -> Float[np.ndarray, "n 3 3"] | None:
-        """The same as a whole covariance, camera frame, mm^2."""
+        """The covariance in the camera frame."""
 
 
 class FollowOptions(Config, frozen=True, kw_only=True):
-    """How one frame of many is located. ``thorough``: also search without the last estimate, and
-    keep the better fit: a search near the last answer alone would keep its error. ``either_side``:
-    somebody may have turned the organ over. ``smoothing_s``: time constant of the mean over past
-    estimates; 0: none. ``known``: causes found a moment ago, by the check that failed (of no
-    estimate: ``none``), which are not looked for again."""
+    """How to locate a frame of a sequence. ``thorough``: also search independently of the last
+    estimate and keep the better fit, as a search near the last one would keep its error.
+    ``either_side``: the organ may have been turned over. ``smoothing_s``: time constant of the mean
+    over past estimates; 0: none. ``known``: recent causes by failed check (``none``: no estimate),
+    which are not searched for again."""
 
     thorough: bool = False
     either_side: bool = False
@@ -85,15 +84,14 @@ class Estimate:
         volume: None where it was not requested (live).
         meshes: the organ's name, tumor_1, ... -> closed surfaces; a part that was not found is
             absent. The organ's surface includes its tumors, as in ``Anatomy``.
-        report: its figures: per part volume, centre, box and probability, the fit's cost, ...
-        motion: where every point of the CT is, if the method knows that; ``unsmoothed``: before the
-            mean over past frames: the next frame's search starts from it.
-        finding: what speaks against it (see ``tracking.quality.judged``); None: it is good.
+        report: figures: per part volume, centre, box and probability, the fit's cost, ...
+        motion: None if the method knows none. ``unsmoothed``: the same before the mean over past
+            frames; the next frame's search starts there.
+        finding: why it is poor (see ``tracking.quality.judged``); None: it is good.
         causes: of a poor one, the likeliest first: see ``tracking.causes``.
-        advice: what most likely happened and what to do, in words; follows the finding's.
-        patient: whose organ the model is of; that this one lies there nothing verifies.
-        organ: which organ that is.
-        structures: what else of the CT moves with it, by name; empty without a motion.
+        advice: sentences after the finding's: what probably happened and what to do.
+        patient: of the model; nothing verifies that this is what the camera sees.
+        structures: other surfaces of the CT that move with it, by name; empty without a motion.
     """
 
     cloud: OccupancyCloud
@@ -111,19 +109,17 @@ class Estimate:
 
     @property
     def quality(self) -> Quality:
-        """Whether it may be relied on."""
         return "good" if self.finding is None else "poor"
 
     @property
     def reason(self) -> str:
-        """Why it is poor, and what to do, in words; empty: it is good."""
+        """Why it is poor and what to do; empty: it is good."""
         return "" if self.finding is None else self.finding.words + self.advice
 
     @property
     def organ_mesh(self) -> Mesh:
-        """The organ's surface, tumors included."""
         return next(iter(self.meshes.values()))
 
     def reporting(self, **changes: Any) -> Estimate:
-        """The same with these fields of its report."""
+        """The same estimate with these fields of its report replaced."""
         return replace(self, report=msgspec.structs.replace(self.report, **changes))

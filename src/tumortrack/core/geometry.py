@@ -1,4 +1,4 @@
-"""Rigid transforms and axes. A transform that carries frame a into frame b is ``b_from_a``."""
+"""Transforms, directions and triangles. A transform from frame a to frame b is ``b_from_a``."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ DIRECTIONS_LPS: dict[str, Direction] = {
     "inferior": (0.0, 0.0, -1.0),
 }
 
-HERE = np.eye(4)  # two frames are one
+HERE = np.eye(4)  # both frames are the same
 HERE.flags.writeable = False
-_NOT_RIGID = 1e-3  # largest deviation of a rotation from orthonormal: files have few digits
+_NOT_RIGID = 1e-3  # deviation of a rotation from orthonormal: files have few digits
 _FARTHEST_MM = 1e6
 
 # NIfTI is RAS+, DICOM is LPS: the first two axes change sign, and nothing else.
@@ -37,13 +37,11 @@ RAS_FROM_LPS = np.diag([-1.0, -1.0, 1.0, 1.0])
 
 
 def transform_points(b_from_a: Affine, points_a: Points) -> Points:
-    """Carry points (n, 3) from frame a to frame b by a 4 x 4 affine transform."""
     linear, shift = b_from_a[:3, :3].T, b_from_a[:3, 3]
     return points_a @ linear.astype(points_a.dtype) + shift.astype(points_a.dtype)
 
 
 def rigid(rotation: Matrix, translation_mm: Vector) -> Affine:
-    """A 4 x 4 transform from a rotation matrix and a translation in mm."""
     b_from_a = np.eye(4)
     b_from_a[:3, :3] = rotation
     b_from_a[:3, 3] = translation_mm
@@ -51,41 +49,41 @@ def rigid(rotation: Matrix, translation_mm: Vector) -> Affine:
 
 
 def read_rigid(rows: Sequence[Sequence[float]], unit: Literal["mm", "m"], where: str) -> Affine:
-    """4 x 4 rows of a file as a transform in mm. Raises InputError, which names ``where``: they are
-    no rigid transform."""
+    """A transform in mm from the 4 x 4 rows in a file. Raises InputError, which names ``where``:
+    not a rigid transform."""
     b_from_a = np.array(rows, float) if {len(row) for row in rows} == {4} else np.zeros((0, 4))
     if len(b_from_a) != 4:
         raise InputError(f"{where} has {len(rows)} rows; it must have 4 of 4 numbers.")
-    turn, per_unit = b_from_a[:3, :3], 1000.0 if unit == "m" else 1.0
-    good = (
-        np.abs(b_from_a).max() < _FARTHEST_MM / per_unit
-        and np.abs(turn @ turn.T - np.eye(3)).max() < _NOT_RIGID
-        and np.linalg.det(turn) > 0
+    rotation, mm_per_unit = b_from_a[:3, :3], 1000.0 if unit == "m" else 1.0
+    is_rigid = (
+        np.abs(b_from_a).max() < _FARTHEST_MM / mm_per_unit
+        and np.abs(rotation @ rotation.T - np.eye(3)).max() < _NOT_RIGID
+        and np.linalg.det(rotation) > 0
         and np.array_equal(b_from_a[3], [0, 0, 0, 1])
     )
-    if not good:
+    if not is_rigid:
         raise InputError(
             f"{where} is no rigid transform: its rotation must be orthonormal and right-handed, "
             "its last row 0 0 0 1, its shift less than a kilometre."
         )
-    b_from_a[:3, 3] *= per_unit
+    b_from_a[:3, 3] *= mm_per_unit
     return b_from_a
 
 
 def rotation_onto(source: Vector, target: Vector) -> Matrix:
-    """The smallest rotation matrix that turns the direction ``source`` onto ``target``."""
+    """The smallest rotation that turns the direction ``source`` onto ``target``."""
     a, b = unit(np.asarray(source, float)), unit(np.asarray(target, float))
     middle = a + b
     if np.linalg.norm(middle) < 1e-8:  # opposite: half a turn about any perpendicular axis
         middle = np.cross(a, np.eye(3)[np.argmin(np.abs(a))])
     middle /= np.linalg.norm(middle)
-    # Two reflections, a -> -a -> b: a rotation to the last digit, near opposite directions too.
+    # Two reflections, a -> -a -> b: exact to the last digit, also for nearly opposite directions.
     return (np.eye(3) - 2 * np.outer(middle, middle)) @ (np.eye(3) - 2 * np.outer(a, a))
 
 
 def turned_by(vector_rad: Vector) -> Matrix:
-    """The rotation matrix about a vector, by its length in radians (Rodrigues;
-    SciPy's Rotation takes a tenth of a second to import, for which a verdict would wait)."""
+    """The rotation about a vector by its length in radians (Rodrigues). A verdict would wait a
+    tenth of a second for the import of SciPy's Rotation."""
     angle = float(np.linalg.norm(vector_rad))
     if angle == 0:
         return np.eye(3)
@@ -95,8 +93,8 @@ def turned_by(vector_rad: Vector) -> Matrix:
 
 
 def direction_lps(text: str) -> Direction:
-    """A unit vector in LPS from a name (``anterior``) or three numbers (``0,-1,0``); InputError for
-    neither a known name nor a non-zero finite 3-vector."""
+    """A unit vector in LPS from a name (``anterior``) or three numbers (``0,-1,0``). Raises
+    InputError: not a known name or a finite 3-vector other than 0."""
     if text.lower() in DIRECTIONS_LPS:
         return DIRECTIONS_LPS[text.lower()]
     try:
@@ -119,19 +117,18 @@ def spacing_mm(frame_from_index: Affine) -> Vector:
 
 
 def unit(vector: Vector) -> Vector:
-    """The same direction with length 1."""
     return vector / np.linalg.norm(vector)
 
 
 def perpendicular(vector: Vector) -> Vector:
-    """Some unit vector at right angles to a vector."""
+    """Some unit vector perpendicular to a vector."""
     return unit(np.cross(vector, np.eye(3)[np.argmin(np.abs(vector))]))
 
 
 def triangles_of(
     vertices_mm: Points, faces: Faces
 ) -> tuple[Float[np.ndarray, "f 3"], Float[np.ndarray, "f 3"]]:
-    """Each triangle's middle (mm) and outward normal, twice its area long (mm2)."""
+    """Each triangle's centroid (mm) and outward normal, whose length is twice the area (mm2)."""
     corners = vertices_mm[faces]
     doubled = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     return corners.mean(1), doubled
@@ -140,8 +137,8 @@ def triangles_of(
 def spread_over(
     vertices: Float64[np.ndarray, "v k"], faces: Faces, longest_mm: float
 ) -> Float64[np.ndarray, "n k"]:
-    """The vertices, and more until no triangle has an edge longer than ``longest_mm``: x, y, z in
-    mm come first, and what follows them is interpolated."""
+    """The vertices (x, y, z in mm first; further columns are interpolated), and those of a finer
+    mesh without edges longer than ``longest_mm``."""
     corners = vertices[faces, :3]
     edges_mm = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)
     coarse = faces[(edges_mm > longest_mm).any(1)]
@@ -155,22 +152,22 @@ def spread_over(
 def plane_section(
     vertices: Points, faces: Faces, normal: Vector, through: Vector
 ) -> Float[np.ndarray, "m 2 3"]:
-    """Where triangles cross the plane through a point: a segment of each that does."""
+    """The segments where triangles cross the plane through a point."""
     height = (vertices - through) @ normal
     above = height[faces] > 0
     faces = faces[above.any(axis=1) & ~above.all(axis=1)]
     start, end = vertices[faces], vertices[np.roll(faces, -1, axis=1)]
-    here, there = height[faces], height[np.roll(faces, -1, axis=1)]
-    crosses = (here > 0) != (there > 0)  # two edges of each
-    share = here[crosses] / (here - there)[crosses]
+    start_height, end_height = height[faces], height[np.roll(faces, -1, axis=1)]
+    crosses = (start_height > 0) != (end_height > 0)  # two edges of each triangle
+    share = start_height[crosses] / (start_height - end_height)[crosses]
     return (start[crosses] + share[:, None] * (end - start)[crosses]).reshape(-1, 2, 3)
 
 
 def std_of(covariance: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, " n"]:
-    """One standard deviation along any axis: the root of the mean over three of them."""
+    """One standard deviation: the root mean square of the three axes."""
     return np.sqrt(np.trace(covariance, axis1=1, axis2=2) / 3)
 
 
 def largest_std_of(covariance: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, " n"]:
-    """One standard deviation along the axis where it is largest."""
+    """One standard deviation along the direction where it is largest."""
     return np.sqrt(np.linalg.eigvalsh(covariance)[:, -1])

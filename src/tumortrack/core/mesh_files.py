@@ -1,4 +1,4 @@
-"""Mesh files: PLY is written by own code; the rest uses trimesh, which is slow to import."""
+"""Mesh files. PLY is written by own code, as trimesh, which does the rest, is slow to import."""
 
 from __future__ import annotations
 
@@ -15,21 +15,20 @@ from tumortrack.core.types import Anatomy, Mesh
 
 SUFFIXES = (".ply", ".stl", ".obj")
 _LARGEST_FILE = 512 * 2**20  # bytes
-# trimesh logs tracebacks of what it leaves out (normals, textures), which is not needed here.
-_SILENT = logging.NullHandler()
+_SILENT = logging.NullHandler()  # trimesh logs tracebacks of normals and textures that it skips
 _SPACE, _STL_HEADER = b"SPACE=LPS", 80
 
 
 def read_mesh(path: Path) -> Mesh:
-    """Read one triangle mesh (PLY, STL or OBJ) as it is, equal vertices merged; InputError where it
-    is missing, too large, no mesh or without triangles."""
+    """Read one triangle mesh (PLY, STL or OBJ) with equal vertices merged. Raises InputError:
+    missing, too large, not a mesh, no triangles."""
     import trimesh
 
     if path.suffix.lower() not in SUFFIXES:
         raise InputError(f"{path}: unknown mesh type. Allowed: {', '.join(SUFFIXES)}.")
     content = read_file(path, _LARGEST_FILE, "Reduce the mesh first.")
     logging.getLogger("trimesh").addHandler(_SILENT)
-    try:  # from memory: no other file that it names, as of a texture, is looked for
+    try:  # from memory, so that no other file that it names, such as a texture, is opened
         loaded = trimesh.load_mesh(
             io.BytesIO(content), path.suffix.lower()[1:], process=False, skip_materials=True
         )
@@ -40,7 +39,7 @@ def read_mesh(path: Path) -> Mesh:
         raise InputError(f"{path} holds no triangles (an empty or damaged file).")
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise InputError(f"{path} has triangles that name vertices it does not have (damaged).")
-    # STL repeats each corner: merge exact duplicates so that the surface can be closed.
+    # STL repeats each vertex: merge equal ones so that the surface can be closed.
     unique, inverse = np.unique(vertices, axis=0, return_inverse=True)
     faces = inverse.reshape(-1)[faces]
     a, b, c = faces.T
@@ -51,10 +50,9 @@ def read_mesh(path: Path) -> Mesh:
 
 
 def write_mesh(path: Path, mesh: Mesh) -> None:
-    """Write a binary PLY (or STL, by suffix), vertices in mm, in the mesh's own frame. The header
-    states ``SPACE=LPS``, which 3D Slicer looks for; also for meshes in the camera frame: Slicer
-    shows all files of a run as if their frame were the patient's. StorageError where the disk
-    refuses."""
+    """Write a binary PLY or STL, by suffix, in mm. The header states ``SPACE=LPS`` for 3D Slicer,
+    also for meshes in the camera frame, which Slicer shows as if it were the patient's. Raises
+    StorageError: the disk refuses."""
     content = {".ply": _ply, ".stl": _stl}[path.suffix](mesh)
     with writing(path):
         path.write_bytes(content)
@@ -82,14 +80,14 @@ def _stl(mesh: Mesh) -> bytes:
 
 
 def write_anatomy(folder: Path, anatomy: Anatomy) -> None:
-    """kidney.ply (or of the organ's name), tumor_1.ply, ... into a folder."""
+    """Write kidney.ply (or as the organ is named), tumor_1.ply, ... into a folder."""
     for name, part in zip(anatomy.names, anatomy.parts, strict=True):
         write_mesh(folder / f"{name}.ply", part)
 
 
 def read_anatomy(folder: Path, kind: Organ = KIDNEY) -> Anatomy:
-    """The organ's surface and tumor_1.ply, tumor_2.ply, ... (without a gap) from a folder;
-    InputError where there is no such organ, or a mesh cannot be read."""
+    """Read what ``write_anatomy`` wrote. Raises InputError: no such organ, or an unreadable
+    mesh."""
     parts = [read_mesh(folder / f"{kind.name}.ply")]
     while (path := folder / f"tumor_{len(parts)}.ply").exists():
         parts.append(read_mesh(path))

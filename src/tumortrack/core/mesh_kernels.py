@@ -1,4 +1,4 @@
-"""Kernels on meshes: volumes, and points inside."""
+"""Kernels on meshes: volume, and points inside."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from tumortrack.core.compiled import njit
 
 @njit(fastmath=True, nogil=True)
 def signed_volume(vertices, faces):  # type: ignore[no-untyped-def]
-    """Sum over faces (f, 3) of their area seen along z times their height over the first vertex. A
-    closed surface's volume, positive where faces turn outward."""
+    """The volume of a closed surface, positive where faces (f, 3) turn outward: the sum of each
+    face's area projected along z times its height over the first vertex."""
     triple = 0.0
     for n in range(len(faces)):
         a, b, c = vertices[faces[n, 0]], vertices[faces[n, 1]], vertices[faces[n, 2]]
@@ -20,9 +20,9 @@ def signed_volume(vertices, faces):  # type: ignore[no-untyped-def]
 
 
 def contained(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Whether points (n, 3) lie inside a closed surface: an odd number of its faces (f, 3) lies
-    above such a point."""
-    side = int(np.sqrt(len(points) / 2)) + 1  # of a grid of cells over x and y
+    """Whether points (n, 3) lie inside a closed surface, that is below an odd number of its
+    faces (f, 3)."""
+    side = int(np.sqrt(len(points) / 2)) + 1  # of a grid over x and y
     lower = points[:, :2].min(0, initial=np.inf)
     per_mm = side / np.maximum(points[:, :2].max(0, initial=-np.inf) - lower, 1e-9)
     column, row = np.minimum((points[:, :2] - lower) * per_mm, side - 1).astype(np.int64).T
@@ -36,12 +36,11 @@ def contained(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> np
 
 @njit(nogil=True)
 def _above(points, vertices, faces, side, starts, grid):  # type: ignore[no-untyped-def]
-    """Whether an odd number of faces lies above each point. Points are sorted by the cell of the
-    grid that they are in; only those in cells below a face are looked at.
+    """Whether an odd number of faces lies above each point. Points are sorted by grid cell; each
+    face is tested only against those in cells below it.
 
-    A point belongs to one of two triangles that share an edge, never to both or none: both look at
-    that edge from its lower end and get the same sign (crossing rule of Shimrat 1962,
-    doi 10.1145/368637.368653).
+    Of two triangles that share an edge exactly one owns a point on it, as both compute that edge's
+    sign from its lower end (crossing rule of Shimrat 1962, doi 10.1145/368637.368653).
     """
     inside = np.zeros(len(points), np.bool_)
     x0, y0, per_x, per_y = grid
@@ -71,7 +70,7 @@ def _above(points, vertices, faces, side, starts, grid):  # type: ignore[no-unty
 
 @njit(inline="always")
 def _left_of(a, b, x, y):  # type: ignore[no-untyped-def]
-    """Whether an edge, seen in the plane of x and y, passes the point at its right."""
+    """Whether, projected on x and y, the edge passes to the right of the point."""
     if (a[1] > y) == (b[1] > y):
         return False
     if a[1] > b[1]:

@@ -1,7 +1,7 @@
-"""Whose organ it is: a patient and a side, as far as they are known.
+"""The patient and the side of the organ, if known.
 
-Geometry cannot verify either (docs/results.md, "Another kidney"), so both are stated once, where a
-case is made, and travel from there to everything that is made of it.
+Geometry cannot verify either (docs/results.md, "Another kidney"), so both are stated when a case is
+made, and copied from there to all that is derived from the case.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ _LONGEST = 64  # of a DICOM PatientID (PS3.5, LO)
 
 
 class Patient(Config, frozen=True):
-    """``id``: as DICOM's PatientID or whatever the user calls the patient; never name or birth
-    date. ``side``: the patient's own left or right."""
+    """``id``: the DICOM PatientID or an identifier from the user, never name or birth date.
+    ``side``: the patient's own left or right."""
 
     id: str = UNKNOWN
     side: Side = UNKNOWN
@@ -37,24 +37,23 @@ class Patient(Config, frozen=True):
 
     @property
     def known(self) -> bool:
-        """Both are."""
+        """Whether both are known."""
         return UNKNOWN not in (self.id, self.side)
 
     def differs(self, other: Patient) -> bool:
-        """Whether they cannot be the same, as far as both are known."""
+        """Whether id or side, where both are known, are different."""
         pairs = (self.id, other.id), (self.side, other.side)
-        return any(one != two for one, two in pairs if UNKNOWN not in (one, two))
+        return any(ours != theirs for ours, theirs in pairs if UNKNOWN not in (ours, theirs))
 
     def check_shown(self, model: Patient, what: str) -> None:
-        """Raises InputError where what is shown is known to be of another than the model."""
+        """InputError if ``what`` shows another patient than the model's."""
         if self.differs(model):
             raise InputError(f"{what} shows {self}; the model is of {model}. Give what is of one.")
 
     def check_is(self, stated: Patient, what: str) -> None:
-        """Raises InputError where this, the patient of ``what``, is not known to be the stated
-        one, in all that was stated."""
+        """InputError if this, the patient of ``what``, is not known to be the stated one."""
         pairs = (stated.id, self.id), (stated.side, self.side)
-        if any(wanted not in (UNKNOWN, mine) for wanted, mine in pairs):
+        if any(wanted not in (UNKNOWN, actual) for wanted, actual in pairs):
             raise InputError(
                 f"{what} is of {self}; you stated {stated}. Give what belongs to that patient and "
                 "side. If it is unknown, say whose it is when the case is made: tumortrack prepare "
@@ -65,6 +64,6 @@ class Patient(Config, frozen=True):
 NOBODY = Patient()  # nothing is known
 
 
-def patient_in(found: object, where: str) -> Patient:
-    """What a file says under ``patient``; nothing: unknown. InputError where it is no patient."""
-    return NOBODY if found is None else from_builtins(found, Patient, f"{where}: patient")
+def patient_in(entry: object, where: str) -> Patient:
+    """From a file's entry ``patient``; none: unknown. Raises InputError: not a patient."""
+    return NOBODY if entry is None else from_builtins(entry, Patient, f"{where}: patient")

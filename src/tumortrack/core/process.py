@@ -1,4 +1,4 @@
-"""What this process may use of the machine: its cores, a second thread, freed memory."""
+"""Resources of this process: cores, a second thread, freed memory."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD, _M_MMAP_MAX = -1, -3, -4  # glibc's malloc
 _MMAP_MAX = 65536  # glibc's default
 _SMALL = 32 * 2**20  # bytes: the largest threshold that glibc accepts
 _Item = TypeVar("_Item")
-_Made = TypeVar("_Made")
+_Result = TypeVar("_Result")
 
 
 def available_cores(cgroups: Path = _CGROUPS) -> int:
-    """Cores for this process by its affinity mask and its container's quota: 1 or more."""
+    """The number of cores by the affinity mask and the container's quota, at least 1."""
     affinity = getattr(os, "sched_getaffinity", None)  # Linux only
     cores, quota = len(affinity(0)) if affinity else os.cpu_count() or 1, _quota(cgroups)
     return cores if quota is None else max(1, min(cores, round(quota)))
 
 
 def _quota(cgroups: Path) -> float | None:
-    """Cores that the control group grants (version 2, then 1); None: no limit."""
+    """Cores that the control group allows (version 2, then 1); None: no limit."""
     try:
         if (cgroups / "cpu.max").is_file():
             quota, period = (cgroups / "cpu.max").read_text().split()
@@ -41,10 +41,10 @@ def _quota(cgroups: Path) -> float | None:
 
 
 def parallel_for(body: Callable[[slice], object], count: int, chunk: int) -> None:
-    """Call ``body`` on every chunk of ``range(count)``, on two threads where there are two cores.
-    The chunks do not depend on the number of cores, so sums over them do not either. The second
-    thread helps only where ``body`` releases Python's lock; if it starts too late, nobody waits
-    for it. ``NUMBA_NUM_THREADS=1`` keeps all work on the calling thread."""
+    """Call ``body`` on every chunk of ``range(count)``, on two threads if there are two cores.
+    Chunks, and so sums over them, do not depend on the number of cores. The second thread helps
+    only if ``body`` releases the GIL; if it starts too late, it is not waited for.
+    ``NUMBA_NUM_THREADS=1`` keeps all work on the calling thread."""
     chunks = deque(slice(first, first + chunk) for first in range(0, count, chunk))
 
     def drain() -> None:
@@ -62,33 +62,33 @@ def parallel_for(body: Callable[[slice], object], count: int, chunk: int) -> Non
         other.result()
 
 
-def parallel_map(call: Callable[[_Item], _Made], items: Sequence[_Item]) -> list[_Made]:
-    """What ``call`` makes of each item, in their order, by ``parallel_for``."""
-    made: dict[int, _Made] = {}
+def parallel_map(call: Callable[[_Item], _Result], items: Sequence[_Item]) -> list[_Result]:
+    """``list(map(call, items))`` by ``parallel_for``."""
+    results: dict[int, _Result] = {}
 
-    def make(part: slice) -> None:
-        made[part.start] = call(items[part.start])
+    def run(part: slice) -> None:
+        results[part.start] = call(items[part.start])
 
-    parallel_for(make, len(items), 1)
-    return [made[n] for n in range(len(items))]
+    parallel_for(run, len(items), 1)
+    return [results[n] for n in range(len(items))]
 
 
 @cache
 def _helper(process: int) -> ThreadPoolExecutor | None:
-    """A second thread of this process (a fork has none of its parent's), if it has a core."""
+    """A second thread of this process (threads do not survive a fork), if there is a core."""
     cores = min(available_cores(), int(os.environ.get("NUMBA_NUM_THREADS", "2")))
     return ThreadPoolExecutor(1, "parallel") if cores > 1 else None
 
 
 def keep_freed_memory() -> None:
-    """Make glibc keep freed blocks: page faults cost more than the memory. Training on a CPU
-    becomes about a tenth faster. No effect with other C libraries."""
+    """Make glibc keep freed blocks, as page faults cost more than the memory: CPU training becomes
+    about a tenth faster. No effect with other C libraries."""
     _mallopt({_M_MMAP_MAX: 0, _M_TRIM_THRESHOLD: 2**31 - 1})
 
 
 def keep_small_blocks() -> None:
-    """The same for blocks of up to 32 MB, which is all that a frame needs: ``clinic`` takes a third
-    less time. Larger blocks, of volumes, are still returned to the system."""
+    """The same for blocks of up to 32 MB, as frames need: ``clinic`` takes a third less time.
+    Larger blocks, such as volumes, are still returned to the system."""
     _mallopt({_M_MMAP_MAX: _MMAP_MAX, _M_MMAP_THRESHOLD: _SMALL, _M_TRIM_THRESHOLD: 8 * _SMALL})
 
 

@@ -1,4 +1,4 @@
-"""pydicom, imported so that nothing of a user's is taken for a part of it."""
+"""A safe import of pydicom."""
 
 from __future__ import annotations
 
@@ -7,17 +7,17 @@ from typing import Any
 
 
 def load_pydicom() -> None:
-    """Import pydicom, before anything else does. It loads GDCM, which asks for Python 2's module
-    ``dl`` and would take a module or folder of that name on the user's path for it."""
+    """Import pydicom; to be called before any other import of it. It loads GDCM, which imports
+    Python 2's module ``dl`` and would execute a module of that name on the user's path."""
     if "pydicom" in sys.modules:
         return
     modules: dict[str, Any] = sys.modules
     absent = object()
-    theirs = modules.get("dl", absent)
+    users = modules.get("dl", absent)
     modules["dl"] = None
     try:
         import pydicom  # noqa: F401
     finally:
         del modules["dl"]
-        if theirs is not absent:
-            modules["dl"] = theirs
+        if users is not absent:
+            modules["dl"] = users

@@ -1,4 +1,4 @@
-"""The rigid motion that lays points, or a whole body, on others best, by known correspondence."""
+"""Least-squares rigid transforms between points, or between bodies, with known correspondence."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import Affine, Points, rigid, transform_points
 from tumortrack.core.types import Mesh
 
-# Barycentric points of a tetrahedron that integrate quadratics exactly (Keast 1986, 4 points).
+# Barycentric quadrature points of a tetrahedron, exact for quadratics (Keast 1986, 4 points)
 _NEAR, _FAR = 0.1381966011250105, 0.5854101966249685
 
 
 def kabsch(source_mm: Points, target_mm: Points, weights: Float[np.ndarray, " n"]) -> Affine:
-    """The rigid transform that carries source points to target points best, in weighted squares
-    (Kabsch 1976, doi 10.1107/S0567739476001873)."""
+    """The weighted least-squares rigid transform from source to target points (Kabsch 1976,
+    doi 10.1107/S0567739476001873)."""
     share = weights / weights.sum()
     source_centre, target_centre = share @ source_mm, share @ target_mm
     spread = (source_mm - source_centre).T @ (share[:, None] * (target_mm - target_centre))
@@ -26,9 +26,9 @@ def kabsch(source_mm: Points, target_mm: Points, weights: Float[np.ndarray, " n"
 
 
 def matched_vertices(rest: Mesh, moved: Mesh) -> Float64[np.ndarray, "_ 3"]:
-    """Where each vertex of ``rest`` lies in ``moved``, the same triangles in the same order: read
-    meshes lose the order of their vertices (equal ones are merged), but never that of their
-    triangles. Raises InputError: ``moved`` has other triangles."""
+    """The place in ``moved`` of each vertex of ``rest``, by triangles: reading a mesh merges and
+    reorders vertices but keeps the order of triangles. Raises InputError: ``moved`` has other
+    triangles."""
     vertex = np.full(len(rest.vertices_mm), -1)
     same = rest.faces.shape == moved.faces.shape
     if same:
@@ -43,9 +43,9 @@ def matched_vertices(rest: Mesh, moved: Mesh) -> Float64[np.ndarray, "_ 3"]:
 
 
 def fit_over_volume(source: Mesh, target: Mesh) -> tuple[Affine, float]:
-    """``target_from_source`` with the least squared displacement over the source's volume, and the
-    root mean square displacement that it leaves, mm. Exact for a displacement that is linear in
-    each tetrahedron of a triangle and the vertices' mean."""
+    """``target_from_source`` with the least squared residual displacement over the source's volume,
+    and the root of its mean square, mm. Exact if the displacement is linear in each tetrahedron of
+    a triangle and the vertices' mean."""
     from_mm, weights = _volume_points(source, source)
     to_mm, _ = _volume_points(source, target)
     transform = kabsch(from_mm, to_mm, weights)
@@ -56,7 +56,7 @@ def fit_over_volume(source: Mesh, target: Mesh) -> tuple[Affine, float]:
 def _volume_points(
     rest: Mesh, moved: Mesh
 ) -> tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, " n"]]:
-    """Quadrature points carried along with ``moved``; their signed weights from ``rest``."""
+    """Quadrature points of ``moved``, and their signed weights from ``rest``."""
     corners = rest.vertices_mm[rest.faces] - rest.vertices_mm.mean(0)
     volume = np.einsum("ij,ij->i", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) / 6
     apex = np.broadcast_to(moved.vertices_mm.mean(0), (len(volume), 1, 3))

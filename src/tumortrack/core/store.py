@@ -1,8 +1,5 @@
-"""Artifact folders: written aside and renamed, one JSON manifest each, checked by sha256.
-
-A manifest states kind, schema number, code version, the sha256 of every file, the inputs'
-sha256, the full configuration, units and frame. Nothing here loads pickles or runs code.
-"""
+"""Artifact folders: written aside and renamed, with a JSON manifest that states kind, schema,
+version, units, frame and the sha256 of every file. Nothing here loads pickles or runs code."""
 
 from __future__ import annotations
 
@@ -22,7 +19,7 @@ from typing import Any
 import tumortrack
 from tumortrack.core.errors import ArtifactError, InputError, StorageError
 
-SCHEMA = 3  # raise it with every change of what a folder holds or its numbers rest on
+SCHEMA = 3  # raise it with every change of a folder's content or of what its numbers depend on
 _MADE_BY = {  # by kind
     "case": "prepare INPUT CASE",
     "twin": "twin CASE SCENES",
@@ -48,16 +45,16 @@ def sha256_of(path: Path) -> str:
 def read_file(
     path: Path, most_bytes: int, advice: str = "tumortrack writes no such file."
 ) -> bytes:
-    """The content of a regular file: a pipe or a device may have no end. InputError where it is
-    missing, none, or larger than ``most_bytes``, which is told before anything is read."""
+    """The content of a file. Raises InputError before anything is read: missing, not a regular file
+    (a pipe or a device may have no end), larger than ``most_bytes``."""
     try:
-        found = path.stat()
-        if not stat.S_ISREG(found.st_mode):
+        status = path.stat()
+        if not stat.S_ISREG(status.st_mode):
             raise InputError(f"{path} is not a regular file (but a folder, a pipe or a device).")
-        if found.st_size > most_bytes:
+        if status.st_size > most_bytes:
             raise InputError(f"{path} is larger than {most_bytes >> 20} MiB. {advice}")
         with path.open("rb") as stream:
-            return stream.read(found.st_size)
+            return stream.read(status.st_size)
     except FileNotFoundError as error:
         raise InputError(f"{path} does not exist.") from error
     except OSError as error:
@@ -66,7 +63,7 @@ def read_file(
 
 @contextmanager
 def writing(path: Path) -> Iterator[None]:
-    """Round what writes there: StorageError where the disk refuses."""
+    """A context for writing ``path``: an OSError in it becomes a StorageError."""
     try:
         yield
     except OSError as error:
@@ -74,8 +71,8 @@ def writing(path: Path) -> Iterator[None]:
 
 
 def write_atomically(path: Path, content: bytes) -> None:
-    """Write a file so that a reader sees the old or the new content, never a part. StorageError
-    where the disk is full or not writable; the old file is then untouched."""
+    """Write a file so that readers see either the old or the new content. Raises StorageError: the
+    disk is full or not writable; the old file is then untouched."""
     aside = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
         with aside.open("wb") as stream:
@@ -91,12 +88,12 @@ def write_atomically(path: Path, content: bytes) -> None:
 
 
 def write_json(path: Path, data: object) -> None:
-    """Atomically write JSON, indented, with a final newline; NaN is refused."""
+    """Write JSON atomically, indented, with a final newline; NaN is refused."""
     write_atomically(path, (json.dumps(data, indent=1, allow_nan=False) + "\n").encode())
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """Read a JSON object; ArtifactError where it is missing, too large, or none."""
+    """Read a JSON object. Raises ArtifactError: missing, too large, or not one."""
     try:
         data = json.loads(read_file(path, _LARGEST_MANIFEST))
     except InputError as error:
@@ -109,7 +106,7 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 def seal(folder: Path, kind: str, content: dict[str, Any], frame: str) -> None:
-    """Write the folder's manifest over the files that lie in it now (sub-folders not counted)."""
+    """Write the manifest of a folder with the files that are in it now, without sub-folders."""
     files = {
         p.name: sha256_of(p)
         for p in sorted(folder.iterdir())
@@ -120,9 +117,9 @@ def seal(folder: Path, kind: str, content: dict[str, Any], frame: str) -> None:
 
 
 def check_place(path: Path, kind: str, overwrite: bool | None) -> None:
-    """InputError for a place where something lies that must stay: ``overwrite`` replaces an empty
-    folder or an artifact of the same kind in which nothing else lies, and nothing but that, for a
-    mistyped path must not cost the user's files. None: who asks has no such option."""
+    """InputError if writing to ``path`` would lose something, as a mistyped path must not cost the
+    user's files: ``overwrite`` only replaces an empty folder, or an artifact of the same kind with
+    nothing else in it. None: the caller has no such option."""
     try:
         if not path.exists():
             return
@@ -150,32 +147,32 @@ def check_place(path: Path, kind: str, overwrite: bool | None) -> None:
 
 
 def _strays(folder: Path, manifest: dict[str, Any]) -> list[str]:
-    """What lies in an artifact, and in the artifacts that it may hold, beside what was written."""
+    """Files in an artifact, and in the artifacts inside it, that their manifests do not list."""
     files, folders = manifest.get("files", {}), manifest.get("folders", ())
-    found = []
+    strays = []
     for path in sorted(folder.iterdir()):
         if path.name in folders and (path / MANIFEST).is_file():
             inner = _strays(path, read_json(path / MANIFEST))
-            found += [f"{path.name}/{name}" for name in inner]
+            strays += [f"{path.name}/{name}" for name in inner]
         elif path.name not in (MANIFEST, *files) and not path.name.startswith("."):
-            found.append(path.name)
-    return found
+            strays.append(path.name)
+    return strays
 
 
 @contextmanager
 def new_folder(path: Path, overwrite: bool | None = None) -> Iterator[Path]:
-    """Fill a folder aside, then move it to ``path`` in one step; on any error nothing appears. What
-    it replaces must be empty or of the kind that the new folder's manifest states: InputError as by
-    ``check_place``. StorageError where the disk is full or not writable."""
+    """Fill a folder aside, then rename it to ``path``; on any error nothing appears there. What it
+    replaces must be empty or of the new folder's kind. Raises InputError: see ``check_place``;
+    StorageError: the disk is full or not writable."""
     try:
-        _clear(path)
+        _clean_up(path)
         if not overwrite:
             check_place(path, "", overwrite)
         path.parent.mkdir(parents=True, exist_ok=True)
         aside = Path(tempfile.mkdtemp(prefix=f".{path.name}.", suffix=".part", dir=path.parent))
     except OSError as error:
         raise StorageError(f"cannot write beside {path}: {error.strerror}.") from error
-    ours = _lock(aside)
+    lock = _lock(aside)
     try:
         yield aside
         aside.chmod(0o755)
@@ -197,13 +194,13 @@ def new_folder(path: Path, overwrite: bool | None = None) -> Iterator[Path]:
         raise StorageError(f"cannot write {path}: {error.strerror or error}.") from error
     finally:
         remove(aside)
-        if ours is not None:
-            os.close(ours)
+        if lock is not None:
+            os.close(lock)
 
 
 def _lock(folder: Path) -> int | None:
-    """Make a folder this process's own, until the descriptor is closed or the process ends, however
-    that happens. None: another has it, or the file system knows no locks."""
+    """Lock a folder until the returned descriptor is closed or the process ends. None: another
+    process has it, or the file system has no locks."""
     descriptor = None
     try:
         descriptor = os.open(folder, os.O_RDONLY)
@@ -215,9 +212,9 @@ def _lock(folder: Path) -> int | None:
     return descriptor
 
 
-def _clear(path: Path) -> None:
-    """Take away what processes that were killed left beside ``path``; what they had moved aside
-    and not replaced comes back."""
+def _clean_up(path: Path) -> None:
+    """Remove what killed processes left beside ``path``; move back what they had moved aside and
+    not replaced."""
     name = glob.escape(path.name)
     for stale in path.parent.glob(f".{name}.????????.part"):
         if (descriptor := _lock(stale)) is not None:
@@ -229,7 +226,7 @@ def _clear(path: Path) -> None:
 
 
 def remove(path: Path) -> None:
-    """Take a file or folder away, if it is there."""
+    """Remove a file or folder if it exists."""
     if path.is_dir() and not path.is_symlink():
         shutil.rmtree(path, ignore_errors=True)
     else:
@@ -237,8 +234,8 @@ def remove(path: Path) -> None:
 
 
 def read_manifest(folder: Path, kind: str) -> dict[str, Any]:
-    """The manifest of an artifact of this kind, every file's sha256 checked; ArtifactError for no
-    such folder, another kind or schema, a file missing or changed."""
+    """The manifest of an artifact, with every file's sha256 checked. Raises ArtifactError: no such
+    folder, another kind or schema, a missing or changed file."""
     if not (folder / MANIFEST).is_file():
         raise ArtifactError(
             f"{folder} is not a tumortrack {kind}: it has no {MANIFEST}. "

@@ -1,4 +1,4 @@
-"""The values that flow through the pipeline: frozen, arrays read-only, shapes annotated.
+"""The pipeline's values: frozen, with read-only arrays and annotated shapes.
 
 Frames: ``lps`` is the patient's (DICOM), ``camera`` is OpenCV's (x right, y down, z forward).
 Labels: 0 outside, 1 organ, 2, 3, ... tumors; a tumor wins where parts overlap.
@@ -22,12 +22,12 @@ OUTSIDE, ORGAN, FIRST_TUMOR = 0, 1, 2
 
 
 def _freeze(value: object, name: str, dtype: npt.DTypeLike, shape: tuple[int | None, ...]) -> None:
-    """Convert one field to a read-only array and check its shape (None: any length)."""
+    """Convert a field to a read-only array and check its shape (None: any length)."""
     given, field = np.asarray(getattr(value, name)), f"{type(value).__name__}.{name}"
     if given.dtype == dtype and given.flags.owndata and not given.flags.writeable:
-        array = given  # frozen already, by another value
+        array = given  # already frozen by another value
     else:
-        array = given.astype(dtype)  # a copy: the caller's stays writable
+        array = given.astype(dtype)  # a copy, so that the caller's stays writable
     if array.dtype.kind in "iu" and array.dtype != given.dtype and (array != given).any():
         raise InputError(
             f"{field} has numbers that are no {array.dtype}; give whole "
@@ -42,7 +42,7 @@ def _freeze(value: object, name: str, dtype: npt.DTypeLike, shape: tuple[int | N
 
 
 def _freeze_grid(value: object, values: str, dtype: npt.DTypeLike, name: str) -> None:
-    """The same for values on a voxel grid, and its affine transform."""
+    """The same for values on a voxel grid and its affine."""
     _freeze(value, values, dtype, (None, None, None))
     _freeze(value, name, np.float64, (4, 4))
     affine = getattr(value, name)
@@ -77,7 +77,7 @@ class LabelVolume:
 
 @dataclass(frozen=True, eq=False)
 class CameraLabels:
-    """Labels on a voxel grid before the camera, axes (i, j, k)."""
+    """Labels on a voxel grid in the camera frame, axes (i, j, k)."""
 
     labels: UInt8[np.ndarray, "i j k"]
     camera_from_index: Float64[np.ndarray, "4 4"]
@@ -111,13 +111,12 @@ class Mesh:
 
     @property
     def volume_ml(self) -> float:
-        """The volume that people are told: of the closed surface, in millilitres."""
         return self.volume_mm3 / 1000
 
     @cached_property
     def box_mm(self) -> Float64[np.ndarray, "2 3"]:
         """Axis-aligned bounding box: lower and upper corner."""
-        axes = np.ascontiguousarray(self.vertices_mm.T)  # ten times as fast as along the short axis
+        axes = np.ascontiguousarray(self.vertices_mm.T)  # ten times faster than along axis 0
         return np.stack([axes.min(1), axes.max(1)])
 
     @property
@@ -126,20 +125,20 @@ class Mesh:
         return float(np.ptp(self.box_mm, axis=0).max())
 
     def spread_mm(self, longest_mm: float = 2.0) -> Float64[np.ndarray, "n 3"]:
-        """Points all over the surface, see ``spread_over``. With the default one of them is at most
-        1.2 mm away, which makes a distance of 5 mm to the surface too long by 0.1 mm at most."""
+        """Points all over the surface, see ``spread_over``. By default one is at most 1.2 mm
+        away, so that a distance of 5 mm to the surface is at most 0.1 mm too long."""
         return spread_over(self.vertices_mm, self.faces, longest_mm)
 
     def moved(self, vertices_mm: Float[np.ndarray, "v 3"]) -> Mesh:
-        """The same triangles over other vertices (a deformation or a change of frame)."""
+        """The same triangles with other vertices (a deformation or a change of frame)."""
         return Mesh(vertices_mm, self.faces)
 
 
 @dataclass(frozen=True, eq=False)
 class Anatomy:
-    """Closed surfaces, outermost first: ``parts[0]`` is the whole organ, tumors included (the
-    union), so that it is the visible surface; ``parts[n]`` is the tumor labelled n + 1. ``kind``:
-    which organ it is. ``structures``: further surfaces that move with it, closed or open."""
+    """Closed surfaces: ``parts[0]`` is the union of organ and tumors, and so the visible surface;
+    ``parts[n]`` is the tumor labelled n + 1. ``structures``: further surfaces that move with the
+    organ, closed or open."""
 
     parts: tuple[Mesh, ...]
     kind: Organ = KIDNEY
@@ -151,8 +150,7 @@ class Anatomy:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """``kidney`` (or the organ's other name), ``tumor_1``, ``tumor_2``, ...: also the mesh
-        files' names."""
+        """See ``part_names``; mesh files have these names, too."""
         return part_names(len(self.parts), self.kind.name)
 
     def of(self, parts: Iterable[Mesh]) -> Anatomy:
@@ -169,7 +167,7 @@ class Anatomy:
 
 
 def part_names(n_parts: int, organ: str) -> tuple[str, ...]:
-    """Names of the parts by label 1, 2, 3, ...: the organ's, tumor_1, tumor_2, ..."""
+    """Names of the parts with label 1, 2, 3, ...: the organ's, tumor_1, tumor_2, ..."""
     return (organ, *(f"tumor_{n}" for n in range(1, n_parts)))
 
 
@@ -204,7 +202,7 @@ class DepthFrame:
         _freeze(self, "depth_mm", np.float32, (self.intrinsics.height, self.intrinsics.width))
 
     def with_depth(self, depth_mm: Float32[np.ndarray, "h w"]) -> DepthFrame:
-        """The same camera and stamp with another depth, taken over: the array becomes read-only."""
+        """The same frame with another depth, which is not copied but becomes read-only."""
         depth_mm.flags.writeable = False
         return DepthFrame(depth_mm, self.intrinsics, self.stamp_ns)
 
@@ -226,8 +224,8 @@ class SensorCloud:
 
 @dataclass(frozen=True, eq=False)
 class Look:
-    """The organ's points from one more camera, or from another place: ``cloud`` and all that it saw
-    in its own frame, and ``camera_from_look`` from there to the first camera's."""
+    """The organ seen by another camera or from another place: its points, ``cloud``, and all that
+    was ``seen``, in that camera's frame; ``camera_from_look`` leads to the first camera's."""
 
     cloud: SensorCloud
     seen: DepthFrame | SensorCloud
@@ -239,7 +237,7 @@ class Look:
 
 @dataclass(frozen=True, eq=False)
 class OccupancyCloud:
-    """The estimate as points inside the organ: label >= 1 and its probability, camera frame."""
+    """An estimate as points inside the organ, with label >= 1 and its probability, camera frame."""
 
     points_mm: Float32[np.ndarray, "n 3"]
     labels: UInt8[np.ndarray, " n"]

@@ -1,4 +1,4 @@
-"""A case: one patient's (or phantom's) anatomy, ready for simulation, as a folder."""
+"""A case: the anatomy of one patient or phantom, as a folder."""
 
 from __future__ import annotations
 
@@ -23,20 +23,18 @@ KIND = "case"
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """Everything later steps need of a patient; all in LPS mm.
+    """All that later steps need of a patient, in LPS mm.
 
     Attributes:
         anatomy: organ (tumors included) and tumors as closed surfaces.
-        labels: cropped round the organ with a margin.
+        labels: cropped to the organ with a margin.
         up_lps: unit vector, the patient direction that faces the camera.
         report: JSON types: volumes, smoothing, what was dropped, notes, source, options.
-        ct: the CT on the labels' crop, where the input was one.
-        patient: whose organ it is, as far as it is known.
-        rotations, tilt_degrees: how it may lie before the camera: any way (``full``), or turned
-            about the line of sight and tilted up to so much about the axes across it.
-        sensor: the camera that will see it.
-        folder: where it was read from, or written.
-        sha256: of its manifest there.
+        ct: the CT on the labels' grid, where the input was one.
+        rotations, tilt_degrees: possible poses: any (``full``), or turned about the line of sight
+            and tilted by at most so much about each axis across it.
+        sensor: the camera that will be used.
+        folder, sha256: where it was read or written, and the digest of its manifest there.
     """
 
     MODEL: ClassVar[str] = "model"  # sub-folder
@@ -55,7 +53,7 @@ class Case:
 
 
 class _Manifest(msgspec.Struct):
-    """What a case's manifest says beside what all manifests say."""
+    """The fields that only a case's manifest has."""
 
     organ: Organ
     structures: list[str]
@@ -69,11 +67,8 @@ class _Manifest(msgspec.Struct):
 
 
 def save_case(case: Case, folder: Path) -> None:
-    """Write the case's files into an existing (aside) folder and seal it with its manifest.
-
-    kidney.ply (or of the organ's name), tumor_1.ply, ..., a surface of each structure,
-    labels.nii.gz, ct.nii.gz (of a CT) and manifest.json. Raises StorageError: the disk refused.
-    """
+    """Write the case's files and manifest into an existing folder. Raises StorageError: the disk
+    refused."""
     write_anatomy(folder, case.anatomy)
     for name, mesh in case.anatomy.structures.items():
         write_mesh(folder / f"{name}.ply", mesh)
@@ -97,7 +92,6 @@ def save_case(case: Case, folder: Path) -> None:
 
 
 def holds_case(folder: Path) -> bool:
-    """Whether a folder holds a case."""
     path = folder / store.MANIFEST
     return path.is_file() and store.read_json(path).get("kind") == KIND
 
@@ -106,20 +100,29 @@ def load_case(folder: Path) -> Case:
     """Read a case folder, every file checked against its sha256. Raises ArtifactError: not a case,
     of another schema, damaged or changed."""
     try:
-        said = msgspec.convert(store.read_manifest(folder, KIND), _Manifest)
-        for name in said.structures:
+        manifest = msgspec.convert(store.read_manifest(folder, KIND), _Manifest)
+        for name in manifest.structures:
             check_name(name, "a structure", "--structure")
     except (InputError, msgspec.ValidationError) as error:
         reason = str(error).rstrip(".")
         raise ArtifactError(
             f"{folder} is not a case folder: {reason}. Make one with `tumortrack prepare`."
         ) from error
-    structures = {name: read_mesh(folder / f"{name}.ply") for name in said.structures}
-    anatomy = replace(read_anatomy(folder, said.organ), structures=structures)
-    if (found := list(anatomy.names)) != said.parts:
-        raise ArtifactError(f"{folder} lacks parts: {said.parts} expected, {found} found.")
-    labels, ct = read_labels(folder / "labels.nii.gz"), folder / "ct.nii.gz"
-    volume = read_volume(ct) if ct.exists() else None
-    lies = said.rotations, said.tilt_degrees, said.sensor
-    where = folder, store.sha256_of(folder / store.MANIFEST)
-    return Case(anatomy, labels, said.up_lps, said.report, volume, said.patient, *lies, *where)
+    structures = {name: read_mesh(folder / f"{name}.ply") for name in manifest.structures}
+    anatomy = replace(read_anatomy(folder, manifest.organ), structures=structures)
+    if (names := list(anatomy.names)) != manifest.parts:
+        raise ArtifactError(f"{folder} lacks parts: {manifest.parts} expected, {names} found.")
+    ct = folder / "ct.nii.gz"
+    return Case(
+        anatomy,
+        read_labels(folder / "labels.nii.gz"),
+        manifest.up_lps,
+        manifest.report,
+        read_volume(ct) if ct.exists() else None,
+        manifest.patient,
+        manifest.rotations,
+        manifest.tilt_degrees,
+        manifest.sensor,
+        folder,
+        store.sha256_of(folder / store.MANIFEST),
+    )

@@ -1,7 +1,7 @@
-"""A DICOM series as a volume; its pixels are read in ``dicom_pixels``.
+"""A DICOM series as a volume; ``dicom_pixels`` reads its pixels.
 
-Slices are sorted by their position along the slice normal, and every gap is checked here:
-readers only warn of a missing slice and stretch the patient.
+Slices are sorted by their position along the slice normal, and gaps are refused: other readers only
+warn of a missing slice and stretch the patient.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _MAX_FILES = 20_000
 _NO_SLICE, _MULTI_FRAME = "no DICOM slices", "multi-frame DICOM objects"
 _CT = "1.2.840.10008.5.1.4.1.1.2"  # SOP class of CT images
 _UNDEFINED = 0xFFFFFFFF  # length of compressed pixels
-_DEFLATED = "1.2.840.10008.1.2.1.99"  # transfer syntax; readers unpack it before they look at it
+_DEFLATED = "1.2.840.10008.1.2.1.99"  # transfer syntax; pydicom would unpack it unchecked
 _AGAIN = "Export the series again."
 
 
@@ -41,23 +41,20 @@ class _Slice:
     position_mm: tuple[float, ...]  # LPS, first pixel
     orientation: tuple[float, ...]  # along a row, along a column
     scale: tuple[float, float]  # stored number -> HU: slope, intercept
-    samples: int  # of a pixel
-    pixel_fault: str  # what is wrong with the length of the pixels; "": nothing
+    samples: int  # per pixel
+    pixel_fault: str  # what is wrong with the length of the pixel data; "": nothing
     patient_id: str
     laterality: str  # L, R or something else
 
 
 class NoSeries(InputError):
-    """A folder without slices."""
+    """The folder has no slices."""
 
 
 @dataclass(frozen=True, eq=False)
 class Series:
-    """The slices of one series, in order along the slice normal, and how they lie.
-
-    ``shape``: columns, rows, slices; ``lps_from_index``: (column, row, slice) -> LPS mm; ``scale``:
-    slope and intercept from stored numbers to HU.
-    """
+    """The slices of one series, in order along the slice normal. ``shape``: columns, rows, slices;
+    ``lps_from_index``: (column, row, slice) -> LPS mm; ``scale``: slope and intercept to HU."""
 
     files: tuple[Path, ...]
     shape: tuple[int, int, int]
@@ -68,11 +65,11 @@ class Series:
 
 
 def find_series(folder: Path, series: str | None = None) -> Series:
-    """Find one CT series of a folder (sub-folders not searched); its pixels are not read.
+    """Find one CT series in a folder (sub-folders not searched) without reading its pixels.
 
-    The rule among several: the only one with modality CT and at least 10 slices of one size and
-    orientation. Otherwise ``series`` must name one: its UID or its number in the error's list.
-    Raises InputError: no series, several, a missing, double or stray slice; images of two patients.
+    ``series``: its UID, or its number in the error's list; None: the only one with modality CT and
+    at least 10 slices of one size and orientation. Raises InputError: no series, several, a
+    missing, double or stray slice; images of two patients.
     """
     groups, notes = _groups(folder)
     slices = _choose(folder, groups, series)
@@ -88,11 +85,10 @@ def find_series(folder: Path, series: str | None = None) -> Series:
     axes = (row * between_columns, column * between_rows, _slice_step(slices, normal))
     lps_from_index[:3] = np.stack([*axes, slices[0].position_mm], axis=1)
     shape = (first.shape[1], first.shape[0], len(slices))
-    stored = sum(one.path.stat().st_size for one in slices)
+    stored = sum(s.path.stat().st_size for s in slices)
     check_size(folder, shape, 4, compressed=True, stored=stored)
     check_affine(folder, lps_from_index)
-    # A damaged slice may be among the images that are not taken.
-    if others := sum(map(len, groups)) - len(slices):
+    if others := sum(map(len, groups)) - len(slices):  # perhaps a damaged slice is among them
         notes += (f"{others} images of other series, sizes or orientations left out",)
     if not first.uid:
         notes += ("the slices have no SeriesInstanceUID: taken as one series",)
@@ -101,43 +97,43 @@ def find_series(folder: Path, series: str | None = None) -> Series:
 
 
 def read_dicom(folder: Path, series: str | None = None) -> RawVolume:
-    """Read one CT series of a folder, chosen as by ``find_series``: rescaled values (HU), float32.
-    Raises InputError: see ``find_series``; damaged pixels."""
-    found = find_series(folder, series)
-    array = read_pixels(found.files, found.shape, found.scale)
-    return RawVolume(array, found.lps_from_index, found.notes, found.patient)
+    """Read one CT series in HU, float32. Raises InputError: as ``find_series``; damaged pixels."""
+    chosen = find_series(folder, series)
+    array = read_pixels(chosen.files, chosen.shape, chosen.scale)
+    return RawVolume(array, chosen.lps_from_index, chosen.notes, chosen.patient)
 
 
 def _patient(folder: Path, groups: list[list[_Slice]], slices: list[_Slice]) -> Patient:
-    """Whom the chosen slices show; InputError where the folder mixes patients."""
-    ids = sorted({one.patient_id for group in groups for one in group} - {""})
+    """The patient of the chosen slices. Raises InputError: the folder mixes patients."""
+    ids = sorted({s.patient_id for group in groups for s in group} - {""})
     if len(ids) > 1:
         raise InputError(
             f"{folder} holds images of {len(ids)} patients (PatientID {', '.join(ids[:3])}"
             f"{', ...' if len(ids) > 3 else ''}). Give a folder that holds one patient's alone."
         )
     sides: dict[str, Side] = {"L": "left", "R": "right"}
-    said = {one.laterality for one in slices}
-    side: Side = sides.get(said.pop(), UNKNOWN) if len(said) == 1 else UNKNOWN
+    stated = {s.laterality for s in slices}
+    side: Side = sides.get(stated.pop(), UNKNOWN) if len(stated) == 1 else UNKNOWN
     return Patient(ids[0] if ids else UNKNOWN, side)
 
 
 def _check_tags(folder: Path, slices: list[_Slice]) -> None:
-    """What holds for each slice of a series of Hounsfield units; its place is checked apart."""
-    if len({one.scale for one in slices}) > 1:
+    """Refuse slices that cannot be Hounsfield units; positions are checked in ``_slice_step``."""
+    if len({s.scale for s in slices}) > 1:
         raise InputError(
             f"{folder}: its slices differ in RescaleSlope or RescaleIntercept, so their Hounsfield "
             f"units are uncertain. {_AGAIN}"
         )
-    for one in slices:
-        faults = {
-            f"PixelSpacing {one.spacing_mm} must be above 0": min(one.spacing_mm) <= 0,
-            f"RescaleSlope {one.scale[0]:g} must be above 0": one.scale[0] <= 0,
-            f"{one.samples} samples a pixel are no CT's, which has 1": one.samples != 1,
-            one.pixel_fault: bool(one.pixel_fault),
-        }
-        if found := [fault for fault, there in faults.items() if there]:
-            raise InputError(f"{one.path}: {found[0]}. {_AGAIN}")
+    for s in slices:
+        fault = s.pixel_fault
+        if min(s.spacing_mm) <= 0:
+            fault = f"PixelSpacing {s.spacing_mm} must be above 0"
+        elif s.scale[0] <= 0:
+            fault = f"RescaleSlope {s.scale[0]:g} must be above 0"
+        elif s.samples != 1:
+            fault = f"{s.samples} samples a pixel are no CT's, which has 1"
+        if fault:
+            raise InputError(f"{s.path}: {fault}. {_AGAIN}")
 
 
 def _groups(folder: Path) -> tuple[list[list[_Slice]], tuple[str, ...]]:
@@ -145,32 +141,31 @@ def _groups(folder: Path) -> tuple[list[list[_Slice]], tuple[str, ...]]:
     files = sorted(p for p in folder.iterdir() if p.is_file() and not p.name.startswith("."))
     if len(files) > _MAX_FILES:
         raise InputError(f"{folder} holds {len(files)} files; the limit is {_MAX_FILES}.")
-    found: dict[tuple[Any, ...], list[_Slice]] = {}
+    by_key: dict[tuple[Any, ...], list[_Slice]] = {}
     left_out: dict[str, list[Path]] = {_NO_SLICE: [], _MULTI_FRAME: []}
     for file in files:
-        one = _read_tags(file)
-        if isinstance(one, str):
-            left_out[one].append(file)
-        elif not np.isfinite(
-            (*one.position_mm, *one.orientation, *one.spacing_mm, *one.scale)
-        ).all():
+        tags = _read_tags(file)
+        if isinstance(tags, str):
+            left_out[tags].append(file)
+            continue
+        numbers = (*tags.position_mm, *tags.orientation, *tags.spacing_mm, *tags.scale)
+        if not np.isfinite(numbers).all():
             raise InputError(
                 f"{file}: its position, orientation, spacing or rescaling is not finite. {_AGAIN}"
             )
-        else:
-            turn = tuple(round(c, 3) for c in one.orientation)
-            found.setdefault((one.uid, one.shape, turn), []).append(one)
-    if not found and (multi_frame := left_out[_MULTI_FRAME]):
+        orientation = tuple(round(c, 3) for c in tags.orientation)
+        by_key.setdefault((tags.uid, tags.shape, orientation), []).append(tags)
+    if not by_key and (multi_frame := left_out[_MULTI_FRAME]):
         raise InputError(
             f"{multi_frame[0]} is a multi-frame DICOM object; export classic slices, one file "
             "each, or NIfTI."
         )
-    if not found:
+    if not by_key:
         raise NoSeries(
             f"{folder} holds no DICOM image with a position. Give the folder that holds the CT's "
             "slices themselves."
         )
-    groups = [found[key] for key in sorted(found, key=lambda key: (-len(found[key]), repr(key)))]
+    groups = [by_key[key] for key in sorted(by_key, key=lambda key: (-len(by_key[key]), repr(key)))]
     notes = tuple(
         f"{len(paths)} files are {what}: left out ({', '.join(p.name for p in paths[:3])}"
         + (", ...)" if len(paths) > 3 else ")")
@@ -181,7 +176,7 @@ def _groups(folder: Path) -> tuple[list[list[_Slice]], tuple[str, ...]]:
 
 
 def _read_tags(path: Path) -> _Slice | str:
-    """The tags of one slice, or why the file is none (``_NO_SLICE``, ``_MULTI_FRAME``)."""
+    """The tags of one slice, or why the file is not one (``_NO_SLICE``, ``_MULTI_FRAME``)."""
     load_pydicom()
     import pydicom
     from pydicom.filereader import read_dataset, read_file_meta_info
@@ -189,24 +184,22 @@ def _read_tags(path: Path) -> _Slice | str:
 
     tags: Any = None
     with warnings.catch_warnings(), path.open("rb") as stream:
-        warnings.simplefilter("ignore")  # a damaged header gets our own errors
+        warnings.simplefilter("ignore")  # damage is reported by our own errors
         is_dicom = stream.read(132)[128:] == b"DICM"
         stream.seek(0)
         try:
-            if (
-                is_dicom
-                and (meta := read_file_meta_info(path)).get("TransferSyntaxUID") == _DEFLATED
-            ):
+            meta = read_file_meta_info(path) if is_dicom else {}
+            if meta.get("TransferSyntaxUID") == _DEFLATED:
                 tags = pydicom.FileDataset(path, {}, file_meta=meta)
                 raise ValueError("deflated as a whole, which is not read")
             tags = pydicom.dcmread(stream, stop_before_pixels=True)
-            start = stream.tell()  # of the pixels; long values from there on are not read
+            start = stream.tell()  # of the pixel data; long values from there on are not read
             implicit, little = tags.original_encoding
             rest = read_dataset(stream, implicit, little, defer_size=1024)
             stream.seek(start)
             parts = (tags.file_meta, tags, rest)
             types = {str(element.VR) for part in parts for element in part.values()}
-            if strange := types - STANDARD_VR - {"None"}:  # GDCM takes their lengths for gigabytes
+            if strange := types - STANDARD_VR - {"None"}:  # GDCM would read gigabyte lengths
                 raise ValueError(f"elements of the type {sorted(strange)[0]!r}")
             if int(tags.get("NumberOfFrames") or 1) > 1:
                 return _MULTI_FRAME
@@ -247,7 +240,7 @@ def _numbers(values: Any, count: int) -> tuple[float, ...]:
 
 
 def _should_be_slice(tags: Any) -> bool:
-    """Whether a file that is no slice calls itself one, or could not be read far enough to say."""
+    """Whether an unreadable file calls itself a CT slice, or does not get as far as to say."""
     try:
         return tags is None or tags.file_meta.get("MediaStorageSOPClassUID") == _CT
     except Exception:  # likewise
@@ -255,21 +248,21 @@ def _should_be_slice(tags: Any) -> bool:
 
 
 def _pixel_fault(tags: Any, stream: BinaryIO) -> str:
-    """What is wrong with the length of the pixels, to which the stream has come: decoders fill up
-    what is missing, and make room for all that is claimed."""
+    """What is wrong with the length of the pixel data, at which the stream stands: decoders pad
+    what is missing and allocate whatever is claimed."""
     start, head = stream.tell(), stream.read(12)
     implicit, little = tags.original_encoding
     if head and not implicit and head[4:6] not in (b"OB", b"OW", b"OF", b"OD"):
         return "its pixels are of no known type"
     size = 8 if implicit else 12  # of the element's head, which ends with the length
     length = int.from_bytes(head[size - 4 : size], "little" if little else "big")
-    there = os.fstat(stream.fileno()).st_size - start - size
+    stored = os.fstat(stream.fileno()).st_size - start - size
     bits = int(tags.get("BitsAllocated") or 16) * int(tags.get("SamplesPerPixel") or 1)
     needed = int(tags.Rows) * int(tags.Columns) * bits // 8
-    room = there * GZIP_BEST if length == _UNDEFINED else min(length, there)
-    if room >= needed:
+    possible = stored * GZIP_BEST if length == _UNDEFINED else min(length, stored)
+    if possible >= needed:
         return ""
-    return f"it claims {tags.Columns} x {tags.Rows} pixels and holds {max(0, there)} bytes of them"
+    return f"it claims {tags.Columns} x {tags.Rows} pixels and holds {max(0, stored)} bytes of them"
 
 
 def _choose(folder: Path, groups: list[list[_Slice]], series: str | None) -> list[_Slice]:
@@ -304,20 +297,19 @@ def _slice_step(slices: list[_Slice], normal: np.ndarray) -> np.ndarray:
     gaps = np.diff(along)
     usual = float(np.median(gaps))
     for n in np.flatnonzero(np.abs(gaps - usual) > max(0.02, 0.05 * abs(usual))):
-        double = gaps[n] < 0.5 * usual or usual < 0.01
-        kind = "two slices lie at" if double else "a slice is missing after"
+        doubled = gaps[n] < 0.5 * usual or usual < 0.01
+        kind = "two slices lie at" if doubled else "a slice is missing after"
         raise InputError(
             f"{folder}: {kind} position {along[n]:.2f} mm ({slices[n].path.name} to "
             f"{slices[n + 1].path.name}: {gaps[n]:.2f} mm, usually {usual:.2f} mm). Export the "
             "whole series again, each slice once."
         )
     step = (positions[-1] - positions[0]) / (len(slices) - 1)
-    stray = np.linalg.norm(
-        positions - positions[0] - np.arange(len(slices))[:, None] * step, axis=1
-    )
-    if stray.max() > max(0.1, 0.1 * abs(usual)):
+    line = positions[0] + np.arange(len(slices))[:, None] * step
+    off_mm = np.linalg.norm(positions - line, axis=1)
+    if off_mm.max() > max(0.1, 0.1 * abs(usual)):
         raise InputError(
-            f"{slices[int(stray.argmax())].path}: this slice lies {stray.max():.2f} mm off the "
+            f"{slices[int(off_mm.argmax())].path}: this slice lies {off_mm.max():.2f} mm off the "
             "line through the others. Export one continuous series."
         )
     return step

@@ -1,7 +1,7 @@
-"""The pixels of DICOM slices: pydicom unpacks them, with GDCM where they are JPEG of any kind.
+"""The pixels of DICOM slices, decoded by pydicom, with GDCM for every kind of JPEG.
 
-A decoder trusts what a compressed picture says of itself, fills up what is missing and makes room
-for all that is claimed. So that is compared with the slice's tags before one sees it.
+Decoders trust the header of a compressed picture, pad what is missing and allocate whatever is
+claimed. So the header is compared with the slice's tags before a decoder sees it.
 """
 
 from __future__ import annotations
@@ -20,20 +20,20 @@ from tumortrack.core.errors import InputError
 if TYPE_CHECKING:
     from pydicom import Dataset
 
-_TAGS = (  # what pixels are read by
+_TAGS = (  # that decoding needs
     *("SamplesPerPixel", "PhotometricInterpretation", "Rows", "Columns", "BitsAllocated"),
     *("BitsStored", "HighBit", "PixelRepresentation", "PixelData"),
 )
 _DAMAGED = "the compressed picture is cut short, damaged or of another kind"
 _START, _END = b"\xff\xd8", b"\xff\xd9"
 _J2K_START = b"\xff\x4f\xff\x51"
-_SCAN = 0xDA  # the segment behind which the coded numbers come
+_SCAN = 0xDA  # the segment that the coded numbers follow
 _SEGMENTS = {0xC4, 0xDB, 0xDD, 0xFE, *range(0xE0, 0xF0)}  # tables, restarts, comments, applications
 _LS_SEGMENTS = {*_SEGMENTS - {0xC4, 0xDB}, 0xF8}
 
 
 class _Picture(NamedTuple):
-    """What a compressed picture says of itself."""
+    """The header of a compressed picture."""
 
     rows: int
     columns: int
@@ -44,24 +44,24 @@ class _Picture(NamedTuple):
 def read_pixels(
     files: tuple[Path, ...], shape: tuple[int, int, int], scale: tuple[float, float]
 ) -> Float[np.ndarray, "columns rows slices"]:
-    """The slices' stored numbers times ``scale[0]`` plus ``scale[1]``, float32.
-
-    ``shape``: columns, rows, slices. What a slice says of padding or of display is not applied.
-    Raises InputError: pixels that cannot be decoded, or are not of this shape."""
+    """The slices' stored numbers times ``scale[0]`` plus ``scale[1]``, float32; tags on padding and
+    display are not applied. ``shape``: columns, rows, slices. Raises InputError: pixels that cannot
+    be decoded, or are not of this shape."""
     columns, rows, _ = shape
     values = np.empty((len(files), rows, columns), np.float32)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # pydicom warns of what is checked here or does no harm,
-        warnings.filterwarnings("error", "The decoded RLE segment contains")  # but for more pixels
+        # pydicom's warnings are harmless or checked here, but for excess pixels.
+        warnings.simplefilter("ignore")
+        warnings.filterwarnings("error", "The decoded RLE segment contains")
         for file, out in zip(files, values, strict=True):
             try:
                 stored = _stored(file)
                 if stored.shape != out.shape:
                     raise ValueError(f"they are {stored.shape}, the other slices' {out.shape}")
             except Exception as error:  # pydicom and its decoders raise anything
-                said = str(error).strip().splitlines() or [type(error).__name__]
+                reason = (str(error).strip().splitlines() or [type(error).__name__])[-1]
                 raise InputError(
-                    f"{file}: the slice's pixels cannot be decoded: {said[-1].strip().rstrip('.')}."
+                    f"{file}: the slice's pixels cannot be decoded: {reason.strip().rstrip('.')}."
                 ) from error
             out[...] = stored * scale[0] + scale[1]  # in double precision
     return values.transpose(2, 1, 0)
@@ -77,46 +77,39 @@ def _stored(file: Path) -> Integer[np.ndarray, "rows columns"]:
     tags = pydicom.dcmread(file, specific_tags=list(_TAGS))
     tags.setdefault("SamplesPerPixel", 1)
     tags.setdefault("PhotometricInterpretation", "MONOCHROME2")
-    if fault := _fault(tags):
-        raise ValueError(fault)
+    photometric = tags.PhotometricInterpretation
+    if photometric != "MONOCHROME2":  # some readers invert MONOCHROME1 and others do not
+        raise ValueError(
+            f"PhotometricInterpretation {photometric!s:.20} is read by no one rule, only "
+            "MONOCHROME2"
+        )
+    high_bit, bits = tags.get("HighBit"), tags.BitsStored
+    if high_bit not in (None, bits - 1):
+        raise ValueError(f"HighBit {high_bit} does not fit BitsStored {bits}")
     syntax = tags.file_meta.TransferSyntaxUID
     plugin = "pydicom"
     if syntax.is_encapsulated and syntax != RLELossless:
-        _quiet_gdcm()
+        _silence_gdcm()
         plugin = "gdcm"
         frame = get_frame(tags.PixelData, 0, number_of_frames=1)
         is_j2k = syntax in JPEG2000TransferSyntaxes
-        _check_picture(_of_j2k(frame) if is_j2k else _of_jpeg(frame, syntax), tags)
+        _check_picture(_j2k_header(frame) if is_j2k else _jpeg_header(frame, syntax), tags)
     return get_decoder(syntax).as_array(tags, index=0, raw=True, decoding_plugin=plugin)[0]
 
 
-def _fault(tags: Dataset) -> str:
-    """Why the stored numbers are no Hounsfield units before rescaling; "": they are."""
-    photometric = tags.PhotometricInterpretation
-    high_bit, stored = tags.get("HighBit"), tags.BitsStored
-    faults = {
-        # Some readers invert MONOCHROME1 and others do not.
-        f"PhotometricInterpretation {photometric!s:.20} is read by no one rule, only MONOCHROME2": (
-            photometric != "MONOCHROME2"
-        ),
-        f"HighBit {high_bit} does not fit BitsStored {stored}": high_bit not in (None, stored - 1),
-    }
-    return next((fault for fault, there in faults.items() if there), "")
-
-
 def _check_picture(picture: _Picture, tags: Dataset) -> None:
-    said = (tags.Rows, tags.Columns, tags.SamplesPerPixel)
-    if picture[:3] != said:
-        raise ValueError(f"the compressed picture is {picture[:3]}, the tags say {said}")
+    stated = (tags.Rows, tags.Columns, tags.SamplesPerPixel)
+    if picture[:3] != stated:
+        raise ValueError(f"the compressed picture is {picture[:3]}, the tags say {stated}")
     if not 2 <= picture.bits <= tags.BitsAllocated:
         raise ValueError(f"the compressed picture has {picture.bits} bits a pixel")
 
 
-def _of_jpeg(frame: bytes, syntax: str) -> _Picture:
-    """Of the head of a JPEG or JPEG-LS picture (ISO/IEC 10918-1, B.2; 14495-1, C.2).
+def _jpeg_header(frame: bytes, syntax: str) -> _Picture:
+    """The header of a JPEG or JPEG-LS picture (ISO/IEC 10918-1, B.2; 14495-1, C.2).
 
-    Raises ValueError or struct.error: it is not one frame and one scan that reach from the first
-    byte to the last. GDCM ends the process on some that are not."""
+    Raises ValueError or struct.error: it is not exactly one frame with one scan, from the first
+    byte to the last. GDCM ends the process on some of those."""
     from pydicom.uid import JPEGLossless, JPEGLosslessSV1, JPEGLSTransferSyntaxes
 
     is_ls = syntax in JPEGLSTransferSyntaxes
@@ -124,29 +117,30 @@ def _of_jpeg(frame: bytes, syntax: str) -> _Picture:
     kinds = {0xF7} if is_ls else {0xC3} if lossless else {0xC0, 0xC1}
     others = _LS_SEGMENTS if is_ls else _SEGMENTS
     _check_ends(frame, _START)
-    at, found, marker = len(_START), [], 0
+    at, frames, marker = len(_START), [], 0
     while marker != _SCAN:
         fill, marker, length = struct.unpack_from(">BBH", frame, at)
         if fill != 0xFF or length < 2 or marker not in {_SCAN, *kinds, *others}:
             raise ValueError(_DAMAGED)
         if marker in kinds:
             bits, rows, columns, samples, name = struct.unpack_from(">BHHBB", frame, at + 4)
-            found.append((length, name, _Picture(rows, columns, samples, bits)))
+            frames.append((length, name, _Picture(rows, columns, samples, bits)))
         at += 2 + length
-    # A marker among the numbers would be another segment. A byte 0xFF of theirs has one behind it
-    # that no marker has.
-    stray = re.compile(rb"\xff[\x80-\xff]" if is_ls else rb"\xff[^\x00\xd0-\xd7]")
-    end = stray.search(frame, at)
+    # The first marker among the coded numbers must be the end: a coded byte 0xFF is followed by
+    # one that no marker has.
+    marker_bytes = re.compile(rb"\xff[\x80-\xff]" if is_ls else rb"\xff[^\x00\xd0-\xd7]")
+    end = marker_bytes.search(frame, at)
     whole = end is not None and not frame[end.start() + len(_END) :].strip(b"\0")
-    if len(found) != 1 or found[0][0] != 11 or not whole:
+    if len(frames) != 1 or frames[0][0] != 11 or not whole:
         raise ValueError(_DAMAGED)
-    if length != 8 or frame[at - 6 : at - 4] != bytes([1, found[0][1]]):
+    _, name, picture = frames[0]
+    if length != 8 or frame[at - 6 : at - 4] != bytes([1, name]):
         raise ValueError(_DAMAGED)
-    return found[0][2]
+    return picture
 
 
-def _of_j2k(frame: bytes) -> _Picture:
-    """Of the head of a JPEG 2000 codestream (ISO/IEC 15444-1, A.5.1), likewise."""
+def _j2k_header(frame: bytes) -> _Picture:
+    """The header of a JPEG 2000 codestream (ISO/IEC 15444-1, A.5.1), likewise."""
     _check_ends(frame, _J2K_START)
     right, lower, left, upper, *_, samples = struct.unpack_from(">8IH", frame, 8)
     bits, across, down = struct.unpack_from(">3B", frame, 42)
@@ -160,8 +154,8 @@ def _check_ends(frame: bytes, start: bytes) -> None:
         raise ValueError(_DAMAGED)
 
 
-def _quiet_gdcm() -> None:
-    """It prints its errors, which pydicom turns into exceptions."""
+def _silence_gdcm() -> None:
+    """GDCM prints its errors, which pydicom raises as exceptions anyway."""
     import gdcm
 
     gdcm.Trace.WarningOff()

@@ -1,10 +1,14 @@
-"""Voxel grids: the checks that hold for every file format, and operations that many files need."""
+"""Voxel grids: reading and checks shared by all file formats, and operations on masks and boxes."""
 
 from __future__ import annotations
 
+import gzip
 import math
-from collections.abc import Iterable
+import zlib
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
+from io import BufferedIOBase
 from pathlib import Path
 
 import numpy as np
@@ -22,16 +26,15 @@ _MAX_VOXELS = 2**30
 _MAX_BYTES = 8 * 2**30
 _SPACING_RANGE_MM = (0.05, 10.0)
 GZIP_BEST = 1100  # deflate cannot compress better than 1032 : 1
-_USUAL_BEST, _MUCH = 100, 2**30  # what is beyond is refused if it unpacks to so many bytes
-_AT_ONCE = 2**16  # labels: counting makes eight bytes of each
+_USUAL_BEST, _MUCH = 100, 2**30  # a better ratio is refused if the volume has so many bytes
+_MOST_BEHIND = 16 * 2**20  # bytes after the voxels
+_CHUNK = 2**16  # labels that are counted at once
 
 
 @dataclass(frozen=True, eq=False)
 class RawVolume:
     """Voxels in the file's own number type; axes (i, j, k); ``lps_from_index``: index -> LPS mm.
-
-    ``notes`` name what was beside them and was left out; ``patient`` is whom the file names.
-    """
+    ``notes``: what else was there and was left out. ``patient``: as the file states."""
 
     array: np.ndarray
     lps_from_index: Float[np.ndarray, "4 4"]
@@ -46,9 +49,8 @@ def check_size(
     compressed: bool,
     stored: int | None = None,
 ) -> None:
-    """Refuse a shape that is no volume or too large, and a file too short to hold what its header
-    claims (``stored`` None: the file's size), before anything is allocated. Raises InputError: not
-    three axes, fewer than two voxels along one, above the limits; truncated."""
+    """Check, before anything is allocated, that a shape is a 3-D volume within the limits and that
+    the file (``stored`` bytes; None: its size) is long enough for it; InputError where not."""
     dims = " x ".join(str(n) for n in shape)
     if len(shape) != 3:
         raise InputError(
@@ -77,9 +79,36 @@ def check_size(
         )
 
 
+@contextmanager
+def volume_stream(path: Path, compressed: bool, start: int = 0) -> Iterator[BufferedIOBase]:
+    """The content of a volume file from byte ``start`` on, unpacked if it is compressed. Raises
+    InputError where reading it fails."""
+    try:
+        with path.open("rb") as stored:
+            stored.seek(start)
+            yield gzip.GzipFile(fileobj=stored) if compressed else stored
+    except (OSError, EOFError, zlib.error) as error:
+        raise InputError(f"{path} is truncated or damaged: {error}.") from error
+
+
+def read_voxels(
+    path: Path, stream: BufferedIOBase, shape: tuple[int, ...], dtype: np.dtype, compressed: bool
+) -> np.ndarray:
+    """The next voxels of a stream, first axis fastest, in native byte order. A compressed stream is
+    read to its end, where its checksum is. Raises InputError: too few bytes, or far too many."""
+    n_bytes = math.prod(shape) * dtype.itemsize
+    data = stream.read(n_bytes)
+    if len(data) < n_bytes:
+        raise InputError(f"{path} is truncated: {len(data)} of {n_bytes} bytes of voxels.")
+    if compressed and len(stream.read(_MOST_BEHIND + 1)) > _MOST_BEHIND:
+        raise InputError(f"{path} holds much more than its header says. Export it again.")
+    array = np.frombuffer(data, dtype).reshape(shape, order="F")
+    return array.astype(dtype.newbyteorder("="), copy=False)
+
+
 def check_affine(path: Path, lps_from_index: Float[np.ndarray, "4 4"]) -> None:
-    """Refuse a NaN or singular affine, and spacing that is not plausibly millimetres (metres are
-    recognised), with an InputError."""
+    """InputError for a NaN or singular affine, and for a spacing that is not plausibly millimetres
+    (metres are recognised)."""
     linear = lps_from_index[:3, :3]
     if not np.isfinite(lps_from_index).all():
         raise InputError(f"{path}: the affine has NaN or infinite numbers. Export it again.")
@@ -102,7 +131,6 @@ def check_affine(path: Path, lps_from_index: Float[np.ndarray, "4 4"]) -> None:
 
 
 def voxel_ml(lps_from_index: Float[np.ndarray, "4 4"]) -> float:
-    """The volume of one voxel in ml."""
     return float(abs(np.linalg.det(lps_from_index[:3, :3]))) / 1000
 
 
@@ -110,17 +138,17 @@ def label_counts(labels: UInt8[np.ndarray, "i j k"]) -> Int64[np.ndarray, " 256"
     """How many voxels have each label."""
     flat = labels.ravel(order="K")
     counts = np.zeros(256, np.int64)
-    for start in range(0, len(flat), _AT_ONCE):
-        part = flat[start : start + _AT_ONCE]
-        some = part[part > 0]  # few: bincount makes 8 bytes of each
-        counts += np.bincount(some, minlength=256)
-        counts[0] += len(part) - len(some)
+    for start in range(0, len(flat), _CHUNK):
+        chunk = flat[start : start + _CHUNK]
+        inside = chunk[chunk > 0]  # few, and bincount makes eight bytes of each
+        counts += np.bincount(inside, minlength=256)
+        counts[0] += len(chunk) - len(inside)
     return counts
 
 
 def components(mask: Bool[np.ndarray, "i j k"]) -> tuple[Int32[np.ndarray, "i j k"], np.ndarray]:
-    """Connected pieces (26 neighbours), numbered 1, 2, ... largest first, 0 outside, and their
-    voxel counts, ``counts[n - 1]`` of piece n."""
+    """Connected pieces (26 neighbours), numbered 1, 2, ... largest first, 0 outside; and their
+    voxel counts, largest first."""
     from scipy import ndimage
 
     pieces, n = ndimage.label(mask, np.ones((3, 3, 3)))
@@ -133,7 +161,7 @@ def components(mask: Bool[np.ndarray, "i j k"]) -> tuple[Int32[np.ndarray, "i j 
 
 
 def tight_box(mask: Bool[np.ndarray, "i j k"]) -> Box:
-    """The slices that hold every True voxel; there must be one."""
+    """The smallest box that holds every True voxel; there must be one."""
     hits = [np.flatnonzero(mask.any(axis=axes)) for axes in ((1, 2), (0, 2), (0, 1))]
     i, j, k = (slice(int(hit[0]), int(hit[-1]) + 1) for hit in hits)
     return i, j, k
@@ -142,7 +170,7 @@ def tight_box(mask: Bool[np.ndarray, "i j k"]) -> Box:
 def grown_box(
     box: Iterable[slice], shape: tuple[int, ...], margin: npt.ArrayLike = (0, 0, 0)
 ) -> Box:
-    """A box grown on every side by a margin (3,) in voxels, within the grid."""
+    """A box grown on every side by a margin (3,) in voxels, clipped to the grid."""
     i, j, k = (
         slice(max(0, s.start - m), min(n, s.stop + m))
         for s, n, m in zip(box, shape, np.asarray(margin).tolist(), strict=True)
@@ -153,7 +181,7 @@ def grown_box(
 def bounding_box(
     mask: Bool[np.ndarray, "i j k"], lps_from_index: Float[np.ndarray, "4 4"], margin_mm: float
 ) -> Box:
-    """The slices that hold every True voxel and a margin, within the grid."""
+    """The box that holds every True voxel and a margin, clipped to the grid."""
     margin = np.ceil(margin_mm / spacing_mm(lps_from_index)).astype(int)
     return grown_box(tight_box(mask), mask.shape, margin)
 
@@ -164,7 +192,7 @@ def extent_mm(box: tuple[slice, ...], steps_mm: np.ndarray) -> Float[np.ndarray,
 
 
 def depth_mm(mask: Bool[np.ndarray, "i j k"], steps_mm: np.ndarray) -> Float[np.ndarray, "i j k"]:
-    """Distance of each True voxel to the nearest False one or to the grid's edge."""
+    """Distance of each True voxel to the nearest False one; beyond the grid all are False."""
     from scipy import ndimage
 
     return ndimage.distance_transform_edt(np.pad(mask, 1), sampling=steps_mm)[1:-1, 1:-1, 1:-1]
@@ -182,7 +210,7 @@ def cropped(
     lps_from_index: Float[np.ndarray, "4 4"],
     margin_mm: float = 8.0,
 ) -> LabelVolume:
-    """The labels round everything labelled, with a margin of zeros on every side."""
+    """The labels cropped to what is labelled, with a margin of zeros on every side."""
     box = tight_box(labels > 0)
     margin = np.ceil(margin_mm / spacing_mm(lps_from_index)).astype(int)
     affine = moved_origin(lps_from_index, box)

@@ -1,8 +1,5 @@
-"""Labels of organ and tumors from a phantom's CT by HU windows.
-
-The scan also shows a table, a registration block and partial-volume rims; one free-standing
-organ is found among them.
-"""
+"""Organ and tumor labels from a phantom's CT by HU windows. The scan also shows a table, a
+registration block and partial-volume rims; the one free-standing organ is found among them."""
 
 from __future__ import annotations
 
@@ -21,17 +18,17 @@ from tumortrack.imaging.select import MIN_TUMOR_ML
 
 ORGAN_HU = (-300.0, 300.0)
 TUMOR_HU = (300.0, 1000.0)
-_RIM_MM = 1.2  # half of what a partial-volume rim can measure, at voxels below a millimetre
-_REACH_MM = 30.0  # an exophytic tumor's far side may lie this far off the organ found
-# Volume and longest side of a kidney, and of any other organ.
+_RIM_MM = 1.2  # half the width of a partial-volume rim at voxels below a millimetre
+_REACH_MM = 30.0  # how far an exophytic tumor may reach out of the organ that was found
+# Volume (ml) and longest side (mm) of a kidney, and of any other organ.
 _KIDNEY_SIZES, _OTHER_SIZES = ((20.0, 1000.0), 220.0), ((10.0, 4000.0), 400.0)
 _THINNEST_MM = 15.0
 _STEP_MM = 1.5  # the search runs on cells of about this size
-_OPEN_MM = 3.0  # what is thinner than twice this is no organ
+_OPEN_MM = 3.0  # what is thinner than twice this is not organ
 _CUT_RADII_MM = (3.0, 4.5, 6.0, 8.0, 10.0, 12.0, 15.0)
 _LEAST_SOLIDITY = 0.68  # share of the convex hull that is filled: real kidneys have 0.75 to 0.9
 _LEAST_FLATNESS = 0.28  # shortest over longest principal spread: real kidneys have 0.4 to 0.5
-_MOST_CONTACT = 0.25  # share of the surface that was cut off something else
+_MOST_CONTACT = 0.25  # share of the surface where it was cut from something else
 _MOST_TUMOR = 0.7  # share of the volume in the tumor window: a block is all of it
 _LEAST_CONTACT = 0.08  # share of a tumor's surroundings that is parenchyma
 
@@ -44,13 +41,13 @@ def segment_ct(
     kind: Organ = KIDNEY,
 ) -> tuple[LabelVolume, list[str]]:
     """Segment a phantom's CT by HU windows (half open, [low, high)), as in the paper: labels 1
-    organ, 2, 3, ... tumors by volume, cropped round the organ; and notes.
+    organ, 2, 3, ... tumors by volume, cropped to the organ; and notes.
 
-    Table, registration block, air and specks are dropped: see ``_find_organ``. A piece of the tumor
-    window with little parenchyma about it is no tumor but a block beside the phantom, whose own rim
-    is too thin to be parenchyma. The rim between an exophytic tumor and air falls into the organ's
-    window by partial volume; where it is thin it is given to the tumor. Raises InputError: unusable
-    windows, or no body like an organ (a patient's CT)."""
+    Table, registration block, air and specks are dropped: see ``_find_organ``. A piece in the tumor
+    window with little parenchyma around it is not a tumor but a block beside the phantom. Between
+    an exophytic tumor and air, partial volume makes a rim in the organ window; where it is thin it
+    becomes tumor. Raises InputError: unusable windows, or nothing like an organ (a patient's
+    CT)."""
     limits = (*organ_hu, *tumor_hu)
     if not (np.isfinite(limits).all() and organ_hu[0] < organ_hu[1] <= tumor_hu[0] < tumor_hu[1]):
         raise InputError(
@@ -64,7 +61,7 @@ def segment_ct(
     everything_ml = float(solid.sum()) * voxel_ml(affine)
     box = bounding_box(organ, affine, _REACH_MM)
     affine = grids.moved_origin(affine, box)
-    organ, tumors, more = _tumors_of(organ[box], solid[box], dense[box], affine, min_tumor_ml)
+    organ, tumors, more = _find_tumors(organ[box], solid[box], dense[box], affine, min_tumor_ml)
     kept_ml = float(organ.sum()) * voxel_ml(affine)
     note = (
         f"{kept_ml:.1f} ml of {everything_ml:.1f} ml between the HU limits are the organ; table, "
@@ -78,10 +75,10 @@ def segment_ct(
     return grids.cropped(labels, affine), [note, *more]
 
 
-def _tumors_of(
+def _find_tumors(
     organ: np.ndarray, solid: np.ndarray, dense: np.ndarray, affine: np.ndarray, min_tumor_ml: float
 ) -> tuple[np.ndarray, list[np.ndarray], list[str]]:
-    """The organ, corrected by its tumors; the tumors' masks; notes on what was dropped."""
+    """The organ with tumors and without blocks, the tumors' masks, notes on what was dropped."""
     from scipy import ndimage
 
     steps = spacing_mm(affine)
@@ -101,14 +98,14 @@ def _tumors_of(
         shell = (around > 0) & (around <= max(3.0, 2.0 * float(steps.max())))
         if (shell & parenchyma[grown]).sum() < _LEAST_CONTACT * shell.sum():
             beside.append(ml)
-            # The piece and its rim are no part of the organ, even if they touch it.
+            # The block and its rim are not organ, even if they touch it.
             organ[grown] &= (around > rim_mm) | parenchyma[grown]
             continue
         rim = solid[grown] & (around <= rim_mm) & ~parenchyma[grown] & ~dense[grown]
-        whole = np.zeros_like(organ)
-        whole[grown] = mask | rim
-        organ |= whole
-        tumors.append(whole)
+        tumor = np.zeros_like(organ)
+        tumor[grown] = mask | rim
+        organ |= tumor
+        tumors.append(tumor)
     notes = []
     if small:
         notes.append(
@@ -122,11 +119,11 @@ def _tumors_of(
     if not tumors:
         notes.append("no tumor found in this organ")
     organ = ndimage.binary_fill_holes(components(organ)[0] == 1)
-    return organ, [t & organ for t in tumors], notes
+    return organ, [tumor & organ for tumor in tumors], notes
 
 
 def _opened(mask: np.ndarray, steps_mm: np.ndarray, radius_mm: float) -> np.ndarray:
-    """Morphological opening by a ball: what is thinner than twice the radius is removed."""
+    """Morphological opening by a ball: removes what is thinner than twice the radius."""
     from scipy import ndimage
 
     inner = depth_mm(mask, steps_mm) > radius_mm
@@ -137,7 +134,7 @@ def _opened(mask: np.ndarray, steps_mm: np.ndarray, radius_mm: float) -> np.ndar
 
 @dataclass(frozen=True, eq=False)
 class _Grid:
-    """The solid mask and its part in the tumor window on coarse cells."""
+    """The masks on coarse cells, and which sizes an organ may have."""
 
     solid: Bool[np.ndarray, "i j k"]
     dense: Bool[np.ndarray, "i j k"]
@@ -153,24 +150,23 @@ class _Grid:
 def _find_organ(
     solid: np.ndarray, dense: np.ndarray, lps_from_index: np.ndarray, kind: Organ
 ) -> np.ndarray:
-    """The voxels of ``solid`` that belong to the one body like an organ; ``dense`` is its part in
-    the tumor window.
+    """The voxels of ``solid`` in the one body like an organ; ``dense``: those in the tumor window.
 
-    On coarse cells: erode by little, then by more, until a piece stands alone that, grown back and
-    cut from its neighbours at the narrowest place (watershed of the distance to the background),
-    is like an organ (``_is_organ``). The largest such piece is the organ; a deeper cut replaces it
-    only where that frees it of a sheet. Thin sheets that are attached to it are removed.
+    On coarse cells, erode more and more until a piece comes off that looks like an organ
+    (``_is_organ``) once it is grown back and cut from its neighbours where they are narrowest
+    (watershed of the distance to the background). The largest such piece is the organ; a deeper cut
+    replaces it only if that frees it of a sheet. Attached thin sheets are removed.
     """
     from skimage.measure import block_reduce
 
     factors = np.maximum(1, np.rint(_STEP_MM / spacing_mm(lps_from_index)).astype(int))
     # Blocks at the ends are padded with False.
     single, blocks = {"dtype": np.float32}, tuple(factors.tolist())
-    filled, bright = (
+    coarse_solid, coarse_dense = (
         block_reduce(mask, blocks, np.mean, func_kwargs=single) >= 0.5 for mask in (solid, dense)
     )
     sizes = _KIDNEY_SIZES if kind.name == KIDNEY.name else _OTHER_SIZES
-    grid = _Grid(filled, bright, lps_from_index @ np.diag([*factors, 1.0]), *sizes)
+    grid = _Grid(coarse_solid, coarse_dense, lps_from_index @ np.diag([*factors, 1.0]), *sizes)
     region = _search(grid) if grid.solid.any() else None
     if region is None:
         raise InputError(
@@ -186,37 +182,35 @@ def _search(grid: _Grid) -> np.ndarray | None:
     from scipy import ndimage
 
     depth = depth_mm(grid.solid, grid.steps_mm)
-    least = grid.organ_ml[0] / voxel_ml(grid.lps_from_index)
-    found: np.ndarray | None = None
+    # Eroding by r leaves at least a few percent even of the smallest organ.
+    least = 0.02 * grid.organ_ml[0] / voxel_ml(grid.lps_from_index)
+    organ: np.ndarray | None = None
     for radius in _CUT_RADII_MM:
         pieces, counts = components(depth > radius)
         best: np.ndarray | None = None
         for n, box in enumerate(ndimage.find_objects(pieces)[:12], 1):
-            # Eroding by r leaves at least a few percent even of the smallest organ.
-            if (
-                counts[n - 1] < 0.02 * least
-                or extent_mm(box, grid.steps_mm).max() > grid.longest_mm
-            ):
+            too_long = extent_mm(box, grid.steps_mm).max() > grid.longest_mm
+            if counts[n - 1] < least or too_long:
                 continue
-            region = _piece_region(pieces == n, depth, radius, grid)
+            region = _grown_back(pieces == n, depth, radius, grid)
             if _is_organ(region, grid) and (best is None or region.sum() > best.sum()):
                 best = region
-        if best is not None and (found is None or _sheds_sheet(found, best, grid)):
-            found = best
-    return found
+        if best is not None and (organ is None or _sheds_sheet(organ, best, grid)):
+            organ = best
+    return organ
 
 
 def _sheds_sheet(before: np.ndarray, after: np.ndarray, grid: _Grid) -> bool:
-    """A deeper cut is better where it frees the organ of a flat thing, never of a lump."""
-    off = before & ~after
+    """Whether a deeper cut frees the organ of something flat, not of a lump."""
+    removed = before & ~after
     return (
         bool((after & before).sum() > 0.9 * after.sum())
-        and _flatness(off, grid.steps_mm) < _LEAST_FLATNESS
+        and _flatness(removed, grid.steps_mm) < _LEAST_FLATNESS
         and _solidity(after, grid.steps_mm) > _solidity(before, grid.steps_mm) + 0.05
     )
 
 
-def _piece_region(core: np.ndarray, depth: np.ndarray, radius: float, grid: _Grid) -> np.ndarray:
+def _grown_back(core: np.ndarray, depth: np.ndarray, radius: float, grid: _Grid) -> np.ndarray:
     """Grow a core back to the surface, cut from its neighbours, without attached sheets."""
     from scipy import ndimage
     from skimage.segmentation import watershed
@@ -224,15 +218,15 @@ def _piece_region(core: np.ndarray, depth: np.ndarray, radius: float, grid: _Gri
     steps = grid.steps_mm
     box = bounding_box(core, grid.lps_from_index, radius + 12.0)
     solid = grid.solid[box]
-    away = ndimage.distance_transform_edt(~core[box], sampling=steps)
-    markers = np.where(core[box], 1, np.where(solid & (away > radius + 5.0), 2, 0))
-    own = watershed(-depth[box], markers, mask=solid) == 1
-    core_again = depth_mm(own, steps) > _OPEN_MM
-    if core_again.any():
-        back = ndimage.distance_transform_edt(~core_again, sampling=steps)
-        own &= back <= _OPEN_MM + float(steps.max())
+    to_core = ndimage.distance_transform_edt(~core[box], sampling=steps)
+    markers = np.where(core[box], 1, np.where(solid & (to_core > radius + 5.0), 2, 0))
+    grown = watershed(-depth[box], markers, mask=solid) == 1
+    thick = depth_mm(grown, steps) > _OPEN_MM
+    if thick.any():
+        to_thick = ndimage.distance_transform_edt(~thick, sampling=steps)
+        grown &= to_thick <= _OPEN_MM + float(steps.max())
     region = np.zeros_like(grid.solid)
-    region[box] = components(own)[0] == 1
+    region[box] = components(grown)[0] == 1
     return region
 
 
@@ -255,7 +249,7 @@ def _is_organ(region: np.ndarray, grid: _Grid) -> bool:
 
 
 def _contact(region: np.ndarray, solid: np.ndarray) -> float:
-    """Share of the region's surface faces behind which the solid continues."""
+    """Share of the region's surface faces beyond which the solid continues."""
     faces = cut = 0
     for axis in range(3):
         a, b = (np.moveaxis(x, axis, 0) for x in (region, solid))
@@ -291,11 +285,11 @@ def _solidity(region: np.ndarray, steps_mm: np.ndarray) -> float:
 def _refine(
     region: np.ndarray, other: np.ndarray, solid: np.ndarray, factors: np.ndarray
 ) -> np.ndarray:
-    """The coarse decision on the voxels; a cell that was neither takes its nearest cell's."""
+    """The coarse region on the voxels; cells that are not solid follow their nearest solid cell."""
     from scipy import ndimage
 
     label = np.where(region, 1, np.where(other, 2, 0)).astype(np.uint8)
-    reach = ndimage.binary_dilation(region, np.ones((3, 3, 3)), iterations=1)
+    reach = ndimage.binary_dilation(region, np.ones((3, 3, 3)))
     nearest = ndimage.distance_transform_edt(
         label == 0, return_distances=False, return_indices=True
     )

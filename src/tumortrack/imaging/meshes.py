@@ -1,4 +1,4 @@
-"""Anatomy from a folder of surface meshes (STL, OBJ, PLY), which are repaired or refused."""
+"""Anatomy from a folder of surface meshes (STL, OBJ, PLY), repaired where that is safe."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ _TUMOR_WORDS = ("tumor", "tumour", "lesion", "mass")
 _ORGAN_MM = (15.0, 600.0)  # plausible longest extent
 _VOXEL_MM = 1.0
 _MOST_TUMORS = 254  # labels 2 to 255
-_LARGEST_HOLE_MM = 10.0  # across; larger ones would invent anatomy
-_LARGEST_REMESH = 1.5  # change of volume that a remesh may make, as a ratio
+_LARGEST_HOLE_MM = 10.0  # to close a larger one would invent anatomy
+_LARGEST_REMESH = 1.5  # ratio by which a remesh may change the volume
 _RULE = (
     "The rule: one file whose name contains {} or organ is the organ; names with tumor, lesion or "
     "mass are tumors, in order of name."
@@ -34,23 +34,16 @@ def read_mesh_folder(
 ) -> tuple[Anatomy, list[str]]:
     """Read one organ and its tumors, LPS mm; and notes on every change.
 
-    Files are LPS unless a comment in them states ``SPACE=RAS``. Small holes, doubled faces,
-    inside-out surfaces and crossings are repaired. The organ becomes the union of organ and tumors.
-    Raises InputError: unclear names, open or damaged meshes, wrong unit, a tumor apart from the
-    organ.
-
-    Args:
-        unit: ``m`` converts metres; None or ``mm``: millimetres (metres are recognised, refused).
+    Files are LPS unless a comment in them states ``SPACE=RAS``. ``unit``: None is mm; metres are
+    then recognised and refused. Small holes, doubled faces, inside-out surfaces and
+    self-intersections are repaired. The organ becomes the union of organ and tumors. Raises
+    InputError: unclear names, open or damaged meshes, wrong unit, a tumor apart from the organ.
     """
-    if not folder.is_dir():
-        raise InputError(f"{folder} is not a folder of meshes.")
     organ_file, *tumor_files = files = _files_by_name(folder, kind.name)
-    if unit not in (None, "mm", "m"):
-        raise InputError(f"unit {unit!r} is not allowed: mm or m.")
     notes: list[str] = []
     organ, *tumors = [read_lps(file, 1000.0 if unit == "m" else 1.0, notes) for file in files]
     _check_unit(organ_file, organ, unit)
-    # A bed cut out for an inner tumor is no outside: the outermost shell is the organ.
+    # Without the wall of a cavity that was cut out for an inner tumor
     organ = largest_shell(closed_mesh(organ, organ_file.name, notes))
     tumors = [closed_mesh(t, f.name, notes) for t, f in zip(tumors, tumor_files, strict=True)]
     for tumor, file in zip(tumors, tumor_files, strict=True):
@@ -63,7 +56,7 @@ def read_mesh_folder(
 
 
 def label_meshes(anatomy: Anatomy) -> LabelVolume:
-    """Label the cells of an LPS-aligned grid whose centres the parts contain; tumors win."""
+    """Label the voxels of an LPS-aligned grid whose centres the parts contain; tumors win."""
     lps_from_index, shape = grid_round(anatomy.organ.box_mm, _VOXEL_MM, 8.0)
     labels = np.zeros(shape, np.uint8)
     for number, part in enumerate(anatomy.parts, ORGAN):
@@ -84,24 +77,23 @@ def _files_by_name(folder: Path, organ: str) -> list[Path]:
         return [f for f in files if any(word in f.stem.lower() for word in words)]
 
     tumors = named(_TUMOR_WORDS)
-    organs = [f for f in named((organ, "organ")) if f not in tumors]
+    organs = [f for f in named((organ, "organ")) if f not in tumors]  # not kidney_tumor.stl
     other = [f.name for f in files if f not in organs and f not in tumors]
-    # kidney_tumor.stl names both: a tumor, as long as another file is plainly the organ.
     if len(organs) != 1 or other:
         problem = f"{len(organs)} name an organ" + (f", {other} name neither" if other else "")
         raise InputError(f"{folder}: of {[f.name for f in files]} {problem}. {_RULE.format(organ)}")
     if len(tumors) > _MOST_TUMORS:
         raise InputError(f"{folder}: {len(tumors)} tumors; up to {_MOST_TUMORS} are read.")
 
-    def natural(path: Path) -> list[Any]:  # tumor_2 before tumor_10
+    def natural_order(path: Path) -> list[Any]:  # tumor_2 before tumor_10
         return [int(p) if p.isdigit() else p for p in re.split(r"(\d+)", path.stem.lower())]
 
-    return [organs[0], *sorted(tumors, key=natural)]
+    return [organs[0], *sorted(tumors, key=natural_order)]
 
 
 def read_lps(path: Path, scale: float, notes: list[str]) -> Mesh:
-    """A mesh file's vertices times ``scale``, LPS; a conversion from RAS is noted. InputError where
-    it is none, or of an unknown frame."""
+    """A mesh file in LPS, its vertices times ``scale``; a conversion from RAS is noted. Raises
+    InputError: not a mesh, or an unknown frame."""
     mesh = read_mesh(path)
     if not np.abs(mesh.vertices_mm).max() < 1e7:
         raise InputError(f"{path} has vertices kilometres away; it is damaged or not in mm.")
@@ -123,8 +115,8 @@ def _stated_space(path: Path) -> str | None:
         head = head.partition(b"end_header")[0]
     elif path.suffix.lower() == ".stl":
         head = head[:80] if not head.lstrip().startswith(b"solid") else head.partition(b"\n")[0]
-    found = re.search(rb"SPACE\s*=\s*([A-Za-z]+)", head)
-    return found.group(1).decode().upper() if found else None
+    match = re.search(rb"SPACE\s*=\s*([A-Za-z]+)", head)
+    return match.group(1).decode().upper() if match else None
 
 
 def _check_unit(path: Path, organ: Mesh, unit: str | None) -> None:
@@ -143,7 +135,7 @@ def _check_unit(path: Path, organ: Mesh, unit: str | None) -> None:
 
 
 def _union(organ: Mesh, tumor: Mesh, name: str) -> Mesh:
-    """Organ and tumor as one closed surface; cavities that remain between them are closed."""
+    """Organ and tumor as one closed surface, without cavities between them."""
     joined = solid_of(organ, "the organ") + solid_of(tumor, name)
     outer = [shell for shell in joined.decompose() if shell.volume() > 0]
     outer.sort(key=lambda shell: -shell.volume())
@@ -156,12 +148,9 @@ def _union(organ: Mesh, tumor: Mesh, name: str) -> Mesh:
 
 
 def closed_mesh(mesh: Mesh, name: str, notes: list[str]) -> Mesh:
-    """Repair what can be repaired safely; every change adds a note that names the file.
-
-    Doubled faces are removed, holes up to 10 mm across are closed, faces are turned outward, and a
-    mesh that crosses itself is remeshed from its winding numbers. Raises InputError: open beyond
-    that, or not a surface.
-    """
+    """Repair a mesh and note each change: doubled faces are removed, holes up to 10 mm closed and
+    faces turned outward; a mesh that crosses itself is remeshed from its winding numbers. Raises
+    InputError: still open, or not a surface."""
     import trimesh
 
     size = mesh.longest_mm
@@ -194,27 +183,27 @@ def closed_mesh(mesh: Mesh, name: str, notes: list[str]) -> Mesh:
 
 
 def _close_holes(mesh: Mesh, name: str, notes: list[str]) -> Mesh:
-    """Fan every boundary loop from its centre, if all are small."""
+    """Close every boundary loop by a fan about its centre, if all are small."""
     edges = np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]], mesh.faces[:, [2, 0]]])
     n = len(mesh.vertices_mm)
     codes, back = (edges.astype(np.int64) @ weights for weights in ([n, 1], [1, n]))
     border = edges[~np.isin(codes, back)]
     if len(border) == 0:
         return mesh
-    following = {int(a): int(b) for a, b in border}
-    if len(following) != len(border):
+    successor = {int(a): int(b) for a, b in border}
+    if len(successor) != len(border):
         raise InputError(f"{name} has holes that meet in one point; repair the mesh first.")
     centres: list[np.ndarray] = []
     faces, widest = [mesh.faces], 0.0
-    while following:
-        loop = [next(iter(following))]
-        while (ahead := following.pop(loop[-1], None)) is not None and ahead != loop[0]:
-            loop.append(ahead)
-        if ahead is None:
+    while successor:
+        loop = [next(iter(successor))]
+        while (vertex := successor.pop(loop[-1], None)) is not None and vertex != loop[0]:
+            loop.append(vertex)
+        if vertex is None:
             raise InputError(f"{name} has a border that does not close; repair the mesh first.")
         ring = mesh.vertices_mm[loop]
         widest = max(widest, float(np.ptp(ring, axis=0).max()))
-        # The border runs as its faces do; the new ones run against it.
+        # Border edges run as their faces do; new faces run the other way.
         centre = np.full(len(loop), n + len(centres))
         faces.append(np.stack([np.roll(loop, -1), loop, centre], axis=1))
         centres.append(ring.mean(0))
@@ -228,7 +217,7 @@ def _close_holes(mesh: Mesh, name: str, notes: list[str]) -> Mesh:
 
 
 def _remesh(mesh: Mesh, name: str, step: float) -> Mesh:
-    """March the region of positive winding number: crossings and inner walls vanish."""
+    """The surface of the region with a positive winding number: no crossings or inner walls."""
     affine, shape = grid_round(mesh.box_mm, step, 4 * step)
     inside = winding_numbers(mesh, affine, shape) > 0
     if not inside.any():
@@ -240,11 +229,11 @@ def _remesh(mesh: Mesh, name: str, step: float) -> Mesh:
 
 
 def is_simple(mesh: Mesh, step_mm: float) -> bool:
-    """True where rays along all three axes find only winding numbers 0 and 1."""
-    for turn in range(3):
-        turned = mesh.moved(np.roll(mesh.vertices_mm, turn, axis=1))
-        numbers = winding_numbers(turned, *grid_round(turned.box_mm, step_mm, 2 * step_mm))
-        # Slivers thinner than rounding may swap their two faces: single columns do not decide.
+    """Whether rays along all three axes find only winding numbers 0 and 1."""
+    for axis in range(3):
+        rolled = mesh.moved(np.roll(mesh.vertices_mm, axis, axis=1))
+        numbers = winding_numbers(rolled, *grid_round(rolled.box_mm, step_mm, 2 * step_mm))
+        # Rounding may swap the faces of thin slivers: tolerate single rays.
         wrong = ((numbers < 0) | (numbers > 1)).any(2) | (numbers[:, :, -1] != 0)
         if wrong.sum() > 2:
             return False
@@ -252,8 +241,8 @@ def is_simple(mesh: Mesh, step_mm: float) -> bool:
 
 
 def solid_of(mesh: Mesh, name: str) -> Any:
-    """A closed mesh as a ``manifold3d.Manifold``; ``name`` is for the InputError where it is open,
-    crosses itself beyond use, or is inside out."""
+    """A closed mesh as a ``manifold3d.Manifold``. Raises InputError, which names ``name``: it is
+    open, crosses itself too much, or is inside out."""
     import manifold3d
 
     raw = manifold3d.Mesh64(mesh.vertices_mm.copy(), mesh.faces.astype(np.uint64))

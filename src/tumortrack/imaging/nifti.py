@@ -1,7 +1,7 @@
-"""NIfTI files: read through nibabel, written by own code. NIfTI is RAS+; it becomes LPS here.
+"""NIfTI files, converted between NIfTI's RAS+ and our LPS. Read with nibabel; written by own code,
+as `tumortrack locate` would wait for nibabel's import (docs/decisions/004-nifti-writer.md).
 
-A header is 352 bytes, and importing nibabel, which brings pydicom, would take a tenth of the time
-in which `tumortrack locate` answers. Format: https://nifti.nimh.nih.gov/nifti-1.
+Format: https://nifti.nimh.nih.gov/nifti-1.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import gzip
 import logging
 import math
 import struct
-import zlib
+from io import BufferedIOBase
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +24,7 @@ from tumortrack.core.store import write_atomically
 from tumortrack.imaging import grid
 
 GZIP_LEVEL = 4  # higher ones take several times longer and save little
-_HEADER = np.dtype(  # what is written of it; all else is 0
+_HEADER = np.dtype(  # the fields that are written; all others are 0
     {
         "names": ["sizeof_hdr", "dim", "datatype", "bitpix", "pixdim", "vox_offset"]
         + ["scl_slope", "xyzt_units", "qform_code", "sform_code", "quaternion", "offset"]
@@ -45,27 +45,21 @@ _NO_GEOMETRY = (
     "the affine is the identity, as programs write it that lost the geometry: voxels of 1 mm, the "
     "first axis to the patient's right. Check size and side in qc.png, or export it again"
 )
-_MOST_BEHIND = 16 * 2**20  # bytes after the voxels
-# nibabel would log what it mends in a header: errors here name what is wrong.
-_UNSAID = logging.Logger("nibabel", logging.CRITICAL)
+_SILENT = logging.Logger("nibabel", logging.CRITICAL)  # nibabel logs each repair of a header
 
 
 def read_nifti(path: Path) -> grid.RawVolume:
-    """Read .nii or .nii.gz. The sform places it, or the qform where there is no sform. Raises
+    """Read .nii or .nii.gz. The sform is used, or the qform where there is no sform. Raises
     InputError: damaged, not 3-D, too large, without or with contradictory orientation, not in
     millimetres."""
     compressed = path.suffix.lower() == ".gz"
-    stream: Any
-    try:
-        with (gzip.open if compressed else open)(path, "rb") as stream:
-            return _read(path, stream, compressed)
-    except (OSError, EOFError, zlib.error) as error:
-        raise InputError(f"{path} is truncated or damaged: {error}.") from error
+    with grid.volume_stream(path, compressed) as stream:
+        return _read(path, stream, compressed)
 
 
-def _read(path: Path, stream: Any, compressed: bool) -> grid.RawVolume:
-    """Header, voxels and, of a compressed file, the rest: at its end stands the checksum. Not
-    ``nibabel.load``, which reads extensions as long as they say they are, and not to the end."""
+def _read(path: Path, stream: BufferedIOBase, compressed: bool) -> grid.RawVolume:
+    """``nibabel.load`` would trust the stated length of extensions, and not read up to the
+    checksum."""
     load_pydicom()
     import nibabel
     from nibabel.volumeutils import apply_read_scaling
@@ -78,12 +72,12 @@ def _read(path: Path, stream: Any, compressed: bool) -> grid.RawVolume:
         raise InputError(f"{path} is no NIfTI file (its header has {sizes[0]} bytes, not 348).")
     try:
         header = kinds[size](head[:size], check=False)
-        header.check_fix(logger=_UNSAID)
+        header.check_fix(logger=_SILENT)
         shape = tuple(int(n) for n in header.get_data_shape())
         dtype = header.get_data_dtype()
         units = header.get_xyzt_units()[0]
         offset = float(header["vox_offset"]) or size + 4.0
-        stated = [header["scl_slope"], header["scl_inter"]]
+        stored_scale = [header["scl_slope"], header["scl_inter"]]
         magic = bytes(header["magic"].tobytes())
         slope, intercept = header.get_slope_inter()
     except Exception as error:  # nibabel raises anything on a damaged file
@@ -108,29 +102,18 @@ def _read(path: Path, stream: Any, compressed: bool) -> grid.RawVolume:
         )
     lps_from_index = _lps_from_index(path, header)
     grid.check_affine(path, lps_from_index)
-    # Both NaN: not scaled, as nibabel keeps the header of an image whose scale it has applied.
-    if not (np.isfinite(stated).all() or np.isnan(stated).all()):
+    # Both NaN means unscaled: so nibabel keeps the header of an image that it has scaled.
+    if not (np.isfinite(stored_scale).all() or np.isnan(stored_scale).all()):
         raise InputError(f"{path}: its numbers' slope or intercept is not finite. Export it again.")
     stream.seek(int(offset))
-    data = _voxels(path, stream, math.prod(shape) * dtype.itemsize, compressed)
-    array = np.frombuffer(data, dtype).reshape(shape, order="F")
-    array = array.astype(dtype.newbyteorder("="), copy=False)
+    array = grid.read_voxels(path, stream, shape, dtype, compressed)
     scale = np.float64(slope or 1.0), np.float64(intercept or 0.0)
     notes = (_NO_GEOMETRY,) if np.array_equal(lps_from_index, RAS_FROM_LPS) else ()
     return grid.RawVolume(apply_read_scaling(array, *scale), lps_from_index, notes)
 
 
-def _voxels(path: Path, stream: Any, n_bytes: int, compressed: bool) -> bytes:
-    data = bytes(stream.read(n_bytes))
-    if len(data) < n_bytes:
-        raise InputError(f"{path} is truncated: {len(data)} of {n_bytes} bytes of voxels.")
-    if compressed and len(stream.read(_MOST_BEHIND + 1)) > _MOST_BEHIND:
-        raise InputError(f"{path} holds much more than its header says. Export it again.")
-    return data
-
-
 def _lps_from_index(path: Path, header: Any) -> Float[np.ndarray, "4 4"]:
-    """The affine the header states; never a guess, since a guess may mirror the patient."""
+    """The affine that the header states; never a guess, which might mirror the patient."""
     try:
         sform, sform_code = header.get_sform(coded=True)
         qform, qform_code = header.get_qform(coded=True)
@@ -170,21 +153,34 @@ def write_nifti(
     lps: bool,
 ) -> None:
     """Write an array in its own number type as .nii or .nii.gz, units mm. Raises InputError:
-    numbers of a type that NIfTI does not know, or more than 32,767 along an axis; StorageError: the
-    disk refused; an older file is untouched.
+    a number type that NIfTI does not know, or more than 32,767 voxels along an axis; StorageError:
+    the disk refused; an older file is untouched.
 
     Args:
-        frame_from_index: index -> mm. Patient frame (``lps`` True): converted from LPS to NIfTI's
-            RAS. Camera frame (``lps`` False): written as it is.
+        lps: the frame is the patient's, LPS, and is converted to RAS; False: the camera's, which is
+            written as it is.
     """
     kind = f"{array.dtype.kind}{array.dtype.itemsize}"
     if kind not in _TYPES or max(array.shape) > np.iinfo(np.int16).max:
         raise InputError(
             f"{path}: a volume of {array.dtype} of shape {array.shape} is no NIfTI. Allowed: "
-            f"{', '.join(str(np.dtype(one)) for one in _TYPES)}; 32,767 voxels along an axis."
+            f"{', '.join(str(np.dtype(name)) for name in _TYPES)}; 32,767 voxels along an axis."
         )
-    header = _header_of(array, RAS_FROM_LPS @ frame_from_index if lps else frame_from_index)
+    affine = RAS_FROM_LPS @ frame_from_index if lps else frame_from_index
+    spacing = spacing_mm(affine)
+    axes = affine[:3, :3] / spacing
+    handedness = 1.0 if np.linalg.det(affine[:3, :3]) > 0 else -1.0
+    header = np.zeros((), _HEADER)
+    header["sizeof_hdr"], header["vox_offset"], header["magic"] = 348, 352, b"n+1"
     header["datatype"], header["bitpix"] = _TYPES[kind], 8 * array.dtype.itemsize
+    header["dim"] = [3, *array.shape, 1, 1, 1, 1]
+    header["pixdim"] = [handedness, *spacing, 1, 1, 1, 1]
+    header["scl_slope"], header["xyzt_units"] = 1, _MM
+    header["sform_code"], header["srow"] = _SCANNER, affine[:3]
+    # A quaternion cannot hold shear; the sform alone is right for every affine.
+    if np.allclose(axes.T @ axes, np.eye(3), atol=1e-4):
+        header["qform_code"], header["offset"] = _SCANNER, affine[:3, 3]
+        header["quaternion"] = _quaternion(axes * [1, 1, handedness])
     voxels = array.astype(array.dtype.newbyteorder("<"), copy=False)
     content = header.tobytes() + voxels.tobytes(order="F")
     if path.name.endswith(".gz"):
@@ -192,27 +188,9 @@ def write_nifti(
     write_atomically(path, content)
 
 
-def _header_of(array: np.ndarray, affine: np.ndarray) -> np.ndarray:
-    """Everything but the numbers' type."""
-    spacing = spacing_mm(affine)
-    turn = affine[:3, :3] / spacing
-    handed = 1.0 if np.linalg.det(affine[:3, :3]) > 0 else -1.0
-    header = np.zeros((), _HEADER)
-    header["sizeof_hdr"], header["vox_offset"], header["magic"] = 348, 352, b"n+1"
-    header["dim"] = [3, *array.shape, 1, 1, 1, 1]
-    header["pixdim"] = [handed, *spacing, 1, 1, 1, 1]
-    header["scl_slope"], header["xyzt_units"] = 1, _MM
-    header["sform_code"], header["srow"] = _SCANNER, affine[:3]
-    # A quaternion cannot hold shear; the sform alone is right for every affine.
-    if np.allclose(turn.T @ turn, np.eye(3), atol=1e-4):
-        header["qform_code"], header["offset"] = _SCANNER, affine[:3, 3]
-        header["quaternion"] = _quaternion(turn * [1, 1, handed])
-    return header
-
-
 def _quaternion(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, " 3"]:
-    """b, c and d of a rotation; a, which is left out, is not negative. (Bar-Itzhack 2000,
-    doi 10.2514/2.4654: the eigenvector that has the largest eigenvalue.)"""
+    """b, c and d of a rotation's quaternion with a >= 0 (Bar-Itzhack 2000, doi 10.2514/2.4654: the
+    eigenvector of the largest eigenvalue)."""
     whole = np.zeros((4, 4))
     whole[:3, :3] = rotation + rotation.T - np.trace(rotation) * np.eye(3)
     b, c, d = rotation[2, 1], rotation[0, 2], rotation[1, 0]

@@ -1,4 +1,4 @@
-"""From what a user has to a case: DICOM, CT volume, label map or meshes."""
+"""A case from DICOM, a CT volume, a label map or meshes."""
 
 from __future__ import annotations
 
@@ -30,34 +30,34 @@ from tumortrack.imaging.surface import surfaces
 from tumortrack.imaging.symmetry import alike, half_turns, warning
 from tumortrack.imaging.volume import is_label_map, labels_of, read_raw, volume_of
 
-# Options that only one kind of input uses.
+# Options for one kind of input only.
 _OF_CT, OF_LABELS = ("organ_hu", "tumor_hu"), ("labels", "organ", "tumor")
 _LEAST_ORGAN_OUTSIDE = 0.02  # of the outer surface
-_LARGEST_SHARE = 0.6  # of an organ that a tumor takes without a note; our choice
-_MOST_TILTED = 60.0  # degrees: two such tilts add up to 85, and more is another side
-_MOST_CHANGE_PERCENT = 1.0  # of a part's volume, by smoothing; more is noted
+_LARGEST_SHARE = 0.6  # of organ and tumors that one tumor may take without a note
+_MOST_TILTED = 60.0  # degrees: two such tilts make 85, and more would show another side
+_MOST_CHANGE_PERCENT = 1.0  # of a part's volume by smoothing, without a note
 
 
 @dataclass(frozen=True)
 class PrepareOptions:
-    """What the user may state about an input.
+    """How to read an input.
 
     Attributes:
         organ_hu, tumor_hu: half-open HU windows [low, high) for a CT.
-        labels: the volume is a label map (recognised without this where it is plain).
-        side: the patient's ``left`` or ``right``, of organs in pairs: of a label map, the one to
-            take (None: the tumor-bearing one); of a CT by HU windows or meshes, which one it is.
+        labels: the volume is a label map; False: it is one if that is obvious.
+        side: the patient's ``left`` or ``right``, of organs in pairs. Selects from a label map
+            (None: the one with most tumor); of a CT by HU windows or meshes it is only recorded.
         organ, tumor: label numbers; tumor None takes every label from 2 up, 0 none.
         up: the patient direction that faces the camera: a name, or three numbers in LPS.
-        rotations: how the organ may lie then: ``limited``, turned about the line of sight and
-            tilted, or ``full``, in any way.
-        tilt: up to so many degrees about each axis across the line of sight.
-        sensor: the camera that will see it: ``d405`` or ``stereo`` (an endoscope's pictures).
+        rotations: which poses are possible: ``limited``, turned about the line of sight and tilted,
+            or ``full``, any.
+        tilt: at most so many degrees about each axis across the line of sight.
+        sensor: the camera: ``d405`` or ``stereo`` (an endoscope's pictures).
         series: UID or number of one DICOM series among several.
         unit: of meshes, ``mm`` or ``m``; None: mm, and metres are refused with an explanation.
         min_tumor_ml: smaller tumors are reported and dropped.
         patient: an identifier, instead of the DICOM PatientID; None: that, or unknown.
-        name: which organ it is: lower-case letters, digits and _.
+        name: of the organ: lower-case letters, digits and _.
         structure: ``NAME=NUMBER`` of a label map, or ``NAME=PATH`` of a mesh: surfaces that move
             with the organ.
         term: SNOMED CT code and meaning of an organ whose name is not known here.
@@ -107,7 +107,6 @@ class PrepareOptions:
 
     @property
     def kind(self) -> Organ:
-        """Which organ it is."""
         return Organ(name=self.name, term=self.term)
 
     @property
@@ -116,8 +115,7 @@ class PrepareOptions:
 
 
 def prepare(input: Path, options: PrepareOptions | None = None) -> Case:
-    """Read any supported input and make a case of it; nothing is written. Raises InputError: no
-    usable input there."""
+    """A case from any supported input; nothing is written. Raises InputError: it is not usable."""
     options = options or PrepareOptions()
     try:
         if not input.exists():
@@ -133,18 +131,21 @@ def prepare(input: Path, options: PrepareOptions | None = None) -> Case:
         source_sha256 = store.sha256_of(input)
     except OSError as error:
         raise InputError(f"{input} cannot be read: {error.strerror or error}.") from error
-    given = {k: list(v) if isinstance(v, tuple) else v for k, v in asdict(options).items()}
-    origin = {"source": input.name, "source_sha256": source_sha256, "options": given}
     turns, notes = half_turns(case.anatomy), case.report["notes"]
-    said = warning(alike(turns))
-    looks = {
-        "warning": said,
-        "turns": [{k: v for k, v in asdict(one).items() if k != "ct_from_ct"} for one in turns],
+    text = warning(alike(turns))
+    report = case.report | {
+        "source": input.name,
+        "source_sha256": source_sha256,
+        "options": {k: list(v) if isinstance(v, tuple) else v for k, v in asdict(options).items()},
+        "half_turn": {
+            "warning": text,
+            "turns": [{k: v for k, v in asdict(t).items() if k != "ct_from_ct"} for t in turns],
+        },
+        "notes": [*notes, text] if text else notes,
     }
-    origin |= {"half_turn": looks, "notes": [*notes, said] if said else notes}
     return replace(
         case,
-        report={**case.report, **origin},
+        report=report,
         rotations=options.rotations,
         tilt_degrees=options.tilt,
         sensor=options.sensor,
@@ -152,7 +153,7 @@ def prepare(input: Path, options: PrepareOptions | None = None) -> Case:
 
 
 def _with_structures(case: Case, options: PrepareOptions) -> Case:
-    """With those in mesh files as well, and what is known of all."""
+    """The case with structures from mesh files as well, and a report on all structures."""
     stated = stated_structures(options.structure, options.name)
     read, notes = read_structures(stated, options.unit)
     structures = {**case.anatomy.structures, **read}
@@ -168,7 +169,7 @@ def _with_structures(case: Case, options: PrepareOptions) -> Case:
 
 
 def _check_organ_outside(labels: LabelVolume) -> None:
-    """Refuse a tumor that encloses the organ: of a real one some surface is left."""
+    """Refuse tumors that enclose the organ: a real organ has some surface left."""
     from scipy import ndimage
 
     inside = labels.labels > 0
@@ -182,7 +183,7 @@ def _check_organ_outside(labels: LabelVolume) -> None:
 
 
 def _large_tumors(case: Case) -> list[str]:
-    """Notes on tumors that take most of the organ: perhaps the two label numbers are swapped."""
+    """Notes on tumors that take most of the organ, whose labels may be swapped."""
     voxels = np.bincount(case.labels.labels.reshape(-1))
     shares = voxels[FIRST_TUMOR:] / voxels[ORGAN:].sum()
     return [
@@ -195,8 +196,8 @@ def _large_tumors(case: Case) -> list[str]:
 
 def refuse_unused(what: str, options: PrepareOptions, *unused: str) -> None:
     """Refuse options that this kind of input would ignore."""
-    usual = PrepareOptions()
-    given = [name for name in unused if getattr(options, name) != getattr(usual, name)]
+    default = PrepareOptions()
+    given = [name for name in unused if getattr(options, name) != getattr(default, name)]
     if given:
         names = ", ".join("--" + name.replace("_", "-") for name in given)
         raise InputError(f"{what}, where {names} means nothing. Leave it out.")
@@ -208,24 +209,18 @@ def _from_volume(path: Path, options: PrepareOptions) -> Case:
     raw = read_raw(path, options.series)
     as_labels = options.labels or (path.is_file() and is_label_map(raw))
     structures: dict[str, Mesh] = {}
-    up, ct, notes = direction_lps(options.up), None, list(raw.notes)
-    stated, side = raw.patient, options.stated_side
+    ct, notes = None, list(raw.notes)
+    file_patient, side = raw.patient, options.stated_side
     if as_labels:
         refuse_unused(f"{path} is read as a label map", options, *_OF_CT, "unit")
         if not options.labels:
             notes.append("few distinct whole numbers: read as a label map, not as a CT")
         source = labels_of(raw, path)
         del raw  # the largest maps are gigabytes: one copy is enough
-        named = stated_structures(options.structure, options.name)
-        source, structures = set_apart(source, named, options.organ)
-        labels, more, side = select_labels(
-            source,
-            options.stated_side,
-            options.organ,
-            options.tumor,
-            options.min_tumor_ml,
-            options.kind,
-        )
+        stated = stated_structures(options.structure, options.name)
+        source, structures = set_apart(source, stated, options.organ)
+        wanted = (options.organ, options.tumor, options.min_tumor_ml, options.kind)
+        labels, more, side = select_labels(source, side, *wanted)
     else:
         what = f"{path} is read as a CT (a label map needs --labels)"
         refuse_unused(what, options, *OF_LABELS, "unit")
@@ -244,20 +239,21 @@ def _from_volume(path: Path, options: PrepareOptions) -> Case:
         for name, change in zip(surface["names"], surface["change_percent"], strict=True)
         if abs(change) > _MOST_CHANGE_PERCENT
     ]
-    kind, measured = "label map" if as_labels else "ct", _measured(labels, anatomy, surface)
-    patient = stated_patient(path, stated, options.patient, side)
-    return Case(anatomy, labels, up, {"kind": kind, "notes": notes, **measured}, ct, patient)
+    measured = _measured(labels, anatomy, surface)
+    report = {"kind": "label map" if as_labels else "ct", "notes": notes, **measured}
+    patient = patient_of(path, file_patient, options.patient, side)
+    return Case(anatomy, labels, direction_lps(options.up), report, ct, patient)
 
 
-def stated_patient(path: Path, stated: Patient, given: str | None, side: Side) -> Patient:
-    """Whose organ it is: ``stated`` by the file; ``given`` by the user, instead; on the ``side``
-    that was selected or given. InputError where the file says the other side."""
-    if stated.differs(Patient(side=side)):
+def patient_of(path: Path, in_file: Patient, identifier: str | None, side: Side) -> Patient:
+    """The patient as the file ``path`` states it, with the user's ``identifier`` instead where
+    given, and the selected ``side``. Raises InputError: the file states the other side."""
+    if in_file.differs(Patient(side=side)):
         raise InputError(
-            f"{path} states the {stated.side} side (DICOM Laterality), and the {side} one was "
+            f"{path} states the {in_file.side} side (DICOM Laterality), and the {side} one was "
             "selected. Check --side, and that these are the right images."
         )
-    return Patient(given or stated.id, stated.side if side == UNKNOWN else side)
+    return Patient(identifier or in_file.id, in_file.side if side == UNKNOWN else side)
 
 
 def _from_meshes(folder: Path, options: PrepareOptions) -> Case:
@@ -275,7 +271,8 @@ def _from_meshes(folder: Path, options: PrepareOptions) -> Case:
 def _measured(
     labels: LabelVolume, anatomy: Anatomy, surface: dict[str, list[Any]]
 ) -> dict[str, Any]:
-    """Volumes by part from the labels (the organ's includes its tumors), and how they lie."""
+    """For the report: volumes by part from the labels (the organ's includes its tumors), figures of
+    the surfaces, and the spacing."""
     counts = np.bincount(labels.labels.ravel(), minlength=2) * voxel_ml(labels.lps_from_index)
     tumors = {f"tumor_{n - 1}": float(counts[n]) for n in range(2, len(counts))}
     return {
@@ -286,12 +283,12 @@ def _measured(
 
 
 def crop_ct(volume: Volume, labels: LabelVolume) -> Volume:
-    """The CT on the labels' crop; beyond the scan's edge it is air."""
+    """The CT on the labels' grid, air beyond the scan's edge."""
     shape = labels.labels.shape
     index_from_lps = np.linalg.inv(volume.lps_from_index)
     start = np.rint((index_from_lps @ labels.lps_from_index)[:3, 3]).astype(int)
     inner = grown_box([slice(a, a + n) for a, n in zip(start, shape, strict=True)], volume.hu.shape)
     hu = np.full(shape, -1000.0, np.float32)
-    there = tuple(slice(s.start - a, s.stop - a) for s, a in zip(inner, start, strict=True))
-    hu[there] = volume.hu[inner]
+    target = tuple(slice(s.start - a, s.stop - a) for s, a in zip(inner, start, strict=True))
+    hu[target] = volume.hu[inner]
     return Volume(hu, labels.lps_from_index)

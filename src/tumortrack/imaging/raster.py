@@ -1,4 +1,4 @@
-"""Exact scan conversion of triangles: what voxelisation and shaded pictures are made of."""
+"""Exact scan conversion of triangle meshes into voxel grids."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import Anatomy, Mesh
 
-_MOST_CELLS = 2**28  # of a grid
+_MOST_CELLS = 2**28
 
 
 def expand(counts: Int[np.ndarray, " n"]) -> tuple[Int[np.ndarray, " m"], Int[np.ndarray, " m"]]:
-    """``counts[item]`` entries for each item: the item and the running number within it."""
+    """``counts[item]`` entries for each item: the item, and the entry's number within it."""
     item = np.repeat(np.arange(len(counts)), counts)
     return item, np.arange(len(item)) - np.repeat(np.cumsum(counts) - counts, counts)
 
@@ -24,14 +24,10 @@ def expand(counts: Int[np.ndarray, " n"]) -> tuple[Int[np.ndarray, " m"], Int[np
 def winding_numbers(
     mesh: Mesh, frame_from_index: Float[np.ndarray, "4 4"], shape: tuple[int, int, int]
 ) -> Int16[np.ndarray, "i j k"]:
-    """The winding number at voxel centres (whole indices), by rays along the last axis.
-
-    Each triangle adds +1 or -1 to every voxel behind it. A closed mesh (in some frame, mm) whose
-    faces turn outward and that does not cross itself gives 0 outside and 1 inside, and nothing
-    else. ``frame_from_index``: array index -> that frame; any invertible affine. Raises InputError:
-    the grid is too large.
-    """
-    out = _room(shape, np.int16)
+    """The winding number at voxel centres (integer indices), by rays along the last axis: each
+    triangle adds +1 or -1 to every voxel behind it. A closed mesh whose faces turn outward and that
+    does not cross itself gives 0 outside and 1 inside. Raises InputError: the grid is too large."""
+    out = _zeros(shape, np.int16)
     _fill(mesh, frame_from_index, out, 0)
     return out
 
@@ -39,11 +35,9 @@ def winding_numbers(
 def voxelise(
     mesh: Mesh, frame_from_index: Float[np.ndarray, "4 4"], shape: tuple[int, int, int]
 ) -> Bool[np.ndarray, "i j k"]:
-    """Which voxel centres lie inside a closed mesh: where its winding number is not 0.
-
-    Overlapping sheets of a folded surface so cut no holes, as plain parity would.
-    """
-    inside = _room(shape, np.uint8)
+    """Which voxel centres lie inside a closed mesh: where its winding number is not 0, so that a
+    surface that overlaps itself makes no holes, as parity would."""
+    inside = _zeros(shape, np.uint8)
     _fill(mesh, frame_from_index, inside, 1)
     return inside.view(bool)
 
@@ -52,21 +46,21 @@ def label_grid(
     anatomy: Anatomy, camera_from_index: Float[np.ndarray, "4 4"], shape: tuple[int, int, int]
 ) -> UInt8[np.ndarray, "i j k"]:
     """Labels of an anatomy on a grid: 1 organ, 2, 3, ... tumors; a tumor wins over the organ."""
-    labels = _room(shape, np.uint8)
+    labels = _zeros(shape, np.uint8)
     for label, part in enumerate(anatomy.parts, start=1):
         _fill(part, camera_from_index, labels, label)
     return labels
 
 
-def _room(shape: tuple[int, int, int], dtype: type) -> np.ndarray:
+def _zeros(shape: tuple[int, int, int], dtype: type) -> np.ndarray:
     if np.prod(np.array(shape, float)) > _MOST_CELLS:
         raise InputError(f"a grid of {' x '.join(map(str, shape))} voxels is too large.")
     return np.zeros(shape, dtype)
 
 
 def _fill(mesh: Mesh, frame_from_index: np.ndarray, out: np.ndarray, value: int) -> None:
-    """``value`` into the voxels of ``out`` whose winding number is not 0, or that number itself
-    where ``value`` is 0; others stay as they are."""
+    """Set the voxels of ``out`` whose winding number is not 0 to ``value``, or to that number where
+    ``value`` is 0."""
     if len(mesh.faces) == 0:
         return
     index = transform_points(np.linalg.inv(frame_from_index), mesh.vertices_mm)
@@ -74,7 +68,7 @@ def _fill(mesh: Mesh, frame_from_index: np.ndarray, out: np.ndarray, value: int)
     high = np.clip(np.ceil(index.max(0)) + 1, 0, out.shape).astype(int)
     if (high <= low).any():
         return
-    high[2] = out.shape[2]  # of an open mesh the rays do not leave what they entered
+    high[2] = out.shape[2]  # rays need not leave an open mesh
     triangles = (index - low)[mesh.faces]
     i, j, k = (high - low).tolist()
     first = np.zeros(i * j + 1, np.int64)
@@ -90,13 +84,14 @@ def _fill(mesh: Mesh, frame_from_index: np.ndarray, out: np.ndarray, value: int)
     _fill_along_rays(first, behind, sign, value, out[box])
 
 
-@njit(nogil=True)  # no fast math: each number is rounded as in ``cover``
+@njit(nogil=True)  # no fast math: rounded as in the reference, ``cover`` in tests/support
 def _find_crossings(triangles, shape, first, k, sign):  # type: ignore[no-untyped-def]
-    """Where rays along the last axis pass triangles (t, 3, 3), in cells: into ``k`` the first voxel
-    behind each crossing, into ``sign`` +1 where a face is entered, -1 where it is left.
+    """Where rays along the last axis cross triangles (t, 3, 3), in cells: ``k``, the first voxel
+    behind each crossing, and ``sign``, +1 where the ray enters, -1 where it leaves.
 
-    Called twice. With ``k`` empty it counts, ``first[i * shape[1] + j + 1]`` for the ray (i, j).
-    With their cumulative sum in ``first`` it writes the crossings and advances ``first``.
+    Called twice. With ``k`` empty it counts the crossings of ray (i, j) in
+    ``first[i * shape[1] + j + 1]``. With their cumulative sum in ``first`` it writes the crossings
+    and advances ``first``.
     """
     fill = len(k) > 0
     for t in range(len(triangles)):
@@ -105,7 +100,7 @@ def _find_crossings(triangles, shape, first, k, sign):  # type: ignore[no-untype
         bx, by = tri[2, 0] - tri[0, 0], tri[2, 1] - tri[0, 1]
         area = ax * by - ay * bx
         turned = np.int8(area < 0) - np.int8(area > 0)
-        # As numpy's cross product: the same products, in the same order.
+        # As NumPy's cross product: the same products in the same order
         az, bz = tri[1, 2] - tri[0, 2], tri[2, 2] - tri[0, 2]
         along = area if area != 0 else 1.0
         slope_i, slope_j = (ay * bz - az * by) / along, (az * bx - ax * bz) / along
@@ -139,7 +134,7 @@ def _span(tri, i):  # type: ignore[no-untyped-def]
     low, high = np.inf, -np.inf
     for edge in range(3):
         a, b = edge, (edge + 1) % 3
-        if tri[a, 0] > tri[b, 0]:  # the same direction, hence the same rounding, from both sides
+        if tri[a, 0] > tri[b, 0]:  # one direction, so that both triangles round alike
             a, b = b, a
         if tri[a, 0] <= i and tri[b, 0] > i:
             at = tri[a, 1] + (i - tri[a, 0]) * (tri[b, 1] - tri[a, 1]) / (tri[b, 0] - tri[a, 0])
@@ -149,12 +144,12 @@ def _span(tri, i):  # type: ignore[no-untyped-def]
 
 @njit(nogil=True)
 def _fill_along_rays(first, k, sign, value, out):  # type: ignore[no-untyped-def]
-    """See ``_fill``; of each ray the crossings in ``k`` and ``sign`` begin at ``first``."""
+    """See ``_fill``; the crossings of each ray in ``k`` and ``sign`` begin at ``first``."""
     for i in range(out.shape[0]):
         for j in range(out.shape[1]):
             ray = i * out.shape[1] + j
             begin, end = first[ray], first[ray + 1]
-            _in_order(k, sign, begin, end)
+            _sort(k, sign, begin, end)
             winding = 0
             for at in range(begin, end):
                 winding += sign[at]
@@ -164,12 +159,12 @@ def _fill_along_rays(first, k, sign, value, out):  # type: ignore[no-untyped-def
 
 
 @njit(nogil=True)
-def _in_order(k, sign, begin, end):  # type: ignore[no-untyped-def]
-    """Sort one ray's crossings, a handful, by ``k``."""
+def _sort(k, sign, begin, end):  # type: ignore[no-untyped-def]
+    """Insertion sort of one ray's few crossings by ``k``."""
     for at in range(begin + 1, end):
-        here, its = k[at], sign[at]
+        this_k, this_sign = k[at], sign[at]
         before = at - 1
-        while before >= begin and k[before] > here:
+        while before >= begin and k[before] > this_k:
             k[before + 1], sign[before + 1] = k[before], sign[before]
             before -= 1
-        k[before + 1], sign[before + 1] = here, its
+        k[before + 1], sign[before + 1] = this_k, this_sign

@@ -1,9 +1,8 @@
-"""Label maps with names, colours and standard terms: for 3D Slicer (.seg.nrrd), and as a DICOM
-segmentation of the CT that they were drawn on.
+"""Label maps with names, colours and SNOMED CT terms: for 3D Slicer (.seg.nrrd), and as a DICOM
+segmentation of their CT.
 
 Formats: https://slicer.readthedocs.io/en/latest/developer_guide/modules/segmentations.html,
-https://teem.sourceforge.net/nrrd/format.html; DICOM PS3.3 A.51 (Segmentation IOD), through
-highdicom. Terms are SNOMED CT's.
+https://teem.sourceforge.net/nrrd/format.html; DICOM PS3.3 A.51 (Segmentation IOD), by highdicom.
 """
 
 from __future__ import annotations
@@ -33,12 +32,12 @@ from tumortrack.imaging.nifti import GZIP_LEVEL
 if TYPE_CHECKING:
     from pydicom.dataset import Dataset
 
-_OFF_GRID = 0.05  # of a voxel: rounding of positions in files, and nothing else
+_OFF_GRID = 0.05  # of a voxel: rounding of positions in files
 _SERIES_NUMBER = 900
 
 
 class Term(NamedTuple):
-    """A code and what it means, as pydicom and highdicom take it."""
+    """A coded concept, in the order of pydicom's ``Code``."""
 
     code: str
     scheme: str
@@ -59,10 +58,7 @@ _SIDES: dict[Side, Term] = {
 
 @dataclass(frozen=True)
 class Segment:
-    """One label of a map: the part's name, what it is, and its colour (red, green, blue: 0..255).
-
-    Labels do not overlap: the organ's segment, label 1, is the parenchyma.
-    """
+    """One label of a map. Labels do not overlap: the organ's, 1, is the parenchyma."""
 
     label: int
     name: str
@@ -75,13 +71,13 @@ class Segment:
 
     @property
     def region(self) -> Term:
-        """The organ that it is, or lies in."""
+        """The organ that it is or lies in."""
         code, meaning = self.organ.snomed
         return Term(code, "SCT", meaning)
 
     @property
     def terms(self) -> tuple[Term, Term]:
-        """Category and type."""
+        """Its category and type."""
         return (STRUCTURE, self.region) if self.is_organ else (ALTERED, MASS)
 
     @property
@@ -92,10 +88,10 @@ class Segment:
     def terminology(self) -> str:
         """As Slicer writes it: category, type and its modifier; region and its modifier."""
         side = str(_SIDES.get(self.side, "^^"))
-        where, region = (side, "^^~^^") if self.is_organ else ("^^", f"{self.region}~{side}")
+        modifier, region = (side, "^^~^^") if self.is_organ else ("^^", f"{self.region}~{side}")
         category, kind = self.terms
         return (
-            f"Segmentation category and type - DICOM master list~{category}~{kind}~{where}"
+            f"Segmentation category and type - DICOM master list~{category}~{kind}~{modifier}"
             f"~Anatomic codes - DICOM master list~{region}"
         )
 
@@ -103,7 +99,7 @@ class Segment:
 def segments(
     names: Iterable[str], side: Side = UNKNOWN, organ: Organ = KIDNEY
 ) -> tuple[Segment, ...]:
-    """The segments of parts (the organ's name, tumor_1, ...), labelled 1, 2, ..."""
+    """Segments with labels 1, 2, ... of the parts' ``names``."""
     return tuple(Segment(label, name, side, organ) for label, name in enumerate(names, ORGAN))
 
 
@@ -113,13 +109,9 @@ def write_seg_nrrd(
     lps_from_index: Float[np.ndarray, "4 4"],
     parts: Sequence[Segment],
 ) -> None:
-    """Write labels as one layer of segments, gzip; all bytes follow from the arguments. Raises
-    StorageError: the disk refused; an older file is untouched.
-
-    Args:
-        lps_from_index: index -> LPS mm. Labels before the camera: their camera frame, which Slicer
-            then shows as if it were the patient's.
-    """
+    """Write labels as one layer of segments, gzip; the same arguments give the same bytes. Labels
+    in the camera frame are written as if that were LPS, which is how Slicer then shows them. Raises
+    StorageError: the disk refused; an older file is untouched."""
     columns = ["(" + ",".join(repr(float(n)) for n in c) + ")" for c in lps_from_index[:3].T]
     lines = [
         "NRRD0004",
@@ -164,50 +156,52 @@ def write_dicom_seg(
     series: str | None = None,
     patient: Patient = NOBODY,
 ) -> tuple[str, ...]:
-    """Write ``labels`` as a binary segmentation on the slices in ``folder``: viewers overlay it.
-    Returns notes on what else was in the folder.
-    Raises InputError: no such series; another patient's; another grid; slices that lack what a
-    segmentation must repeat; highdicom is not installed; StorageError: the disk refused.
+    """Write ``labels`` as a binary segmentation of the CT in ``folder``, which viewers overlay.
+    Returns notes on what else was in the folder. Raises InputError: no such series; another
+    patient's; another grid; slices that lack what a segmentation must repeat; highdicom is not
+    installed; StorageError: the disk refused.
 
     Args:
-        parts: as many as there are labels, in their order.
-        folder, series: the CT, as for ``read_dicom``. It need not be what the labels were made
-            from, but their voxels must coincide (axes may be turned or run the other way).
-        patient: whose labels these are.
+        parts: one for each label, in order.
+        folder, series: the CT, as for ``read_dicom``. Its voxels must coincide with the labels'
+            (axes may be permuted or flipped).
+        patient: of the labels.
     """
-    found = find_series(folder, series)
+    ct = find_series(folder, series)
     import pydicom
 
-    if patient.differs(found.patient):
+    if patient.differs(ct.patient):
         raise InputError(
-            f"{folder} is of {found.patient}, the labels are of {patient}. Give the CT of that "
+            f"{folder} is of {ct.patient}, the labels are of {patient}. Give the CT of that "
             "patient; if the case has a pseudonym, say whom its CT names: --patient PATIENTID."
         )
-    pixels = _labels_on(found, labels, str(folder))
-    slices = [pydicom.dcmread(file, stop_before_pixels=True) for file in found.files]
+    pixels = _resampled(labels, ct, folder)
+    slices = [pydicom.dcmread(file, stop_before_pixels=True) for file in ct.files]
     dataset = _segmentation(slices, pixels, parts)
     with writing(path):
         dataset.save_as(path)
-    return found.notes
+    return ct.notes
 
 
-def _labels_on(series: Series, labels: LabelVolume, where: str) -> UInt8[np.ndarray, "k j i"]:
-    """The labels on the series' voxels, which must coincide: (slice, row, column)."""
+def _resampled(labels: LabelVolume, series: Series, folder: Path) -> UInt8[np.ndarray, "k j i"]:
+    """The labels as (slice, row, column) of the series, whose voxels must coincide."""
     ct_from_index = np.linalg.inv(series.lps_from_index) @ labels.lps_from_index
     turn = np.rint(ct_from_index[:3, :3])
     corners = np.indices((2, 2, 2)).reshape(3, -1).T * (np.array(labels.labels.shape) - 1.0)
-    there = transform_points(ct_from_index, corners)
-    off = np.abs(there - np.rint(there)).max()
-    # A turn by right angles, and every corner on a voxel: then so is every voxel between them.
+    corners = transform_points(ct_from_index, corners)
+    off = np.abs(corners - np.rint(corners)).max()
+    # If axes map to axes and every corner lies on a voxel, so does every voxel between them.
     if abs(abs(np.linalg.det(turn)) - 1) > 1e-6 or off > _OFF_GRID:
         raise InputError(
-            f"{where}: the case's voxels are not this CT's, so the segmentation cannot lie on its "
+            f"{folder}: the case's voxels are not this CT's, so the segmentation cannot lie on its "
             "slices. Give the DICOM folder of which the case, or its label map, was made."
         )
     inside = np.argwhere(labels.labels > 0)
     index = np.rint(transform_points(ct_from_index, inside.astype(float))).astype(int)
     if (index < 0).any() or (index >= series.shape).any():
-        raise InputError(f"{where}: the case's labels reach beyond this CT. Give its whole series.")
+        raise InputError(
+            f"{folder}: the case's labels reach beyond this CT. Give its whole series."
+        )
     pixels = np.zeros(series.shape[::-1], np.uint8)
     pixels[tuple(index.T[::-1])] = labels.labels[tuple(inside.T)]
     return pixels
@@ -225,7 +219,7 @@ def _segmentation(
     from pydicom.uid import generate_uid
 
     digest = hashlib.sha256(pixels.tobytes())
-    digest.update("".join(str(one.get("SOPInstanceUID")) for one in slices).encode())
+    digest.update("".join(str(tags.get("SOPInstanceUID")) for tags in slices).encode())
     organ = parts[0].organ
     entropy = ["tumortrack", digest.hexdigest()]
     try:
@@ -245,7 +239,7 @@ def _segmentation(
             content_label=f"{organ.name[:9].upper()}_TUMORS",
             series_description=f"{organ.words.capitalize()} and tumors (tumortrack)",
         )
-    except AttributeError as error:  # highdicom's word for a tag that a slice lacks
+    except AttributeError as error:  # what highdicom raises for a missing tag
         raise InputError(
             f"the CT's slices lack what a segmentation must repeat ({error}). Export the series "
             "again from the archive, anonymised if need be but with its tags."
@@ -258,12 +252,12 @@ def _description(part: Segment) -> Any:
     from pydicom.sr.coding import Code
 
     category, kind = (Code(*term) for term in part.terms)
-    described = hd.seg.SegmentDescription(
+    description = hd.seg.SegmentDescription(
         segment_number=part.label,
         segment_label=part.name,
         segmented_property_category=category,
         segmented_property_type=kind,
-        # Whoever drew them, `prepare` has chosen among the pieces and closed their cavities.
+        # Whoever drew them, `prepare` selected pieces and filled holes.
         algorithm_type=hd.seg.SegmentAlgorithmTypeValues.SEMIAUTOMATIC,
         algorithm_identification=hd.AlgorithmIdentificationSequence(
             "tumortrack prepare", codes.cid7162.MorphologicalOperations, tumortrack.__version__
@@ -274,8 +268,8 @@ def _description(part: Segment) -> Any:
     if part.side in _SIDES:
         side = [hd.sr.CodedConcept(*_SIDES[part.side])]
         if part.is_organ:
-            what = described.SegmentedPropertyTypeCodeSequence[0]
-            what.SegmentedPropertyTypeModifierCodeSequence = side
+            kind_item = description.SegmentedPropertyTypeCodeSequence[0]
+            kind_item.SegmentedPropertyTypeModifierCodeSequence = side
         else:
-            described.AnatomicRegionSequence[0].AnatomicRegionModifierSequence = side
-    return described
+            description.AnatomicRegionSequence[0].AnatomicRegionModifierSequence = side
+    return description

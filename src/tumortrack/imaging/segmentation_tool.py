@@ -1,9 +1,9 @@
-"""A CT -> a label map by the user's own tool: TotalSegmentator, an nnU-Net model, a MONAI bundle.
+"""Segment a CT with the user's own tool: TotalSegmentator, an nnU-Net model, a MONAI bundle.
 
-The tool runs as a process of its own, by its own command line, and needs weights that lie on this
-machine: nothing is fetched from here. Its numbers become ours by their names: 1 the organ, 2 its
-tumors. Documents: github.com/wasserth/TotalSegmentator (README, map_to_binary.py), github.com/
-MIC-DKFZ/nnUNet (how_to_use_nnunet.md), docs.monai.io (MONAI Bundle specification).
+The tool runs in its own process by its own command line, with weights that are on this machine:
+nothing is downloaded. Its labels become ours by name: 1 the organ, 2 its tumors. Documentation:
+github.com/wasserth/TotalSegmentator (README, map_to_binary.py), github.com/MIC-DKFZ/nnUNet
+(how_to_use_nnunet.md), docs.monai.io (MONAI Bundle specification).
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
@@ -33,13 +33,13 @@ from tumortrack.imaging.prepare import (
     OF_LABELS,
     PrepareOptions,
     crop_ct,
+    patient_of,
     prepare,
     refuse_unused,
-    stated_patient,
 )
 from tumortrack.imaging.volume import read_raw, volume_of
 
-# Datasets of TotalSegmentator's tasks, and the masks of theirs that are tumors, or cut out as such.
+# Datasets of TotalSegmentator's tasks, and which of their masks count as tumors.
 _TOTAL = (291, 292, 293, 294, 295, 298)
 _LESIONS = {
     "liver_lesions": (591, ("liver_lesions",)),
@@ -48,13 +48,14 @@ _LESIONS = {
 }
 _TUMOR = re.compile("tumou?r|neoplasm|lesion|cancer|carcinoma|mass")
 _SAME_MM = 0.01  # of the label map's grid
-# Where the organ is, and where its tumors are; None: the tool knows none.
+# The organ's mask and its tumors'; None: the tool knows no tumors.
 Masks = tuple[Bool[np.ndarray, "i j k"], Bool[np.ndarray, "i j k"] | None]
 
 
 @dataclass(frozen=True)
 class Tool:
-    """What runs in a folder, from its in/ct_0000.nii.gz to its out/, and what reads that."""
+    """``commands`` run in a folder and turn its in/ct_0000.nii.gz into files in out/, which
+    ``masks`` reads."""
 
     name: str
     package: str
@@ -66,18 +67,18 @@ class Tool:
     def version(self) -> str:
         try:
             return version(self.package)
-        except PackageNotFoundError:  # of another environment
+        except PackageNotFoundError:  # it is in another environment
             return "(version unknown)"
 
 
 def segmented_case(ct: Path, spec: str, options: PrepareOptions, keep: Path) -> Case:
-    """A case of a CT that a tool segments; its output goes to this process's. Raises InputError: an
-    unknown tool, one that is not installed or lacks its weights, one that fails or finds no such
-    organ; and as ``prepare``.
+    """A case from a CT that a tool segments; what the tool prints is shown. Raises InputError: a
+    tool that is unknown, not installed, lacks its weights, fails or finds no such organ; and as
+    ``prepare``.
 
     Args:
         spec: totalsegmentator, totalsegmentator:TASK, nnunet:FOLDER or monai:BUNDLE.
-        keep: file for the label map in our numbers; it must not exist.
+        keep: file for the label map, which must not exist yet.
     """
     refuse_unused("--segment makes the labels", options, *OF_LABELS)
     if keep.exists():
@@ -100,10 +101,9 @@ def segmented_case(ct: Path, spec: str, options: PrepareOptions, keep: Path) -> 
         labels[tumors] = FIRST_TUMOR
     keep.parent.mkdir(parents=True, exist_ok=True)
     write_nifti(keep, labels, volume.lps_from_index, lps=True)
-    has_tumors = tumors is not None and tumors.any()
-    asked = replace(options, labels=True, series=None, organ=1, tumor=2 if has_tumors else 0)
-    case = prepare(keep, asked)
-    about = {
+    tumor = FIRST_TUMOR if tumors is not None and tumors.any() else 0
+    case = prepare(keep, replace(options, labels=True, series=None, organ=ORGAN, tumor=tumor))
+    segmentation = {
         "tool": tool.name,
         "version": tool.version,
         "commands": [" ".join(command) for command in tool.commands],
@@ -114,8 +114,8 @@ def segmented_case(ct: Path, spec: str, options: PrepareOptions, keep: Path) -> 
     }
     note = f"segmented by {tool.name} {tool.version}, and by nobody else: check it in qc.png"
     notes = [*raw.notes, *case.report["notes"], note]
-    report = case.report | {"kind": "segmented ct", "segmentation": about, "notes": notes}
-    patient = stated_patient(ct, raw.patient, options.patient, case.patient.side)
+    report = case.report | {"kind": "segmented ct", "segmentation": segmentation, "notes": notes}
+    patient = patient_of(ct, raw.patient, options.patient, case.patient.side)
     return replace(case, ct=crop_ct(volume, case.labels), report=report, patient=patient)
 
 
@@ -132,15 +132,15 @@ def _tool(spec: str, organ: str) -> Tool:
 
 
 def _program(name: str, package: str) -> str:
-    """Its path: beside this Python, or on the PATH."""
-    places = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")])
-    found = shutil.which(name, path=places)
-    if found is None:
+    """The path of a program beside this Python or on the PATH."""
+    folders = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")])
+    path = shutil.which(name, path=folders)
+    if path is None:
         raise InputError(
             f"{name} is not installed. Install it, which brings its own dependencies: pip install "
             f"{package}. Its weights are apart (docs/segment.md)."
         )
-    return found
+    return path
 
 
 def _run(command: tuple[str, ...], work: Path) -> None:
@@ -162,28 +162,26 @@ def _totalsegmentator(task: str, organ: str) -> Tool:
     folder = Path(os.environ.get("TOTALSEG_WEIGHTS_PATH", home / "nnunet" / "results"))
     number, lesions = _LESIONS.get(task, (0, ()))
     weights = []
-    for of, datasets in (("total", _TOTAL), *([(task, (number,))] if task else [])):
-        for dataset in datasets:
-            found = sorted(folder.glob(f"Dataset{dataset:03d}_*"))
-            if not found:
-                raise InputError(
-                    f"{folder} lacks the weights of TotalSegmentator's task {of} (Dataset"
-                    f"{dataset:03d}). Fetch them yourself: totalseg_download_weights -t {of}. "
-                    "TotalSegmentator would download them without asking, so it is not started."
-                )
-            weights += found
+    needed = [("total", dataset) for dataset in _TOTAL] + ([(task, number)] if task else [])
+    for of, dataset in needed:
+        paths = sorted(folder.glob(f"Dataset{dataset:03d}_*"))
+        if not paths:
+            raise InputError(
+                f"{folder} lacks the weights of TotalSegmentator's task {of} (Dataset"
+                f"{dataset:03d}). Fetch them yourself: totalseg_download_weights -t {of}. "
+                "TotalSegmentator would download them without asking, so it is not started."
+            )
+        weights += paths
     sides = [f"{organ}_left", f"{organ}_right"] if organ in ("kidney", "adrenal_gland") else [organ]
     run = (program, "-i", "in/ct_0000.nii.gz", "-o")
     commands = [(*run, "out/total", "--task", "total", "--roi_subset", *sides)]
     commands += [(*run, "out/lesions", "--task", task)] if task else []
 
     def masks(out: Path, ct: Volume) -> Masks:
-        def union(names: list[Path]) -> np.ndarray:
-            return np.any([_voxels(file, ct) > 0 for file in names], axis=0)
+        def union(folder: Path, names: Iterable[str]) -> np.ndarray:
+            return np.any([_voxels(folder / f"{name}.nii.gz", ct) > 0 for name in names], axis=0)
 
-        found = union([out / "total" / f"{name}.nii.gz" for name in sides])
-        tumors = [out / "lesions" / f"{name}.nii.gz" for name in lesions]
-        return found, union(tumors) if tumors else None
+        return union(out / "total", sides), union(out / "lesions", lesions) if lesions else None
 
     return Tool("TotalSegmentator", "TotalSegmentator", tuple(weights), tuple(commands), masks)
 
@@ -200,18 +198,18 @@ def _nnunet(model: Path, organ: str) -> Tool:
     channels, ending = dataset.get("channel_names", {}), dataset.get("file_ending")
     if len(channels) != 1 or ending != ".nii.gz":
         raise InputError(f"{model} takes {channels} as {ending}; what we have is one CT, .nii.gz.")
-    chosen = _chosen(dataset.get("labels", {}), organ, model)
+    numbers = _numbers(dataset.get("labels", {}), organ, model)
     device = "cuda" if _has_gpu() else "cpu"
     command = (
         *(program, "-i", "in", "-o", "out", "-m", str(model), "-device", device),
         *("-npp", "1", "-nps", "1", "-f", *(fold.name.removeprefix("fold_") for fold in folds)),
     )
     weights = (model / "dataset.json", model / "plans.json", *folds)
-    return Tool("nnU-Net", "nnunetv2", weights, (command,), _of_one_map(chosen))
+    return Tool("nnU-Net", "nnunetv2", weights, (command,), _from_label_map(*numbers))
 
 
 def _has_gpu() -> bool:
-    """As PyTorch says, where nnU-Net brought it into this environment; else by the driver."""
+    """By PyTorch if it is in this environment (nnU-Net brings it), else by the driver."""
     if find_spec("torch") is None:
         return shutil.which("nvidia-smi") is not None
     import torch
@@ -229,18 +227,18 @@ def _monai(bundle: Path, organ: str) -> Tool:
         )
     meta = _json(bundle / "configs" / "metadata.json", "monai")
     try:
-        said = meta["network_data_format"]["outputs"]["pred"]["channel_def"]
-        names = {str(name): int(number) for number, name in said.items()}
+        channels = meta["network_data_format"]["outputs"]["pred"]["channel_def"]
+        names = {str(name): int(number) for number, name in channels.items()}
     except (KeyError, ValueError, AttributeError) as error:
         raise InputError(f"{bundle}: metadata.json does not name its labels ({error}).") from error
-    chosen = _chosen(names, organ, bundle)
+    numbers = _numbers(names, organ, bundle)
     config = next((bundle / "configs").glob("inference.*"), bundle / "configs" / "inference.json")
     command = (
         *(sys.executable, "-m", "monai.bundle", "run", "--config_file", str(config)),
         *("--meta_file", str(bundle / "configs" / "metadata.json"), "--bundle_root", str(bundle)),
         *("--datalist", "['in/ct_0000.nii.gz']", "--output_dir", "out"),
     )
-    return Tool("MONAI", "monai", (bundle,), (command,), _of_one_map(chosen))
+    return Tool("MONAI", "monai", (bundle,), (command,), _from_label_map(*numbers))
 
 
 def _json(path: Path, kind: str) -> dict[str, Any]:
@@ -249,39 +247,38 @@ def _json(path: Path, kind: str) -> dict[str, Any]:
     return store.read_json(path)
 
 
-def _chosen(labels: dict[str, Any], organ: str, where: Path) -> tuple[list[int], list[int]]:
-    """The organ's numbers and the tumors', by the names of labels; a region (nnU-Net) has several
-    numbers."""
+def _numbers(labels: dict[str, Any], organ: str, where: Path) -> tuple[list[int], list[int]]:
+    """The label numbers of the organ and of tumors, by name; an nnU-Net region has several."""
+    numbers: dict[str, set[int]] = {}
     try:
-        names = {
-            re.sub(r"[\s-]+", "_", name.lower()): tuple(numbers)
-            if isinstance(numbers, list)
-            else (int(numbers),)
-            for name, numbers in labels.items()
-        }
+        for name, value in labels.items():
+            values = value if isinstance(value, list) else [int(value)]
+            numbers[re.sub(r"[\s-]+", "_", name.lower())] = set(values)
     except (TypeError, ValueError) as error:
         raise InputError(f"{where}: its labels {str(labels)[:200]} have no numbers.") from error
-    mine = {organ, f"{organ}_left", f"{organ}_right", f"left_{organ}", f"right_{organ}"}
-    tumors = sorted({n for name in names if _TUMOR.search(name) for n in names[name]})
-    organs = sorted({n for name in mine & names.keys() for n in names[name]} - set(tumors))
+    names = {organ, f"{organ}_left", f"{organ}_right", f"left_{organ}", f"right_{organ}"}
+    tumors = {n for name in numbers if _TUMOR.search(name) for n in numbers[name]}
+    organs = {n for name in names & numbers.keys() for n in numbers[name]} - tumors
     if not organs:
-        raise InputError(f"{where} knows {', '.join(names)}, and no {organ}. Choose it by --name.")
-    return organs, tumors
+        raise InputError(
+            f"{where} knows {', '.join(numbers)}, and no {organ}. Choose it by --name."
+        )
+    return sorted(organs), sorted(tumors)
 
 
-def _of_one_map(chosen: tuple[list[int], list[int]]) -> Callable[[Path, Volume], Masks]:
+def _from_label_map(organs: list[int], tumors: list[int]) -> Callable[[Path, Volume], Masks]:
     def masks(out: Path, ct: Volume) -> Masks:
         files = sorted(out.rglob("*.nii.gz"))
         if len(files) != 1:
             raise InputError(f"the tool wrote {len(files)} label maps, and one was to be expected.")
-        voxels, (organs, tumors) = _voxels(files[0], ct), chosen
+        voxels = _voxels(files[0], ct)
         return np.isin(voxels, organs), np.isin(voxels, tumors) if tumors else None
 
     return masks
 
 
 def _voxels(file: Path, ct: Volume) -> np.ndarray:
-    """Of a mask or a label map, which must lie on the CT's voxels."""
+    """The numbers of a mask or label map on the CT's grid."""
     if not file.is_file():
         raise InputError(
             f"the tool ended well and wrote no {file.name}; it may be another version."

@@ -1,4 +1,4 @@
-"""One organ and its tumors out of a label map."""
+"""Select one organ and its tumors from a label map."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from tumortrack.core.types import FIRST_TUMOR, ORGAN, LabelVolume
 from tumortrack.imaging import grid
 
 MIN_TUMOR_ML = 0.2
-_GAP_MM = 3.0  # annotators and resampling leave such gaps; a thicker slice counts as one voxel
-_MIN_ML, _MAX_ML = 10.0, 4000.0  # of a small prostate; of a large liver
+_GAP_MM = 3.0  # annotators and resampling leave such gaps; of thicker slices one voxel counts
+_MIN_ML, _MAX_ML = 10.0, 4000.0  # a small prostate; a large liver
 _MIDLINE_MARGIN_MM = 20.0
-_PAIR_APART_MM = 60.0  # middles, from side to side (kidneys' usually over 100): of no torn organ
+_PAIR_APART_MM = 60.0  # between centres, left to right: kidneys have over 100, a torn organ less
 _MOST_TUMORS = 254
 _MOST_OF_BORDER = 1 / 3  # of the map's outermost voxels; an organ cut in half covers a quarter
 _MOST_RUGGED = 60.0  # area of all labels' borders over volume^(2/3); a voxelised ball has 7
@@ -28,9 +28,7 @@ _MOST_RUGGED = 60.0  # area of all labels' borders over volume^(2/3); a voxelise
 @dataclass(frozen=True, eq=False)
 class _Pieces:
     """Connected pieces of organ and tumor voxels, numbered 1, 2, ... largest first; 0 outside.
-
-    ``labels`` keep the map's own values; ``organ`` and ``tumors`` name those that count.
-    """
+    ``organ`` and ``tumors``: the values of those parts in ``labels``, which are the map's."""
 
     labels: UInt8[np.ndarray, "i j k"]
     numbers: Int32[np.ndarray, "i j k"]
@@ -40,7 +38,7 @@ class _Pieces:
 
     @cached_property
     def organ_ml(self) -> Float[np.ndarray, " n"]:
-        """Organ volume by piece number (entry 0 is the outside's: 0)."""
+        """By piece number; entry 0, the outside, is 0."""
         return self._ml((self.organ,))
 
     @cached_property
@@ -56,13 +54,9 @@ class _Pieces:
         count = np.bincount(inside, minlength=int(self.numbers.max()) + 1)
         return count * grid.voxel_ml(self.lps_from_index)
 
-
-@dataclass(frozen=True)
-class _Candidate:
-    piece: int
-    ml: float
-    tumor_ml: float
-    x_mm: float  # LPS: grows to the patient's left
+    def x_mm(self, number: int) -> float:
+        """Of a piece's centre, LPS: grows to the patient's left."""
+        return float((self.lps_from_index @ [*np.argwhere(self.numbers == number).mean(0), 1])[0])
 
 
 def select_labels(
@@ -75,22 +69,21 @@ def select_labels(
 ) -> tuple[LabelVolume, list[str], Side]:
     """Keep one organ (label 1) and its tumors (2, 3, ...), cropped with a margin.
 
-    An organ is a connected piece of organ and tumor voxels: see ``_large_pieces``. A tumor within 3
-    mm of an organ belongs to it: see ``_attach_tumors``. One farther off is left out with a note;
-    other pieces are specks and dropped. A tumor is a piece of one tumor label inside that organ;
-    smaller ones than ``min_tumor_ml`` become organ. Different tumor labels keep their order; the
-    pieces of one label follow each other, largest first. Raises InputError: no organ, no such tumor
-    label, two of a pair without tumor and no ``side``, no tumor but one apart from every organ.
+    An organ is a large connected piece of organ and tumor voxels. A tumor within 3 mm of an organ
+    belongs to it; one farther off is left out with a note, and other pieces are dropped as specks.
+    A tumor is a piece of one tumor label inside that organ; those below ``min_tumor_ml`` become
+    organ. Tumor labels keep their order; pieces of one label are ordered by size. Raises
+    InputError: no organ, no such tumor label, two organs of a pair without tumor and no ``side``,
+    the only tumor lies apart from every organ.
 
     Args:
         side: the PATIENT's ``left`` or ``right``; unknown: the organ with most tumor is taken.
-        organ: the organ's label.
         tumor: the tumor's label; None takes every other label from 2 up, 0 takes none.
-        kind: which organ it is; only of those in pairs is one chosen by its side.
+        kind: which organ it is; only organs in pairs are chosen by side.
 
     Returns:
-        The selected labels, notes on what was dropped or renumbered, and the organ's side: as
-        the map shows it, if it has two kidneys, say; else what was asked for.
+        The selected labels, notes on what was dropped or renumbered, and the organ's side: as seen
+        in a map with both organs of a pair, else as given.
     """
     labels, affine = label_volume.labels, label_volume.lps_from_index
     present = [int(n) for n in np.flatnonzero(grid.label_counts(labels)) if n > 0]
@@ -102,35 +95,34 @@ def select_labels(
     affine = grid.moved_origin(affine, box)
     numbered, _ = grid.components(counted[box])
     pieces = _Pieces(labels[box], numbered, affine, organ, tuple(tumors))
-    numbers = _large_pieces(pieces)
-    pieces, notes, apart = _attach_tumors(pieces, numbers, min_tumor_ml)
-    found = _candidates(pieces, numbers)
-    notes += _left_out(pieces, found, apart, min_tumor_ml)
-    chosen, more, found_side = _choose(found, side, float(middle[0]), kind)
-    notes += more
-    if not _MIN_ML <= chosen.ml <= _MAX_ML:
+    organs = _large_pieces(pieces)
+    pieces, notes, apart = _attach_tumors(pieces, organs, min_tumor_ml)
+    notes += _left_out(pieces, organs, apart, min_tumor_ml)
+    chosen, note, side = _choose(pieces, organs, side, float(middle[0]), kind)
+    notes += [note] if note else []
+    if not _MIN_ML <= (ml := pieces.whole_ml[chosen]) <= _MAX_ML:
         raise InputError(
-            f"label {organ} and its tumors fill {chosen.ml:.1f} ml; an organ has "
+            f"label {organ} and its tumors fill {ml:.1f} ml; an organ has "
             f"{_MIN_ML:g} to {_MAX_ML:g} ml. Check --organ, --tumor and the spacing."
         )
-    mine = pieces.numbers == chosen.piece
-    box = grid.bounding_box(mine, affine, 2.0)
-    own = np.where(mine, pieces.labels, 0)[box].astype(np.uint8)
-    _check_ruggedness(own, affine)
-    out, more = _number_tumors(own, tumors, grid.voxel_ml(affine), min_tumor_ml)
-    return grid.cropped(out, grid.moved_origin(affine, box)), notes + more, found_side
+    inside = pieces.numbers == chosen
+    box = grid.bounding_box(inside, affine, 2.0)
+    kept = np.where(inside, pieces.labels, 0)[box].astype(np.uint8)
+    _check_ruggedness(kept, affine)
+    out, more = _number_tumors(kept, tumors, grid.voxel_ml(affine), min_tumor_ml)
+    return grid.cropped(out, grid.moved_origin(affine, box)), notes + more, side
 
 
 def _among(labels: np.ndarray, values: tuple[int, ...]) -> np.ndarray:
-    """Where the labels are among these values: ``np.isin``, in a tenth of its time."""
-    found = np.zeros_like(labels, bool)
+    """``np.isin`` in a tenth of its time."""
+    mask = np.zeros_like(labels, bool)
     for value in values:
-        found |= labels == value
-    return found
+        mask |= labels == value
+    return mask
 
 
 def _check_border(counted: np.ndarray) -> None:
-    """Refuse a map whose outermost voxels are labelled to a large part: no surface lies in it."""
+    """Refuse a map with much of its outermost voxels labelled: the surface is not in it."""
     inner = counted[1:-1, 1:-1, 1:-1]
     share = (counted.sum() - inner.sum()) / max(counted.size - inner.size, 1)
     if share > _MOST_OF_BORDER:
@@ -141,7 +133,7 @@ def _check_border(counted: np.ndarray) -> None:
 
 
 def _check_ruggedness(labels: np.ndarray, affine: np.ndarray) -> None:
-    """Refuse labels that are torn to shreds: what makes surfaces of them would take minutes."""
+    """Refuse noise: making its surface would take minutes."""
     i, j, k = affine[:3, :3].T
     area_mm2 = sum(
         np.count_nonzero(np.diff(labels, axis=axis)) * float(np.linalg.norm(np.cross(a, b)))
@@ -176,42 +168,27 @@ def _tumor_labels(present: list[int], organ: int, tumor: int | None) -> list[int
 
 
 def _large_pieces(pieces: _Pieces) -> list[int]:
-    """The numbers of the pieces that are organs, largest first: with at least 10 ml of organ and a
-    tenth of the largest one's volume; where there is none, the one with most organ."""
+    """Numbers of the pieces that are organs, largest first: those with at least 10 ml of organ and
+    a tenth of the largest one's volume; else the one with most organ."""
     whole_ml = pieces.whole_ml
     large = np.flatnonzero(pieces.organ_ml >= _MIN_ML).tolist()
-    if not large:  # an organ nearly eaten up by its tumor, or a very small one
+    if not large:  # a very small organ, or one that is nearly all tumor
         return [int(pieces.organ_ml.argmax())]
     return [n for n in large if whole_ml[n] >= whole_ml[large].max() / 10]
-
-
-def _candidates(pieces: _Pieces, numbers: list[int]) -> list[_Candidate]:
-    from scipy import ndimage
-
-    boxes = ndimage.find_objects(pieces.numbers, max_label=max(numbers))
-    out = []
-    for n in numbers:
-        box = boxes[n - 1]
-        index = np.argwhere(pieces.numbers[box] == n).mean(0) + [s.start for s in box]
-        x_mm = float((pieces.lps_from_index @ [*index, 1])[0])
-        out.append(_Candidate(n, float(pieces.whole_ml[n]), float(pieces.tumor_ml[n]), x_mm))
-    return out
 
 
 def _attach_tumors(
     pieces: _Pieces, organs: list[int], min_tumor_ml: float
 ) -> tuple[_Pieces, list[str], list[int]]:
-    """Join every piece with a tumor of at least ``min_tumor_ml`` to an organ within 3 mm.
+    """Join each piece with a tumor of at least ``min_tumor_ml`` to an organ within 3 mm (or one
+    voxel where voxels are larger), so that they have one surface. The gap is filled with organ
+    where the two face each other.
 
-    The gap (up to 3 mm, or one voxel where voxels are larger) is filled with organ, no wider
-    than the two face each other, so that organ and tumor have one surface.
-    Returns the pieces with joined ones numbered as their organ, notes, and the numbers of the
-    pieces that lie farther off.
+    Returns the pieces, joined ones numbered as their organ; notes; numbers of pieces farther off.
     """
     notes: list[str] = []
     apart: list[int] = []
-    beside = np.flatnonzero((pieces.tumor_ml > 0) & (pieces.tumor_ml >= min_tumor_ml)).tolist()
-    beside = [number for number in beside if number not in organs]
+    beside = [n for n in _with_tumor(pieces, min_tumor_ml) if n not in organs]
     if len(beside) > _MOST_TUMORS:
         raise InputError(
             f"{len(beside)} tumors lie beside the organ, more than {_MOST_TUMORS}; raise "
@@ -231,8 +208,13 @@ def _attach_tumors(
     return pieces, notes, apart
 
 
+def _with_tumor(pieces: _Pieces, min_tumor_ml: float) -> list[int]:
+    return np.flatnonzero((pieces.tumor_ml > 0) & (pieces.tumor_ml >= min_tumor_ml)).tolist()
+
+
 def _joined(pieces: _Pieces, organs: list[int], number: int) -> tuple[_Pieces, float, float] | None:
-    """The pieces with one joined to its nearest organ, the gap in mm and what fills it in ml."""
+    """The pieces with one joined to its nearest organ, and the gap's width and volume; None: it is
+    too far off."""
     from scipy.ndimage import distance_transform_edt
 
     affine = pieces.lps_from_index
@@ -240,32 +222,32 @@ def _joined(pieces: _Pieces, organs: list[int], number: int) -> tuple[_Pieces, f
     reach_mm = max(_GAP_MM, float(spacing.max()))
     box = grid.bounding_box(pieces.numbers == number, affine, reach_mm + 2 * float(spacing.max()))
     numbers = pieces.numbers[box]
-    own, organ = numbers == number, np.isin(numbers, organs)
+    tumor, organ = numbers == number, np.isin(numbers, organs)
     if not organ.any():
         return None
     to_organ, nearest = distance_transform_edt(~organ, sampling=spacing, return_indices=True)
-    here = np.unravel_index(np.where(own, to_organ, np.inf).argmin(), own.shape)
-    there = tuple(int(axis[here]) for axis in nearest)
-    steps = np.abs(np.subtract(here, there))
+    tumor_voxel = np.unravel_index(np.where(tumor, to_organ, np.inf).argmin(), tumor.shape)
+    organ_voxel = tuple(int(axis[tumor_voxel]) for axis in nearest)
+    steps = np.abs(np.subtract(tumor_voxel, organ_voxel))
     gap_mm = float(np.linalg.norm(np.maximum(steps - 1, 0) * spacing))  # between voxels' faces
     if gap_mm > reach_mm:
         return None
-    to_own = distance_transform_edt(~own, sampling=spacing)
-    between = to_organ + to_own <= float(to_organ[here]) + float(np.median(spacing))
+    to_tumor = distance_transform_edt(~tumor, sampling=spacing)
+    between = to_organ + to_tumor <= float(to_organ[tumor_voxel]) + float(np.median(spacing))
     bridge = between & (numbers == 0)
     joined, labels = pieces.numbers.copy(), pieces.labels.copy()
-    joined[box][own | bridge] = numbers[there]
+    joined[box][tumor | bridge] = numbers[organ_voxel]
     labels[box][bridge] = pieces.organ
     ml = float(bridge.sum()) * grid.voxel_ml(affine)
     return replace(pieces, labels=labels, numbers=joined), gap_mm, ml
 
 
 def _left_out(
-    pieces: _Pieces, organs: list[_Candidate], apart: list[int], min_tumor_ml: float
+    pieces: _Pieces, organs: list[int], apart: list[int], min_tumor_ml: float
 ) -> list[str]:
-    """Notes on tumors that no organ is near, and on specks; refused where no other tumor is."""
+    """Notes on tumors apart from every organ and on specks; InputError if no other tumor is."""
     notes: list[str] = []
-    rest_ml = np.delete(pieces.whole_ml, [0, *apart, *(k.piece for k in organs)])
+    rest_ml = np.delete(pieces.whole_ml, [0, *apart, *organs])
     if n_specks := int((rest_ml > 0).sum()):
         notes.append(
             f"{n_specks} specks beside the organ dropped ({rest_ml.sum():.2f} ml together)"
@@ -273,7 +255,7 @@ def _left_out(
     if not apart:
         return notes
     text = " and ".join(f"{pieces.tumor_ml[n]:.1f} ml" for n in apart[:5])
-    if not any(k.tumor_ml > 0 and k.tumor_ml >= min_tumor_ml for k in organs):
+    if not set(organs) & set(_with_tumor(pieces, min_tumor_ml)):
         raise InputError(
             f"the only tumor ({text}) lies more than {_GAP_MM:g} mm from the organ. Check the "
             "labels and --organ, or give --tumor 0 to leave it out."
@@ -286,44 +268,49 @@ def _left_out(
 
 
 def _choose(
-    found: list[_Candidate], side: Side, middle_x_mm: float, kind: Organ
-) -> tuple[_Candidate, list[str], Side]:
-    best = max(found, key=lambda one: (one.tumor_ml, one.ml))
-    alone = len(found) == 1
+    pieces: _Pieces, organs: list[int], side: Side, middle_x_mm: float, kind: Organ
+) -> tuple[int, str, Side]:
+    """The number of the organ to keep, a note (perhaps empty), and its side."""
+
+    def tumor_then_size(number: int) -> tuple[float, float]:
+        return pieces.tumor_ml[number], pieces.whole_ml[number]
+
+    best, alone = max(organs, key=tumor_then_size), len(organs) == 1
     if not kind.in_pairs:
-        note = f"of {len(found)} large pieces the one with most tumor, or the largest, was taken"
-        return best, [] if alone else [note], side
-    xs = [one.x_mm for one in found]
+        note = f"of {len(organs)} large pieces the one with most tumor, or the largest, was taken"
+        return best, "" if alone else note, side
+    if side == UNKNOWN and alone:
+        return best, "", UNKNOWN
+    x_mm = {number: pieces.x_mm(number) for number in organs}
+    right_mm, left_mm = min(x_mm.values()), max(x_mm.values())
     if not alone:
-        middle_x_mm = (min(xs) + max(xs)) / 2
+        middle_x_mm = (right_mm + left_mm) / 2
     if side == UNKNOWN:
-        if not alone and best.tumor_ml == 0:
+        if pieces.tumor_ml[best] == 0:
             raise InputError(
-                f"the label map holds {len(found)} {kind.words}s and no tumor. Give --side left or "
-                "--side right (the patient's)."
+                f"the label map holds {len(organs)} {kind.words}s and no tumor. Give --side left "
+                "or --side right (the patient's)."
             )
-        name: Side = "left" if best.x_mm > middle_x_mm else "right"
-        note = f"the patient's {name} {kind.words} was chosen: it bears most tumor"
-        plain = max(xs) - min(xs) > _PAIR_APART_MM
-        return best, [] if alone else [note], name if plain else UNKNOWN
+        side = "left" if x_mm[best] > middle_x_mm else "right"
+        note = f"the patient's {side} {kind.words} was chosen: it bears most tumor"
+        return best, note, side if left_mm - right_mm > _PAIR_APART_MM else UNKNOWN
     sign = 1 if side == "left" else -1
     # With one organ only the image's midline is known: near it, trust the user.
     slack = _MIDLINE_MARGIN_MM if alone else 0.0
-    fitting = [k for k in found if sign * (k.x_mm - middle_x_mm) > -slack]
+    fitting = [n for n in organs if sign * (x_mm[n] - middle_x_mm) > -slack]
     if not fitting:
         raise InputError(
             f"no {kind.words} on the patient's {side} side in this label map; its {kind.words} "
             "lies on the other side. Leave out --side, or check the map's orientation."
         )
-    best = max(fitting, key=lambda one: (one.tumor_ml, one.ml))
     note = f"only one {kind.words} in the map; its side was checked against the image's middle only"
-    return best, [note] if alone else [], side
+    return max(fitting, key=tumor_then_size), note if alone else "", side
 
 
 def _number_tumors(
     labels: np.ndarray, tumors: list[int], voxel_volume_ml: float, min_tumor_ml: float
 ) -> tuple[np.ndarray, list[str]]:
-    """Renumber to 1, 2, 3, ... without gaps; report what went and what changed its number."""
+    """Labels 1, 2, 3, ... without gaps, and notes on what was dropped or renumbered."""
     from scipy import ndimage
 
     notes: list[str] = []

@@ -1,7 +1,7 @@
-"""What lies in or about an organ and moves with it: vessels, collecting system, planned cuts.
+"""Surfaces in or around an organ that move with it: vessels, collecting system, planned cuts.
 
-Surfaces, closed or open, of label numbers or of mesh files. They change neither the organ nor its
-physics; where they reach out of the organ, its motion is extrapolated.
+They come from labels or from mesh files, closed or open, and change neither the organ nor its
+physics. Where they reach out of the organ, its motion is extrapolated.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from tumortrack.imaging.grid import bounding_box
 from tumortrack.imaging.meshes import read_lps
 from tumortrack.imaging.surface import surface_of
 
-TRUSTED_MM = 5.0  # outside the organ; farther out a motion is a guess
-_APART_MM = 50.0  # from the organ: of another frame or unit
-_BAY_MM = 5.0  # half the width of what runs into an organ and still counts as the organ's
+TRUSTED_MM = 5.0  # outside the organ; farther out the motion is a guess
+_APART_MM = 50.0  # from the organ: in another frame or unit
+_BAY_MM = 5.0  # half the width of a structure that runs into the organ and counts as organ there
 _STEP_MM = 1.0
 _MOST_FACES = 200_000
 
@@ -32,50 +32,50 @@ Stated = dict[str, int | Path]
 
 
 def stated_structures(options: tuple[str, ...], organ: str) -> Stated:
-    """By name: a label number, or a mesh's path. Raises InputError: not NAME=NUMBER or NAME=PATH, a
-    name twice, or one that is not allowed."""
-    found: Stated = {}
+    """The label number or the mesh's path by name. Raises InputError: not NAME=NUMBER or NAME=PATH,
+    a name twice, or one that is not allowed."""
+    stated: Stated = {}
     for option in options:
         name, _, value = option.partition("=")
         if not value:
             raise InputError(f"--structure {option!r} is not NAME=NUMBER or NAME=PATH.")
         check_name(name, "a structure", "--structure")
-        if name in found or name == organ:
+        if name in stated or name == organ:
             raise InputError(f"--structure {name}: that name is taken. Give another.")
-        found[name] = int(value) if value.isdecimal() else Path(value)
-    return found
+        stated[name] = int(value) if value.isdecimal() else Path(value)
+    return stated
 
 
 def set_apart(
     volume: LabelVolume, stated: Stated, organ: int
 ) -> tuple[LabelVolume, dict[str, Mesh]]:
-    """The labels without the structures', and these as surfaces, LPS mm. What of a structure lies
-    in the organ, or runs into it in a bay up to 10 mm wide, becomes organ. Raises InputError: no
-    such label, or the organ's own."""
+    """The labels without the structures', and those as surfaces, LPS mm. Where a structure lies in
+    the organ, or in a bay up to 10 mm wide, its voxels become organ. Raises InputError: no such
+    label, or the organ's own."""
     labels, affine, meshes = volume.labels.copy(), volume.lps_from_index, {}
-    apart = np.zeros(labels.shape, bool)
+    removed = np.zeros(labels.shape, bool)
     for name, number in stated.items():
         if isinstance(number, Path):
             continue
-        mine = volume.labels == number
-        if number == organ or not mine.any():
+        mask = volume.labels == number
+        if number == organ or not mask.any():
             present = np.unique(volume.labels).tolist()
             raise InputError(f"--structure {name}={number}: the map's labels are {present}.")
-        meshes[name] = surface_of(name, mine, affine, _STEP_MM, keep=lambda mesh: mesh)
-        apart |= mine
+        meshes[name] = surface_of(name, mask, affine, _STEP_MM, keep=lambda mesh: mesh)
+        removed |= mask
     if meshes:
-        labels[apart] = 0
+        labels[removed] = 0
         spacing, box = spacing_mm(affine), bounding_box(labels == organ, affine, 3 * _BAY_MM)
         outside = labels[box] != organ
         grown = distance_transform_edt(outside, sampling=spacing) <= _BAY_MM
         closed = distance_transform_edt(grown, sampling=spacing) > _BAY_MM
-        labels[box][closed & apart[box]] = organ
+        labels[box][closed & removed[box]] = organ
     return LabelVolume(labels, affine), meshes
 
 
 def read_structures(stated: Stated, unit: str | None) -> tuple[dict[str, Mesh], list[str]]:
-    """Those in mesh files, LPS mm, as they are, and notes. Raises InputError: no mesh, or one of
-    too many triangles."""
+    """The structures in mesh files, LPS mm, and notes. Raises InputError: not a mesh, or too many
+    triangles."""
     meshes, notes = {}, list[str]()
     for name, path in stated.items():
         if isinstance(path, Path):
@@ -88,15 +88,15 @@ def read_structures(stated: Stated, unit: str | None) -> tuple[dict[str, Mesh], 
 def described(
     meshes: Mapping[str, Mesh], anatomy: Anatomy, labels: LabelVolume
 ) -> tuple[dict[str, Any], list[str]]:
-    """How far each reaches out of the organ (JSON types), and notes on those that are extrapolated.
-    Raises InputError: one that lies apart from the organ."""
+    """How far each reaches out of the organ (JSON types), and notes on extrapolated ones. Raises
+    InputError: one lies apart from the organ."""
     report, notes, tree = {}, [], cKDTree(anatomy.organ.spread_mm())
     index_from_lps = np.linalg.inv(labels.lps_from_index)
     for name, mesh in meshes.items():
         index = np.rint(transform_points(index_from_lps, mesh.vertices_mm)).astype(int)
-        there = ((index >= 0) & (index < labels.labels.shape)).all(1)
-        there[there] = labels.labels[tuple(index[there].T)] > 0
-        out_mm = np.where(there, 0.0, tree.query(mesh.vertices_mm)[0])
+        inside = ((index >= 0) & (index < labels.labels.shape)).all(1)
+        inside[inside] = labels.labels[tuple(index[inside].T)] > 0
+        out_mm = np.where(inside, 0.0, tree.query(mesh.vertices_mm)[0])
         if out_mm.min() > _APART_MM:
             raise InputError(
                 f"the structure {name} lies {out_mm.min():.0f} mm from the organ. Check that it "

@@ -1,8 +1,5 @@
-"""Smooth closed surfaces from labels.
-
-A blurred indicator of each part is resampled to a finer or coarser grid and marched (Lewiner et
-al. 2003, scikit-image); the level is then chosen so that the mesh holds the labels' volume.
-"""
+"""Smooth closed surfaces from labels: marching cubes (Lewiner et al. 2003, scikit-image) on a
+blurred, resampled mask of each part, at the level where the mesh has the labels' volume."""
 
 from __future__ import annotations
 
@@ -17,9 +14,9 @@ from tumortrack.core.organ import KIDNEY, Organ
 from tumortrack.core.types import FIRST_TUMOR, Anatomy, LabelVolume, Mesh, part_names
 from tumortrack.imaging.grid import extent_mm, tight_box, voxel_ml
 
-_TRIANGLES = 28_000  # aimed at for the organ
-_LARGE_MM3 = 8e5  # of an organ that needs no steps as fine as 1.5 mm
-_BLUR_VOXELS = 0.9  # enough to melt steps of one voxel, too little to lose a small tumor
+_TRIANGLES = 28_000  # of the organ, about
+_LARGE_MM3 = 8e5  # of an organ that needs no grid as fine as 1.5 mm
+_BLUR_VOXELS = 0.9  # enough to remove steps of one voxel, too little to lose a small tumor
 _STEPS_ACROSS = 14  # cells across the thinnest extent of a small part
 _MOST_MARCHES = 16  # 2 to 4 suffice where the volume is a smooth function of the level
 _REPORTED = (
@@ -31,21 +28,17 @@ _REPORTED = (
 def surfaces(
     label_volume: LabelVolume, kind: Organ = KIDNEY
 ) -> tuple[Anatomy, dict[str, list[Any]]]:
-    """The organ's surface (all labels from 1 up) and one per tumor, LPS mm, faces outward. Raises
-    InputError: no organ, a gap in the tumor numbers, or a part too small for a surface.
-
-    Returns:
-        The anatomy, and lists of a number per part, organ first: ``names``, ``labels_ml``,
-        ``mesh_ml``, ``change_percent``, and how far mesh vertices lie from the labels' boundary:
-        ``distance_mean_voxels``, ``distance_95_voxels``, ``distance_max_voxels``.
-    """
+    """The organ's surface (all labels from 1 up) and one per tumor, LPS mm, faces outward; and a
+    report: lists with an entry per part, ``names``, ``labels_ml``, ``mesh_ml``, ``change_percent``,
+    and the vertices' distances to the labels' boundary, ``distance_mean_voxels``, ... Raises
+    InputError: no organ, a gap in the tumor numbers, or a part too small for a surface."""
     labels, affine = label_volume.labels, label_volume.lps_from_index
     top = int(labels.max())
     if top == 0:
         raise InputError("the labels are empty: no organ to take a surface of.")
     masks = [labels > 0, *(labels == n for n in range(FIRST_TUMOR, top + 1))]
     names = part_names(len(masks), kind.name)
-    # The grid step that gives about the wanted number of triangles (about 2.2 per cell face)
+    # The grid step for about that number of triangles, 2.2 per cell face
     volume_mm3 = 1000 * float(masks[0].sum()) * voxel_ml(affine)
     area_mm2 = 1.35 * 4.836 * volume_mm3 ** (2 / 3)  # a kidney has 1.35 times a sphere's area
     coarsest = 1.5 * max(1.0, volume_mm3 / _LARGE_MM3)
@@ -61,10 +54,7 @@ def surfaces(
         rows.append((ml, mesh_ml, 100 * (mesh_ml / ml - 1), distance.mean(), p95, distance.max()))
         parts.append(mesh)
     columns = [[round(float(x), 4) for x in column] for column in zip(*rows, strict=True)]
-    report: dict[str, list[Any]] = {
-        "names": list(names),
-        **dict(zip(_REPORTED, columns, strict=True)),
-    }
+    report = {"names": list(names), **dict(zip(_REPORTED, columns, strict=True))}
     return Anatomy(tuple(parts), kind), report
 
 
@@ -75,9 +65,8 @@ def surface_of(
     step_mm: float,
     keep: Callable[[Mesh], Mesh] | None = None,
 ) -> Mesh:
-    """The closed surface of a mask, LPS mm, faces outward, with the mask's volume. ``keep``: what
-    of its pieces; None: the largest. Raises InputError: it is too small or thin for a surface."""
-    keep = keep or largest_shell
+    """The closed surface of a mask, LPS mm, faces outward, with the mask's volume. ``keep`` selects
+    pieces; None: the largest. Raises InputError: the mask is too small or thin for a surface."""
     from scipy import ndimage
 
     spacing = spacing_mm(affine)
@@ -94,7 +83,7 @@ def surface_of(
     cell_mm3 = abs(float(np.linalg.det(affine[:3, :3] * scale)))
     wanted_mm3 = 1000 * float(mask.sum()) * voxel_ml(affine)
 
-    # The level where that many cells lie above is close; the rest is a search on the volume.
+    # A first guess: the level that as many cells exceed as make the volume.
     level = float(-np.partition(-field.ravel(), n := int(wanted_mm3 / cell_mm3))[n])
 
     def march(level: float) -> tuple[Mesh, float]:
@@ -105,7 +94,7 @@ def surface_of(
         vertices, faces, _, _ = measure.marching_cubes(field, level, gradient_direction="ascent")
         vertices_mm = transform_points(affine, vertices.astype(np.float64) * scale + offset)
         mesh = Mesh(vertices_mm, faces[:, ::-1] if np.linalg.det(affine[:3, :3]) < 0 else faces)
-        mesh = keep(mesh)
+        mesh = (keep or largest_shell)(mesh)
         mesh = mesh if mesh.volume_mm3 > 0 else Mesh(mesh.vertices_mm, mesh.faces[:, ::-1])
         return mesh, mesh.volume_mm3 / wanted_mm3 - 1
 
@@ -115,9 +104,9 @@ def surface_of(
 def _keep_volume(
     march: Callable[[float], tuple[Mesh, float]], level: float, highest: float
 ) -> Mesh:
-    """The mesh whose volume errs least: secant steps on the level, bisection where they fail.
+    """The mesh with the smallest error of volume: secant steps on the level, else bisection.
 
-    Volume falls with the level, but may jump where a piece comes off; then no level is right.
+    The volume falls with the level, but may jump where a piece comes off; then no level is exact.
     """
     too_large, too_small = 0.0, highest
     tried: list[tuple[float, float]] = []
@@ -142,11 +131,9 @@ def _keep_volume(
 
 
 def _boundary_distance(mesh: Mesh, mask: np.ndarray, affine: np.ndarray) -> np.ndarray:
-    """Distance of each vertex to the nearest face between mask and background, in voxels.
-
-    A voxel here is the largest edge of one, in mm. Faces are stood for by points on a 5 x 5
-    raster, so the distance is at most a tenth of a voxel too long.
-    """
+    """Distance of each vertex (4,000 of them at most) to the nearest face between mask and
+    background, in units of a voxel's longest edge. Faces are sampled at 5 x 5 points, so that it is
+    at most a tenth of a voxel too long."""
     from scipy.spatial import cKDTree
 
     box = tight_box(mask)
@@ -158,7 +145,7 @@ def _boundary_distance(mesh: Mesh, mask: np.ndarray, affine: np.ndarray) -> np.n
         low += [s.start for s in box]
         shift = np.insert(raster, axis, 0.5, axis=1)
         points.append((low[:, None] + shift).reshape(-1, 3))
-    # Loose, since points are many and questions few.
+    # A tree that is quick to build: points are many and queries few.
     places = transform_points(affine, np.concatenate(points))
     tree = cKDTree(places, balanced_tree=False, compact_nodes=False)
     vertices = mesh.vertices_mm[:: max(1, len(mesh.vertices_mm) // 4000)]
@@ -166,8 +153,7 @@ def _boundary_distance(mesh: Mesh, mask: np.ndarray, affine: np.ndarray) -> np.n
 
 
 def largest_shell(mesh: Mesh) -> Mesh:
-    """The piece that encloses most (by the size of its signed volume); shells inside it and
-    specks are dropped."""
+    """The connected piece with the largest absolute volume, without shells inside it and specks."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
@@ -178,6 +164,6 @@ def largest_shell(mesh: Mesh) -> Mesh:
     graph = coo_array((np.ones(2 * len(i), np.int8), (np.r_[i, j], np.r_[j, k])), shape=(n, n))
     piece = connected_components(graph, directed=False)[1][i]
     a, b, c = (mesh.vertices_mm[corner] - mesh.vertices_mm[0] for corner in (i, j, k))
-    volumes = np.bincount(piece, np.einsum("ij,ij->i", a, np.cross(b, c)))
+    volumes = np.bincount(piece, np.einsum("ij,ij->i", a, np.cross(b, c)))  # times 6, signed
     used, compact = np.unique(mesh.faces[piece == np.abs(volumes).argmax()], return_inverse=True)
     return Mesh(mesh.vertices_mm[used], compact.reshape(-1, 3))

@@ -1,4 +1,4 @@
-"""Does an organ look the same after half a turn, or any? Then a view may not tell them apart."""
+"""Whether an organ looks the same after half a turn, so that a view cannot tell the two apart."""
 
 from __future__ import annotations
 
@@ -12,23 +12,23 @@ from scipy.spatial.transform import Rotation
 from tumortrack.core.geometry import Points, rigid, transform_points, triangles_of
 from tumortrack.core.types import Anatomy
 
-# Mean distance below which a view may not tell. Of organs between an ellipsoid and a phantom, 40
-# clouds each, the half-turned organ was nearly as likely (a hundredth at least) for 95 % at 0.15
-# mm, 60 % at 0.7, 25 % at 0.9, 10 % at 1.2 mm. 74 real kidneys, as segmented, have 1.9 to 6 mm, the
-# built-in phantom 2.1.
+# Mean distance below which a view may not tell them apart. With shapes between an ellipsoid and the
+# phantom, 40 clouds each, the half-turned organ had at least a hundredth of the likelihood for 95 %
+# of the clouds at 0.15 mm, 60 % at 0.7, 25 % at 0.9, 10 % at 1.2 mm. 74 segmented real kidneys have
+# 1.9 to 6 mm, the built-in phantom 2.1.
 ALIKE_MM = 1.5
-_SPACING_MM = 2.0  # of the surface's points, about
-_MOVED = 3000  # points that are laid on it; other ones change the mean by 0.03 mm
+_SPACING_MM = 2.0  # of points on the surface, about
+_MOVED = 3000  # points that are fitted; another sample changes the mean by 0.03 mm
 _STILL_RAD = 0.5
-_STEPS, _ENOUGH_MM = 30, 0.01  # at most; one that moves less is the last
+_STEPS, _ENOUGH_MM = 30, 0.01  # iterations at most; a smaller motion ends them
 
 
 @dataclass(frozen=True, eq=False)
 class HalfTurn:
-    """The organ, turned by 180 degrees about a principal axis, then laid on itself by
-    ``ct_from_ct`` (LPS, mm). ``mean_mm``, ``p90_mm``: distances of the turned surface to the
-    organ's, mean and what nine tenths do not exceed. ``tumors_mm``: how far the middles move.
-    ``any_turn``: a quarter about this axis is as good, so that any angle is: a body of revolution.
+    """The organ turned by 180 degrees about a principal axis and fitted to itself: ``ct_from_ct``
+    (LPS, mm). ``mean_mm``, ``p90_mm``: mean and 90th percentile of the distances between the
+    surfaces. ``tumors_mm``: how far the tumors' centres move. ``any_turn``: a quarter turn fits as
+    well, and so any angle does: a body of revolution.
     """
 
     ct_from_ct: Float64[np.ndarray, "4 4"]
@@ -39,64 +39,66 @@ class HalfTurn:
 
 
 def half_turns(anatomy: Anatomy) -> list[HalfTurn]:
-    """About each principal axis of the organ's surface, the best match first; a second at most."""
+    """One about each principal axis of the organ's surface, the best match first; takes a second at
+    most."""
     points, normals = triangles_of(anatomy.organ.vertices_mm, anatomy.organ.faces)
     area = np.linalg.norm(normals, axis=1) / 2
     count = max(_MOVED, round(area.sum() / _SPACING_MM**2))
     drawn = np.random.default_rng(0).choice(len(points), count, p=area / area.sum())
     normals = normals[drawn] / (2 * area[drawn])[:, None]
     points, tree = points[drawn], cKDTree(points[drawn])
-    middle, found = points.mean(0), list[HalfTurn]()
+    center, turns = points.mean(0), list[HalfTurn]()
     tumors = np.array([tumor.box_mm.mean(0) for tumor in anatomy.tumors]).reshape(-1, 3)
-    for axis in np.linalg.svd(points - middle, full_matrices=False)[2]:
-        way, away_mm = _symmetric_pose(points, normals, tree, np.pi * axis)
-        moved_mm = np.linalg.norm(transform_points(way, tumors) - tumors, axis=1).tolist()
-        mean_mm, p90_mm = float(away_mm.mean()), float(np.quantile(away_mm, 0.9))
-        quarter = False
+    for axis in np.linalg.svd(points - center, full_matrices=False)[2]:
+        pose, distances_mm = _symmetric_pose(points, normals, tree, np.pi * axis)
+        moved_mm = np.linalg.norm(transform_points(pose, tumors) - tumors, axis=1).tolist()
+        mean_mm, p90_mm = float(distances_mm.mean()), float(np.quantile(distances_mm, 0.9))
+        any_turn = False
         if mean_mm < ALIKE_MM:
-            turned, left_mm = _symmetric_pose(points, normals, tree, np.pi / 2 * axis)
-            # A quarter turn that was undone by laying it on the surface tells nothing.
-            angle = Rotation.from_matrix(turned[:3, :3]).magnitude()
-            quarter = abs(angle - np.pi / 2) < _STILL_RAD and left_mm.mean() < ALIKE_MM
+            quarter, distances_mm = _symmetric_pose(points, normals, tree, np.pi / 2 * axis)
+            # If the fit turned it back, that it matches says nothing.
+            angle = Rotation.from_matrix(quarter[:3, :3]).magnitude()
+            kept = abs(angle - np.pi / 2) < _STILL_RAD
+            any_turn = bool(kept and distances_mm.mean() < ALIKE_MM)
         tumors_mm = dict(zip(anatomy.names[1:], moved_mm, strict=True))
-        found.append(HalfTurn(way, mean_mm, p90_mm, tumors_mm, bool(quarter)))
-    return sorted(found, key=lambda one: one.mean_mm)
+        turns.append(HalfTurn(pose, mean_mm, p90_mm, tumors_mm, any_turn))
+    return sorted(turns, key=lambda turn: turn.mean_mm)
 
 
 def _symmetric_pose(
     points: Points, normals: Points, tree: cKDTree, turn_rad: Float64[np.ndarray, " 3"]
 ) -> tuple[Float64[np.ndarray, "4 4"], Float64[np.ndarray, " m"]]:
-    """Some of a surface's points, turned about their middle by a rotation vector, then fitted to
-    the surface: the motion, and how far off (mm) they are left."""
-    middle = points.mean(0)
-    turn = Rotation.from_rotvec(turn_rad).as_matrix()
-    way = rigid(turn, middle - turn @ middle)
-    there = transform_points(way, points[:_MOVED])
-    for _ in range(_STEPS):  # iterated closest points, to the planes at the nearest ones
-        away, near = tree.query(there)
-        off = ((points[near] - there) * normals[near]).sum(1)
-        rows = np.hstack([np.cross(there - middle, normals[near]), normals[near]])
-        step = np.linalg.lstsq(rows, off, rcond=1e-3)[0]  # turns that stay free are left out
-        turn = Rotation.from_rotvec(step[:3]).as_matrix()
-        way = rigid(turn, middle - turn @ middle + step[3:]) @ way
-        before, there = there, transform_points(way, points[:_MOVED])
-        if np.abs(there - before).max() < _ENOUGH_MM:
+    """Points of a surface, turned about their mean by a rotation vector and then fitted to the
+    surface by point-to-plane ICP: the motion, and the distances (mm) that remain."""
+    center = points.mean(0)
+    rotation = Rotation.from_rotvec(turn_rad).as_matrix()
+    pose = rigid(rotation, center - rotation @ center)
+    moved = transform_points(pose, points[:_MOVED])
+    for _ in range(_STEPS):
+        distance, nearest = tree.query(moved)
+        to_plane = ((points[nearest] - moved) * normals[nearest]).sum(1)
+        rows = np.hstack([np.cross(moved - center, normals[nearest]), normals[nearest]])
+        step = np.linalg.lstsq(rows, to_plane, rcond=1e-3)[0]  # without undetermined turns
+        rotation = Rotation.from_rotvec(step[:3]).as_matrix()
+        pose = rigid(rotation, center - rotation @ center + step[3:]) @ pose
+        before, moved = moved, transform_points(pose, points[:_MOVED])
+        if np.abs(moved - before).max() < _ENOUGH_MM:
             break
-    return way, np.where(away < 2 * _SPACING_MM, np.abs(off), away)
+    return pose, np.where(distance < 2 * _SPACING_MM, np.abs(to_plane), distance)
 
 
 def alike(turns: list[HalfTurn]) -> list[HalfTurn]:
-    """Those after which a view may not tell that the organ was turned."""
-    return [one for one in turns if one.mean_mm < ALIKE_MM]
+    """Those that a view may not tell from the organ as it is."""
+    return [turn for turn in turns if turn.mean_mm < ALIKE_MM]
 
 
 def warning(turns: list[HalfTurn]) -> str:
-    """What ``alike`` found, for people; empty: nothing."""
+    """A sentence on the turns that ``alike`` returned; empty: none."""
     if not turns:
         return ""
-    worst = max(turns, key=lambda one: max(one.tumors_mm.values(), default=0.0))
+    worst = max(turns, key=lambda turn: max(turn.tumors_mm.values(), default=0.0))
     tumors = " and ".join(f"{name} {mm:.0f} mm" for name, mm in worst.tumors_mm.items())
-    turn = "any turn about an axis" if any(one.any_turn for one in turns) else "half a turn"
+    turn = "any turn about an axis" if any(turn.any_turn for turn in turns) else "half a turn"
     return (
         f"the organ looks much the same after {turn} (surfaces {worst.mean_mm:.1f} mm apart "
         f"in the mean, {worst.p90_mm:.1f} mm at 90 %), which would put {tumors or 'inner points'} "

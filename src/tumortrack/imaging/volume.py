@@ -1,14 +1,12 @@
 """Volumes from files: a DICOM folder, NIfTI or NRRD -> Volume or LabelVolume, LPS mm.
 
-NRRD is read here, so that nothing is trusted before it is checked; its format:
-https://teem.sourceforge.net/nrrd/format.html.
+NRRD is read here (https://teem.sourceforge.net/nrrd/format.html), so that its header is checked
+before it is trusted.
 """
 
 from __future__ import annotations
 
-import math
 import re
-import zlib
 from pathlib import Path
 
 import numpy as np
@@ -22,22 +20,20 @@ from tumortrack.imaging.nifti import read_nifti
 _DETACHED = (".nhdr", ".mhd", ".hdr", ".img")
 _MOST_LABELS = 32  # distinct values that still look like a label map
 _MAX_HEADER = 2**20
-_MOST_BEHIND = 16 * 2**20  # bytes after the voxels
 _IS_GZIP = {"raw": False, "gzip": True, "gz": True}
-_TYPES = {
-    **dict.fromkeys(("signed char", "int8", "int8_t"), "i1"),
-    **dict.fromkeys(("uchar", "unsigned char", "uint8", "uint8_t"), "u1"),
-    **dict.fromkeys(
-        ("short", "short int", "signed short", "signed short int", "int16", "int16_t"), "i2"
-    ),
-    **dict.fromkeys(("ushort", "unsigned short", "unsigned short int", "uint16", "uint16_t"), "u2"),
-    **dict.fromkeys(("int", "signed int", "int32", "int32_t"), "i4"),
-    **dict.fromkeys(("uint", "unsigned int", "uint32", "uint32_t"), "u4"),
-    **dict.fromkeys(("longlong", "long long", "int64", "int64_t"), "i8"),
-    **dict.fromkeys(("ulonglong", "unsigned long long", "uint64", "uint64_t"), "u8"),
-    "float": "f4",
-    "double": "f8",
+_NAMES = {  # of number types in NRRD headers
+    "i1": "signed char, int8, int8_t",
+    "u1": "uchar, unsigned char, uint8, uint8_t",
+    "i2": "short, short int, signed short, signed short int, int16, int16_t",
+    "u2": "ushort, unsigned short, unsigned short int, uint16, uint16_t",
+    "i4": "int, signed int, int32, int32_t",
+    "u4": "uint, unsigned int, uint32, uint32_t",
+    "i8": "longlong, long long, int64, int64_t",
+    "u8": "ulonglong, unsigned long long, uint64, uint64_t",
+    "f4": "float",
+    "f8": "double",
 }
+_TYPES = {name: dtype for dtype, names in _NAMES.items() for name in names.split(", ")}
 _LPS_FROM_SPACE = {
     **dict.fromkeys(("lps", "left-posterior-superior"), (1.0, 1.0, 1.0)),
     **dict.fromkeys(("ras", "right-anterior-superior"), (-1.0, -1.0, 1.0)),
@@ -46,8 +42,9 @@ _LPS_FROM_SPACE = {
 
 
 def read_raw(path: Path, series: str | None = None) -> grid.RawVolume:
-    """Read the voxels of any supported volume in their stored type. Raises InputError: missing,
-    unknown type, detached, damaged, not a plausible patient volume."""
+    """Read any supported volume in its stored number type; of several DICOM series, ``series`` is
+    the wanted one's UID or number. Raises InputError: missing, unknown type, detached, damaged, not
+    a plausible patient volume."""
     name = path.name.lower()
     if path.is_dir():
         return read_dicom(path, series)
@@ -71,8 +68,7 @@ def read_raw(path: Path, series: str | None = None) -> grid.RawVolume:
 
 
 def read_volume(path: Path, series: str | None = None) -> Volume:
-    """Read a CT volume (HU); of several DICOM series, ``series`` is the wanted one's UID or number.
-    Errors as ``read_raw`` and ``volume_of``."""
+    """Read a CT volume (HU); errors as ``read_raw`` and ``volume_of``."""
     return volume_of(read_raw(path, series), path)
 
 
@@ -82,7 +78,7 @@ def read_labels(path: Path) -> LabelVolume:
 
 
 def volume_of(raw: grid.RawVolume, path: Path) -> Volume:
-    """Raw voxels as a CT; ``path`` names them in the InputError where they are not plausibly HU."""
+    """Raw voxels as a CT. Raises InputError, which names ``path``: not plausibly HU."""
     hu = raw.array.astype(np.float32, copy=False)
     low, high = float(hu.min()), float(hu.max())
     if not (np.isfinite(low) and np.isfinite(high)):
@@ -95,32 +91,26 @@ def volume_of(raw: grid.RawVolume, path: Path) -> Volume:
 
 
 def labels_of(raw: grid.RawVolume, path: Path) -> LabelVolume:
-    """Raw voxels as labels: whole numbers 0..255, in any number type, or else an InputError."""
+    """Raw voxels as labels. Raises InputError: not whole numbers in 0..255, of any type."""
     low, high = float(raw.array.min()), float(raw.array.max())
     if not (low >= 0 and high <= 255):
         raise InputError(
             f"{path} is no label map: values from {low:g} to {high:g}; whole numbers from 0 to "
             "255 are allowed."
         )
-    labels = _whole_numbers(raw.array)
-    if labels is None:
+    labels = raw.array.astype(np.uint8)
+    if raw.array.dtype.kind == "f" and not np.array_equal(labels, raw.array):
         raise InputError(f"{path} is no label map: it has fractions. Whole numbers are needed.")
     return LabelVolume(labels, raw.lps_from_index)
 
 
 def is_label_map(raw: grid.RawVolume) -> bool:
-    """True for whole numbers within 0..255 of which at most 32 occur: no CT looks like that."""
+    """Whether there are only whole numbers in 0..255, at most 32 different ones: no CT is so."""
     if not (raw.array.min() >= 0 and raw.array.max() <= 255):
         return False
-    labels = _whole_numbers(raw.array)
-    return labels is not None and int(np.count_nonzero(grid.label_counts(labels))) <= _MOST_LABELS
-
-
-def _whole_numbers(array: np.ndarray) -> np.ndarray | None:
-    """Numbers in 0..255 as uint8; None where one has a fraction."""
-    labels = array.astype(np.uint8)
-    whole = array.dtype.kind != "f" or np.array_equal(labels, array)
-    return labels if whole else None
+    labels = raw.array.astype(np.uint8)
+    different = np.count_nonzero(grid.label_counts(labels))
+    return bool(different <= _MOST_LABELS and np.array_equal(labels, raw.array))
 
 
 def _read_nrrd(path: Path) -> grid.RawVolume:
@@ -145,9 +135,10 @@ def _read_nrrd(path: Path) -> grid.RawVolume:
         if fields.get("endian", "").lower() not in ("little", "big"):
             raise InputError(f"{path}: the NRRD header states no byte order. Export it again.")
         dtype = dtype.newbyteorder("<" if fields["endian"].lower() == "little" else ">")
-    data = _voxels(path, start, _IS_GZIP[encoding], math.prod(shape) * dtype.itemsize)
-    array = np.frombuffer(data, dtype).reshape(shape, order="F")
-    return grid.RawVolume(array.astype(dtype.newbyteorder("="), copy=False), lps_from_index)
+    compressed = _IS_GZIP[encoding]
+    with grid.volume_stream(path, compressed, start) as stream:
+        array = grid.read_voxels(path, stream, shape, dtype, compressed)
+    return grid.RawVolume(array, lps_from_index)
 
 
 def _header(path: Path) -> tuple[dict[str, str], int]:
@@ -195,24 +186,3 @@ def _vector(text: str) -> list[float]:
     if len(numbers) != 3:
         raise ValueError(f"{text!r} is no 3-vector")
     return numbers
-
-
-def _voxels(path: Path, start: int, compressed: bool, n_bytes: int) -> bytes:
-    """At most ``n_bytes`` of voxels: a compressed file cannot unpack to more."""
-    with path.open("rb") as stream:
-        stream.seek(start)
-        stored = stream.read()
-    data, whole = stored[:n_bytes], True  # whole: with its checksum, which stands at the end
-    if compressed:
-        packed = zlib.decompressobj(wbits=31)
-        try:
-            data = packed.decompress(stored, n_bytes)
-            packed.decompress(packed.unconsumed_tail, _MOST_BEHIND)
-        except zlib.error as error:
-            raise InputError(f"{path}: its compressed voxels are damaged: {error}.") from error
-        whole = packed.eof
-    if len(data) < n_bytes:
-        raise InputError(f"{path} is truncated: {len(data)} of {n_bytes} bytes of voxels.")
-    if not whole:
-        raise InputError(f"{path}: its compressed voxels do not end where they should: damaged.")
-    return data

@@ -1,4 +1,4 @@
-"""A CT as scanners store it: a DICOM series."""
+"""A CT written as a DICOM series."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from tumortrack.core.types import Volume
 if TYPE_CHECKING:
     from pydicom.dataset import Dataset
 
-_INTERCEPT = -1024  # stored values are unsigned, as scanners write them
+_INTERCEPT = -1024  # stored values are unsigned, as from scanners
 _HIGHEST_HU = 65535 + _INTERCEPT
 _DATE, _TIME = "20250101", "120000"  # fixed, so that the same volume gives the same files
 
@@ -30,12 +30,12 @@ def write_dicom_series(
     description: str = "Hydrogel kidney phantom",
     side: Side = UNKNOWN,
 ) -> None:
-    """Write a CT Image Storage series, one uncompressed file a slice (the third array axis).
+    """Write a CT Image Storage series, one uncompressed file per slice (third array axis).
 
-    UIDs follow from the volume and the seed. File names are in random order, so that a reader must
-    sort by ImagePositionPatient. Exposure as in the paper (90 kV, 13.6 mA). ``side``: of the kidney
-    (Laterality). Raises InputError: ``folder`` exists; HU not finite or outside -1024..64511;
-    sheared voxels; StorageError: the disk refused; no part of the folder is left behind."""
+    UIDs are derived from the volume and the seed. File names are in random order, so that readers
+    must sort by ImagePositionPatient. Exposure as in the paper (90 kV, 13.6 mA). ``side`` is
+    written as Laterality. Raises InputError: ``folder`` exists; HU not finite or outside
+    -1024..64511; sheared voxels; StorageError: the disk refused, and nothing is left behind."""
     load_pydicom()
     from pydicom import dcmwrite
 

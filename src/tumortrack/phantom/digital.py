@@ -1,10 +1,10 @@
-"""The built-in kidney phantom as geometry: parameters -> labels.
+"""The geometry of the built-in kidney phantom: parameters -> labels.
 
 The organ is an implicit surface in the organ frame: axes as in LPS, origin at the centre of the
-organ's box, mm. A right kidney: long axis superior-inferior, hilum medial (+x, patient left) and
-a little anterior. Its poles differ in size and its lumps are irregular, so that no rotation or
-mirror image of it can pass for the phantom itself. Sizes follow the hydrogel phantom of the paper
-(one endophytic, one exophytic tumor); the shape is our own.
+organ's box, mm. It is a right kidney: long axis superior-inferior, hilum medial (+x, patient left)
+and slightly anterior. Its poles differ and its lumps are irregular, so that no rotation or mirror
+image of it looks the same. Sizes follow the paper's hydrogel phantom (one endophytic, one exophytic
+tumor); the shape is our own.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ SMALLEST_GAP_MM = 3.0  # between tumors: closer ones merge in a CT's partial-vol
 
 
 class TumorParameters(Config, frozen=True):
-    """A lobulated ball. Opposite surface points lie ``diameter_mm`` apart in every direction."""
+    """A lobulated ball, in every direction ``diameter_mm`` across."""
 
     diameter_mm: float
     center_mm: tuple[float, float, float]
     """Organ frame (medial is +x for a right kidney; a left one is mirrored with its tumors)."""
     lobulation: float = 0.08
-    """Largest deviation from a ball, as a share of the radius."""
+    """Largest deviation from a ball relative to the radius."""
 
     def __post_init__(self) -> None:
         self.check_between("tumor:", diameter_mm=(2, 120), lobulation=(0, 0.2))
@@ -43,7 +43,7 @@ class TumorParameters(Config, frozen=True):
 
 
 class PhantomParameters(Config, frozen=True):
-    """Everything the phantom's shape depends on; the defaults are the paper's phantom."""
+    """The shape; by default the paper's phantom."""
 
     size_mm: tuple[float, float, float] = (60.0, 50.0, 110.0)
     """The organ's box without tumors: left-right, anterior-posterior, superior-inferior."""
@@ -52,7 +52,7 @@ class PhantomParameters(Config, frozen=True):
     taper: float = 0.10
     """How much thicker the superior pole is, and thinner the inferior one."""
     hilum_depth_mm: float = 18.0
-    """Of the carving tool; its rounded rim leaves a dent some 4 mm shallower."""
+    """Of the slot that is carved; with its rounded rim the dent is some 4 mm shallower."""
     lump_mm: float = 1.2
     shape_seed: int = 1
     """Places the lumps of the organ and the lobes of the tumors."""
@@ -66,20 +66,18 @@ class PhantomParameters(Config, frozen=True):
     def __post_init__(self) -> None:
         self.check_between("phantom:", size_mm=(20, 250), bend_mm=(0, 25), taper=(0, 0.3))
         self.check_between("phantom:", hilum_depth_mm=(0, 25), lump_mm=(0, 2))
-        for one, other in itertools.combinations(self.tumors, 2):
-            if gap_mm(one, other) < SMALLEST_GAP_MM:
+        for a, b in itertools.combinations(self.tumors, 2):
+            if gap_mm(a, b) < SMALLEST_GAP_MM:
                 raise InputError(
-                    f"the tumors of {one.diameter_mm} and {other.diameter_mm} mm may come within "
-                    f"{gap_mm(one, other):.1f} mm of one another; place them "
-                    f"{SMALLEST_GAP_MM} mm or more apart."
+                    f"the tumors of {a.diameter_mm} and {b.diameter_mm} mm may come within "
+                    f"{gap_mm(a, b):.1f} mm of one another; place them {SMALLEST_GAP_MM} mm or "
+                    "more apart."
                 )
 
 
 def phantom_labels(parameters: PhantomParameters, voxel_mm: float = 0.8) -> LabelVolume:
-    """The phantom on an isotropic voxel grid along the LPS axes.
-
-    Labels: 0 outside, 1 organ, 2 the tumor of largest diameter, 3 the next, ...; a tumor wins over
-    the organ. Raises InputError: ``voxel_mm`` outside 0.2..4, more than 50 million voxels, or a
+    """The phantom on an isotropic grid along the LPS axes; tumors are labelled by diameter, the
+    largest first. Raises InputError: ``voxel_mm`` outside 0.2..4, more than 50 million voxels, or a
     tumor wholly outside the organ."""
     if not 0.2 <= voxel_mm <= 4:
         raise InputError(f"voxel size {voxel_mm} mm: allowed are 0.2 to 4 mm.")
@@ -116,41 +114,41 @@ def phantom_labels(parameters: PhantomParameters, voxel_mm: float = 0.8) -> Labe
     return LabelVolume(labels, lps_from_index)
 
 
-def gap_mm(one: TumorParameters, other: TumorParameters) -> float:
+def gap_mm(a: TumorParameters, b: TumorParameters) -> float:
     """A lower bound of the distance between two tumors' surfaces."""
-    radii_mm = [tumor.diameter_mm / 2 * (1 + tumor.lobulation) for tumor in (one, other)]
-    return float(np.linalg.norm(np.subtract(one.center_mm, other.center_mm)) - sum(radii_mm))
+    radii_mm = [tumor.diameter_mm / 2 * (1 + tumor.lobulation) for tumor in (a, b)]
+    return float(np.linalg.norm(np.subtract(a.center_mm, b.center_mm)) - sum(radii_mm))
 
 
 def organ_field(parameters: PhantomParameters, axes_mm: Axes) -> Float[np.ndarray, "i j k"]:
-    """About the signed distance to the organ without its tumors, negative inside, on the grid of
-    three axes (organ frame, mm)."""
+    """The approximate signed distance to the organ without its tumors, negative inside, on the grid
+    of three axes (organ frame, mm)."""
     x, y, z = (np.linspace(-0.75 * length, 0.75 * length, 65) for length in parameters.size_mm)
     raw = (x, y, z)
     field = _organ_field(parameters, raw)
-    stretched = []
-    # Bending, hilum and lumps change the box: stretch each axis so that it has the stated size.
+    scaled = []
+    # Bending, hilum and lumps change the box: scale each axis so that it has the stated size.
     for axis, length_mm in enumerate(parameters.size_mm):
-        rest = tuple(other for other in range(3) if other != axis)
-        low, high = _crossings(raw[axis], field.min(axis=rest))
+        others = tuple(other for other in range(3) if other != axis)
+        low, high = _crossings(raw[axis], field.min(axis=others))
         scale = (high - low) / length_mm
-        stretched.append(np.asarray(axes_mm[axis]) * scale + (low + high) / 2)
-    x, y, z = stretched
+        scaled.append(np.asarray(axes_mm[axis]) * scale + (low + high) / 2)
+    x, y, z = scaled
     return _organ_field(parameters, (x, y, z))
 
 
 def _crossings(axis_mm: np.ndarray, values: np.ndarray) -> tuple[float, float]:
-    """First and last place where ``values`` change sign, by linear interpolation."""
+    """The first and the last zero of ``values``, by linear interpolation."""
     inside = np.flatnonzero(values < 0)
     ends = []
-    for at, beyond in ((inside[0], inside[0] - 1), (inside[-1], inside[-1] + 1)):
-        t = values[at] / (values[at] - values[beyond])
-        ends.append(float(axis_mm[at] + t * (axis_mm[beyond] - axis_mm[at])))
+    for inner, outer in ((inside[0], inside[0] - 1), (inside[-1], inside[-1] + 1)):
+        t = values[inner] / (values[inner] - values[outer])
+        ends.append(float(axis_mm[inner] + t * (axis_mm[outer] - axis_mm[inner])))
     return ends[0], ends[1]
 
 
 def _organ_field(parameters: PhantomParameters, axes_mm: Axes) -> Float[np.ndarray, "i j k"]:
-    """About the signed distance to the organ's raw surface in mm, negative inside."""
+    """The same before scaling."""
     x, y, z = np.meshgrid(*axes_mm, indexing="ij", sparse=True)
     rx, ry, rz = np.array(parameters.size_mm) / 2
     along = z / rz
@@ -160,19 +158,19 @@ def _organ_field(parameters: PhantomParameters, axes_mm: Axes) -> Float[np.ndarr
     body = _ellipsoid(
         ((x - spine_mm) / thickness, (y + 1.5 * along) / thickness, z), (rx, ry, rz), power=2.3
     )
-    # The renal sinus: a slot that enters from the medial side, a little from the front.
+    # The renal sinus: a slot from the medial side, slightly from the front
     turn = np.deg2rad(32.0)
     u = (x - rx - 2) * np.cos(turn) - (y + 8) * np.sin(turn)
     v = (x - rx - 2) * np.sin(turn) + (y + 8) * np.cos(turn)
     slot = _ellipsoid((u, v, z + 4), (parameters.hilum_depth_mm + 4, 9.0, 0.33 * rz), power=2.0)
-    # Their maximum with a rounded edge (polynomial smooth maximum)
+    # Polynomial smooth maximum, which rounds the rim
     blend = np.clip(_RIM_MM - np.abs(body + slot), 0, None)
     carved = np.maximum(body, -slot) + blend**2 / (4 * _RIM_MM)
     return carved + _lumps(parameters, (x, y, z))
 
 
 def _ellipsoid(point: tuple[np.ndarray, ...], radii: tuple[float, ...], power: float) -> np.ndarray:
-    """Approximate signed distance to a (super)ellipsoid: value over gradient length."""
+    """Approximate signed distance to a superellipsoid: value over gradient length."""
     scaled = [np.abs(p) / r for p, r in zip(point, radii, strict=True)]
     norm = sum(s**power for s in scaled) ** (1 / power) + 1e-9
     gradient = [(s / norm) ** (power - 1) / r for s, r in zip(scaled, radii, strict=True)]
@@ -180,7 +178,7 @@ def _ellipsoid(point: tuple[np.ndarray, ...], radii: tuple[float, ...], power: f
 
 
 def _lumps(parameters: PhantomParameters, point_mm: tuple[np.ndarray, ...]) -> np.ndarray:
-    """Smooth waves of 30 to 60 mm in irregular directions, at most ``lump_mm`` in all."""
+    """Waves of 30 to 60 mm in random directions, at most ``lump_mm`` in sum."""
     rng = np.random.default_rng((parameters.shape_seed, 0))
     total = np.zeros(np.broadcast_shapes(*(p.shape for p in point_mm)))
     for _ in range(4):
@@ -193,8 +191,7 @@ def _lumps(parameters: PhantomParameters, point_mm: tuple[np.ndarray, ...]) -> n
 
 
 def tumor_fields(parameters: PhantomParameters, axes_mm: Axes) -> list[Float[np.ndarray, "i j k"]]:
-    """About the signed distance to each tumor, in label order, negative inside, on the grid of
-    three axes (organ frame, mm)."""
+    """The approximate signed distance to each tumor, in label order, as in ``organ_field``."""
     fields = []
     largest_first = sorted(parameters.tumors, key=lambda tumor: -tumor.diameter_mm)
     for number, tumor in enumerate(largest_first):
@@ -204,8 +201,8 @@ def tumor_fields(parameters: PhantomParameters, axes_mm: Axes) -> list[Float[np.
         offsets = [a - c for a, c in zip(axes_mm, tumor.center_mm, strict=True)]
         x, y, z = np.meshgrid(*offsets, indexing="ij", sparse=True)
         distance_mm = np.sqrt(x**2 + y**2 + z**2)
-        away = np.maximum(distance_mm, 1e-9)
-        # Odd in direction: what one side gains its opposite loses, so diameters stay as stated.
-        lobes = sum(np.sin((a * x + b * y + c * z) / away) for a, b, c in waves) / 3
+        length_mm = np.maximum(distance_mm, 1e-9)
+        # An odd function: what one side gains the opposite side loses, so diameters are exact.
+        lobes = sum(np.sin((a * x + b * y + c * z) / length_mm) for a, b, c in waves) / 3
         fields.append(distance_mm - tumor.diameter_mm / 2 * (1 + tumor.lobulation * lobes))
     return fields

@@ -1,8 +1,6 @@
-"""A virtual CT scanner: any label map -> a CT volume with table and registration block.
-
-Every structure is blurred by the point-spread function and by the voxel it is averaged over, then
-correlated Gaussian noise is added. Beam hardening, scatter and streaks are left out.
-"""
+"""A virtual CT scanner: a label map -> a CT volume with table and registration block, blurred by
+the point-spread function and the voxel size, with correlated Gaussian noise. Beam hardening,
+scatter and streaks are not modelled."""
 
 from __future__ import annotations
 
@@ -26,31 +24,31 @@ _Object = tuple[np.ndarray, np.ndarray, float]  # lower and upper corner, HU
 class ScannerParameters(Config, frozen=True):
     """Materials, objects beside the phantom, and the scanner's resolution and noise.
 
-    Where the HU come from. Organ: 10 % PVA hydrogel attenuates as soft tissue does (Price et al.
-    2010, doi 10.1088/0031-9155/55/4/018); 40 HU is our choice. Tumors: 2.27 % BaSO4 by weight
-    is about 13 mg barium per ml; with the attenuation of barium and water at 60 keV (8.5 and
-    0.206 cm2/g, NIST XCOM) it adds some 550 HU. Block: polyoxymethylene, about 340 HU (as the
-    Delrin rod of the Catphan phantom), inside the tumor window on purpose.
+    Sources of the HU. Organ: 10 % PVA hydrogel attenuates like soft tissue (Price et al. 2010,
+    doi 10.1088/0031-9155/55/4/018); 40 HU is our choice. Tumors: 2.27 % BaSO4 by weight is about
+    13 mg barium per ml; with the attenuation of barium and water at 60 keV (8.5 and 0.206 cm2/g,
+    NIST XCOM) it adds some 550 HU. Block: polyoxymethylene, about 340 HU (as the Delrin rod of the
+    Catphan phantom), intentionally inside the tumor window.
     """
 
     organ_hu: float = 40.0
     tumor_hu: float = 570.0
     spacing_mm: tuple[float, float, float] = (0.6, 0.6, 0.8)
     margin_mm: float = 12.0
-    """Air kept round the label map; the table ends where the field of view ends."""
+    """Air around the label map; the table ends with the field of view."""
     tilt_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Turns the voxel grid about the patient's x, y, z axes: an oblique volume."""
+    """Rotates the voxel grid about the patient's x, y, z axes: an oblique volume."""
     psf_sigma_mm: float = 0.65
     noise_hu: float = 14.0
     noise_correlation_voxels: float = 0.7
     table_hu: float = -80.0
-    """A thin carbon skin; 0 thickness leaves the table out."""
+    """A thin carbon skin; thickness 0: no table."""
     table_thickness_mm: float = 2.0
     table_gap_mm: float = 4.0
-    """A foam pad, as good as air, between phantom and table."""
+    """A foam pad, like air, between phantom and table."""
     block_hu: float = 340.0
     block_size_mm: tuple[float, float, float] = (22.0, 22.0, 40.0)
-    """Left-right, anterior-posterior, superior-inferior; 0 leaves the block out."""
+    """Left-right, anterior-posterior, superior-inferior; 0: no block."""
     block_gap_mm: float = 14.0
     """Between the label map's box and the block, on the patient's right."""
 
@@ -69,12 +67,9 @@ def scan(
     seed: int,
     material_hu: Mapping[int, float] | None = None,
 ) -> Volume:
-    """Scan a label map: 1 becomes hydrogel, 2 and above contrast-loaded tumor, 0 air, and what
-    ``material_hu`` names by its label, that.
-
-    Only the box round the labels is scanned. HU are whole numbers in -1024..3071; the same seed
-    gives the same volume. Raises InputError: no label at all, or a scan of more than 400 million
-    voxels."""
+    """Scan the box around a label map: 1 is hydrogel, 2 and above tumor with contrast, 0 air;
+    ``material_hu`` overrides labels. HU are whole numbers in -1024..3071; the same seed gives the
+    same volume. Raises InputError: no label at all, or a scan of more than 400 million voxels."""
     body = _crop(labels)
     # Lower and upper corner in LPS of the grid's voxel centres
     ends = np.stack(np.meshgrid(*[(0, n - 1) for n in body.labels.shape]), -1).reshape(-1, 3)
@@ -91,7 +86,7 @@ def scan(
 
 
 def _crop(labels: LabelVolume) -> LabelVolume:
-    """The box round all labels with one empty voxel about it."""
+    """The box around all labels with an empty voxel on every side."""
     from scipy import ndimage
 
     if not labels.labels.any():
@@ -108,7 +103,7 @@ def _objects(box_mm: np.ndarray, parameters: ScannerParameters) -> list[_Object]
     lower, upper = box_mm.copy()
     block = np.array(parameters.block_size_mm)
     if block.min() > 0:
-        # It stands on the table's pad, beside the phantom, nearer the feet than the middle.
+        # It stands on the pad beside the phantom, a little towards the feet.
         right_mm, middle_mm = lower[0] - parameters.block_gap_mm, box_mm.mean(0)[2]
         corner = np.array([right_mm, upper[1], middle_mm - 5 + block[2] / 2])
         objects.append((corner - block, corner, parameters.block_hu))
@@ -124,7 +119,7 @@ def _objects(box_mm: np.ndarray, parameters: ScannerParameters) -> list[_Object]
 def _field_of_view(
     box_mm: np.ndarray, objects: list[_Object], parameters: ScannerParameters
 ) -> tuple[np.ndarray, tuple[int, int, int]]:
-    """lps_from_index and shape of a grid that holds everything, tilted as requested."""
+    """``lps_from_index`` and shape of a grid that holds everything, tilted as requested."""
     from scipy.spatial.transform import Rotation
 
     lower = np.min([box_mm[0] - parameters.margin_mm, *(o[0] - 4 for o in objects)], axis=0)
@@ -146,8 +141,8 @@ def _field_of_view(
 def _blur_mm(
     axes: np.ndarray, lps_from_index: np.ndarray, parameters: ScannerParameters
 ) -> Float[np.ndarray, " 3"]:
-    """Blur along three directions (columns, LPS): point spread and a voxel's own extent, which has
-    the variance h^2/12."""
+    """Standard deviation of the blur along three directions (columns, LPS): point spread, and
+    averaging over a voxel, which has the variance h^2/12."""
     voxel = ((axes.T @ lps_from_index[:3, :3]) ** 2).sum(1) / 12
     return np.sqrt(parameters.psf_sigma_mm**2 + voxel)
 
@@ -159,7 +154,7 @@ def _scan_labels(
     parameters: ScannerParameters,
     material_hu: Mapping[int, float],
 ) -> Float32[np.ndarray, "i j k"]:
-    """The label map's HU, blurred on its own grid and read at the scanner's voxels."""
+    """The label map's HU, blurred on its own grid and resampled to the scanner's."""
     from scipy import ndimage
 
     hu_of_label = np.full(256, AIR_HU, np.float32)
@@ -192,7 +187,7 @@ def _add_box(
     contrast_hu: float,
     sigma_mm: np.ndarray,
 ) -> None:
-    """Add a box along the LPS axes, exactly blurred: a product of three error functions."""
+    """Add a box along the LPS axes with the exact blur: a product of three error functions."""
     from scipy.special import ndtr
 
     lower, upper = (np.asarray(c, np.float32) for c in corners_mm)
@@ -208,7 +203,7 @@ def _add_box(
 
 
 def _noise(shape: tuple[int, ...], parameters: ScannerParameters, seed: int) -> np.ndarray:
-    """Gaussian noise of the stated standard deviation, correlated between neighbours."""
+    """Gaussian noise of the stated standard deviation, correlated between neighbouring voxels."""
     from scipy import ndimage
 
     noise = np.random.default_rng(seed).standard_normal(shape, dtype=np.float32)
