@@ -1,7 +1,7 @@
-"""The pinhole depth camera: presets, pixels to points and back.
+"""The pinhole depth camera: the D405's intrinsics, pixels to points and back.
 
 Camera frame as in OpenCV: x right, y down, z forward, mm. Pixel centres lie at whole numbers,
-so the image spans -0.5 .. width - 0.5; librealsense uses the same convention.
+so the image spans -0.5 .. width - 0.5, as in librealsense.
 """
 
 from __future__ import annotations
@@ -21,13 +21,10 @@ D405_FOV_DEGREES = (87.0, 58.0)
 
 
 def d405(width: int = 848, height: int = 480) -> Intrinsics:
-    """A RealSense D405 with its nominal depth field of view and centred principal point.
+    """A RealSense D405 with its nominal depth field of view and centred principal point; fx and fy
+    differ by 3 %. For real frames use the intrinsics that the device reports.
 
-    Both nominal angles are kept, so fx and fy differ by 3 %. A device reports its own
-    intrinsics; read those for real frames.
-
-    Raises:
-        InputError: the size is not 16:9 within 1 % (other modes crop the field of view).
+    Raises InputError: the size is not 16:9 within 1 % (other modes crop the field of view).
     """
     if width <= 0 or height <= 0 or abs(width / height * 9 / 16 - 1) > 0.01:
         raise InputError(
@@ -40,7 +37,8 @@ def d405(width: int = 848, height: int = 480) -> Intrinsics:
 
 
 def plausible(camera: Intrinsics, where: str) -> Intrinsics:
-    """The same, if it can be a depth camera's; else InputError, which ``where`` opens."""
+    """Return ``camera``; raise InputError, which starts with ``where``, if no depth camera can have
+    these intrinsics."""
     side = max(camera.width, camera.height)
     if not all(0.1 * side < focal < 5 * side for focal in (camera.fx, camera.fy)):
         raise InputError(
@@ -57,7 +55,7 @@ def plausible(camera: Intrinsics, where: str) -> Intrinsics:
 
 
 class Pinhole(NamedTuple):
-    """The numbers of ``Intrinsics`` that project a point, as compiled kernels take them; px."""
+    """Focal lengths and principal point, px, in the form that compiled kernels take."""
 
     fx: float
     fy: float
@@ -72,7 +70,7 @@ def pinhole_of(intrinsics: Intrinsics) -> Pinhole:
 def deproject_pixels(
     index: Integer[np.ndarray, " n"], depth_mm: Float[np.ndarray, " n"], intrinsics: Intrinsics
 ) -> Float32[np.ndarray, "n 3"]:
-    """Points (n, 3) in the camera frame of pixels given by flat (row-major) index and depth."""
+    """Camera-frame points of pixels given by flat (row-major) index and depth."""
     row, column = np.divmod(index, intrinsics.width)
     x = (column - intrinsics.cx) * (depth_mm / intrinsics.fx)
     y = (row - intrinsics.cy) * (depth_mm / intrinsics.fy)
@@ -80,7 +78,7 @@ def deproject_pixels(
 
 
 def deproject(frame: DepthFrame) -> Float32[np.ndarray, "n 3"]:
-    """All pixels with a return as points (n, 3), camera frame, mm, in row-major pixel order."""
+    """All pixels with a return as camera-frame points, mm, in row-major pixel order."""
     depth_mm = frame.depth_mm.ravel()
     index = np.flatnonzero(np.isfinite(depth_mm))
     return deproject_pixels(index, depth_mm[index].astype(np.float64), frame.intrinsics)
@@ -89,14 +87,10 @@ def deproject(frame: DepthFrame) -> Float32[np.ndarray, "n 3"]:
 def project(
     points_mm: Float[np.ndarray, "n 3"], intrinsics: Intrinsics
 ) -> tuple[Float64[np.ndarray, "n 2"], Float64[np.ndarray, " n"]]:
-    """Pixel coordinates (n, 2) as (column, row), not rounded, and depth (n,) in mm.
-
-    The inverse of ``deproject``. Pixels may lie outside the image; a point at or behind the
-    camera's centre has no pixel and gets NaN.
-    """
+    """Pixel coordinates (column, row), not rounded, possibly outside the image, and depth in mm.
+    A point at or behind the camera's centre has no pixel and gets NaN."""
     points = np.asarray(points_mm, np.float64)
     depth_mm = points[:, 2].copy()
-    before = np.where(depth_mm > 0, depth_mm, np.nan)
-    focal = np.array([intrinsics.fx, intrinsics.fy])
-    centre = np.array([intrinsics.cx, intrinsics.cy])
-    return points[:, :2] / before[:, None] * focal + centre, depth_mm
+    in_front = np.where(depth_mm > 0, depth_mm, np.nan)
+    fx, fy, cx, cy = pinhole_of(intrinsics)
+    return points[:, :2] / in_front[:, None] * [fx, fy] + [cx, cy], depth_mm

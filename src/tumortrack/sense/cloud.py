@@ -1,4 +1,4 @@
-"""Depth image -> sensor cloud: the one path, for simulation and the operating room alike."""
+"""Depth image -> sensor cloud, for simulated and real images alike; checks of clouds."""
 
 from __future__ import annotations
 
@@ -14,20 +14,18 @@ from tumortrack.sense.units import Unit, unit_advice
 
 FEWEST_POINTS = 200  # fewer do not determine an organ's shape and pose
 _FARTHEST_MM = 20_000.0  # beyond any depth camera
-_NEAREST_MM = 40.0  # a D405, the nearest of all, sees nothing nearer
-# mm: of the D405; of other depth cameras; whole mm; floats in metres.
+_NEAREST_MM = 40.0  # minimum range of a D405, the shortest of all depth cameras
+# mm per step: the D405's; other depth cameras'; whole mm; floats in metres.
 _DEPTH_UNITS_MM = (0.1, 0.125, 0.25, 1.0, 1000.0)
-_MOST_FAR = 0.01  # of a cloud's points: more are no flaws of single ones
-_LONGEST_M = 0.6  # of an organ; in inches no organ's side is shorter
-# Standard deviation along the second axis; an organ's is more than 10 mm, and half of the first.
+_MOST_FAR = 0.01  # share of a cloud's points that may be outliers
+_LONGEST_M = 0.6  # longest organ in metres; in inches no organ's side is shorter
+# Least standard deviation along the second axis: in mm, and over that along the first. An organ has
+# over 10 mm and half of the first.
 _THINNEST_MM, _THINNEST = 1.0, 0.1
 
 
 class CloudConfig(Config, frozen=True, kw_only=True):
-    """What of a depth image becomes the cloud: depths strictly between near and far (mm).
-
-    The defaults are the paper's: (11 cm, 15 cm) from the camera and 1000 points.
-    """
+    """Depths strictly between near and far (mm) become the cloud. The defaults are the paper's."""
 
     near_mm: float = 110.0
     far_mm: float = 150.0
@@ -42,12 +40,8 @@ class CloudConfig(Config, frozen=True, kw_only=True):
 def cloud_from_depth(
     frame: DepthFrame, config: CloudConfig, rng: np.random.Generator
 ) -> SensorCloud:
-    """Crop by depth, draw ``n_points`` unique random pixels (all where fewer lie in range), and
-    deproject them.
-
-    Raises:
-        NoEstimate: fewer than 200 pixels lie in range.
-    """
+    """Crop by depth, draw ``n_points`` distinct random pixels (all if fewer lie in range), and
+    deproject them. Raises NoEstimate: fewer than 200 pixels lie in range."""
     depth_mm = frame.depth_mm.ravel()
     index = np.flatnonzero((depth_mm > config.near_mm) & (depth_mm < config.far_mm))
     if len(index) < FEWEST_POINTS:
@@ -58,18 +52,14 @@ def cloud_from_depth(
 
 
 def thin_cloud(cloud: SensorCloud, n_points: int, rng: np.random.Generator) -> SensorCloud:
-    """``n_points`` unique random points of the cloud (all of them if it has no more)."""
+    """``n_points`` distinct random points of the cloud (all of them if it has no more)."""
     chosen = draw_some(len(cloud.points_mm), n_points, rng)
     return SensorCloud(cloud.points_mm[chosen], cloud.stamp_ns)
 
 
 def crop_cloud(cloud: SensorCloud, near_mm: float, far_mm: float) -> SensorCloud:
-    """The points with near_mm < z < far_mm, in their order.
-
-    Raises:
-        InputError: not 0 <= near < far.
-        NoEstimate: fewer than 200 points lie in range.
-    """
+    """The points with near_mm < z < far_mm, in their order. Raises InputError: not
+    0 <= near < far; NoEstimate: fewer than 200 points lie in range."""
     _check_range(near_mm, far_mm)
     z = cloud.points_mm[:, 2]
     inside = (z > near_mm) & (z < far_mm)
@@ -81,53 +71,50 @@ def crop_cloud(cloud: SensorCloud, near_mm: float, far_mm: float) -> SensorCloud
 def seen_points(
     points_mm: Float32[np.ndarray, "n 3"], name: str
 ) -> tuple[Float32[np.ndarray, "m 3"], tuple[str, ...]]:
-    """The points that can be something seen, and notes on what was dropped: points without return
-    (NaN, infinite, or exactly 0, 0, 0, as RealSense and organised clouds have them), and up to 1 %
-    beyond 20 m. InputError, which names the cloud, where more are beyond."""
+    """The points that a camera can have measured, and notes on what was dropped: points without
+    return (NaN, infinite, or exactly 0, 0, 0, as in RealSense's and organised clouds), and up to
+    1 % beyond 20 m. Raises InputError, which names the cloud, if more lie beyond."""
     returned = np.isfinite(points_mm).all(axis=1) & (points_mm != 0).any(axis=1)
     near = np.abs(points_mm).max(axis=1, initial=0) <= _FARTHEST_MM
-    dropped, far = len(points_mm) - int(returned.sum()), int((returned & ~near).sum())
+    missing, far = len(points_mm) - int(returned.sum()), int((returned & ~near).sum())
     if far > _MOST_FAR * returned.sum():
         raise InputError(
             f"{name}: {far} of {len(points_mm)} points lie more than 20 m away, beyond any depth "
             "camera: its numbers look like millimetres read as metres (then leave out --unit m), "
             "or they are damaged. Give the camera frame, in mm."
         )
-    notes = {
-        "without return (NaN or 0, 0, 0)": dropped,
-        "more than 20 m away": far,
-    }
-    kept = points_mm if not dropped + far else points_mm[returned & near]
+    dropped = {"without return (NaN or 0, 0, 0)": missing, "more than 20 m away": far}
+    kept = points_mm if not missing + far else points_mm[returned & near]
     return kept, tuple(
-        f"dropped {count} of {len(points_mm)} points {what}"
-        for what, count in notes.items()
+        f"dropped {count} of {len(points_mm)} points {kind}"
+        for kind, count in dropped.items()
         if count
     )
 
 
 def check_cloud(cloud: SensorCloud) -> None:
-    """Refuse a cloud from elsewhere that cannot show an organ before the camera, in mm.
+    """Refuse a cloud that cannot show an organ in front of the camera, in mm.
 
     Raises:
         InputError: the unit is evidently not mm (metres, or mm read as metres), or a point lies
             more than 20 m away.
-        NoEstimate: fewer than 200 different points, on one line, or none before the camera.
+        NoEstimate: fewer than 200 distinct points, all on one line, or none before the camera.
     """
     points_mm = cloud.points_mm
     ordered = np.sort(points_mm.T, axis=1)
-    different = 1 + int(np.count_nonzero(np.diff(ordered[0])))  # mostly decides, and is cheap
+    distinct = 1 + int(np.count_nonzero(np.diff(ordered[0])))  # cheap, and mostly enough
     for some in (points_mm[:2000], points_mm):  # sorting all of a large cloud takes a while
-        if different < FEWEST_POINTS:
-            different = len(np.unique(some, axis=0))
-    if different < FEWEST_POINTS:
+        if distinct < FEWEST_POINTS:
+            distinct = len(np.unique(some, axis=0))
+    if distinct < FEWEST_POINTS:
         raise NoEstimate(
-            f"the cloud has {different} different points with a return; at least {FEWEST_POINTS} "
+            f"the cloud has {distinct} different points with a return; at least {FEWEST_POINTS} "
             "are needed. Give a denser cloud."
         )
     few = len(points_mm) // 100
     low, middle, high = ordered[:, [few, len(points_mm) // 2, -1 - few]].T
     extent_mm = float((high - low).max())
-    # A D405 sees nothing nearer than 40 mm, and an organ is larger than 5 mm.
+    # A D405 measures nothing nearer than 40 mm, and an organ is larger than 5 mm.
     if abs(middle[2]) < 5 and extent_mm < 5:
         unit = Unit.METRE if extent_mm < _LONGEST_M else Unit.INCH
         raise InputError(
@@ -162,30 +149,26 @@ def check_cloud(cloud: SensorCloud) -> None:
 
 
 def check_depth_unit(frame: DepthFrame, unit_mm: float, near_mm: float, far_mm: float) -> None:
-    """Question the unit of a depth image, mm a step, where it cannot be right: too much is nearer
-    than any camera sees; or next to nothing lies in the range, and with another unit it does.
-
-    Raises:
-        InputError: as above; it names the unit that fits.
-    """
-    seen = frame.depth_mm[np.isfinite(frame.depth_mm)]
-    if not len(seen):
+    """Refuse a depth image whose unit (mm per step) cannot be right: too much is nearer than any
+    camera measures, or hardly anything lies in range that would with another unit. Raises
+    InputError, which names the unit that fits."""
+    depths = _finite_depths(frame)
+    if not len(depths):
         return
 
     def in_range(unit: float) -> int:
-        depth_mm = seen * (unit / unit_mm)
+        depth_mm = depths * (unit / unit_mm)
         return int(((depth_mm > near_mm) & (depth_mm < far_mm)).sum())
 
-    low, high = np.quantile(seen, (0.05, 0.95))
+    low, high = np.quantile(depths, (0.05, 0.95))
     likely = max(_DEPTH_UNITS_MM, key=in_range)
     fits = in_range(likely) >= FEWEST_POINTS and likely != unit_mm
     impossible = low < _NEAREST_MM
     if not impossible and (in_range(unit_mm) >= FEWEST_POINTS or not fits):
         return
-    what = f"with {unit_mm:g} mm a step most depths run from {low:.4g} to {high:.4g} mm, "
-    what += "nearer than any depth camera sees" if impossible else (
-        f"and hardly any lies between {near_mm:g} and {far_mm:g} mm"
-    )  # fmt: skip
+    fault = f"hardly any lies between {near_mm:g} and {far_mm:g} mm"
+    fault = "nearer than any depth camera sees" if impossible else f"and {fault}"
+    what = f"with {unit_mm:g} mm a step most depths run from {low:.4g} to {high:.4g} mm, {fault}"
     if not fits:
         raise InputError(f"{what}. Say how many mm a step of this image is (--depth-unit).")
     low, high = (value * likely / unit_mm for value in (low, high))
@@ -197,7 +180,7 @@ def check_depth_unit(frame: DepthFrame, unit_mm: float, near_mm: float, far_mm: 
 
 
 def draw_some(available: int, wanted: int, rng: np.random.Generator) -> np.ndarray:
-    """Which of the ``available`` become a cloud of ``wanted``, or of all if they are no more."""
+    """Indices of ``wanted`` random ones of ``available`` points; of all if there are no more."""
     return rng.choice(available, min(available, wanted), replace=False)
 
 
@@ -209,14 +192,16 @@ def _check_range(near_mm: float, far_mm: float) -> None:
         )
 
 
-def _too_few(count: int, content: DepthFrame | SensorCloud, near_mm: float, far_mm: float) -> str:
+def _finite_depths(content: DepthFrame | SensorCloud) -> Float32[np.ndarray, " n"]:
     depth_mm = content.depth_mm if isinstance(content, DepthFrame) else content.points_mm[:, 2]
-    seen = depth_mm[np.isfinite(depth_mm)]
-    where = (
-        f"the {len(seen)} depths seen run from {seen.min():.1f} to {seen.max():.1f} mm"
-        if len(seen)
-        else "the sensor had no return at all"
-    )
+    return depth_mm[np.isfinite(depth_mm)]
+
+
+def _too_few(count: int, content: DepthFrame | SensorCloud, near_mm: float, far_mm: float) -> str:
+    depths, where = _finite_depths(content), "the sensor had no return at all"
+    if len(depths):
+        span = f"{depths.min():.1f} to {depths.max():.1f} mm"
+        where = f"the {len(depths)} depths seen run from {span}"
     do = unit_advice(content, near_mm, far_mm) or "move the camera, or choose another depth range"
     return (
         f"only {count} points lie between {near_mm:g} and {far_mm:g} mm ({where}); at least "

@@ -1,7 +1,7 @@
-"""What a depth image shows besides the organ: the table, tools, drapes.
+"""Background that a depth image shows besides the organ: the table, tools, drapes.
 
-A user's crop rarely takes all of it away, so training shows some. Lengths are relative to the
-organ's own depths and width, so that background looks alike from near and far.
+A user's crop rarely removes all of it, so training shows some. Lengths are relative to the organ's
+depths and width, so that background looks the same from near and far.
 """
 
 from __future__ import annotations
@@ -15,43 +15,40 @@ from tumortrack.core.config import Config
 from tumortrack.core.types import DepthFrame
 
 _STEEPEST = 0.6  # slope of a plane: 30 degrees
-_SAMPLED = 400  # pixels that show where the organ lies
-_MOST = 0.5  # share of all points
+_SAMPLED = 400  # pixels that stand for the organ
 
 
 class ClutterConfig(Config, frozen=True, kw_only=True):
-    """``scenes``: share of images with background; ``largest_share``: of all points, in those
-    images; each draws its own share uniformly up to it. Zero switches it off."""
+    """``scenes``: share of images with background; ``largest_share``: its largest share of all
+    points there, up to which each image draws uniformly. Zero switches it off."""
 
     scenes: float = 0.0
     largest_share: float = 0.0
 
     def __post_init__(self) -> None:
-        self.check_ranges("clutter", scenes=1.0, largest_share=_MOST)
+        self.check_ranges("clutter", scenes=1.0, largest_share=0.5)
 
 
 @dataclass(frozen=True)
 class _Organ:
-    """Where the organ lies in the image: (column, row), pixels and mm."""
+    """Where the organ lies in the image."""
 
-    middle_px: Float[np.ndarray, " 2"]
+    middle_px: Float[np.ndarray, " 2"]  # (column, row)
     width_px: float
     width_mm: float
     near_mm: float
     far_mm: float
 
 
-# A disc of the image: its middle and radius (px), and the depths of what it shows at the offsets
-# (n, 2), in radii, that it was made for.
+# A disc in the image: its middle and radius (px), and the depths (n,) at given offsets (n, 2) from
+# the middle, in radii.
 _Patch = tuple[Float[np.ndarray, " 2"], float, Float[np.ndarray, " n"]]
 
 
 def add_clutter(frame: DepthFrame, config: ClutterConfig, rng: np.random.Generator) -> DepthFrame:
-    """The frame with background in some of its pixels without return.
-
-    One kind a frame, with equal chance: a piece of a tilted plane behind the organ, a ball beside
-    it, or points anywhere. It has random numbers of its own: ``rng`` is left as it was.
-    """
+    """The frame with background in some of its pixels without return: a piece of a tilted plane
+    behind the organ, a ball beside it, or points anywhere, with equal chance. ``rng`` does not
+    advance."""
     rng = rng.spawn(1)[0]
     if rng.uniform() >= config.scenes:
         return frame
@@ -60,12 +57,12 @@ def add_clutter(frame: DepthFrame, config: ClutterConfig, rng: np.random.Generat
     count = round(share / (1 - share) * len(seen))
     if count == 0:
         return frame
-    organ = _where(frame, seen, rng)
-    radius = np.sqrt(rng.uniform(size=4 * count))  # most may lie on the organ or off the image
+    organ = _organ(frame, seen, rng)
+    radius = np.sqrt(rng.uniform(size=4 * count))  # most may hit the organ or miss the image
     angle = rng.uniform(0, 2 * np.pi, 4 * count)
     offsets = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
-    shows = (_plane, _ball, _anywhere)[rng.integers(3)]
-    middle_px, radius_px, patch_mm = shows(frame, organ, offsets, rng)
+    make_patch = (_plane, _ball, _anywhere)[rng.integers(3)]
+    middle_px, radius_px, patch_mm = make_patch(frame, organ, offsets, rng)
     column, row = np.rint(middle_px + offsets * radius_px).astype(int).T
     camera = frame.intrinsics
     free = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
@@ -77,7 +74,7 @@ def add_clutter(frame: DepthFrame, config: ClutterConfig, rng: np.random.Generat
     return frame.with_depth(depth_mm)
 
 
-def _where(frame: DepthFrame, seen: np.ndarray, rng: np.random.Generator) -> _Organ:
+def _organ(frame: DepthFrame, seen: np.ndarray, rng: np.random.Generator) -> _Organ:
     pixels = seen[rng.integers(len(seen), size=_SAMPLED)]
     row, column = np.divmod(pixels, frame.intrinsics.width)
     depth_mm = frame.depth_mm.flat[pixels]
@@ -106,7 +103,7 @@ def _plane(
 def _ball(
     frame: DepthFrame, organ: _Organ, offsets: np.ndarray, rng: np.random.Generator
 ) -> _Patch:
-    """Beside the organ, at its depths or a little behind; seen from its front."""
+    """Beside the organ, at its depths or a little behind; only its front is visible."""
     angle = rng.uniform(0, 2 * np.pi)
     apart = rng.uniform(0.4, 1.0) * organ.width_px
     middle = organ.middle_px + apart * np.array([np.cos(angle), np.sin(angle)])
@@ -120,7 +117,7 @@ def _ball(
 def _anywhere(
     frame: DepthFrame, organ: _Organ, offsets: np.ndarray, rng: np.random.Generator
 ) -> _Patch:
-    """Spread over the whole image and from before the organ to behind it."""
+    """Over the whole image, from in front of the organ to behind it."""
     size = np.array([frame.intrinsics.width, frame.intrinsics.height])
     low = organ.near_mm - 0.2 * organ.width_mm
     depth_mm = rng.uniform(low, organ.far_mm + 0.4 * organ.width_mm, len(offsets))

@@ -1,7 +1,7 @@
 """Clouds, depth images and intrinsics from and to files. Every failure is an InputError.
 
-Millimetres inside: metres are converted here, at the edge. Sizes claimed by a header are held
-against the file and a limit before anything is allocated; nothing here loads pickles.
+Metres are converted here. Sizes that a header claims are checked against the file and a limit
+before anything is allocated; nothing here loads pickles.
 """
 
 from __future__ import annotations
@@ -39,9 +39,8 @@ _DISTORTION_KEYS = (
 
 
 class PosesFile(Config, frozen=True, kw_only=True):
-    """Where a camera was for each of several views, in their order: 4 x 4 rows each, which carry
-    points of the camera's optical frame into one fixed frame; ``unit``: of the translations;
-    ``frame_id``: the fixed frame's name, ``base_link`` say."""
+    """Camera poses of several views, in their order: 4 x 4 rows that carry points from the camera's
+    optical frame into one fixed frame, called ``frame_id``; ``unit``: of the translations."""
 
     fixed_from_camera: tuple[tuple[tuple[float, float, float, float], ...], ...]
     unit: Literal["mm", "m"]
@@ -49,8 +48,7 @@ class PosesFile(Config, frozen=True, kw_only=True):
 
 
 class DepthCorrection(Config, frozen=True, kw_only=True):
-    """As `calibrate camera` finds it: the true depth is ``scale`` times the measured one, plus
-    ``offset_mm``."""
+    """True depth = ``scale`` x measured depth + ``offset_mm``, as `calibrate camera` finds it."""
 
     scale: float = 1.0
     offset_mm: float = 0.0
@@ -59,7 +57,7 @@ class DepthCorrection(Config, frozen=True, kw_only=True):
         self.check_between("depth correction:", scale=(0.8, 1.25), offset_mm=(-20.0, 20.0))
 
     def corrected(self, depth_mm: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
-        """What lies behind the camera then has no return (NaN)."""
+        """NaN where the corrected depth is not in front of the camera."""
         if self == DepthCorrection():
             return depth_mm
         true_mm = depth_mm * np.float32(self.scale) + np.float32(self.offset_mm)
@@ -67,9 +65,9 @@ class DepthCorrection(Config, frozen=True, kw_only=True):
 
 
 def read_poses(path: Path, count: int) -> tuple[str, tuple[Affine, ...]]:
-    """``frame_id`` and ``fixed_from_camera`` of ``count`` views, mm, from JSON (``PosesFile``).
-    Raises InputError: missing, an unknown key, another number of views, or a matrix that is no
-    rigid transform."""
+    """``frame_id`` and ``fixed_from_camera`` (mm) of ``count`` views from JSON (``PosesFile``).
+    Raises InputError: missing file, unknown key, wrong number of views, a matrix that is no rigid
+    transform."""
     file = from_builtins(read_json(path), PosesFile, str(path))
     if len(file.fixed_from_camera) != count:
         raise InputError(
@@ -84,13 +82,11 @@ def read_poses(path: Path, count: int) -> tuple[str, tuple[Affine, ...]]:
 
 
 def read_cloud(path: Path, unit: Literal["mm", "m"] = "mm") -> tuple[SensorCloud, tuple[str, ...]]:
-    """A cloud in the camera frame from .ply, .pcd (all three encodings) or .npz, and notes.
+    """A cloud in the camera frame from .ply, .pcd (all three encodings) or .npz, without what
+    ``cloud.seen_points`` drops, and its notes. Whether it can be an organ in mm is left to
+    ``cloud.check_cloud``.
 
-    What is no point seen is dropped with a note, as by ``cloud.seen_points``; ``cloud.check_cloud``
-    then tells whether the rest can be an organ in mm.
-
-    Raises:
-        InputError: missing, too large, damaged, of another kind, or without any point.
+    Raises InputError: missing, too large, damaged, of another kind, or without any point.
     """
     suffix = path.suffix.lower()
     if path.is_dir():
@@ -111,7 +107,7 @@ def read_cloud(path: Path, unit: Literal["mm", "m"] = "mm") -> tuple[SensorCloud
 
 
 def _pcd_points(content: bytes, name: str) -> np.ndarray:
-    """x, y, z as floats (n, 3), in the file's unit; ascii, binary or compressed."""
+    """x, y, z as floats (n, 3), in the file's unit."""
     try:
         from pypcd4 import PointCloud
     except ImportError as error:
@@ -134,15 +130,15 @@ def _pcd_points(content: bytes, name: str) -> np.ndarray:
 
 
 def _check_pcd_size(content: bytes, name: str) -> None:
-    """Hold the claimed size against the limit, before pypcd4 allocates it."""
-    header, found, body = content[: 64 * 1024].partition(b"\nDATA ")
+    """Check the claimed size before pypcd4 allocates it, and the viewpoint."""
+    header, separator, body = content[: 64 * 1024].partition(b"\nDATA ")
     fields = {line.split()[0]: line.split()[1:] for line in header.splitlines() if line.split()}
     try:
         points = int(fields[b"POINTS"][0])
         sizes = [int(size) for size in fields[b"SIZE"]]
         counts = [int(count) for count in fields.get(b"COUNT", [b"1"] * len(sizes))]
         claimed = points * sum(size * n for size, n in zip(sizes, counts, strict=True))
-        start = len(header) + len(found) + body.index(b"\n") + 1
+        start = len(header) + len(separator) + body.index(b"\n") + 1
         x, y, z, _, *turn = map(float, fields.get(b"VIEWPOINT", b"0 0 0 1 0 0 0".split()))
     except (KeyError, ValueError, IndexError) as error:
         raise InputError(f"{name} is no PCD file (its header lacks or garbles a line).") from error
@@ -155,10 +151,10 @@ def _check_pcd_size(content: bytes, name: str) -> None:
         packed, unpacked = struct.unpack_from("<II", content[start : start + 8].ljust(8, b"\0"))
         too_large = unpacked > LARGEST_FILE or packed > len(content) - start - 8
         too_large |= claimed > unpacked
+    elif body.startswith(b"binary"):
+        too_large = claimed > len(content) - start
     else:  # ascii: at least a digit and a blank for each number
-        room = len(content) - start
-        numbers = 2 * points * sum(counts)
-        too_large = (claimed > room) if body.startswith(b"binary") else (numbers > room + 1)
+        too_large = 2 * points * sum(counts) > len(content) - start + 1
     if too_large or points < 0 or claimed > LARGEST_FILE or sum(counts) > 1000:
         raise InputError(f"{name} claims {points} points but has no room for them; it is damaged.")
 
@@ -170,33 +166,33 @@ def _npz_points(unit: str, content: bytes, name: str) -> np.ndarray:
             _check_npz_size(archive, name)
         with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
             preferred = [key for key in ("points_mm", "points") if key in arrays.files]
-            found = {key: arrays[key] for key in preferred[:1] or arrays.files}
+            read = {key: arrays[key] for key in preferred[:1] or arrays.files}
     except InputError:
         raise
     except Exception as error:  # zipfile and numpy raise anything on a damaged file
         raise InputError(f"{name} cannot be read as .npz: {error or type(error)}.") from error
-    clouds = [key for key, a in found.items() if a.shape[1:] == (3,) and a.dtype.kind in "fiu"]
+    clouds = [key for key, a in read.items() if a.shape[1:] == (3,) and a.dtype.kind in "fiu"]
     if len(clouds) != 1:
-        shapes = ", ".join(f"{key} {array.shape}" for key, array in found.items())
+        shapes = ", ".join(f"{key} {array.shape}" for key, array in read.items())
         raise InputError(
             f"{name} must hold points_mm, points, or exactly one (n, 3) array of numbers; "
             f"it has: {shapes or 'nothing'}."
         )
     if unit == "m" and clouds == ["points_mm"]:
         raise InputError(f"{name}: 'points_mm' is in mm by its name; leave out --unit m.")
-    return found[clouds[0]]
+    return read[clouds[0]]
 
 
 def _check_npz_size(archive: zipfile.ZipFile, name: str) -> None:
-    """Hold each array's claimed shape against its bytes; numpy allocates what a header claims."""
+    """Check each array's claimed shape against its bytes: numpy allocates what a header claims."""
     if sum(member.file_size for member in archive.infolist()) > LARGEST_FILE:
         raise InputError(f"{name} unpacks to more than 256 MiB; thin the cloud first.")
-    forms = np.lib.format
+    npy = np.lib.format
     for member in archive.infolist():
         with archive.open(member) as stream:
-            first = forms.read_magic(stream)[0] == 1
-            read = forms.read_array_header_1_0 if first else forms.read_array_header_2_0
-            shape, _, dtype = read(stream)
+            version, _ = npy.read_magic(stream)
+            read_header = npy.read_array_header_1_0 if version == 1 else npy.read_array_header_2_0
+            shape, _, dtype = read_header(stream)
         claimed = math.prod((dtype.itemsize, *shape))
         if claimed > member.file_size or min(shape, default=0) < 0:
             raise InputError(f"{name}: {member.filename} claims more than the file holds.")
@@ -204,15 +200,12 @@ def _check_npz_size(archive: zipfile.ZipFile, name: str) -> None:
 
 def read_intrinsics(path: Path) -> Intrinsics:
     """A pinhole camera from JSON: width, height, fx, fy, cx (or ppx), cy (or ppy), in pixels.
-
-    Raises:
-        InputError: missing, not JSON, a key missing or no number, or lens distortion.
-    """
+    Raises InputError: missing, not JSON, a key missing or no number, or lens distortion."""
     return _camera(path)[0]
 
 
 def read_camera(path: Path | None) -> tuple[Intrinsics | None, DepthCorrection]:
-    """The same, and the correction that the file may have; without a file neither."""
+    """A camera as ``read_intrinsics`` reads it, and the file's depth correction, if any."""
     if path is None:
         return None, DepthCorrection()
     camera, data = _camera(path)
@@ -226,7 +219,7 @@ def _correction(data: dict[str, Any], path: Path) -> DepthCorrection:
 
 
 def _camera(path: Path) -> tuple[Intrinsics, dict[str, Any]]:
-    """The camera, and all that its file has."""
+    """The camera, and everything in its file."""
     data = read_json(path)
     for key in _DISTORTION_KEYS:
         if any(_numbers(data.get(key, 0), key, path)):
@@ -236,11 +229,11 @@ def _camera(path: Path) -> tuple[Intrinsics, dict[str, Any]]:
             )
     values = {}
     for key in _PINHOLE_KEYS:
-        found = data.get(key, data.get(_OTHER_KEYS.get(key, "")))
-        if found is None or isinstance(found, list):
+        value = data.get(key, data.get(_OTHER_KEYS.get(key, "")))
+        if value is None or isinstance(value, list):
             needed = "width, height, fx, fy, cx (or ppx), cy (or ppy)"
             raise InputError(f"{path} lacks the number {key!r}; it must have {needed}, in pixels.")
-        values[key] = _numbers(found, key, path)[0]
+        values[key] = _numbers(value, key, path)[0]
     for key in ("width", "height"):
         if not values[key].is_integer():
             raise InputError(f"{path}: {key} is {values[key]}; it must be a whole number.")
@@ -260,27 +253,26 @@ def _numbers(value: object, key: str, path: Path) -> list[float]:
 
 
 def intrinsics_json(intrinsics: Intrinsics) -> dict[str, Any]:
-    """intrinsics.json beside a depth.png: the pinhole and what one step of depth means."""
+    """Content of intrinsics.json beside a depth.png: the pinhole and the mm per step of depth."""
     values = {key: getattr(intrinsics, key) for key in _PINHOLE_KEYS}
     return {**values, "depth_unit_mm": DEPTH_UNIT_MM}
 
 
 def read_depth_png(path: Path, intrinsics_path: Path) -> DepthFrame:
-    """What ``read_depth`` reads, alone."""
+    """A depth image with the unit of its intrinsics file; see ``read_depth``."""
     return read_depth(path, intrinsics_path)[0]
 
 
 def read_depth(
     path: Path, intrinsics_path: Path, unit_mm: float | None = None
 ) -> tuple[DepthFrame, float]:
-    """A depth image as a 16-bit PNG or TIFF, or a TIFF of floats, and its unit: the mm of one step.
+    """A depth image (16-bit PNG or TIFF, or a TIFF of floats) and its unit, mm per step.
 
-    0, and what is no finite number, is no return. The unit is ``unit_mm``, else what the intrinsics
-    file states as depth_unit_mm, else 0.1 for whole numbers, and 1000 (metres) for floats; then
-    comes what that file states as correction. ``cloud.check_depth_unit`` tells whether it can be.
+    0 and numbers that are not finite are no return. The unit is ``unit_mm``, else depth_unit_mm of
+    the intrinsics file, else 0.1 for whole numbers and 1000 (metres) for floats. The file's depth
+    correction is applied. Whether the unit can be right is left to ``cloud.check_depth_unit``.
 
-    Raises:
-        InputError: no such image, of another size than the intrinsics, or a unit that is none.
+    Raises InputError: no such image, of another size than the intrinsics, or no valid unit.
     """
     intrinsics, data = _camera(intrinsics_path)
     steps, mode = _image(path, (intrinsics.width, intrinsics.height))
@@ -301,20 +293,20 @@ def read_depth(
 
 
 def read_mask(path: Path, size: tuple[int, int]) -> Bool[np.ndarray, "h w"]:
-    """True where an image (PNG, TIFF or BMP) is not 0; transparency does not count. InputError: no
-    such image, or not of this width and height."""
+    """True where an image (PNG, TIFF or BMP) is not 0, whatever its transparency. Raises
+    InputError: no such image, or not of this width and height."""
     values, _ = _image(path, size)
     return np.not_equal(values, 0).reshape(*values.shape[:2], -1).any(axis=2)
 
 
 def _image(path: Path, size: tuple[int, int]) -> tuple[np.ndarray, str]:
-    """An image's values without its transparency, and Pillow's name of its kind."""
+    """An image's values without its transparency, and its Pillow mode."""
     from PIL import Image
 
     try:
         content = io.BytesIO(read_file(path, LARGEST_FILE))
         image = Image.open(content, formats=["PNG", "TIFF", "BMP"])
-        if image.size == size:  # from the header: nothing was decoded before
+        if image.size == size:  # known from the header, before anything is decoded
             opaque = image.convert("RGB") if image.mode in ("RGBA", "LA", "PA") else image
             return np.asarray(opaque), image.mode
     except InputError:
@@ -329,21 +321,17 @@ def _image(path: Path, size: tuple[int, int]) -> tuple[np.ndarray, str]:
 
 def depth_png(frame: DepthFrame, compress_level: int = 6) -> bytes:
     """The depth as a 16-bit PNG in steps of 0.1 mm; NaN becomes 0. ``compress_level`` 1 takes a
-    sixth of the time, for a fifth more bytes.
-
-    Raises:
-        InputError: a depth that 16 bits of this unit cannot hold.
-    """
+    sixth of the time, for a fifth more bytes. Raises InputError: a depth that does not fit."""
     from PIL import Image
 
     steps = np.rint(frame.depth_mm.astype(np.float64) / DEPTH_UNIT_MM)
-    seen = np.isfinite(steps)
-    if not ((steps[seen] >= 1) & (steps[seen] <= 65535)).all():
+    returned = np.isfinite(steps)
+    if not ((steps[returned] >= 1) & (steps[returned] <= 65535)).all():
         raise InputError(
             f"a depth lies outside {DEPTH_UNIT_MM:g}..{65535 * DEPTH_UNIT_MM:g} mm, which 16 bits "
             f"of {DEPTH_UNIT_MM:g} mm hold; crop the frame."
         )
     stream = io.BytesIO()
-    image = Image.fromarray(np.where(seen, steps, 0).astype(np.uint16))
+    image = Image.fromarray(np.where(returned, steps, 0).astype(np.uint16))
     image.save(stream, format="PNG", compress_level=compress_level)
     return stream.getvalue()

@@ -2,15 +2,13 @@
 
 Order as in the sensor: the matcher errs at edges (flying pixels) and everywhere (noise growing
 with z^2, slow distortion), fails in places (holes), invents some matches (scattered points), and
-the result is stored in whole units.
+the result is stored in whole units. Stereo endoscopes have two errors more: the nearer surface
+spreads over edges, and what only one camera sees has no match.
 
-Axial noise: the error of a disparity of s pixels is z^2 s / (f b). For a D405 at 848 x 480
-(f = 447 px, baseline b = 18 mm) and the s = 0.08 that RealSense's engineers advise (0.032 at best;
-github.com/realsenseai/librealsense issue 3904) this is 0.22 mm (0.09 mm) at 150 mm. Correlation:
-one matching window spans several pixels, so near pixels err together.
-
-A matcher on a stereo endoscope's pictures errs in two ways more: the nearer surface spreads over
-edges, and what one camera alone sees has no match.
+Axial noise: a disparity error of s pixels is a depth error of z^2 s / (f b). For a D405 at
+848 x 480 (f = 447 px, baseline b = 18 mm) and the s = 0.08 that RealSense's engineers advise (0.032
+at best; github.com/realsenseai/librealsense issue 3904) this is 0.22 mm (0.09 mm) at 150 mm.
+Neighbouring pixels share most of a matching window, so their errors are correlated.
 """
 
 from __future__ import annotations
@@ -28,17 +26,14 @@ from tumortrack.sense.camera import pinhole_of
 if TYPE_CHECKING:
     from tumortrack.sense.kernels import Seen
 
-_NOTHING_MM = np.float32(1e6)
-REFERENCE_MM = 150.0  # the distance at which ``axial_mm`` is stated
+_NO_RETURN_MM = np.float32(1e6)
+REFERENCE_MM = 150.0  # the distance for which ``axial_mm`` is stated
 
 
 class CalibrationConfig(Config, frozen=True, kw_only=True):
-    """Largest errors of a camera out of calibration, as stereo cameras drift with temperature and
-    shocks; zero switches it off. Each frame draws its own error, uniformly to either side and the
-    same for all pixels: no averaging removes it.
-
-    ``offset_mm`` is added to every depth; ``scale`` is a share of the depth, 0..0.2.
-    """
+    """Largest calibration errors of a camera, as stereo cameras drift with temperature and shocks;
+    zero switches one off. Each frame draws its own, uniformly to either side and the same for all
+    pixels. ``offset_mm`` is added to every depth, ``scale`` is a share of the depth."""
 
     offset_mm: float = 0.0
     scale: float = 0.0
@@ -47,7 +42,7 @@ class CalibrationConfig(Config, frozen=True, kw_only=True):
         self.check_ranges("calibration", offset_mm=20.0, scale=0.2)
 
     def variance_mm2(self, depth_mm: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-        """Of these errors at depths, along the line of sight: a third of the largest squares."""
+        """Variance of these errors at depths, along the line of sight."""
         return (self.offset_mm**2 + (self.scale * depth_mm) ** 2) / 3
 
 
@@ -61,7 +56,7 @@ CAMERA_STD = np.array([1.0] * 3 + [0.01] * 3)  # mm at the organ, rad
 def miscalibrate(
     frame: DepthFrame, config: CalibrationConfig, rng: np.random.Generator
 ) -> DepthFrame:
-    """The frame as a camera out of calibration would measure it; ``rng`` is left as it was."""
+    """The frame as a miscalibrated camera would measure it; ``rng`` does not advance."""
     if config == CALIBRATED:
         return frame
     offset, scale = rng.spawn(1)[0].uniform(-1, 1, 2)
@@ -73,21 +68,19 @@ class NoiseConfig(Config, frozen=True, kw_only=True):
     """Strength of each part; zero switches it off.
 
     axial_mm: standard deviation at 150 mm; grows with z^2.
-    correlated_share: share of that variance that neighbouring pixels have in common, 0..1.
-    correlation_px: the distance over which they do.
-    flying_share: share of edge pixels that fly; they end up anywhere between the edge and what
-        lies behind it, at most ``flying_mm`` behind.
-    edge_px, edge_mm: a pixel is at an edge where, so near, depth falls back by so much or ends.
+    correlated_share: share of that variance that is common to neighbours within correlation_px.
+    flying_share: share of edge pixels that end up anywhere between the edge and what lies behind
+        it, at most ``flying_mm`` behind.
+    edge_px, edge_mm: at an edge, depth grows by edge_mm or ends within edge_px.
     hole_share: share of pixels lost in random blobs about ``hole_px`` wide.
     grazing_share: share lost where the surface is turned away by over ``grazing_degrees``.
     distortion_mm: largest slow depth error; each frame's peak is uniform in 0..distortion_mm.
-    scatter_share: false points per true one, in pixels without return; their depths are uniform
-        from the nearest true depth to the farthest, and ``scatter_mm`` to either side.
+    scatter_share: false points per true one, in pixels without return, at depths uniform over the
+        true ones and ``scatter_mm`` to either side.
     quantum_mm: depth unit of the sensor.
     fatten_px: how far the nearer surface spreads over what lies ``edge_mm`` or more behind an edge:
-        standard deviation of a normal distribution's magnitude, alike over about ``hole_px``.
-    shadow_px_mm: focal length times baseline; what the right camera does not see, or has outside
-        its picture, is lost.
+        standard deviation of a half-normal distribution, correlated over about ``hole_px``.
+    shadow_px_mm: focal length times baseline; what the right camera does not see is lost.
     """
 
     axial_mm: float = 0.0
@@ -136,9 +129,9 @@ D405_NOISE = NoiseConfig(
 
 
 def stereo_noise(focal_px: float, baseline_mm: float, disparity_px: float = 0.3) -> NoiseConfig:
-    """Of depth by semi-global matching of two pictures; ``focal_px`` and ``baseline_mm`` are the
-    endoscope's, ``disparity_px`` the standard deviation of its matches (docs/method.md). Lengths in
-    pixels are of an image as wide as training's, 424."""
+    """Noise of semi-global matching with an endoscope's ``focal_px`` and ``baseline_mm``;
+    ``disparity_px``: standard deviation of its matches (docs/method.md). Lengths in pixels are
+    for images 424 wide, as in training."""
     return NoiseConfig(
         axial_mm=REFERENCE_MM**2 * disparity_px / (focal_px * baseline_mm),
         correlated_share=0.95,
@@ -158,10 +151,10 @@ SENSORS: dict[Sensor, NoiseConfig] = {"d405": D405_NOISE, "stereo": STEREO_NOISE
 
 
 def add_noise(frame: DepthFrame, config: NoiseConfig, rng: np.random.Generator) -> DepthFrame:
-    """The frame as a noisy sensor would have seen it; the frame itself if all parts are off.
+    """The frame as a noisy sensor would have measured it.
 
-    One number is drawn from ``rng``, whatever is on; each part hashes its own stream from it. So
-    switching one part off leaves the random numbers of the others as they were.
+    Whatever is on, one number is drawn from ``rng``, and each part hashes its own stream from it:
+    switching one part off does not change the others' random numbers.
     """
     seed = int(rng.integers(2**62))
     if config == CLEAN:
@@ -187,26 +180,26 @@ def add_noise(frame: DepthFrame, config: NoiseConfig, rng: np.random.Generator) 
 
 
 def _matched(true_mm: np.ndarray, config: NoiseConfig, seed: int) -> np.ndarray:
-    """What two cameras' pictures have matches for, and where these belong to a nearer surface."""
+    """Depths where both cameras see the surface; those of nearer surfaces spread over edges."""
     from scipy.ndimage import minimum_filter
 
     from tumortrack.sense import kernels
 
     out_mm = true_mm.copy()
-    disparity_px = config.shadow_px_mm / np.nan_to_num(true_mm, nan=float(_NOTHING_MM))
-    lost = disparity_px > np.arange(true_mm.shape[1])  # outside the right picture
-    for k in range(1, int(disparity_px.max()) + 1):  # hidden by what stands k pixels to the right
+    disparity_px = config.shadow_px_mm / np.nan_to_num(true_mm, nan=float(_NO_RETURN_MM))
+    lost = disparity_px > np.arange(true_mm.shape[1])  # outside the right image
+    for k in range(1, int(disparity_px.max()) + 1):  # hidden by a surface k pixels to the right
         lost[:, :-k] |= disparity_px[:, k:] - disparity_px[:, :-k] > k + 0.5
     out_mm[lost] = np.nan
     if not config.fatten_px:
         return out_mm
-    every = kernels.seen_pixels(np.zeros(true_mm.shape, np.float32))
-    smooth = kernels.smooth_at(every, true_mm.shape, config.hole_px, seed).reshape(true_mm.shape)
-    wide_px = config.fatten_px * np.abs(smooth)
-    depth_mm = np.nan_to_num(true_mm, nan=float(_NOTHING_MM))
+    every_pixel = kernels.seen_pixels(np.zeros(true_mm.shape, np.float32))
+    smooth = kernels.smooth_at(every_pixel, true_mm.shape, config.hole_px, seed)
+    wide_px = config.fatten_px * np.abs(smooth.reshape(true_mm.shape))
+    depth_mm = np.nan_to_num(true_mm, nan=float(_NO_RETURN_MM))
     near_mm = minimum_filter(depth_mm, 3)
-    # Only from jumps: a slope is nearer in its neighbours too.
-    near_mm[depth_mm - near_mm < config.edge_mm] = _NOTHING_MM
+    # Only from jumps: on a slope, too, some neighbours are nearer.
+    near_mm[depth_mm - near_mm < config.edge_mm] = _NO_RETURN_MM
     for step in range(1, int(wide_px.max() + 0.5) + 1):
         fat = (near_mm < depth_mm - config.edge_mm) & (wide_px > step - 0.5)
         out_mm[fat] = np.fmin(out_mm, near_mm)[fat]
@@ -217,7 +210,7 @@ def _matched(true_mm: np.ndarray, config: NoiseConfig, seed: int) -> np.ndarray:
 def _disturb(
     frame: DepthFrame, depths_mm: np.ndarray, seen: Seen, config: NoiseConfig, seed: int
 ) -> None:
-    """Change the seen depths in place: edges, slow distortion, noise, holes."""
+    """Add edge effects, slow distortion, noise and holes to the seen depths, in place."""
     from scipy.special import ndtri
 
     from tumortrack.sense import kernels
@@ -247,14 +240,14 @@ def _disturb(
 def _scatter(
     size: int, seen: np.ndarray, depths_mm: np.ndarray, config: NoiseConfig, seed: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The pixels (flat indices, of ``size``) that get a false point, and its depth."""
+    """Pixels (flat indices of an image of ``size``) that get a false point, and its depth."""
     rng = np.random.default_rng((seed, 0))
     n_empty = size - len(seen)
     count = rng.poisson(config.scatter_share * len(seen)) if config.scatter_share else 0
     if not n_empty or not count:
         return seen[:0], depths_mm[:0]
     number = rng.integers(n_empty, size=count)
-    # Before the k-th empty pixel lie all seen ones with at most k empty ones before them.
+    # The k-th empty pixel comes after all seen ones with at most k empty ones before them.
     pixels = number + np.searchsorted(seen - np.arange(len(seen)), number, side="right")
     near_mm = max(depths_mm.min() - config.scatter_mm, 1.0)
     values_mm = rng.uniform(near_mm, depths_mm.max() + config.scatter_mm, count)

@@ -1,7 +1,7 @@
-"""Point clouds as PLY. Counts are held against the file's size before anything is allocated.
+"""Point clouds as PLY (Turk 1994, "The PLY Polygon File Format").
 
-Own code: readers of PLY at hand are either GPL or believe the header's counts.
-Format: Turk 1994, "The PLY Polygon File Format".
+Own code, because available readers are either GPL or allocate whatever a header claims; here counts
+are checked against the file's size first.
 """
 
 from __future__ import annotations
@@ -27,11 +27,8 @@ _LONGEST_HEADER = 64 * 1024  # bytes
 
 
 def parse_ply_properties(content: bytes, name: str, wanted: Sequence[str] = "xyz") -> np.ndarray:
-    """The wanted properties of the vertices as floats (n, len(wanted)), in the file's unit; faces
-    are not looked at.
-
-    Raises:
-        InputError: not a PLY, fewer bytes than the header claims, a property that is not there.
+    """The wanted vertex properties as floats (n, len(wanted)), in the file's unit; faces are
+    ignored. Raises InputError: not a PLY, fewer bytes than the header claims, a missing property.
     """
     end = content.find(b"end_header", 0, _LONGEST_HEADER)
     start = content.find(b"\n", end) + 1
@@ -53,13 +50,13 @@ def parse_ply_properties(content: bytes, name: str, wanted: Sequence[str] = "xyz
         return _ascii(body, count, places, len(columns), name)
     dtype = np.dtype([(column, _ORDERS[form] + code) for column, code in columns.items()])
     if count * dtype.itemsize > len(body):
-        raise InputError(_cut_off(name, count, len(body) // dtype.itemsize))
+        raise _cut_off(name, count, len(body) // dtype.itemsize)
     table = np.frombuffer(body, dtype, count)
     return np.stack([table[column].astype(np.float64) for column in wanted], axis=1)
 
 
 def _vertex_layout(lines: list[list[str]], name: str) -> tuple[int, dict[str, str]]:
-    """Number of vertices, and each property's type code, in the file's order."""
+    """Number of vertices, and the type code of each property, in the file's order."""
     count, columns, inside = -1, {}, False
     for line in lines:
         match line:
@@ -79,8 +76,8 @@ def _vertex_layout(lines: list[list[str]], name: str) -> tuple[int, dict[str, st
 
 
 def _ascii(body: bytes, count: int, wanted: list[int], columns: int, name: str) -> np.ndarray:
-    if 2 * count * columns > len(body) + 1:  # a digit and a blank each
-        raise InputError(_cut_off(name, count, len(body) // (2 * columns)))
+    if 2 * count * columns > len(body) + 1:  # at least a digit and a blank per number
+        raise _cut_off(name, count, len(body) // (2 * columns))
     if count == 0:
         return np.empty((0, len(wanted)))
     try:
@@ -90,19 +87,19 @@ def _ascii(body: bytes, count: int, wanted: list[int], columns: int, name: str) 
     except ValueError as error:
         raise InputError(f"{name} has a vertex that is no row of numbers: {error}.") from error
     if len(points) < count:
-        raise InputError(_cut_off(name, count, len(points)))
+        raise _cut_off(name, count, len(points))
     return points
 
 
-def _cut_off(name: str, claimed: int, held: int) -> str:
-    return (
+def _cut_off(name: str, claimed: int, held: int) -> InputError:
+    return InputError(
         f"{name} claims {claimed} points but has room for {held}; it is cut off or damaged. "
         "Export it again."
     )
 
 
 def write_cloud_ply(path: Path, points_mm: np.ndarray, **point_properties: np.ndarray) -> None:
-    """Write points (n, 3) of the camera frame; see ``cloud_ply``."""
+    """Write camera-frame points (n, 3); see ``cloud_ply``."""
     write_atomically(path, cloud_ply(points_mm, point_properties))
 
 
@@ -111,10 +108,7 @@ def cloud_ply(
 ) -> bytes:
     """Points (n, 3) as binary little-endian PLY, float32 mm, with further properties (``label``,
     ``probability``): arrays (n,) of uint8, int32, float32 or float64. A comment names the frame.
-
-    Raises:
-        InputError: a property of another length or type.
-    """
+    Raises InputError: a property of another length or type."""
     points = np.asarray(points_mm, "<f4")
     columns = dict(zip("xyz", points.T, strict=True)) | dict(point_properties)
     for name, values in columns.items():
@@ -124,9 +118,8 @@ def cloud_ply(
                 f"uint8, int32, float32, float64, and one value for each of {len(points)} points."
             )
     codes = {name: values.dtype.str[1:] for name, values in columns.items()}
-    table = np.empty(len(points), [(name, "<" + code) for name, code in codes.items()])
-    for name, values in columns.items():
-        table[name] = values
+    dtype = [(name, "<" + code) for name, code in codes.items()]
+    table = np.rec.fromarrays([*columns.values()], dtype)
     header = [
         "ply",
         "format binary_little_endian 1.0",

@@ -1,4 +1,4 @@
-"""What the camera sees of a mesh: a z-buffer depth image, and which vertices are visible."""
+"""Depth images of a mesh (z-buffer), and which points of it are visible."""
 
 from __future__ import annotations
 
@@ -11,6 +11,8 @@ from tumortrack.core.compiled import njit
 from tumortrack.core.types import DepthFrame, Intrinsics, Mesh
 from tumortrack.sense.camera import pinhole_of
 
+_TOLERANCE_MM = 0.05  # a ray to a vertex hits that vertex's triangles at about its own length
+
 
 def render_depth(
     vertices_camera_mm: Float[np.ndarray, "v 3"],
@@ -18,11 +20,9 @@ def render_depth(
     intrinsics: Intrinsics,
     stamp_ns: int = 0,
 ) -> DepthFrame:
-    """Depth image (mm along z, NaN where nothing is hit) of a closed mesh seen from outside.
-
-    Vertices (v, 3) in the camera frame, faces (f, 3) turned outward. Only triangles that face
-    the camera are drawn; a triangle that reaches behind the camera is left out.
-    """
+    """Depth image (mm along z, NaN where nothing is hit) of a closed mesh seen from outside, with
+    faces (f, 3) turned outward. Only triangles that face the camera and lie wholly in front of it
+    are drawn."""
     vertices = np.ascontiguousarray(vertices_camera_mm, np.float32)
     shape = (intrinsics.height, intrinsics.width)
     faces = np.ascontiguousarray(faces, np.int32)
@@ -69,20 +69,18 @@ def _z_buffer(vertices, faces, shape, pinhole):  # type: ignore[no-untyped-def]
                 pb = ((uc - x) * (va - y) - (vc - y) * (ua - x)) * inverse
                 pc = 1.0 - pa - pb
                 here = np.float32(pa * wa + pb * wb + pc * wc)
-                # No branch: half of these pixels lie outside, at random.
+                # No branch: half of these pixels lie outside, unpredictably.
                 here = here if min(pa, pb, pc) >= -1e-5 else np.float32(0.0)
                 nearest[y, x] = max(nearest[y, x], here)
     return nearest
 
 
 class Visibility:
-    """Which points on one fixed mesh an eye sees: exact, by ray.
+    """Which points on a fixed mesh are visible from an eye, by exact ray casting.
 
-    All rays leave one eye, so a triangle can hide only points within its bounds in the eye's
-    picture: these are found by bisection, and no tree is needed.
+    All rays leave one eye, so a triangle can hide only points within its bounds in the eye's image:
+    these are found by bisection, and no tree is needed.
     """
-
-    _TOLERANCE_MM = 0.05  # a ray to a vertex hits the vertex's own triangles at about its length
 
     def __init__(self, mesh: Mesh) -> None:
         self._centre = mesh.vertices_mm.mean(0)
@@ -92,7 +90,7 @@ class Visibility:
     def __call__(
         self, points_mm: Float[np.ndarray, "n 3"], eye_mm: Float[np.ndarray, " 3"]
     ) -> Bool[np.ndarray, " n"]:
-        """True where nothing of the mesh lies between the eye and the point (mesh's frame)."""
+        """True where no part of the mesh lies between eye and point (mesh's frame)."""
         eye = np.asarray(eye_mm, np.float64) - self._centre
         axes = np.linalg.svd(eye[None])[2]  # rows: along the line of sight, and two across it
         axes = np.stack([axes[1], axes[2], -axes[0] * np.sign(axes[0] @ eye)])
@@ -100,28 +98,28 @@ class Visibility:
         vertices = (self._vertices - eye) @ axes.T
         order = np.argsort(_across(rays)[:, 0], kind="stable")
         uv = _across(rays)[order]
-        before = uv[np.isfinite(uv[:, 0]), 0]  # other rays point away from the mesh
-        lowest, width = (before[0], np.ptp(before) / 256 + 1e-12) if len(before) else (0.0, 1.0)
-        starts = np.searchsorted(before, lowest + width * np.arange(258))  # of columns of rays
+        ahead = uv[np.isfinite(uv[:, 0]), 0]  # other rays point away from the mesh
+        lowest, width = (ahead[0], np.ptp(ahead) / 256 + 1e-12) if len(ahead) else (0.0, 1.0)
+        starts = np.searchsorted(ahead, lowest + width * np.arange(258))  # of columns of rays
         hidden = np.empty(len(rays), np.bool_)
         columns = (starts, lowest, width)
-        seen, meshed = (rays[order], uv), (vertices, _across(vertices), self._faces)
-        hidden[order] = _hidden(*seen, *meshed, columns, self._TOLERANCE_MM)
+        sorted_rays, mesh = (rays[order], uv), (vertices, _across(vertices), self._faces)
+        hidden[order] = _hidden(*sorted_rays, *mesh, columns, _TOLERANCE_MM)
         return ~hidden
 
 
 def _across(points: np.ndarray) -> np.ndarray:
-    """x / z and y / z of points (n, 3) before an eye; infinite where they are not before it."""
-    before = points[:, 2:] > 1e-6
-    return np.divide(points[:, :2], points[:, 2:], np.full((len(points), 2), np.inf), where=before)
+    """x / z and y / z of points (n, 3); infinite where they are not in front of the eye."""
+    ahead = points[:, 2:] > 1e-6
+    return np.divide(points[:, :2], points[:, 2:], np.full((len(points), 2), np.inf), where=ahead)
 
 
 @njit(nogil=True)
 def _hidden(rays, rays_uv, vertices, vertices_uv, faces, columns, tolerance_mm):  # type: ignore[no-untyped-def]
-    """Whether a triangle crosses each ray (n, 3), sorted by its first coordinate in the picture,
-    nearer to the eye than its end by more than the tolerance (Moeller and Trumbore 1997,
-    doi 10.1080/10867651.1997.10487468). columns: where each starts, the first's place, the width.
-    """
+    """Whether a triangle crosses each ray (n, 3) nearer to the eye than the ray's end by more than
+    the tolerance (Moeller and Trumbore 1997, doi 10.1080/10867651.1997.10487468). Rays are sorted
+    by their first image coordinate; columns: index of each one's first ray, lowest coordinate,
+    width."""
     starts, lowest, width = columns
     hidden = np.zeros(len(rays), np.bool_)
     slack = 1e-9  # rounding: a ray along an edge belongs to both triangles

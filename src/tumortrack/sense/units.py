@@ -1,4 +1,4 @@
-"""The unit that numbers taken for millimetres are probably in."""
+"""Guessing the unit of depths that were read as millimetres."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from jaxtyping import Float
 
 from tumortrack.core.types import DepthFrame, SensorCloud
 
-_SHARE = 0.1  # of the lengths: an organ may be that little of a depth image
-_MOST = 20_000  # of them tell enough
+_SHARE = 0.1  # of the lengths in range: an organ may be that little of a depth image
+_SAMPLED = 20_000  # lengths at most
 
 
 class Unit(Enum):
-    """How many mm one is, of what is often taken for mm: also by a depth image's step, 1 mm read
-    as 0.1 being ``CENTIMETRE``, and mm read as metres ``MICROMETRE``."""
+    """Units often taken for mm, and how many mm one is. Depth steps of 1 mm read as 0.1 are
+    ``CENTIMETRE``, mm read as metres ``MICROMETRE``."""
 
     METRE = 1000.0
     INCH = 25.4
@@ -25,12 +25,12 @@ class Unit(Enum):
 
     @property
     def of_cloud(self) -> str:
-        """What to do with a cloud in this unit, as a clause."""
+        """Advice, as a clause, about a cloud in this unit."""
         return _OF_CLOUD[self]
 
     @property
     def of_depth(self) -> str:
-        """What to do with a depth image whose depths are out by this factor, as a clause."""
+        """Advice, as a clause, about a depth image whose depths are off by this factor."""
         return (
             f"times {self.value:g} they would lie there; check what one step of the depth image is "
             "(depth_unit_mm in the intrinsics file; 0.1 mm where the file does not say)"
@@ -47,11 +47,10 @@ _OF_CLOUD = {
 
 
 def likely_unit(lengths_mm: Float[np.ndarray, ...], range_mm: tuple[float, float]) -> Unit | None:
-    """The unit in which most of some lengths (depths, say), which were taken for mm, lie in the
-    range where they should. None: a tenth of them lie there as they are, or in no unit. Lengths
-    that are not finite do not count."""
+    """The unit in which most of the lengths, which were read as mm, lie in the expected range; None
+    if a tenth of them do as they are, or in no unit. Only finite lengths count."""
     lengths = lengths_mm[np.isfinite(lengths_mm)]
-    lengths = lengths[:: len(lengths) // _MOST + 1]
+    lengths = lengths[:: len(lengths) // _SAMPLED + 1]
 
     def share(factor: float) -> float:
         return float(np.mean((lengths > range_mm[0] / factor) & (lengths < range_mm[1] / factor)))
@@ -63,8 +62,8 @@ def likely_unit(lengths_mm: Float[np.ndarray, ...], range_mm: tuple[float, float
 
 
 def unit_advice(content: DepthFrame | SensorCloud, near_mm: float, far_mm: float) -> str:
-    """What to do about the unit, as a clause, where hardly any depth lies between near and far but
-    in another unit many would; else nothing."""
+    """Advice about the unit, as a clause, if hardly any depth lies between near and far but many
+    would in another unit; else empty."""
     z_mm = content.depth_mm if isinstance(content, DepthFrame) else content.points_mm[:, 2]
     unit = likely_unit(z_mm, (near_mm, far_mm))
     if unit is None:
