@@ -1,8 +1,8 @@
-"""The values of live tracking, and what a source and a sink must be.
+"""The values of live tracking, and the interfaces of sources and sinks.
 
-A source hands over an ``Observation``. The loop makes one ``TrackingResult`` of it. Every sink gets
-every result or, if it is slow, the newest. A source or sink is one file: a configuration whose
-``open`` makes it. Other packages add their own: see ``live.spec`` and docs/live.md.
+A source returns an ``Observation``, from which the loop makes one ``TrackingResult``. Each sink
+gets every result or, if it is slow, the newest. A source or sink is one file: a configuration with
+a method ``open``. Other packages can add their own: see ``live.spec`` and docs/live.md.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ if TYPE_CHECKING:
 
 
 class SourceLost(TumortrackError):
-    """The source is gone for now: unplugged, killed, unreadable. It is opened again."""
+    """The source is gone for now: unplugged, killed, unreadable. It will be reopened."""
 
     exit_code = 3
 
 
 class SourceEnded(TumortrackError):
-    """The source has nothing more to give, as a recording at its end. Not a fault."""
+    """There are no more frames, as at the end of a recording. Not a fault."""
 
     exit_code = 0
 
@@ -47,10 +47,10 @@ class Observation:
     """What a source observed at one instant; camera frame, mm.
 
     ``content`` has the ``stamp_ns`` of its exposure. ``arrived_ns``: when it reached this program,
-    by ``time.time_ns``. ``mask``: of a depth image: True where the organ may be. ``truth``: the
-    true surfaces, where the source simulates them. ``frame_id``: what the source calls the camera's
-    frame; None: it is of a kind that calls it nothing. ``picture``: what the camera saw in the
-    pixels of the depth image: grey, or red, green and blue.
+    by ``time.time_ns``. ``mask``: True in pixels of the depth image where the organ may be.
+    ``truth``: the true surfaces, from a simulation. ``frame_id``: the source's name for the camera
+    frame; None: this kind of source has no names. ``picture``: grey or RGB, aligned with the depth
+    image.
     """
 
     content: DepthFrame | SensorCloud
@@ -69,33 +69,29 @@ class Observation:
 class Source(Protocol):
     """An open source. One thread calls ``read``; another may call ``close``."""
 
-    # Stamps are this machine's time.time_ns, so the age of a frame is known; of the one read last.
+    # The stamp of the frame read last is this machine's time.time_ns, so its age is known.
     host_clock: bool
     lossless: bool  # every frame is processed, not only the newest: the source waits for the loop
 
     @property
     def dropped(self) -> int:
         """Frames lost inside the source, as far as it knows."""
-        ...
 
     def read(self, timeout_s: float) -> Observation | None:
         """The newest frame that was not read before; None if none came in time. Raises SourceLost,
-        SourceEnded: as they say; InputError: this frame cannot be used; the loop reports it and
-        reads on."""
-        ...
+        SourceEnded, or InputError: this frame cannot be used; the loop reports it and reads on."""
 
     def close(self) -> None:
         """Release everything; may be called twice."""
-        ...
 
 
 @dataclass(frozen=True, eq=False)
 class PublishedFrame:
-    """Where results are published. Of a calibration also (``calibrated``), as far as its file
-    says it: ``camera_frame_id``, what sources call the camera's frame; ``table_in_camera``: unit
-    normal and offset (mm) of the table's plane, ``normal @ point = offset``, when it was made;
-    ``error_mm`` and ``error_deg``: bounds of its error, at the camera and of its direction.
-    ``moves``: the camera is meant to; then each result has where it was."""
+    """Where results are published. From a calibration file (``calibrated``), where it has them:
+    ``camera_frame_id``, the sources' name for the camera frame; ``table_in_camera``, unit normal
+    and offset (mm) of the table's plane at the calibration, ``normal @ point = offset``;
+    ``error_mm`` and ``error_deg``, bounds of the calibration's error, at the camera and of its
+    direction. ``moves``: the camera is meant to move, and each result has its pose."""
 
     frame_id: str = "camera"
     published_from_camera: Float64[np.ndarray, "4 4"] = field(default_factory=lambda: np.eye(4))
@@ -107,20 +103,20 @@ class PublishedFrame:
     moves: bool = False
 
     def of_camera(self, published_from_camera: Float64[np.ndarray, "4 4"]) -> PublishedFrame:
-        """The same frame, for a camera that stands there."""
+        """The same frame, for a camera at another pose."""
         if np.array_equal(published_from_camera, self.published_from_camera):
             return self
         return replace(self, published_from_camera=published_from_camera, table_in_camera=None)
 
     def error_at(self, distance_mm: float) -> float | None:
-        """The calibration's error so far from the camera, mm; None: it states none."""
-        turned_mm = distance_mm * math.radians(self.error_deg)
-        return None if self.error_mm is None else self.error_mm + turned_mm
+        """The calibration's error at a distance from the camera, mm; None: it states none."""
+        rotation_mm = distance_mm * math.radians(self.error_deg)
+        return None if self.error_mm is None else self.error_mm + rotation_mm
 
 
 @dataclass(frozen=True, eq=False)
 class CameraView:
-    """What one of the cameras saw, and where it was then. ``number``: the camera's, from 1."""
+    """What one of several cameras saw, and its pose then. ``number``: of the camera, from 1."""
 
     number: int
     seen: Observation
@@ -141,8 +137,8 @@ class TransformedEstimate:
 @dataclass(frozen=True, eq=False)
 class RigidShape:
     """A surface that moves rigidly: a link of an arm, a table, a planned piece. ``name`` is unique
-    within a workcell, with slashes between levels (``cutter/forearm``). Sinks send the surface
-    again only if ``mesh`` is another object than before, otherwise its pose alone."""
+    within a workcell, with slashes between levels (``cutter/forearm``). Sinks may send the surface
+    again only when ``mesh`` is another object than before, otherwise only its pose."""
 
     name: str
     mesh: Mesh  # in its own frame, mm
@@ -163,12 +159,12 @@ class Polyline:
 
 @dataclass(frozen=True, eq=False)
 class Workcell:
-    """What the arms do now, and what is shown with them; published frame, mm.
+    """What the arms are doing, and what is shown with them; published frame, mm.
 
-    ``state``: of the procedure: approach, grasp, hold, sweep 1, ... ``halted``: why the arms stand
-    still before their end; empty: they do not. ``joints_rad``: angle by the joint's name.
-    ``left_mm``: of the planned margin, once all errors of the moment are taken off; None: unknown.
-    ``cutting``: the instrument is on a cut.
+    ``state``: of the procedure: approach, grasp, hold, sweep 1, ... ``halted``: why the arms have
+    stopped early; empty: they have not. ``joints_rad``: angle by name of the joint. ``left_mm``:
+    what the present errors leave of the planned margin; None: unknown. ``cutting``: the instrument
+    is on a cut.
     """
 
     state: str
@@ -186,14 +182,14 @@ class Workcell:
 
     @property
     def box_mm(self) -> Float64[np.ndarray, "2 3"] | None:
-        """The box round the boxes of all shapes, where they are now; None without any."""
+        """The bounding box of the bounding boxes of all shapes; None without any."""
         if not self.shapes:
             return None
         boxes = np.array([shape.mesh.box_mm for shape in self.shapes])  # (n, 2, 3)
         poses = np.array([shape.published_from_shape for shape in self.shapes])
-        middles = np.einsum("nij,nj->ni", poses[:, :3, :3], boxes.mean(1)) + poses[:, :3, 3]
+        centers = np.einsum("nij,nj->ni", poses[:, :3, :3], boxes.mean(1)) + poses[:, :3, 3]
         halves = np.einsum("nij,nj->ni", np.abs(poses[:, :3, :3]), np.ptp(boxes, axis=1) / 2)
-        return np.stack([(middles - halves).min(0), (middles + halves).max(0)])
+        return np.stack([(centers - halves).min(0), (centers + halves).max(0)])
 
 
 @dataclass(frozen=True, eq=False)
@@ -202,22 +198,22 @@ class TrackingResult:
 
     Attributes:
         sequence: number of the result, from 0.
-        stamp_ns: of the frame; if none came, the present by the source's clock.
-        estimate: camera frame, mm; None where nothing can be said. Never an older one.
+        stamp_ns: of the frame; without one, the present time on the source's clock.
+        estimate: camera frame, mm; None if there is none. Never an older one.
         reason: why there is no estimate; empty with one.
-        quality: ``poor``: it should not be relied on, and ``warning`` says why.
-        observation: what the source saw, of several cameras the one in whose frame the estimate
-            is; None if no frame came, or where the camera was is unknown.
-        organ: its points that belong to the organ; camera frame.
+        quality: ``poor``: do not rely on it; ``warning`` says why.
+        observation: what the source saw; of several cameras, the one in whose frame the estimate
+            is. None without a frame, or if the camera's pose is unknown.
+        organ: the points that belong to the organ; camera frame.
         seconds: duration of each stage.
-        latency_ms: until the result was handed to the sinks, from the stamp (if the source does
-            not have this machine's clock: from the arrival; if it waits for the loop: from the
-            reading); None if no frame came.
+        latency_ms: from the stamp to the handover to the sinks (without this machine's clock: from
+            the arrival; from a lossless source: from the reading); None without a frame.
         workcell: what the arms do with it; None without arms.
-        dropped: frames so far that newer ones overtook.
-        views: of several cameras: what each saw. ``cameras``: which of them the estimate is from,
-            and of the others why not; of a scan what each look added. In words; else empty.
-        playback: a stored plan is shown; nothing is tracked, and there never is an estimate.
+        dropped: frames so far that newer ones replaced.
+        views: of several cameras, what each saw.
+        cameras: in words, which cameras the estimate is from and why not from the others; of a
+            scan, what each look added; else empty.
+        playback: a stored plan is shown: nothing is tracked, and there never is an estimate.
     """
 
     sequence: int
@@ -242,16 +238,23 @@ class TrackingResult:
         """The estimate in the published frame: what sinks send."""
         if self.estimate is None:
             return None
-        way, cloud = self.published_frame.published_from_camera, self.estimate.cloud
+        pose, cloud = self.published_frame.published_from_camera, self.estimate.cloud
         meshes, structures = (
-            {name: one.moved(transform_points(way, one.vertices_mm)) for name, one in some.items()}
-            for some in (self.estimate.meshes, self.estimate.structures)
+            {name: m.moved(transform_points(pose, m.vertices_mm)) for name, m in group.items()}
+            for group in (self.estimate.meshes, self.estimate.structures)
         )
-        points_mm = transform_points(way, cloud.points_mm)
+        points_mm = transform_points(pose, cloud.points_mm)
         return TransformedEstimate(points_mm, cloud.labels, cloud.probability, meshes, structures)
 
+    @property
+    def camera_views(self) -> tuple[CameraView, ...]:
+        """What each camera saw, also of a single one."""
+        if self.views or self.observation is None:
+            return self.views
+        return (CameraView(1, self.observation, self.published_frame.published_from_camera),)
+
     def center_mm(self, part: str) -> Float64[np.ndarray, " 3"] | None:
-        """The centre of a part's box (of its axes in the camera frame), in the published frame."""
+        """The centre of a part's bounding box in the camera frame, carried to the published one."""
         mesh = None if self.estimate is None else self.estimate.meshes.get(part)
         if mesh is None:
             return None
@@ -259,7 +262,7 @@ class TrackingResult:
         return transform_points(self.published_frame.published_from_camera, center_mm)[0]
 
     def describe(self) -> str:
-        """How good the estimate is, in words for people, or why there is none."""
+        """How good the estimate is, in words, or why there is none."""
         if self.estimate is None:
             return f"none, no estimate: {self.reason}"
         by = self.cameras and f"; {self.cameras}"
@@ -271,33 +274,29 @@ class TrackingResult:
 
 @runtime_checkable
 class ArmsController(Protocol):
-    """Moves arms by the results. The loop calls it from its own thread alone."""
+    """Moves arms by the results. The loop calls it from its own thread only."""
 
     @property
     def ended(self) -> bool:
         """The procedure is over; the loop ends too."""
-        ...
 
     def act(self, result: TrackingResult) -> TrackingResult:
-        """The result with the present workcell, as sinks get it. Called with every result, with and
+        """The result with the present workcell, for the sinks. Called with every result, with and
         without an estimate."""
-        ...
 
     def abort(self, reason: str) -> None:
         """Stop the arms for good."""
-        ...
 
     def summary(self) -> dict[str, Any]:
-        """What they did, for a run's report."""
-        ...
+        """What they did, for the run's report."""
 
 
 @dataclass(eq=False)
 class Controls:
-    """What the user asks of the running loop; from any thread. ``picked_mm``: this point (published
-    frame) lies on the organ: track the piece that it is on. ``aborted``: the arms stop for good.
-    ``clicks``: what clicks in pictures showed; ``taught``: what follows from them, as far as they
-    can be told apart; ``colour``: how far, in words."""
+    """What the user asks of the running loop; from any thread. ``picked_mm``: a point on the organ
+    (published frame): track the piece that it is on. ``aborted``: the arms stop for good.
+    ``clicks``: colours at clicks in pictures; ``taught``: the classifier learned from them, if they
+    can be separated; ``colour``: its state in words."""
 
     picked_mm: Float64[np.ndarray, " 3"] | None = None
     aborted: threading.Event = field(default_factory=threading.Event)
@@ -306,8 +305,8 @@ class Controls:
     colour: str = ""
 
     def click(self, seen: Observation, place_mm: Float[np.ndarray, " 3"], organ: bool) -> None:
-        """The user clicked on this place (camera frame), and says whether it is the organ's. Raises
-        InputError: there is no picture, or it shows too little there; then nothing changes."""
+        """The user clicked on this place (camera frame): on the ``organ``, or beside it. Raises
+        InputError, and changes nothing: there is no picture, or it shows too little there."""
         from tumortrack.sense.camera import project
         from tumortrack.sense.region.taught import look, teach
 
@@ -321,26 +320,26 @@ class Controls:
         self.clicks, self.taught = (*self.clicks, new), None
         try:
             self.taught = teach(self.clicks)
-            said = f"in use: {100 * self.taught.right:.0f} % of a click are told by the others"
+            state = f"in use: {100 * self.taught.right:.0f} % of a click are told by the others"
         except InputError as error:
-            said = f"not in use: {error}"
-        count = sum(one.organ for one in self.clicks)
+            state = f"not in use: {error}"
+        count = sum(click.organ for click in self.clicks)
         beside = len(self.clicks) - count
-        self.colour = f"clicks: {count} on the organ, {beside} beside it; {said}"
+        self.colour = f"clicks: {count} on the organ, {beside} beside it; {state}"
 
     def forget(self) -> None:
-        """Whatever was clicked on."""
+        """Forget all clicks."""
         self.picked_mm, self.clicks, self.taught, self.colour = None, (), None, ""
 
 
 @dataclass(frozen=True, eq=False)
 class SinkContext:
-    """What a sink knows when it is opened. ``parts``: the model's, the organ first. ``anatomy_ct``:
-    the organ in the CT (LPS, mm), if the model has it: estimates then have a motion, and their
-    meshes its triangles. ``arms``: results may have a workcell. ``patient``: whose organ the model
-    is of. ``cameras``: where several stand still, published frame. ``tip_mm``: where the tool's tip
-    of an arm (cutter, holder) is, by the arm's six joints; published frame. ``corrected``: depths
-    are corrected before sinks see them."""
+    """What a sink knows when it is opened. ``parts``: of the model, the organ first.
+    ``anatomy_ct``: the organ in the CT (LPS, mm), if the model has it: estimates then have a
+    motion, and their meshes its triangles. ``arms``: results may have a workcell. ``patient``: of
+    the model. ``cameras``: poses of several fixed cameras, published frame. ``tip_mm``: from an
+    arm's name (cutter, holder) and its six joints to the tip of its tool, published frame.
+    ``corrected``: depths are corrected before sinks see them."""
 
     parts: tuple[str, ...]
     published_frame: PublishedFrame
@@ -354,43 +353,42 @@ class SinkContext:
 
     @property
     def structures(self) -> tuple[str, ...]:
-        """Names of what else moves with the organ."""
+        """Names of the structures that move with the organ."""
         return () if self.anatomy_ct is None else tuple(self.anatomy_ct.structures)
 
 
 @runtime_checkable
 class Sink(Protocol):
     """An open sink. Both methods are called from one thread of its own, so they may take their
-    time. Errors are counted and reported, and the loop goes on. A ``counts: dict[str, int]``, if
-    there is one, goes into the run's report; ``notes``, lines of text, are told when it is open."""
+    time. Errors are counted and reported, and the loop goes on. An optional ``counts: dict[str,
+    int]`` goes into the run's report; optional ``notes``, lines of text, are printed when it is
+    open."""
 
     def publish(self, result: TrackingResult) -> None: ...
 
     def close(self) -> None:
         """Flush and release everything; may be called twice."""
-        ...
 
 
 class SourceConfig(Config, frozen=True, kw_only=True, tag_field="kind"):
-    """Base of every source's configuration; its fields are the options on the command line, its
-    ``tag`` is the kind's name. ``target`` names the field that stands before the question mark in
-    ``kind:target?key=value``; empty: there is none."""
+    """Base of source configurations. Its fields are the options on the command line, its ``tag`` is
+    the kind. ``target`` names the field before the question mark in ``kind:target?key=value``;
+    empty: there is none."""
 
     target: ClassVar[str] = ""
 
     def patient(self) -> Patient:
-        """Whose organ it shows, as far as it says so. Raises TumortrackError: what it says cannot
-        be read."""
+        """The patient, where the source states one. Raises TumortrackError: it cannot be read."""
         return NOBODY
 
     @abstractmethod
     def open(self) -> Source:
-        """Raises SourceLost if what it needs is missing now, InputError if it can never work."""
+        """Raises SourceLost if something is missing now, InputError if it can never work."""
 
 
 class SinkConfig(Config, frozen=True, kw_only=True, tag_field="kind"):
-    """Base of every sink's configuration, as ``SourceConfig``. ``queue_size``: how many results
-    wait for a slow sink before the oldest is dropped; 1: it gets the newest."""
+    """Base of sink configurations, as ``SourceConfig``. ``queue_size``: how many results wait for a
+    slow sink before the oldest is dropped; 1: it gets the newest."""
 
     target: ClassVar[str] = ""
     queue_size: ClassVar[int] = 1

@@ -1,2 +1,2 @@
-"""The ROS graph, and its messages without ROS. ROS is in metres and everything else here in
-millimetres: both become each other in these files and in no other."""
+"""ROS graphs and messages, with or without ROS installed. ROS uses metres, everything else here
+millimetres; only these files convert between them."""

@@ -1,9 +1,9 @@
 """ROS 2 topics without ROS: CDR bytes over Cyclone DDS, named and typed as ROS 2 does it.
 
 A topic /a/b is ``rt/a/b`` on the wire, its type ``pkg::msg::dds_::Name_``, its encoding XCDR1,
-and the type's hash stands in the endpoint's user data (https://design.ros2.org/articles/
-topic_and_service_names.html, REP 2011, REP 2016). cyclonedds' Python layer would take a sample
-apart into Python objects, 40,000 points at 17 Hz; here bytes go straight to its C library.
+and the endpoint's user data holds the type's hash (https://design.ros2.org/articles/
+topic_and_service_names.html, REP 2011, REP 2016). cyclonedds' Python layer would turn samples into
+Python objects, 40,000 points at 17 Hz; here bytes go straight to its C library.
 """
 
 from __future__ import annotations
@@ -35,18 +35,18 @@ from tumortrack.core.errors import InputError, TumortrackError
 from tumortrack.live.ros.bus import Publisher, Subscriber
 from tumortrack.live.ros.messages import Messages
 
-# A writer waits while more than WhcHigh is not acknowledged. One cloud is more than the default,
-# 500 kB: beside a reliable subscriber that hangs, one call in twenty took 25 ms instead of 2. The
-# newest message alone is kept, so the limit set here is never reached. The receive buffer holds a
-# few clouds; the kernel cuts it to net.core.rmem_max. Where there is no multicast, programs with
-# another maker's DDS that start later are found by announcements alone: each second, not every 8.
+# A writer waits while more than WhcHigh is unacknowledged. One cloud exceeds the default of 500 kB:
+# beside a reliable subscriber that hangs, one call in twenty took 25 ms instead of 2. Only the
+# newest message is kept, so this limit is never reached. The receive buffer holds a few clouds; the
+# kernel caps it at net.core.rmem_max. Without multicast, programs with another vendor's DDS that
+# start later are found by announcements only: each second, not every 8.
 _TUNING = (
     "<CycloneDDS><Domain><Internal><Watermarks><WhcHigh>64MB</WhcHigh></Watermarks>"
     '<SocketReceiveBufferSize max="16MB"/></Internal>'
     "<Discovery><SPDPInterval>1s</SPDPInterval></Discovery></Domain></CycloneDDS>"
 )
-# As rmw_cyclonedds does it for the discovery range LOCALHOST; bound to the loopback interface
-# besides, as its ROS_LOCALHOST_ONLY is.
+# As rmw_cyclonedds does for the discovery range LOCALHOST, and bound to the loopback interface, as
+# it does for ROS_LOCALHOST_ONLY.
 _LOCAL = (
     "<CycloneDDS><Domain><General><AllowMulticast>false</AllowMulticast><Interfaces>"
     '<NetworkInterface address="127.0.0.1"/></Interfaces></General><Discovery>'
@@ -57,25 +57,24 @@ _LOCAL = (
 _BLOCKED_NS = 20_000_000  # how long a writer may wait for a slow subscriber
 _MOST_ENDPOINTS = 4096
 _LARGEST_DOMAIN = 232  # further ones have ports beyond 65535 (DDSI-RTPS 9.6.1.1)
-_OTHER_TYPES: dict[str, Any] = {  # those that cyclonedds calls otherwise than ROS
+_OTHER_TYPES: dict[str, Any] = {  # that have other names in cyclonedds than in ROS
     **{"string": str, "bool": bool},
     **dict.fromkeys(("char", "byte", "octet"), types.uint8),
 }
 
-# A domain is set up once per process, with one participant and one topic of each name and type. All
-# of it outlives whoever used it: a domain that is made again would cut off the others, and while
-# Cyclone (11.0.1) makes a topic, it looks through all types without the lock under which types that
-# nobody uses any more are freed. A program that left the graph and joined it again could crash.
+# A domain is set up once per process, with one participant and one topic of each name and type.
+# None of it is ever released: making a domain again would cut off its other users, and Cyclone
+# (11.0.1) searches all types without a lock while it makes a topic, so that a program that left the
+# graph and joined it again could crash.
 _domains: dict[int, tuple[Any, DomainParticipant]] = {}
 _topics: dict[tuple[int, str, str], Any] = {}
 _setting_up = threading.Lock()
 
 
 class DdsBus:
-    """Readers and writers in the environment's domain; see ``bus.Bus``. ``CYCLONEDDS_URI``,
-    ``ROS_LOCALHOST_ONLY`` and ``ROS_AUTOMATIC_DISCOVERY_RANGE`` choose the network. Raises
-    InputError if the environment or the network cannot be used.
-    """
+    """See ``bus.Bus``; in the environment's domain. ``CYCLONEDDS_URI``, ``ROS_LOCALHOST_ONLY`` and
+    ``ROS_AUTOMATIC_DISCOVERY_RANGE`` choose the network. Raises InputError if the environment or
+    the network cannot be used."""
 
     def __init__(self, messages: Messages) -> None:
         self.messages = messages
@@ -84,7 +83,7 @@ class DdsBus:
         try:
             member = _member_of(domain)
             self._waitset, self._over = core.WaitSet(member), core.GuardCondition(member)
-            self._waitset.attach(self._over)  # and without anything attached it would not wait
+            self._waitset.attach(self._over)  # with nothing attached it would not wait
             self._published = BuiltinDataReader(member, BuiltinTopicDcpsPublication)
             self._writers, self._readers = DdsPublisher(member), DdsSubscription(member)
         except core.DDSException as error:
@@ -94,42 +93,41 @@ class DdsBus:
                 "programs are in that domain."
             ) from error
         self._closed = False
-        self.note = "on this machine alone"
-        if not _stays_here():
-            self.note = (
-                "anyone in this network can see the patient's organ, and publish under these "
-                "names; ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST keeps it on this machine"
-            )
+        self.note = (
+            "on this machine alone"
+            if _stays_here()
+            else "anyone in this network can see the patient's organ, and publish under these "
+            "names; ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST keeps it on this machine"
+        )
 
     def publisher(self, topic: str, kind: str, latched: bool = False) -> Publisher:
         durability = Policy.Durability
         kept = durability.TransientLocal if latched else durability.Volatile
         reliable = Policy.Reliability.Reliable(_BLOCKED_NS)
         writer: Any = DataWriter(self._writers, *self._endpoint(topic, kind, reliable, kept, 1))
-        # By ctypes, and not by the extension module: that one keeps Python's lock while it waits
-        # for a slow subscriber.
+        # By ctypes: the extension module holds the GIL while it waits for a slow subscriber.
         write = DDS._dll_handle.dds_write
         write.argtypes = [ctypes.c_int32, ctypes.POINTER(Sample)]
         write.restype = ctypes.c_int32
 
         def publish(raw: bytes | memoryview) -> None:
-            """Fails where subscribers don't keep up, or these bytes are not what the topic's type
-            says."""
+            """Fails if subscribers don't keep up, or the bytes are not of the topic's type."""
             padded = np.frombuffer(bytes(raw) + bytes(-len(raw) % 4), np.uint8)
             sample = Sample(padded.ctypes.data, padded.nbytes)
             if (code := write(writer._ref, ctypes.byref(sample))) < 0:
-                said = f"a message of {len(raw)} bytes was not sent ({_error_text(code)})"
-                raise TumortrackError(f"{topic}: {said}.")
+                raise TumortrackError(
+                    f"{topic}: a message of {len(raw)} bytes was not sent ({_error_text(code)})."
+                )
 
         def flush(timeout_s: float) -> None:
-            # Not its public method: that one fails on a timeout (11.0.1).
+            # Its public method fails on a timeout (11.0.1).
             writer._wait_for_acks(writer._ref, int(timeout_s * 1e9))
 
         return Publisher(publish, flush)
 
     def subscriber(self, topic: str, kind: str, most: int = 5, latched: bool = False) -> Subscriber:
-        # Best effort and volatile ask for the least, and so match every publisher; what was
-        # published before comes only to who asks for it, reliably.
+        # Best effort and volatile match every publisher; what was published before comes only to
+        # reliable, transient local subscribers.
         qos: tuple[Any, Any] = (Policy.Reliability.BestEffort, Policy.Durability.Volatile)
         if latched:
             qos = Policy.Reliability.Reliable(0), Policy.Durability.TransientLocal
@@ -145,17 +143,15 @@ class DdsBus:
     def topics(self) -> dict[str, set[str]]:
         mask = core.ViewState.Any | core.SampleState.Any | core.InstanceState.Alive
         alive = core.ReadCondition(self._published, mask)
-        known = self._published.read(_MOST_ENDPOINTS, alive)
-        found: dict[str, set[str]] = {}
-        for one in known:
-            if one.topic_name.startswith("rt/"):
-                kind = ros_name(one.type_name) or one.type_name
-                found.setdefault(one.topic_name.removeprefix("rt"), set()).add(kind)
-        return found
+        topics: dict[str, set[str]] = {}
+        for endpoint in self._published.read(_MOST_ENDPOINTS, alive):
+            if endpoint.topic_name.startswith("rt/"):
+                kind = ros_name(endpoint.type_name) or endpoint.type_name
+                topics.setdefault(endpoint.topic_name.removeprefix("rt"), set()).add(kind)
+        return topics
 
     def wait(self, timeout_s: float) -> None:
-        # Closed meanwhile by another thread: nothing will come.
-        with contextlib.suppress(core.DDSException):
+        with contextlib.suppress(core.DDSException):  # closed meanwhile by another thread
             self._waitset.wait(max(0, int(timeout_s * 1e9)))
 
     def close(self) -> None:
@@ -163,8 +159,9 @@ class DdsBus:
             closed, self._closed = self._closed, True
         if not closed:
             self._over.set(True)
-            for one in (self._writers, self._readers, self._published, self._waitset, self._over):
-                one._delete(one._ref)  # and with it all that it made
+            made = (self._writers, self._readers, self._published, self._waitset, self._over)
+            for entity in made:
+                entity._delete(entity._ref)  # and with it all that it made
 
     def _endpoint(
         self, topic: str, kind: str, reliability: Any, durability: Any, most: int
@@ -178,7 +175,7 @@ class DdsBus:
 
 
 class DdsSubscriber(Subscriber):
-    """It takes what came from Cyclone's own queue."""
+    """Takes messages from Cyclone's own queue."""
 
     def __init__(self, reader: Any, most: int) -> None:
         super().__init__(most)
@@ -187,8 +184,8 @@ class DdsSubscriber(Subscriber):
         self.condition = core.ReadCondition(self._reader, mask)
 
     def take(self) -> list[bytes | memoryview]:
-        # Asked for, not reported to a listener: that would make the thread that empties the socket
-        # wait for Python's lock. Once closed it is 0.
+        # Polled: a listener would make the thread that empties the socket wait for the GIL. Once
+        # closed it is 0.
         status = dds_c_t.sample_lost_status()
         DDS._dll_handle.dds_get_sample_lost_status(self._reader._ref, ctypes.byref(status))
         self.lost = max(self.lost, int(status.total_count))
@@ -250,15 +247,15 @@ def dds_name(message_type: str) -> str:
 
 
 def ros_name(type_name: str) -> str:
-    """The way back; empty for a type that is none of ROS."""
+    """The inverse of ``dds_name``; empty if the type is not from ROS."""
     parts = re.fullmatch(r"(\w+)::(\w+)::dds_::(\w+)_", type_name)
     return "/".join(parts.groups()) if parts else ""
 
 
 @cache
 def idl_type(message_type: str) -> Any:
-    """The type as a cyclonedds ``IdlStruct``; final, no key, as ROS 2 makes it. By it Cyclone
-    checks that bytes from the network are what their type says, lengths included."""
+    """The type as a cyclonedds ``IdlStruct``: final, without a key, as ROS 2 makes it. Cyclone
+    validates bytes from the network by it, lengths included."""
     members = {name: _member(kind) for name, kind in Messages().fields(message_type)}
     name = message_type.rsplit("/", 1)[-1]
     return make_idl_struct(f"{name}_", dds_name(message_type), members)

@@ -1,7 +1,7 @@
-"""Messages of ROS 2, made from field names, and their bytes (CDR); and of ROS 1, as bags hold them.
+"""Messages of ROS 2, made from field names, and their bytes (CDR); and of ROS 1, from its bags.
 
-Types come from rosbags, a pure Python library that needs no ROS. ROS 1 has the same types by
-shorter names: ``sensor_msgs/msg/Image`` here is its ``sensor_msgs/Image``.
+Types come from rosbags, a pure Python library that needs no ROS. ROS 1 has shorter names for the
+same types: ``sensor_msgs/msg/Image`` here is its ``sensor_msgs/Image``.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ Distro = Literal["noetic", "humble"]
 
 MM_PER_M = 1000
 _POINT = "geometry_msgs/msg/Point"
-_LATEST_S = 2**31 - 1  # ROS counts seconds in 32 bits, ROS 2 with a sign
-_ZEROS = bytes(4096)  # in ROS 1's form any message, with nothing in it
+_LATEST_S = 2**31 - 1  # ROS counts seconds in 32 bits, ROS 2 in signed ones
+_ZEROS = bytes(4096)  # in ROS 1's form: any message, empty
 
 
 class Outgoing(NamedTuple):
-    """A message, and the end of the name of its topic (``meshes``), or a whole name (``/tf``)."""
+    """A message, and the last part of its topic's name (``meshes``), or a full name (``/tf``)."""
 
     suffix: str
     message_type: str
@@ -37,8 +37,8 @@ class Outgoing(NamedTuple):
 
 
 class PointBlock:
-    """Points of a marker as one array, its only element, written in one piece: a list of tens of
-    thousands of point messages would take a tenth of a second to write."""
+    """A marker's points as one array, its only element, written in one piece: tens of thousands of
+    point messages would take a tenth of a second."""
 
     def __init__(self, points: Float64[np.ndarray, "n 3"]) -> None:
         self.array = np.ascontiguousarray(points, "<f8")
@@ -59,8 +59,8 @@ class Messages:
 
     def make(self, message_type: str, **values: Any) -> Any:
         """A message: fields by name, the others empty (0, "", no elements). A dictionary stands for
-        a message inside it, a list of dictionaries for several. Letters' case does not count: ROS 1
-        writes ``K`` where ROS 2 writes ``k``."""
+        a nested message, a list of dictionaries for several. Case does not matter: ROS 1 writes
+        ``K`` where ROS 2 writes ``k``."""
         about = self._store.get_msgdef(message_type)
         message, _ = about.deserialize_ros1(_ZEROS, 0, about.cls, self._store)
         fields = {name.lower(): (name, kind) for name, kind in about.fields}
@@ -72,21 +72,21 @@ class Messages:
                 value = self.make(inner, **value)
             elif isinstance(value, list):
                 of = inner[0][1]
-                value = [self.make(of, **one) if isinstance(one, dict) else one for one in value]
+                value = [self.make(of, **v) if isinstance(v, dict) else v for v in value]
             setattr(message, name, value)
         return message
 
     def fields(self, message_type: str) -> list[tuple[str, Any]]:
-        """Names and kinds of a type's fields, as rosbags says them."""
+        """Names and types of a message type's fields, as rosbags defines them."""
         return self._store.fielddefs[message_type][1]
 
     def to_bytes(self, message: Any) -> memoryview:
-        """What goes over the wire: CDR with its header in ROS 2, ROS 1's form in Noetic."""
+        """As on the wire: CDR with its header in ROS 2, ROS 1's form in Noetic."""
         write = self._store.serialize_ros1 if self._is_ros1 else self._store.serialize_cdr
         return write(message, message.__msgtype__)
 
     def from_bytes(self, data: bytes | memoryview, message_type: str) -> Any:
-        """The message that these bytes are; InputError if they are none of that type."""
+        """Raises InputError if the bytes are not of that type."""
         from rosbags.serde import SerdeError
 
         read = self._store.deserialize_ros1 if self._is_ros1 else self._store.deserialize_cdr
@@ -101,15 +101,15 @@ class Messages:
             ) from error
 
     def definition(self, message_type: str) -> str:
-        """The type in ROS 2's own words, with the types that it is made of."""
+        """The type's definition for ROS 2, with the types that it contains."""
         return self._store.generate_msgdef(message_type, ros_version=2)[0]
 
     def type_hash(self, message_type: str) -> str:
-        """By which ROS 2 knows the type: ``RIHS01_...`` (REP 2011)."""
+        """``RIHS01_...`` (REP 2011)."""
         return self._store.hash_rihs01(message_type)
 
     def header(self, stamp_ns: int, frame_id: str) -> Any:
-        """Raises InputError before 1970 or after 2038, which 32 bits of seconds can't say."""
+        """Raises InputError before 1970 or after 2038: beyond 32 bits of seconds."""
         seconds, nanoseconds = divmod(int(stamp_ns), 1_000_000_000)
         if not 0 <= seconds <= _LATEST_S:
             raise InputError(
@@ -126,13 +126,12 @@ def xyz(numbers: Iterable[float]) -> dict[str, Any]:
 
 
 def stamp_of(header: Any) -> int:
-    """A header's stamp in ns."""
     return int(header.stamp.sec) * 1_000_000_000 + int(header.stamp.nanosec)
 
 
 @cache
 def _store(distro: Distro) -> Any:
-    """A typestore that also writes ``PointBlock``. Shared: it never changes afterwards."""
+    """A typestore that also writes ``PointBlock``; shared and never changed afterwards."""
     try:
         from rosbags.typesys import Stores, get_types_from_msg, get_typestore
     except ImportError as error:
@@ -154,7 +153,7 @@ def _store(distro: Distro) -> Any:
         raw[pos : pos + point.nbytes] = point.data.cast("B")
         return pos + point.nbytes
 
-    # No fixed size: whoever holds points then asks `size`, and aligns before it writes.
+    # No fixed size: messages that hold points then call `size`, and align before they write.
     store.cache[_POINT] = dataclasses.replace(
         known, size_cdr=0, getsize_cdr=size, serialize_cdr_le=write
     )

@@ -1,7 +1,7 @@
-"""What is published over ROS of a tracking result. Millimetres in, metres and radians out.
+"""ROS messages of a tracking result. Millimetres in, metres and radians out.
 
 Every message has the result's stamp and frame. Without an estimate each topic says so: an empty
-cloud, deleted markers, places that are NaN, a diagnostic with the reason.
+cloud, deleted markers, NaN positions, a diagnostic with the reason.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from jaxtyping import Float32
 from tumortrack.core import colours
 from tumortrack.core.colours import Colour
 from tumortrack.core.geometry import rigid, transform_points
-from tumortrack.core.organ import organ_name
+from tumortrack.core.organ import is_tumor, organ_name
 from tumortrack.core.patient import Patient
 from tumortrack.core.types import Mesh, SensorCloud
 from tumortrack.live.display import MOST_SEEN, seen_points, thinned, wxyz_of
@@ -32,21 +32,19 @@ DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
 PLACE = "geometry_msgs/msg/PointStamped"
 JOINTS = "sensor_msgs/msg/JointState"
 
-_STATE = "state"  # the namespace of the arms' text
+_STATE = "state"  # the marker namespace of the arms' text
 _DELETE, _DELETE_ALL = 2, 3  # Marker's actions
 _LINE, _TEXT, _TRIANGLES = 4, 9, 11  # and types
-# Markers vanish if nothing follows, so that a stopped loop leaves nothing that looks current.
-_LIFETIME_S = 2
-_STATUS_HZ = 1.0  # of /diagnostics, as rqt's monitor expects it; and at once where a level changes
+_LIFETIME_S = 2  # of markers, so that a stopped loop leaves nothing that looks current
+_STATUS_HZ = 1.0  # of /diagnostics, as rqt's monitor expects; and at once when a level changes
 _RATE_OVER = 30  # results
 _OK, _WARN, _ERROR, _STALE = range(4)  # DiagnosticStatus
 _LEVELS = {"good": _OK, "poor": _WARN, "none": _ERROR}
-_TEXT_COLOURS = {"good": colours.GOOD, "poor": colours.POOR, "none": colours.NONE}
 _STATE_COLOUR: Colour = (235, 238, 242)
 ORGAN_OPACITY = 0.35
 _TEXT_HEIGHT_M, _STATE_HEIGHT_M = 0.008, 0.025
-_TEXT_COLUMNS, _STATE_COLUMNS = 44, 70  # RViz breaks no line: long ones leave the screen
-_GAP_M = 0.012  # between lines, besides their height: measured in RViz of ROS 1; RViz 2's has 0.005
+_TEXT_COLUMNS, _STATE_COLUMNS = 44, 70  # RViz does not wrap: long lines leave the screen
+_GAP_M = 0.012  # between lines, besides their height: measured in RViz of ROS 1; RViz 2 has 0.005
 _ORIGIN = np.zeros(3)
 
 _POINT = np.dtype(
@@ -56,12 +54,11 @@ _POINT = np.dtype(
 
 
 class ResultMessages:
-    """The messages of one publisher. It remembers what it showed of the arms, so that what is gone
-    is deleted.
+    """The messages of one publisher. It remembers the markers of the arms, to delete those that are
+    gone.
 
-    ``namespace``: of their topics; frames on tf are called by it. ``hz``: triangles, arms' markers
-    and observed points at most so often (0: with every result); without ``observed`` those points
-    are left out.
+    ``namespace``: of the topics and of tf frames. ``hz``: limit for triangles, the arms' markers
+    and observed points (0: with every result); without ``observed`` those points are left out.
     """
 
     def __init__(
@@ -75,14 +72,14 @@ class ResultMessages:
         self._messages, self._context, self._observed = messages, context, observed
         self._namespace = namespace.removeprefix("/")
         self._status_rate, self._levels = Rate(_STATUS_HZ), list[int]()
-        self._times_s = deque[float](maxlen=_RATE_OVER)  # of the last results
+        self._times_s = deque[float](maxlen=_RATE_OVER)  # of the latest results
         self._meshes_rate, self._markers_rate, self._points_rate = Rate(hz), Rate(hz), Rate(hz)
         self._shown: set[str] = set()
         self._shown_state: tuple[str, bool] | None = None
 
     def of(self, result: TrackingResult) -> list[Outgoing]:
-        """What is published of one result; docs/ros.md says it topic by topic. Raises InputError
-        for a stamp that ROS can't say."""
+        """The messages of one result; docs/ros.md describes each topic. Raises InputError for a
+        stamp beyond ROS's range."""
         header = self._messages.header(result.stamp_ns, result.published_frame.frame_id)
         out: list[Outgoing] = []
 
@@ -91,8 +88,8 @@ class ResultMessages:
             out.append(Outgoing(suffix, message_type, message))
 
         def send_markers(suffix: str, markers: list[dict[str, Any]]) -> None:
-            always = {"header": header, "lifetime": {"sec": _LIFETIME_S}}
-            send(suffix, MARKERS, markers=[always | marker for marker in markers])
+            common = {"header": header, "lifetime": {"sec": _LIFETIME_S}}
+            send(suffix, MARKERS, markers=[common | marker for marker in markers])
 
         cloud = _labelled_cloud(result.transformed, header, self._messages)
         out.append(Outgoing("cloud", CLOUD, cloud))
@@ -108,7 +105,7 @@ class ResultMessages:
         arms = [_arms_status(result)] if self._context.arms else []
         status = [_estimate_status(result, self._context.patient, hz), *arms]
         send("diagnostics", DIAGNOSTICS, header=header, status=status)
-        levels = [one["level"] for one in status]
+        levels = [entry["level"] for entry in status]
         if self._status_rate.due() or levels != self._levels:
             send("/diagnostics", DIAGNOSTICS, header=header, status=status)
         self._levels = levels
@@ -125,9 +122,9 @@ class ResultMessages:
         return out
 
     def _frames(self, result: TrackingResult) -> Any:
-        """A transform to each part, of good estimates alone: tf can't say that one is poor. The
-        origin is the middle of the part's box; the axes are the CT's, as the organ is turned now,
-        or, where no motion is known, the published frame's."""
+        """A transform to each part, of good estimates only: tf can't mark one as poor. The origin
+        is the center of the part's box; the axes are the CT's, rotated with the organ, or without a
+        motion the published frame's."""
         parent, transforms, turn = result.published_frame, [], np.eye(3)
         if result.estimate is not None and result.quality == "good":
             if (motion := result.estimate.report.motion) is not None:
@@ -135,61 +132,60 @@ class ResultMessages:
             for name in result.estimate.meshes:
                 center_mm = result.center_mm(name)
                 assert center_mm is not None
-                place, child = rigid(turn, center_mm), f"{self._namespace}/{name}"
-                of_whom = result.stamp_ns, parent.frame_id, child
-                transforms.append(transform_fields(self._messages, *of_whom, place))
+                pose, child = rigid(turn, center_mm), f"{self._namespace}/{name}"
+                names = parent.frame_id, child
+                transforms.append(transform_fields(self._messages, result.stamp_ns, *names, pose))
         return self._messages.make(TRANSFORMS, transforms=transforms)
 
     def _organ(self, result: TrackingResult) -> list[dict[str, Any]]:
-        """Triangles per part and a text of their quality; everything deleted without estimate."""
+        """Triangles per part and a text of the quality; without an estimate all are deleted."""
         estimate = result.transformed
         markers: list[dict[str, Any]] = []
         if estimate is None:
             markers.append({"action": _DELETE_ALL})
         elif self._meshes_rate.due():
-            names = dict.fromkeys((*self._context.parts, *estimate.meshes))
-            for label, name in enumerate(names, start=1):
+            for name in dict.fromkeys((*self._context.parts, *estimate.meshes)):
                 if (mesh := estimate.meshes.get(name)) is None:
                     markers.append({"ns": name, "action": _DELETE})
                 else:
-                    opacity = ORGAN_OPACITY if label == 1 else 1.0
-                    markers.append(_triangles(name, mesh, colours.part_colour(label), opacity))
+                    opacity = 1.0 if is_tumor(name) else ORGAN_OPACITY
+                    markers.append(_triangles(name, mesh, colours.name_colour(name), opacity))
             for number, (name, mesh) in enumerate(estimate.structures.items()):
                 markers.append(_triangles(name, mesh, colours.structure_colour(number), 1.0))
-        if estimate is not None or result.workcell is None:  # else the workcell's text says it
+        if estimate is not None or result.workcell is None:  # else it is in the workcell's text
             markers.append(_quality_text(result))
         return markers
 
     def _workcell(self, result: TrackingResult) -> list[dict[str, Any]] | None:
-        """All of its markers or, if they are not due, None: a slow receiver keeps the newest
-        message alone, so each must be whole."""
+        """All of its markers or, if they are not due, None: a slow receiver keeps only the newest
+        message, so each must be complete."""
         cell = result.workcell
         if cell is None:
             self._shown, self._shown_state = set(), None
             return [{"action": _DELETE_ALL}]
         names = {_STATE, *(s.name for s in cell.shapes), *(line.name for line in cell.drawn_lines)}
         gone, self._shown = self._shown - names, names
-        state = cell.state, bool(cell.halted)  # why may change with each frame
+        state = cell.state, bool(cell.halted)  # the reason may change with each frame
         changed, self._shown_state = gone or state != self._shown_state, state
         if not self._markers_rate.due() and not changed:
             return None
         markers: list[dict[str, Any]] = [{"ns": name, "action": _DELETE} for name in sorted(gone)]
         turns = [shape.published_from_shape[:3, :3] for shape in cell.shapes]
-        quaternions = wxyz_of(np.array(turns)) if turns else ()  # all at once: 5 times quicker
+        quaternions = wxyz_of(np.array(turns)) if turns else ()  # all at once: 5 times faster
         for shape, wxyz in zip(cell.shapes, quaternions, strict=True):
             marker = _triangles(shape.name, shape.mesh, shape.colour, shape.opacity)
-            place_m = shape.published_from_shape[:3, 3] / MM_PER_M
-            orientation = dict(zip("wxyz", wxyz.tolist(), strict=True))
-            markers.append(
-                marker | {"pose": {"position": xyz(place_m), "orientation": orientation}}
-            )
+            marker["pose"] = {
+                "position": xyz(shape.published_from_shape[:3, 3] / MM_PER_M),
+                "orientation": dict(zip("wxyz", wxyz.tolist(), strict=True)),
+            }
+            markers.append(marker)
         for line in cell.drawn_lines:
             scale, points = {"x": line.width_mm / MM_PER_M}, PointBlock(line.points_mm / MM_PER_M)
-            markers.append(_drawn(line.name, _LINE, line.colour, scale=scale, points=points))
+            markers.append(_marker(line.name, _LINE, line.colour, scale=scale, points=points))
         return [*markers, _state_text(result, cell)]
 
     def _points(self, result: TrackingResult) -> Float32[np.ndarray, "n 3"] | None:
-        """What the camera saw, published frame; None: they are not due."""
+        """The observed points, published frame; None: they are not due."""
         if result.observation is None:
             return np.zeros((0, 3), np.float32)
         if not self._points_rate.due():
@@ -249,53 +245,52 @@ def _labelled_cloud(estimate: TransformedEstimate | None, header: Any, messages:
 
 
 def _quality_text(result: TrackingResult) -> dict[str, Any]:
-    """Above the organ, as the camera sees it; without one, in front of the camera."""
-    said, above_mm = fill(result.describe(), _TEXT_COLUMNS), np.array([[0.0, 0.0, 150.0]])
+    """Above the organ in the camera's image; without an organ, in front of the camera."""
+    text, above_mm = fill(result.describe(), _TEXT_COLUMNS), np.array([[0.0, 0.0, 150.0]])
     if result.estimate is not None and (name := organ_name(result.estimate.meshes)):
         low, high = result.estimate.meshes[name].box_mm
-        up_mm = 1000 * _TEXT_HEIGHT_M + _half_height_mm(said, _TEXT_HEIGHT_M)  # to its middle
+        up_mm = 1000 * _TEXT_HEIGHT_M + _half_height_mm(text, _TEXT_HEIGHT_M)
         above_mm = np.array([[(low + high)[0] / 2, low[1] - up_mm, (low + high)[2] / 2]])
-    place_mm = transform_points(result.published_frame.published_from_camera, above_mm)[0]
-    look = {"text": said, "scale": {"z": _TEXT_HEIGHT_M}}
-    return _drawn("quality", _TEXT, _TEXT_COLOURS[result.quality], place_mm, **look)
+    position_mm = transform_points(result.published_frame.published_from_camera, above_mm)[0]
+    colour, scale = colours.VERDICTS[result.quality], {"z": _TEXT_HEIGHT_M}
+    return _marker("quality", _TEXT, colour, position_mm, text=text, scale=scale)
 
 
 def _state_text(result: TrackingResult, cell: Workcell) -> dict[str, Any]:
-    """Hung from the height of what is highest (where arms are, z is up): a view of all has room."""
-    said = fill(_describe(cell), _STATE_COLUMNS)
+    """Its top is as high as the highest shape (where arms are, z is up), inside a view of all."""
+    text = fill(_describe(cell), _STATE_COLUMNS)
     if result.estimate is None:
-        said += f"\n{fill(result.describe(), _STATE_COLUMNS)}"
+        text += f"\n{fill(result.describe(), _STATE_COLUMNS)}"
     box_mm, lines_mm = cell.box_mm, [line.points_mm for line in cell.drawn_lines]
-    spots = lines_mm if box_mm is None else [box_mm, *lines_mm]
-    corners = np.concatenate(spots) if spots else np.zeros((1, 3))
-    place_mm = (corners.min(0) + corners.max(0)) / 2
-    place_mm[2] = corners[:, 2].max() - _half_height_mm(said, _STATE_HEIGHT_M)
+    extents = lines_mm if box_mm is None else [box_mm, *lines_mm]
+    corners = np.concatenate(extents) if extents else np.zeros((1, 3))
+    position_mm = (corners.min(0) + corners.max(0)) / 2
+    position_mm[2] = corners[:, 2].max() - _half_height_mm(text, _STATE_HEIGHT_M)
     colour, scale = colours.NONE if cell.halted else _STATE_COLOUR, {"z": _STATE_HEIGHT_M}
-    return _drawn(_STATE, _TEXT, colour, place_mm, text=said, scale=scale)
+    return _marker(_STATE, _TEXT, colour, position_mm, text=text, scale=scale)
 
 
-def _half_height_mm(said: str, height_m: float) -> float:
-    """From the middle of a text, which RViz puts in its place, to the middle of its first line."""
-    return MM_PER_M * (height_m + _GAP_M) / 2 * said.count("\n")
+def _half_height_mm(text: str, height_m: float) -> float:
+    """From the middle of a text, its position in RViz, to the middle of its first line."""
+    return MM_PER_M * (height_m + _GAP_M) / 2 * text.count("\n")
 
 
 def _describe(cell: Workcell) -> str:
-    """The state, and why the arms stand still."""
     return f"{cell.state}, halted: {cell.halted}" if cell.halted else cell.state
 
 
 def _triangles(ns: str, mesh: Mesh, colour: Colour, opacity: float) -> dict[str, Any]:
-    """A Marker of a mesh where it is: three corners each triangle."""
+    """A Marker of a mesh, by the three corners of each triangle."""
     points = PointBlock(mesh.vertices_mm[mesh.faces.ravel()] / MM_PER_M)
-    marker = _drawn(ns, _TRIANGLES, colour, scale=xyz((1, 1, 1)), points=points)
+    marker = _marker(ns, _TRIANGLES, colour, scale=xyz((1, 1, 1)), points=points)
     marker["color"]["a"] = opacity
     return marker
 
 
-def _drawn(
-    ns: str, kind: int, colour: Colour, place_mm: np.ndarray = _ORIGIN, **more: Any
+def _marker(
+    ns: str, kind: int, colour: Colour, position_mm: np.ndarray = _ORIGIN, **more: Any
 ) -> dict[str, Any]:
-    """What every Marker that shows something has, and ``more``."""
+    """The common fields of visible Markers, and ``more``."""
     rgb = dict(zip("rgb", (value / 255 for value in colour), strict=True))
-    pose = {"position": xyz(place_mm / MM_PER_M), "orientation": {"w": 1.0}}
+    pose = {"position": xyz(position_mm / MM_PER_M), "orientation": {"w": 1.0}}
     return {"ns": ns, "type": kind, "pose": pose, "color": {**rgb, "a": 1.0}, **more}

@@ -1,4 +1,4 @@
-"""ROS 2: without ROS (``dds``), or through the user's own (``rclpy``)."""
+"""ROS 2 without ROS installed (``dds``), or through the user's own (``rclpy``)."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ Via = Literal["auto", "dds", "rclpy"]
 
 
 def open_bus(via: Via) -> Bus:
-    """Join the ROS 2 graph of ``ROS_DOMAIN_ID``; ``auto``: by rclpy where it can be imported.
-    Raises InputError if that way is not there, or the environment cannot be used."""
+    """Join the ROS 2 graph of ``ROS_DOMAIN_ID``; ``auto``: by rclpy if it can be imported. Raises
+    InputError if that is not installed, or the environment cannot be used."""
     messages = Messages()
     if via == "rclpy" or (via == "auto" and importlib.util.find_spec("rclpy")):
         return RclpyBus(messages)
@@ -31,11 +31,9 @@ def open_bus(via: Via) -> Bus:
 
 
 class RclpyBus:
-    """ROS 2 through the user's own ROS: a node of its own, in a context of its own.
-
-    Serialised bytes pass through in both directions, so that rclpy's conversion to Python objects,
-    slow for clouds, is not used. Needs a sourced ROS 2, Humble or later, of this Python's version.
-    """
+    """ROS 2 through the user's own ROS, by a node in its own context. Serialised bytes pass through
+    in both directions: rclpy's conversion to Python objects is slow for clouds. Needs a sourced
+    ROS 2, Humble or later, of this Python's version."""
 
     def __init__(self, messages: Messages) -> None:
         try:
@@ -48,11 +46,11 @@ class RclpyBus:
             ) from error
         self.messages, self._qos = messages, qos
         self._context = rclpy.Context()
-        rclpy.init(args=[], context=self._context)  # its own context: no grip on signals
+        rclpy.init(args=[], context=self._context)  # its own context: no signal handlers
         self._node = rclpy.create_node("tumortrack", context=self._context)
         self._executor = executors.SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self._node)
-        self._lock = threading.Lock()  # held while spinning: nothing is taken apart under it
+        self._lock = threading.Lock()  # held while spinning, so that close waits
         self._closed = False
         self.note = "as far as the sourced ROS 2 reaches, whoever is there can see and publish"
 
@@ -61,18 +59,17 @@ class RclpyBus:
 
         durability = self._qos.DurabilityPolicy
         kept = durability.TRANSIENT_LOCAL if latched else durability.VOLATILE
-        profile = self._qos.QoSProfile(depth=1, durability=kept)  # and by default reliable
+        profile = self._qos.QoSProfile(depth=1, durability=kept)  # reliable by default
         writer = self._node.create_publisher(_message_class(kind), topic, profile)
 
         def publish(raw: bytes | memoryview) -> None:
             try:
                 writer.publish(bytes(raw))  # bytes: taken as serialised already
-            except Exception as error:  # rclpy's own kinds differ between distributions
+            except Exception as error:  # rclpy's own types differ between distributions
                 raise TumortrackError(f"{topic}: a message was not sent ({error}).") from error
 
         def flush(timeout_s: float) -> None:
-            # Not every RMW can say what arrived; then there is nothing to wait for.
-            with contextlib.suppress(NotImplementedError, RuntimeError):
+            with contextlib.suppress(NotImplementedError, RuntimeError):  # not in every RMW
                 writer.wait_for_all_acked(Duration(seconds=timeout_s))
 
         return Publisher(publish, flush)
@@ -90,7 +87,7 @@ class RclpyBus:
         return subscriber
 
     def types_of(self, topic: str) -> set[str]:
-        return {one.topic_type for one in self._node.get_publishers_info_by_topic(topic)}
+        return {info.topic_type for info in self._node.get_publishers_info_by_topic(topic)}
 
     def topics(self) -> dict[str, set[str]]:
         return {topic: set(kinds) for topic, kinds in self._node.get_topic_names_and_types()}

@@ -1,5 +1,5 @@
-"""Transforms of tf: how they are said, and where a camera is by them (/tf between stamps,
-/tf_static always)."""
+"""tf: messages of transforms, and the pose of a camera from them (/tf interpolated, /tf_static
+always)."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from tumortrack.live.ros.ros2 import Via, open_bus
 from tumortrack.live.values import Observation
 
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
-_WAIT_S = 0.1  # for a transform of after the frame's stamp: publishers of 10 Hz and faster
+_WAIT_S = 0.1  # for a transform after the frame's stamp: publishers of 10 Hz and faster
 _MOST = 1000  # messages between two frames: 30 publishers of 1 kHz at 30 Hz
-_NOT_UNIT = 1e-3  # of a quaternion's length
+_NOT_UNIT = 1e-3  # tolerance of a quaternion's length
 
 
 class Ros2PosesConfig(PosesConfig, frozen=True, kw_only=True, tag="ros2"):
-    """tf. ``frame``: the fixed one, base_link say. ``camera``: the camera's, or its tool's where
-    the calibration has tool_from_camera; empty: as the source's messages call it."""
+    """tf. ``frame``: the fixed one, such as base_link. ``camera``: the camera's, or its tool's if
+    the calibration has tool_from_camera; empty: as in the source's messages."""
 
     target: ClassVar[str] = "frame"
 
@@ -39,25 +39,25 @@ class Ros2PosesConfig(PosesConfig, frozen=True, kw_only=True, tag="ros2"):
 
 
 class TfPoses(CameraPoses):
-    """Of a frame that ``camera`` names, or else the observation."""
+    """Poses of the frame ``camera``, or if that is empty, of the observation's frame."""
 
     def __init__(self, bus: Bus, frame: str, camera: str) -> None:
         self.frame_id, self._camera, self._bus = frame.removeprefix("/"), camera, bus
-        self._heard = [bus.subscriber("/tf", TRANSFORMS, _MOST)]
-        self._heard.append(bus.subscriber("/tf_static", TRANSFORMS, _MOST, latched=True))
-        # Each frame's parent, and its poses there, or the one that it always has.
+        self._tf = bus.subscriber("/tf", TRANSFORMS, _MOST)
+        self._tf_static = bus.subscriber("/tf_static", TRANSFORMS, _MOST, latched=True)
+        # Each frame's parent, and its poses there, or its only one.
         self._known: dict[str, tuple[str, PoseBuffer | Affine]] = {}
 
     def pose(self, seen: Observation) -> Affine:
-        """Waits for what may still be on its way."""
+        """Waits for transforms that may still arrive."""
         until_s = time.monotonic() + _WAIT_S
         while True:
-            for static, subscriber in enumerate(self._heard):
+            for subscriber in (self._tf, self._tf_static):
                 for raw in subscriber.take():
-                    for one in self._bus.messages.from_bytes(raw, TRANSFORMS).transforms:
-                        self._keep(one, bool(static))
+                    for transform in self._bus.messages.from_bytes(raw, TRANSFORMS).transforms:
+                        self._keep(transform, static=subscriber is self._tf_static)
             try:
-                return self._way(self._camera or seen.frame_id or "", seen.stamp_ns)
+                return self._fixed_from(self._camera or seen.frame_id or "", seen.stamp_ns)
             except NoEstimate:
                 if time.monotonic() >= until_s:
                     raise
@@ -68,7 +68,7 @@ class TfPoses(CameraPoses):
 
     def _keep(self, message: Any, static: bool) -> None:
         if (pose := pose_of(message)) is None:
-            return  # without another one nothing is known
+            return
         parent = message.header.frame_id.removeprefix("/")
         child = message.child_frame_id.removeprefix("/")
         before, poses = self._known.get(child, ("", None))
@@ -79,23 +79,23 @@ class TfPoses(CameraPoses):
             self._known[child] = parent, (poses := PoseBuffer())
         poses.add(stamp_of(message.header), pose)
 
-    def _way(self, camera: str, stamp_ns: int) -> Affine:
-        """From the camera to the fixed frame, over the first frame above both."""
-        above, mine = self._above(self.frame_id), self._above(camera)
-        common = next((name for name in mine if name in above), None)
+    def _fixed_from(self, camera: str, stamp_ns: int) -> Affine:
+        """The camera's pose in the fixed frame, by their lowest common ancestor."""
+        of_fixed, of_camera = self._ancestors(self.frame_id), self._ancestors(camera)
+        common = next((name for name in of_camera if name in of_fixed), None)
         if common is None:
             raise NoEstimate(f"tf does not connect the camera, {camera!r}, with {self.frame_id!r}")
-        ways = []
-        for names in (above, mine):
-            ways.append(np.eye(4))
+        common_from = []
+        for names in (of_fixed, of_camera):
+            common_from.append(np.eye(4))
             for name in names[: names.index(common)]:
                 pose = self._known[name][1]
                 now = pose.at(stamp_ns) if isinstance(pose, PoseBuffer) else pose
-                ways[-1] = now @ ways[-1]
-        return np.linalg.inv(ways[0]) @ ways[1]
+                common_from[-1] = now @ common_from[-1]
+        return np.linalg.inv(common_from[0]) @ common_from[1]
 
-    def _above(self, name: str) -> list[str]:
-        """A frame and those that it hangs on, upwards."""
+    def _ancestors(self, name: str) -> list[str]:
+        """A frame, its parent, and so on."""
         names = [name]
         while (parent := self._known.get(names[-1], ("",))[0]) and parent not in names:
             names.append(parent)
@@ -105,21 +105,19 @@ class TfPoses(CameraPoses):
 def transform_fields(
     messages: Messages, stamp_ns: int, parent: str, child: str, parent_from_child: Affine
 ) -> dict[str, Any]:
-    """The fields of a TransformStamped, of a pose in mm. Raises InputError for a stamp that ROS
-    can't say."""
+    """The fields of a TransformStamped, from a pose in mm. Raises InputError for a stamp beyond
+    ROS's range."""
     turn = wxyz_of(parent_from_child[:3, :3]).tolist()
+    shift, rotation = xyz(parent_from_child[:3, 3] / MM_PER_M), dict(zip("wxyz", turn, strict=True))
     return {
         "header": messages.header(stamp_ns, parent),
         "child_frame_id": child,
-        "transform": {
-            "translation": xyz(parent_from_child[:3, 3] / MM_PER_M),
-            "rotation": dict(zip("wxyz", turn, strict=True)),
-        },
+        "transform": {"translation": shift, "rotation": rotation},
     }
 
 
 def pose_of(message: Any) -> Affine | None:
-    """Parent from child, mm, of a TransformStamped; None: its numbers are no transform."""
+    """Parent from child, mm, of a TransformStamped; None: it is no rigid transform."""
     shift, turn = message.transform.translation, message.transform.rotation
     numbers = np.array([turn.x, turn.y, turn.z, turn.w, shift.x, shift.y, shift.z])
     if not abs(np.linalg.norm(numbers[:4]) - 1) < _NOT_UNIT or not np.isfinite(numbers).all():
