@@ -1,4 +1,4 @@
-"""Organ, tumors and their margins as obstacles in MoveIt's planning scene; over ROS 2."""
+"""Organ, tumors and margins as obstacles in MoveIt's planning scene, over ROS 2."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from tumortrack.core.colours import PICKED, Colour, part_colour
+from tumortrack.core.colours import PICKED, Colour, name_colour
 from tumortrack.core.types import Mesh
 from tumortrack.live.meter import Rate
 from tumortrack.live.ros.bus import check_topic
@@ -22,11 +22,9 @@ _HERE = {"orientation": {"w": 1.0}}
 
 
 class MoveItSinkConfig(SinkConfig, frozen=True, kw_only=True, tag="moveit"):
-    """Differences to the scene on ``topic``, at most ``hz`` times a second (0: with every result).
-
-    ``detail_mm``: obstacles' triangles are about as long. ``margin_mm``: an obstacle round each
-    tumor, the convex body that holds all within so many mm of it; 0: none.
-    """
+    """Changes of the scene on ``topic``, at most ``hz`` times a second (0: with every result).
+    ``detail_mm``: approximate edges of the obstacles' triangles. ``margin_mm``: an obstacle around
+    each tumor, the convex hull of all within that distance; 0: none."""
 
     target: ClassVar[str] = "topic"
 
@@ -47,8 +45,8 @@ class MoveItSinkConfig(SinkConfig, frozen=True, kw_only=True, tag="moveit"):
 
 
 class MoveItSink:
-    """Only good estimates move the obstacles, and nothing takes them away, not even the end: a
-    planner that forgot the organ would lead an arm through it."""
+    """Only good estimates move the obstacles, and nothing removes them, not even the end: a planner
+    that forgot the organ would lead an arm through it."""
 
     def __init__(self, config: MoveItSinkConfig, context: SinkContext) -> None:
         self._config, self._context, self._rate = config, context, Rate(config.hz)
@@ -66,8 +64,9 @@ class MoveItSink:
         for name, mesh, colour, opacity in self._obstacles(result.transformed.meshes):
             rgb = dict(zip("rgb", (value / 255 for value in colour), strict=True))
             colours.append({"id": name, "color": {**rgb, "a": opacity}})
-            said = {"id": name, "header": header, "pose": _HERE, "mesh_poses": [_HERE]}
-            objects.append({**said, "meshes": [_mesh_fields(messages, mesh)]})  # operation 0: ADD
+            poses = {"pose": _HERE, "mesh_poses": [_HERE]}  # operation 0: ADD
+            meshes = [_mesh_fields(messages, mesh)]
+            objects.append({"id": name, "header": header, "meshes": meshes, **poses})
         scene = messages.make(
             SCENE,
             is_diff=True,
@@ -78,33 +77,32 @@ class MoveItSink:
         self._publisher.publish(messages.to_bytes(scene))
 
     def close(self) -> None:
-        """Leave the graph."""
         self._bus.close()
 
     def _obstacles(self, meshes: dict[str, Mesh]) -> list[tuple[str, Mesh, Colour, float]]:
         """Name, surface, colour and opacity of each, published frame."""
         organ, *tumors = self._context.parts
-        found = []
-        for label, (name, mesh) in enumerate(meshes.items(), start=1):
+        obstacles = []
+        for name, mesh in meshes.items():
             opacity = ORGAN_OPACITY if name == organ else 1.0
-            few = coarser(mesh, self._config.detail_mm)
-            found.append((f"tumortrack/{name}", few, part_colour(label), opacity))
+            coarse = coarser(mesh, self._config.detail_mm)
+            obstacles.append((f"tumortrack/{name}", coarse, name_colour(name), opacity))
             if name in tumors and self._config.margin_mm:
-                wider = widened_hull(mesh, self._config.margin_mm)
-                found.append((f"tumortrack/{name}/margin", wider, PICKED, _MARGIN_OPACITY))
-        return found
+                hull = widened_hull(mesh, self._config.margin_mm)
+                obstacles.append((f"tumortrack/{name}/margin", hull, PICKED, _MARGIN_OPACITY))
+        return obstacles
 
 
 def coarser(mesh: Mesh, cell_mm: float) -> Mesh:
-    """The surface with one vertex in each cube of space, the mean of those that were there: open
-    surfaces stay open, and no point moves by more than the cube's diagonal."""
+    """The surface with one vertex in each cube of space, the mean of those inside: open surfaces
+    stay open, and no point moves by more than the cube's diagonal."""
     cubes = np.floor(mesh.vertices_mm / cell_mm).astype(np.int64)
-    _, owner, sizes = np.unique(cubes, axis=0, return_inverse=True, return_counts=True)
-    owner = owner.ravel()
-    sums = [np.bincount(owner, axis) for axis in mesh.vertices_mm.T]
-    faces = owner[mesh.faces]
-    turned = np.roll(faces, 1, axis=1)
-    return Mesh(np.stack(sums, axis=1) / sizes[:, None], faces[(faces != turned).all(1)])
+    _, cube_of, sizes = np.unique(cubes, axis=0, return_inverse=True, return_counts=True)
+    cube_of = cube_of.ravel()
+    sums = [np.bincount(cube_of, axis) for axis in mesh.vertices_mm.T]
+    faces = cube_of[mesh.faces]
+    whole = (faces != np.roll(faces, 1, axis=1)).all(1)
+    return Mesh(np.stack(sums, axis=1) / sizes[:, None], faces[whole])
 
 
 def widened_hull(mesh: Mesh, margin_mm: float) -> Mesh:
@@ -113,15 +111,15 @@ def widened_hull(mesh: Mesh, margin_mm: float) -> Mesh:
     from trimesh.creation import icosphere
 
     ball = icosphere(2)
-    within = np.einsum("ij,ij->i", ball.triangles_center, ball.face_normals).min()  # radius
+    inscribed = np.einsum("ij,ij->i", ball.triangles_center, ball.face_normals).min()  # radius
     corners = PointCloud(mesh.vertices_mm).convex_hull.vertices
-    points = corners[:, None] + ball.vertices * (margin_mm / within)
+    points = corners[:, None] + ball.vertices * (margin_mm / inscribed)
     hull = PointCloud(points.reshape(-1, 3)).convex_hull
     return Mesh(hull.vertices, hull.faces)
 
 
 def _mesh_fields(messages: Messages, mesh: Mesh) -> dict[str, Any]:
     """Of a shape_msgs/Mesh, metres."""
-    one = messages.make("shape_msgs/msg/MeshTriangle")
-    faces = [replace(one, vertex_indices=face) for face in mesh.faces.astype(np.uint32)]
+    triangle = messages.make("shape_msgs/msg/MeshTriangle")
+    faces = [replace(triangle, vertex_indices=face) for face in mesh.faces.astype(np.uint32)]
     return {"vertices": PointBlock(mesh.vertices_mm / MM_PER_M), "triangles": faces}

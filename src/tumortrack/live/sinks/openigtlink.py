@@ -1,22 +1,20 @@
-"""OpenIGTLink: tumors' places, surfaces and status for 3D Slicer, PLUS and other receivers.
+"""OpenIGTLink: positions of tumors, surfaces and status for 3D Slicer, PLUS and other receivers.
 
-Slicer takes what arrives as RAS. Its files are LPS, and ours say that they are; so x and y are
-sent with the other sign, and what is sent lies where the files lie (``space="lps"``: as it is).
+Slicer takes what it receives as RAS. Our files are LPS and declared so; to coincide with them,
+x and y are sent negated (``space="lps"``: as they are).
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Iterator
-from itertools import chain
 from typing import ClassVar, Literal
 
 import numpy as np
-from jaxtyping import Float64
 
 from tumortrack.core.colours import name_colour
 from tumortrack.core.errors import InputError
-from tumortrack.core.geometry import RAS_FROM_LPS, rigid, transform_points
+from tumortrack.core.geometry import RAS_FROM_LPS, Affine, rigid, transform_points
 from tumortrack.core.report import FitReport
 from tumortrack.core.types import Mesh
 from tumortrack.live.igtl import message as igtl
@@ -31,21 +29,21 @@ from tumortrack.tracking.shells import rough_margin
 from tumortrack.tracking.slicer_scene import CENTRES, CT, centre_label
 
 STATUS_DEVICE, CLOUD_DEVICE, ARMS_DEVICE = "tumortrack", "occupancy", "arms"
-_TIP = "/tip"  # how the names of shapes at the tips of tools end
+_TIP = "/tip"  # the end of the names of shapes at tool tips
 _NOTHING = Polydata(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32))
-_Content = tuple[str, str, bytes, dict[str, str]]  # type, device, content, metadata of its own
+_Content = tuple[str, str, bytes, dict[str, str]]  # type, device, content, own metadata
 
 
 class OpenIgtLinkSinkConfig(SinkConfig, frozen=True, kw_only=True, tag="openigtlink"):
     """A server that 3D Slicer connects to, or, with ``connect``, a client of one.
 
     Attributes:
-        port: the protocol's own is 18944; 0 takes a free one.
+        port: the protocol's default is 18944; 0: a free one.
         host: which of this machine's addresses to serve; 0.0.0.0: all, for other machines.
-        connect: host of a server to go to instead.
-        mesh_hz: surfaces at most so often; 0: none.
-        cloud_hz: the labelled cloud at most so often; 0: none.
-        space: ras turns x and y round, for 3D Slicer; lps sends what is published.
+        connect: host of a server to connect to instead.
+        mesh_hz: limit for surfaces; 0: none.
+        cloud_hz: limit for the labelled cloud; 0: none.
+        space: ras negates x and y, for 3D Slicer; lps sends what is published.
     """
 
     target: ClassVar[str] = "port"
@@ -63,8 +61,8 @@ class OpenIgtLinkSinkConfig(SinkConfig, frozen=True, kw_only=True, tag="openigtl
         self.check_ranges("openigtlink:", "0 (none)", mesh_hz=1000, cloud_hz=1000)
 
     def open(self, context: SinkContext) -> OpenIgtLinkSink:
-        """Serve, or begin to try to connect. Raises InputError as ``Link``, and for a part whose
-        name is too long for a message."""
+        """Serve, or start to connect. Raises InputError as ``Link``, and for a part whose name is
+        too long for a message."""
         if long := [name for name in context.parts if len(name) > igtl.LONGEST_DEVICE]:
             raise InputError(
                 f"openigtlink: {long[0]!r} has {len(long[0])} letters, and OpenIGTLink allows "
@@ -74,18 +72,18 @@ class OpenIgtLinkSinkConfig(SinkConfig, frozen=True, kw_only=True, tag="openigtl
 
 
 class OpenIgtLinkSink:
-    """Per result: STATUS ``tumortrack``, TRANSFORM of each tumor, POINT ``tumors`` (their centres,
-    labelled with how sure they are), and POLYDATA of each part and of each stated margin.
+    """Per result: STATUS ``tumortrack``, TRANSFORM of each tumor, POINT ``tumors`` (their centers,
+    labelled with their uncertainty), and POLYDATA of each part and of each stated margin.
 
-    A tumor's TRANSFORM has its origin in the middle of the tumor's box; its axes are the CT's, as
-    the organ is turned now, or, without a motion, those of the published frame. With a motion
+    A tumor's TRANSFORM has its origin at the center of the tumor's box; its axes are the CT's,
+    rotated with the organ, or, without a motion, those of the published frame. With a motion
     TRANSFORM ``ct`` is the organ's pose, and vertices of tumors have the scalar ``std_mm``: one
-    standard deviation along the axis that is least sure. Without an estimate STATUS says why,
+    standard deviation along the least certain axis. Without an estimate STATUS says why,
     transforms are the identity with ``TransformStatus`` MISSING, and all else is empty.
 
-    Where there may be arms also STATUS ``arms`` (well: its name is their state; not ready: halted,
-    and why; not present: nothing is known), and a TRANSFORM of each tool's tip, named as its shape
-    (``cutter/tip``): from the tip's own frame, and MISSING once it is gone.
+    With arms also STATUS ``arms`` (OK: its name is their state; not ready: halted, and why; not
+    present: unknown), and a TRANSFORM of each tool tip, named as its shape (``cutter/tip``): from
+    the tip's own frame, and MISSING once it is gone.
     """
 
     def __init__(self, config: OpenIgtLinkSinkConfig, context: SinkContext) -> None:
@@ -93,13 +91,12 @@ class OpenIgtLinkSink:
         self._axes = RAS_FROM_LPS if config.space == "ras" else np.eye(4)
         self.link = Link(config.host, config.port, config.connect)
         self._mesh_rate, self._cloud_rate = Rate(config.mesh_hz), Rate(config.cloud_hz)
-        self._tips: set[str] = set()  # that ever were
-        self._margins: set[str] = set()  # likewise
+        self._tips: set[str] = set()  # all so far
+        self._margins: set[str] = set()  # all so far
         self._next, self._closed = 0, False
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Where it serves, and who else can receive."""
         host, port = self._config.host, self.link.port
         if self._config.connect:
             return ()
@@ -112,7 +109,7 @@ class OpenIgtLinkSink:
         self._next = result.sequence + 1
 
     def close(self) -> None:
-        """Say that it is over, and leave nothing that looks as if it were still true."""
+        """Send that tracking has ended, so that nothing looks current."""
         if not self._closed:
             self._closed = True
             frame, why = self._context.published_frame, "tracking has ended"
@@ -123,12 +120,12 @@ class OpenIgtLinkSink:
     def _send(self, result: TrackingResult, code: int) -> None:
         about = {"frame_id": result.published_frame.frame_id, "sequence": str(result.sequence)}
         about |= {"patient": self._context.patient.id, "side": self._context.patient.side}
-        contents = chain(
-            self._statuses(result, code),
-            self._transforms(result),
-            self._centres(result),
-            self._surfaces(result),
-        )
+        contents = [
+            *self._statuses(result, code),
+            *self._transforms(result),
+            *self._centers(result),
+            *self._surfaces(result),
+        ]
         self.link.send(
             [
                 Message(kind, device, result.stamp_ns, content, about | more)
@@ -137,9 +134,9 @@ class OpenIgtLinkSink:
         )
 
     def _statuses(self, result: TrackingResult, code: int) -> Iterator[_Content]:
-        found = result.estimate is not None
-        name = result.quality if found else "no estimate"
-        text = result.describe() if found else result.reason
+        name, text = str(result.quality), result.describe()
+        if result.estimate is None:
+            name, text = "no estimate", result.reason
         more = {"quality": str(result.quality)}
         if result.latency_ms is not None:
             more["latency_ms"] = f"{result.latency_ms:.1f}"
@@ -154,42 +151,45 @@ class OpenIgtLinkSink:
         yield "STATUS", ARMS_DEVICE, igtl.pack_status(*status), more
 
     def _transforms(self, result: TrackingResult) -> Iterator[_Content]:
-        way, tumors = result.published_frame.published_from_camera, self._context.parts[1:]
+        tumors = self._context.parts[1:]
         # The organ's pose without its deformation, where the method knows one.
         motion = None if result.estimate is None else result.estimate.report.motion
-        pose = None if motion is None else np.array(motion.camera_from_ct)
-        places: dict[str, Float64[np.ndarray, "4 4"] | None] = dict.fromkeys(tumors)
+        published_from_ct = None
+        if motion is not None:
+            published_from_camera = result.published_frame.published_from_camera
+            published_from_ct = published_from_camera @ np.array(motion.camera_from_ct)
+        poses: dict[str, Affine | None] = dict.fromkeys(tumors)
         if self._context.anatomy_ct is not None:
-            places[CT] = None if pose is None else way @ pose
-        turn = np.eye(3) if pose is None else (way @ pose)[:3, :3]
+            poses[CT] = published_from_ct
+        turn = np.eye(3) if published_from_ct is None else published_from_ct[:3, :3]
         for name in tumors:
             if (center_mm := result.center_mm(name)) is not None:
-                places[name] = rigid(turn, center_mm)
+                poses[name] = rigid(turn, center_mm)
         cell = result.workcell if self._context.arms else None
         shapes = () if cell is None else cell.shapes
         tips = {s.name: s.published_from_shape for s in shapes if s.name.endswith(_TIP)}
         self._tips |= tips.keys()
-        places |= {name: tips.get(name) for name in sorted(self._tips)}
-        for name, place in places.items():
-            turned = np.eye(4) if place is None else self._axes @ place @ self._axes
-            known = {"TransformStatus": "MISSING" if place is None else "OK"}
-            yield "TRANSFORM", name, igtl.pack_transform(turned), known
+        poses |= {name: tips.get(name) for name in sorted(self._tips)}
+        for name, pose in poses.items():
+            sent = np.eye(4) if pose is None else self._axes @ pose @ self._axes
+            status = {"TransformStatus": "MISSING" if pose is None else "OK"}
+            yield "TRANSFORM", name, igtl.pack_transform(sent), status
 
-    def _centres(self, result: TrackingResult) -> Iterator[_Content]:
+    def _centers(self, result: TrackingResult) -> Iterator[_Content]:
         report = FitReport() if result.estimate is None else result.estimate.report
         tumors = self._context.parts[1:]
-        places = {n: place for n in tumors if (place := result.center_mm(n)) is not None}
-        labels = [centre_label(report, name, result.quality != "good") for name in places]
-        points_mm = transform_points(self._axes, np.reshape([*places.values()], (-1, 3)))
+        centers = {n: mm for n in tumors if (mm := result.center_mm(n)) is not None}
+        labels = [centre_label(report, name, result.quality != "good") for name in centers]
+        points_mm = transform_points(self._axes, np.reshape([*centers.values()], (-1, 3)))
         if tumors:
-            shades = [name_colour(name) for name in places]
-            yield "POINT", CENTRES, igtl.pack_points(points_mm, labels, shades), {}
+            colours = [name_colour(name) for name in centers]
+            yield "POINT", CENTRES, igtl.pack_points(points_mm, labels, colours), {}
 
     def _surfaces(self, result: TrackingResult) -> Iterator[_Content]:
         estimate = result.transformed
         contents: dict[str, Polydata] = {}
         if self._config.mesh_hz:
-            # What is gone is deleted at once; what is there may wait until it is due.
+            # Surfaces that are gone are deleted at once; others wait until they are due.
             due = estimate is None or self._mesh_rate.due()
             meshes = {**estimate.meshes, **estimate.structures} if estimate else {}
             for name in (*self._context.parts, *self._context.structures):
@@ -202,8 +202,8 @@ class OpenIgtLinkSink:
             if estimate is None:
                 contents[CLOUD_DEVICE] = _NOTHING
             elif self._cloud_rate.due():
-                # Each point as a line without length: Slicer shows points of cells only, and its
-                # reader does not bear cells of one point.
+                # Each point is a line of length 0: Slicer shows only points of cells, and its
+                # reader does not support cells of one point.
                 segments = np.repeat(np.arange(len(estimate.points_mm))[:, None], 2, axis=1)
                 scalars = {"label": estimate.labels, "probability": estimate.probability}
                 points = transform_points(self._axes, estimate.points_mm)
@@ -214,7 +214,7 @@ class OpenIgtLinkSink:
     def _shells(
         self, result: TrackingResult, meshes: dict[str, Mesh], due: bool
     ) -> dict[str, Polydata]:
-        """The surfaces of the tumors' stated margins; empty where one is stated no more."""
+        """The surfaces of the tumors' stated margins; empty for one that is no longer stated."""
         margin = None if result.estimate is None else result.estimate.report.margin
         contents: dict[str, Polydata] = {}
         for name in self._context.parts[1:]:

@@ -1,5 +1,5 @@
-"""A recording of observations and results, to be played again: a rosbag2 folder (MCAP), as
-`ros2 bag play` and Foxglove read it, by rosbags."""
+"""Recordings of observations and results: a rosbag2 folder (MCAP) for the source ``recording``,
+`ros2 bag play` and Foxglove, written by rosbags."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from tumortrack.live.recording.folders import ABOUT
 from tumortrack.live.recording.mcap import CHUNK_S, STRING, McapBag, camera_messages
 from tumortrack.live.ros.messages import Messages, Outgoing
 from tumortrack.live.ros.results import ResultMessages
-from tumortrack.live.values import CameraView, SinkConfig, SinkContext, TrackingResult
+from tumortrack.live.values import SinkConfig, SinkContext, TrackingResult
 from tumortrack.tracking.files import report_entry
 
-POSES, STILL = "poses.csv", "poses.json"  # of a camera that moves; of several that stand still
+POSES, STILL = "poses.csv", "poses.json"  # of a moving camera; of several fixed ones
 _ON_FULL_DISK = (
     f"The recording ends {CHUNK_S:g} s before or less; it can be played with recording:FOLDER, and "
     "`mcap recover` makes it whole for others."
@@ -29,12 +29,8 @@ _ON_FULL_DISK = (
 
 
 class RecordingSinkConfig(SinkConfig, frozen=True, kw_only=True, tag="recording"):
-    """A new folder with every result and what the source saw: depth images as 32FC1 in metres
-    (float32 to 1e-5 mm), stamps exact.
-
-    Attributes:
-        meshes_hz: surfaces at most so often; 0: with every result.
-    """
+    """A new folder with every result and observation: depth images as 32FC1 in metres (float32 to
+    1e-5 mm), stamps exact. ``meshes_hz``: limit for surfaces; 0: with every result."""
 
     target: ClassVar[str] = "path"
     queue_size: ClassVar[int] = 30
@@ -69,10 +65,9 @@ class RecordingSinkConfig(SinkConfig, frozen=True, kw_only=True, tag="recording"
 
 
 class RecordingSink:
-    """Topics: ``/camera/...`` what the source saw, in the camera's frame, of further cameras
+    """Topics: ``/camera/...`` observations in the camera's frame, of further cameras
     ``/camera_2/...``; ``/tumortrack/...`` the results as in ROS, and ``report`` (JSON); ``/tf``
-    where the frames differ. Beside them, of a camera that moves, where it was in each frame: a
-    table as `track --moving` reads it."""
+    where the frames differ. For a moving camera also a table of its poses for `track --moving`."""
 
     def __init__(self, folder: Path, context: SinkContext, meshes_hz: float) -> None:
         self._messages = Messages()
@@ -84,7 +79,7 @@ class RecordingSink:
             self._poses.write(f"{COLUMNS}\n".encode())
 
     def publish(self, result: TrackingResult) -> None:
-        """Whatever the disk refuses raises, and the next result is tried."""
+        """Raises StorageError; later results are still tried."""
         seen, frame = result.observation, result.published_frame
         arrived_ns = time.time_ns() if seen is None else seen.arrived_ns
         self._bag.write(arrived_ns, self._messages_of(result))
@@ -101,31 +96,29 @@ class RecordingSink:
     def _messages_of(self, result: TrackingResult) -> list[Outgoing]:
         """With the full names of their topics."""
         make, frame = self._messages.make, result.published_frame
-        text = json.dumps(_report(result), allow_nan=False)
-        said = Outgoing("report", STRING, make(STRING, data=text))
-        out = [*self._results.of(result), said]
-        out = [one._replace(suffix=one.topic("/tumortrack")) for one in out]
+        report = make(STRING, data=json.dumps(_report(result), allow_nan=False))
+        results = [*self._results.of(result), Outgoing("report", STRING, report)]
+        out = [message._replace(suffix=message.topic("/tumortrack")) for message in results]
         if result.observation is None:
             return out
-        alone = CameraView(1, result.observation, frame.published_from_camera)
-        for view in result.views or (alone,):
-            where = view.published_from_camera, frame.frame_id
-            out = [*camera_messages(view.seen, *where, self._messages, view.number), *out]
+        for view in result.camera_views:
+            pose = view.published_from_camera, frame.frame_id
+            out = [*camera_messages(view.seen, *pose, self._messages, view.number), *out]
         return out
 
 
 def _report(result: TrackingResult) -> dict[str, Any]:
-    """Everything about a result (JSON types): facts, times of stages, and the estimate's own
-    report, or null with the reason."""
+    """A result as JSON types: its fields, times of stages, and the estimate's own report, or null
+    and the reason."""
     seen = result.observation
     kind = None if seen is None else "cloud" if isinstance(seen.content, SensorCloud) else "depth"
-    same = ("quality", "reason", "warning", "latency_ms", "cameras")
+    copied = ("quality", "reason", "warning", "latency_ms", "cameras")
     return {
         "sequence": result.sequence,
         "stamp_ns": result.stamp_ns,
         "arrived_ns": None if seen is None else seen.arrived_ns,
         "seen": kind,
-        **{name: getattr(result, name) for name in same},
+        **{name: getattr(result, name) for name in copied},
         "organ_points": None if result.organ is None else len(result.organ.points_mm),
         "seconds": dict(result.seconds),
         "estimate": None if result.estimate is None else report_entry(result.estimate),
