@@ -16,11 +16,11 @@ from clock import PATIENCE_S, until
 from live_objects import empty_update, small_frame, small_update
 from tumortrack.core.errors import InputError, NoEstimate, StorageError
 from tumortrack.live.calibration_file import read_frames
+from tumortrack.live.loop import check_age
 from tumortrack.live.meter import Histogram
 from tumortrack.live.spec import Registry
-from tumortrack.live.stamps import StampOrder, check_age
 from tumortrack.live.values import Observation, PublishedFrame, SinkConfig, SourceEnded, SourceLost
-from tumortrack.live.workers import SinkWorker, SourceWorker
+from tumortrack.live.workers import SinkWorker, SourceWorker, StampOrder
 
 SECOND = 1_000_000_000
 

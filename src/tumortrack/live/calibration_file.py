@@ -1,5 +1,4 @@
-"""Where results are published: the camera's frame, or a robot's by a calibration file; and where
-the cameras are."""
+"""Calibration files: the robot's frame, in which results are then published."""
 
 from __future__ import annotations
 
@@ -15,20 +14,18 @@ from tumortrack.core.store import read_json
 from tumortrack.live.values import PublishedFrame
 
 _LARGEST_MM, _LARGEST_DEG = 100.0, 10.0  # with more, it is no calibration
-_NOT_UNIT = 1e-3  # of a normal's length: files have few digits
-
+_NOT_UNIT = 1e-3  # tolerance of a normal's length: files have few digits
 _TOOL = "tool_from_camera"
 
 Rows = tuple[tuple[float, float, float, float], ...]
 
 
 class CalibrationFile(Config, frozen=True, kw_only=True):
-    """A file that says where the camera is, in one of three ways, each by 4 x 4 rows:
-    ``camera_from_robot`` or ``robot_from_camera``, of a hand-eye calibration, or
-    ``camera_from_marker`` with ``robot_from_marker``: a marker that both know. Of a camera that a
-    robot moves ``tool_from_camera``, its place on the tool. ``unit``: of the
-    translations, and of a plane's offset. ``frame_id``: the robot's frame, as ROS calls it;
-    ``camera_frame_id``: the camera's optical frame, as the source's messages call it;
+    """The camera's pose, in one of three ways, each as 4 x 4 rows: ``camera_from_robot`` or
+    ``robot_from_camera``, of a hand-eye calibration, or ``camera_from_marker`` with
+    ``robot_from_marker``, of a marker known to both. For a camera that a robot moves:
+    ``tool_from_camera``. ``unit``: of translations, and of the plane's offset. ``frame_id``: the
+    robot's frame in ROS; ``camera_frame_id``: the camera's optical frame in the source's messages;
     ``table_in_camera``: the table's plane in the camera's frame, unit normal (3) and offset.
     ``error_mm`` and ``error_deg``: bounds of the calibration's error, at the camera and of its
     direction; without ``error_deg`` the first holds at the organ."""
@@ -55,9 +52,9 @@ class CalibrationFile(Config, frozen=True, kw_only=True):
 
 
 def read_frames(path: Path, moves: bool = False) -> PublishedFrame:
-    """The robot's frame of a calibration file (JSON; keys as in ``CalibrationFile``). ``moves``: of
-    a camera on a tool, which it is placed by. Raises InputError if it is missing, or has an unknown
-    key, a matrix that is no rigid transform, or not exactly one of the ways."""
+    """The robot's frame from a calibration file (JSON; keys as in ``CalibrationFile``). ``moves``:
+    for a camera on a tool. Raises InputError if it is missing, or has an unknown key, a matrix that
+    is no rigid transform, or not exactly one way of giving the pose."""
     file = from_builtins(read_json(path), CalibrationFile, str(path))
     matrices = {
         name: read_rigid(rows, file.unit, f"{path}: {name}")
@@ -90,8 +87,8 @@ def read_frames(path: Path, moves: bool = False) -> PublishedFrame:
                 f"{path}: table_in_camera must be a unit normal (3 numbers) and the plane's offset "
                 f"in {file.unit}, camera frame, as a run's report says it."
             )
-        unit = float(np.linalg.norm(table[:3]))  # but for the file's few digits
-        x, y, z, offset = (number / unit for number in table)
+        length = float(np.linalg.norm(table[:3]))  # 1 but for the file's few digits
+        x, y, z, offset = (number / length for number in table)
         table = x, y, z, offset * (1000 if file.unit == "m" else 1)
     if moves and table is not None:
         raise InputError(f"{path}: table_in_camera is of a camera that stands still.")

@@ -1,4 +1,4 @@
-"""What ROS and the viewer share: which observed points are shown, and rotations as quaternions."""
+"""Shared by ROS and the viewer: which observed points are shown, and rotations as quaternions."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ MOST_SEEN = 20_000  # points shown
 
 
 def seen_points(observation: Observation) -> Float32[np.ndarray, "n 3"]:
-    """Points of an observation, thinned while they are still pixels; camera frame."""
+    """Points of an observation, camera frame; a depth image's are thinned."""
     content = observation.content
     if isinstance(content, SensorCloud):
         return content.points_mm
@@ -23,7 +23,7 @@ def seen_points(observation: Observation) -> Float32[np.ndarray, "n 3"]:
 
 
 def seen_colours(observation: Observation) -> UInt8[np.ndarray, "n 3"] | None:
-    """Of these points, where there is a picture."""
+    """Of these points; None without a picture."""
     content, picture = observation.content, observation.picture
     if picture is None or isinstance(content, SensorCloud):
         return None
@@ -35,12 +35,11 @@ def _seen_pixels(frame: DepthFrame) -> Int[np.ndarray, " n"]:
     height, width = frame.depth_mm.shape
     step = max(1, int(np.ceil(np.sqrt(height * width / MOST_SEEN))))
     rows, columns = np.mgrid[0:height:step, 0:width:step]
-    there = frame.depth_mm[::step, ::step] > 0
-    return (rows * width + columns)[there]
+    return (rows * width + columns)[frame.depth_mm[::step, ::step] > 0]
 
 
 def thinned(rows: np.ndarray, most: int) -> np.ndarray:
-    """Evenly spaced rows, ``most`` at the most."""
+    """At most ``most`` rows, evenly spaced."""
     return rows[:: max(1, -(-len(rows) // most))]
 
 

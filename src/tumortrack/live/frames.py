@@ -1,5 +1,5 @@
-"""Whether a frame shows something new, and is of the camera that results are placed by: by its
-name, its intrinsics, and a table that stands still."""
+"""Checks that a frame is new, and from the calibrated camera at its calibrated pose: by frame name,
+intrinsics, and the plane of the table."""
 
 from __future__ import annotations
 
@@ -24,19 +24,18 @@ _SLIDING = (
 
 
 class FrameCheck:
-    """Of one run. ``notes``: what nobody can check, said once each, as it turns out. The table is
-    watched only where places depend on where the camera stands: in the frame of a calibration, and
-    not where it is meant to move.
+    """State of one run. ``notes``: what cannot be checked, once each. The table is watched only if
+    results depend on the camera's pose: with a calibration, and a camera that is not meant to move.
 
-    A sensor's noise never repeats bit for bit: an image that does is an old one, whatever its
-    stamp says. A camera that is replaced, zoomed or set to another mode in between may stand
-    elsewhere too, so its frames are refused until the run is started again.
+    A sensor's noise never repeats bit for bit: an image that does is old, whatever its stamp. A
+    camera that was replaced, zoomed or set to another mode may also have another pose, so its
+    frames are refused until a restart.
     """
 
     def __init__(self, published: PublishedFrame, config: RegionConfig, frozen_s: float) -> None:
         self._published, self._frozen_s = published, frozen_s
         self._values: np.ndarray | None = None
-        self._since_ns = self._last_ns = 0  # an image may have come since; the last frame
+        self._since_ns = self._last_ns = 0  # the earliest arrival of this image; the last frame
         self._camera: Intrinsics | None = None
         self._first: Observation | None = None
         watched = published.calibrated and not published.moves
@@ -46,8 +45,8 @@ class FrameCheck:
             self.notes.append(UNNAMED)
 
     def check(self, seen: Observation) -> str:
-        """A doubt about this frame, or nothing. Raises NoEstimate for a frame of another camera
-        than the calibration or the first frame was of, and once camera or table have moved."""
+        """A doubt about this frame, or an empty text. Raises NoEstimate if its camera is not that
+        of the calibration and of the first frame, and once camera or table have moved."""
         name, wanted = seen.frame_id, self._published.camera_frame_id
         self._first = self._first or seen
         first = self._first.frame_id
@@ -63,7 +62,13 @@ class FrameCheck:
                 "another setting of it. Restart to accept it"
             )
         if isinstance(seen.content, DepthFrame):
-            self._same_intrinsics(seen.content.intrinsics)
+            camera = seen.content.intrinsics
+            self._camera = self._camera or camera
+            if camera != self._camera:
+                raise NoEstimate(
+                    f"the camera's intrinsics changed from {_text(self._camera)} to "
+                    f"{_text(camera)}. If that is meant, start again."
+                )
         if self.watch is None:
             return ""
         doubt = self.watch.check(seen.content)
@@ -72,11 +77,11 @@ class FrameCheck:
         return doubt
 
     def check_new(self, content: DepthFrame | SensorCloud) -> None:
-        """Raises NoEstimate where the same image has been coming for too long."""
+        """Raises NoEstimate if the same image has been repeated for too long."""
         values = content.depth_mm if isinstance(content, DepthFrame) else content.points_mm
         before_ns, self._last_ns = self._last_ns, content.stamp_ns
         if self._values is None or not _same(values, self._values):
-            # It may have come right after the last frame that was taken: others were dropped.
+            # It may have come right after the frame taken last: others were dropped.
             self._since_ns = content.stamp_ns if self._values is None else before_ns
             self._values = values
             return
@@ -87,24 +92,14 @@ class FrameCheck:
                 "camera; a simulated one without noise needs --frozen 0."
             )
 
-    def _same_intrinsics(self, camera: Intrinsics) -> None:
-        self._camera = self._camera or camera
-        if camera != self._camera:
-            raise NoEstimate(
-                f"the camera's intrinsics changed from {_text(self._camera)} to {_text(camera)}. "
-                "If that is meant, start again."
-            )
-
     def _note(self, note: str, now: bool) -> None:
         if now and note not in self.notes:
             self.notes.append(note)
 
 
-def _same(one: np.ndarray, other: np.ndarray) -> bool:
-    """Bit for bit: no return (NaN) is equal to itself."""
-    if one is other:
-        return True
-    return one.shape == other.shape and bool(np.array_equal(one.view("u4"), other.view("u4")))
+def _same(a: np.ndarray, b: np.ndarray) -> bool:
+    """Bit for bit: NaN (no return) equals itself."""
+    return a is b or (a.shape == b.shape and bool(np.array_equal(a.view("u4"), b.view("u4"))))
 
 
 def _text(camera: Intrinsics) -> str:

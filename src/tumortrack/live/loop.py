@@ -1,7 +1,7 @@
 """The live loop: newest frame -> organ's points -> estimate -> every sink.
 
-Each frame gives exactly one result; without an estimate it has the reason, and no older
-estimate is ever repeated.
+Each frame gives exactly one result: an estimate, or the reason why there is none. An older
+estimate is never repeated.
 """
 
 from __future__ import annotations
@@ -24,7 +24,6 @@ from tumortrack.core.types import DepthFrame, Intrinsics
 from tumortrack.live import values as live
 from tumortrack.live.cameras import Cameras
 from tumortrack.live.meter import RunStatistics
-from tumortrack.live.stamps import check_age
 from tumortrack.live.values import CameraView, Observation, SourceLost, TrackingResult
 from tumortrack.live.views import OrganInView, Scan, ViewsLocator, camera_words, timed
 from tumortrack.live.workers import SinkWorker, SourceWorker
@@ -33,17 +32,18 @@ from tumortrack.sense.files import DepthCorrection
 from tumortrack.sense.region import Hints, RegionConfig, organ_points
 from tumortrack.tracking.tracker import Follower, FollowerConfig, Tracker
 
-_OPENING_S = 60.0  # so long a source may take to be opened
-_QUIET = 0.8  # of stale_s: silence is said while what is shown still holds
+_OPENING_S = 60.0  # allowed for opening a source
+_QUIET = 0.8  # of stale_s: silence is reported while the last result is still valid
+_AHEAD_S = 0.1  # allowed difference of two clocks
 SURE_AFTER = 3  # good estimates in a row after doubt: single frames of something else may pass
 
 
 class LoopConfig(Config, frozen=True, kw_only=True):
-    """``stale_s``: no frame for so long, or one that old, gives 'no estimate'. ``give_up_s``: the
-    loop ends where no frame came for so long. ``intrinsics``: of depth images, instead of what the
-    source says, and ``correction`` of their depths with them. ``frozen_s``: an image that repeats
-    bit for bit for so long is an old one; 0: it may repeat. ``seconds``: the loop ends so long
-    after the first frame; 0: never. ``scan``: the first estimate is from several looks."""
+    """``stale_s``: after this time without a frame, or with one that old, there is 'no estimate'.
+    ``give_up_s``: after this time without a frame the loop ends. ``intrinsics``: replace the
+    source's, ``correction`` of depths included. ``frozen_s``: an image that repeats bit for bit for
+    this time is old; 0: it may repeat. ``seconds``: the loop ends this time after the first frame;
+    0: never. ``scan``: the first estimate is from several looks."""
 
     region: RegionConfig = RegionConfig()
     follower: FollowerConfig = FollowerConfig()
@@ -71,9 +71,20 @@ class _TooLate(NoEstimate):
     """The estimate is right, but its frame is stale by now."""
 
 
+def check_age(age_s: float, stale_s: float, other_clock: bool = True) -> None:
+    """Raises NoEstimate for a frame that is stale, or from the future. ``age_s``: since it was
+    made, or arrived; ``other_clock``: by a camera's clock against this computer's."""
+    clocks = "the clocks of camera and computer"
+    if age_s > stale_s:
+        doubt = f", if {clocks} agree" if other_clock else ""
+        raise NoEstimate(f"the frame is stale: {age_s:.2f} s old{doubt}")
+    if age_s < -_AHEAD_S:
+        raise NoEstimate(f"the frame's stamp lies {-age_s:.2f} s in the future: {clocks} disagree")
+
+
 class Loop:
-    """One run from a source to sinks: until the source ends, ``stop`` is called from anywhere, or
-    the time is up."""
+    """One run from a source to sinks: until the source ends, another thread calls ``stop``, or the
+    time is up."""
 
     def __init__(
         self,
@@ -92,12 +103,12 @@ class Loop:
         self._sequence = itertools.count()
         self._cameras: Cameras
         self._in_a_row = SURE_AFTER  # good estimates since the last doubt
-        self._says: Intrinsics | None = None  # the source, where others are given
-        self._stamp: tuple[int, int] | None = None  # of the last frame, and when that was here
+        self._source_intrinsics: Intrinsics | None = None  # of the first frame, if others are given
+        self._stamp: tuple[int, int] | None = None  # of the last frame, and when it was handled
         self.statistics = RunStatistics()
 
     def warm(self) -> None:
-        """Do once what every frame needs, so that the first does not wait for it."""
+        """Run each step once: the first frame need not wait for imports and compilation."""
         bump = np.full((240, 424), 180.0, np.float32)
         rows, columns = np.mgrid[:240, :424]
         middle = np.hypot(rows - 120, columns - 212) < 60
@@ -108,7 +119,7 @@ class Loop:
         self._follower.warm()
 
     def stop(self) -> None:
-        """Ask the loop to end after the frame it is at."""
+        """End the loop after the present frame."""
         self._stop.set()
 
     def run(
@@ -117,8 +128,8 @@ class Loop:
         sink_workers: list[SinkWorker],
         on_result: Callable[[TrackingResult], None],
     ) -> None:
-        """``on_result`` is called with every result, after the sink_workers have it. SourceLost: no
-        frame came for ``give_up_s``. Whatever keeps a source from ever working is raised too."""
+        """``on_result`` is called with every result, after the sinks have got it. Raises
+        SourceLost: no frame came for ``give_up_s``; and whatever keeps a source from working."""
         if not isinstance(source, Cameras):
             source = Cameras([source], [self._context.published_frame.published_from_camera])
         self._cameras = source
@@ -135,7 +146,7 @@ class Loop:
     def _results(self, source_worker: Cameras) -> Iterator[TrackingResult]:
         began_s = fresh_s = time.monotonic()
         quiet_s = _QUIET * self._config.stale_s
-        ends_s, shown_s = math.inf, fresh_s  # by when what is shown came to be
+        ends_s, shown_s = math.inf, fresh_s  # the time of what is shown
         while not self._stop.is_set():
             got = source_worker.take(max(shown_s + quiet_s - time.monotonic(), 0.0))
             now_s = shown_s = time.monotonic()
@@ -159,27 +170,27 @@ class Loop:
             if now_s >= ends_s:
                 return
             if source_worker.opening and now_s - began_s < _OPENING_S:
-                fresh_s = now_s  # it may load libraries first, on a machine with much to do
+                fresh_s = now_s  # it may first load libraries, on a busy machine
             if now_s - fresh_s > self._config.give_up_s:
-                trouble = (source_worker.trouble or "").rstrip(".")
-                trouble = f": {trouble}" if trouble else ""
+                trouble = source_worker.trouble.rstrip(".")
                 raise SourceLost(
-                    f"no frame for {now_s - fresh_s:.0f} s{trouble}. Look at the camera or the "
-                    "topic, then start again."
+                    f"no frame for {now_s - fresh_s:.0f} s{trouble and f': {trouble}'}. Look at "
+                    "the camera or the topic, then start again."
                 )
 
     def _answer(self, seen: Observation, born_ns: int, live_clock: bool) -> TrackingResult:
-        """The result of one frame, which came to be at ``born_ns``. ``live_clock``: time goes
-        on while we work, so an answer can come too late."""
+        """The result of one frame of the time ``born_ns``. ``live_clock``: time goes on while we
+        work, so an answer can come too late."""
         seconds: dict[str, float] = {}
         organ, estimate, reason, warning = None, None, "", ""
         quality: Quality = "none"
         timely = False
         views: list[CameraView] = []
-        absent: dict[int, str] = {}  # cameras that say nothing now, and why
+        absent: dict[int, str] = {}  # cameras without the organ, and why
         found: list[OrganInView] = []
+        several = len(self._cameras.workers) > 1
         try:
-            # What is simulated has this computer's clock, and so has the moment of arrival.
+            # Simulations have this computer's clock, and so has the arrival.
             other_clock = born_ns == seen.stamp_ns and seen.truth is None
             check_age(_age_s(born_ns), self._config.stale_s, other_clock)
             timely = True
@@ -193,14 +204,14 @@ class Loop:
             with timed(seconds, "locate"):
                 estimate = self.views.locate(found)
             seconds |= {f"locate.{k}": v for k, v in estimate.report.timings.items()}
-            if len(self._cameras.workers) > 1:
+            if several:
                 estimate = estimate.reporting(cameras=tuple(view.number for view, _ in found))
             quality, warning = self._confirmed(estimate, doubt)
             if live_clock and _age_s(born_ns) > self._config.stale_s:
                 raise _TooLate(f"the answer came too late: {_age_s(born_ns):.2f} s after the frame")
         except Exception as error:
             estimate, reason, quality, warning = None, str(error), "none", ""
-            # The last place is the best one to start the next search, if only time was wrong.
+            # If only the time was wrong, the last estimate is the best start of the next search.
             if timely and not isinstance(error, _TooLate):
                 self._follower.forget()
                 self._in_a_row = 0
@@ -208,8 +219,7 @@ class Loop:
                 self.statistics.add_defect(error)
                 reason = f"internal error, {type(error).__name__}: {error}"
         self._stamp = (seen.stamp_ns, time.monotonic_ns())
-        several, published = len(self._cameras.workers) > 1, self._context.published_frame
-        numbers = [view.number for view, _ in found]
+        published, numbers = self._context.published_frame, [view.number for view, _ in found]
         lead = found[0][0] if found else next(iter(views), None)
         return TrackingResult(
             next(self._sequence),
@@ -229,8 +239,8 @@ class Loop:
         )
 
     def _confirmed(self, estimate: Estimate, doubt: str) -> tuple[Quality, str]:
-        """Its quality and warning, with a doubt about its frame; after doubt, good is what stays
-        good."""
+        """Quality and warning, with a doubt about the frame; after doubt an estimate counts as good
+        again when several in a row were."""
         quality, warning = estimate.quality, estimate.reason
         if doubt and quality == "good":
             quality, warning = "poor", doubt
@@ -240,8 +250,7 @@ class Loop:
         return quality, warning
 
     def _without_frame(self, reason: str) -> TrackingResult:
-        """The result where there is no frame; its stamp is now, by the source's clock as far as it
-        is known."""
+        """The result without a frame; its stamp is now, by the source's clock if that is known."""
         stamp_ns = time.time_ns()
         if self._stamp is not None:
             last_ns, then_ns = self._stamp
@@ -250,12 +259,13 @@ class Loop:
         return TrackingResult(next(self._sequence), stamp_ns, reason=reason, published_frame=frame)
 
     def _calibrated(self, seen: Observation) -> Observation | InputError:
-        """The frame as the camera that the user says it is took it."""
+        """The frame with the intrinsics and depths that the user calibrated."""
         given, content = self._config.intrinsics, seen.content
         if given is None or not isinstance(content, DepthFrame):
             return seen
-        self._says, has = self._says or content.intrinsics, content.intrinsics
-        if has != self._says:
+        has = content.intrinsics
+        self._source_intrinsics = self._source_intrinsics or has
+        if has != self._source_intrinsics:
             return InputError(
                 "the camera's own intrinsics changed, and those of --intrinsics were for the ones "
                 "before. If that is meant, calibrate it anew and start again."
@@ -281,7 +291,7 @@ class Loop:
             if self._context.controls.aborted.is_set():
                 arms.abort("stopped by the viewer, or a real arm gave up")
             return arms.act(result)
-        except Exception as error:  # a defect there: no arms move, and the organ is still seen
+        except Exception as error:  # a defect there stops the arms, but not tracking
             self.statistics.add_defect(error)
             arms.abort(f"internal error, {type(error).__name__}: {error}")
             return result

@@ -1,8 +1,9 @@
-"""Where a camera that moves is at a frame's stamp: stamped poses, interpolated; from a file."""
+"""The pose of a moving camera at a frame's stamp: interpolated poses from a file or a UR arm."""
 
 from __future__ import annotations
 
 import threading
+import time
 from abc import abstractmethod
 from bisect import bisect_left
 from pathlib import Path
@@ -18,27 +19,29 @@ from tumortrack.core.store import read_file
 from tumortrack.live.display import wxyz_of
 from tumortrack.live.values import Observation
 
-# Between two poses an arm that speeds up by 1 m/s2 is off the straight way by at most a t^2 / 8 =
-# 1.3 mm, about what is allowed for a camera's place (``sense.noise.CAMERA_STD``).
+# Between two poses an arm that accelerates by 1 m/s2 deviates from linear interpolation by at most
+# a t^2 / 8 = 1.3 mm, about the tolerance of a camera's place (``sense.noise.CAMERA_STD``).
 _GAP_NS = 100_000_000
 _BACK_NS = 1_000_000_000
 _KEPT = 2000  # poses of a live source: 4 s at 500 Hz
-_NOT_UNIT = 1e-3  # of a quaternion's length: files have few digits
+_NOT_UNIT = 1e-3  # tolerance of a quaternion's length: files have few digits
+_TICK_S = 0.004  # UR controllers send at 500 Hz (e-Series) or 125 Hz (CB3)
+_WAIT_S = 0.05  # for a UR pose after the frame's stamp
 _LARGEST_TABLE = 256 * 2**20  # bytes
 _UNKNOWN = "where the camera was is unknown"
 COLUMNS = "stamp_ns,frame_id,x_mm,y_mm,z_mm,qw,qx,qy,qz"
 
 
 class CameraPoses:
-    """Where a camera is, or the tool that holds it so (``tool_from_camera``); one thread asks.
-    ``frame_id`` names the fixed frame; empty: nobody says how it is called."""
+    """Poses of a camera, or of the tool that holds it at ``tool_from_camera``; for one thread.
+    ``frame_id`` names the fixed frame; empty: unknown."""
 
     frame_id = ""
     tool_from_camera = HERE
 
     def at(self, seen: Observation) -> Affine:
-        """Fixed frame from the camera at the observation's stamp. Raises NoEstimate: no pose is
-        known then."""
+        """Fixed frame from camera at the observation's stamp. Raises NoEstimate: the pose at that
+        time is unknown."""
         return self.pose(seen) @ self.tool_from_camera
 
     @abstractmethod
@@ -50,7 +53,7 @@ class CameraPoses:
 
 
 class PosesConfig(Config, frozen=True, kw_only=True, tag_field="kind"):
-    """Base of what says where a moving camera is; as ``live.values.SourceConfig``."""
+    """Base of configurations of a moving camera's poses; as ``live.values.SourceConfig``."""
 
     target: ClassVar[str] = ""
 
@@ -60,7 +63,7 @@ class PosesConfig(Config, frozen=True, kw_only=True, tag_field="kind"):
 
 
 class PoseBuffer:
-    """The last stamped poses of one thing. One thread may add while another asks."""
+    """The latest stamped poses of one thing. One thread may add while another asks."""
 
     def __init__(self) -> None:
         self._stamps_ns: list[int] = []
@@ -68,8 +71,8 @@ class PoseBuffer:
         self._lock = threading.Condition()
 
     def add(self, stamp_ns: int, pose: Affine, kept: int = _KEPT) -> None:
-        """One that is out of order is left out; after one whose stamp goes back by more than a
-        second it begins anew: the clock was set back."""
+        """A pose that is out of order is ignored; if its stamp goes back by more than a second, all
+        earlier ones are discarded: the clock was set back."""
         with self._lock:
             if self._stamps_ns and stamp_ns <= self._stamps_ns[-1]:
                 if stamp_ns > self._stamps_ns[-1] - _BACK_NS:
@@ -81,9 +84,8 @@ class PoseBuffer:
             self._lock.notify_all()
 
     def at(self, stamp_ns: int, wait_s: float = 0.0) -> Affine:
-        """The pose then: between its neighbours, shifted linearly and turned at a constant rate
-        (slerp). ``wait_s``: for the later one. Raises NoEstimate: one is missing, or they are too
-        far apart."""
+        """Interpolated between its neighbours (linear, slerp). ``wait_s``: for the later one.
+        Raises NoEstimate: one is missing, or they are too far apart."""
         with self._lock:
             self._lock.wait_for(lambda: max(self._stamps_ns, default=-1) >= stamp_ns, wait_s)
             place, stamps_ns = bisect_left(self._stamps_ns, stamp_ns), self._stamps_ns
@@ -119,7 +121,7 @@ class PosesFileConfig(PosesConfig, frozen=True, kw_only=True, tag="file"):
 
 
 class FilePoses(CameraPoses):
-    """Raises InputError: no such table, or one that is damaged."""
+    """Raises InputError: there is no such table, or it is damaged."""
 
     def __init__(self, path: Path) -> None:
         head, *lines = read_file(path, _LARGEST_TABLE).decode(errors="replace").split("\n")
@@ -151,6 +153,52 @@ class FilePoses(CameraPoses):
 
 
 def pose_row(stamp_ns: int, frame_id: str, pose: Affine) -> str:
-    """A line of such a table."""
+    """A line of a table of poses."""
     numbers = [*pose[:3, 3].tolist(), *wxyz_of(pose[:3, :3]).tolist()]
     return ",".join([str(stamp_ns), frame_id, *(f"{number:.9f}" for number in numbers)]) + "\n"
+
+
+class UrPosesConfig(PosesConfig, frozen=True, kw_only=True, tag="ur"):
+    """The tool of the arm of Universal Robots at ``host`` in its base's frame, by the controller's
+    tool centre point, which must be as at the hand-eye calibration. It only reads."""
+
+    target: ClassVar[str] = "host"
+
+    host: str
+
+    def open(self) -> UrPoses:
+        return UrPoses(self.host)
+
+
+class UrPoses(CameraPoses):
+    """Through ur_rtde. Poses have the time of their arrival: milliseconds late. Raises InputError:
+    ur_rtde is missing, or the arm cannot be reached."""
+
+    def __init__(self, host: str) -> None:
+        try:
+            import rtde_receive
+
+            self._receive = rtde_receive.RTDEReceiveInterface(host)
+        except (ImportError, RuntimeError) as error:
+            raise InputError(
+                f"ur: the arm at {host} cannot be read ({error}). That needs ur_rtde (pip install "
+                "'tumortrack[ur]') and an arm that is on, and reachable on port 30004."
+            ) from error
+        self._poses, self._closed = PoseBuffer(), threading.Event()
+        threading.Thread(target=self._read, name="ur poses", daemon=True).start()
+
+    def pose(self, seen: Observation) -> Affine:
+        return self._poses.at(seen.stamp_ns, _WAIT_S)
+
+    def close(self) -> None:
+        self._closed.set()
+
+    def _read(self) -> None:
+        """An arm that falls silent repeats its clock: no pose is added, and frames find none."""
+        last_s = -1.0
+        while not self._closed.wait(_TICK_S):
+            if (clock_s := self._receive.getTimestamp()) != last_s and self._receive.isConnected():
+                last_s, numbers = clock_s, np.array(self._receive.getActualTCPPose(), float)
+                turn = Rotation.from_rotvec(numbers[3:]).as_matrix()
+                self._poses.add(time.time_ns(), rigid(turn, 1000 * numbers[:3]))
+        self._receive.disconnect()

@@ -134,7 +134,7 @@ POSES = Registry[PosesConfig](
     {
         "file": f"{_LIVE}.poses:PosesFileConfig",
         "ros2": f"{_LIVE}.ros.tf:Ros2PosesConfig",
-        "ur": f"{_LIVE}.robot:UrPosesConfig",
+        "ur": f"{_LIVE}.poses:UrPosesConfig",
     },
 )
 

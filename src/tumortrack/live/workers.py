@@ -1,5 +1,5 @@
-"""The threads round the loop: one reads the source, and each sink works in one of its own, so that
-none holds up the loop or another."""
+"""The threads around the loop: one reads the source, and each sink has its own, so that none holds
+up the loop or another."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ from typing import Any
 
 from tumortrack.core.errors import InputError, NoEstimate, TumortrackError
 from tumortrack.live.meter import Histogram
-from tumortrack.live.stamps import StampOrder
 from tumortrack.live.values import (
     Observation,
     Sink,
@@ -23,21 +22,42 @@ from tumortrack.live.values import (
     TrackingResult,
 )
 
-_READ_S = 0.2  # one wait for a frame: how soon the thread sees that it is to stop
-_AGAIN_S = 1.0  # between two tries to open
-_FROZEN_S = 5.0  # without a frame: closed and opened again
+_READ_S = 0.2  # timeout of one read: how soon the thread notices that it must stop
+_AGAIN_S = 1.0  # between two attempts to open
+_FROZEN_S = 5.0  # without a frame: reopened
 _DEFECTS = 5  # tracebacks that are kept
 _STOP_S = 2.0  # how long close waits for a source that hangs
 _CLOSE_S = 10.0  # for a sink to write what waits, and flush
-_SILENT_S = 2.0  # without a word from the loop: what a sink shows holds no longer
+_SILENT_S = 2.0  # without a result from the loop: what a sink shows is no longer valid
 _SLOW_S = 0.25  # at one result: what a sink shows lags by as much
+_ACCEPTED_AFTER = 3  # frames whose stamps increase: then the clock was set back
+
+
+class StampOrder:
+    """Refuses stamps that go back unless the clock was set back. It must see every frame: of two
+    that were swapped the loop may get only one."""
+
+    def __init__(self) -> None:
+        self._last_ns = -1
+        self._behind: list[int] = []
+
+    def check(self, stamp_ns: int) -> None:
+        """Raises NoEstimate for a frame that is out of order."""
+        if stamp_ns < 0:
+            raise NoEstimate(f"the frame's stamp is {stamp_ns} ns; it must be 0 or more")
+        back_ns = self._last_ns - stamp_ns
+        if back_ns >= 0:
+            grows = not self._behind or stamp_ns > self._behind[-1]
+            self._behind = [*self._behind, stamp_ns] if grows else [stamp_ns]
+            if len(self._behind) < _ACCEPTED_AFTER:
+                raise NoEstimate(f"the frame's stamp went back by {back_ns * 1e-9:.3f} s")
+        self._last_ns, self._behind = stamp_ns, []
 
 
 class SourceWorker:
-    """Opens a source, reads it, and opens it again when it is lost. Of frames that come faster than
-    they are taken the newest stays, and the others count as dropped; a ``lossless`` source is read
-    only as they are taken. What was wrong with a frame, its order too, is handed over before later
-    frames, however many come."""
+    """Opens a source, reads it, and reopens it when it is lost. If frames come faster than they are
+    taken, the newest stays and the others count as dropped; a ``lossless`` source is read only as
+    they are taken. An error about a frame, its order too, is handed over before later frames."""
 
     def __init__(self, open_source: Callable[[], Source]) -> None:
         self._open = open_source
@@ -46,53 +66,48 @@ class SourceWorker:
         self._refused: TumortrackError | None = None  # since the last frame that was taken
         self._order = StampOrder()
         self._stop = threading.Event()
-        self._passed = 0  # replaced before they were taken, or dropped by sources that are closed
+        self._passed = 0  # replaced before they were taken, or dropped by sources now closed
         self._source: Source | None = None
-        self.latency_from = "arrival"  # what the age of what was taken counts from
+        self.latency_from = "arrival"  # where the age of the frame taken last counts from
         self.trouble = "the source is not open yet"
         self.ended = False
         self.failure: Exception | None = None
         self.defects: list[str] = []
         self.opened = 0
-        self.opening = True  # until the first try has ended, well or not
+        self.opening = True  # until the first attempt has succeeded or failed
         self._thread = threading.Thread(target=self._run, name="source", daemon=True)
         self._thread.start()
 
     @property
     def dropped(self) -> int:
-        """Frames that nobody got: overtaken by newer ones, here or in the source."""
+        """Frames that newer ones replaced, here or in the source."""
         return self._passed + (source.dropped if (source := self._source) else 0)
 
     def born_ns(self, seen: Observation) -> int:
-        """When the frame just taken came to be, by ``time.time_ns``: its stamp, or where the source
-        has another clock, its arrival; of a source that waits for us, now."""
+        """The time of the frame taken last, by ``time.time_ns``: its stamp, or, if the source has
+        another clock, its arrival; for a lossless source, now."""
         if self.latency_from == "stamp":
             return seen.stamp_ns
         return seen.arrived_ns if self.latency_from == "arrival" else time.time_ns()
 
     def take(self, timeout_s: float) -> Observation | TumortrackError | None:
-        """The newest frame, or what was wrong with it; None if none came in time or all is over.
-
-        Raises whatever stopped the reading for good.
-        """
+        """The newest frame, or what was wrong with it; None if none came in time or the source has
+        ended. Raises whatever stopped the reading for good."""
         with self._lock:
             self._lock.wait_for(lambda: self._waits or self._over, timeout_s)
-            refused, self._refused = self._refused, None
-            newest = None
-            if refused is None:
-                newest, self._newest = self._newest, None
-            self._lock.notify_all()
-        if refused is not None:
-            return refused
-        if newest is None:
-            if self.failure is not None:
-                raise self.failure
-            return None
-        taken, self.latency_from = newest
-        return taken
+            self._lock.notify_all()  # lossless sources go on
+            if self._refused is not None:
+                refused, self._refused = self._refused, None
+                return refused
+            if self._newest is not None:
+                (newest, self.latency_from), self._newest = self._newest, None
+                return newest
+        if self.failure is not None:
+            raise self.failure
+        return None
 
     def close(self) -> None:
-        """Stop reading and close the source; one that hangs is left behind after 2 s."""
+        """Stop reading and close the source; one that hangs is abandoned after 2 s."""
         self._stop.set()
         with self._lock:
             self._lock.notify_all()
@@ -123,7 +138,7 @@ class SourceWorker:
             self._lock.notify_all()
 
     def _note(self, error: Exception) -> None:
-        """After it worked once, whatever it is may pass."""
+        """Once the source has worked, any error may be temporary."""
         if not self.opened and not isinstance(error, SourceLost):
             self.failure = error  # handed to the loop, which raises it
         elif isinstance(error, TumortrackError):
@@ -150,7 +165,7 @@ class SourceWorker:
                     got = error
                 if got is not None:
                     came = time.monotonic()
-                    # Asked for again: some know whose clock it is from the first frame on only.
+                    # Read each time: some sources know their clock only from the first frame on.
                     clock = "stamp" if source.host_clock else "arrival"
                     self._put(got, "taking" if source.lossless else clock)
                 elif time.monotonic() - came > _FROZEN_S:
@@ -172,8 +187,8 @@ class SourceWorker:
 
 
 class SinkWorker:
-    """Hands results to one sink: the newest ``waiting`` of them. What does not fit is dropped,
-    oldest first, and counted; errors are counted and the last one kept."""
+    """Hands results to one sink. More than ``waiting`` are dropped, oldest first, and counted;
+    errors are counted and the last one kept."""
 
     def __init__(self, name: str, sink: Sink, waiting: int) -> None:
         self.name = name
@@ -182,10 +197,10 @@ class SinkWorker:
         self._waiting: deque[tuple[TrackingResult, float]] = deque(maxlen=waiting)
         self._lock = threading.Condition()
         self._stop = False
-        self.unclosed = False  # it failed at its end
+        self.unclosed = False  # closing failed
         self.delivered = self.dropped = self.errors = 0
-        self.failing, self.error = False, ""  # now; the last one there was
-        self._busy_s = math.inf  # since when it has been at one result
+        self.failing, self.error = False, ""  # now; the last one so far
+        self._busy_s = math.inf  # when it started with the present result
         self.latency = Histogram()  # from the stamp (or arrival) to the end of publish
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
         self._thread.start()
@@ -198,7 +213,6 @@ class SinkWorker:
         return self.error if self.failing else ""
 
     def put(self, result: TrackingResult) -> None:
-        """Returns at once."""
         with self._lock:
             if len(self._waiting) == self._waiting.maxlen:
                 self.dropped += 1
@@ -206,7 +220,7 @@ class SinkWorker:
             self._lock.notify()
 
     def close(self) -> None:
-        """Hand over what waits, then close the sink; a sink that hangs is left after 10 s."""
+        """Hand over what waits, then close the sink; one that hangs is abandoned after 10 s."""
         with self._lock:
             self._stop = True
             self._lock.notify()
@@ -216,7 +230,7 @@ class SinkWorker:
             self.unclosed = True
 
     def summary(self) -> dict[str, Any]:
-        """What became of the results (JSON types)."""
+        """Counts and latencies of the results (JSON types)."""
         counts = getattr(self._sink, "counts", None)
         return {
             "delivered": self.delivered,
@@ -228,21 +242,22 @@ class SinkWorker:
         }
 
     def _run(self) -> None:
-        shown: TrackingResult | None = None  # the last result, until it was replaced for silence
+        shown: TrackingResult | None = None  # the last result, until silence replaced it
         while True:
             with self._lock:
                 self._lock.wait_for(lambda: self._waiting or self._stop, _SILENT_S)
-                came = self._waiting.popleft() if self._waiting else None
-                if came is None and self._stop:
+                waiting = self._waiting.popleft() if self._waiting else None
+                if waiting is None and self._stop:
                     break
-            if came is not None:
-                shown = came[0]
-                self._publish(*came)
-            elif shown is not None and self._waiting.maxlen == 1:  # a recording has no present
-                stamp_ns, frame = shown.stamp_ns + int(_SILENT_S * 1e9), shown.published_frame
-                why = f"the loop has said nothing for {_SILENT_S:g} s"
+            if waiting is not None:
+                shown = waiting[0]
+                self._publish(*waiting)
+            elif shown is not None and self._waiting.maxlen == 1:  # it shows the present
                 silence = TrackingResult(
-                    shown.sequence, stamp_ns, reason=why, published_frame=frame
+                    shown.sequence,
+                    shown.stamp_ns + int(_SILENT_S * 1e9),
+                    reason=f"the loop has said nothing for {_SILENT_S:g} s",
+                    published_frame=shown.published_frame,
                 )
                 self._publish(silence, 0.0)
                 shown = None
