@@ -1,8 +1,7 @@
 """OpenIGTLink over TCP to many receivers, none of which can delay the sender.
 
 One thread serves all. A message that a receiver has not taken yet is replaced by the next one of
-its type and device. So a slow receiver skips messages and still gets the last ones; at most one of
-each type and device waits for it, besides the one that is being sent.
+its type and device. So a slow receiver skips messages and still gets the last ones.
 """
 
 from __future__ import annotations
@@ -19,23 +18,23 @@ from tumortrack.live.igtl import message as igtl
 from tumortrack.live.igtl.message import Header, Message, ProtocolError, pack
 from tumortrack.live.network import Pace
 
-_LARGEST_REQUEST = 2**16  # bytes; what a receiver sends is small
-MOST_RECEIVERS = 16  # further ones are turned away: each may hold half a megabyte
+_LARGEST_REQUEST = 2**16  # bytes
+MOST_RECEIVERS = 16  # further ones are refused: each may hold half a megabyte
 _REQUESTS_PER_S = 100.0
-_MOST_ANSWERS = 100  # that wait for a receiver: one that only asks gets no more
-_STALLED_S = 10.0  # a receiver that takes nothing for so long is gone
-_RETRY_S = 1.0  # between tries to connect
+_MOST_ANSWERS = 100  # waiting for one receiver, which may only ask and never read
+_STALLED_S = 10.0  # a receiver that takes no piece for this long is dropped
+_RETRY_S = 1.0  # between attempts to connect
 _PATIENCE_S = 1.0  # at the end, with receivers that have not taken all
-_PIECE = 2**14  # bytes handed over in one go, within that time
+_PIECE = 2**14  # bytes
 _BUFFER = 2**19  # of the socket: about one result, so that what waits there is not old
 
 Key = tuple[str, str]  # type and device
 
 
 class Link:
-    """Sends messages to whoever is connected; a newcomer gets the newest of each kind.
+    """Sends messages to all receivers; a new one gets the newest of each type and device.
 
-    With ``connect`` it goes to that host's server itself, again and again until it is there;
+    With ``connect`` it is a client of that host's server, and retries until that is there;
     otherwise it is the server on ``host``. ``port``: the server's. Raises InputError: the port is
     taken, the host's name is unknown, or fastcrc is missing."""
 
@@ -55,7 +54,7 @@ class Link:
                 cure = "Choose another port, or end the program that has it."
                 fault = f"cannot listen on {host}:{port}: {error}. {cure}"
             raise InputError(f"openigtlink: {fault}") from error
-        # The thread's own; others only look.
+        # Changed by the thread only.
         self._newest: dict[Key, bytes] = {}
         self.receivers: list[_Receiver] = []
         self._loop, self._closing = asyncio.new_event_loop(), asyncio.Event()
@@ -65,18 +64,17 @@ class Link:
         self._thread.start()
 
     def send(self, messages: list[Message]) -> None:
-        """Hand these over; returns at once. ProtocolError: the protocol cannot hold one of them;
-        then none is sent."""
+        """Returns at once. Raises ProtocolError, and sends none, if the protocol cannot hold one of
+        them."""
         self._call(self._offer, {(m.type, m.device): pack(m) for m in messages})
 
     def close(self) -> None:
-        """Let receivers take what waits for them, for a second at most, and go; may be called
-        twice."""
+        """Give receivers up to a second to take what waits for them; may be called twice."""
         self._call(self._closing.set)
         self._thread.join()
 
     def _call(self, function: Callable[..., object], *arguments: object) -> None:
-        with contextlib.suppress(RuntimeError):  # it is over
+        with contextlib.suppress(RuntimeError):  # closed
             self._loop.call_soon_threadsafe(function, *arguments)
 
     def _offer(self, packed: dict[Key, bytes]) -> None:
@@ -92,7 +90,7 @@ class Link:
         serving = asyncio.create_task(self._visit(connect) if connect else self._accept())
         await self._closing.wait()
         until_s = time.monotonic() + _PATIENCE_S
-        while time.monotonic() < until_s and any(one.busy for one in self.receivers):
+        while time.monotonic() < until_s and any(receiver.busy for receiver in self.receivers):
             await asyncio.sleep(0.01)
         serving.cancel()
         while self.receivers:
@@ -121,11 +119,11 @@ class Link:
         receiver = _Receiver(writer, self._newest)
         self.receivers.append(receiver)
         try:
-            async with asyncio.TaskGroup() as both:
-                both.create_task(self._receive(reader, receiver))
-                both.create_task(receiver.send())
+            async with asyncio.TaskGroup() as group:
+                group.create_task(self._receive(reader, receiver))
+                group.create_task(receiver.send())
         except* (OSError, EOFError, ProtocolError):
-            pass  # gone, it takes nothing any more, or it speaks another language
+            pass  # it is gone, stalled, or uses another protocol
         finally:
             self.receivers.remove(receiver)
             writer.transport.abort()
@@ -143,9 +141,9 @@ class Link:
                     receiver.offer({key: answer})
 
     def _answers(self, header: Header, body: bytes) -> dict[Key, bytes]:
-        """To GET_...: the newest of that type (of that device, if it names one), an empty message
-        where there is none. To STT_...: done, since everything is sent anyway; to STP_...: not
-        done. Whatever else comes is not for us."""
+        """To GET_...: the newest messages of that type (and device, if it names one), or an empty
+        one. To STT_...: success, since everything is sent anyway; to STP_...: failure. Other
+        messages are ignored."""
         try:
             igtl.check_body(header, body)
         except ProtocolError as error:
@@ -158,16 +156,16 @@ class Link:
             answer = Message(f"RTS_{kind}", header.device, 0, bytes([verb == "STP"]))
             return {(answer.type, answer.device): pack(answer)}
         # The type may be cut to fit: GET_TRANSFOR, GET_TRANS.
-        found = {
+        answers = {
             (full, device): message
             for (full, device), message in self._newest.items()
             if full.startswith(kind) and header.device in ("", device)
         }
-        return found or {(kind, header.device): pack(Message(kind, header.device))}
+        return answers or {(kind, header.device): pack(Message(kind, header.device))}
 
 
 class _Receiver:
-    """One that is connected, and what waits for it."""
+    """A connection, and what waits for it."""
 
     def __init__(self, writer: asyncio.StreamWriter, newest: dict[Key, bytes]) -> None:
         self.writer = writer
@@ -177,14 +175,14 @@ class _Receiver:
         self.offer(newest)
 
     def offer(self, packed: dict[Key, bytes]) -> None:
-        """Send these instead of what waits of the same type and device."""
+        """Send these, replacing what waits of the same type and device."""
         if packed:
             self.waiting.update(packed)
             self.busy = True
             self._came.set()
 
     async def send(self) -> None:
-        """Raises TimeoutError where nothing is taken any more."""
+        """Raises TimeoutError if the receiver stalls."""
         while await self._came.wait():
             while self.waiting:
                 message = self.waiting.pop(next(iter(self.waiting)))

@@ -1,8 +1,8 @@
 """OpenIGTLink messages as bytes: header, extended header, content, metadata and checksum.
 
 Header version 2 (protocol 3), which 3D Slicer (since 4.7), PLUS and pyigtl read: version 1 has no
-metadata, so nothing could say in which frame a place is given or that a transform is missing.
-Headers of version 1 are read too, since clients' requests come in it. All numbers are big-endian.
+metadata for frames and missing transforms. Headers of version 1 are read too, since clients use it
+for requests. All numbers are big-endian.
 Source: the protocol's Documents/Protocol: header.md, timestamp.md, transform.md, status.md,
 polydata.md, point.md.
 """
@@ -36,20 +36,14 @@ _POINT = struct.Struct("> 64s 32s 4B 4f 20s")
 
 
 class ProtocolError(InputError):
-    """Bytes that are no message, or a message that the protocol cannot hold."""
+    """Bytes that are no message, or a message that does not fit the protocol."""
 
 
 @dataclass(frozen=True)
 class Message:
-    """One message.
-
-    Attributes:
-        type: TRANSFORM, STATUS, POLYDATA, GET_STATUS, ...; at most 12 ASCII characters.
-        device: whose it is; at most 20 ASCII characters.
-        stamp_ns: since 1970, UTC; 0: unknown. Kept to 1/4 ns.
-        content: the type's own bytes.
-        metadata: texts by name.
-    """
+    """``type``: TRANSFORM, STATUS, POLYDATA, GET_STATUS, ..., at most 12 ASCII characters;
+    ``device``: at most 20. ``stamp_ns``: since 1970, UTC; 0: unknown. Kept to 1/4 ns. ``content``:
+    the type's own bytes. ``metadata``: texts by name."""
 
     type: str
     device: str
@@ -60,7 +54,7 @@ class Message:
 
 @dataclass(frozen=True)
 class Header:
-    """What the first 58 bytes say; ``body_size`` bytes follow."""
+    """The first 58 bytes; ``body_size`` bytes follow."""
 
     version: int
     type: str
@@ -71,8 +65,8 @@ class Header:
 
 
 def pack(message: Message) -> bytes:
-    """The message as it goes over the wire. Raises ProtocolError for a name too long or not ASCII,
-    and a stamp before 1970 or after 2106."""
+    """The message's bytes. Raises ProtocolError for a name too long or not ASCII, and a stamp
+    before 1970 or after 2106."""
     index, texts = [struct.pack("> H", len(message.metadata))], []
     for key, value in message.metadata.items():
         name, text = key.encode("ascii"), value.encode("utf-8")
@@ -136,14 +130,14 @@ def pack_transform(b_from_a: Float[np.ndarray, "4 4"]) -> bytes:
 
 
 def pack_status(code: int, name: str, text: str) -> bytes:
-    """How the sender is: ``code`` 1 is well; ``name`` is cut to 20 characters. The text ends with
-    a zero byte, as the protocol's own library writes it; the sub code is 0."""
+    """``name`` is cut to 20 characters. The text ends with a zero byte, as the protocol's own
+    library writes it; the sub code is 0."""
     return _STATUS.pack(code, 0, name.encode("ascii", "replace")[:20]) + text.encode() + b"\0"
 
 
 @dataclass(frozen=True, eq=False)
 class Polydata:
-    """Points and cells over them, which hold point numbers; ``scalars``: one a point, by name."""
+    """Points and cells of point numbers; ``scalars``: one per point, by name."""
 
     points: Float[np.ndarray, "n 3"]
     triangles: Int[np.ndarray, "f 3"]
@@ -173,8 +167,7 @@ def pack_polydata(data: Polydata) -> bytes:
 def pack_points(
     points_mm: Float[np.ndarray, "n 3"], labels: Sequence[str], colours: Sequence[Colour]
 ) -> bytes:
-    """Fiducials; labels are cut to 63 bytes: the protocol's own library reads one of
-    64 past its end."""
+    """Fiducials; labels are cut to 63 bytes: the protocol's own library reads beyond one of 64."""
     return b"".join(
         _POINT.pack(label.encode("ascii", "replace")[:63], b"Fiducial", *rgb, 255, *point, 0.0, b"")
         for label, rgb, point in zip(labels, colours, points_mm, strict=True)
@@ -182,5 +175,4 @@ def pack_points(
 
 
 def _cells(cells: np.ndarray) -> bytes:
-    """Each cell as its number of points and their numbers."""
     return np.insert(cells, 0, cells.shape[1], axis=1).astype(">u4").tobytes()

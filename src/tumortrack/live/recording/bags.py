@@ -1,7 +1,7 @@
 """ROS bags as recordings: rosbag2 (.mcap, .db3, folders of them) and ROS 1 (.bag), by rosbags.
 
-Messages are read by the types that are known here, never by definitions from the bag: those would
-become code.
+Messages are decoded by the types known here, never by definitions from the bag, which rosbags would
+turn into code.
 """
 
 from __future__ import annotations
@@ -22,21 +22,20 @@ from tumortrack.live.values import Observation
 
 _KINDS = (sensors.IMAGE, sensors.CLOUD)
 SUFFIXES = (".mcap", ".db3", ".bag")
-ESTIMATES = "/tumortrack/"  # topics of our own estimates, which are no input
+ESTIMATES = "/tumortrack/"  # topics of our own estimates: no input
 OWN_DEPTH = "/camera/depth/image_rect"  # of the sink ``recording``
 MASK_TOPIC, PICTURE_TOPIC = "/camera/mask", "/camera/color/image_raw"
-_REALSENSE = "/device_0/"  # how the RealSense SDK names all its topics
+_REALSENSE = "/device_0/"  # prefix of all topics of the RealSense SDK
 # https://mcap.dev/spec
 _MAGIC = b"\x89MCAP0\r\n"
 _DATA_END = 0x0F
 
 
 class BagRecording:
-    """An open bag: depth images, each with the camera_info that came last and mask and picture of
-    its own stamp, or clouds. An empty topic is the only one there is; ``rectified`` and ``unit_mm``
-    as in ``ros.sensors.depth_of``. Raises InputError if it is no bag or damaged, or if there is not
-    exactly one topic to choose.
-    """
+    """An open bag: depth images, each with the latest camera_info and the mask and picture of its
+    stamp, or clouds. An empty topic means the only one; ``rectified`` and ``unit_mm`` as in
+    ``ros.sensors.depth_of``. Raises InputError if it is no bag or damaged, or if there is not
+    exactly one topic to choose."""
 
     def __init__(
         self,
@@ -66,57 +65,54 @@ class BagRecording:
         self._opened.close()
 
     def frames(self) -> Iterator[RecordedFrame]:
-        """From first to last; each call starts again. A damaged frame is one whose ``load``
-        raises."""
+        """From first to last; each call starts again. ``load`` of a damaged frame raises."""
         first = self._first(self._info_topic) if self._info_topic else None
-        beside: dict[str, Any] = {self._info_topic: first}  # by topic: the last
+        companions: dict[str, Any] = {self._info_topic: first}  # the latest of each topic
         stamp_ns = 0
-        waiting: Any = None  # an image: what belongs to it may follow it
+        waiting: Any = None  # an image: its companions may follow it
         topics = {self._topic, self._info_topic, MASK_TOPIC}
-        if self._topic == OWN_DEPTH:  # elsewhere the picture's pixels may be other ones
+        if self._topic == OWN_DEPTH:  # another bag's picture may not be aligned
             topics.add(PICTURE_TOPIC)
         for topic, message in chain(self._all(topics), [("", None)]):
             if topic and topic != self._topic:
-                beside[topic] = message
+                companions[topic] = message
                 continue
             if waiting is not None:
-                yield RecordedFrame(stamp_ns, partial(self._observed, waiting, {**beside}))
+                yield RecordedFrame(stamp_ns, partial(self._observed, waiting, {**companions}))
             if message is not None and not isinstance(message, InputError):
                 stamp_ns = stamp_of(message.header)
             waiting = message
 
-    def _observed(self, message: Any, beside: dict[str, Any]) -> Observation:
+    def _observed(self, message: Any, companions: dict[str, Any]) -> Observation:
         if isinstance(message, InputError):
             raise message
-        info, mask = beside[self._info_topic], beside.get(MASK_TOPIC)
+        info, image = companions[self._info_topic], companions.get(MASK_TOPIC)
         if info is None:
             return Observation(sensors.cloud_of(message), 0, frame_id=sensors.frame_of(message))
         frame = sensors.depth_of(message, info, self._rectified, self._unit_mm)
-        here = mask is not None and stamp_of(mask.header) == frame.stamp_ns
-        seen = sensors.mask_of(mask) if here else None
-        picture = beside.get(PICTURE_TOPIC)
+        same_time = image is not None and stamp_of(image.header) == frame.stamp_ns
+        mask = sensors.mask_of(image) if same_time else None
+        picture = companions.get(PICTURE_TOPIC)
         picture = picture and sensors.picture_of(picture, frame)
-        return Observation(frame, 0, seen, None, sensors.frame_of(message), picture)
+        return Observation(frame, 0, mask, None, sensors.frame_of(message), picture)
 
     def _all(self, topics: set[str]) -> Iterator[tuple[str, Any]]:
-        """Topic and message in the order of their recording; without a topic an InputError, where
-        a message, or the bag from there on, is damaged."""
+        """Topic and message in recorded order; an InputError without a topic if a message, or the
+        rest of the bag, is damaged."""
         for reader in self._readers:
             wanted = [c for c in reader.connections if c.topic in topics]
             raw = reader.messages(wanted) if wanted else iter(())
-            while True:
-                got = None
+            entry: Any = True
+            while entry is not None:
+                entry = None
                 try:
                     with _guarded(self._path):
-                        got = next(raw, None)
-                    if got is None:
-                        break
-                    topic = got[0].topic
-                    yield topic, self._messages.from_bytes(got[2], self._types[topic])
+                        entry = next(raw, None)
+                    if entry is not None:
+                        topic = entry[0].topic
+                        yield topic, self._messages.from_bytes(entry[2], self._types[topic])
                 except InputError as error:
                     yield "", error
-                    if got is None:
-                        break
 
     def _first(self, topic: str) -> Any:
         for _, message in self._all({topic}):
@@ -139,9 +135,9 @@ class BagRecording:
                 f"{', '.join(usable) or 'none'}."
             )
         clouds = [topic for topic in usable if self._types[topic] == sensors.CLOUD]
-        found = [topic for topic in usable if self._is_depth(topic)] or clouds
-        if len(found) == 1:
-            return found[0]
+        candidates = [topic for topic in usable if self._is_depth(topic)] or clouds
+        if len(candidates) == 1:
+            return candidates[0]
         if any(topic.startswith(_REALSENSE) for topic in self._types):
             raise InputError(
                 f"{self._path} was recorded by the RealSense SDK, whose depth unit stands apart: "
@@ -154,7 +150,7 @@ class BagRecording:
             )
         raise InputError(
             f"{self._path}: which topic holds the depth images or clouds? Say topic=NAME; "
-            f"candidates: {', '.join(found or usable)}."
+            f"candidates: {', '.join(candidates or usable)}."
         )
 
     def _is_depth(self, topic: str) -> bool:
@@ -165,15 +161,15 @@ class BagRecording:
         return False
 
     def _choose_info(self, wanted: str) -> str:
-        """The camera_info beside the image, by ROS's convention or RealSense's; or the only one."""
+        """The image's camera_info, by the naming of ROS or RealSense; or the only one."""
         infos = [topic for topic, kind in self._types.items() if kind == sensors.CAMERA_INFO]
         if wanted and wanted not in infos:
             raise InputError(f"{self._path} has no camera_info topic {wanted!r}.")
         parent = self._topic.rpartition("/")[0]
-        beside = (f"{parent}/camera_info", f"{parent.rpartition('/')[0]}/info/camera_info")
-        found = [topic for topic in beside if topic in infos] or infos
-        if wanted or len(found) == 1:
-            return wanted or found[0]
+        usual = (f"{parent}/camera_info", f"{parent.rpartition('/')[0]}/info/camera_info")
+        candidates = [topic for topic in usual if topic in infos] or infos
+        if wanted or len(candidates) == 1:
+            return wanted or candidates[0]
         raise InputError(
             f"{self._path}: which camera_info belongs to {self._topic}? Say info_topic=NAME; "
             f"candidates: {', '.join(infos) or 'none, so its depth images cannot be used'}."
@@ -181,8 +177,8 @@ class BagRecording:
 
 
 def bag_files(path: Path) -> list[Path]:
-    """The bag's files in the order of their numbers; a rosbag2 folder is one of its own. None
-    where there is no bag."""
+    """The bag's files in the order of their numbers; a rosbag2 folder is itself one. Empty if there
+    is no bag."""
     if (path / "metadata.yaml").is_file():
         return [path]
     if not path.is_dir():
@@ -192,8 +188,8 @@ def bag_files(path: Path) -> list[Path]:
 
 
 def bag_contents(path: Path) -> tuple[dict[str, int], float]:
-    """How many depth images or clouds a bag has, by topic, and how many seconds it lasts; of one
-    without its end, as a killed recorder leaves it, too. InputError where it cannot be read."""
+    """The number of depth images or clouds by topic, and the duration in s; also of a bag without
+    an end, as after a crash. Raises InputError if it cannot be read."""
     counts: dict[str, int] = {}
     times_ns: list[int] = []
     for file in bag_files(path):
@@ -219,7 +215,7 @@ def _opened(path: Path) -> Any:
         whole: Any = rosbag1.Reader(path) if kind == ".bag" else rosbag2.Reader(path)
         whole.open()
         return whole
-    # Readers begin at the end. This one is told where the records end, and goes through them all.
+    # Readers begin at the index. This one is given the end of the records, and scans them all.
     reader: Any = McapReader(path)
     try:
         reader.open()
@@ -243,8 +239,8 @@ def _guarded(path: Path) -> Iterator[None]:
 
 
 def _end_of_records(path: Path) -> int:
-    """Behind the last whole record of an MCAP without an end, as a killed recorder or a full disk
-    leaves it; 0 of one with an end, or of another file. A file is magic, records (opcode, length,
+    """The end of the last whole record of an MCAP without an end, as after a crash or on a full
+    disk; 0 of one with an end, or of another file. A file is magic, records (opcode, length,
     content), footer, magic."""
     with path.open("rb") as stream:
         begins = stream.read(len(_MAGIC)) == _MAGIC

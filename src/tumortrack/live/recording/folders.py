@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -16,25 +17,24 @@ from tumortrack.sense import files
 from tumortrack.simulate.scene_folder import organ_of_folder
 
 INTRINSICS, DEPTH, CLOUD, META = "intrinsics.json", "depth.png", "cloud.ply", "meta.json"
-ABOUT = "recording.json"  # beside what the sink ``recording`` wrote
-_STAMP_DIGITS = 12  # a name with fewer digits is a number of a frame, no time in ns
+ABOUT = "recording.json"  # of the sink ``recording``
 
 
 class RecordedFrame(NamedTuple):
-    """A frame that is read when ``load`` is called, which raises InputError if it is damaged. The
-    observation is to get this stamp; its ``arrived_ns`` is 0."""
+    """A frame that ``load`` reads, raising InputError if it is damaged. The observation must be
+    given this stamp; its ``arrived_ns`` is 0."""
 
     stamp_ns: int
     load: Callable[[], Observation]
 
 
 def folder_frames(path: Path, fps: float, unit: Literal["mm", "m"]) -> list[RecordedFrame]:
-    """The frames in a folder, by name; none is read before its turn.
+    """The frames in a folder, by name; none is read yet.
 
-    Of: scene folders (with depth.png and intrinsics.json, or cloud.ply); depth images (.png) beside
-    one intrinsics.json; clouds (.ply, .pcd, .npz; ``unit`` is theirs). Stamps: what a scene's
-    meta.json says as ``stamp_ns``, or file names of at least 12 digits, which are nanoseconds; else
-    ``fps`` frames a second. Raises InputError where there are none of these.
+    Scene folders (with depth.png and intrinsics.json, or cloud.ply), depth images (.png) with one
+    intrinsics.json, or clouds (.ply, .pcd, .npz, in ``unit``). Stamps: ``stamp_ns`` of a scene's
+    meta.json, or file names of at least 12 digits, in ns; else ``fps`` frames a second. Raises
+    InputError if there are none of these.
     """
     listed = path.iterdir() if path.is_dir() else ()
     inside = sorted(p for p in listed if not p.name.startswith("."))
@@ -47,29 +47,25 @@ def folder_frames(path: Path, fps: float, unit: Literal["mm", "m"]) -> list[Reco
         (images if camera.is_file() else [], lambda file: Observation(image(file, camera), 0)),
         (clouds, lambda file: Observation(cloud(file, unit)[0], 0)),
     ]
-    found, read = next((kind for kind in kinds if kind[0]), ([], _read_scene))
-    if not found:
+    frame_paths, read = next((kind for kind in kinds if kind[0]), ([], _read_scene))
+    if not frame_paths:
         lack = f"its .png need {INTRINSICS} beside them" if images else "it holds none of these"
         raise InputError(
             f"{path} is no recording: {lack}. Allowed: a folder of clouds "
             f"({', '.join(files.CLOUD_SUFFIXES)}), of depth images (.png) with {INTRINSICS}, of "
             "scene folders, a rosbag2 folder, .mcap, .db3 or .bag."
         )
-    named = all(_is_stamp(p.stem) for p in found)
+    named = all(re.fullmatch(r"[0-9]{12,}", p.stem) for p in frame_paths)  # fewer: a number
     period_ns, last_ns, frames = round(1e9 / fps), 0, []
-    for file in found:
+    for file in frame_paths:
         known_ns = _scene_stamp(file) if scenes else int(file.stem) if named else None
         last_ns = last_ns + period_ns if known_ns is None else known_ns
         frames.append(RecordedFrame(last_ns, partial(read, file)))
     return frames
 
 
-def _is_stamp(name: str) -> bool:
-    return name.isdecimal() and name.isascii() and len(name) >= _STAMP_DIGITS
-
-
 def _scene_stamp(folder: Path) -> int | None:
-    """None where there is none, or where its file is damaged."""
+    """None if there is none, or its file is damaged."""
     try:
         stamp_ns = _meta(folder).get("stamp_ns")
     except InputError:
@@ -82,7 +78,7 @@ def _meta(folder: Path) -> dict[str, Any]:
 
 
 def _read_scene(folder: Path) -> Observation:
-    """The depth image (else the cloud), and the true surfaces of a scene."""
+    """The depth image (or the cloud) and the true surfaces of a scene."""
     if (folder / DEPTH).is_file():
         frame: DepthFrame | SensorCloud = files.read_depth_png(folder / DEPTH, folder / INTRINSICS)
     else:

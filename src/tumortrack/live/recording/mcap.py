@@ -1,4 +1,4 @@
-"""ROS 2's messages into an MCAP: whatever ends the writing leaves what came before."""
+"""Writing ROS 2 messages to an MCAP that a crash or a full disk leaves readable up to there."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ from tumortrack.live.ros.sensors import CAMERA_FRAME, messages_seen
 from tumortrack.live.ros.tf import TRANSFORMS, transform_fields
 from tumortrack.live.values import Observation
 
-CHUNK_S = 0.25  # a killed program loses what is in no chunk yet
+CHUNK_S = 0.25  # a crash loses messages that are not in a chunk yet
 STRING = "std_msgs/msg/String"
 
 
 class McapBag:
     """A new rosbag2 folder with one MCAP.
 
-    Messages are filed under their time of arrival, which never goes back; headers have the stamps.
-    Where the disk refuses, whole chunks stay, in a file without an end, and each later writing
-    raises the same StorageError, which ends with ``advice``: it is not in the recording.
+    Messages are filed by time of arrival, which never goes back; headers have the stamps. When the
+    disk is full, whole chunks stay, in a file without an end, and each later write raises the same
+    StorageError, which ends with ``advice``.
     """
 
     def __init__(self, folder: Path, messages: Messages, advice: str) -> None:
@@ -45,12 +45,12 @@ class McapBag:
         except WriterError as error:
             raise InputError(f"{folder} exists already. Choose another path.") from error
         self._writer, self._storage = writer, writer.storage
-        self._storage.bio.close()  # what is buffered could not be taken back on a full disk
+        self._storage.bio.close()  # a buffer could not be truncated on a full disk
         self._storage.bio = self._file = _WholeWrites(self._storage.path)
-        self._whole = self._file.tell()  # behind the last whole chunk
+        self._whole = self._file.tell()  # the end of the last whole chunk
 
     def write(self, arrived_ns: int, out: Iterable[Outgoing]) -> None:
-        """Messages with the full names of their topics; they are on the disk 0.25 s later."""
+        """Messages with full topic names; they are on the disk 0.25 s later."""
         if self._refused:
             raise StorageError(self._refused)
         self._last_ns = max(self._last_ns, arrived_ns)
@@ -76,13 +76,12 @@ class McapBag:
                 self._writer.close()
 
     def flush(self) -> None:
-        """What was written is on the disk."""
         with self._on_disk():
             self._storage.close_chunk()
 
     @contextmanager
     def _on_disk(self) -> Iterator[None]:
-        """Around what may write a chunk: where it fails, whole chunks only are left."""
+        """For calls that may write a chunk: if one fails, only whole chunks are left."""
         try:
             yield
         except OSError as error:
@@ -98,27 +97,27 @@ class McapBag:
 def camera_messages(
     seen: Observation, fixed_from_camera: Affine, frame_id: str, messages: Messages, number: int = 1
 ) -> list[Outgoing]:
-    """What a camera saw, and its pose in the frame ``frame_id`` on ``/tf`` where the two differ,
-    with the full names of their topics. ``number``: of the camera, from 1."""
+    """A camera's observation and, if the frames differ, its pose in ``frame_id`` on ``/tf``, with
+    full topic names. ``number``: of the camera, from 1."""
     suffix = f"_{number}" if number > 1 else ""
     same = np.array_equal(fixed_from_camera, np.eye(4))
     other = CAMERA_FRAME + ("_optical" if frame_id == CAMERA_FRAME else "") + suffix
-    # As the source calls it: a calibration may know the camera by that when this is played.
+    # The source's name, which a calibration may refer to when this is played.
     camera = seen.frame_id or (frame_id if same else other)
     if camera == frame_id and not same:
         camera = other
     out = [
-        one._replace(suffix=f"/camera{suffix}/{one.suffix}")
-        for one in messages_seen(seen, messages, camera)
+        message._replace(suffix=f"/camera{suffix}/{message.suffix}")
+        for message in messages_seen(seen, messages, camera)
     ]
     if camera != frame_id:
-        said = transform_fields(messages, seen.stamp_ns, frame_id, camera, fixed_from_camera)
-        out.append(Outgoing("/tf", TRANSFORMS, messages.make(TRANSFORMS, transforms=[said])))
+        pose = transform_fields(messages, seen.stamp_ns, frame_id, camera, fixed_from_camera)
+        out.append(Outgoing("/tf", TRANSFORMS, messages.make(TRANSFORMS, transforms=[pose])))
     return out
 
 
 class _WholeWrites(io.FileIO):
-    """Appends, without a buffer; each write is whole or raises."""
+    """Appends without a buffer; each write is complete or raises."""
 
     def __init__(self, path: Path) -> None:
         super().__init__(path, "r+")

@@ -1,8 +1,8 @@
-"""A RealSense depth camera, or what one recorded.
+"""A RealSense depth camera, or its recording.
 
-Camera, recording and the SDK's software device are all a device with a depth sensor that calls back
-with frames, so one class serves them. The SDK's own frame queue is not used: from Python it holds
-the interpreter while it waits for room, and a recording that is read frame by frame stops for good.
+Camera, recording and the SDK's software device all have a depth sensor that calls back with frames,
+so one class serves them. The SDK's own frame queue is not used: from Python it holds the GIL while
+it waits for room, and a recording that is read frame by frame deadlocks.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ from tumortrack.live.values import Observation, SourceConfig, SourceEnded, Sourc
 from tumortrack.sense.camera import plausible
 
 _RECORDINGS = (".db3", ".bag")
-_LAST_S = 0.2  # after a recording's end: its last frame may still be on its way
-_TOGETHER_MS = 5.0  # of one exposure: depth image and picture
-_MOST_UNTIMED = 150  # frames before the camera's clock is tied to this machine's
+_LAST_S = 0.2  # after a recording's end, for its last frame
+_TOGETHER_MS = 5.0  # depth image and picture of one exposure
+_MOST_UNTIMED = 150  # frames before the camera's clock is synchronised with this machine's
 
 
 @contextlib.contextmanager
 def _while_connected() -> Iterator[None]:
-    """Anything that the SDK is asked fails while a camera comes or goes."""
+    """Any call of the SDK fails while a camera is plugged in or out."""
     try:
         yield
     except RuntimeError as error:
@@ -44,9 +44,9 @@ class RealSenseSourceConfig(SourceConfig, frozen=True, kw_only=True, tag="realse
         device: empty, a serial number or a recording's path.
         width, height, fps: of a camera's depth stream; a recording has its own.
         global_time: stamps of a camera by this machine's clock, else by its own.
-        realtime: a recording at its own speed, else every frame as it is asked for.
-        picture: also what the camera saw in the depth image's pixels: in colour where the depth
-            sensor has that, else the left infrared image.
+        realtime: a recording at its own speed, else every frame on demand.
+        picture: also the picture in the depth image's pixels: in colour if the depth sensor has
+            that, else the left infrared image.
     """
 
     target: ClassVar[str] = "device"
@@ -60,9 +60,9 @@ class RealSenseSourceConfig(SourceConfig, frozen=True, kw_only=True, tag="realse
     picture: bool = False
 
     def open(self) -> RealSenseSource:
-        """Start the camera or the recording. Raises SourceLost if no such camera is connected or
-        another program has it; InputError if it can't do what was asked, its image is distorted,
-        there is no such recording, or pyrealsense2 is missing."""
+        """Raises SourceLost if no such camera is connected or another program has it; InputError if
+        it lacks the mode, its image is distorted, there is no such recording, or pyrealsense2 is
+        missing."""
         rs, path = _sdk(), Path(self.device)
         if path.suffix not in _RECORDINGS:
             with _while_connected():
@@ -91,14 +91,13 @@ class RealSenseSource:
     """Depth frames of an SDK device: camera, playback or software device."""
 
     def __init__(self, device: Any, config: RealSenseSourceConfig) -> None:
-        """Start streaming; raises as ``RealSenseSourceConfig.open``."""
         self._rs = rs = _sdk()
         self.dropped = 0
         self._device = device
         self._playback = device.as_playback() if device.is_playback() else None
         self.lossless = self._playback is not None and not config.realtime
         self._room = threading.Condition()
-        # The SDK's depth image (True) and picture (False) of one moment, and when they came.
+        # The SDK's depth image (True) and picture (False) of one moment, and their arrival.
         self._newest: tuple[dict[bool, Any], int] | None = None
         self._wanted, self._pair = {True, not config.picture}, dict[bool, Any]()
         self._closed = False
@@ -110,37 +109,35 @@ class RealSenseSource:
                 f"the RealSense's depth image is distorted ({given.model}, {list(given.coeffs)}); "
                 "a rectified stream is needed. Calibrate the camera."
             )
-        focal, center = (given.fx, given.fy), (given.ppx, given.ppy)
-        camera = Intrinsics(given.width, given.height, *focal, *center)
-        self._intrinsics = plausible(camera, "the RealSense")
+        lens = given.fx, given.fy, given.ppx, given.ppy
+        self._intrinsics = plausible(Intrinsics(given.width, given.height, *lens), "the RealSense")
         self._unit_mm = float(f"{self._sensor.get_option(rs.option.depth_units) * 1000:.6g}")
         option = rs.option.global_time_enabled
         if self._playback is None and self._sensor.supports(option):
             self._sensor.set_option(option, int(config.global_time))
-        tied = self._sensor.supports(option) and self._sensor.get_option(option)
-        self.host_clock = self._playback is None and bool(tied)
-        beside = [_picture_stream(rs, self._sensor, profile)] if config.picture else []
-        self._sensor.open([profile, *beside])
+        synchronised = self._sensor.supports(option) and self._sensor.get_option(option)
+        self.host_clock = self._playback is None and bool(synchronised)
+        pictures = [_picture_stream(rs, self._sensor, profile)] if config.picture else []
+        self._sensor.open([profile, *pictures])
         self._sensor.start(self._take)
 
     @_while_connected()
     def read(self, timeout_s: float) -> Observation | None:
-        """See ``Source``."""
-        came = self._next(timeout_s)
+        newest = self._next(timeout_s)
         stopped = self._rs.playback_status.stopped
-        if came is None and self._playback and self._playback.current_status() == stopped:
-            came = self._next(_LAST_S)
-            if came is None:
+        if newest is None and self._playback and self._playback.current_status() == stopped:
+            newest = self._next(_LAST_S)
+            if newest is None:
                 raise SourceEnded("the recording is over.")
-        if came is None:
+        if newest is None:
             if not self._device.is_connected():
                 raise SourceLost("the RealSense is unplugged.")
             return None
-        pair, arrived_ns = came
+        pair, arrived_ns = newest
         frame = pair[True]
         hardware_clock = self._rs.timestamp_domain.hardware_clock
         if self.host_clock and frame.get_frame_timestamp_domain() == hardware_clock:
-            # A camera's first frames come before its clock is tied to this machine's.
+            # A camera's first frames come before its clock is synchronised.
             self.dropped += 1
             self._untimed += 1
             if self._untimed > _MOST_UNTIMED:
@@ -151,14 +148,12 @@ class RealSenseSource:
             return None
         raw = np.asarray(frame.get_data())
         depth_mm = raw * np.float32(self._unit_mm)
-        depth_mm[raw == 0] = np.nan  # the sensor's way to say: no return
-        stamp_ns = round(frame.get_timestamp() * 1e6)
+        depth_mm[raw == 0] = np.nan  # no return
+        depth = DepthFrame(depth_mm, self._intrinsics, round(frame.get_timestamp() * 1e6))
         picture = np.array(pair[False].get_data()) if False in pair else None
-        depth = DepthFrame(depth_mm, self._intrinsics, stamp_ns)
         return Observation(depth, arrived_ns, picture=picture)
 
     def close(self) -> None:
-        """Stop the stream; may be called twice."""
         with self._room:
             closed, self._closed, self._newest = self._closed, True, None
             self._room.notify_all()
@@ -175,7 +170,7 @@ class RealSenseSource:
             return
         with self._room:
             self._pair[is_depth] = frame
-            times_ms = [one.get_timestamp() for one in self._pair.values()]
+            times_ms = [image.get_timestamp() for image in self._pair.values()]
             if self._pair.keys() != self._wanted or np.ptp(times_ms) > _TOGETHER_MS:
                 return
             pair, self._pair = self._pair, {}
@@ -192,9 +187,9 @@ class RealSenseSource:
             self._room.wait_for(lambda: self._newest is not None or self._closed, timeout_s)
             if self._closed:
                 raise SourceLost("the RealSense is closed; open it again.")
-            came, self._newest = self._newest, None
+            newest, self._newest = self._newest, None
             self._room.notify_all()
-        return came
+        return newest
 
 
 def _sdk() -> ModuleType:
@@ -234,14 +229,14 @@ def _picture_stream(rs: ModuleType, sensor: Any, depth: Any) -> Any:
     """The profile of a picture in the depth image's pixels."""
     profiles = [profile.as_video_stream_profile() for profile in sensor.get_stream_profiles()]
     for kind in ((rs.stream.color, rs.format.rgb8), (rs.stream.infrared, rs.format.y8)):
-        for one in profiles:
-            if (one.stream_type(), one.format()) == kind and _lens_of(one) == _lens_of(depth):
-                return one
+        for p in profiles:
+            if (p.stream_type(), p.format()) == kind and _lens_of(p) == _lens_of(depth):
+                return p
     raise InputError("the RealSense has no picture in the depth image's pixels; leave it out.")
 
 
 def _lens_of(profile: Any) -> tuple[Any, ...]:
-    """What two streams of the same pixels at the same moments share."""
+    """What two streams with the same pixels and moments have in common."""
     lens = profile.get_intrinsics()
     size = lens.width, lens.height, profile.fps(), max(profile.stream_index(), 1)
     return *size, lens.fx, lens.fy, lens.ppx, lens.ppy, *lens.coeffs

@@ -1,4 +1,4 @@
-"""A recording as a source: at the pace of its stamps, or as fast as the loop takes it."""
+"""A recording as a source: at the pace of its stamps, or as fast as the loop takes frames."""
 
 from __future__ import annotations
 
@@ -18,8 +18,7 @@ from tumortrack.live.recording.folders import ABOUT, RecordedFrame, folder_frame
 from tumortrack.live.values import Observation, SourceConfig, SourceEnded, SourceLost
 
 Frames = Callable[[], Iterator[RecordedFrame]]
-# Less than what the loop takes for a frozen source.
-_LONGEST_WAIT_S = 2.0
+_LONGEST_WAIT_S = 2.0  # less than what the loop takes for a frozen source
 
 
 class RecordingSourceConfig(SourceConfig, frozen=True, kw_only=True, tag="recording"):
@@ -28,11 +27,11 @@ class RecordingSourceConfig(SourceConfig, frozen=True, kw_only=True, tag="record
 
     Attributes:
         rate: 1 plays at the pace of the stamps, 2 twice as fast; 0: every frame, as fast as the
-            loop takes them. Pauses of more than 2 s are cut to 2 s.
-        fps: of files that state no time.
-        unit: of loose cloud files; bags are in metres, as ROS is, depth images state theirs.
+            loop takes them. Pauses are cut to 2 s.
+        fps: of files without stamps.
+        unit: of cloud files; bags are in metres, depth images state theirs.
         topic, info_topic: of a bag with several.
-        rectified: the bag's camera_info means its P (a rectified image).
+        rectified: the images are rectified: P of the bag's camera_info holds.
         unit_mm: one step of a bag's 16-bit depth images.
     """
 
@@ -60,34 +59,34 @@ class RecordingSourceConfig(SourceConfig, frozen=True, kw_only=True, tag="record
     def patient(self) -> Patient:
         if not self.path.exists():
             raise InputError(f"{self.path} does not exist, so it cannot be played.")
-        about = (self.path if self.path.is_dir() else self.path.parent) / ABOUT
-        if not about.is_file():
-            return NOBODY
-        return patient_in(read_json(about).get("patient"), str(about))
+        about = self._about
+        return patient_in(read_json(about).get("patient"), str(about)) if about else NOBODY
 
     @property
     def is_corrected(self) -> bool:
-        """Whether its depths were corrected before they were recorded, as far as it says so."""
+        """Whether the recording states that its depths are corrected."""
+        return self._about is not None and read_json(self._about).get("corrected") is True
+
+    @property
+    def _about(self) -> Path | None:
         about = (self.path if self.path.is_dir() else self.path.parent) / ABOUT
-        return about.is_file() and read_json(about).get("corrected") is True
+        return about if about.is_file() else None
 
     def open(self) -> RecordingSource:
-        """Find the frames; none is read yet. Raises InputError if there are none to play."""
+        """Find the frames; none is read yet. Raises InputError if there are none."""
         self.patient()
         if bag_files(self.path):
-            chosen = self.topic, self.info_topic, self.rectified, self.unit_mm
-            bag = BagRecording(self.path, *chosen)
+            options = self.topic, self.info_topic, self.rectified, self.unit_mm
+            bag = BagRecording(self.path, *options)
             return RecordingSource(self, bag.frames, bag.close)
         frames = folder_frames(self.path, self.fps, self.unit)
         return RecordingSource(self, partial(iter, frames), lambda: None)
 
 
 class RecordingSource:
-    """Plays a recording: its ``frames`` from first to last, ``close`` ends it. Frames that were due
-    before they could be read are dropped, unless it is ``lossless``.
-
-    A damaged frame is an InputError of its own, and the next read goes on behind it.
-    """
+    """Plays ``frames`` from first to last. Frames that were due before they could be read are
+    dropped, unless it is ``lossless``. A damaged frame raises InputError, and the next read
+    continues after it."""
 
     host_clock = False  # the stamps are those of the recording
 
@@ -98,13 +97,12 @@ class RecordingSource:
         self._close, self._rate = close, config.rate
         self._frames = frames()
         self._next: RecordedFrame | None = None
-        self._shown_ns: int | None = None  # stamp of the frame before
+        self._shown_ns: int | None = None  # stamp of the previous frame
         self._due_s = 0.0  # when the next one is due, by time.monotonic
         self._closed = threading.Event()
         self._lock = threading.Lock()  # close may come while a frame is being read
 
     def read(self, timeout_s: float) -> Observation | None:
-        """See ``Source``."""
         with self._lock:
             frame = self._newest_due()
         if frame is None:
@@ -124,7 +122,7 @@ class RecordingSource:
             self._close()
 
     def _newest_due(self) -> RecordedFrame | None:
-        """The last frame whose time has come; those before it were missed."""
+        """The latest frame that is due; earlier ones are dropped."""
         due: RecordedFrame | None = None
         while True:
             if self._closed.is_set():

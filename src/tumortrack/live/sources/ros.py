@@ -1,4 +1,4 @@
-"""Depth images or clouds of a ROS 2 graph, without ROS or through the user's."""
+"""Depth images or clouds from a ROS 2 graph."""
 
 from __future__ import annotations
 
@@ -18,23 +18,22 @@ from tumortrack.live.ros.ros2 import Via, open_bus
 from tumortrack.live.values import Observation, SourceConfig, SourceLost
 
 _KINDS = {"image": sensors.IMAGE, "packed": sensors.COMPRESSED, "cloud": sensors.CLOUD}
-_PACKED = "/compressedDepth"  # how image_transport calls the topic, behind the image's name
-_PICTURE_S = 0.03  # so much later than its depth image a picture may come: a frame at 30 Hz
-_ALONE_S = 2.0  # until then a topic that nobody publishes may only not be heard of yet
+_PACKED = "/compressedDepth"  # image_transport appends it to the image's topic
+_PICTURE_S = 0.03  # how much later than its depth image a picture may come: a frame at 30 Hz
+_ALONE_S = 2.0  # for the publisher of a topic to be discovered
 _LOOK_S = 0.1  # how often the graph is asked for the topic's type, until it is known
 # A late frame, or a camera's computer with a wrong time, is no other clock; a bag is older.
 _SAME_CLOCK_NS = 24 * 3600 * 1_000_000_000
-_MASK_APART_NS = 500_000_000  # a mask that is further from its frame shows another place
+_MASK_APART_NS = 500_000_000  # a mask of another time than this shows another place
 
 
 class Ros2SourceConfig(SourceConfig, frozen=True, kw_only=True, tag="ros2"):
     """A topic of ROS 2, by its full name: a PointCloud2, or a depth Image with its CameraInfo;
     docs/ros.md has the options.
 
-    ``clock``: whose time the stamps are. host: this machine's, or one kept equal to it; other:
-    another (simulated, replayed, of the camera); auto: host if the first frame's stamp is less than
-    a day off. A day, so that a stream that lags is recognised as such, and not taken for one with
-    its own clock.
+    ``clock`` of the stamps: host, this machine's or one synchronised with it; other (simulated,
+    replayed, of the camera); auto: host if the first frame's stamp is less than a day off. A day,
+    so that a stream that lags is not taken for one with its own clock.
     """
 
     target: ClassVar[str] = "topic"
@@ -63,8 +62,8 @@ class Ros2SourceConfig(SourceConfig, frozen=True, kw_only=True, tag="ros2"):
 
 
 class RosSource:
-    """An open subscription, from reliable and best effort publishers alike. The newest frame wins.
-    Before there is a publisher nothing comes; after 2 s that is said."""
+    """An open subscription, to reliable and best effort publishers alike. The newest frame wins.
+    Without a publisher for 2 s, ``read`` raises InputError."""
 
     lossless = False
 
@@ -72,14 +71,14 @@ class RosSource:
         self._clock: str = config.clock  # or "known"
         self.host_clock = config.clock == "host"
         self._config, self._bus = config, bus
-        self._kind = _KINDS.get(config.type, "")  # of message; empty: what is published
+        self._kind = _KINDS.get(config.type, "")  # of message; empty: as published
         self._topic, self._name = config.topic, f"ros2:{config.topic}"
-        beside = config.topic.removesuffix(_PACKED).rpartition("/")[0]
-        self._info_topic = config.info or f"{beside}/camera_info"
+        namespace = config.topic.removesuffix(_PACKED).rpartition("/")[0]
+        self._info_topic = config.info or f"{namespace}/camera_info"
         self._frames: Subscriber | None = None
         self._companions: list[tuple[str, str, Subscriber]] = []
         self._latest: dict[str, Any] = {}  # by topic: CameraInfo, mask and picture
-        self._waiting: bytes | memoryview | None = None  # an image whose CameraInfo is not here yet
+        self._waiting: bytes | memoryview | None = None  # an image without its CameraInfo
         self._passed = 0
         self._opened_s = time.monotonic()
         self._lock, self._closed = threading.Lock(), False
@@ -89,13 +88,12 @@ class RosSource:
         return self._passed + (self._frames.lost if self._frames else 0)
 
     def read(self, timeout_s: float) -> Observation | None:
-        """See ``Source``."""
         until_s = time.monotonic() + timeout_s
         while True:
             if self._closed:
                 raise SourceLost(f"the source {self._name} is closed")
             left_s = max(0.0, until_s - time.monotonic())
-            known = self._frames is not None or self._found(final=not left_s)
+            known = self._frames is not None or self._subscribed(final=not left_s)
             raw = self._newest() if known else None
             complete = {topic for topic, *_ in self._companions} <= self._latest.keys()
             if raw is not None and (complete or not left_s):
@@ -106,59 +104,57 @@ class RosSource:
             self._bus.wait(left_s if known else min(left_s, _LOOK_S))
 
     def close(self) -> None:
-        """Unsubscribe, and wake whoever reads."""
         with self._lock:
             self._closed = True
             self._bus.close()
 
-    def _found(self, final: bool) -> bool:
-        """Subscribe, once the type is known. ``final``: say what is wrong with what is there."""
+    def _subscribed(self, final: bool) -> bool:
+        """Subscribe, once the type is known. ``final``: raise InputError if it is not usable."""
         mask, picture = self._config.mask, self._config.picture
         with self._lock:
             if self._closed:
                 return False
             if not self._kind:
-                there = self._bus.types_of(self._topic)
+                published = self._bus.types_of(self._topic)
                 wanted = set(_KINDS.values()) - ({sensors.CLOUD} if mask or picture else set())
-                usable = there & wanted
-                if len(usable) != 1 and final and there:
+                usable = published & wanted
+                if len(usable) != 1 and final and published:
                     raise InputError(
-                        f"{self._topic} is published as {' and as '.join(sorted(there))}; it must "
-                        f"be {' or '.join(sorted(wanted))}, and one of them (say which: "
+                        f"{self._topic} is published as {' and as '.join(sorted(published))}; it "
+                        f"must be {' or '.join(sorted(wanted))}, and one of them (say which: "
                         "type=cloud, image or packed)."
                     )
-                if final and not there and time.monotonic() - self._opened_s > _ALONE_S:
+                if final and not published and time.monotonic() - self._opened_s > _ALONE_S:
                     raise InputError(self._alone())
                 if len(usable) != 1:
                     return False
                 (self._kind,) = usable
-            beside = {self._info_topic: sensors.CAMERA_INFO, mask: sensors.IMAGE}
-            beside[picture] = sensors.IMAGE
-            # In both ways: some nodes publish it once and keep it for those who come later.
+            companions = {self._info_topic: sensors.CAMERA_INFO}
+            companions |= dict.fromkeys(filter(None, (mask, picture)), sensors.IMAGE)
+            # Volatile and latched: some nodes publish once and keep it for later subscribers.
             self._companions = [
                 (topic, kind, self._bus.subscriber(topic, kind, 1, latched))
                 for latched in (False, True)
-                for topic, kind in ({} if self._kind == sensors.CLOUD else beside).items()
-                if topic
+                for topic, kind in ({} if self._kind == sensors.CLOUD else companions).items()
             ]
             self._frames = self._bus.subscriber(self._topic, self._kind)
         return True
 
     def _alone(self) -> str:
-        published = self._bus.topics().items()
-        seen = sorted(topic for topic, kinds in published if kinds & set(_KINDS.values()))
-        there = f"images and clouds seen: {', '.join(seen)}" if seen else "nor any image or cloud"
+        topics = self._bus.topics().items()
+        usable = sorted(topic for topic, kinds in topics if kinds & set(_KINDS.values()))
+        others = f"images and clouds seen: {', '.join(usable)}"
         return (
-            f"nobody publishes {self._topic}; {there}. Look at the topic's name, at ROS_DOMAIN_ID "
-            "and at the network."
+            f"nobody publishes {self._topic}; {others if usable else 'nor any image or cloud'}. "
+            "Look at the topic's name, at ROS_DOMAIN_ID and at the network."
         )
 
     def _newest(self) -> bytes | memoryview | None:
         assert self._frames is not None
         self._take_companions()
-        if came := self._frames.take():
-            self._passed += len(came) - 1 + (self._waiting is not None)
-            self._waiting = came[-1]
+        if images := self._frames.take():
+            self._passed += len(images) - 1 + (self._waiting is not None)
+            self._waiting = images[-1]
         return self._waiting
 
     def _take_companions(self) -> None:
@@ -188,8 +184,7 @@ class RosSource:
         return Observation(frame, arrived_ns, mask, None, frame_id, picture)
 
     def _picture_for(self, frame: DepthFrame) -> UInt8[np.ndarray, "h w *rgb"] | None:
-        """That of the frame's own moment, which may come a little later; one of another moment
-        shows other pixels."""
+        """The picture with the frame's stamp, which may come a little later."""
         topic, until_s = self._config.picture, time.monotonic() + _PICTURE_S
         while (image := self._latest.get(topic)) is None or (
             stamp_of(image.header) < frame.stamp_ns
@@ -201,7 +196,7 @@ class RosSource:
         return image and sensors.picture_of(image, frame)
 
     def _mask_for(self, frame: DepthFrame) -> Bool[np.ndarray, "h w"]:
-        """The newest mask, held against the frame that it goes with."""
+        """The newest mask, checked against the frame."""
         topic, camera = self._config.mask, frame.intrinsics
         image = self._latest.get(topic)
         if image is None:

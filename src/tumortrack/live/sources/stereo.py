@@ -1,7 +1,7 @@
-"""A stereo endoscope, or any two cameras side by side: pictures of both become depth images.
+"""A stereo endoscope, or any two cameras side by side, as a source of depth images.
 
-A thread of its own keeps the newest pair of two devices: OpenCV's queue would else hand over old
-pictures. Nothing here makes two cameras expose together: an endoscope's do.
+A thread keeps the newest pair of two devices: OpenCV's queue would hand over old pictures. The
+cameras must be synchronised, as an endoscope's are.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ class StereoSourceConfig(SourceConfig, frozen=True, kw_only=True, tag="stereo"):
     ``stereo:LEFT,RIGHT?calibration=FILE``.
 
     Attributes:
-        pair: the left and the right one, parted by a comma.
+        pair: the left and the right one, separated by a comma.
         calibration: OpenCV's stereo calibration (``sense.stereo.read_calibration``).
-        near_mm, far_mm: depths that are looked for.
-        block_px: side of what is compared at a time: larger blocks are less noisy, and spread the
-            nearer surface farther over edges.
+        near_mm, far_mm: range of depths.
+        block_px: side of the compared blocks: larger ones are less noisy, and spread the nearer
+            surface farther over edges.
         fps: of files; their stamps begin at 0.
     """
 
@@ -53,8 +53,8 @@ class StereoSourceConfig(SourceConfig, frozen=True, kw_only=True, tag="stereo"):
             )
 
     def open(self) -> StereoSource:
-        """Open both. Raises SourceLost if a device does not answer, InputError if files, numbers or
-        calibration cannot be used, or OpenCV is missing."""
+        """Raises SourceLost if a device does not answer, InputError if files or calibration cannot
+        be used, or OpenCV is missing."""
         options = self.near_mm, self.far_mm, self.block_px, str(self.calibration)
         rig = StereoRig(read_calibration(self.calibration), *options)
         left, right = self.pair.split(",")
@@ -62,24 +62,22 @@ class StereoSourceConfig(SourceConfig, frozen=True, kw_only=True, tag="stereo"):
 
 
 class StereoSource:
-    """Depth images, each with the rectified left picture: of devices the newest, of files all."""
+    """Depth images with the rectified left picture: from devices the newest, from files all."""
 
     dropped = 0
 
     def __init__(self, rig: StereoRig, pair: tuple[str, str], fps: float) -> None:
-        """Raises as ``StereoSourceConfig.open``."""
         self._rig, self._fps, self._cv2 = rig, fps, opencv()
         self.host_clock = pair[0].isdecimal()
         self.lossless = not self.host_clock
         self._room, self._closed = threading.Condition(), False
         self._newest: tuple[list[np.ndarray], int] | None = None
         self._end: TumortrackError | None = None
-        self._eyes = [self._opened(name) for name in pair]
+        self._cameras = [self._opened(name) for name in pair]
         self._thread = threading.Thread(target=self._keep_reading, name="stereo", daemon=True)
         self._thread.start()
 
     def read(self, timeout_s: float) -> Observation | None:
-        """See ``Source``."""
         with self._room:
             self._room.wait_for(lambda: self._newest or self._end or self._closed, timeout_s)
             if self._closed:
@@ -96,7 +94,6 @@ class StereoSource:
         return Observation(self._rig.depth(left, right, stamp_ns), arrived_ns, picture=left)
 
     def close(self) -> None:
-        """Release both; may be called twice."""
         with self._room:
             self._closed = True
             self._room.notify_all()
@@ -104,36 +101,36 @@ class StereoSource:
 
     def _opened(self, name: str) -> Any:
         cv2, device, camera = self._cv2, name.isdecimal(), self._rig.intrinsics
-        eye = cv2.VideoCapture(int(name) if device else name)
+        capture = cv2.VideoCapture(int(name) if device else name)
         if device:
-            eye.set(cv2.CAP_PROP_FRAME_WIDTH, camera.width)
-            eye.set(cv2.CAP_PROP_FRAME_HEIGHT, camera.height)
-        if not eye.isOpened():
+            capture.set(cv2.CAP_PROP_FRAME_WIDTH, camera.width)
+            capture.set(cv2.CAP_PROP_FRAME_HEIGHT, camera.height)
+        if not capture.isOpened():
             if device:
                 raise SourceLost(f"/dev/video{name} does not open. Plug the camera in.")
             raise InputError(
                 f"{name} cannot be read. Give a video, or pictures as FOLDER/left_%04d.png."
             )
-        return eye
+        return capture
 
     def _keep_reading(self) -> None:
         number = 0
         while not self._closed and self._end is None:
-            there = [eye.grab() for eye in self._eyes]  # both first: decoding takes a while
+            grabbed = [camera.grab() for camera in self._cameras]  # both first: decoding is slow
             stamp_ns = time.time_ns() if self.host_clock else round(number * 1e9 / self._fps)
-            seen = [eye.retrieve() for eye in self._eyes] if all(there) else []
+            seen = [camera.retrieve() for camera in self._cameras] if all(grabbed) else []
             number += 1
             with self._room:
                 if self.lossless:
                     self._room.wait_for(lambda: self._newest is None or self._closed)
                 if seen and all(good for good, _ in seen):
                     self.dropped += self._newest is not None
-                    turn, colours = self._cv2.cvtColor, self._cv2.COLOR_BGR2RGB
-                    self._newest = [turn(picture, colours) for _, picture in seen], stamp_ns
+                    convert, to_rgb = self._cv2.cvtColor, self._cv2.COLOR_BGR2RGB
+                    self._newest = [convert(picture, to_rgb) for _, picture in seen], stamp_ns
                 elif self.lossless:
                     self._end = SourceEnded(f"no pair of pictures follows the first {number - 1}.")
                 else:
                     self._end = SourceLost("a camera gives no more pictures. Replug it.")
                 self._room.notify_all()
-        for eye in self._eyes:
-            eye.release()
+        for camera in self._cameras:
+            camera.release()

@@ -1,4 +1,4 @@
-"""A made-up operating room in real time: a case that breathes and is pushed, before a D405."""
+"""A simulated operating room in real time: a case that breathes and is pushed, seen by a D405."""
 
 from __future__ import annotations
 
@@ -22,14 +22,13 @@ class VirtualSourceConfig(SourceConfig, frozen=True, kw_only=True, tag="virtual"
 
     Attributes:
         case: the folder that ``prepare`` wrote.
-        fps: frames a second; what the machine doesn't manage counts as dropped.
-        distance_mm: depth of the organ's nearest point, before all motion; default: 118, of an
-            organ larger than a kidney as much more.
-        seed: pose, places that are pushed, tissue and noise follow from it.
-        table, drape: what lies about the organ.
-        instrument: a shaft that comes and pushes, else nothing does.
-        breathing, camera_motion, noise: the rest that can be switched off.
-        sensor: whose noise.
+        fps: frames that the machine doesn't manage count as dropped.
+        distance_mm: depth of the organ's nearest point, before all motion; default: 118, more for
+            an organ larger than a kidney.
+        seed: of pose, pushed places, tissue and noise.
+        table, drape: around the organ.
+        instrument: a shaft that comes and pushes; else nothing pushes.
+        sensor: of the noise.
     """
 
     target: ClassVar[str] = "case"
@@ -56,8 +55,8 @@ class VirtualSourceConfig(SourceConfig, frozen=True, kw_only=True, tag="virtual"
         return patient_in(store.read_manifest(self.case, "case").get("patient"), str(self.case))
 
     def player(self) -> ScenePlayer:
-        """The room that this shows; building it takes some seconds. Raises ArtifactError if there
-        is no case, InputError if case or options make no scene."""
+        """The simulated room; building it takes some seconds. Raises ArtifactError if there is no
+        case, InputError if case or options make no scene."""
         from tumortrack.imaging.case import load_case
         from tumortrack.sense.noise import CLEAN, SENSORS
         from tumortrack.simulate.player import ScenePlayer, ScenePlayerConfig
@@ -67,20 +66,20 @@ class VirtualSourceConfig(SourceConfig, frozen=True, kw_only=True, tag="virtual"
             *(() if self.instrument else ("push_mm",)),
             *(() if self.camera_motion else ("sway_mm", "sway_degrees")),
         ]
-        same = ("width", "height", "distance_mm", "table", "drape")
-        options = {name: getattr(self, name) for name in same} | dict.fromkeys(off, 0.0)
+        copied = ("width", "height", "distance_mm", "table", "drape")
+        options = {name: getattr(self, name) for name in copied} | dict.fromkeys(off, 0.0)
         noise = SENSORS[self.sensor] if self.noise else CLEAN
         config = ScenePlayerConfig(noise=noise, **options)
         case = load_case(self.case)
         return ScenePlayer(case.anatomy, case.up_lps, config, self.seed)
 
     def open(self) -> VirtualSource:
-        """Build the room; its time begins with the first read. Raises as ``player``."""
+        """Its time begins with the first read. Raises as ``player``."""
         return VirtualSource(self.player(), self.fps)
 
 
 class VirtualSource:
-    """Renders the scene as it is now, ``fps`` times a second, with its true surfaces."""
+    """Renders the scene ``fps`` times a second, with its true surfaces."""
 
     host_clock = True
     lossless = False
@@ -94,8 +93,7 @@ class VirtualSource:
         self._closed = threading.Event()
 
     def read(self, timeout_s: float) -> Observation | None:
-        """The frame that is due, once it is; None if that is later. Frames whose time passed
-        unread are dropped."""
+        """The next frame, when it is due. Frames that were not read in time are dropped."""
         if self._begin is None:
             self._begin = time.monotonic()
         wait_s = self._begin + self._next * self._period_s - time.monotonic()
@@ -110,12 +108,11 @@ class VirtualSource:
         return self.at(t_s, stamp_ns)
 
     def at(self, t_s: float, stamp_ns: int) -> Observation:
-        """The scene at a time since its beginning: what ``read`` gives, without a clock."""
+        """The scene at a time since its beginning."""
         instant = self.player.state_at(t_s)
         truth = self.player.truth(instant)
         frame = self.player.frame(instant, truth, stamp_ns)
         return Observation(frame, arrived_ns=time.time_ns(), truth=truth)
 
     def close(self) -> None:
-        """Wake who reads, and end; may be called twice."""
         self._closed.set()
