@@ -127,7 +127,7 @@ def test_without_the_token_nothing_changes_and_the_arms_are_stopped(viewer):
         say(stranger, "ShareUrlRequest")  # viser would publish the server on the internet
         say(stranger, "ScenePointerMessage", event_type="click", ray_origin=[0, 0, 0],
             ray_direction=[0, 0, 1], screen_pos=[[0.5, 0.5]], modifier=None)  # fmt: skip
-        until(lambda: any(one.told_until_s for one in viewer._guard._pages), "the notice")
+        until(lambda: any(one.notice_due_s for one in viewer._guard._pages), "the notice")
         assert not controls.aborted.is_set()
         change(stranger, panel.abort, True)  # what came before it has been seen by then
         until(controls.aborted.is_set, "the stop")

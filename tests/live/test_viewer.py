@@ -30,8 +30,8 @@ from tumortrack.live.sinks.viewer import ViewerSink, ViewerSinkConfig
 from tumortrack.live.values import PublishedFrame, SinkContext, TrackingResult
 from tumortrack.live.viewer.look import point_under
 from tumortrack.live.viewer.panel import StatusPanel
+from tumortrack.live.viewer.scene import bare_faces
 from tumortrack.live.viewer.slices import CarriedCt, SlicePlane, plane_through, slice_picture
-from tumortrack.live.viewer.surfaces import bare_faces
 from tumortrack.tracking.shells import exact_margin, rough_margin
 from workcell_objects import virtual, with_arms, workcell, working
 

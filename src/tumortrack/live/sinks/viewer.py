@@ -1,9 +1,7 @@
 """A web page that shows each estimate: ``viewer:8080?case=CASE_FOLDER``.
 
-Who may see it and who may change anything is the affair of ``viewer.guard``.
-
-The page says how good the estimate is, how old, and why there is none; without one, or after a
-second of silence, nothing of an older one stays visible.
+The page says how good the estimate is, how old, or why there is none; without one, or after a
+second of silence, nothing of an older one stays visible. ``viewer.guard`` controls access.
 """
 
 from __future__ import annotations
@@ -37,27 +35,26 @@ if TYPE_CHECKING:
     from tumortrack.live.viewer.guard import Guard, GuardedConnection
 
 _STALE_S = 1.0
-_TICK_S = 0.2  # the status grows older, and slices are renewed, this often
+_TICK_S = 0.2  # how often the age is updated and the slice renewed
 _SLICE_PIXELS = 320
-# For viser's thread to stand still, else what changes may arrive in pieces: on a busy machine, or
-# in a full garbage collection, it may not come to run for a second.
+# For viser's thread to pause, else changes may arrive in pieces: on a busy machine, or in a full
+# garbage collection, it may not run for a second.
 _PARKED_S = 5.0
-_TOLD_S = 5.0  # between two notices to a visitor who may only watch
+_NOTICE_S = 5.0  # between two notices to a visitor who may only watch
 
 
 class ViewerSinkConfig(SinkConfig, frozen=True, kw_only=True, tag="viewer"):
-    """A page at ``http://host:port``. What its visitors change needs the address with the token,
-    which is said at the start.
+    """A page at ``http://host:port``. Changing anything needs the address with the token, which is
+    printed at the start.
 
     Attributes:
         port: 0: any free one.
-        host: who may look, and stop arms: 127.0.0.1, this machine; 0.0.0.0, whoever can reach it;
-            a name of this machine, by which the page may then be called.
-        case: folder of the patient's case: its CT (its labels, where it has none) is shown in
-            slices.
-        margin_mm: a fixed distance of the shell round each tumor; 0: no shell. By default it is
-            the margin that the model states for each estimate, and no shell where it states none.
-        hz: how often clouds and surfaces are sent at the most.
+        host: who may watch, and stop arms: 127.0.0.1, this machine; 0.0.0.0, all that can reach it;
+            or a name of this machine, which is then allowed in the page's address.
+        case: folder of the patient's case, of whose CT (or labels) slices are shown.
+        margin_mm: a fixed distance of the shell around each tumor; 0: no shell; default: the margin
+            that the model states for the estimate, if any.
+        hz: limit for clouds and surfaces.
     """
 
     target: ClassVar[str] = "port"
@@ -78,14 +75,13 @@ class ViewerSinkConfig(SinkConfig, frozen=True, kw_only=True, tag="viewer"):
             raise InputError(f"viewer: case={self.case} is not a folder that `prepare` wrote.")
 
     def open(self, context: SinkContext) -> ViewerSink:
-        """The page, ready for visitors. Raises InputError where the port is taken, viser is
-        missing, or the case is another patient's, ArtifactError where ``case`` is none."""
+        """Raises InputError if the port is taken, viser is missing, or the case is another
+        patient's, ArtifactError if ``case`` is none."""
         return ViewerSink(self, context)
 
 
 class ViewerSink:
-    """See ``live.values.Sink``. ``port``: where the page is; ``url``: its address for those who may
-    change something."""
+    """``port``: of the page; ``url``: its address with the token."""
 
     def __init__(self, config: ViewerSinkConfig, context: SinkContext) -> None:
         self._ct = load_ct(config.case, context) if config.case else None
@@ -93,20 +89,21 @@ class ViewerSink:
         self._server, self._guard = _opened(config.host, config.port)
         self.port: int = self._server.get_port()
         self.url = f"{self._page_url()}/{self._guard.token}"
-        self._lock = threading.RLock()  # round every change of the page
-        self._result: TrackingResult | None = None  # the last that came
-        self._told: TrackingResult | None = None  # the page is of this one, all of it
+        self._lock = threading.RLock()  # for every change of the page
+        self._result: TrackingResult | None = None  # the latest
+        self._drawn: TrackingResult | None = None  # the whole page shows this one
         self._shown: TrackingResult | None = None  # the same, if its estimate is visible
-        self._came = self._drawn = -np.inf
-        self._hidden_count = 0  # a slice made before the last hiding is void
+        self._came_s = self._drawn_s = -np.inf
+        self._hidden_count = 0  # a slice computed before the last hiding is invalid
         self._counter = 0
         self._fault: BaseException | None = None  # for the next publish to raise
         self._asked: bool | None = None  # for a click on the organ (True) or beside it
         self._state: State = "waiting"
         self._server.scene.set_background_image(np.full((4, 4, 3), colours.BACKGROUND, np.uint8))
         self._scene = ViewerScene(self._server, context, config.margin_mm)
-        whose, slices = str(context.patient), "" if self._ct is None else self._ct.name
-        self._panel = Panel(self._server, context.parts, slices, context.arms, whose)
+        slices = "" if self._ct is None else self._ct.name
+        options = slices, context.arms, str(context.patient)
+        self._panel = Panel(self._server, context.parts, *options)
         self._connect()
         self._say("waiting")
         self._closing = threading.Event()
@@ -114,7 +111,7 @@ class ViewerSink:
         self._watch.start()
 
     def _connect(self) -> None:
-        """What the panel's elements do; viser calls it from its own threads."""
+        """Callbacks of the panel's elements; viser calls them from its own threads."""
         panel = self._panel
 
         def changed(_: object) -> None:
@@ -133,20 +130,20 @@ class ViewerSink:
 
             @panel.views.on_click
             def _(event: GuiEvent[Any]) -> None:
-                if event.client is not None:  # nobody's click otherwise: set by the program
+                if event.client is not None:  # else set by the program
                     self._scene.look.turn(event.client, event.target.value)
 
     def publish(self, result: TrackingResult) -> None:
-        """Show it, all of it at once and not more often than ``hz``; a change of the quality, and
-        arms that halt or go on, without delay."""
+        """Show all of it at once, at most ``hz`` times a second; a change of the quality, and arms
+        that halt or go on, without delay."""
         if self._closing.is_set():
             return
         now = time.monotonic()
         with self._page():
-            self._result, self._came = result, now
-            changed = self._told is None or _kind(self._told) != _kind(result)
-            if changed or self._state == "stale" or now - self._drawn >= 1 / self._config.hz:
-                self._drawn = now
+            self._result, self._came_s = result, now
+            changed = self._drawn is None or _kind(self._drawn) != _kind(result)
+            if changed or self._state == "stale" or now - self._drawn_s >= 1 / self._config.hz:
+                self._drawn_s = now
                 self._draw(result)
         fault, self._fault = self._fault, None
         if fault is not None:
@@ -160,12 +157,10 @@ class ViewerSink:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Where the page is, and who else can see it."""
-        said = f"open {self.url}"
         if is_loopback(self._config.host):
-            return (said,)
+            return (f"open {self.url}",)
         power = "see the patient's organ" + (" and stop the arms" if self._context.arms else "")
-        return said, (
+        return f"open {self.url}", (
             f"anyone in this network can {power} at {self._page_url()}; nothing is encrypted. "
             "Whoever has the longer address can change what is shown and tracked."
         )
@@ -181,8 +176,8 @@ class ViewerSink:
         now = time.monotonic()
         for client in self._server.get_clients().values():
             known = self._server._websock_server._live_connections
-            if known.get(client.client_id) is connection and now >= connection.told_until_s:
-                connection.told_until_s = now + _TOLD_S
+            if known.get(client.client_id) is connection and now >= connection.notice_due_s:
+                connection.notice_due_s = now + _NOTICE_S
                 client.add_notification(
                     "This page only watches",
                     "Use the address that tumortrack printed at its start to change something."
@@ -191,8 +186,8 @@ class ViewerSink:
 
     @contextmanager
     def _page(self) -> Iterator[None]:
-        """What is changed inside arrives at clients together. viser's thread stands still
-        meanwhile: its own ``atomic`` cuts what it is sending where the next change begins."""
+        """Changes inside arrive at clients together. viser's thread is paused: its own ``atomic``
+        cuts what it is sending where the next change begins."""
         parked, go_on = threading.Event(), threading.Event()
 
         def park() -> None:
@@ -200,7 +195,7 @@ class ViewerSink:
             go_on.wait()
 
         with self._lock:
-            with suppress(RuntimeError):  # it has ended: nobody is looking
+            with suppress(RuntimeError):  # it has ended
                 self._server.get_event_loop().call_soon_threadsafe(park)
                 parked.wait(_PARKED_S)
             try:
@@ -209,8 +204,12 @@ class ViewerSink:
                 go_on.set()
 
     def _draw(self, result: TrackingResult) -> None:
-        self._told = result
-        self._draw_cell(result)
+        self._drawn = result
+        try:
+            self._scene.show_cell(result.workcell)
+        except Exception as error:
+            self._scene.show_cell(None)
+            self._fault = error  # raised when the estimate has been shown
         try:
             self._scene.observe(result)
             if result.estimate is None:
@@ -223,16 +222,9 @@ class ViewerSink:
         except Exception as error:
             self._hide()
             reason = f"this estimate cannot be shown ({error!r})"
-            self._told = replace(result, estimate=None, quality="none", reason=reason)
+            self._drawn = replace(result, estimate=None, quality="none", reason=reason)
             self._say("none")
             raise
-
-    def _draw_cell(self, result: TrackingResult) -> None:
-        try:
-            self._scene.show_cell(result.workcell)
-        except Exception as error:
-            self._scene.show_cell(None)
-            self._fault = error  # raised when the estimate has been shown
 
     def _hide(self) -> None:
         self._shown = None
@@ -243,26 +235,26 @@ class ViewerSink:
     def _say(self, state: State) -> None:
         self._state = state
         self._counter += 1
-        result = self._told
-        late_s = 0.0 if result is None else (result.latency_ms or 0.0) / 1000
-        since_s = self._came if state == "stale" else self._drawn
-        age_s = 0.0 if result is None else time.monotonic() - since_s + late_s
+        result, age_s = self._drawn, 0.0
+        if result is not None:
+            since_s = self._came_s if state == "stale" else self._drawn_s
+            age_s = time.monotonic() - since_s + (result.latency_ms or 0.0) / 1000
         arms, parts = self._context.arms, self._context.parts
         self._panel.say(StatusPanel(state, result, age_s, self._counter, arms, parts))
 
     def _keep_watch(self) -> None:
-        """Says how old the last frame is, hides what got too old, renews the slice."""
+        """Update the age, hide what is too old, renew the slice."""
         while not self._closing.wait(_TICK_S):
             try:
                 with self._page():
-                    stale = self._result and time.monotonic() - self._came > _STALE_S
+                    stale = self._result and time.monotonic() - self._came_s > _STALE_S
                     if stale and self._shown is not None:
                         self._hide()
                     if stale:
                         self._scene.show_cell(None)
                     self._say("stale" if stale else self._state)
                 self._renew_slice()
-            except Exception as error:  # the watch must go on
+            except Exception as error:  # the thread must go on
                 self._fault = error
 
     def _renew_slice(self) -> None:
@@ -270,7 +262,7 @@ class ViewerSink:
             return
         with self._lock:
             result, hidden_count = self._shown, self._hidden_count
-            margins = self._scene.margins  # of that result; a later one brings its own
+            margins = self._scene.margins  # of that result
             part, orientation = self._panel.through.value, self._panel.plane.value
         if result is None or result.estimate is None:
             return
@@ -284,25 +276,26 @@ class ViewerSink:
             if hidden_count == self._hidden_count:
                 self._panel.put_slice(picture)
                 if picture is not None and plane is not None:
-                    way = result.published_frame.published_from_camera
-                    self._scene.put_slice(picture, plane, way)
+                    pose = result.published_frame.published_from_camera
+                    self._scene.put_slice(picture, plane, pose)
 
     def _outlines(
         self, result: TrackingResult, margins: dict[str, Mesh]
     ) -> Iterator[tuple[Mesh, colours.Colour, int]]:
         assert result.estimate is not None
-        back = np.linalg.inv(result.published_frame.published_from_camera)
+        camera_from_published = np.linalg.inv(result.published_frame.published_from_camera)
         for label, name in enumerate(self._context.parts, start=1):
             colour = colours.part_colour(label)
             if (mesh := result.estimate.meshes.get(name)) is not None:
                 yield mesh, colour, 2 if label > 1 else 1
             if (margin := margins.get(name)) is not None:
-                yield margin.moved(transform_points(back, margin.vertices_mm)), colour, 1
+                vertices_mm = transform_points(camera_from_published, margin.vertices_mm)
+                yield margin.moved(vertices_mm), colour, 1
         for number, mesh in enumerate(result.estimate.structures.values()):
             yield mesh, colours.structure_colour(number), 1
 
     def _ask(self, organ: bool) -> None:
-        """The next click in the scene is on the organ, or beside it; asked twice: on nothing."""
+        """The next click in the scene is on the organ, or beside it; asked twice: cancelled."""
         with self._lock:
             if self._asked is not None:
                 self._server.scene.remove_click_callback(self._clicked)
@@ -321,15 +314,16 @@ class ViewerSink:
             if result is None or (seen := result.observation) is None:
                 event.client.add_notification("Nothing is seen at present", "Click again later.")
                 return
-            way, points_mm = result.published_frame.published_from_camera, seen_points(seen)
+            pose, points_mm = result.published_frame.published_from_camera, seen_points(seen)
             ray = np.array(event.ray_origin), np.array(event.ray_direction)
-            place_mm = point_under(transform_points(way, points_mm.astype(float)), *ray)
+            place_mm = point_under(transform_points(pose, points_mm.astype(float)), *ray)
             if place_mm is None:
                 event.client.add_notification("No observed point there", "Click on the points.")
                 return
             controls = self._context.controls
             try:
-                controls.click(seen, transform_points(np.linalg.inv(way), place_mm[None])[0], organ)
+                place_in_camera = transform_points(np.linalg.inv(pose), place_mm[None])[0]
+                controls.click(seen, place_in_camera, organ)
             except InputError as error:
                 if not organ or seen.picture is not None:
                     event.client.add_notification("This click taught no colour", str(error))
@@ -351,13 +345,13 @@ class ViewerSink:
 
 
 def _kind(result: TrackingResult) -> tuple[str, str, bool]:
-    """What a page must not be late to say."""
+    """What a page must show without delay."""
     cell = result.workcell
     return result.quality, "" if cell is None else cell.state, cell is None or bool(cell.halted)
 
 
 def _opened(host: str, port: int) -> tuple[ViserServer, Guard]:
-    """A running server with an empty scene, where it was asked for; port 0: any free one."""
+    """A running server with an empty scene, on this very port; 0: any free one."""
     try:
         import viser
 
@@ -368,7 +362,7 @@ def _opened(host: str, port: int) -> tuple[ViserServer, Guard]:
         f"the viewer cannot listen on port {port} of {host}: another program does, or it may not "
         f"be used. Close that, or choose another port: viewer:{port + 1}."
     )
-    try:  # asked for a taken port, viser takes another and doesn't say so
+    try:  # if the port is taken, viser silently uses another
         family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][0]
         with socket.socket(family, socket.SOCK_STREAM) as probe:
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # as the server will
@@ -383,7 +377,7 @@ def _opened(host: str, port: int) -> tuple[ViserServer, Guard]:
     guard = Guard(host, f"viser-v{viser.__version__}")
     with _silence(), guard.around_start():
         server = viser.ViserServer(host=host, port=port, label="tumortrack", verbose=False)
-    # One change may be more messages than viser sends in one piece, 128; a visitor's first too.
+    # A change may be more than the 128 messages that viser sends at once; a first visit too.
     server._websock_server._broadcast_buffer.max_window_size = 10_000
     if not guard.installed:
         _close(server)
@@ -395,14 +389,14 @@ def _opened(host: str, port: int) -> tuple[ViserServer, Guard]:
 
 
 def _close(server: ViserServer) -> None:
-    """Stop it, its threads and its connections; browsers have up to 6 s to say goodbye."""
+    """Stop it, its threads and its connections; browsers have up to 6 s to close."""
     with _silence():
         server.stop()
 
 
 @contextmanager
 def _silence() -> Iterator[None]:
-    """viser prints when it starts and stops, through rich's shared console."""
+    """viser prints through rich's shared console when it starts and stops."""
     import rich
 
     console = rich.get_console()

@@ -1,1 +1,1 @@
-"""Parts of the web viewer: scene, panel, slices of the CT, margins."""
+"""Parts of the web viewer: scene, panel, slices of the CT, access control."""

@@ -1,13 +1,13 @@
-"""Who may see the viewer's page, who may change what it shows, and how much anyone may ask for.
+"""Access control of the viewer's page: who may see it, who may change it, and rate limits.
 
 A browser runs scripts of every page it has open, and those can reach this machine's own ports. So
-a request is answered only if it was made for this server's own address (a foreign site whose name
-is made to point here has another one), by this server's own page or by no page at all. The page's
-address holds a token that is new with every start; without it a page shows everything, and what
-it sends changes nothing, except that arms are stopped: that must always be easy.
+a request is answered only if it was made for this server's own address (not through a foreign name
+that is made to point here: DNS rebinding), by this server's own page or by no page at all. The
+page's address holds a token that is new with every start; without it a page shows everything but
+changes nothing, except that it can stop the arms: that must always be easy.
 
-viser answers whatever a client sends, uploads and requests to publish the server on the internet
-among it. What goes through here is listed.
+viser accepts anything from a client, also uploads and requests to publish the server on the
+internet. Only the messages listed here pass.
 """
 
 from __future__ import annotations
@@ -34,13 +34,13 @@ from websockets.http11 import Request, Response
 
 from tumortrack.live.network import Pace, is_loopback
 
-MOST_CONNECTIONS = 64  # at a time, those that only fetch the page included
+MOST_CONNECTIONS = 64  # at a time, including those that only fetch the page
 MOST_PAGES = 8  # each gets every surface: 8 at 15 Hz are some 100 MB/s
-LARGEST_MESSAGE = 2**14  # bytes; what a page sends has a few hundred
-_FRAMES_PER_S, _BURST_S = 200.0, 5.0  # a page that is turned sends 50 a second, after a pause more
+LARGEST_MESSAGE = 2**14  # bytes; a page's messages have a few hundred
+_FRAMES_PER_S, _BURST_S = 200.0, 5.0  # turning the view sends 50 a second, more after a pause
 _BYTES_PER_S, _PIECE = 2**15, 2**10
-_OPENING_S = 5.0  # for a request to come whole
-_PING_S = 10.0  # a page that takes and answers nothing for twice as long is gone
+_OPENING_S = 5.0  # for a complete request
+_PING_S = 10.0  # a page that does not respond for twice as long is gone
 _FARTHEST_MM = 1e6  # of a camera from the scene
 _TEXT = 200  # characters of an element's value
 
@@ -77,14 +77,14 @@ class _SceneClicked(msgspec.Struct, tag="ScenePointerMessage", forbid_unknown_fi
     modifier: str | None
 
 
-_Asked = _CameraMoved | _ElementChanged | _SceneClicked
-_decoder: msgspec.msgpack.Decoder[_Asked] = msgspec.msgpack.Decoder(_Asked)
+_Message = _CameraMoved | _ElementChanged | _SceneClicked
+_decoder: msgspec.msgpack.Decoder[_Message] = msgspec.msgpack.Decoder(_Message)
 
 
 class Guard:
-    """Of one server. ``free``: what is called, with and without the token, when an element of
-    viser's identifier is used, before viser knows of it (it ignores a page that is still loading);
-    ``on_refused``: called with a connection whose change was refused for want of the token."""
+    """Of one server. ``free``: callbacks by viser's identifier of an element that may be used
+    without the token; called before viser, which ignores pages that are still loading.
+    ``on_refused``: called with a connection whose change was refused without the token."""
 
     def __init__(self, host: str, protocol: str) -> None:
         self.token = secrets.token_urlsafe(16)
@@ -101,7 +101,7 @@ class Guard:
 
     @contextlib.contextmanager
     def around_start(self) -> Iterator[None]:
-        """The server of websockets that is started within is guarded: viser has no hook for it."""
+        """Guard the websockets server that is started inside: viser has no hook for it."""
         theirs = websockets_server.serve
 
         def guarded(*arguments: Any, process_request: Any, **options: Any) -> Any:
@@ -109,7 +109,7 @@ class Guard:
                 refusal = self._refusal(connection, request)
                 if refusal is not None:
                     return connection.respond(*refusal)
-                request.path = "/"  # the one page there is; the token is none of viser's business
+                request.path = "/"  # the only page; viser need not see the token
                 response: Response | None = process_request(connection, request)
                 if response is not None:
                     for name, value in _headers(request).items():
@@ -134,7 +134,7 @@ class Guard:
                 websockets_server.serve = theirs  # type: ignore[misc]
 
     def admit(self, newcomer: GuardedConnection) -> None:
-        """Of too many connections the oldest goes that is no page: who asks at once gets in."""
+        """Of too many connections, drop the oldest that is no page, so that new ones get in."""
         self._pending[newcomer] = None
         if len(self._pending) + len(self._pages) > MOST_CONNECTIONS:
             oldest = next(iter(self._pending))
@@ -161,7 +161,7 @@ class Guard:
         if "upgrade" not in request.headers:
             return None
         offered = ",".join(request.headers.get_all("Sec-WebSocket-Protocol")).split(",")
-        if self._protocol not in [one.strip() for one in offered]:
+        if self._protocol not in [name.strip() for name in offered]:
             return HTTPStatus.BAD_REQUEST, "Only the viewer's own page connects here.\n"
         if len(self._pages) >= MOST_PAGES:
             watching = [page for page in self._pages if not page.may_change]
@@ -174,7 +174,7 @@ class Guard:
         return None
 
     def _is_ours(self, host: str) -> bool:
-        """A name that only this machine has. An IP address is nobody's name."""
+        """One of this machine's names, or an IP address, which no foreign site can have as name."""
         try:
             name = urlsplit(f"//{host}").hostname or ""
         except ValueError:
@@ -184,25 +184,25 @@ class Guard:
         return name in self._names
 
     def passes(self, connection: GuardedConnection, data: bytes | str) -> bool:
-        """Whether viser may see a message. Raises ValueError for one that is none of its own."""
+        """Whether viser may see a message. Raises ValueError if it is not MessagePack."""
         try:
-            asked = _decoder.decode(b"" if isinstance(data, str) else data)
+            message = _decoder.decode(b"" if isinstance(data, str) else data)
         except msgspec.ValidationError:
-            return False  # something else that viser knows, or not as it should be
+            return False  # another message of viser, or a malformed one
         except msgspec.DecodeError as error:
             raise ValueError("that is no message") from error
-        if isinstance(asked, _CameraMoved):
-            numbers = (*asked.wxyz, *asked.position, *asked.look_at, *asked.up_direction)
-            return all(map(_plausible, (*numbers, asked.fov, asked.near, asked.far)))
-        if isinstance(asked, _ElementChanged):
-            if list(asked.updates) != ["value"] or not _plausible(asked.updates["value"]):
+        if isinstance(message, _CameraMoved):
+            numbers = (*message.wxyz, *message.position, *message.look_at, *message.up_direction)
+            return all(map(_plausible, (*numbers, message.fov, message.near, message.far)))
+        if isinstance(message, _ElementChanged):
+            if list(message.updates) != ["value"] or not _plausible(message.updates["value"]):
                 return False
-            free = self.free.get(asked.uuid)
+            free = self.free.get(message.uuid)
             if free is not None:
                 free()
             allowed = connection.may_change or free is not None
         else:
-            ray = (*asked.ray_origin, *asked.ray_direction)
+            ray = (*message.ray_origin, *message.ray_direction)
             allowed = connection.may_change and all(map(_plausible, ray))
         if not allowed:
             self.on_refused(connection)
@@ -210,13 +210,13 @@ class Guard:
 
 
 class GuardedConnection(ServerConnection):
-    """``may_change``: its address has the token; ``told_until_s``: no further notice before."""
+    """``may_change``: its address has the token; ``notice_due_s``: no further notice before."""
 
     def __init__(self, guard: Guard, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
         self._guard = guard
         self._frames, self._bytes = Pace(_FRAMES_PER_S, _BURST_S), Pace(_BYTES_PER_S, _BURST_S)
-        self.may_change, self.told_until_s = False, 0.0
+        self.may_change, self.notice_due_s = False, 0.0
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         super().connection_made(transport)
@@ -237,7 +237,7 @@ class GuardedConnection(ServerConnection):
                 super().data_received(piece)
 
     def process_event(self, event: Any) -> None:
-        ping = getattr(event, "opcode", None) is Opcode.PING  # no browser's page sends any
+        ping = getattr(event, "opcode", None) is Opcode.PING  # never sent by browsers
         if ping or self._frames.wait_s():
             self.transport.abort()
         else:
@@ -261,7 +261,7 @@ def _plausible(value: bool | float | str) -> bool:
 
 
 def _headers(request: Request) -> dict[str, str]:
-    """The page talks to this server alone, is in nobody's frame, and tells nobody its address."""
+    """The page talks only to this server, is in no frame, and does not leak its address."""
     host = request.headers["Host"]
     policy = f"connect-src 'self' ws://{host} wss://{host} blob: data:; frame-ancestors 'none'"
     return {
