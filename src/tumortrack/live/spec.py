@@ -1,8 +1,8 @@
 """``kind:target?key=value&key=value`` -> the configuration of a source or sink.
 
-A kind is a class: one of those listed here, or one that an installed package offers by an entry
-point in ``tumortrack.sources`` or ``tumortrack.sinks``, named as the class's ``tag``. Only the
-kind that is asked for is imported, so a broken package harms no other kind.
+A kind is a configuration class: one listed here, or one that an installed package offers by an
+entry point in ``tumortrack.sources``, ``tumortrack.sinks`` or ``tumortrack.poses``, named as the
+class's ``tag``. Only the requested kind is imported, so a broken package affects no other.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ C = TypeVar("C", bound=Config)
 
 
 class Extension(NamedTuple):
-    """A source or sink of another package; ``fault``: why it cannot be used, empty if it can."""
+    """A kind of another package; ``fault``: why it cannot be used, empty if it can."""
 
     what: str
     kind: str
@@ -34,8 +34,8 @@ class Extension(NamedTuple):
 
 @dataclass(frozen=True)
 class Registry(Generic[C]):
-    """All kinds of source, or of sink: ``built_in`` (``module:class`` by kind), and those of the
-    entry points' ``group``. ``what`` names one in messages; ``base`` is its class's base."""
+    """All kinds of source, sink, or poses: ``built_in`` (``module:class`` by kind), and those of
+    the entry points' ``group``. ``what`` names one in messages; ``base`` is the base class."""
 
     what: str
     group: str
@@ -43,15 +43,15 @@ class Registry(Generic[C]):
     built_in: Mapping[str, str]
 
     def parse(self, text: str) -> C:
-        """The configuration that ``text`` describes. Raises InputError for a kind, key or value
-        that there is not (the message lists what there is), and where a package is broken."""
+        """The configuration that ``text`` describes. Raises InputError for an unknown kind, key or
+        value (listing what is allowed), and if a package is broken."""
         head, _, options = text.partition("?")
         kind, _, target = head.partition(":")
-        config = self._class(kind, f"{self.what} {text!r}")
-        return _filled(config, target, options, f"{self.what} {text!r}")
+        where = f"{self.what} {text!r}"
+        return _filled(self._class(kind, where), target, options, where)
 
     def extensions(self) -> Iterator[Extension]:
-        """What other packages offer; each class is imported."""
+        """The kinds of other packages; each class is imported."""
         for entry in self._entry_points():
             fault = ""
             try:
@@ -63,26 +63,26 @@ class Registry(Generic[C]):
             yield Extension(self.what, entry.name, _package_of(entry), fault)
 
     def _class(self, kind: str, where: str) -> type[C]:
-        """Raises InputError, which ``where`` opens."""
+        """Raises InputError, which begins with ``where``."""
         if kind in self.built_in:
             return EntryPoint(kind, self.built_in[kind], self.group).load()
         entries = self._entry_points()
-        found = [entry for entry in entries if entry.name == kind]
-        if not found and kind == "ros1":
+        matches = [entry for entry in entries if entry.name == kind]
+        if not matches and kind == "ros1":
             raise InputError(
                 f"{where}: ROS 1 was removed after its end of life, May 2025. Bridge its topics to "
                 "ROS 2 (ros1_bridge) and say ros2, or play a .bag: recording:PATH."
             )
-        if not found:
+        if not matches:
             allowed = sorted({*self.built_in, *(entry.name for entry in entries)})
             raise InputError(f"{where}: there is no kind {kind!r}. Allowed: {', '.join(allowed)}.")
-        if len(found) > 1:
-            packages = " and ".join(sorted(map(_package_of, found)))
+        if len(matches) > 1:
+            packages = " and ".join(sorted(map(_package_of, matches)))
             raise InputError(f"{where}: {packages} both offer {kind!r}. Uninstall one of them.")
         cause: Exception | None = None
         try:
-            config: type[C] = found[0].load()
-            fault = f"offers {found[0].value}, which is no {self.base.__name__} of tumortrack"
+            config: type[C] = matches[0].load()
+            fault = f"offers {matches[0].value}, which is no {self.base.__name__} of tumortrack"
             if isinstance(config, type) and issubclass(config, self.base):
                 tag = config.__struct_config__.tag
                 if tag == kind:
@@ -93,7 +93,7 @@ class Registry(Generic[C]):
             cause = error
             fault = f"offers {kind!r}, but it cannot be imported ({type(error).__name__}: {error})"
         raise InputError(
-            f"{where}: the package {_package_of(found[0])} {fault}. Repair or uninstall it."
+            f"{where}: the package {_package_of(matches[0])} {fault}. Repair or uninstall it."
         ) from cause
 
     def _entry_points(self) -> list[EntryPoint]:
@@ -125,8 +125,6 @@ SINKS = Registry[SinkConfig](
         "openigtlink": f"{_LIVE}.sinks.openigtlink:OpenIgtLinkSinkConfig",
     },
 )
-
-
 POSES = Registry[PosesConfig](
     "camera's pose",
     "tumortrack.poses",
@@ -140,7 +138,7 @@ POSES = Registry[PosesConfig](
 
 
 def extensions() -> list[Extension]:
-    """Every source, sink and source of a camera's pose that installed packages offer."""
+    """All kinds that installed packages add."""
     return [*SOURCES.extensions(), *SINKS.extensions(), *POSES.extensions()]
 
 
@@ -152,7 +150,7 @@ def _package_of(entry: EntryPoint) -> str:
 def _filled(config: type[C], target: str, options: str, where: str) -> C:
     given: dict[str, str] = {}
     for option in filter(None, options.split("&")):
-        key, _, value = option.partition("=")  # as it is: paths may hold + and %
+        key, _, value = option.partition("=")  # not unquoted: paths may contain + and %
         if key in given:
             raise InputError(f"{where}: {key!r} is given twice.")
         given[key] = value
@@ -198,7 +196,7 @@ _BOUNDS = {"ge": "from", "gt": "more than", "le": "to", "lt": "less than"}
 
 
 def _allowed(info: msgspec.inspect.Type) -> str:
-    """What an option's text may be, in words."""
+    """The allowed text of an option, in words."""
     if isinstance(info, msgspec.inspect.Metadata):
         return _allowed(info.type)
     if isinstance(info, msgspec.inspect.UnionType):
@@ -211,7 +209,7 @@ def _allowed(info: msgspec.inspect.Type) -> str:
 
 
 def usage(config: type[Config]) -> str:
-    """How a kind is written, with its options' defaults."""
+    """How to write a kind, with the defaults of its options."""
     kind, target = str(config.__struct_config__.tag), getattr(config, "target", "")
     fields = {field.name: field for field in msgspec.structs.fields(config)}
     first = fields.pop(target, None)

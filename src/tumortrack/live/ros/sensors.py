@@ -1,8 +1,8 @@
 """Depth images, clouds and masks <-> ROS messages, in the camera's frame; mm here, metres there.
 
-Messages are rosbags' objects (``Messages.from_bytes``). What they claim is checked against the
-bytes they hold, and that it is supported (no lens distortion, binning, region of interest, shift or
-skew of the camera; see each message): whatever is refused is an InputError.
+Messages are rosbags' objects (``Messages.from_bytes``). InputError is raised if what they declare
+does not fit their bytes, or is not supported (lens distortion, binning, region of interest, shift
+or skew of the camera).
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 CAMERA_FRAME = "camera"
 _UINT8, _FLOAT32, _FLOAT64 = 2, 7, 8  # PointField's numbers
 _FLOATS = {_FLOAT32: "f4", _FLOAT64: "f8"}
-_POINT_FIELDS = {"|u1": _UINT8, "<f4": _FLOAT32, "<u4": _FLOAT32}  # four bytes of colour, by PCL
+_POINT_FIELDS = {"|u1": _UINT8, "<f4": _FLOAT32, "<u4": _FLOAT32}  # PCL's four bytes of colour
 DEPTHS = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
 _MASKS = {"mono8": "u1", "8UC1": "u1"}
-_PACKED = struct.Struct("<i2f")  # a number for the packing, and two of compressedDepth's
+_PACKED = struct.Struct("<i2f")  # header of compressedDepth: the format, and two parameters
 _PNG = ["compressedDepth", "png"]
 _PICTURES = {"rgb8": "3u1", "bgr8": "3u1", "rgba8": "4u1", "bgra8": "4u1"} | _MASKS
 _LONGEST_SIDE = 8192  # as of Intrinsics
@@ -40,8 +40,8 @@ _LONGEST_SIDE = 8192  # as of Intrinsics
 def cloud_of(message: Any) -> SensorCloud:
     """A PointCloud2 in metres as points in mm, in the message's order, with its stamp.
 
-    x, y and z are float32 or float64 at any place of a point; either byte order, organised or
-    not, rows padded or not. What is no point seen is dropped, as by ``seen_points``.
+    x, y and z are float32 or float64 at any offset; either byte order, organised or not, rows
+    padded or not. Invalid points are dropped, as by ``seen_points``.
     """
     step, places = int(message.point_step), {}
     for field in message.fields:
@@ -68,9 +68,8 @@ def cloud_of(message: Any) -> SensorCloud:
             offset, code = places[name]
             metres = np.ndarray((height, width), order + code, data, offset, (row, step))
             np.multiply(metres, 1000, out=points_mm[..., axis], casting="same_kind")
-    return SensorCloud(
-        seen_points(points_mm.reshape(-1, 3), "a cloud")[0], stamp_of(message.header)
-    )
+    points_mm, _ = seen_points(points_mm.reshape(-1, 3), "a cloud")
+    return SensorCloud(points_mm, stamp_of(message.header))
 
 
 def _place(field: Any, step: int) -> tuple[int, str]:
@@ -94,9 +93,9 @@ def depth_of(image: Any, info: Any, rectified: bool = False, unit_mm: float = 1.
 
     Args:
         image: 32FC1 (metres), 16UC1 or mono16 (whole numbers); 0, NaN and infinity are no return.
-        rectified: the image's topic is a rectified one: its camera is P, and D is what was taken
-            out of it. Otherwise its camera is K, and D must be zero.
-        unit_mm: of one step of a 16-bit image; ROS says 1 mm (REP 118).
+        rectified: the image is rectified: its camera is P, and D was removed. Otherwise its camera
+            is K, and D must be zero.
+        unit_mm: one step of a 16-bit image; in ROS 1 mm (REP 118).
     """
     names = frame_of(image), frame_of(info)
     if all(names) and names[0] != names[1]:
@@ -119,9 +118,9 @@ def depth_of(image: Any, info: Any, rectified: bool = False, unit_mm: float = 1.
 
 
 def image_of(message: Any, messages: Messages) -> Any:
-    """The depth Image in a CompressedImage of image_transport's ``compressedDepth``: a PNG of 16
-    bits behind 12 bytes, the depth itself or, of metres, a / (value - b). Raises InputError for
-    another packing (JPEG, RVL), and for damaged ones."""
+    """The depth Image in a CompressedImage of image_transport's ``compressedDepth``: a 16-bit PNG
+    after 12 bytes, of depths or, for metres, of a / (value - b). Raises InputError for another
+    packing (JPEG, RVL), and for damaged ones."""
     from PIL import Image
 
     encoding, _, packing = str(message.format).partition(";")
@@ -140,13 +139,13 @@ def image_of(message: Any, messages: Messages) -> Any:
     except Exception as error:  # Pillow raises anything on a damaged file
         raise InputError(f"a packed depth image came that is damaged ({error}).") from error
     if DEPTHS[encoding] == "f4":
-        with np.errstate(all="ignore"):  # what has no return is dropped later on
+        with np.errstate(all="ignore"):  # pixels without return are dropped later
             depth = np.where(depth == 0, np.nan, a / (depth - np.float64(b))).astype(np.float32)
     return _image(depth, encoding, message.header, messages)
 
 
 def frame_of(message: Any) -> str:
-    """The frame that a message says it is in; empty: none. ROS 1 wrote some with a slash."""
+    """The message's frame; empty: none. Some in ROS 1 begin with a slash."""
     return str(message.header.frame_id).strip().removeprefix("/")
 
 
@@ -156,8 +155,8 @@ def mask_of(image: Any) -> Bool[np.ndarray, "h w"]:
 
 
 def picture_of(image: Any, frame: DepthFrame) -> UInt8[np.ndarray, "h w *rgb"] | None:
-    """An rgb8, bgr8, rgba8, bgra8 or mono8 image as the picture of a depth image's pixels; None
-    where it is of another moment. Raises InputError where it is of another size."""
+    """An rgb8, bgr8, rgba8, bgra8 or mono8 image as the picture of a depth image; None if it has
+    another stamp. Raises InputError if it has another size."""
     if stamp_of(image.header) != frame.stamp_ns:
         return None
     picture = _pixels(image, _PICTURES, "a picture")
@@ -200,8 +199,7 @@ def _intrinsics_of(info: Any, rectified: bool) -> Intrinsics:
 
 
 def _pixels(image: Any, allowed: dict[str, str], what: str) -> np.ndarray:
-    """The values of an image (height, width), in this machine's byte order; of several channels
-    (height, width, channels)."""
+    """The image (height, width) or (height, width, channels), in this machine's byte order."""
     code = allowed.get(image.encoding)
     if code is None:
         raise InputError(
@@ -225,11 +223,10 @@ def messages_seen(
     seen: Observation, messages: Messages, frame_id: str = CAMERA_FRAME
 ) -> list[Outgoing]:
     """An observation in the camera's frame: ``depth/image_rect`` (32FC1, metres, NaN without
-    return (REP 118): float32 there and back is exact to one part in 10 million, 1e-5 mm at 150 mm)
-    and ``depth/camera_info`` (K and P, no distortion), or ``points``; and where there are such,
-    ``mask`` (mono8) and ``color/image_raw`` (mono8 or rgb8) with its camera_info. Raises
-    InputError for a stamp that ROS can't say.
-    """
+    return (REP 118); exact to one part in 10 million, 1e-5 mm at 150 mm) and ``depth/camera_info``
+    (K and P, no distortion), or ``points``; where present, ``mask`` (mono8) and
+    ``color/image_raw`` (mono8 or rgb8) with its camera_info. Raises InputError for a stamp beyond
+    ROS's range."""
     header = messages.header(seen.stamp_ns, frame_id)
     frame = seen.content
     if isinstance(frame, SensorCloud):
@@ -283,7 +280,7 @@ def plain_cloud(cloud: SensorCloud, header: Any, messages: Messages) -> Any:
 
 
 def cloud_message(table: np.ndarray, header: Any, messages: Messages) -> Any:
-    """A PointCloud2 whose data are the bytes of a structured array, an element a point."""
+    """A PointCloud2 of a structured array's bytes, one element per point."""
     fields = [
         {"name": name, "offset": at[1], "datatype": _POINT_FIELDS[at[0].str], "count": 1}
         for name, at in table.dtype.fields.items()  # type: ignore[union-attr]
@@ -303,5 +300,5 @@ def cloud_message(table: np.ndarray, header: Any, messages: Messages) -> Any:
 
 
 def _octets(table: np.ndarray) -> np.ndarray:
-    """An array's bytes, without a copy where they lie in one piece."""
+    """An array's bytes, without a copy if it is contiguous."""
     return np.ascontiguousarray(table).reshape(-1).view(np.uint8)

@@ -1,5 +1,4 @@
-"""The viewer's panel: status as HTML (how good the estimate is, how old), slice, buttons,
-switches."""
+"""The viewer's panel: status as HTML, slice, buttons, switches."""
 
 from __future__ import annotations
 
@@ -28,19 +27,23 @@ if TYPE_CHECKING:
 
 State = Literal["waiting", "good", "poor", "none", "stale", "playback"]
 
-_WIDTH = 360  # pixels; what lies over the scene leaves this much room
+_WIDTH = 360  # pixels, which overlays of the scene leave free
 ABORT, ABORTED = "Stop the arms for good", "The arms were stopped for good"
 CLICKS = {True: "Point at the organ", False: "Point beside it"}
 CANCEL = {
     True: "Now click on the organ (again: cancel)",
     False: "Now click beside it (again: cancel)",
 }
-SILENCE_S = 2  # without a word from the server the page itself says so
+_CLICK_HINTS = {
+    True: "Choose the thing that is the organ; a picture teaches its colour",
+    False: "Teach the colour of fat, a hand, a drape",
+}
+SILENCE_S = 2  # without a message from the server, after which the page itself says so
 
-# Over the scene and in the panel: a shape, the state's own word and a colour tell states apart.
+# Shape and colour of each state, over the scene and in the panel.
 _SIGNS: dict[State, tuple[str, Colour]] = {
     "waiting": ("○", colours.STALE),
-    "good": ("●", colours.GOOD),  # a tick would say more than is known
+    "good": ("●", colours.GOOD),  # a tick would promise too much
     "poor": ("▲", colours.POOR),
     "none": ("✕", colours.NONE),
     "stale": ("◆", colours.STALE),
@@ -48,14 +51,14 @@ _SIGNS: dict[State, tuple[str, Colour]] = {
 }
 _EMPTY: tuple[State, ...] = ("waiting", "none", "stale")
 
-# Styles, where the status is shown, and how it gets there. Surfaces reach the screen one frame
-# after the message that brought them, so what a message says waits as long (status.html).
+# Styles and places of the status. Surfaces reach the screen one frame after their message, so the
+# status waits as long (status.html).
 _PAGE = Template(files(__package__).joinpath("status.html").read_text("utf-8")).substitute(
     stale=css(colours.STALE), silence_s=SILENCE_S, right=_WIDTH + 18
 )
-# The page's own watch: every message replaces this element and so restarts its clock. When none
-# comes (the program was killed, the network is gone) it shows itself, by the browser alone; as a
-# popover it lies above all, where the panel has been dimmed too.
+# The page's own watch: every message replaces this element and so restarts its animation. When
+# none comes (the program was killed, the network is down) the browser shows it, as a popover over
+# everything.
 _SILENCE = (
     '<div class="tumortrack-silence" onanimationend="this.popover = \'manual\'; '
     f'this.showPopover()"><div>◆ STALE<small>tumortrack has been silent for {SILENCE_S} s, or its '
@@ -65,8 +68,8 @@ _SILENCE = (
 
 @dataclass(frozen=True, eq=False)
 class StatusPanel:
-    """What is said of the result that is shown. ``age_s``: since its frame; ``counter``: another
-    with each message; ``arms``: there may be some; ``parts``: the model's, the organ first."""
+    """The status of the shown result. ``age_s``: since its frame; ``counter``: of messages;
+    ``arms``: there may be some; ``parts``: the model's, the organ first."""
 
     state: State
     result: TrackingResult | None
@@ -77,27 +80,27 @@ class StatusPanel:
 
     @property
     def alarming(self) -> bool:
-        """There is nothing that may be looked at. Arms that go on without an estimate are meant
-        to, as of a plan that is only shown: they would be halted."""
+        """There is no estimate. Arms that go on without one are meant to, as in a playback: else
+        they would be halted."""
         cell = self._cell
         return self.state in _EMPTY and (cell is None or bool(cell.halted))
 
     @property
     def _cell(self) -> Workcell | None:
-        """What arms do, as far as it is still true."""
+        """What the arms do, if that is current."""
         if self.result is None or self.state in ("waiting", "stale"):
             return None
         return self.result.workcell
 
     def stage(self) -> str:
-        """All that is said, in one piece that the page shows at once: in the panel (``flag``,
-        ``numbers``) and over everything (``over``)."""
+        """Everything, in one piece that the page shows at once: in the panel (``flag``,
+        ``numbers``) and over the scene (``over``)."""
         parts = {"flag": self.flag(), "numbers": self.numbers(), "over": self._over_scene()}
         inside = "".join(f'<div class="{name}">{html}</div>' for name, html in parts.items())
         return f'<div class="tumortrack-stage" hidden data-n="{self.counter}">{inside}</div>'
 
     def flag(self) -> str:
-        """How good, of which frame; what the arms do."""
+        """Quality and frame number; the arms' state."""
         heading, colour = self._heading
         return _box(heading, colour, self._number()) + (self._arms()[0] if self.arms else "")
 
@@ -107,12 +110,11 @@ class StatusPanel:
         return f"{shape} {self.state.upper()}", colour
 
     def _over_scene(self) -> str:
-        """A banner with the reason; where it is alarming the whole page in its colour; the page's
-        watch."""
+        """A banner with the reason; if alarming, the whole page in its colour; the watch."""
         heading, colour = self._heading
         tint, size = "", "quiet" if self.state == "good" else "plain"
         if self.alarming:
-            size = "loud"  # big where there is nothing to see
+            size = "loud"
             style = f"background:{css(colour)}48;color:{css(colour)}"
             tint = f"<div class='tumortrack-tint' style='{style}'></div>"
         why = f"{self._number()}: {self._reason()}"
@@ -123,7 +125,7 @@ class StatusPanel:
         return "" if self.result is None else f"frame no. {self.result.sequence}"
 
     def _arms(self) -> tuple[str, str]:
-        """What they do: in the panel, and over the scene; where they stand still, why."""
+        """Their state, or why they are halted: in the panel, and over the scene."""
         cell = self._cell
         if cell is None:
             return _box("ARMS: nothing is known of them", colours.STALE), ""
@@ -165,8 +167,8 @@ class StatusPanel:
         )
 
     def _parts(self, report: FitReport) -> str:
-        """A row for each part, with and without an estimate: what is below must not jump. Under a
-        failed check the deviation is no longer the place's, and is left out."""
+        """A row for each part, with and without an estimate: nothing below must jump. After a
+        failed check the standard deviation is not valid, and left out."""
         margins, good = report.margin, self.state == "good"
         stated = margins.stated[-1].confidence if margins and margins.stated else None
         heads = ["", "volume", "standard deviation of place"]
@@ -191,7 +193,6 @@ class StatusPanel:
 
 
 def _over(edge: str, size: str, colour: Colour, text: str, why: str) -> str:
-    """A box over the scene."""
     return (
         f"<div class='tumortrack-over tumortrack-{size}' style='{edge}:18px'>"
         f"<div style='background:{css(colour)}'>{escape(text)}<small>{escape(why)}</small></div>"
@@ -200,7 +201,6 @@ def _over(edge: str, size: str, colour: Colour, text: str, why: str) -> str:
 
 
 def _box(text: str, colour: Colour, why: str = "") -> str:
-    """A line of the panel."""
     return (
         f"<div class='tumortrack-box' style='background:{css(colour)}'>{escape(text)}"
         f"<small>{escape(why)}</small></div>"
@@ -208,9 +208,9 @@ def _box(text: str, colour: Colour, why: str = "") -> str:
 
 
 class Panel:
-    """The elements, shared by all clients; whoever made it says what they do. The result comes
-    first, then what shows it, then what changes it. ``slices``: what they show; empty: there are
-    none; ``arms``: with what they do; ``patient``: in words."""
+    """The elements, shared by all clients; the sink sets their callbacks. The result comes first,
+    then what shows it, then what changes it. ``slices``: of what; empty: there are none; ``arms``:
+    there may be some; ``patient``: in words."""
 
     def __init__(
         self,
@@ -228,7 +228,7 @@ class Panel:
             f"<div class='tumortrack-row tumortrack-whose'><b>{escape(patient)}</b>"
             "<label><input type='checkbox' id='tumortrack-more'> more</label></div>"
         )
-        gui.add_html(_PAGE)  # of one height: what is to be clicked must not jump
+        gui.add_html(_PAGE)  # of constant height: buttons must not jump
         self.stage = gui.add_html("")
         if arms:
             self.abort = gui.add_button(
@@ -250,14 +250,8 @@ class Panel:
                 shown["slice_plane"] = gui.add_checkbox("In the scene", default.slice_plane)
         with gui.add_folder("Is something else tracked?"):
             self.clicks = {
-                True: gui.add_button(
-                    CLICKS[True],
-                    color="gray",
-                    hint="Choose the thing that is the organ; a picture teaches its colour",
-                ),
-                False: gui.add_button(
-                    CLICKS[False], color="gray", hint="Teach the colour of fat, a hand, a drape"
-                ),
+                organ: gui.add_button(CLICKS[organ], color="gray", hint=_CLICK_HINTS[organ])
+                for organ in (True, False)
             }
             self.colour = gui.add_html("")
             self.forget = gui.add_button("Forget", color="gray", visible=False)
@@ -287,7 +281,7 @@ class Panel:
         self.stage.content = status.stage()
 
     def say_clicks(self, asked: bool | None, controls: Controls) -> None:
-        """``asked``: for a click on the organ, beside it, or for none."""
+        """``asked``: for a click on the organ (True), beside it (False), or for none."""
         for organ, button in self.clicks.items():
             button.label = (CANCEL if organ is asked else CLICKS)[organ]
         self.forget.visible = controls.picked_mm is not None or bool(controls.clicks)

@@ -1,4 +1,4 @@
-"""Slices of the CT through the present scene: every pixel is carried back into the CT."""
+"""Slices of the CT through the present scene: each pixel is mapped back into the CT."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ ORIENTATIONS: dict[str, tuple[tuple[float, ...], tuple[float, ...]]] = {
 }
 _SURE_MM, _UNSURE_MM = 5.0, 20.0  # outside the organ the motion is a guess: the CT fades out
 _FAINT = 0.3
-_FILL = 0.6  # brightness of a label: the outlines of what was estimated stand out from it
-_SLICE_ROOM = 1.15  # side of a slice in the organ's largest extent
+_FILL = 0.6  # brightness of a label: estimated outlines stand out from it
+_SLICE_ROOM = 1.15  # side of a slice, relative to the organ's largest extent
 _SAME_ORGAN_MM = 3.0  # a case's surface may differ from the model's by so much
 _BAR_MM = 10
 _FINER = 2
@@ -36,7 +36,7 @@ _COARSER = 2  # the CT is sampled coarser: a pixel in the panel is less than a v
 
 @dataclass(frozen=True, eq=False)
 class SlicePlane:
-    """A square in the camera frame: centre, unit directions of columns and rows, side; mm."""
+    """A square in the camera frame: center, unit directions of columns and rows, side; mm."""
 
     centre_mm: Float64[np.ndarray, " 3"]
     across: Float64[np.ndarray, " 3"]
@@ -44,31 +44,28 @@ class SlicePlane:
     side_mm: float
 
     def points(self, pixels: int) -> Float64[np.ndarray, "n 3"]:
-        """The pixels' centres, row by row."""
+        """The centers of the pixels, row by row."""
         steps = ((np.arange(pixels) + 0.5) / pixels - 0.5) * self.side_mm
         rows = self.centre_mm + steps[:, None, None] * self.down
         return (rows + steps[None, :, None] * self.across).reshape(-1, 3)
 
     def section(self, mesh: Mesh) -> Float64[np.ndarray, "m 2 2"]:
-        """Where a surface crosses the plane, as segments; (column, row) in mm from the centre."""
+        """Where a surface crosses the plane: segments of (column, row) in mm from the center."""
         normal = np.cross(self.across, self.down)
         lines = plane_section(mesh.vertices_mm, mesh.faces, normal, self.centre_mm)
         return (lines - self.centre_mm) @ np.stack([self.across, self.down], axis=1)
 
 
 class CarriedCt:
-    """A case's CT, or its labels where it has none, as a picture at points of the CT; ``name``:
-    which of the two."""
+    """Samples a case's CT, or its labels if it has none; ``name``: which of the two."""
 
     def __init__(self, case: Case) -> None:
         from scipy.ndimage import distance_transform_edt
 
         labels, ct = case.labels, case.ct
         self.name = "Label map" if ct is None else "CT"
-        self._labels, self._label_index_from_lps = (
-            labels.labels,
-            np.linalg.inv(labels.lps_from_index),
-        )
+        self._labels = labels.labels
+        self._label_index_from_lps = np.linalg.inv(labels.lps_from_index)
         self._hu = None if ct is None else ct.hu
         if ct is None:
             return
@@ -76,15 +73,15 @@ class CarriedCt:
         outside_mm = distance_transform_edt(~organ, sampling=spacing_mm(labels.lps_from_index))
         self._outside_mm = outside_mm.astype(np.float32)
         self._index_from_lps = np.linalg.inv(ct.lps_from_index)
-        # Black and white: the organ's values (of each tenth voxel), and as much again round them.
+        # Black and white: the organ's range (of each tenth voxel), widened by as much.
         inside = transform_points(labels.lps_from_index, np.argwhere(organ)[::10].astype(float))
         low, high = np.nanpercentile(_sample(ct.hu, self._index_from_lps, inside, 0), (1, 99))
         room = max(50.0, 0.5 * float(high - low))
         self._window = float(low) - room, float(high) + room
 
     def picture(self, points_ct: Float[np.ndarray, "n 3"]) -> UInt8[np.ndarray, "n 3"]:
-        """Grey values: 0 where there is no CT, faint far outside the organ. Without a CT the parts'
-        colours, black outside them."""
+        """Grey values: 0 outside the CT, faint far outside the organ. Without a CT the parts'
+        colours, black outside."""
         if self._hu is None:
             labels = _sample(self._labels, self._label_index_from_lps, points_ct, 0)
             labels = np.nan_to_num(labels).astype(np.uint8)
@@ -107,15 +104,14 @@ def slice_picture(
     note: str = "",
 ) -> UInt8[np.ndarray, "h w 3"] | None:
     """The CT in a plane before the camera, over it the outlines of surfaces (camera frame) in
-    their colour and width (pixels), a bar of 10 mm, and ``note`` in the corner. None where
-    ``motion`` knows no way back."""
+    their colour and width (pixels), a bar of 10 mm, and ``note`` in the corner. None if ``motion``
+    has no inverse."""
     sampled = pixels // _COARSER
     points_ct = motion.back(plane.points(sampled))
     if points_ct is None:
         return None
-    return outlined(
-        ct.picture(points_ct).reshape(sampled, sampled, 3), plane, outlines, pixels, note
-    )
+    picture = ct.picture(points_ct).reshape(sampled, sampled, 3)
+    return outlined(picture, plane, outlines, pixels, note)
 
 
 def outlined(
@@ -125,10 +121,10 @@ def outlined(
     pixels: int,
     note: str = "",
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """What lies in the plane, with outlines, bar and note as of ``slice_picture``."""
+    """A picture of the plane, with outlines, bar and note as in ``slice_picture``."""
     from PIL import Image, ImageDraw
 
-    fine = _FINER * pixels  # lines are drawn finer and then shrunk, so that they are smooth
+    fine = _FINER * pixels  # lines are drawn finer and then shrunk: smooth
     image = Image.fromarray(picture).resize((fine, fine), Image.Resampling.BILINEAR).convert("RGB")
     draw = ImageDraw.Draw(image)
     per_mm = fine / plane.side_mm
@@ -145,7 +141,7 @@ def outlined(
 def _sample(
     values: np.ndarray, index_from_lps: np.ndarray, points_ct: np.ndarray, order: int
 ) -> Float32[np.ndarray, " n"]:
-    """Values at points (order 0: of the nearest voxel, 1: between them), NaN outside the grid."""
+    """Values at points (order 0: nearest voxel, 1: trilinear), NaN outside the grid."""
     from scipy.ndimage import map_coordinates
 
     index = transform_points(index_from_lps, points_ct).T
@@ -153,8 +149,8 @@ def _sample(
 
 
 def load_ct(case: str, context: SinkContext) -> CarriedCt:
-    """Raises InputError where the model knows no motion or the case is another patient's,
-    ArtifactError where it is none."""
+    """Raises InputError if the model has no motion or the case is another patient's, ArtifactError
+    if it is none."""
     loaded = load_case(Path(case))
     if context.anatomy_ct is None:
         raise InputError(
@@ -176,7 +172,7 @@ def load_ct(case: str, context: SinkContext) -> CarriedCt:
 
 
 def plane_through(meshes: dict[str, Mesh], part: str, orientation: str) -> SlicePlane | None:
-    """Through the middle of a part's present surface; centred on the organ, and as large."""
+    """Through the center of a part's present surface; centred on the organ, and as large."""
     if part not in meshes or (organ := organ_name(meshes)) is None:
         return None
     across, down = np.array(ORIENTATIONS[orientation])
