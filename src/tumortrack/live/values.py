@@ -187,9 +187,9 @@ class Workcell:
             return None
         boxes = np.array([shape.mesh.box_mm for shape in self.shapes])  # (n, 2, 3)
         poses = np.array([shape.published_from_shape for shape in self.shapes])
-        centers = np.einsum("nij,nj->ni", poses[:, :3, :3], boxes.mean(1)) + poses[:, :3, 3]
+        centres = np.einsum("nij,nj->ni", poses[:, :3, :3], boxes.mean(1)) + poses[:, :3, 3]
         halves = np.einsum("nij,nj->ni", np.abs(poses[:, :3, :3]), np.ptp(boxes, axis=1) / 2)
-        return np.stack([(centers - halves).min(0), (centers + halves).max(0)])
+        return np.stack([(centres - halves).min(0), (centres + halves).max(0)])
 
 
 @dataclass(frozen=True, eq=False)

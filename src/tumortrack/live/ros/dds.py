@@ -17,17 +17,13 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-from cyclonedds import core
+from cyclonedds import core, pub, sub
 from cyclonedds._clayer import ddspy_take
 from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication
 from cyclonedds.domain import Domain, DomainParticipant
 from cyclonedds.idl import make_idl_struct, types
 from cyclonedds.internal import DDS, dds_c_t
-from cyclonedds.pub import DataWriter
-from cyclonedds.pub import Publisher as DdsPublisher
 from cyclonedds.qos import Policy, Qos
-from cyclonedds.sub import DataReader
-from cyclonedds.sub import Subscriber as DdsSubscription
 from cyclonedds.topic import Sample, Topic
 from rosbags.interfaces import Nodetype
 
@@ -85,7 +81,7 @@ class DdsBus:
             self._waitset, self._over = core.WaitSet(member), core.GuardCondition(member)
             self._waitset.attach(self._over)  # with nothing attached it would not wait
             self._published = BuiltinDataReader(member, BuiltinTopicDcpsPublication)
-            self._writers, self._readers = DdsPublisher(member), DdsSubscription(member)
+            self._writers, self._readers = pub.Publisher(member), sub.Subscriber(member)
         except core.DDSException as error:
             raise InputError(
                 f"DDS domain {domain} cannot be joined ({_error_text(error.code)}; Cyclone "
@@ -104,7 +100,7 @@ class DdsBus:
         durability = Policy.Durability
         kept = durability.TransientLocal if latched else durability.Volatile
         reliable = Policy.Reliability.Reliable(_BLOCKED_NS)
-        writer: Any = DataWriter(self._writers, *self._endpoint(topic, kind, reliable, kept, 1))
+        writer: Any = pub.DataWriter(self._writers, *self._endpoint(topic, kind, reliable, kept, 1))
         # By ctypes: the extension module holds the GIL while it waits for a slow subscriber.
         write = DDS._dll_handle.dds_write
         write.argtypes = [ctypes.c_int32, ctypes.POINTER(Sample)]
@@ -132,7 +128,7 @@ class DdsBus:
         if latched:
             qos = Policy.Reliability.Reliable(0), Policy.Durability.TransientLocal
         subscriber = DdsSubscriber(
-            DataReader(self._readers, *self._endpoint(topic, kind, *qos, most)), most
+            sub.DataReader(self._readers, *self._endpoint(topic, kind, *qos, most)), most
         )
         self._waitset.attach(subscriber.condition)
         return subscriber

@@ -123,7 +123,7 @@ class ResultMessages:
 
     def _frames(self, result: TrackingResult) -> Any:
         """A transform to each part, of good estimates only: tf can't mark one as poor. The origin
-        is the center of the part's box; the axes are the CT's, rotated with the organ, or without a
+        is the centre of the part's box; the axes are the CT's, rotated with the organ, or without a
         motion the published frame's."""
         parent, transforms, turn = result.published_frame, [], np.eye(3)
         if result.estimate is not None and result.quality == "good":

@@ -40,7 +40,6 @@ class MoveItSinkConfig(SinkConfig, frozen=True, kw_only=True, tag="moveit"):
         self.check_between("moveit:", **limits)
 
     def open(self, context: SinkContext) -> MoveItSink:
-        """Join the graph and announce the topic."""
         return MoveItSink(self, context)
 
 
@@ -55,7 +54,6 @@ class MoveItSink:
         self._publisher = self._bus.publisher(config.topic, SCENE)
 
     def publish(self, result: TrackingResult) -> None:
-        """Raises TumortrackError: it was not sent."""
         if result.transformed is None or result.quality != "good" or not self._rate.due():
             return
         messages = self._bus.messages

@@ -61,8 +61,6 @@ class OpenIgtLinkSinkConfig(SinkConfig, frozen=True, kw_only=True, tag="openigtl
         self.check_ranges("openigtlink:", "0 (none)", mesh_hz=1000, cloud_hz=1000)
 
     def open(self, context: SinkContext) -> OpenIgtLinkSink:
-        """Serve, or start to connect. Raises InputError as ``Link``, and for a part whose name is
-        too long for a message."""
         if long := [name for name in context.parts if len(name) > igtl.LONGEST_DEVICE]:
             raise InputError(
                 f"openigtlink: {long[0]!r} has {len(long[0])} letters, and OpenIGTLink allows "
@@ -72,10 +70,10 @@ class OpenIgtLinkSinkConfig(SinkConfig, frozen=True, kw_only=True, tag="openigtl
 
 
 class OpenIgtLinkSink:
-    """Per result: STATUS ``tumortrack``, TRANSFORM of each tumor, POINT ``tumors`` (their centers,
+    """Per result: STATUS ``tumortrack``, TRANSFORM of each tumor, POINT ``tumors`` (their centres,
     labelled with their uncertainty), and POLYDATA of each part and of each stated margin.
 
-    A tumor's TRANSFORM has its origin at the center of the tumor's box; its axes are the CT's,
+    A tumor's TRANSFORM has its origin at the centre of the tumor's box; its axes are the CT's,
     rotated with the organ, or, without a motion, those of the published frame. With a motion
     TRANSFORM ``ct`` is the organ's pose, and vertices of tumors have the scalar ``std_mm``: one
     standard deviation along the least certain axis. Without an estimate STATUS says why,
@@ -123,7 +121,7 @@ class OpenIgtLinkSink:
         contents = [
             *self._statuses(result, code),
             *self._transforms(result),
-            *self._centers(result),
+            *self._centres(result),
             *self._surfaces(result),
         ]
         self.link.send(
@@ -175,14 +173,14 @@ class OpenIgtLinkSink:
             status = {"TransformStatus": "MISSING" if pose is None else "OK"}
             yield "TRANSFORM", name, igtl.pack_transform(sent), status
 
-    def _centers(self, result: TrackingResult) -> Iterator[_Content]:
+    def _centres(self, result: TrackingResult) -> Iterator[_Content]:
         report = FitReport() if result.estimate is None else result.estimate.report
         tumors = self._context.parts[1:]
-        centers = {n: mm for n in tumors if (mm := result.center_mm(n)) is not None}
-        labels = [centre_label(report, name, result.quality != "good") for name in centers]
-        points_mm = transform_points(self._axes, np.reshape([*centers.values()], (-1, 3)))
+        centres = {n: mm for n in tumors if (mm := result.center_mm(n)) is not None}
+        labels = [centre_label(report, name, result.quality != "good") for name in centres]
+        points_mm = transform_points(self._axes, np.reshape([*centres.values()], (-1, 3)))
         if tumors:
-            colours = [name_colour(name) for name in centers]
+            colours = [name_colour(name) for name in centres]
             yield "POINT", CENTRES, igtl.pack_points(points_mm, labels, colours), {}
 
     def _surfaces(self, result: TrackingResult) -> Iterator[_Content]:

@@ -42,7 +42,6 @@ class RecordingSinkConfig(SinkConfig, frozen=True, kw_only=True, tag="recording"
         self.check_between("recording:", meshes_hz=(0, 1000))
 
     def open(self, context: SinkContext) -> RecordingSink:
-        """Raises InputError if the folder exists."""
         with writing(self.path):
             self.path.parent.mkdir(parents=True, exist_ok=True)
             sink = RecordingSink(self.path, context, self.meshes_hz)

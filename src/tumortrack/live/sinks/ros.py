@@ -34,7 +34,6 @@ class Ros2SinkConfig(SinkConfig, frozen=True, kw_only=True, tag="ros2"):
         self.check_between("ros2:", mesh_hz=(0, 1000))
 
     def open(self, context: SinkContext) -> RosSink:
-        """Join the graph and announce the topics."""
         return RosSink(self, context, open_bus(self.via))
 
 

@@ -75,8 +75,6 @@ class ViewerSinkConfig(SinkConfig, frozen=True, kw_only=True, tag="viewer"):
             raise InputError(f"viewer: case={self.case} is not a folder that `prepare` wrote.")
 
     def open(self, context: SinkContext) -> ViewerSink:
-        """Raises InputError if the port is taken, viser is missing, or the case is another
-        patient's, ArtifactError if ``case`` is none."""
         return ViewerSink(self, context)
 
 
@@ -167,8 +165,7 @@ class ViewerSink:
 
     def _page_url(self) -> str:
         host = self._config.host
-        if host in ("0.0.0.0", "::"):
-            host = socket.gethostname()
+        host = socket.gethostname() if host in ("0.0.0.0", "::") else host
         return f"http://{f'[{host}]' if ':' in host else host}:{self.port}"
 
     def _refused(self, connection: GuardedConnection) -> None:
@@ -240,7 +237,8 @@ class ViewerSink:
             since_s = self._came_s if state == "stale" else self._drawn_s
             age_s = time.monotonic() - since_s + (result.latency_ms or 0.0) / 1000
         arms, parts = self._context.arms, self._context.parts
-        self._panel.say(StatusPanel(state, result, age_s, self._counter, arms, parts))
+        status = StatusPanel(state, result, age_s, self._counter, arms, parts)
+        self._panel.stage.content = status.stage()
 
     def _keep_watch(self) -> None:
         """Update the age, hide what is too old, renew the slice."""

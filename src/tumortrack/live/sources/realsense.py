@@ -60,9 +60,6 @@ class RealSenseSourceConfig(SourceConfig, frozen=True, kw_only=True, tag="realse
     picture: bool = False
 
     def open(self) -> RealSenseSource:
-        """Raises SourceLost if no such camera is connected or another program has it; InputError if
-        it lacks the mode, its image is distorted, there is no such recording, or pyrealsense2 is
-        missing."""
         rs, path = _sdk(), Path(self.device)
         if path.suffix not in _RECORDINGS:
             with _while_connected():

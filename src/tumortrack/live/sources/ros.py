@@ -57,7 +57,6 @@ class Ros2SourceConfig(SourceConfig, frozen=True, kw_only=True, tag="ros2"):
             raise InputError("ros2: info, mask and picture belong to a depth image, not a cloud.")
 
     def open(self) -> RosSource:
-        """Join the graph; the topic may come later."""
         return RosSource(self, open_bus(self.via))
 
 

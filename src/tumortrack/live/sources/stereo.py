@@ -53,8 +53,6 @@ class StereoSourceConfig(SourceConfig, frozen=True, kw_only=True, tag="stereo"):
             )
 
     def open(self) -> StereoSource:
-        """Raises SourceLost if a device does not answer, InputError if files or calibration cannot
-        be used, or OpenCV is missing."""
         options = self.near_mm, self.far_mm, self.block_px, str(self.calibration)
         rig = StereoRig(read_calibration(self.calibration), *options)
         left, right = self.pair.split(",")

@@ -104,9 +104,9 @@ class Viewpoint:
         return center_mm + away_mm, center_mm, _UP
 
     def last_drawn(self, surface: Mesh) -> Mesh:
-        """The same triangles, and two unused vertices that put the center of all into the eye of
+        """The same triangles, and two unused vertices that put the centre of all into the eye of
         the visitor who moved last. Browsers draw translucent surfaces in the order of their
-        centers: the organ must be the last, or it covers the margins inside."""
+        centres: the organ must be the last, or it covers the margins inside."""
         half = np.abs(surface.vertices_mm - self._eye_mm).max(0)
         corners = [self._eye_mm - half, self._eye_mm + half]
         return Mesh(np.concatenate([surface.vertices_mm, corners]), surface.faces)

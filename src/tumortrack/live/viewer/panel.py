@@ -277,9 +277,6 @@ class Panel:
     def options(self) -> DisplayOptions:
         return DisplayOptions(**{name: element.value for name, element in self._shown.items()})
 
-    def say(self, status: StatusPanel) -> None:
-        self.stage.content = status.stage()
-
     def say_clicks(self, asked: bool | None, controls: Controls) -> None:
         """``asked``: for a click on the organ (True), beside it (False), or for none."""
         for organ, button in self.clicks.items():

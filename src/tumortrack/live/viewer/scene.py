@@ -161,7 +161,10 @@ class ViewerScene:
         self.margins = self._margins_of(result, estimate)
         meshes = {**estimate.meshes}
         if self._name in meshes:
-            meshes[self._name] = self.look.last_drawn(self._bare(meshes[self._name]))
+            organ = meshes[self._name]
+            if self._at_rest is not None and np.array_equal(self._at_rest.organ.faces, organ.faces):
+                organ = Mesh(organ.vertices_mm, self._bare_faces)
+            meshes[self._name] = self.look.last_drawn(organ)
         groups = (self._parts, meshes), (self._shells, self.margins)
         for nodes, surfaces in (*groups, (self._structures, estimate.structures)):
             for name, node in nodes.items():
@@ -254,8 +257,11 @@ class ViewerScene:
         poses = np.array([shape.published_from_shape for shape in cell.shapes]).reshape(-1, 4, 4)
         turns = wxyz_of(poses[:, :3, :3]) if len(poses) else ()  # all at once: 5 times faster
         for (name, shape), wxyz in zip(shapes.items(), turns, strict=True):
-            look = {"mesh": shape.mesh, "color": shape.colour, "opacity": shape.opacity}
-            node = self._placed_node(name, shape.published_from_shape, self._add_shape, look)
+            # None: opaque. With any opacity a mesh is drawn as translucent, and sorted.
+            opacity = shape.opacity if shape.opacity < 1 else None
+            look = {"mesh": shape.mesh, "color": shape.colour, "opacity": opacity}
+            add: Callable[..., Any] = partial(self._mesh, flat_shading=True)
+            node = self._placed_node(name, shape.published_from_shape, add, look)
             if node is not None:
                 node.position, node.wxyz = shape.published_from_shape[:3, 3], wxyz
         for name, line in lines.items():
@@ -278,11 +284,6 @@ class ViewerScene:
             node, present = add(f"/workcell/{kind}/{own.replace('/', ':')}", **look), None
         self._drawn[name] = look, place, node
         return None if present is not None and np.array_equal(present, place) else node
-
-    def _add_shape(self, name: str, opacity: float, **look: Any) -> MeshHandle:
-        # None: opaque. With any opacity a mesh is drawn as translucent, and sorted.
-        translucent = opacity if opacity < 1 else None
-        return self._mesh(name, opacity=translucent, flat_shading=True, **look)
 
     def _put_optional(self, result: TrackingResult, estimate: TransformedEstimate) -> None:
         """What is computed and sent only if the user wants to see it."""
@@ -320,7 +321,7 @@ class ViewerScene:
         return Mesh(ball.vertices, ball.faces)
 
     def _ellipsoid(self, result: TrackingResult, name: str) -> Mesh:
-        """The 95 % ellipsoid of a tumor's center by the fit's own covariance; published frame.
+        """The 95 % ellipsoid of a tumor's centre by the fit's own covariance; published frame.
         Nothing without a motion."""
         assert result.estimate is not None
         motion, part = result.estimate.motion, result.estimate.report.parts.get(name)
@@ -331,12 +332,6 @@ class ViewerScene:
         radii_mm = _ELLIPSOID * np.array(part.center_axes_std_mm)
         points_mm = center_mm + (self._ball.vertices_mm * radii_mm) @ np.array(part.center_axes)
         return self._ball.moved(transform_points(self._pose, points_mm))
-
-    def _bare(self, organ: Mesh) -> Mesh:
-        """The organ's surface where it is no tumor's, if its triangles are those of the CT."""
-        if self._at_rest is None or not np.array_equal(self._at_rest.organ.faces, organ.faces):
-            return organ
-        return Mesh(organ.vertices_mm, self._bare_faces)
 
 
 def _put_mesh(node: MeshHandle, mesh: Mesh) -> None:

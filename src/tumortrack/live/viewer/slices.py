@@ -36,7 +36,7 @@ _COARSER = 2  # the CT is sampled coarser: a pixel in the panel is less than a v
 
 @dataclass(frozen=True, eq=False)
 class SlicePlane:
-    """A square in the camera frame: center, unit directions of columns and rows, side; mm."""
+    """A square in the camera frame: centre, unit directions of columns and rows, side; mm."""
 
     centre_mm: Float64[np.ndarray, " 3"]
     across: Float64[np.ndarray, " 3"]
@@ -44,13 +44,13 @@ class SlicePlane:
     side_mm: float
 
     def points(self, pixels: int) -> Float64[np.ndarray, "n 3"]:
-        """The centers of the pixels, row by row."""
+        """The centres of the pixels, row by row."""
         steps = ((np.arange(pixels) + 0.5) / pixels - 0.5) * self.side_mm
         rows = self.centre_mm + steps[:, None, None] * self.down
         return (rows + steps[None, :, None] * self.across).reshape(-1, 3)
 
     def section(self, mesh: Mesh) -> Float64[np.ndarray, "m 2 2"]:
-        """Where a surface crosses the plane: segments of (column, row) in mm from the center."""
+        """Where a surface crosses the plane: segments of (column, row) in mm from the centre."""
         normal = np.cross(self.across, self.down)
         lines = plane_section(mesh.vertices_mm, mesh.faces, normal, self.centre_mm)
         return (lines - self.centre_mm) @ np.stack([self.across, self.down], axis=1)
@@ -172,7 +172,7 @@ def load_ct(case: str, context: SinkContext) -> CarriedCt:
 
 
 def plane_through(meshes: dict[str, Mesh], part: str, orientation: str) -> SlicePlane | None:
-    """Through the center of a part's present surface; centred on the organ, and as large."""
+    """Through the centre of a part's present surface; centred on the organ, and as large."""
     if part not in meshes or (organ := organ_name(meshes)) is None:
         return None
     across, down = np.array(ORIENTATIONS[orientation])
