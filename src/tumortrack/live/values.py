@@ -21,7 +21,7 @@ from jaxtyping import Bool, Float, Float32, Float64, UInt8
 from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError, TumortrackError
 from tumortrack.core.estimate import NO_CHECK_FAILED, UNVERIFIED, Estimate, Quality
-from tumortrack.core.geometry import transform_points
+from tumortrack.core.geometry import Affine, rigid, transform_points
 from tumortrack.core.patient import NOBODY, Patient
 from tumortrack.core.types import Anatomy, DepthFrame, Mesh, SensorCloud
 from tumortrack.models.margins import margin_words
@@ -102,7 +102,7 @@ class PublishedFrame:
     error_deg: float = 0.0
     moves: bool = False
 
-    def of_camera(self, published_from_camera: Float64[np.ndarray, "4 4"]) -> PublishedFrame:
+    def of_camera(self, published_from_camera: Affine) -> PublishedFrame:
         """The same frame, for a camera at another pose."""
         if np.array_equal(published_from_camera, self.published_from_camera):
             return self
@@ -260,6 +260,21 @@ class TrackingResult:
             return None
         center_mm = mesh.box_mm.mean(0, keepdims=True)
         return transform_points(self.published_frame.published_from_camera, center_mm)[0]
+
+    @property
+    def published_from_ct(self) -> Affine | None:
+        """The organ's pose without its deformation; None without a motion."""
+        motion = None if self.estimate is None else self.estimate.report.motion
+        if motion is None:
+            return None
+        return self.published_frame.published_from_camera @ np.array(motion.camera_from_ct)
+
+    def part_pose(self, part: str) -> Affine | None:
+        """A part's pose in the published frame: the origin is the centre of its box; the axes are
+        the CT's, rotated with the organ, or without a motion those of the published frame."""
+        center_mm, pose = self.center_mm(part), self.published_from_ct
+        turn = np.eye(3) if pose is None else pose[:3, :3]
+        return None if center_mm is None else rigid(turn, center_mm)
 
     def describe(self) -> str:
         """How good the estimate is, in words, or why there is none."""

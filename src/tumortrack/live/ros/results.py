@@ -16,7 +16,7 @@ from jaxtyping import Float32
 
 from tumortrack.core import colours
 from tumortrack.core.colours import Colour
-from tumortrack.core.geometry import rigid, transform_points
+from tumortrack.core.geometry import transform_points
 from tumortrack.core.organ import is_tumor, organ_name
 from tumortrack.core.patient import Patient
 from tumortrack.core.types import Mesh, SensorCloud
@@ -122,18 +122,12 @@ class ResultMessages:
         return out
 
     def _frames(self, result: TrackingResult) -> Any:
-        """A transform to each part, of good estimates only: tf can't mark one as poor. The origin
-        is the centre of the part's box; the axes are the CT's, rotated with the organ, or without a
-        motion the published frame's."""
-        parent, transforms, turn = result.published_frame, [], np.eye(3)
+        """A transform to each part, of good estimates only: tf can't mark one as poor."""
+        parent, transforms = result.published_frame.frame_id, []
         if result.estimate is not None and result.quality == "good":
-            if (motion := result.estimate.report.motion) is not None:
-                turn = (parent.published_from_camera @ np.array(motion.camera_from_ct))[:3, :3]
             for name in result.estimate.meshes:
-                center_mm = result.center_mm(name)
-                assert center_mm is not None
-                pose, child = rigid(turn, center_mm), f"{self._namespace}/{name}"
-                names = parent.frame_id, child
+                pose, names = result.part_pose(name), (parent, f"{self._namespace}/{name}")
+                assert pose is not None
                 transforms.append(transform_fields(self._messages, result.stamp_ns, *names, pose))
         return self._messages.make(TRANSFORMS, transforms=transforms)
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from tumortrack.core.colours import name_colour
 from tumortrack.core.errors import InputError
-from tumortrack.core.geometry import RAS_FROM_LPS, Affine, rigid, transform_points
+from tumortrack.core.geometry import RAS_FROM_LPS, transform_points
 from tumortrack.core.report import FitReport
 from tumortrack.core.types import Mesh
 from tumortrack.live.igtl import message as igtl
@@ -73,11 +73,9 @@ class OpenIgtLinkSink:
     """Per result: STATUS ``tumortrack``, TRANSFORM of each tumor, POINT ``tumors`` (their centres,
     labelled with their uncertainty), and POLYDATA of each part and of each stated margin.
 
-    A tumor's TRANSFORM has its origin at the centre of the tumor's box; its axes are the CT's,
-    rotated with the organ, or, without a motion, those of the published frame. With a motion
-    TRANSFORM ``ct`` is the organ's pose, and vertices of tumors have the scalar ``std_mm``: one
-    standard deviation along the least certain axis. Without an estimate STATUS says why,
-    transforms are the identity with ``TransformStatus`` MISSING, and all else is empty.
+    With a motion TRANSFORM ``ct`` is the organ's pose, and vertices of tumors have the scalar
+    ``std_mm``: one standard deviation along the least certain axis. Without an estimate STATUS says
+    why, transforms are the identity with ``TransformStatus`` MISSING, and all else is empty.
 
     With arms also STATUS ``arms`` (OK: its name is their state; not ready: halted, and why; not
     present: unknown), and a TRANSFORM of each tool tip, named as its shape (``cutter/tip``): from
@@ -149,20 +147,9 @@ class OpenIgtLinkSink:
         yield "STATUS", ARMS_DEVICE, igtl.pack_status(*status), more
 
     def _transforms(self, result: TrackingResult) -> Iterator[_Content]:
-        tumors = self._context.parts[1:]
-        # The organ's pose without its deformation, where the method knows one.
-        motion = None if result.estimate is None else result.estimate.report.motion
-        published_from_ct = None
-        if motion is not None:
-            published_from_camera = result.published_frame.published_from_camera
-            published_from_ct = published_from_camera @ np.array(motion.camera_from_ct)
-        poses: dict[str, Affine | None] = dict.fromkeys(tumors)
+        poses = {name: result.part_pose(name) for name in self._context.parts[1:]}
         if self._context.anatomy_ct is not None:
-            poses[CT] = published_from_ct
-        turn = np.eye(3) if published_from_ct is None else published_from_ct[:3, :3]
-        for name in tumors:
-            if (center_mm := result.center_mm(name)) is not None:
-                poses[name] = rigid(turn, center_mm)
+            poses[CT] = result.published_from_ct
         cell = result.workcell if self._context.arms else None
         shapes = () if cell is None else cell.shapes
         tips = {s.name: s.published_from_shape for s in shapes if s.name.endswith(_TIP)}
