@@ -234,13 +234,9 @@ def messages_seen(
     metres = frame.depth_mm / np.float32(MM_PER_M)
     camera = frame.intrinsics
     k = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]], float)
-    lens: dict[str, Any] = {
-        "k": k.ravel(),
-        "p": np.hstack([k, np.zeros((3, 1))]).ravel(),
-        "r": np.eye(3).ravel(),
-    }
-    lens |= {"d": np.zeros(5), "height": camera.height, "width": camera.width}
-    info = messages.make(CAMERA_INFO, header=header, distortion_model="plumb_bob", **lens)
+    p, size = np.hstack([k, np.zeros((3, 1))]), {"height": camera.height, "width": camera.width}
+    lens = {"distortion_model": "plumb_bob", "d": np.zeros(5), "k": k.ravel(), "p": p.ravel()}
+    info = messages.make(CAMERA_INFO, header=header, r=np.eye(3).ravel(), **size, **lens)
     out = [
         Outgoing("depth/image_rect", IMAGE, _image(metres, "32FC1", header, messages)),
         Outgoing("depth/camera_info", CAMERA_INFO, info),
