@@ -155,7 +155,7 @@ class SourceWorker:
         self.opening = False
         self.trouble = ""
         try:
-            came = time.monotonic()
+            last_s = time.monotonic()
             while not self._stop.is_set():
                 try:
                     got: Observation | TumortrackError | None = source.read(_READ_S)
@@ -164,11 +164,11 @@ class SourceWorker:
                 except (InputError, NoEstimate) as error:
                     got = error
                 if got is not None:
-                    came = time.monotonic()
+                    last_s = time.monotonic()
                     # Read each time: some sources know their clock only from the first frame on.
                     clock = "stamp" if source.host_clock else "arrival"
                     self._put(got, "taking" if source.lossless else clock)
-                elif time.monotonic() - came > _FROZEN_S:
+                elif time.monotonic() - last_s > _FROZEN_S:
                     raise SourceLost(f"no frame for {_FROZEN_S:g} s; the source is opened again")
         finally:
             self._passed, self._source = self.dropped, None

@@ -28,14 +28,14 @@ class Publisher(NamedTuple):
 
 
 class Subscriber:
-    """One topic in, from reliable and best effort publishers alike. The ROS library calls ``came``
+    """One topic in, from reliable and best effort publishers. The ROS library calls ``receive``
     with each message; of more than ``most`` the oldest are lost."""
 
     def __init__(self, most: int) -> None:
         self.lost = 0  # messages that were sent and never taken, as far as known
         self.pending: deque[Any] = deque(maxlen=most)
 
-    def came(self, message: Any) -> None:
+    def receive(self, message: Any) -> None:
         self.lost += len(self.pending) == self.pending.maxlen
         self.pending.append(message)
 

@@ -82,8 +82,8 @@ class RclpyBus:
             durability=durability.TRANSIENT_LOCAL if latched else durability.VOLATILE,
         )
         subscriber = Subscriber(most)
-        came, message_class = subscriber.came, _message_class(kind)
-        self._node.create_subscription(message_class, topic, came, profile, raw=True)
+        receive, message_class = subscriber.receive, _message_class(kind)
+        self._node.create_subscription(message_class, topic, receive, profile, raw=True)
         return subscriber
 
     def types_of(self, topic: str) -> set[str]:

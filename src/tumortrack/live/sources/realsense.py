@@ -79,8 +79,8 @@ class RealSenseSourceConfig(SourceConfig, frozen=True, kw_only=True, tag="realse
         if not devices:
             raise SourceLost("no RealSense is connected. Plug one in, at a USB 3 port.")
         if self.device and self.device not in devices:
-            there = ", ".join(sorted(devices))
-            raise SourceLost(f"no RealSense {self.device!r} is connected; there is {there}.")
+            serials = ", ".join(sorted(devices))
+            raise SourceLost(f"no RealSense {self.device!r} is connected; there is {serials}.")
         return devices[self.device or next(iter(devices))]
 
 
@@ -204,18 +204,18 @@ def _depth_stream(
     rs: ModuleType, device: Any, wanted: RealSenseSourceConfig | None
 ) -> tuple[Any, Any]:
     """The sensor and profile of the depth stream: the only one, or as ``wanted``."""
-    there = [
+    streams = [
         (sensor, profile.as_video_stream_profile())
         for sensor in device.query_sensors()
         for profile in sensor.get_stream_profiles()
         if profile.stream_type() == rs.stream.depth and profile.format() == rs.format.z16
     ]
-    if not there:
+    if not streams:
         raise InputError("the RealSense has no depth stream; choose another camera or recording.")
     if wanted is None:
-        return there[0]
+        return streams[0]
     size = (wanted.width, wanted.height, wanted.fps)
-    modes = {(p.width(), p.height(), p.fps()): (s, p) for s, p in there}
+    modes = {(p.width(), p.height(), p.fps()): (s, p) for s, p in streams}
     if size not in modes:
         listed = ", ".join(f"{w}x{h}@{fps}" for w, h, fps in sorted(modes))
         raise InputError(f"the RealSense has no {size[0]}x{size[1]}@{size[2]}. Allowed: {listed}.")
