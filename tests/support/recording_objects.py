@@ -63,7 +63,7 @@ def write_bag(path: Path, topics: dict[str, list], kind: str) -> Path:
         for stamp_ns, topic, out in sorted(rows, key=lambda row: row[:2]):
             if topic not in connections:
                 connections[topic] = writer.add_connection(
-                    topic, out.message_type, typestore=messages._store
+                    topic, out.message_type, typestore=messages.store
                 )
             writer.write(connections[topic], stamp_ns, messages.to_bytes(out.message))
     return path

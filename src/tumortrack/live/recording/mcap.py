@@ -56,10 +56,8 @@ class McapBag:
         self._last_ns = max(self._last_ns, arrived_ns)
         for topic, message_type, message in out:
             if topic not in self._connections:
-                definition = self._messages.definition(message_type)
-                type_hash = self._messages.type_hash(message_type)
                 self._connections[topic] = self._writer.add_connection(
-                    topic, message_type, msgdef=definition, rihs01=type_hash
+                    topic, message_type, typestore=self._messages.store
                 )
             data = self._messages.to_bytes(message)
             with self._on_disk():

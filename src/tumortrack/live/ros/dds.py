@@ -163,7 +163,7 @@ class DdsBus:
         self, topic: str, kind: str, reliability: Any, durability: Any, most: int
     ) -> tuple[Any, Any]:
         """Topic and QoS of a reader or writer."""
-        user_data = f"typehash={self.messages.type_hash(kind)};".encode()
+        user_data = f"typehash={self.messages.store.hash_rihs01(kind)};".encode()
         encoding = Policy.DataRepresentation(use_cdrv0_representation=True)
         kept = Policy.History.KeepLast(most)
         qos = Qos(reliability, durability, kept, encoding, Policy.Userdata(user_data))
@@ -252,7 +252,8 @@ def ros_name(type_name: str) -> str:
 def idl_type(message_type: str) -> Any:
     """The type as a cyclonedds ``IdlStruct``: final, without a key, as ROS 2 makes it. Cyclone
     validates bytes from the network by it, lengths included."""
-    members = {name: _member(kind) for name, kind in Messages().fields(message_type)}
+    _, fields = Messages().store.fielddefs[message_type]
+    members = {name: _member(kind) for name, kind in fields}
     name = message_type.rsplit("/", 1)[-1]
     return make_idl_struct(f"{name}_", dds_name(message_type), members)
 

@@ -51,18 +51,19 @@ class PointBlock:
 
 
 class Messages:
-    """The message types of one distribution; ROS 2's are the same from Humble to Lyrical."""
+    """The message types of one distribution; ROS 2's are the same from Humble to Lyrical.
+    ``store``: rosbags' typestore of them."""
 
     def __init__(self, distro: Distro = "humble") -> None:
         self._is_ros1 = distro == "noetic"
-        self._store = _store(distro)
+        self.store = _store(distro)
 
     def make(self, message_type: str, **values: Any) -> Any:
         """A message: fields by name, the others empty (0, "", no elements). A dictionary stands for
         a nested message, a list of dictionaries for several. Case does not matter: ROS 1 writes
         ``K`` where ROS 2 writes ``k``."""
-        about = self._store.get_msgdef(message_type)
-        message, _ = about.deserialize_ros1(_ZEROS, 0, about.cls, self._store)
+        about = self.store.get_msgdef(message_type)
+        message, _ = about.deserialize_ros1(_ZEROS, 0, about.cls, self.store)
         fields = {name.lower(): (name, kind) for name, kind in about.fields}
         for given, value in values.items():
             if given.lower() not in fields:
@@ -76,20 +77,16 @@ class Messages:
             setattr(message, name, value)
         return message
 
-    def fields(self, message_type: str) -> list[tuple[str, Any]]:
-        """Names and types of a message type's fields, as rosbags defines them."""
-        return self._store.fielddefs[message_type][1]
-
     def to_bytes(self, message: Any) -> memoryview:
         """As on the wire: CDR with its header in ROS 2, ROS 1's form in Noetic."""
-        write = self._store.serialize_ros1 if self._is_ros1 else self._store.serialize_cdr
+        write = self.store.serialize_ros1 if self._is_ros1 else self.store.serialize_cdr
         return write(message, message.__msgtype__)
 
     def from_bytes(self, data: bytes | memoryview, message_type: str) -> Any:
         """Raises InputError if the bytes are not of that type."""
         from rosbags.serde import SerdeError
 
-        read = self._store.deserialize_ros1 if self._is_ros1 else self._store.deserialize_cdr
+        read = self.store.deserialize_ros1 if self._is_ros1 else self.store.deserialize_cdr
         try:
             return read(data, message_type)
         except KeyError as error:
@@ -99,14 +96,6 @@ class Messages:
                 f"{len(data)} bytes that came are no {message_type} ({error}). Are sender and "
                 "receiver of the same ROS distribution?"
             ) from error
-
-    def definition(self, message_type: str) -> str:
-        """The type's definition for ROS 2, with the types that it contains."""
-        return self._store.generate_msgdef(message_type, ros_version=2)[0]
-
-    def type_hash(self, message_type: str) -> str:
-        """``RIHS01_...`` (REP 2011)."""
-        return self._store.hash_rihs01(message_type)
 
     def header(self, stamp_ns: int, frame_id: str) -> Any:
         """Raises InputError before 1970 or after 2038: beyond 32 bits of seconds."""
