@@ -88,9 +88,8 @@ attack: setup  ## hostile files and calls: each must end in one clear line (3 mi
 fuzz: setup  ## a million damaged inputs over all readers (20 minutes; ARGS="--inputs 60000 --target NAME")
 	$(BIN)/python tests/support/fuzz.py --artifacts $(ARGS)
 
-crash: setup  ## kill -9 at random moments, shortages, two at once (ARGS="--times 20 --only NAME")
+crash: setup  ## kill -9 at random moments, shortages, two at once (ARGS="--times 20 --only NAME ...")
 	$(BIN)/python tests/support/crashes.py runs/crashes $(ARGS)
-	$(BIN)/python tests/support/shortages.py runs/crashes
 
 replay: setup  ## has any number changed since runs/replay.json? Without that file: record it (4 minutes; ARGS=--quick)
 	$(BIN)/python tools/replay.py either runs/replay.json $(ARGS)

@@ -1,125 +1,27 @@
-"""Hostile input: clouds, depth images and intrinsics."""
+"""Hostile input: clouds, depth images, intrinsics and poses."""
 
 from __future__ import annotations
 
 import io
 import json
-import os
 import struct
+import zipfile
 import zlib
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from attack_registry import ATTACKS, FINISH, Attack, Made, attack
+from attack import Make, Room, attacks
+
+CPU = ("--device", "cpu")
 
 
-def ply(points: np.ndarray, head: str = "") -> bytes:
+def ply(points: np.ndarray) -> bytes:
     return (
-        f"ply\nformat binary_little_endian 1.0\nelement vertex {len(points)}\n{head}"
+        f"ply\nformat binary_little_endian 1.0\nelement vertex {len(points)}\n"
         "property float x\nproperty float y\nproperty float z\nend_header\n"
     ).encode() + points.astype("<f4").tobytes()
-
-
-def locate(folder: Path, base: Path, content: np.ndarray | bytes, name: str = "in.ply") -> Made:
-    (folder / name).write_bytes(content if isinstance(content, bytes) else ply(content))
-    return ["locate", base / "model", folder / name, folder / "out", "--device", "cpu"]
-
-
-def seen(base: Path) -> np.ndarray:
-    """A right cloud of the model's organ."""
-    from tumortrack.sense.files import read_cloud
-
-    return np.array(read_cloud(base / "scenes" / "0000" / "cloud.ply")[0].points_mm)
-
-
-def cloud_of(make: Callable[[np.ndarray, np.random.Generator], Any]) -> Attack:
-    return lambda folder, base: locate(
-        folder, base, np.asarray(make(seen(base), np.random.default_rng(0)))
-    )
-
-
-def _ball_surface(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    direction = rng.normal(size=(4000, 3))
-    direction /= np.linalg.norm(direction, axis=1)[:, None]
-    return (points.mean(0) + 35 * direction)[direction[:, 2] < 0]
-
-
-def _one_at_1e30(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    points[5] = 1e30
-    return points
-
-
-def _one_at_1e12(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    points[5, 0] = 1e12
-    return points
-
-
-def _flat(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    return np.column_stack([rng.uniform(-60, 60, (5000, 2)), np.full(5000, 130.0)])
-
-
-ATTACKS |= {
-    "cloud_one_point_at_1e30": cloud_of(_one_at_1e30),
-    "cloud_one_point_at_1e12": cloud_of(_one_at_1e12),
-    "cloud_a_tenth_at_1e6": cloud_of(
-        lambda points, rng: np.concatenate([points, points[::9] * 1e4])
-    ),
-    "cloud_on_a_line_with_strays": cloud_of(
-        lambda points, rng: np.concatenate(
-            [np.outer(rng.uniform(0, 100, 5000), [0.9, 0.1, 0]) + [0, 0, 130], points[:20]]
-        )
-    ),
-    "cloud_in_the_other_byte_order": cloud_of(
-        lambda points, rng: points.astype("<f4").byteswap().view("<f4")
-    ),
-    "cloud_empty": cloud_of(lambda points, rng: points[:0]),
-    "cloud_five_points": cloud_of(lambda points, rng: points[:5]),
-    "cloud_one_point_5000_times": cloud_of(lambda points, rng: np.repeat(points[:1], 5000, 0)),
-    "cloud_all_nan": cloud_of(lambda points, rng: points * np.nan),
-    "cloud_behind_the_camera": cloud_of(lambda points, rng: -points),
-    "cloud_metres": cloud_of(lambda points, rng: points / 1000),
-    "cloud_kilometres_away": cloud_of(lambda points, rng: points + [0, 0, 1e6]),
-    "cloud_on_a_line": cloud_of(
-        lambda points, rng: np.outer(rng.uniform(0, 100, 5000), [0.9, 0.1, 0]) + [0, 0, 130]
-    ),
-    "cloud_on_a_table": cloud_of(_flat),
-    "cloud_of_a_ball": cloud_of(_ball_surface),
-    "cloud_mirrored": cloud_of(lambda points, rng: points * [-1, 1, 1]),
-    "cloud_seen_from_behind": cloud_of(
-        lambda points, rng: (points - points.mean(0)) * [1, -1, -1] + points.mean(0)
-    ),
-    "cloud_of_noise": cloud_of(
-        lambda points, rng: points.mean(0) + rng.uniform(-50, 50, (5000, 3))
-    ),
-    "cloud_stretched_twice": cloud_of(
-        lambda points, rng: (points - points.mean(0)) * [2, 2, 1] + points.mean(0)
-    ),
-}
-FINISH |= {
-    "cloud_of_a_ball",
-    "cloud_mirrored",
-    "cloud_seen_from_behind",
-    "cloud_of_noise",
-    "cloud_stretched_twice",
-    "cloud_one_point_at_1e30",  # dropped, with a note
-    "cloud_one_point_at_1e12",
-    "model_of_endless_points",  # of depth images only, which have fewer
-}
-
-
-for name, head in (
-    ("ply_without_end", "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\n"),
-    ("ply_of_a_billion", "ply\nformat binary_little_endian 1.0\nelement vertex 1000000000\n"),
-    ("ply_of_words", "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\n"
-     "property float z\nend_header\none two three\n"),
-    ("ply_endless_header", "ply\ncomment " + "x" * 3_000_000),
-    ("ply_count_is_a_word", "ply\nformat ascii 1.0\nelement vertex many\nend_header\n"),
-    ("ply_count_of_400_digits", f"ply\nformat ascii 1.0\nelement vertex {'9' * 400}\nend_header\n"),
-):  # fmt: skip
-    ATTACKS[name] = lambda folder, base, h=head: locate(folder, base, h.encode())
 
 
 def pcd(viewpoint: str = "0 0 0 1 0 0 0", count: int = 3) -> bytes:
@@ -129,193 +31,231 @@ def pcd(viewpoint: str = "0 0 0 1 0 0 0", count: int = 3) -> bytes:
     ).encode()
 
 
-@attack
-def _pcd_of_two_billion(folder: Path, base: Path) -> Made:
-    return locate(folder, base, pcd(count=2**31), "in.pcd")
-
-
-@attack
-def _pcd_viewpoint_of_words(folder: Path, base: Path) -> Made:
-    points = seen(base)
-    content = pcd("a b c", len(points)) + points.astype("<f4").tobytes()
-    return locate(folder, base, content, "in.pcd")
-
-
-@attack
-def _pcd_from_another_viewpoint(folder: Path, base: Path) -> Made:
-    points = seen(base)
-    content = pcd("100 0 0 0 1 0 0", len(points)) + points.astype("<f4").tobytes()
-    return locate(folder, base, content, "in.pcd")
-
-
 def npz(**arrays: np.ndarray) -> bytes:
     out = io.BytesIO()
     np.savez_compressed(out, **arrays)
     return out.getvalue()
 
 
-@attack
-def _npz_pickle(folder: Path, base: Path) -> Made:
-    return locate(folder, base, npz(points_mm=np.array([{}], object)), "in.npz")
+def right_points(room: Room) -> np.ndarray:
+    from tumortrack.sense.files import read_cloud
+
+    return np.array(read_cloud(room.cloud)[0].points_mm)
 
 
-@attack
-def _npz_bomb(folder: Path, base: Path) -> Made:
+def file(content: Callable[[], bytes], name: str = "in.ply") -> Make:
+    """`locate` in a file of such content."""
+    return lambda room: ["locate", room.base / "model", room.file(name, content()), room.out, *CPU]
+
+
+def cloud(change: Callable[[np.ndarray, np.random.Generator], Any]) -> Make:
+    """`locate` in a right cloud that was changed."""
+
+    def make(room: Room) -> list[object]:
+        points = np.asarray(change(right_points(room), np.random.default_rng(0)))
+        return file(lambda: ply(points))(room)
+
+    return make
+
+
+def with_right_cloud(*options: object) -> Make:
+    return lambda room: ["locate", room.base / "model", room.cloud, room.out, *options]
+
+
+def _about(change: Callable[[np.ndarray], np.ndarray]) -> Make:
+    """A right cloud changed about its middle."""
+    return cloud(lambda points, rng: change(points - points.mean(0)) + points.mean(0))
+
+
+def _one(where: object, value: float) -> Make:
+    def change(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        points[where] = value
+        return points
+
+    return cloud(change)
+
+
+def _line(rng: np.random.Generator) -> np.ndarray:
+    return np.outer(rng.uniform(0, 100, 5000), [0.9, 0.1, 0]) + [0, 0, 130]
+
+
+def _ball_surface(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    direction = rng.normal(size=(4000, 3))
+    direction /= np.linalg.norm(direction, axis=1)[:, None]
+    return (points.mean(0) + 35 * direction)[direction[:, 2] < 0]
+
+
+def _ply_head(kind: str, count: object, *more: str) -> Make:
+    lines = ["ply", f"format {kind} 1.0", f"element vertex {count}", *more]
+    return file(lambda: "\n".join([*lines, ""]).encode())
+
+
+def _pcd_from(viewpoint: str) -> Make:
+    def make(room: Room) -> list[object]:
+        points = right_points(room)
+        return file(lambda: pcd(viewpoint, len(points)) + points.astype("<f4").tobytes(), "in.pcd")(
+            room
+        )
+
+    return make
+
+
+def _npz_bomb() -> bytes:
     """2 MB that unpack to 2.4 GB."""
-    head = io.BytesIO()
+    head, out = io.BytesIO(), io.BytesIO()
     np.lib.format.write_array_header_1_0(
         head, {"descr": "<f4", "fortran_order": False, "shape": (200_000_000, 3)}
     )
-    import zipfile
-
-    with zipfile.ZipFile(folder / "in.npz", "w", zipfile.ZIP_DEFLATED) as archive:  # noqa: SIM117
-        with archive.open("points_mm.npy", "w", force_zip64=True) as stream:
-            stream.write(head.getvalue())
-            for _ in range(2400):
-                stream.write(bytes(1_000_000))
-    return ["locate", base / "model", folder / "in.npz", folder / "out", "--device", "cpu"]
-
-
-@attack
-def _npz_without_points(folder: Path, base: Path) -> Made:
-    return locate(folder, base, npz(other=np.zeros(3)), "in.npz")
-
-
-@attack
-def _cloud_is_a_fifo(folder: Path, base: Path) -> Made:
-    os.mkfifo(folder / "in.ply")
-    return ["locate", base / "model", folder / "in.ply", folder / "out"]
-
-
-@attack
-def _cloud_without_end(folder: Path, base: Path) -> Made:
-    (folder / "in.ply").symlink_to("/dev/zero")
-    return ["locate", base / "model", folder / "in.ply", folder / "out"]
-
-
-def depth(folder: Path, base: Path, intrinsics: object = None, png: bytes | None = None) -> Made:
-    scene = base / "scenes" / "0000"
-    given = json.loads((scene / "intrinsics.json").read_text())
-    if isinstance(intrinsics, dict):
-        given |= intrinsics
-    text = intrinsics if isinstance(intrinsics, str) else json.dumps(given)
-    (folder / "intrinsics.json").write_text(text)
-    (folder / "in.png").write_bytes((scene / "depth.png").read_bytes() if png is None else png)
-    options = ["--intrinsics", folder / "intrinsics.json", "--device", "cpu"]
-    return ["locate", base / "model", folder / "in.png", folder / "out", *options]
-
-
-for name, change in (
-    ("intrinsics_1e308", {"fx": 1e308}),
-    ("intrinsics_nan", {"fx": float("nan")}),
-    ("intrinsics_zero", {"fx": 0}),
-    ("intrinsics_negative_width", {"width": -848}),
-    ("intrinsics_words", {"fx": "wide"}),
-    ("intrinsics_of_another_size", {"width": 640}),
-    ("intrinsics_infinite_unit", {"depth_unit_mm": 1e300}),
-    ("intrinsics_focal_length_tenfold", {"fx": 6000.0, "fy": 6000.0}),
-    ("intrinsics_axis_far_away", {"cx": 1e6}),
-    ("intrinsics_nested", "[" * 100_000),
-    ("intrinsics_a_list", "[1, 2, 3]"),
-):
-    ATTACKS[name] = lambda folder, base, c=change: depth(folder, base, c)
-
-
-@attack
-def _intrinsics_are_a_fifo(folder: Path, base: Path) -> Made:
-    made = depth(folder, base)
-    (folder / "intrinsics.json").unlink()
-    os.mkfifo(folder / "intrinsics.json")
-    return made
-
-
-@attack
-def _intrinsics_without_end(folder: Path, base: Path) -> Made:
-    made = depth(folder, base)
-    (folder / "intrinsics.json").unlink()
-    (folder / "intrinsics.json").symlink_to("/dev/zero")
-    return made
-
-
-@attack
-def _map_is_a_fifo(folder: Path, base: Path) -> Made:
-    os.mkfifo(folder / "map.csv")
-    cloud = base / "scenes" / "0000" / "cloud.ply"
-    return ["locate", base / "model", cloud, folder / "out", "--map", folder / "map.csv"]
-
-
-@attack
-def _map_at_1e300(folder: Path, base: Path) -> Made:
-    (folder / "map.csv").write_text("x,y,z\n1e300,-1e300,1e300\n")
-    cloud = base / "scenes" / "0000" / "cloud.ply"
-    return ["locate", base / "model", cloud, folder / "out", "--map", folder / "map.csv"]
-
-
-@attack
-def _seed_of_100_bits(folder: Path, base: Path) -> Made:
-    cloud = base / "scenes" / "0000" / "cloud.ply"
-    return ["locate", base / "model", cloud, folder / "out", "--seed", 10**30]
-
-
-def views(folder: Path, base: Path, *poses: object, **changed: object) -> Made:
-    """Two views of a right cloud, from such places."""
-    cloud = base / "scenes" / "0000" / "cloud.ply"
-    given = {"fixed_from_camera": poses, "unit": "mm", "frame_id": "base_link"} | changed
-    (folder / "poses.json").write_text(json.dumps(given))
-    options = ["--poses", folder / "poses.json", "--device", "cpu"]
-    return ["locate", base / "model", cloud, cloud, folder / "out", *options]
-
-
-HERE = np.eye(4).tolist()
-for name, poses in (
-    ("poses_of_one_view", [HERE]),
-    ("poses_nested", [[[HERE]]] * 2),
-    ("poses_mirrored", [HERE, np.diag([1.0, 1, -1, 1]).tolist()]),
-    ("poses_at_1e300", [HERE, [*HERE[:2], [0, 0, 1, 1e300], [0, 0, 0, 1]]]),
-    ("poses_100_m_away", [HERE, [[1, 0, 0, 1e5], *HERE[1:]]]),
-    ("poses_nan", [HERE, [[float("nan")] * 4] * 4]),
-    ("poses_from_behind", [HERE, np.diag([1.0, -1, -1, 1]).tolist()]),
-):
-    ATTACKS[name] = lambda folder, base, p=poses: views(folder, base, *p)
-FINISH.add("poses_from_behind")
-
-
-@attack
-def _poses_are_a_fifo(folder: Path, base: Path) -> Made:
-    made = views(folder, base, HERE, HERE)
-    (folder / "poses.json").unlink()
-    os.mkfifo(folder / "poses.json")
-    return made
+    with (
+        zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as archive,
+        archive.open("points_mm.npy", "w", force_zip64=True) as stream,
+    ):
+        stream.write(head.getvalue())
+        for _ in range(2400):
+            stream.write(bytes(1_000_000))
+    return out.getvalue()
 
 
 def png_of(width: int, height: int, bits: int, data: bytes) -> bytes:
     def chunk(kind: bytes, body: bytes) -> bytes:
-        return (
-            struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
-        )
+        size, checksum = struct.pack(">I", len(body)), struct.pack(">I", zlib.crc32(kind + body))
+        return size + kind + body + checksum
 
     head = struct.pack(">IIBBBBB", width, height, bits, 0, 0, 0, 0)
     return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", data) + chunk(b"IEND", b"")
 
 
-@attack
-def _depth_of_8_bits(folder: Path, base: Path) -> Made:
-    rows = bytes(849) * 480
-    return depth(folder, base, png=png_of(848, 480, 8, zlib.compress(rows)))
+def depth(change: Callable[[bytes], bytes] = bytes, text: str = "", **intrinsics: object) -> Make:
+    """`locate` in a right depth image with changed pixels, or other intrinsics."""
+
+    def make(room: Room) -> list[object]:
+        given = json.loads(room.cloud.with_name("intrinsics.json").read_text()) | intrinsics
+        image = room.file("in.png", change(room.cloud.with_name("depth.png").read_bytes()))
+        written = room.file("intrinsics.json", (text or json.dumps(given)).encode())
+        return ["locate", room.base / "model", image, room.out, "--intrinsics", written, *CPU]
+
+    return make
 
 
-@attack
-def _depth_claims_gigapixels(folder: Path, base: Path) -> Made:
-    return depth(folder, base, png=png_of(60000, 60000, 16, zlib.compress(bytes(10_000_000))))
+def _image(width: int, height: int, bits: int, data: Callable[[], bytes]) -> Make:
+    return depth(lambda _: png_of(width, height, bits, zlib.compress(data())))
 
 
-@attack
-def _depth_cut_short(folder: Path, base: Path) -> Made:
-    whole = (base / "scenes" / "0000" / "depth.png").read_bytes()
-    return depth(folder, base, png=whole[: len(whole) // 2])
+def views(*poses: object) -> Make:
+    """Two views of a right cloud, from such places."""
+
+    def make(room: Room) -> list[object]:
+        given = {"fixed_from_camera": poses, "unit": "mm", "frame_id": "base_link"}
+        file = room.file("poses.json", json.dumps(given).encode())
+        clouds = (room.cloud, room.cloud)
+        return ["locate", room.base / "model", *clouds, room.out, "--poses", file, *CPU]
+
+    return make
 
 
-@attack
-def _depth_all_zero(folder: Path, base: Path) -> Made:
-    rows = bytes(1 + 2 * 848) * 480
-    return depth(folder, base, png=png_of(848, 480, 16, zlib.compress(rows)))
+def _then(make: Make, change: Callable[[Room], object]) -> Make:
+    """What was made, and a file of it replaced."""
+
+    def both(room: Room) -> list[object]:
+        arguments = make(room)
+        change(room)
+        return arguments
+
+    return both
+
+
+def _map_at_1e300(room: Room) -> list[object]:
+    points = room.file("map.csv", b"x,y,z\n1e300,-1e300,1e300\n")
+    return with_right_cloud("--map", points)(room)
+
+
+HERE = np.eye(4).tolist()
+
+ATTACKS = attacks(
+    refused={
+        "cloud_a_tenth_at_1e6": cloud(
+            lambda points, rng: np.concatenate([points, points[::9] * 1e4])
+        ),
+        "cloud_on_a_line_with_strays": cloud(
+            lambda points, rng: np.concatenate([_line(rng), points[:20]])
+        ),
+        "cloud_in_the_other_byte_order": cloud(
+            lambda points, rng: points.astype("<f4").byteswap().view("<f4")
+        ),
+        "cloud_empty": cloud(lambda points, rng: points[:0]),
+        "cloud_five_points": cloud(lambda points, rng: points[:5]),
+        "cloud_one_point_5000_times": cloud(lambda points, rng: np.repeat(points[:1], 5000, 0)),
+        "cloud_all_nan": cloud(lambda points, rng: points * np.nan),
+        "cloud_behind_the_camera": cloud(lambda points, rng: -points),
+        "cloud_metres": cloud(lambda points, rng: points / 1000),
+        "cloud_kilometres_away": cloud(lambda points, rng: points + [0, 0, 1e6]),
+        "cloud_on_a_line": cloud(lambda points, rng: _line(rng)),
+        "cloud_on_a_table": cloud(
+            lambda points, rng: np.insert(rng.uniform(-60, 60, (5000, 2)), 2, 130.0, axis=1)
+        ),
+        "ply_without_end": _ply_head("ascii", 3, "property float x"),
+        "ply_of_a_billion": _ply_head("binary_little_endian", 10**9),
+        "ply_of_words": _ply_head(
+            *("ascii", 1, "property float x", "property float y", "property float z"),
+            *("end_header", "one two three"),
+        ),
+        "ply_endless_header": file(lambda: b"ply\ncomment " + b"x" * 3_000_000),
+        "ply_count_is_a_word": _ply_head("ascii", "many", "end_header"),
+        "ply_count_of_400_digits": _ply_head("ascii", "9" * 400, "end_header"),
+        "pcd_of_two_billion": file(lambda: pcd(count=2**31), "in.pcd"),
+        "pcd_viewpoint_of_words": _pcd_from("a b c"),
+        "pcd_from_another_viewpoint": _pcd_from("100 0 0 0 1 0 0"),
+        "npz_pickle": file(lambda: npz(points_mm=np.array([{}], object)), "in.npz"),
+        "npz_bomb": file(_npz_bomb, "in.npz"),
+        "npz_without_points": file(lambda: npz(other=np.zeros(3)), "in.npz"),
+        "cloud_is_a_fifo": lambda room: [
+            *("locate", room.base / "model", room.fifo("in.ply"), room.out)
+        ],
+        "cloud_without_end": lambda room: [
+            *("locate", room.base / "model", room.endless("in.ply"), room.out)
+        ],
+        "cloud_name_of_300_bytes": lambda room: [
+            *("locate", room.base / "model", "x" * 300 + ".ply", room.out)
+        ],
+        "model_name_of_300_bytes": lambda room: ["locate", "x" * 300, room.cloud, room.out],
+        "intrinsics_1e308": depth(fx=1e308),
+        "intrinsics_nan": depth(fx=float("nan")),
+        "intrinsics_zero": depth(fx=0),
+        "intrinsics_negative_width": depth(width=-848),
+        "intrinsics_words": depth(fx="wide"),
+        "intrinsics_of_another_size": depth(width=640),
+        "intrinsics_infinite_unit": depth(depth_unit_mm=1e300),
+        "intrinsics_focal_length_tenfold": depth(fx=6000.0, fy=6000.0),
+        "intrinsics_axis_far_away": depth(cx=1e6),
+        "intrinsics_nested": depth(text="[" * 100_000),
+        "intrinsics_a_list": depth(text="[1, 2, 3]"),
+        "intrinsics_are_a_fifo": _then(depth(), lambda room: room.fifo("intrinsics.json")),
+        "intrinsics_without_end": _then(depth(), lambda room: room.endless("intrinsics.json")),
+        "depth_of_8_bits": _image(848, 480, 8, lambda: bytes(849) * 480),
+        "depth_claims_gigapixels": _image(60000, 60000, 16, lambda: bytes(10_000_000)),
+        "depth_cut_short": depth(lambda png: png[: len(png) // 2]),
+        "depth_all_zero": _image(848, 480, 16, lambda: bytes(1 + 2 * 848) * 480),
+        "map_is_a_fifo": lambda room: with_right_cloud("--map", room.fifo("map.csv"))(room),
+        "map_at_1e300": _map_at_1e300,
+        "seed_of_100_bits": with_right_cloud("--seed", 10**30),
+        "poses_of_one_view": views(HERE),
+        "poses_nested": views(*[[[HERE]]] * 2),
+        "poses_mirrored": views(HERE, np.diag([1.0, 1, -1, 1]).tolist()),
+        "poses_at_1e300": views(HERE, [*HERE[:2], [0, 0, 1, 1e300], [0, 0, 0, 1]]),
+        "poses_100_m_away": views(HERE, [[1, 0, 0, 1e5], *HERE[1:]]),
+        "poses_nan": views(HERE, [[float("nan")] * 4] * 4),
+        "poses_are_a_fifo": _then(views(HERE, HERE), lambda room: room.fifo("poses.json")),
+    },
+    either={
+        "cloud_one_point_at_1e30": _one(5, 1e30),  # dropped, with a note
+        "cloud_one_point_at_1e12": _one((5, 0), 1e12),
+        "cloud_of_a_ball": cloud(_ball_surface),
+        "cloud_mirrored": cloud(lambda points, rng: points * [-1, 1, 1]),
+        "cloud_seen_from_behind": _about(lambda points: points * [1, -1, -1]),
+        "cloud_of_noise": cloud(
+            lambda points, rng: points.mean(0) + rng.uniform(-50, 50, (5000, 3))
+        ),
+        "cloud_stretched_twice": _about(lambda points: points * [2, 2, 1]),
+        "poses_from_behind": views(HERE, np.diag([1.0, -1, -1, 1]).tolist()),
+    },
+)

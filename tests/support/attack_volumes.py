@@ -8,11 +8,12 @@ import os
 import struct
 import zlib
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 
-from attack_registry import ATTACKS, Made, attack, may_finish, must_finish
+from attack import Make, Room, attacks
+
+NAN = float("nan")
 
 
 def ball(size: int = 40) -> np.ndarray:
@@ -39,50 +40,19 @@ def nifti_header(shape: tuple[int, ...], code: int = 2, bits: int = 8) -> bytear
     return header
 
 
-def volume(folder: Path, change: Callable[[bytearray], None], data: bytes | None = None) -> Made:
-    """`prepare` on a NIfTI ball whose header was changed."""
-    header = nifti_header((60, 60, 60))
-    change(header)
-    (folder / "in.nii").write_bytes(
-        bytes(header) + (ball(60).tobytes("F") if data is None else data)
-    )
-    return ["prepare", folder / "in.nii", folder / "out", "--labels"]
+def file(content: Callable[[], bytes], name: str = "in.nii.gz", *options: object) -> Make:
+    return lambda room: ["prepare", room.file(name, content()), room.out, "--labels", *options]
 
 
-def put(form: str, offset: int, *values: object) -> Callable[[bytearray], None]:
-    return lambda header: struct.pack_into(form, header, offset, *values)
+def header(form: str, offset: int, *values: object) -> Make:
+    """A ball whose header was changed."""
 
+    def content() -> bytes:
+        changed = nifti_header((60, 60, 60))
+        struct.pack_into(form, changed, offset, *values)
+        return bytes(changed) + ball(60).tobytes("F")
 
-@must_finish
-def _nifti_big_endian(folder: Path, base: Path) -> Made:
-    """With the scale that nibabel leaves in headers whose scale it has applied."""
-    import nibabel
-
-    header = nibabel.Nifti1Header(bytes(nifti_header((60, 60, 60), 4, 16)[:348]))
-    header["scl_slope"] = header["scl_inter"] = np.nan
-    content = header.as_byteswapped(">").binaryblock + bytes(4)
-    return packed(folder, gzip.compress(content + ball(60).astype(">i2").tobytes("F")))
-
-
-for name, form, offset, values in (
-    ("nifti_nan_affine", "<f", 280, (float("nan"),)),
-    ("nifti_infinite_origin", "<f", 292, (float("inf"),)),
-    ("nifti_singular_affine", "<4f", 312, (0, 0, 0, 0)),
-    ("nifti_sform_half_of_qform", "<4f", 280, (0.5, 0, 0, 0)),
-    ("nifti_negative_dimension", "<h", 42, (-40,)),
-    ("nifti_claims_more_than_it_holds", "<3h", 42, (4000, 4000, 4000)),
-    ("nifti_complex_numbers", "<hh", 70, (32, 64)),
-    ("nifti_unknown_numbers", "<hh", 70, (77, 8)),
-    ("nifti_data_far_behind", "<f", 108, (1e30,)),
-    ("nifti_data_in_the_header", "<f", 108, (-4.0,)),
-    ("nifti_nan_slope", "<f", 112, (float("nan"),)),
-    ("nifti_five_dimensions", "<8h", 40, (5, 60, 60, 60, 2, 2, 1, 1)),
-    ("nifti_a_plane", "<8h", 40, (2, 60, 60, 1, 1, 1, 1, 1)),
-    ("nifti_header_of_another_size", "<i", 0, (2**31 - 1,)),
-    ("nifti_metres", "<B", 123, (1,)),
-    ("nifti_kilometre_voxels", "<4f", 280, (1e6, 0, 0, 0)),
-):
-    ATTACKS[name] = lambda folder, base, f=form, o=offset, v=values: volume(folder, put(f, o, *v))
+    return file(content, "in.nii")
 
 
 def zipped(head: bytes, megabytes: int, level: int = 1) -> bytes:
@@ -95,248 +65,186 @@ def zipped(head: bytes, megabytes: int, level: int = 1) -> bytes:
     return out.getvalue()
 
 
-def packed(folder: Path, content: bytes, name: str = "in.nii.gz") -> Made:
-    (folder / name).write_bytes(content)
-    return ["prepare", folder / name, folder / "out", "--labels"]
+def labels(make: Callable[[], np.ndarray], *options: object) -> Make:
+    def content() -> bytes:
+        array = make()
+        return gzip.compress(bytes(nifti_header(array.shape)) + array.tobytes("F"), 1)
+
+    return file(content, "in.nii.gz", *options)
 
 
-@attack
-def _gzip_cut_short(folder: Path, base: Path) -> Made:
+def _cut_short() -> bytes:
     whole = gzip.compress(bytes(nifti_header((40, 40, 40))) + ball().tobytes("F"))
-    return packed(folder, whole[: len(whole) // 2])
+    return whole[: len(whole) // 2]
 
 
-@attack
-def _gzip_of_other_content(folder: Path, base: Path) -> Made:
+def _of_other_content() -> bytes:
     """Voxels zeroed and the checksum of what was there before: only reading to the end tells."""
     voxels = ball(60)
     head = bytes(nifti_header((60, 60, 60)))
     whole = head + voxels.tobytes("F")
     voxels[:, :, 55:] = 0
     voxels[10:13, 30, 30] = 0
-    changed = head + voxels.tobytes("F")
-    stream = gzip.compress(changed)
-    return packed(folder, stream[:-8] + struct.pack("<II", zlib.crc32(whole), len(whole)))
+    stream = gzip.compress(head + voxels.tobytes("F"))
+    return stream[:-8] + struct.pack("<II", zlib.crc32(whole), len(whole))
 
 
-@attack
-def _gzip_goes_on(folder: Path, base: Path) -> Made:
-    """A whole volume, and 2 GB behind it."""
-    whole = bytes(nifti_header((60, 60, 60))) + ball(60).tobytes("F")
-    return packed(folder, zipped(whole, 2000))
+def _extended(offset: float, size: int, zeros_mb: int) -> bytes:
+    """An extension of the header of such a size, before the data at such an offset."""
+    changed = nifti_header((60, 60, 60))
+    struct.pack_into("<f", changed, 108, offset)
+    changed[348] = 1
+    return zipped(bytes(changed) + struct.pack("<ii", size, 6), zeros_mb)
 
 
-@attack
-def _gzip_unpacks_to_4_gb(folder: Path, base: Path) -> Made:
-    """4 MB of 64-bit zeros within all limits of shape."""
-    return packed(folder, zipped(bytes(nifti_header((1000, 1000, 500), 64, 64)), 4000, 9))
+def _big_endian() -> bytes:
+    """With the scale that nibabel leaves in headers whose scale it has applied."""
+    import nibabel
+
+    native = nibabel.Nifti1Header(bytes(nifti_header((60, 60, 60), 4, 16)[:348]))
+    native["scl_slope"] = native["scl_inter"] = np.nan
+    content = native.as_byteswapped(">").binaryblock + bytes(4)
+    return gzip.compress(content + ball(60).astype(">i2").tobytes("F"))
 
 
-@attack
-def _gzip_extension_of_size_7(folder: Path, base: Path) -> Made:
-    """An extension of the header too short for its own head, before 2 GB."""
-    header = nifti_header((60, 60, 60))
-    struct.pack_into("<f", header, 108, 1024.0)
-    header[348] = 1
-    return packed(folder, zipped(bytes(header) + struct.pack("<ii", 7, 6), 2000))
+def _noise(size: int, labels: tuple[int, int], margin: int) -> np.ndarray:
+    noise = np.random.default_rng(0).integers(*labels, (size,) * 3, dtype=np.uint8)
+    return np.pad(noise, margin)
 
 
-@attack
-def _gzip_bomb(folder: Path, base: Path) -> Made:
-    """7 MB that unpack to 7 GB."""
-    return packed(folder, zipped(bytes(nifti_header((2000, 2000, 1800))), 1800 * 4, 9))
-
-
-@attack
-def _gzip_header_extension(folder: Path, base: Path) -> Made:
-    """An extension of the header that claims 2 GB."""
-    header = nifti_header((40, 40, 40))
-    struct.pack_into("<f", header, 108, 2.0e9)
-    header[348] = 1
-    extension = struct.pack("<ii", 1_999_999_632, 6)
-    return packed(folder, gzip.compress(bytes(header) + extension + bytes(5_000_000)))
-
-
-@attack
-def _labels_of_noise(folder: Path, base: Path) -> Made:
-    """Thousands of pieces."""
-    noise = np.random.default_rng(0).integers(0, 3, (128, 128, 128), dtype=np.uint8)
-    labels = np.pad(noise, 4)
-    return packed(folder, gzip.compress(bytes(nifti_header(labels.shape)) + labels.tobytes("F")))
-
-
-@attack
-def _labels_of_255_noises(folder: Path, base: Path) -> Made:
-    """Every voxel another tumor."""
-    noise = np.random.default_rng(0).integers(1, 256, (130, 130, 130), dtype=np.uint8)
-    labels = np.pad(noise, 8)
-    return packed(folder, gzip.compress(bytes(nifti_header(labels.shape)) + labels.tobytes("F"), 1))
-
-
-@attack
-def _labels_of_2000_tumors(folder: Path, base: Path) -> Made:
+def _2000_tumors() -> np.ndarray:
     """Cubes of half a ml on a lattice beside the kidney."""
-    labels = np.zeros((200, 200, 200), np.uint8)
-    labels[:60, :60, :60] = ball(60)
-    one = np.zeros((12, 12, 12), np.uint8)
-    one[:8, :8, :8] = 2
-    labels[:192, :192, 80:176] = np.tile(one, (16, 16, 8))
-    return packed(folder, gzip.compress(bytes(nifti_header(labels.shape)) + labels.tobytes("F"), 1))
+    array = np.zeros((200, 200, 200), np.uint8)
+    array[:60, :60, :60] = ball(60)
+    tumor = np.zeros((12, 12, 12), np.uint8)
+    tumor[:8, :8, :8] = 2
+    array[:192, :192, 80:176] = np.tile(tumor, (16, 16, 8))
+    return array
 
 
-@attack
-def _labels_of_sparse_dots(folder: Path, base: Path) -> Made:
+def _sparse_dots() -> np.ndarray:
     """A kidney, and every eighth voxel about it a piece of its own."""
-    labels = np.zeros((256, 256, 256), np.uint8)
-    labels[1::2, 1::2, 1::2] = 2
-    labels[100:160, 100:160, 100:160] = 0
-    labels[100:160, 100:160, 100:160] = ball(60)
-    made = packed(folder, gzip.compress(bytes(nifti_header(labels.shape)) + labels.tobytes("F"), 1))
-    return [*made, "--min-tumor-ml", 0]
+    array = np.zeros((256, 256, 256), np.uint8)
+    array[1::2, 1::2, 1::2] = 2
+    array[100:160, 100:160, 100:160] = ball(60)
+    return array
 
 
-@attack
-def _labels_of_fractions(folder: Path, base: Path) -> Made:
-    header = nifti_header((40, 40, 40), 16, 32)
-    return packed(folder, gzip.compress(bytes(header) + (ball() * 0.5).astype("<f4").tobytes("F")))
+def _tumor_round_the_organ() -> np.ndarray:
+    array = 2 * ball(60)
+    array[28:32, 28:32, 28:32] = 1
+    return array
 
 
-@attack
-def _labels_all_one(folder: Path, base: Path) -> Made:
-    """The organ fills the volume: there is no surface in it."""
-    return volume(folder, lambda header: None, np.ones(60**3, np.uint8).tobytes())
+def _fractions() -> bytes:
+    values = (ball() * 0.5).astype("<f4").tobytes("F")
+    return gzip.compress(bytes(nifti_header((40, 40, 40), 16, 32)) + values)
 
 
-@attack
-def _labels_all_zero(folder: Path, base: Path) -> Made:
-    return volume(folder, lambda header: None, bytes(60**3))
-
-
-@attack
-def _labels_tumor_round_the_organ(folder: Path, base: Path) -> Made:
-    """The tumor encloses the kidney."""
-    labels = 2 * ball(60)
-    labels[28:32, 28:32, 28:32] = 1
-    return volume(folder, lambda header: None, labels.tobytes("F"))
-
-
-def nrrd(folder: Path, lines: str, data: bytes = b"") -> Made:
-    (folder / "in.nrrd").write_bytes(f"NRRD0004\n{lines}\n\n".encode() + data)
-    return ["prepare", folder / "in.nrrd", folder / "out", "--labels"]
-
-
-_SPACE = (
-    "space: left-posterior-superior\nspace directions: (1,0,0) (0,1,0) (0,0,1)\nspace origin: "
-    "(0,0,0)\n"
+SPACE = (
+    "space: left-posterior-superior\nspace directions: (1,0,0) (0,1,0) (0,0,1)\n"
+    "space origin: (0,0,0)\n"
 )
 
 
-@attack
-def _nrrd_two_dimensions_three_sizes(folder: Path, base: Path) -> Made:
-    head = f"type: uint8\ndimension: 2\nsizes: 40 40 40\n{_SPACE}encoding: raw"
-    return nrrd(folder, head, ball().tobytes("F"))
+def nrrd(sizes: str, more: str, data: bytes = b"", dimension: int = 3, space: str = SPACE) -> bytes:
+    head = f"type: uint8\ndimension: {dimension}\nsizes: {sizes}\n{space}{more}"
+    return f"NRRD0004\n{head}\n\n".encode() + data
 
 
-@attack
-def _nrrd_gzip_of_other_content(folder: Path, base: Path) -> Made:
-    head = f"type: uint8\ndimension: 3\nsizes: 60 60 60\n{_SPACE}encoding: gzip"
-    stream = gzip.compress(ball(60).tobytes("F"))
-    return nrrd(folder, head, stream[:-8] + b"\0" * 8)
+def nrrd_file(*arguments: object, **more: object) -> Make:
+    return file(lambda: nrrd(*arguments, **more), "in.nrrd")  # type: ignore[arg-type]
 
 
-@attack
-def _nrrd_detached_data(folder: Path, base: Path) -> Made:
-    (folder / "secret.raw").write_bytes(ball().tobytes("F"))
-    head = f"type: uint8\ndimension: 3\nsizes: 40 40 40\n{_SPACE}encoding: raw"
-    return nrrd(folder, head + "\ndata file: secret.raw")
+def _detached_data(room: Room) -> list[object]:
+    room.file("secret.raw", ball().tobytes("F"))
+    return nrrd_file("40 40 40", "encoding: raw\ndata file: secret.raw")(room)
 
 
-@attack
-def _nrrd_claims_terabytes(folder: Path, base: Path) -> Made:
-    return nrrd(
-        folder, f"type: uint8\ndimension: 3\nsizes: 30000 30000 30000\n{_SPACE}encoding: raw"
-    )
+def _target(*names: str) -> Make:
+    """A right volume, and a folder that cannot be made."""
+    return lambda room: [*header("<B", 123, 2)(room)[:2], room.folder.joinpath(*names), "--labels"]
 
 
-@attack
-def _nrrd_nan_directions(folder: Path, base: Path) -> Made:
-    head = "type: uint8\ndimension: 3\nsizes: 40 40 40\nspace: left-posterior-superior\n"
-    head += "space directions: (nan,0,0) (0,1,0) (0,0,1)\nspace origin: (0,0,0)\nencoding: raw"
-    return nrrd(folder, head, ball().tobytes("F"))
-
-
-@attack
-def _nrrd_unknown_encoding(folder: Path, base: Path) -> Made:
-    return nrrd(folder, f"type: uint8\ndimension: 3\nsizes: 4 4 4\n{_SPACE}encoding: zstd")
-
-
-@attack
-def _mha_names_another_file(folder: Path, base: Path) -> Made:
-    (folder / "in.mha").write_text(
-        "ObjectType = Image\nNDims = 3\nBinaryData = True\nDimSize = 40 40 40\n"
-        "ElementType = MET_UCHAR\nElementDataFile = /etc/passwd\n"
-    )
-    return ["prepare", folder / "in.mha", folder / "out", "--labels"]
-
-
-@attack
-def _volume_is_a_fifo(folder: Path, base: Path) -> Made:
-    os.mkfifo(folder / "in.nii.gz")
-    return ["prepare", folder / "in.nii.gz", folder / "out"]
-
-
-@attack
-def _volume_without_end(folder: Path, base: Path) -> Made:
-    (folder / "in.nii").symlink_to("/dev/zero")
-    return ["prepare", folder / "in.nii", folder / "out"]
-
-
-@attack
-def _volume_is_text(folder: Path, base: Path) -> Made:
-    return packed(folder, b"no volume at all", "in.nii")
-
-
-@attack
-def _volume_is_empty(folder: Path, base: Path) -> Made:
-    return packed(folder, b"")
-
-
-@attack
-def _volume_is_missing(folder: Path, base: Path) -> Made:
-    return ["prepare", folder / "nothing.nii.gz", folder / "out"]
-
-
-@attack
-def _name_of_300_bytes(folder: Path, base: Path) -> Made:
-    return ["prepare", folder / ("x" * 300 + ".nii"), folder / "out"]
-
-
-@attack
-def _target_of_300_bytes(folder: Path, base: Path) -> Made:
-    made = volume(folder, lambda header: None)
-    return [*made[:2], folder / ("x" * 300), "--labels"]
-
-
-@may_finish
-def _name_in_latin1(folder: Path, base: Path) -> Made:
+def _names_in_latin1(room: Room) -> list[object]:
     """Names that are no UTF-8, of input and target: used as they are, or refused."""
-    made = volume(folder, lambda header: None)
-    other = folder / os.fsdecode(b"sch\xf6n.nii")
-    Path(str(made[1])).rename(other)
-    return ["prepare", other, folder / os.fsdecode(b"f\xfcr"), "--labels"]
+    _, volume, _, labels = header("<B", 123, 2)(room)
+    other = room.folder / os.fsdecode(b"sch\xf6n.nii")
+    os.rename(str(volume), other)
+    return ["prepare", other, room.folder / os.fsdecode(b"f\xfcr"), labels]
 
 
-@attack
-def _model_name_of_300_bytes(folder: Path, base: Path) -> Made:
-    return ["locate", "x" * 300, base / "scenes" / "0000" / "cloud.ply", folder / "out"]
-
-
-@attack
-def _cloud_name_of_300_bytes(folder: Path, base: Path) -> Made:
-    return ["locate", base / "model", "x" * 300 + ".ply", folder / "out"]
-
-
-@attack
-def _target_below_a_file(folder: Path, base: Path) -> Made:
-    made = volume(folder, lambda header: None)
-    return [*made[:2], folder / "in.nii" / "out", "--labels"]
+ATTACKS = attacks(
+    refused={
+        "nifti_nan_affine": header("<f", 280, NAN),
+        "nifti_infinite_origin": header("<f", 292, float("inf")),
+        "nifti_singular_affine": header("<4f", 312, 0, 0, 0, 0),
+        "nifti_sform_half_of_qform": header("<4f", 280, 0.5, 0, 0, 0),
+        "nifti_negative_dimension": header("<h", 42, -40),
+        "nifti_claims_more_than_it_holds": header("<3h", 42, 4000, 4000, 4000),
+        "nifti_complex_numbers": header("<hh", 70, 32, 64),
+        "nifti_unknown_numbers": header("<hh", 70, 77, 8),
+        "nifti_data_far_behind": header("<f", 108, 1e30),
+        "nifti_data_in_the_header": header("<f", 108, -4.0),
+        "nifti_nan_slope": header("<f", 112, NAN),
+        "nifti_five_dimensions": header("<8h", 40, 5, 60, 60, 60, 2, 2, 1, 1),
+        "nifti_a_plane": header("<8h", 40, 2, 60, 60, 1, 1, 1, 1, 1),
+        "nifti_header_of_another_size": header("<i", 0, 2**31 - 1),
+        "nifti_metres": header("<B", 123, 1),
+        "nifti_kilometre_voxels": header("<4f", 280, 1e6, 0, 0, 0),
+        "gzip_cut_short": file(_cut_short),
+        "gzip_of_other_content": file(_of_other_content),
+        # A whole volume, and 2 GB behind it.
+        "gzip_goes_on": file(
+            lambda: zipped(bytes(nifti_header((60, 60, 60))) + ball(60).tobytes("F"), 2000)
+        ),
+        # 4 MB of 64-bit zeros within all limits of shape.
+        "gzip_unpacks_to_4_gb": file(
+            lambda: zipped(bytes(nifti_header((1000, 1000, 500), 64, 64)), 4000, 9)
+        ),
+        # Too short for its own head, before 2 GB.
+        "gzip_extension_of_size_7": file(lambda: _extended(1024.0, 7, 2000)),
+        # 7 MB that unpack to 7 GB.
+        "gzip_bomb": file(lambda: zipped(bytes(nifti_header((2000, 2000, 1800))), 1800 * 4, 9)),
+        # It claims 2 GB.
+        "gzip_header_extension": file(lambda: _extended(2.0e9, 1_999_999_632, 5)),
+        "labels_of_noise": labels(lambda: _noise(128, (0, 3), 4)),  # thousands of pieces
+        "labels_of_255_noises": labels(lambda: _noise(130, (1, 256), 8)),  # as many tumors
+        "labels_of_2000_tumors": labels(_2000_tumors),
+        "labels_of_sparse_dots": labels(_sparse_dots, "--min-tumor-ml", 0),
+        "labels_of_fractions": file(_fractions),
+        # The organ fills the volume: there is no surface in it.
+        "labels_all_one": labels(lambda: np.ones((60, 60, 60), np.uint8)),
+        "labels_all_zero": labels(lambda: np.zeros((60, 60, 60), np.uint8)),
+        "labels_tumor_round_the_organ": labels(_tumor_round_the_organ),
+        "nrrd_two_dimensions_three_sizes": nrrd_file(
+            "40 40 40", "encoding: raw", ball().tobytes("F"), dimension=2
+        ),
+        "nrrd_gzip_of_other_content": nrrd_file(
+            "60 60 60", "encoding: gzip", gzip.compress(ball(60).tobytes("F"))[:-8] + bytes(8)
+        ),
+        "nrrd_detached_data": _detached_data,
+        "nrrd_claims_terabytes": nrrd_file("30000 30000 30000", "encoding: raw"),
+        "nrrd_nan_directions": nrrd_file(
+            *("40 40 40", "encoding: raw", ball().tobytes("F")), space=SPACE.replace("(1", "(nan")
+        ),
+        "nrrd_unknown_encoding": nrrd_file("4 4 4", "encoding: zstd"),
+        "mha_names_another_file": file(
+            lambda: (
+                b"ObjectType = Image\nNDims = 3\nBinaryData = True\nDimSize = 40 40 40\n"
+                b"ElementType = MET_UCHAR\nElementDataFile = /etc/passwd\n"
+            ),
+            "in.mha",
+        ),
+        "volume_is_a_fifo": lambda room: ["prepare", room.fifo("in.nii.gz"), room.out],
+        "volume_without_end": lambda room: ["prepare", room.endless("in.nii"), room.out],
+        "volume_is_text": file(lambda: b"no volume at all", "in.nii"),
+        "volume_is_empty": file(lambda: b""),
+        "volume_is_missing": lambda room: ["prepare", room.folder / "nothing.nii.gz", room.out],
+        "name_of_300_bytes": lambda room: ["prepare", room.folder / ("x" * 300 + ".nii"), room.out],
+        "target_of_300_bytes": _target("x" * 300),
+        "target_below_a_file": _target("in.nii", "out"),
+    },
+    either={"name_in_latin1": _names_in_latin1},
+    read={"nifti_big_endian": file(_big_endian)},
+)

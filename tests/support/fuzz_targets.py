@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import gzip
 import io
 import json
 import shutil
 import tempfile
+import zlib
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
 
 Read = Callable[[bytes], object]
 Target = tuple[list[bytes], Read]
+TURN = [[0, -1, 0, 0.4], [-1, 0, 0, 0.1], [0, 0, -1, 0.7], [0, 0, 0, 1]]
 
 
 def scratch() -> Path:
@@ -21,18 +25,44 @@ def scratch() -> Path:
     return Path(tempfile.mkdtemp(dir="/dev/shm" if Path("/dev/shm").is_dir() else None))
 
 
-def of_file(suffix: str, read: Callable[[Path], object]) -> Read:
-    """A reader of files as one of bytes."""
-    path = scratch() / f"in{suffix}"
+def of_file(read: Callable[[Path], object], name: str, *seeds: bytes | str | object) -> Target:
+    """A reader of files, with their contents: bytes, text, or what JSON is made of."""
+    path = scratch() / name
 
     def of_bytes(content: bytes) -> object:
         path.write_bytes(content)
         return read(path)
 
-    return of_bytes
+    return [_bytes(seed) for seed in seeds], of_bytes
 
 
-def _cloud_files() -> dict[str, Target]:
+def _bytes(seed: object) -> bytes:
+    if isinstance(seed, bytes):
+        return seed
+    return (seed if isinstance(seed, str) else json.dumps(seed)).encode()
+
+
+def of_member(read: Callable[[Path], object], folder: Path, name: str) -> Target:
+    """One file of a folder that is read; what an artifact's manifest says of it is made true."""
+    from tumortrack.core import store
+
+    copy = scratch() / folder.name
+    shutil.copytree(folder, copy)
+    content = (copy / name).read_bytes()
+    sealed = copy / store.MANIFEST
+    manifest = json.loads(sealed.read_text()) if sealed.is_file() and name != sealed.name else None
+
+    def of_bytes(changed: bytes) -> object:
+        (copy / name).write_bytes(changed)
+        if manifest is not None and name in manifest["files"]:
+            manifest["files"][name] = store.sha256_of(copy / name)
+            sealed.write_text(json.dumps(manifest))
+        return read(copy)
+
+    return [content], of_bytes
+
+
+def _clouds() -> dict[str, Target]:
     from attack_clouds import npz, pcd, ply
     from tumortrack.sense.files import read_cloud
 
@@ -40,56 +70,47 @@ def _cloud_files() -> dict[str, Target]:
     rows = "\n".join(" ".join(map(str, row)) for row in points[:5])
     text = ply(points[:5]).split(b"end_header")[0].replace(b"binary_little_endian", b"ascii")
     return {
-        "ply": (
-            [ply(points), text + b"end_header\n" + rows.encode()],
-            of_file(".ply", read_cloud),
-        ),
-        "pcd": ([pcd(count=40) + points.tobytes()], of_file(".pcd", read_cloud)),
-        "npz": ([npz(points_mm=points)], of_file(".npz", read_cloud)),
+        "ply": of_file(read_cloud, "in.ply", ply(points), text + b"end_header\n" + rows.encode()),
+        "pcd": of_file(read_cloud, "in.pcd", pcd(count=40) + points.tobytes()),
+        "npz": of_file(read_cloud, "in.npz", npz(points_mm=points)),
     }
 
 
 def _images() -> dict[str, Target]:
-    import zlib
-
     from attack_clouds import png_of
     from stereo_objects import endoscope
     from tumortrack.sense.files import read_depth_png, read_intrinsics
     from tumortrack.sense.stereo import read_calibration
 
-    stereo = msgspec.json.encode(endoscope())
     yaml = (
-        b"%YAML:1.0\n---\nK1: !!opencv-matrix\n   rows: 1\n   cols: 1\n   dt: d\n   data: [ 1. ]\n"
+        "%YAML:1.0\n---\nK1: !!opencv-matrix\n   rows: 1\n   cols: 1\n   dt: d\n   data: [ 1. ]\n"
     )
     camera = {"width": 16, "height": 12, "fx": 10.0, "fy": 10.0, "cx": 8, "cy": 6}
-    text = json.dumps({**camera, "depth_unit_mm": 0.1}).encode()
+    camera["depth_unit_mm"] = 0.1
     intrinsics = scratch() / "intrinsics.json"
-    intrinsics.write_bytes(text)
+    intrinsics.write_text(json.dumps(camera))
     png = png_of(16, 12, 16, zlib.compress(bytes(33 * 12)))
     return {
-        "intrinsics": ([text], of_file(".json", read_intrinsics)),
-        "stereo calibration": ([stereo, yaml], of_file(".yaml", read_calibration)),
-        "depth image": ([png], of_file(".png", lambda path: read_depth_png(path, intrinsics))),
+        "intrinsics": of_file(read_intrinsics, "in.json", camera),
+        "stereo calibration": of_file(
+            read_calibration, "in.yaml", msgspec.json.encode(endoscope()), yaml
+        ),
+        "depth image": of_file(lambda path: read_depth_png(path, intrinsics), "in.png", png),
     }
 
 
 def _volumes() -> dict[str, Target]:
-    import gzip
-
-    from attack_volumes import ball, nifti_header
+    from attack_volumes import ball, nifti_header, nrrd
     from tumortrack.imaging.volume import read_raw
 
-    nifti = bytes(nifti_header((12, 12, 12))) + ball(12).tobytes("F")
-    head = (
-        "NRRD0004\ntype: uint8\ndimension: 3\nsizes: 12 12 12\nspace: left-posterior-superior\n"
-        "space directions: (1,0,0) (0,1,0) (0,0,1)\nspace origin: (0,0,0)\nencoding: "
-    )
-    raw = f"{head}raw\n\n".encode() + ball(12).tobytes("F")
-    packed = f"{head}gzip\n\n".encode() + gzip.compress(ball(12).tobytes("F"), mtime=0)
+    voxels = ball(12).tobytes("F")
+    nifti = bytes(nifti_header((12, 12, 12))) + voxels
+    raw = nrrd("12 12 12", "encoding: raw", voxels)
+    packed = nrrd("12 12 12", "encoding: gzip", gzip.compress(voxels, mtime=0))
     return {
-        "nifti": ([nifti], of_file(".nii", read_raw)),
-        "nifti.gz": ([gzip.compress(nifti, mtime=0)], of_file(".nii.gz", read_raw)),
-        "nrrd": ([raw, packed], of_file(".nrrd", read_raw)),
+        "nifti": of_file(read_raw, "in.nii", nifti),
+        "nifti.gz": of_file(read_raw, "in.nii.gz", gzip.compress(nifti, mtime=0)),
+        "nrrd": of_file(read_raw, "in.nrrd", raw, packed),
     }
 
 
@@ -102,38 +123,30 @@ def _dicom() -> dict[str, Target]:
     from tumortrack.imaging.dicom import read_dicom
     from tumortrack.phantom.dicom import write_dicom_series
 
+    def read(folder: Path) -> object:
+        return read_dicom(folder, "1")
+
     series = scratch() / "ct"
     hu = np.zeros((12, 12, 12), np.float32)
     write_dicom_series(Volume(hu, np.diag([1.0, 1.0, 1.0, 1.0])), series)
-    first = sorted(series.iterdir())[0]
-    content = first.read_bytes()
-
-    def of_slice(path: Path) -> Read:
-        def read(changed: bytes) -> object:
-            path.write_bytes(changed)
-            return read_dicom(path.parent, "1")
-
-        return read
-
-    def of_frame(slice_: pydicom.Dataset, read: Read) -> Read:
-        """Of the compressed picture in a slice whose tags are as they were."""
-
-        def read_frame(changed: bytes) -> object:
-            slice_.PixelData = encapsulate([changed.ljust(8, b"\0")])
-            slice_.save_as(stream := io.BytesIO())
-            return read(stream.getvalue())
-
-        return read_frame
-
-    targets: dict[str, Target] = {"dicom slice": ([content], of_slice(first))}
+    first = min(series.iterdir())
+    targets = {"dicom slice": of_member(read, series, first.name)}
     hu = np.random.default_rng(0).integers(0, 100, (24, 24, 2)).cumsum(0).astype("<i2")
     for syntax in ("rle", "jpeg lossless", "jpeg-ls", "jpeg 2000"):
         paths = write_slices(scratch(), hu, 12)
         for path in paths:
             packed(path, syntax)
         slice_ = pydicom.dcmread(paths[0])
+
+        def of_frame(changed: bytes, path: Path = paths[0], slice_: Any = slice_) -> object:
+            """The compressed picture in a slice whose tags are as they were."""
+            slice_.PixelData = encapsulate([changed.ljust(8, b"\0")])
+            slice_.save_as(stream := io.BytesIO())
+            path.write_bytes(stream.getvalue())
+            return read(path.parent)
+
         frame = get_frame(slice_.PixelData, 0, number_of_frames=1)
-        targets[f"dicom {syntax}"] = ([frame], of_frame(slice_, of_slice(paths[0])))
+        targets[f"dicom {syntax}"] = [frame], of_frame
     return targets
 
 
@@ -143,16 +156,12 @@ def _meshes() -> dict[str, Target]:
 
     small = sphere(30.0)
     return {
-        f"mesh {kind}": (
-            [(made if isinstance(made, bytes) else made.encode())],
-            of_file(f".{kind}", read_mesh),
-        )
+        f"mesh {kind}": of_file(read_mesh, f"in.{kind}", small.export(file_type=kind))
         for kind in ("stl", "ply", "obj")
-        for made in [small.export(file_type=kind)]
     }
 
 
-def _artifacts() -> dict[str, Target]:
+def _tables() -> dict[str, Target]:
     from tumortrack.core.store import read_json
     from tumortrack.tracking.points import read_points
 
@@ -161,101 +170,73 @@ def _artifacts() -> dict[str, Target]:
     head = (
         "# Markups fiducial file version = 4.11\n# CoordinateSystem = LPS\n# columns = id,x,y,z\n"
     )
-    fcsv = f"{head}1,1,2,3,0,0,0,1,1,1,0,a,,\n".encode()
     return {
-        "json": ([json.dumps({"a": [1, 2, {"b": "c"}]}).encode()], of_file(".json", read_json)),
-        "points csv": ([b"x,y,z\n1,2,3\n4,5,6\n"], of_file(".csv", read_points)),
-        "markups": ([json.dumps(markups).encode()], of_file(".mrk.json", read_points)),
-        "fcsv": ([fcsv], of_file(".fcsv", read_points)),
+        "json": of_file(read_json, "in.json", {"a": [1, 2, {"b": "c"}]}),
+        "points csv": of_file(read_points, "in.csv", "x,y,z\n1,2,3\n4,5,6\n"),
+        "markups": of_file(read_points, "in.mrk.json", markups),
+        "fcsv": of_file(read_points, "in.fcsv", f"{head}1,1,2,3,0,0,0,1,1,1,0,a,,\n"),
     }
 
 
-def _texts() -> dict[str, Target]:
+def _command_line() -> dict[str, Target]:
     from tumortrack.live.spec import SINKS, SOURCES
 
-    def text(parse: Callable[[str], object]) -> Read:
-        return lambda data: parse(data.decode("utf-8", "replace"))
+    def text(parse: Callable[[str], object], *seeds: bytes) -> Target:
+        return [*seeds], lambda data: parse(data.decode("utf-8", "replace"))
 
+    sources = (b"ros2:/camera/depth?mask=/mask", b"virtual:case?fps=20", b"recording:a?rate=2")
     return {
-        "source": (
-            [b"ros2:/camera/depth?mask=/mask", b"virtual:case?fps=20", b"recording:a?rate=2"],
-            text(SOURCES.parse),
-        ),
-        "sink": ([b"viewer:8080", b"ur:1.2.3.4?arm=cutter&gain=300"], text(SINKS.parse)),
+        "source": text(SOURCES.parse, *sources),
+        "sink": text(SINKS.parse, b"viewer:8080", b"ur:1.2.3.4?arm=cutter&gain=300"),
     }
 
 
 def _wire() -> dict[str, Target]:
-    from tumortrack.live.igtl.message import (
-        HEADER_SIZE,
-        Message,
-        check_body,
-        pack,
-        unpack_header,
-    )
+    from tumortrack.live.igtl.message import HEADER_SIZE, Message, check_body, pack, unpack_header
+    from tumortrack.live.ros import sensors
     from tumortrack.live.ros.messages import Messages
-    from tumortrack.live.ros.sensors import CLOUD, IMAGE, cloud_of
 
     def igtl(data: bytes) -> None:
         check_body(unpack_header(data[:HEADER_SIZE]), data[HEADER_SIZE:])
 
-    made: dict[str, Target] = {
+    def read_image(message: Any) -> object:
+        return sensors._pixels(message, {"16UC1": "u2"}, "a depth image")  # type: ignore[attr-defined]
+
+    def read_info(message: Any) -> object:
+        return sensors._intrinsics_of(message, False)  # type: ignore[attr-defined]
+
+    targets: dict[str, Target] = {
         "openigtlink": ([pack(Message("STATUS", "x", 10**18, b"abc", {"k": "v"}))], igtl)
     }
+    points = np.random.default_rng(0).random((20, 3)).astype("<f4").view(np.uint8).reshape(-1)
+    camera = np.array([5.0, 0, 4, 0, 5, 3, 0, 0, 1])
+    info_type = "sensor_msgs/msg/CameraInfo"
     for distro in ("humble", "noetic"):
         messages = Messages(distro)  # type: ignore[arg-type]
-        points = np.random.default_rng(0).random((20, 3)).astype("<f4")
-        field = "sensor_msgs/msg/PointField"
-        cloud = messages.make(
-            CLOUD,
-            header=messages.header(10**18, "camera"),
-            height=1,
-            width=20,
-            point_step=12,
-            row_step=240,
-            data=points.view(np.uint8).reshape(-1),
-            fields=[
-                messages.make(field, name=name, offset=4 * n, datatype=7, count=1)
-                for n, name in enumerate("xyz")
-            ],
-        )
 
-        def of_cloud(data: bytes, messages: Messages = messages) -> object:
-            return cloud_of(messages.from_bytes(data, CLOUD))
+        def target(
+            kind: str, read: Callable[[Any], object], messages: Any = messages, **fields: Any
+        ) -> Target:
+            message = messages.make(kind, header=messages.header(10**18, "camera"), **fields)
+            seed = bytes(messages.to_bytes(message))
+            return [seed], lambda data: read(messages.from_bytes(data, kind))
 
-        def of_image(data: bytes, messages: Messages = messages) -> object:
-            from tumortrack.live.ros import sensors
-
-            return sensors._pixels(  # type: ignore[attr-defined]
-                messages.from_bytes(data, IMAGE), {"16UC1": "u2"}, "a depth image"
-            )
-
-        def of_info(data: bytes, messages: Messages = messages) -> object:
-            from tumortrack.live.ros import sensors
-
-            info = messages.from_bytes(data, "sensor_msgs/msg/CameraInfo")
-            return sensors._intrinsics_of(info, False)  # type: ignore[attr-defined]
-
-        image = messages.make(
-            IMAGE,
-            header=messages.header(10**18, "camera"),
-            height=6,
-            width=8,
-            encoding="16UC1",
-            step=16,
-            data=np.zeros(96, np.uint8),
-        )
-        info = messages.make(
-            "sensor_msgs/msg/CameraInfo",
-            header=messages.header(10**18, "camera"),
-            height=6,
-            width=8,
-            k=np.array([5.0, 0, 4, 0, 5, 3, 0, 0, 1]),
-        )
-        made[f"{distro} cloud"] = [bytes(messages.to_bytes(cloud))], of_cloud
-        made[f"{distro} image"] = [bytes(messages.to_bytes(image))], of_image
-        made[f"{distro} camera_info"] = [bytes(messages.to_bytes(info))], of_info
-    return made
+        fields = [
+            messages.make("sensor_msgs/msg/PointField", name=axis, offset=n, datatype=7, count=1)
+            for n, axis in zip((0, 4, 8), "xyz", strict=True)
+        ]
+        grid = {"height": 1, "width": 20, "point_step": 12, "row_step": 240}
+        pixels = {"height": 6, "width": 8, "encoding": "16UC1", "step": 16}
+        targets |= {
+            f"{distro} cloud": target(
+                sensors.CLOUD, sensors.cloud_of, data=points, fields=fields, **grid
+            ),
+            f"{distro} image": target(
+                sensors.IMAGE, read_image, data=np.zeros(96, np.uint8), **pixels
+            ),
+            f"{distro} camera_info": target(info_type, read_info, height=6, width=8, k=camera),
+        }
+    return targets
 
 
 def _configurations() -> dict[str, Target]:
@@ -268,28 +249,23 @@ def _configurations() -> dict[str, Target]:
     from tumortrack_resection.values import ResectionConfig
     from warp_objects import ANATOMY
 
-    def written(kind: type, value: object) -> Target:
+    def written(value: object) -> Target:
         def read(path: Path) -> object:
-            return from_builtins(read_json(path), kind, str(path))
+            return from_builtins(read_json(path), type(value), str(path))
 
-        return [json.dumps(to_builtins(value)).encode()], of_file(".json", read)
+        return of_file(read, "in.json", to_builtins(value))
 
-    turn = [[0, -1, 0, 0.4], [-1, 0, 0, 0.1], [0, 0, -1, 0.7], [0, 0, 0, 1]]
-    frame = {"frame_id": "base_link", "unit": "m", "robot_from_camera": turn}
-    marker = {**frame, "camera_from_marker": turn, "robot_from_marker": turn}
-    del marker["robot_from_camera"]
-    clinic, quick = (PRESETS[name](ANATOMY) for name in ("clinic", "quick"))
-    poses = {"fixed_from_camera": [turn, turn], "unit": "m", "frame_id": "base_link"}
+    frame = {"frame_id": "base_link", "unit": "m"}
+    hand_eye = {**frame, "robot_from_camera": TURN}
+    marker = {**frame, "camera_from_marker": TURN, "robot_from_marker": TURN}
+    poses = {"fixed_from_camera": [TURN, TURN], "unit": "m", "frame_id": "base_link"}
     return {
-        "poses": ([json.dumps(poses).encode()], of_file(".json", lambda path: read_poses(path, 2))),
-        "calibration": (
-            [json.dumps(frame).encode(), json.dumps(marker).encode()],
-            of_file(".json", read_frames),
-        ),
-        "cell": written(CellConfig, CellConfig()),
-        "resection": written(ResectionConfig, ResectionConfig()),
-        "registration": written(type(clinic), clinic),
-        "training": written(type(quick), quick),
+        "poses": of_file(lambda path: read_poses(path, 2), "in.json", poses),
+        "calibration": of_file(read_frames, "in.json", hand_eye, marker),
+        "cell": written(CellConfig()),
+        "resection": written(ResectionConfig()),
+        "registration": written(PRESETS["clinic"](ANATOMY)),
+        "training": written(PRESETS["quick"](ANATOMY)),
     }
 
 
@@ -318,35 +294,14 @@ def _recordings() -> dict[str, Target]:
     ours = record(folder / "ours", [update_number(n) for n in range(2)]) / "ours.mcap"
     packed = write_bag(folder / "packed", topics, "packed mcap")
     bag = write_bag(folder / "a.bag", topics, "bag")
-    sqlite = write_bag(folder / "sqlite", topics, "sqlite3")
-    (file,) = [path for path in sqlite.iterdir() if path.suffix == ".db3"]
+    (file,) = write_bag(folder / "sqlite", topics, "sqlite3").glob("*.db3")
     return {
-        "mcap": ([ours.read_bytes()], of_file(".mcap", play)),
-        "bag": ([bag.read_bytes()], of_file(".bag", play)),
-        "db3": ([file.read_bytes()], of_file(".db3", play)),
-        "rosbag2 folder": of_member(packed, "metadata.yaml", play),
-        "packed mcap": of_member(packed, "packed.mcap", play),
+        "mcap": of_file(play, "in.mcap", ours.read_bytes()),
+        "bag": of_file(play, "in.bag", bag.read_bytes()),
+        "db3": of_file(play, "in.db3", file.read_bytes()),
+        "rosbag2 folder": of_member(play, packed, "metadata.yaml"),
+        "packed mcap": of_member(play, packed, "packed.mcap"),
     }
-
-
-def of_member(folder: Path, name: str, read: Callable[[Path], object]) -> Target:
-    """One file of a folder that is read; what an artifact's manifest says of it is made true."""
-    from tumortrack.core import store
-
-    copy = scratch() / folder.name
-    shutil.copytree(folder, copy)
-    content = (copy / name).read_bytes()
-    sealed = copy / store.MANIFEST
-    manifest = json.loads(sealed.read_text()) if sealed.is_file() and name != sealed.name else None
-
-    def of_bytes(changed: bytes) -> object:
-        (copy / name).write_bytes(changed)
-        if manifest is not None and name in manifest["files"]:
-            manifest["files"][name] = store.sha256_of(copy / name)
-            sealed.write_text(json.dumps(manifest))
-        return read(copy)
-
-    return [content], of_bytes
 
 
 def _margins() -> dict[str, Target]:
@@ -363,15 +318,15 @@ def _margins() -> dict[str, Target]:
     )  # fmt: skip
     margins.write_sealed(path := scratch() / "margins.json", valid)
     row = {"scene": "s", "sha256": "", "label": ["a", "b", "c"], "misses": {"tumor": [[1.0, None]]}}
-    table = "\n".join(map(json.dumps, (head_of("", 0), row))).encode()
+    table = "\n".join(map(json.dumps, (head_of("", 0), row)))
     return {
-        "margins": ([path.read_bytes()], of_file(".json", margins.read_sealed)),
-        "margins table": ([table], of_file(".jsonl", read_table)),
+        "margins": of_file(margins.read_sealed, "in.json", path.read_bytes()),
+        "margins table": of_file(read_table, "in.jsonl", table),
     }
 
 
 def _experiment() -> dict[str, Target]:
-    """Kits, lenses, robots' poses, pictures of boards, and MCAPs with attachments."""
+    """Kits, lenses, robots' poses, and pictures of boards."""
     import cv2
 
     from tumortrack_experiment.calibrate.lens import read_lens
@@ -386,59 +341,44 @@ def _experiment() -> dict[str, Target]:
     kit = {"case_sha256": "0", "bead_diameter_mm": 6, "beads": beads, "base_from_ct": rows}
     kit |= {"organ_ml": 100, "tumors_ml": [3], "states": ["rest"], "parts": parts}
     lens = {"width": 16, "height": 12, "fx": 10, "fy": 10, "cx": 8, "cy": 6}
+    lens["distortion"] = [0.0] * 5
     poses = {"base_from_tool": [rows, rows], "unit": "mm", "frame_id": "base"}
     shots = [Shot(str(n), np.zeros((2, 2), np.uint8)) for n in range(2)]
-    pictures = scratch()
     grey = np.arange(192, dtype=np.uint8).reshape(12, 16)
-
-    def read_picture(content: bytes) -> object:
-        (pictures / "a.png").write_bytes(content)
-        return read_shots(pictures)
-
+    pictures = [cv2.imencode(kind, grey)[1].tobytes() for kind in (".png", ".jpg")]
     return {
-        "kit": ([json.dumps(kit).encode()], of_file(".json", read_kit)),
-        "lens": (
-            [json.dumps(lens | {"distortion": [0.0] * 5}).encode()],
-            of_file(".json", read_lens),
-        ),
-        "robot poses": (
-            [json.dumps(poses).encode()],
-            of_file(".json", lambda path: with_poses(shots, path)),
-        ),
-        "picture": (
-            [cv2.imencode(kind, grey)[1].tobytes() for kind in (".png", ".jpg")],
-            read_picture,
-        ),
+        "kit": of_file(read_kit, "in.json", kit),
+        "lens": of_file(read_lens, "in.json", lens),
+        "robot poses": of_file(lambda path: with_poses(shots, path), "in.json", poses),
+        "picture": of_file(lambda path: read_shots(path.parent), "a.png", *pictures),
     }
 
 
-def of_base(base: Path) -> dict[str, Target]:
-    """Case, scene, both kinds of model, run and plan, as ``attacks.make_base`` makes them."""
+def _artifacts(base: Path) -> dict[str, Target]:
+    """Case, scene, both kinds of model, run and plan, as ``harness.base_in`` makes them."""
     from tumortrack.imaging.case import load_case
     from tumortrack.simulate.scene_folder import read_scene
     from tumortrack.tracking.model_files import load_model
     from tumortrack_resection.files import read_plan
     from tumortrack_resection.located import read_run
 
-    scene = base / "scenes" / "0000"
-    members: list[tuple[Path, str, Callable[[Path], object]]] = [
-        *((base / "case", name, load_case) for name in ("manifest.json", "tumor_1.ply")),
-        *((scene, name, read_scene) for name in ("meta.json", "targets.csv", "tumor_1.ply")),
-        *((base / "run", name, read_run) for name in ("manifest.json", "report.json")),
-        (base / "run", "occupancy.ply", read_run),
-        *((base / "plan", name, read_plan) for name in ("plan.json", "motions.safetensors")),
-        *(
-            (base / kind, name, lambda folder: load_model(folder, "cpu"))
-            for kind in ("model", "network")
-            for name in ("manifest.json", "weights.safetensors", "shape.safetensors")
-        ),
+    def read_model(folder: Path) -> object:
+        return load_model(folder, "cpu")
+
+    model = ("manifest.json", "weights.safetensors", "shape.safetensors")
+    members: list[tuple[str, Callable[[Path], object], tuple[str, ...]]] = [
+        ("case", load_case, ("manifest.json", "tumor_1.ply")),
+        ("scenes/0000", read_scene, ("meta.json", "targets.csv", "tumor_1.ply")),
+        ("run", read_run, ("manifest.json", "report.json", "occupancy.ply")),
+        ("plan", read_plan, ("plan.json", "motions.safetensors")),
+        ("model", read_model, model),
+        ("network", read_model, model),
     ]
     return {
-        f"{folder.parent.name if folder is scene else folder.name} {name}": of_member(
-            folder, name, read
-        )
-        for folder, name, read in members
-        if (folder / name).is_file()
+        f"{folder.split('/')[0]} {name}": of_member(read, base / folder, name)
+        for folder, read, names in members
+        for name in names
+        if (base / folder / name).is_file()
     }
 
 
@@ -446,8 +386,8 @@ def targets(base: Path | None = None) -> dict[str, Target]:
     """All of them; those that need a model only with a ``base``."""
     found: dict[str, Target] = {}
     for make in (
-        *(_cloud_files, _images, _volumes, _dicom, _meshes, _artifacts, _texts, _wire),
+        *(_clouds, _images, _volumes, _dicom, _meshes, _tables, _command_line, _wire),
         *(_configurations, _recordings, _margins, _experiment),
     ):
         found |= make()
-    return found | (of_base(base) if base is not None else {})
+    return found | (_artifacts(base) if base is not None else {})

@@ -6,6 +6,7 @@ As a script: that one. It takes orders (JSON lines) and answers each with its ex
 from __future__ import annotations
 
 import gc
+import importlib
 import json
 import os
 import subprocess
@@ -14,6 +15,7 @@ import tempfile
 import traceback
 from collections.abc import Callable
 from functools import cache
+from typing import NoReturn
 
 PRELOADED = (
     "torch",
@@ -54,13 +56,16 @@ def run(arguments: list[str], environment: dict[str, str]) -> subprocess.Complet
         return subprocess.CompletedProcess(arguments, code, out.read(), errors.read())
 
 
-def _serve() -> Callable[[], None]:
-    """Fork for every order; returns what a fork has to do."""
-    import importlib
-
+def preload() -> None:
+    """Import what commands need, for forks of this process."""
     for name in PRELOADED:
         importlib.import_module(name)
     gc.freeze()  # nothing of it is looked through, and copied, in a fork
+
+
+def _serve() -> Callable[[], None]:
+    """Fork for every order; returns what a fork has to do."""
+    preload()
     while line := sys.stdin.readline():
         if not (pid := os.fork()):
             arguments, environment, folder, out, errors = json.loads(line)
@@ -69,16 +74,16 @@ def _serve() -> Callable[[], None]:
             os.chdir(folder)
             for name, number in ((os.devnull, 0), (out, 1), (errors, 2)):
                 os.dup2(os.open(name, os.O_RDWR | os.O_APPEND), number)
-            sys.argv = ["tumortrack", *arguments]
-            return _command
+            return lambda: become_command(arguments)
         print(os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]), flush=True)
     return sys.exit
 
 
-def _command() -> None:
+def become_command(arguments: list[str]) -> NoReturn:
     """The command, and out at once: to take apart all that was imported takes seconds."""
+    sys.argv = ["tumortrack", *arguments]
     try:
-        sys.modules["tumortrack.cli.main"].main()
+        importlib.import_module("tumortrack.cli.main").main()
         code = 0
     except SystemExit as ended:
         code = ended.code if isinstance(ended.code, int) else 1

@@ -23,7 +23,7 @@ from tumortrack.live.values import TrackingResult, TransformedEstimate
 from tumortrack.live.viewer.look import Viewpoint
 from tumortrack.live.viewer.slices import SlicePlane
 from tumortrack.models.margins import stated_radius
-from tumortrack.simulate.occupancy import surface_distance
+from tumortrack.core.mesh_query import surface_distance
 from tumortrack.tracking.shells import exact_margin, rough_margin
 
 if TYPE_CHECKING:
