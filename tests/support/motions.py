@@ -24,20 +24,19 @@ class Wave:
     height_mm: float = 5.0
     sure: bool = False
 
-    def carry(self, points_ct):
+    def carry(self, points_ct: np.ndarray) -> np.ndarray:
         moved = points_ct + self.height_mm * np.sin(points_ct @ WAVE)[:, None] * ALONG
         return transform_points(CAMERA_FROM_CT, moved)
 
-    def back(self, points_camera):
+    def back(self, points_camera: np.ndarray) -> np.ndarray:
         moved = transform_points(np.linalg.inv(CAMERA_FROM_CT), points_camera)
         return moved - self.height_mm * np.sin(moved @ WAVE)[:, None] * ALONG
 
-    def std_mm(self, points_ct):
+    def std_mm(self, points_ct: np.ndarray) -> np.ndarray | None:
         return 0.5 + np.abs(points_ct[:, 0]) / 100 if self.sure else None
 
     largest_std_mm = std_mm
 
-    def covariance_mm2(self, points_ct):
-        if not self.sure:
-            return None
-        return self.std_mm(points_ct)[:, None, None] ** 2 * np.eye(3)
+    def covariance_mm2(self, points_ct: np.ndarray) -> np.ndarray | None:
+        std_mm = self.std_mm(points_ct)
+        return None if std_mm is None else std_mm[:, None, None] ** 2 * np.eye(3)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from tumortrack.core.types import LabelVolume
@@ -33,7 +35,12 @@ def _in_prostate(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
     return whole & (y < 11)
 
 
-def _labelled(size_mm, voxel_mm, inside, tumors: tuple[Ball, ...]) -> LabelVolume:
+def _labelled(
+    size_mm: tuple[float, float, float],
+    voxel_mm: float,
+    inside: Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray],
+    tumors: tuple[Ball, ...],
+) -> LabelVolume:
     count = [round(side / voxel_mm) for side in size_mm]
     low = -voxel_mm * (np.array(count) - 1) / 2
     x, y, z = (voxel_mm * np.indices(count).T + low).T

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from rosbags.rosbag1 import Writer as Writer1
@@ -27,14 +28,14 @@ def frame_number(n: int) -> DepthFrame:
 
 
 def update_number(
-    n: int, content: DepthFrame | SensorCloud | None = None, **seen
+    n: int, content: DepthFrame | SensorCloud | None = None, **more: Any
 ) -> live.TrackingResult:
     content = frame_number(n) if content is None else content
     update = small_update(n, content.stamp_ns)
-    return replace(update, observation=Observation(content, content.stamp_ns + 2_000_000, **seen))
+    return replace(update, observation=Observation(content, content.stamp_ns + 2_000_000, **more))
 
 
-def record(path: Path, updates: list[live.TrackingResult], **options) -> Path:
+def record(path: Path, updates: list[live.TrackingResult], **options: Any) -> Path:
     sink = RecordTo(path=path, **options).open(small_setting())
     for update in updates:
         sink.publish(update)
@@ -43,7 +44,7 @@ def record(path: Path, updates: list[live.TrackingResult], **options) -> Path:
     return path
 
 
-def write_bag(path: Path, topics: dict[str, list], kind: str) -> Path:
+def write_bag(path: Path, topics: dict[str, tuple[str, list[Any]]], kind: str) -> Path:
     """A foreign bag: per topic messages' suffix in ``messages_seen`` and frames."""
     messages = Messages("noetic" if kind == "bag" else "humble")
     plugin = StoragePlugin.MCAP if "mcap" in kind else StoragePlugin.SQLITE3

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import trimesh
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from tumortrack.core.geometry import rigid, rotation_onto, transform_points
@@ -176,7 +177,9 @@ class _Ground:
     """The background as a height over the table: waves, a bed that rises around the organ, or a
     hole around it."""
 
-    def __init__(self, props, sunk_mm, size_mm, rng):  # type: ignore[no-untyped-def]
+    def __init__(
+        self, props: Props, sunk_mm: float, size_mm: np.ndarray, rng: np.random.Generator
+    ) -> None:
         self.waves_mm, self.size_mm = props.waves_mm, size_mm
         self.along = rng.normal(size=(5, 2))
         self.along /= np.linalg.norm(self.along, axis=1, keepdims=True)
@@ -207,7 +210,7 @@ class _Ground:
         return Mesh(np.stack([x.ravel(), y.ravel(), height.ravel()], 1), faces)
 
 
-def _capsule(start, end, radius_mm) -> trimesh.Trimesh:  # type: ignore[no-untyped-def]
+def _capsule(start: ArrayLike, end: ArrayLike, radius_mm: float) -> trimesh.Trimesh:
     start, end = np.asarray(start, float), np.asarray(end, float)
     length = float(np.linalg.norm(end - start))
     shape = trimesh.creation.capsule(height=length, radius=radius_mm, count=(16, 16))

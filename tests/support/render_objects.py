@@ -1,25 +1,30 @@
 """Meshes, cameras and slow references for the tests of rendering and simulation."""
 
+from __future__ import annotations
+
 import numpy as np
 import trimesh
+from numpy.typing import ArrayLike
 
 from tumortrack.core.geometry import rotation_onto
 from tumortrack.core.types import Anatomy, Mesh
 
 
-def sphere(radius_mm, center_mm, subdivisions=4):
+def sphere(radius_mm: float, center_mm: ArrayLike, subdivisions: int = 4) -> Mesh:
     """An icosphere with one vertex exactly on the side that faces the camera (-z)."""
     solid = trimesh.creation.icosphere(subdivisions, 1.0)
     turn = rotation_onto(solid.vertices[0], np.array([0.0, 0.0, -1.0]))
     return Mesh(radius_mm * solid.vertices @ turn.T + np.array(center_mm, float), solid.faces)
 
 
-def ellipsoid(half_axes_mm, center_mm=(0, 0, 0), subdivisions=4):
+def ellipsoid(
+    half_axes_mm: ArrayLike, center_mm: ArrayLike = (0, 0, 0), subdivisions: int = 4
+) -> Mesh:
     unit = sphere(1.0, (0, 0, 0), subdivisions)
     return unit.moved(unit.vertices_mm * np.array(half_axes_mm) + np.array(center_mm, float))
 
 
-def bumpy(radius_mm, center_mm, subdivisions=4):
+def bumpy(radius_mm: float, center_mm: ArrayLike, subdivisions: int = 4) -> Mesh:
     """A ball with hills and valleys, parts of which hide others."""
     unit = sphere(1.0, (0, 0, 0), subdivisions)
     x, y, z = unit.vertices_mm.T
@@ -35,11 +40,13 @@ ELLIPSOIDS = (
 )
 
 
-def anatomy(subdivisions=4):
+def anatomy(subdivisions: int = 4) -> Anatomy:
     return Anatomy(tuple(ellipsoid(*e, subdivisions) for e in ELLIPSOIDS))
 
 
-def ray_hits(origin, directions, mesh, slack=0.0):
+def ray_hits(
+    origin: np.ndarray, directions: np.ndarray, mesh: Mesh, slack: float = 0.0
+) -> np.ndarray:
     """Every ray against every triangle (Moeller, Trumbore 1997): multiple t of the direction at
     the hit, (r, f), inf where it misses. ``slack`` widens the triangles."""
     a, b, c = (mesh.vertices_mm[mesh.faces[:, i]] for i in range(3))
@@ -55,7 +62,7 @@ def ray_hits(origin, directions, mesh, slack=0.0):
     return np.where(hit, t, np.inf)
 
 
-def winding_number(mesh, points_mm):
+def winding_number(mesh: Mesh, points_mm: np.ndarray) -> np.ndarray:
     """1 inside a closed mesh, 0 outside: solid angles of all triangles (van Oosterom, Strackee
     1983), nothing shared with rays."""
     out = np.empty(len(points_mm))

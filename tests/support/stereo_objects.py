@@ -4,10 +4,12 @@ are painted onto the bodies, through lenses with distortion."""
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import msgspec
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.ndimage import gaussian_filter, map_coordinates
 from scipy.spatial.transform import Rotation
 
@@ -55,9 +57,9 @@ class StereoScene:
 
     def pictures(self, calibration: StereoCalibration) -> tuple[np.ndarray, np.ndarray]:
         """Left and right, as the cameras give them."""
-        one = self._seen(calibration.K1, calibration.D1, calibration, np.eye(4))
+        left = self._picture(calibration.K1, calibration.D1, calibration, np.eye(4))
         right_from_left = rigid(np.array(calibration.R), np.array(calibration.T))
-        return one, self._seen(calibration.K2, calibration.D2, calibration, right_from_left)
+        return left, self._picture(calibration.K2, calibration.D2, calibration, right_from_left)
 
     def depth(self, camera: Intrinsics, camera_from_left: np.ndarray) -> DepthFrame:
         """The true depth image of a pinhole camera."""
@@ -70,7 +72,13 @@ class StereoScene:
         placed_mm = transform_points(camera_from_left, body.vertices_mm)
         return render_depth(placed_mm, body.faces, camera)
 
-    def _seen(self, matrix, distortion, calibration, camera_from_left) -> np.ndarray:
+    def _picture(
+        self,
+        matrix: ArrayLike,
+        distortion: ArrayLike,
+        calibration: StereoCalibration,
+        camera_from_left: np.ndarray,
+    ) -> np.ndarray:
         k, wide = np.array(matrix), 2 * _MARGIN_PX
         camera = Intrinsics(
             calibration.width + wide,
@@ -109,7 +117,7 @@ class StereoScene:
         return cv2.GaussianBlur(picture, (0, 0), 0.7)
 
 
-def over_a_table(organ: Mesh, left_from_ct: np.ndarray, **look) -> StereoScene:
+def over_a_table(organ: Mesh, left_from_ct: np.ndarray, **look: Any) -> StereoScene:
     """The organ as it is placed, red, above a blue table."""
     placed = Mesh(transform_points(left_from_ct, organ.vertices_mm), organ.faces)
     below = table(placed.box_mm[1, 2] + 3)

@@ -6,6 +6,7 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from elastic_objects import SMALL, UP, organ
@@ -45,7 +46,7 @@ def placed(state: int = 73, share: float = 1.0) -> ElasticMotion:
     return ElasticMotion(shape(), TURNED, PLACE_MM, coefficients)
 
 
-def nudged(motion, shift_mm, turn_rad):
+def nudged(motion: ElasticMotion, shift_mm: ArrayLike, turn_rad: ArrayLike) -> ElasticMotion:
     """Another place for the undeformed organ, to start from."""
     turn = Rotation.from_rotvec(turn_rad).as_matrix()
     mean = motion.shape.body.mean
@@ -54,7 +55,7 @@ def nudged(motion, shift_mm, turn_rad):
     )
 
 
-def with_slope(field, points) -> tuple[np.ndarray, np.ndarray]:
+def with_slope(field: kernels.DistanceField, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """A field's distances at points (n, 3), and their slopes."""
     lattice = field.values_mm, field.origin_mm, np.float32(field.spacing_mm)
     found = np.array([kernels.distance_at(*lattice, *point) for point in points], np.float32)

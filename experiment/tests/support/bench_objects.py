@@ -1,5 +1,7 @@
 """A small bench: an ellipsoid with two tumors on a base with beads, its case, kit, CT and depth."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -18,7 +20,7 @@ from tumortrack.imaging.nifti import write_volume_nifti
 from tumortrack.imaging.surface import surfaces
 from tumortrack.sense.camera import d405
 from tumortrack.sense.files import depth_png, intrinsics_json
-from tumortrack.sense.noise import D405_NOISE, add_noise
+from tumortrack.sense.noise import D405_NOISE, NoiseConfig, add_noise
 from tumortrack.sense.render import render_depth
 from tumortrack_experiment.kit_file import Bead, Kit, KitPart
 
@@ -38,12 +40,14 @@ PRESS = np.array([[-20, 19.6, 1], [20, 22.6, 35.0]])  # a plate of the state D1,
 STRETCH = np.array([1.06, 0.96, 1 / (1.06 * 0.96)])  # of the state D1: keeps the volume
 
 
-def camera_from_base(distance_mm=150.0, shift_mm=(0, 0, 0)):
+def camera_from_base(
+    distance_mm: float = 150.0, shift_mm: tuple[float, float, float] = (0, 0, 0)
+) -> np.ndarray:
     turn = Rotation.from_euler("xyz", [188, 7, 4], degrees=True).as_matrix()
     return rigid(turn, np.array([0, 0, distance_mm]) + shift_mm - turn @ [0, 0, 15])
 
 
-def box_mesh(corners_mm):
+def box_mesh(corners_mm: np.ndarray) -> Mesh:
     box = trimesh.creation.box(bounds=corners_mm)
     return Mesh(box.vertices, box.faces)
 
@@ -55,12 +59,14 @@ class State:
     stretch: np.ndarray = field(default_factory=lambda: STRETCH)
     press: bool = True
     beads_mm: np.ndarray = field(default_factory=lambda: BEADS_MM)
-    tumors: tuple = TUMORS
+    tumors: tuple[tuple[np.ndarray, float], ...] = TUMORS
     slab: bool = False  # beside the organ, of its HU, that no kit knows
-    pins: tuple = ()  # middles at rest, base frame, of 3 mm beads cast into the organ
+    pins: tuple[
+        tuple[float, float, float], ...
+    ] = ()  # middles at rest, base frame, of 3 mm beads cast into the organ
 
 
-def labels_of(points_mm, state):
+def labels_of(points_mm: np.ndarray, state: State) -> np.ndarray:
     """0, 1, 2, 3 at points of the base frame."""
     rest = points_mm / state.stretch
     labels = ((((rest - ORGAN[0]) / ORGAN[1]) ** 2).sum(-1) < 1).astype(np.uint8)
@@ -83,7 +89,7 @@ def a_case(folder: Path) -> Case:
     return case
 
 
-def a_kit(folder: Path, case_folder: Path, case: Case, beads_mm=BEADS_MM) -> Kit:
+def a_kit(folder: Path, case_folder: Path, case: Case, beads_mm: np.ndarray = BEADS_MM) -> Kit:
     rows = tuple(map(tuple, np.eye(4).tolist()))
     parts = [("base", PLATE, ""), ("D1-plate", PRESS, "D1")]
     kit = Kit(
@@ -110,7 +116,13 @@ def a_kit(folder: Path, case_folder: Path, case: Case, beads_mm=BEADS_MM) -> Kit
     return kit
 
 
-def a_scan(state: State, ct_from_base: np.ndarray, spacing_mm=1.2, bead_hu=9000.0, seed=0):
+def a_scan(
+    state: State,
+    ct_from_base: np.ndarray,
+    spacing_mm: float = 1.2,
+    bead_hu: float = 9000.0,
+    seed: int = 0,
+) -> Volume:
     """The bench in a virtual scanner: each shape is blurred by the scanner and its voxels."""
     sigma = np.sqrt(0.65**2 + spacing_mm**2 / 12)
     turn = Rotation.from_euler("xyz", [4, -3, 9], degrees=True).as_matrix()
@@ -121,11 +133,11 @@ def a_scan(state: State, ct_from_base: np.ndarray, spacing_mm=1.2, bead_hu=9000.
     at = transform_points(base_from_index, np.indices(shape).reshape(3, -1).T.astype(float))
     hu = np.full(len(at), -1000.0)
 
-    def paint(inside_mm, value):
+    def paint(inside_mm: np.ndarray, value: float) -> None:
         share = ndtr(inside_mm / sigma)
         hu[:] = hu * (1 - share) + value * share
 
-    def box(corners_mm):
+    def box(corners_mm: np.ndarray) -> np.ndarray:
         return np.minimum(at - corners_mm[0], corners_mm[1] - at).min(1)
 
     paint(box(TABLE), -80)
@@ -157,7 +169,9 @@ def write_scan(path: Path, volume: Volume) -> Path:
     return path
 
 
-def a_view(state: State, pose: np.ndarray, case: Case, seed=0, noise=D405_NOISE) -> DepthFrame:
+def a_view(
+    state: State, pose: np.ndarray, case: Case, seed: int = 0, noise: NoiseConfig = D405_NOISE
+) -> DepthFrame:
     """What a D405 sees of the bench."""
     organ = case.anatomy.organ
     organ_mm = transform_points(BASE_FROM_CT, organ.vertices_mm) * state.stretch

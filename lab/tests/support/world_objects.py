@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import cache
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -13,8 +14,10 @@ from tumortrack_lab.tets import tetrahedralise
 from tumortrack_lab.world.organ import Organ
 from tumortrack_lab.world.scenes import World, WorldConfig
 
+Vector = tuple[float, float, float]
 
-def ellipsoid(half_mm: tuple[float, float, float], centre_mm=(0.0, 0.0, 0.0)) -> Mesh:
+
+def ellipsoid(half_mm: Vector, centre_mm: Vector = (0.0, 0.0, 0.0)) -> Mesh:
     sphere = trimesh.creation.icosphere(subdivisions=3)
     return Mesh(sphere.vertices * half_mm + centre_mm, sphere.faces)
 
@@ -27,7 +30,7 @@ def organ() -> Organ:
     return Organ.of(ANATOMY, tetrahedralise(ANATOMY.organ, 9.0, 0.01))
 
 
-def world(**options) -> World:
+def world(**options: Any) -> World:
     turned = Anatomy(tuple(p.moved(p.vertices_mm + [30.0, -40.0, 100.0]) for p in ANATOMY.parts))
     labels = LabelVolume(np.ones((2, 2, 2), np.uint8), np.diag([1.0, 1.0, 3.0, 1.0]))
     config = WorldConfig(**{"families": ("rest",), **options})

@@ -1,18 +1,22 @@
 """A kidney-like ellipsoid with a tumor at its side, and a plan to cut it out in two sweeps."""
 
+from __future__ import annotations
+
 import msgspec
 import numpy as np
 
 from tumortrack.core.types import Mesh
 from tumortrack_resection.arms.cell import ArmCell
+from tumortrack_resection.arms.kinematics import ArmModel
 from tumortrack_resection.values import Cut, CutLayer, ResectionPlan
 
+Vector = tuple[float, float, float]
 HALF_MM = np.array([55.0, 30.0, 25.0])
 STAND_MM = 120.0
 TUMOR_MM = 12.0  # radius
 
 
-def organ(shift_mm=(0.0, 0.0, 0.0), angle_rad=0.6):
+def organ(shift_mm: Vector = (0.0, 0.0, 0.0), angle_rad: float = 0.6) -> Mesh:
     """The ellipsoid united with the tumor, lowest point on the stand."""
     import manifold3d
 
@@ -22,11 +26,16 @@ def organ(shift_mm=(0.0, 0.0, 0.0), angle_rad=0.6):
     return Mesh(both.vert_properties[:, :3] + np.array(shift_mm), both.tri_verts)
 
 
-def _tumor(angle_rad):
+def _tumor(angle_rad: float) -> np.ndarray:
     return np.array([np.cos(angle_rad), np.sin(angle_rad), 0.1]) * HALF_MM
 
 
-def plan(shift_mm=(0.0, 0.0, 0.0), angle_rad=0.6, radius_mm=17.0, step_mm=1.5):
+def plan(
+    shift_mm: Vector = (0.0, 0.0, 0.0),
+    angle_rad: float = 0.6,
+    radius_mm: float = 17.0,
+    step_mm: float = 1.5,
+) -> ResectionPlan:
     """Closed contours around the tumor at its middle and at its underside."""
     centre = _tumor(angle_rad) + [0.0, 0.0, STAND_MM + HALF_MM[2]] + np.array(shift_mm)
     angles = np.linspace(0, 2 * np.pi, int(2 * np.pi * radius_mm / step_mm) + 1) + angle_rad
@@ -41,7 +50,7 @@ def plan(shift_mm=(0.0, 0.0, 0.0), angle_rad=0.6, radius_mm=17.0, step_mm=1.5):
     return ResectionPlan("published", "tumor_1", 2, grasp, cuts, layers, 5.0, {}, 0.5)
 
 
-def bare(cell):
+def bare(cell: ArmCell) -> ArmCell:
     """The same workcell without clearances: only what touches collides."""
     config = msgspec.structs.replace(cell.config)
     for name in ("clearance_mm", "organ_clearance_mm", "contact_mm"):
@@ -49,7 +58,7 @@ def bare(cell):
     return ArmCell(config, cell.organ)
 
 
-def nearest_mm(cell, joints_rad):
+def nearest_mm(cell: ArmCell, joints_rad: np.ndarray) -> float:
     """The least distance of any pair that is checked, mm (negative: how deep)."""
     import pinocchio as pin
 
@@ -59,7 +68,7 @@ def nearest_mm(cell, joints_rad):
     return 1000 * state.distanceResults[n].min_distance
 
 
-def flange_pose(model, joints_rad):
+def flange_pose(model: ArmModel, joints_rad: np.ndarray) -> np.ndarray:
     """``base_from_flange`` (..., 4, 4), mm, of joints (..., 6), by the plain product of the six
     Denavit-Hartenberg transforms.
 

@@ -1,7 +1,10 @@
 """Organs and tumors whose plans are known: an ellipsoid with a half-sunk sphere."""
 
+from __future__ import annotations
+
 import numpy as np
 import trimesh
+from numpy.typing import ArrayLike
 
 from tumortrack.core.types import Mesh
 from tumortrack.imaging.meshes import mesh_of, solid_of
@@ -12,12 +15,12 @@ MIDDLE_MM = np.array([0.0, 0.0, 145.0])  # its lowest point is 120 mm over the t
 TUMOR_MM, RADIUS_MM = np.array([10.0, -27.0, 148.0]), 12.0  # bulges out of the organ's side
 
 
-def sphere(middle_mm, radius_mm, finer=4):
+def sphere(middle_mm: ArrayLike, radius_mm: ArrayLike, finer: int = 4) -> Mesh:
     ball = trimesh.creation.icosphere(finer, 1.0)
     return Mesh(ball.vertices * radius_mm + middle_mm, ball.faces)
 
 
-def organ_with(*tumors):
+def organ_with(*tumors: Mesh) -> Mesh:
     """The union of the ellipsoid and its tumors."""
     whole = solid_of(sphere(MIDDLE_MM, HALF_MM), "organ")
     for tumor in tumors:
@@ -25,7 +28,7 @@ def organ_with(*tumors):
     return mesh_of(whole)
 
 
-def located(*tumors, n=40_000, seed=0, std_mm=None):
+def located(*tumors: Mesh, n: int = 40_000, seed: int = 0, std_mm: float | None = None) -> Located:
     """As an estimate in the table's frame: points evenly in the organ, labelled."""
     if not tumors:
         tumors = (sphere(TUMOR_MM, RADIUS_MM),)
@@ -49,20 +52,20 @@ def located(*tumors, n=40_000, seed=0, std_mm=None):
 class Deviating:
     """A motion that leaves points where they are, everywhere as unsure along z as the tests say."""
 
-    def __init__(self, deviation_mm=0.5):
+    def __init__(self, deviation_mm: float = 0.5) -> None:
         self.deviation_mm = deviation_mm
 
-    def carry(self, points):
+    def carry(self, points: np.ndarray) -> np.ndarray:
         return points
 
-    def back(self, points):
+    def back(self, points: np.ndarray) -> np.ndarray:
         return points
 
-    def std_mm(self, points):
+    def std_mm(self, points: np.ndarray) -> np.ndarray:
         return self.largest_std_mm(points) / np.sqrt(3)
 
-    def largest_std_mm(self, points):
+    def largest_std_mm(self, points: np.ndarray) -> np.ndarray:
         return np.full(len(points), self.deviation_mm)
 
-    def covariance_mm2(self, points):
+    def covariance_mm2(self, points: np.ndarray) -> np.ndarray:
         return self.deviation_mm**2 * np.tile(np.diag([0.0, 0.0, 1.0]), (len(points), 1, 1))
