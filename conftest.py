@@ -3,7 +3,9 @@
 import fcntl
 import os
 import re
+import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import jaxtyping
@@ -42,15 +44,18 @@ MODELS = {"clinic_model", "quick_model", "learnt_model", "slim_model"}
 SLOWEST = (
     "test_soak.py",
     "test_locate.py",
-    "test_attacks.py",
+    "test_demo.py",
     "test_training.py",
+    "test_endurance.py",
     "test_real_patients.py",
     "test_examples.py",
+    "test_howto.py",
     "test_resect.py",
     "test_gauss_newton.py",
     "test_registration.py",
     "test_track.py",
-    "test_demo.py",
+    "test_wheel.py",
+    "test_attacks.py",
     "test_bench_gpu.py",
     "test_margins.py",
     "test_twin_physics.py",
@@ -118,6 +123,33 @@ def clinic_model(once, phantom_case) -> Path:
     from stories import write_clinic
 
     return once("clinic_model", lambda model: write_clinic(phantom_case, model))
+
+
+@pytest.fixture(scope="session")
+def ready_case(once, phantom_case, clinic_model) -> Path:
+    """The phantom's case with its model in it."""
+
+    def make(case: Path) -> None:
+        shutil.copytree(phantom_case, case)
+        shutil.copytree(clinic_model, case / "model")
+
+    return once("ready_case", make)
+
+
+@pytest.fixture
+def models_at_once(monkeypatch, clinic_model) -> list[object]:
+    """In this process every case's model is the phantom's: none has to be made. The list of cases
+    whose model was asked for."""
+    from tumortrack.tracking import model_files
+
+    model, asked = model_files.load_model(clinic_model), []
+
+    def make(case, config=None, seed=0, progress=None):
+        asked.append(case)
+        return replace(model, provenance={**model.provenance, "case_sha256": case.sha256})
+
+    monkeypatch.setattr(model_files, "make_model", make)
+    return asked
 
 
 @pytest.fixture(scope="session")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -34,19 +33,6 @@ def cloud(tmp_path_factory, phantom_case):
 def case(tmp_path, phantom_case):
     """Without a model."""
     return Path(shutil.copytree(phantom_case, tmp_path / "case"))
-
-
-@pytest.fixture
-def ready(monkeypatch, clinic_model):
-    """Models are made at once. What is told of progress."""
-    model, told = model_files.load_model(clinic_model), []
-
-    def make(case, config=None, seed=0, progress=None):
-        told.append(case)
-        return replace(model, provenance={**model.provenance, "case_sha256": case.sha256})
-
-    monkeypatch.setattr(model_files, "make_model", make)
-    return told
 
 
 def ended(folder: Path) -> list[str]:
@@ -98,7 +84,9 @@ def test_a_case_has_no_network_to_write(case, tmp_path):
 
 @pytest.mark.parametrize("at", ["make_model", "save_model"])
 @pytest.mark.slow
-def test_an_interrupted_making_leaves_nothing(at, ready, case, cloud, tmp_path, monkeypatch):
+def test_an_interrupted_making_leaves_nothing(
+    at, models_at_once, case, cloud, tmp_path, monkeypatch
+):
     before = store.sha256_of(case)
 
     def stop(_model: object, folder: Path | None = None, **_: object) -> None:
@@ -130,7 +118,9 @@ def test_a_case_that_cannot_be_written_to_says_so_at_once(case, monkeypatch, cap
 
 
 @pytest.mark.slow
-def test_another_cases_model_is_replaced_and_a_strangers_file_is_not(ready, case, clinic_model):
+def test_another_cases_model_is_replaced_and_a_strangers_file_is_not(
+    models_at_once, case, clinic_model
+):
     """As after a copy of one case's folder over another's."""
     kept = case / "model"
     shutil.copytree(clinic_model, kept)
@@ -141,15 +131,17 @@ def test_another_cases_model_is_replaced_and_a_strangers_file_is_not(ready, case
     (kept / "notes.txt").write_text("dear")
     with pytest.raises(api.InputError, match=r"also holds notes\.txt, which would be lost"):
         api.load_model(case)
-    assert ready == []
+    assert models_at_once == []
     (kept / "notes.txt").unlink()
     assert api.load_model(case).provenance["case_sha256"] == load_case(case).sha256
     assert api.load_model(case).provenance["case_sha256"] == load_case(case).sha256
-    assert len(ready) == 1
+    assert len(models_at_once) == 1
 
 
 @pytest.mark.slow
-def test_a_case_is_replaced_with_its_model_and_with_nothing_else(ready, case, tmp_path, capsys):
+def test_a_case_is_replaced_with_its_model_and_with_nothing_else(
+    models_at_once, case, tmp_path, capsys
+):
     new = tmp_path / "new"
     command = ["prepare", str(case / "labels.nii.gz"), str(new)]
     assert run(command) == 0
@@ -173,11 +165,11 @@ def test_a_case_is_replaced_with_its_model_and_with_nothing_else(ready, case, tm
     assert run([*command, "--rotations", "full", "--overwrite"]) == 0
     assert "before the camera (d405) it lies in any way" in "\n".join(describe(new))
     assert ended(tmp_path) == ["case", "new"]
-    assert len(ready) == 3
+    assert len(models_at_once) == 3
 
 
 @pytest.mark.slow
-def test_train_says_that_nothing_needs_to_be_learnt(ready, case, tmp_path, capsys):
+def test_train_says_that_nothing_needs_to_be_learnt(models_at_once, case, tmp_path, capsys):
     model, command = tmp_path / "model", ["train", str(case), str(tmp_path / "model")]
     for _ in range(2):  # the second time it is there
         assert run(command) == 0
@@ -193,7 +185,7 @@ def test_train_says_that_nothing_needs_to_be_learnt(ready, case, tmp_path, capsy
         (folder / "training").mkdir(parents=True, exist_ok=folder == model)
         (folder / "training" / "dear.txt").write_text("dear")
     (tmp_path / "mine" / "training").rename(tmp_path / "mine" / "notes")
-    made = len(ready)
+    made = len(models_at_once)
     for folder, words in (
         (model, "also holds margins.json, training, which would be lost"),
         (tmp_path / "mine", "exists already. Choose another path."),
@@ -205,7 +197,7 @@ def test_train_says_that_nothing_needs_to_be_learnt(ready, case, tmp_path, capsy
         assert words in said
         assert "--overwrite" not in said
         assert store.sha256_of(folder) == before
-    assert len(ready) == made  # refused at once
+    assert len(models_at_once) == made  # refused at once
 
 
 def test_what_is_gone_is_an_unknown_option(case, tmp_path):

@@ -13,11 +13,19 @@ from tumortrack.core import store
 from tumortrack.imaging.case import load_case
 from tumortrack.simulate.scene_folder import list_scenes, read_scene
 
+pytestmark = pytest.mark.slow
 
-@pytest.mark.slow
-def test_the_demo_tells_the_whole_story(tmp_path):
-    out = tmp_path / "demo"
-    said = succeeded(tumortrack("demo", "--out", out, "--scenes", 2))
+
+@pytest.fixture(scope="module")
+def demo(tmp_path_factory):
+    """The folder, and what was printed. Without --preset all is the same up to the training."""
+    out = tmp_path_factory.mktemp("demo") / "demo"
+    options = ("--preset", "quick", "--minutes", 0.2, "--scenes", 2)
+    return out, succeeded(tumortrack("demo", "--out", out, *options))
+
+
+def test_the_demo_tells_the_whole_story(demo):
+    out, said = demo
     assert [f"{n}/4" in said for n in range(1, 5)] == [True] * 4
     case = load_case(out / "case")
     assert case.ct is not None
@@ -42,11 +50,8 @@ def test_the_demo_tells_the_whole_story(tmp_path):
     assert str(out / "index.html") in said.replace("\n", "")
 
 
-@pytest.mark.slow
-def test_the_papers_chain_runs_beside_it(tmp_path):
-    out = tmp_path / "demo"
-    options = ("--preset", "quick", "--minutes", 0.2, "--scenes", 2)
-    said = succeeded(tumortrack("demo", "--out", out, *options))
+def test_the_papers_chain_runs_beside_it(demo):
+    out, said = demo
     assert said.index("default method:") < said.index("the paper's, quick:")
     digest = store.sha256_of(out / "model" / store.MANIFEST)
     report, run = (store.read_json(out / "paper" / x) for x in ("report.json", "run/report.json"))

@@ -49,10 +49,10 @@ def desk(tmp_path, phantom_case, clinic_model):
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
-def test_a_page_does_what_it_says(page, desk, phantom_case, capsys, monkeypatch):
+def test_a_page_does_what_it_says(page, desk, ready_case, capsys, monkeypatch):
     monkeypatch.setenv("ROS_LOCALHOST_ONLY", "1")
     if page.stem != "ct":  # whose reader makes the case
-        shutil.copytree(phantom_case, desk / "CASE")
+        shutil.copytree(ready_case, desk / "CASE")
     found = commands(page)
     assert found
     with contextlib.chdir(desk):

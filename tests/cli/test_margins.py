@@ -30,11 +30,10 @@ def scenes(once, phantom_case):
     return once("margin_scenes", make)
 
 
-def test_margins_are_found_stated_and_planned_with(phantom_case, clinic_model, scenes, tmp_path):
+def test_margins_are_found_stated_and_planned_with(ready_case, scenes, tmp_path):
     """Of a case: they are kept beside its model."""
     case, model = tmp_path / "case", tmp_path / "case" / "model"
-    shutil.copytree(phantom_case, case)
-    shutil.copytree(clinic_model, model)
+    shutil.copytree(ready_case, case)
     table = model / "margins.jsonl"
     cloud, run = list_scenes(scenes)[3] / "cloud.ply", tmp_path / "run"
     said = answered(tumortrack("locate", case, cloud, tmp_path / "before", "--device", "cpu"))

@@ -29,10 +29,10 @@ def test_they_are_kept_without_outputs():
 
 
 @pytest.fixture(scope="module")
-def ran(tmp_path_factory, phantom_case):
+def ran(tmp_path_factory, ready_case):
     """What each notebook's cells print: one kernel for all, emptied in between."""
     folder = tmp_path_factory.mktemp("notebooks")
-    shutil.copytree(phantom_case, folder / "case")
+    shutil.copytree(ready_case, folder / "case")
     notebooks = [nbformat.read(file, 4) for file in FILES]
     forget = nbformat.v4.new_code_cell("%reset -f")
     joined = nbformat.v4.new_notebook()

@@ -3,32 +3,19 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from stories import answered, refusal, succeeded, tumortrack
+from tumortrack.cli.main import run
 from tumortrack.core.mesh_files import read_mesh
 from tumortrack.imaging.case import load_case
+from tumortrack.imaging.prepare import prepare
 from tumortrack.imaging.volume import read_labels
 from tumortrack.phantom.dicom import write_dicom_series
 from tumortrack.phantom.scanner import ScannerParameters, scan
-
-
-@pytest.fixture(scope="module")
-def prepared(shared_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
-    """The case of a patient's label map, prepared once."""
-    folder = tmp_path_factory.mktemp("patients")
-
-    def case_of(patient: str) -> Path:
-        if not (folder / patient).exists():
-            source = shared_data / "kits19" / patient / "segmentation.nii.gz"
-            succeeded(tumortrack("prepare", source, folder / patient))
-        return folder / patient
-
-    return case_of
 
 
 def locates_its_organ(case: Path, folder: Path) -> None:
@@ -42,9 +29,11 @@ def locates_its_organ(case: Path, folder: Path) -> None:
 
 
 @pytest.mark.slow
-def test_label_map_to_located_organ(prepared, tmp_path):
+def test_label_map_to_located_organ(shared_data, tmp_path):
     """All the way; from a CT the demo goes there. More patients: ``test_imaging_prepare``."""
-    case = prepared("case_00000")
+    case = tmp_path / "case"
+    source = shared_data / "kits19" / "case_00000" / "segmentation.nii.gz"
+    succeeded(tumortrack("prepare", source, case))
     anatomy = load_case(case).anatomy
     assert anatomy.organ.volume_mm3 / 1000 == pytest.approx(215, rel=0.02)
     assert [t.volume_mm3 / 1000 for t in anatomy.tumors] == pytest.approx([7.8], rel=0.02)
@@ -53,13 +42,13 @@ def test_label_map_to_located_organ(prepared, tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("patient", ["case_00000", "case_00003"])
-def test_virtual_ct_gives_back_the_anatomy(patient, prepared, tmp_path):
-    patients = load_case(prepared(patient))
-    write_dicom_series(scan(patients.labels, ScannerParameters(), 4), tmp_path / "dicom")
-    succeeded(tumortrack("prepare", tmp_path / "dicom", tmp_path / "ct_case"))
-    truth, found = patients.anatomy, load_case(tmp_path / "ct_case").anatomy
-    assert len(found.parts) == len(truth.parts)
-    for mine, theirs in zip(found.parts, truth.parts, strict=True):
+def test_virtual_ct_gives_back_the_anatomy(patient, shared_data, models_at_once, tmp_path):
+    true = prepare(shared_data / "kits19" / patient / "segmentation.nii.gz")
+    write_dicom_series(scan(true.labels, ScannerParameters(), 4), tmp_path / "dicom")
+    assert run(["prepare", str(tmp_path / "dicom"), str(tmp_path / "ct_case")]) == 0
+    prepared = load_case(tmp_path / "ct_case").anatomy
+    assert len(prepared.parts) == len(true.anatomy.parts)
+    for mine, theirs in zip(prepared.parts, true.anatomy.parts, strict=True):
         assert mine.volume_mm3 == pytest.approx(theirs.volume_mm3, rel=0.05)
         assert np.abs(mine.box_mm - theirs.box_mm).max() < 2.0  # in place, not mirrored
     assert (tmp_path / "ct_case" / "qc.png").stat().st_size > 20_000
@@ -67,10 +56,10 @@ def test_virtual_ct_gives_back_the_anatomy(patient, prepared, tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("side", ["left", "right"])
-def test_a_kidney_without_tumor_from_a_mask(side, shared_data, tmp_path):
+def test_a_kidney_without_tumor_from_a_mask(side, shared_data, models_at_once, tmp_path, capsys):
     source = shared_data / "totalsegmentator" / f"kidney_{side}.nii.gz"
-    said = succeeded(tumortrack("prepare", source, tmp_path / "case"))
-    assert "tumor" in said  # told that there is none
+    assert run(["prepare", str(source), str(tmp_path / "case")]) == 0
+    assert "tumor" in capsys.readouterr().out  # told that there is none
     anatomy = load_case(tmp_path / "case").anatomy
     assert anatomy.names == ("kidney",)
     labels = read_labels(source)

@@ -2,6 +2,7 @@
 
 import os
 import re
+import shutil
 import subprocess
 import sys
 import sysconfig
@@ -47,7 +48,19 @@ def environment(wheel, tmp_path_factory):
     (packages / "dependencies.pth").write_text(here)
     with zipfile.ZipFile(wheel) as archive:
         archive.extractall(packages)
+    keep_kernels(packages / "tumortrack")
     return place
+
+
+def keep_kernels(package: Path) -> None:
+    """Take the machine code that lies beside the sources here; it is for files of this time."""
+    source = ROOT / "src" / "tumortrack"
+    for file in source.rglob("*.py"):
+        shutil.copystat(file, package / file.relative_to(source))
+    for kept in source.rglob("*.nb[ic]"):
+        there = package / kept.relative_to(source)
+        there.parent.mkdir(exist_ok=True)
+        shutil.copy(kept, there)
 
 
 def test_commands_and_an_example_run_from_the_wheel(environment, tmp_path):
