@@ -133,22 +133,22 @@ def _locks() -> dict[str, str]:
 
 def pinned(text: str) -> dict[str, str]:
     """Each package's lines in a lock file, by its canonical name."""
-    found: dict[str, str] = {}
+    blocks: dict[str, str] = {}
     for block in re.findall(r"^[A-Za-z0-9].*\n(?:    .*\n)*", text, re.MULTILINE):
         requirement = Requirement(re.split(r"\s*\\?\n", block)[0].rstrip(" \\"))
-        found[canonicalize_name(requirement.name)] = block
-    return found
+        blocks[canonicalize_name(requirement.name)] = block
+    return blocks
 
 
 def versions() -> dict[str, tuple[str, list[str]]]:
     """Version and SHA-256 digests of everything locked, by canonical name."""
-    found = {}
+    locked = {}
     for text in _locks().values():
         for name, block in pinned(text).items():
             requirement = Requirement(block.splitlines()[0].rstrip(" \\"))
             version = next(iter(requirement.specifier)).version
-            found[name] = version, re.findall(r"--hash=sha256:([0-9a-f]{64})", block)
-    return found
+            locked[name] = version, re.findall(r"--hash=sha256:([0-9a-f]{64})", block)
+    return locked
 
 
 def needed(
@@ -157,16 +157,16 @@ def needed(
     """What is installed of all that a package needs here, directly or not, by canonical name."""
     seen = {} if seen is None else seen
     try:
-        found = distribution(name)
+        package = distribution(name)
     except PackageNotFoundError:
         return seen  # for another platform, or of an extra that is not installed
     key = canonicalize_name(name)
     if key in seen and not extras:
         return seen
-    seen[key] = found
-    for requirement in map(Requirement, found.requires or ()):
+    seen[key] = package
+    for requirement in map(Requirement, package.requires or ()):
         marker = requirement.marker
-        holds = marker is None or any(marker.evaluate({"extra": one}) for one in ("", *extras))
+        holds = marker is None or any(marker.evaluate({"extra": extra}) for extra in ("", *extras))
         if holds and (canonicalize_name(requirement.name) not in seen or requirement.extras):
             needed(requirement.name, set(requirement.extras), seen)
     return seen
@@ -175,14 +175,14 @@ def needed(
 def everything() -> dict[str, Distribution]:
     """All that is installed of what is locked, but CUDA's packages: NVIDIA's own licence allows
     their use, PyPI's PyTorch asks for them, and nothing here imports them."""
-    found = {}
+    packages = {}
     ours = [pinned(text) for file, text in _locks().items() if file != "cuda"]
     for name in (name for pins in ours for name in pins):
         try:
-            found[name] = distribution(name)
+            packages[name] = distribution(name)
         except PackageNotFoundError:
             continue  # for another platform, or not part of `make setup`
-    return found
+    return packages
 
 
 def licence(package: Distribution) -> str:
@@ -195,11 +195,13 @@ def licence(package: Distribution) -> str:
         return str(expression)
     prefix = "License :: "
     classes = [
-        one.split(" :: ")[-1] for one in about.get_all("Classifier") or [] if one.startswith(prefix)
+        text.split(" :: ")[-1]
+        for text in about.get_all("Classifier") or []
+        if text.startswith(prefix)
     ]
     words = classes or [str(about.get("License") or "").strip().partition("\n")[0]]
-    said = [SAID.get(word.lower(), word) for word in words]
-    return " AND ".join(dict.fromkeys(filter(None, said)))
+    names = [SAID.get(word.lower(), word) for word in words]
+    return " AND ".join(dict.fromkeys(filter(None, names)))
 
 
 def is_allowed(expression: str) -> bool:
@@ -245,7 +247,7 @@ def sbom(wheel: Path) -> dict[str, Any]:
         "metadata": {"component": top},
         "components": components,
         "dependencies": [
-            {"ref": name, "dependsOn": [one["bom-ref"] for one in components]},
+            {"ref": name, "dependsOn": [component["bom-ref"] for component in components]},
         ],
     }
 
@@ -286,8 +288,8 @@ def main(arguments: list[str]) -> int:
                 for name, package in everything().items()
                 if not is_allowed(licence(package))
             }
-            for name, said in refused.items():
-                print(f"{name}: the licence {said or 'is not stated, which'!r} is not allowed")
+            for name, words in refused.items():
+                print(f"{name}: the licence {words or 'is not stated, which'!r} is not allowed")
             return len(refused) > 0
         case ["table"]:
             TABLE.write_text(table(), "utf-8")

@@ -60,27 +60,27 @@ def steady(value: Any) -> Any:
 
 
 def digests(sections: Iterable[str], states: Path, recording: bool) -> dict[str, str]:
-    found: dict[str, str] = {}
+    entries: dict[str, str] = {}
     made_by = {**SECTIONS, "twin": partial(twin, states, recording)}
     with tempfile.TemporaryDirectory() as work:
         os.chdir(work)  # what is written names folders: the same ones every time
         for name in sections:
             start = time.perf_counter()
             made = {key: digest(value) for key, value in under(name, made_by[name]())}
-            found |= made
+            entries |= made
             print(f"{name}: {len(made)} in {time.perf_counter() - start:.0f} s", flush=True)
         os.chdir("/")
-    return found
+    return entries
 
 
-def compare(found: dict[str, str], recorded: dict[str, str]) -> int:
+def compare(entries: dict[str, str], recorded: dict[str, str]) -> int:
     """Exit status; only sections that ran are compared."""
-    ran = {key.split("/")[0] for key in found}
+    ran = {key.split("/")[0] for key in entries}
     known = {key: value for key, value in recorded.items() if key.split("/")[0] in ran}
-    differing = sorted(key for key in found | known if found.get(key) != known.get(key))
+    differing = sorted(key for key in entries | known if entries.get(key) != known.get(key))
     for key in differing:
-        print(f"{'new' if key not in known else 'differs' if key in found else 'missing'}: {key}")
-    equal = len(found | known) - len(differing)
+        print(f"{'new' if key not in known else 'differs' if key in entries else 'missing'}: {key}")
+    equal = len(entries | known) - len(differing)
     print(f"{equal} entries equal, {len(differing)} differ")
     return 1 if differing else 0
 
@@ -102,12 +102,12 @@ def main() -> int:
     if not recording and recorded["machine"] != machine:
         print(f"ANOTHER MACHINE OR LIBRARY: {recorded['machine']}; this is {machine}", flush=True)
     chosen = [name for name in given.only if not (given.quick and name in TRAINED)]
-    found = digests(chosen, file.parent / "replay-state", recording)
+    entries = digests(chosen, file.parent / "replay-state", recording)
     if not recording:
-        return compare(found, recorded["entries"])
+        return compare(entries, recorded["entries"])
     file.parent.mkdir(parents=True, exist_ok=True)
-    file.write_text(json.dumps({"machine": machine, "entries": found}, indent=1))
-    print(f"{len(found)} entries recorded")
+    file.write_text(json.dumps({"machine": machine, "entries": entries}, indent=1))
+    print(f"{len(entries)} entries recorded")
     return 0
 
 

@@ -71,15 +71,15 @@ def fields(made: Any, names: str) -> Entries:
 
 def command(*arguments: object) -> str:
     """What a command says. It must succeed; a poor answer is one."""
-    said = io.StringIO()
-    with redirect_stdout(said), redirect_stderr(said):
+    output = io.StringIO()
+    with redirect_stdout(output), redirect_stderr(output):
         try:
             code: Any = run([str(argument) for argument in arguments])
         except SystemExit as left:  # --help
             code = left.code
     if code not in (None, 0, 4):
-        raise SystemExit(f"tumortrack {' '.join(map(str, arguments))}: {said.getvalue()}")
-    return said.getvalue()
+        raise SystemExit(f"tumortrack {' '.join(map(str, arguments))}: {output.getvalue()}")
+    return output.getvalue()
 
 
 def ran(out: str, *arguments: object) -> Entries:
@@ -162,10 +162,10 @@ def watched(config: FollowerConfig) -> Entries:
     follower = Follower(Tracker(load_model(model("clinic"))), config)
     region_config = RegionConfig(crop=CloudConfig(near_mm=75, far_mm=340))
     for frame in range(3):
-        seen = source.at(0.5 + 0.1 * frame, frame * 10**8)
+        observation = source.at(0.5 + 0.1 * frame, frame * 10**8)
         hints = Hints(last_box_mm=follower.last_box_mm(frame * 10**8))
-        region = organ_points(seen.content, region_config, hints, np.random.default_rng(0))
-        yield f"{frame}/image", seen.content.depth_mm  # type: ignore[union-attr]
+        region = organ_points(observation.content, region_config, hints, np.random.default_rng(0))
+        yield f"{frame}/image", observation.content.depth_mm  # type: ignore[union-attr]
         yield f"{frame}/region", region.taken
         yield from under(frame, followed(follower, region.cloud))
 

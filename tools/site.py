@@ -50,7 +50,7 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
     for number, line in enumerate(lines):
         # Alone in its paragraph; headings and comments end one, too.
         around = (lines[max(number - 1, 0) : number], lines[number + 1 : number + 2])
-        alone = all(not one or one[0].strip()[:1] in ("", "#", "<") for one in around)
+        alone = all(not text or text[0].strip()[:1] in ("", "#", "<") for text in around)
         if alone and (link := _DATA_LINK.fullmatch(line.strip())):
             path = ROOT / "docs" / posixpath.normpath(posixpath.join(here, link[2]))
             if path.exists():  # else MkDocs tells
@@ -92,15 +92,16 @@ def command_line() -> str:
         "This page is generated from the code: it says what `tumortrack COMMAND --help` says.\n",
         "| command | |\n|---|---|",
     ]
-    found = [
+    parsers = [
         (f"tumortrack {name}", parser)
         for name, command in all_commands("").items()
         for parser in [_parser(command, name)]
     ]
     text += [
-        f"| [`{words}`](#{words.replace(' ', '-')}) | {_first(parser)} |" for words, parser in found
+        f"| [`{words}`](#{words.replace(' ', '-')}) | {_first(parser)} |"
+        for words, parser in parsers
     ]
-    for words, parser in found:
+    for words, parser in parsers:
         text += _section(words, parser, 2)
     return "\n".join(text) + "\n"
 
@@ -122,7 +123,7 @@ def _section(words: str, parser: argparse.ArgumentParser, level: int) -> Iterato
     rows, below = [], []
     for action in parser._actions:
         if isinstance(action, argparse._SubParsersAction):
-            below += [(f"{words} {name}", one) for name, one in action.choices.items()]
+            below += [(f"{words} {name}", subparser) for name, subparser in action.choices.items()]
         elif action.dest != "help":
             rows.append(_row(action))
     places = [_place(action) for action in parser._actions if _positional(action)]
@@ -131,8 +132,8 @@ def _section(words: str, parser: argparse.ArgumentParser, level: int) -> Iterato
     if rows:
         yield "| | value | meaning |\n|---|---|---|"
         yield from rows
-    for name, one in below:
-        yield from _section(name, one, level + 1)
+    for name, subparser in below:
+        yield from _section(name, subparser, level + 1)
 
 
 def _positional(action: argparse.Action) -> bool:
@@ -148,8 +149,8 @@ def _place(action: argparse.Action) -> str:
 def _row(action: argparse.Action) -> str:
     name = ", ".join(f"`{option}`" for option in action.option_strings)
     value = re.sub(r"\{None\}\||None,", "", str(action.metavar or ""))
-    said = " ".join((action.help or "").split()).replace(" (default: None)", "")
+    meaning = " ".join((action.help or "").split()).replace(" (default: None)", "")
     if not action.option_strings:
         name, value = f"`{_place(action)}`", ""
-    cells = (name, f"`{value}`" if value else "", said)
+    cells = (name, f"`{value}`" if value else "", meaning)
     return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"

@@ -131,8 +131,8 @@ class Browser:
         """Where the first such element is: left, top, width, height, in pixels of the page."""
         script = f"""(r => [r.x, r.y, r.width, r.height])(
             document.querySelector({json.dumps(selector)}).getBoundingClientRect())"""
-        found = self.call("Runtime.evaluate", expression=script, returnByValue=True)
-        left, top, width, height = found["result"]["value"]
+        rectangle = self.call("Runtime.evaluate", expression=script, returnByValue=True)
+        left, top, width, height = rectangle["result"]["value"]
         return left, top, width, height
 
     def click(self, x: float, y: float) -> None:

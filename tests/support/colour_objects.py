@@ -87,17 +87,17 @@ def painted(
     shine = np.clip((_unit(normal + film) * half).sum(-1, keepdims=True), 0, 1) ** 60
     wet = np.isin(kinds, (ORGAN, FAT, SHAFT))[..., None]
     linear = light.exposure * lit * (albedo * shade + 0.5 * wet * shine) * np.array(light.gain)
-    seen = 255 * np.clip(linear, 0, 1) ** (1 / 2.2) + rng.normal(0, light.noise, points.shape)
-    return np.clip(np.rint(seen), 0, 255).astype(np.uint8)
+    grey = 255 * np.clip(linear, 0, 1) ** (1 / 2.2) + rng.normal(0, light.noise, points.shape)
+    return np.clip(np.rint(grey), 0, 255).astype(np.uint8)
 
 
 def clicks_on(scene: Scene, organ: bool, count: int, rng: np.random.Generator) -> list[Pixel]:
     """Places well inside the organ, or of each other thing in turn, that have a depth, far from
     those before."""
-    seen = np.isfinite(scene.frame.depth_mm)
+    measured = np.isfinite(scene.frame.depth_mm)
     kinds = (ORGAN,) if organ else (FAT, HAND, BACKGROUND, SHAFT)
     inside = {
-        kind: distance_transform_edt(scene.kinds == kind) * seen
+        kind: distance_transform_edt(scene.kinds == kind) * measured
         for kind in kinds
         if (scene.kinds == kind).sum() > 400
     }

@@ -18,22 +18,22 @@ def crowd(port: int, count: int = MANY, opening: bytes = b"") -> Iterator[list[s
         sockets = []
         for _ in range(count):
             with contextlib.suppress(OSError):  # refused, or thrown out at once
-                one = socket.socket()
-                open_ones.callback(one.close)
-                one.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 2048)
-                one.settimeout(5)
-                one.connect(("127.0.0.1", port))
-                sockets.append(one)
-                one.settimeout(0.05)
-                one.sendall(opening)
+                client = socket.socket()
+                open_ones.callback(client.close)
+                client.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 2048)
+                client.settimeout(5)
+                client.connect(("127.0.0.1", port))
+                sockets.append(client)
+                client.settimeout(0.05)
+                client.sendall(opening)
         yield sockets
 
 
 def drip(sockets: list[socket.socket], byte: bytes) -> None:
     """One more byte on every connection."""
-    for one in sockets:
+    for client in sockets:
         with contextlib.suppress(OSError):
-            one.send(byte)
+            client.send(byte)
 
 
 def noise(size: int = 300, seed: int = 3) -> bytes:

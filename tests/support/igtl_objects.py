@@ -64,11 +64,11 @@ def hear(sock: socket.socket) -> Heard:
 def hear_all(sock: socket.socket, wanted: int, wait_s: float = PATIENCE_S) -> dict[tuple, Heard]:
     """Messages by type and device, until there are ``wanted`` different ones."""
     sock.settimeout(wait_s)
-    found: dict[tuple, Heard] = {}
-    while len(found) < wanted:
-        one = hear(sock)
-        found[one.type, one.device] = one
-    return found
+    messages: dict[tuple, Heard] = {}
+    while len(messages) < wanted:
+        message = hear(sock)
+        messages[message.type, message.device] = message
+    return messages
 
 
 def polydata_by_the_book(content: bytes) -> dict:

@@ -58,7 +58,7 @@ def unpack(header: Header, body: bytes) -> Message:
 
 
 def _read_metadata(index: bytes, texts: bytes) -> dict[str, str]:
-    found, at = {}, 0
+    metadata, at = {}, 0
     try:
         (count,) = struct.unpack_from("> H", index)
         for n in range(count):
@@ -66,12 +66,12 @@ def _read_metadata(index: bytes, texts: bytes) -> dict[str, str]:
             key = texts[at : at + key_size].decode("ascii")
             value = texts[at + key_size : at + key_size + value_size]
             at += key_size + value_size
-            found[key] = value.decode("utf-8" if charset == _UTF8 else "latin-1")
+            metadata[key] = value.decode("utf-8" if charset == _UTF8 else "latin-1")
     except (struct.error, UnicodeDecodeError) as error:
         raise ProtocolError(f"the message's metadata are damaged: {error}.") from error
     if at != len(texts):
         raise ProtocolError(f"the metadata's sizes add up to {at} of {len(texts)} bytes.")
-    return found
+    return metadata
 
 
 def unpack_transform(content: bytes) -> Float[np.ndarray, "4 4"]:
@@ -109,7 +109,7 @@ def unpack_polydata(content: bytes) -> Polydata:
         counts = dict(zip(sizes, cells[::2], strict=True))
         if counts["vertices"] or counts["strips"]:
             raise ProtocolError("POLYDATA: only lines and polygons are read.")
-        found = {name: take.numbers(size // 4, ">u4") for name, size in sizes.items()}
+        cells_of = {name: take.numbers(size // 4, ">u4") for name, size in sizes.items()}
         kinds = [_ATTRIBUTE.unpack(take.bytes(_ATTRIBUTE.size)) for _ in range(n_attributes)]
         if any(kind != (_POINT_SCALARS, 1, n_points) for kind in kinds):
             raise ProtocolError("POLYDATA: only attributes of one number a point are read.")
@@ -121,8 +121,8 @@ def unpack_polydata(content: bytes) -> Polydata:
         raise ProtocolError(f"POLYDATA is damaged: {error}.") from error
     return Polydata(
         points,
-        _corners(found["polygons"], counts["polygons"], 3, n_points),
-        _corners(found["lines"], counts["lines"], 2, n_points),
+        _corners(cells_of["polygons"], counts["polygons"], 3, n_points),
+        _corners(cells_of["lines"], counts["lines"], 2, n_points),
         scalars,
     )
 
@@ -160,9 +160,9 @@ class _Reader:
 
     def names(self, count: int) -> list[str]:
         """Texts that each end with a zero byte; one more where that makes the size even."""
-        start, found = self._at, []
+        start, names = self._at, []
         for _ in range(count):
             end = self._content.index(b"\0", self._at)
-            found.append(self.bytes(end + 1 - self._at)[:-1].decode("ascii"))
+            names.append(self.bytes(end + 1 - self._at)[:-1].decode("ascii"))
         self.bytes((self._at - start) % 2)
-        return found
+        return names

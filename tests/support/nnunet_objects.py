@@ -72,9 +72,9 @@ def tiny_model(folder: Path, labels: dict) -> Path:
     wanted = torch.cat([kinds >= 1, kinds == 2], 1).float()  # regions: kidney, tumor
     network, optimizer = trainer.network, torch.optim.Adam(trainer.network.parameters(), 0.02)
     for _ in range(150):
-        found = network(image)
-        found = found[0] if isinstance(found, (list, tuple)) else found
-        loss = torch.nn.functional.binary_cross_entropy_with_logits(found, wanted)
+        logits = network(image)
+        logits = logits[0] if isinstance(logits, (list, tuple)) else logits
+        loss = torch.nn.functional.binary_cross_entropy_with_logits(logits, wanted)
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()

@@ -21,9 +21,9 @@ def texts(figure: Figure) -> list[Text]:
     """Everything that is written, but for the words within axes."""
     legends = [text for legend in figure.legends for text in legend.get_texts()]
     titles = [title for axes in figure.axes for title in (axes.title, axes.yaxis.label)]
-    found = [*figure.texts, *legends, *titles]
+    every = [*figure.texts, *legends, *titles]
     assert figure._suptitle is None  # it knows of no borders
-    return [text for text in found if text.get_text()]
+    return [text for text in every if text.get_text()]
 
 
 def check(figure: Figure, warnings: tuple[str, ...]) -> None:

@@ -81,9 +81,9 @@ def kidney_of(label_map: Path) -> Mesh:
     image = nibabel.load(label_map)
     labels = np.asarray(image.dataobj)
     pieces, _ = label(labels > 0)
-    one = np.bincount(pieces[labels == 2]).argmax()
-    box = tuple(slice(max(s.start - 2, 0), s.stop + 2) for s in find_objects(pieces)[one - 1])
-    inside = (pieces[box] == one).astype(np.float32)
+    largest = np.bincount(pieces[labels == 2]).argmax()
+    box = tuple(slice(max(s.start - 2, 0), s.stop + 2) for s in find_objects(pieces)[largest - 1])
+    inside = (pieces[box] == largest).astype(np.float32)
     spacing = tuple(float(x) for x in image.header.get_zooms())
     vertices, faces, _, _ = marching_cubes(inside, 0.5, spacing=spacing, step_size=2)
     mesh = Mesh(vertices, faces)
@@ -119,9 +119,9 @@ def make_scene(
     what = np.full(depth_mm.shape, BACKGROUND, np.uint8)
     for kind, mesh in things:
         placed = transform_points(camera_from_table, mesh.vertices_mm)
-        one = render_depth(placed, mesh.faces, camera).depth_mm
-        nearer = (one < depth_mm) | (np.isfinite(one) & np.isnan(depth_mm))
-        depth_mm[nearer], what[nearer] = one[nearer], kind
+        thing_mm = render_depth(placed, mesh.faces, camera).depth_mm
+        nearer = (thing_mm < depth_mm) | (np.isfinite(thing_mm) & np.isnan(depth_mm))
+        depth_mm[nearer], what[nearer] = thing_mm[nearer], kind
     clean = DepthFrame(depth_mm, camera, 5)
     shaded = depth_mm.copy()
     shaded[stereo_shadow(clean)] = np.nan
@@ -239,8 +239,8 @@ def _fat(organ: Mesh, rng: np.random.Generator) -> Mesh:
     side = np.arange(-120.0, 121.0)  # mm, a cell each
     far = 10_000.0  # from so far above all rays are parallel
     above = Intrinsics(len(side), len(side), far, far, 120.0, 120.0)
-    seen = organ.vertices_mm * [1, -1, -1] + [0, 0, far]
-    organ_mm = far - np.nan_to_num(render_depth(seen, organ.faces, above).depth_mm, nan=far)
+    placed = organ.vertices_mm * [1, -1, -1] + [0, 0, far]
+    organ_mm = far - np.nan_to_num(render_depth(placed, organ.faces, above).depth_mm, nan=far)
     x, y = np.meshgrid(side, -side)
     level = rng.uniform(0.5, 0.85) * organ_mm.max()
     away = distance_transform_edt(organ_mm < level)
@@ -293,6 +293,6 @@ def working_truth(scene: Scene, shape: tuple[int, int]) -> np.ndarray:
 def precision_recall(scene: Scene, taken: np.ndarray) -> tuple[float, float]:
     """Of the pixels taken for the organ, the share that is; of the organ's, the share found."""
     truth = working_truth(scene, taken.shape) == ORGAN
-    found = taken == 0
-    both = np.count_nonzero(truth & found)
-    return both / max(np.count_nonzero(found), 1), both / max(np.count_nonzero(truth), 1)
+    predicted = taken == 0
+    both = np.count_nonzero(truth & predicted)
+    return both / max(np.count_nonzero(predicted), 1), both / max(np.count_nonzero(truth), 1)

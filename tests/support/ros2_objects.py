@@ -37,8 +37,8 @@ DOMAIN = str(1 + _WORKER + _WORKERS * secrets.randbelow(100 // _WORKERS))
 @contextmanager
 def own_graph() -> Iterator[None]:
     """ROS's environment for tests: the other programs of this machine are not heard."""
-    said = {"ROS_DOMAIN_ID": DOMAIN, "ROS_LOCALHOST_ONLY": "1"}
-    with mock.patch.dict(os.environ, said):
+    environment = {"ROS_DOMAIN_ID": DOMAIN, "ROS_LOCALHOST_ONLY": "1"}
+    with mock.patch.dict(os.environ, environment):
         os.environ.pop("CYCLONEDDS_URI", None)
         yield
 
@@ -122,17 +122,17 @@ class Other:
 
     def lines_until(self, good: Callable[[dict], bool]) -> list[dict]:
         """What it said (JSON), up to the first line that is good."""
-        said = [json.loads(self.line())]
-        while not good(said[-1]):
-            said.append(json.loads(self.line()))
-        return said
+        lines = [json.loads(self.line())]
+        while not good(lines[-1]):
+            lines.append(json.loads(self.line()))
+        return lines
 
     def topics_until(self, good: Callable[[dict[str, dict]], bool]) -> dict[str, dict]:
         """The last message of each topic, once they are good together. Topics race."""
         last: dict[str, dict] = {}
 
-        def heard(said: dict) -> bool:
-            last[said.get("topic", "")] = said
+        def heard(message: dict) -> bool:
+            last[message.get("topic", "")] = message
             return len(last) >= N_TOPICS and good(last)
 
         self.lines_until(heard)

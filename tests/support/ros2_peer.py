@@ -58,8 +58,8 @@ def send(kind: str, hz: float, seconds: float) -> None:
             header = messages.header(start_ns, "camera")
             out = [("points", CLOUD, plain_cloud(SensorCloud(points, start_ns), header, messages))]
         else:
-            seen = Observation(frame_numbered(number, start_ns), start_ns, mask)
-            out = list(reversed(messages_seen(seen, messages)))
+            observation = Observation(frame_numbered(number, start_ns), start_ns, mask)
+            out = list(reversed(messages_seen(observation, messages)))
         for suffix, message_type, message in out:
             if suffix not in publishers:
                 publishers[suffix] = bus.publisher(f"/camera/{suffix}", message_type)
@@ -90,7 +90,7 @@ def transforms(hz: float, seconds: float) -> None:
 
     def send(publisher: Publisher, stamp_ns: int, parent: str, child: str, way: np.ndarray) -> None:
         x, y, z, w = Rotation.from_matrix(way[:3, :3]).as_quat().tolist()
-        one = {
+        transform = {
             "header": bus.messages.header(stamp_ns, parent),
             "child_frame_id": child,
             "transform": {
@@ -98,7 +98,7 @@ def transforms(hz: float, seconds: float) -> None:
                 "rotation": {"x": x, "y": y, "z": z, "w": w},
             },
         }
-        message = bus.messages.make(TRANSFORMS, transforms=[one])
+        message = bus.messages.make(TRANSFORMS, transforms=[transform])
         publisher.publish(bus.messages.to_bytes(message))
 
     send(static, 1, "tool0", "optical", TOOL_FROM_CAMERA)
@@ -116,7 +116,7 @@ def hear(seconds: float) -> None:
     messages = bus.messages
     _reliable = reliably(bus)
     out = ResultMessages(messages, small_setting()).of(empty_update())
-    kinds = {one.suffix: one.message_type for one in out if not one.suffix.startswith("/")}
+    kinds = {sent.suffix: sent.message_type for sent in out if not sent.suffix.startswith("/")}
     heard = {name: bus.subscriber(f"/tumortrack/{name}", kind) for name, kind in kinds.items()}
     print(json.dumps({"listens": sorted(heard)}), flush=True)
     end_s = time.monotonic() + seconds
@@ -125,8 +125,8 @@ def hear(seconds: float) -> None:
         for name, subscriber in heard.items():
             for cdr in subscriber.take():
                 now_ns = time.time_ns()
-                said = told(messages.from_bytes(cdr, kinds[name]), kinds[name])
-                print(json.dumps({"topic": name, "now_ns": now_ns, **said}), flush=True)
+                content = content_of(messages.from_bytes(cdr, kinds[name]), kinds[name])
+                print(json.dumps({"topic": name, "now_ns": now_ns, **content}), flush=True)
     bus.close()
 
 
@@ -140,16 +140,16 @@ def reliably(bus: DdsBus) -> object:
     )
 
 
-def told(message: object, kind: str) -> dict:
+def content_of(message: object, kind: str) -> dict:
     if kind == MARKERS:
         markers = [[m.ns, int(m.action), len(m.points)] for m in message.markers]
         return {"stamp_ns": stamp_of(message.markers[0].header), "markers": markers}
-    said = {"stamp_ns": stamp_of(message.header), "frame": message.header.frame_id}
+    content = {"stamp_ns": stamp_of(message.header), "frame": message.header.frame_id}
     if kind == CLOUD:
-        return {**said, "points": int(message.width), "sum": int(message.data.sum())}
+        return {**content, "points": int(message.width), "sum": int(message.data.sum())}
     if kind == DIAGNOSTICS:
-        return {**said, "level": int(message.status[0].level), "text": message.status[0].message}
-    return {**said, "m": [message.point.x, message.point.y, message.point.z]}
+        return {**content, "level": int(message.status[0].level), "text": message.status[0].message}
+    return {**content, "m": [message.point.x, message.point.y, message.point.z]}
 
 
 if __name__ == "__main__":

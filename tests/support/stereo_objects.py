@@ -64,7 +64,7 @@ class StereoScene:
     def depth(self, camera: Intrinsics, camera_from_left: np.ndarray) -> DepthFrame:
         """The true depth image of a pinhole camera."""
         every = [self.depth_of(n, camera, camera_from_left) for n in range(len(self.bodies))]
-        return DepthFrame(np.fmin.reduce([one.depth_mm for one in every]), camera)
+        return DepthFrame(np.fmin.reduce([frame.depth_mm for frame in every]), camera)
 
     def depth_of(self, n: int, camera: Intrinsics, camera_from_left: np.ndarray) -> DepthFrame:
         """Of one of the bodies, alone."""
@@ -100,7 +100,8 @@ class StereoScene:
         chance = np.random.default_rng(self.seed)
         fine = chance.normal(size=(_SIDE,) * 3)
         field = sum(
-            one / one.std() for one in (gaussian_filter(fine, s, mode="wrap") for s in (0.7, 3.0))
+            octave / octave.std()
+            for octave in (gaussian_filter(fine, s, mode="wrap") for s in (0.7, 3.0))
         ) / np.sqrt(2)
         out = np.full((camera.height * camera.width, 3), 10.0, np.float32)
         nearest = np.full(camera.height * camera.width, np.inf)

@@ -24,7 +24,7 @@ COMMAND = [sys.executable, "-m", "tumortrack.cli.main"]
 def tumortrack(*arguments: object, **options: object) -> subprocess.CompletedProcess[str]:
     """Run a command to its end; with options of ``subprocess.run``, as a process started anew."""
     if not options and hasattr(os, "fork"):
-        return warm.run([str(one) for one in arguments], environment())
+        return warm.run([str(word) for word in arguments], environment())
     return subprocess.run(
         [*COMMAND, *map(str, arguments)],
         capture_output=True,
@@ -142,4 +142,4 @@ def live_resection(demo: Path, plan: Path, sink: str) -> list[str]:
     """A command for pictures: the plan, live, on the demo's phantom, which lies still."""
     source = f"virtual:{demo / 'case'}?seed=1&instrument=false&breathing=false&camera_motion=false"
     command = [*COMMAND, "resect", plan, sink, "--live", demo / "model", source, "--speed", "2"]
-    return [str(one) for one in command]
+    return [str(word) for word in command]

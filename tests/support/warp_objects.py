@@ -58,8 +58,8 @@ def nudged(motion: ElasticMotion, shift_mm: ArrayLike, turn_rad: ArrayLike) -> E
 def with_slope(field: kernels.DistanceField, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """A field's distances at points (n, 3), and their slopes."""
     lattice = field.values_mm, field.origin_mm, np.float32(field.spacing_mm)
-    found = np.array([kernels.distance_at(*lattice, *point) for point in points], np.float32)
-    return found[:, 0], found[:, 1:]
+    rows = np.array([kernels.distance_at(*lattice, *point) for point in points], np.float32)
+    return rows[:, 0], rows[:, 1:]
 
 
 def refined(points_mm, start, config=GaussNewtonConfig()) -> RegistrationResult:  # noqa: B008

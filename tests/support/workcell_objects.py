@@ -82,8 +82,8 @@ def workcell(
         *arm("holder", -480.0, middle + [0, 0, 18.0], HOLDER),
     )
     joints = {
-        f"{one}_{joint}_joint": 0.1 * k + 0.2 * progress + (0.5 if one == "holder" else 0.0)
-        for one in ("cutter", "holder")
+        f"{arm}_{joint}_joint": 0.1 * k + 0.2 * progress + (0.5 if arm == "holder" else 0.0)
+        for arm in ("cutter", "holder")
         for k, joint in enumerate(UR)
     }
     lines = (Polyline("cut/1", circle, CUT, 2.0), Polyline("cut/2", circle - [0, 0, 8.0], CUT, 2.0))

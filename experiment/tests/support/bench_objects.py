@@ -185,9 +185,9 @@ def a_view(
             Mesh(ball.vertices + bead, ball.faces),
             Mesh(post.vertices + [bead[0], bead[1], (bead[2] - 1.5) / 2], post.faces),
         ]
-    counts = np.cumsum([0, *(len(one.vertices_mm) for one in solids)])
-    vertices = np.concatenate([one.vertices_mm for one in solids])
-    faces = np.concatenate([one.faces + n for one, n in zip(solids, counts, strict=False)])
+    counts = np.cumsum([0, *(len(mesh.vertices_mm) for mesh in solids)])
+    vertices = np.concatenate([mesh.vertices_mm for mesh in solids])
+    faces = np.concatenate([mesh.faces + n for mesh, n in zip(solids, counts, strict=False)])
     frame = render_depth(transform_points(pose, vertices), faces, d405(640, 360))
     return add_noise(frame, noise, np.random.default_rng(seed))
 

@@ -68,9 +68,9 @@ class SmallBench:
             picture = np.full((CAMERA.height, CAMERA.width, 3), config.grey, np.uint8)
             picture[0] = config.number[0] % 200
         name = config.frame_id or None
-        seen = Observation(frame, stamp_ns + 1000, frame_id=name, picture=picture)
-        config.taken.append(seen)
-        return seen
+        observation = Observation(frame, stamp_ns + 1000, frame_id=name, picture=picture)
+        config.taken.append(observation)
+        return observation
 
     def close(self) -> None:
         pass

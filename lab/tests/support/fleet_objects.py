@@ -117,9 +117,9 @@ def drive(address: str, url: str, count: int) -> None:
     executors._SILENT_S = 3.0
     try:
         executor = executors.OnRay(address)
-        for one in run(patients(count), Store(url), executor, tries=3):
-            words = {"patient": one.task.patient, "state": one.state, "reason": one.reason}
-            print(json.dumps({**words, "step": one.step}), flush=True)
+        for done in run(patients(count), Store(url), executor, tries=3):
+            words = {"patient": done.task.patient, "state": done.state, "reason": done.reason}
+            print(json.dumps({**words, "step": done.step}), flush=True)
     except TumortrackError as error:
         print(json.dumps({"error": str(error)}), flush=True)
         sys.exit(error.exit_code)
