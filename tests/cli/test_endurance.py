@@ -29,7 +29,7 @@ def test_killed_commands_leave_what_is_whole(tmp_path, phantom_case, clinic_mode
     (base / "case").symlink_to(phantom_case)
     (base / "model").symlink_to(clinic_model)
     succeeded(tumortrack("simulate", phantom_case, base / "scenes", "--scenes", 1))
-    options = ["--times", "2", "--seed", "3", "--only", "making", "locating", "recording"]
+    options = ["--times", "2", "--seed", "3", "--slim", "--only", "making", "locating", "recording"]
     done = subprocess.run(
         [sys.executable, crashes.__file__, str(tmp_path), *options],
         capture_output=True,

@@ -92,7 +92,7 @@ def training(place: Place) -> str:
     from tumortrack.core.store import sha256_of
 
     takes_s = whole(place.train("undisturbed", 100))
-    kills, names = 0, []
+    kills, names = 0, list[str]()
     while kills < place.times:
         names.append(f"killed{len(names)}")
         words = place.train(names[-1], 100)
@@ -341,8 +341,14 @@ def main() -> int:
     parser.add_argument("--times", type=int, default=20)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--only", nargs="+", choices=CIRCUMSTANCES, default=list(CIRCUMSTANCES))
+    parser.add_argument("--slim", action="store_true", help="cases' models are made in seconds")
     given = parser.parse_args()
     base, faults = base_in(given.folder), 0
+    if given.slim:  # in forks of this process
+        from tumortrack.tracking import model_files
+        from warp_objects import slim_clinic
+
+        model_files.clinic = lambda *_: slim_clinic()  # type: ignore[attr-defined]
     print("| what was done | what happened | |\n|---|---|---|")
     for name in given.only:
         circumstance, folder = CIRCUMSTANCES[name], given.folder.resolve() / name
