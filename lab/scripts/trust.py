@@ -16,7 +16,7 @@ import pandas as pd
 import tyro
 
 from tumortrack.cli.console import say
-from tumortrack.report.calibration import WIDEST_MM
+from tumortrack_lab.margins.calibration import WIDEST_MM
 from tumortrack_lab.study import scripts, trust
 from tumortrack_lab.study.document import ReportWriter, table_of
 

@@ -10,7 +10,7 @@ import pytest
 from tumortrack.core import store
 from tumortrack.core.config import to_builtins
 from tumortrack.core.errors import InputError
-from tumortrack.report.calibration_table import Row, head_of
+from tumortrack_lab.margins.table import Row, head_of
 from tumortrack_lab.study import trust
 
 FAMILIES = {"rest": 1.0, "plate": 1.0, "pull": 1.0, "cut": 4.0}  # how far it misses, times the size

@@ -12,7 +12,6 @@ from stories import refusal, tumortrack
 from tumortrack.cli.main import run
 from tumortrack.core import store
 from tumortrack.core.errors import InputError
-from tumortrack.report.calibration_table import head_of, open_table
 
 ROOT = Path(__file__).parents[2]
 PACKAGES = (
@@ -90,25 +89,6 @@ def test_options_that_messages_name_are_options_of_some_command(capsys, monkeypa
             for text in (n for one in raised for n in ast.walk(one) if isinstance(n, ast.Constant)):
                 named = set(OPTION.findall(text.value)) if isinstance(text.value, str) else set()
                 assert named <= known, f"{path}: {named - known}"
-
-
-def test_a_table_of_margins_is_not_made_of_somebodys_notes(tmp_path):
-    notes = tmp_path / "notes.txt"
-    notes.write_text("first line\nno end of line")
-    with pytest.raises(InputError, match="not a table"), open_table(notes, head_of("sha", 0)):
-        pass
-    assert notes.read_text() == "first line\nno end of line"
-
-
-def test_a_table_whose_first_line_was_cut_short_is_begun_again(tmp_path):
-    table, head = tmp_path / "margins.jsonl", head_of("sha", 0)
-    with open_table(table, head):
-        pass
-    whole = table.read_bytes()
-    table.write_bytes(whole[:10])
-    with open_table(table, head) as (rows, _):
-        assert rows == []
-    assert table.read_bytes() == whole
 
 
 @pytest.mark.slow

@@ -81,6 +81,7 @@ def test_commands_and_an_example_run_from_the_wheel(environment, tmp_path):
     for name, package in (
         ("plan", "tumortrack-resection"),
         ("twin", "tumortrack-lab"),
+        ("margins", "tumortrack-lab"),
         ("record", "tumortrack-experiment"),
     ):
         without = subprocess.run([*command, name], capture_output=True, text=True, env=clean)

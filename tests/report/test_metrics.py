@@ -17,6 +17,7 @@ from tumortrack.report.metrics import (
     label_grid,
     label_ious,
     mean_iou,
+    outward_miss,
     surface_distances,
     surface_samples,
     triangle_distance,
@@ -264,3 +265,9 @@ def test_far_or_absent_parts_have_iou_zero():
     frame = grid((500.0, 0, 0), 1.0)
     estimate = CameraLabels(np.ones((5, 5, 5), np.uint8), frame)
     assert label_ious(estimate, reference) == {"kidney": 0.0, "tumor_1": 0.0}
+
+
+@pytest.mark.parametrize(("shift", "radius", "expected"), [(3, 10, 3), (0, 12, 0), (1, 8, 3)])
+def test_the_outward_miss_of_balls(shift, radius, expected):
+    reference, estimate = sphere(10.0), sphere(radius, (shift, 0, 0))
+    assert outward_miss(estimate, reference) == pytest.approx(expected, abs=0.1)

@@ -306,7 +306,7 @@ def _recordings() -> dict[str, Target]:
 
 def _margins() -> dict[str, Target]:
     from tumortrack.models import margins
-    from tumortrack.report.calibration_table import head_of, read_table
+    from tumortrack_lab.margins.table import head_of, read_table
 
     shells = margins.Shells(
         confidence=0.9, radii={"tumor": margins.Radius(used="constant", constant_mm=3.0)}

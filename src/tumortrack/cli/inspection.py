@@ -165,9 +165,8 @@ def _of_the_cases_model(case: Path) -> Content:
 
 def _of_model(manifest: Content, folder: Path) -> Content:
     """How good a model is."""
-    from tumortrack.cli.margins import described
     from tumortrack.models.folder import training_words, weakness_of
-    from tumortrack.models.margins import UNKNOWN, read_margins
+    from tumortrack.models.margins import UNKNOWN, described, read_margins
 
     about, margins = manifest["provenance"], read_margins(folder)
     trained = "trained for " * ("network" in manifest["config"])

@@ -22,6 +22,7 @@ from tumortrack.core.report import Finding, FitReport, MarginReport, StatedMargi
 METHOD = 4
 NAME = "margins.json"
 Kind = Literal["tumor", "organ", "map"]
+_WHAT = {"tumor": "a tumor's surface", "organ": "the organ's surface", "map": "mapped points"}
 UNKNOWN = "the model was not calibrated (tumortrack margins)"
 
 
@@ -261,3 +262,35 @@ def keep_margins(folder: Path, margins: ModelMargins) -> Path:
     digest = store.sha256_of(folder / store.MANIFEST)
     write_sealed(folder / NAME, msgspec.structs.replace(margins, model_sha256=digest))
     return folder / NAME
+
+
+def described(margins: ModelMargins) -> list[str]:
+    """Lines for the screen: radii, what they rest on, and where there is no answer."""
+    lines = []
+    for shells in margins.shells:
+        for kind, radius in shells.radii.items():
+            size = f"{radius.constant_mm:.1f} mm"
+            if radius.used == "scaled":
+                size = f"{radius.offset_mm:g} mm + largest deviation"
+                if radius.bend_mm:
+                    size += f" + {radius.bend_mm:g} mm x root of rarity"
+                size = f"{radius.scaled:.2f} x ({size})"
+            lines.append(f"{100 * shells.confidence:g} % margin of {_WHAT[kind]}: {size}")
+    lines += [
+        f"{', '.join(group.label)} (family, visible share, organ): {group.states} states, "
+        f"{group.good} good, {group.accepted} with an answer: {group.tested} to test limits, "
+        f"{group.calibrated} to find margins"
+        for group in margins.groups
+    ]
+    lines += [
+        f"{small} has too few of them: {large} counts instead"
+        for small, large in margins.joined.items()
+    ]
+    limits = ", ".join(f"{name} {limit:.3g}" for name, limit in margins.limits.items())
+    return [
+        *lines,
+        f"no answer where one of these is exceeded: {limits}",
+        f"of all states {100 * margins.accepted:.0f} % have an answer, "
+        f"{100 * margins.missed:.1f} % one that is outside the widest margin; of the worst group's "
+        f"answers these are no more than {100 * margins.risk_bound:.1f} %, with 95 % confidence",
+    ]

@@ -153,21 +153,22 @@ def margins(inputs: Inputs, options: Given, out: Path, cores: int) -> None:
 
     from tumortrack.imaging.case import Case
     from tumortrack.models.margins import NAME, write_sealed
-    from tumortrack.report import calibration, calibration_table
     from tumortrack.simulate.scene_folder import read_scene
     from tumortrack.tracking.model_files import load_model
     from tumortrack.tracking.tracker import Tracker
+    from tumortrack_lab.margins.calibration import list_states, margins_of, row_of
+    from tumortrack_lab.margins.table import head_of, open_table
 
     model = inputs["case"] / Case.MODEL
     seed, digest = options["seed"], store.sha256_of(model / store.MANIFEST)
     tracker, rows = Tracker(load_model(model)), []
     groups = [folder for name, folder in inputs.items() if name.startswith("states_")]
-    listed = calibration.list_states([folder for folder in groups if _scenes(folder)], seed)
+    listed = list_states([folder for folder in groups if _scenes(folder)], seed)
     for one in sorted(listed, key=lambda one: one.folder.name):
-        row = calibration.row_of(tracker, read_scene(one.folder), one, seed)
+        row = row_of(tracker, read_scene(one.folder), one, seed)
         rows.append(msgspec.structs.replace(row, scene=one.folder.name))
-    head = calibration_table.head_of(digest, seed)
-    with calibration_table.open_table(out / "margins.jsonl", head) as (_, add):
+    head = head_of(digest, seed)
+    with open_table(out / "margins.jsonl", head) as (_, add):
         for row in rows:
             add(row)
     good = [row for row in rows if not row.doubt]
@@ -179,7 +180,7 @@ def margins(inputs: Inputs, options: Given, out: Path, cores: int) -> None:
     }  # fmt: skip
     try:
         table = store.sha256_of(out / "margins.jsonl")
-        found = calibration.margins_of(rows, table, CONFIDENCES, seed=seed)
+        found = margins_of(rows, table, CONFIDENCES, seed=seed)
         write_sealed(out / NAME, msgspec.structs.replace(found, model_sha256=digest))
         for shells in found.shells:
             at = [

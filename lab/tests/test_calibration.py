@@ -2,29 +2,28 @@
 
 from __future__ import annotations
 
-import dataclasses
-import json
-
 import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from live_objects import CAMERA, ball, small_anatomy, small_estimate
-from reports import NOWHERE, looked, poor, report_of, reporting
+from live_objects import CAMERA, small_anatomy, small_estimate
 from tumortrack.core import store
-from tumortrack.core.errors import ArtifactError, InputError
-from tumortrack.core.report import MarginReport
+from tumortrack.core.errors import InputError
 from tumortrack.core.types import SensorCloud
-from tumortrack.models import margins as stored
-from tumortrack.models.margins import ModelMargins, stated_margin, stated_radius
-from tumortrack.report.calibration import Listed, answered, list_states, margins_of, row_of
-from tumortrack.report.calibration_table import Row, head_of, open_table
-from tumortrack.report.metrics import outward_miss
+from tumortrack.models.margins import ModelMargins
 from tumortrack.sense.cloud import CloudConfig, cloud_from_depth
 from tumortrack.sense.render import render_depth
 from tumortrack.simulate.scene_folder import Scene
-from tumortrack.tracking.quality import judged, with_margin
+from tumortrack.tracking.quality import judged
 from tumortrack.tracking.tracker import Tracker
+from tumortrack_lab.margins.calibration import (
+    Listed,
+    answered,
+    list_states,
+    margins_of,
+    row_of,
+)
+from tumortrack_lab.margins.table import Row, head_of, open_table
 
 GROUPS = [(f, share, o) for f in ("plate", "poke") for share in ("far", "near") for o in ("x", "y")]
 
@@ -184,12 +183,6 @@ def test_too_few_states_are_refused_with_their_number_and_small_groups_join():
     assert wider >= margins.shells[0].radii["tumor"].constant_mm
 
 
-@pytest.mark.parametrize(("shift", "radius", "expected"), [(3, 10, 3), (0, 12, 0), (1, 8, 3)])
-def test_the_outward_miss_of_balls(shift, radius, expected):
-    reference, estimate = ball((0, 0, 100), 10.0), ball((shift, 0, 100), radius)
-    assert outward_miss(estimate, reference) == pytest.approx(expected, abs=0.1)
-
-
 def test_a_table_goes_on_where_it_was_killed(tmp_path):
     path, head = tmp_path / "table.jsonl", head_of("abc", 0)
     first, second = drawn(np.random.default_rng(0), 1)[:2]
@@ -215,46 +208,23 @@ def test_a_table_goes_on_where_it_was_killed(tmp_path):
         pass
 
 
-def test_stored_margins_are_refused_where_anything_differs(tmp_path, monkeypatch):
-    (tmp_path / store.MANIFEST).write_text("{}")
-    assert stored.read_margins(tmp_path) is None
-    margins = margins_of(drawn(np.random.default_rng(2), 60), "abc", (0.8,))
-    path = stored.keep_margins(tmp_path, margins)
-    digest = store.sha256_of(tmp_path / store.MANIFEST)
-    assert stored.read_margins(tmp_path) == replace(margins, model_sha256=digest)
-    content = json.loads(path.read_text())
-    content["margins"]["shells"][0]["radii"]["tumor"]["constant_mm"] = 0.1
-    path.write_text(json.dumps(content))
-    with pytest.raises(ArtifactError, match="was changed after it was written"):
-        stored.read_margins(tmp_path)
-    stored.keep_margins(tmp_path, margins)
-    (tmp_path / store.MANIFEST).write_text('{"another": 1}')
-    with pytest.raises(ArtifactError, match="is of another model"):
-        stored.read_margins(tmp_path)
-    stored.keep_margins(tmp_path, margins)
-    now = stored.METHOD
-    monkeypatch.setattr(stored, "METHOD", now + 1)
-    said = f"version {now} of the method; this is version {now + 1}"
-    with pytest.raises(ArtifactError, match=said):
-        stored.read_margins(tmp_path)
+def test_a_table_of_margins_is_not_made_of_somebodys_notes(tmp_path):
+    notes = tmp_path / "notes.txt"
+    notes.write_text("first line\nno end of line")
+    with pytest.raises(InputError, match="not a table"), open_table(notes, head_of("sha", 0)):
+        pass
+    assert notes.read_text() == "first line\nno end of line"
 
 
-def test_an_estimate_states_its_margins_or_why_it_has_none():
-    margins = margins_of(drawn(np.random.default_rng(2), 60), "", (0.8, 0.9), 20.0)
-    parts = {"kidney": {"surface_std_mm": 2.0}, "tumor_1": {"surface_std_mm": 1.0}}
-    report = report_of(parts=parts)
-    said = stated_margin(report, margins, good=True)
-    radius = margins.shells[1].radii["tumor"]
-    assert stated_radius(said, "tumor_1").mm == radius.at(1.0, {})
-    assert stated_radius(said, "tumor_1").words == f"90 % margin {radius.at(1.0, {}):.1f} mm"
-    assert stated_radius(said, "kidney").mm == margins.shells[1].radii["organ"].at(2.0, {})
-    assert stated_radius(said, "tumor_1", 0.8).mm < radius.at(1.0, {})
-    assert stated_radius(said, "tumor_1", 0.95) is None
-    assert stated_radius(said, "map") is None  # no scene had targets
-    assert stated_margin(report, None, good=True).stated == ()
-    assert stated_margin(report, margins, good=False).stated == ()
-    smoothed = report_of(parts=parts, smoothing={"time_s": 0.2})
-    assert "smoothed" in stated_margin(smoothed, margins, good=True).reason
+def test_a_table_whose_first_line_was_cut_short_is_begun_again(tmp_path):
+    table, head = tmp_path / "margins.jsonl", head_of("sha", 0)
+    with open_table(table, head):
+        pass
+    whole = table.read_bytes()
+    table.write_bytes(whole[:10])
+    with open_table(table, head) as (rows, _):
+        assert rows == []
+    assert table.read_bytes() == whole
 
 
 def test_one_scene_of_each_state_counts(tmp_path):
@@ -276,30 +246,3 @@ def test_one_scene_of_each_state_counts(tmp_path):
     store.write_json(tmp_path / "0" / "meta.json", {"visible_share": 70})
     with pytest.raises(InputError, match="visible_share is 70; allowed: 0 to 1"):
         list_states([tmp_path], 0)
-
-
-def test_an_estimate_beyond_a_limit_is_poor_and_says_which():
-    margins = margins_of(drawn(np.random.default_rng(2), 60), "", (0.8, 0.9), 20.0)
-    rare = replace(margins, limits={"rarity": 1.0, "unseen": 0.5})
-
-    def judged(rarity, cloud, finding=None):
-        estimate = dataclasses.replace(small_estimate(), finding=finding)
-        parts = {name: {"surface_std_mm": 1.0} for name in estimate.report.parts}
-        estimate = reporting(estimate, parts=parts, motion={**NOWHERE, "rarity": rarity})
-        return with_margin(estimate, cloud, rare)
-
-    organ = small_estimate().meshes["kidney"].vertices_mm
-    whole = SensorCloud(organ.astype(np.float32))
-    fine = judged(0.9, whole)
-    assert (fine.quality, len(fine.report.margin.stated)) == ("good", 2)
-    far = judged(1.2, whole)
-    assert (far.quality, far.report.margin.stated) == ("poor", ())
-    assert far.reason == "rarity is 1.2; margins are known up to 1"
-    assert far.finding.values == {"figure": "rarity", "value": 1.2, "limit": 1.0}
-    end = SensorCloud(organ[organ[:, 0] < np.quantile(organ[:, 0], 0.2)].astype(np.float32))
-    assert "unseen is 0." in judged(0.9, end).reason  # worked out here: an image was judged
-    before = judged(0.9, whole, poor("it is hidden"))
-    assert before.report.margin == MarginReport(reason="a poor estimate has no margin")
-    without = with_margin(dataclasses.replace(small_estimate(), finding=None), whole, None)
-    assert without.quality == "good"
-    assert without.report.margin.reason.startswith("the model was not calibrated")

@@ -20,7 +20,6 @@ from msgspec.structs import replace
 import tumortrack
 from tumortrack.core import store
 from tumortrack.core.errors import InputError, NoEstimate
-from tumortrack.models import conformal
 from tumortrack.models.margins import (
     METHOD,
     Group,
@@ -32,10 +31,11 @@ from tumortrack.models.margins import (
     measured,
     sized,
 )
-from tumortrack.report.calibration_table import Miss, Row
 from tumortrack.report.metrics import outward_miss
 from tumortrack.simulate.scene_folder import Scene, list_scenes
 from tumortrack.tracking.quality import cloud_shares
+from tumortrack_lab.margins import conformal
+from tumortrack_lab.margins.table import Miss, Row
 
 if TYPE_CHECKING:
     from tumortrack.tracking.tracker import Tracker

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.stats import binom
 
-from tumortrack.models.conformal import (
+from tumortrack_lab.margins.conformal import (
     conformal_quantile,
     groups_of,
     least_scores,

@@ -1,0 +1,99 @@
+"""Margins as a model states them: kept with it, stated or refused with an estimate."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+from msgspec.structs import replace
+
+from live_objects import small_estimate
+from reports import NOWHERE, poor, report_of, reporting
+from tumortrack.core import store
+from tumortrack.core.errors import ArtifactError
+from tumortrack.core.report import MarginReport
+from tumortrack.core.types import SensorCloud
+from tumortrack.models import margins as stored
+from tumortrack.models.margins import ModelMargins, Radius, Shells, stated_margin, stated_radius
+from tumortrack.tracking.quality import with_margin
+
+
+def _shells(confidence: float, factor: float) -> Shells:
+    tumor = Radius(used="scaled", constant_mm=4.0, scaled=factor, offset_mm=0.5)
+    organ = Radius(used="constant", constant_mm=factor)
+    return Shells(confidence=confidence, radii={"tumor": tumor, "organ": organ})
+
+
+MARGINS = ModelMargins(
+    method=stored.METHOD, tumortrack="0", model_sha256="", table_sha256="abc", seed=0,
+    widest_mm=20.0, limits={"fit_cost": 1.0}, shells=(_shells(0.8, 2.0), _shells(0.9, 3.0)),
+    groups=(), joined={}, risk_bound=0.1, accepted=1.0, missed=0.0,
+)  # fmt: skip
+
+
+def test_stored_margins_are_refused_where_anything_differs(tmp_path, monkeypatch):
+    (tmp_path / store.MANIFEST).write_text("{}")
+    assert stored.read_margins(tmp_path) is None
+    path = stored.keep_margins(tmp_path, MARGINS)
+    digest = store.sha256_of(tmp_path / store.MANIFEST)
+    assert stored.read_margins(tmp_path) == replace(MARGINS, model_sha256=digest)
+    content = json.loads(path.read_text())
+    content["margins"]["shells"][0]["radii"]["tumor"]["constant_mm"] = 0.1
+    path.write_text(json.dumps(content))
+    with pytest.raises(ArtifactError, match="was changed after it was written"):
+        stored.read_margins(tmp_path)
+    stored.keep_margins(tmp_path, MARGINS)
+    (tmp_path / store.MANIFEST).write_text('{"another": 1}')
+    with pytest.raises(ArtifactError, match="is of another model"):
+        stored.read_margins(tmp_path)
+    stored.keep_margins(tmp_path, MARGINS)
+    now = stored.METHOD
+    monkeypatch.setattr(stored, "METHOD", now + 1)
+    said = f"version {now} of the method; this is version {now + 1}"
+    with pytest.raises(ArtifactError, match=said):
+        stored.read_margins(tmp_path)
+
+
+def test_an_estimate_states_its_margins_or_why_it_has_none():
+    parts = {"kidney": {"surface_std_mm": 2.0}, "tumor_1": {"surface_std_mm": 1.0}}
+    report = report_of(parts=parts)
+    said = stated_margin(report, MARGINS, good=True)
+    radius = MARGINS.shells[1].radii["tumor"]
+    assert stated_radius(said, "tumor_1").mm == radius.at(1.0, {})
+    assert stated_radius(said, "tumor_1").words == f"90 % margin {radius.at(1.0, {}):.1f} mm"
+    assert stated_radius(said, "kidney").mm == MARGINS.shells[1].radii["organ"].at(2.0, {})
+    assert stated_radius(said, "tumor_1", 0.8).mm < radius.at(1.0, {})
+    assert stated_radius(said, "tumor_1", 0.95) is None
+    assert stated_radius(said, "map") is None  # no scene had targets
+    assert stated_margin(report, None, good=True).stated == ()
+    assert stated_margin(report, MARGINS, good=False).stated == ()
+    smoothed = report_of(parts=parts, smoothing={"time_s": 0.2})
+    assert "smoothed" in stated_margin(smoothed, MARGINS, good=True).reason
+
+
+def test_an_estimate_beyond_a_limit_is_poor_and_says_which():
+    rare = replace(MARGINS, limits={"rarity": 1.0, "unseen": 0.5})
+
+    def judged(rarity, cloud, finding=None):
+        estimate = dataclasses.replace(small_estimate(), finding=finding)
+        parts = {name: {"surface_std_mm": 1.0} for name in estimate.report.parts}
+        estimate = reporting(estimate, parts=parts, motion={**NOWHERE, "rarity": rarity})
+        return with_margin(estimate, cloud, rare)
+
+    organ = small_estimate().meshes["kidney"].vertices_mm
+    whole = SensorCloud(organ.astype(np.float32))
+    fine = judged(0.9, whole)
+    assert (fine.quality, len(fine.report.margin.stated)) == ("good", 2)
+    far = judged(1.2, whole)
+    assert (far.quality, far.report.margin.stated) == ("poor", ())
+    assert far.reason == "rarity is 1.2; margins are known up to 1"
+    assert far.finding.values == {"figure": "rarity", "value": 1.2, "limit": 1.0}
+    end = SensorCloud(organ[organ[:, 0] < np.quantile(organ[:, 0], 0.2)].astype(np.float32))
+    assert "unseen is 0." in judged(0.9, end).reason  # worked out here: an image was judged
+    before = judged(0.9, whole, poor("it is hidden"))
+    assert before.report.margin == MarginReport(reason="a poor estimate has no margin")
+    without = with_margin(dataclasses.replace(small_estimate(), finding=None), whole, None)
+    assert without.quality == "good"
+    assert without.report.margin.reason.startswith("the model was not calibrated")
