@@ -10,10 +10,10 @@ from live_objects import CAMERA, small_anatomy, small_estimate
 from tumortrack.core import store
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import SensorCloud
-from tumortrack.models.margins import ModelMargins
 from tumortrack.sense.cloud import CloudConfig, cloud_from_depth
 from tumortrack.sense.render import render_depth
 from tumortrack.simulate.scene_folder import Scene
+from tumortrack.tracking.margins import ModelMargins
 from tumortrack.tracking.quality import judged
 from tumortrack.tracking.tracker import Tracker
 from tumortrack_lab.margins.calibration import (

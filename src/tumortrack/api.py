@@ -28,10 +28,10 @@ from tumortrack.imaging.case import load_case as read_case
 if TYPE_CHECKING:
     from tumortrack.live.values import SinkContext, TrackingResult
     from tumortrack.live.workers import SinkWorker
-    from tumortrack.models.config import RegistrationConfig
     from tumortrack.models.model import Model
     from tumortrack.occupancy.config import TrainConfig
     from tumortrack.occupancy.training.train import TrainingStatus
+    from tumortrack.registration.config import RegistrationConfig
     from tumortrack.sense.region.taught import Taught
     from tumortrack.simulate.scene import SceneConfig
     from tumortrack.simulate.scene_folder import Scene
@@ -211,7 +211,7 @@ def train(
         InputError, ArtifactError: no case, or ``folder`` holds another model or run.
         StorageError: the disk is full; the last checkpoint is whole.
     """
-    from tumortrack.models.config import RegistrationConfig
+    from tumortrack.registration.config import RegistrationConfig
     from tumortrack.tracking.model_files import write_model
     from tumortrack.tracking.presets import PRESETS, occupancy
 

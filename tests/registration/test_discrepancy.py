@@ -10,7 +10,6 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from elastic_objects import CENTER, RADII
-from tumortrack.models.config import GaussNewtonConfig
 from tumortrack.models.in_distribution import RIVAL_COST
 from tumortrack.registration import kernels
 from tumortrack.registration.choose import likeliest

@@ -21,7 +21,6 @@ from tumortrack.core.estimate import FollowOptions
 from tumortrack.core.process import parallel_for, parallel_map
 from tumortrack.core.types import Mesh, SensorCloud
 from tumortrack.imaging.raster import label_grid, winding_numbers
-from tumortrack.models.config import GaussNewtonConfig
 from tumortrack.registration import gauss_newton_kernels as kernels
 from tumortrack.registration import registration
 from tumortrack.registration.gauss_newton import GaussNewton, _prior

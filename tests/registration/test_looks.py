@@ -19,9 +19,9 @@ from tumortrack.core.geometry import rigid, transform_points
 from tumortrack.core.types import DepthFrame, Look, SensorCloud
 from tumortrack.live.values import CameraView, Observation
 from tumortrack.live.views import Scan, ViewsLocator
-from tumortrack.models.config import GaussNewtonConfig
 from tumortrack.occupancy.locator import OccupancyLocator
 from tumortrack.registration import looks as module
+from tumortrack.registration.config import GaussNewtonConfig
 from tumortrack.registration.discrepancy import fit_discrepancy
 from tumortrack.registration.gauss_newton import refine
 from tumortrack.registration.looks import CAMERA_STD, Looks, seen_from_first

@@ -20,7 +20,7 @@ from tumortrack.core.errors import InputError
 from tumortrack.core.estimate import Motion
 from tumortrack.core.mesh_query import labels_of, surface_distance
 from tumortrack.core.types import Mesh
-from tumortrack.models.config import GaussNewtonConfig
+from tumortrack.registration.config import GaussNewtonConfig
 from tumortrack.registration.gauss_newton import _prior
 from tumortrack.registration.looks import Looks
 from tumortrack.registration.motion import ElasticMotion
@@ -359,7 +359,7 @@ _FITTED = """
 import sys
 import numpy as np
 from tumortrack.registration.motion import ElasticMotion
-from tumortrack.models.config import GaussNewtonConfig
+from tumortrack.registration.config import GaussNewtonConfig
 from tumortrack.registration.gauss_newton import refine
 from tumortrack.registration.looks import Looks
 from tumortrack.registration.rest_shape import RestShape

@@ -15,8 +15,8 @@ from tumortrack.core.estimate import FollowOptions
 from tumortrack.core.geometry import rigid
 from tumortrack.core.types import Anatomy, SensorCloud
 from tumortrack.imaging.case import load_case
-from tumortrack.models.config import GaussNewtonConfig
 from tumortrack.models.in_distribution import RIVAL_COST
+from tumortrack.registration.config import GaussNewtonConfig
 from tumortrack.registration.looks import Looks
 from tumortrack.registration.registration import Registration
 from tumortrack.registration.search import APART_MM, PosePrior, Search, apart_mm

@@ -305,7 +305,7 @@ def _recordings() -> dict[str, Target]:
 
 
 def _margins() -> dict[str, Target]:
-    from tumortrack.models import margins
+    from tumortrack.tracking import margins
     from tumortrack_lab.margins.table import head_of, read_table
 
     shells = margins.Shells(

@@ -11,7 +11,6 @@ from scipy.spatial.transform import Rotation
 
 from elastic_objects import SMALL, UP, organ
 from tumortrack.core.types import Anatomy
-from tumortrack.models.config import GaussNewtonConfig, RegistrationConfig
 from tumortrack.models.folder import save_model
 from tumortrack.registration import kernels
 from tumortrack.registration.build import build_model

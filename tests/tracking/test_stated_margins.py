@@ -15,8 +15,8 @@ from tumortrack.core import store
 from tumortrack.core.errors import ArtifactError
 from tumortrack.core.report import MarginReport
 from tumortrack.core.types import SensorCloud
-from tumortrack.models import margins as stored
-from tumortrack.models.margins import ModelMargins, Radius, Shells, stated_margin, stated_radius
+from tumortrack.tracking import margins as stored
+from tumortrack.tracking.margins import ModelMargins, Radius, Shells, stated_margin, stated_radius
 from tumortrack.tracking.quality import with_margin
 
 

@@ -19,7 +19,7 @@ from scipy.spatial import cKDTree
 
 from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError, NoPlan
-from tumortrack.models.margins import StatedRadius, margin_words, stated_radius
+from tumortrack.tracking.margins import StatedRadius, margin_words, stated_radius
 from tumortrack_resection.outline import evenly_round, polygon_of
 from tumortrack_resection.resection import inside, plan_resection
 from tumortrack_resection.ur_sink import OFF_MM

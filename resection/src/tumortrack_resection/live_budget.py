@@ -12,7 +12,7 @@ from jaxtyping import Float64
 from tumortrack.core.config import to_builtins
 from tumortrack.core.types import Mesh
 from tumortrack.live.values import TrackingResult
-from tumortrack.models.margins import stated_radius
+from tumortrack.tracking.margins import stated_radius
 from tumortrack_resection.budget import ErrorBudget
 
 _SPEED_S = 0.3  # that a speed is taken over: estimates jitter from frame to frame

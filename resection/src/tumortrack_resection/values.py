@@ -99,7 +99,7 @@ class Located:
         meshes: closed surfaces: the organ's name (tumors included), tumor_1, ...
         std_mm: per tumor, the standard deviation of each of its mesh's vertices along the axis that
             is least sure; left out where the estimate has none.
-        margin: what margins the estimate states (``models.margins``).
+        margin: what margins the estimate states (``tracking.margins``).
         structures: further surfaces that were carried along, closed or open.
         doubt: why the estimate is poor; empty: it is good.
     """

@@ -132,8 +132,8 @@ def _with_figures(content: Content, folder: Path) -> Content:
         import msgspec
 
         from tumortrack.core.report import FitReport
-        from tumortrack.models.margins import margin_words
         from tumortrack.report.seen import part_rows, row_words
+        from tumortrack.tracking.margins import margin_words
 
         report, good = msgspec.convert(content, FitReport), content["quality"]["verdict"] == "good"
         figures["margin_words"] = margin_words(report.margin)
@@ -166,7 +166,7 @@ def _of_the_cases_model(case: Path) -> Content:
 def _of_model(manifest: Content, folder: Path) -> Content:
     """How good a model is."""
     from tumortrack.models.folder import training_words, weakness_of
-    from tumortrack.models.margins import UNKNOWN, described, read_margins
+    from tumortrack.tracking.margins import UNKNOWN, described, read_margins
 
     about, margins = manifest["provenance"], read_margins(folder)
     trained = "trained for " * ("network" in manifest["config"])

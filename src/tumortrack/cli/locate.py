@@ -231,7 +231,7 @@ class Locate(FindingOrgan):
 
     def _nothing(self, reason: str, view: View, model: Model) -> dict[str, Any]:
         """The report's head, where there is no estimate."""
-        from tumortrack.models.report import report_head
+        from tumortrack.tracking.files import report_head
 
         if view.unit is not None:
             reason = f"{reason.rstrip('.')}; {_ASK}."
@@ -320,8 +320,8 @@ def looks_at(
 def _say_found(estimate: Estimate, about: dict[str, Any]) -> None:
     """How far it is to be trusted, and what is where."""
     from tumortrack.core.estimate import verdict_words
-    from tumortrack.models.margins import margin_words
     from tumortrack.report.seen import part_rows, row_words
+    from tumortrack.tracking.margins import margin_words
 
     report, margin = estimate.report, estimate.report.margin
     say(verdict_words(estimate.quality, estimate.reason))
@@ -336,9 +336,9 @@ def _say_found(estimate: Estimate, about: dict[str, Any]) -> None:
 
 
 def _say_written(estimate: Estimate, points: PointTable | None, out: Path) -> None:
-    from tumortrack.models.margins import stated_radius
     from tumortrack.registration.kernels import carry
     from tumortrack.report.seen import PAGE
+    from tumortrack.tracking.margins import stated_radius
 
     if points is not None:
         radius = stated_radius(estimate.report.margin, "map")

@@ -24,7 +24,7 @@ from tumortrack.core.estimate import NO_CHECK_FAILED, UNVERIFIED, Estimate, Qual
 from tumortrack.core.geometry import Affine, rigid, transform_points
 from tumortrack.core.patient import NOBODY, Patient
 from tumortrack.core.types import Anatomy, DepthFrame, Mesh, SensorCloud
-from tumortrack.models.margins import margin_words
+from tumortrack.tracking.margins import margin_words
 
 if TYPE_CHECKING:
     from tumortrack.sense.region.taught import Click, Taught

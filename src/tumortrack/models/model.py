@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from tumortrack.core.organ import Organ, organ_in
 from tumortrack.core.patient import Patient, patient_in
-from tumortrack.models.config import RegistrationConfig
 from tumortrack.models.in_distribution import InDistributionRange
-from tumortrack.models.margins import ModelMargins
 
 if TYPE_CHECKING:
     from tumortrack.occupancy.config import TrainConfig
+    from tumortrack.registration.config import RegistrationConfig
+    from tumortrack.tracking.margins import ModelMargins
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

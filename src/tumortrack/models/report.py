@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-import tumortrack
 from tumortrack.core.estimate import Estimate
 from tumortrack.core.geometry import Affine, transform_points
 from tumortrack.core.report import FitReport, PartReport, Residuals
@@ -55,12 +54,6 @@ class Frame:
             timings={**self.seconds, "total": sum(self.seconds.values())},
             **more,
         )
-
-
-def report_head(stamp_ns: int) -> dict[str, Any]:
-    """What every report begins with."""
-    about = {"tumortrack": tumortrack.__version__, "units": "mm", "frame": "camera"}
-    return {**about, "stamp_ns": stamp_ns}
 
 
 def grid_over(points_mm: np.ndarray, grid: int) -> tuple[Affine, tuple[int, int, int]]:

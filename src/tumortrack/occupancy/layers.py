@@ -15,7 +15,7 @@ from torch.autograd import Function
 from torch.autograd.function import once_differentiable
 from torch.nn import functional
 
-from tumortrack.models import kernels
+from tumortrack.occupancy import point_kernels
 from tumortrack.occupancy.sampling import traced
 
 Norm = Literal["none", "batch"]
@@ -97,7 +97,7 @@ class _Greatest(Function):
         out = torch.empty(batch, m, channels, dtype=values.dtype)
         chosen = torch.empty(batch * m, channels, dtype=bits.dtype)
         infinity = torch.tensor(torch.inf, dtype=values.dtype).view(bits.dtype)
-        kernels.greatest(
+        point_kernels.greatest(
             bits.view(-1, k, channels).numpy(),
             infinity.numpy()[()],
             out.view(bits.dtype).view(-1, channels).numpy(),
@@ -115,5 +115,5 @@ class _Greatest(Function):
         out = torch.empty(ctx.shape, dtype=gradient.dtype)
         _, _, k, channels = ctx.shape
         spread = out.view(chosen.dtype).view(-1, k, channels)
-        kernels.handed_back(bits.numpy(), chosen.numpy(), spread.numpy())
+        point_kernels.handed_back(bits.numpy(), chosen.numpy(), spread.numpy())
         return out

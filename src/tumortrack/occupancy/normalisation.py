@@ -8,7 +8,7 @@ from torch import Tensor
 
 from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError
-from tumortrack.models import kernels
+from tumortrack.occupancy import point_kernels
 from tumortrack.occupancy.sampling import compiled, take
 
 
@@ -66,7 +66,7 @@ def without_strays(points_mm: Tensor, reach_mm: float) -> Tensor:
     points that stay is kept."""
     if compiled(points_mm):
         out = torch.empty_like(points_mm, memory_format=torch.contiguous_format)
-        kernels.near(points_mm.contiguous().numpy(), np.float32(reach_mm), out.numpy())
+        point_kernels.near(points_mm.contiguous().numpy(), np.float32(reach_mm), out.numpy())
         return out
     n = points_mm.shape[1]
     if torch.jit.is_tracing():  # ONNX has no median

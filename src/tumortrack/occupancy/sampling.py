@@ -11,7 +11,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from tumortrack.models import kernels
+from tumortrack.core.mesh_kernels import farthest
+from tumortrack.occupancy.point_kernels import balls
 
 
 def farthest_points(points: Tensor, k: int) -> Tensor:
@@ -25,7 +26,7 @@ def farthest_points(points: Tensor, k: int) -> Tensor:
     chosen = torch.empty((len(points), k), dtype=torch.int64, device=points.device)
     newest = _distance_2(x, y, z, *centre.unbind(-1)).argmax(dim=1, keepdim=True)
     if compiled(points):
-        kernels.farthest(rows.numpy(), newest[:, 0].numpy(), chosen.numpy())
+        farthest(rows.numpy(), newest[:, 0].numpy(), chosen.numpy())
         return chosen
     nearest = torch.full_like(x, torch.inf)
     for step in range(k):
@@ -53,7 +54,7 @@ def ball_query(points: Tensor, centres: Tensor, radius: float, k: int) -> Tensor
     if compiled(points):
         found = torch.empty((*centres.shape[:2], k), dtype=torch.int64)
         rows = _rows(points).numpy(), _rows(centres).numpy()
-        kernels.balls(*rows, np.float32(radius**2), found.numpy())
+        balls(*rows, np.float32(radius**2), found.numpy())
         return found
     across, down = _rows(points)[:, :, None].unbind(1), _rows(centres)[..., None].unbind(1)
     inside = _distance_2(*across, *down) <= radius**2

@@ -20,7 +20,6 @@ from tumortrack.core.errors import InputError
 from tumortrack.core.estimate import FAR_MM
 from tumortrack.core.process import parallel_map
 from tumortrack.core.types import Anatomy
-from tumortrack.models.config import RegistrationConfig
 from tumortrack.models.in_distribution import InDistributionRange, fit_mm, spread_mm
 from tumortrack.registration.gauss_newton import RegistrationResult, refine
 from tumortrack.registration.looks import Looks

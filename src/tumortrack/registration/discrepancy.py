@@ -20,7 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float32, Float64, Int64
 
-from tumortrack.models.kernels import farthest
+from tumortrack.core.mesh_kernels import farthest
 from tumortrack.registration import kernels
 
 # 15 and 30 mm rank and cover the errors of training's and the twin's scenes equally well.

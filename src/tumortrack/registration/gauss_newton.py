@@ -21,8 +21,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Float64
 
-from tumortrack.models.config import GaussNewtonConfig
 from tumortrack.registration import gauss_newton_kernels as kernels
+from tumortrack.registration.config import GaussNewtonConfig
 from tumortrack.registration.discrepancy import FARTHEST
 from tumortrack.registration.looks import Looks
 from tumortrack.registration.motion import ElasticMotion

@@ -15,7 +15,7 @@ from jaxtyping import Float, Float64, Int64
 
 from tumortrack.core.geometry import Affine, Points, rigid, transform_points, turned_by
 from tumortrack.core.report import LooksReport
-from tumortrack.models.config import GaussNewtonConfig
+from tumortrack.registration.config import GaussNewtonConfig
 from tumortrack.registration.kernels import POSE
 from tumortrack.registration.motion import ElasticMotion
 from tumortrack.sense.noise import CAMERA_STD

@@ -13,9 +13,9 @@ from safetensors.numpy import load, save
 
 from tumortrack.core.config import Config, from_builtins, to_builtins
 from tumortrack.core.errors import InputError
-from tumortrack.models.config import RegistrationConfig
 from tumortrack.models.folder import SHAPE, organ_of, read_tensors
 from tumortrack.models.model import Model
+from tumortrack.registration.config import RegistrationConfig
 from tumortrack.registration.registration import Registration
 from tumortrack.registration.rest_shape import RestShape
 from tumortrack.registration.search import PosePrior

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Literal
 
 from tumortrack.core.types import Anatomy
-from tumortrack.models.config import RegistrationConfig
+from tumortrack.registration.config import RegistrationConfig
 from tumortrack.sense.clutter import ClutterConfig
 from tumortrack.sense.noise import D405_NOISE, CalibrationConfig
 from tumortrack.sense.occlusion import OcclusionConfig

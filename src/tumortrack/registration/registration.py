@@ -29,13 +29,13 @@ import msgspec
 import numpy as np
 
 from tumortrack.core.process import parallel_map
-from tumortrack.models.config import GaussNewtonConfig
 from tumortrack.models.in_distribution import (
     InDistributionRange,
     check_in_distribution,
     check_likely,
 )
 from tumortrack.registration.choose import cost_with_prior, likeliest
+from tumortrack.registration.config import GaussNewtonConfig
 from tumortrack.registration.gauss_newton import GaussNewton, RegistrationResult, refine
 from tumortrack.registration.looks import Looks
 from tumortrack.registration.motion import ElasticMotion

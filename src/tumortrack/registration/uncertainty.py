@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from tumortrack.models.config import GaussNewtonConfig
+from tumortrack.registration.config import GaussNewtonConfig
 from tumortrack.registration.discrepancy import fit_discrepancy
 from tumortrack.registration.kernels import POSE
 from tumortrack.registration.looks import Looks

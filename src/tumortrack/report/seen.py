@@ -11,7 +11,7 @@ from jaxtyping import UInt8
 
 from tumortrack.core.report import FitReport
 from tumortrack.core.types import DepthFrame, SensorCloud
-from tumortrack.models.margins import stated_radius
+from tumortrack.tracking.margins import stated_radius
 
 if TYPE_CHECKING:
     from tumortrack.live.viewer.slices import CarriedCt

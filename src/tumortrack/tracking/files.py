@@ -11,6 +11,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
+import tumortrack
 from tumortrack.core import store
 from tumortrack.core.config import to_builtins
 from tumortrack.core.errors import ArtifactError, InputError
@@ -23,9 +24,8 @@ from tumortrack.core.report import Finding, FitReport
 from tumortrack.core.types import CameraLabels, OccupancyCloud
 from tumortrack.imaging.nifti import read_nifti, write_nifti
 from tumortrack.imaging.segmentation_files import segments, write_seg_nrrd
-from tumortrack.models.margins import stated_radius
-from tumortrack.models.report import report_head
 from tumortrack.sense.ply import parse_ply_properties, write_cloud_ply
+from tumortrack.tracking.margins import stated_radius
 from tumortrack.tracking.points import PointTable, camera_table
 from tumortrack.tracking.shells import exact_margin
 
@@ -77,6 +77,12 @@ def write_estimate(
             store.write_atomically(aside / "points.csv", table)
         added.result()
         _seal(aside, {**report_entry(estimate), **about}, estimate.quality)
+
+
+def report_head(stamp_ns: int) -> dict[str, Any]:
+    """What every report begins with."""
+    about = {"tumortrack": tumortrack.__version__, "units": "mm", "frame": "camera"}
+    return {**about, "stamp_ns": stamp_ns}
 
 
 def report_entry(estimate: Estimate) -> dict[str, Any]:

@@ -22,13 +22,13 @@ from tumortrack.models.folder import (
     save_model,
 )
 from tumortrack.models.in_distribution import InDistributionRange
-from tumortrack.models.margins import read_margins
 from tumortrack.models.model import Model
 from tumortrack.registration.model import RegistrationModel
+from tumortrack.tracking.margins import read_margins
 from tumortrack.tracking.presets import clinic, occupancy, seen_by
 
 if TYPE_CHECKING:
-    from tumortrack.models.config import RegistrationConfig
+    from tumortrack.registration.config import RegistrationConfig
 
 Progress = Callable[[int, int], None]
 

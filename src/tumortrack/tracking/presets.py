@@ -11,7 +11,7 @@ import msgspec
 
 from tumortrack.core.errors import InputError, PackageError
 from tumortrack.core.types import Anatomy
-from tumortrack.models.config import RegistrationConfig
+from tumortrack.registration.config import RegistrationConfig
 from tumortrack.registration.presets import Rotations, clinic
 from tumortrack.sense.noise import CLEAN, SENSORS, Sensor
 

@@ -15,9 +15,9 @@ from tumortrack.core.geometry import transform_points
 from tumortrack.core.report import Finding, FitReport, Kind, LooksReport
 from tumortrack.core.types import DepthFrame, Intrinsics, Look, Mesh, SensorCloud
 from tumortrack.models.in_distribution import FIT_FACTOR, RIVAL_COST
-from tumortrack.models.margins import ModelMargins, exceeded, figures, stated_margin
 from tumortrack.sense.noise import CAMERA_STD
 from tumortrack.sense.render import render_depth
+from tumortrack.tracking.margins import ModelMargins, exceeded, figures, stated_margin
 
 # Standard deviation of a tumor's middle, and how far from it another fit, nearly as likely, may
 # have it.

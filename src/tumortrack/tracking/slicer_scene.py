@@ -24,8 +24,8 @@ from tumortrack.core.geometry import RAS_FROM_LPS
 from tumortrack.core.report import FitReport
 from tumortrack.core.types import FIRST_TUMOR, ORGAN
 from tumortrack.imaging.case import Case
-from tumortrack.models.margins import stated_radius
 from tumortrack.tracking.files import MARGIN
+from tumortrack.tracking.margins import stated_radius
 
 _SCHEMA = (
     "https://raw.githubusercontent.com/slicer/slicer/master/Modules/Loadable/Markups/Resources/"

@@ -46,7 +46,7 @@ class Margins:
         """Raises InputError: options or scenes that can't be used, too few of them, no limits that
         hold."""
         from tumortrack.models.folder import read_model_manifest
-        from tumortrack.models.margins import described, keep_margins
+        from tumortrack.tracking.margins import described, keep_margins
         from tumortrack_lab.margins.calibration import least_states, list_states, margins_of
         from tumortrack_lab.margins.table import head_of, open_table
 

@@ -152,8 +152,8 @@ def margins(inputs: Inputs, options: Given, out: Path, cores: int) -> None:
     import numpy as np
 
     from tumortrack.imaging.case import Case
-    from tumortrack.models.margins import NAME, write_sealed
     from tumortrack.simulate.scene_folder import read_scene
+    from tumortrack.tracking.margins import NAME, write_sealed
     from tumortrack.tracking.model_files import load_model
     from tumortrack.tracking.tracker import Tracker
     from tumortrack_lab.margins.calibration import list_states, margins_of, row_of

@@ -20,7 +20,9 @@ from msgspec.structs import replace
 import tumortrack
 from tumortrack.core import store
 from tumortrack.core.errors import InputError, NoEstimate
-from tumortrack.models.margins import (
+from tumortrack.report.metrics import outward_miss
+from tumortrack.simulate.scene_folder import Scene, list_scenes
+from tumortrack.tracking.margins import (
     METHOD,
     Group,
     Kind,
@@ -31,8 +33,6 @@ from tumortrack.models.margins import (
     measured,
     sized,
 )
-from tumortrack.report.metrics import outward_miss
-from tumortrack.simulate.scene_folder import Scene, list_scenes
 from tumortrack.tracking.quality import cloud_shares
 from tumortrack_lab.margins import conformal
 from tumortrack_lab.margins.table import Miss, Row

@@ -15,7 +15,7 @@ from msgspec import field
 from tumortrack.core import store
 from tumortrack.core.config import Config, from_builtins, to_builtins
 from tumortrack.core.errors import InputError
-from tumortrack.models.margins import METHOD, Kind, Radius
+from tumortrack.tracking.margins import METHOD, Kind, Radius
 
 Miss = tuple[float, float | None]  # outward miss or distance (mm), and s (mm)
 

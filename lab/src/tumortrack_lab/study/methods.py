@@ -22,9 +22,9 @@ from tumortrack.core.patient import Patient
 from tumortrack.core.types import Anatomy
 from tumortrack.imaging.case import Case, load_case, save_case
 from tumortrack.imaging.surface import surfaces
-from tumortrack.models.margins import METHOD
 from tumortrack.phantom.digital import PhantomParameters, TumorParameters, phantom_labels
 from tumortrack.simulate.scene_folder import Scene
+from tumortrack.tracking.margins import METHOD
 from tumortrack.tracking.model_files import make_model
 from tumortrack.tracking.tracker import Tracker
 from tumortrack_lab.peers.base import OneWay, estimate_of

@@ -25,9 +25,9 @@ from tumortrack.core.errors import InputError, NoEstimate, NoPlan
 from tumortrack.core.estimate import Estimate
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import Anatomy, OccupancyCloud
-from tumortrack.models.margins import NAME, read_margins
 from tumortrack.registration.locator import QUERIES
 from tumortrack.simulate.scene_folder import Scene, read_scene
+from tumortrack.tracking.margins import NAME, read_margins
 from tumortrack.tracking.model_files import load_model
 from tumortrack.tracking.tracker import Tracker
 from tumortrack_lab.cut import VOXEL_MM, cut

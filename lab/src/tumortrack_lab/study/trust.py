@@ -17,10 +17,10 @@ from tumortrack.core import store
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.rigid_fit import kabsch
-from tumortrack.models.margins import METHOD, ModelMargins
 from tumortrack.report.drawing import new_figure, save
 from tumortrack.report.pictures import FROM_CAMERA, FROM_SIDE, draw_solid_view, scene_legend
 from tumortrack.simulate.scene_folder import Scene, read_scene
+from tumortrack.tracking.margins import METHOD, ModelMargins
 from tumortrack.tracking.tracker import Tracker
 from tumortrack_lab.margins.calibration import WIDEST_MM, answered, margins_of
 from tumortrack_lab.margins.table import Row, read_table

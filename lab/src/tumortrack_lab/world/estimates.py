@@ -14,8 +14,8 @@ from tumortrack.core import store
 from tumortrack.core.errors import InputError
 from tumortrack.core.estimate import FAR_MM
 from tumortrack.core.types import Anatomy
-from tumortrack.models.margins import METHOD
 from tumortrack.simulate.scene_folder import Scene, read_scene
+from tumortrack.tracking.margins import METHOD
 from tumortrack.tracking.model_files import load_model
 from tumortrack.tracking.tracker import Tracker
 from tumortrack_lab.real.judging import by_tumor, judge

@@ -23,8 +23,8 @@ from tumortrack.live.igtl.message import Message, Polydata
 from tumortrack.live.meter import Rate
 from tumortrack.live.network import is_loopback
 from tumortrack.live.values import SinkConfig, SinkContext, TrackingResult
-from tumortrack.models.margins import stated_radius
 from tumortrack.tracking.files import MARGIN
+from tumortrack.tracking.margins import stated_radius
 from tumortrack.tracking.shells import rough_margin
 from tumortrack.tracking.slicer_scene import CENTRES, CT, centre_label
 

@@ -20,7 +20,7 @@ from tumortrack.live.values import Controls, TrackingResult, Workcell
 from tumortrack.live.viewer.look import View
 from tumortrack.live.viewer.scene import DisplayOptions
 from tumortrack.live.viewer.slices import ORIENTATIONS
-from tumortrack.models.margins import margin_words, stated_radius
+from tumortrack.tracking.margins import margin_words, stated_radius
 
 if TYPE_CHECKING:
     from viser import ViserServer

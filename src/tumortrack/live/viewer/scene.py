@@ -16,14 +16,14 @@ from jaxtyping import Bool, Float, Int32, UInt8
 
 from tumortrack.core import colours
 from tumortrack.core.geometry import transform_points
+from tumortrack.core.mesh_query import surface_distance
 from tumortrack.core.types import Anatomy, Mesh
 from tumortrack.live import values as live
 from tumortrack.live.display import MOST_SEEN, seen_colours, seen_points, thinned, wxyz_of
 from tumortrack.live.values import TrackingResult, TransformedEstimate
 from tumortrack.live.viewer.look import Viewpoint
 from tumortrack.live.viewer.slices import SlicePlane
-from tumortrack.models.margins import stated_radius
-from tumortrack.core.mesh_query import surface_distance
+from tumortrack.tracking.margins import stated_radius
 from tumortrack.tracking.shells import exact_margin, rough_margin
 
 if TYPE_CHECKING:

@@ -1,36 +1,10 @@
-"""Kernels of points and encoders, compiled on a CPU: farthest points, balls, maxima, strays."""
+"""Kernels of encoders, compiled on a CPU: balls, maxima, strays."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from tumortrack.core.compiled import njit
-
-_MAXIMUM = {"nnan", "nsz"}  # lets a maximum be taken in lanes; sums stay as they are written
-
-
-@njit(nogil=True, fastmath=_MAXIMUM)
-def farthest(points, first, chosen):  # type: ignore[no-untyped-def]
-    """Farthest points of clouds (B, 3, N), float32, into ``chosen`` (B, k), int64, from the first
-    choices (B,) on."""
-    n_clouds, _, n = points.shape
-    nearest = np.empty(n, np.float32)
-    for cloud in range(n_clouds):
-        x, y, z = points[cloud, 0], points[cloud, 1], points[cloud, 2]
-        nearest[:] = np.inf
-        newest = first[cloud]
-        for step in range(chosen.shape[1]):
-            chosen[cloud, step] = newest
-            cx, cy, cz = x[newest], y[newest], z[newest]
-            for i in range(n):
-                dx, dy, dz = x[i] - cx, y[i] - cy, z[i] - cz
-                nearest[i] = min(nearest[i], dx * dx + dy * dy + dz * dz)
-            most = np.float32(-1.0)
-            for i in range(n):
-                most = max(most, nearest[i])
-            newest = 0
-            while newest < n - 1 and nearest[newest] != most:
-                newest += 1
 
 
 @njit(nogil=True)
