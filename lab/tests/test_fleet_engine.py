@@ -177,12 +177,11 @@ def test_memory_is_doubled_where_it_was_too_little(folder):
     class Small(Serial):
         """A machine on which a task that asks for less than 300 MB has too little."""
 
-        def start(self, job: Job) -> None:
+        async def do(self, job: Job) -> Report:
             asked.append(job.needs.memory_mb)
             if job.needs.memory_mb < 300:
-                self._done.append((job.key, Report("memory", "too little")))
-            else:
-                super().start(job)
+                return Report("memory", "too little")
+            return await super().do(job)
 
     store = Store(str(folder / "store"))
     [outcome] = run([before(chain(0), 2)], store, Small())
@@ -215,11 +214,12 @@ def test_what_another_run_is_doing_is_left_to_it(store, folder, monkeypatch):
     class Meanwhile(Serial):
         """At the third look the other run has given it up."""
 
-        def start(self, job: Job) -> None:
-            super().start(job)
-            looks.append(self._done[-1][1].state)
+        async def do(self, job: Job) -> Report:
+            report = await super().do(job)
+            looks.append(report.state)
             if looks.count("elsewhere") == 3:
                 store.release(key)
+            return report
 
     [outcome] = run([chain(0)], store, Meanwhile())
     assert outcome.state == "done"

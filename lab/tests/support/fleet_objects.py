@@ -95,11 +95,11 @@ def misbehave(name: str, out: Path) -> None:
 
 
 def results(store: Path) -> dict[str, bytes]:
-    """Every file of a plain store but for costs, claims and what is aside, by its path."""
+    """Every file of a plain store but for costs and claims, by its path."""
     return {
         str(path.relative_to(store)): path.read_bytes()
         for path in sorted(store.rglob("*"))
-        if path.is_file() and path.relative_to(store).parts[0] not in ("costs", "aside", "claims")
+        if path.is_file() and path.relative_to(store).parts[0] not in ("costs", "claims")
     }
 
 

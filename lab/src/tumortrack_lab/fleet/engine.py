@@ -1,30 +1,34 @@
-"""From wanted tasks to results in the store: what is missing is done, in the order of its inputs,
-as many at once as an executor takes. What fails is tried again, and never stops the others.
+"""From wanted tasks to results in the store: what is missing is made, inputs first, by an executor.
+What fails is tried again and never stops the others.
 
-Wanted tasks are taken one after the other as there is room, so that the memory needed does not grow
-with their number; of those under way the first is preferred, so that patients are finished.
+A patient's chain is a coroutine; as many are under way as the executor has room for, so that the
+memory needed does not grow with their number.
 """
 
 from __future__ import annotations
 
-import heapq
+import asyncio
 import secrets
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sized
+from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Sized
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
-from itertools import count
 from typing import Literal, Protocol, runtime_checkable
 
 from tumortrack_lab.fleet.store import Store
-from tumortrack_lab.fleet.task import File, Needs, Task
+from tumortrack_lab.fleet.task import Task
 from tumortrack_lab.fleet.worker import Job, Report, job_of
 
 _LOOKED_AHEAD = 64  # wanted tasks that the store is asked about before their turn
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.5, 60.0  # between attempts
 _ELSEWHERE_S = 2.0  # between looks at what another run is doing
+_SHOWN_S = 0.5
 
+# Reports after which a task is not tried again in this run, and what becomes of it.
+_FINAL: dict[str, Literal["done", "cannot", "failed"]] = {
+    "there": "done", "done": "done", "cannot": "cannot", "changed": "failed",
+}  # fmt: skip
 
 Wanted = Task | Callable[[], Task]
 Found = tuple[bool, str | None]  # what the store has of a task (``Store.found``)
@@ -35,12 +39,10 @@ class Executor(Protocol):
     """Who does the tasks."""
 
     def room(self) -> int:
-        """How many tasks may be handed over at once, those under way included."""
+        """How many patients may be under way. Called often; TumortrackError: nobody is left who
+        could do anything."""
 
-    def start(self, job: Job) -> None: ...
-
-    def finished(self, wait_s: float) -> list[tuple[str, Report]]:
-        """Keys and reports of what has ended; waits for one for so long at most."""
+    async def do(self, job: Job) -> Report: ...
 
     def close(self) -> None:
         """Stop what is under way."""
@@ -48,9 +50,9 @@ class Executor(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """What became of a wanted task. there: it was done before. cannot: its patient's data do not
-    allow it (kept in the store); failed: after all attempts, or since the patient's file was
-    changed; the next run tries again. ``step``: where."""
+    """What became of a task. there: it was done before. cannot: its patient's data do not allow it
+    (kept in the store); failed: after all attempts, or since the patient's file was changed; the
+    next run tries again. ``step``: where."""
 
     task: Task
     state: Literal["there", "done", "cannot", "failed"]
@@ -60,7 +62,7 @@ class Outcome:
 
 @dataclass
 class Status:
-    """How far a run is. Counts are of tasks, but for ``wanted`` ones."""
+    """Progress of a run. Counts are of tasks, but for ``wanted`` ones."""
 
     total: int | None = None  # wanted
     wanted: int = 0  # settled
@@ -84,19 +86,6 @@ class Status:
         return 3600 * (self.total - self.wanted) / self.per_hour
 
 
-@dataclass(eq=False)
-class _Node:
-    """A task that is not settled yet."""
-
-    task: Task
-    place: int  # in the order of the wanted ones
-    needs: Needs
-    missing: set[str] = field(default_factory=set)  # keys of inputs
-    waited_for_by: list[_Node] = field(default_factory=list)
-    wanted: list[Task] = field(default_factory=list)  # itself, and others of the same key
-    reasons: tuple[str, ...] = ()
-
-
 def run(
     wanted: Iterable[Wanted],
     store: Store,
@@ -115,23 +104,21 @@ def run(
     store.open()
     fleet = _Fleet(store, executor, tries, again)
     fleet.status.total = len(wanted) if isinstance(wanted, Sized) else None
+    loop = asyncio.new_event_loop()
+    loop.set_exception_handler(lambda *_: None)  # whoever waits for a task gets its error
     try:
         with ThreadPoolExecutor(8, "store") as pool:
-            coming = _looked_up(wanted, store, pool)
-            is_last = False
-            while not is_last or fleet.nodes:
-                while not is_last and fleet.has_room() and not fleet.settled:
-                    if (one := next(coming, None)) is None:
-                        is_last = True
-                    else:
-                        fleet.take(*one)
-                if fleet.nodes and not fleet.settled:
-                    fleet.turn()
-                show(fleet.status)
-                yield from fleet.settled
-                fleet.settled.clear()
+            settled = fleet.settled(_looked_up(wanted, store, pool), show)
+            while (outcome := loop.run_until_complete(anext(settled, None))) is not None:
+                yield outcome
     finally:
         executor.close()
+        if left := asyncio.all_tasks(loop):
+            for task in left:
+                task.cancel()
+            loop.run_until_complete(asyncio.wait(left))
+        loop.run_until_complete(loop.shutdown_asyncgens())
+        loop.close()
 
 
 def _looked_up(
@@ -153,135 +140,100 @@ def _looked_up(
 
 
 class _Fleet:
-    """What is under way: unsettled tasks by key, those ready to run by their patient's turn."""
+    """``under_way``: of every task that is being made the coroutine that makes it, by key, so that
+    all who need it wait for the same one."""
 
     def __init__(self, store: Store, executor: Executor, tries: int, again: bool) -> None:
         self.store, self.executor, self.tries, self.again = store, executor, tries, again
-        self.nodes: dict[str, _Node] = {}
-        self.settled: list[Outcome] = []
         self.status = Status()
-        self._ready: list[tuple[int, int, _Node]] = []
-        self._later: list[tuple[float, int, _Node]] = []  # when; attempts that wait
-        self._running = 0
-        self._numbers = count()
+        self.under_way: dict[str, asyncio.Task[Outcome]] = {}
+        self._tried_again: set[str] = set()
         self._run = secrets.token_hex(8)
 
-    def has_room(self) -> bool:
-        return self._running + len(self._ready) + len(self._later) < self.executor.room()
+    async def settled(
+        self, wanted: Iterator[tuple[Task, Found]], show: Callable[[Status], None]
+    ) -> AsyncIterator[Outcome]:
+        """Each of the wanted tasks, once nothing more is to be done for it."""
+        pending: set[asyncio.Task[Outcome]] = set()
+        is_last = False
+        while not is_last or pending or self.under_way:
+            room = self.executor.room()
+            while not is_last and len(pending) < room:
+                if (one := next(wanted, None)) is None:
+                    is_last = True
+                else:
+                    pending.add(asyncio.create_task(self._settle(*one)))
+            if waited_for := pending | {*self.under_way.values()}:
+                first = asyncio.FIRST_COMPLETED
+                await asyncio.wait(waited_for, timeout=_SHOWN_S, return_when=first)
+            show(self.status)
+            for task in [task for task in pending if task.done()]:
+                pending.remove(task)
+                yield task.result()
 
-    def take(self, task: Task, found: Found) -> None:
-        """The next of the wanted tasks."""
-        node = self.nodes.get(task.key) or self._plan(task, next(self._numbers), found)
-        if isinstance(node, Outcome):
-            self._settle(node)
-        else:
-            node.wanted.append(task)
-
-    def turn(self) -> None:
-        """Hand over what may run, wait a moment for what ends, and act on it."""
-        while self._later and self._later[0][0] <= time.monotonic():
-            self._push(heapq.heappop(self._later)[2])
-        while self._ready and self._running < self.executor.room():
-            node = heapq.heappop(self._ready)[2]
-            self._running += 1
-            job = job_of(node.task, node.needs, self.store.url, self._run, node.reasons)
-            self.executor.start(job)
-        for key, report in self.executor.finished(0.5):
-            self._running -= 1
-            self._react(self.nodes[key], report)
-        self.status.running = self._running
-
-    def _plan(self, task: Task, place: int, found: Found) -> _Node | Outcome:
-        """The task and all that it waits for; or, where the store has it, what is known of it."""
-        there, failure = found
-        if failure is not None and self.again:
-            self.store.remove(task.key)
-        elif failure is not None:
-            return Outcome(task, "cannot", task.step, failure)
-        elif there:
-            return Outcome(task, "there")
-        node = _Node(task, place, task.needs)
-        for one in task.inputs.values():
-            if isinstance(one, File) or one.key in node.missing:
-                continue
-            before = self.nodes.get(one.key) or self._plan(one, place, self.store.found(one.key))
-            if isinstance(before, _Node):
-                node.missing.add(one.key)
-                before.waited_for_by.append(node)
-            elif before.state == "cannot":
-                return Outcome(task, "cannot", before.step, before.reason)
-        self.nodes[task.key] = node
-        if not node.missing:
-            self._push(node)
-        return node
-
-    def _push(self, node: _Node) -> None:
-        heapq.heappush(self._ready, (node.place, next(self._numbers), node))
-
-    def _react(self, node: _Node, report: Report) -> None:
-        if report.state in ("there", "done"):
-            self.status.done += report.state == "done"
-            del self.nodes[node.task.key]
-            for one in node.wanted:
-                self._settle(Outcome(one, "done"))
-            for waiting in node.waited_for_by:
-                waiting.missing.discard(node.task.key)
-                if not waiting.missing and self.nodes.get(waiting.task.key) is waiting:
-                    self._push(waiting)
-        elif report.state == "elsewhere":
-            self._wait(node, _ELSEWHERE_S)
-        elif report.state == "cannot":
-            self._give_up(node, "cannot", node.task.step, report.reason)
-        elif report.state == "changed":
-            self._give_up(node, "failed", node.task.step, report.reason)
-        else:
-            self._again(node, report)
-
-    def _again(self, node: _Node, report: Report) -> None:
-        """Another attempt, after a pause and with what the last one lacked; or none."""
-        node.reasons += (report.reason,)
-        if len(node.reasons) >= self.tries:
-            self.store.put_cost(node.task.key, {"attempts": node.reasons})
-            reason = f"{report.reason} (attempt {len(node.reasons)} of {self.tries})"
-            return self._give_up(node, "failed", node.task.step, reason)
-        self.status.retried += 1
-        self.status.note = f"{node.task.patient} {node.task.step} again: {report.reason}"
-        if report.state == "memory":
-            node.needs = replace(node.needs, memory_mb=2 * node.needs.memory_mb)
-        if report.state == "damaged":
-            return self._make_again(node, report.damaged)
-        pause_s = min(_FIRST_PAUSE_S * 2 ** (len(node.reasons) - 1), _LONGEST_PAUSE_S)
-        self._wait(node, pause_s)
-
-    def _wait(self, node: _Node, pause_s: float) -> None:
-        heapq.heappush(self._later, (time.monotonic() + pause_s, next(self._numbers), node))
-
-    def _make_again(self, node: _Node, key: str) -> None:
-        """An input lies in the store damaged: the node waits until it has been made anew."""
-        [task] = {one.key: one for one in node.task.inputs.values() if one.key == key}.values()
-        assert isinstance(task, Task)
-        before: _Node | Outcome | None = self.nodes.get(key)
-        if before is None:
-            self.store.remove(key)
-            before = self._plan(task, node.place, (False, None))
-        if isinstance(before, Outcome):
-            return self._give_up(node, "cannot", before.step, before.reason)
-        node.missing.add(key)
-        before.waited_for_by.append(node)
-
-    def _give_up(
-        self, node: _Node, state: Literal["cannot", "failed"], step: str, reason: str
-    ) -> None:
-        """Settle a task that has no result, and all that wait for it."""
-        if self.nodes.pop(node.task.key, None) is None:
-            return  # two of its inputs failed
-        for one in node.wanted:
-            self._settle(Outcome(one, state, step, reason))
-        for waiting in node.waited_for_by:
-            self._give_up(waiting, state, step, reason)
-
-    def _settle(self, outcome: Outcome) -> None:
+    async def _settle(self, task: Task, found: Found) -> Outcome:
+        outcome = replace(await self._begin(task, found), task=task)
         self.status.wanted += 1
         self.status.there += outcome.state == "there"
         self.status.failed += outcome.state in ("cannot", "failed")
-        self.settled.append(outcome)
+        return outcome
+
+    def _begin(self, task: Task, found: Found | None = None) -> asyncio.Task[Outcome]:
+        """Make a task's result, unless that is under way."""
+        making = self.under_way.get(task.key)
+        if making is None:
+            making = self.under_way[task.key] = asyncio.create_task(self._make(task, found))
+            making.add_done_callback(lambda _: self.under_way.pop(task.key))
+        return making
+
+    async def _make(self, task: Task, found: Found | None) -> Outcome:
+        """A task's result, and before it those of its inputs, where the store lacks them."""
+        if (known := await self._known(task, found)) is not None:
+            return known
+        needs, reasons = task.needs, tuple[str, ...]()
+        lacking = await self._lacking_input(task)
+        while lacking is None:
+            job = job_of(task, needs, self.store.url, self._run, reasons)
+            self.status.running += 1
+            report = await self.executor.do(job)
+            self.status.running -= 1
+            if report.state in _FINAL:
+                self.status.done += report.state == "done"
+                step = task.step if report.reason else ""
+                return Outcome(task, _FINAL[report.state], step, report.reason)
+            if report.state == "elsewhere":
+                await asyncio.sleep(_ELSEWHERE_S)
+                continue
+            reasons += (report.reason,)
+            if len(reasons) >= self.tries:
+                self.store.put_cost(task.key, {"attempts": reasons})
+                reason = f"{report.reason} (attempt {len(reasons)} of {self.tries})"
+                return Outcome(task, "failed", task.step, reason)
+            self.status.retried += 1
+            self.status.note = f"{task.patient} {task.step} again: {report.reason}"
+            if report.state == "damaged":
+                if report.damaged not in self.under_way:
+                    self.store.remove(report.damaged)
+                lacking = await self._lacking_input(task)
+                continue
+            if report.state == "memory":
+                needs = replace(needs, memory_mb=2 * needs.memory_mb)
+            await asyncio.sleep(min(_FIRST_PAUSE_S * 2 ** (len(reasons) - 1), _LONGEST_PAUSE_S))
+        return replace(lacking, task=task)
+
+    async def _known(self, task: Task, found: Found | None) -> Outcome | None:
+        """What the store says of a task; None: it is to be done."""
+        there, failure = found or await asyncio.to_thread(self.store.found, task.key)
+        if failure is None:
+            return Outcome(task, "there") if there else None
+        if not self.again or task.key in self._tried_again:
+            return Outcome(task, "cannot", task.step, failure)
+        self._tried_again.add(task.key)
+        self.store.remove(task.key)
+        return None
+
+    async def _lacking_input(self, task: Task) -> Outcome | None:
+        """Make all inputs; the first that can't be made."""
+        inputs = [one for one in task.inputs.values() if isinstance(one, Task)]
+        outcomes = await asyncio.gather(*map(self._begin, inputs))
+        return next((one for one in outcomes if one.state in ("cannot", "failed")), None)

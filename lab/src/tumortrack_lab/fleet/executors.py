@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import asyncio
 import atexit
 import logging
 import os
-import queue
 import secrets
 import shutil
 import socket
@@ -14,17 +14,13 @@ import tempfile
 import time
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from tumortrack.core.errors import InputError, TumortrackError
 from tumortrack.core.process import available_cores
 from tumortrack_lab.fleet.store import is_running
 from tumortrack_lab.fleet.worker import Job, Report, perform
 
-if TYPE_CHECKING:
-    from concurrent.futures import Future
-
-_AHEAD = 2.0  # tasks handed over per core: the next ones are at hand when one ends
 _LOOK_S = 5.0  # between looks at which machines there are
 _SILENT_S = 8.0  # without a word from the cluster's head: it is gone
 _LARGE_MB = 2000
@@ -34,20 +30,11 @@ _STORE_BYTES = 80 * 2**20  # Ray's least for its object store, which carries no 
 class Serial:
     """One task at a time, in this process."""
 
-    def __init__(self) -> None:
-        self._done: list[tuple[str, Report]] = []
-
     def room(self) -> int:
         return 1
 
-    def start(self, job: Job) -> None:
-        self._done.append((job.key, perform(job)))
-
-    def finished(self, wait_s: float) -> list[tuple[str, Report]]:
-        if not self._done:
-            time.sleep(wait_s)
-        done, self._done = self._done, []
-        return done
+    async def do(self, job: Job) -> Report:
+        return perform(job)
 
     def close(self) -> None:
         pass
@@ -87,37 +74,37 @@ class OnRay:
         # A large task has a process of its own, whose memory is free again when it ends.
         self._small = ray.remote(max_calls=100, max_retries=0)(perform)
         self._large = ray.remote(max_calls=1, max_retries=0)(perform)
-        self._ended: queue.SimpleQueue[tuple[str, Future[Report]]] = queue.SimpleQueue()
-        self._refs: dict[str, Any] = {}
         self._looked_s, self._machines = -_LOOK_S, [dict[str, float]()]
 
     def room(self) -> int:
-        return int(_AHEAD * sum(one.get("CPU", 0) for one in self._largest())) + 4
+        if time.monotonic() - self._heard_s > 1.0:
+            self._look_for_head()
+        return int(sum(one.get("CPU", 0) for one in self._largest())) + 4
 
-    def start(self, job: Job) -> None:
-        """Its needs are held to what the largest machine has: there it runs alone, and slower."""
-        machines = self._largest()
+    async def do(self, job: Job) -> Report:
+        """Its needs are held to what the largest machine has: there it runs alone, and slower. Of a
+        task that can't report, what Ray says of its end."""
+        machines, errors = self._largest(), self._ray.exceptions
         most = {name: max(one.get(name, 0) for one in machines) for name in ("CPU", "memory")}
         function = self._large if job.needs.memory_mb >= _LARGE_MB else self._small
-        ref = self._refs[job.key] = function.options(
+        options = function.options(
             name=job.name,
             num_cpus=min(job.needs.cores, most["CPU"]),
             memory=min(job.needs.memory_mb * 2**20, int(0.95 * most["memory"])),
             num_gpus=job.needs.gpus,
-        ).remote(job)
-        ref.future().add_done_callback(lambda future: self._ended.put((job.key, future)))
-
-    def finished(self, wait_s: float) -> list[tuple[str, Report]]:
-        found = []
-        with suppress(queue.Empty):
-            found.append(self._ended.get(timeout=wait_s))
-            while True:
-                found.append(self._ended.get_nowait())
-        for key, _ in found:
-            del self._refs[key]
-        if time.monotonic() - self._heard_s > 1.0:
-            self._look_for_head()
-        return [(key, self._report(future)) for key, future in found]
+        )
+        try:
+            report: Report = await asyncio.wrap_future(options.remote(job).future())
+        except errors.OutOfMemoryError:
+            return Report("memory", "ended by Ray: its machine ran out of memory")
+        except errors.WorkerCrashedError:  # as after the kernel's own choice when memory runs out
+            return Report("memory", "its process ended unexpectedly (killed, or out of memory)")
+        except errors.NodeDiedError:
+            return Report("failed", "its machine was lost")
+        except errors.RayError as error:
+            words = (str(error).strip().splitlines() or [""])[-1]
+            return Report("failed", f"{type(error).__name__}: {words}")
+        return report
 
     def close(self) -> None:
         if self._is_lost:  # it would wait for its head, or crash
@@ -142,21 +129,6 @@ class OnRay:
             ) from error
         self._heard_s = time.monotonic()
         return True
-
-    def _report(self, future: Future[Report]) -> Report:
-        """What the task says; or, where it can't, what Ray says of its end."""
-        errors = self._ray.exceptions
-        try:
-            return future.result()
-        except errors.OutOfMemoryError:
-            return Report("memory", "ended by Ray: its machine ran out of memory")
-        except errors.WorkerCrashedError:  # as after the kernel's own choice when memory runs out
-            return Report("memory", "its process ended unexpectedly (killed, or out of memory)")
-        except errors.NodeDiedError:
-            return Report("failed", "its machine was lost")
-        except errors.RayError as error:
-            words = (str(error).strip().splitlines() or [""])[-1]
-            return Report("failed", f"{type(error).__name__}: {words}")
 
     def _largest(self) -> list[dict[str, float]]:
         """What each machine has, as of a few seconds ago. TumortrackError: the cluster is gone."""

@@ -6,14 +6,13 @@
     costs/KK/KEY.json     what it cost: apart, since results are equal bit for bit and costs are not
     claims/KEY.json       who is doing it: a hint alone, that two runs don't do the same
 
-In a plain folder a result is moved into place in one step, and used where it lies; from elsewhere
-it is fetched into a cache on this machine. Storage must replace a single file in one step, as S3,
-Google's and Azure's do.
+In a plain folder a result is used where it lies; from elsewhere it is fetched into a cache on this
+machine. Whatever is written by halves, the next reader finds out: by the manifest, which is written
+last, or by a checksum.
 """
 
 from __future__ import annotations
 
-import errno
 import hashlib
 import json
 import os
@@ -21,8 +20,7 @@ import shutil
 import socket
 import tempfile
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -31,9 +29,8 @@ from tumortrack.core.errors import InputError
 from tumortrack.core.store import MANIFEST, sha256_of
 from tumortrack_lab.fleet.task import File
 
-_ASIDE = "aside"  # what is being written, and what killed processes left there
 _CLAIMED_S = 60.0  # a claim that was not renewed for so long is void
-_KEPT_S = 24 * 3600  # what was cached or left aside, and nobody asked for for so long, is removed
+_KEPT_S = 24 * 3600  # what was cached and not asked for so long is removed
 
 
 class DamagedError(Exception):
@@ -58,8 +55,10 @@ class Store:
     def __init__(self, url: str, cache: Path | None = None) -> None:
         import fsspec
 
+        is_plain = fsspec.core.split_protocol(url)[0] in (None, "file", "local")
+        options = {"auto_mkdir": True} if is_plain else {}
         try:
-            self._files, self.root = fsspec.core.url_to_fs(url, use_listings_cache=False)
+            self._files, self.root = fsspec.core.url_to_fs(url, use_listings_cache=False, **options)
         except (ImportError, ValueError) as error:
             raise InputError(f"the store {url} cannot be opened: {error}") from error
         self.url = self.root if self.is_local else url
@@ -71,11 +70,8 @@ class Store:
         return "file" in ((protocol,) if isinstance(protocol, str) else protocol)
 
     def open(self) -> None:
-        """Make sure that it can be written, and clear what was left aside long ago. InputError: it
-        can't be used."""
+        """Raises InputError: it can't be written."""
         try:
-            if self.is_local:
-                _clear_old(Path(self.root) / _ASIDE)
             self._files.pipe_file(
                 f"{self.root}/store.txt", b"Results of tumortrack fleet, by key.\n"
             )
@@ -105,15 +101,13 @@ class Store:
         try:
             _check(folder, key, files)
         except DamagedError:  # not fetched yet, or altered
-            shutil.rmtree(folder, ignore_errors=True)
-            with _aside(self._kept, folder) as aside:
-                for name in files:
-                    (aside / name).parent.mkdir(parents=True, exist_ok=True)
-                    try:
-                        self._files.get_file(f"{place}/{name}", str(aside / name))
-                    except FileNotFoundError as error:
-                        raise DamagedError(key, f"it lacks {name}") from error
-                _check(aside, key, files)
+            for name in files:
+                try:
+                    _fetch(self._files, f"{place}/{name}", folder / name)
+                except FileNotFoundError as error:
+                    raise DamagedError(key, f"it lacks {name}") from error
+            _check(folder, key, files)
+        folder.mkdir(parents=True, exist_ok=True)
         os.utime(folder)
         return folder
 
@@ -122,12 +116,15 @@ class Store:
         if self.has(key):
             return
         paths = sorted(path for path in folder.rglob("*") if path.is_file())
-        names = [path.relative_to(folder).as_posix() for path in paths]
-        self._commit(key, folder, {name: sha256_of(folder / name) for name in names}, None)
+        names = {path.relative_to(folder).as_posix(): path for path in paths}
+        digests = {name: sha256_of(path) for name, path in names.items()}
+        for name, path in names.items():
+            self._files.put_file(str(path), f"{self._place(key)}/files/{name}")
+        self._seal(key, digests, None)
 
     def put_failure(self, key: str, reason: str) -> None:
         """Keep that this task can't be done."""
-        self._commit(key, Path(), {}, reason)
+        self._seal(key, {}, reason)
 
     def remove(self, key: str) -> None:
         """Take a result away, its manifest first."""
@@ -152,7 +149,7 @@ class Store:
         except (FileNotFoundError, ValueError):
             pass
         mine = {"run": run, "host": here, "process": os.getpid(), "time": now}
-        self._pipe(self._claim(key), json.dumps(mine).encode())
+        self._files.pipe_file(self._claim(key), json.dumps(mine).encode())
         return True
 
     def release(self, key: str) -> None:
@@ -169,7 +166,7 @@ class Store:
         return found
 
     def put_cost(self, key: str, cost: dict[str, Any]) -> None:
-        self._pipe(self._cost(key), json.dumps(cost, indent=1).encode())
+        self._files.pipe_file(self._cost(key), json.dumps(cost, indent=1).encode())
 
     def user_file(self, file: File) -> Path:
         """A user's file on this machine; of a URL, a copy. InputError: it is another by now."""
@@ -179,35 +176,17 @@ class Store:
 
             path = self._kept / file.sha256
             if not path.exists():
-                files, source = fsspec.core.url_to_fs(file.path)
-                with _aside(self._kept, path, is_file=True) as aside:
-                    files.get_file(source, str(aside))
+                _fetch(*fsspec.core.url_to_fs(file.path), path)
         if not path.exists():
             raise FileNotFoundError(f"{file.path} is not there (on this machine)")
         if sha256_of(path) != file.sha256:
             raise InputError(f"{file.path} was changed after the list was read; start again.")
         return path
 
-    def _commit(self, key: str, folder: Path, files: dict[str, str], failure: str | None) -> None:
-        """The files, then the manifest; or all at once, by renaming a folder."""
+    def _seal(self, key: str, files: dict[str, str], failure: str | None) -> None:
         manifest = {"key": key, "failure": failure, "files": files}
-        text = (json.dumps(manifest, indent=1) + "\n").encode()
-        place = self._place(key)
-        if not self.is_local:
-            for name in files:
-                self._files.put_file(str(folder / name), f"{place}/files/{name}")
-            self._files.pipe_file(f"{place}/{MANIFEST}", text)
-            return
-        with _aside(Path(self.root), Path(place)) as aside:
-            (aside / "files").mkdir()
-            for name in files:
-                (aside / "files" / name).parent.mkdir(parents=True, exist_ok=True)
-                shutil.copyfile(folder / name, aside / "files" / name)
-                _flush(aside / "files" / name)
-            (aside / MANIFEST).write_bytes(text)
-            _flush(aside / MANIFEST)
-            if Path(place).exists() and not self.has(key):  # a failure, tried again; or not whole
-                shutil.rmtree(place)
+        text = json.dumps(manifest, indent=1) + "\n"
+        self._files.pipe_file(f"{self._place(key)}/{MANIFEST}", text.encode())
 
     def _manifest(self, key: str) -> dict[str, Any]:
         """Empty: there is none that can be read."""
@@ -219,14 +198,6 @@ class Store:
             return {}
         inside = all(".." not in name.split("/") and name[:1] != "/" for name in found["files"])
         return found if found.get("key") == key and inside else {}
-
-    def _pipe(self, path: str, content: bytes) -> None:
-        """Write a small file in one step."""
-        if not self.is_local:
-            self._files.pipe_file(path, content)
-            return
-        with _aside(Path(self.root), Path(path), is_file=True) as aside:
-            aside.write_bytes(content)
 
     def _claim(self, key: str) -> str:
         return f"{self.root}/claims/{key}.json"
@@ -240,13 +211,9 @@ class Store:
     @cached_property
     def _kept(self) -> Path:
         """This machine's cache of this store, freed of what is old."""
-        if self._cache is not None:
-            kept = self._cache
-        else:
-            name = hashlib.sha256(self.url.encode()).hexdigest()[:12]
-            kept = scratch() / name
-        for folder in (kept, kept / _ASIDE):
-            _clear_old(folder)
+        name = hashlib.sha256(self.url.encode()).hexdigest()[:12]
+        kept = self._cache or scratch() / name
+        _clear_old(kept)
         return kept
 
 
@@ -264,25 +231,12 @@ def is_running(process: int) -> bool:
     return True
 
 
-@contextmanager
-def _aside(root: Path, place: Path, is_file: bool = False) -> Iterator[Path]:
-    """A new folder (or the path of a file) on the same disk, which is then moved to ``place`` in
-    one step; if somebody else has put the same there meanwhile, theirs stays."""
-    (root / _ASIDE).mkdir(parents=True, exist_ok=True)
-    outer = Path(tempfile.mkdtemp(dir=root / _ASIDE))
-    inner = outer / place.name
-    try:
-        if not is_file:
-            inner.mkdir()
-        yield inner
-        place.parent.mkdir(parents=True, exist_ok=True)
-        try:
-            os.replace(inner, place)
-        except OSError as error:
-            if error.errno not in (errno.ENOTEMPTY, errno.EEXIST):
-                raise
-    finally:
-        shutil.rmtree(outer, ignore_errors=True)
+def _fetch(files: Any, source: str, target: Path) -> None:
+    """Copy a file from any storage in one step."""
+    part = scratch() / f"{os.getpid()}.part"
+    files.get_file(source, str(part))
+    target.parent.mkdir(parents=True, exist_ok=True)
+    os.replace(part, target)
 
 
 def scratch() -> Path:
@@ -296,7 +250,7 @@ def _clear_old(folder: Path) -> None:
     """Make the folder, or remove from it what nobody has touched for a day."""
     folder.mkdir(parents=True, exist_ok=True)
     for old in folder.iterdir():
-        if old.name != _ASIDE and time.time() - old.stat().st_mtime > _KEPT_S:
+        if time.time() - old.stat().st_mtime > _KEPT_S:
             shutil.rmtree(old, ignore_errors=True) if old.is_dir() else old.unlink()
 
 
@@ -307,8 +261,3 @@ def _check(folder: Path, key: str, files: dict[str, str]) -> None:
             raise DamagedError(key, f"it lacks {name}")
         if sha256_of(folder / name) != digest:
             raise DamagedError(key, f"{name} was changed (sha256 differs)")
-
-
-def _flush(path: Path) -> None:
-    with path.open("rb") as stream:
-        os.fsync(stream.fileno())
