@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 _NAMES = {  # by the module that has them
     "api": "estimate_from_surfaces evaluate find_organ load_case load_estimate load_model "
-    "prepare read_cloud read_depth save_estimate scan_phantom simulate_scenes teach "
+    "locate prepare read_cloud read_depth save_estimate scan_phantom simulate_scenes teach "
     "track train",
     "core": "errors",
     "core.estimate": "Estimate",

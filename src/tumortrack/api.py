@@ -11,9 +11,9 @@ import logging
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
@@ -24,6 +24,7 @@ from tumortrack.core.estimate import Estimate
 from tumortrack.core.types import DepthFrame, Mesh, SensorCloud
 from tumortrack.imaging.case import Case
 from tumortrack.imaging.case import load_case as read_case
+from tumortrack.tracking.options import Device, LocateOptions
 
 if TYPE_CHECKING:
     from tumortrack.live.values import SinkContext, TrackingResult
@@ -32,13 +33,14 @@ if TYPE_CHECKING:
     from tumortrack.occupancy.config import TrainConfig
     from tumortrack.occupancy.training.train import TrainingStatus
     from tumortrack.registration.config import RegistrationConfig
+    from tumortrack.report.locating import Located
     from tumortrack.sense.region.taught import Taught
     from tumortrack.simulate.scene import SceneConfig
     from tumortrack.simulate.scene_folder import Scene
     from tumortrack.tracking.tracker import Tracker
 
 StrPath = str | Path
-Device = Literal["auto", "cpu", "cuda"]
+_Options = TypeVar("_Options")
 _TEST_BODY = 2**20  # and the seed: elastic states that training with the same seed never sees
 
 
@@ -93,12 +95,9 @@ def prepare(
     from tumortrack.imaging.case import KIND, save_case
     from tumortrack.tracking.model_files import case_model
 
-    known = preparing.PrepareOptions.__dataclass_fields__
-    if unknown := sorted(set(options) - set(known)):
-        raise InputError(f"prepare knows no {unknown[0]!r}; allowed: {', '.join(known)}.")
+    asked = _options(preparing.PrepareOptions, options, "prepare")
     if folder is not None:
         store.check_place(Path(folder), KIND, overwrite)
-    asked = preparing.PrepareOptions(**options)
     if segment is None:
         case = preparing.prepare(Path(source), asked)
     elif folder is None:
@@ -121,6 +120,19 @@ def prepare(
         case = load_case(folder)
         case_model(case, progress=progress)
     return case
+
+
+def _options(kind: type[_Options], given: dict[str, Any], what: str) -> _Options:
+    """InputError: one that is none."""
+    known = [field.name for field in fields(kind)]
+    if unknown := sorted(set(given) - set(known)):
+        raise InputError(f"{what} knows no {unknown[0]!r}; allowed: {', '.join(known)}.")
+    for field in fields(kind):
+        value = given.get(field.name)
+        if "Path" in str(field.type) and value is not None:
+            path = isinstance(value, str | Path)
+            given[field.name] = Path(value) if path else tuple(map(Path, value))
+    return kind(**given)
 
 
 def load_case(folder: StrPath) -> Case:
@@ -335,6 +347,31 @@ def teach(
     return taught.teach([taught.look(frame, picture, *pixel) for pixel in pixels])
 
 
+def locate(model: StrPath, clouds: StrPath | Sequence[StrPath], **options: Any) -> Located:
+    """Locate organ and tumors in the file of a cloud or depth image, or in those of several views
+    of the organ at rest, as `tumortrack locate` does; ``Tracker.locate`` takes clouds in memory.
+
+    Args:
+        model: folder of a case, or that ``train`` wrote.
+        options: as on the command line: ``range``, ``box``, ``whole``, ``at``, ``mask``,
+            ``poses``, ``intrinsics`` (one for each view), ``depth_unit``, ``unit``, ``grid``,
+            ``seed``, ``map``, ``case``, ``patient``, ``side``, ``device``.
+
+    Returns:
+        ``estimate``, which is None where nothing could be located; ``report``, as in report.json;
+        ``save(folder, overwrite)`` writes all.
+
+    Raises:
+        InputError, ArtifactError: a file or an option cannot be used, or the model is another
+            patient's than ``patient`` and ``side`` state.
+    """
+    from tumortrack.report.locating import locate as locate_files
+
+    files = [clouds] if isinstance(clouds, str | Path) else clouds
+    asked = _options(LocateOptions, options, "locate")
+    return locate_files(Path(model), [Path(file) for file in files], asked)
+
+
 def save_estimate(
     estimate: Estimate,
     folder: StrPath,
@@ -354,15 +391,10 @@ def save_estimate(
         InputError: the folder exists and ``overwrite`` is False.
         StorageError: the disk refused.
     """
-    from functools import partial
-
-    from tumortrack.report.run_page import write_run_page
+    from tumortrack.report.locating import Located
     from tumortrack.report.seen import Seen
-    from tumortrack.tracking.files import report_entry, write_estimate
 
-    shown = Seen(cloud, seen)
-    add = partial(write_run_page, report=report_entry(estimate), estimate=estimate, seen=shown)
-    write_estimate(Path(folder), estimate, overwrite, add=add)
+    Located(estimate, seen=Seen(cloud, seen)).save(Path(folder), overwrite)
 
 
 def load_estimate(folder: StrPath) -> Estimate:

@@ -9,12 +9,15 @@ import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import fields
+from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from rich.console import Console
 
-Device = Literal["auto", "cpu", "cuda"]
+from tumortrack.tracking import options
+from tumortrack.tracking.options import Device as Device
 
 _EVERY_S = 15.0  # between lines where there is no terminal
 
@@ -88,20 +91,13 @@ def progress_of(what: str, first: str = "") -> Iterator[Callable[[int, int], Non
 
 
 def model_folder(given: Path) -> Path:
-    """The folder of a model that a command was given; of a case the one that it holds, made now
-    where there is none. Raises as ``load_case`` and ``case_model`` do."""
-    from tumortrack.imaging.case import Case, holds_case, load_case
-    from tumortrack.models.folder import is_model_of
+    """``tracking.options.model_folder``, with a progress bar where a case's model is made."""
+    return options.model_folder(given, partial(progress_of, "making the case's model, once"))
 
-    if not holds_case(given):
-        return given
-    kept = given / Case.MODEL
-    if not is_model_of(kept, given):
-        with progress_of("making the case's model, once") as progress:
-            from tumortrack.tracking.model_files import case_model
 
-            case_model(load_case(given), progress=progress)
-    return kept
+def options_of(command: object, kind: type[Any]) -> dict[str, Any]:
+    """Those of a command's options that are fields of ``kind``."""
+    return {field.name: getattr(command, field.name) for field in fields(kind)}
 
 
 @contextmanager

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Any
 from tyro.conf import Positional
 
 from tumortrack.cli.console import Device, console, keep_loaded, model_folder, progress_bar, say
-from tumortrack.cli.locate import check_grid
 from tumortrack.core import store
 from tumortrack.core.config import to_builtins
 from tumortrack.core.errors import InputError
+from tumortrack.tracking.options import check_grid
 
 if TYPE_CHECKING:
     from tumortrack.models.model import Model

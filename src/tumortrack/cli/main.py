@@ -14,7 +14,7 @@ from typing import NoReturn, Protocol, runtime_checkable
 import tyro
 
 import tumortrack
-from tumortrack.core.errors import InputError, PackageError, TumortrackError
+from tumortrack.core.errors import EXIT_STATUSES, InputError, PackageError, TumortrackError
 
 
 @runtime_checkable
@@ -40,7 +40,6 @@ _OF_OTHERS = {
 }
 _OBJECTS_A_COLLECTION = 20_000
 _LEFT_AT_ONCE = ["locate"]  # holds nothing open in the end, and is waited for
-_ANSWERS = (0, 3, 4)  # its exit statuses where OUT is written
 
 
 def main() -> None:
@@ -54,7 +53,7 @@ def main() -> None:
     # them for garbage again and again is a tenth of the time of their import.
     gc.set_threshold(_OBJECTS_A_COLLECTION)
     code = run(sys.argv[1:])
-    if sys.argv[1:2] == _LEFT_AT_ONCE and code in _ANSWERS:
+    if sys.argv[1:2] == _LEFT_AT_ONCE and code in EXIT_STATUSES.values():
         leave(code)
     if code:
         sys.exit(code)

@@ -16,9 +16,9 @@ from typing import TYPE_CHECKING, Any
 from tyro.conf import Positional
 
 from tumortrack.cli.console import Device, console, keep_loaded, model_folder, say
-from tumortrack.cli.finding import FindingOrgan
 from tumortrack.core import store
 from tumortrack.core.errors import InputError, StorageError
+from tumortrack.tracking.options import RegionOptions
 
 if TYPE_CHECKING:
     from tumortrack.live.cameras import Cameras, CameraSetup
@@ -49,7 +49,7 @@ class Arms:
 
 
 @dataclass(frozen=True, kw_only=True)
-class FollowingOptions(FindingOrgan):
+class FollowingOptions(RegionOptions):
     """Options of commands that follow an organ.
 
     Attributes:

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from tumortrack.core.causes import Likely
 
+# Of `locate`, by its verdict; each of them with a folder written.
+EXIT_STATUSES = {"good": 0, "poor": 4, "none": 3}
+
 
 class TumortrackError(Exception):
     """Base of errors raised on purpose: the command line prints the message on one line and exits
@@ -30,7 +33,7 @@ class NoEstimate(TumortrackError):
     """The input is well formed but gives no answer (too few points, no organ). ``causes``, if they
     were looked for: the likeliest first."""
 
-    exit_code = 3
+    exit_code = EXIT_STATUSES["none"]
 
     def __init__(self, text: str, causes: tuple[Likely, ...] = ()) -> None:
         super().__init__(text)

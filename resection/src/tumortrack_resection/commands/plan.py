@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Literal
 from tyro.conf import Positional, UseAppendAction
 
 from tumortrack.cli.console import say, say_notes, warn
-from tumortrack.cli.stated import StatedPatient
 from tumortrack.core import store
 from tumortrack.core.errors import InputError, NoPlan
+from tumortrack.tracking.options import PatientOptions
 
 if TYPE_CHECKING:
     from tumortrack.core.types import Mesh
@@ -27,7 +27,7 @@ _BASES = ("cutter_base", "holder_base")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Plan(StatedPatient):
+class Plan(PatientOptions):
     """Plan how to cut a located tumor out, and how two arms do it.
 
     Attributes:

@@ -1,29 +1,33 @@
-"""The views that `locate` reads, and the organ in them."""
+"""The views that `locate` reads, where their cameras were, and the organ in them."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, UInt8
 
 from tumortrack.core.errors import InputError
+from tumortrack.core.geometry import Affine
 from tumortrack.core.store import read_json
-from tumortrack.core.types import DepthFrame, SensorCloud
+from tumortrack.core.types import DepthFrame, Look, SensorCloud
+from tumortrack.models.model import Model
 from tumortrack.sense.camera import deproject_pixels
 from tumortrack.sense.cloud import check_cloud, check_depth_unit, crop_cloud
-from tumortrack.sense.files import DEPTH_SUFFIXES, read_cloud, read_depth, read_mask
-from tumortrack.sense.region import Hints, RegionConfig, organ_points
+from tumortrack.sense.files import DEPTH_SUFFIXES, read_cloud, read_depth, read_mask, read_poses
+from tumortrack.sense.region import Hints, organ_points
+from tumortrack.tracking.options import LocateOptions
 
 _NEAR = range(-3, 4)  # pixels from the one that was pointed at
 
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """What a file of `locate` holds; ``unit``: of a depth image, the mm of one step and who says
-    so; ``notes``: on what was dropped."""
+    """What a file of `locate` holds; ``unit``: of a depth image, the mm of one step and what states
+    it; ``notes``: on what was dropped."""
 
     path: Path
     content: SensorCloud | DepthFrame
@@ -42,23 +46,34 @@ class View:
         return Hints(inside, None if at is None else _picked_mm(self.content, *at))
 
     def organ(
-        self, region: RegionConfig, hints: Hints, by: str, seed: int
+        self, model: Model, options: LocateOptions, hints: Hints
     ) -> tuple[SensorCloud, dict[str, Any], UInt8[np.ndarray, "h w"] | None]:
         """The organ's points; what was done, for the report, with ``words`` for people; and what
-        became of each pixel (``sense.region.Region``). ``by``: the hints in words.
+        became of each pixel (``sense.region.Region``). A cloud shows the organ alone, unless a box
+        is given.
 
         Raises NoEstimate: nothing can be the organ; InputError: the depth's unit cannot be right.
         """
-        what = f"{self.path.name}: "
+        if isinstance(self.content, SensorCloud) and options.box is None:
+            return *self._cropped(self.content, options.range), None
+        given = {
+            "--box": options.box,
+            f"--at {' '.join(map(str, options.at or ()))}": options.at,
+            f"--mask {options.mask}": options.mask,
+            "--whole": options.whole,
+        }
+        by = " and ".join(name for name, value in given.items() if value)
+        by = by or "shape, size and place alone"
+        region, what = options.region(model), f"{self.path.name}: "
         about: dict[str, Any] = {"file": self.path.name, "hint": by}
         if self.unit is not None and isinstance(self.content, DepthFrame):
-            unit_mm, said_by = self.unit
+            unit_mm, stated_by = self.unit
             crop = region.crop
             check_depth_unit(self.content, unit_mm, crop.near_mm, crop.far_mm)
             about["depth_unit_mm"] = unit_mm
             unit = "in metres" if unit_mm == 1000 else f"in steps of {unit_mm:g} mm"
-            what += f"depth {unit} ({said_by}); "
-        found = organ_points(self.content, region, hints, np.random.default_rng(seed))
+            what += f"depth {unit} ({stated_by}); "
+        found = organ_points(self.content, region, hints, np.random.default_rng(options.seed))
         counts = {name: n for name, n in found.counts.items() if n}
         of = sum(n for name, n in counts.items() if name != "no return")
         rest = ", ".join(f"{name} {n}" for name, n in counts.items()
@@ -68,44 +83,78 @@ class View:
         about["words"] = f"{what}{f' (others: {rest})' if rest else ''}."
         return found.cloud, about, found.taken
 
-    def alone(self, range_mm: tuple[float, float] | None) -> tuple[SensorCloud, dict[str, Any]]:
-        """The same of a cloud that shows the organ alone. Raises NoEstimate: too few points."""
-        assert isinstance(self.content, SensorCloud)
-        cloud = crop_cloud(self.content, *range_mm) if range_mm else self.content
-        kept, of = len(cloud.points_mm), len(self.content.points_mm)
-        by = "--range" if range_mm else ""
+    def _cropped(
+        self, cloud: SensorCloud, range_mm: tuple[float, float] | None
+    ) -> tuple[SensorCloud, dict[str, Any]]:
+        of, by = len(cloud.points_mm), "--range" if range_mm else ""
+        if range_mm:
+            cloud = crop_cloud(cloud, *range_mm)
+        kept = len(cloud.points_mm)
         words = f"{self.path.name}: {kept} of {of} points were taken for the organ"
         words += f", by {by}." if by else ": a cloud is taken for the organ alone."
         return cloud, {"file": self.path.name, "hint": by, "organ": kept, "of": of, "words": words}
 
 
-def read_view(
-    path: Path, unit: Literal["mm", "m"], intrinsics: Path | None, depth_unit_mm: float | None
-) -> View:
-    """A cloud, or a depth image with its intrinsics. Raises InputError: it cannot be read, or an
+def read_views(paths: Sequence[Path], options: LocateOptions) -> list[View]:
+    """Clouds, or depth images with their intrinsics. Raises InputError: one cannot be read, or an
     option is of the other kind."""
+    cameras, count = options.intrinsics or (None,), len(paths)
+    if len(cameras) not in (1, count):
+        raise InputError(
+            f"--intrinsics is given {len(cameras)} times for {count} view{'s' * (count > 1)}: "
+            "give it once for all of them, or once for each, in their order."
+        )
+    cameras = cameras if len(cameras) == count else cameras * count
+    return [_read_view(*pair, options) for pair in zip(paths, cameras, strict=True)]
+
+
+def _read_view(path: Path, intrinsics: Path | None, options: LocateOptions) -> View:
     if path.suffix.lower() in DEPTH_SUFFIXES:
         if intrinsics is None:
             raise InputError(f"{path} is a depth image: give --intrinsics FILE.json with it.")
-        if unit != "mm":
+        if options.unit != "mm":
             raise InputError(
                 "--unit is for clouds; of a depth image give --depth-unit, the mm of one step, or "
                 "have it in the intrinsics file as depth_unit_mm."
             )
-        frame, unit_mm = read_depth(path, intrinsics, depth_unit_mm)
-        stated = "depth_unit_mm" in read_json(intrinsics)
-        said_by = f"stated in {intrinsics.name}" if stated else "the default"
-        return View(
-            path, frame, unit=(unit_mm, said_by if depth_unit_mm is None else "--depth-unit")
-        )
-    if intrinsics is not None or depth_unit_mm is not None:
+        frame, unit_mm = read_depth(path, intrinsics, options.depth_unit)
+        if options.depth_unit is not None:
+            stated_by = "--depth-unit"
+        elif "depth_unit_mm" in read_json(intrinsics):
+            stated_by = f"stated in {intrinsics.name}"
+        else:
+            stated_by = "the default"
+        return View(path, frame, unit=(unit_mm, stated_by))
+    if intrinsics is not None or options.depth_unit is not None:
         option = "--intrinsics" if intrinsics is not None else "--depth-unit"
         raise InputError(
             f"{option} is for depth images ({', '.join(DEPTH_SUFFIXES)}); {path} is a cloud."
         )
-    cloud, notes = read_cloud(path, unit)
+    cloud, notes = read_cloud(path, options.unit)
     check_cloud(cloud)  # before the crop, which would only say that nothing lies in range
     return View(path, cloud, notes)
+
+
+def read_places(poses: Path | None, views: int) -> tuple[str, tuple[Affine, ...]]:
+    """The fixed frame's name, and where the views' cameras were in it; of one view nothing."""
+    if poses is None and views == 1:
+        return "", ()
+    if poses is None or views == 1:
+        raise InputError(
+            f"{views} view{'s' * (views > 1)} with{'out' * (poses is None)} --poses: give "
+            "--poses FILE with several views (locate MODEL CLOUD CLOUD ... OUT), and only then."
+        )
+    return read_poses(poses, views)
+
+
+def further_looks(
+    organs: Sequence[SensorCloud], views: Sequence[View], fixed_from_camera: Sequence[Affine]
+) -> list[Look]:
+    """All views but the first, whose frame is the answer's."""
+    return [
+        Look(organ, view.content, np.linalg.inv(fixed_from_camera[0]) @ pose)
+        for organ, view, pose in list(zip(organs, views, fixed_from_camera, strict=False))[1:]
+    ]
 
 
 def _picked_mm(frame: DepthFrame, column: int, row: int) -> Float[np.ndarray, " 3"]:

@@ -1,0 +1,188 @@
+"""From the files of one or several views to a located organ and its folder."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from tumortrack.core import store
+from tumortrack.core.config import to_builtins
+from tumortrack.core.errors import InputError, NoEstimate
+from tumortrack.report.seen import Seen
+from tumortrack.tracking.options import LocateOptions, check_grid, model_folder
+from tumortrack.tracking.points import PointTable, check_near_organ, read_points
+from tumortrack.tracking.views import View, further_looks, read_places, read_views
+
+if TYPE_CHECKING:
+    from tumortrack.core.estimate import Estimate
+    from tumortrack.core.types import Anatomy
+    from tumortrack.live.viewer.slices import CarriedCt
+    from tumortrack.models.model import Model
+
+_ASK = "say where the organ is: --at COLUMN ROW, --box or --mask"
+
+
+@dataclass(frozen=True, eq=False)
+class Located:
+    """What ``locate`` found in its files, to be saved.
+
+    Attributes:
+        estimate: None where nothing could be located; ``reason`` says why then.
+        about: what report.json says besides the estimate: notes, inputs, model, digests.
+        seen: what the page shows besides the estimate.
+        points: those of the CT whose places were asked for.
+        error: why there is no estimate.
+    """
+
+    estimate: Estimate | None
+    about: dict[str, Any] = field(default_factory=dict)
+    seen: Seen = field(default_factory=Seen)
+    points: PointTable | None = None
+    error: NoEstimate | None = None
+
+    @property
+    def reason(self) -> str:
+        """Why there is no estimate, or a poor one."""
+        return self.about["quality"]["reason"] if self.estimate is None else self.estimate.reason
+
+    @property
+    def report(self) -> dict[str, Any]:
+        """report.json."""
+        from tumortrack.tracking.files import report_entry
+
+        head = {} if self.estimate is None else report_entry(self.estimate)
+        return {**head, **self.about}
+
+    def save(self, folder: Path, overwrite: bool = False) -> None:
+        """Write the folder that `tumortrack locate` writes. Raises InputError: it exists and
+        ``overwrite`` is False; StorageError: the disk refused."""
+        from tumortrack.report.run_page import write_run_page
+        from tumortrack.tracking import files
+
+        report = self.report
+        add = partial(write_run_page, report=report, estimate=self.estimate, seen=self.seen)
+        if self.estimate is None:
+            files.write_no_estimate(folder, report, overwrite, add)
+        else:
+            files.write_estimate(folder, self.estimate, overwrite, self.points, add, self.about)
+
+
+def locate(given: Path, clouds: Sequence[Path], options: LocateOptions) -> Located:
+    """Locate in views of an organ at rest, with a model or case; see ``api.locate``."""
+    check_grid(options.grid)
+    folder = model_folder(given)
+    points = _points(given, folder, options)
+    frame_id, fixed_from_camera = read_places(options.poses, len(clouds))
+    views = read_views(clouds, options)
+    hints = views[0].hints(options.at, options.mask)
+
+    from tumortrack.tracking.model_files import load_model
+    from tumortrack.tracking.tracker import Tracker
+
+    model = load_model(folder, options.device)
+    tracker = Tracker(model)
+    about: dict[str, Any] = {
+        "notes": _notes(views, points, tracker.anatomy_ct, options),
+        "input": [],
+        "model": model.provenance,
+        "model_sha256": store.sha256_of(folder / store.MANIFEST),
+        "cloud_sha256": store.sha256_of(clouds[0]),
+    }
+    ct, organs = _ct(options.case, model, tracker.anatomy_ct), []
+    seen = Seen(content=views[0].content, ct=ct)
+    try:
+        for view in views:
+            organ, done, taken = view.organ(model, options, hints)
+            organs.append(organ)
+            about["input"].append(done)
+            if view is views[0]:
+                seen = replace(seen, cloud=organ, taken=taken)
+        looks = further_looks(organs, views, fixed_from_camera)
+        estimate = tracker.locate(organs[0], options.grid, options.seed, views[0].content, looks)
+    except NoEstimate as error:
+        about = {**_no_estimate(error, views[0], model, options), **about}
+        return Located(None, about, seen, points, error)
+    if estimate.quality == "poor" and views[0].unit is not None:
+        doubt = f"if that is not the organ, or not all of it: {_ASK}; --whole takes all."
+        about["notes"].append(doubt)
+    if options.poses is not None and estimate.report.looks is not None:
+        about["looks"] = {
+            **to_builtins(estimate.report.looks),
+            "frame_id": frame_id,
+            "fixed_from_camera": fixed_from_camera[0].tolist(),
+            "poses_sha256": store.sha256_of(options.poses),
+            "clouds_sha256": [store.sha256_of(path) for path in clouds],
+        }
+    if options.map is not None and points is not None:
+        digest, count = store.sha256_of(options.map), len(points.points_ct)
+        about["map"] = {"points": count, "from": "lps", "to": "camera", "sha256": digest}
+    return Located(estimate, about, seen, points)
+
+
+def _points(given: Path, folder: Path, options: LocateOptions) -> PointTable | None:
+    """The points of --map; what is wrong with them or the model is reported before it is loaded."""
+    from tumortrack.models.folder import has_shape, patient_of, read_model_manifest
+
+    manifest = read_model_manifest(folder)
+    patient_of(manifest, folder).check_is(options.stated, str(given))
+    if options.map is None:
+        return None
+    if not has_shape(manifest):
+        raise InputError(
+            f"--map: {given} says what is where, but not which point of the CT lies "
+            "there. The case itself knows: give CASE in place of MODEL."
+        )
+    return read_points(options.map)
+
+
+def _notes(
+    views: list[View],
+    points: PointTable | None,
+    anatomy_ct: Anatomy | None,
+    options: LocateOptions,
+) -> list[str]:
+    """What was dropped in reading, and which points of --map lie far from the organ."""
+    notes = [note for view in views for note in view.notes]
+    if points is not None:
+        assert anatomy_ct is not None  # a model with a shape
+        box_mm = anatomy_ct.organ.box_mm
+        notes += [*points.notes, *check_near_organ(points.points_ct, box_mm, str(options.map))]
+    return notes
+
+
+def _no_estimate(
+    error: NoEstimate, view: View, model: Model, options: LocateOptions
+) -> dict[str, Any]:
+    """The report's head, where there is no estimate."""
+    from tumortrack.models.report import report_head
+
+    reason = str(error)
+    if view.unit is not None:
+        reason = f"{reason.rstrip('.')}; {_ASK}."
+    return {
+        **report_head(view.content.stamp_ns),
+        "seed": options.seed,
+        "patient": to_builtins(model.patient),
+        "quality": {"verdict": "none", "reason": reason},
+    }
+
+
+def _ct(folder: Path | None, model: Model, anatomy_ct: Anatomy | None) -> CarriedCt | None:
+    """The CT of --case, if it has one."""
+    if folder is None:
+        return None
+    from tumortrack.imaging.case import load_case
+    from tumortrack.live.viewer.slices import CarriedCt
+
+    case = load_case(folder)
+    same = store.sha256_of(folder / store.MANIFEST) == model.provenance.get("case_sha256")
+    if not same or anatomy_ct is None:
+        raise InputError(
+            f"--case {folder} shows nothing here: "
+            + ("the model knows no motion; give the case itself in its place."
+               if same else "the model is of another case. Give that one.")
+        )  # fmt: skip
+    return None if case.ct is None else CarriedCt(case)
