@@ -9,8 +9,7 @@ from __future__ import annotations
 
 import logging
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, closing, contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
@@ -19,16 +18,18 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from tumortrack.core import store
-from tumortrack.core.errors import InputError, NoEstimate, StorageError
+from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.estimate import Estimate
 from tumortrack.core.types import DepthFrame, Mesh, SensorCloud
 from tumortrack.imaging.case import Case
 from tumortrack.imaging.case import load_case as read_case
-from tumortrack.tracking.options import Device, LocateOptions
+from tumortrack.tracking.options import Device, LocateOptions, TrackOptions
 
 if TYPE_CHECKING:
-    from tumortrack.live.values import SinkContext, TrackingResult
-    from tumortrack.live.workers import SinkWorker
+    from _typeshed import DataclassInstance
+
+    from tumortrack.live.session import Arms, Session
+    from tumortrack.live.values import TrackingResult
     from tumortrack.models.model import Model
     from tumortrack.occupancy.config import TrainConfig
     from tumortrack.occupancy.training.train import TrainingStatus
@@ -40,7 +41,7 @@ if TYPE_CHECKING:
     from tumortrack.tracking.tracker import Tracker
 
 StrPath = str | Path
-_Options = TypeVar("_Options")
+_Options = TypeVar("_Options", bound="DataclassInstance")
 _TEST_BODY = 2**20  # and the seed: elastic states that training with the same seed never sees
 
 
@@ -471,93 +472,65 @@ def evaluate(
 
 
 def track(
-    tracker: Tracker,
+    tracker: Tracker | StrPath,
     source: Any,
     sinks: Sequence[Any] = (),
     *,
     until: Callable[[TrackingResult], bool] | None = None,
     seconds: float = 0.0,
     range_mm: tuple[float, float] | None = None,
+    **options: Any,
 ) -> dict[str, Any]:
     """Follow the organ live, from a source to sinks, until the source ends.
 
     Args:
+        tracker: or the folder of a case or model.
         source: as on the command line (``"virtual:CASE"``, ``"realsense"``, ...), or a source's
             configuration.
         sinks: likewise, or objects with ``publish(result)`` and ``close()``.
         until: called with every result; True ends the loop.
-        seconds: end after so long; 0: not.
+        seconds: end so many s after the first frame; 0: not.
         range_mm: depths to keep (default: those that training showed).
+        options: as on the command line: ``box``, ``whole``, ``intrinsics``,
+            ``frame``, ``views``, ``poses``, ``moving``, ``scan``, ``smoothing``, ``rescan``,
+            ``stale``, ``frozen``, ``give_up``, ``report``, ``seed``, ``patient``, ``side``,
+            ``device``.
 
     Returns:
         The run's figures: counts, latencies, stage times (docs/conventions.md).
 
     Raises:
-        InputError: a source or sink that is not written as it must be, or cannot work.
+        InputError: an option, or a source or sink that is not written as it must be, or cannot
+            work.
         StorageError: a sink cannot write.
         SourceLost: no frame came for a minute.
     """
-    from tumortrack.live.loop import Loop, LoopConfig, summary
-    from tumortrack.live.spec import SOURCES
-    from tumortrack.live.values import PublishedFrame, SinkContext
-    from tumortrack.live.workers import SourceWorker
-    from tumortrack.tracking.tracker import region_for
-
-    config = SOURCES.parse(source) if isinstance(source, str) else source
-    named = named_sinks(sinks)
-    model, frames = tracker.model, PublishedFrame()
-    config.patient().check_shown(model.patient, "the source")
-    context = SinkContext(model.parts, frames, tracker.anatomy_ct, patient=model.patient)
-    region = region_for(model, range_mm=range_mm)
-    loop = Loop(tracker, context, LoopConfig(region=region, seconds=seconds))
-    loop.warm()
+    run = session(tracker, source, sinks, seconds=seconds, range=range_mm, **options)
+    run.loop.warm()
 
     def seen(result: TrackingResult) -> None:
         if until is not None and until(result):
-            loop.stop()
+            run.loop.stop()
 
-    with open_sinks(named, context) as workers, closing(SourceWorker(config.open)) as reader:
-        for worker in workers:
+    with run.opened():
+        for worker in run.sinks:
             for note in worker.notes:  # a viewer's address, or that others can see it
                 logging.getLogger("tumortrack").warning("sink %s: %s", worker.name, note)
-        loop.run(reader, workers, seen)
-    return summary(loop, reader, workers)
+        run.run(seen)
+    return run.summary()
 
 
-def named_sinks(sinks: Sequence[Any]) -> dict[str, Any]:
-    """Sinks, or their configurations, by the names that reports give them. Raises InputError: one
-    is not written as it must be, or is given twice."""
-    from tumortrack.live.spec import SINKS
+def session(
+    tracker: Tracker | StrPath,
+    source: Any,
+    sinks: Sequence[Any] = (),
+    arms: Arms | None = None,
+    **options: Any,
+) -> Session:
+    """``track``, ready to be opened: for programs that show what happens meanwhile, as the command
+    does. ``arms`` act on what is tracked."""
+    from tumortrack.live.session import session
 
-    named: dict[str, Any] = {}
-    for number, sink in enumerate(sinks):
-        name = sink if isinstance(sink, str) else f"sink {number}"
-        if name in named:
-            raise InputError(f"sink {name!r} is given twice.")
-        named[name] = SINKS.parse(sink) if isinstance(sink, str) else sink
-    return named
-
-
-@contextmanager
-def open_sinks(sinks: Mapping[str, Any], context: SinkContext) -> Iterator[list[SinkWorker]]:
-    """``named_sinks``, each at work in a thread of its own. Raises InputError, StorageError: one
-    cannot work, or not write."""
-    from tumortrack.live.values import SinkConfig
-    from tumortrack.live.workers import SinkWorker
-
-    def waiting(sink: Any) -> int:
-        return sink.queue_size if isinstance(sink, SinkConfig) else 1
-
-    workers: list[SinkWorker] = []
-    with ExitStack() as stack:
-        # Those that make a folder last: if another cannot open, none is left behind.
-        for name, sink in sorted(sinks.items(), key=lambda pair: waiting(pair[1])):
-            try:
-                opened = sink.open(context) if isinstance(sink, SinkConfig) else sink
-            except OSError as error:  # a sink of another package that does not translate it
-                raise StorageError(
-                    f"sink {name!r} cannot be opened: {error.strerror}: {error.filename}."
-                ) from error
-            workers.append(SinkWorker(name, opened, waiting(sink)))
-            stack.callback(workers[-1].close)
-        yield workers
+    asked = _options(TrackOptions, options, "track")
+    model = Path(tracker) if isinstance(tracker, str | Path) else tracker
+    return session(model, source, sinks, asked, arms)

@@ -19,6 +19,7 @@ SIGNATURES = {
     "load_case": "folder",
     "load_estimate": "folder",
     "load_model": "folder device='auto'",
+    "locate": "model clouds options",
     "prepare": "source folder=None overwrite=False segment=None progress=None options",
     "read_cloud": "path unit='mm'",
     "read_depth": "path intrinsics unit_mm=None",
@@ -26,7 +27,7 @@ SIGNATURES = {
     "scan_phantom": "folder seed=1",
     "simulate_scenes": "case count=1 seed=0 elastic=True noise=True",
     "teach": "frame picture organ beside",
-    "track": "tracker source sinks=() until=None seconds=0.0 range_mm=None",
+    "track": "tracker source sinks=() until=None seconds=0.0 range_mm=None options",
     "train": "case folder preset='clinic' config=None minutes=None steps=None seed=0 "
     "device='auto' workers=None report=None",
 }

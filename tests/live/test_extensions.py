@@ -14,8 +14,8 @@ from depth_files import write_depth_png, write_intrinsics
 from extension_objects import EXAMPLE, distribution, installed_example
 from live_objects import small_frame, small_setting, small_update
 from stories import COMMAND, environment, succeeded
-from tumortrack.api import named_sinks, open_sinks
 from tumortrack.core.errors import InputError, StorageError
+from tumortrack.live.session import named_sinks, open_sinks
 from tumortrack.live.spec import SINKS, SOURCES, extensions
 from tumortrack.live.values import Sink, Source
 

@@ -39,10 +39,10 @@ class CameraSetup:
 
 
 def camera_setup(
-    sources: Sequence[str], poses: Path | None, moving: str, frame: Path | None
+    sources: Sequence[str | SourceConfig], poses: Path | None, moving: str, frame: Path | None
 ) -> CameraSetup:
     """As the options of `track` say it. Raises InputError: they do not go together."""
-    configs = {text: SOURCES.parse(text) for text in sources}
+    configs = dict(map(_named, sources))
     several = len(sources) > 1
     if len(configs) < len(sources) or several != (poses is not None) or (several and moving):
         raise InputError(
@@ -68,6 +68,12 @@ def camera_setup(
     published_from_fixed = published.published_from_camera @ np.linalg.inv(places[0])
     still = published.published_from_camera, *(published_from_fixed @ one for one in places[1:])
     return CameraSetup(published, configs, still)
+
+
+def _named(source: str | SourceConfig) -> tuple[str, SourceConfig]:
+    if isinstance(source, SourceConfig):
+        return "the source", source
+    return source, SOURCES.parse(source)
 
 
 class Cameras:

@@ -98,6 +98,61 @@ class LocateOptions(RegionOptions):
     device: Device = "auto"
 
 
+@dataclass(frozen=True, kw_only=True)
+class CameraOptions(RegionOptions):
+    """Options of commands that follow an organ.
+
+    Attributes:
+        intrinsics: JSON with the camera's width, height, fx, fy, cx, cy in pixels, instead of what
+            the source says, and perhaps a correction of depths, as `calibrate camera` writes it.
+        device: auto takes CUDA if there is a GPU.
+    """
+
+    intrinsics: Path | None = None
+    device: Device = "auto"
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrackOptions(CameraOptions):
+    """Options of `track`.
+
+    Attributes:
+        frame: JSON file that says where the camera is; results are then in the robot's frame.
+        views: further cameras that stand still; what all see at about one moment is laid together.
+        poses: JSON that says where all cameras stand, as for `locate`, SOURCE's first; results are
+            in its frame, unless --frame gives another.
+        moving: SOURCE's camera moves; where it is in each frame comes from file:POSES.csv, tf
+            (ros2:FIXED_FRAME) or a robot (ur:HOST). Where that gives poses of a
+            tool, --frame has tool_from_camera.
+        scan: with --moving: begin with three looks at the organ at rest, from 30 degrees apart,
+            within 5 s; what they show together is what the following starts from.
+        smoothing: time constant in s of a mean over past estimates; the lag is in the report.
+        rescan: every so many s, search for the organ as in a first frame.
+        stale: frames older than so many s are refused; a pause is reported after four fifths of it.
+        frozen: an image that repeats bit for bit for so many s is refused; 0: it may repeat, as
+            of a simulated camera without noise.
+        give_up: end after so many s without a frame.
+        seconds: end so many s after the first frame, and without one after as many (but 5 at
+            least: cameras take time to open); 0: never.
+        report: file for latencies, counts and reasons (default: runs/track-TIME.json).
+        seed: of the random points.
+    """
+
+    frame: Path | None = None
+    views: tuple[str, ...] = ()
+    poses: Path | None = None
+    moving: str = ""
+    scan: bool = False
+    smoothing: float = 0.0
+    rescan: float = 1.0
+    stale: float = 0.5
+    frozen: float = 0.25
+    give_up: float = 60.0
+    seconds: float = 0.0
+    report: Path | None = None
+    seed: int = 0
+
+
 def check_grid(grid: int) -> None:
     from tumortrack.core.estimate import LARGEST_GRID
 

@@ -98,7 +98,8 @@ class View:
 def read_views(paths: Sequence[Path], options: LocateOptions) -> list[View]:
     """Clouds, or depth images with their intrinsics. Raises InputError: one cannot be read, or an
     option is of the other kind."""
-    cameras, count = options.intrinsics or (None,), len(paths)
+    cameras: tuple[Path | None, ...] = options.intrinsics or (None,)
+    count = len(paths)
     if len(cameras) not in (1, count):
         raise InputError(
             f"--intrinsics is given {len(cameras)} times for {count} view{'s' * (count > 1)}: "

@@ -21,6 +21,7 @@ from tumortrack.core.config import to_builtins
 from tumortrack.core.errors import Aborted, ArtifactError, InputError
 from tumortrack.core.organ import KIDNEY, Organ, organ_first, organ_name
 from tumortrack.core.patient import Patient
+from tumortrack.tracking.options import CameraOptions
 from tumortrack_resection.commands.plan import check_arms_installed
 
 if TYPE_CHECKING:
@@ -47,7 +48,7 @@ _LIVE = ("realsense", "ros2")  # sources that show the present
 
 
 @dataclass(frozen=True, kw_only=True)
-class Resect(track.FollowingOptions):
+class Resect(CameraOptions):
     """Carry a plan out with virtual arms, shown by the same sinks as `track`.
 
     Attributes:
@@ -75,7 +76,7 @@ class Resect(track.FollowingOptions):
     report: Path | None = None
 
     def run(self) -> None:
-        from tumortrack import api
+        from tumortrack.live.session import named_sinks
         from tumortrack_resection.files import read_plan
         from tumortrack_resection.operation import OperationConfig
         from tumortrack_resection.ur_sink import UrSinkConfig
@@ -91,7 +92,7 @@ class Resect(track.FollowingOptions):
         if organ is None or stored.plan.tumor not in stored.meshes:
             lacking = stored.plan.tumor if organ else "the organ"
             raise ArtifactError(f"{self.plan} lacks {lacking}'s surface. Plan again.")
-        sinks = api.named_sinks(self.sinks).values()  # wrong: said before all that takes long
+        sinks = named_sinks(self.sinks).values()  # wrong: said before all that takes long
         moved_mm = self._moved_mm(stored)
         config = OperationConfig(speed=self.speed, moved_mm=moved_mm, replan_cut=self.replan_cut)
         arms = [sink for sink in sinks if isinstance(sink, UrSinkConfig)]
@@ -204,6 +205,7 @@ class _Procedure:
         import msgspec
 
         from tumortrack.live.cameras import CameraSetup
+        from tumortrack.live.session import Arms
         from tumortrack_resection.arms import procedure
         from tumortrack_resection.arms.cell import tip_places
         from tumortrack_resection.live_budget import LiveBudget
@@ -240,26 +242,25 @@ class _Procedure:
             operation = self._operation(locate=locate, replan=replan, budget=budget)
             setup = CameraSetup(frames, {live.named: live.source})
             about = {"plan_config": to_builtins(self.config)}
-            same = {one.name: getattr(asked, one.name) for one in fields(track.FollowingOptions)}
+            same = {one.name: getattr(asked, one.name) for one in fields(CameraOptions)}
             track.Track(
                 model=live.model, source=live.named, sinks=asked.sinks, report=asked.report, **same
-            ).run(
-                track.Arms(operation, setup, about, tip_places(self.cell.config), bool(self.arms))
-            )
+            ).run(Arms(operation, setup, about, tip_places(self.cell.config), bool(self.arms)))
         self._say_end(operation)
 
     def execute(self) -> None:
         """Without a camera: the stored motions in real time."""
-        from tumortrack import api
+        from tumortrack.live import session
         from tumortrack.live.values import Controls, SinkContext, TrackingResult
 
         stored, frames, controls = self.stored, self.stored.frames, Controls()
         operation = self._operation()
         operation.still_life = _organ_shapes(stored)
-        report = track.report_path(self.asked.report, "resect")
+        report = self.asked.report or track.default_report("resect")
+        session.check_report(report)
         context = SinkContext(tuple(stored.meshes), frames, None, controls, True, stored.patient)
         stop = track.stopping(lambda: operation.abort(track.STOPPED))
-        with stop, api.open_sinks(api.named_sinks(self.asked.sinks), context) as sinks:
+        with stop, session.open_sinks(session.named_sinks(self.asked.sinks), context) as sinks:
             track.say_opened(sinks)
             seconds = self.motions.seconds / self.config.speed
             say(f"{seconds:.0f} s in frame {frames.frame_id!r}; Ctrl-C stops the arms.")
@@ -294,7 +295,7 @@ class _Procedure:
         store.write_json(report, content)
         say(f"written to {report}.")
         self._say_end(operation)
-        track.check_closed(sinks)
+        session.check_closed(sinks)
 
     def film(self, path: Path) -> None:
         """An animated GIF of about twelve seconds."""

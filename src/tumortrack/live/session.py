@@ -1,0 +1,315 @@
+"""A run of `track`: what it is given is checked and loaded, then source and sinks are opened, and a
+report is kept while it lasts."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, closing, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from tumortrack.core import store
+from tumortrack.core.config import to_builtins
+from tumortrack.core.errors import InputError, StorageError
+from tumortrack.core.patient import Patient
+from tumortrack.live.cameras import Cameras, CameraSetup, camera_setup
+from tumortrack.live.loop import Loop, LoopConfig, summary
+from tumortrack.live.sinks.recording import RecordingSinkConfig
+from tumortrack.live.spec import SINKS
+from tumortrack.live.values import (
+    ArmsController,
+    SinkConfig,
+    SinkContext,
+    SourceConfig,
+    TrackingResult,
+)
+from tumortrack.live.workers import SinkWorker, SourceWorker
+from tumortrack.models.folder import patient_of, read_model_manifest
+from tumortrack.models.model import Model
+from tumortrack.sense.files import DepthCorrection, read_camera
+from tumortrack.tracking.model_files import load_model
+from tumortrack.tracking.options import TrackOptions, model_folder
+from tumortrack.tracking.tracker import FollowerConfig, Tracker
+
+_SETTLED_S = 60.0  # by then all buffers have their size: memory that grows on is a leak
+_OPENING_S = 5.0  # the first frame may take so long, however short a run is wanted
+_STORE_S = 10.0  # between two writings of the report: kill -9 loses no more
+
+
+@dataclass(frozen=True, eq=False)
+class Arms:
+    """Arms that act on what is tracked. ``setup``: what they were checked with; ``about`` them, for
+    the report; ``tip_mm``: as of ``SinkContext``; ``ur``: there are sinks of real arms, connected
+    or not."""
+
+    operation: ArmsController
+    setup: CameraSetup
+    about: dict[str, Any]
+    tip_mm: Any
+    ur: bool
+
+
+class Session:
+    """A source's frames on their way to sinks; made by ``session``.
+
+    Attributes:
+        unwritten: why the report could not be written last; empty: it could.
+        started: a frame came.
+    """
+
+    cameras: Cameras
+    sinks: list[SinkWorker]
+
+    def __init__(
+        self,
+        tracker: Tracker,
+        setup: CameraSetup,
+        named: Mapping[str, Any],
+        config: LoopConfig,
+        arms: Arms | None,
+    ) -> None:
+        self.tracker, self.setup, self._named, self._config = tracker, setup, named, config
+        self.arms, model = arms, tracker.model
+        self._context = SinkContext(
+            model.parts,
+            setup.published,
+            tracker.anatomy_ct,
+            arms=arms is not None,
+            patient=model.patient,
+            cameras=setup.still,
+            tip_mm=None if arms is None else arms.tip_mm,
+            corrected=config.correction != DepthCorrection(),
+        )
+        self.loop = Loop(tracker, self._context, config, None if arms is None else arms.operation)
+        self.report: Path | None = None
+        self.about: dict[str, Any] = {}
+        self.unwritten, self.started = "", False
+
+    @contextmanager
+    def opened(self) -> Iterator[None]:
+        """Sinks and source at work; the report is written when all have flushed. A start that
+        failed leaves nothing: the next one may use its names. Raises as ``open_sinks``."""
+        self._began = self._stored = time.monotonic()
+        self._memory_mb = {"start": round(resident_mb(), 1)}
+        with (
+            ExitStack() as ending,
+            open_sinks(self._named, self._context) as self.sinks,
+            closing(self._open_cameras()) as self.cameras,
+        ):
+            ending.push(self._end)  # once all workers have flushed
+            yield
+
+    def _open_cameras(self) -> Cameras:
+        workers = [SourceWorker(source.open) for source in self.setup.sources.values()]
+        here = self.setup.published.published_from_camera
+        return Cameras(
+            workers, self.setup.poses or self.setup.still or (here,), self._config.stale_s
+        )
+
+    def _end(self, error: type[BaseException] | None, *_: object) -> None:
+        if error is None or self.started:
+            self._store()
+            return
+        for sink in self._named.values():
+            if isinstance(sink, RecordingSinkConfig):
+                store.remove(sink.path)
+        if self.report is not None:
+            store.remove(self.report)
+
+    def run(self, on_result: Callable[[TrackingResult], None]) -> None:
+        """Until the source ends, the time is up, the arms have ended, or ``loop.stop``. Raises as
+        ``Loop.run``."""
+
+        def show(result: TrackingResult) -> None:
+            self.started |= result.observation is not None
+            on_result(result)
+            if time.monotonic() - self._stored >= _STORE_S:
+                self._store()
+
+        self.loop.run(self.cameras, self.sinks, show)
+
+    def summary(self) -> dict[str, Any]:
+        """The run's figures, JSON types."""
+        return summary(self.loop, self.cameras, self.sinks)
+
+    def _store(self) -> None:
+        if self.report is None:
+            return
+        self._stored = time.monotonic()
+        self._memory_mb["now"] = now_mb = round(resident_mb(), 1)
+        if self._stored - self._began > _SETTLED_S:
+            self._memory_mb.setdefault("settled", now_mb)
+        frames = self.loop.views.frames
+        content = {
+            **self.about,
+            "seconds": round(self._stored - self._began, 2),
+            "memory_mb": self._memory_mb,
+            "table_in_camera": frames.watch and frames.watch.table_in_camera,
+            "frame_notes": frames.notes,
+            **self.summary(),
+            **({} if self.arms is None else {"resection": self.arms.operation.summary()}),
+        }
+        try:
+            store.write_json(self.report, content)
+            self.unwritten = ""
+        except StorageError as error:  # a full disk must not end what is seen live
+            self.unwritten = str(error)
+
+
+def session(
+    model: Tracker | Path,
+    source: str | SourceConfig,
+    sinks: Sequence[Any],
+    options: TrackOptions,
+    arms: Arms | None = None,
+) -> Session:
+    """Everything that `track` needs, before anything is opened. What is wrong is reported before
+    a model is loaded.
+
+    Args:
+        model: a tracker, or the folder of a case or model.
+        sinks: as written on the command line, their configurations, or sinks.
+
+    Raises:
+        InputError, ArtifactError: an option, a file or a combination of them cannot be used.
+    """
+    setup = _cameras(source, options) if arms is None else arms.setup  # what executes was checked
+    named = named_sinks(sinks)
+    digest = {}
+    if isinstance(model, Tracker):
+        tracker = model
+        _check(setup, model.model.patient, "the model", options)
+    else:
+        folder = model_folder(model)
+        _check(setup, patient_of(read_model_manifest(folder), folder), str(model), options)
+        digest = {"model_sha256": store.sha256_of(folder / store.MANIFEST)}
+        tracker = Tracker(load_model(folder, options.device))
+    if setup.still and tracker.anatomy_ct is None:
+        raise InputError("--views needs a model that knows a motion: give the case itself.")
+    config = _loop_config(options, tracker.model)
+    made = Session(tracker, setup, named, config, arms)
+    frames = setup.published
+    placed = None if frames.moves else frames.published_from_camera.tolist()
+    made.report, made.about = (
+        options.report,
+        {
+            "patient": to_builtins(tracker.model.patient),
+            "model": tracker.model.provenance,
+            **digest,
+            "source": next(iter(setup.sources)),
+            "sinks": list(named),
+            "config": to_builtins(config),
+            "frame": {"frame_id": frames.frame_id, "published_from_camera": placed},
+            "views": list(options.views),
+            "moving": options.moving,
+            "published_from_cameras": [place.tolist() for place in setup.still],
+            **({} if arms is None else arms.about),
+        },
+    )
+    return made
+
+
+def _cameras(source: str | SourceConfig, options: TrackOptions) -> CameraSetup:
+    wrong = ""
+    if options.box and (options.views or options.moving):
+        wrong = "--box lies before one camera that stands still"
+    elif options.intrinsics and options.views:
+        wrong = "--intrinsics is of one camera; with --views each says its own"
+    elif options.scan and not options.moving:
+        wrong = "--scan is of one camera that moves (--moving); several look all the time"
+    if wrong:
+        raise InputError(f"{wrong}. Leave it out.")
+    return camera_setup((source, *options.views), options.poses, options.moving, options.frame)
+
+
+def _check(setup: CameraSetup, patient: Patient, what: str, options: TrackOptions) -> None:
+    """InputError: the model (``what``) or a source is of another patient, depths were corrected
+    already, or the report has no place."""
+    patient.check_is(options.stated, what)
+    for text, source in setup.sources.items():
+        source.patient().check_shown(patient, text)
+        corrects = read_camera(options.intrinsics)[1] != DepthCorrection()
+        if corrects and getattr(source, "is_corrected", False):
+            raise InputError(
+                f"the depths of {text} were corrected as they were recorded. Leave "
+                "--intrinsics out, or give it without depth_scale and depth_offset_mm."
+            )
+    if options.report is not None:
+        check_report(options.report)
+
+
+def _loop_config(options: TrackOptions, model: Model) -> LoopConfig:
+    intrinsics, correction = read_camera(options.intrinsics)
+    first_s = max(options.seconds, _OPENING_S, 2 * options.stale)
+    return LoopConfig(
+        region=options.region(model),
+        follower=FollowerConfig(
+            rescan_s=options.rescan, smoothing_s=options.smoothing, seed=options.seed
+        ),
+        intrinsics=intrinsics,
+        correction=correction,
+        stale_s=options.stale,
+        frozen_s=options.frozen,
+        scan=options.scan,
+        give_up_s=min(options.give_up, first_s) if options.seconds else options.give_up,
+        seconds=options.seconds,
+    )
+
+
+def check_report(path: Path) -> None:
+    """A place for a report; its folder is made. InputError: it cannot be used."""
+    store.check_place(path, "", None)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"--report {path}: {error.strerror}.") from error
+
+
+def named_sinks(sinks: Sequence[Any]) -> dict[str, Any]:
+    """Sinks, or their configurations, by the names that reports give them. Raises InputError: one
+    is not written as it must be, or is given twice."""
+    named: dict[str, Any] = {}
+    for number, sink in enumerate(sinks):
+        name = sink if isinstance(sink, str) else f"sink {number}"
+        if name in named:
+            raise InputError(f"sink {name!r} is given twice.")
+        named[name] = SINKS.parse(sink) if isinstance(sink, str) else sink
+    return named
+
+
+@contextmanager
+def open_sinks(sinks: Mapping[str, Any], context: SinkContext) -> Iterator[list[SinkWorker]]:
+    """``named_sinks``, each at work in a thread of its own. Raises InputError, StorageError: one
+    cannot work, or not write."""
+
+    def waiting(sink: Any) -> int:
+        return sink.queue_size if isinstance(sink, SinkConfig) else 1
+
+    workers: list[SinkWorker] = []
+    with ExitStack() as stack:
+        # Those that make a folder last: if another cannot open, none is left behind.
+        for name, sink in sorted(sinks.items(), key=lambda pair: waiting(pair[1])):
+            try:
+                opened = sink.open(context) if isinstance(sink, SinkConfig) else sink
+            except OSError as error:  # a sink of another package that does not translate it
+                raise StorageError(
+                    f"sink {name!r} cannot be opened: {error.strerror}: {error.filename}."
+                ) from error
+            workers.append(SinkWorker(name, opened, waiting(sink)))
+            stack.callback(workers[-1].close)
+        yield workers
+
+
+def check_closed(sinks: list[SinkWorker]) -> None:
+    """Raises StorageError where a sink failed at its end."""
+    if lost := [sink for sink in sinks if sink.unclosed]:
+        raise StorageError(f"sink {lost[0].name} did not end well: {lost[0].error}.")
+
+
+def resident_mb() -> float:
+    """Memory of this process now."""
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return pages * os.sysconf("SC_PAGE_SIZE") / 2**20
