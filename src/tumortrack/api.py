@@ -11,6 +11,7 @@ import logging
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, fields
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
@@ -424,18 +425,28 @@ def estimate_from_surfaces(surfaces: Mapping[str, Mesh], grid: int = 160) -> Est
 
 
 def evaluate(
-    locate: Tracker | Callable[[SensorCloud], Estimate],
+    locate: Tracker | StrPath | Callable[[SensorCloud], Estimate],
     scenes: StrPath | Sequence[Scene],
     report: StrPath | None = None,
     overwrite: bool = False,
+    *,
+    grid: int = 160,
+    seed: int = 0,
+    device: Device = "auto",
+    progress: Callable[[], None] | None = None,
 ) -> dict[str, Any]:
     """Locate in every scene and compare with the truth.
 
     Args:
-        locate: a tracker, or any function from an observed cloud to an estimate.
+        locate: a tracker, the folder of a case or model, or any function from an observed cloud to
+            an estimate.
         scenes: folder of scene folders, or scenes.
         report: folder for report.json, index.html and pictures (scenes of a folder only).
         overwrite: replace an earlier report there.
+        grid: voxels along the longest side of a tracker's labelled volume.
+        seed: of its random points and queries.
+        device: of the folder's model.
+        progress: called after each scene of a folder.
 
     Returns:
         The report: per scene and part Hausdorff distances, surface and centre distance (mm), IoU,
@@ -444,28 +455,40 @@ def evaluate(
         defines each.
 
     Raises:
-        InputError: no scenes, or a scene that cannot be read; the folder exists and ``overwrite``
-            is False.
+        InputError: no scenes, or a scene that cannot be read, or of another case than the model;
+            the folder exists and ``overwrite`` is False.
     """
     from tumortrack.report import protocol
     from tumortrack.report.place import check_place
     from tumortrack.report.rivals import rivals_of
     from tumortrack.report.summary import summarise
+    from tumortrack.tracking.tracker import Tracker
 
-    call: Any = getattr(locate, "locate", None) or locate
-    if not callable(call):
+    if isinstance(locate, str | Path):
+        locate = Path(locate)
+    elif not callable(getattr(locate, "locate", locate)):
         raise InputError(
             f"evaluate takes a tracker or a function, not {type(locate).__name__}: "
             "evaluate(Tracker(load_model(FOLDER)), scenes)."
         )
+    progress = progress or (lambda: None)
     rivals = rivals_of(getattr(locate, "model", None))
     if isinstance(scenes, str | Path):
         if report is None:
             raise InputError("evaluating a folder of scenes writes a report: say where.")
-        check_place(Path(report), overwrite)
-        return protocol.evaluate_scenes(call, Path(scenes), Path(report), rivals=rivals)
+        folder, out = Path(scenes), Path(report)
+        check_place(out, overwrite)
+        if isinstance(locate, Path | Tracker):
+            return protocol.evaluate_model(locate, folder, out, grid, seed, device, progress)
+        call: Any = getattr(locate, "locate", locate)
+        return protocol.evaluate_scenes(call, folder, out, progress, rivals=rivals)
     if not scenes:
         raise InputError("there are no scenes to evaluate: simulate_scenes(case, 20) makes some.")
+    if isinstance(locate, Path):
+        locate = Tracker(load_model(locate, device))
+    call = getattr(locate, "locate", locate)
+    if isinstance(locate, Tracker):
+        call, rivals = partial(call, grid=grid, seed=seed), rivals_of(locate.model)
     named = ((f"{n:04d}", scene) for n, scene in enumerate(scenes))
     entries = [protocol.evaluate_scene(call, scene, name, rivals)[0] for name, scene in named]
     return {"scenes": entries, "summary": summarise(entries)}

@@ -13,7 +13,8 @@ from live_objects import ball
 # A name or a parameter that goes or changes its meaning breaks users' scripts: think twice.
 SIGNATURES = {
     "estimate_from_surfaces": "surfaces grid=160",
-    "evaluate": "locate scenes report=None overwrite=False",
+    "evaluate": "locate scenes report=None overwrite=False grid=160 seed=0 device='auto' "
+    "progress=None",
     "find_organ": "content model=None range_mm=None box_mm=None mask=None picked_mm=None "
     "picture=None taught=None seed=0",
     "load_case": "folder",
@@ -94,7 +95,7 @@ for call in (
     lambda: tt.Tracker("MODEL"),
     lambda: unmade.locate(np.zeros((2000, 3), np.float32)),
     lambda: tt.evaluate(print, []),
-    lambda: tt.evaluate("MODEL", [1]),
+    lambda: tt.evaluate(7, [1]),
 ):
     try:
         call()
@@ -112,4 +113,4 @@ def test_other_types_are_refused_with_the_call_that_makes_the_right_ones():
     assert tracker.endswith("not str: Tracker(load_case(FOLDER)).")
     assert "not ndarray: read_cloud(FILE)" in locate
     assert none.startswith("there are no scenes to evaluate")
-    assert "a tracker or a function, not str" in function
+    assert "a tracker or a function, not int" in function

@@ -4,20 +4,28 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import tumortrack
+from tumortrack.core import store
+from tumortrack.core.config import to_builtins
 from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.estimate import FAR_MM, Estimate
 from tumortrack.core.store import write_json, writing
 from tumortrack.core.types import SensorCloud
+from tumortrack.models.model import Model
 from tumortrack.report import metrics
 from tumortrack.report.page import page_scene, write_page
 from tumortrack.report.pictures import scene_picture
 from tumortrack.report.place import clear
+from tumortrack.report.rivals import rivals_of
 from tumortrack.report.summary import MEANING, summarise
 from tumortrack.simulate.scene_folder import Scene, list_scenes, read_scene
+from tumortrack.tracking.model_files import load_model
+from tumortrack.tracking.options import model_folder
+from tumortrack.tracking.tracker import Tracker
 
 MEDIANS = (
     "Medians over all scenes that have the part. A part that was not found counts as infinitely "
@@ -34,6 +42,50 @@ NO_RIVALS = (
     "Rigid registration is left out: it needs the organ at rest, which models of the preset clinic "
     "alone keep; a function that estimates states none."
 )
+
+
+def evaluate_model(
+    model: Path | Tracker,
+    scenes_dir: Path,
+    out: Path,
+    grid: int = 160,
+    seed: int = 0,
+    device: str = "auto",
+    progress: Callable[[], None] = lambda: None,
+) -> dict[str, Any]:
+    """``evaluate_scenes`` with a tracker, or the model of a folder; the report says which it was.
+    Raises InputError also for scenes of another case."""
+    folders, digest = list_scenes(scenes_dir), {}
+    if isinstance(model, Path):
+        folder = model_folder(model)
+        digest = {"model_sha256": store.sha256_of(folder / store.MANIFEST)}
+        model = Tracker(load_model(folder, device))
+    check_case(model.model, folders)
+    about = {
+        "patient": to_builtins(model.model.patient),
+        "model": model.model.provenance,
+        **digest,
+        "scenes_folder": str(scenes_dir),
+        "grid": grid,
+        "seed": seed,
+    }
+    locate = partial(model.locate, grid=grid, seed=seed)
+    return evaluate_scenes(locate, scenes_dir, out, progress, about, rivals_of(model.model))
+
+
+def check_case(model: Model, folders: list[Path]) -> None:
+    """Raises InputError for a scene that `simulate` made of another case than the model's. Scenes
+    of other programs do not say which case they show; they pass."""
+    wanted = model.provenance.get("case_sha256")
+    for folder in folders:
+        path = folder / "meta.json"
+        stated = store.read_json(path).get("case_sha256") if path.is_file() else None
+        if wanted is not None and stated is not None and stated != wanted:
+            raise InputError(
+                f"{folder} shows another case than the one that this model is of, so the "
+                "figures would mean nothing. Make scenes of the model's own case with: "
+                "tumortrack simulate CASE DATASET."
+            )
 
 
 def evaluate_scenes(
