@@ -97,7 +97,6 @@ def _say_found(estimate: Estimate, located: Located) -> None:
 
 
 def _say_written(estimate: Estimate, located: Located, out: Path) -> None:
-    from tumortrack.models.margins import stated_radius
     from tumortrack.registration.kernels import carry
     from tumortrack.report.seen import PAGE
     from tumortrack.tracking.margins import stated_radius

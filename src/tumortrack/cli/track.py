@@ -126,20 +126,22 @@ class _Screen:
     def __init__(self, run: Session, report: Path) -> None:
         self._run, self._report = run, report
         self._began = self._shown = time.monotonic()
-        self._before, self._state, self._changed, self._unwritten = 0, "", 0.0, ""
+        self._before, self._changed, self._unwritten = 0, 0.0, ""
+        self._state: list[object] = []  # as last shown, without its numbers
         self._errors: dict[str, str] = {}
         self._notes = 0  # of those about the camera's frame, that were shown
 
     def show(self, result: TrackingResult) -> None:
         """Called with every result."""
         state = result.describe()
-        kind = re.sub(r"\d", "", state)  # numbers change with every frame
+        finding, used = result.finding, result.estimate and result.estimate.report.cameras
+        kind: list[object] = [result.quality, finding.same_as if finding else result.reason, used]
         if (cell := result.workcell) is not None:
             arms = self._run.arms
             stage = stage_words(cell.state, arms is not None and arms.ur)
             state += f"; arms: {stage}" + (f" ({cell.halted})" if cell.halted else "")
             state += "" if cell.left_mm is None else f"; {cell.left_mm:.1f} mm of the margin left"
-            kind += cell.state + re.sub(r"\d", "", cell.halted)
+            kind += [cell.state, re.sub(r"\d", "", cell.halted)]
         now = time.monotonic()
         if kind != self._state and now - self._changed >= _SAY_S:
             self._state, self._changed = kind, now

@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 from tumortrack.core.causes import Likely
+
+if TYPE_CHECKING:
+    from tumortrack.core.report import Finding
 
 # Of `locate`, by its verdict; each of them with a folder written.
 EXIT_STATUSES = {"good": 0, "poor": 4, "none": 3}
@@ -30,13 +35,18 @@ class PackageError(InputError):
 
 
 class NoEstimate(TumortrackError):
-    """The input is well formed but gives no answer (too few points, no organ). ``causes``, if they
-    were looked for: the likeliest first."""
+    """The input is well formed but allows no answer (too few points, no organ).
+
+    ``finding``: the reason by its kind; None where none was given. ``causes``: the likeliest first,
+    where they were looked for. ``advice``: what they mean and what to do, in words."""
 
     exit_code = EXIT_STATUSES["none"]
 
-    def __init__(self, text: str, causes: tuple[Likely, ...] = ()) -> None:
-        super().__init__(text)
+    def __init__(
+        self, reason: str | Finding, causes: tuple[Likely, ...] = (), advice: str = ""
+    ) -> None:
+        self.finding = None if isinstance(reason, str) else reason
+        super().__init__((reason if isinstance(reason, str) else reason.words) + advice)
         self.causes = causes
 
 

@@ -188,7 +188,7 @@ def _read_tags(path: Path) -> _Slice | str:
         is_dicom = stream.read(132)[128:] == b"DICM"
         stream.seek(0)
         try:
-            meta = read_file_meta_info(path) if is_dicom else {}
+            meta: Any = read_file_meta_info(path) if is_dicom else {}
             if meta.get("TransferSyntaxUID") == _DEFLATED:
                 tags = pydicom.FileDataset(path, {}, file_meta=meta)
                 raise ValueError("deflated as a whole, which is not read")

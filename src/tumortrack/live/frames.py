@@ -6,6 +6,7 @@ from __future__ import annotations
 import numpy as np
 
 from tumortrack.core.errors import NoEstimate
+from tumortrack.core.report import Finding
 from tumortrack.core.types import DepthFrame, Intrinsics, SensorCloud
 from tumortrack.live.values import Observation, PublishedFrame
 from tumortrack.sense.region.picture import RegionConfig
@@ -52,23 +53,15 @@ class FrameCheck:
         first = self._first.frame_id
         self._note(_NAMELESS, bool(wanted) and first is None)
         if wanted and name not in (None, wanted):
-            raise NoEstimate(
-                f"the frame is in {name!r}, and the calibration is for {wanted!r}. Give "
-                "this camera's calibration, or the topic of the calibrated camera"
-            )
+            raise NoEstimate(Finding("other_frame_id", {"name": name, "wanted": wanted}))
         if name != first:
-            raise NoEstimate(
-                f"the source's frame changed from {first!r} to {name!r}: another camera, or "
-                "another setting of it. Restart to accept it"
-            )
+            raise NoEstimate(Finding("frame_id_changed", {"first": first, "name": name}))
         if isinstance(seen.content, DepthFrame):
             camera = seen.content.intrinsics
             self._camera = self._camera or camera
             if camera != self._camera:
-                raise NoEstimate(
-                    f"the camera's intrinsics changed from {_text(self._camera)} to "
-                    f"{_text(camera)}. If that is meant, start again."
-                )
+                values = {"before": _text(self._camera), "now": _text(camera)}
+                raise NoEstimate(Finding("intrinsics_changed", values))
         if self.watch is None:
             return ""
         doubt = self.watch.check(seen.content)
@@ -87,10 +80,7 @@ class FrameCheck:
             return
         same_s = (content.stamp_ns - self._since_ns) * 1e-9
         if 0 < self._frozen_s <= same_s:
-            raise NoEstimate(
-                f"the source is frozen: the same image for up to {same_s:.2f} s. Look at the "
-                "camera; a simulated one without noise needs --frozen 0."
-            )
+            raise NoEstimate(Finding("frozen", {"seconds": same_s}))
 
     def _note(self, note: str, now: bool) -> None:
         if now and note not in self.notes:

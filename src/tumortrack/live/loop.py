@@ -20,6 +20,7 @@ import numpy as np
 from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError, NoEstimate, TumortrackError
 from tumortrack.core.estimate import Estimate, Quality
+from tumortrack.core.report import Finding
 from tumortrack.core.types import DepthFrame, Intrinsics
 from tumortrack.live import values as live
 from tumortrack.live.cameras import Cameras
@@ -77,9 +78,9 @@ def check_age(age_s: float, stale_s: float, other_clock: bool = True) -> None:
     clocks = "the clocks of camera and computer"
     if age_s > stale_s:
         doubt = f", if {clocks} agree" if other_clock else ""
-        raise NoEstimate(f"the frame is stale: {age_s:.2f} s old{doubt}")
+        raise NoEstimate(Finding("stale", {"seconds": age_s, "doubt": doubt}))
     if age_s < -_AHEAD_S:
-        raise NoEstimate(f"the frame's stamp lies {-age_s:.2f} s in the future: {clocks} disagree")
+        raise NoEstimate(Finding("future", {"seconds": -age_s, "clocks": clocks}))
 
 
 class Loop:
@@ -141,7 +142,10 @@ class Loop:
         finally:
             if self._arms is not None and not self._arms.ended:
                 self._arms.abort("tracking has ended")
-                self._publish(self._without_frame("tracking has ended"), sink_workers)
+                self._publish(
+                    self._without_frame("tracking has ended"),
+                    sink_workers,
+                )
 
     def _results(self, source_worker: Cameras) -> Iterator[TrackingResult]:
         began_s = fresh_s = time.monotonic()
@@ -165,8 +169,9 @@ class Loop:
             elif got is None and source_worker.ended:
                 return
             else:
-                silence = source_worker.trouble or f"no frame for {now_s - fresh_s:.1f} s"
-                yield self._without_frame(silence if got is None else str(got))
+                silence = Finding("no_frame", {"seconds": now_s - fresh_s})
+                trouble = source_worker.trouble if got is None else _reason_of(got)
+                yield self._without_frame(trouble or silence)
             if now_s >= ends_s:
                 return
             if source_worker.opening and now_s - began_s < _OPENING_S:
@@ -184,6 +189,7 @@ class Loop:
         seconds: dict[str, float] = {}
         organ, estimate, reason, warning = None, None, "", ""
         quality: Quality = "none"
+        finding: Finding | None = None
         timely = False
         views: list[CameraView] = []
         absent: dict[int, str] = {}  # cameras without the organ, and why
@@ -206,18 +212,22 @@ class Loop:
             seconds |= {f"locate.{k}": v for k, v in estimate.report.timings.items()}
             if several:
                 estimate = estimate.reporting(cameras=tuple(view.number for view, _ in found))
-            quality, warning = self._confirmed(estimate, doubt)
+            finding, warning = self._confirmed(estimate, doubt)
+            quality = "good" if finding is None else "poor"
             if live_clock and _age_s(born_ns) > self._config.stale_s:
-                raise _TooLate(f"the answer came too late: {_age_s(born_ns):.2f} s after the frame")
+                raise _TooLate(Finding("too_late", {"seconds": _age_s(born_ns)}))
         except Exception as error:
             estimate, reason, quality, warning = None, str(error), "none", ""
             # If only the time was wrong, the last estimate is the best start of the next search.
+            finding = _finding_of(_reason_of(error))
             if timely and not isinstance(error, _TooLate):
                 self._follower.forget()
                 self._in_a_row = 0
             if not isinstance(error, TumortrackError):  # a defect of ours: the next frame is tried
                 self.statistics.add_defect(error)
-                reason = f"internal error, {type(error).__name__}: {error}"
+                values = {"words": type(error).__name__, "error": str(error)}
+                finding = Finding("defect", values)
+                reason = finding.words
         self._stamp = (seen.stamp_ns, time.monotonic_ns())
         published, numbers = self._context.published_frame, [view.number for view, _ in found]
         lead = found[0][0] if found else next(iter(views), None)
@@ -236,27 +246,36 @@ class Loop:
             dropped=self._cameras.dropped,
             views=tuple(views) if several else (),
             cameras=camera_words(numbers, absent) if several else self.views.scanned,
+            finding=finding,
         )
 
-    def _confirmed(self, estimate: Estimate, doubt: str) -> tuple[Quality, str]:
-        """Quality and warning, with a doubt about the frame; after doubt an estimate counts as good
-        again when several in a row were."""
-        quality, warning = estimate.quality, estimate.reason
-        if doubt and quality == "good":
-            quality, warning = "poor", doubt
-        self._in_a_row = self._in_a_row + 1 if quality == "good" else 0
+    def _confirmed(self, estimate: Estimate, doubt: str) -> tuple[Finding | None, str]:
+        """The finding against it and its words, with a doubt about the frame; after doubt an
+        estimate counts as good again when several in a row were."""
+        finding, warning = estimate.finding, estimate.reason
+        if doubt and finding is None:
+            finding, warning = Finding("frame_in_doubt", {"words": doubt}), doubt
+        self._in_a_row = self._in_a_row + 1 if finding is None else 0
         if 0 < self._in_a_row < SURE_AFTER:
-            return "poor", f"good again for {self._in_a_row} of {SURE_AFTER} frames; wait"
-        return quality, warning
+            finding = Finding("good_again", {"frames": self._in_a_row, "of": SURE_AFTER})
+            return finding, finding.words
+        return finding, warning
 
-    def _without_frame(self, reason: str) -> TrackingResult:
+    def _without_frame(self, reason: str | Finding) -> TrackingResult:
         """The result without a frame; its stamp is now, by the source's clock if that is known."""
         stamp_ns = time.time_ns()
         if self._stamp is not None:
             last_ns, then_ns = self._stamp
             stamp_ns = last_ns + time.monotonic_ns() - then_ns
         frame = self._context.published_frame
-        return TrackingResult(next(self._sequence), stamp_ns, reason=reason, published_frame=frame)
+        finding = _finding_of(reason)
+        return TrackingResult(
+            next(self._sequence),
+            stamp_ns,
+            reason=finding.words,
+            published_frame=frame,
+            finding=finding,
+        )
 
     def _calibrated(self, seen: Observation) -> Observation | InputError:
         """The frame with the intrinsics and depths that the user calibrated."""
@@ -295,6 +314,14 @@ class Loop:
             self.statistics.add_defect(error)
             arms.abort(f"internal error, {type(error).__name__}: {error}")
             return result
+
+
+def _reason_of(error: Exception) -> str | Finding:
+    return error.finding or str(error) if isinstance(error, NoEstimate) else str(error)
+
+
+def _finding_of(reason: str | Finding) -> Finding:
+    return reason if isinstance(reason, Finding) else Finding("source", {"words": reason})
 
 
 def _age_s(born_ns: int) -> float:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import time
 import traceback
 from collections import Counter
@@ -10,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from tumortrack.core.report import Finding
 from tumortrack.live.values import TrackingResult
 
 _FINEST, _COARSEST = 0.01, 1e6
@@ -76,7 +76,8 @@ class RunStatistics:
         self.stages: dict[str, Histogram] = {}
         self.errors: dict[str, Histogram] = {}  # mm, of a source that knows the truth
         self.counts: Counter[str] = Counter()  # by quality
-        self.reasons: Counter[str] = Counter()
+        self.reasons: Counter[str] = Counter()  # in words, numbers replaced by #
+        self._labels: dict[tuple[str, object], str] = {}
         self.cameras: Counter[str] = Counter()  # of several: estimates that each took part in
         self.clock_jumps = 0  # how often the source's clock was set back
         self.defects: list[str] = []
@@ -84,10 +85,13 @@ class RunStatistics:
     def add(self, result: TrackingResult) -> None:
         self.counts[result.quality] += 1
         if result.reason:
-            kind = re.sub(r"-?[0-9]+([.,][0-9]+)?", "#", result.reason)
-            if kind not in self.reasons and len(self.reasons) >= _KINDS:
-                kind = "other reasons"
-            self.reasons[kind] += 1
+            finding = result.finding or Finding("source", {"words": result.reason})
+            if finding.same_as not in self._labels:
+                several = len(self._labels) < _KINDS
+                self._labels[finding.same_as] = (
+                    finding.words_without_numbers if several else "other reasons"
+                )
+            self.reasons[self._labels[finding.same_as]] += 1
         for name, stage_s in result.seconds.items():
             self.stages.setdefault(name, Histogram()).add(1000 * stage_s)
         if result.estimate is None:

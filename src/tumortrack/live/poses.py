@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.geometry import HERE, Affine, rigid
+from tumortrack.core.report import Finding
 from tumortrack.core.store import read_file
 from tumortrack.live.display import wxyz_of
 from tumortrack.live.values import Observation
@@ -28,7 +29,6 @@ _NOT_UNIT = 1e-3  # tolerance of a quaternion's length: files have few digits
 _TICK_S = 0.004  # UR controllers send at 500 Hz (e-Series) or 125 Hz (CB3)
 _WAIT_S = 0.05  # for a UR pose after the frame's stamp
 _LARGEST_TABLE = 256 * 2**20  # bytes
-_UNKNOWN = "where the camera was is unknown"
 COLUMNS = "stamp_ns,frame_id,x_mm,y_mm,z_mm,qw,qx,qy,qz"
 
 
@@ -92,18 +92,17 @@ class PoseBuffer:
             if stamp_ns in stamps_ns[place : place + 1]:
                 return self._poses[place]
             if not stamps_ns:
-                raise NoEstimate(f"{_UNKNOWN}: no pose has come")
+                raise NoEstimate(Finding("no_pose"))
             if place in (0, len(stamps_ns)):
                 off_s = abs(stamp_ns - stamps_ns[place and -1]) * 1e-9
-                which = "last pose is older" if place else "first pose is newer"
-                raise NoEstimate(f"{_UNKNOWN}: its {which} than the frame by {off_s:.2f} s")
+                raise NoEstimate(
+                    Finding("old_pose" if place else "new_pose", {"seconds": float(off_s)})
+                )
             before_ns, after_ns = stamps_ns[place - 1 : place + 1]
             a, b = self._poses[place - 1 : place + 1]
         if (gap_ns := after_ns - before_ns) > _GAP_NS:
-            raise NoEstimate(
-                f"{_UNKNOWN}: its poses before and after the frame are {gap_ns * 1e-9:.2f} s "
-                f"apart; allowed: {_GAP_NS * 1e-9:g} s"
-            )
+            values = {"seconds": float(gap_ns * 1e-9), "allowed_s": _GAP_NS * 1e-9}
+            raise NoEstimate(Finding("pose_gap", values))
         share = (stamp_ns - before_ns) / gap_ns
         turns = Slerp([0, 1], Rotation.from_matrix([a[:3, :3], b[:3, :3]]))([share])
         return rigid(turns.as_matrix()[0], (1 - share) * a[:3, 3] + share * b[:3, 3])

@@ -23,6 +23,7 @@ from tumortrack.core.errors import InputError, TumortrackError
 from tumortrack.core.estimate import NO_CHECK_FAILED, UNVERIFIED, Estimate, Quality
 from tumortrack.core.geometry import Affine, rigid, transform_points
 from tumortrack.core.patient import NOBODY, Patient
+from tumortrack.core.report import Finding
 from tumortrack.core.types import Anatomy, DepthFrame, Mesh, SensorCloud
 from tumortrack.tracking.margins import margin_words
 
@@ -214,6 +215,7 @@ class TrackingResult:
         cameras: in words, which cameras the estimate is from and why not from the others; of a
             scan, what each look added; else empty.
         playback: a stored plan is shown: nothing is tracked, and there never is an estimate.
+        finding: what ``reason`` or ``warning`` says, by its kind.
     """
 
     sequence: int
@@ -232,6 +234,7 @@ class TrackingResult:
     views: tuple[CameraView, ...] = ()
     cameras: str = ""
     playback: bool = False
+    finding: Finding | None = None
 
     @cached_property
     def transformed(self) -> TransformedEstimate | None:

@@ -13,7 +13,7 @@ from jaxtyping import Float64
 from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.estimate import Estimate
 from tumortrack.core.geometry import HERE, Affine, transform_points, unit
-from tumortrack.core.report import ScanReport
+from tumortrack.core.report import Finding, ScanReport
 from tumortrack.core.types import Look, SensorCloud
 from tumortrack.live.frames import FrameCheck
 from tumortrack.live.values import CameraView, PublishedFrame, SinkContext
@@ -76,7 +76,7 @@ class ViewsLocator:
             several = len(views) + len(absent) > 1
             doubts += [f"camera {view.number}: {doubt}" if several else doubt] if doubt else []
         if not found:
-            raise NoEstimate(camera_words([], absent))
+            raise NoEstimate(Finding("cameras", {"troubles": camera_words([], absent)}))
         return found, "; ".join(doubts)
 
     def locate(self, found: list[OrganInView]) -> Estimate:
@@ -170,10 +170,9 @@ class Scan:
         if angles.min(initial=180.0) >= SCAN_APART_DEG:
             self._views.append((view, organ))
         if len(self._views) < SCAN_LOOKS:
-            raise NoEstimate(
-                f"scan: {len(self._views)} of {SCAN_LOOKS} looks; lead the camera on round the "
-                f"organ, {SCAN_APART_DEG:g} degrees from each look, all within {SCAN_WITHIN_S:g} s"
-            )
+            values: dict[str, float | str] = {"looks": len(self._views), "of": SCAN_LOOKS}
+            values |= {"degrees": SCAN_APART_DEG, "seconds": SCAN_WITHIN_S}
+            raise NoEstimate(Finding("scan_waits", values))
         *others, (last, cloud) = self._views
         self._views = []
         looks = _further_looks(last, others)
@@ -183,10 +182,10 @@ class Scan:
                 for n in range(SCAN_LOOKS)
             ]
         except NoEstimate as error:
-            raise NoEstimate(f"scan, begun anew: {error}") from error
+            raise NoEstimate(Finding("scan_failed", {"reason": str(error)})) from error
         whole = estimates[-1]
         if whole.quality != "good":
-            raise NoEstimate(f"scan, begun anew: laid together, the looks are poor: {whole.reason}")
+            raise NoEstimate(Finding("scan_poor", {"reason": whole.reason}))
         least_sure_mm = [_least_sure_mm(estimate) for estimate in estimates]
         whole = whole.reporting(scan=ScanReport(center_std_mm=tuple(least_sure_mm)))
         steps = ", then ".join(f"{mm:.1f} mm" for mm in least_sure_mm)

@@ -12,6 +12,7 @@ from collections.abc import Callable
 from typing import Any
 
 from tumortrack.core.errors import InputError, NoEstimate, TumortrackError
+from tumortrack.core.report import Finding
 from tumortrack.live.meter import Histogram
 from tumortrack.live.values import (
     Observation,
@@ -44,13 +45,13 @@ class StampOrder:
     def check(self, stamp_ns: int) -> None:
         """Raises NoEstimate for a frame that is out of order."""
         if stamp_ns < 0:
-            raise NoEstimate(f"the frame's stamp is {stamp_ns} ns; it must be 0 or more")
+            raise NoEstimate(Finding("stamp_negative", {"stamp_ns": stamp_ns}))
         back_ns = self._last_ns - stamp_ns
         if back_ns >= 0:
             grows = not self._behind or stamp_ns > self._behind[-1]
             self._behind = [*self._behind, stamp_ns] if grows else [stamp_ns]
             if len(self._behind) < _ACCEPTED_AFTER:
-                raise NoEstimate(f"the frame's stamp went back by {back_ns * 1e-9:.3f} s")
+                raise NoEstimate(Finding("stamp_back", {"seconds": back_ns * 1e-9}))
         self._last_ns, self._behind = stamp_ns, []
 
 

@@ -17,6 +17,7 @@ from jaxtyping import Float
 from tumortrack.core.config import Config
 from tumortrack.core.errors import NotThisOrgan
 from tumortrack.core.geometry import Points
+from tumortrack.core.report import Finding
 
 Distances = Float[np.ndarray, " n"]
 _SHARE = 80  # per cent of the points that must fit: a tenth may be background
@@ -71,30 +72,19 @@ def check_in_distribution(
     spread = spread_mm(points_mm)
     low, high = known.spread_mm[0] / _SPREAD_FACTOR, known.spread_mm[1] * _SPREAD_FACTOR
     if not low <= spread <= high:
-        raise _refusal(
-            f"four fifths of its points lie within {spread:.0f} mm of their middle, in this "
-            f"model's scenes within {low:.0f} to {high:.0f} mm"
-        )
+        values: dict[str, float | str] = {"spread_mm": spread, "low_mm": low, "high_mm": high}
+        raise NotThisOrgan(Finding("spread", values))
     limit = max(known.fit_mm * FIT_FACTOR, _SMALLEST_LIMIT_MM)
     which, fit = "a fifth", fit_mm(distances_mm)
     if registered:
         which, fit, limit = "half", float(np.median(distances_mm)), limit / _PER_MEDIAN
     if fit > limit:
-        raise _refusal(
-            f"{which} of its points lie more than {fit:.1f} mm from the estimated surface, where "
-            f"{limit:.1f} mm are the most to expect"
-        )
+        raise NotThisOrgan(Finding("misfit", {"share": which, "fit_mm": fit, "limit_mm": limit}))
 
 
 def check_likely(mahalanobis_2: float) -> None:
     """NotThisOrgan for what only an implausible deformation explains: a state's squared Mahalanobis
     distance, in units of the library's mean, is too large."""
     if mahalanobis_2 > _LARGEST_MAHALANOBIS_2:
-        raise _refusal(
-            f"only a deformation {mahalanobis_2:.1f} times as rare as usual would fit it, where "
-            f"{_LARGEST_MAHALANOBIS_2:g} times is the most to expect"
-        )
-
-
-def _refusal(why: str) -> NotThisOrgan:
-    return NotThisOrgan(f"the cloud does not show this model's organ: {why}")
+        values: dict[str, float | str] = {"times": mahalanobis_2, "limit": _LARGEST_MAHALANOBIS_2}
+        raise NotThisOrgan(Finding("implausible", values))

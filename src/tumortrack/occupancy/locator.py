@@ -13,6 +13,7 @@ from jaxtyping import Float32
 
 from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.estimate import Estimate, FollowOptions
+from tumortrack.core.report import Finding
 from tumortrack.core.types import Anatomy, CameraLabels, Look, OccupancyCloud, SensorCloud
 from tumortrack.models.in_distribution import check_in_distribution
 from tumortrack.models.report import Frame, Rng, describe_parts, grid_over
@@ -123,10 +124,8 @@ class _Frame(Frame):
         with self.stage("coarse"):
             inside = points[self.logits_at(points).argmax(-1).cpu().numpy() > 0]
         if len(inside) < FEWEST_INSIDE:
-            raise NoEstimate(
-                f"no organ was found: {len(inside)} of {COARSE_QUERIES} queries round the cloud "
-                "lie inside. Does the cloud show this model's organ, freed of its background?"
-            )
+            values: dict[str, float | str] = {"inside": len(inside), "queries": COARSE_QUERIES}
+            raise NoEstimate(Finding("few_inside", values))
         gap = float((np.prod(upper - lower) / COARSE_QUERIES) ** (1 / 3))
         low, high = inside.min(0), inside.max(0)
         margin = 0.05 * (high - low) + gap / 2
@@ -154,7 +153,7 @@ class _Frame(Frame):
             inside = labels > 0
             probability = torch.from_numpy(logits[inside]).softmax(-1).amax(-1).numpy()
         if inside.sum() < FEWEST_INSIDE:
-            raise NoEstimate("no organ was found: it has left the place where it was.")
+            raise NoEstimate(Finding("left"))
         stamp_ns = self.cloud.stamp_ns
         return OccupancyCloud(points[inside], labels[inside], probability, stamp_ns)
 

@@ -13,6 +13,7 @@ from scipy import ndimage
 from tumortrack.core.errors import NoEstimate
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.mesh_query import surface_distance
+from tumortrack.core.report import Finding
 from tumortrack.core.types import FIRST_TUMOR, ORGAN, OUTSIDE, Mesh, OccupancyCloud
 from tumortrack.imaging.grid import grown_box, tight_box
 from tumortrack.occupancy.kernels import between
@@ -168,7 +169,7 @@ def surface_distances(lattice: LogitLattice, points_mm: Points) -> Float32[np.nd
     logits = lattice.logits
     field = (logits[..., 1:].max(-1) - logits[..., 0]).clip(-LARGEST_MARGIN, LARGEST_MARGIN)
     if not field.min() < 0 < field.max():
-        raise NoEstimate("no organ was found: its surface is nowhere near the cloud.")
+        raise NoEstimate(Finding("far_off"))
     corners, faces, _, _ = measure.marching_cubes(field, 0.0)
     surface = Mesh(corners * lattice.step_mm + lattice.origin_mm, faces)
     return surface_distance(surface, points_mm)

@@ -21,6 +21,7 @@ from tumortrack.core.estimate import FAR_MM
 from tumortrack.core.process import parallel_map
 from tumortrack.core.types import Anatomy
 from tumortrack.models.in_distribution import InDistributionRange, fit_mm, spread_mm
+from tumortrack.registration.config import RegistrationConfig
 from tumortrack.registration.gauss_newton import RegistrationResult, refine
 from tumortrack.registration.looks import Looks
 from tumortrack.registration.model import (

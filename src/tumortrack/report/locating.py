@@ -157,7 +157,7 @@ def _no_estimate(
     error: NoEstimate, view: View, model: Model, options: LocateOptions
 ) -> dict[str, Any]:
     """The report's head, where there is no estimate."""
-    from tumortrack.models.report import report_head
+    from tumortrack.tracking.files import report_head
 
     reason = str(error)
     if view.unit is not None:

@@ -8,6 +8,7 @@ from jaxtyping import Float32
 from tumortrack.core.causes import Cause, Likely
 from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError, NoEstimate
+from tumortrack.core.report import Finding
 from tumortrack.core.types import DepthFrame, SensorCloud
 from tumortrack.sense.camera import deproject_pixels
 from tumortrack.sense.units import Unit, unit_advice
@@ -45,7 +46,7 @@ def cloud_from_depth(
     depth_mm = frame.depth_mm.ravel()
     index = np.flatnonzero((depth_mm > config.near_mm) & (depth_mm < config.far_mm))
     if len(index) < FEWEST_POINTS:
-        raise NoEstimate(_too_few(len(index), frame, config.near_mm, config.far_mm))
+        raise _too_few(len(index), frame, config.near_mm, config.far_mm)
     chosen = index[draw_some(len(index), config.n_points, rng)]
     points_mm = deproject_pixels(chosen, depth_mm[chosen].astype(np.float64), frame.intrinsics)
     return SensorCloud(points_mm, frame.stamp_ns)
@@ -64,7 +65,7 @@ def crop_cloud(cloud: SensorCloud, near_mm: float, far_mm: float) -> SensorCloud
     z = cloud.points_mm[:, 2]
     inside = (z > near_mm) & (z < far_mm)
     if inside.sum() < FEWEST_POINTS:
-        raise NoEstimate(_too_few(int(inside.sum()), cloud, near_mm, far_mm))
+        raise _too_few(int(inside.sum()), cloud, near_mm, far_mm)
     return SensorCloud(cloud.points_mm[inside], cloud.stamp_ns)
 
 
@@ -107,10 +108,7 @@ def check_cloud(cloud: SensorCloud) -> None:
         if distinct < FEWEST_POINTS:
             distinct = len(np.unique(some, axis=0))
     if distinct < FEWEST_POINTS:
-        raise NoEstimate(
-            f"the cloud has {distinct} different points with a return; at least {FEWEST_POINTS} "
-            "are needed. Give a denser cloud."
-        )
+        raise NoEstimate(Finding("sparse", {"points": distinct, "fewest": FEWEST_POINTS}))
     few = len(points_mm) // 100
     low, middle, high = ordered[:, [few, len(points_mm) // 2, -1 - few]].T
     extent_mm = float((high - low).max())
@@ -136,16 +134,9 @@ def check_cloud(cloud: SensorCloud) -> None:
     inner = some[((some >= low) & (some <= high)).all(axis=1)].astype(float)
     _, second, first = np.linalg.eigvalsh(np.cov(inner.T))
     if second < min(_THINNEST_MM**2, _THINNEST**2 * first):
-        raise NoEstimate(
-            "the points of the cloud lie on one line; an organ has extent along two axes at least. "
-            "Give the whole surface that the camera sees."
-        )
+        raise NoEstimate(Finding("line"))
     if not (points_mm[:, 2] > 0).any():
-        raise NoEstimate(
-            "no point of the cloud lies before the camera (z > 0). The camera frame has x right, "
-            "y down, z forward; turn the cloud into that frame.",
-            (Likely(Cause.FRAME),),
-        )
+        raise NoEstimate(Finding("behind_camera"), (Likely(Cause.FRAME),))
 
 
 def check_depth_unit(frame: DepthFrame, unit_mm: float, near_mm: float, far_mm: float) -> None:
@@ -197,13 +188,14 @@ def _finite_depths(content: DepthFrame | SensorCloud) -> Float32[np.ndarray, " n
     return depth_mm[np.isfinite(depth_mm)]
 
 
-def _too_few(count: int, content: DepthFrame | SensorCloud, near_mm: float, far_mm: float) -> str:
+def _too_few(
+    count: int, content: DepthFrame | SensorCloud, near_mm: float, far_mm: float
+) -> NoEstimate:
     depths, where = _finite_depths(content), "the sensor had no return at all"
     if len(depths):
         span = f"{depths.min():.1f} to {depths.max():.1f} mm"
         where = f"the {len(depths)} depths seen run from {span}"
     do = unit_advice(content, near_mm, far_mm) or "move the camera, or choose another depth range"
-    return (
-        f"only {count} points lie between {near_mm:g} and {far_mm:g} mm ({where}); at least "
-        f"{FEWEST_POINTS} are needed: {do}."
-    )
+    values: dict[str, float | str] = {"points": count, "near_mm": near_mm, "far_mm": far_mm}
+    values |= {"seen": where, "fewest": FEWEST_POINTS, "advice": do}
+    return NoEstimate(Finding("few_in_range", values))

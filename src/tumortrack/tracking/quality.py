@@ -75,9 +75,7 @@ def judged(estimate: Estimate, looks: Sequence[Look], strictly: bool = False) ->
     through = max(by_depth, *(share for share, _ in clouds), 0.0)
     doubtful, impossible = _LIMITS if estimate.motion is not None else _ROUGH_LIMITS
     if by_depth > impossible:
-        raise NotThisOrgan(
-            f"the camera sees through {100 * by_depth:.0f} % of where the organ would lie"
-        )
+        raise NotThisOrgan(Finding("organ_seen_through", {"percent": 100 * by_depth}))
     report = estimate.report
     finding = _misplaced(report.looks) or _misfit(report, told > _TOLD and not strictly)
     finding = finding or _doubt(report)

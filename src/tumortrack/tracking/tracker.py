@@ -180,7 +180,8 @@ class Tracker:
             yield
         except NotThisOrgan as error:
             causes = self._causes(looks, how, None)
-            raise NotThisOrgan(f"{error}{words(causes, '')}.", causes) from error
+            advice = f"{words(causes, '')}."
+            raise NotThisOrgan(error.finding or str(error), causes, advice) from error
 
     def warm(self) -> None:
         """Load and compile what ``follow`` needs, which its first call would otherwise wait for."""

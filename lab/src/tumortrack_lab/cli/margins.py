@@ -81,7 +81,7 @@ class Margins:
         self, folder: Path, listed: list[Listed], known: list[Row], add: Callable[[Row], None]
     ) -> list[Row]:
         """A row for every state; those that are known are not located again."""
-        from tumortrack.cli.evaluate import check_case
+        from tumortrack.report.protocol import check_case
         from tumortrack.simulate.scene_folder import read_scene
         from tumortrack.tracking.model_files import load_model
         from tumortrack.tracking.tracker import Tracker

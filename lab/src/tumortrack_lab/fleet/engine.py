@@ -223,7 +223,9 @@ class _Fleet:
 
     async def _known(self, task: Task, found: Found | None) -> Outcome | None:
         """What the store says of a task; None: it is to be done."""
-        there, failure = found or await asyncio.to_thread(self.store.found, task.key)
+        if found is None:
+            found = await asyncio.to_thread(self.store.found, task.key)
+        there, failure = found
         if failure is None:
             return Outcome(task, "there") if there else None
         if not self.again or task.key in self._tried_again:

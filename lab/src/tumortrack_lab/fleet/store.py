@@ -176,7 +176,8 @@ class Store:
 
             path = self._kept / file.sha256
             if not path.exists():
-                _fetch(*fsspec.core.url_to_fs(file.path), path)
+                files, source = fsspec.core.url_to_fs(file.path)
+                _fetch(files, source, path)
         if not path.exists():
             raise FileNotFoundError(f"{file.path} is not there (on this machine)")
         if sha256_of(path) != file.sha256:

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from tumortrack.core.errors import NoEstimate
 from tumortrack.core.geometry import Affine, rigid
+from tumortrack.core.report import Finding
 from tumortrack.live.display import wxyz_of
 from tumortrack.live.poses import CameraPoses, PoseBuffer, PosesConfig
 from tumortrack.live.ros.bus import Bus
@@ -84,7 +85,8 @@ class TfPoses(CameraPoses):
         of_fixed, of_camera = self._ancestors(self.frame_id), self._ancestors(camera)
         common = next((name for name in of_camera if name in of_fixed), None)
         if common is None:
-            raise NoEstimate(f"tf does not connect the camera, {camera!r}, with {self.frame_id!r}")
+            values = {"camera": camera, "frame_id": self.frame_id}
+            raise NoEstimate(Finding("unconnected", values))
         common_from = []
         for names in (of_fixed, of_camera):
             common_from.append(np.eye(4))

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tumortrack.core.errors import InputError, NoEstimate
+from tumortrack.core.report import Finding
 from tumortrack.core.types import DepthFrame, SensorCloud
 from tumortrack.sense.cloud import FEWEST_POINTS
 from tumortrack.sense.region import picture as pictures
@@ -90,11 +91,17 @@ def organ_points(
         took = ", ".join(f"{name} {n}" for name, n in counts.items() if n and name != "organ")
         near, far = config.crop.near_mm, config.crop.far_mm
         do = "move the camera until the organ is in view and in range, or say where it is"
-        raise NoEstimate(
-            f"only {len(left)} points are left for the organ; at least {FEWEST_POINTS} are needed. "
-            f"Of {picture.taken.size} pixels went to: {took or 'nothing'} (range {near:g}..{far:g} "
-            f"mm): {unit_advice(content, near, far) or do}." + (doubt and f" Also, {doubt}.")
-        )
+        values: dict[str, float | str | None] = {
+            "points": len(left),
+            "fewest": FEWEST_POINTS,
+            "pixels": picture.taken.size,
+            "steps": took or "nothing",
+            "near_mm": near,
+            "far_mm": far,
+            "advice": unit_advice(content, near, far) or do,
+            "doubt": doubt and f" Also, {doubt}.",
+        }
+        raise NoEstimate(Finding("few_points", values))
     drawn = rng.choice(left, min(len(left), config.crop.n_points), replace=False)
     cloud = SensorCloud(picture.points(drawn), content.stamp_ns)
     return Region(cloud, counts, picture.taken, time.perf_counter() - start, doubt)

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from tumortrack.core.errors import NoEstimate
+from tumortrack.core.report import Finding
 from tumortrack.sense.region.hints import Hints
 from tumortrack.sense.region.picture import (
     FLYING,
@@ -132,11 +133,7 @@ def _hinted(picture: Picture, pieces: np.ndarray, these: _Sizes, hints: Hints) -
         square = ((points_mm - hints.picked_mm) ** 2).sum(1)
         if not square.min(initial=np.inf) <= _PICK_REACH_MM**2:
             there = ", ".join(f"{x:.0f}" for x in hints.picked_mm)
-            raise NoEstimate(
-                f"no piece of the scene lies within {_PICK_REACH_MM:g} mm of the picked point "
-                f"({there}) mm: it is on the background, on something thin, or outside the range. "
-                "Pick again, or clear the pick."
-            )
+            raise NoEstimate(Finding("pick_missed", {"reach_mm": _PICK_REACH_MM, "place": there}))
         nearest = square.argmin()
         return int(pieces[rows[nearest], columns[nearest]])
     if hints.last_box_mm is None:

@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 
 from tumortrack.core.errors import InputError, NoEstimate
+from tumortrack.core.report import Finding
 from tumortrack.core.types import DepthFrame
 from tumortrack.sense.region.picture import ORGAN, Picture, picture_of_frame, some_pixels
 
@@ -61,7 +62,7 @@ class Taught:
         pixels. Raises NoEstimate, with the reason: there are none, or hardly anything in them
         resembles a click."""
         if colours is None:
-            raise NoEstimate("this frame has no picture")
+            raise NoEstimate(Finding("no_picture"))
         features, usable = _features(working, colours)
         height, width = usable.shape
         looked_at = working.taken[: 2 * height : 2, : 2 * width : 2] == ORGAN
@@ -71,10 +72,7 @@ class Taught:
         block_mm = 2 * working.pixel_mm
         likely_mm2 = np.count_nonzero(odds > 0) * block_mm**2
         if known.sum() < _SEEN * np.count_nonzero(looked_at) or likely_mm2 < _LEAST_MM2:
-            raise NoEstimate(
-                "hardly anything that is seen looks like the organ where it was clicked on: "
-                "another light, or it is hidden. Wait, or forget the clicks and click again"
-            )
+            raise NoEstimate(Finding("no_organ_colour"))
         # What has no colour, as highlights, is of the kind of what is round it.
         fine, wide = (_mean([odds], known, mm / block_mm)[0] for mm in (_FINE_MM, _FILL_MM))
         beside = np.zeros(working.taken.shape, bool)

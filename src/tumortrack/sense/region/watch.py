@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from tumortrack.core.errors import NoEstimate
+from tumortrack.core.report import Finding
 from tumortrack.core.types import DepthFrame, SensorCloud
 from tumortrack.sense.camera import deproject_pixels
 from tumortrack.sense.region.picture import RegionConfig, picture_of_cloud, picture_of_frame
@@ -45,7 +46,7 @@ class TableWatch:
         self._offset_mm = np.zeros(3)  # of the first table from the known one, as ``_shifts``
         self._shifts: deque[np.ndarray] = deque(maxlen=_LOOKS)  # at three spots, mm
         self._frames = self._hidden = 0
-        self._moved = ""
+        self._moved: Finding | None = None
 
     @property
     def table_in_camera(self) -> tuple[float, float, float, float] | None:
@@ -90,11 +91,9 @@ class TableWatch:
         if len(self._shifts) > _LOOKS // 2 and np.abs(shifts).max() > least_mm:
             slope = np.linalg.norm(shifts[1:] - shifts[0]) / self._reach_mm
             since = "the calibration" if self._known else "the start"
-            self._moved = (
-                f"the camera or the table has moved since {since}: the table lies "
-                f"{abs(shifts[0]):.1f} mm off and {np.degrees(np.arctan(slope)):.1f} degrees "
-                "tilted. Calibrate again, and restart"
-            )
+            degrees = float(np.degrees(np.arctan(slope)))
+            values = {"since": since, "shift_mm": float(abs(shifts[0])), "degrees": degrees}
+            self._moved = Finding("moved", values)
 
     def _learn(self, content: DepthFrame | SensorCloud, points_mm: np.ndarray) -> None:
         frame = isinstance(content, DepthFrame)
