@@ -17,8 +17,8 @@ from tumortrack.core.errors import ArtifactError, InputError
 from tumortrack.core.organ import is_tumor
 from tumortrack.core.report import Finding, FitReport, MarginReport, StatedMargin
 
-# Raise it with every change by which the same cloud gives another estimate, or another figure of
-# those in ``measured``: margins that were found before are then refused.
+# Raise it with every change that gives another estimate, or other figures (``measured``), for the
+# same cloud: margins that were found before are then refused.
 METHOD = 4
 NAME = "margins.json"
 Kind = Literal["tumor", "organ", "map"]
@@ -27,11 +27,11 @@ UNKNOWN = "the model was not calibrated (tumortrack margins)"
 
 
 class Radius(Config, frozen=True):
-    """A radius: ``scaled`` times a part's size, or ``constant_mm``, whatever that is; ``used`` is
-    the one with the smaller mean where that was chosen. The size is ``offset_mm`` + s + ``bend_mm``
-    times the root of the elastic state's rarity: s (mm) is the largest standard deviation over the
-    surface as estimated, and the farther an organ is bent the less a library of states knows of it.
-    ``scaled`` is None where the method knows no s."""
+    """A radius: ``scaled`` times a part's size, or ``constant_mm`` for any size; ``used`` says
+    which, the one with the smaller mean over the states it was chosen on. The size is ``offset_mm``
+    + s + ``bend_mm`` times the square root of the elastic state's rarity: s (mm) is the largest
+    estimated standard deviation over the surface; the farther an organ is bent, the less a library
+    of states tells about it. ``scaled`` is None if the method knows no s."""
 
     used: Literal["scaled", "constant"]
     constant_mm: float
@@ -47,17 +47,17 @@ class Radius(Config, frozen=True):
         elif self.used == "scaled":
             raise InputError("margins: a scaled radius needs its factor.")
 
-    def size_mm(self, std_mm: float, found: dict[str, float]) -> float:
-        """``found``: the estimate's figures (``measured``); one without rarity is unbounded."""
-        bent = math.sqrt(found.get("rarity", math.inf)) if self.bend_mm else 0.0
+    def size_mm(self, std_mm: float, figures: dict[str, float]) -> float:
+        """``figures``: of the estimate (``measured``); without rarity the size is unbounded."""
+        bent = math.sqrt(figures.get("rarity", math.inf)) if self.bend_mm else 0.0
         return self.offset_mm + std_mm + self.bend_mm * bent
 
-    def at(self, std_mm: float | None, found: dict[str, float]) -> float | None:
-        """mm; None where it depends on a standard deviation that is not known."""
+    def at(self, std_mm: float | None, figures: dict[str, float]) -> float | None:
+        """mm; None if it depends on a standard deviation that is not known."""
         if self.used == "constant":
             return self.constant_mm
         assert self.scaled is not None
-        return None if std_mm is None else self.scaled * self.size_mm(std_mm, found)
+        return None if std_mm is None else self.scaled * self.size_mm(std_mm, figures)
 
 
 class Shells(Config, frozen=True):
@@ -137,7 +137,7 @@ def read_margins(folder: Path) -> ModelMargins | None:
 
 
 def read_sealed(path: Path) -> ModelMargins:
-    """The same of any file, whatever model it is of."""
+    """``read_margins`` of a file, without asking which model it belongs to."""
     stored = store.read_json(path)
     content = stored.get("margins")
     if not isinstance(content, dict) or stored.get("sha256") != _digest(content):
@@ -161,47 +161,47 @@ def _digest(content: dict[str, Any]) -> str:
 
 
 def measured(report: FitReport) -> dict[str, float]:
-    """What an estimate's report says of how far it can be trusted; all the larger the worse."""
+    """Figures of an estimate that limits are set on; of each, larger is worse."""
     deviations = [part.surface_std_mm for part in report.tumors.values()]
     known, cost = [std_mm for std_mm in deviations if std_mm is not None], report.fit_cost
-    found = {
+    values = {
         "fit_cost": None if cost is None else cost.now / cost.usual,
         "rarity": None if report.motion is None else report.motion.rarity,
         "unseen": report.unseen,
         "seen_through": report.seen_through,
         "unsure_mm": max(known, default=None),
     }
-    return {name: float(value) for name, value in found.items() if value is not None}
+    return {name: float(value) for name, value in values.items() if value is not None}
 
 
 def figures(report: FitReport, margins: ModelMargins) -> dict[str, float]:
-    """What limits are on: ``measured``, and the largest size of a tumor."""
+    """``measured``, and the largest size of a tumor."""
     form = margins.shells[-1].radii["tumor"]
     deviations = [part.surface_std_mm for part in report.tumors.values()]
     return sized(measured(report), deviations, form)
 
 
 def sized(
-    found: dict[str, float], deviations: Sequence[float | None], form: Radius
+    figures: dict[str, float], deviations: Sequence[float | None], form: Radius
 ) -> dict[str, float]:
-    """The figures with ``size_mm``, the largest of a tumor; as they are where a form has none."""
+    """The figures with ``size_mm``, the largest of a tumor; unchanged if the form has no size."""
     known = [std_mm for std_mm in deviations if std_mm is not None]
     if form.scaled is None or len(known) < len(deviations):
-        return found
-    return {**found, "size_mm": max(form.size_mm(std_mm, found) for std_mm in known)}
+        return figures
+    return {**figures, "size_mm": max(form.size_mm(std_mm, figures) for std_mm in known)}
 
 
-def exceeded(limits: dict[str, float], found: dict[str, float]) -> Finding | None:
-    """Which limit is exceeded."""
+def exceeded(limits: dict[str, float], figures: dict[str, float]) -> Finding | None:
+    """The first limit that is exceeded."""
     for name, limit in limits.items():
-        if not (value := found.get(name, math.inf)) <= limit:
+        if not (value := figures.get(name, math.inf)) <= limit:
             return Finding("beyond_margins", {"figure": name, "value": value, "limit": limit})
     return None
 
 
 def stated_margin(report: FitReport, margins: ModelMargins | None, good: bool) -> MarginReport:
-    """What the margins say of such an estimate. ``good``: no check failed, and none of the
-    ``limits`` is exceeded."""
+    """The margins stated with an estimate, or why none are. ``good``: no check failed, and none of
+    the ``limits`` is exceeded."""
     if report.looks is not None:
         return MarginReport(reason="margins are of single views, not of several")
     if margins is None:
@@ -210,14 +210,14 @@ def stated_margin(report: FitReport, margins: ModelMargins | None, good: bool) -
         return MarginReport(reason="a poor estimate has no margin")
     if report.smoothing is not None and report.smoothing.time_s > 0:
         return MarginReport(reason="margins are of single clouds, not of smoothed motions")
-    parts, found, stated = report.parts, measured(report), list[StatedMargin]()
+    parts, figures, stated = report.parts, measured(report), list[StatedMargin]()
     kinds: dict[str, Kind] = {name: "tumor" for name in parts}
     kinds |= {next(iter(parts)): "organ", "map": "map"}
     deviations = {name: part.surface_std_mm for name, part in parts.items()}
     deviations["map"] = next(iter(deviations.values()))
     for shells in margins.shells:
         radii = {
-            name: shells.radii[kind].at(deviations[name], found)
+            name: shells.radii[kind].at(deviations[name], figures)
             for name, kind in kinds.items()
             if kind in shells.radii
         }
@@ -240,15 +240,15 @@ class StatedRadius(msgspec.Struct, frozen=True):
 def stated_radius(
     margin: MarginReport | None, name: str, confidence: float | None = None
 ) -> StatedRadius | None:
-    """Of a part, or of ``map``, with this or else the highest confidence; None: none is stated."""
-    for one in reversed(() if margin is None else margin.stated):
-        if confidence in (None, one.confidence) and name in one.mm:
-            return StatedRadius(one.confidence, one.mm[name])
+    """Of a part, or of ``map``, with this or else the highest confidence; None if none is stated."""
+    for stated in reversed(() if margin is None else margin.stated):
+        if confidence in (None, stated.confidence) and name in stated.mm:
+            return StatedRadius(stated.confidence, stated.mm[name])
     return None
 
 
 def margin_words(margin: MarginReport | None) -> str:
-    """The tumors' margins for people, or that there are none."""
+    """The tumors' margins in words, or why there are none."""
     if margin is None or not margin.stated:
         return f"no margin: {UNKNOWN if margin is None else margin.reason}"
     highest = margin.stated[-1]
@@ -258,14 +258,14 @@ def margin_words(margin: MarginReport | None) -> str:
 
 
 def keep_margins(folder: Path, margins: ModelMargins) -> Path:
-    """Write them as those of the model in this folder. Raises StorageError."""
+    """Write them as the margins of the model in this folder. Raises StorageError."""
     digest = store.sha256_of(folder / store.MANIFEST)
     write_sealed(folder / NAME, msgspec.structs.replace(margins, model_sha256=digest))
     return folder / NAME
 
 
 def described(margins: ModelMargins) -> list[str]:
-    """Lines for the screen: radii, what they rest on, and where there is no answer."""
+    """Lines for the screen: radii, what they rest on, and the limits."""
     lines = []
     for shells in margins.shells:
         for kind, radius in shells.radii.items():

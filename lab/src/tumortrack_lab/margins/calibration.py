@@ -1,4 +1,4 @@
-"""Calibration of margins: scenes of known truth -> a line a state -> ``ModelMargins``.
+"""Calibration of margins: scenes of known truth -> one row per state -> ``ModelMargins``.
 
 The unit is the physical state: one scene of each counts. docs/trust.md says what is promised.
 """
@@ -42,11 +42,11 @@ if TYPE_CHECKING:
 
 _Turn = Literal["choose", "test", "calibrate"]
 CONFIDENCES = (0.9, 0.95)
-WIDEST_MM = 8.0  # what plans assume of estimates that say nothing of their error
-SHARES = (1 / 3, 2 / 3)  # of visible surface, that part the groups
-# Limits are tried at these quantiles of the states that they are chosen on, in two sequences: of
-# all that is reported; and of the size, the largest values of all else. The first may keep out what
-# fits badly; the second keeps out much at little loss.
+WIDEST_MM = 8.0  # as plans assume for estimates without a stated error
+SHARES = (1 / 3, 2 / 3)  # of visible surface: bounds between groups
+# Limits are tried at these quantiles (of the size, of every other figure) of the states they are
+# chosen on, in two sequences. The first can keep out what fits badly; the second limits the size
+# alone, which keeps out much at little loss.
 _LEVELS = {
     "all": ((0.8, 0.8), (0.9, 0.9), (0.95, 0.95), (1.0, 1.0)),
     "size": ((0.8, 1.0), (0.9, 1.0), (0.95, 1.0)),
@@ -54,52 +54,52 @@ _LEVELS = {
 _ERROR = conformal.ERROR / len(_LEVELS)
 _OFFSETS_MM = (0.1, 0.5, 1.0, 2.0, 4.0, 8.0)
 _BENDS_MM = (0.0, 2.0, 4.0, 8.0, 16.0)
-# What a state is for: choosing form and limits, testing limits, finding radii. Of each group's
-# states, drawn by the seed, in turn.
+# What a state is used for: choosing form and limits, testing limits, finding radii. The states of
+# each group take these turns, in an order drawn by the seed.
 _TURNS: tuple[_Turn, ...] = ("test", "calibrate", "choose", "test", "calibrate")
 _SIZE = "size_mm"
-_GRID = 8  # voxels: the labelled volume is not looked at
-_ALONE = 2  # times the scores that a quantile needs: the largest of few says little of a group
-_WORTH = 0.95  # of the constant radius: nothing less pays for one that varies
+_GRID = 8  # voxels: the labelled volume is not used
+_ALONE = 2  # times the scores that a quantile needs: the maximum of a few says little
+_WORTH = 0.95  # of the constant radius's mean: a varying one must be smaller than this
 
 
 @dataclass(frozen=True)
 class Listed:
-    """A scene that counts: its folder, and family, visible share and organ."""
+    """The scene that stands for a state; ``label``: family, visible share, organ."""
 
     folder: Path
     label: tuple[str, str, str]
 
 
 def list_states(folders: Sequence[Path], seed: int) -> list[Listed]:
-    """One scene of every state, drawn by the seed. Meta.json names ``family``, ``visible_share``
-    and ``state``; scenes without are of the family of their deformation, of unknown share, and a
-    state each. Left out is what shows no organ of the model's (``model_organ`` false). Raises
-    InputError: no scenes, or a share that is none."""
+    """One scene of every state, drawn by the seed. meta.json names ``family``, ``visible_share``
+    and ``state``; without them a scene belongs to the family of its deformation, to an unknown
+    share, and is a state of its own. Scenes of another organ (``model_organ`` false) are left out.
+    Raises InputError: no scenes, or a share outside 0 to 1."""
     scenes = [scene for folder in folders for scene in list_scenes(folder)]
     first: dict[tuple[str, ...], Listed] = {}
     for n in np.random.default_rng(seed).permutation(len(scenes)):
         path = scenes[n] / "meta.json"
         meta = store.read_json(path) if path.is_file() else {}
         if meta.get("model_organ") is False:
-            continue  # something else in its place: nothing true can be said
+            continue  # another organ: no estimate of it can be right
         family = meta.get("family") or (meta.get("deformation") or {}).get("kind") or "unknown"
         organ, share = str(meta.get("case_sha256") or "unknown"), meta.get("visible_share")
         if not (share is None or (isinstance(share, int | float) and 0 <= share <= 1)):
             raise InputError(f"{path}: visible_share is {share!r}; allowed: 0 to 1.")
         words = "unknown" if share is None else _WORDS[int(np.searchsorted(SHARES, share))]
-        one = Listed(scenes[n], (str(family), words, organ[:12]))
+        scene = Listed(scenes[n], (str(family), words, organ[:12]))
         state = str(meta.get("state") or scenes[n].resolve())
-        first.setdefault((*one.label[::2], state), one)
-    return sorted(first.values(), key=lambda one: str(one.folder))
+        first.setdefault((*scene.label[::2], state), scene)
+    return sorted(first.values(), key=lambda scene: str(scene.folder))
 
 
 _WORDS = ("under 1/3", "1/3 to 2/3", "over 2/3")
 
 
 def row_of(tracker: Tracker, scene: Scene, listed: Listed, seed: int) -> Row:
-    """One state's line: judged by the depth image, where there is one, as `locate` and `track` do.
-    The tracker's model must have no margins of its own."""
+    """Locate one state, judged by its depth image, if any, as `locate` and `track` do. The
+    tracker's model must have no margins of its own."""
     row = Row(
         scene=str(listed.folder.resolve()),
         sha256=store.sha256_of(listed.folder),
@@ -111,7 +111,7 @@ def row_of(tracker: Tracker, scene: Scene, listed: Listed, seed: int) -> Row:
         return replace(row, doubt=str(error))
     if estimate.quality != "good":
         return replace(row, doubt=estimate.reason)
-    if scene.depth is not None:  # which says nothing of what lies where the cloud has no points
+    if scene.depth is not None:  # judging by an image leaves ``unseen`` open
         organ = estimate.meshes[scene.reference.names[0]]
         estimate = estimate.reporting(unseen=cloud_shares(organ, scene.cloud)[1])
     misses: dict[Kind, list[Miss]] = {}
@@ -127,8 +127,8 @@ def row_of(tracker: Tracker, scene: Scene, listed: Listed, seed: int) -> Row:
         off_mm = estimate.motion.carry(scene.targets.points_ct) - scene.targets.points_mm
         largest = float(np.linalg.norm(off_mm, axis=1).max())
         misses["map"] = [(largest, unsure[scene.reference.names[0]])]
-    found = {kind: tuple(some) for kind, some in misses.items()}
-    return replace(row, measured=measured(estimate.report), misses=found)
+    by_kind = {kind: tuple(each) for kind, each in misses.items()}
+    return replace(row, measured=measured(estimate.report), misses=by_kind)
 
 
 def margins_of(
@@ -138,9 +138,9 @@ def margins_of(
     widest_mm: float = WIDEST_MM,
     seed: int = 0,
 ) -> ModelMargins:
-    """The margins that these states give; see docs/trust.md. Answers that miss by more than
-    ``widest_mm`` are to be kept out by limits. Raises InputError: too few states, or no limits that
-    hold their risk; says how many there are and how many it takes."""
+    """The margins that these states give; see docs/trust.md. Limits are to keep out answers that
+    miss by more than ``widest_mm``. Raises InputError: too few states, or no limits that hold their
+    risk; says how many states there are and how many it takes."""
     highest = max(confidences)
     turns = _dealt([row.label for row in rows], seed)
     good = [
@@ -155,12 +155,12 @@ def margins_of(
     kinds: list[Kind] = [kind for kind in get_args(Kind) if all(kind in r.misses for r in located)]
     forms = {kind: _form(good, kind) for kind in kinds}
     rows = [_sized(row, forms[kinds[0]]) for row in rows]
-    some: dict[_Turn, list[Row]] = {turn: [] for turn in get_args(_Turn)}
+    by_turn: dict[_Turn, list[Row]] = {turn: [] for turn in get_args(_Turn)}
     for row, turn in zip(rows, turns, strict=True):
-        some[turn].append(row)
-    rules = _rules([row for row in some["choose"] if not row.doubt])
-    limits = _tested(rules, some["test"], kinds[0], widest_mm, 1 - highest)
-    accepted = {turn: [row for row in some[turn] if _accepted(row, limits)] for turn in some}
+        by_turn[turn].append(row)
+    rules = _rules([row for row in by_turn["choose"] if not row.doubt])
+    limits = _tested(rules, by_turn["test"], kinds[0], widest_mm, 1 - highest)
+    accepted = {turn: [row for row in by_turn[turn] if _accepted(row, limits)] for turn in by_turn}
     least = conformal.least_scores(highest)  # fewer than the test of limits asks for
     groups, joined = _grouped(accepted["calibrate"], _ALONE * least)
     shells: list[Shells] = []
@@ -183,38 +183,37 @@ def margins_of(
         groups=tuple(_counts(rows, turns, limits)),
         joined=joined,
         risk_bound=max(bounds),
-        accepted=len(tested) / len(some["test"]),
-        missed=_misses(tested, kinds[0], last) / len(some["test"]),
+        accepted=len(tested) / len(by_turn["test"]),
+        missed=_misses(tested, kinds[0], last) / len(by_turn["test"]),
     )
 
 
 def least_states(confidence: float, misses: int = 0) -> int:
-    """How many states it takes, all answered, to show that margins hold so often, where so many of
-    the answers that are tested miss them."""
+    """How many states, all answered, it takes to show that margins hold with this confidence if so
+    many of the tested answers miss them."""
     tested = conformal.least_tested(1 - confidence, _ERROR, misses=misses)
     return math.ceil(tested * len(_TURNS) / _TURNS.count("test"))
 
 
 def _dealt(labels: Sequence[conformal.Label], seed: int) -> list[_Turn]:
-    """What each state is for; drawn within its group."""
+    """What each state is used for; drawn within its group."""
     turns: dict[int, _Turn] = {}
-    seen = dict.fromkeys(labels, 0)
+    dealt = dict.fromkeys(labels, 0)
     for n in np.random.default_rng(seed).permutation(len(labels)):
-        turns[n] = _TURNS[seen[labels[n]] % len(_TURNS)]
-        seen[labels[n]] += 1
+        turns[n] = _TURNS[dealt[labels[n]] % len(_TURNS)]
+        dealt[labels[n]] += 1
     return [turns[n] for n in range(len(labels))]
 
 
 def _rules(good: Sequence[Row]) -> list[list[dict[str, float]]]:
-    """Sequences of limits, the strictest first; none that lets pass what is worse than all that was
-    seen."""
+    """Sequences of limits, the strictest first; the loosest is the worst value in ``good``."""
     names = [name for name in good[0].measured if all(name in row.measured for row in good)]
-    some = {name: np.array([row.measured[name] for row in good]) for name in names}
+    values = {name: np.array([row.measured[name] for row in good]) for name in names}
     return [
         [
             {
                 name: float(np.quantile(of, size if name == _SIZE else other, method="higher"))
-                for name, of in some.items()
+                for name, of in values.items()
             }
             for size, other in levels
         ]
@@ -223,7 +222,7 @@ def _rules(good: Sequence[Row]) -> list[list[dict[str, float]]]:
 
 
 def answered(row: Row, margins: ModelMargins) -> bool:
-    """Whether an estimate states margins, by checks and limits."""
+    """Whether the estimate states a margin: no check failed and no limit is exceeded."""
     return _accepted(_sized(row, margins.shells[-1].radii["tumor"]), margins.limits)
 
 
@@ -240,8 +239,8 @@ def _accepted(row: Row, limits: dict[str, float]) -> bool:
 
 
 def _form(rows: Sequence[Row], kind: Kind) -> Radius:
-    """The form under which these misses are likeliest, if they are exponential in the size;
-    constant where they are about as likely without. Its factors are still to be found."""
+    """The form that gives these misses the largest likelihood, if they are exponential in the size;
+    constant if that is about as likely. Its factors are still to be found."""
     constant = Radius(used="constant", constant_mm=1.0)
     deviations = [(s, row.measured) for row in rows for _, s in row.misses[kind]]
     if any(s is None for s, _ in deviations):
@@ -250,7 +249,7 @@ def _form(rows: Sequence[Row], kind: Kind) -> Radius:
     forms = []
     for offset_mm, bend_mm in product(_OFFSETS_MM, bends):
         form = replace(constant, scaled=1.0, offset_mm=offset_mm, bend_mm=bend_mm)
-        sizes = [form.size_mm(s or 0.0, found) for s, found in deviations]
+        sizes = [form.size_mm(s or 0.0, figures) for s, figures in deviations]
         mean = float(_scores(rows, kind, form).mean() * np.exp(np.log(sizes).mean()))
         forms.append((mean, form))
     mean, form = min(forms, key=itemgetter(0))
@@ -265,8 +264,8 @@ def _tested(
     widest_mm: float,
     risk: float,
 ) -> dict[str, float]:
-    """The limits that give most answers of those under which no more of these than the risk miss by
-    more than ``widest_mm``, in any group."""
+    """Of the limits under which the share of answers that miss by more than ``widest_mm`` stays
+    within the risk in every group, those with the most answers."""
     least, held = conformal.least_tested(risk, _ERROR, misses=1), []
     for rules in sequences:
         answers = [[row for row in rows if _accepted(row, limits)] for limits in rules]
@@ -277,14 +276,14 @@ def _tested(
             }
             for taken in answers
         ]
-        number = conformal.loosest_rule([[*one.values()] for one in tables], risk, _ERROR)
+        number = conformal.loosest_rule([[*table.values()] for table in tables], risk, _ERROR)
         if number is not None:
             held.append((len(answers[number]), rules[number]))
     if not held:
-        said = "; ".join(f"{name}: {m} of {n}" for name, (m, n) in tables[0].items())
+        counts = "; ".join(f"{name}: {m} of {n}" for name, (m, n) in tables[0].items())
         raise InputError(
             f"no limits hold {100 * risk:.3g} %. Tested answers that miss by more than "
-            f"{widest_mm:g} mm: {said}. If none does, about {least_states(1 - risk)} scenes are "
+            f"{widest_mm:g} mm: {counts}. If none does, about {least_states(1 - risk)} scenes are "
             f"needed, and {least_states(1 - risk, misses=1)} if one does. Give more scenes, a "
             "wider --widest, or a lower --confidence."
         )
@@ -292,20 +291,20 @@ def _tested(
 
 
 def _misses(rows: Sequence[Row], kind: Kind, radius: Radius) -> int:
-    """How many have a tumor that is not within its radius."""
+    """How many have a tumor outside its radius."""
     return sum(not row.within(kind, radius) for row in rows)
 
 
 def _grouped(rows: Sequence[Row], least: int) -> tuple[dict[str, list[Row]], dict[str, str]]:
-    """The members of each group; which were too small to stand alone, and who speaks for them."""
+    """The members of each group; and of groups too small to stand alone, the one they joined."""
     labels = [row.label for row in rows]
     groups = conformal.groups_of(labels, least)
-    found = {_name(label): [rows[n] for n in members] for label, members in groups.items()}
+    members = {_name(label): [rows[n] for n in numbers] for label, numbers in groups.items()}
     joined = {}
     for label in set(labels) - groups.keys():
         larger = next(label[:n] for n in (2, 1, 0) if label[:n] in groups)
         joined[_name(label)] = _name(larger)
-    return found, joined
+    return members, joined
 
 
 def _name(label: conformal.Label) -> str:
@@ -313,11 +312,11 @@ def _name(label: conformal.Label) -> str:
 
 
 def _radius(groups: dict[str, list[Row]], kind: Kind, form: Radius, confidence: float) -> Radius:
-    """The form with the greatest of the groups' quantiles."""
+    """The form, its factor the greatest of the groups' quantiles."""
 
     def greatest(form: Radius | None) -> float:
         scores = [_scores(of, kind, form) for of in groups.values()]
-        return max(conformal.conformal_quantile(some, confidence) for some in scores)
+        return max(conformal.conformal_quantile(each, confidence) for each in scores)
 
     scaled = None if form.scaled is None else greatest(form)
     return replace(form, constant_mm=greatest(None), scaled=scaled)

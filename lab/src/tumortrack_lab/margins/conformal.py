@@ -13,14 +13,14 @@ import numpy as np
 from jaxtyping import Float, Int64
 from scipy.special import betaincinv
 
-ERROR = 0.05  # the chance that a tested rule fails its risk all the same
-_ROUNDING = 1e-9  # (n + 1) * 0.9 is a little more than a whole number where it should be one
+ERROR = 0.05  # chance that a rule passes its test although its risk is too large
+_ROUNDING = 1e-9  # (n + 1) * 0.9 may be a little more than the whole number that it is
 
 Label = tuple[str, ...]
 
 
 def least_scores(confidence: float) -> int:
-    """So many scores a quantile needs; with fewer it is infinite."""
+    """How many scores a quantile needs; with fewer it is infinite."""
     return math.ceil(confidence / (1 - confidence) - _ROUNDING)
 
 
@@ -37,7 +37,7 @@ def risk_bound(misses: int, cases: int, error: float = ERROR) -> float:
 
 
 def least_tested(risk: float, error: float = ERROR, misses: int = 0) -> int:
-    """So many cases with so few misses show that the risk is no larger."""
+    """How many cases with so many misses show that the risk is no larger."""
     cases = misses + 1
     while risk_bound(misses, cases, error) > risk:
         cases += 1
@@ -47,11 +47,11 @@ def least_tested(risk: float, error: float = ERROR, misses: int = 0) -> int:
 def loosest_rule(
     rules: Sequence[Sequence[tuple[int, int]]], risk: float, error: float = ERROR
 ) -> int | None:
-    """The number of the last rule before the first one that does not hold its risk in every group;
-    None where that is the first of all. ``rules``: of each rule, in an order fixed beforehand, best
-    the strictest first, (misses, accepted cases) of each group. Each is tested with the whole
-    ``error``, which, as testing ends with the first failure, is the largest chance that the one
-    returned has a larger risk in any group (fixed-sequence testing)."""
+    """The number of the last rule before the first that does not hold its risk in every group; None
+    if the first rule fails. ``rules``: (misses, accepted cases) of each group, rule by rule, in an
+    order fixed beforehand, the strictest first. Each is tested with the whole ``error``: as testing
+    ends with the first failure, this bounds the chance that the rule returned has a larger risk in
+    any group (fixed-sequence testing)."""
     for number, groups in enumerate(rules):
         if not all(risk_bound(misses, cases, error) <= risk for misses, cases in groups):
             return number - 1 if number else None
@@ -59,15 +59,15 @@ def loosest_rule(
 
 
 def groups_of(labels: Sequence[Label], least: int) -> dict[Label, Int64[np.ndarray, " m"]]:
-    """The members of each group, by their numbers. A group with fewer than ``least`` gives way to
-    the one that its label without the last word names, with all who are in that; the last is the
-    empty label's, with everyone, however few."""
-    found: dict[Label, Int64[np.ndarray, " m"]] = {}
+    """The members of each group, by their numbers. A group with fewer than ``least`` members is
+    replaced by the larger one whose label lacks the last word; in the end by that of all, whose
+    label is empty, however few they are."""
+    groups: dict[Label, Int64[np.ndarray, " m"]] = {}
     for label in sorted(set(labels)) or [()]:
         while True:
-            mine = [n for n, other in enumerate(labels) if other[: len(label)] == label]
-            if len(mine) >= least or not label:
+            members = [n for n, other in enumerate(labels) if other[: len(label)] == label]
+            if len(members) >= least or not label:
                 break
             label = label[:-1]
-        found[label] = np.array(mine, np.int64)
-    return found
+        groups[label] = np.array(members, np.int64)
+    return groups

@@ -1,4 +1,4 @@
-"""The table of a calibration: a line a state, on the disk before the next is located."""
+"""The table of a calibration: one line per state, on disk before the next is located."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Miss = tuple[float, float | None]  # outward miss or distance (mm), and s (mm)
 
 class Row(Config, frozen=True):
     """One state, located. ``doubt``: why there is no good estimate; ``misses``: of every tumor, of
-    the organ's surface, and of the target that is farthest off."""
+    the organ's surface, and of the worst target."""
 
     scene: str
     sha256: str
@@ -32,14 +32,14 @@ class Row(Config, frozen=True):
     misses: dict[Kind, tuple[Miss, ...]] = field(default_factory=dict)
 
     def score(self, kind: Kind, form: Radius | None = None) -> float:
-        """Largest miss, mm; with a ``form`` over the size that this gives it."""
+        """Largest miss, mm; with a ``form`` relative to the size that it gives."""
         misses = self.misses[kind]
         if form is None:
             return max(miss for miss, _ in misses)
         return max(miss / form.size_mm(s or 0.0, self.measured) for miss, s in misses)
 
     def within(self, kind: Kind, radius: Radius) -> bool:
-        """Whether all are within their radii."""
+        """Whether all misses are within their radii."""
         radii = [(miss, radius.at(s, self.measured)) for miss, s in self.misses[kind]]
         return all(at is not None and miss <= at for miss, at in radii)
 
@@ -48,9 +48,9 @@ class Row(Config, frozen=True):
 def open_table(
     path: Path, head: dict[str, Any]
 ) -> Iterator[tuple[list[Row], Callable[[Row], None]]]:
-    """The rows that are in a table already, and a function that adds one: on the disk before it
-    returns. A line that a killed process left unfinished is dropped. Raises InputError: it was
-    begun with another ``head``, or another process fills it; StorageError: the disk refused."""
+    """The rows of a table, and a function that adds one, which is on disk when it returns. A line
+    that a killed process left unfinished is dropped. Raises InputError: the table has another
+    ``head``, or another process is filling it; StorageError: the disk refused."""
     with store.writing(path):
         stream = path.open("a+b")
     with stream:
@@ -82,7 +82,7 @@ def open_table(
 
 
 def read_table(path: Path) -> tuple[dict[str, Any], list[Row]]:
-    """Head and rows; InputError where it is none."""
+    """Head and rows. Raises InputError: it is no such table."""
     return _parsed(store.read_file(path, 2**30), path)
 
 
@@ -95,5 +95,5 @@ def _parsed(content: bytes, path: Path) -> tuple[dict[str, Any], list[Row]]:
 
 
 def head_of(model_sha256: str, seed: int) -> dict[str, Any]:
-    """What every row of a table depends on besides its scene."""
+    """What every row depends on besides its scene."""
     return {"model_sha256": model_sha256, "method": METHOD, "seed": seed}
