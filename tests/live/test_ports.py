@@ -168,7 +168,7 @@ def test_numbers_that_are_none_reach_nobody(viewer):
         until(lambda: viewer._server.get_clients(), "the last look")
     assert viewer._panel.options.organ <= 1
     with page(viewer) as other:
-        other.send(noise())
+        other.send(b"\xc1" * 300)  # which no message of msgpack has
         gone(other)
 
 

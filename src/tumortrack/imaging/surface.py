@@ -54,7 +54,10 @@ def surfaces(
         rows.append((ml, mesh_ml, 100 * (mesh_ml / ml - 1), distance.mean(), p95, distance.max()))
         parts.append(mesh)
     columns = [[round(float(x), 4) for x in column] for column in zip(*rows, strict=True)]
-    report: dict[str, list[Any]] = {"names": list(names), **dict(zip(_REPORTED, columns, strict=True))}
+    report: dict[str, list[Any]] = {
+        "names": list(names),
+        **dict(zip(_REPORTED, columns, strict=True)),
+    }
     return Anatomy(tuple(parts), kind), report
 
 

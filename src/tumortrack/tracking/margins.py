@@ -240,7 +240,7 @@ class StatedRadius(msgspec.Struct, frozen=True):
 def stated_radius(
     margin: MarginReport | None, name: str, confidence: float | None = None
 ) -> StatedRadius | None:
-    """Of a part, or of ``map``, with this or else the highest confidence; None if none is stated."""
+    """Of a part or ``map``, with this or else the highest confidence; None if none is stated."""
     for stated in reversed(() if margin is None else margin.stated):
         if confidence in (None, stated.confidence) and name in stated.mm:
             return StatedRadius(stated.confidence, stated.mm[name])

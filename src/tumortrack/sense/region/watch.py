@@ -92,7 +92,11 @@ class TableWatch:
             slope = np.linalg.norm(shifts[1:] - shifts[0]) / self._reach_mm
             since = "the calibration" if self._known else "the start"
             degrees = float(np.degrees(np.arctan(slope)))
-            values = {"since": since, "shift_mm": float(abs(shifts[0])), "degrees": degrees}
+            values: dict[str, float | str | None] = {
+                "since": since,
+                "shift_mm": float(abs(shifts[0])),
+                "degrees": degrees,
+            }
             self._moved = Finding("moved", values)
 
     def _learn(self, content: DepthFrame | SensorCloud, points_mm: np.ndarray) -> None:
