@@ -27,8 +27,6 @@ from tumortrack.imaging.case import load_case as read_case
 from tumortrack.tracking.options import Device, LocateOptions, TrackOptions
 
 if TYPE_CHECKING:
-    from _typeshed import DataclassInstance
-
     from tumortrack.live.session import Arms, Session
     from tumortrack.live.values import TrackingResult
     from tumortrack.models.model import Model
@@ -42,7 +40,7 @@ if TYPE_CHECKING:
     from tumortrack.tracking.tracker import Tracker
 
 StrPath = str | Path
-_Options = TypeVar("_Options", bound="DataclassInstance")
+_Options = TypeVar("_Options")  # a dataclass
 _TEST_BODY = 2**20  # and the seed: elastic states that training with the same seed never sees
 
 
@@ -126,7 +124,7 @@ def prepare(
 
 def _options(kind: type[_Options], given: dict[str, Any], what: str) -> _Options:
     """InputError: one that is none."""
-    known = [field.name for field in fields(kind)]
+    known = [field.name for field in fields(kind)]  # type: ignore[arg-type]
     if unknown := sorted(set(given) - set(known)):
         raise InputError(f"{what} knows no {unknown[0]!r}; allowed: {', '.join(known)}.")
     for field in fields(kind):

@@ -13,6 +13,7 @@ from elastic_objects import CENTER, RADII
 from tumortrack.models.in_distribution import RIVAL_COST
 from tumortrack.registration import kernels
 from tumortrack.registration.choose import likeliest
+from tumortrack.registration.config import GaussNewtonConfig
 from tumortrack.registration.discrepancy import (
     AMPLITUDES_MM,
     LENGTH_MM,

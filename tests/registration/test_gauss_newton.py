@@ -23,6 +23,7 @@ from tumortrack.core.types import Mesh, SensorCloud
 from tumortrack.imaging.raster import label_grid, winding_numbers
 from tumortrack.registration import gauss_newton_kernels as kernels
 from tumortrack.registration import registration
+from tumortrack.registration.config import GaussNewtonConfig
 from tumortrack.registration.gauss_newton import GaussNewton, _prior
 from tumortrack.registration.kernels import look_up, probabilities
 from tumortrack.registration.locator import RegistrationLocator, nearest_lookup

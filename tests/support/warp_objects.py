@@ -14,6 +14,7 @@ from tumortrack.core.types import Anatomy
 from tumortrack.models.folder import save_model
 from tumortrack.registration import kernels
 from tumortrack.registration.build import build_model
+from tumortrack.registration.config import GaussNewtonConfig, RegistrationConfig
 from tumortrack.registration.gauss_newton import GaussNewton, RegistrationResult, refine
 from tumortrack.registration.looks import Looks
 from tumortrack.registration.motion import ElasticMotion
