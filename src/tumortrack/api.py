@@ -124,10 +124,11 @@ def prepare(
 
 def _options(kind: type[_Options], given: dict[str, Any], what: str) -> _Options:
     """InputError: one that is none."""
-    known = [field.name for field in fields(kind)]  # type: ignore[arg-type]
+    declared = fields(kind)  # type: ignore[arg-type]
+    known = [field.name for field in declared]
     if unknown := sorted(set(given) - set(known)):
         raise InputError(f"{what} knows no {unknown[0]!r}; allowed: {', '.join(known)}.")
-    for field in fields(kind):
+    for field in declared:
         value = given.get(field.name)
         if "Path" in str(field.type) and value is not None:
             path = isinstance(value, str | Path)
