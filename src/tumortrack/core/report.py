@@ -29,8 +29,6 @@ Kind = Literal[
     "no_organ_colour", "spread", "misfit", "implausible", "organ_seen_through", "few_inside",
     "left", "far_off",
 ]  # fmt: skip
-_NO_ORGAN = "the cloud does not show this model's organ: "
-_NO_PLACE = "where the camera was is unknown"
 # The check that each kind of finding belongs to, and its sentence.
 _FINDINGS: dict[Kind, tuple[Check, str]] = {
     "not_judged": ("other", "it was not judged"),
@@ -77,124 +75,106 @@ _FINDINGS: dict[Kind, tuple[Check, str]] = {
     "model": ("other", "{words}"),
     "frame_in_doubt": ("other", "{words}"),
     "good_again": ("other", "good again for {frames} of {of} frames; wait"),
-    "no_frame": ("none", "no frame for {seconds:.1f} s"),
-    "source": ("none", "{words}"),
-    "defect": ("none", "internal error, {words}: {error}"),
-    "stamp_negative": ("none", "the frame's stamp is {stamp_ns} ns; it must be 0 or more"),
-    "stamp_back": ("none", "the frame's stamp went back by {seconds:.3f} s"),
-    "stale": ("none", "the frame is stale: {seconds:.2f} s old{doubt}"),
-    "future": ("none", "the frame's stamp lies {seconds:.2f} s in the future: {clocks} disagree"),
-    "too_late": ("none", "the answer came too late: {seconds:.2f} s after the frame"),
+}
+# Why there is no estimate: of the frame and its source, then of the organ in it.
+_NO_ESTIMATE: dict[Kind, str] = {
+    "no_frame": "no frame for {seconds:.1f} s",
+    "source": "{words}",
+    "defect": "internal error, {words}: {error}",
+    "stamp_negative": "the frame's stamp is {stamp_ns} ns; it must be 0 or more",
+    "stamp_back": "the frame's stamp went back by {seconds:.3f} s",
+    "stale": "the frame is stale: {seconds:.2f} s old{doubt}",
+    "future": "the frame's stamp lies {seconds:.2f} s in the future: {clocks} disagree",
+    "too_late": "the answer came too late: {seconds:.2f} s after the frame",
     "frozen": (
-        "none",
         "the source is frozen: the same image for up to {seconds:.2f} s. Look at the camera; a "
-        "simulated one without noise needs --frozen 0.",
+        "simulated one without noise needs --frozen 0."
     ),
     "other_frame_id": (
-        "none",
         "the frame is in {name!r}, and the calibration is for {wanted!r}. Give this camera's "
-        "calibration, or the topic of the calibrated camera",
+        "calibration, or the topic of the calibrated camera"
     ),
     "frame_id_changed": (
-        "none",
-        "the source's frame changed from {first!r} to {name!r}: another camera, or another "
-        "setting of it. Restart to accept it",
+        "the source's frame changed from {first!r} to {name!r}: another camera, or another setting "
+        "of it. Restart to accept it"
     ),
     "intrinsics_changed": (
-        "none",
-        "the camera's intrinsics changed from {before} to {now}. If that is meant, start again.",
+        "the camera's intrinsics changed from {before} to {now}. If that is meant, start again."
     ),
     "moved": (
-        "none",
-        "the camera or the table has moved since {since}: the table lies {shift_mm:.1f} mm off "
-        "and {degrees:.1f} degrees tilted. Calibrate again, and restart",
+        "the camera or the table has moved since {since}: the table lies {shift_mm:.1f} mm off and "
+        "{degrees:.1f} degrees tilted. Calibrate again, and restart"
     ),
-    "cameras": ("none", "{troubles}"),
-    "no_pose": ("none", f"{_NO_PLACE}: no pose has come"),
+    "cameras": "{troubles}",
+    "no_pose": "where the camera was is unknown: no pose has come",
     "old_pose": (
-        "none",
-        f"{_NO_PLACE}: its last pose is older than the frame by {{seconds:.2f}} s",
+        "where the camera was is unknown: its last pose is older than the frame by {seconds:.2f} s"
     ),
     "new_pose": (
-        "none",
-        f"{_NO_PLACE}: its first pose is newer than the frame by {{seconds:.2f}} s",
+        "where the camera was is unknown: its first pose is newer than the frame by {seconds:.2f} s"
     ),
     "pose_gap": (
-        "none",
-        f"{_NO_PLACE}: its poses before and after the frame are {{seconds:.2f}} s apart; allowed: "
-        "{allowed_s:g} s",
+        "where the camera was is unknown: its poses before and after the frame are {seconds:.2f} s "
+        "apart; allowed: {allowed_s:g} s"
     ),
-    "unconnected": ("none", "tf does not connect the camera, {camera!r}, with {frame_id!r}"),
+    "unconnected": "tf does not connect the camera, {camera!r}, with {frame_id!r}",
     "scan_waits": (
-        "none",
-        "scan: {looks} of {of} looks; lead the camera on round the organ, {degrees:g} degrees "
-        "from each look, all within {seconds:g} s",
+        "scan: {looks} of {of} looks; lead the camera on round the organ, {degrees:g} degrees from "
+        "each look, all within {seconds:g} s"
     ),
-    "scan_failed": ("none", "scan, begun anew: {reason}"),
-    "scan_poor": ("none", "scan, begun anew: laid together, the looks are poor: {reason}"),
+    "scan_failed": "scan, begun anew: {reason}",
+    "scan_poor": "scan, begun anew: laid together, the looks are poor: {reason}",
     "few_points": (
-        "none",
         "only {points} points are left for the organ; at least {fewest} are needed. Of {pixels} "
-        "pixels went to: {steps} (range {near_mm:g}..{far_mm:g} mm): {advice}.{doubt}",
+        "pixels went to: {steps} (range {near_mm:g}..{far_mm:g} mm): {advice}.{doubt}"
     ),
     "few_in_range": (
-        "none",
         "only {points} points lie between {near_mm:g} and {far_mm:g} mm ({seen}); at least "
-        "{fewest} are needed: {advice}.",
+        "{fewest} are needed: {advice}."
     ),
     "sparse": (
-        "none",
-        "the cloud has {points} different points with a return; at least {fewest} are needed. "
-        "Give a denser cloud.",
+        "the cloud has {points} different points with a return; at least {fewest} are needed. Give "
+        "a denser cloud."
     ),
     "line": (
-        "none",
         "the points of the cloud lie on one line; an organ has extent along two axes at least. "
-        "Give the whole surface that the camera sees.",
+        "Give the whole surface that the camera sees."
     ),
     "behind_camera": (
-        "none",
-        "no point of the cloud lies before the camera (z > 0). The camera frame has x right, "
-        "y down, z forward; turn the cloud into that frame.",
+        "no point of the cloud lies before the camera (z > 0). The camera frame has x right, y "
+        "down, z forward; turn the cloud into that frame."
     ),
     "pick_missed": (
-        "none",
-        "no piece of the scene lies within {reach_mm:g} mm of the picked point ({place}) mm: it "
-        "is on the background, on something thin, or outside the range. Pick again, or clear the "
-        "pick.",
+        "no piece of the scene lies within {reach_mm:g} mm of the picked point ({place}) mm: it is "
+        "on the background, on something thin, or outside the range. Pick again, or clear the "
+        "pick."
     ),
-    "no_picture": ("none", "this frame has no picture"),
+    "no_picture": "this frame has no picture",
     "no_organ_colour": (
-        "none",
-        "hardly anything that is seen looks like the organ where it was clicked on: another "
-        "light, or it is hidden. Wait, or forget the clicks and click again",
+        "hardly anything that is seen looks like the organ where it was clicked on: another light, "
+        "or it is hidden. Wait, or forget the clicks and click again"
     ),
     "spread": (
-        "none",
-        f"{_NO_ORGAN}four fifths of its points lie within {{spread_mm:.0f}} mm of their middle, "
-        "in this model's scenes within {low_mm:.0f} to {high_mm:.0f} mm",
+        "the cloud does not show this model's organ: four fifths of its points lie within "
+        "{spread_mm:.0f} mm of their middle, in this model's scenes within {low_mm:.0f} to "
+        "{high_mm:.0f} mm"
     ),
     "misfit": (
-        "none",
-        f"{_NO_ORGAN}{{share}} of its points lie more than {{fit_mm:.1f}} mm from the estimated "
-        "surface, where {limit_mm:.1f} mm are the most to expect",
+        "the cloud does not show this model's organ: {share} of its points lie more than "
+        "{fit_mm:.1f} mm from the estimated surface, where {limit_mm:.1f} mm are the most to "
+        "expect"
     ),
     "implausible": (
-        "none",
-        f"{_NO_ORGAN}only a deformation {{times:.1f}} times as rare as usual would fit it, where "
-        "{limit:g} times is the most to expect",
+        "the cloud does not show this model's organ: only a deformation {times:.1f} times as rare "
+        "as usual would fit it, where {limit:g} times is the most to expect"
     ),
-    "organ_seen_through": (
-        "none",
-        "the camera sees through {percent:.0f} % of where the organ would lie",
-    ),
+    "organ_seen_through": "the camera sees through {percent:.0f} % of where the organ would lie",
     "few_inside": (
-        "none",
         "no organ was found: {inside} of {queries} queries round the cloud lie inside. Does the "
-        "cloud show this model's organ, freed of its background?",
+        "cloud show this model's organ, freed of its background?"
     ),
-    "left": ("none", "no organ was found: it has left the place where it was."),
-    "far_off": ("none", "no organ was found: its surface is nowhere near the cloud."),
+    "left": "no organ was found: it has left the place where it was.",
+    "far_off": "no organ was found: its surface is nowhere near the cloud.",
 }
 
 
@@ -215,17 +195,21 @@ class Finding(msgspec.Struct, frozen=True):
     @property
     def check(self) -> Check:
         """The check that failed."""
-        return _FINDINGS[self.kind][0]
+        return "none" if self.kind in _NO_ESTIMATE else _FINDINGS[self.kind][0]
+
+    @property
+    def _sentence(self) -> str:
+        return _NO_ESTIMATE.get(self.kind) or _FINDINGS[self.kind][1]
 
     @property
     def words(self) -> str:
         """For people."""
-        return _FINDINGS[self.kind][1].format(**self.values)
+        return self._sentence.format(**self.values)
 
     @property
     def words_without_numbers(self) -> str:
         """For counts of what happened often."""
-        return _WithoutNumbers().vformat(_FINDINGS[self.kind][1], (), self.values)
+        return _WithoutNumbers().vformat(self._sentence, (), self.values)
 
     @property
     def same_as(self) -> tuple[Kind, object]:
