@@ -134,7 +134,7 @@ class Looks:
             mine = self.look == n
             points_mm[mine], poses[n] = _moved(back, points_mm[mine]), back @ poses[n]
         shifts = self.shifts + np.concatenate([np.zeros((1, POSE)), changes])
-        return Looks(points_mm, self.look, tuple(poses), shifts)
+        return replace(self, points_mm=points_mm, camera_from_look=tuple(poses), shifts=shifts)
 
 
 def seen_from_first(motion: ElasticMotion, camera_from_look: Affine) -> ElasticMotion:
