@@ -7,6 +7,7 @@ import pytest
 from msgspec.structs import replace
 
 from live_objects import CAMERA, small_anatomy, small_estimate
+from reports import looked
 from tumortrack.core import store
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import SensorCloud
