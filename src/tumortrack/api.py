@@ -10,10 +10,10 @@ from __future__ import annotations
 import logging
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, fields
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, TypeVar, get_type_hints
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
@@ -124,15 +124,15 @@ def prepare(
 
 def _options(kind: type[_Options], given: dict[str, Any], what: str) -> _Options:
     """InputError: one that is none."""
-    declared = fields(kind)  # type: ignore[arg-type]
-    known = [field.name for field in declared]
-    if unknown := sorted(set(given) - set(known)):
-        raise InputError(f"{what} knows no {unknown[0]!r}; allowed: {', '.join(known)}.")
-    for field in declared:
-        value = given.get(field.name)
-        if "Path" in str(field.type) and value is not None:
-            path = isinstance(value, str | Path)
-            given[field.name] = Path(value) if path else tuple(map(Path, value))
+    hints = get_type_hints(kind)
+    if unknown := sorted(set(given) - set(hints)):
+        raise InputError(f"{what} knows no {unknown[0]!r}; allowed: {', '.join(hints)}.")
+    for name, value in given.items():
+        if hints[name] == tuple[Path, ...]:
+            paths = [value] if isinstance(value, str | Path) else value
+            given[name] = tuple(map(Path, paths))
+        elif hints[name] == Path | None and value is not None:
+            given[name] = Path(value)
     return kind(**given)
 
 
@@ -470,24 +470,23 @@ def evaluate(
             f"evaluate takes a tracker or a function, not {type(locate).__name__}: "
             "evaluate(Tracker(load_model(FOLDER)), scenes)."
         )
-    progress = progress or (lambda: None)
-    rivals = rivals_of(getattr(locate, "model", None))
     if isinstance(scenes, str | Path):
         if report is None:
             raise InputError("evaluating a folder of scenes writes a report: say where.")
-        folder, out = Path(scenes), Path(report)
+        folder, out, progress = Path(scenes), Path(report), progress or (lambda: None)
         check_place(out, overwrite)
         if isinstance(locate, Path | Tracker):
             return protocol.evaluate_model(locate, folder, out, grid, seed, device, progress)
         call: Any = getattr(locate, "locate", locate)
+        rivals = rivals_of(getattr(locate, "model", None))
         return protocol.evaluate_scenes(call, folder, out, progress, rivals=rivals)
     if not scenes:
         raise InputError("there are no scenes to evaluate: simulate_scenes(case, 20) makes some.")
     if isinstance(locate, Path):
         locate = Tracker(load_model(locate, device))
-    call = getattr(locate, "locate", locate)
+    call, rivals = getattr(locate, "locate", locate), rivals_of(getattr(locate, "model", None))
     if isinstance(locate, Tracker):
-        call, rivals = partial(call, grid=grid, seed=seed), rivals_of(locate.model)
+        call = partial(call, grid=grid, seed=seed)
     named = ((f"{n:04d}", scene) for n, scene in enumerate(scenes))
     entries = [protocol.evaluate_scene(call, scene, name, rivals)[0] for name, scene in named]
     return {"scenes": entries, "summary": summarise(entries)}

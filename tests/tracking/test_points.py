@@ -427,3 +427,16 @@ def test_points_that_cannot_be_meant_cost_no_locating(model, cloud, tmp_path, mo
         Locate(model=model, cloud=cloud, out=tmp_path / "out", map=asked).run()
     assert Knowing.asked == 0
     assert not (tmp_path / "out").exists()
+
+
+def test_python_takes_the_commands_options(model, cloud, tmp_path):
+    import tumortrack as tt
+
+    with pytest.raises(InputError, match=r"knows no 'crop'; allowed: .*box"):
+        tt.locate(model, cloud, crop=1)
+    depth = tmp_path / "depth.png"
+    depth.write_bytes(cloud.read_bytes())
+    with pytest.raises(InputError, match=r"absent\.json"):  # one camera, as text
+        tt.locate(str(model), str(depth), intrinsics=str(tmp_path / "absent.json"))
+    with pytest.raises(InputError, match="2 times for 1 view"):
+        tt.locate(model, [cloud], intrinsics=["a.json", "b.json"])

@@ -161,8 +161,8 @@ class Scan:
 
     def look(self, view: CameraView, organ: SensorCloud) -> Estimate:
         """The estimate from all looks, in the frame of the last one. Raises NoEstimate: there are
-        too few yet, they are too much alike, or they do not show one organ at rest; then it begins
-        anew."""
+        too few yet, they are too much alike, or they do not show one organ at rest; then it starts
+        over."""
         oldest_ns = view.seen.stamp_ns - SCAN_WITHIN_S * 1e9
         self._views = [known for known in self._views if known[0].seen.stamp_ns >= oldest_ns]
         cosines = [_towards(view, organ) @ _towards(*known) for known in self._views]

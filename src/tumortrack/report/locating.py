@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -48,7 +48,7 @@ class Located:
         """Why there is no estimate, or a poor one."""
         return self.about["quality"]["reason"] if self.estimate is None else self.estimate.reason
 
-    @property
+    @cached_property
     def report(self) -> dict[str, Any]:
         """report.json."""
         from tumortrack.tracking.files import report_entry
