@@ -39,6 +39,10 @@ def read_mesh_folder(
     self-intersections are repaired. The organ becomes the union of organ and tumors. Raises
     InputError: unclear names, open or damaged meshes, wrong unit, a tumor apart from the organ.
     """
+    if not folder.is_dir():
+        raise InputError(f"{folder} is not a folder of meshes.")
+    if unit not in (None, "mm", "m"):
+        raise InputError(f"unit {unit!r} is not allowed: mm or m.")
     organ_file, *tumor_files = files = _files_by_name(folder, kind.name)
     notes: list[str] = []
     organ, *tumors = [read_lps(file, 1000.0 if unit == "m" else 1.0, notes) for file in files]
