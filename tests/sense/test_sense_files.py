@@ -112,6 +112,21 @@ def test_cloud_written_by_trimesh_is_read(points, tmp_path):
         np.testing.assert_allclose(read_cloud(path)[0].points_mm, points, rtol=1e-6)
 
 
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("dtype", ["<f4", ">f4", "<f8", ">f8"])
+def test_signalling_nans_of_a_ply_are_dropped_without_a_warning(dtype, points, tmp_path):
+    """Coordinates whose byte order the header states wrongly contain some."""
+    stored = points.astype(dtype)
+    bits, signalling = {"4": ("u4", 0x7F800001), "8": ("u8", 0x7FF0000000000001)}[dtype[2]]
+    stored.view(dtype[0] + bits)[::3, 0] = signalling
+    form = {"<": "binary_little_endian", ">": "binary_big_endian"}[dtype[0]]
+    path = tmp_path / "cloud.ply"
+    path.write_bytes(ply_bytes(stored, form, dtype=dtype))
+    cloud, (note,) = read_cloud(path)
+    assert note.startswith(f"dropped {len(points[::3])} of {len(points)} points")
+    np.testing.assert_array_equal(cloud.points_mm, np.delete(points, np.s_[::3], axis=0))
+
+
 @pytest.mark.parametrize("encoding", ["ascii", "binary", "binary_compressed"])
 def test_organised_pcd_with_nans_loses_them_and_says_so(encoding, tmp_path):
     frame = dome()

@@ -98,7 +98,8 @@ def read_cloud(path: Path, unit: Literal["mm", "m"] = "mm") -> tuple[SensorCloud
     npz = partial(_npz_points, unit)
     parse: Any = {".ply": parse_ply_properties, ".pcd": _pcd_points, ".npz": npz}[suffix]
     raw = parse(read_file(path, LARGEST_FILE, "Thin it first."), str(path))
-    with np.errstate(over="ignore"):  # beyond float32 becomes infinite, and is dropped
+    # Beyond float32 becomes infinite, and is dropped like NaN, signalling or not.
+    with np.errstate(over="ignore", invalid="ignore"):
         points_mm = (raw * (1000.0 if unit == "m" else 1.0)).astype(np.float32)
     kept, notes = seen_points(points_mm, str(path))
     if len(kept) == 0:

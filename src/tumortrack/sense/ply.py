@@ -52,7 +52,8 @@ def parse_ply_properties(content: bytes, name: str, wanted: Sequence[str] = "xyz
     if count * dtype.itemsize > len(body):
         raise _cut_off(name, count, len(body) // dtype.itemsize)
     table = np.frombuffer(body, dtype, count)
-    return np.stack([table[column].astype(np.float64) for column in wanted], axis=1)
+    with np.errstate(invalid="ignore"):  # signalling NaNs, as a wrongly stated byte order gives
+        return np.stack([table[column].astype(np.float64) for column in wanted], axis=1)
 
 
 def _vertex_layout(lines: list[list[str]], name: str) -> tuple[int, dict[str, str]]:
