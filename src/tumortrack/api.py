@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from tumortrack.occupancy.training.train import TrainingStatus
     from tumortrack.registration.config import RegistrationConfig
     from tumortrack.report.locating import Located
-    from tumortrack.sense.region.taught import Taught
+    from tumortrack.sense.region.tissue import TissueClassifier
     from tumortrack.simulate.scene import SceneConfig
     from tumortrack.simulate.scene_folder import Scene
     from tumortrack.tracking.tracker import Tracker
@@ -300,7 +300,7 @@ def find_organ(
     mask: Bool[np.ndarray, "h w"] | None = None,
     picked_mm: Float[np.ndarray, " 3"] | None = None,
     picture: UInt8[np.ndarray, "h w *rgb"] | None = None,
-    taught: Taught | None = None,
+    taught: TissueClassifier | None = None,
     seed: int = 0,
 ) -> SensorCloud:
     """The organ's points among table, drape, instruments and hands; camera frame, mm.
@@ -335,17 +335,17 @@ def teach(
     picture: UInt8[np.ndarray, "h w *rgb"],
     organ: Sequence[tuple[int, int]],
     beside: Sequence[tuple[int, int]],
-) -> Taught:
+) -> TissueClassifier:
     """What the organ looks like in colour and depth, from pixels (row, column) on it and beside it,
     two of each at least; for ``find_organ``.
 
     Raises:
         InputError: a pixel shows too little, or organ and surroundings look alike.
     """
-    from tumortrack.sense.region import taught
+    from tumortrack.sense.region import tissue
 
     pixels = [(pixel, True) for pixel in organ] + [(pixel, False) for pixel in beside]
-    return taught.teach([taught.look(frame, picture, *pixel) for pixel in pixels])
+    return tissue.teach([tissue.sample_click(frame, picture, *pixel) for pixel in pixels])
 
 
 def locate(model: StrPath, clouds: StrPath | Sequence[StrPath], **options: Any) -> Located:

@@ -17,7 +17,7 @@ from tumortrack.live.frames import UNNAMED, FrameCheck
 from tumortrack.live.sources.recording import RecordingSourceConfig
 from tumortrack.live.values import Observation, PublishedFrame
 from tumortrack.sense.camera import d405, deproject
-from tumortrack.sense.region.picture import RegionConfig
+from tumortrack.sense.region import RegionConfig
 from tumortrack.sense.region.watch import TableWatch
 
 CAMERA = d405(424, 240)

@@ -9,7 +9,7 @@ from tumortrack.core.errors import NoEstimate
 from tumortrack.core.report import Finding
 from tumortrack.core.types import DepthFrame, Intrinsics, SensorCloud
 from tumortrack.live.values import Observation, PublishedFrame
-from tumortrack.sense.region.picture import RegionConfig
+from tumortrack.sense.region import RegionConfig
 from tumortrack.sense.region.watch import TableWatch
 
 UNNAMED = (

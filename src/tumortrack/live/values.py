@@ -28,7 +28,7 @@ from tumortrack.core.types import Anatomy, DepthFrame, Mesh, SensorCloud
 from tumortrack.tracking.margins import margin_words
 
 if TYPE_CHECKING:
-    from tumortrack.sense.region.taught import Click, Taught
+    from tumortrack.sense.region.tissue import Click, TissueClassifier
 
 
 class SourceLost(TumortrackError):
@@ -319,14 +319,14 @@ class Controls:
     picked_mm: Float64[np.ndarray, " 3"] | None = None
     aborted: threading.Event = field(default_factory=threading.Event)
     clicks: tuple[Click, ...] = ()
-    taught: Taught | None = None
+    taught: TissueClassifier | None = None
     colour: str = ""
 
     def click(self, seen: Observation, place_mm: Float[np.ndarray, " 3"], organ: bool) -> None:
         """The user clicked on this place (camera frame): on the ``organ``, or beside it. Raises
         InputError, and changes nothing: there is no picture, or it shows too little there."""
         from tumortrack.sense.camera import project
-        from tumortrack.sense.region.taught import look, teach
+        from tumortrack.sense.region.tissue import sample_click, teach
 
         if seen.picture is None or not isinstance(seen.content, DepthFrame):
             raise InputError(
@@ -334,7 +334,7 @@ class Controls:
                 "ros2:TOPIC?picture=TOPIC, stereo)."
             )
         ((column, row),), _ = project(place_mm[None], seen.content.intrinsics)
-        new = look(seen.content, seen.picture, (round(row), round(column)), organ)
+        new = sample_click(seen.content, seen.picture, (round(row), round(column)), organ)
         self.clicks, self.taught = (*self.clicks, new), None
         try:
             self.taught = teach(self.clicks)

@@ -18,7 +18,7 @@ from tumortrack.core.types import Look, SensorCloud
 from tumortrack.live.frames import FrameCheck
 from tumortrack.live.values import CameraView, PublishedFrame, SinkContext
 from tumortrack.sense.region import Hints, RegionConfig, organ_points
-from tumortrack.sense.region.taught import Taught
+from tumortrack.sense.region.tissue import TissueClassifier
 from tumortrack.tracking.tracker import Follower, Tracker
 
 _PICK_S = 3.0  # without the organ: a pick is forgotten
@@ -51,7 +51,7 @@ class ViewsLocator:
         self._published_from_last = context.published_frame.published_from_camera
         self._picked: Float64[np.ndarray, " 3"] | None = None  # by the user, published frame
         self._place_mm: Float64[np.ndarray, " 3"] | None = None  # where that is by now
-        self._taught: Taught | None = None  # likewise
+        self._taught: TissueClassifier | None = None  # likewise
         self._found_s = time.monotonic()
         # Of the first camera by its calibration, of others as they come.
         self.frames = FrameCheck(context.published_frame, region, frozen_s)

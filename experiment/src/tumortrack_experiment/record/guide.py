@@ -20,7 +20,7 @@ from tumortrack.live.values import Observation, SourceLost
 from tumortrack.live.workers import SourceWorker
 from tumortrack.sense.cloud import CloudConfig
 from tumortrack.sense.files import DepthCorrection
-from tumortrack.sense.region.picture import RegionConfig
+from tumortrack.sense.region import RegionConfig
 from tumortrack_experiment.kit_file import Kit
 from tumortrack_experiment.record.folder import RecordingFolder
 from tumortrack_experiment.record.quality import DepthMeter

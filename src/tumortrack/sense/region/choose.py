@@ -1,5 +1,5 @@
-"""Which pieces are the organ: the one picked by the user, the last one seen, or the likeliest; what
-continues it behind something nearer; and what lies wholly in the last estimate's box."""
+"""Choose the organ's pieces: the one that the user picked, that the last estimate points to, or the
+likeliest; what continues it behind an occluder; and what lies wholly in the last estimate's box."""
 
 from __future__ import annotations
 
@@ -9,74 +9,74 @@ import numpy as np
 
 from tumortrack.core.errors import NoEstimate
 from tumortrack.core.report import Finding
-from tumortrack.sense.region.hints import Hints
-from tumortrack.sense.region.picture import (
+from tumortrack.sense.region.pieces import find_edges, find_pieces
+from tumortrack.sense.region.working_image import (
     FLYING,
     LAST_BOX,
     PIECES,
     THIN,
-    Picture,
+    Hints,
     RegionConfig,
+    WorkingImage,
     jit,
 )
-from tumortrack.sense.region.pieces import find_edges, find_pieces
 
 _OPENINGS = (1.0, 1.7, 2.8)  # times ``opening_mm``: the last is wider than fingers
-_CLEARLY = 1.1  # better by so much is worth a wider opening
-_PICK_REACH_MM = 10.0  # from the picked point to the piece it means
-_STEEPEST_GAP = 0.5  # slope of a surface behind what hides part of it
-_STEP_MM = 3.0
-_SAME_MM = 5.0  # neighbouring pixels of one surface
+_CLEARLY = 1.1  # a wider opening must raise the score by this factor
+_PICK_REACH_MM = 10.0  # from the picked point to its piece
+_STEEPEST_GAP = 0.5  # slope of a surface behind an occluder
+_STEP_MM = 3.0  # an occluder is nearer, the background farther, by this much
+_SAME_MM = 5.0  # largest step in depth between neighbouring pixels of one surface
 _FEWEST_LINES = 0.4  # length along which pieces continue each other, over the smaller one's size
 _STRAY = 2  # false matches in a row that are no background
-_TIMES = 2  # so many things may lie between the chosen piece and another
-_CUT = 0.1
-_POOR = 0.5
-_WHOLLY = 0.97  # of a piece's surface in the last box: it is a part of the organ
-_BOX_MM = 5.0  # the last box may be wrong by so much
-_FAR_SIDE = 0.4  # of the box's depth: the camera sees an organ's near side; there is the ground
-_THICK_PART_MM = 9.0
-_AIMED = 0.4  # so far (tangent) from the optical axis a piece is half as likely the organ
+_TIMES = 2  # occluders between the chosen piece and the last one that continues it
+_CUT = 0.1  # ``_Sizes.cut`` from which a piece leaves the image
+_POOR = 0.5  # likeness of an organ below which a guess is doubtful
+_WHOLLY = 0.97  # share of a piece in the last box from which it is part of the organ
+_BOX_MM = 5.0  # tolerance of the last box
+_FAR_SIDE = 0.4  # of the box's depth: its far side shows the ground, the near side the organ
+_THICK_PART_MM = 9.0  # thinner pieces in the last box are no part of the organ
+_AIMED = 0.4  # at this angle (tangent) from the optical axis a piece is half as likely the organ
 _THICK = 0.8  # of an organ's shortest extent: thinner pieces are likely fingers or shafts
 
 
-def take_one_piece(picture: Picture, config: RegionConfig, hints: Hints) -> None:
-    """Leave one piece (and what continues it) to the organ. NoEstimate: a point was picked, and no
-    piece lies within 10 mm of it.
+def choose_pieces(image: WorkingImage, config: RegionConfig, hints: Hints) -> None:
+    """Remove all but the organ's piece and what belongs to it. Raises NoEstimate: no piece lies
+    within 10 mm of the picked point.
 
-    A hand that touches the organ makes one large piece with it that leaves the picture. Then the
+    A hand that touches the organ makes one large piece with it that leaves the image. Then the
     opening is widened until fingers are too narrow to connect.
     """
-    edges = find_edges(picture, config)
+    edges = find_edges(image, config)
     best: tuple[float, np.ndarray, _Sizes, np.ndarray] | None = None
     for wider in _OPENINGS:
-        pieces, count = find_pieces(picture, edges, config, wider)
-        seen = (picture.depth_mm, edges[1], picture.taken)
-        these = _measure(*seen, pieces, picture.pinhole, count)
-        together, score, doubtful = _chosen(picture, pieces, these, config, hints)
+        pieces, count = find_pieces(image, edges, config, wider)
+        arrays = (image.depth_mm, edges[1], image.taken, pieces)
+        sizes = _measure(*arrays, image.pinhole, count)
+        chosen, score, doubtful = _chosen(image, pieces, sizes, config, hints)
         if best is None or score > _CLEARLY * best[0]:
-            best = score, pieces, these, together
+            best = score, pieces, sizes, chosen
         if not doubtful:
             break
     assert best is not None
-    _, pieces, these, together = best
-    picture.take(pieces == 0, THIN)
-    if hints.last_box_mm is not None and together.any():
-        # A tumor that stands out, a part beyond a crease: wholly in the box, not at its far side,
-        # and not thin.
+    _, pieces, sizes, chosen = best
+    image.remove(pieces == 0, THIN)
+    if hints.last_box_mm is not None and chosen.any():
+        # A protruding tumor or a part beyond a crease: wholly in the box, not at its far side, and
+        # not thin.
         low, high = np.sort(np.asarray(hints.last_box_mm, np.float64), axis=0)
         high[2] -= _FAR_SIDE * (high[2] - low[2])
-        area = _area_in_box(picture, pieces, these, low - _BOX_MM, high + _BOX_MM)
-        parts = (area > _WHOLLY * these.area_mm2) & (these.thick_mm > _THICK_PART_MM) & (area > 0)
-        together = together | parts
-    picture.take(~together[pieces], PIECES)
+        area = _area_in_box(image, pieces, sizes, low - _BOX_MM, high + _BOX_MM)
+        parts = (area > _WHOLLY * sizes.area_mm2) & (sizes.thick_mm > _THICK_PART_MM) & (area > 0)
+        chosen = chosen | parts
+    image.remove(~chosen[pieces], PIECES)
 
 
 class _Sizes(NamedTuple):
-    """Of every piece (count + 1,); entry 0 is not used. ``area_mm2``: across the line of sight.
-    ``wide_mm``: longest extent. ``cut``: 0..1, how much of it continues outside the examined part:
-    the width there over the square root of the area. ``thick_mm``: diameter of the largest disc in
-    it. ``aside``: tangent of the angle between its middle and the optical axis."""
+    """Measures of every piece (count + 1,); entry 0 is not used. ``area_mm2``: across the line of
+    sight. ``wide_mm``: longest extent. ``cut``: 0..1, how much of it continues outside the examined
+    part: the width there over the square root of the area. ``thick_mm``: diameter of its largest
+    inscribed disc. ``aside``: tangent of the angle between its middle and the optical axis."""
 
     area_mm2: np.ndarray
     wide_mm: np.ndarray
@@ -86,49 +86,49 @@ class _Sizes(NamedTuple):
 
 
 def _chosen(
-    picture: Picture, pieces: np.ndarray, these: _Sizes, config: RegionConfig, hints: Hints
+    image: WorkingImage, pieces: np.ndarray, sizes: _Sizes, config: RegionConfig, hints: Hints
 ) -> tuple[np.ndarray, float, bool]:
-    """Which pieces (count + 1,) are the organ at one way of parting the picture: the one that the
-    hints name, else the likeliest (the largest of an organ's size; what leaves the picture counts
-    less, as arms do), and those that continue it behind something nearer. How like an organ that
-    is; and whether it is doubtful: it leaves the picture or is too wide, or something that does
-    seems to continue it, so that perhaps a wider opening parts them."""
-    likeness = _like_an_organ(these, config)
-    together = np.zeros(len(these.cut), bool)
-    piece = _hinted(picture, pieces, these, hints)
+    """Which pieces (count + 1,) of one split of the image are the organ: the one that the hints
+    select, else the likeliest (the largest of an organ's size; what leaves the image counts less,
+    as arms do), and those that continue it behind an occluder. Their score; and whether they are
+    doubtful, so that a wider opening may split them better: the piece leaves the image or is too
+    wide, or one that leaves the image seems to continue it."""
+    likeness = _like_an_organ(sizes, config)
+    chosen = np.zeros(len(sizes.cut), bool)
+    piece = _hinted(image, pieces, sizes, hints)
     guessed = piece is None
     if guessed:
-        scores = these.area_mm2 * likeness
+        scores = sizes.area_mm2 * likeness
         if not scores.max() > 0:
-            return together, -1.0, True
+            return chosen, -1.0, True
         piece = int(scores.argmax())
-    leaves = these.cut > _CUT
-    gap = config.gap_mm / picture.footprint
-    seen = (picture.depth_mm, picture.taken, pieces)
-    lines = _continuing(*seen, gap, picture.footprint, len(together))
+    leaves = sizes.cut > _CUT
+    gap = config.gap_mm / image.footprint
+    arrays = (image.depth_mm, image.taken, pieces)
+    lines = _continuing(*arrays, gap, image.footprint, len(chosen))
     lines = lines + lines.T
-    together[piece] = True
+    chosen[piece] = True
     refused = False
     for _ in range(_TIMES):
-        more = lines[together].sum(0) > _FEWEST_LINES * np.sqrt(these.area_mm2)
+        more = lines[chosen].sum(0) > _FEWEST_LINES * np.sqrt(sizes.area_mm2)
         more[0] = False
-        refused |= bool((more & leaves & ~together).any())
-        together |= more & ~leaves
-    score = these.area_mm2[together].sum() * likeness[piece]
-    too_wide = these.wide_mm[piece] > config.organ_mm[1]
-    # A poor guess beside something larger that leaves the picture: a hand that holds the organ?
-    larger = these.area_mm2[leaves].max(initial=0) > score
+        refused |= bool((more & leaves & ~chosen).any())
+        chosen |= more & ~leaves
+    score = sizes.area_mm2[chosen].sum() * likeness[piece]
+    too_wide = sizes.wide_mm[piece] > config.organ_mm[1]
+    # A poor guess beside something larger that leaves the image: a hand that holds the organ?
+    larger = sizes.area_mm2[leaves].max(initial=0) > score
     held = guessed and likeness[piece] < _POOR and larger
     doubtful = refused or leaves[piece] or too_wide or held
-    return together, float(score), bool(doubtful)
+    return chosen, float(score), bool(doubtful)
 
 
-def _hinted(picture: Picture, pieces: np.ndarray, these: _Sizes, hints: Hints) -> int | None:
-    """The piece nearest to the picked point; without one, that with the most surface, and the most
-    of its surface, in the last box. None if there is none."""
+def _hinted(image: WorkingImage, pieces: np.ndarray, sizes: _Sizes, hints: Hints) -> int | None:
+    """The piece nearest to the picked point; without one, that with the largest area, and the
+    largest share of its area, in the last box. None without a hint or such a piece."""
     if hints.picked_mm is not None:
         rows, columns = np.nonzero(pieces)
-        z, (fx, fy, cx, cy) = picture.depth_mm[rows, columns].astype(float), picture.pinhole
+        z, (fx, fy, cx, cy) = image.depth_mm[rows, columns].astype(float), image.pinhole
         points_mm = np.stack([(columns - cx) / fx * z, (rows - cy) / fy * z, z], axis=1)
         square = ((points_mm - hints.picked_mm) ** 2).sum(1)
         if not square.min(initial=np.inf) <= _PICK_REACH_MM**2:
@@ -139,24 +139,24 @@ def _hinted(picture: Picture, pieces: np.ndarray, these: _Sizes, hints: Hints) -
     if hints.last_box_mm is None:
         return None
     low, high = np.sort(np.asarray(hints.last_box_mm, np.float64), axis=0)
-    area = _area_in_box(picture, pieces, these, low, high)
-    inside = area**2 / np.maximum(these.area_mm2, 1e-9)  # what surrounds it reaches in, too
+    area = _area_in_box(image, pieces, sizes, low, high)
+    inside = area**2 / np.maximum(sizes.area_mm2, 1e-9)  # the surroundings reach in, too
     return int(inside.argmax()) if inside.max() > 0 else None
 
 
 def _area_in_box(
-    picture: Picture, pieces: np.ndarray, these: _Sizes, low: np.ndarray, high: np.ndarray
+    image: WorkingImage, pieces: np.ndarray, sizes: _Sizes, low: np.ndarray, high: np.ndarray
 ) -> np.ndarray:
-    return _area_inside(picture.depth_mm, pieces, picture.pinhole, low, high, len(these.cut))
+    return _area_inside(image.depth_mm, pieces, image.pinhole, low, high, len(sizes.cut))
 
 
-def _like_an_organ(these: _Sizes, config: RegionConfig) -> np.ndarray:
-    """Of every piece, 0..1."""
+def _like_an_organ(sizes: _Sizes, config: RegionConfig) -> np.ndarray:
+    """How much each piece resembles an organ, 0..1."""
     low, high = config.organ_mm
-    fits = np.minimum(1.0, (high / np.maximum(these.wide_mm, 1e-9)) ** 4)
-    thick = np.minimum(1.0, these.thick_mm / (_THICK * low)) ** 2
-    aimed = 1 / (1 + (these.aside / _AIMED) ** 2)
-    return fits * thick * aimed * (1 - 0.95 * these.cut) ** 4 * (these.wide_mm > low)
+    fits = np.minimum(1.0, (high / np.maximum(sizes.wide_mm, 1e-9)) ** 4)
+    thick = np.minimum(1.0, sizes.thick_mm / (_THICK * low)) ** 2
+    aimed = 1 / (1 + (sizes.aside / _AIMED) ** 2)
+    return fits * thick * aimed * (1 - 0.95 * sizes.cut) ** 4 * (sizes.wide_mm > low)
 
 
 @jit
@@ -221,8 +221,8 @@ def _measure(depth_mm, distance, taken, pieces, pinhole, count):  # type: ignore
 
 @jit
 def _goes_on(depth_mm, taken, z, v, u):  # type: ignore[no-untyped-def]
-    """Beyond the image's border, or as the same surface beyond the last estimate's surroundings.
-    Range, box and mask don't count: they are there to cut around the organ."""
+    """Whether a piece continues at a pixel beyond the image's border or the last estimate's
+    surroundings. Range, box and mask don't count: they are meant to cut around the organ."""
     height, width = taken.shape
     if not (0 <= v < height and 0 <= u < width):
         return True
@@ -231,8 +231,7 @@ def _goes_on(depth_mm, taken, z, v, u):  # type: ignore[no-untyped-def]
 
 @jit
 def _continuing(depth_mm, taken, pieces, gap, footprint, count):  # type: ignore[no-untyped-def]
-    """Length (count, count), mm, along which one piece continues as another after a gap in which
-    something is nearer and nothing is farther."""
+    """Length (count, count), mm, along which one piece continues as another behind an occluder."""
     lines = np.zeros((count, count))
     height, width = depth_mm.shape
     for v in range(height):
@@ -248,8 +247,9 @@ def _continuing(depth_mm, taken, pieces, gap, footprint, count):  # type: ignore
 
 @jit
 def _beyond_gap(depth_mm, taken, pieces, start, step, scale):  # type: ignore[no-untyped-def]
-    """The piece that continues the one at ``start``, a few pixels on; 0 for none. ``scale``: the
-    longest gap in px at distance 1, and a pixel's width there."""
+    """The piece that continues the one at ``start`` after a gap with something nearer and nothing
+    farther in it; 0 for none. ``scale``: the longest gap in px at distance 1, and a pixel's width
+    there."""
     gap, footprint = scale
     y, x = start
     z, piece = depth_mm[y, x], pieces[y, x]
@@ -268,7 +268,7 @@ def _beyond_gap(depth_mm, taken, pieces, start, step, scale):  # type: ignore[no
                 return 0
             continue
         farther = 0
-        # Where another piece begins, not in its midst: that one is itself in front.
+        # Only where another piece begins: one that is met in its midst is itself in front.
         if other and other != last and nearer >= 2 and abs(there - z) < most:
             return other
         nearer += there < z - _STEP_MM

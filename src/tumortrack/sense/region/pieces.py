@@ -1,8 +1,8 @@
-"""The picture in connected pieces, parted by jumps of depth, creases and narrow places.
+"""Split the image into connected pieces at depth jumps, creases and narrow places.
 
 A pixel is an edge where a neighbour is missing, lies at another depth, or where the surface folds
-into a valley. What is farther than ``opening_mm`` from every edge is the core of a piece; pieces
-grow from their cores, by little more than what the opening took, and never over a jump.
+into a valley. Pixels farther than ``opening_mm`` from every edge are the cores of pieces. Cores
+grow by little more than what the opening took away, and never across a jump.
 """
 
 from __future__ import annotations
@@ -13,59 +13,59 @@ from typing import NamedTuple
 import numpy as np
 
 from tumortrack.sense.noise import REFERENCE_MM
-from tumortrack.sense.region.picture import FLYING, ORGAN, Picture, RegionConfig, jit
+from tumortrack.sense.region.working_image import FLYING, ORGAN, RegionConfig, WorkingImage, jit
 
 _CREASE_REACH_MM = 4.0
-_FEWEST_NEIGHBOURS = 3  # of 8; a straight edge leaves 5, a right angle 3
-_LONGEST_HOLE = 5  # px; failed matches, not a gap
+_FEWEST_NEIGHBOURS = 3  # of 8; at a straight edge there are 5, at a right angle 3
+_LONGEST_HOLE = 5  # px; shorter ones are failed matches, not a gap
 
 
 class Jump(NamedTuple):
-    """Neighbouring pixels at depth z belong together if their depths differ by less than
-    ``slope * z + noise * z**2``: the steepest surface, and four standard deviations of noise."""
+    """Neighbouring pixels at depth z are connected if their depths differ by less than
+    ``slope * z + noise * z**2``: the steepest surface plus four standard deviations of noise."""
 
     slope: float
     noise: float
 
 
-def _jump(picture: Picture, config: RegionConfig) -> Jump:
-    slope = math.tan(math.radians(config.steepest_degrees)) * picture.footprint
+def _jump(image: WorkingImage, config: RegionConfig) -> Jump:
+    slope = math.tan(math.radians(config.steepest_degrees)) * image.footprint
     return Jump(slope, 4 * config.noise_mm / REFERENCE_MM**2)
 
 
-def remove_flying(picture: Picture, config: RegionConfig) -> None:
-    """Take pixels with hardly a neighbour at their depth: between two surfaces, or alone."""
-    picture.take(_lonely(picture.depth_mm, picture.taken, _jump(picture, config)), FLYING)
+def remove_flying(image: WorkingImage, config: RegionConfig) -> None:
+    """Remove pixels with few neighbours at their depth: between two surfaces, or isolated."""
+    image.remove(_isolated(image.depth_mm, image.taken, _jump(image, config)), FLYING)
 
 
-def find_edges(picture: Picture, config: RegionConfig) -> tuple[np.ndarray, np.ndarray]:
-    """Where the picture may part: what is left of its depths (h, w), mm, with short holes bridged
-    and NaN elsewhere; and the distance (h, w) of every pixel to the nearest edge, px."""
-    jump = _jump(picture, config)
-    depth_mm = _without_holes(picture.depth_mm, picture.taken, jump)
-    crease = (config.crease_mm, _CREASE_REACH_MM / picture.footprint)
+def find_edges(image: WorkingImage, config: RegionConfig) -> tuple[np.ndarray, np.ndarray]:
+    """The remaining depths (h, w), mm, with short holes bridged, NaN otherwise; and the distance
+    (h, w) of every pixel to the nearest edge, px."""
+    jump = _jump(image, config)
+    depth_mm = _without_holes(image.depth_mm, image.taken, jump)
+    crease = (config.crease_mm, _CREASE_REACH_MM / image.footprint)
     return depth_mm, _edge_distance(depth_mm, jump, crease)
 
 
 def find_pieces(
-    picture: Picture, edges: tuple[np.ndarray, np.ndarray], config: RegionConfig, wider: float
+    image: WorkingImage, edges: tuple[np.ndarray, np.ndarray], config: RegionConfig, wider: float
 ) -> tuple[np.ndarray, int]:
-    """Number of its piece for every pixel (h, w), int32, 0 for none, and how many there are; at
-    ``wider`` times the configured opening."""
+    """Piece number of every pixel (h, w), int32, 0 for none, and the number of pieces, at ``wider``
+    times the configured opening."""
     from scipy.ndimage import label
 
     depth_mm, distance = edges
-    radius = wider * config.opening_mm / picture.footprint  # px at distance 1
+    radius = wider * config.opening_mm / image.footprint  # px at distance 1
     pieces, count = label(distance * depth_mm > radius)
-    _grow(depth_mm, pieces, _jump(picture, config), radius)
-    pieces[picture.taken != ORGAN] = 0  # bridged holes
+    _grow(depth_mm, pieces, _jump(image, config), radius)
+    pieces[image.taken != ORGAN] = 0  # bridged holes
     return pieces, count
 
 
 @jit
-def _lonely(depth_mm, taken, jump):  # type: ignore[no-untyped-def]
+def _isolated(depth_mm, taken, jump):  # type: ignore[no-untyped-def]
     height, width = depth_mm.shape
-    lonely = np.zeros((height, width), np.bool_)
+    isolated = np.zeros((height, width), np.bool_)
     for v in range(height):
         for u in range(width):
             if taken[v, u]:
@@ -80,13 +80,13 @@ def _lonely(depth_mm, taken, jump):  # type: ignore[no-untyped-def]
                         near += taken[y, x] == 0 and abs(depth_mm[y, x] - z) < most
                     else:
                         near += 1  # outside: unknown
-            lonely[v, u] = near - 1 < _FEWEST_NEIGHBOURS
-    return lonely
+            isolated[v, u] = near - 1 < _FEWEST_NEIGHBOURS
+    return isolated
 
 
 @jit
 def _without_holes(depth_mm, taken, jump):  # type: ignore[no-untyped-def]
-    """What is left (NaN elsewhere), with short failures along a row bridged where both ends
+    """The remaining depths (NaN otherwise), with short holes along a row bridged where both ends
     agree."""
     height, width = depth_mm.shape
     out = np.full((height, width), np.nan, np.float32)
@@ -109,23 +109,23 @@ def _without_holes(depth_mm, taken, jump):  # type: ignore[no-untyped-def]
 @jit
 def _edge_distance(depth_mm, jump, crease):  # type: ignore[no-untyped-def]
     """Chamfer distance (Borgefors 1986, doi 10.1016/S0734-189X(86)80047-0) in px to the nearest
-    edge; 0 on edges and where nothing is left. The image's border is no edge: the frame of pixels
-    around it is far from everything."""
+    edge; 0 on edges and removed pixels. The image's border is no edge: a frame of pixels around it
+    is far from everything."""
     height, width = depth_mm.shape
     far = np.float32(height + width)
     out = np.full((height + 2, width + 2), far, np.float32)
     _mark_jumps(depth_mm, out, np.float32(jump.slope), np.float32(jump.noise))
     if crease[0] > 0:
         _mark_creases(depth_mm, out, np.float32(jump.noise), crease)
-    one, oblique = np.float32(0.955), np.float32(1.369)
+    axial, oblique = np.float32(0.955), np.float32(1.369)
     for v in range(1, height + 1):
         for u in range(1, width + 1):
-            straight = min(out[v, u - 1], out[v - 1, u]) + one
+            straight = min(out[v, u - 1], out[v - 1, u]) + axial
             across = min(out[v - 1, u - 1], out[v - 1, u + 1]) + oblique
             out[v, u] = min(out[v, u], straight, across)
     for v in range(height, 0, -1):
         for u in range(width, 0, -1):
-            straight = min(out[v, u + 1], out[v + 1, u]) + one
+            straight = min(out[v, u + 1], out[v + 1, u]) + axial
             across = min(out[v + 1, u - 1], out[v + 1, u + 1]) + oblique
             out[v, u] = min(out[v, u], straight, across)
     return out[1:-1, 1:-1].copy()
@@ -133,7 +133,7 @@ def _edge_distance(depth_mm, jump, crease):  # type: ignore[no-untyped-def]
 
 @jit
 def _mark_jumps(depth_mm, out, slope, noise):  # type: ignore[no-untyped-def]
-    """Zero what is missing, and both sides of a jump; ``out`` is larger by 1 on every side."""
+    """Zero missing pixels and both sides of a jump; ``out`` is larger by 1 on every side."""
     height, width = depth_mm.shape
     for v in range(height):
         for u in range(width):
@@ -149,7 +149,7 @@ def _mark_jumps(depth_mm, out, slope, noise):  # type: ignore[no-untyped-def]
 
 @jit
 def _mark_creases(depth_mm, out, noise, crease):  # type: ignore[no-untyped-def]
-    """Zero where the surface lies deeper than its neighbourhood to both sides."""
+    """Zero pixels where the surface lies deeper than on both sides."""
     height, width = depth_mm.shape
     least, reach_mm = np.float32(2 * crease[0]), np.float32(crease[1])
     for v in range(height):
@@ -173,7 +173,7 @@ def _mark_creases(depth_mm, out, noise, crease):  # type: ignore[no-untyped-def]
 
 @jit
 def _grow(depth_mm, pieces, jump, radius):  # type: ignore[no-untyped-def]
-    """Grow all cores at the same pace, a pixel a round, never over a jump."""
+    """Grow all cores at the same pace, a pixel a round, never across a jump."""
     height, width = depth_mm.shape
     queue = np.empty(height * width, np.int32)
     rounds = np.zeros(height * width, np.int16)

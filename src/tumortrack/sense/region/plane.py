@@ -1,9 +1,9 @@
 """The large plane behind the organ: table, drape.
 
 Random sample consensus (Fischler, Bolles 1981, doi 10.1145/358669.358692) with graded inliers
-(MSAC; Torr, Zisserman 2000, doi 10.1006/cviu.1999.0832). A background has things before it and
-nothing close behind it; an organ's flat side has the rest of the organ behind it, so points a
-little behind a plane speak against it.
+(MSAC; Torr, Zisserman 2000, doi 10.1006/cviu.1999.0832). A background has objects in front of it
+and nothing close behind it; an organ's flat side has the rest of the organ behind it. So points a
+little behind a plane count against it.
 """
 
 from __future__ import annotations
@@ -12,21 +12,22 @@ from typing import NamedTuple
 
 import numpy as np
 
-from tumortrack.sense.region.picture import NO_RETURN, PLANE, Picture, RegionConfig, jit
+from tumortrack.sense.region.working_image import NO_RETURN, PLANE, RegionConfig, WorkingImage, jit
 
 _SAMPLED = 1200  # pixels
 _TRIES = 150
-_BEYOND_MM = 120.0  # so far behind the range there may be something to fit to
+_BEYOND_MM = 120.0  # points up to this far beyond the range are used for the fit
 _STEEPEST = 0.35  # cosine of the largest angle between the plane's normal and the optical axis
-_DEEPEST_MM = 60.0  # an organ is not deeper: what lies farther behind a plane is no part of it
-_BEHIND_COSTS = 2.0  # points on the plane outweighed by one behind it
-_MOST_BEHIND = 0.03  # of the points on the plane: more is a cavity, and the organ may lie in it
+_DEEPEST_MM = 60.0  # no organ is deeper: what lies farther behind a plane is no part of it
+_BEHIND_COST = 2.0  # one point behind the plane cancels this many on it
+_MOST_BEHIND = 0.03  # share of the points on it; more is a cavity, in which the organ may lie
 _NARROWEST_MM = 120.0  # extent of a background across its long side
 
 
 class Plane(NamedTuple):
-    """``normal @ point = offset``, mm; the unit normal points to the camera. ``half_mm``: what lies
-    so far from it is still the plane. ``middle``, ``wide_mm``: of what is seen of it."""
+    """``normal @ point = offset``, mm; the unit normal points to the camera. ``half_mm``: points up
+    to this far from it belong to it. ``middle``, ``wide_mm``: centre and width of its visible
+    part."""
 
     normal: np.ndarray
     offset: float
@@ -35,19 +36,19 @@ class Plane(NamedTuple):
     wide_mm: float
 
 
-def remove_plane(picture: Picture, config: RegionConfig, rng: np.random.Generator) -> None:
-    """Take the background plane, and what lies behind it, where there is one."""
-    if (found := find_plane(picture, config, rng)) is not None:
-        normal, offset, half_mm = found[:3]
-        _take_below(picture.depth_mm, picture.taken, picture.pinhole, normal, offset, half_mm)
+def remove_plane(image: WorkingImage, config: RegionConfig, rng: np.random.Generator) -> None:
+    """Remove the background plane and what lies behind it, if there is one."""
+    if (plane := find_plane(image, config, rng)) is not None:
+        normal, offset, half_mm = plane[:3]
+        _remove_below(image.depth_mm, image.taken, image.pinhole, normal, offset, half_mm)
 
 
-def find_plane(picture: Picture, config: RegionConfig, rng: np.random.Generator) -> Plane | None:
-    """The background plane, looked for in all pixels, also those that a step has taken."""
-    points = _some_points(picture, config.crop.far_mm + _BEYOND_MM, rng)
+def find_plane(image: WorkingImage, config: RegionConfig, rng: np.random.Generator) -> Plane | None:
+    """The background plane, searched for in all pixels, also those that earlier steps removed."""
+    points = _sampled_points(image, config.crop.far_mm + _BEYOND_MM, rng)
     if len(points) < 50:
         return None
-    # Uneven, and noisy: three standard deviations.
+    # The drape's unevenness plus three standard deviations of noise.
     most_mm = config.plane_mm + 3 * config.noise_mm * float(np.median(points[:, 2]) / 150) ** 2
     triples = rng.integers(len(points), size=(_TRIES, 3))
     score, normal, offset = _consensus(points, triples, most_mm)
@@ -60,17 +61,17 @@ def find_plane(picture: Picture, config: RegionConfig, rng: np.random.Generator)
         if len(inliers) < 20:
             return None
         middle = inliers.mean(0)
-        apart = inliers - middle
-        spreads, axes = np.linalg.eigh(apart.T @ apart / len(apart))
+        centred = inliers - middle
+        variances, axes = np.linalg.eigh(centred.T @ centred / len(centred))
         normal = axes[:, 0] * -np.sign(axes[2, 0] or 1.0)
         offset = float(normal @ middle)
-        off = np.abs(apart @ normal)
-        half_mm = float(np.clip(4.5 * np.median(off), 1.5, most_mm))
+        residuals = np.abs(centred @ normal)
+        half_mm = float(np.clip(4.5 * np.median(residuals), 1.5, most_mm))
     height = points @ normal - offset
     on = np.count_nonzero(np.abs(height) < half_mm)
     behind = np.count_nonzero((height < -half_mm) & (height > -_DEEPEST_MM))
-    # A strip or disc of even density is sqrt(12) or 4 standard deviations wide.
-    wide_mm = np.sqrt(12 * spreads[1])
+    # A strip or disc of uniform density is sqrt(12) or 4 standard deviations wide.
+    wide_mm = np.sqrt(12 * variances[1])
     if (
         on < config.plane_share * len(points)
         or behind > _MOST_BEHIND * on
@@ -80,21 +81,21 @@ def find_plane(picture: Picture, config: RegionConfig, rng: np.random.Generator)
     return Plane(normal.astype(np.float64), offset, half_mm, middle.astype(np.float64), wide_mm)
 
 
-def _some_points(picture: Picture, far_mm: float, rng: np.random.Generator) -> np.ndarray:
-    """Points (n, 3), float32, of random pixels not farther than ``far_mm``."""
-    height, width = picture.depth_mm.shape
+def _sampled_points(image: WorkingImage, far_mm: float, rng: np.random.Generator) -> np.ndarray:
+    """Points (n, 3), float32, of random pixels nearer than ``far_mm``."""
+    height, width = image.depth_mm.shape
     pixel = rng.integers(height * width, size=3 * _SAMPLED)
-    z = picture.depth_mm.ravel()[pixel]
-    good = np.flatnonzero((picture.taken.ravel()[pixel] != NO_RETURN) & (z < far_mm))[:_SAMPLED]
-    row, column = np.divmod(pixel[good], width)
-    (fx, fy, cx, cy), z = picture.pinhole, z[good]
+    z = image.depth_mm.ravel()[pixel]
+    valid = np.flatnonzero((image.taken.ravel()[pixel] != NO_RETURN) & (z < far_mm))[:_SAMPLED]
+    row, column = np.divmod(pixel[valid], width)
+    (fx, fy, cx, cy), z = image.pinhole, z[valid]
     return np.stack([(column - cx) / fx * z, (row - cy) / fy * z, z], axis=1).astype(np.float32)
 
 
 @jit
 def _consensus(points, triples, tolerance):  # type: ignore[no-untyped-def]
-    """The plane through three points with the best score: normal and offset. A tenth of the
-    points rejects hopeless planes."""
+    """Score, normal and offset of the best plane through three points. A tenth of the points
+    suffices to reject hopeless planes."""
     best, best_offset = -np.inf, 0.0
     best_normal = np.zeros(3, np.float32)
     few = len(points) // 10
@@ -128,14 +129,13 @@ def _score(points, nx, ny, nz, offset, tolerance):  # type: ignore[no-untyped-de
         if abs(share) < 1:
             score += 1 - share * share
         elif -_DEEPEST_MM < height < 0:
-            score -= np.float32(_BEHIND_COSTS)
+            score -= np.float32(_BEHIND_COST)
     return score
 
 
 @jit
-def _take_below(depth_mm, taken, pinhole, normal, offset, half):  # type: ignore[no-untyped-def]
-    """Take what lies less than ``half`` above the plane ``normal @ point = offset``, mm; the unit
-    normal points to the camera."""
+def _remove_below(depth_mm, taken, pinhole, normal, offset, half):  # type: ignore[no-untyped-def]
+    """Remove what lies less than ``half`` (mm) above the plane."""
     fx, fy, cx, cy = pinhole
     height, width = depth_mm.shape
     for v in range(height):

@@ -1,7 +1,7 @@
-"""Has the camera moved against the table? Seen on the table's plane, which stands still.
+"""Detect motion of the camera relative to the table, from the table's plane.
 
-A plane shows three of six degrees of freedom: how far off it is, and its two tilts. A camera that
-slides along the table or turns about its normal is not noticed, nor anything without a table.
+A plane shows three of six degrees of freedom: its distance and two tilts. A camera that slides
+along the table or turns about its normal is not noticed, nor any motion without a table.
 """
 
 from __future__ import annotations
@@ -15,41 +15,41 @@ from tumortrack.core.errors import NoEstimate
 from tumortrack.core.report import Finding
 from tumortrack.core.types import DepthFrame, SensorCloud
 from tumortrack.sense.camera import deproject_pixels
-from tumortrack.sense.region.picture import RegionConfig, picture_of_cloud, picture_of_frame
 from tumortrack.sense.region.plane import Plane, find_plane
+from tumortrack.sense.region.working_image import RegionConfig, image_of_cloud, image_of_frame
 
-# Of an image that are looked at; of a cloud, as many cells of a fixed picture, and points in each.
-_PIXELS, _PER_CELL = 1500, 6
-_EVERY, _SELDOM = 2, 30  # a look each so many frames; where there was no table so far
-_LOOKS = 7  # whose median counts: noise, and hands that come and go
-_LEARNED = 15  # looks whose median is the table at the start: a second at 30 Hz
-# Without motion the median wavers by up to 0.3 mm (docs/live.md); the least shift that counts is
+_PIXELS = 1500  # sampled from an image; of a cloud as many cells
+_PER_CELL = 6  # points of a cloud sampled for each cell
+_EVERY, _SELDOM = 2, 30  # frames from one check to the next; while no table has been found
+_MEDIAN_OF = 7  # checks, against noise and passing hands
+_LEARNT_FROM = 15  # checks, whose median is the table at the start: a second at 30 Hz
+# Without motion the median varies by up to 0.3 mm (docs/live.md); the least shift that counts is
 # well above that, and grows with the table's unevenness.
 _SHIFT_MM, _SHIFT_SHARE = 1.0, 0.3
-_CAPTURE_MM, _LEAST_MM = 6.0, 1.5  # a shift is fitted to what changed by so much; at the end
-_FEWEST, _MOST_LIKELY = 0.35, 0.6  # of the table's points: for a small shift, for a large one
-_TRIES, _STAYS = 60, 0.15  # a table that moved has no more of its points where it was
-_HIDDEN_LOOKS = 45  # 3 s at 30 Hz
+_CAPTURE_MM, _LEAST_MM = 6.0, 1.5  # tolerance of a shift's inliers, at first and at least
+_FEWEST, _FEWEST_LARGE = 0.35, 0.6  # inliers over the table's points: of a small, of a large shift
+_TRIES, _STAYS = 60, 0.15  # samples for a large shift; it leaves at most this share in place
+_HIDDEN_CHECKS = 45  # 3 s at 30 Hz
 
 
 class TableWatch:
     """Compares the table's plane, frame by frame, with that of the first frames, or with ``known``:
-    unit normal and offset in mm, camera frame. ``table_in_camera``: the one that counts; None until
-    there is one. ``blind``: none has been found so far, or too seldom."""
+    unit normal and offset in mm, camera frame."""
 
     def __init__(
         self, config: RegionConfig, known: tuple[float, float, float, float] | None = None
     ) -> None:
         self._config, self._known = config, known
-        self._first: list[tuple[Plane, np.ndarray]] = []  # and the points that were seen
+        self._first: list[tuple[Plane, np.ndarray]] = []  # with the points of that frame
         self._table: Plane | None = None
         self._offset_mm = np.zeros(3)  # of the first table from the known one, as ``_shifts``
-        self._shifts: deque[np.ndarray] = deque(maxlen=_LOOKS)  # at three spots, mm
+        self._shifts: deque[np.ndarray] = deque(maxlen=_MEDIAN_OF)  # at three spots, mm
         self._frames = self._hidden = 0
         self._moved: Finding | None = None
 
     @property
     def table_in_camera(self) -> tuple[float, float, float, float] | None:
+        """The first frames' table: normal and offset; None until it is known."""
         if self._table is None:
             return None
         x, y, z = self._table.normal.tolist()
@@ -57,67 +57,67 @@ class TableWatch:
 
     @property
     def blind(self) -> bool:
-        enough = _EVERY * _LEARNED * (2 if self._first else 1)
+        """Whether no table has been found so far, or in too few frames."""
+        enough = _EVERY * _LEARNT_FROM * (2 if self._first else 1)
         return self._table is None and self._frames > enough
 
     def check(self, content: DepthFrame | SensorCloud) -> str:
-        """A doubt about this frame, or nothing. Raises NoEstimate, with this frame and all that
-        follow, once camera or table have moved."""
+        """A doubt about this frame, or an empty string. Raises NoEstimate, for this frame and all
+        that follow, once camera or table have moved."""
         self._frames += 1
         every = _SELDOM if self.blind and not self._first else _EVERY
         if not self._moved and self._frames % every == 0:
-            self._look(content)
+            self._compare(content)
         if self._moved:
             raise NoEstimate(self._moved)
-        if self._hidden > _HIDDEN_LOOKS:
+        if self._hidden > _HIDDEN_CHECKS:
             return "the table is hidden, so nobody notices if the camera moves; uncover it"
         if self._known is not None and self._table is None:
             return "the calibration's table is not found: does the camera still stand there?"
         return ""
 
-    def _look(self, content: DepthFrame | SensorCloud) -> None:
+    def _compare(self, content: DepthFrame | SensorCloud) -> None:
         points_mm = _points(content)
         if self._table is None:
             self._learn(content, points_mm)
             return
-        same = len(points_mm) == len(self._heights)  # else images of another size
-        shift = self._shift(points_mm) if same else None
+        same_size = len(points_mm) == len(self._heights)
+        shift = self._shift(points_mm) if same_size else None
         self._hidden = 0 if shift is not None else self._hidden + 1
         if shift is None:
             return
         self._shifts.append(shift + self._offset_mm)
         shifts = np.median(self._shifts, axis=0)
         least_mm = max(_SHIFT_MM, _SHIFT_SHARE * self._table.half_mm)
-        if len(self._shifts) > _LOOKS // 2 and np.abs(shifts).max() > least_mm:
+        if len(self._shifts) > _MEDIAN_OF // 2 and np.abs(shifts).max() > least_mm:
             slope = np.linalg.norm(shifts[1:] - shifts[0]) / self._reach_mm
-            since = "the calibration" if self._known else "the start"
-            degrees = float(np.degrees(np.arctan(slope)))
             values: dict[str, float | str | None] = {
-                "since": since,
+                "since": "the calibration" if self._known else "the start",
                 "shift_mm": float(abs(shifts[0])),
-                "degrees": degrees,
+                "degrees": float(np.degrees(np.arctan(slope))),
             }
             self._moved = Finding("moved", values)
 
     def _learn(self, content: DepthFrame | SensorCloud, points_mm: np.ndarray) -> None:
-        frame = isinstance(content, DepthFrame)
-        picture = picture_of_frame(content, None) if frame else picture_of_cloud(content)  # type: ignore[arg-type]
-        plane = find_plane(picture, self._config, np.random.default_rng(self._frames))
+        cloud = isinstance(content, SensorCloud)
+        image = image_of_cloud(content) if cloud else image_of_frame(content, None)
+        plane = find_plane(image, self._config, np.random.default_rng(self._frames))
         if plane is None:
             return
-        same = [one for one in self._first if one[1].shape == points_mm.shape]
-        self._first = [*same, (plane, points_mm)]
-        if len(self._first) < _LEARNED:
+        same_size = [first for first in self._first if first[1].shape == points_mm.shape]
+        self._first = [*same_size, (plane, points_mm)]
+        if len(self._first) < _LEARNT_FROM:
             return
-        planes, seen = [one for one, _ in self._first], np.array([one for _, one in self._first])
-        normal = np.median([one.normal for one in planes], axis=0)
+        planes, points = zip(*self._first, strict=True)
+        normal = np.median([plane.normal for plane in planes], axis=0)
         normal /= np.linalg.norm(normal)
-        middle = np.median([one.middle for one in planes], axis=0)
-        offset = float(np.median([normal @ one.middle for one in planes]))
-        half_mm, wide_mm = (float(np.median([one[k] for one in planes])) for k in (2, 4))
+        middle = np.median([plane.middle for plane in planes], axis=0)
+        offset = float(np.median([normal @ plane.middle for plane in planes]))
+        half_mm = float(np.median([plane.half_mm for plane in planes]))
+        wide_mm = float(np.median([plane.wide_mm for plane in planes]))
         self._table, self._first = Plane(normal, offset, half_mm, middle, wide_mm), []
-        heights = seen @ normal - offset
-        often = np.isfinite(heights).sum(0) > _LEARNED // 2
+        heights = np.array(points) @ normal - offset
+        often = np.isfinite(heights).sum(0) > _LEARNT_FROM // 2
         self._heights = np.full(len(points_mm), np.nan)
         self._heights[often] = np.nanmedian(heights[:, often], axis=0)
         self._heights[np.abs(self._heights) > half_mm] = np.nan  # of the table alone
@@ -130,50 +130,51 @@ class TableWatch:
 
     def _shift(self, points_mm: np.ndarray) -> Float[np.ndarray, " 3"] | None:
         """How much nearer the table has come in its middle, and at two places half its width from
-        there; None: too little of it is seen."""
+        there; None: too little of it is visible."""
         assert self._table is not None
         change = points_mm @ self._table.normal - self._table.offset - self._heights
-        seen = np.isfinite(change)
-        change, away = change[seen], points_mm[seen] - self._table.middle
-        design = np.column_stack([np.ones(len(away)), away @ self._axes.T / self._reach_mm])
+        visible = np.isfinite(change)
+        change, from_middle = change[visible], points_mm[visible] - self._table.middle
+        slopes = from_middle @ self._axes.T / self._reach_mm
+        design = np.column_stack([np.ones(len(slopes)), slopes])
         total = int(np.isfinite(self._heights).sum())
         fitted = _refined(design, change, np.zeros(3), _FEWEST * total)
         stays = np.count_nonzero(np.abs(change) < _LEAST_MM) > _STAYS * total
-        if fitted is None and len(change) >= 3 and not stays:  # a large shift; else it is covered
+        if fitted is None and len(change) >= 3 and not stays:  # a large shift, or it is covered
             triples = np.random.default_rng(0).integers(len(change), size=(_TRIES, 3))
             start = np.linalg.pinv(design[triples]) @ change[triples][..., None]
             near = np.abs(design @ start[..., 0].T - change[:, None]) < _LEAST_MM
             best = int(near.sum(0).argmax())
-            fitted = _refined(design, change, start[best, :, 0], _MOST_LIKELY * total)
+            fitted = _refined(design, change, start[best, :, 0], _FEWEST_LARGE * total)
         return None if fitted is None else fitted + np.array([0, fitted[0], fitted[0]])
 
 
 def _refined(
     design: np.ndarray, change: np.ndarray, fitted: np.ndarray, fewest: float
 ) -> np.ndarray | None:
-    """Least squares over what is near the fit, nearer each time; None of too few."""
+    """Least squares over inliers, with a tolerance that shrinks; None if they are too few."""
     within_mm = _CAPTURE_MM
     for _ in range(5):
-        off = np.abs(change - design @ fitted)
-        near = off < within_mm
+        residuals = np.abs(change - design @ fitted)
+        near = residuals < within_mm
         if np.count_nonzero(near) < max(fewest, 50):
             return None
         fitted = np.linalg.lstsq(design[near], change[near], rcond=None)[0]
-        within_mm = float(np.clip(4.5 * np.median(off[near]), _LEAST_MM, _CAPTURE_MM))
+        within_mm = float(np.clip(4.5 * np.median(residuals[near]), _LEAST_MM, _CAPTURE_MM))
     return fitted
 
 
 def _points(content: DepthFrame | SensorCloud) -> Float[np.ndarray, "n 3"]:
-    """A point of each of the same pixels each time, evenly spread, NaN where nothing is seen; of a
-    cloud of each cell of a picture as a camera at its origin takes it."""
+    """The points of the same, evenly spread pixels each time, NaN without a return; of a cloud one
+    for each cell of an image that a camera at its origin would take."""
     if isinstance(content, SensorCloud):
         side = int(np.sqrt(_PIXELS))
-        some = content.points_mm[:: max(1, len(content.points_mm) // (_PER_CELL * _PIXELS))]
-        seen = some[some[:, 2] > 1].astype(np.float64)
-        cells = np.floor((seen[:, :2] / seen[:, 2:] + 1) * (side / 2)).astype(int)
+        sampled = content.points_mm[:: max(1, len(content.points_mm) // (_PER_CELL * _PIXELS))]
+        sampled = sampled[sampled[:, 2] > 1].astype(np.float64)
+        cells = np.floor((sampled[:, :2] / sampled[:, 2:] + 1) * (side / 2)).astype(int)
         inside = ((cells >= 0) & (cells < side)).all(1)
         points_mm = np.full((side * side, 3), np.nan)
-        points_mm[cells[inside] @ [side, 1]] = seen[inside]
+        points_mm[cells[inside] @ [side, 1]] = sampled[inside]
         return points_mm
     depth_mm, camera = content.depth_mm, content.intrinsics
     step = max(1, int(np.sqrt(depth_mm.size / _PIXELS)))

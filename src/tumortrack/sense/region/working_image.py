@@ -1,12 +1,14 @@
-"""What finding the organ works on: its switches, hints, and the working picture that all steps
-share, made of a depth image or a cloud; and back to points."""
+"""What the steps of finding the organ work on: settings, hints, and the working image, made from a
+depth image or a cloud and mapped back to points."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
+from jaxtyping import Bool, Float, UInt8
 
 from tumortrack.core.compiled import njit
 from tumortrack.core.config import Config
@@ -15,12 +17,15 @@ from tumortrack.core.types import DepthFrame, SensorCloud
 from tumortrack.sense.camera import Pinhole, deproject_pixels
 from tumortrack.sense.cloud import CloudConfig
 
-MOST_PIXELS = 110_000  # of a working picture: 424 x 240, and every second pixel of 848 x 480
+if TYPE_CHECKING:
+    from tumortrack.sense.region.tissue import TissueClassifier
+
+MOST_PIXELS = 110_000  # 424 x 240 as it is, of 848 x 480 every second pixel
 _POINTS_PER_PIXEL = 2
 _WIDEST = 2.0  # tangent of the largest angle from the optical axis in a rasterised cloud
 _BINS = 1000  # of the histogram of tangents
 
-# What became of a pixel: still the organ's, or the step that took it.
+# Each pixel's state: still the organ's, or the step that removed it.
 ORGAN, NO_RETURN, RANGE, BOX, MASK, LAST_BOX, COLOUR, PLANE, FLYING, THIN, PIECES = range(11)
 STEPS = (
     *("organ", "no return", "range", "box", "mask", "last box"),
@@ -38,19 +43,19 @@ class RegionConfig(Config, frozen=True, kw_only=True):
     last_margin_mm: the last estimate's organ box, enlarged by this much on every side, narrows the
         crop; zero switches that off.
     plane: remove the large plane behind the organ (table, drape), and what lies behind it.
-    plane_mm: at most this far from the plane is still the plane: how uneven a drape may be.
-    plane_share: of everything seen, at least this share must lie on it.
-    flying: remove points that have hardly a neighbour in depth.
-    pieces: take one connected piece; zero ``opening_mm`` and ``gap_mm`` leave it as it is.
-    opening_mm: what is narrower than twice this is no piece of its own and connects nothing:
-        shafts, the strip where a finger touches.
-    crease_mm: a valley deeper than this over 4 mm to either side parts two pieces; zero: never.
-    gap_mm: pieces that continue each other behind something nearer and not wider than this are
-        one: an organ behind a shaft.
-    steepest_degrees: neighbouring pixels whose depths differ by more than a surface turned away by
-        this much (and noise) would explain are parted.
+    plane_mm: largest tolerance of the plane: how uneven a drape may be.
+    plane_share: at least this share of all points must lie on it.
+    flying: remove flying pixels, which have few neighbours at their depth.
+    pieces: choose one connected piece; zero ``opening_mm`` and ``gap_mm`` leave it as it is.
+    opening_mm: what is narrower than twice this is no piece and connects none: shafts, the strip
+        where a finger touches.
+    crease_mm: a valley deeper than this over 4 mm to either side separates two pieces; zero: never.
+    gap_mm: pieces that continue each other behind an occluder up to this wide are one: an organ
+        behind a shaft.
+    steepest_degrees: neighbouring pixels are separated if their depths differ by more than noise
+        and a surface tilted by this much explain.
     noise_mm: standard deviation of depth at 150 mm; grows with z^2.
-    organ_mm: longest and shortest extent of pieces that may be the organ, if no hint names it.
+    organ_mm: shortest and longest extent of pieces that may be the organ, where no hint selects it.
     """
 
     crop: CloudConfig = CloudConfig()
@@ -94,18 +99,38 @@ class RegionConfig(Config, frozen=True, kw_only=True):
 
 
 @dataclass(frozen=True, eq=False)
-class Picture:
-    """A depth image at working size, and what the steps have decided about its pixels so far.
+class Hints:
+    """What is known about a frame besides its depth.
 
-    ``depth_mm`` (h, w) is float32, NaN where there was no return; ``taken`` (h, w), uint8, is one
-    of the numbers above, and the steps write into it. ``left``: ``taken`` -> which points of the
-    content are still called ORGAN (n,); ``points``: of some of these (n, 3), camera frame, mm.
+    Attributes:
+        mask: of a depth image's pixels, True where the organ may be.
+        picked_mm: a point on the organ, camera frame; selects the piece. Organs move: once there is
+            an estimate, give its box instead.
+        last_box_mm: lower and upper corner of the last estimate's organ, camera frame.
+        picture: colour or grey image in the depth image's pixels, for ``taught``.
+        taught: tells the organ from other tissue by colour. None: only geometry counts.
+    """
+
+    mask: Bool[np.ndarray, "h w"] | None = None
+    picked_mm: Float[np.ndarray, " 3"] | None = None
+    last_box_mm: Float[np.ndarray, "2 3"] | None = None
+    picture: UInt8[np.ndarray, "h w *rgb"] | None = None
+    taught: TissueClassifier | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class WorkingImage:
+    """A depth image at working size, and the state of its pixels.
+
+    ``depth_mm`` (h, w) is float32, NaN without a return; ``taken`` (h, w), uint8, holds the states
+    above, which the steps write. ``remaining(taken)``: indices (n,) of the frame's or cloud's
+    points that are still ORGAN; ``points(indices)``: these (n, 3), camera frame, mm.
     """
 
     depth_mm: np.ndarray
     taken: np.ndarray
     pinhole: Pinhole
-    left: Callable[[np.ndarray], np.ndarray]
+    remaining: Callable[[np.ndarray], np.ndarray]
     points: Callable[[np.ndarray], np.ndarray]
 
     @property
@@ -120,71 +145,75 @@ class Picture:
         some = some[some > 0]
         return self.footprint * float(np.median(some)) if some.size else 1.0
 
-    def take(self, where: np.ndarray, step: int) -> None:
-        """Give the pixels (h, w, bool) that are still the organ's to a step."""
+    def remove(self, where: np.ndarray, step: int) -> None:
+        """Mark pixels (h, w, bool) as removed by a step, except those already removed."""
         self.taken[where & (self.taken == ORGAN)] = step
 
-    def cropped(self) -> tuple[tuple[slice, slice], Picture]:
-        """The rows and columns that hold what is left, and one more to each side; and these alone:
-        what is decided there must be written back."""
-        tall = wide = slice(0, 1)
-        left = self.taken == ORGAN
-        if left.any():
-            ends = (np.flatnonzero(left.any(axis))[[0, -1]].tolist() for axis in (1, 0))
-            tall, wide = (slice(max(first - 1, 0), last + 2) for first, last in ends)
+    def cropped(self) -> tuple[tuple[slice, slice], WorkingImage]:
+        """The rows and columns of the remaining pixels, with one more to each side, and a copy of
+        that part; its ``taken`` must be written back."""
+        rows = columns = slice(0, 1)
+        organ = self.taken == ORGAN
+        if organ.any():
+            ends = (np.flatnonzero(organ.any(axis))[[0, -1]].tolist() for axis in (1, 0))
+            rows, columns = (slice(max(first - 1, 0), last + 2) for first, last in ends)
         fx, fy, cx, cy = self.pinhole
-        pinhole = Pinhole(fx, fy, cx - wide.start, cy - tall.start)
-        depth_mm, taken = self.depth_mm[tall, wide].copy(), self.taken[tall, wide].copy()
-        return (tall, wide), Picture(depth_mm, taken, pinhole, self.left, self.points)
+        pinhole = Pinhole(fx, fy, cx - columns.start, cy - rows.start)
+        depth_mm, taken = self.depth_mm[rows, columns].copy(), self.taken[rows, columns].copy()
+        part = WorkingImage(depth_mm, taken, pinhole, self.remaining, self.points)
+        return (rows, columns), part
 
     def counts(self) -> dict[str, int]:
-        """Pixels by what became of them."""
-        found = np.bincount(self.taken.ravel(), minlength=len(STEPS))
-        return dict(zip(STEPS, found.tolist(), strict=True))
+        """Number of pixels by state."""
+        counts = np.bincount(self.taken.ravel(), minlength=len(STEPS))
+        return dict(zip(STEPS, counts.tolist(), strict=True))
 
 
-def some_pixels(frame: DepthFrame) -> tuple[slice, slice]:
-    """Rows and columns of the working picture: all of a small frame, every second, third ... of a
+def sampled_pixels(frame: DepthFrame) -> tuple[slice, slice]:
+    """Rows and columns of the working image: all of a small frame, every second, third ... of a
     large one."""
     step = int(np.ceil(np.sqrt(frame.depth_mm.size / MOST_PIXELS)))
     return slice(step // 2, None, step), slice(step // 2, None, step)
 
 
-def picture_of_frame(frame: DepthFrame, mask: np.ndarray | None) -> Picture:
-    """Of a frame's ``some_pixels``."""
-    camera, some = frame.intrinsics, some_pixels(frame)
-    step = some[0].step
-    depth_mm = frame.depth_mm[some].copy()
+def image_of_frame(frame: DepthFrame, mask: np.ndarray | None) -> WorkingImage:
+    """A frame's ``sampled_pixels``, without those outside a mask. Raises InputError: a mask of
+    another size."""
+    camera, sampled = frame.intrinsics, sampled_pixels(frame)
+    step = sampled[0].step
+    depth_mm = frame.depth_mm[sampled].copy()
     taken = np.isnan(depth_mm).view(np.uint8) * np.uint8(NO_RETURN)
 
     def points(pixel: np.ndarray) -> np.ndarray:
         row, column = np.divmod(pixel, depth_mm.shape[1])
         row, column = step // 2 + row * step, step // 2 + column * step
-        seen_mm = frame.depth_mm[row, column].astype(np.float64)
-        return deproject_pixels(row * camera.width + column, seen_mm, camera)
+        z_mm = frame.depth_mm[row, column].astype(np.float64)
+        return deproject_pixels(row * camera.width + column, z_mm, camera)
 
     cx, cy = (camera.cx - step // 2) / step, (camera.cy - step // 2) / step
     pinhole = Pinhole(camera.fx / step, camera.fy / step, cx, cy)
-    picture = Picture(depth_mm, taken, pinhole, lambda now: np.flatnonzero(now == ORGAN), points)
+
+    def remaining(taken: np.ndarray) -> np.ndarray:
+        return np.flatnonzero(taken == ORGAN)
+
+    image = WorkingImage(depth_mm, taken, pinhole, remaining, points)
     if mask is not None:
         if mask.shape != frame.depth_mm.shape:
             raise InputError(
                 f"the mask is {mask.shape[1]} x {mask.shape[0]}, the depth image {camera.width} x "
                 f"{camera.height}; give a mask of the depth image's pixels."
             )
-        picture.take(~mask[some], MASK)
-    return picture
+        image.remove(~mask[sampled], MASK)
+    return image
 
 
-def picture_of_cloud(cloud: SensorCloud) -> Picture:
-    """A cloud in any order as a pinhole camera at its origin sees it: the nearest point a pixel.
-
-    Points at or behind the camera's centre are left out, and so are those behind another.
-    """
+def image_of_cloud(cloud: SensorCloud) -> WorkingImage:
+    """A cloud, in any order, as a pinhole camera at its origin sees it: the nearest point in each
+    pixel. Points at or behind the camera's centre are left out, and so are occluded ones."""
     points_mm = cloud.points_mm
     tangents, low, high, inner = _spread(points_mm.copy())
     z = points_mm[:, 2].copy()
-    # Stray points widen the picture, but don't coarsen it.
+    # Stray points widen the image, but don't coarsen it.
     pixels = max(len(points_mm) / _POINTS_PER_PIXEL, 64.0)
     most = np.prod(high - low + 1e-3) / MOST_PIXELS
     size = float(np.sqrt(max(np.prod(inner + 1e-3) / pixels, most)))
@@ -193,18 +222,18 @@ def picture_of_cloud(cloud: SensorCloud) -> Picture:
     depth_mm, pixel = _rasterise(tangents, z, pinhole, (height, width))
     taken = np.isnan(depth_mm).view(np.uint8) * np.uint8(NO_RETURN)
 
-    def left(taken: np.ndarray) -> np.ndarray:
-        seen = np.flatnonzero(pixel >= 0)
-        seen = seen[taken.ravel()[pixel[seen]] == ORGAN]
-        return seen[z[seen] - depth_mm.ravel()[pixel[seen]] < 2 + 2 * size * z[seen]]
+    def remaining(taken: np.ndarray) -> np.ndarray:
+        index = np.flatnonzero(pixel >= 0)
+        index = index[taken.ravel()[pixel[index]] == ORGAN]
+        return index[z[index] - depth_mm.ravel()[pixel[index]] < 2 + 2 * size * z[index]]
 
-    return Picture(depth_mm, taken, pinhole, left, lambda some: points_mm[some])
+    return WorkingImage(depth_mm, taken, pinhole, remaining, lambda index: points_mm[index])
 
 
-def keep_inside(picture: Picture, corners_mm: np.ndarray, step: int) -> None:
-    """Take everything outside a box: two corners (2, 3), camera frame, mm, in any order."""
+def keep_inside(image: WorkingImage, corners_mm: np.ndarray, step: int) -> None:
+    """Remove everything outside a box: two corners (2, 3), camera frame, mm, in any order."""
     low, high = np.sort(np.asarray(corners_mm, np.float64), axis=0)
-    _keep_inside(picture.depth_mm, picture.taken, picture.pinhole, low, high, step)
+    _keep_inside(image.depth_mm, image.taken, image.pinhole, low, high, step)
 
 
 @jit
@@ -222,9 +251,9 @@ def _keep_inside(depth_mm, taken, pinhole, low, high, step):  # type: ignore[no-
 
 @jit
 def _spread(points_mm):  # type: ignore[no-untyped-def]
-    """x / z and y / z (n, 2), NaN where not before the camera or too wide; their extremes (2,) and
-    (2,); and how far the middle 96 % spread (2,), from a histogram: the order of the points doesn't
-    matter."""
+    """x / z and y / z (n, 2), NaN for points behind the camera or too far aside; their minima and
+    maxima (2,); and the spread of the middle 96 % (2,), from a histogram, so that the order of the
+    points doesn't matter."""
     tangents = np.full((len(points_mm), 2), np.nan, np.float32)
     low, high, count = np.full(2, np.inf), np.full(2, -np.inf), 0
     for i in range(len(points_mm)):
@@ -243,16 +272,16 @@ def _spread(points_mm):  # type: ignore[no-untyped-def]
 
 @jit
 def _inner_spread(tangents, low, high, count):  # type: ignore[no-untyped-def]
-    inner, found = np.zeros(2), np.zeros((2, _BINS), np.int64)
+    inner, histogram = np.zeros(2), np.zeros((2, _BINS), np.int64)
     for i in range(len(tangents)):
         if not np.isnan(tangents[i, 0]):
             for k in range(2):
                 share = (tangents[i, k] - low[k]) / max(high[k] - low[k], 1e-9)
-                found[k, min(int(share * _BINS), _BINS - 1)] += 1
+                histogram[k, min(int(share * _BINS), _BINS - 1)] += 1
     for k in range(2):
         total = 0
-        for one in found[k]:
-            total += one
+        for points_in_bin in histogram[k]:
+            total += points_in_bin
             if 0.02 * count < total < 0.98 * count:
                 inner[k] += (high[k] - low[k]) / _BINS
     return inner

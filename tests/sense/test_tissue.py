@@ -18,7 +18,7 @@ from tumortrack.core.types import DepthFrame, SensorCloud
 from tumortrack.sense.camera import deproject
 from tumortrack.sense.cloud import CloudConfig
 from tumortrack.sense.region import Hints, RegionConfig, organ_points
-from tumortrack.sense.region.taught import look, teach
+from tumortrack.sense.region.tissue import sample_click, teach
 from tumortrack_lab.world.kidneys import random_anatomy
 
 CONFIG = RegionConfig(crop=CloudConfig(near_mm=60.0, far_mm=400.0))
@@ -40,7 +40,7 @@ def two_tissues(yellow=YELLOW):
 
 
 def clicks_of(frame, picture, on=ON, beside=BESIDE):
-    return [look(frame, picture, p, organ) for some, organ in ((on, True), (beside, False))
+    return [sample_click(frame, picture, p, organ) for some, organ in ((on, True), (beside, False))
             for p in some]  # fmt: skip
 
 
@@ -111,9 +111,9 @@ def test_it_says_when_it_does_not_know():
         depth_mm = frame.depth_mm.copy()
         depth_mm[:20, :20] = np.nan
         with pytest.raises(InputError, match="too little is seen there"):
-            look(DepthFrame(depth_mm, SMALL), seen, pixel, True)
+            sample_click(DepthFrame(depth_mm, SMALL), seen, pixel, True)
     with pytest.raises(InputError, match="the picture is 424 x 239"):
-        look(frame, picture[1:], (3, 3), True)
+        sample_click(frame, picture[1:], (3, 3), True)
 
 
 def test_where_it_cannot_be_used_depth_decides_and_it_is_said():
@@ -186,7 +186,7 @@ def clicked(scene, picture, rng):
         for pixel in clicks_on(scene, organ, 4 * count, rng):
             if left:
                 try:
-                    clicks.append(look(scene.frame, picture, pixel, organ))
+                    clicks.append(sample_click(scene.frame, picture, pixel, organ))
                     left -= 1
                 except InputError:
                     pass
