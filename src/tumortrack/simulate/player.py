@@ -1,8 +1,8 @@
-"""A scene in motion: an organ that breathes and is pushed on its table, before a camera.
+"""A moving scene: a camera looks at an organ that breathes and is pushed on its table.
 
 A state is an equilibrium of ``elastic``: coefficients of the body's modes and a small rigid motion
 on the bed. It is solved for a few depths of a push; between them the unknowns follow a monotone
-cubic (PCHIP: Fritsch and Carlson 1980, doi 10.1137/0717021), so that nothing overshoots or jumps.
+cubic (PCHIP: Fritsch and Carlson 1980, doi 10.1137/0717021), without overshoot or jumps.
 
 ``ScenePlayer`` is a function of time: the same seed and time give the same state, depth image and
 true surfaces.
@@ -30,8 +30,8 @@ from tumortrack.simulate.elastic.body import (
     BodyConfig,
     Points,
     body_of,
+    length_over_kidney,
     reduced_organ,
-    times_kidney,
 )
 from tumortrack.simulate.elastic.loads import ReducedProblem, in_bed
 from tumortrack.simulate.elastic.modes import LEVER_MM
@@ -39,43 +39,43 @@ from tumortrack.simulate.scene import PoseConfig, sample_pose
 
 SHAFT_MM = 4.0  # an instrument's radius
 _SHAFT_LENGTH_MM = 200.0
-_BREATH_S, _PUSH_S = 4.0, 6.0  # from one to the next
+_BREATH_S, _PUSH_S = 4.0, 6.0  # periods
 _KIDNEY_MM = 118.0  # from the camera to a kidney
-_AWAY_MM = 160.0  # along its shaft: an instrument out of the picture
-_STEPS = 3  # along the body's field: within 0.02 mm of the exact position, for states as here
+_AWAY_MM = 160.0  # an instrument withdrawn this far along its shaft is out of view
+_STEPS = 3  # of integration: for these states within 0.02 mm of the exact position
 _SWAY_S = (17.0, 23.0, 29.0, 19.0, 13.0, 31.0)  # periods of the camera's rotations and shifts
-# A push in fractions of its time: the instrument's distance from the organ, then its depth.
+# Over the period of a push (0..1): the instrument's relative distance from the organ, its depth.
 _AWAY = PchipInterpolator([0.0, 0.2, 0.85, 1.0], [1.0, 0.0, 0.0, 1.0])
 _DEPTH = PchipInterpolator([0.0, 0.2, 0.45, 0.6, 0.85, 1.0], [0.0, 0.0, 1.0, 1.0, 0.0, 0.0])
 
 _REACH_MM = 400.0  # of the drape to every side
 _CELLS = 40  # of the drape along each edge
-_WAVES = 5
-_RING_MM = 4.0
-_SECTIONS = 24
-_FARTHEST_MM = 500.0  # that the sensor sees of a table
-_DEPTHS = 7
+_WAVES = 5  # of the drape
+_RING_MM = 4.0  # between the rings of an instrument's triangles
+_SECTIONS = 24  # of each ring
+_FARTHEST_MM = 500.0  # of the table, as seen by the sensor
+_DEPTHS = 7  # of a push for which the state is solved
 _FOOT_MM = 2.0  # the tissue is held down this far beyond the instrument's radius
 _FACING = 0.85  # least cosine between an indented place's normal and up
 _RISE_DEGREES = 50.0  # of an instrument's shaft over the surface
-_SIDES = 24  # from which it may come
+_SIDES = 24  # directions from which it may come
 _NOTHING = Mesh(np.empty((0, 3)), np.empty((0, 3), np.int32))
 
 
 class ScenePlayerConfig(Config, frozen=True, kw_only=True):
-    """What moves and what is seen; a length of zero switches its part off."""
+    """What moves and what is visible; a length of zero switches its part off."""
 
     width: int = 424
     height: int = 240
-    # Depth of the organ's nearest point, before all motion; of an organ larger than a kidney by
-    # default as much more.
+    # Depth of the organ's nearest point before all motion; None: as for a kidney, scaled with the
+    # length of a larger organ.
     distance_mm: float | None = None
-    breath_mm: float = 6.0  # down the body and back
+    breath_mm: float = 6.0  # motion down the body and back
     swell: float = 0.01  # strain of the organ's volume with a breath
-    push_mm: float = 8.0  # how deep an instrument presses, at each place in turn
+    push_mm: float = 8.0  # depth to which an instrument presses, at each place in turn
     places: int = 3
-    sway_mm: float = 3.0  # of the camera along each axis, and about each
-    sway_degrees: float = 3.0
+    sway_mm: float = 3.0  # of the camera along each axis
+    sway_degrees: float = 3.0  # about each axis
     table: bool = True
     drape: bool = False
     noise: NoiseConfig = D405_NOISE
@@ -89,12 +89,12 @@ class ScenePlayerConfig(Config, frozen=True, kw_only=True):
 
 @dataclass(frozen=True, eq=False)
 class Instant:
-    """The scene at a time. The room's frame is the CT's, with the organ where it lay there."""
+    """The scene at a time. The room's frame is the CT's, with the organ at rest in its place."""
 
     t_s: float
     camera_from_room: Float64[np.ndarray, "4 4"]
     room_from_organ: Float64[np.ndarray, "4 4"]  # the organ's rigid motion, after its deformation
-    room_from_rod: Float64[np.ndarray, "4 4"]  # of the instrument
+    room_from_rod: Float64[np.ndarray, "4 4"]  # the instrument's pose
     velocity: Float32[np.ndarray, "i j k 3"]  # the field that points of the CT follow
     depth_mm: float  # of the push
 
@@ -109,8 +109,8 @@ class Indentation:
 
 
 class ScenePlayer:
-    """One case in motion. Building it solves the elastic states: some seconds. Raises InputError: a
-    case that makes no elastic body, or a configuration that doesn't fit it."""
+    """One case in motion. The constructor solves the elastic states, which takes some seconds.
+    Raises InputError: a case without an elastic body, or a configuration that doesn't fit it."""
 
     def __init__(
         self,
@@ -125,19 +125,20 @@ class ScenePlayer:
         self.intrinsics = d405(config.width, config.height)
         self._seed, self._up = seed, up
         pose = PoseConfig(tilt_deg=8.0, sideways_mm=5.0)
-        away_mm = config.distance_mm
-        if away_mm is None:
-            away_mm = min(_KIDNEY_MM * max(1.0, times_kidney(anatomy_ct)), 400.0)
-        near_mm = (away_mm, away_mm)
-        self._camera_from_ct = sample_pose(pose, anatomy_ct.organ, up_lps, near_mm, rng)
+        distance_mm = config.distance_mm
+        if distance_mm is None:
+            distance_mm = min(_KIDNEY_MM * max(1.0, length_over_kidney(anatomy_ct)), 400.0)
+        nearest_mm = (distance_mm, distance_mm)
+        self._camera_from_ct = sample_pose(pose, anatomy_ct.organ, up_lps, nearest_mm, rng)
         organ = self._organ = reduced_organ(anatomy_ct, up, config.body, rng)
-        self._swollen = self._under("swell", ReducedProblem.expand, config.swell)
+        self._swollen = self._at_rest("swell", ReducedProblem.expand, config.swell)
         self._pushes = self._indentations(rng) if config.push_mm > 0 else []
         states = [self._swollen, *(push.unknowns(config.push_mm) for push in self._pushes)]
         self._body = body_of(organ, np.array(states, np.float32)[:, : organ.n_modes])
         inferior = np.array([0.0, 0.0, -1.0])
-        along = inferior - (inferior @ up) * up  # for a body that stands, any direction
-        self._down_the_body = perpendicular(up) if np.linalg.norm(along) < 0.1 else unit(along)
+        along = inferior - (inferior @ up) * up
+        upright = np.linalg.norm(along) < 0.1  # then any horizontal direction
+        self._down_the_body = perpendicular(up) if upright else unit(along)
         self._vertices = np.concatenate([part.vertices_mm for part in anatomy_ct.parts])
         self._table = Table(anatomy_ct.organ, up)
         self._drape = drape(self._table, rng) if config.drape else _NOTHING
@@ -148,15 +149,15 @@ class ScenePlayer:
         self._faces = np.concatenate(faces)
 
     def state_at(self, t_s: float) -> Instant:
-        """Everything at a time from 0 s on. A pure function: no clock, no memory."""
+        """The scene at a time from 0 s on; a pure function."""
         if not t_s >= 0:
             raise InputError(f"time {t_s} s is before the scene's beginning, 0 s.")
         config = self.config
         breath = np.sin(np.pi * t_s / _BREATH_S) ** 4  # Lujan 1999, doi 10.1118/1.598577
         unknowns, depth_mm, push = breath * self._swollen, 0.0, None
-        number, phase = divmod(t_s / _PUSH_S, 1)
+        count, phase = divmod(t_s / _PUSH_S, 1)
         if self._pushes:
-            push = self._pushes[int(number) % len(self._pushes)]
+            push = self._pushes[int(count) % len(self._pushes)]
             depth_mm = config.push_mm * float(_DEPTH(phase))
             unknowns = unknowns + push.unknowns(depth_mm)
         modes = self._body.modes.shape[-1]
@@ -175,7 +176,7 @@ class ScenePlayer:
         return Instant(t_s, *poses, velocity, depth_mm)
 
     def carry(self, instant: Instant, points_ct: Points) -> Float64[np.ndarray, "n 3"]:
-        """Where points of the CT are before the camera."""
+        """Points of the CT in the camera frame."""
         camera_from_organ = instant.camera_from_room @ instant.room_from_organ
         return transform_points(camera_from_organ, self._deformed(instant.velocity, points_ct))
 
@@ -187,12 +188,12 @@ class ScenePlayer:
         return self.anatomy_ct.of(part.moved(v) for part, v in zip(parts, vertices, strict=True))
 
     def frame(self, instant: Instant, truth: Anatomy, stamp_ns: int) -> DepthFrame:
-        """What the sensor sees at an instant with these true surfaces. Its noise follows from seed
-        and time."""
-        others = transform_points(instant.room_from_rod, self._rod.vertices_mm)
-        others = np.concatenate([self._drape.vertices_mm, others])
-        others = transform_points(instant.camera_from_room, others)
-        vertices = np.concatenate([truth.organ.vertices_mm, others])
+        """The sensor's depth image at an instant with these true surfaces. Its noise follows from
+        seed and time."""
+        rod_mm = transform_points(instant.room_from_rod, self._rod.vertices_mm)
+        room_mm = np.concatenate([self._drape.vertices_mm, rod_mm])
+        camera_mm = transform_points(instant.camera_from_room, room_mm)
+        vertices = np.concatenate([truth.organ.vertices_mm, camera_mm])
         clean = render_depth(vertices, self._faces, self.intrinsics, stamp_ns)
         if self.config.table:
             table_mm = self._table.depth_mm(instant.camera_from_room, self.intrinsics)
@@ -200,21 +201,21 @@ class ScenePlayer:
         rng = np.random.default_rng([self._seed, round(instant.t_s * 1e6)])
         return add_noise(clean, self.config.noise, rng)
 
-    def _under(self, what: str, load: Callable[..., None], *how: object) -> np.ndarray:
-        """The organ's unknowns, its tissue and bed drawn by the seed, at rest under a load with its
-        arguments; ``what`` names it in the error."""
+    def _at_rest(self, name: str, load: Callable[..., None], *arguments: object) -> np.ndarray:
+        """The organ's unknowns at rest under a load, its tissue and bed drawn by the seed; ``name``
+        is the load's in the error."""
         problem = in_bed(self._organ, self._up, np.random.default_rng([self._seed, 0xBED]))
-        load(problem, *how)
-        found = problem.equilibrium()
-        if found is None:
+        load(problem, *arguments)
+        unknowns = problem.equilibrium()
+        if unknowns is None:
             raise InputError(
-                f"the organ does not come to rest under {what}; choose another seed. If that does "
+                f"the organ does not come to rest under {name}; choose another seed. If that does "
                 "not help, look at the case's pictures."
             )
-        return found
+        return unknowns
 
     def _indentations(self, rng: np.random.Generator) -> list[Indentation]:
-        """By an instrument, of different places that face up."""
+        """Indentations at places that face up, far from each other."""
         count, patches = self.config.places, self._organ.patches
         places, normals = patches.points_mm, patches.normals
         facing = np.flatnonzero(normals @ self._up > _FACING)
@@ -229,15 +230,15 @@ class ScenePlayer:
         while len(chosen) < count:
             distance = np.minimum(distance, np.linalg.norm(points - points[chosen[-1]], axis=1))
             chosen.append(int(np.argmax(distance)))
-        made, depths = [], np.linspace(0, self.config.push_mm, _DEPTHS)
+        indentations, depths = [], np.linspace(0, self.config.push_mm, _DEPTHS)
         for patch in facing[chosen].tolist():
-            how = patch, normals[patch], SHAFT_MM + _FOOT_MM
-            poke = partial(self._under, "poke", ReducedProblem.indent, *how)
+            instrument = patch, normals[patch], SHAFT_MM + _FOOT_MM
+            poke = partial(self._at_rest, "poke", ReducedProblem.indent, *instrument)
             states = [poke(depth) for depth in depths.tolist()]
             unknowns = PchipInterpolator(depths, np.stack(states) - states[0])
             axis = _clearest_axis(places - places[patch], normals[patch])
-            made.append(Indentation(places[patch], axis, unknowns))
-        return made
+            indentations.append(Indentation(places[patch], axis, unknowns))
+        return indentations
 
     def _deformed(self, velocity: np.ndarray, points_ct: Points) -> Float64[np.ndarray, "n 3"]:
         return self._body.follow(velocity, points_ct, _STEPS).astype(np.float64)
@@ -252,10 +253,10 @@ class ScenePlayer:
 
 
 def _clearest_axis(offset_mm: np.ndarray, outward: np.ndarray) -> np.ndarray:
-    """The direction of a shaft that stays farthest from the organ, of those of equal rise;
-    ``offset_mm``: of the organ's places from the shaft's tip."""
-    one = perpendicular(outward)
-    other, rise = np.cross(outward, one), np.deg2rad(_RISE_DEGREES)
+    """The direction of a shaft that stays farthest from the organ, of those of equal rise.
+    ``offset_mm``: the organ's patches relative to the shaft's tip."""
+    x_axis, rise = perpendicular(outward), np.deg2rad(_RISE_DEGREES)
+    y_axis = np.cross(outward, x_axis)
 
     def gap(axis: np.ndarray) -> float:
         along = offset_mm @ axis
@@ -263,13 +264,13 @@ def _clearest_axis(offset_mm: np.ndarray, outward: np.ndarray) -> np.ndarray:
         return float((apart[along > 10] / along[along > 10]).min(initial=np.inf))
 
     turns = np.arange(_SIDES) * 2 * np.pi / _SIDES
-    aside = [np.cos(angle) * one + np.sin(angle) * other for angle in turns]
-    return max((np.sin(rise) * outward + np.cos(rise) * way for way in aside), key=gap)
+    sides = [np.cos(angle) * x_axis + np.sin(angle) * y_axis for angle in turns]
+    return max((np.sin(rise) * outward + np.cos(rise) * side for side in sides), key=gap)
 
 
 class Table:
-    """The plane on which an organ lies, and how the organ rises over it; CT frame. ``up`` is a unit
-    vector, ``origin`` lies under the organ's middle."""
+    """The plane on which an organ lies, with the organ's height and radius over it; CT frame.
+    ``up`` is a unit vector, ``origin`` lies below the organ's middle."""
 
     def __init__(self, organ: Mesh, up: Float64[np.ndarray, " 3"]) -> None:
         heights, middle = organ.vertices_mm @ up, organ.box_mm.mean(0)
@@ -294,11 +295,10 @@ class Table:
         return np.float32(1) / nearness
 
 
-# Surfaces are cut into small triangles, as the renderer leaves out those that reach behind the
-# camera.
+# Surfaces have small triangles, as the renderer leaves out those that reach behind the camera.
 def drape(table: Table, rng: np.random.Generator) -> Mesh:
-    """A cloth with folds, seen from above only: next to the organ nearly half as high as it,
-    farther off it falls to the table."""
+    """A cloth with folds, its upper side only: nearly half as high as the organ beside it, farther
+    away it falls to the table."""
     steps = np.linspace(-_REACH_MM, _REACH_MM, _CELLS + 1)
     x, y = np.meshgrid(steps, steps, indexing="ij")
     beyond = np.clip(np.hypot(x, y) - table.organ_radius_mm, 0, None)
@@ -308,11 +308,11 @@ def drape(table: Table, rng: np.random.Generator) -> Mesh:
         length_mm = rng.uniform(25, 70)
         along = np.cos(angle) * x + np.sin(angle) * y
         height += rng.uniform(0.3, 1.2) * np.sin(2 * np.pi * along / length_mm + phase)
-    one = perpendicular(table.up)
+    x_axis = perpendicular(table.up)
     places = np.stack([x, y, np.maximum(height, 0.5)], -1)
-    places = places @ np.stack([one, np.cross(table.up, one), table.up])
-    number = np.arange(x.size).reshape(x.shape)
-    a, b, c, d = number[:-1, :-1], number[1:, :-1], number[1:, 1:], number[:-1, 1:]
+    places = places @ np.stack([x_axis, np.cross(table.up, x_axis), table.up])
+    index = np.arange(x.size).reshape(x.shape)
+    a, b, c, d = index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]
     faces = np.stack([a, b, c, a, c, d], -1).reshape(-1, 3)
     return Mesh(table.origin + places.reshape(-1, 3), faces)
 
@@ -328,12 +328,12 @@ def rod(radius_mm: float, length_mm: float) -> Mesh:
     circles = np.stack([x, y, np.repeat(height[:, None], _SECTIONS, 1)], -1).reshape(-1, 3)
     vertices = np.concatenate([circles, [[0.0, 0.0, 0.0], [0.0, 0.0, length_mm]]])
     ring = np.arange(len(circles)).reshape(x.shape)
-    beside = np.roll(ring, -1, axis=1)
+    following = np.roll(ring, -1, axis=1)
     tip, end = np.full((2, _SECTIONS), [[len(circles)], [len(circles) + 1]])
     corners = [
-        (ring[:-1], beside[:-1], ring[1:]),
-        (beside[:-1], beside[1:], ring[1:]),
-        (tip, beside[0], ring[0]),
-        (end, ring[-1], beside[-1]),
+        (ring[:-1], following[:-1], ring[1:]),
+        (following[:-1], following[1:], ring[1:]),
+        (tip, following[0], ring[0]),
+        (end, ring[-1], following[-1]),
     ]
     return Mesh(vertices, np.concatenate([np.stack(abc, -1).reshape(-1, 3) for abc in corners]))

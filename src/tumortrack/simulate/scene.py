@@ -1,7 +1,7 @@
 """One scene from a recipe (pose, deformation, depth image, cloud, labelled points), and streams.
 
 A recipe is (seed, stream, index); with the case and the configuration it replays bit for bit on
-the same machine and versions. Elsewhere last digits may differ: compiled code may reorder sums,
+the same machine and versions. On others the last digits may differ: compiled code may reorder sums
 and evaluate the exponential of a drag differently.
 """
 
@@ -26,18 +26,13 @@ from tumortrack.sense.clutter import ClutterConfig, add_clutter
 from tumortrack.sense.noise import CalibrationConfig, NoiseConfig, add_noise, miscalibrate
 from tumortrack.sense.occlusion import OcclusionConfig, occlude
 from tumortrack.sense.render import Visibility, render_depth
-from tumortrack.simulate.deform import (
-    ChainConfig,
-    DragConfig,
-    installed,
-    links_of,
-)
+from tumortrack.simulate.deform import ChainConfig, DragConfig, installed, links_of
 from tumortrack.simulate.deform.base import Deformation, Points, View
-from tumortrack.simulate.elastic.body import BodyConfig, ElasticBody, build_body, times_kidney
+from tumortrack.simulate.elastic.body import BodyConfig, ElasticBody, build_body, length_over_kidney
 from tumortrack.simulate.occupancy import OccupancyConfig, OccupancyPool
 
 STREAMS = ("train", "validation", "test")
-_FARTHEST_MM = 500.0  # that depth cameras for near things are specified for
+_FARTHEST_MM = 500.0  # range of depth cameras for close work
 _ATTEMPTS = 20  # draws of a recipe until one shows enough of the organ
 
 
@@ -63,14 +58,14 @@ class SceneConfig(Config, frozen=True):
 
     A fraction ``free_range`` of them is seen from any distance and not cropped by depth, like a
     cloud whose background the user has removed. The others follow the paper: near 15 cm, cropped
-    to 11..15 cm. With ``cloud_points`` the largest number of points of each scene's cloud is drawn
+    to 11..15 cm. With ``cloud_points`` the largest number of points in each scene's cloud is drawn
     from that range, log-uniformly, instead of ``cloud.n_points``.
     """
 
     width: int = 424
     height: int = 240
     pose: PoseConfig = PoseConfig()
-    # One a scene, drawn uniformly.
+    # Each scene has one of these, drawn uniformly.
     deform: tuple[installed.LinkConfig | ChainConfig, ...] = (DragConfig(),)
     clutter: ClutterConfig = ClutterConfig()
     noise: NoiseConfig = NoiseConfig()
@@ -83,18 +78,18 @@ class SceneConfig(Config, frozen=True):
     cloud_points: tuple[int, int] | None = None
 
     def seen_whole(self, anatomy_ct: Anatomy) -> SceneConfig:
-        """The same, with an organ that is larger than a kidney, for which the distances are meant,
-        as much farther off, so that it is pictured as a kidney is."""
-        times = max(1.0, times_kidney(anatomy_ct))
-        if times == 1.0:
+        """The same with distances, which are meant for kidneys, scaled up for a larger organ, so
+        that it fills the image as a kidney does."""
+        scale = max(1.0, length_over_kidney(anatomy_ct))
+        if scale == 1.0:
             return self
         (low, high), (near_mm, far_mm) = self.pose.nearest_mm, self.free_nearest_mm
         replace, cloud = msgspec.structs.replace, self.cloud
         return replace(
             self,
-            pose=replace(self.pose, nearest_mm=(times * low, times * high)),
-            cloud=replace(cloud, near_mm=times * cloud.near_mm, far_mm=times * cloud.far_mm),
-            free_nearest_mm=(times * near_mm, max(far_mm, min(times * far_mm, _FARTHEST_MM))),
+            pose=replace(self.pose, nearest_mm=(scale * low, scale * high)),
+            cloud=replace(cloud, near_mm=scale * cloud.near_mm, far_mm=scale * cloud.far_mm),
+            free_nearest_mm=(scale * near_mm, max(far_mm, min(scale * far_mm, _FARTHEST_MM))),
         )
 
     def __post_init__(self) -> None:
@@ -125,7 +120,7 @@ class SceneRecipe:
 
 @dataclass(frozen=True, eq=False)
 class RenderedScene:
-    """A scene before points are labelled: where the organ lies, and what the camera sees of it."""
+    """A scene without labelled points: the organ's pose and deformation, and the camera's view."""
 
     camera_from_ct: Float64[np.ndarray, "4 4"]  # the organ's pose, without its deformation
     deformation: Deformation
@@ -133,14 +128,14 @@ class RenderedScene:
     cloud: SensorCloud
 
     def carry(self, points_ct: Points) -> Points:
-        """Points of the undeformed CT frame at their place before the camera."""
+        """Points of the undeformed CT in the camera frame."""
         return transform_points(self.camera_from_ct, self.deformation.apply(points_ct))
 
 
 @dataclass(eq=False)
 class Simulator:
-    """Makes the scenes of one anatomy (CT frame, LPS mm); ``body`` where the configuration has
-    elastic deformations (``body_for`` builds it)."""
+    """Makes the scenes of one anatomy (CT frame, LPS mm). A configuration with elastic deformations
+    needs a ``body`` (``body_for`` builds it)."""
 
     anatomy_ct: Anatomy
     up_lps: tuple[float, float, float]
@@ -153,7 +148,7 @@ class Simulator:
         self._intrinsics = d405(self.config.width, self.config.height)
         self._visibility = Visibility(self.anatomy_ct.organ)
         vertices = self.anatomy_ct.organ.vertices_mm
-        corners = vertices[ConvexHull(vertices).vertices]  # the farthest in any direction
+        corners = vertices[ConvexHull(vertices).vertices]  # include the extremes in any direction
         self._hull_ct = Mesh(corners, np.empty((0, 3)))
 
     def pair(
@@ -179,8 +174,7 @@ class Simulator:
             rng = recipe.generator(attempt)
             free = bool(rng.uniform() < config.free_range)
             nearest_mm = config.free_nearest_mm if free else config.pose.nearest_mm
-            placed = self._hull_ct, self.up_lps, nearest_mm
-            camera_from_ct = sample_pose(config.pose, *placed, rng)
+            camera_from_ct = sample_pose(config.pose, self._hull_ct, self.up_lps, nearest_mm, rng)
             model = config.deform[rng.integers(len(config.deform))]
             deformation = model.sample(self._view(camera_from_ct), rng)
             vertices = transform_points(camera_from_ct, deformation.apply(organ.vertices_mm))
@@ -214,8 +208,8 @@ class Simulator:
         def visible(points_ct: np.ndarray) -> np.ndarray:
             pixels, depth = project(transform_points(camera_from_ct, points_ct), camera)
             size = np.array([camera.width, camera.height])
-            pictured = ((pixels > -0.5) & (pixels < size - 0.5)).all(1) & (depth > 0)
-            return pictured & self._visibility(points_ct, eye_ct)
+            in_view = ((pixels > -0.5) & (pixels < size - 0.5)).all(1) & (depth > 0)
+            return in_view & self._visibility(points_ct, eye_ct)
 
         return View(self.anatomy_ct, visible, self.body)
 
@@ -245,8 +239,8 @@ def sample_pose(
 
 
 def _turn(about_x: float, about_y: float, about_z: float) -> Float64[np.ndarray, "3 3"]:
-    """A rotation about z, then y, then x, all fixed axes; radians. (Scipy's Rotation takes a
-    twentieth of a scene's time for a single one.)"""
+    """A rotation about z, then y, then x, all fixed axes; radians. (A single SciPy Rotation takes a
+    twentieth of a scene's time.)"""
     sx, sy, sz = np.sin([about_x, about_y, about_z]).tolist()
     cx, cy, cz = np.cos([about_x, about_y, about_z]).tolist()
     first = [cy * cz, -cy * sz, sy]
@@ -287,7 +281,7 @@ class SceneStream:
 
     @cached_property
     def simulator(self) -> Simulator:
-        """Built where it is used: ray trees cannot be pickled."""
+        """Built in the process that uses it, as ray trees cannot be pickled."""
         return Simulator(self.anatomy_ct, self.up_lps, self.config, self.body)
 
     def __getstate__(self) -> dict[str, Any]:
@@ -295,12 +289,11 @@ class SceneStream:
 
     def batch(self, index: int) -> Batch:
         """The batch with this number."""
-        first, n = index * self.batch_size, self.config.cloud.n_points
-        rows = []
+        first, rows = index * self.batch_size, []
         for number in range(first, first + self.batch_size):
             recipe = SceneRecipe(self.seed, self.stream, number)
             scene, points_mm, labels = self.simulator.pair(recipe, self.pool)
-            cloud_mm = refill(scene.cloud.points_mm, n)
+            cloud_mm = refill(scene.cloud.points_mm, self.config.cloud.n_points)
             rows.append((cloud_mm, points_mm, labels))
         return Batch(*map(np.stack, zip(*rows, strict=True)))
 
@@ -314,22 +307,22 @@ def refill(points_mm: Num[np.ndarray, m * row], n: int) -> Num[np.ndarray, n * r
 def body_for(
     anatomy_ct: Anatomy, up_lps: tuple[float, float, float], config: SceneConfig, seed: int
 ) -> ElasticBody | None:
-    """The organ's elastic body where a deformation of the configuration needs it, else None.
+    """The organ's elastic body if a deformation of the configuration needs one, else None.
 
-    Where every rotation of the organ is shown (``full``), its bed lies on any side of it.
-    Deformations that ask for different bodies raise InputError.
+    With ``full`` rotations the organ's bed lies on any side of it. Raises InputError: deformations
+    with different bodies.
     """
     links = (link for model in config.deform for link in links_of(model))
     bodies = (getattr(link, "body", None) for link in links)
-    wanted = {body for body in bodies if isinstance(body, BodyConfig)}
-    if len(wanted) > 1:
+    configs = {body for body in bodies if isinstance(body, BodyConfig)}
+    if len(configs) > 1:
         raise InputError(
             "the scene configuration has elastic deformations with different bodies; give them "
             "all the same `body`."
         )
-    if not wanted:
+    if not configs:
         return None
-    kind = wanted.pop()
+    body = configs.pop()
     if config.pose.rotations == "full":
-        kind = msgspec.structs.replace(kind, bed_anywhere=1.0)
-    return build_body(anatomy_ct, up_lps, kind, seed)
+        body = msgspec.structs.replace(body, bed_anywhere=1.0)
+    return build_body(anatomy_ct, up_lps, body, seed)

@@ -1,9 +1,6 @@
-"""One scene on disk: what the sensor saw and the truth, in files that other programs can make.
-
-cloud.ply (camera frame, mm), depth.png (16 bit, steps of 0.1 mm) with intrinsics.json, kidney.ply
-(or of the organ's name), tumor_1.ply, ... (the truth, camera frame, mm), targets.csv (points
-inside the organ: label, ct_x, ct_y, ct_z in LPS, camera_x, camera_y, camera_z; mm) and meta.json.
-Depth, targets and meta.json may be absent.
+"""One scene on disk, measurement and truth, in files that other programs can make: cloud.ply,
+depth.png with intrinsics.json, kidney.ply (or of the organ's name), tumor_1.ply, ..., targets.csv
+and meta.json. docs/conventions.md defines them.
 """
 
 from __future__ import annotations
@@ -28,11 +25,11 @@ from tumortrack.imaging.meshes import mesh_of, solid_of
 from tumortrack.sense.files import depth_png, intrinsics_json, read_cloud, read_depth_png
 from tumortrack.sense.ply import write_cloud_ply
 
-# Our own scenes state in meta.json that the organ's surface is of all of it, tumors included.
+# Our own scenes state in meta.json that the organ's surface includes its tumors.
 _UNITED = "organ_includes_tumors"
 _STAMP = "stamp_ns"
 _TARGETS = "targets.csv"
-_STICKS_OUT = 0.02  # of a tumor's volume: smoothing alone lets it stick out by less
+_STICKS_OUT = 0.02  # share of a tumor's volume; smoothing alone makes less stick out
 _ORGAN_SIZE_MM = (5.0, 1000.0)
 TARGETS = 200
 _COLUMNS = ("label", *(f"{frame}_{axis}" for frame in ("ct", "camera") for axis in "xyz"))
@@ -40,7 +37,7 @@ _COLUMNS = ("label", *(f"{frame}_{axis}" for frame in ("ct", "camera") for axis 
 
 @dataclass(frozen=True, eq=False)
 class Targets:
-    """Points in the undeformed CT (LPS, mm), their true places before the camera (mm), labels."""
+    """Points in the undeformed CT (LPS, mm), their true places in the camera frame (mm), labels."""
 
     points_ct: Float64[np.ndarray, "n 3"]
     points_mm: Float[np.ndarray, "n 3"]
@@ -55,16 +52,15 @@ class InnerPoints:
     labels: UInt8[np.ndarray, " n"]
 
     def at(self, points_mm: Float[np.ndarray, "n 3"]) -> Targets:
-        """These points as targets of a scene in which they lie there (camera frame)."""
+        """Targets of a scene in which these points lie at ``points_mm`` (camera frame)."""
         return Targets(self.points_ct, points_mm, self.labels)
 
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """An observed cloud and the truth behind it, camera frame, mm. ``reference.parts[0]`` is the
-    whole organ, tumors included; ``depth`` the image that the cloud was taken from, where it is
-    known; ``meta`` plain JSON (recipe, origin, ...); ``targets`` inner points with known positions
-    in the CT."""
+    """An observed cloud and the truth, camera frame, mm. ``reference.parts[0]`` is the whole organ,
+    tumors included; ``depth`` the cloud's image, if known; ``meta`` plain JSON (recipe, origin,
+    ...); ``targets`` inner points with known positions in the CT."""
 
     cloud: SensorCloud
     reference: Anatomy
@@ -80,7 +76,7 @@ class Scene:
 
 
 def write_scene_files(folder: Path, scene: Scene) -> None:
-    """A scene's files into a folder that is being filled aside; raises StorageError."""
+    """Write a scene's files into an existing folder. Raises StorageError."""
     write_cloud_ply(folder / "cloud.ply", scene.cloud.points_mm)
     if scene.depth is not None:
         write_atomically(folder / "depth.png", depth_png(scene.depth))
@@ -92,11 +88,9 @@ def write_scene_files(folder: Path, scene: Scene) -> None:
         numbers, head = ["%d", *["%.5f"] * 6], ",".join(_COLUMNS)  # to 0.01 micrometres
         np.savetxt(text, table, numbers, delimiter=",", header=head, comments="")
         write_atomically(folder / _TARGETS, text.getvalue().encode())
-    meta = {**scene.meta, "units": "mm", "frame": "camera", _STAMP: scene.cloud.stamp_ns}
-    write_json(
-        folder / "meta.json",
-        {**meta, _UNITED: True, "organ": organ_entry(scene.reference.kind)},
-    )
+    fixed = {"units": "mm", "frame": "camera", _STAMP: scene.cloud.stamp_ns, _UNITED: True}
+    meta = {**scene.meta, **fixed, "organ": organ_entry(scene.reference.kind)}
+    write_json(folder / "meta.json", meta)
 
 
 def read_scene(folder: Path) -> Scene:
@@ -149,12 +143,12 @@ def organ_of_folder(folder: Path, meta: dict[str, Any]) -> Organ:
 
 
 def list_scenes(folder: Path) -> list[Path]:
-    """The scene folders (those with a cloud.ply or a surface) in a folder, by name; InputError
-    where there is none."""
+    """The scene folders (those with a cloud.ply or a surface) in a folder, sorted by name. Raises
+    InputError: there are none."""
     if not folder.is_dir():
         raise InputError(f"{folder} does not exist or is not a folder.")
-    found = (path for path in folder.iterdir() if any(path.glob("*.ply")))
-    scenes = sorted(path for path in found if not path.name.startswith("."))
+    visible = (path for path in folder.iterdir() if not path.name.startswith("."))
+    scenes = sorted(path for path in visible if any(path.glob("*.ply")))
     if not scenes:
         raise InputError(
             f"{folder} holds no scenes: none of its folders has a cloud.ply and a surface. "
@@ -181,7 +175,7 @@ def _check_parts(folder: Path, anatomy: Anatomy) -> None:
 
 
 def _united(folder: Path, anatomy: Anatomy) -> Anatomy:
-    """The same anatomy with every tumor that sticks out made part of the organ's surface."""
+    """The anatomy with every tumor that sticks out united with the organ's surface."""
     whole = organ = solid_of(anatomy.organ, str(folder / f"{anatomy.names[0]}.ply"))
     for name, mesh in zip(anatomy.names[1:], anatomy.tumors, strict=True):
         tumor = solid_of(mesh, str(folder / f"{name}.ply"))
@@ -192,45 +186,45 @@ def _united(folder: Path, anatomy: Anatomy) -> Anatomy:
 
 
 def draw_targets(anatomy_ct: Anatomy, seed: int) -> InnerPoints:
-    """``TARGETS`` points spread evenly inside each part: half of them in the parenchyma, the others
-    shared by the tumors (all in the organ where it has none). A tumor that others cover and a
-    seed that is not allowed raise InputError."""
+    """``TARGETS`` points, uniform inside each part: half of them in the parenchyma, the others
+    shared by the tumors; without tumors all in the organ. Raises InputError: a tumor that others
+    cover, or a seed out of range."""
     check_seed(seed)
     rng = np.random.default_rng([seed, 1000])
     n_tumors = len(anatomy_ct.tumors)
-    inside = TARGETS // 2 if n_tumors else TARGETS
-    each = np.full(n_tumors, (TARGETS - inside) // max(n_tumors, 1))
-    each[: TARGETS - inside - each.sum()] += 1
-    points, counts = [], [inside, *each.tolist()]
-    for label, (part, wanted) in enumerate(zip(anatomy_ct.parts, counts, strict=True), start=1):
-        found = np.zeros((0, 3))
+    in_parenchyma = TARGETS // 2 if n_tumors else TARGETS
+    per_tumor = np.full(n_tumors, (TARGETS - in_parenchyma) // max(n_tumors, 1))
+    per_tumor[: TARGETS - in_parenchyma - per_tumor.sum()] += 1
+    points, counts = [], [in_parenchyma, *per_tumor.tolist()]
+    for label, (part, count) in enumerate(zip(anatomy_ct.parts, counts, strict=True), start=1):
+        accepted = np.zeros((0, 3))
         for _ in range(40):
-            if len(found) >= wanted:
+            if len(accepted) >= count:
                 break
             low, high = part.box_mm
             drawn = low + rng.random((4 * TARGETS, 3)) * (high - low)
             drawn = drawn[contains(part, drawn)]
-            found = np.concatenate([found, drawn[labels_of(anatomy_ct, drawn) == label]])
+            accepted = np.concatenate([accepted, drawn[labels_of(anatomy_ct, drawn) == label]])
         else:
             name = anatomy_ct.names[label - 1]
             raise InputError(f"{name} has no room for target points: other tumors cover it.")
-        points.append(found[:wanted])
+        points.append(accepted[:count])
     labels = np.repeat(np.arange(1, len(counts) + 1, dtype=np.uint8), counts)
     return InnerPoints(np.concatenate(points), labels)
 
 
 def read_targets(path: Path) -> Targets:
-    """Read targets.csv, ours or another program's; further columns are not looked at. Missing
-    columns or rows, and values that are no finite numbers, raise InputError."""
+    """Read targets.csv, ours or another program's; further columns are ignored. Raises InputError:
+    missing columns or rows, or values that are not finite numbers."""
     try:
         with path.open(encoding="utf-8-sig", newline="") as stream:
             rows = list(csv.DictReader(stream))
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise InputError(f"{path} cannot be read as a table: {error}.") from error
-    lacks = [name for name in _COLUMNS if not rows or name not in rows[0]]
-    if lacks:
+    missing = [name for name in _COLUMNS if not rows or name not in rows[0]]
+    if missing:
         raise InputError(
-            f"{path} has no rows, or lacks the columns {', '.join(lacks)}. Targets need "
+            f"{path} has no rows, or lacks the columns {', '.join(missing)}. Targets need "
             f"{','.join(_COLUMNS)}; remove the file if the scene has none."
         )
     try:

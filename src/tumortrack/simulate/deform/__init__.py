@@ -1,9 +1,9 @@
-"""Deformations: one file per model; and several one after the other.
+"""Deformations, one file per model, and chains of them.
 
-A model's configuration samples parameters from what the camera sees (``sample``); the sampled
+A model's configuration samples parameters from the camera's view (``sample``); the sampled
 deformation is a value that maps any point of the CT frame to its new place (``apply``) and can be
-recorded (``record``). To add one here: write its file, add its configuration to the union in
-``installed``. Other packages add theirs with an entry point, see there.
+recorded (``record``). To add one here: write its file, and add its configuration to the union in
+``installed``. Other packages add theirs by an entry point, see there.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ __all__ = ["ChainConfig", "DragConfig", "ElasticConfig", "StretchConfig"]
 
 @dataclass(frozen=True)
 class Chain:
-    """The first is applied first."""
+    """Deformations applied one after the other."""
 
     links: tuple[Deformation, ...]
 
@@ -39,7 +39,7 @@ class Chain:
 
 
 class ChainConfig(Config, frozen=True, tag="chain"):
-    """Each link is sampled from the view of the undeformed organ; local ones come first."""
+    """Each link is sampled from the view of the undeformed organ; list local ones first."""
 
     links: tuple[installed.LinkConfig, ...]
 
@@ -48,5 +48,5 @@ class ChainConfig(Config, frozen=True, tag="chain"):
 
 
 def links_of(model: Config) -> tuple[Config, ...]:
-    """A model's links: of one that is no chain, itself."""
+    """The links of a chain; any other model alone."""
     return model.links if isinstance(model, ChainConfig) else (model,)

@@ -1,4 +1,4 @@
-"""What every deformation model offers."""
+"""The interface of deformation models."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ Points = Float[np.ndarray, "n 3"]
 
 @dataclass(frozen=True)
 class View:
-    """The undeformed organ as the camera sees it: what a deformation may be sampled from."""
+    """The undeformed organ as the camera sees it, from which a deformation is sampled."""
 
     anatomy_ct: Anatomy
-    # visible(points_ct) -> bool each: nothing before the point, and the point in the picture
+    # visible(points_ct) -> bool each: the point is in the image and not occluded
     visible: Callable[[np.ndarray], np.ndarray]
-    body: ElasticBody | None = None  # where the deformation's configuration asks for one
+    body: ElasticBody | None = None  # if the deformation's configuration asks for one
 
 
 @runtime_checkable

@@ -3,10 +3,10 @@
 Source: the paper, section Localization and table "compare_deformations". The table calls its
 third number sigma^2. Its values are 100/3, 50/3, 35/3, 30/3, 20/3 and 10/3: radii of 100 ...
 10 mm under the three-sigma rule, so they are standard deviations in mm. Read as variances, most
-of the table's drags fold space over (a drag is one-to-one only while
-exp(-1/2) * distance / sigma < 1), labels of folded points are undefined, and configuration 3
-moves next to nothing 10 mm below the surface. ``falloff = "sigma"`` (default) takes the first
-reading; ``"variance"`` takes the table's heading literally. See docs/method.md.
+of the table's drags fold space (a drag is one-to-one only if exp(-1/2) * distance / sigma < 1), so
+that labels of folded points are undefined, and configuration 3 moves next to nothing 10 mm below
+the surface. ``falloff = "sigma"`` (default) takes the first reading; ``"variance"`` takes the
+table's heading literally. See docs/method.md.
 """
 
 from __future__ import annotations
@@ -51,15 +51,15 @@ class Drags:
 
 
 class DragConfig(Config, frozen=True, tag="drag"):
-    """Drags of vertices that the camera sees, by default the table's configuration 3; without
-    steps the organ stays as it was in the CT."""
+    """Drags of visible vertices, by default the table's configuration 3; without steps the organ
+    stays undeformed."""
 
     steps: tuple[Step, ...] = CONFIGURATIONS[3]
     falloff: Literal["sigma", "variance"] = "sigma"
 
     def sample(self, view: View, rng: np.random.Generator) -> Drags:
-        """Draw centres among the visible vertices of the undeformed organ, uniformly; a
-        distance uniform up to the step's; a direction uniform on the sphere."""
+        """Draw centres uniformly among the visible vertices of the undeformed organ, distances
+        uniformly up to the step's, directions uniformly on the sphere."""
         steps = [(d, s) for d, s, times in self.steps for _ in range(times)]
         distances, sigmas = np.array(steps, float).reshape(-1, 2).T
         if self.falloff == "variance":
@@ -96,7 +96,7 @@ _T1, _T2, _T3, _T4, _T5, _T6 = (
 # bit on the machine that made it, and elsewhere to that precision.
 @njit(nogil=True, fastmath=True, inline="always")
 def _exp(x):  # type: ignore[no-untyped-def]
-    """For -80 < x <= 0. Unlike the C library's it is vectorized over points."""
+    """exp(x) for -80 < x <= 0. Unlike the C library's it is vectorized over points."""
     binary = x * _LOG2_E
     whole = np.floor(binary + np.float32(0.5))
     r = binary - whole
@@ -129,8 +129,8 @@ def _carry(points, centres, shifts, sigmas, out):  # type: ignore[no-untyped-def
             out[start + i, 0], out[start + i, 1], out[start + i, 2] = x[i], y[i], z[i]
 
 
-# Neither calls the other: whether a call is inlined, which in fast math moves last digits, depends
-# on whether this process compiled them or found them in numba's cache.
+# Neither of the next two calls the other: whether a call is inlined, which in fast math moves last
+# digits, depends on whether this process compiled them or loaded them from numba's cache.
 @njit(nogil=True, fastmath=True)
 def _drag(points, centres, shifts, sigmas):  # type: ignore[no-untyped-def]
     out = np.empty_like(points)

@@ -1,4 +1,4 @@
-"""Deformations of the organ's own elastic body: states of its library, scaled and mixed."""
+"""Deformations of the organ's elastic body: states of its library, scaled and mixed."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from tumortrack.simulate.elastic.body import BodyConfig, ElasticBody
 
 @dataclass(frozen=True, eq=False)
 class ElasticDeformation:
-    """Points follow the velocity field of some coefficients of a body's modes."""
+    """Points follow the velocity field that coefficients of the body's modes give."""
 
     body: ElasticBody
     coefficients: Float32[np.ndarray, " m"]
@@ -34,8 +34,8 @@ class ElasticDeformation:
 
 
 class ElasticConfig(Config, frozen=True, tag="elastic"):
-    """A random state of the body's library times ``scale``; a fraction ``mixed`` of scenes
-    adds a second one times ``second_scale``. ``body`` says how the library is made."""
+    """A random state of the body's library times ``scale``; a fraction ``mixed`` of scenes adds a
+    second state times ``second_scale``. ``body``: how the library is made."""
 
     scale: tuple[float, float] = (0.2, 1.1)
     mixed: float = 0.25
@@ -43,7 +43,7 @@ class ElasticConfig(Config, frozen=True, tag="elastic"):
     body: BodyConfig = BodyConfig()
 
     def sample(self, view: View, rng: np.random.Generator) -> ElasticDeformation:
-        """Draw states and scales uniformly; a view without a body raises InputError."""
+        """Draw states and scales uniformly. Raises InputError: a view without a body."""
         if view.body is None:
             raise InputError(
                 "elastic deformations need the organ's body; build it with body_for(...) and give "
@@ -54,6 +54,6 @@ class ElasticConfig(Config, frozen=True, tag="elastic"):
         if rng.uniform() < self.mixed:
             state = state + states[rng.integers(len(states))] * rng.uniform(*self.second_scale)
         coefficients, swelling = state.astype(np.float32), states[:, -1]
-        # No more swelling or shrinking than the library has.
+        # Swell or shrink no more than the library's states.
         coefficients[-1] = np.clip(coefficients[-1], swelling.min(), swelling.max())
         return ElasticDeformation(view.body, coefficients)

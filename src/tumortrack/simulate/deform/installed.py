@@ -1,14 +1,14 @@
-"""Deformations that a configuration may name: ours and those that installed packages add.
+"""Deformations that a configuration may name: our own and those that installed packages add.
 
-A package adds one with an entry point of the group ``tumortrack.deformations``:
+A package adds one by an entry point of the group ``tumortrack.deformations``:
 
     [project.entry-points."tumortrack.deformations"]
     twist = "my_package.twist:TwistConfig"
 
 ``TwistConfig`` is a ``core.config.Config`` whose ``tag`` is the entry point's name, with
 ``sample(view, rng) -> Deformation`` (``base``). A field ``body: BodyConfig`` asks for the organ's
-elastic body in the view. Foreign packages are imported when a configuration is first read. One that
-is broken is refused, with the reason, only where a configuration names it.
+elastic body in the view. Such packages are imported when a configuration is first read. A broken
+one is refused, with the reason, only if a configuration names it.
 """
 
 from functools import reduce
@@ -35,7 +35,7 @@ else:
         """``LinkConfig``: the deformations that may stand in a chain."""
         if name != "LinkConfig":
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-        known = {one.name: one.config for one in extensions()} | _OURS
+        known = {extension.name: extension.config for extension in extensions()} | _OURS
         globals()[name] = union = reduce(or_, known.values())
         return union
 
@@ -50,7 +50,7 @@ class Extension(NamedTuple):
 
 
 def extensions() -> list[Extension]:
-    """Deformations that installed packages offer; each is imported."""
+    """The deformations of installed packages, which are imported."""
     points = sorted(entry_points(group=GROUP), key=lambda point: point.name)
     names = [point.name for point in points]
     return [_loaded(point, names.count(point.name) > 1) for point in points]
@@ -61,7 +61,7 @@ def _loaded(point: EntryPoint, twice: bool) -> Extension:
     try:
         config = point.load()
         fault = _fault(config, point.name, twice)
-    except Exception as error:  # a foreign package raises anything
+    except Exception as error:  # another package's code may raise anything
         fault = f"{type(error).__name__}: {error}"
     if not fault:
         return Extension(point.name, package, "", config)

@@ -1,7 +1,7 @@
-"""An elastic body: an organ's displacement modes and typical states, small enough for every frame.
+"""An elastic body: an organ's displacement modes and typical states, fast enough for every frame.
 
 Finite elements (``finite``) of the organ respond to random loads; the principal components of the
-responses are its modes (``modes``). In their space the organ takes loads in its bed (``loads``),
+responses are its modes (``modes``). In their space the organ is loaded in its bed (``loads``),
 which gives a library of states. See docs/method.md, section "The elastic body".
 """
 
@@ -27,16 +27,16 @@ if TYPE_CHECKING:
 Points = Float[np.ndarray, "n 3"]
 Moved = Float32[np.ndarray, "n 3"]
 Field = Float32[np.ndarray, "i j k 3"]
-_KIDNEY_MM = 115.0  # long
-_RIDGE = 1e-4  # mm2, on the covariance: no coefficient is ever known for sure
+_KIDNEY_MM = 115.0  # length
+_RIDGE = 1e-4  # mm2, added to the covariance's diagonal
 _ARRAYS = ("origin_mm", "spacing_mm", "center_ct", "modes", "states")
 
 
 class BodyConfig(Config, frozen=True):
-    """How an organ's body is built. ``bed_anywhere``: fraction of states whose bed lies on any side
+    """How an organ's body is built. ``bed_anywhere``: fraction of states with the bed on any side
     of the organ, instead of opposite to the direction that faces the camera."""
 
-    cells: int = 1000  # cubes in the organ's volume: decides the spacing
+    cells: int = 1000  # cubes in the organ's volume; sets the spacing
     modes: int = 48
     responses: int = 480
     contrasts: tuple[float, ...] = (1.0, 3.0, 10.0)  # of tumors' stiffness, among the responses
@@ -77,17 +77,17 @@ class ElasticBody:
 
     @cached_property
     def mean(self) -> Float64[np.ndarray, " m"]:
-        """Of the library."""
+        """Mean of the library."""
         return self.states.mean(0, dtype=float)
 
     @cached_property
     def covariance(self) -> Float64[np.ndarray, "m m"]:
-        """Of the library, with a small ridge: always invertible."""
+        """Covariance of the library, with a small ridge that keeps it invertible."""
         return np.cov(self.states.T.astype(float)) + _RIDGE * np.eye(self.states.shape[1])
 
     @cached_property
     def precision(self) -> Float64[np.ndarray, "m m"]:
-        """The inverse of ``covariance``."""
+        """Inverse of ``covariance``."""
         return np.linalg.inv(self.covariance)
 
     def velocity(self, coefficients: Float[np.ndarray, " m"]) -> Field:
@@ -95,13 +95,13 @@ class ElasticBody:
         return combine(self.modes, np.asarray(coefficients, np.float32))
 
     def carry(self, coefficients: Float[np.ndarray, " m"], points_ct: Points) -> Moved:
-        """Where points of the undeformed organ or near it are in a state; the negative coefficients
-        move them back."""
+        """Points in or near the undeformed organ, moved to a state; negative coefficients move them
+        back."""
         return self.follow(self.velocity(coefficients), points_ct)
 
     def follow(self, velocity_mm: Field, points: Points, steps: int | None = None) -> Moved:
-        """Where points are after one unit of time in a velocity field on this body's lattice,
-        integrated in ``steps`` (None: as many as the field needs)."""
+        """Points moved for one unit of time by a velocity field on this body's lattice, integrated
+        in ``steps`` (None: as many as the field needs)."""
         if steps is None:
             steps = steps_for(velocity_mm, self.spacing_mm)
         return follow(self._field(velocity_mm), np.ascontiguousarray(points, np.float32), steps)
@@ -117,20 +117,20 @@ class ElasticBody:
         return LatticeField(values, self.origin_mm, np.float32(self.spacing_mm))
 
     def to_arrays(self) -> dict[str, np.ndarray]:
-        """Everything as named arrays, for a file."""
+        """The body as named arrays, for a file."""
         return {name: np.asarray(getattr(self, name)) for name in _ARRAYS}
 
     @classmethod
     def from_arrays(cls, arrays: dict[str, np.ndarray]) -> ElasticBody:
-        """The inverse of ``to_arrays``; an array that is missing or of a wrong shape raises
-        InputError."""
+        """The inverse of ``to_arrays``. Raises InputError: an array is missing or has a wrong
+        shape."""
         missing = [name for name in _ARRAYS if name not in arrays]
         if missing:
             raise InputError(f"a body lacks {', '.join(missing)}; build it again.")
         names = ("origin_mm", "modes", "states")
         origin_mm, modes, states = (np.ascontiguousarray(arrays[n], np.float32) for n in names)
-        place = origin_mm, float(arrays["spacing_mm"]), np.asarray(arrays["center_ct"], float)
-        return cls(*place, modes, states)
+        spacing_mm, center_ct = float(arrays["spacing_mm"]), np.asarray(arrays["center_ct"], float)
+        return cls(origin_mm, spacing_mm, center_ct, modes, states)
 
 
 def build_body(
@@ -138,11 +138,11 @@ def build_body(
 ) -> ElasticBody:
     """Finite elements of an organ, its modes, and a library of states under random loads.
 
-    Takes seconds on one core. The same arguments give the same body on the same machine; elsewhere
-    last digits differ, and with them possibly the order of modes that matter equally.
+    Takes seconds on one core. The same arguments give the same body on the same machine; on others
+    last digits differ, and with them possibly the order of modes of equal energy.
 
     Raises:
-        InputError: a surface that turns inside, or numbers that make no body.
+        InputError: a surface that turns inward, or a configuration that allows no body.
     """
     from tumortrack.simulate.elastic.loads import random_states
 
@@ -158,9 +158,9 @@ def build_body(
     return body_of(reduced, np.array(states, np.float32))
 
 
-def times_kidney(anatomy_ct: Anatomy) -> float:
-    """An organ's length over a usual kidney's, to scale what is meant for kidneys; of all kidneys
-    1."""
+def length_over_kidney(anatomy_ct: Anatomy) -> float:
+    """An organ's length over a typical kidney's, to scale what is meant for kidneys; 1 for every
+    kidney."""
     kidney = anatomy_ct.kind.name == KIDNEY.name
     return 1.0 if kidney else anatomy_ct.organ.longest_mm / _KIDNEY_MM
 
@@ -168,8 +168,8 @@ def times_kidney(anatomy_ct: Anatomy) -> float:
 def reduced_organ(
     anatomy_ct: Anatomy, up: Float64[np.ndarray, " 3"], config: BodyConfig, rng: np.random.Generator
 ) -> ReducedModel:
-    """An organ in the space of its modes, ready for loads; ``up`` is a unit vector. Raises as
-    ``build_body``."""
+    """An organ in the space of its modes, ready for loads; ``up`` is a unit vector. Raises the same
+    as ``build_body``."""
     from tumortrack.simulate.elastic.finite import ElementLattice, LatticeSolid
     from tumortrack.simulate.elastic.modes import ReducedModel, modes_of, patches_of, random_loads
 
@@ -195,12 +195,12 @@ def reduced_organ(
     patches = patches_of(organ, config.patches, rng)
     loads = random_loads(solid, patches, up, config.responses, rng)
     modes = modes_of(solid, patches, config.modes, config.contrasts, loads)
-    return ReducedModel(solid, modes, patches, times_kidney(anatomy_ct))
+    return ReducedModel(solid, modes, patches, length_over_kidney(anatomy_ct))
 
 
 def body_of(reduced: ReducedModel, states: Float32[np.ndarray, "s m"]) -> ElasticBody:
     """The body of a reduced organ with these states as its library."""
     solid, lattice = reduced.solid, reduced.solid.lattice
-    origin_mm, modes = lattice.origin_mm, solid.spread(reduced.modes)
-    place = origin_mm.astype(np.float32), lattice.spacing_mm, solid.center_mm
-    return ElasticBody(*place, modes.astype(np.float32), states)
+    modes = solid.spread(reduced.modes).astype(np.float32)
+    origin_mm = lattice.origin_mm.astype(np.float32)
+    return ElasticBody(origin_mm, lattice.spacing_mm, solid.center_mm, modes, states)

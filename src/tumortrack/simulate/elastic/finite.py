@@ -1,7 +1,7 @@
 """Linear elasticity of an organ on a regular lattice of cubes.
 
-An element counts by the fraction of it that the organ fills; outside is a fictitious medium, so
-soft that it only extends the displacement, and no mesh has to follow the surface (finite cell
+An element is weighted by the fraction of it that the organ fills. Outside is a fictitious medium,
+so soft that it only extends the displacement; no mesh has to follow the surface (finite cell
 method: Parvizian, Duester and Rank 2007, doi 10.1007/s00466-007-0173-y). The dilatation is averaged
 over each cube (B-bar: Hughes 1980, doi 10.1002/nme.1620150914), so that nearly incompressible
 tissue does not lock.
@@ -27,7 +27,7 @@ from tumortrack.core.types import Anatomy, Mesh
 Points = Float[np.ndarray, "p 3"]
 VOID = 1e-2  # stiffness of the medium outside, relative to the organ's
 _SUBCELLS = 3  # samples along each axis of a cell for its filled fraction
-_ANCHOR = 1e-6  # of the stiffness: holds the rigid motions, which no load here excites
+_ANCHOR = 1e-6  # relative stiffness that holds the rigid motions, which no load here excites
 
 # The eight corners of a cell, the last axis fastest.
 CORNERS = np.array([[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)])
@@ -44,14 +44,14 @@ class ElementLattice:
 
     @classmethod
     def around(cls, box_mm: Float64[np.ndarray, "2 3"], spacing_mm: float) -> ElementLattice:
-        """The lattice around a box with a margin of two cells on every side."""
+        """The lattice around a box, with a margin of two cells on every side."""
         cells = np.ceil((box_mm[1] - box_mm[0]) / spacing_mm + 4.0).astype(int)
         origin_mm = box_mm.mean(0) - cells * spacing_mm / 2
         return cls(origin_mm, spacing_mm, tuple((cells + 1).tolist()))
 
     @property
     def cells(self) -> tuple[int, ...]:
-        """Along each axis."""
+        """Cells along each axis."""
         return tuple(nodes - 1 for nodes in self.shape)
 
     def nodes_mm(self) -> Float64[np.ndarray, "n 3"]:
@@ -59,12 +59,12 @@ class ElementLattice:
         return self.origin_mm + self.spacing_mm * np.indices(self.shape).reshape(3, -1).T
 
     def weights(self, points_mm: Points) -> csr_matrix:
-        """Sparse (p, n): trilinear values at points = weights @ values at nodes; beyond the
-        lattice those of its nearest border."""
+        """Sparse (p, n): trilinear values at points = weights @ values at nodes; points beyond the
+        lattice are clamped to its border."""
         place = np.clip((points_mm - self.origin_mm) / self.spacing_mm, 0, np.array(self.cells))
         lowest = np.minimum(place.astype(int), np.array(self.cells) - 1)
-        part = (place - lowest)[:, None]
-        weight = np.where(CORNERS, part, 1 - part).prod(2)
+        fraction = (place - lowest)[:, None]
+        weight = np.where(CORNERS, fraction, 1 - fraction).prod(2)
         entries = (np.repeat(np.arange(len(points_mm)), 8), self.corner_nodes(lowest).ravel())
         return csr_matrix((weight.ravel(), entries), (len(points_mm), int(np.prod(self.shape))))
 
@@ -74,9 +74,9 @@ class ElementLattice:
 
 
 def cube_stiffness(poisson: float) -> tuple[np.ndarray, np.ndarray]:
-    """Of a unit cube with Young's modulus 1: stiffness (24, 24), and mean dilatation per
-    displacement (24,). Unknowns: x, y, z of the corners in the order of ``CORNERS``. A cube of edge
-    h has h times this stiffness, and 1 / h times this dilatation.
+    """Stiffness (24, 24), and mean dilatation per displacement (24,), of a unit cube with Young's
+    modulus 1. Unknowns: x, y, z of the corners in the order of ``CORNERS``. A cube of edge h has h
+    times this stiffness, and 1 / h times this dilatation.
     """
     shear = 1 / (2 * (1 + poisson))
     bulk = 1 / (3 * (1 - 2 * poisson))
@@ -106,18 +106,18 @@ def _strain(x: Float64[np.ndarray, " 3"]) -> Float64[np.ndarray, "6 24"]:
 def _filled(mesh: Mesh, lattice: ElementLattice) -> Float64[np.ndarray, " c"]:
     """The fraction of each cell that lies inside a closed surface."""
     n, s = np.array(lattice.cells), _SUBCELLS
-    fine = np.indices(tuple(n * s)).reshape(3, -1).T
-    points = lattice.origin_mm + lattice.spacing_mm * (fine + 0.5) / s
+    subcells = np.indices(tuple(n * s)).reshape(3, -1).T
+    points = lattice.origin_mm + lattice.spacing_mm * (subcells + 0.5) / s
     lower, upper = mesh.box_mm
-    near = ((points > lower) & (points < upper)).all(1)
+    in_box = ((points > lower) & (points < upper)).all(1)
     inside = np.zeros(len(points))
-    inside[near] = contains(mesh, points[near])
+    inside[in_box] = contains(mesh, points[in_box])
     return inside.reshape(n[0], s, n[1], s, n[2], s).mean((1, 3, 5)).ravel()
 
 
 class LatticeSolid:
     """An organ and its tumors on a lattice. Cells that do not touch a filled one are left out; the
-    nodes run by layers along the lattice's longest axis."""
+    nodes are ordered by layers along the lattice's longest axis."""
 
     def __init__(self, anatomy_ct: Anatomy, lattice: ElementLattice, poisson: float) -> None:
         organ = _filled(anatomy_ct.organ, lattice)
@@ -126,7 +126,7 @@ class LatticeSolid:
             tumor = np.maximum(tumor, _filled(part, lattice))
         near = binary_dilation((organ > 0).reshape(lattice.cells), np.ones((3, 3, 3))).ravel()
         self.lattice, self.poisson = lattice, poisson
-        # The filled fraction of each remaining cell.
+        # The filled fraction of each cell kept.
         self.organ, self.tumor = organ[near], np.minimum(tumor, organ)[near]
         corners = lattice.corner_nodes(np.indices(lattice.cells).reshape(3, -1).T[near])
         used = np.unique(corners)
@@ -171,16 +171,16 @@ class LatticeSolid:
         return coo_matrix(entries, (size, size)).tocsr()
 
     def factor(self, contrast: float) -> BlockCholesky:
-        """Of the stiffness with tumors ``contrast`` times as stiff as the organ; the rigid motions
-        are held by next to nothing."""
+        """Factor of the stiffness with tumors ``contrast`` times as stiff as the organ; the rigid
+        motions are held very softly."""
         stiffness = self.stiffness(np.maximum(self.organ, VOID) + (contrast - 1) * self.tumor)
         inertia = np.repeat(self.volume_mm3 / self.volume_mm3.max(), 3)
         held = stiffness + diags(_ANCHOR * stiffness.diagonal().max() * inertia)
         return BlockCholesky(held.tocsr(), [3 * b for b in self.bounds])
 
     def spread(self, values: Float[np.ndarray, "f k"]) -> Float[np.ndarray, "i j l 3 k"]:
-        """Values of the unknowns on the whole lattice: a node that was left out takes those of
-        its nearest neighbour."""
+        """Values of the unknowns on the whole lattice; nodes that were left out take those of
+        their nearest neighbour."""
         absent = np.ones(self.lattice.shape, bool)
         absent.ravel()[self.nodes] = False
         nearest = distance_transform_edt(absent, return_distances=False, return_indices=True)
@@ -193,10 +193,10 @@ class BlockCholesky:
     """Cholesky factor of a symmetric positive definite, block tridiagonal matrix.
 
     A lattice cut across its longest axis has such a stiffness. Every block is dense after
-    elimination, so BLAS does all the work on whole blocks and all right-hand sides at once: for an
-    organ of some 10,000 unknowns many times faster than sparse factorisations with a general
+    elimination, so BLAS works on whole blocks and all right-hand sides at once: for an organ of
+    some 10,000 unknowns this is many times faster than sparse factorisations with a general
     ordering. Block s holds the unknowns ``bounds[s] : bounds[s + 1]``; entries between blocks that
-    are not neighbours are taken to be zero.
+    are not adjacent must be zero.
     """
 
     def __init__(self, matrix: csr_matrix, bounds: list[int]) -> None:
@@ -204,15 +204,17 @@ class BlockCholesky:
         self._diagonal: list[np.ndarray] = []  # lower factor of each block
         self._coupling: list[np.ndarray] = []  # of block s with s + 1
         for s, block in enumerate(self._blocks):
-            own = matrix[block, block].toarray()
+            diagonal = matrix[block, block].toarray()
             if s:
-                own -= self._coupling[-1].T @ self._coupling[-1]
-            self._diagonal.append(cholesky(own, lower=True, overwrite_a=True, check_finite=False))
-            for beside in self._blocks[s + 1 : s + 2]:
-                self._coupling.append(self._solve(s, matrix[block, beside].toarray()))
+                diagonal -= self._coupling[-1].T @ self._coupling[-1]
+            factor = cholesky(diagonal, lower=True, overwrite_a=True, check_finite=False)
+            self._diagonal.append(factor)
+            if s + 1 < len(self._blocks):
+                coupling = matrix[block, self._blocks[s + 1]].toarray()
+                self._coupling.append(self._solve(s, coupling))
 
     def solve(self, right: Float64[np.ndarray, "n r"]) -> Float64[np.ndarray, "n r"]:
-        """The solutions for all right-hand sides at once."""
+        """Solutions for all right-hand sides."""
         x, blocks = np.empty_like(right), self._blocks
         for s, block in enumerate(blocks):
             part = right[block]

@@ -1,8 +1,8 @@
-"""Kernels: a velocity field on a lattice, sampled and integrated.
+"""Kernels that sample and integrate a velocity field on a lattice.
 
 The deformation is the exponential of a stationary velocity field (Arsigny et al. 2006, doi
 10.1007/11866565_113): points follow the field for one unit of time. It is one-to-one, its inverse
-follows the opposite field, and a field without divergence keeps volumes, however far points go.
+follows the opposite field, and a field without divergence preserves volume even for large motions.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from jaxtyping import Float32
 
 from tumortrack.core.compiled import njit
 
-_PER_SLOPE = 10  # steps, times the field's steepest slope: back within 0.01 mm of the start
-_FEWEST, _MOST = 3, 24
-BLOCK = 64  # points that take each step together: one alone waits for its last step's numbers
+_PER_SLOPE = 10  # steps over the field's steepest slope; the inverse is then within 0.01 mm
+_FEWEST, _MOST = 3, 24  # steps
+BLOCK = 64  # points that take each step together; a single one stalls on its previous step
 
 
 class LatticeField(NamedTuple):
@@ -30,11 +30,11 @@ class LatticeField(NamedTuple):
 
 
 def steps_for(velocity: Float32[np.ndarray, "i j k 3"], spacing_mm: float) -> int:
-    """Steps that a field needs: the more, the faster neighbouring points move apart."""
+    """Integration steps that a field needs: the more, the steeper it is."""
     return int(steps_of(velocity, np.float32(spacing_mm)))
 
 
-# Fast math: see simulate.deform.drag; here no sum is long enough to matter more.
+# Fast math: see simulate.deform.drag; sums here are too short to add more error.
 @njit(fastmath=True, nogil=True)
 def _steepest(velocity):  # type: ignore[no-untyped-def]
     """Largest difference between neighbouring nodes of a field (i, j, k, 3)."""
@@ -43,21 +43,20 @@ def _steepest(velocity):  # type: ignore[no-untyped-def]
     for i in range(len(nodes)):
         for j in range(nodes.shape[1]):
             here = nodes[i, j]
-            most = max(most, _apart(here[3:], here[:-3]))
+            most = max(most, _largest_difference(here[3:], here[:-3]))
             if i > 0:
-                most = max(most, _apart(here, nodes[i - 1, j]))
+                most = max(most, _largest_difference(here, nodes[i - 1, j]))
             if j > 0:
-                most = max(most, _apart(here, nodes[i, j - 1]))
+                most = max(most, _largest_difference(here, nodes[i, j - 1]))
     return most
 
 
 @njit(fastmath=True, nogil=True)
-def _apart(a, b):  # type: ignore[no-untyped-def]
-    """Largest difference between two rows of numbers."""
+def _largest_difference(a, b):  # type: ignore[no-untyped-def]
     most = np.float32(0)
     for n in range(len(a)):
-        apart = abs(a[n] - b[n])
-        most = apart if apart > most else most
+        difference = abs(a[n] - b[n])
+        most = difference if difference > most else most
     return most
 
 
@@ -70,8 +69,8 @@ def steps_of(velocity, spacing):  # type: ignore[no-untyped-def]
 
 @njit(fastmath=True, nogil=True)
 def combine(modes, coefficients):  # type: ignore[no-untyped-def]
-    """``modes @ coefficients``, (..., m) by (m,), float32. BLAS would wake threads that then wait
-    busily, in the way of those that move points."""
+    """``modes @ coefficients``, (..., m) by (m,), float32. BLAS would wake threads that then
+    busy-wait and slow down those that move points."""
     rows = modes.reshape(-1, len(coefficients))
     out = np.empty(len(rows), np.float32)
     for n in range(len(rows)):
@@ -87,14 +86,14 @@ def advance(velocity, places, speeds, count, half, move):  # type: ignore[no-unt
     """One step of ``count`` points: ``places`` and ``speeds`` (3, BLOCK), in cells and mm per unit
     of time. A place moves by ``move`` times the speed at ``places + half * speeds``.
 
-    Trilinear; beyond the lattice the value of its nearest border.
+    Trilinear; places beyond the lattice are clamped to its border.
     """
     flat = velocity.reshape(-1)
     zero, one, most = np.float32(0), np.float32(1), np.float32(1.001)
     most_x = np.float32(velocity.shape[0]) - most
     most_y = np.float32(velocity.shape[1]) - most
     most_z = np.float32(velocity.shape[2]) - most
-    # Unsigned indices: no check for negative ones, which count from the end.
+    # Unsigned indices spare the check for negative ones, which count from the end.
     row = np.uint32(3 * velocity.shape[2])
     plane = np.uint32(velocity.shape[1] * row)
     for p in range(count):
@@ -121,9 +120,9 @@ def advance(velocity, places, speeds, count, half, move):  # type: ignore[no-unt
 
 @njit(fastmath=True, nogil=True)
 def block():  # type: ignore[no-untyped-def]
-    """Buffers for the places, speeds and places halfway of one block of points."""
-    room = np.empty((3, 3, BLOCK), np.float32)
-    return room[0], room[1], room[2]
+    """Buffers for the places, speeds and midway places of one block of points."""
+    buffers = np.empty((3, 3, BLOCK), np.float32)
+    return buffers[0], buffers[1], buffers[2]
 
 
 @njit(fastmath=True, nogil=True)
@@ -137,11 +136,11 @@ def enter(points, origin, spacing, places):  # type: ignore[no-untyped-def]
 
 @njit(fastmath=True, nogil=True)
 def travel(velocity, spacing, steps, count, places, speeds, middles):  # type: ignore[no-untyped-def]
-    """Move ``count`` places of a block for one unit of time; ``middles`` are those halfway.
+    """Move ``count`` places of a block for one unit of time; ``middles`` are those at half time.
 
-    Midpoint rule, with the middle of a step predicted from the last step's velocity: of second
-    order for one sample a step, and nearly symmetric, so that the opposite field leads back to
-    within some micrometres.
+    Midpoint rule, with the middle of a step predicted from the last step's velocity: second order
+    with one sample a step, and nearly symmetric, so that the opposite field leads back to within
+    some micrometres.
     """
     zero = np.float32(0)
     dt = np.float32(1) / (spacing * np.float32(steps))
@@ -159,8 +158,7 @@ def travel(velocity, spacing, steps, count, places, speeds, middles):  # type: i
 
 @njit(fastmath=True, nogil=True)
 def follow(field, points, steps):  # type: ignore[no-untyped-def]
-    """Where points (n, 3), mm, float32, are after one unit of time in a velocity field; see
-    ``travel``."""
+    """Points (n, 3), mm, float32, after one unit of time in a velocity field; see ``travel``."""
     velocity, origin, spacing = field.values, field.origin_mm, field.spacing_mm
     out = np.empty_like(points)
     places, speeds, middles = block()
@@ -177,7 +175,7 @@ def follow(field, points, steps):  # type: ignore[no-untyped-def]
 @njit(fastmath=True, nogil=True)
 def project(field, points, directions):  # type: ignore[no-untyped-def]
     """Trilinear values (n, m) of modes at points (n, 3), mm, each along a direction (n, 3); all
-    float32. Beyond the lattice those of its nearest border."""
+    float32. Points beyond the lattice are clamped to its border."""
     modes, origin, spacing = field.values, field.origin_mm, field.spacing_mm
     n, m = len(points), modes.shape[4]
     out = np.zeros((n, m), np.float32)

@@ -1,11 +1,11 @@
-"""An organ in its bed takes loads: equilibrium with one-sided contacts in the space of its modes.
+"""Loads on an organ in its bed: equilibrium with unilateral contacts in the space of its modes.
 
 Unknowns are the modes' coefficients and six rigid ones. The bed is a layer of springs on the
-underside, obstacles are stiff springs that only push. Each Newton step solves for the contacts
-that the last one left closed. Lengths in mm, stress in N/mm2 (1 kPa = 1e-3).
+underside, obstacles are stiff springs that only push. Each Newton step solves with the contacts
+that the last one closed. Lengths in mm, stress in N/mm2 (1 kPa = 1e-3).
 
 A random load is a function in ``LOADS`` that adds itself to the problem of an organ in its bed.
-Its lengths are a kidney's, times the organ's length over a kidney's (``ReducedModel.times``).
+Its lengths are a kidney's, scaled with the organ's length (``ReducedModel.scale``).
 """
 
 from __future__ import annotations
@@ -27,18 +27,18 @@ Vector = Float64[np.ndarray, " 3"]
 _MOST_STEPS = 20
 _CONVERGED_MM = 1e-2
 _OBSTACLE = 100 * KPA  # N/mm3, of plates and instruments
-_GRIP = 50 * KPA  # N/mm3, of what holds a place
+_GRIP = 50 * KPA  # N/mm3, of a held region
 _WEIGHT = 1.05e-6 * 9.81  # N/mm3
-_EDGE_MM = 4.0  # over which an obstacle's edge fades
-_DEEPEST = 0.28  # of the organ's thickness, that a plate goes
-_FARTHEST_MM = 16.0  # that a place of a kidney's surface moves
-_TOGETHER = 32  # problems that are solved together: some 2 MB each
-_SWELLING = 0.025  # largest change of volume: leaves room below 3 % for what modes do to it
+_EDGE_MM = 4.0  # width over which an obstacle's edge fades
+_DEEPEST = 0.28  # largest depth of a plate, over the organ's thickness
+_FARTHEST_MM = 16.0  # largest motion of a place on a kidney's surface
+_TOGETHER = 32  # problems solved in one batch, of some 2 MB each
+_SWELLING = 0.025  # largest strain of the volume, which modes change further, to 3 % at most
 
 
 @dataclass(eq=False)
 class ReducedProblem:
-    """What acts on the organ, gathered by the loads: energy z' H z / 2 - g z + springs' energy."""
+    """What acts on the organ: energy z' H z / 2 - g z + the springs' energy. Loads add to it."""
 
     organ: ReducedModel
     up: Vector
@@ -47,27 +47,28 @@ class ReducedProblem:
     forces: Float64[np.ndarray, " m"]  # g
     # (rows, depth_mm, springs): they push where depth_mm + rows @ z is above zero
     contacts: list[tuple[np.ndarray, ...]] = field(default_factory=list)
-    later: list[Callable[[], object]] = field(default_factory=list)  # adds to H and g
+    # Additions to H and g, made by the thread that solves the problem.
+    additions: list[Callable[[], object]] = field(default_factory=list)
 
     def touch(self, rows: np.ndarray, depth_mm: np.ndarray, springs: np.ndarray) -> None:
         """Add contacts with springs in N/mm."""
-        near = springs > 0
-        self.contacts.append((rows[near], depth_mm[near], springs[near]))
+        active = springs > 0
+        self.contacts.append((rows[active], depth_mm[active], springs[active]))
 
     def tie(self, along: Vector, target_mm: float, springs: Float64[np.ndarray, " p"]) -> None:
-        """Springs (N/mm) that hold the patches at a target along a direction, both ways."""
-        known, loads = (self.stiffness, self.forces), (springs * target_mm, springs)
-        self.later.append(lambda: _add_springs(*known, self.organ.along(along), *loads))
+        """Add springs (N/mm) that hold the patches at a target along a direction, both ways."""
+        system, loads = (self.stiffness, self.forces), (springs * target_mm, springs)
+        self.additions.append(lambda: _add_springs(*system, self.organ.along(along), *loads))
 
     def press(self, outward: Vector, height_mm: float, foot: Float64[np.ndarray, " p"]) -> None:
-        """Something hard comes from a unit vector and stops at ``height_mm`` along it, felt by a
-        fraction ``foot`` of each patch."""
+        """A rigid obstacle comes from the direction ``outward`` (unit vector) and stops at
+        ``height_mm`` along it; it touches a fraction ``foot`` of each patch."""
         patches = self.organ.patches
         depth = patches.points_mm @ outward - height_mm
         self.touch(self.organ.along(outward), depth, _OBSTACLE * patches.areas_mm2 * foot)
 
     def indent(self, patch: int, outward: Vector, radius_mm: float, depth_mm: float) -> None:
-        """An instrument of a radius is pressed to a depth at a patch, against a unit vector."""
+        """An instrument is pressed in at a patch, against the unit vector ``outward``."""
         points, normals = self.organ.patches.points_mm, self.organ.patches.normals
         offset = points - points[patch]
         aside = np.linalg.norm(offset - np.outer(offset @ outward, outward), axis=1)
@@ -75,63 +76,64 @@ class ReducedProblem:
         self.press(outward, float(points[patch] @ outward - depth_mm), foot)
 
     def hold(self, patch: int, radius_mm: float, shift_mm: Vector) -> None:
-        """A region around a patch is held at a shift."""
+        """A region around a patch is held at a displacement."""
         patches = self.organ.patches
         springs = _GRIP * patches.areas_mm2 * patches.spot(patches.points_mm[patch], radius_mm)
         for axis, shift in zip(np.eye(3), shift_mm, strict=True):
             self.tie(axis, float(shift), springs)
 
     def weigh(self, down: Vector, fraction: float) -> None:
-        """A fraction of the weight that the tissue bore in the CT is no longer borne."""
-        added = fraction * _WEIGHT * (down @ self.organ.volume_moves)
-        self.later.append(lambda: np.add(self.forces, added, out=self.forces))
+        """The tissue no longer supports a fraction of the weight that it did in the CT."""
+        self._add_forces(fraction * _WEIGHT * (down @ self.organ.volume_moves))
 
     def expand(self, strain: float) -> None:
-        """The organ takes up or loses fluid: a strain of its volume, if nothing hinders it."""
-        added = self.modulus * strain * self.organ.swelling
-        self.later.append(lambda: np.add(self.forces, added, out=self.forces))
+        """The organ takes up or loses fluid: a strain of its volume, if nothing resists."""
+        self._add_forces(self.modulus * strain * self.organ.swelling)
+
+    def _add_forces(self, forces: Float64[np.ndarray, " m"]) -> None:
+        self.additions.append(lambda: np.add(self.forces, forces, out=self.forces))
 
     def equilibrium(self) -> Float64[np.ndarray, " m"] | None:
-        """The unknowns at rest; None where the contacts do not converge."""
-        while self.later:
-            self.later.pop(0)()
+        """The unknowns at rest; None if the contacts do not converge."""
+        while self.additions:
+            self.additions.pop(0)()
         none = np.zeros((0, len(self.forces))), np.zeros(0), np.zeros(0)
         contacts = map(np.concatenate, zip(none, *self.contacts, strict=True))
         z, converged = _equilibrium(self.stiffness, self.forces, *contacts)
         return z if converged else None
 
 
-# Own loops for small matrices: BLAS would wake every thread for each product, which on a busy
-# machine takes many times longer than the product; and most springs are open.
+# Loops instead of BLAS, as matrices are small: BLAS would wake every thread for each product, which
+# on a busy machine takes many times longer than the product. And most springs are open.
 @njit(nogil=True)
 def _equilibrium(stiffness, forces, rows, depth, springs):  # type: ignore[no-untyped-def]
     z = np.zeros(len(forces))
     for step in range(_MOST_STEPS):
         closed, loads = np.zeros(len(rows)), np.zeros(len(rows))
         for p in range(len(rows)):
-            sunk = depth[p]
+            penetration = depth[p]
             for a in range(len(z)):
-                sunk += rows[p, a] * z[a]
-            if sunk > 0:
+                penetration += rows[p, a] * z[a]
+            if penetration > 0:
                 closed[p] = springs[p]
                 loads[p] = -springs[p] * depth[p]
-        matrix, found = stiffness.copy(), forces.copy()
-        _add_springs(matrix, found, rows, loads, closed)
-        _solve(matrix, found)
+        matrix, solution = stiffness.copy(), forces.copy()
+        _add_springs(matrix, solution, rows, loads, closed)
+        _solve(matrix, solution)
         farthest = 0.0
         for a in range(len(z)):
-            move = found[a] - z[a]
+            move = solution[a] - z[a]
             farthest = max(farthest, abs(move))
-            z[a] += move if step < 6 else 0.6 * move  # contacts that open and close in turns
+            z[a] += move if step < 6 else 0.6 * move  # damps contacts that open and close in turns
         if farthest < _CONVERGED_MM:
-            return found, True
+            return solution, True
     return z, False
 
 
 @njit(nogil=True)
 def _add_springs(matrix, right, rows, loads, springs):  # type: ignore[no-untyped-def]
-    """matrix += rows' diag(springs) rows, of which the lower triangle is all that ``_solve`` asks
-    for, and right += rows' loads, in place."""
+    """In place: matrix += rows' diag(springs) rows, its lower triangle only, as ``_solve`` needs no
+    more; right += rows' loads."""
     for p in range(len(rows)):
         if springs[p] == 0.0:
             continue
@@ -163,43 +165,43 @@ def _solve(matrix, right):  # type: ignore[no-untyped-def]
 
 
 def plate(problem: ReducedProblem, rng: np.random.Generator) -> None:
-    """A plate or strip pressed down on the organ, a little tilted."""
+    """A plate or strip pressed down on the organ, slightly tilted."""
     _press_strip(problem, _turned(problem.up, 0.15, rng), rng)
 
 
 def side(problem: ReducedProblem, rng: np.random.Generator) -> None:
-    """A retractor or plate that presses from the side."""
+    """A retractor or plate pressing from the side."""
     outward = rng.normal(size=3)
     outward -= problem.up * (outward @ problem.up) * rng.uniform(0.5, 1)
     _press_strip(problem, unit(outward), rng)
 
 
 def poke(problem: ReducedProblem, rng: np.random.Generator) -> None:
-    """A blunt instrument pressed into the surface that does not face down."""
+    """A blunt instrument pressed into a part of the surface that does not face down."""
     tip = _reachable(problem, rng)
     outward = unit(problem.organ.patches.normals[tip] + rng.normal(0, 0.25, 3))
-    times = problem.organ.times
-    problem.indent(tip, outward, times * rng.uniform(3, 10), times * rng.uniform(1, 14))
+    scale = problem.organ.scale
+    problem.indent(tip, outward, scale * rng.uniform(3, 10), scale * rng.uniform(1, 14))
 
 
 def pull(problem: ReducedProblem, rng: np.random.Generator) -> None:
-    """Forceps pull at the surface."""
-    times, place, radius_mm = problem.organ.times, _reachable(problem, rng), rng.uniform(4, 9)
-    along = unit(problem.organ.patches.normals[place] + rng.normal(0, 0.6, 3))
-    problem.hold(place, times * radius_mm, along * (times * rng.uniform(1, 12)))
+    """Forceps pulling at the surface."""
+    scale, patch, radius_mm = problem.organ.scale, _reachable(problem, rng), rng.uniform(4, 9)
+    along = unit(problem.organ.patches.normals[patch] + rng.normal(0, 0.6, 3))
+    problem.hold(patch, scale * radius_mm, along * (scale * rng.uniform(1, 12)))
 
 
 def lift(problem: ReducedProblem, rng: np.random.Generator) -> None:
-    """A pole is raised or moved aside, mostly upwards."""
+    """A pole raised or moved aside, mostly upwards."""
     outward, up = rng.normal(size=3), problem.up
     outward -= 0.7 * up * (outward @ up)
-    place, radius_mm = int(np.argmax(problem.organ.patches.points_mm @ outward)), rng.uniform(8, 20)
-    times, along = problem.organ.times, unit(rng.normal(size=3) + 0.7 * up)
-    problem.hold(place, times * radius_mm, along * (times * rng.uniform(1, 12)))
+    patch, radius_mm = int(np.argmax(problem.organ.patches.points_mm @ outward)), rng.uniform(8, 20)
+    scale, along = problem.organ.scale, unit(rng.normal(size=3) + 0.7 * up)
+    problem.hold(patch, scale * radius_mm, along * (scale * rng.uniform(1, 12)))
 
 
 def sag(problem: ReducedProblem, rng: np.random.Generator) -> None:
-    """Tissue softened, or cut open and without its turgor."""
+    """Tissue softened, or cut open and so without turgor."""
     problem.weigh(_turned(-problem.up, 0.15, rng), float(rng.uniform(0.2, 1)))
 
 
@@ -208,7 +210,7 @@ def swell(problem: ReducedProblem, rng: np.random.Generator) -> None:
     problem.expand(float(rng.uniform(-_SWELLING, _SWELLING)))
 
 
-# Each with its probability.
+# Loads with their probabilities.
 LOADS: tuple[tuple[Callable[[ReducedProblem, np.random.Generator], None], float], ...] = (
     (plate, 0.32),
     (side, 0.11),
@@ -222,7 +224,7 @@ LOADS: tuple[tuple[Callable[[ReducedProblem, np.random.Generator], None], float]
 
 def in_bed(organ: ReducedModel, up: Vector, rng: np.random.Generator) -> ReducedProblem:
     """An organ of random tissue (3-30 kPa, tumors 0.8-8 times that) in a random bed: springs of
-    0.5-20 kPa/mm on the underside, in some states only against sinking, in others both ways."""
+    0.5-20 kPa/mm on the underside, in some states against sinking only, in others both ways."""
     modulus = KPA * _log_uniform(3, 30, rng)
     stiffness = organ.stiffness(modulus, _log_uniform(0.8, 8, rng))
     problem = ReducedProblem(organ, up, modulus, stiffness, np.zeros(len(stiffness)))
@@ -234,8 +236,8 @@ def in_bed(organ: ReducedModel, up: Vector, rng: np.random.Generator) -> Reduced
         problem.tie(-up, 0.0, 1e-3 * springs)  # keeps it over the bed
     else:
         problem.tie(-up, 0.0, springs)
-    grip, one = rng.uniform(0, 0.3), perpendicular(up)
-    for aside in (one, np.cross(up, one)):
+    grip, x_axis = rng.uniform(0, 0.3), perpendicular(up)
+    for aside in (x_axis, np.cross(up, x_axis)):
         problem.tie(aside, 0.0, grip * springs)
     return problem
 
@@ -243,12 +245,12 @@ def in_bed(organ: ReducedModel, up: Vector, rng: np.random.Generator) -> Reduced
 def random_states(
     organ: ReducedModel, up: Vector, anywhere: float, rng: np.random.Generator, count: int
 ) -> list[Float64[np.ndarray, " k"]]:
-    """The first ``count`` states (``state_of``) of twice as many loads at most; fewer where few are
-    at rest. They are drawn in turn and solved on two threads."""
+    """The first ``count`` states (``state_of``) of at most twice as many problems; fewer if too few
+    come to rest. Problems are drawn in sequence and solved on two threads."""
     states: list[Float64[np.ndarray, " k"]] = []
     for first in range(0, 2 * count, _TOGETHER):
-        some = range(first, min(first + _TOGETHER, 2 * count))
-        problems = [random_problem(organ, up, anywhere, rng) for _ in some]
+        batch = range(first, min(first + _TOGETHER, 2 * count))
+        problems = [random_problem(organ, up, anywhere, rng) for _ in batch]
         states += [state for state in parallel_map(state_of, problems) if state is not None]
         if len(states) >= count:
             break
@@ -270,23 +272,23 @@ def random_problem(
 
 
 def state_of(problem: ReducedProblem) -> Float64[np.ndarray, " k"] | None:
-    """Coefficients of the modes at rest; None for states that find no equilibrium or move a place
-    by more than 24 mm (of a kidney). Motions of 16 to 24 mm are scaled to 16."""
-    found, organ = problem.equilibrium(), problem.organ
-    if found is None:
+    """Coefficients of the modes at rest; None without an equilibrium, or if a place moves by more
+    than 24 mm (on a kidney). Motions of 16 to 24 mm are scaled to 16."""
+    unknowns, organ = problem.equilibrium(), problem.organ
+    if unknowns is None:
         return None
-    state = found[: organ.n_modes]
+    state = unknowns[: organ.n_modes]
     farthest = np.linalg.norm(organ.moves[:, :, : organ.n_modes] @ state, axis=1).max()
-    most = _FARTHEST_MM * organ.times
+    most = _FARTHEST_MM * organ.scale
     return None if farthest > 1.5 * most else state * min(1.0, most / farthest)
 
 
 def _press_strip(problem: ReducedProblem, outward: np.ndarray, rng: np.random.Generator) -> None:
-    """A strip across a random line, pressed in by up to ``_DEEPEST``; of a kidney 10-70 mm wide."""
+    """A strip in a random direction, on a kidney 10-70 mm wide, pressed in up to ``_DEEPEST``."""
     patches = problem.organ.patches
     across = patches.points_mm @ unit(np.cross(outward, rng.normal(size=3)))
     low, high = np.percentile(across, [15, 85])
-    middle, width = rng.uniform(low, high), problem.organ.times * rng.uniform(10, 70)
+    middle, width = rng.uniform(low, high), problem.organ.scale * rng.uniform(10, 70)
     foot = _faded(width / 2 - np.abs(across - middle)) * (patches.normals @ outward > 0)
     height = patches.points_mm @ outward
     depth = rng.uniform(0.02, _DEEPEST) * np.ptp(height)
@@ -295,7 +297,7 @@ def _press_strip(problem: ReducedProblem, outward: np.ndarray, rng: np.random.Ge
 
 
 def _faded(inward_mm: np.ndarray) -> np.ndarray:
-    """1 well within an edge, 0 beyond it."""
+    """1 well inside an edge, 0 outside."""
     return np.clip(inward_mm / _EDGE_MM + 0.5, 0, 1)
 
 

@@ -1,9 +1,9 @@
-"""Displacement modes: the principal components of an organ's responses to many random loads; and
-the organ in their space.
+"""Displacement modes, the principal components of an organ's responses to random loads, and the
+organ reduced to them.
 
-Reduced bases of elastic bodies from their responses, in the inner product of the mass: Barbic and
-James 2005, doi 10.1145/1073204.1073300. Loads balance themselves (inertia relief), so responses
-and modes are free of rigid motion, which belongs to the pose.
+Reduced bases from responses, in the mass inner product: Barbic and James 2005, doi
+10.1145/1073204.1073300. Loads are balanced by inertia (inertia relief), so responses and modes are
+free of rigid motion, which belongs to the pose.
 """
 
 from __future__ import annotations
@@ -22,19 +22,19 @@ from tumortrack.core.types import Mesh
 from tumortrack.simulate.elastic.finite import LatticeSolid
 
 LEVER_MM = 50.0  # a rotation's unknown is the motion at this lever arm
-_FREE = 1e-4  # N/mm: keeps the rigid motions solvable where nothing touches
+_FREE = 1e-4  # N/mm: keeps rigid motions solvable without contacts
 
 
 @dataclass(frozen=True, eq=False)
 class Patches:
-    """The organ's surface as some hundred areas, where loads act and obstacles are felt."""
+    """The organ's surface as some hundred areas, on which loads and obstacles act."""
 
     points_mm: Float64[np.ndarray, "p 3"]  # centroids
     areas_mm2: Float64[np.ndarray, " p"]
     normals: Float64[np.ndarray, "p 3"]  # mean, outward
 
     def spot(self, middle_mm: np.ndarray, radius_mm: float) -> Float64[np.ndarray, " p"]:
-        """A weight that falls off from a place as a Gaussian."""
+        """A Gaussian weight around a place."""
         return np.exp(-0.5 * ((self.points_mm - middle_mm) ** 2).sum(1) / radius_mm**2)
 
     def facing(self, along: np.ndarray) -> Float64[np.ndarray, " p"]:
@@ -43,7 +43,7 @@ class Patches:
 
 
 def patches_of(mesh: Mesh, count: int, rng: np.random.Generator) -> Patches:
-    """At most ``count`` patches: faces go to the nearest of random ones, drawn by area."""
+    """At most ``count`` patches: each face joins the nearest of random ones, drawn by area."""
     middles, doubled = triangles_of(mesh.vertices_mm, mesh.faces)
     areas = np.linalg.norm(doubled, axis=1) / 2
     drawn = rng.choice(len(areas), min(count, len(areas)), replace=False, p=areas / areas.sum())
@@ -55,17 +55,17 @@ def patches_of(mesh: Mesh, count: int, rng: np.random.Generator) -> Patches:
     area = np.bincount(patch, areas, len(drawn))
     normals = total(doubled)
     length = np.linalg.norm(normals, axis=1)
-    some = (area > 0) & (length > 0)
-    points = total(areas[:, None] * middles)[some] / area[some][:, None]
-    return Patches(points, area[some], normals[some] / length[some][:, None])
+    valid = (area > 0) & (length > 0)
+    points = total(areas[:, None] * middles)[valid] / area[valid][:, None]
+    return Patches(points, area[valid], normals[valid] / length[valid][:, None])
 
 
 def modes_of(
     solid: LatticeSolid, patches: Patches, count: int, contrasts: Sequence[float], loads: np.ndarray
 ) -> Float64[np.ndarray, "f k"]:
-    """``count`` modes of the responses to loads (f, n), which alternate between the tumors'
-    contrasts, as displacements of the solid's nodes: a unit coefficient moves the organ by 1 mm
-    rms. The last mode swells the organ; the others keep its volume."""
+    """``count`` modes of the responses to loads (f, n) with the tumors' contrasts in turn, as
+    displacements of the solid's nodes: a unit coefficient moves the organ by 1 mm rms. The last
+    mode swells the organ; the others keep its volume."""
     arms, axes = solid.nodes_mm - solid.center_mm, np.eye(3)
     turns = [np.cross(axis, arms).ravel() for axis in axes]
     rigid = np.stack([*(np.tile(axis, len(arms)) for axis in axes), *turns], 1)
@@ -79,17 +79,17 @@ def modes_of(
     forces = forces - mass * (rigid @ (inverse @ (rigid.T @ forces)))  # inertia balances them
     responses = np.empty_like(forces)
 
-    def respond(turn: int) -> None:
-        factor, taken = solid.factor(contrasts[turn]), slice(turn, -1, len(contrasts))
-        responses[:, taken] = factor.solve(forces[:, taken])
-        if turn == 0:
+    def respond(number: int) -> None:
+        factor, columns = solid.factor(contrasts[number]), slice(number, -1, len(contrasts))
+        responses[:, columns] = factor.solve(forces[:, columns])
+        if number == 0:
             responses[:, -1:] = factor.solve(forces[:, -1:])
 
     parallel_map(respond, range(len(contrasts)))
     responses = without_rigid(responses)
     responses, swelling = responses[:, :-1], responses[:, -1:]
-    moved = solid.at(patches.points_mm, responses)
-    responses /= np.linalg.norm(moved, axis=1).max(0)  # each moves its farthest patch by 1 mm
+    moves = solid.at(patches.points_mm, responses)
+    responses /= np.linalg.norm(moves, axis=1).max(0)  # the farthest patch moves by 1 mm
 
     energies, mixes = np.linalg.eigh(responses.T @ (mass * responses))
     energies, mixes = energies[::-1], mixes[:, ::-1]
@@ -102,8 +102,8 @@ def modes_of(
 def random_loads(
     solid: LatticeSolid, patches: Patches, up: np.ndarray, count: int, rng: np.random.Generator
 ) -> Float64[np.ndarray, "f n"]:
-    """Forces at the nodes, one column a load. They only have to be diverse: magnitudes, and how an
-    organ in its bed responds, are decided for every state by itself (``loads.state_of``)."""
+    """Forces at the nodes, one column per load. They only have to be diverse: magnitudes, and the
+    response of an organ in its bed, are decided for each state (``loads.state_of``)."""
     draw = _Tractions(patches, solid.center_mm, up, rng)
     kinds = (draw.squeeze, draw.poke, draw.hang, draw.bend, draw.shear)
     shares = np.array([0.36, 0.28, 0.12, 0.16, 0.08])
@@ -123,7 +123,7 @@ class _Tractions:
     rng: np.random.Generator
 
     def squeeze(self) -> np.ndarray:
-        """A pad presses, a bed or a second pad holds against it."""
+        """A pad presses; a bed or a second pad supports the other side."""
         rng, patches, along = self.rng, self.patches, self._direction()
         facing = patches.facing(along)
         place = patches.points_mm[rng.choice(len(facing), p=facing / facing.sum())]
@@ -134,7 +134,7 @@ class _Tractions:
         return _total(bed, along) - _total(pad, along)
 
     def poke(self) -> np.ndarray:
-        """An instrument presses or pulls in one place; inertia alone, or the far side, holds."""
+        """An instrument presses or pulls in one place; inertia or the far side balances it."""
         rng, patches = self.rng, self.patches
         areas = patches.areas_mm2
         patch = rng.choice(len(areas), p=areas / areas.sum())
@@ -144,11 +144,12 @@ class _Tractions:
         return force - _total(patches.facing(-along), along) if rng.uniform() < 0.6 else force
 
     def hang(self) -> np.ndarray:
-        """Borne in one place; weight, which is all that inertia relief is, pulls elsewhere."""
+        """Supported in one place; the weight, which is what inertia relief amounts to, pulls on
+        the rest."""
         along, points = self._direction(), self.patches.points_mm
         radius = self.rng.uniform(0.4, 2) * self._size_mm
-        borne = self.patches.spot(points[self.rng.integers(len(points))], radius)
-        return _total(self.patches.facing(-along) * borne + 1e-12, along)
+        support = self.patches.spot(points[self.rng.integers(len(points))], radius)
+        return _total(self.patches.facing(-along) * support + 1e-12, along)
 
     def bend(self) -> np.ndarray:
         """The ends go one way, the middle the other."""
@@ -164,12 +165,12 @@ class _Tractions:
         radii = rng.uniform(0.3, 0.6, 2) * self._size_mm
         middles = (patches.points_mm[rng.integers(len(patches.points_mm))] for _ in radii)
         spots = (patches.spot(*place) for place in zip(middles, radii, strict=True))
-        one, other = (spot * patches.areas_mm2 for spot in spots)
+        first, second = (spot * patches.areas_mm2 for spot in spots)
         along = unit(rng.normal(size=3))
-        return _total(one, along) - _total(other, along)
+        return _total(first, along) - _total(second, along)
 
     def _direction(self) -> np.ndarray:
-        """Half of the time roughly up, else anywhere."""
+        """Roughly up half of the time, else any direction."""
         if self.rng.uniform() < 0.5:
             return unit(self.rng.normal(size=3))
         return Rotation.from_rotvec(self.rng.normal(0, 0.3, 3)).apply(self.up)
@@ -185,38 +186,40 @@ def _total(weights: np.ndarray, along: np.ndarray) -> np.ndarray:
 
 
 class ReducedModel:
-    """A solid in the space of its modes and six rigid motions: k + 6 unknowns. ``times``: how long
-    it is, over the kidney that the loads' lengths are meant for."""
+    """A solid in the space of its modes and six rigid motions: k + 6 unknowns. ``scale``: its
+    length over that of the kidney for which the loads' lengths are meant."""
 
     def __init__(
         self,
         solid: LatticeSolid,
         modes: Float64[np.ndarray, "f k"],
         patches: Patches,
-        times: float = 1.0,
+        scale: float = 1.0,
     ) -> None:
-        self.times = times
+        self.scale = scale
         k, n = modes.shape[1], len(solid.nodes)
         self.solid, self.modes, self.patches, self.n_modes = solid, modes, patches, k
-        bent = solid.at(patches.points_mm, modes)
+        deformed = solid.at(patches.points_mm, modes)
         arms = (patches.points_mm - solid.center_mm) / LEVER_MM
         turned = np.stack([np.cross(axis, arms) for axis in np.eye(3)], -1)
         shifted = np.broadcast_to(np.eye(3), turned.shape)
-        self.moves = np.concatenate([bent, shifted, turned], -1)  # of patches: (p, 3, k + 6)
+        # Displacement per unknown: of each patch (p, 3, k + 6); integrated over the volume
+        # (3, k + 6), mm3.
+        self.moves = np.concatenate([deformed, shifted, turned], -1)
         volume = solid.volume_mm3
         mean = np.tensordot(volume, modes.reshape(n, 3, k), 1)
         rigid = np.concatenate([np.eye(3) * volume.sum(), np.zeros((3, 3))], 1)
-        self.volume_moves = np.concatenate([mean, rigid], 1)  # of all volume: (3, k + 6), mm3
+        self.volume_moves = np.concatenate([mean, rigid], 1)
         self.swelling = np.append(modes.T @ solid.swelling, np.zeros(6))  # as the solid's
         self._tissue = modes.T @ (solid.stiffness(solid.organ) @ modes)
         self._tumors = modes.T @ (solid.stiffness(solid.tumor) @ modes)
 
     def stiffness(self, modulus: float, contrast: float) -> Float64[np.ndarray, "m m"]:
-        """For the tissue's Young's modulus (N/mm2) and how many times stiffer the tumors are."""
-        k, whole = self.n_modes, _FREE * np.eye(self.n_modes + 6)
-        whole[:k, :k] = modulus * (self._tissue + (contrast - 1) * self._tumors)
-        return whole
+        """For the tissue's Young's modulus (N/mm2), with tumors ``contrast`` times as stiff."""
+        k, stiffness = self.n_modes, _FREE * np.eye(self.n_modes + 6)
+        stiffness[:k, :k] = modulus * (self._tissue + (contrast - 1) * self._tumors)
+        return stiffness
 
     def along(self, direction: Float64[np.ndarray, " 3"]) -> Float64[np.ndarray, "p m"]:
-        """How far each patch moves along a direction, per unknown."""
+        """Displacement of each patch along a direction, per unknown."""
         return np.einsum("d,pdm->pm", direction, self.moves)
