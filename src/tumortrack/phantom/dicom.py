@@ -1,4 +1,4 @@
-"""A CT written as a DICOM series."""
+"""Write a CT as a DICOM series."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from tumortrack.core.types import Volume
 if TYPE_CHECKING:
     from pydicom.dataset import Dataset
 
-_INTERCEPT = -1024  # stored values are unsigned, as from scanners
+_INTERCEPT = -1024  # stored values are unsigned, as scanners write them
 _HIGHEST_HU = 65535 + _INTERCEPT
 _DATE, _TIME = "20250101", "120000"  # fixed, so that the same volume gives the same files
 
@@ -35,7 +35,7 @@ def write_dicom_series(
     UIDs are derived from the volume and the seed. File names are in random order, so that readers
     must sort by ImagePositionPatient. Exposure as in the paper (90 kV, 13.6 mA). ``side`` is
     written as Laterality. Raises InputError: ``folder`` exists; HU not finite or outside
-    -1024..64511; sheared voxels; StorageError: the disk refused, and nothing is left behind."""
+    -1024..64511; sheared voxels. Raises StorageError: writing failed; nothing is left behind."""
     load_pydicom()
     from pydicom import dcmwrite
 
@@ -105,7 +105,7 @@ def _slice(volume: Volume, k: int, entropy: list[str], description: str) -> Data
         **dict.fromkeys(("SeriesNumber", "AcquisitionNumber"), 1),
         "InstanceNumber": k + 1,
         "ImagePositionPatient": decimal(position[:3]),
-        # The direction in which the column number grows (axis 0), then the row number (axis 1)
+        # Direction of increasing column number (axis 0), then of increasing row number (axis 1)
         "ImageOrientationPatient": decimal(directions[:, :2].T.ravel()),
         "PixelSpacing": decimal(spacing[[1, 0]]),  # between rows, then between columns
         "SliceThickness": decimal(spacing[2:])[0],

@@ -2,9 +2,9 @@
 
 The organ is an implicit surface in the organ frame: axes as in LPS, origin at the centre of the
 organ's box, mm. It is a right kidney: long axis superior-inferior, hilum medial (+x, patient left)
-and slightly anterior. Its poles differ and its lumps are irregular, so that no rotation or mirror
-image of it looks the same. Sizes follow the paper's hydrogel phantom (one endophytic, one exophytic
-tumor); the shape is our own.
+and slightly anterior. Its poles differ and its lumps are irregular, so that it has no symmetry
+under rotation or reflection. Sizes follow the paper's hydrogel phantom (one endophytic, one
+exophytic tumor); the shape is our own.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ SMALLEST_GAP_MM = 3.0  # between tumors: closer ones merge in a CT's partial-vol
 
 
 class TumorParameters(Config, frozen=True):
-    """A lobulated ball, in every direction ``diameter_mm`` across."""
+    """A lobulated ball, ``diameter_mm`` across in every direction."""
 
     diameter_mm: float
     center_mm: tuple[float, float, float]
     """Organ frame (medial is +x for a right kidney; a left one is mirrored with its tumors)."""
     lobulation: float = 0.08
-    """Largest deviation from a ball relative to the radius."""
+    """Largest deviation from a ball, relative to the radius."""
 
     def __post_init__(self) -> None:
         self.check_between("tumor:", diameter_mm=(2, 120), lobulation=(0, 0.2))
@@ -50,9 +50,9 @@ class PhantomParameters(Config, frozen=True):
     bend_mm: float = 12.0
     """How far the poles lean medially."""
     taper: float = 0.10
-    """How much thicker the superior pole is, and thinner the inferior one."""
+    """How much thicker the superior pole is, and how much thinner the inferior one."""
     hilum_depth_mm: float = 18.0
-    """Of the slot that is carved; with its rounded rim the dent is some 4 mm shallower."""
+    """Depth of the carved slot; with its rounded rim the dent is some 4 mm shallower."""
     lump_mm: float = 1.2
     shape_seed: int = 1
     """Places the lumps of the organ and the lobes of the tumors."""
@@ -121,20 +121,20 @@ def gap_mm(a: TumorParameters, b: TumorParameters) -> float:
 
 
 def organ_field(parameters: PhantomParameters, axes_mm: Axes) -> Float[np.ndarray, "i j k"]:
-    """The approximate signed distance to the organ without its tumors, negative inside, on the grid
-    of three axes (organ frame, mm)."""
+    """Approximate signed distance to the organ without its tumors, negative inside, on the grid of
+    three axes (organ frame, mm)."""
     x, y, z = (np.linspace(-0.75 * length, 0.75 * length, 65) for length in parameters.size_mm)
-    raw = (x, y, z)
-    field = _organ_field(parameters, raw)
+    unscaled = (x, y, z)
+    field = _unscaled_field(parameters, unscaled)
     scaled = []
     # Bending, hilum and lumps change the box: scale each axis so that it has the stated size.
     for axis, length_mm in enumerate(parameters.size_mm):
         others = tuple(other for other in range(3) if other != axis)
-        low, high = _crossings(raw[axis], field.min(axis=others))
+        low, high = _crossings(unscaled[axis], field.min(axis=others))
         scale = (high - low) / length_mm
         scaled.append(np.asarray(axes_mm[axis]) * scale + (low + high) / 2)
     x, y, z = scaled
-    return _organ_field(parameters, (x, y, z))
+    return _unscaled_field(parameters, (x, y, z))
 
 
 def _crossings(axis_mm: np.ndarray, values: np.ndarray) -> tuple[float, float]:
@@ -147,8 +147,7 @@ def _crossings(axis_mm: np.ndarray, values: np.ndarray) -> tuple[float, float]:
     return ends[0], ends[1]
 
 
-def _organ_field(parameters: PhantomParameters, axes_mm: Axes) -> Float[np.ndarray, "i j k"]:
-    """The same before scaling."""
+def _unscaled_field(parameters: PhantomParameters, axes_mm: Axes) -> Float[np.ndarray, "i j k"]:
     x, y, z = np.meshgrid(*axes_mm, indexing="ij", sparse=True)
     rx, ry, rz = np.array(parameters.size_mm) / 2
     along = z / rz
@@ -178,7 +177,7 @@ def _ellipsoid(point: tuple[np.ndarray, ...], radii: tuple[float, ...], power: f
 
 
 def _lumps(parameters: PhantomParameters, point_mm: tuple[np.ndarray, ...]) -> np.ndarray:
-    """Waves of 30 to 60 mm in random directions, at most ``lump_mm`` in sum."""
+    """Waves of 30 to 60 mm in random directions, their sum at most ``lump_mm``."""
     rng = np.random.default_rng((parameters.shape_seed, 0))
     total = np.zeros(np.broadcast_shapes(*(p.shape for p in point_mm)))
     for _ in range(4):
@@ -191,7 +190,7 @@ def _lumps(parameters: PhantomParameters, point_mm: tuple[np.ndarray, ...]) -> n
 
 
 def tumor_fields(parameters: PhantomParameters, axes_mm: Axes) -> list[Float[np.ndarray, "i j k"]]:
-    """The approximate signed distance to each tumor, in label order, as in ``organ_field``."""
+    """Approximate signed distance to each tumor, in label order, as in ``organ_field``."""
     fields = []
     largest_first = sorted(parameters.tumors, key=lambda tumor: -tumor.diameter_mm)
     for number, tumor in enumerate(largest_first):
@@ -202,7 +201,7 @@ def tumor_fields(parameters: PhantomParameters, axes_mm: Axes) -> list[Float[np.
         x, y, z = np.meshgrid(*offsets, indexing="ij", sparse=True)
         distance_mm = np.sqrt(x**2 + y**2 + z**2)
         length_mm = np.maximum(distance_mm, 1e-9)
-        # An odd function: what one side gains the opposite side loses, so diameters are exact.
+        # An odd function: one side gains what the opposite side loses, so diameters are exact.
         lobes = sum(np.sin((a * x + b * y + c * z) / length_mm) for a, b, c in waves) / 3
         fields.append(distance_mm - tumor.diameter_mm / 2 * (1 + tumor.lobulation * lobes))
     return fields

@@ -1,6 +1,6 @@
-"""A virtual CT scanner: a label map -> a CT volume with table and registration block, blurred by
-the point-spread function and the voxel size, with correlated Gaussian noise. Beam hardening,
-scatter and streaks are not modelled."""
+"""A virtual CT scanner: label map -> CT volume with table and registration block, blurred by the
+point-spread function and the voxel size, with correlated Gaussian noise. Beam hardening, scatter
+and streaks are not modelled."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _Object = tuple[np.ndarray, np.ndarray, float]  # lower and upper corner, HU
 
 
 class ScannerParameters(Config, frozen=True):
-    """Materials, objects beside the phantom, and the scanner's resolution and noise.
+    """Materials, objects next to the phantom, and the scanner's resolution and noise.
 
     Sources of the HU. Organ: 10 % PVA hydrogel attenuates like soft tissue (Price et al. 2010,
     doi 10.1088/0031-9155/55/4/018); 40 HU is our choice. Tumors: 2.27 % BaSO4 by weight is about
@@ -35,7 +35,7 @@ class ScannerParameters(Config, frozen=True):
     tumor_hu: float = 570.0
     spacing_mm: tuple[float, float, float] = (0.6, 0.6, 0.8)
     margin_mm: float = 12.0
-    """Air around the label map; the table ends with the field of view."""
+    """Of air around the label map; the table ends with the field of view."""
     tilt_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Rotates the voxel grid about the patient's x, y, z axes: an oblique volume."""
     psf_sigma_mm: float = 0.65
@@ -68,10 +68,10 @@ def scan(
     material_hu: Mapping[int, float] | None = None,
 ) -> Volume:
     """Scan the box around a label map: 1 is hydrogel, 2 and above tumor with contrast, 0 air;
-    ``material_hu`` overrides labels. HU are whole numbers in -1024..3071; the same seed gives the
-    same volume. Raises InputError: no label at all, or a scan of more than 400 million voxels."""
+    ``material_hu`` overrides them by label. HU are whole numbers in -1024..3071; the same seed
+    gives the same volume. Raises InputError: an empty map, or more than 400 million voxels."""
     body = _crop(labels)
-    # Lower and upper corner in LPS of the grid's voxel centres
+    # Box of the voxel centres in LPS
     ends = np.stack(np.meshgrid(*[(0, n - 1) for n in body.labels.shape]), -1).reshape(-1, 3)
     corners = ends @ body.lps_from_index[:3, :3].T + body.lps_from_index[:3, 3]
     box_mm = np.stack([corners.min(0), corners.max(0)])
@@ -86,7 +86,7 @@ def scan(
 
 
 def _crop(labels: LabelVolume) -> LabelVolume:
-    """The box around all labels with an empty voxel on every side."""
+    """The map's box around all labels, with an empty voxel on every side."""
     from scipy import ndimage
 
     if not labels.labels.any():
@@ -103,7 +103,7 @@ def _objects(box_mm: np.ndarray, parameters: ScannerParameters) -> list[_Object]
     lower, upper = box_mm.copy()
     block = np.array(parameters.block_size_mm)
     if block.min() > 0:
-        # It stands on the pad beside the phantom, a little towards the feet.
+        # It stands on the pad next to the phantom, a little towards the feet.
         right_mm, middle_mm = lower[0] - parameters.block_gap_mm, box_mm.mean(0)[2]
         corner = np.array([right_mm, upper[1], middle_mm - 5 + block[2] / 2])
         objects.append((corner - block, corner, parameters.block_hu))
@@ -187,7 +187,7 @@ def _add_box(
     contrast_hu: float,
     sigma_mm: np.ndarray,
 ) -> None:
-    """Add a box along the LPS axes with the exact blur: a product of three error functions."""
+    """Add a box along the LPS axes, blurred exactly: a product of three error functions."""
     from scipy.special import ndtr
 
     lower, upper = (np.asarray(c, np.float32) for c in corners_mm)
