@@ -105,9 +105,9 @@ def test_patient_and_side_come_from_the_tags_or_the_user(tmp_path):
     assert prepare(ct, PrepareOptions(patient="study-3")).patient == Patient("study-3", "left")
     with pytest.raises(InputError, match=r"states the left side .* the right one was selected"):
         prepare(ct, PrepareOptions(side="right"))
-    said = (tmp_path / "case" / "manifest.json").read_text()
-    assert "Doe" not in said
-    assert "4711" in said
+    manifest = (tmp_path / "case" / "manifest.json").read_text()
+    assert "Doe" not in manifest
+    assert "4711" in manifest
     by_image = tagged(tmp_path / "image", ImageLaterality="R")
     assert prepare(by_image).patient == Patient(side="right")
     pair = tagged(tmp_path / "pair", ImageLaterality="B")  # both kidneys: says nothing of this one

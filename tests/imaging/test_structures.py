@@ -10,7 +10,7 @@ from tumortrack.core.types import LabelVolume, Mesh
 from tumortrack.imaging.case import load_case, save_case
 from tumortrack.imaging.nifti import write_nifti
 from tumortrack.imaging.prepare import PrepareOptions, prepare
-from tumortrack.imaging.structures import TRUSTED_MM, set_apart, stated_structures
+from tumortrack.imaging.structures import TRUSTED_MM, parse_structures, split_structures
 
 VESSEL = 4
 
@@ -60,9 +60,9 @@ def test_open_meshes_are_taken_as_they_are(label_map, tmp_path):
     )
     write_mesh(tmp_path / "cut.stl", sheet)
     options = PrepareOptions(name="liver", structure=(f"cut={tmp_path / 'cut.stl'}",), tumor=2)
-    found = prepare(label_map, options).anatomy.structures["cut"]
-    assert len(found.faces) == 2
-    assert found.box_mm == pytest.approx(sheet.box_mm)
+    sheet_read = prepare(label_map, options).anatomy.structures["cut"]
+    assert len(sheet_read.faces) == 2
+    assert sheet_read.box_mm == pytest.approx(sheet.box_mm)
     write_mesh(tmp_path / "far.ply", sheet.moved(sheet.vertices_mm + 500))
     far = replace(options, structure=(f"cut={tmp_path / 'far.ply'}",))
     with pytest.raises(InputError, match="from the organ"):
@@ -71,7 +71,7 @@ def test_open_meshes_are_taken_as_they_are(label_map, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("said", "why"),
+    ("options", "why"),
     [
         (("artery",), "NAME=NUMBER"),
         (("liver=3",), "taken"),
@@ -80,15 +80,15 @@ def test_open_meshes_are_taken_as_they_are(label_map, tmp_path):
         (("../x=3",), "can't be the name of a structure"),
     ],
 )
-def test_what_names_no_structure_is_refused(said, why):
+def test_what_names_no_structure_is_refused(options, why):
     with pytest.raises(InputError, match=why):
-        stated_structures(said, "liver")
-    assert stated_structures(("a=3", "b=c/d.stl"), "liver")["a"] == 3
+        parse_structures(options, "liver")
+    assert parse_structures(("a=3", "b=c/d.stl"), "liver")["a"] == 3
 
 
 def test_labels_that_are_not_there_or_the_organs_are_refused():
     volume = with_vessel(6.0)
     for number in (1, 9):
         with pytest.raises(InputError, match="the map's labels are"):
-            set_apart(volume, {"artery": number}, 1)
+            split_structures(volume, {"artery": number}, 1)
     assert TRUSTED_MM == 5.0

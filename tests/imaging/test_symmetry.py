@@ -11,7 +11,7 @@ from tumortrack.cli.main import run
 from tumortrack.core import store
 from tumortrack.core.mesh_files import write_anatomy
 from tumortrack.core.types import Anatomy
-from tumortrack.imaging.symmetry import ALIKE_MM, alike, half_turns, warning
+from tumortrack.imaging.symmetry import AMBIGUOUS_MM, ambiguous, half_turns, warning
 from tumortrack_lab.world.kidneys import random_anatomy
 
 # Of the ellipsoid's tumor, 8 mm and 20 mm from the middle along two of its axes: half a turn about
@@ -33,16 +33,16 @@ def bent(anatomy: Anatomy, share: float) -> Anatomy:
 
 
 def test_an_ellipsoid_looks_the_same_after_each_half_turn():
-    found = half_turns(organ())
-    assert len(alike(found)) == 3
-    assert max(one.p90_mm for one in found) < 0.2  # facets
-    away_mm = sorted(one.tumors_mm["tumor_1"] for one in found)
+    turns = half_turns(organ())
+    assert len(ambiguous(turns)) == 3
+    assert max(turn.p90_mm for turn in turns) < 0.2  # facets
+    away_mm = sorted(turn.tumors_mm["tumor_1"] for turn in turns)
     assert away_mm == pytest.approx(AWAY_MM, abs=0.2)
-    for one in found:
-        turn = Rotation.from_matrix(one.ct_from_ct[:3, :3])
-        assert np.degrees(turn.magnitude()) == pytest.approx(180, abs=1)
-    said = warning(found)
-    assert "tumor_1 43 mm elsewhere" in said
+    for turn in turns:
+        rotation = Rotation.from_matrix(turn.ct_from_ct[:3, :3])
+        assert np.degrees(rotation.magnitude()) == pytest.approx(180, abs=1)
+    sentence = warning(turns)
+    assert "tumor_1 43 mm elsewhere" in sentence
     assert "inner points elsewhere" in warning(half_turns(Anatomy((organ().organ,))))
 
 
@@ -51,19 +51,19 @@ def test_figures_do_not_depend_on_where_the_organ_lies():
     turn, shift = Rotation.from_rotvec([0.4, -1.1, 0.7]).as_matrix(), [30.0, -70.0, 400.0]
     moved = tuple(part.moved(part.vertices_mm @ turn.T + shift) for part in anatomy.parts)
     here, there = half_turns(anatomy), half_turns(Anatomy(moved))
-    for one, other in zip(here, there, strict=True):
-        assert other.mean_mm == pytest.approx(one.mean_mm, abs=0.02)
-        assert other.tumors_mm["tumor_1"] == pytest.approx(one.tumors_mm["tumor_1"], abs=1)
+    for first, second in zip(here, there, strict=True):
+        assert second.mean_mm == pytest.approx(first.mean_mm, abs=0.02)
+        assert second.tumors_mm["tumor_1"] == pytest.approx(first.tumors_mm["tumor_1"], abs=1)
 
 
 def test_the_less_it_is_alike_the_farther_apart_the_surfaces():
     means = [half_turns(bent(organ(), share))[0].mean_mm for share in (0, 0.3, 0.6, 1.0)]
     assert means == sorted(means)
     assert means[0] < 0.1
-    assert means[-1] > ALIKE_MM
+    assert means[-1] > AMBIGUOUS_MM
     kidney = half_turns(random_anatomy(0)[0])
-    assert kidney[0].mean_mm > ALIKE_MM
-    assert warning(alike(kidney)) == ""
+    assert kidney[0].mean_mm > AMBIGUOUS_MM
+    assert warning(ambiguous(kidney)) == ""
 
 
 def test_prepare_says_it_and_inspect_repeats_it(tmp_path, models_at_once, capsys):

@@ -21,21 +21,21 @@ from tumortrack.imaging.hu_windows import ORGAN_HU, TUMOR_HU, segment_ct
 from tumortrack.imaging.meshes import label_meshes, read_mesh_folder
 from tumortrack.imaging.select import MIN_TUMOR_ML, select_labels
 from tumortrack.imaging.structures import (
-    described,
+    extent_report,
+    parse_structures,
     read_structures,
-    set_apart,
-    stated_structures,
+    split_structures,
 )
 from tumortrack.imaging.surface import surfaces
-from tumortrack.imaging.symmetry import alike, half_turns, warning
+from tumortrack.imaging.symmetry import ambiguous, half_turns, warning
 from tumortrack.imaging.volume import is_label_map, labels_of, read_raw, volume_of
 
 # Options for one kind of input only.
 _OF_CT, OF_LABELS = ("organ_hu", "tumor_hu"), ("labels", "organ", "tumor")
 _LEAST_ORGAN_OUTSIDE = 0.02  # of the outer surface
-_LARGEST_SHARE = 0.6  # of organ and tumors that one tumor may take without a note
+_LARGEST_SHARE = 0.6  # of organ and tumors; a larger tumor gets a note
 _MOST_TILTED = 60.0  # degrees: two such tilts make 85, and more would show another side
-_MOST_CHANGE_PERCENT = 1.0  # of a part's volume by smoothing, without a note
+_MOST_CHANGE_PERCENT = 1.0  # of a part's volume by smoothing; more gets a note
 
 
 @dataclass(frozen=True)
@@ -45,22 +45,22 @@ class PrepareOptions:
     Attributes:
         organ_hu, tumor_hu: half-open HU windows [low, high) for a CT.
         labels: the volume is a label map; False: it is one if that is obvious.
-        side: the patient's ``left`` or ``right``, of organs in pairs. Selects from a label map
-            (None: the one with most tumor); of a CT by HU windows or meshes it is only recorded.
+        side: the patient's ``left`` or ``right``, for paired organs. Selects from a label map
+            (None: the one with the most tumor); for a CT by HU windows or meshes only recorded.
         organ, tumor: label numbers; tumor None takes every label from 2 up, 0 none.
         up: the patient direction that faces the camera: a name, or three numbers in LPS.
-        rotations: which poses are possible: ``limited``, turned about the line of sight and tilted,
-            or ``full``, any.
-        tilt: at most so many degrees about each axis across the line of sight.
+        rotations: possible poses: ``limited``, turned about the line of sight and tilted, or
+            ``full``, any.
+        tilt: largest angle in degrees about each axis across the line of sight.
         sensor: the camera: ``d405`` or ``stereo`` (an endoscope's pictures).
         series: UID or number of one DICOM series among several.
         unit: of meshes, ``mm`` or ``m``; None: mm, and metres are refused with an explanation.
         min_tumor_ml: smaller tumors are reported and dropped.
-        patient: an identifier, instead of the DICOM PatientID; None: that, or unknown.
-        name: of the organ: lower-case letters, digits and _.
-        structure: ``NAME=NUMBER`` of a label map, or ``NAME=PATH`` of a mesh: surfaces that move
+        patient: an identifier that replaces the DICOM PatientID; None: that, or unknown.
+        name: the organ's: lower-case letters, digits and _.
+        structure: ``NAME=NUMBER`` in a label map, or ``NAME=PATH`` of a mesh: surfaces that move
             with the organ.
-        term: SNOMED CT code and meaning of an organ whose name is not known here.
+        term: SNOMED CT code and meaning of an organ that has no built-in one.
     """
 
     organ_hu: tuple[float, float] = ORGAN_HU
@@ -89,7 +89,7 @@ class PrepareOptions:
         if self.side not in (None, "left", "right"):
             raise InputError(f"side {self.side!r} is not allowed: left or right (the patient's).")
         self.kind.check_side(self.side)
-        stated_structures(self.structure, self.name)
+        parse_structures(self.structure, self.name)
         direction_lps(self.up)
         if self.rotations not in ("limited", "full"):
             raise InputError(f"rotations {self.rotations!r} is not allowed: limited or full.")
@@ -111,19 +111,19 @@ class PrepareOptions:
 
     @property
     def stated_side(self) -> Side:
-        return cast(Side, self.side or UNKNOWN)  # it was checked above
+        return cast(Side, self.side or UNKNOWN)  # checked above
 
 
 def prepare(input: Path, options: PrepareOptions | None = None) -> Case:
-    """A case from any supported input; nothing is written. Raises InputError: it is not usable."""
+    """A case from any supported input; writes nothing. Raises InputError: unusable input."""
     options = options or PrepareOptions()
     try:
         if not input.exists():
             raise InputError(f"{input} does not exist.")
-        inside = list(input.iterdir()) if input.is_dir() else []
-        if input.is_dir() and not any(p.is_file() for p in inside):
+        paths = list(input.iterdir()) if input.is_dir() else []
+        if input.is_dir() and not any(path.is_file() for path in paths):
             raise InputError(f"{input} holds no files. Give a folder of DICOM slices or of meshes.")
-        is_meshes = any(p.suffix.lower() in SUFFIXES for p in inside)
+        is_meshes = any(path.suffix.lower() in SUFFIXES for path in paths)
         case = _from_meshes(input, options) if is_meshes else _from_volume(input, options)
         _check_organ_outside(case.labels)
         case.report["notes"].extend([*_large_tumors(case), *options.kind.doubts()])
@@ -132,7 +132,7 @@ def prepare(input: Path, options: PrepareOptions | None = None) -> Case:
     except OSError as error:
         raise InputError(f"{input} cannot be read: {error.strerror or error}.") from error
     turns, notes = half_turns(case.anatomy), case.report["notes"]
-    text = warning(alike(turns))
+    text = warning(ambiguous(turns))
     report = case.report | {
         "source": input.name,
         "source_sha256": source_sha256,
@@ -154,22 +154,22 @@ def prepare(input: Path, options: PrepareOptions | None = None) -> Case:
 
 def _with_structures(case: Case, options: PrepareOptions) -> Case:
     """The case with structures from mesh files as well, and a report on all structures."""
-    stated = stated_structures(options.structure, options.name)
-    read, notes = read_structures(stated, options.unit)
-    structures = {**case.anatomy.structures, **read}
-    if lacking := [name for name in stated if name not in structures]:
+    sources = parse_structures(options.structure, options.name)
+    from_files, notes = read_structures(sources, options.unit)
+    structures = {**case.anatomy.structures, **from_files}
+    if missing := [name for name in sources if name not in structures]:
         raise InputError(
-            f"--structure {lacking[0]}={stated[lacking[0]]}: a number is a label of a label map, "
+            f"--structure {missing[0]}={sources[missing[0]]}: a number is a label of a label map, "
             "and this is none. Give a mesh."
         )
-    about, more = described(structures, case.anatomy, case.labels)
+    extents, more = extent_report(structures, case.anatomy, case.labels)
     report = {**case.report, "notes": [*case.report["notes"], *notes, *more]}
     anatomy = replace(case.anatomy, structures=structures)
-    return replace(case, anatomy=anatomy, report={**report, "structures": about})
+    return replace(case, anatomy=anatomy, report={**report, "structures": extents})
 
 
 def _check_organ_outside(labels: LabelVolume) -> None:
-    """Refuse tumors that enclose the organ: a real organ has some surface left."""
+    """Refuse tumors that enclose the organ, which in reality keeps some surface of its own."""
     from scipy import ndimage
 
     inside = labels.labels > 0
@@ -183,7 +183,7 @@ def _check_organ_outside(labels: LabelVolume) -> None:
 
 
 def _large_tumors(case: Case) -> list[str]:
-    """Notes on tumors that take most of the organ, whose labels may be swapped."""
+    """Notes on tumors that fill most of the organ: the labels may be swapped."""
     voxels = np.bincount(case.labels.labels.reshape(-1))
     shares = voxels[FIRST_TUMOR:] / voxels[ORGAN:].sum()
     return [
@@ -217,10 +217,10 @@ def _from_volume(path: Path, options: PrepareOptions) -> Case:
             notes.append("few distinct whole numbers: read as a label map, not as a CT")
         source = labels_of(raw, path)
         del raw  # the largest maps are gigabytes: one copy is enough
-        stated = stated_structures(options.structure, options.name)
-        source, structures = set_apart(source, stated, options.organ)
-        wanted = (options.organ, options.tumor, options.min_tumor_ml, options.kind)
-        labels, more, side = select_labels(source, side, *wanted)
+        sources = parse_structures(options.structure, options.name)
+        source, structures = split_structures(source, sources, options.organ)
+        selection = (options.organ, options.tumor, options.min_tumor_ml, options.kind)
+        labels, more, side = select_labels(source, side, *selection)
     else:
         what = f"{path} is read as a CT (a label map needs --labels)"
         refuse_unused(what, options, *OF_LABELS, "unit")
@@ -246,8 +246,8 @@ def _from_volume(path: Path, options: PrepareOptions) -> Case:
 
 
 def patient_of(path: Path, in_file: Patient, identifier: str | None, side: Side) -> Patient:
-    """The patient as the file ``path`` states it, with the user's ``identifier`` instead where
-    given, and the selected ``side``. Raises InputError: the file states the other side."""
+    """The patient as stated ``in_file``, with the user's ``identifier`` if given, and the selected
+    ``side``. Raises InputError: the file at ``path`` states the other side."""
     if in_file.differs(Patient(side=side)):
         raise InputError(
             f"{path} states the {in_file.side} side (DICOM Laterality), and the {side} one was "
@@ -271,8 +271,8 @@ def _from_meshes(folder: Path, options: PrepareOptions) -> Case:
 def _measured(
     labels: LabelVolume, anatomy: Anatomy, surface: dict[str, list[Any]]
 ) -> dict[str, Any]:
-    """For the report: volumes by part from the labels (the organ's includes its tumors), figures of
-    the surfaces, and the spacing."""
+    """For the report: volumes of the parts by their labels (the organ's includes its tumors),
+    measures of the surfaces, and the spacing."""
     counts = np.bincount(labels.labels.ravel(), minlength=2) * voxel_ml(labels.lps_from_index)
     tumors = {f"tumor_{n - 1}": float(counts[n]) for n in range(2, len(counts))}
     return {

@@ -1,7 +1,7 @@
 """Segment a CT with the user's own tool: TotalSegmentator, an nnU-Net model, a MONAI bundle.
 
-The tool runs in its own process by its own command line, with weights that are on this machine:
-nothing is downloaded. Its labels become ours by name: 1 the organ, 2 its tumors. Documentation:
+The tool runs in its own process by its own command line, with weights that are on this machine;
+nothing is downloaded. Its labels are mapped by name: 1 the organ, 2 its tumors. Documentation:
 github.com/wasserth/TotalSegmentator (README, map_to_binary.py), github.com/MIC-DKFZ/nnUNet
 (how_to_use_nnunet.md), docs.monai.io (MONAI Bundle specification).
 """
@@ -39,7 +39,7 @@ from tumortrack.imaging.prepare import (
 )
 from tumortrack.imaging.volume import read_raw, volume_of
 
-# Datasets of TotalSegmentator's tasks, and which of their masks count as tumors.
+# Datasets of TotalSegmentator's tasks, and the masks in them that count as tumors.
 _TOTAL = (291, 292, 293, 294, 295, 298)
 _LESIONS = {
     "liver_lesions": (591, ("liver_lesions",)),
@@ -48,13 +48,13 @@ _LESIONS = {
 }
 _TUMOR = re.compile("tumou?r|neoplasm|lesion|cancer|carcinoma|mass")
 _SAME_MM = 0.01  # of the label map's grid
-# The organ's mask and its tumors'; None: the tool knows no tumors.
+# Masks of the organ and of its tumors; None: the tool knows no tumors.
 Masks = tuple[Bool[np.ndarray, "i j k"], Bool[np.ndarray, "i j k"] | None]
 
 
 @dataclass(frozen=True)
 class Tool:
-    """``commands`` run in a folder and turn its in/ct_0000.nii.gz into files in out/, which
+    """``commands`` are run in a folder and turn in/ct_0000.nii.gz into files in out/, from which
     ``masks`` reads."""
 
     name: str
@@ -67,18 +67,17 @@ class Tool:
     def version(self) -> str:
         try:
             return version(self.package)
-        except PackageNotFoundError:  # it is in another environment
+        except PackageNotFoundError:  # in another environment
             return "(version unknown)"
 
 
 def segmented_case(ct: Path, spec: str, options: PrepareOptions, keep: Path) -> Case:
-    """A case from a CT that a tool segments; what the tool prints is shown. Raises InputError: a
-    tool that is unknown, not installed, lacks its weights, fails or finds no such organ; and as
-    ``prepare``.
+    """A case from a CT that a tool segments; its output is shown. Raises InputError: a tool that is
+    unknown, not installed, lacks its weights, fails or finds no such organ; and as ``prepare``.
 
     Args:
         spec: totalsegmentator, totalsegmentator:TASK, nnunet:FOLDER or monai:BUNDLE.
-        keep: file for the label map, which must not exist yet.
+        keep: file for the label map; must not exist.
     """
     refuse_unused("--segment makes the labels", options, *OF_LABELS)
     if keep.exists():
@@ -132,7 +131,7 @@ def _tool(spec: str, organ: str) -> Tool:
 
 
 def _program(name: str, package: str) -> str:
-    """The path of a program beside this Python or on the PATH."""
+    """The path of a program next to this Python or on the PATH."""
     folders = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")])
     path = shutil.which(name, path=folders)
     if path is None:
@@ -163,12 +162,12 @@ def _totalsegmentator(task: str, organ: str) -> Tool:
     number, lesions = _LESIONS.get(task, (0, ()))
     weights = []
     needed = [("total", dataset) for dataset in _TOTAL] + ([(task, number)] if task else [])
-    for of, dataset in needed:
+    for needed_task, dataset in needed:
         paths = sorted(folder.glob(f"Dataset{dataset:03d}_*"))
         if not paths:
             raise InputError(
-                f"{folder} lacks the weights of TotalSegmentator's task {of} (Dataset"
-                f"{dataset:03d}). Fetch them yourself: totalseg_download_weights -t {of}. "
+                f"{folder} lacks the weights of TotalSegmentator's task {needed_task} (Dataset"
+                f"{dataset:03d}). Fetch them yourself: totalseg_download_weights -t {needed_task}. "
                 "TotalSegmentator would download them without asking, so it is not started."
             )
         weights += paths
@@ -209,7 +208,7 @@ def _nnunet(model: Path, organ: str) -> Tool:
 
 
 def _has_gpu() -> bool:
-    """By PyTorch if it is in this environment (nnU-Net brings it), else by the driver."""
+    """Asks PyTorch if it is in this environment (nnU-Net brings it), else the driver."""
     if find_spec("torch") is None:
         return shutil.which("nvidia-smi") is not None
     import torch
@@ -248,7 +247,7 @@ def _json(path: Path, kind: str) -> dict[str, Any]:
 
 
 def _numbers(labels: dict[str, Any], organ: str, where: Path) -> tuple[list[int], list[int]]:
-    """The label numbers of the organ and of tumors, by name; an nnU-Net region has several."""
+    """Label numbers of the organ and of tumors, by name; an nnU-Net region has several."""
     numbers: dict[str, set[int]] = {}
     try:
         for name, value in labels.items():
@@ -278,7 +277,7 @@ def _from_label_map(organs: list[int], tumors: list[int]) -> Callable[[Path, Vol
 
 
 def _voxels(file: Path, ct: Volume) -> np.ndarray:
-    """The numbers of a mask or label map on the CT's grid."""
+    """Voxels of a mask or label map on the CT's grid."""
     if not file.is_file():
         raise InputError(
             f"the tool ended well and wrote no {file.name}; it may be another version."

@@ -23,38 +23,38 @@ from tumortrack.imaging.meshes import read_lps
 from tumortrack.imaging.surface import surface_of
 
 TRUSTED_MM = 5.0  # outside the organ; farther out the motion is a guess
-_APART_MM = 50.0  # from the organ: in another frame or unit
+_APART_MM = 50.0  # from the organ; farther away it must be in another frame or unit
 _BAY_MM = 5.0  # half the width of a structure that runs into the organ and counts as organ there
 _STEP_MM = 1.0
 _MOST_FACES = 200_000
 
-Stated = dict[str, int | Path]
+Sources = dict[str, int | Path]
 
 
-def stated_structures(options: tuple[str, ...], organ: str) -> Stated:
-    """The label number or the mesh's path by name. Raises InputError: not NAME=NUMBER or NAME=PATH,
-    a name twice, or one that is not allowed."""
-    stated: Stated = {}
+def parse_structures(options: tuple[str, ...], organ: str) -> Sources:
+    """Label number or mesh path of each structure by name. Raises InputError: not NAME=NUMBER or
+    NAME=PATH, a name that is taken or not allowed."""
+    sources: Sources = {}
     for option in options:
         name, _, value = option.partition("=")
         if not value:
             raise InputError(f"--structure {option!r} is not NAME=NUMBER or NAME=PATH.")
         check_name(name, "a structure", "--structure")
-        if name in stated or name == organ:
+        if name in sources or name == organ:
             raise InputError(f"--structure {name}: that name is taken. Give another.")
-        stated[name] = int(value) if value.isdecimal() else Path(value)
-    return stated
+        sources[name] = int(value) if value.isdecimal() else Path(value)
+    return sources
 
 
-def set_apart(
-    volume: LabelVolume, stated: Stated, organ: int
+def split_structures(
+    volume: LabelVolume, sources: Sources, organ: int
 ) -> tuple[LabelVolume, dict[str, Mesh]]:
-    """The labels without the structures', and those as surfaces, LPS mm. Where a structure lies in
-    the organ, or in a bay up to 10 mm wide, its voxels become organ. Raises InputError: no such
-    label, or the organ's own."""
+    """The labels without the structures, and the structures as surfaces, LPS mm. Where a structure
+    lies in the organ, or in a bay up to 10 mm wide, its voxels become organ. Raises InputError: no
+    such label, or the organ's own."""
     labels, affine, meshes = volume.labels.copy(), volume.lps_from_index, {}
     removed = np.zeros(labels.shape, bool)
-    for name, number in stated.items():
+    for name, number in sources.items():
         if isinstance(number, Path):
             continue
         mask = volume.labels == number
@@ -73,11 +73,11 @@ def set_apart(
     return LabelVolume(labels, affine), meshes
 
 
-def read_structures(stated: Stated, unit: str | None) -> tuple[dict[str, Mesh], list[str]]:
+def read_structures(sources: Sources, unit: str | None) -> tuple[dict[str, Mesh], list[str]]:
     """The structures in mesh files, LPS mm, and notes. Raises InputError: not a mesh, or too many
     triangles."""
     meshes, notes = {}, list[str]()
-    for name, path in stated.items():
+    for name, path in sources.items():
         if isinstance(path, Path):
             meshes[name] = read_lps(path, 1000.0 if unit == "m" else 1.0, notes)
             if len(meshes[name].faces) > _MOST_FACES:
@@ -85,11 +85,11 @@ def read_structures(stated: Stated, unit: str | None) -> tuple[dict[str, Mesh], 
     return meshes, notes
 
 
-def described(
+def extent_report(
     meshes: Mapping[str, Mesh], anatomy: Anatomy, labels: LabelVolume
 ) -> tuple[dict[str, Any], list[str]]:
-    """How far each reaches out of the organ (JSON types), and notes on extrapolated ones. Raises
-    InputError: one lies apart from the organ."""
+    """How far each structure extends outside the organ (JSON types), and notes on those whose
+    motion is extrapolated. Raises InputError: one lies apart from the organ."""
     report, notes, tree = {}, [], cKDTree(anatomy.organ.spread_mm())
     index_from_lps = np.linalg.inv(labels.lps_from_index)
     for name, mesh in meshes.items():

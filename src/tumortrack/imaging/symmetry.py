@@ -1,4 +1,4 @@
-"""Whether an organ looks the same after half a turn, so that a view cannot tell the two apart."""
+"""Test whether an organ looks the same after half a turn, so that a view is ambiguous."""
 
 from __future__ import annotations
 
@@ -12,23 +12,23 @@ from scipy.spatial.transform import Rotation
 from tumortrack.core.geometry import Points, rigid, transform_points, triangles_of
 from tumortrack.core.types import Anatomy
 
-# Mean distance below which a view may not tell them apart. With shapes between an ellipsoid and the
+# Mean distance below which a view may be ambiguous. With shapes between an ellipsoid and the
 # phantom, 40 clouds each, the half-turned organ had at least a hundredth of the likelihood for 95 %
 # of the clouds at 0.15 mm, 60 % at 0.7, 25 % at 0.9, 10 % at 1.2 mm. 74 segmented real kidneys have
 # 1.9 to 6 mm, the built-in phantom 2.1.
-ALIKE_MM = 1.5
-_SPACING_MM = 2.0  # of points on the surface, about
-_MOVED = 3000  # points that are fitted; another sample changes the mean by 0.03 mm
-_STILL_RAD = 0.5
-_STEPS, _ENOUGH_MM = 30, 0.01  # iterations at most; a smaller motion ends them
+AMBIGUOUS_MM = 1.5
+_SPACING_MM = 2.0  # approximate distance between points on the surface
+_FITTED = 3000  # points; another sample changes the mean by 0.03 mm
+_KEPT_RAD = 0.5  # a fit that changes a quarter turn by more has turned it back
+_STEPS, _ENOUGH_MM = 30, 0.01  # most iterations; a smaller motion ends them
 
 
 @dataclass(frozen=True, eq=False)
 class HalfTurn:
-    """The organ turned by 180 degrees about a principal axis and fitted to itself: ``ct_from_ct``
+    """The organ turned by 180 degrees about a principal axis and fitted to itself by ``ct_from_ct``
     (LPS, mm). ``mean_mm``, ``p90_mm``: mean and 90th percentile of the distances between the
     surfaces. ``tumors_mm``: how far the tumors' centres move. ``any_turn``: a quarter turn fits as
-    well, and so any angle does: a body of revolution.
+    well, so that any angle does, as for a body of revolution.
     """
 
     ct_from_ct: Float64[np.ndarray, "4 4"]
@@ -39,11 +39,11 @@ class HalfTurn:
 
 
 def half_turns(anatomy: Anatomy) -> list[HalfTurn]:
-    """One about each principal axis of the organ's surface, the best match first; takes a second at
-    most."""
+    """Half turns about the principal axes of the organ's surface, best match first; takes at most a
+    second."""
     points, normals = triangles_of(anatomy.organ.vertices_mm, anatomy.organ.faces)
     area = np.linalg.norm(normals, axis=1) / 2
-    count = max(_MOVED, round(area.sum() / _SPACING_MM**2))
+    count = max(_FITTED, round(area.sum() / _SPACING_MM**2))
     drawn = np.random.default_rng(0).choice(len(points), count, p=area / area.sum())
     normals = normals[drawn] / (2 * area[drawn])[:, None]
     points, tree = points[drawn], cKDTree(points[drawn])
@@ -54,12 +54,12 @@ def half_turns(anatomy: Anatomy) -> list[HalfTurn]:
         moved_mm = np.linalg.norm(transform_points(pose, tumors) - tumors, axis=1).tolist()
         mean_mm, p90_mm = float(distances_mm.mean()), float(np.quantile(distances_mm, 0.9))
         any_turn = False
-        if mean_mm < ALIKE_MM:
+        if mean_mm < AMBIGUOUS_MM:
             quarter, distances_mm = _symmetric_pose(points, normals, tree, np.pi / 2 * axis)
-            # If the fit turned it back, that it matches says nothing.
+            # A match means nothing if the fit has turned it back.
             angle = Rotation.from_matrix(quarter[:3, :3]).magnitude()
-            kept = abs(angle - np.pi / 2) < _STILL_RAD
-            any_turn = bool(kept and distances_mm.mean() < ALIKE_MM)
+            kept = abs(angle - np.pi / 2) < _KEPT_RAD
+            any_turn = bool(kept and distances_mm.mean() < AMBIGUOUS_MM)
         tumors_mm = dict(zip(anatomy.names[1:], moved_mm, strict=True))
         turns.append(HalfTurn(pose, mean_mm, p90_mm, tumors_mm, any_turn))
     return sorted(turns, key=lambda turn: turn.mean_mm)
@@ -68,32 +68,32 @@ def half_turns(anatomy: Anatomy) -> list[HalfTurn]:
 def _symmetric_pose(
     points: Points, normals: Points, tree: cKDTree, turn_rad: Float64[np.ndarray, " 3"]
 ) -> tuple[Float64[np.ndarray, "4 4"], Float64[np.ndarray, " m"]]:
-    """Points of a surface, turned about their mean by a rotation vector and then fitted to the
-    surface by point-to-plane ICP: the motion, and the distances (mm) that remain."""
+    """Turn a surface's points about their mean by a rotation vector and fit them to the surface by
+    point-to-plane ICP. Returns the motion, and the remaining distances (mm)."""
     center = points.mean(0)
     rotation = Rotation.from_rotvec(turn_rad).as_matrix()
     pose = rigid(rotation, center - rotation @ center)
-    moved = transform_points(pose, points[:_MOVED])
+    moved = transform_points(pose, points[:_FITTED])
     for _ in range(_STEPS):
         distance, nearest = tree.query(moved)
         to_plane = ((points[nearest] - moved) * normals[nearest]).sum(1)
         rows = np.hstack([np.cross(moved - center, normals[nearest]), normals[nearest]])
-        step = np.linalg.lstsq(rows, to_plane, rcond=1e-3)[0]  # without undetermined turns
+        step = np.linalg.lstsq(rows, to_plane, rcond=1e-3)[0]  # drops undetermined rotations
         rotation = Rotation.from_rotvec(step[:3]).as_matrix()
         pose = rigid(rotation, center - rotation @ center + step[3:]) @ pose
-        before, moved = moved, transform_points(pose, points[:_MOVED])
+        before, moved = moved, transform_points(pose, points[:_FITTED])
         if np.abs(moved - before).max() < _ENOUGH_MM:
             break
     return pose, np.where(distance < 2 * _SPACING_MM, np.abs(to_plane), distance)
 
 
-def alike(turns: list[HalfTurn]) -> list[HalfTurn]:
-    """Those that a view may not tell from the organ as it is."""
-    return [turn for turn in turns if turn.mean_mm < ALIKE_MM]
+def ambiguous(turns: list[HalfTurn]) -> list[HalfTurn]:
+    """The turns after which a view may look the same."""
+    return [turn for turn in turns if turn.mean_mm < AMBIGUOUS_MM]
 
 
 def warning(turns: list[HalfTurn]) -> str:
-    """A sentence on the turns that ``alike`` returned; empty: none."""
+    """A sentence on ``ambiguous`` turns; empty without any."""
     if not turns:
         return ""
     worst = max(turns, key=lambda turn: max(turn.tumors_mm.values(), default=0.0))

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float32, Float64, UInt8
 
 from tumortrack.core.errors import NoEstimate
-from tumortrack.imaging.symmetry import alike, half_turns
+from tumortrack.imaging.symmetry import ambiguous, half_turns
 from tumortrack.models.in_distribution import InDistributionRange, fit_mm, spread_mm
 from tumortrack.occupancy.model import OccupancyModel
 from tumortrack.occupancy.network import Latent, OccupancyNetwork
@@ -66,7 +66,7 @@ class OccupancyTask:
                 fit = fit_mm(surface_distances(lattice, points_mm))
             spreads.append(spread)
             fits.append(fit)
-        if same := alike(half_turns(self._run.anatomy_ct)):
+        if same := ambiguous(half_turns(self._run.anatomy_ct)):
             provenance = {**provenance, "half_turn_mm": same[0].mean_mm}
         known = InDistributionRange(
             spread_mm=(min(spreads), max(spreads)), fit_mm=float(np.percentile(fits, 95))
