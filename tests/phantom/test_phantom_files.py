@@ -65,12 +65,12 @@ def test_dicom_headers(series, oblique):
     assert sorted(order) == list(range(1, len(slices) + 1))
     assert len({s.SOPInstanceUID for s in slices}) == len(slices)
     assert len({s.SeriesInstanceUID for s in slices}) == 1
-    one = slices[0]
-    assert one.SOPClassUID.name == "CT Image Storage"
-    assert (one.Modality, one.PatientPosition) == ("CT", "HFS")
-    assert str(one.PatientName) == "PHANTOM^TUMORTRACK"
-    assert (one.KVP, one.XRayTubeCurrentInuA) == (90, 13600)
-    assert all(np.isclose(one.PixelSpacing, (1.1, 1.0)))  # between rows first
+    first = slices[0]
+    assert first.SOPClassUID.name == "CT Image Storage"
+    assert (first.Modality, first.PatientPosition) == ("CT", "HFS")
+    assert str(first.PatientName) == "PHANTOM^TUMORTRACK"
+    assert (first.KVP, first.XRayTubeCurrentInuA) == (90, 13600)
+    assert all(np.isclose(first.PixelSpacing, (1.1, 1.0)))  # between rows first
 
 
 def test_dicom_is_deterministic_by_seed(series, oblique, tmp_path):

@@ -126,18 +126,18 @@ def test_table_and_block_are_there_and_apart_from_the_phantom(ct, labels):
     large = np.flatnonzero(sizes > 1) + 1
     assert count >= 3
     assert len(large) == 3
-    found = {}
+    objects = {}
     for n in large:
         mask = parts == n
         name = {40: "phantom", 340: "block", -80: "table"}[
             min((40, 340, -80), key=lambda hu, m=mask: abs(np.median(ct.hu[m]) - hu))
         ]
-        found[name] = lps_of(ct, np.argwhere(mask))
-    body_low, body_high = (found["phantom"].min(0), found["phantom"].max(0))
-    assert found["table"].min(0)[1] > body_high[1] + 2  # posterior of the phantom
-    assert np.all(np.ptp(found["table"], axis=0)[[0, 2]] > (body_high - body_low)[[0, 2]])
-    assert found["block"].max(0)[0] < body_low[0] - 8  # on the patient's right
-    assert np.allclose(np.ptp(found["block"], axis=0), (21, 21, 39), atol=2.5)
+        objects[name] = lps_of(ct, np.argwhere(mask))
+    body_low, body_high = (objects["phantom"].min(0), objects["phantom"].max(0))
+    assert objects["table"].min(0)[1] > body_high[1] + 2  # posterior of the phantom
+    assert np.all(np.ptp(objects["table"], axis=0)[[0, 2]] > (body_high - body_low)[[0, 2]])
+    assert objects["block"].max(0)[0] < body_low[0] - 8  # on the patient's right
+    assert np.allclose(np.ptp(objects["block"], axis=0), (21, 21, 39), atol=2.5)
 
 
 def test_objects_can_be_left_out(labels):

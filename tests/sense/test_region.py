@@ -70,12 +70,12 @@ def column_of(cloud):
 
 def test_with_everything_off_it_is_the_crop():
     frame = dome()
-    found = points(frame, NOTHING)
+    region = points(frame, NOTHING)
     depth = frame.depth_mm
-    assert as_set(found.cloud) == as_set(SensorCloud(deproject(frame)))
-    assert found.counts["organ"] == np.isfinite(depth).sum()
-    assert sum(found.counts.values()) == depth.size
-    assert found.cloud.stamp_ns == frame.stamp_ns
+    assert as_set(region.cloud) == as_set(SensorCloud(deproject(frame)))
+    assert region.counts["organ"] == np.isfinite(depth).sum()
+    assert sum(region.counts.values()) == depth.size
+    assert region.cloud.stamp_ns == frame.stamp_ns
     nearer = CloudConfig(near_mm=60.0, far_mm=130.0)
     half = points(frame, msgspec.structs.replace(NOTHING, crop=nearer))
     assert half.counts["organ"] == ((depth > 60) & (depth < 130)).sum()
@@ -93,10 +93,10 @@ def test_same_generator_same_points(kidneys):
 def test_points_are_drawn_from_the_frame(kidneys):
     """Unique pixels of the frame itself, also where every second pixel is looked at."""
     scene = make_scene(kidneys[0], TOOLS, np.random.default_rng(4), d405(848, 480))
-    found = points(scene.frame)
-    assert len(as_set(found.cloud)) == 1000
-    assert as_set(found.cloud) <= as_set(SensorCloud(deproject(scene.frame)))
-    column, row = np.rint(project(found.cloud.points_mm, scene.frame.intrinsics)[0]).astype(int).T
+    region = points(scene.frame)
+    assert len(as_set(region.cloud)) == 1000
+    assert as_set(region.cloud) <= as_set(SensorCloud(deproject(scene.frame)))
+    column, row = np.rint(project(region.cloud.points_mm, scene.frame.intrinsics)[0]).astype(int).T
     assert (scene.what[row, column] == ORGAN).mean() > 0.95
 
 
@@ -108,9 +108,9 @@ def test_an_organ_alone_is_no_plane(kidneys):
         depth = np.where(scene.what == ORGAN, scene.frame.depth_mm, np.nan)
         for deepest in (np.inf, np.nanmin(depth) + 15.0):
             alone = DepthFrame(np.where(depth < deepest, depth, np.nan), scene.frame.intrinsics)
-            found = points(alone)
-            assert found.counts["plane"] == 0
-            assert found.counts["organ"] > 0.8 * np.isfinite(alone.depth_mm).sum()
+            region = points(alone)
+            assert region.counts["plane"] == 0
+            assert region.counts["organ"] > 0.8 * np.isfinite(alone.depth_mm).sum()
 
 
 def test_table_and_what_is_behind_it_goes_the_organ_stays():
@@ -122,21 +122,21 @@ def test_table_and_what_is_behind_it_goes_the_organ_stays():
     r2 = ((u - 200) / 75.0) ** 2 + ((v - 120) / 55.0) ** 2
     organ = r2 < 1
     depth = np.where(organ, 165 - 30 * np.sqrt(np.clip(1 - r2, 0, 1)), depth)
-    found = points(DepthFrame(depth, SMALL))
-    assert not (found.taken == 0)[~organ].any()
-    assert (found.taken == 0)[organ].mean() > 0.95
-    assert found.counts["plane"] > 0.95 * (~organ).sum()
+    region = points(DepthFrame(depth, SMALL))
+    assert not (region.taken == 0)[~organ].any()
+    assert (region.taken == 0)[organ].mean() > 0.95
+    assert region.counts["plane"] > 0.95 * (~organ).sum()
 
 
 def test_mask_and_boxes_are_respected():
     frame = dome()
     mask = np.zeros(frame.depth_mm.shape, bool)
     mask[100:140, 150:260] = True
-    found = points(frame, RegionConfig(crop=EVERY, plane=False), mask=mask)
-    assert as_set(found.cloud) <= as_set(
+    region = points(frame, RegionConfig(crop=EVERY, plane=False), mask=mask)
+    assert as_set(region.cloud) <= as_set(
         SensorCloud(deproject(DepthFrame(np.where(mask, frame.depth_mm, np.nan), SMALL)))
     )
-    assert found.counts["organ"] > 0.9 * (mask & np.isfinite(frame.depth_mm)).sum()
+    assert region.counts["organ"] > 0.9 * (mask & np.isfinite(frame.depth_mm)).sum()
     corners = ((20.0, -20.0, 200.0), (-10.0, 15.0, 60.0))  # in any order
     boxed = RegionConfig(crop=EVERY, plane=False, box_mm=corners)
     got = points(frame, boxed).cloud.points_mm
@@ -186,9 +186,9 @@ def test_an_organ_behind_a_shaft_stays_one():
     config = RegionConfig(crop=EVERY)
     organ = np.isfinite(frame.depth_mm)
     organ[:, band] = False
-    found = points(shafted, config)
-    assert not (found.taken == 0)[:, band].any()
-    assert (found.taken == 0)[organ].mean() > 0.95
+    region = points(shafted, config)
+    assert not (region.taken == 0)[:, band].any()
+    assert (region.taken == 0)[organ].mean() > 0.95
     one_side = points(shafted, RegionConfig(crop=EVERY, gap_mm=0.0))
     assert (one_side.taken == 0)[organ].mean() < 0.6
 
@@ -199,9 +199,9 @@ def test_stray_points_go():
     depth = frame.depth_mm.copy()
     stray = np.isnan(depth) & (rng.random(depth.shape) < 0.03)
     depth[stray] = rng.uniform(100, 160, stray.sum())
-    found = points(DepthFrame(depth, SMALL))
-    assert not (found.taken == 0)[stray].mean() > 0.02
-    assert (found.taken == 0)[np.isfinite(frame.depth_mm)].mean() > 0.97
+    region = points(DepthFrame(depth, SMALL))
+    assert not (region.taken == 0)[stray].mean() > 0.02
+    assert (region.taken == 0)[np.isfinite(frame.depth_mm)].mean() > 0.97
 
 
 @pytest.mark.slow
@@ -267,8 +267,8 @@ def measured(organs, props, seeds):
     rows = []
     for seed in seeds:
         scene = make_scene(organs[seed % len(organs)], props, np.random.default_rng((31, seed)))
-        found = points(scene.frame)
-        rows.append(precision_recall(scene, found.taken))
+        region = points(scene.frame)
+        rows.append(precision_recall(scene, region.taken))
     return np.array(rows)
 
 
@@ -295,8 +295,8 @@ def test_the_hand_is_what_a_pick_on_it_gives():
     pixel = np.array([int(np.median(rows)) * SMALL.width + int(np.median(columns))])
     depth_mm = scene.clean.depth_mm.ravel()[pixel].astype(float)
     there = deproject_pixels(pixel, depth_mm, SMALL)[0]
-    found = points(scene.frame, picked_mm=there)
-    kinds = working_truth(scene, found.taken.shape)[found.taken == 0]
+    region = points(scene.frame, picked_mm=there)
+    kinds = working_truth(scene, region.taken.shape)[region.taken == 0]
     assert (kinds == HAND).mean() > 0.9
 
 

@@ -44,7 +44,7 @@ def clicks_of(frame, picture, on=ON, beside=BESIDE):
             for p in some]  # fmt: skip
 
 
-def found(frame, picture, taught):
+def find(frame, picture, taught):
     hints = Hints(picture=picture, taught=taught)
     return organ_points(frame, CONFIG, hints, np.random.default_rng(0))
 
@@ -57,7 +57,7 @@ def test_colour_parts_what_is_one_thing_to_depth():
     ].mean() > 0.9
     taught = teach(clicks_of(frame, picture))
     assert taught.right == 1
-    region = found(frame, picture, taught)
+    region = find(frame, picture, taught)
     organ = region.taken == 0
     assert region.doubt == ""
     assert organ[on & (u < 205)].mean() > 0.95
@@ -77,19 +77,19 @@ def test_the_order_of_clicks_and_repetition_change_nothing():
     taught, other = teach(clicks), teach([clicks[k] for k in (5, 0, 3, 6, 1, 4, 2)])
     assert np.array_equal(taught.centres, other.centres)
     assert np.array_equal(taught.whiten, other.whiten)
-    one, two = (found(frame, picture, each) for each in (taught, other))
-    assert np.array_equal(one.taken, two.taken)
-    assert np.array_equal(one.cloud.points_mm, two.cloud.points_mm)
+    first, second = (find(frame, picture, each) for each in (taught, other))
+    assert np.array_equal(first.taken, second.taken)
+    assert np.array_equal(first.cloud.points_mm, second.cloud.points_mm)
 
 
 def test_exposure_and_shading_change_hardly_a_pixel():
     frame, picture, on = two_tissues()
     taught = teach(clicks_of(frame, picture))
-    as_taught = found(frame, picture, taught).taken == 0
+    as_taught = find(frame, picture, taught).taken == 0
     shades = (0.5, 0.75, 1.15, np.linspace(0.6, 1.1, SMALL.width)[:, None])
     for shade in shades:
         other = np.clip(picture * shade, 0, 255).astype(np.uint8)
-        changed = (found(frame, other, taught).taken == 0) != as_taught
+        changed = (find(frame, other, taught).taken == 0) != as_taught
         assert changed.sum() < 0.02 * on.sum()
 
 
@@ -103,15 +103,15 @@ def test_it_says_when_it_does_not_know():
     frame, same, _ = two_tissues(RED)
     with pytest.raises(InputError, match="look alike"):
         teach(clicks_of(frame, same))
-    mixed = [replace(one, organ=k % 2 == 0) for k, one in enumerate(clicks)]
+    mixed = [replace(click, organ=k % 2 == 0) for k, click in enumerate(clicks)]
     with pytest.raises(InputError, match="look alike"):
         teach(mixed)
     for pixel, painted_white in (((0, 0), False), ((120, 150), True)):
-        seen = np.full_like(picture, 255) if painted_white else picture
+        shown = np.full_like(picture, 255) if painted_white else picture
         depth_mm = frame.depth_mm.copy()
         depth_mm[:20, :20] = np.nan
         with pytest.raises(InputError, match="too little is seen there"):
-            sample_click(DepthFrame(depth_mm, SMALL), seen, pixel, True)
+            sample_click(DepthFrame(depth_mm, SMALL), shown, pixel, True)
     with pytest.raises(InputError, match="the picture is 424 x 239"):
         sample_click(frame, picture[1:], (3, 3), True)
 
@@ -128,16 +128,16 @@ def test_where_it_cannot_be_used_depth_decides_and_it_is_said():
         *((None, "no picture"), (blue, "another light"), (dark, "another light")),
         (grey, "another light"),
     ):
-        region = found(frame, other, taught)
+        region = find(frame, other, taught)
         assert why in region.doubt
         assert np.array_equal(region.taken, alone.taken)
     cloud = SensorCloud(deproject(frame))
-    assert "no picture" in found(cloud, picture, taught).doubt
+    assert "no picture" in find(cloud, picture, taught).doubt
     with pytest.raises(NoEstimate, match="another light"):
         tt.find_organ(frame, range_mm=(60, 400), picture=blue, taught=taught)
     empty = DepthFrame(np.full((240, 424), np.nan), SMALL)
     with pytest.raises(NoEstimate, match="Also, what the clicks taught is not used"):
-        found(empty, picture, taught)
+        find(empty, picture, taught)
 
 
 def test_grey_pictures_teach_only_large_differences():
@@ -148,7 +148,7 @@ def test_grey_pictures_teach_only_large_differences():
     u, _ = pixels(SMALL)
     grey[~on | (u > 212)] = 14 + grey[~on | (u > 212)] // 20
     taught = teach(clicks_of(frame, grey))
-    organ = found(frame, grey, taught).taken == 0
+    organ = find(frame, grey, taught).taken == 0
     assert organ[on & (u < 205)].mean() > 0.9
     assert organ[on & (u > 219)].mean() < 0.05
 
@@ -206,7 +206,7 @@ def with_and_without(kind, kidneys):
         picture = painted(scene, colours, random_light(rng), rng)
         regions = [organ_points(scene.frame, CONFIG, Hints(), np.random.default_rng(0))] * 2
         try:
-            regions[1] = found(scene.frame, picture, teach(clicked(scene, picture, rng)))
+            regions[1] = find(scene.frame, picture, teach(clicked(scene, picture, rng)))
             refused += bool(regions[1].doubt)
         except InputError:
             refused += 1
@@ -221,10 +221,10 @@ def test_what_clicks_gain_in_scenes(kind, kidneys):
     good = (rows[:, ::2] > 0.85) & (rows[:, 1::2] > 0.6)
     means, tenth = 100 * rows.mean(0), 100 * np.quantile(rows, 0.1, axis=0)
     worst = 100 * rows[rows[:, 2:].prod(1).argmin()]
-    told = [f"{m:.1f} ({t:.0f})" for m, t in zip(means, tenth, strict=True)]
+    shares = [f"{m:.1f} ({t:.0f})" for m, t in zip(means, tenth, strict=True)]
     print(
-        f"\n| {kind} | {told[0]}, {told[1]} | {good[:, 0].sum()}/{len(rows)} "
-        f"| {told[2]}, {told[3]} | {good[:, 1].sum()}/{len(rows)} | {refused} "
+        f"\n| {kind} | {shares[0]}, {shares[1]} | {good[:, 0].sum()}/{len(rows)} "
+        f"| {shares[2]}, {shares[3]} | {good[:, 1].sum()}/{len(rows)} | {refused} "
         f"| {worst[2]:.0f}, {worst[3]:.0f} |"
     )
     if kind == "fat of its colour":

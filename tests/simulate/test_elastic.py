@@ -128,8 +128,8 @@ def test_blocks_solve_like_a_dense_matrix():
         20
     )
     right = rng.normal(size=(20, 3))
-    found = BlockCholesky(csr_matrix(matrix), bounds).solve(right)
-    np.testing.assert_allclose(found, np.linalg.solve(matrix, right), atol=1e-12)
+    solution = BlockCholesky(csr_matrix(matrix), bounds).solve(right)
+    np.testing.assert_allclose(solution, np.linalg.solve(matrix, right), atol=1e-12)
 
 
 def test_weights_are_exact_for_linear_fields_and_constant_beyond():
@@ -361,9 +361,9 @@ def test_a_state_that_moves_far_is_scaled_back(reduced):
     ]
     assert len(farthest) > 140
     assert 10 < max(farthest) <= 16 + 1e-9
-    found = [s for s in states if s is not None][:140]  # one after the other; now on two threads
+    in_turn = [s for s in states if s is not None][:140]  # solved in turn, not on two threads
     together = random_states(reduced, np.array(UP), 0.2, np.random.default_rng(0), 140)
-    np.testing.assert_array_equal(together, found)
+    np.testing.assert_array_equal(together, in_turn)
 
 
 def test_a_body_survives_a_file(body, unchecked):

@@ -118,8 +118,8 @@ def test_configurations_are_the_papers_table(shared_data):
     for number, row in enumerate(re.findall(r"^(\d) & (.*?)\\hline", table, re.M | re.S), start=1):
         assert int(row[0]) == number
         triples = re.findall(r"\(([\d.]+), ([\d.]+), (\d+)\)", row[1])
-        found = tuple((float(d), float(s), int(n)) for d, s, n in triples)
-        assert found == CONFIGURATIONS[number]
+        steps = tuple((float(d), float(s), int(n)) for d, s, n in triples)
+        assert steps == CONFIGURATIONS[number]
     assert number == len(CONFIGURATIONS) == 6
 
 

@@ -85,10 +85,10 @@ def test_distance_to_a_sphere_is_about_right():
     radius = rng.uniform(5, 30, 2000)
     points = direction / np.linalg.norm(direction, axis=1, keepdims=True) * radius[:, None]
     true = np.abs(radius - 15)
-    found = surface_distance(sphere(15, (0, 0, 0)), points)
-    assert (found > true - 0.03).all()  # of samples of the surface: never too near ...
-    assert (found - true)[true > 2].max() < 0.1  # ... and hardly too far
-    assert found[true < 0.2].max() < 0.5
+    distance = surface_distance(sphere(15, (0, 0, 0)), points)
+    assert (distance > true - 0.03).all()  # of samples of the surface: never too near ...
+    assert (distance - true)[true > 2].max() < 0.1  # ... and hardly too far
+    assert distance[true < 0.2].max() < 0.5
 
 
 @pytest.mark.parametrize("finer", [2, 4])
@@ -100,10 +100,10 @@ def test_distances_are_those_to_the_nearest_sample_of_a_surface(finer):
     inner = np.einsum("fkx,wk->wfx", corners, shares / shares.sum(1, keepdims=True)).reshape(-1, 3)
     samples = np.concatenate([mesh.vertices_mm, inner])
     nearest = np.linalg.norm(points[:, None] - samples, axis=2).min(1)
-    found = surface_distance(mesh, points)
-    np.testing.assert_allclose(found[nearest < 2], nearest[nearest < 2], rtol=1e-6)
-    assert (found - nearest).min() > -1e-4
-    assert (found - nearest).max() < (1e-4 if finer == 2 else 0.1)  # long edges: all are near
+    distance = surface_distance(mesh, points)
+    np.testing.assert_allclose(distance[nearest < 2], nearest[nearest < 2], rtol=1e-6)
+    assert (distance - nearest).min() > -1e-4
+    assert (distance - nearest).max() < (1e-4 if finer == 2 else 0.1)  # long edges: all are near
 
 
 def test_even_points_measure_volume(pool):

@@ -44,7 +44,7 @@ class Region:
         counts: number of working-image pixels that are ``organ``, had ``no return``, or were
             removed by each step (``working_image.STEPS``).
         taken: (h, w) uint8, the same for each pixel of the working image: index into ``STEPS``, 0
-            the organ. A cloud's is as seen by a camera at its origin.
+            the organ. Of a cloud as seen by a camera at its origin.
         seconds: run time.
         doubt: why the colours learnt from clicks were not used, so that depth alone decided; or
             empty.

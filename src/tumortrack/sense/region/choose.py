@@ -51,8 +51,7 @@ def choose_pieces(image: WorkingImage, config: RegionConfig, hints: Hints) -> No
     best: tuple[float, np.ndarray, _Sizes, np.ndarray] | None = None
     for wider in _OPENINGS:
         pieces, count = find_pieces(image, edges, config, wider)
-        arrays = (image.depth_mm, edges[1], image.taken, pieces)
-        sizes = _measure(*arrays, image.pinhole, count)
+        sizes = _measure(image.depth_mm, edges[1], image.taken, pieces, image.pinhole, count)
         chosen, score, doubtful = _chosen(image, pieces, sizes, config, hints)
         if best is None or score > _CLEARLY * best[0]:
             best = score, pieces, sizes, chosen
@@ -66,7 +65,8 @@ def choose_pieces(image: WorkingImage, config: RegionConfig, hints: Hints) -> No
         # not thin.
         low, high = np.sort(np.asarray(hints.last_box_mm, np.float64), axis=0)
         high[2] -= _FAR_SIDE * (high[2] - low[2])
-        area = _area_in_box(image, pieces, sizes, low - _BOX_MM, high + _BOX_MM)
+        box = low - _BOX_MM, high + _BOX_MM
+        area = _area_inside(image.depth_mm, pieces, image.pinhole, *box, len(chosen))
         parts = (area > _WHOLLY * sizes.area_mm2) & (sizes.thick_mm > _THICK_PART_MM) & (area > 0)
         chosen = chosen | parts
     image.remove(~chosen[pieces], PIECES)
@@ -104,8 +104,7 @@ def _chosen(
         piece = int(scores.argmax())
     leaves = sizes.cut > _CUT
     gap = config.gap_mm / image.footprint
-    arrays = (image.depth_mm, image.taken, pieces)
-    lines = _continuing(*arrays, gap, image.footprint, len(chosen))
+    lines = _continuing(image.depth_mm, image.taken, pieces, gap, image.footprint, len(chosen))
     lines = lines + lines.T
     chosen[piece] = True
     refused = False
@@ -139,15 +138,9 @@ def _hinted(image: WorkingImage, pieces: np.ndarray, sizes: _Sizes, hints: Hints
     if hints.last_box_mm is None:
         return None
     low, high = np.sort(np.asarray(hints.last_box_mm, np.float64), axis=0)
-    area = _area_in_box(image, pieces, sizes, low, high)
+    area = _area_inside(image.depth_mm, pieces, image.pinhole, low, high, len(sizes.cut))
     inside = area**2 / np.maximum(sizes.area_mm2, 1e-9)  # the surroundings reach in, too
     return int(inside.argmax()) if inside.max() > 0 else None
-
-
-def _area_in_box(
-    image: WorkingImage, pieces: np.ndarray, sizes: _Sizes, low: np.ndarray, high: np.ndarray
-) -> np.ndarray:
-    return _area_inside(image.depth_mm, pieces, image.pinhole, low, high, len(sizes.cut))
 
 
 def _like_an_organ(sizes: _Sizes, config: RegionConfig) -> np.ndarray:

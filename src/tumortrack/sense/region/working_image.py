@@ -141,9 +141,9 @@ class WorkingImage:
     @property
     def pixel_mm(self) -> float:
         """Width of a pixel at the median depth."""
-        some = self.depth_mm[::4, ::4]
-        some = some[some > 0]
-        return self.footprint * float(np.median(some)) if some.size else 1.0
+        depths = self.depth_mm[::4, ::4]
+        depths = depths[depths > 0]
+        return self.footprint * float(np.median(depths)) if depths.size else 1.0
 
     def remove(self, where: np.ndarray, step: int) -> None:
         """Mark pixels (h, w, bool) as removed by a step, except those already removed."""

@@ -194,7 +194,7 @@ class BlockCholesky:
 
     A lattice cut across its longest axis has such a stiffness. Every block is dense after
     elimination, so BLAS works on whole blocks and all right-hand sides at once: for an organ of
-    some 10,000 unknowns this is many times faster than sparse factorisations with a general
+    about 10,000 unknowns this is many times faster than sparse factorisations with a general
     ordering. Block s holds the unknowns ``bounds[s] : bounds[s + 1]``; entries between blocks that
     are not adjacent must be zero.
     """

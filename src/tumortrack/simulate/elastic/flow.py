@@ -15,7 +15,7 @@ from jaxtyping import Float32
 
 from tumortrack.core.compiled import njit
 
-_PER_SLOPE = 10  # steps over the field's steepest slope; the inverse is then within 0.01 mm
+_PER_SLOPE = 10  # steps over the steepest slope: the inverse then leads back within 0.01 mm
 _FEWEST, _MOST = 3, 24  # steps
 BLOCK = 64  # points that take each step together; a single one stalls on its previous step
 
@@ -140,7 +140,7 @@ def travel(velocity, spacing, steps, count, places, speeds, middles):  # type: i
 
     Midpoint rule, with the middle of a step predicted from the last step's velocity: second order
     with one sample a step, and nearly symmetric, so that the opposite field leads back to within
-    some micrometres.
+    a few micrometres.
     """
     zero = np.float32(0)
     dt = np.float32(1) / (spacing * np.float32(steps))
@@ -163,10 +163,10 @@ def follow(field, points, steps):  # type: ignore[no-untyped-def]
     out = np.empty_like(points)
     places, speeds, middles = block()
     for first in range(0, len(points), BLOCK):
-        some = points[first : first + BLOCK]
-        enter(some, origin, spacing, places)
-        travel(velocity, spacing, steps, len(some), places, speeds, middles)
-        for p in range(len(some)):
+        part = points[first : first + BLOCK]
+        enter(part, origin, spacing, places)
+        travel(velocity, spacing, steps, len(part), places, speeds, middles)
+        for p in range(len(part)):
             for axis in range(3):
                 out[first + p, axis] = origin[axis] + spacing * places[axis, p]
     return out

@@ -32,7 +32,7 @@ _WEIGHT = 1.05e-6 * 9.81  # N/mm3
 _EDGE_MM = 4.0  # width over which an obstacle's edge fades
 _DEEPEST = 0.28  # largest depth of a plate, over the organ's thickness
 _FARTHEST_MM = 16.0  # largest motion of a place on a kidney's surface
-_TOGETHER = 32  # problems solved in one batch, of some 2 MB each
+_TOGETHER = 32  # problems solved in one batch, of about 2 MB each
 _SWELLING = 0.025  # largest strain of the volume, which modes change further, to 3 % at most
 
 

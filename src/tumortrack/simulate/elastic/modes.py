@@ -27,7 +27,7 @@ _FREE = 1e-4  # N/mm: keeps rigid motions solvable without contacts
 
 @dataclass(frozen=True, eq=False)
 class Patches:
-    """The organ's surface as some hundred areas, on which loads and obstacles act."""
+    """The organ's surface as several hundred areas, on which loads and obstacles act."""
 
     points_mm: Float64[np.ndarray, "p 3"]  # centroids
     areas_mm2: Float64[np.ndarray, " p"]
