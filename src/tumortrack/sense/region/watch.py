@@ -99,8 +99,10 @@ class TableWatch:
             self._moved = Finding("moved", values)
 
     def _learn(self, content: DepthFrame | SensorCloud, points_mm: np.ndarray) -> None:
-        cloud = isinstance(content, SensorCloud)
-        image = image_of_cloud(content) if cloud else image_of_frame(content, None)
+        if isinstance(content, DepthFrame):
+            image = image_of_frame(content, None)
+        else:
+            image = image_of_cloud(content)
         plane = find_plane(image, self._config, np.random.default_rng(self._frames))
         if plane is None:
             return
