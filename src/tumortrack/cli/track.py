@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import signal
 import time
 from collections.abc import Callable, Iterator
@@ -141,7 +140,7 @@ class _Screen:
             stage = stage_words(cell.state, arms is not None and arms.ur)
             state += f"; arms: {stage}" + (f" ({cell.halted})" if cell.halted else "")
             state += "" if cell.left_mm is None else f"; {cell.left_mm:.1f} mm of the margin left"
-            kind += [cell.state, re.sub(r"\d", "", cell.halted)]
+            kind += [cell.state, cell.halt and cell.halt.same_as]
         now = time.monotonic()
         if kind != self._state and now - self._changed >= _SAY_S:
             self._state, self._changed = kind, now
