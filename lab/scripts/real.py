@@ -26,6 +26,7 @@ from tumortrack.core.errors import InputError
 from tumortrack.core.mesh_files import read_mesh, write_mesh
 from tumortrack.core.types import Mesh
 from tumortrack.imaging.case import Case, load_case
+from tumortrack.simulate.dataset import scene_maker
 from tumortrack.tracking.tracker import Tracker
 from tumortrack_lab.real import kidneys, lungs, silicone
 from tumortrack_lab.real.judging import DRAGGED, by_tumor, judge, quantiles, scene_of
@@ -143,7 +144,7 @@ def _dragged(organ: Organ) -> list[dict]:
 
     def measure() -> list[dict]:
         case, tracker = organ.case, organ.tracker()
-        make = api.scene_maker(case, DRAGGED, organ.options.seed)
+        make = scene_maker(case, DRAGGED, organ.options.seed)
         rows = [judge(tracker, case.anatomy, make(number)) for number in range(count)]
         say(f"{organ.name}, dragged: {quantiles(by_tumor(rows).middle_mm)}")
         return rows

@@ -17,7 +17,6 @@ import trimesh
 
 import render_objects
 from tumortrack.cli import main as cli
-from tumortrack.cli.inspection import describe
 from tumortrack.core import store
 from tumortrack.core.errors import ArtifactError, InputError
 from tumortrack.core.estimate import Estimate
@@ -26,6 +25,7 @@ from tumortrack.core.mesh_query import contains, labels_of
 from tumortrack.core.report import FitReport
 from tumortrack.core.types import CameraLabels, LabelVolume
 from tumortrack.imaging.case import Case, save_case
+from tumortrack.report.inspection import describe
 from tumortrack.report.metrics import label_grid
 from tumortrack.report.protocol import evaluate_scenes
 from tumortrack.sense.camera import deproject

@@ -197,15 +197,15 @@ def test_a_camera_whose_clock_is_ahead_takes_nothing_off_the_lag():
 
 def test_a_new_plan_helps_where_the_motion_alone_is_too_much():
     live, tumor = LiveBudget(budget(9.0)), sphere(TUMOR_MM, RADIUS_MM)
-    assert live.add_up(update(0), "tumor_1", tumor, 1.0, 5.6) == ("", False)
+    assert live.add_up(update(0), "tumor_1", tumor, 1.0, 5.6) == (None, False)
     said, helps = live.add_up(update(1), "tumor_1", tumor, 1.9, 5.6)
-    assert said == "6.1 mm of error, most of it tracking (4.2), against a margin of 5.6 mm"
+    assert said.words == "6.1 mm of error, most of it tracking (4.2), against a margin of 5.6 mm"
     assert helps
     _, helps = live.add_up(update(2, std_mm=2.0), "tumor_1", tumor, 1.9, 5.6)
     assert not helps
     # Accepted by a person when it was planned: added up, and nothing follows.
     accepted = LiveBudget(budget(1.0, motion_mm=2))
-    assert accepted.add_up(update(0), "tumor_1", tumor, 1.9, 1.0) == ("", False)
+    assert accepted.add_up(update(0), "tumor_1", tumor, 1.9, 1.0) == (None, False)
     assert accepted.now.left_mm < 0
 
 
@@ -261,11 +261,11 @@ def test_live_the_margin_of_the_moment_counts():
     of = update(0, std_mm=0.1)
     said = stating(tumor_1=6.0).margin
     of = replace(of, estimate=of.estimate.reporting(margin=said))
-    assert live.add_up(of, "tumor_1", sphere(TUMOR_MM, RADIUS_MM), 0.0, 20.0) == ("", False)
+    assert live.add_up(of, "tumor_1", sphere(TUMOR_MM, RADIUS_MM), 0.0, 20.0) == (None, False)
     assert (live.now.tracking_mm, live.now.confidence) == (5.0, 0.9)
     of = replace(of, estimate=of.estimate.reporting(margin=MarginReport(reason="poor")))
     why, _ = live.add_up(of, "tumor_1", sphere(TUMOR_MM, RADIUS_MM), 0.0, 20.0)
-    assert why == "the estimate states no 90 % margin, with which it was planned"
+    assert why.words == "the estimate states no 90 % margin, with which it was planned"
     assert (live.now.tracking_mm, live.now.confidence) == (LEAST_TRACKING_MM, 0)
 
 

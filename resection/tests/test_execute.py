@@ -16,12 +16,12 @@ from clock import PATIENCE_S
 from live_objects import small_update
 from plan_objects import MIDDLE_MM, RADIUS_MM, TUMOR_MM, Deviating, located, sphere
 from tumortrack.core.errors import InputError, NoPlan
+from tumortrack.core.halt import CUT_NOTE, Halt
 from tumortrack.live.values import TrackingResult
 from tumortrack_resection.budget import ErrorBudget
 from tumortrack_resection.live_budget import LiveBudget
 from tumortrack_resection.motions import ABORTED, DONE, JOINTS, Execution, Motions, MotionStage
 from tumortrack_resection.operation import (
-    CUT_NOTE,
     Operation,
     OperationConfig,
     Planned,
@@ -75,14 +75,14 @@ def test_an_abort_stops_the_arms_smoothly_from_every_state_and_for_good(state):
     run_until(execution, state)
     execution.step(0.3)
     joints = [execution.joints_rad]
-    execution.abort("the surgeon said so")
+    execution.abort(Halt("stopped", {"words": "the surgeon said so"}))
     assert execution.state == ABORTED
     for _ in range(200):
         execution.step(0.005)
         joints.append(execution.joints_rad)
     joints = np.array(joints)
     assert execution.ended
-    assert execution.halted == "the surgeon said so"
+    assert execution.halted.words == "the surgeon said so"
     assert np.abs(joints[-1] - joints[-60]).max() == 0  # stands
     speed = np.diff(joints, axis=0) / 0.005
     assert np.abs(np.diff(speed, axis=0)).max() / 0.005 < 4.6  # braked, not thrown
@@ -114,7 +114,7 @@ def test_halts_only_delay(orders):
     execution = Execution(straight)
     before = execution.joints_rad
     for go, seconds in orders:
-        execution.go() if go else execution.halt("a doubt")
+        execution.go() if go else execution.halt(Halt("silent"))
         execution.step(seconds)
         after = execution.joints_rad
         stage = straight.stages[0 if execution.state == "approach" else 1]
@@ -130,16 +130,14 @@ def test_halts_only_delay(orders):
     assert execution.joints_rad == pytest.approx(straight.stages[-1].joints_rad[-1])
 
 
-def test_a_halt_needs_its_reason_and_new_motions_begin_where_the_arms_are():
+def test_new_motions_begin_where_the_arms_are():
     execution = Execution(motions())
-    with pytest.raises(InputError, match="reason"):
-        execution.halt("")
     with pytest.raises(InputError, match="goes forward"):
         execution.step(-0.1)
     execution.step(0.5)
     with pytest.raises(InputError, match="while the arms stand"):
         execution.replace(motions())
-    execution.halt("planning")
+    execution.halt(Halt("planning"))
     execution.step(2.0)
     with pytest.raises(InputError, match="rad from where the arms are"):
         execution.replace(motions())
@@ -408,6 +406,7 @@ def test_a_tumor_that_keeps_moving_is_waited_for_and_its_return_is_enough():
         cell = world.frame()
     assert cell.halted.startswith("tumor_1 has moved by")
     assert not world.calls
+    assert world.operation.halts == {"tumor_ has moved by  mm": 1}  # one reason, many numbers
     world.shift = np.zeros(3)
     assert world.frames(2).halted == ""
     world.until(DONE)

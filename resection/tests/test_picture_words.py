@@ -23,6 +23,7 @@ from tumortrack_resection.values import (
     Located,
     ResectionPlan,
 )
+from workcell_objects import stopped
 
 WARNINGS = (
     f"{POOR_ESTIMATE}: only 12% of the organ's surface is seen, and 3 of 1000 points lie farther "
@@ -76,7 +77,7 @@ def test_every_frame_of_a_film_has_its_words(
     plan: ResectionPlan,  # noqa: F811
     tmp_path: Path,
 ) -> None:
-    cells = [*workcells[:2], replace(workcells[2], halted=WARNINGS[0])]
+    cells = [*workcells[:2], replace(workcells[2], halt=stopped(WARNINGS[0]))]
     film(cells, located, tmp_path / "film.gif", (320, 240), plan=replace(plan, notes=WARNINGS))
     film(cells, located, tmp_path / "none.gif", (320, 240), plan=plan)
     with Image.open(tmp_path / "film.gif") as gif, Image.open(tmp_path / "none.gif") as bare:

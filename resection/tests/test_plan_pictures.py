@@ -27,6 +27,7 @@ from tumortrack_resection.pictures import (
     plan_figure,
 )
 from tumortrack_resection.values import Cut, CutLayer, Located, ResectionPlan
+from workcell_objects import stopped
 
 CENTRE, RADII = np.array([0.0, 0.0, 145.0]), np.array([55.0, 30.0, 25.0])
 TUMOR, TUMOR_MM = np.array([18.0, -6.0, 163.0]), 14.0
@@ -220,7 +221,7 @@ def workcells(plan: ResectionPlan) -> list[Workcell]:
             RigidShape(name, table if name == "table" else rod, place, grey)
             for name, place in places.items()
         )
-        frames.append(Workcell("approach" if n < 3 else "sweep 1", "", {}, shapes, cuts))
+        frames.append(Workcell("approach" if n < 3 else "sweep 1", None, {}, shapes, cuts))
     return frames
 
 
@@ -254,7 +255,7 @@ def test_the_film_shows_every_frame_and_what_moves(
 def test_the_same_frames_are_the_same_film(
     workcells: list[Workcell], located: Located, tmp_path: Path
 ) -> None:
-    halted = [replace(workcells[0], halted="no fresh estimate"), workcells[1]]
+    halted = [replace(workcells[0], halt=stopped("no fresh estimate")), workcells[1]]
     for name in ("one.gif", "two.gif"):
         film(halted, located, tmp_path / name, size=(200, 160))
     assert (tmp_path / "one.gif").read_bytes() == (tmp_path / "two.gif").read_bytes()

@@ -25,9 +25,9 @@ if TYPE_CHECKING:
     from tumortrack.tracking.tracker import Tracker as Tracker
 
 _NAMES = {  # by the module that has them
-    "api": "estimate_from_surfaces evaluate find_organ load_case load_estimate load_model "
-    "locate prepare read_cloud read_depth save_estimate scan_phantom simulate_scenes teach "
-    "track train",
+    "api": "describe estimate_from_surfaces evaluate export find_organ load_case "
+    "load_estimate load_model locate prepare read_cloud read_depth save_estimate scan_phantom "
+    "simulate_scenes teach track train write_scenes",
     "core": "errors",
     "core.estimate": "Estimate",
     "core.types": "DepthFrame Intrinsics Look SensorCloud",

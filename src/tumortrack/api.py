@@ -10,10 +10,9 @@ from __future__ import annotations
 import logging
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, TypeVar, get_type_hints
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
@@ -24,7 +23,14 @@ from tumortrack.core.estimate import Estimate
 from tumortrack.core.types import DepthFrame, Mesh, SensorCloud
 from tumortrack.imaging.case import Case
 from tumortrack.imaging.case import load_case as read_case
-from tumortrack.tracking.options import Device, LocateOptions, TrackOptions
+from tumortrack.tracking.options import (
+    Device,
+    ExportOptions,
+    LocateOptions,
+    SimulateOptions,
+    TrackOptions,
+    options_from,
+)
 
 if TYPE_CHECKING:
     from tumortrack.live.session import Arms, Session
@@ -35,16 +41,15 @@ if TYPE_CHECKING:
     from tumortrack.registration.config import RegistrationConfig
     from tumortrack.report.locating import Located
     from tumortrack.sense.region.tissue import TissueClassifier
-    from tumortrack.simulate.scene import SceneConfig
     from tumortrack.simulate.scene_folder import Scene
     from tumortrack.tracking.tracker import Tracker
 
 StrPath = str | Path
-_Options = TypeVar("_Options")  # a dataclass
-_TEST_BODY = 2**20  # and the seed: elastic states that training with the same seed never sees
 
 
-def scan_phantom(folder: StrPath, seed: int = 1) -> Path:
+def scan_phantom(
+    folder: StrPath, seed: int = 1, spacing_mm: tuple[float, float, float] = (1.2, 1.2, 1.5)
+) -> Path:
     """Write a virtual CT of the built-in kidney phantom as a DICOM series, if none is there;
     returns the folder, which ``prepare`` reads.
 
@@ -56,7 +61,7 @@ def scan_phantom(folder: StrPath, seed: int = 1) -> Path:
     folder = Path(folder)
     if not folder.exists():
         phantom = digital.PhantomParameters()
-        parameters = scanner.ScannerParameters(spacing_mm=(1.2, 1.2, 1.5))
+        parameters = scanner.ScannerParameters(spacing_mm=spacing_mm)
         ct = scanner.scan(digital.phantom_labels(phantom), parameters, seed)
         dicom.write_dicom_series(ct, folder, side=phantom.side)
     return folder
@@ -79,7 +84,7 @@ def prepare(
         segment: of a CT: what segments it, as ``prepare --segment``; its label map is kept beside
             ``folder`` (FOLDER.labels.nii.gz).
         progress: of making the case's model, as its last step: steps done, of how many.
-        options: fields of ``imaging.prepare.PrepareOptions``: ``name``, ``term``,
+        options: as on the command line: ``name``, ``term``,
             ``structure``, ``organ_hu``, ``tumor_hu``, ``labels``, ``side``, ``organ``,
             ``tumor``, ``up``, ``rotations``, ``tilt``, ``sensor``, ``series``,
             ``unit``, ``min_tumor_ml``, ``patient``.
@@ -93,9 +98,10 @@ def prepare(
     """
     from tumortrack.imaging import prepare as preparing
     from tumortrack.imaging.case import KIND, save_case
+    from tumortrack.imaging.options import PrepareOptions
     from tumortrack.tracking.model_files import case_model
 
-    asked = _options(preparing.PrepareOptions, options, "prepare")
+    asked = options_from(PrepareOptions, options, "prepare")
     if folder is not None:
         store.check_place(Path(folder), KIND, overwrite)
     if segment is None:
@@ -122,20 +128,6 @@ def prepare(
     return case
 
 
-def _options(kind: type[_Options], given: dict[str, Any], what: str) -> _Options:
-    """InputError: one that is none."""
-    hints = get_type_hints(kind)
-    if unknown := sorted(set(given) - set(hints)):
-        raise InputError(f"{what} knows no {unknown[0]!r}; allowed: {', '.join(hints)}.")
-    for name, value in given.items():
-        if hints[name] == tuple[Path, ...]:
-            paths = [value] if isinstance(value, str | Path) else value
-            given[name] = tuple(map(Path, paths))
-        elif hints[name] == Path | None and value is not None:
-            given[name] = Path(value)
-    return kind(**given)
-
-
 def load_case(folder: StrPath) -> Case:
     """Read a folder that ``prepare`` wrote.
 
@@ -143,6 +135,18 @@ def load_case(folder: StrPath) -> Case:
         ArtifactError: missing, of another schema, or changed since.
     """
     return read_case(Path(folder))
+
+
+def describe(path: StrPath) -> list[str]:
+    """What a folder or file is and what is in it, as lines of text: of all that commands write, and
+    of clouds, depth images, meshes, CTs and label maps.
+
+    Raises:
+        InputError, ArtifactError: it is missing, of no kind that is known here, or damaged.
+    """
+    from tumortrack.report import inspection
+
+    return inspection.describe(Path(path))
 
 
 def simulate_scenes(
@@ -159,37 +163,67 @@ def simulate_scenes(
         Scenes: ``cloud`` and ``depth`` (camera frame, mm), ``reference`` (the true surfaces),
         ``targets`` (inner points in both frames), ``meta`` (``camera_from_ct``, the recipe).
     """
-    from tumortrack.sense.noise import CLEAN, D405_NOISE
-    from tumortrack.simulate.deform import DragConfig, ElasticConfig
-    from tumortrack.simulate.scene import SceneConfig
+    from msgspec.structs import replace
 
-    deform = ElasticConfig() if elastic else DragConfig()
-    config = SceneConfig(deform=(deform,), noise=D405_NOISE if noise else CLEAN)
-    config = config.seen_whole(case.anatomy)
+    from tumortrack.simulate.dataset import scene_maker
+
+    config = SimulateOptions(elastic=elastic, noise=noise).scene_config()
+    config = replace(config, width=424, height=240).seen_whole(case.anatomy)
     return list(map(scene_maker(case, config, seed), range(count)))
 
 
-def scene_maker(case: Case, config: SceneConfig, seed: int) -> Callable[[int], Scene]:
-    """Makes any scene of the stream ``test`` by its number."""
-    from tumortrack.simulate.scene import SceneRecipe, Simulator, body_for
-    from tumortrack.simulate.scene_folder import Scene, draw_targets
+def write_scenes(
+    case: StrPath,
+    folder: StrPath,
+    *,
+    prefix: str = "",
+    progress: Callable[[], None] | None = None,
+    **options: Any,
+) -> None:
+    """Write deformed scenes of a case with their truth, as `tumortrack simulate` does: what
+    ``evaluate`` reads. Scenes that are there stay.
 
-    body = body_for(case.anatomy, case.up_lps, config, _TEST_BODY + seed)
-    simulator = Simulator(case.anatomy, case.up_lps, config, body)
-    inner = draw_targets(case.anatomy, seed)
+    Args:
+        case: folder that ``prepare`` wrote.
+        folder: where to write scene folders PREFIX0000, PREFIX0001, ...
+        progress: called after each scene.
+        options: as on the command line: ``scenes``, ``seed``, ``configuration``, ``falloff``,
+            ``rotations``, ``squeeze``, ``noise``, ``sensor``, ``elastic``.
 
-    def make(index: int) -> Scene:
-        recipe = SceneRecipe(seed, "test", index)
-        made = simulator.render(recipe)
-        meta = {
-            "recipe": asdict(recipe),
-            "camera_from_ct": made.camera_from_ct.tolist(),
-            "deformation": made.deformation.record(),
-        }
-        targets = inner.at(made.carry(inner.points_ct))
-        return Scene(made.cloud, simulator.reference(made), made.frame, meta, targets)
+    Raises:
+        InputError: an option is not allowed, or a scene that is there was made otherwise.
+        StorageError: the disk refused.
+    """
+    from tumortrack.simulate import dataset
 
-    return make
+    asked = options_from(SimulateOptions, options, "write_scenes")
+    made_of = load_case(case)
+    config = asked.scene_config().seen_whole(made_of.anatomy)
+    folders = [Path(folder) / f"{prefix}{index:04d}" for index in range(asked.scenes)]
+    for _ in dataset.write_scenes(made_of, config, asked.seed, folders):
+        if progress is not None:
+            progress()
+
+
+def export(case: StrPath, folder: StrPath, **options: Any) -> tuple[str, ...]:
+    """Write a case, or what was located, as a scene for 3D Slicer, and a CT's as DICOM, as
+    `tumortrack export` does.
+
+    Args:
+        case: folder that ``prepare`` wrote, or alone one that ``locate`` wrote.
+        options: as on the command line: ``located``, ``live``, ``dicom``, ``series``, ``patient``.
+
+    Returns:
+        What to know of the DICOM file.
+
+    Raises:
+        InputError, ArtifactError: folders or options that do not fit each other, or cannot be used.
+        StorageError: the disk refused.
+    """
+    from tumortrack.tracking import slicer_scene
+
+    asked = options_from(ExportOptions, options, "export")
+    return slicer_scene.export(Path(case), Path(folder), asked)
 
 
 def train(
@@ -369,7 +403,7 @@ def locate(model: StrPath, clouds: StrPath | Sequence[StrPath], **options: Any) 
     from tumortrack.report.locating import locate as locate_files
 
     files = [clouds] if isinstance(clouds, str | Path) else clouds
-    asked = _options(LocateOptions, options, "locate")
+    asked = options_from(LocateOptions, options, "locate")
     return locate_files(Path(model), [Path(file) for file in files], asked)
 
 
@@ -552,6 +586,6 @@ def session(
     does. ``arms`` act on what is tracked."""
     from tumortrack.live.session import session
 
-    asked = _options(TrackOptions, options, "track")
+    asked = options_from(TrackOptions, options, "track")
     model = Path(tracker) if isinstance(tracker, str | Path) else tracker
     return session(model, source, sinks, asked, arms)

@@ -16,7 +16,8 @@ from tumortrack.cli.demo import Demo
 from tumortrack.cli.main import run
 from tumortrack.cli.training import Train
 from tumortrack.core.errors import InputError
-from tumortrack.imaging.prepare import PrepareOptions, prepare
+from tumortrack.imaging.options import PrepareOptions
+from tumortrack.imaging.prepare import prepare
 
 
 def _nifti(path: Path, array: np.ndarray, affine: np.ndarray) -> Path:

@@ -10,11 +10,11 @@ import pytest
 
 from stories import answered, cloud_by_rays, looking_down, refusal, succeeded, tumortrack
 from tumortrack import api
-from tumortrack.cli.inspection import describe
 from tumortrack.cli.main import run
 from tumortrack.core import store
 from tumortrack.core.errors import StorageError
 from tumortrack.imaging.case import load_case
+from tumortrack.report.inspection import describe
 from tumortrack.sense.ply import write_cloud_ply
 from tumortrack.tracking import model_files
 

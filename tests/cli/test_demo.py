@@ -8,9 +8,9 @@ import nibabel
 import pytest
 
 from stories import succeeded, tumortrack
-from tumortrack.cli.inspection import describe
 from tumortrack.core import store
 from tumortrack.imaging.case import load_case
+from tumortrack.report.inspection import describe
 from tumortrack.simulate.scene_folder import list_scenes, read_scene
 
 pytestmark = pytest.mark.slow

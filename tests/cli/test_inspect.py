@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from stories import refusal, tumortrack
-from tumortrack.cli.inspection import describe
 from tumortrack.core import store
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import HERE
@@ -20,6 +19,7 @@ from tumortrack.core.types import DepthFrame, Mesh
 from tumortrack.live.recording.mcap import McapBag, camera_messages
 from tumortrack.live.ros.messages import Messages
 from tumortrack.live.values import Observation
+from tumortrack.report.inspection import describe
 from tumortrack.sense.camera import d405
 from tumortrack.sense.files import depth_png, intrinsics_json
 from tumortrack.sense.ply import write_cloud_ply
@@ -196,7 +196,7 @@ def test_what_is_not_known_is_answered_with_what_is(tmp_path):
 
 
 def test_every_sentence_of_the_table_is_one(tmp_path):
-    table = resources.files("tumortrack.cli").joinpath("inspect.toml").read_text("utf-8")
+    table = resources.files("tumortrack.report").joinpath("inspect.toml").read_text("utf-8")
     for kind in tomllib.loads(table).values():
         assert {"name"} < kind.keys() <= {"name", "keys", "file", "sentences"}
         for sentence in kind.get("sentences", ()):

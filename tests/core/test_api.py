@@ -12,9 +12,11 @@ from live_objects import ball
 
 # A name or a parameter that goes or changes its meaning breaks users' scripts: think twice.
 SIGNATURES = {
+    "describe": "path",
     "estimate_from_surfaces": "surfaces grid=160",
     "evaluate": "locate scenes report=None overwrite=False grid=160 seed=0 device='auto' "
     "progress=None",
+    "export": "case folder options",
     "find_organ": "content model=None range_mm=None box_mm=None mask=None picked_mm=None "
     "picture=None taught=None seed=0",
     "load_case": "folder",
@@ -25,12 +27,13 @@ SIGNATURES = {
     "read_cloud": "path unit='mm'",
     "read_depth": "path intrinsics unit_mm=None",
     "save_estimate": "estimate folder overwrite=False cloud=None seen=None",
-    "scan_phantom": "folder seed=1",
+    "scan_phantom": "folder seed=1 spacing_mm=(1.2, 1.2, 1.5)",
     "simulate_scenes": "case count=1 seed=0 elastic=True noise=True",
     "teach": "frame picture organ beside",
     "track": "tracker source sinks=() until=None seconds=0.0 range_mm=None options",
     "train": "case folder preset='clinic' config=None minutes=None steps=None seed=0 "
     "device='auto' workers=None report=None",
+    "write_scenes": "case folder prefix='' progress=None options",
 }
 VALUES = {"Case", "DepthFrame", "Estimate", "Intrinsics", "Look", "SensorCloud", "Tracker"}
 MODULES = {"errors", "presets"}

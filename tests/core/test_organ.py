@@ -10,7 +10,8 @@ from tumortrack.core.organ import KIDNEY, Organ, organ_first, organ_name
 from tumortrack.core.patient import Patient
 from tumortrack.core.types import Anatomy, LabelVolume
 from tumortrack.imaging.case import Case, load_case, save_case
-from tumortrack.imaging.prepare import PrepareOptions, prepare
+from tumortrack.imaging.options import PrepareOptions
+from tumortrack.imaging.prepare import prepare
 from tumortrack.imaging.segmentation_files import segments
 from tumortrack.imaging.select import select_labels
 from tumortrack.imaging.surface import surfaces

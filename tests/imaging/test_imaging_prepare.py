@@ -18,7 +18,8 @@ from tumortrack.core.mesh_files import write_anatomy
 from tumortrack.core.patient import Patient
 from tumortrack.core.types import LabelVolume, Volume
 from tumortrack.imaging.case import load_case, save_case
-from tumortrack.imaging.prepare import PrepareOptions, prepare
+from tumortrack.imaging.options import PrepareOptions
+from tumortrack.imaging.prepare import prepare
 from tumortrack.imaging.surface import surfaces
 from tumortrack.imaging.volume import read_labels, read_raw, read_volume
 from tumortrack.phantom.dicom import write_dicom_series

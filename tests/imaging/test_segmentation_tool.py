@@ -16,7 +16,7 @@ from tumortrack import api
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import LabelVolume
 from tumortrack.imaging.nifti import write_volume_nifti
-from tumortrack.imaging.prepare import PrepareOptions
+from tumortrack.imaging.options import PrepareOptions
 from tumortrack.imaging.segmentation_tool import segmented_case
 from tumortrack.imaging.volume import read_labels
 

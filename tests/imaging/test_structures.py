@@ -9,8 +9,9 @@ from tumortrack.core.mesh_files import read_mesh, write_mesh
 from tumortrack.core.types import LabelVolume, Mesh
 from tumortrack.imaging.case import load_case, save_case
 from tumortrack.imaging.nifti import write_nifti
-from tumortrack.imaging.prepare import PrepareOptions, prepare
-from tumortrack.imaging.structures import TRUSTED_MM, parse_structures, split_structures
+from tumortrack.imaging.options import PrepareOptions, parse_structures
+from tumortrack.imaging.prepare import prepare
+from tumortrack.imaging.structures import TRUSTED_MM, split_structures
 
 VESSEL = 4
 

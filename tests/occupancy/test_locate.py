@@ -13,7 +13,6 @@ import torch
 import trimesh
 
 from stories import answered, cloud_by_rays, looking_down, refusal, succeeded, tumortrack
-from tumortrack.cli.inspection import describe
 from tumortrack.core import store
 from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.estimate import FollowOptions
@@ -22,6 +21,7 @@ from tumortrack.core.mesh_files import read_mesh
 from tumortrack.core.types import Anatomy, SensorCloud
 from tumortrack.imaging.case import load_case
 from tumortrack.occupancy.inference import can_pack, fastest
+from tumortrack.report.inspection import describe
 from tumortrack.report.protocol import check_case
 from tumortrack.tracking.model_files import load_model
 from tumortrack.tracking.tracker import Follower, FollowerConfig, Tracker

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from live_objects import STAMP_NS, small_setting, small_update
 from tumortrack.core.geometry import rigid
+from tumortrack.core.halt import Halt
 from tumortrack.core.types import Mesh
 from tumortrack.live.values import (
     Polyline,
@@ -87,7 +88,11 @@ def workcell(
         for k, joint in enumerate(UR)
     }
     lines = (Polyline("cut/1", circle, CUT, 2.0), Polyline("cut/2", circle - [0, 0, 8.0], CUT, 2.0))
-    return Workcell("sweep 1", halted, joints, shapes, lines)
+    return Workcell("sweep 1", stopped(halted) if halted else None, joints, shapes, lines)
+
+
+def stopped(words: str) -> Halt:
+    return Halt("stopped", {"words": words})
 
 
 def working(sequence: int = 0, progress: float = 0.0, halted: str = "") -> TrackingResult:

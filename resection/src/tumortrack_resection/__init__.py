@@ -11,9 +11,10 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from tumortrack_resection.api import begin_plan as begin_plan
     from tumortrack_resection.api import plan_resection as plan_resection
 
-__all__ = ["plan_resection"]
+__all__ = ["begin_plan", "plan_resection"]
 
 
 def __getattr__(name: str) -> Any:

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 from tumortrack.core.config import from_builtins
 from tumortrack.core.estimate import Estimate
-from tumortrack_resection import budget
+from tumortrack.live.values import PublishedFrame
 from tumortrack_resection import located as places
+from tumortrack_resection.budget import checked_against
+from tumortrack_resection.planning import begin_plan as begin_plan
+from tumortrack_resection.planning import plan_cuts
 from tumortrack_resection.values import ResectionConfig, ResectionPlan
 
 
@@ -48,18 +49,15 @@ def plan_resection(
     """
     config = from_builtins(options, ResectionConfig, "plan_resection")
     if isinstance(located, Estimate):
-        seen = places.of_estimate(located)
+        run = places.of_estimate(located)
     else:
-        seen = places.read_run(Path(located))
+        run = places.read_run(Path(located))
     stand_mm = places.STAND_MM if stand_mm is None else stand_mm
-    seen = seen.moved(places.table_under(seen.meshes, stand_mm))
-    notes = places.notes_of_doubt(seen.doubt, accept_poor)
-    budget_of = partial(budget.planned_budget, located=seen, confidence=confidence)
-    plan, _, errors = budget.plan_within(seen, config, budget_of, confidence is not None)
-    plan = replace(plan, notes=(*notes, *plan.notes))
-    plan = budget.checked_against(plan, errors, accept_budget)
+    frames = PublishedFrame("table", places.table_under(run.meshes, stand_mm))
+    plan, _, errors, run = plan_cuts(run, config, frames, accept_poor, confidence)
+    plan = checked_against(plan, errors, accept_budget)
     if picture is not None:
         from tumortrack_resection.pictures import draw_plan
 
-        draw_plan(plan, seen, Path(picture))
+        draw_plan(plan, run, Path(picture))
     return plan

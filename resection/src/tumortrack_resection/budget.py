@@ -19,6 +19,7 @@ from scipy.spatial import cKDTree
 
 from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError, NoPlan
+from tumortrack.core.halt import Halt
 from tumortrack.tracking.margins import StatedRadius, margin_words, stated_radius
 from tumortrack_resection.outline import evenly_round, polygon_of
 from tumortrack_resection.resection import inside, plan_resection
@@ -96,13 +97,15 @@ class ErrorBudget(Config, frozen=True, kw_only=True):
         return self.margin_mm - self.sum_mm
 
     @property
+    def as_halt(self) -> Halt:
+        """Why arms halt where nothing is left of the margin."""
+        term, term_mm = max(self.terms.items(), key=lambda item: item[1])
+        values: dict[str, float | str] = {"sum_mm": self.sum_mm, "margin_mm": self.margin_mm}
+        return Halt("over_budget", {**values, "term": term, "term_mm": term_mm})
+
+    @property
     def words(self) -> str:
-        terms = self.terms
-        most = max(terms, key=lambda name: terms[name])
-        return (
-            f"{self.sum_mm:.1f} mm of error, most of it {most} ({terms[most]:.1f}), against a "
-            f"margin of {self.margin_mm:.1f} mm"
-        )
+        return self.as_halt.words
 
     def table(self) -> list[str]:
         """Lines for the screen."""

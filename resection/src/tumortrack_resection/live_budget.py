@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from tumortrack.core.config import to_builtins
+from tumortrack.core.halt import Halt
 from tumortrack.core.types import Mesh
 from tumortrack.live.values import TrackingResult
 from tumortrack.tracking.margins import stated_radius
@@ -42,8 +43,8 @@ class LiveBudget:
 
     def add_up(
         self, update: TrackingResult, part: str, tumor: Mesh, motion_mm: float, margin_mm: float
-    ) -> tuple[str, bool]:
-        """Why the arms must stand, empty if they need not, and whether a new plan would help.
+    ) -> tuple[Halt | None, bool]:
+        """Why the arms must stand, None if they need not, and whether a new plan would help.
 
         Args:
             update: with an estimate.
@@ -69,13 +70,12 @@ class LiveBudget:
             lag_mm=self._speed_mm_s(update.stamp_ns, tumor) * (late_ms / 1000 + self._servo_s),
         )
         if self._planned.left_mm < 0:
-            return "", False
+            return None, False
         if self._planned.confidence > now.confidence:
-            sure = f"{100 * self._planned.confidence:g} %"
-            return f"the estimate states no {sure} margin, with which it was planned", False
+            return Halt("no_margin", {"percent": 100 * self._planned.confidence}), False
         if now.left_mm >= 0:
-            return "", False
-        return now.words, msgspec.structs.replace(now, motion_mm=0.0).left_mm >= 0
+            return None, False
+        return now.as_halt, msgspec.structs.replace(now, motion_mm=0.0).left_mm >= 0
 
     def went_on(self) -> None:
         """The arms may move on the last estimate."""

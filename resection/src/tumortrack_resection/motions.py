@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from tumortrack.core.errors import InputError
+from tumortrack.core.halt import Halt
 from tumortrack_resection.ur_sink import UR_JOINTS
 
 CUTTER, HOLDER = "cutter", "holder"  # UR10e with the instrument, UR5 with the vacuum grasper
@@ -78,14 +79,15 @@ class Execution:
     their path, and ``go`` lets them go on; ``abort`` is a halt for good.
 
     ``state`` is the name of the stage, ``done`` or ``aborted``; ``halted`` is why the arms stand or
-    slow down, empty where they don't.
+    slow down, None where they don't.
     """
 
     def __init__(self, motions: Motions) -> None:
         self._motions = motions
         self._number, self._time_s = 0, 0.0
         self._speed = 0.0  # of the motions' own time, 0..1
-        self.halted, self._aborted = "", False
+        self.halted: Halt | None = None
+        self._aborted = False
 
     @property
     def state(self) -> str:
@@ -131,16 +133,14 @@ class Execution:
     def go(self) -> None:
         """Take up the motion again, or begin."""
         if not self._aborted:
-            self.halted = ""
+            self.halted = None
 
-    def halt(self, reason: str) -> None:
+    def halt(self, reason: Halt) -> None:
         """Slow down and stand."""
-        if not reason:
-            raise InputError("a halt needs its reason.")
         if not self._aborted:
             self.halted = reason
 
-    def abort(self, reason: str) -> None:
+    def abort(self, reason: Halt) -> None:
         """Slow down and stand, and never go on; no effect once everything has ended."""
         if not self._over:
             self.halt(reason)

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
+import msgspec
 import numpy as np
 from jaxtyping import Float64
 from scipy.spatial import cKDTree
@@ -20,6 +21,7 @@ from scipy.spatial import cKDTree
 from tumortrack.core.colours import CUT, NOW, TO_CUT
 from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError, TumortrackError
+from tumortrack.core.halt import CUT_NOTE, Halt
 from tumortrack.core.types import Mesh
 from tumortrack.live.values import Polyline, RigidShape, TrackingResult, Workcell
 from tumortrack_resection.budget import MOVED_MM, kept_mm
@@ -30,7 +32,6 @@ from tumortrack_resection.values import Located, ResectionPlan
 _SAME_MM = 0.2  # of heights
 _OTHERS = 2.0  # other parts may have moved so many times as far as the tumor
 _COMPARED = 500  # points of surfaces whose triangles differ
-CUT_NOTE = "cut: estimates are of the intact organ"
 _BLIND_S = 0.2  # without an update for longer, the arms halt by themselves
 
 
@@ -144,7 +145,7 @@ class Operation:
         self.still_life: tuple[RigidShape, ...] = ()
         self.log: list[dict[str, Any]] = []
         self.halts: Counter[str] = Counter()
-        self._counted = ""  # the reason, without its numbers, that ``halts`` has counted
+        self._counted: object = None  # the reason, but for its numbers, that was counted last
 
     @property
     def ended(self) -> bool:
@@ -168,15 +169,16 @@ class Operation:
         self._decide(update, now_s)
         if not self.log or self.log[-1]["state"] != self._execution.state:
             self._log(now_s)
-        halted = "".join(c for c in self._execution.halted if not (c.isdigit() or c == "."))
-        if halted and halted != self._counted:
-            self.halts[halted] += 1
-        self._counted = halted
+        halt = self._execution.halted
+        reason = None if halt is None else halt.same_as
+        if halt is not None and reason != self._counted:
+            self.halts[halt.words_without_numbers] += 1
+        self._counted = reason
         return replace(update, workcell=self.workcell())
 
     def abort(self, reason: str) -> None:
         """Stop for good, from whatever state."""
-        self._execution.abort(reason)
+        self._execution.abort(Halt("stopped", {"words": reason}))
 
     def workcell(self) -> Workcell:
         """State, joints and drawing of the arms."""
@@ -207,7 +209,7 @@ class Operation:
         return {
             "state": self._execution.state,
             "note": self._note,
-            "halted": self._execution.halted,
+            "halted": self._execution.halted.words if self._execution.halted else "",
             "halts": dict(self.halts.most_common()),
             "log": self.log,
             **({} if self._budget is None else {"budget": self._budget.summary()}),
@@ -221,7 +223,7 @@ class Operation:
         self._last_s = now_s
         self._execution.step(min(passed_s, _BLIND_S) * speed)
         if passed_s > _BLIND_S:
-            self._execution.halt("no word from the loop")
+            self._execution.halt(Halt("silent"))
             self._execution.step((passed_s - _BLIND_S) * speed)
         self._cut |= self._execution.sweep > 0
 
@@ -236,18 +238,18 @@ class Operation:
         if self._locate is None or over or execution.sweep > self.planned.plan.sweeps:
             execution.go()  # nothing is compared, nothing moves any more, or all is cut
         elif update.estimate is None:
-            self._halt_in_doubt(f"no estimate: {update.reason}")
+            self._halt_in_doubt(Halt("no_estimate", {"words": update.reason}, update.finding))
         elif update.quality != "good":
-            self._halt_in_doubt(f"{update.quality} estimate: {update.warning}")
+            self._halt_in_doubt(Halt("poor", {"words": update.warning}, update.finding))
         elif self._work is not None:
-            execution.halt("planning anew")
+            execution.halt(Halt("planning"))
         else:
             self._compare(update, self._locate(update), now_s)
 
-    def _halt_in_doubt(self, reason: str) -> None:
+    def _halt_in_doubt(self, halt: Halt) -> None:
         """Halt where it is not known where the tumor is."""
         self._settled = None
-        self._execution.halt(reason)
+        self._execution.halt(halt)
 
     def _compare(self, update: TrackingResult, located: Located, now_s: float) -> None:
         """Go on where everything lies as planned; else halt, and replan once it has settled."""
@@ -255,23 +257,23 @@ class Operation:
         name = self.planned.plan.tumor
         for part in (name, *self.planned.meshes):
             if part not in located.meshes:
-                self._halt_in_doubt(f"{part} was not found")
+                self._halt_in_doubt(Halt("missing", {"part": part}))
                 return
         tumor = located.meshes[name]
-        reason, plan_anew = self._objection(update, located)
-        if not reason:
+        halt, plan_anew = self._objection(update, located)
+        if halt is None:
             self._settled = None
             execution.go()
             if self._budget is not None:
                 self._budget.went_on()
             return
         if not plan_anew:
-            self._halt_in_doubt(reason)
+            self._halt_in_doubt(halt)
             return
         if self._cut and not config.replan_cut:
-            execution.halt(f"{reason} ({CUT_NOTE}; --replan-cut plans on them anyway)")
+            execution.halt(msgspec.structs.replace(halt, cut=True))
             return
-        execution.halt(reason)
+        execution.halt(halt)
         if self._settled is None or apart_mm(tumor, self._settled[0]) > config.settled_mm:
             self._settled = (tumor, now_s)
         elif now_s - self._settled[1] >= config.settled_s and execution.still:
@@ -279,9 +281,10 @@ class Operation:
             if self._replan is not None:
                 self._work = self._replan(update, execution.joints_rad, self.progress)
 
-    def _objection(self, update: TrackingResult, located: Located) -> tuple[str, bool]:
-        """Why the arms must stand, empty if they need not, and whether a new plan would help."""
-        name, far, over = self.planned.plan.tumor, [], ("", False)
+    def _objection(self, update: TrackingResult, located: Located) -> tuple[Halt | None, bool]:
+        """Why the arms must stand, None if they need not, and whether a new plan would help."""
+        name, far = self.planned.plan.tumor, []
+        over: tuple[Halt | None, bool] = None, False
         for part, mesh in self.planned.meshes.items():
             off_mm = apart_mm(located.meshes[part], mesh)
             if off_mm > self._config.moved_mm * (1.0 if part == name else _OTHERS):
@@ -292,7 +295,7 @@ class Operation:
             over = self._budget.add_up(update, name, tumor, motion_mm, kept)
         if far:
             _, off_mm, part = max(far)  # the tumor, or else what moved farthest
-            return f"{part} has moved by {off_mm:.1f} mm", True
+            return Halt("moved", {"part": part, "off_mm": off_mm}), True
         return over
 
     def _take_work(self, work: Future[Planned], now_s: float) -> None:
@@ -311,9 +314,10 @@ class Operation:
             execution.replace(self.planned.motions)
             self._log(now_s, event="planned anew")
         elif isinstance(failure, TumortrackError):
-            execution.abort(f"no new plan: {failure}")
+            execution.abort(Halt("no_plan", {"words": str(failure)}))
         else:  # a defect of the planner must stop the arms, and be reported
-            execution.abort(f"internal error, {type(failure).__name__}: {failure}")
+            words = f"{type(failure).__name__}: {failure}"
+            execution.abort(Halt("defect", {"words": words}))
 
     def _log(self, now_s: float, **event: str) -> None:
         at_s = round(now_s - self._first_s, 3)

@@ -1,4 +1,4 @@
-"""What commands share: lines and bars on the console, devices, and memory that stays."""
+"""What commands share: lines and progress bars on the console, options, garbage collection."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _EVERY_S = 15.0  # between lines where there is no terminal
 
 class _Console(Console):
     def on_broken_pipe(self) -> None:
-        """Nobody reads on (`| head`): the command goes on silently, to its own exit status."""
+        """The reader has gone (`| head`): go on silently, to the command's own exit status."""
         self.quiet = True
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
@@ -33,17 +33,17 @@ console = _Console(soft_wrap=True, highlight=False)
 
 
 def say(text: str) -> None:
-    """One line, as it is."""
+    """Print one line, without markup."""
     console.print(text, markup=False)
 
 
 def say_json(content: Mapping[str, Any]) -> None:
-    """For programs: JSON with indentation, nothing else."""
+    """Print JSON with indentation, for programs."""
     print(json.dumps(content, indent=1, allow_nan=False))
 
 
 def warn(warnings: Iterable[str]) -> None:
-    """A line each, in full, that begins with WARNING, in red where the terminal has colours."""
+    """Print a line each that begins with WARNING, in red where the terminal has colours."""
     for text in warnings:
         console.print(f"WARNING: {text}", style="bold red", markup=False)
 
@@ -55,8 +55,8 @@ def say_notes(notes: Iterable[str]) -> None:
 
 @contextmanager
 def progress_bar(what: str, total: int) -> Iterator[Callable[[], None]]:
-    """A line of what is done, how fast, and of the time left; yields a function to call as each of
-    ``total`` is done. Begin it before what takes seconds to load."""
+    """Shows progress, speed and the time left; yields a function to call after each of ``total``
+    steps. Begin it before slow imports."""
     done = 0
 
     with progress_of(what, f"{what}: 0 of {total} ...") as show:
@@ -71,14 +71,14 @@ def progress_bar(what: str, total: int) -> Iterator[Callable[[], None]]:
 
 @contextmanager
 def progress_of(what: str, first: str = "") -> Iterator[Callable[[int, int], None]]:
-    """The same for a function that gets how many are done, and of how many."""
+    """The same, but the yielded function takes the number of steps done, and of how many."""
     first_s = 0.0
 
     with live_line(first or f"{what} ...") as line:
 
         def show(done: int, total: int) -> None:
             nonlocal first_s
-            if done == 1:  # what it needed may have been loaded and compiled: it tells no rate
+            if done == 1:  # may have included imports and compilation: says nothing of the rate
                 first_s = time.monotonic()
                 line(f"{what}: 1 of {total}")
                 return
@@ -102,8 +102,8 @@ def options_of(command: object, kind: type[Any]) -> dict[str, Any]:
 
 @contextmanager
 def live_line(first: str) -> Iterator[Callable[..., None]]:
-    """Says ``first`` at once. Yields a function of a text, and of whether it is the last: on a
-    terminal it changes one live line, elsewhere it prints a line now and then."""
+    """Prints ``first`` at once. Yields a function of a text, and of whether it is the last: on a
+    terminal it updates one live line, elsewhere it prints a line now and then."""
     from rich.status import Status
 
     spinner, shown_s = Status(first, console=console), time.monotonic()
@@ -127,11 +127,10 @@ def live_line(first: str) -> Iterator[Callable[..., None]]:
 
 
 def keep_loaded() -> None:
-    """Take what is loaded by now out of garbage collection, once a command has all it needs.
+    """Exclude what is loaded by now from garbage collection, once a command has all it needs.
 
-    PyTorch and its kin make objects by the hundred thousand that live to the end of the process.
-    The collector would look through them while frames wait, and for half a second at the end.
-    Don't call it after modules made by nanobind (manifold3d) are loaded: they report leaks if they
-    are not collected at the end.
+    PyTorch and the like create hundreds of thousands of objects that live to the end. Searching
+    them would delay frames, and the exit by half a second. Don't call it after modules made by
+    nanobind (manifold3d) are loaded: they report leaks if they are not collected at the end.
     """
     gc.freeze()

@@ -18,9 +18,9 @@ from tumortrack.cli.training import Train
 from tumortrack.core import store
 from tumortrack.core.errors import InputError, NoEstimate, NoPlan
 
-_CT_SEED, _SCENE_SEED = 1, 2
-_MARKER = "demo.json"  # says that what lies beside it is a demo's and may be replaced
-_MINE = (
+_CT_SPACING_MM, _SCENE_SEED = (0.6, 0.6, 0.8), 2
+_MARKER = "demo.json"  # the files beside it are a demo's and may be replaced
+_MADE = (
     "ct_dicom", "case", "model", "dataset", "scenes", "report.json", "index.html", "paper",
 )  # fmt: skip
 _VOLUME = 400  # voxels along each axis, as the paper has
@@ -44,7 +44,7 @@ class Demo:
     minutes: float = 3.0
 
     def run(self) -> None:
-        from tumortrack.phantom import dicom, digital, scanner
+        from tumortrack import api
 
         if not 0 < self.minutes < float("inf"):
             raise InputError(f"--minutes {self.minutes:g} must be more than 0.")
@@ -58,10 +58,7 @@ class Demo:
         out = self.out
         _clear(out)
         say("1/4 scanning the built-in kidney phantom (virtual CT, DICOM)")
-        phantom = digital.PhantomParameters()
-        labels = digital.phantom_labels(phantom)
-        ct = scanner.scan(labels, scanner.ScannerParameters(), _CT_SEED)
-        dicom.write_dicom_series(ct, out / "ct_dicom", side=phantom.side)
+        api.scan_phantom(out / "ct_dicom", spacing_mm=_CT_SPACING_MM)
         say("2/4 segmenting the CT, making surfaces and an elastic body")
         began = time.perf_counter()
         Prepare(input=out / "ct_dicom", case=out / "case").run()
@@ -71,9 +68,9 @@ class Demo:
             f"3/4 simulating {self.scenes} unseen scenes: {elastic} deformed as an elastic body, "
             f"{dragged} dragged, squeezed and bent as the elastic body cannot be"
         )
-        # Elastic ones are of another body's states. Drags are what no body does: of two of the
-        # paper's configurations, the one it trains with and the one with the most drags, and
-        # squeezed and bent as a whole.
+        # The elastic scenes use states of another body. Drags are deformations that no elastic body
+        # has: by two of the paper's configurations, the one it trains with and the one with the
+        # most drags, then squeezed and bent as a whole.
         unseen = partial(Simulate, case=out / "case", dataset=out / "dataset", seed=_SCENE_SEED)
         unseen(scenes=elastic, elastic=True).write("elastic-")
         if dragged:
@@ -90,7 +87,7 @@ class Demo:
         say(f"open {out / 'index.html'} in a browser: estimate over truth, in 3-D, scene by scene.")
 
     def _show_paper(self, ours: dict[str, Any]) -> None:
-        """The paper's chain on the same CT and scenes, beside the default method's answers."""
+        """The paper's method on the same CT and scenes, compared with the default method."""
         from tumortrack.cli.locate import Locate
         from tumortrack.report.summary import headlines
 
@@ -113,27 +110,27 @@ class Demo:
             ).run()  # fmt: skip
         except (NoEstimate, NoPlan) as error:  # after so short a training
             say(f"no plan: {error}")
-        for name, found in (("default method", ours), (f"the paper's, {self.preset}", report)):
+        for name, result in (("default method", ours), (f"the paper's, {self.preset}", report)):
             say(f"{name}:")
-            for line in headlines(found["summary"]):
+            for line in headlines(result["summary"]):
                 say(f"  {line}")
 
 
 def _clear(out: Path) -> None:
-    """Make ``out``, or empty it of an earlier demo, known by its marker."""
+    """Make ``out``, or remove what an earlier demo, recognised by its marker, left there."""
     if out.exists() and not out.is_dir():
         raise InputError(f"{out} is a file; --out must be a folder.")
     with store.writing(out):
         out.mkdir(parents=True, exist_ok=True)
         names = sorted(p.name for p in out.iterdir())
-    foreign = [name for name in names if name not in (*_MINE, _MARKER)]
+    foreign = [name for name in names if name not in (*_MADE, _MARKER)]
     if names and (foreign or _MARKER not in names):
         raise InputError(
             f"{out} holds files that no demo wrote ({', '.join((foreign or names)[:3])}); choose "
             "another --out folder."
         )
     store.write_json(out / _MARKER, {"kind": "demo", "tumortrack": tumortrack.__version__})
-    for path in (out / name for name in _MINE):
+    for path in (out / name for name in _MADE):
         if path.is_dir():
             shutil.rmtree(path)
         else:

@@ -19,7 +19,7 @@ from tumortrack.cli.console import say
 from tumortrack.core.errors import TumortrackError
 from tumortrack.core.process import available_cores
 
-# What each distribution and its extras are for; "" is what it always needs.
+# By distribution and extra ("": what it always needs).
 PURPOSES = {
     ("tumortrack", ""): "cases, locating, tracking",
     ("tumortrack", "live"): "cameras, ROS 2, the web viewer, 3D Slicer, DICOM segmentations",
@@ -36,7 +36,7 @@ PURPOSES = {
     ("tumortrack-lab", ""): "digital twin, studies, benchmarks",
     ("tumortrack-lab", "fleet"): "many patients on many machines",
 }
-_MODULES = {  # where it is not named as its package
+_MODULES = {  # import names that differ from the package's
     "opencv-python-headless": "cv2",
     "pillow": "PIL",
     "pin": "pinocchio",
@@ -45,7 +45,7 @@ _MODULES = {  # where it is not named as its package
     "scikit-image": "skimage",
     "ur_rtde": "rtde_control",
 }
-# Packages of an extra that serve a part of it alone: without them the rest works.
+# Packages that only a part of their extra needs: the rest works without them.
 _PARTS = {
     "rosbags": "recordings, and messages of ROS",
     "cyclonedds": "ROS 2",
@@ -55,8 +55,8 @@ _PARTS = {
     "highdicom": "DICOM segmentations",
 }
 _ABSENT = " is not installed"
-Finding = tuple[Literal["ok", "absent", "BROKEN"], str]  # the state of a part, and what is said
-# Libraries of the system that pip cannot bring.
+Status = tuple[Literal["ok", "absent", "BROKEN"], str]  # with its text
+# System libraries, which pip cannot install.
 _SYSTEM = {"pyrealsense2": ("libusb", "apt-get install libusb-1.0-0")}
 
 
@@ -69,14 +69,14 @@ class Doctor:
     """
 
     def run(self) -> None:
-        """Print the machine, then what of every extra is there, by importing it. Raises
+        """Print the machine, then each extra's state, found by importing its packages. Raises
         TumortrackError: something that is installed does not work."""
         say(f"tumortrack {version('tumortrack')}, Python {platform.python_version()}")
         say(f"cores: {available_cores()}, {platform.machine()}, {platform.system()}")
         free = shutil.disk_usage(Path.cwd()).free / 2**30
         say(f"free disk here: {free:.1f} GiB" + (" - little" if free < 2 else ""))
         broken = 0
-        for state, text in _findings():
+        for state, text in _statuses():
             say(f"{state:8} {text}")
             broken += state == "BROKEN"
 
@@ -90,7 +90,7 @@ class Doctor:
 
 
 def _say_processors() -> None:
-    """What networks can use."""
+    """Processors for networks."""
     import torch
 
     from tumortrack.occupancy.hardware import has_fast_bfloat16
@@ -105,8 +105,8 @@ def _say_processors() -> None:
     say(f"CUDA: {cuda}{'' if torch.cuda.is_available() else '; everything runs on the CPU'}")
 
 
-def _findings() -> Iterator[Finding]:
-    """What is there, what is not, and what is and does not work."""
+def _statuses() -> Iterator[Status]:
+    """Distributions, extras, plug-ins and compiled kernels."""
     for (name, extra), purpose in PURPOSES.items():
         yield from part(name, extra, purpose)
     if find_spec("rclpy"):
@@ -116,17 +116,17 @@ def _findings() -> Iterator[Finding]:
         from tumortrack.registration.kernels import carry
 
         yield "ok", f"compiled kernels are kept in {carry.stats.cache_path}"
-    except Exception as error:  # Numba's own, where no folder can be written to
+    except Exception as error:  # of Numba, where no folder is writable
         yield "BROKEN", f"compiled kernels: {error}; set NUMBA_CACHE_DIR to a writable folder"
 
 
-def _plug_ins() -> Iterator[Finding]:
-    """What other packages add; each is imported. Commands that work are in ``--help``."""
+def _plug_ins() -> Iterator[Status]:
+    """Sources, sinks, deformations and broken commands of other packages; each is imported."""
     from tumortrack.live import spec
     from tumortrack.simulate.deform import installed
 
-    added = [(f"{one.what} {one.kind}", one.package, one.fault) for one in spec.extensions()]
-    added += [(f"deformation {d.name}", d.package, d.fault) for d in installed.extensions()]
+    added = [(f"{e.what} {e.kind}", e.package, e.fault) for e in spec.extensions()]
+    added += [(f"deformation {e.name}", e.package, e.fault) for e in installed.extensions()]
     for point in entry_points(group="tumortrack.commands"):
         try:
             point.load()
@@ -137,9 +137,9 @@ def _plug_ins() -> Iterator[Finding]:
         yield ("BROKEN", f"{text}: {fault}") if fault else ("ok", text)
 
 
-def part(name: str, extra: str, purpose: str) -> Iterator[Finding]:
-    """A distribution, or one of its extras: whether all that it needs is there and works. What is
-    wrong with a package that serves a part of it alone stands in a line of its own."""
+def part(name: str, extra: str, purpose: str) -> Iterator[Status]:
+    """Whether everything that a distribution, or one of its extras, needs is there and works. A
+    fault of a package that only a part of it needs is a status of its own."""
     what = f"{name}[{extra}]" if extra else name
     install = f"{sys.executable} -m pip install '{what}'"
     try:
@@ -147,8 +147,8 @@ def part(name: str, extra: str, purpose: str) -> Iterator[Finding]:
     except PackageNotFoundError:
         yield "absent", f"{what}: {purpose}; {install}"
         return
-    faults = {one.name: fault for one in needed if (fault := _fault(one))}
-    works = [one.name for one in needed if one.name not in faults]
+    faults = {package.name: fault for package in needed if (fault := _fault(package))}
+    works = [package.name for package in needed if package.name not in faults]
     alone = {name: fault for name, fault in faults.items() if name in _PARTS} if works else {}
     if rest := [fault for name, fault in faults.items() if name not in alone]:
         absent = extra and all(fault.endswith(_ABSENT) for fault in rest)
@@ -165,19 +165,19 @@ def part(name: str, extra: str, purpose: str) -> Iterator[Finding]:
 
 
 def _needed(name: str, extra: str) -> Iterator[Requirement]:
-    """What it asks for on this machine; of another extra of its own, what that asks for."""
-    for one in map(Requirement, requires(name) or ()):
-        if not _belongs(one, extra):
+    """Its requirements on this machine, those of further extras that it names included."""
+    for needed in map(Requirement, requires(name) or ()):
+        if not _belongs(needed, extra):
             continue
-        if one.name == name:
-            for other in one.extras:
+        if needed.name == name:
+            for other in needed.extras:
                 yield from _needed(name, other)
         else:
-            yield one
+            yield needed
 
 
 def _belongs(needed: Requirement, extra: str) -> bool:
-    """Whether this machine needs it for that extra; "": always."""
+    """Whether this machine needs it for the extra; "": whatever the extras."""
     marker = needed.marker
     if marker is None or marker.evaluate({"extra": ""}):
         return not extra
@@ -187,13 +187,13 @@ def _belongs(needed: Requirement, extra: str) -> bool:
 def _fault(needed: Requirement) -> str:
     """What is wrong with a package; empty: nothing."""
     try:
-        found = version(needed.name)
+        present = version(needed.name)
     except PackageNotFoundError:
         return needed.name + _ABSENT
-    if not needed.specifier.contains(found, prereleases=True):
-        return f"{needed.name} {found} is installed, but {needed.specifier} is supported"
+    if not needed.specifier.contains(present, prereleases=True):
+        return f"{needed.name} {present} is installed, but {needed.specifier} is supported"
     try:
         import_module(_MODULES.get(needed.name, needed.name.replace("-", "_")))
-    except Exception as error:  # whatever a broken installation raises is the finding
-        return f"{needed.name} {found}: {error}"
+    except Exception as error:  # a broken installation raises anything
+        return f"{needed.name} {present}: {error}"
     return ""

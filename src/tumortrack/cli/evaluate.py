@@ -42,7 +42,7 @@ class Evaluate:
         self.write()
 
     def write(self) -> dict[str, Any]:
-        """The report, whatever lies in its place."""
+        """Write the report, replacing an earlier one; returns it."""
         from tumortrack.models.folder import patient_of, read_model_manifest
         from tumortrack.simulate.scene_folder import list_scenes
 

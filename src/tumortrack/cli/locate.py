@@ -46,7 +46,7 @@ class Locate(LocateOptions):
     overwrite: bool = False
 
     def run(self) -> int:
-        """Its exit status, by the verdict."""
+        """The exit status, by the verdict."""
         from tumortrack import api
         from tumortrack.report.seen import PAGE
         from tumortrack.tracking.files import has_no_estimate
@@ -65,8 +65,8 @@ class Locate(LocateOptions):
         model_folder(self.model)
         located = api.locate(self.model, clouds, **options_of(self, LocateOptions))
         if located.estimate is not None:
-            _say_found(located.estimate, located)
-        located.save(out, overwrite)  # loads what it needs after the verdict
+            _say_estimate(located.estimate, located)
+        located.save(out, overwrite)  # slow imports come after the verdict
         if located.estimate is not None:
             _say_written(located.estimate, located, out)
         if self.json:
@@ -78,8 +78,8 @@ class Locate(LocateOptions):
         return EXIT_STATUSES[located.estimate.quality]
 
 
-def _say_found(estimate: Estimate, located: Located) -> None:
-    """How far it is to be trusted, and what is where."""
+def _say_estimate(estimate: Estimate, located: Located) -> None:
+    """The verdict, and where each part is."""
     from tumortrack.core.estimate import verdict_words
     from tumortrack.report.seen import part_rows, row_words
     from tumortrack.tracking.margins import margin_words

@@ -26,41 +26,41 @@ class Command(Protocol):
         ...
 
 
-_MODULES = {  # of ours, in the order of --help; only the chosen one is imported
+_MODULES = {  # in the order of --help; only the chosen command's is imported
     "demo": "demo", "prepare": "cases", "export": "cases", "train": "training",
     "locate": "locate", "track": "track", "simulate": "cases",
     "evaluate": "evaluate", "compile": "models", "onnx": "models",
-    "inspect": "inspection", "doctor": "doctor",
+    "inspect": "inspect", "doctor": "doctor",
 }  # fmt: skip
-# Whose they are: where that is not installed, they are no typing errors.
-_OF_OTHERS = {
+# Commands of other distributions: if one is missing, the message names its distribution.
+_DISTRIBUTIONS = {
     **dict.fromkeys(("plan", "resect"), "tumortrack-resection"),
     **dict.fromkeys(("twin", "bench", "fleet", "margins"), "tumortrack-lab"),
     **dict.fromkeys(("phantom-kit", "calibrate", "record", "reference"), "tumortrack-experiment"),
 }
-_OBJECTS_A_COLLECTION = 20_000
-_LEFT_AT_ONCE = ["locate"]  # holds nothing open in the end, and is waited for
+_OBJECTS_PER_COLLECTION = 20_000
+_EXITS_AT_ONCE = ["locate"]  # leaves nothing open, and users wait for its end
 
 
 def main() -> None:
     """Entry point."""
-    # OpenMP's threads wait by spinning; where other programs want the cores that is several times
-    # slower than giving them back soon, and no faster where they don't.
+    # Let waiting OpenMP threads yield early. Spinning is several times slower where other programs
+    # want the cores, and no faster where they don't.
     os.environ.setdefault("GOMP_SPINCOUNT", "1000")
-    # NumPy's and SciPy's matrices here are small: more threads gain little, and lose much likewise.
+    # Matrices are small here: more threads gain little, and lose as much on a busy machine.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    # PyTorch and its kin make objects by the hundred thousand that live to the end: to look through
-    # them for garbage again and again is a tenth of the time of their import.
-    gc.set_threshold(_OBJECTS_A_COLLECTION)
+    # PyTorch and the like create hundreds of thousands of objects that live to the end. Searching
+    # them for garbage takes a tenth of their import's time.
+    gc.set_threshold(_OBJECTS_PER_COLLECTION)
     code = run(sys.argv[1:])
-    if sys.argv[1:2] == _LEFT_AT_ONCE and code in EXIT_STATUSES.values():
+    if sys.argv[1:2] == _EXITS_AT_ONCE and code in EXIT_STATUSES.values():
         leave(code)
     if code:
         sys.exit(code)
 
 
 def run(arguments: list[str]) -> int:
-    """One command: its exit code. A known error is one line, never a traceback."""
+    """Run one command; its exit code. A known error is one line, never a traceback."""
     if arguments == ["--version"]:
         print(f"tumortrack {tumortrack.__version__}")
         return 0
@@ -76,10 +76,10 @@ def run(arguments: list[str]) -> int:
         return 130
     except BrokenPipeError:  # `tumortrack inspect X | head`
         sys.stderr.close()
-    except OSError as error:  # of the file system, not of ours: a name too long, no permission
+    except OSError as error:  # of the file system: a name too long, no permission
         if error.filename is None and error.errno != errno.ENOSPC:
             raise
-        if full := error.filename is None:  # what is still to be said goes nowhere
+        if full := error.filename is None:  # discard what is still buffered
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         where = "standard output or the disk" if full else error.filename
         print(f"tumortrack: {where}: {error.strerror}.", file=sys.stderr)
@@ -88,27 +88,27 @@ def run(arguments: list[str]) -> int:
 
 
 def leave(code: int = 0) -> NoReturn:
-    """End the process at once, when everything is written: taking apart what was loaded, object by
-    object, takes a fifth of a second. Functions registered for Python's end are not called."""
+    """End the process at once, after everything is written: a regular exit takes a fifth of a
+    second more. Exit handlers are not called."""
     if sys.stderr is not None:  # as after 2>&-
         sys.stderr.flush()
     os._exit(code)
 
 
 def command(name: str) -> Callable[..., Command]:
-    """One command, ours or an installed package's. Raises InputError: its package is missing."""
-    if name not in (found := _commands(name)):
-        package = _OF_OTHERS[name]
+    """A command of ours or of an installed package. Raises InputError: its package is missing."""
+    if name not in (commands := _commands(name)):
+        package = _DISTRIBUTIONS[name]
         raise InputError(
             f"the command {name} belongs to {package}, which is not installed here: "
             f"pip install {package}"
         )
-    return found[name]
+    return commands[name]
 
 
 def _commands(chosen: str) -> dict[str, Callable[..., Command]]:
-    """Ours, and behind them other installed packages' (entry points of ``tumortrack.commands``):
-    the chosen one, or all where there is none of that name."""
+    """The chosen command; if there is none of that name all: ours, then those of installed packages
+    (entry points ``tumortrack.commands``)."""
     if chosen in _MODULES:
         return {chosen: _ours(chosen)}
     others = sorted(entry_points(group="tumortrack.commands"), key=lambda point: point.name)
@@ -133,9 +133,9 @@ def _ours(name: str) -> Callable[..., Command]:
 
 
 def _parse(arguments: list[str]) -> Command:
-    """Only the chosen command's options are made; all of them take several times as long."""
+    """Builds only the chosen command's options: all of them take several times as long."""
     commands = _commands(arguments[0] if arguments else "")
-    if arguments and arguments[0] in (*commands, *_OF_OTHERS):
+    if arguments and arguments[0] in (*commands, *_DISTRIBUTIONS):
         named = (tyro.conf.PositionalMetavarFromFieldName,)  # MODEL CLOUD OUT, not PATH PATH PATH
         prog = f"tumortrack {arguments[0]}"
         return tyro.cli(command(arguments[0]), prog=prog, args=arguments[1:], config=named)

@@ -1,8 +1,7 @@
-"""`track`: source -> loop -> sinks, and what the user sees of it."""
+"""`track`: source -> loop -> sinks, and its lines on the screen."""
 
 from __future__ import annotations
 
-import re
 import signal
 import time
 from collections.abc import Callable, Iterator
@@ -23,8 +22,8 @@ if TYPE_CHECKING:
     from tumortrack.live.workers import SinkWorker
 
 _SAY_S, _SAY_PLAIN_S = 1.0, 5.0  # between two lines of state: on a terminal, in a file
-STOPPED = "stopped by the user"  # why arms stand
-_ENDS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+STOPPED = "stopped by the user"  # why arms halt
+_END_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,7 +51,7 @@ class Track(TrackOptions):
         from tumortrack import api
 
         if arms is None:
-            from tumortrack.live import session  # noqa: F401 - loaded by then
+            from tumortrack.live import session  # noqa: F401 - to be loaded by then
 
             keep_loaded()
         model_folder(self.model)
@@ -78,20 +77,19 @@ class Track(TrackOptions):
 
 
 def say_opened(sinks: list[SinkWorker]) -> None:
-    """Where each sink is to be found, and who can reach it."""
+    """Say where each sink can be reached, and by whom."""
     for sink in sinks:
         for note in sink.notes:
             say(f"sink {sink.name}: {note}")
 
 
 def stage_words(state: str, ur: bool) -> str:
-    """A stage for the screen. ``ur``: there are sinks of real arms, and nobody knows that those are
-    home."""
+    """A stage for the screen. ``ur``: there are sinks of real arms, which may not be home yet."""
     return state.replace("home", "the way back", 1) if ur else state
 
 
 def say_failures(sinks: list[SinkWorker], known: dict[str, str]) -> None:
-    """What troubles each sink, unless it is ``known``, where it is then kept."""
+    """Say what is wrong with each sink, unless ``known`` has it, and add it there."""
     for sink in sinks:
         if (trouble := sink.trouble) and known.get(sink.name) != trouble:
             known[sink.name] = trouble
@@ -99,20 +97,20 @@ def say_failures(sinks: list[SinkWorker], known: dict[str, str]) -> None:
 
 
 def default_report(command: str) -> Path:
-    """Where a command's report goes where nothing else is said."""
+    """The report's file where no option gives one."""
     return Path("runs") / f"{command}-{datetime.now(UTC):%Y%m%dT%H%M%SZ}.json"
 
 
 @contextmanager
 def stopping(end: Callable[[], None]) -> Iterator[None]:
-    """Ctrl-C, SIGTERM and a terminal that goes call ``end``, which lets the loop end after the
-    frame it is at, and sinks flush; a second Ctrl-C interrupts."""
+    """Ctrl-C, SIGTERM and a closed terminal call ``end``, which lets the loop finish its frame and
+    sinks flush; a second Ctrl-C interrupts."""
 
     def stop(number: int, _: object) -> None:
         end()
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
-    before = {number: signal.signal(number, stop) for number in _ENDS}
+    before = {number: signal.signal(number, stop) for number in _END_SIGNALS}
     try:
         yield
     finally:
@@ -121,15 +119,15 @@ def stopping(end: Callable[[], None]) -> Iterator[None]:
 
 
 class _Screen:
-    """One line of state now and then, every change of quality, and the last lines."""
+    """Prints a line of state now and then, every change of quality, and a summary."""
 
     def __init__(self, run: Session, report: Path) -> None:
         self._run, self._report = run, report
         self._began = self._shown = time.monotonic()
         self._before, self._changed, self._unwritten = 0, 0.0, ""
-        self._state: list[object] = []  # as last shown, without its numbers
+        self._state: list[object] = []  # as last printed, without its numbers
         self._errors: dict[str, str] = {}
-        self._notes = 0  # of those about the camera's frame, that were shown
+        self._notes = 0  # how many notes on the camera's frame were printed
 
     def show(self, result: TrackingResult) -> None:
         """Called with every result."""
@@ -141,7 +139,7 @@ class _Screen:
             stage = stage_words(cell.state, arms is not None and arms.ur)
             state += f"; arms: {stage}" + (f" ({cell.halted})" if cell.halted else "")
             state += "" if cell.left_mm is None else f"; {cell.left_mm:.1f} mm of the margin left"
-            kind += [cell.state, re.sub(r"\d", "", cell.halted)]
+            kind += [cell.state, cell.halt and cell.halt.same_as]
         now = time.monotonic()
         if kind != self._state and now - self._changed >= _SAY_S:
             self._state, self._changed = kind, now
@@ -158,7 +156,7 @@ class _Screen:
             self._line(now)
 
     def end(self, error: type[BaseException] | None, *_: object) -> None:
-        """The last lines, once all is written; nothing of a start that failed."""
+        """Print the summary, once all is written; nothing if the start failed."""
         from tumortrack.live.session import check_closed
 
         if error is not None and not self._run.started:

@@ -14,10 +14,8 @@ from tumortrack.core.organ import KIDNEY, Organ
 from tumortrack.core.types import FIRST_TUMOR, ORGAN, LabelVolume, Volume
 from tumortrack.imaging import grid as grids
 from tumortrack.imaging.grid import bounding_box, components, depth_mm, extent_mm, voxel_ml
-from tumortrack.imaging.select import MIN_TUMOR_ML
+from tumortrack.imaging.options import MIN_TUMOR_ML, ORGAN_HU, TUMOR_HU
 
-ORGAN_HU = (-300.0, 300.0)
-TUMOR_HU = (300.0, 1000.0)
 _RIM_MM = 1.2  # half the width of a partial-volume rim at voxels below a millimetre
 _REACH_MM = 30.0  # how far an exophytic tumor may reach out of the organ that was found
 # Volume (ml) and longest side (mm) of a kidney, and of any other organ.

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any, Literal, cast
+from typing import Any
 
 import numpy as np
 
@@ -12,20 +12,15 @@ from tumortrack.core import store
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import direction_lps, spacing_mm
 from tumortrack.core.mesh_files import SUFFIXES
-from tumortrack.core.organ import Organ
 from tumortrack.core.patient import UNKNOWN, Patient, Side
 from tumortrack.core.types import FIRST_TUMOR, ORGAN, Anatomy, LabelVolume, Mesh, Volume
 from tumortrack.imaging.case import Case
 from tumortrack.imaging.grid import grown_box, voxel_ml
-from tumortrack.imaging.hu_windows import ORGAN_HU, TUMOR_HU, segment_ct
+from tumortrack.imaging.hu_windows import segment_ct
 from tumortrack.imaging.meshes import label_meshes, read_mesh_folder
-from tumortrack.imaging.select import MIN_TUMOR_ML, select_labels
-from tumortrack.imaging.structures import (
-    extent_report,
-    parse_structures,
-    read_structures,
-    split_structures,
-)
+from tumortrack.imaging.options import PrepareOptions, parse_structures
+from tumortrack.imaging.select import select_labels
+from tumortrack.imaging.structures import extent_report, read_structures, split_structures
 from tumortrack.imaging.surface import surfaces
 from tumortrack.imaging.symmetry import ambiguous, half_turns, warning
 from tumortrack.imaging.volume import is_label_map, labels_of, read_raw, volume_of
@@ -33,85 +28,8 @@ from tumortrack.imaging.volume import is_label_map, labels_of, read_raw, volume_
 # Options for one kind of input only.
 _OF_CT, OF_LABELS = ("organ_hu", "tumor_hu"), ("labels", "organ", "tumor")
 _LEAST_ORGAN_OUTSIDE = 0.02  # of the outer surface
-_LARGEST_SHARE = 0.6  # of organ and tumors; a larger tumor gets a note
-_MOST_TILTED = 60.0  # degrees: two such tilts make 85, and more would show another side
-_MOST_CHANGE_PERCENT = 1.0  # of a part's volume by smoothing; more gets a note
-
-
-@dataclass(frozen=True)
-class PrepareOptions:
-    """How to read an input.
-
-    Attributes:
-        organ_hu, tumor_hu: half-open HU windows [low, high) for a CT.
-        labels: the volume is a label map; False: it is one if that is obvious.
-        side: the patient's ``left`` or ``right``, for paired organs. Selects from a label map
-            (None: the one with the most tumor); for a CT by HU windows or meshes only recorded.
-        organ, tumor: label numbers; tumor None takes every label from 2 up, 0 none.
-        up: the patient direction that faces the camera: a name, or three numbers in LPS.
-        rotations: possible poses: ``limited``, turned about the line of sight and tilted, or
-            ``full``, any.
-        tilt: largest angle in degrees about each axis across the line of sight.
-        sensor: the camera: ``d405`` or ``stereo`` (an endoscope's pictures).
-        series: UID or number of one DICOM series among several.
-        unit: of meshes, ``mm`` or ``m``; None: mm, and metres are refused with an explanation.
-        min_tumor_ml: smaller tumors are reported and dropped.
-        patient: an identifier that replaces the DICOM PatientID; None: that, or unknown.
-        name: the organ's: lower-case letters, digits and _.
-        structure: ``NAME=NUMBER`` in a label map, or ``NAME=PATH`` of a mesh: surfaces that move
-            with the organ.
-        term: SNOMED CT code and meaning of an organ that has no built-in one.
-    """
-
-    organ_hu: tuple[float, float] = ORGAN_HU
-    tumor_hu: tuple[float, float] = TUMOR_HU
-    labels: bool = False
-    side: str | None = None
-    organ: int = ORGAN
-    tumor: int | None = None
-    up: str = "anterior"
-    rotations: Literal["limited", "full"] = "limited"
-    tilt: float = 30.0
-    sensor: Literal["d405", "stereo"] = "d405"
-    series: str | None = None
-    unit: str | None = None
-    min_tumor_ml: float = MIN_TUMOR_ML
-    patient: str | None = None
-    name: str = "kidney"
-    term: tuple[str, str] | None = None
-    structure: tuple[str, ...] = ()
-
-    def __post_init__(self) -> None:
-        if not (np.isfinite(self.min_tumor_ml) and self.min_tumor_ml >= 0):
-            raise InputError(f"min_tumor_ml {self.min_tumor_ml} must be 0 or more (ml).")
-        if not 1 <= self.organ <= 255 or (self.tumor is not None and not 0 <= self.tumor <= 255):
-            raise InputError("label numbers must lie in 1..255 (tumor 0: none).")
-        if self.side not in (None, "left", "right"):
-            raise InputError(f"side {self.side!r} is not allowed: left or right (the patient's).")
-        self.kind.check_side(self.side)
-        parse_structures(self.structure, self.name)
-        direction_lps(self.up)
-        if self.rotations not in ("limited", "full"):
-            raise InputError(f"rotations {self.rotations!r} is not allowed: limited or full.")
-        if not 0 <= self.tilt <= _MOST_TILTED:
-            raise InputError(
-                f"tilt is {self.tilt:g} degrees; allowed: 0 to {_MOST_TILTED:g}. An organ that may "
-                "lie in any way has rotations full."
-            )
-        if self.sensor not in ("d405", "stereo"):
-            raise InputError(f"sensor {self.sensor!r} is not allowed: d405 or stereo.")
-        if self.unit not in (None, "mm", "m"):
-            raise InputError(f"unit {self.unit!r} is not allowed: mm or m.")
-        if self.patient is not None:
-            Patient(self.patient)
-
-    @property
-    def kind(self) -> Organ:
-        return Organ(name=self.name, term=self.term)
-
-    @property
-    def stated_side(self) -> Side:
-        return cast(Side, self.side or UNKNOWN)  # checked above
+_LARGEST_SHARE = 0.6  # of organ and tumors that one tumor may take without a note
+_MOST_CHANGE_PERCENT = 1.0  # of a part's volume by smoothing, without a note
 
 
 def prepare(input: Path, options: PrepareOptions | None = None) -> Case:

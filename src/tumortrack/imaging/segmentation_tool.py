@@ -29,14 +29,8 @@ from tumortrack.core.errors import InputError
 from tumortrack.core.types import FIRST_TUMOR, ORGAN, Volume
 from tumortrack.imaging.case import Case
 from tumortrack.imaging.nifti import write_nifti, write_volume_nifti
-from tumortrack.imaging.prepare import (
-    OF_LABELS,
-    PrepareOptions,
-    crop_ct,
-    patient_of,
-    prepare,
-    refuse_unused,
-)
+from tumortrack.imaging.options import PrepareOptions
+from tumortrack.imaging.prepare import OF_LABELS, crop_ct, patient_of, prepare, refuse_unused
 from tumortrack.imaging.volume import read_raw, volume_of
 
 # Datasets of TotalSegmentator's tasks, and the masks in them that count as tumors.

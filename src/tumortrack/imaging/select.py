@@ -14,9 +14,9 @@ from tumortrack.core.organ import KIDNEY, Organ
 from tumortrack.core.patient import UNKNOWN, Side
 from tumortrack.core.types import FIRST_TUMOR, ORGAN, LabelVolume
 from tumortrack.imaging import grid
+from tumortrack.imaging.options import MIN_TUMOR_ML
 
-MIN_TUMOR_ML = 0.2
-_GAP_MM = 3.0  # annotators and resampling leave such gaps; with larger voxels one voxel
+_GAP_MM = 3.0  # annotators and resampling leave such gaps; of thicker slices one voxel counts
 _MIN_ML, _MAX_ML = 10.0, 4000.0  # a small prostate; a large liver
 _MIDLINE_MARGIN_MM = 20.0
 _PAIR_APART_MM = 60.0  # between centres, left to right: kidneys have over 100, a split organ less

@@ -16,10 +16,10 @@ from scipy.spatial import cKDTree
 
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import spacing_mm, transform_points
-from tumortrack.core.organ import check_name
 from tumortrack.core.types import Anatomy, LabelVolume, Mesh
 from tumortrack.imaging.grid import bounding_box
 from tumortrack.imaging.meshes import read_lps
+from tumortrack.imaging.options import StructureSources
 from tumortrack.imaging.surface import surface_of
 
 TRUSTED_MM = 5.0  # outside the organ; farther out the motion is a guess
@@ -28,26 +28,9 @@ _BAY_MM = 5.0  # half the width of a structure that runs into the organ and coun
 _STEP_MM = 1.0
 _MOST_FACES = 200_000
 
-Sources = dict[str, int | Path]
-
-
-def parse_structures(options: tuple[str, ...], organ: str) -> Sources:
-    """Label number or mesh path of each structure by name. Raises InputError: not NAME=NUMBER or
-    NAME=PATH, a name that is taken or not allowed."""
-    sources: Sources = {}
-    for option in options:
-        name, _, value = option.partition("=")
-        if not value:
-            raise InputError(f"--structure {option!r} is not NAME=NUMBER or NAME=PATH.")
-        check_name(name, "a structure", "--structure")
-        if name in sources or name == organ:
-            raise InputError(f"--structure {name}: that name is taken. Give another.")
-        sources[name] = int(value) if value.isdecimal() else Path(value)
-    return sources
-
 
 def split_structures(
-    volume: LabelVolume, sources: Sources, organ: int
+    volume: LabelVolume, sources: StructureSources, organ: int
 ) -> tuple[LabelVolume, dict[str, Mesh]]:
     """The labels without the structures, and the structures as surfaces, LPS mm. Where a structure
     lies in the organ, or in a bay up to 10 mm wide, its voxels become organ. Raises InputError: no
@@ -73,7 +56,9 @@ def split_structures(
     return LabelVolume(labels, affine), meshes
 
 
-def read_structures(sources: Sources, unit: str | None) -> tuple[dict[str, Mesh], list[str]]:
+def read_structures(
+    sources: StructureSources, unit: str | None
+) -> tuple[dict[str, Mesh], list[str]]:
     """The structures in mesh files, LPS mm, and notes. Raises InputError: not a mesh, or too many
     triangles."""
     meshes, notes = {}, list[str]()

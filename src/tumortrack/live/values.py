@@ -22,6 +22,7 @@ from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError, TumortrackError
 from tumortrack.core.estimate import NO_CHECK_FAILED, UNVERIFIED, Estimate, Quality
 from tumortrack.core.geometry import Affine, rigid, transform_points
+from tumortrack.core.halt import Halt
 from tumortrack.core.patient import NOBODY, Patient
 from tumortrack.core.report import Finding
 from tumortrack.core.types import Anatomy, DepthFrame, Mesh, SensorCloud
@@ -162,19 +163,24 @@ class Polyline:
 class Workcell:
     """What the arms are doing, and what is shown with them; published frame, mm.
 
-    ``state``: of the procedure: approach, grasp, hold, sweep 1, ... ``halted``: why the arms have
-    stopped early; empty: they have not. ``joints_rad``: angle by name of the joint. ``left_mm``:
+    ``state``: of the procedure: approach, grasp, hold, sweep 1, ... ``halt``: why the arms have
+    stopped early; None: they have not. ``joints_rad``: angle by name of the joint. ``left_mm``:
     what the present errors leave of the planned margin; None: unknown. ``cutting``: the instrument
     is on a cut.
     """
 
     state: str
-    halted: str = ""
+    halt: Halt | None = None
     joints_rad: Mapping[str, float] = field(default_factory=dict)
     shapes: tuple[RigidShape, ...] = ()
     lines: tuple[Polyline, ...] = ()
     left_mm: float | None = None
     cutting: bool = False
+
+    @property
+    def halted(self) -> str:
+        """Why the arms have stopped early, in words; empty: they have not."""
+        return "" if self.halt is None else self.halt.words
 
     @property
     def drawn_lines(self) -> list[Polyline]:

@@ -157,7 +157,7 @@ def _no_estimate(
     error: NoEstimate, view: View, model: Model, options: LocateOptions
 ) -> dict[str, Any]:
     """The report's head, where there is no estimate."""
-    from tumortrack.tracking.files import report_head
+    from tumortrack.tracking.files import finding_entry, report_head
 
     reason = str(error)
     if view.unit is not None:
@@ -166,7 +166,7 @@ def _no_estimate(
         **report_head(view.content.stamp_ns),
         "seed": options.seed,
         "patient": to_builtins(model.patient),
-        "quality": {"verdict": "none", "reason": reason},
+        "quality": {"verdict": "none", "reason": reason, "finding": finding_entry(error.finding)},
     }
 
 

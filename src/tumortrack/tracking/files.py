@@ -92,7 +92,7 @@ def report_entry(estimate: Estimate) -> dict[str, Any]:
         "verdict": estimate.quality,
         "reason": estimate.reason,
         "check": "" if finding is None else finding.check,
-        "finding": None if finding is None else msgspec.to_builtins(finding),
+        "finding": finding_entry(finding),
         "advice": estimate.advice,
     }
     return {
@@ -104,6 +104,11 @@ def report_entry(estimate: Estimate) -> dict[str, Any]:
         "organ": organ_entry(estimate.organ),
         "patient": to_builtins(estimate.patient),
     }
+
+
+def finding_entry(finding: Finding | None) -> dict[str, Any] | None:
+    """A finding as JSON types: ``kind`` and ``values``."""
+    return None if finding is None else msgspec.to_builtins(finding, enc_hook=float)
 
 
 def write_no_estimate(

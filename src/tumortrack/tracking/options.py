@@ -7,7 +7,7 @@ from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, TypeVar, get_type_hints
 
 from tumortrack.core.errors import InputError
 from tumortrack.core.patient import UNKNOWN, Patient
@@ -15,8 +15,10 @@ from tumortrack.core.patient import UNKNOWN, Patient
 if TYPE_CHECKING:
     from tumortrack.models.model import Model
     from tumortrack.sense.region import RegionConfig
+    from tumortrack.simulate.scene import SceneConfig
 
 Device = Literal["auto", "cpu", "cuda"]
+_Options = TypeVar("_Options")  # a dataclass
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -151,6 +153,92 @@ class TrackOptions(CameraOptions):
     seconds: float = 0.0
     report: Path | None = None
     seed: int = 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExportOptions:
+    """Options of `export`.
+
+    Attributes:
+        located: folder that `locate` wrote with this case's model: the scene shows its surfaces,
+            and the CT and its segmentation where the organ is.
+        live: HOST:PORT of a sink `openigtlink`: the scene connects to it, shows what it sends, and
+            has the CT follow the organ.
+        dicom: folder of the CT's slices that the case's voxels come from.
+        series: which of its series, if the folder holds several (UID or number in the list).
+        patient: the PatientID of --dicom, where the case has a pseudonym.
+    """
+
+    located: Path | None = None
+    live: str | None = None
+    dicom: Path | None = None
+    series: str | None = None
+    patient: str | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class SimulateOptions:
+    """Options of `simulate`.
+
+    Attributes:
+        scenes: how many.
+        seed: of the scenes; they are never those that training sees.
+        configuration: of the paper's deformation table; several are mixed.
+        falloff: how the table's third number is read (docs/method.md).
+        rotations: poses, as in `train`.
+        squeeze: also squeeze and bend the organ as a whole.
+        noise: with the depth sensor's noise.
+        sensor: whose, as in `train`.
+        elastic: deform the organ as an elastic body in its bed does (plates, instruments, pulls,
+            weight, swelling), instead of by the paper's table.
+    """
+
+    scenes: int = 20
+    seed: int = 0
+    configuration: tuple[Literal[1, 2, 3, 4, 5, 6], ...] = (3,)
+    falloff: Literal["sigma", "variance"] = "sigma"
+    rotations: Literal["limited", "full"] = "limited"
+    squeeze: bool = False
+    noise: bool = True
+    sensor: Literal["d405", "stereo"] = "d405"
+    elastic: bool = False
+
+    def __post_init__(self) -> None:
+        if self.scenes < 1:
+            raise InputError(f"--scenes {self.scenes} must be at least 1.")
+
+    def scene_config(self) -> SceneConfig:
+        from tumortrack.sense.noise import CLEAN, SENSORS
+        from tumortrack.simulate import deform
+        from tumortrack.simulate.deform.drag import CONFIGURATIONS
+        from tumortrack.simulate.scene import PoseConfig, SceneConfig
+
+        models: list[deform.DragConfig | deform.ElasticConfig] = [deform.ElasticConfig()]
+        if not self.elastic:
+            table = (CONFIGURATIONS[number] for number in self.configuration)
+            models = [deform.DragConfig(steps=steps, falloff=self.falloff) for steps in table]
+        chains = [deform.ChainConfig(links=(model, deform.StretchConfig())) for model in models]
+        return SceneConfig(
+            width=848,
+            height=480,
+            pose=PoseConfig(rotations=self.rotations),
+            deform=tuple(chains if self.squeeze else models),
+            noise=SENSORS[self.sensor] if self.noise else CLEAN,
+        )
+
+
+def options_from(kind: type[_Options], given: dict[str, Any], what: str) -> _Options:
+    """Keyword arguments of a public function as its options. InputError: an unknown one."""
+    hints = get_type_hints(kind)
+    if unknown := sorted(set(given) - set(hints)):
+        raise InputError(f"{what} knows no {unknown[0]!r}; allowed: {', '.join(hints)}.")
+    for name, value in given.items():
+        if hints[name] == tuple[Path, ...]:
+            paths = [value] if isinstance(value, str | Path) else value
+            given[name] = tuple(map(Path, paths))
+        elif hints[name] == Path | None and value is not None:
+            given[name] = Path(value)
+    return kind(**given)
 
 
 def check_grid(grid: int) -> None:

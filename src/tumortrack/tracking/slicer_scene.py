@@ -20,12 +20,17 @@ import numpy as np
 
 from tumortrack.core import store
 from tumortrack.core.colours import Colour, part_colour, structure_colour
+from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import RAS_FROM_LPS
+from tumortrack.core.mesh_files import write_mesh
+from tumortrack.core.patient import Patient
 from tumortrack.core.report import FitReport
 from tumortrack.core.types import FIRST_TUMOR, ORGAN
-from tumortrack.imaging.case import Case
-from tumortrack.tracking.files import MARGIN
+from tumortrack.imaging.case import Case, load_case
+from tumortrack.imaging.segmentation_files import segments, write_dicom_seg, write_seg_nrrd
+from tumortrack.tracking.files import MARGIN, read_report
 from tumortrack.tracking.margins import stated_radius
+from tumortrack.tracking.options import ExportOptions
 
 _SCHEMA = (
     "https://raw.githubusercontent.com/slicer/slicer/master/Modules/Loadable/Markups/Resources/"
@@ -37,10 +42,79 @@ _File = tuple[str, str, bytes]  # kind of node that reads it, name, content
 
 
 def centre_label(report: FitReport, name: str, poor: bool) -> str:
-    """How people read a tumor's centre: its name and, as far as it is known, how sure it is."""
+    """A tumor's label: its name and, as far as known, how certain its centre is."""
     radius, std_mm = stated_radius(report.margin, name), report.parts[name].center_std_mm
-    said = [f"{name} POOR" if poor else name] + ([] if std_mm is None else [f"std {std_mm:.1f} mm"])
-    return ", ".join([*said, radius.words if radius else "no margin stated"])
+    words = [f"{name} POOR" if poor else name]
+    words += [] if std_mm is None else [f"std {std_mm:.1f} mm"]
+    return ", ".join([*words, radius.words if radius else "no margin stated"])
+
+
+def export(given: Path, out: Path, options: ExportOptions) -> tuple[str, ...]:
+    """Write a case, or a located organ, as a scene with its files; notes. See ``api.export``."""
+    if options.dicom is None and (options.series, options.patient) != (None, None):
+        raise InputError("--series and --patient are those of --dicom; give that folder too.")
+    if options.located is not None and options.live is not None:
+        raise InputError("--located shows what is done, --live what comes: give one of them.")
+    manifest = given / store.MANIFEST
+    is_run = manifest.is_file() and store.read_json(manifest).get("kind") == "run"
+    if is_run and (options.located, options.live, options.dicom) != (None, None, None):
+        raise InputError(
+            f"{given} was located. --located, --live and --dicom are for a case: "
+            "tumortrack export CASE OUT --located RUN."
+        )
+    scene = Scene()
+    notes: tuple[str, ...] = ()
+    with store.new_folder(out) as aside:
+        if is_run:
+            scene.add_run(given, read_report(given))
+        else:
+            notes = _export_case(load_case(given), given, aside, scene, options)
+        scene.write(aside / "scene.mrb")
+    return notes
+
+
+def _export_case(
+    case: Case, folder: Path, aside: Path, scene: Scene, options: ExportOptions
+) -> tuple[str, ...]:
+    """Adds the case to the scene and writes what else was asked for; notes."""
+    labels, patient = case.labels, case.patient
+    parts = segments(case.anatomy.names, patient.side, case.anatomy.kind)
+    file = aside / "case.seg.nrrd"
+    write_seg_nrrd(file, labels.labels, labels.lps_from_index, parts)
+    for name, mesh in case.anatomy.structures.items():
+        write_mesh(aside / f"{name}.ply", mesh)
+    moved = (options.located, options.live) != (None, None)
+    scene.add_case(folder, case, file.read_bytes(), moved)
+    if options.located is not None:
+        report = _report_with_motion(options.located, case, folder)
+        scene.add_ct_transform(report["motion"]["camera_from_ct"])
+        scene.add_run(options.located, report)
+    if options.live is not None:
+        host, _, port = options.live.rpartition(":")
+        if not host or not port.isdecimal():
+            raise InputError(f"--live {options.live!r} must be HOST:PORT, as localhost:18944.")
+        scene.add_ct_transform(None)
+        scene.add_live(case.anatomy.names, host, int(port))
+    if options.dicom is None:
+        return ()
+    series = options.series or case.report.get("options", {}).get("series")
+    shown = Patient(patient.id if options.patient is None else options.patient, patient.side)
+    file = aside / "segmentation.dcm"
+    return write_dicom_seg(file, labels, parts, options.dicom, series, shown)
+
+
+def _report_with_motion(run: Path, case: Case, folder: Path) -> dict[str, Any]:
+    """report.json of a run. Raises InputError: it was located with another case's model, or without
+    a motion."""
+    report = read_report(run)
+    if report.get("model", {}).get("case_sha256") != case.sha256:
+        raise InputError(f"{run} was not located with a model of {folder}: give its case.")
+    if "motion" not in report:
+        raise InputError(
+            f"{run} does not know where the CT is now: a model of the preset clinic does. "
+            "Export it alone: tumortrack export RUN OUT."
+        )
+    return report
 
 
 class Scene:
@@ -164,8 +238,8 @@ class Scene:
             references["storage"] = self._node(storage, f"{name} storage", **place)
         if under:
             references["transform"] = f"{under}Transform"
-        said = "".join(f"{role}:{node};" for role, node in references.items())
-        self._node(kind, name, references=said)
+        text = "".join(f"{role}:{node};" for role, node in references.items())
+        self._node(kind, name, references=text)
 
     def _node(self, kind: str, name: str, **attributes: str) -> str:
         """Its id."""

@@ -14,7 +14,7 @@ from typing import Any
 from tumortrack.core import store
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import direction_lps
-from tumortrack.imaging.prepare import PrepareOptions
+from tumortrack.imaging.options import PrepareOptions
 from tumortrack_lab.fleet.task import File
 
 _LARGEST = 64 * 2**20  # bytes

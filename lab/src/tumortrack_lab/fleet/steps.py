@@ -78,6 +78,7 @@ def prepare(inputs: Inputs, options: Given, out: Path, cores: int) -> None:
 
     from tumortrack.imaging import prepare as preparing
     from tumortrack.imaging.case import load_case, save_case
+    from tumortrack.imaging.options import PrepareOptions
     from tumortrack.report.pictures import qc_picture
     from tumortrack.tracking.model_files import case_model
 
@@ -85,7 +86,7 @@ def prepare(inputs: Inputs, options: Given, out: Path, cores: int) -> None:
         key: tuple(value) if isinstance(value, list) else value for key, value in options.items()
     }
     given.pop("suffix")
-    case = preparing.prepare(inputs["source"], preparing.PrepareOptions(**given))
+    case = preparing.prepare(inputs["source"], PrepareOptions(**given))
     case = replace(case, report={**case.report, "source": "input"})
     qc_picture(case.labels, case.ct, case.anatomy, out / "qc.png", str(case.patient))
     save_case(case, out)

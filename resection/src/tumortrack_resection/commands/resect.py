@@ -8,21 +8,20 @@ import sys
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tyro.conf import Positional
 
 from tumortrack.cli import track
-from tumortrack.cli.console import live_line, model_folder, say, warn
+from tumortrack.cli.console import model_folder, options_of, progress_of, say, warn
 from tumortrack.core import store
 from tumortrack.core.config import to_builtins
 from tumortrack.core.errors import Aborted, ArtifactError, InputError
 from tumortrack.core.organ import KIDNEY, Organ, organ_first, organ_name
 from tumortrack.core.patient import Patient
 from tumortrack.tracking.options import CameraOptions
-from tumortrack_resection.commands.plan import check_arms_installed
 
 if TYPE_CHECKING:
     from concurrent.futures import Future
@@ -79,6 +78,7 @@ class Resect(CameraOptions):
         from tumortrack.live.session import named_sinks
         from tumortrack_resection.files import read_plan
         from tumortrack_resection.operation import OperationConfig
+        from tumortrack_resection.planning import check_arms_installed
         from tumortrack_resection.ur_sink import UrSinkConfig
 
         check_arms_installed()
@@ -92,7 +92,7 @@ class Resect(CameraOptions):
         if organ is None or stored.plan.tumor not in stored.meshes:
             lacking = stored.plan.tumor if organ else "the organ"
             raise ArtifactError(f"{self.plan} lacks {lacking}'s surface. Plan again.")
-        sinks = named_sinks(self.sinks).values()  # wrong: said before all that takes long
+        sinks = named_sinks(self.sinks).values()  # reports wrong ones before all that takes long
         moved_mm = self._moved_mm(stored)
         config = OperationConfig(speed=self.speed, moved_mm=moved_mm, replan_cut=self.replan_cut)
         arms = [sink for sink in sinks if isinstance(sink, UrSinkConfig)]
@@ -187,7 +187,7 @@ class Resect(CameraOptions):
 
 @dataclass(frozen=True, eq=False)
 class _Procedure:
-    """A stored plan that is carried out. ``arms``: real ones, connected or not."""
+    """Carries a stored plan out. ``arms``: real ones, connected or not."""
 
     asked: Resect
     stored: PlanFolder
@@ -197,8 +197,8 @@ class _Procedure:
     arms: Sequence[UrSinkConfig]
 
     def follow(self, live: _Live) -> None:
-        """Beside the live loop: every estimate is looked at, and planned on where the tumor
-        moved."""
+        """With the live loop: every estimate is compared with the plan, which is made anew where
+        the tumor has moved."""
         from concurrent.futures import ProcessPoolExecutor
         from multiprocessing import get_context
 
@@ -218,7 +218,7 @@ class _Procedure:
             return of_estimate(result.estimate, unsure).moved(frames.published_from_camera)
 
         again = msgspec.structs.replace(stored.config, tumor=stored.plan.tumor)
-        # In a process of its own: planning for a second must not hold up a frame.
+        # In a process of its own: planning takes a second, and must not delay a frame.
         with ProcessPoolExecutor(
             1, get_context("spawn"), procedure.begin_worker, (again, self.cell.config)
         ) as planner:
@@ -232,7 +232,7 @@ class _Procedure:
                 return planner.submit(procedure.replan, seen, joints_rad, progress)
 
             say("starting the replanning worker ...")
-            # The worker does not hear of Ctrl-C: that is the live loop's affair.
+            # The worker ignores Ctrl-C, which the live loop handles.
             before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
             begun = planner.submit(procedure.warm_up)
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
@@ -242,14 +242,17 @@ class _Procedure:
             operation = self._operation(locate=locate, replan=replan, budget=budget)
             setup = CameraSetup(frames, {live.named: live.source})
             about = {"plan_config": to_builtins(self.config)}
-            same = {one.name: getattr(asked, one.name) for one in fields(CameraOptions)}
             track.Track(
-                model=live.model, source=live.named, sinks=asked.sinks, report=asked.report, **same
+                model=live.model,
+                source=live.named,
+                sinks=asked.sinks,
+                report=asked.report,
+                **options_of(asked, CameraOptions),
             ).run(Arms(operation, setup, about, tip_places(self.cell.config), bool(self.arms)))
         self._say_end(operation)
 
     def execute(self) -> None:
-        """Without a camera: the stored motions in real time."""
+        """Without a camera: play the stored motions in real time."""
         from tumortrack.live import session
         from tumortrack.live.values import Controls, SinkContext, TrackingResult
 
@@ -313,23 +316,17 @@ class _Procedure:
             now_s = 0.0
             for time_s in times_s.tolist():
                 cell = operation.act(nothing, now_s).workcell
-                while now_s < time_s:  # heard it of the time less often, the arms would halt
+                while now_s < time_s:  # in steps: after a longer pause the arms would halt
                     now_s = min(now_s + _FILM_STEP_S, time_s)
                     cell = operation.act(nothing, now_s).workcell
                 assert cell is not None
                 yield cell
 
-        drawn, first_s = itertools.count(), 0.0
-        with live_line("choosing views and colours") as show:
-            show("choosing views and colours ...")
+        number = itertools.count(1)
+        with progress_of("frame", "choosing views and colours ...") as show:
 
             def advance() -> None:
-                nonlocal first_s
-                n = next(drawn)
-                first_s = first_s or time.monotonic()
-                left_s = (time.monotonic() - first_s) / max(n, 1) * (len(times_s) - n)
-                if n:
-                    show(f"frame {n} of {len(times_s)}, about {left_s:.0f} s left")
+                show(next(number), len(times_s))
 
             film(frames(), as_located(self.stored), path, progress=advance, plan=self.stored.plan)
         length_s = len(times_s) / FPS
@@ -344,11 +341,11 @@ class _Procedure:
         return Operation(planned, self.config, self.cell.shapes, **live)
 
     def _say_end(self, operation: operations.Operation) -> None:
-        found = operation.summary()
-        if found["state"] != "done":
-            if found["halted"] == track.STOPPED:
+        summary = operation.summary()
+        if summary["state"] != "done":
+            if summary["halted"] == track.STOPPED:
                 raise KeyboardInterrupt
-            raise Aborted(f"the resection was {found['state']}: {found['halted']}.")
+            raise Aborted(f"the resection was {summary['state']}: {summary['halted']}.")
         if any(arm.execute for arm in self.arms):
             say("done: all motions were sent; see where the arms stand.")
         else:
@@ -356,7 +353,7 @@ class _Procedure:
 
 
 def _checked_cell(path: Path, motions: Motions, cell: CellConfig, organ: Mesh) -> ArmCell:
-    """Raises ArtifactError: in it the motions hit something, so they are not those planned."""
+    """Raises ArtifactError: the motions hit something in it, so they are not those planned."""
     from tumortrack_resection.arms.cell import ArmCell
     from tumortrack_resection.arms.trajectory import first_hit
 
@@ -367,8 +364,8 @@ def _checked_cell(path: Path, motions: Motions, cell: CellConfig, organ: Mesh) -
 
 @dataclass(frozen=True, eq=False)
 class _Live:
-    """Of --live: the model's folder, case (its digest; empty where unknown) and patient; the
-    source, and how it was written."""
+    """What --live says: the model's folder, the digest of its case (empty: unknown), its patient;
+    the source, and its text."""
 
     model: Path
     case: str
@@ -406,11 +403,11 @@ def _live_of(model: Path, source: str, stored: PlanFolder) -> _Live:
 
 
 def _confirm(arms: Sequence[UrSinkConfig], patient: Patient) -> None:
-    """A person at the terminal types each arm's address; InputError: something else."""
+    """A person at the terminal types each arm's address; InputError: something else is typed."""
     for arm in arms:
         import termios  # not on Windows, where no terminal would be found above
 
-        termios.tcflush(sys.stdin, termios.TCIFLUSH)  # what was typed before it was asked for
+        termios.tcflush(sys.stdin, termios.TCIFLUSH)  # discard what was typed before the question
         say(
             f"The {arm.arm} at {arm.host} is about to move: as soon as an estimate is good, and "
             f"again after every pause. It cuts in {patient}: is that who lies here? "
@@ -429,7 +426,7 @@ def _dry_run(dry: Sequence[UrSinkConfig], moving: Sequence[UrSinkConfig]) -> Ite
     """Say first and last which arms are not connected."""
     lines = [_DRY_RUN] if dry and not moving else []
     if moving:
-        lines = [f"DRY RUN of the {one.arm} at {one.host}: it is not connected" for one in dry]
+        lines = [f"DRY RUN of the {arm.arm} at {arm.host}: it is not connected" for arm in dry]
     for line in lines:
         say(line)
     try:
@@ -440,7 +437,7 @@ def _dry_run(dry: Sequence[UrSinkConfig], moving: Sequence[UrSinkConfig]) -> Ite
 
 
 def _organ_shapes(stored: PlanFolder) -> tuple[RigidShape, ...]:
-    """Organ and tumors as they were planned on, no surface drawn twice."""
+    """Organ and tumors as planned on; a surface that two parts share is drawn once."""
     import numpy as np
 
     from tumortrack.core.colours import part_colour

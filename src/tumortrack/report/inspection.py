@@ -1,4 +1,4 @@
-"""What lies in a folder or file, in sentences: `inspect`."""
+"""What a folder or file is, in sentences: `inspect`."""
 
 from __future__ import annotations
 
@@ -6,18 +6,14 @@ import string
 import tomllib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from tyro.conf import Positional
-
-from tumortrack.cli.console import say
 from tumortrack.core import store
 from tumortrack.core.errors import InputError
 
 Content = Mapping[str, Any]  # of a JSON file
-_TOLD_BY = {  # of a kind of folder, by another file than its manifest
+_DESCRIBED_BY = {  # kinds of folders that another file than the manifest describes
     "run": "report.json",
     "plan": "plan.json",
     "kit": "kit.json",
@@ -25,30 +21,15 @@ _TOLD_BY = {  # of a kind of folder, by another file than its manifest
     "hand-eye calibration": "calibration.json",
 }
 
-_METHODS = {  # by whether they have a network
+_METHODS = {  # by whether the model has a network
     False: "lays the organ of the CT on the points; `locate --map` says where points of the CT are",
     True: "labels points; it does not know which point of the CT lies where (no `--map`)",
 }
-_KNOWN = (
+_KINDS = (
     "folders that commands write (cases, models, runs, plans, scenes, recordings, evaluations, "
     "fleets, kits, calibrations), their reports, calibration and intrinsics files, clouds, depth "
     "images beside intrinsics.json, meshes, CTs and label maps"
 )
-
-
-@dataclass(frozen=True, kw_only=True)
-class Inspect:
-    """Say what a folder or file is, and what is in it.
-
-    Attributes:
-        path: what a command wrote or reads.
-    """
-
-    path: Positional[Path]
-
-    def run(self) -> None:
-        for line in describe(self.path):
-            say(line)
 
 
 def describe(path: Path) -> list[str]:
@@ -58,7 +39,7 @@ def describe(path: Path) -> list[str]:
         raise InputError(f"{path} does not exist.")
     lines = [line.removesuffix(".") for line in (_folder if path.is_dir() else _file)(path)]
     if not lines:
-        raise InputError(f"{path} is nothing that inspect knows. It knows {_KNOWN}.")
+        raise InputError(f"{path} is nothing that inspect knows. It knows {_KINDS}.")
     return [f"{path}: {lines[0]}.", *(f"  {line}." for line in lines[1:])]
 
 
@@ -66,14 +47,14 @@ class _Words(string.Formatter):
     """Raises KeyError for an entry that is missing or empty."""
 
     def get_field(self, field_name: str, args: Sequence[Any], kwargs: Content) -> Any:
-        found, first = super().get_field(field_name, args, kwargs)
-        if found is None or (isinstance(found, str | list | dict) and not found):
+        value, first = super().get_field(field_name, args, kwargs)
+        if value is None or (isinstance(value, str | list | dict) and not value):
             raise KeyError(field_name)
-        return found, first
+        return value, first
 
 
 def _words(content: Content, sentences: Iterable[str | list[str]]) -> Iterator[str]:
-    """Sentences as inspect.toml has them, filled from JSON."""
+    """Sentences of inspect.toml, filled from JSON; those with missing entries are left out."""
     for sentence in sentences:
         entry, template = ("", sentence) if isinstance(sentence, str) else sentence
         members: Any = content if entry else [{}]
@@ -102,7 +83,7 @@ def _evaluation(report: Content) -> list[str]:
 
 
 def _json(path: Path) -> list[str]:
-    """Of a JSON file; nothing where it is not known."""
+    """Lines about a JSON file; none if its kind is unknown."""
     content = store.read_json(path)
     if content.keys() >= {"rule", "summary", "scenes"}:
         return _evaluation(content)
@@ -118,7 +99,7 @@ def _kinds() -> Iterable[dict[str, Any]]:
 
 
 def _with_figures(content: Content, folder: Path) -> Content:
-    """With what follows from a file's entries."""
+    """The entries of a file, and what is computed from them."""
     figures: dict[str, Any] = {}
     if "up_lps" in content:  # a case
         figures = {"lies": _poses(content["rotations"], content["tilt_degrees"])}
@@ -178,7 +159,7 @@ def _of_model(manifest: Content, folder: Path) -> Content:
 
 
 def _artifact(folder: Path) -> Iterable[str]:
-    """Of a folder with a manifest; of other distributions' kinds, what is a word or a number."""
+    """Lines about a folder with a manifest; of an unknown kind, its texts and numbers."""
     kind = str(store.read_json(folder / store.MANIFEST).get("kind"))
     manifest = store.read_manifest(folder, kind)
     yield (
@@ -187,14 +168,14 @@ def _artifact(folder: Path) -> Iterable[str]:
     )
     if isinstance(manifest.get("scenes"), dict):
         yield from _sealed_scenes(folder, manifest["scenes"])
-    lines = _json(folder / _TOLD_BY.get(kind, store.MANIFEST))[1:]
+    lines = _json(folder / _DESCRIBED_BY.get(kind, store.MANIFEST))[1:]
     plain = ((k, v) for k, v in [*manifest.items()][5:] if isinstance(v, str | int | float))
     yield from lines or (f"{key.replace('_', ' ')}: {value}" for key, value in plain)
     yield f"files: {', '.join(manifest['files'])}"
 
 
 def _sealed_scenes(folder: Path, scenes: Mapping[str, str]) -> Iterable[str]:
-    """With the digests that they were sealed by."""
+    """Lines about scenes whose digests the manifest has."""
     yield f"{len(scenes)} scenes: {', '.join(scenes)}"
     digests = {n: store.sha256_of(folder / n) for n in scenes if (folder / n).is_dir()}
     if changed := [name for name, digest in scenes.items() if digests.get(name) != digest]:
