@@ -13,8 +13,8 @@ from tumortrack.core import store
 from tumortrack.core.errors import InputError
 
 if TYPE_CHECKING:
+    from tumortrack.report.slicer_scene import Scene
     from tumortrack.simulate.scene import SceneConfig
-    from tumortrack.tracking.slicer_scene import Scene
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -121,8 +121,8 @@ class Export:
     patient: str | None = None
 
     def run(self) -> None:
+        from tumortrack.report.slicer_scene import Scene
         from tumortrack.tracking.files import read_report
-        from tumortrack.tracking.slicer_scene import Scene
 
         if self.dicom is None and (self.series, self.patient) != (None, None):
             raise InputError("--series and --patient are those of --dicom; give that folder too.")

@@ -29,7 +29,8 @@ from tumortrack.tracking.margins import stated_radius
 from tumortrack.tracking.points import PointTable, camera_table
 from tumortrack.tracking.shells import exact_margin
 
-MARGIN = "_margin"  # ends the names of shells
+MARGIN = "_margin"  # suffix of the names of shells
+CENTRES, CT = "tumors", "ct"  # names of the tumor centres and of the organ's pose in 3D Slicer
 
 
 def write_estimate(

@@ -257,6 +257,16 @@ def margin_words(margin: MarginReport | None) -> str:
     return f"{100 * highest.confidence:g} % margin: {sizes}"
 
 
+def centre_label(report: FitReport, name: str, poor: bool) -> str:
+    """A tumor's name, with its standard deviation and margin as far as they are known."""
+    radius, std_mm = stated_radius(report.margin, name), report.parts[name].center_std_mm
+    words = [
+        f"{name} POOR" if poor else name,
+        *([] if std_mm is None else [f"std {std_mm:.1f} mm"]),
+    ]
+    return ", ".join([*words, radius.words if radius else "no margin stated"])
+
+
 def keep_margins(folder: Path, margins: ModelMargins) -> Path:
     """Write them as the margins of the model in this folder. Raises StorageError."""
     digest = store.sha256_of(folder / store.MANIFEST)
