@@ -220,7 +220,7 @@ def export(case: StrPath, folder: StrPath, **options: Any) -> tuple[str, ...]:
         InputError, ArtifactError: folders or options that do not fit each other, or cannot be used.
         StorageError: the disk refused.
     """
-    from tumortrack.tracking import slicer_scene
+    from tumortrack.report import slicer_scene
 
     asked = options_from(ExportOptions, options, "export")
     return slicer_scene.export(Path(case), Path(folder), asked)

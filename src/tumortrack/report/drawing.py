@@ -1,5 +1,5 @@
-"""The parts pictures are drawn with: figures without a display, words that are never cut off,
-sections of meshes, scale bars."""
+"""Parts of pictures: figures without a display, text that is never cut off, sections of meshes,
+scale bars."""
 
 from __future__ import annotations
 
@@ -54,11 +54,10 @@ def add_words(
     below: Sequence[str] = (),
     handles: Sequence[Any] = (),
 ) -> None:
-    """Write what a figure says, whole: over its axes each warning in a red box with a sign, then
-    the title and the legend; under them lines. The figure becomes taller by the room that they
-    need. Call it once, when all axes are there."""
-    told = [f"{SIGN} WARNING: {text}" for text in warnings]
-    over: list[Text | Legend] = [*_paragraphs(figure, told, _WARNING)]
+    """Add text to a finished figure, which grows by the height it takes: above the axes each
+    warning in a red box, then title and legend; below them the lines ``below``. Call it once."""
+    texts = [f"{SIGN} WARNING: {text}" for text in warnings]
+    over: list[Text | Legend] = [*_paragraphs(figure, texts, _WARNING)]
     over += _paragraphs(figure, [title], {"fontsize": 13, "fontweight": "bold"})
     over += [_legend(figure, handles)] if handles else []
     under: list[Text | Legend] = [*_paragraphs(figure, below, {"fontsize": 10.5})]
@@ -66,18 +65,18 @@ def add_words(
         sum(_height_in(figure, artist) for artist in artists) + _EDGE_IN * bool(artists)
         for artists in (over, under)
     )
-    pars, old_in = figure.subplotpars, figure.get_figheight()
-    axes_in = pars.bottom * old_in + below_in, pars.top * old_in + below_in
+    borders, old_in = figure.subplotpars, figure.get_figheight()
+    axes_in = borders.bottom * old_in + below_in, borders.top * old_in + below_in
     new_in = old_in + above_in + below_in
     figure.set_figheight(new_in)
     figure.subplots_adjust(bottom=axes_in[0] / new_in, top=axes_in[1] / new_in)
     for artists, y_in in ((over, new_in - _EDGE_IN), (under, below_in)):
         for artist in artists:
-            place = _EDGE_IN / figure.get_figwidth(), y_in / new_in
+            position = _EDGE_IN / figure.get_figwidth(), y_in / new_in
             if isinstance(artist, Legend):
-                artist.set_bbox_to_anchor(place, figure.transFigure)
+                artist.set_bbox_to_anchor(position, figure.transFigure)
             else:
-                artist.set_position(place)
+                artist.set_position(position)
             y_in -= _height_in(figure, artist)
 
 
@@ -159,7 +158,7 @@ def outline(
     axes: Axes, mesh: Mesh, view: ParallelView, frame: Frame, color: RGB | str, width: float,
     **style: Any,
 ) -> None:  # fmt: skip
-    """Draw the contour of what the mesh covers."""
+    """Draw the mesh's silhouette as a contour."""
     x, y = np.meshgrid(*frame.pixel_centres())
     mask = view.silhouette(mesh, frame)
     axes.contour(x, y, mask, levels=[0.5], colors=[color], linewidths=width, **style)
@@ -171,7 +170,7 @@ def draw_lines(axes: Axes, segments: Float[np.ndarray, "n 2 2"], **style: Any) -
 
 
 def tint(axes: Axes, mask: Bool[np.ndarray, "h w"], frame: Frame, color: RGB) -> None:
-    """Lay a translucent colour over the mask."""
+    """Tint the mask with a translucent colour."""
     picture = np.where(mask[..., None], (*color, 0.25), (*color, 0.0))
     axes.imshow(picture, extent=frame.extent, zorder=1)
 
@@ -182,9 +181,9 @@ def finish_view(
     arrows: dict[str, tuple[float, float]] | None = None,
     background: str = "white",
 ) -> None:
-    """Axes in mm, down pointing down, equal scales, without ticks; a scale bar of a round length
-    in the lower left corner. ``arrows``, in the upper left one, name the frame's axes by letter
-    and direction (right, down)."""
+    """Set up axes in mm with equal scales, down pointing down, without ticks, and a scale bar of a
+    round length at the lower left. ``arrows``, at the upper left: letter of an axis -> direction
+    (right, down)."""
     axes.set(xlim=(frame.left, frame.right), ylim=(frame.bottom, frame.top), aspect="equal")
     axes.set(xticks=[], yticks=[], facecolor=background)
     for spine in axes.spines.values():
@@ -197,7 +196,7 @@ def finish_view(
     style: dict[str, Any] = {"color": color, "ha": "center", "va": "bottom", "fontsize": 9}
     axes.text(x + length / 2, y - 0.015 * height, f"{length} mm", **style)
     span, ways = 0.07 * min(width, height), arrows or {}
-    rises = any(down < 0 for _, down in ways.values())  # those that point up begin lower
+    rises = any(down < 0 for _, down in ways.values())  # arrows that point up start lower
     x, y = frame.left + 0.6 * span, frame.top + (2.1 if rises else 0.6) * span
     arrow = {"arrowstyle": "->", "color": "0.35", "shrinkA": 0, "shrinkB": 0}
     for letter, (right, down) in ways.items():

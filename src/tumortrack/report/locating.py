@@ -1,4 +1,4 @@
-"""From the files of one or several views to a located organ and its folder."""
+"""`locate`: from the files of one or several views to an estimate and its folder."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ _ASK = "say where the organ is: --at COLUMN ROW, --box or --mask"
 
 @dataclass(frozen=True, eq=False)
 class Located:
-    """What ``locate`` found in its files, to be saved.
+    """The result of ``locate``, to be saved.
 
     Attributes:
-        estimate: None where nothing could be located; ``reason`` says why then.
-        about: what report.json says besides the estimate: notes, inputs, model, digests.
+        estimate: None if nothing could be located; ``reason`` then says why.
+        about: the entries of report.json besides the estimate: notes, inputs, model, digests.
         seen: what the page shows besides the estimate.
-        points: those of the CT whose places were asked for.
+        points: points of the CT to map to the camera frame.
         error: why there is no estimate.
     """
 
@@ -95,9 +95,9 @@ def locate(given: Path, clouds: Sequence[Path], options: LocateOptions) -> Locat
     seen = Seen(content=views[0].content, ct=ct)
     try:
         for view in views:
-            organ, done, taken = view.organ(model, options, hints)
+            organ, entry, taken = view.organ(model, options, hints)
             organs.append(organ)
-            about["input"].append(done)
+            about["input"].append(entry)
             if view is views[0]:
                 seen = replace(seen, cloud=organ, taken=taken)
         looks = further_looks(organs, views, fixed_from_camera)
@@ -123,7 +123,7 @@ def locate(given: Path, clouds: Sequence[Path], options: LocateOptions) -> Locat
 
 
 def _points(given: Path, folder: Path, options: LocateOptions) -> PointTable | None:
-    """The points of --map; what is wrong with them or the model is reported before it is loaded."""
+    """The points of --map, checked like the model's patient before the model is loaded."""
     from tumortrack.models.folder import has_shape, patient_of, read_model_manifest
 
     manifest = read_model_manifest(folder)
@@ -144,7 +144,7 @@ def _notes(
     anatomy_ct: Anatomy | None,
     options: LocateOptions,
 ) -> list[str]:
-    """What was dropped in reading, and which points of --map lie far from the organ."""
+    """On what was dropped in reading, and on points of --map far from the organ."""
     notes = [note for view in views for note in view.notes]
     if points is not None:
         assert anatomy_ct is not None  # a model with a shape
@@ -156,7 +156,7 @@ def _notes(
 def _no_estimate(
     error: NoEstimate, view: View, model: Model, options: LocateOptions
 ) -> dict[str, Any]:
-    """The report's head, where there is no estimate."""
+    """The first entries of a report without an estimate."""
     from tumortrack.tracking.files import finding_entry, report_head
 
     reason = str(error)

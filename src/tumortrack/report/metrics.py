@@ -1,4 +1,4 @@
-"""How far an estimated anatomy is from the true one. Pure functions, exact definitions.
+"""Metrics of an estimated anatomy against the true one. Pure functions, exact definitions.
 
 Surface distances are measured from samples of one surface to the other surface itself (nearest
 triangle, exact point-to-triangle distance), not to its vertices: libraries differ by millimetres
@@ -51,8 +51,8 @@ def surface_samples(
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"], Int[np.ndarray, " n"]]:
     """Points on a surface, the area each stands for, and the face it lies on.
 
-    Deterministic: every triangle is cut into n^2 equal ones with edges <= spacing; their centroids
-    carry the area (mm^2). The vertices follow with area 0, so that extremes are not cut off.
+    Deterministic: every triangle is cut into n^2 equal ones with edges <= spacing, whose centroids
+    carry the area (mm^2). The vertices follow with area 0, so that extremes are included.
     """
     triangles = mesh.vertices_mm[mesh.faces]
     edges = triangles - np.roll(triangles, 1, axis=1)
@@ -90,8 +90,7 @@ def triangle_distance(
 def surface_distances(
     estimate: Mesh, reference: Mesh, spacing_mm: float = SPACING_MM
 ) -> SurfaceDistances:
-    """Hausdorff distance and its kin between two surfaces in the same frame. Raises InputError: one
-    of them has no triangles."""
+    """Distances between two surfaces in the same frame. Raises InputError: one has no triangles."""
     if len(estimate.faces) == 0 or len(reference.faces) == 0:
         raise InputError("surface distances need two surfaces with triangles; one is empty.")
     points_out, weights_out, _ = surface_samples(estimate, spacing_mm)
@@ -111,8 +110,8 @@ def surface_distances(
 def distance_to_surface(
     points_mm: Float[np.ndarray, "n 3"], target: Mesh
 ) -> Float[np.ndarray, " n"]:
-    """Distance of every point to a surface: exact to the triangles of the nearest few samples, and
-    to one at the nearest corner, whose triangles may be too thin for samples near it.
+    """Distance of every point to a surface: exact to the triangles of the nearest few samples and
+    to one at the nearest vertex, whose triangles may be too thin to have samples near it.
 
     Against all triangles this errs by less than 0.01 mm (tested), always upwards.
     """
@@ -175,9 +174,9 @@ def box_center_distance(estimate: Mesh, reference: Mesh) -> float:
 def label_ious(estimate: CameraLabels, reference: Anatomy) -> dict[str, float]:
     """Intersection over union per part, on the estimate's voxel lattice.
 
-    The lattice goes on beyond the estimate's box as far as the reference reaches, so truth
-    outside that box counts as missed. The organ's name means the parenchyma alone (label 1, tumors
-    excluded). A part that is absent from the estimate has IoU 0.
+    The lattice is extended to the reference, so that truth outside the estimate's box counts as
+    missed. The organ's name means the parenchyma (label 1, without tumors). A part that is absent
+    from the estimate has IoU 0.
     """
     index_from_camera = np.linalg.inv(estimate.camera_from_index)
     index = np.concatenate(
@@ -189,11 +188,11 @@ def label_ious(estimate: CameraLabels, reference: Anatomy) -> dict[str, float]:
     truth = label_grid(reference, camera_from_box, tuple((high - low).tolist()))
     start, stop = np.maximum(low, 0), np.minimum(high, estimate.labels.shape)
     stop = np.maximum(stop, start)
-    both_mine = estimate.labels[tuple(map(slice, start, stop))]
-    both_true = truth[tuple(map(slice, start - low, stop - low))]
+    shared_estimate = estimate.labels[tuple(map(slice, start, stop))]
+    shared_truth = truth[tuple(map(slice, start - low, stop - low))]
     ious = {}
     for label, name in enumerate(reference.names, start=1):
-        common = np.count_nonzero((both_mine == label) & (both_true == label))
+        common = np.count_nonzero((shared_estimate == label) & (shared_truth == label))
         union = np.count_nonzero(estimate.labels == label) + np.count_nonzero(truth == label)
         ious[name] = float(common / (union - common)) if union else 0.0
     return ious

@@ -47,25 +47,23 @@ _COLUMNS = {
     "surface_mm": "surface off in the mean, mm",
     "iou": "overlap (IoU, 0 to 1)",
 }
-_SHOWN_POINTS, _AROUND_MM = 2000, 12.0  # of the cloud: those so near the organ
+_MAX_POINTS, _AROUND_MM = 2000, 12.0  # of the cloud, in a box so much larger than the organ's
 
 
 def page_scene(scene: Scene, estimate: Estimate | None, picture: Path) -> dict[str, Any]:
-    """What the page shows of a scene, small (JSON types): ``layers``, thinned meshes, ``box``,
-    around organ and tumors, and ``picture``, the PNG that ``scene_picture`` wrote, compressed."""
+    """The page's data of a scene (JSON types): ``layers``, simplified meshes, ``box`` around organ
+    and tumors, and ``picture``, the PNG of ``scene_picture``, compressed."""
     shown = estimate.meshes if estimate else {}
     meshes = [*scene.reference.parts, *shown.values()]
     lower = np.min([mesh.box_mm[0] for mesh in meshes], axis=0) - _AROUND_MM
     upper = np.max([mesh.box_mm[1] for mesh in meshes], axis=0) + _AROUND_MM
     points_mm = scene.cloud.points_mm
     points_mm = points_mm[((points_mm > lower) & (points_mm < upper)).all(1)]
-    step = max(1, -(-len(points_mm) // _SHOWN_POINTS))
+    step = max(1, -(-len(points_mm) // _MAX_POINTS))
     points = {"kind": "points", "name": "observed points", "v": _packed(points_mm[::step])}
     layers = [{**points, "color": colours.css(colours.SEEN)}]
-    for part, mesh in shown.items():
-        layers.append(_surface(part, mesh))
-    for part, mesh in zip(scene.reference.names, scene.reference.parts, strict=True):
-        layers.append(_outline(part, mesh))
+    layers += [_surface(part, mesh) for part, mesh in shown.items()]
+    layers += map(_outline, scene.reference.names, scene.reference.parts)
     webp = io.BytesIO()
     with Image.open(picture) as image:
         image.convert("RGB").save(webp, "WEBP", quality=82)
@@ -74,7 +72,7 @@ def page_scene(scene: Scene, estimate: Estimate | None, picture: Path) -> dict[s
 
 
 def write_page(report: dict[str, Any], scenes: list[dict[str, Any]], path: Path) -> None:
-    """Write the page, atomically; it loads nothing from anywhere.
+    """Write the self-contained page, atomically.
 
     ``report``: as ``evaluate_scenes`` returns it; ``scenes``: of ``page_scene``, in its order.
     """
@@ -87,7 +85,7 @@ def write_page(report: dict[str, Any], scenes: list[dict[str, Any]], path: Path)
         **_typical_and_worst(entries),
     }
     embedded = json.dumps(data, allow_nan=False).replace("</", "<\\/")
-    # The texts that are long or hold braces go in by position, never through a formatter.
+    # Long texts, and those with braces, are inserted by position, not by a formatter.
     folder = resources.files("tumortrack.report")
     page = folder.joinpath("page.html").read_text("utf-8")
     texts = {
@@ -111,16 +109,15 @@ def write_page(report: dict[str, Any], scenes: list[dict[str, Any]], path: Path)
 
 
 def thinned(mesh: Mesh, cell_mm: float) -> Mesh:
-    """A coarser mesh for display: vertices of one cubic cell become their mean."""
+    """A coarser mesh for display: the vertices in a cubic cell are replaced by their mean."""
     cells = np.floor(mesh.vertices_mm / cell_mm).astype(np.int64)
     _, group = np.unique(cells, axis=0, return_inverse=True)
     group = group.reshape(-1)
     count = np.bincount(group)
     means = [np.bincount(group, mesh.vertices_mm[:, axis]) / count for axis in range(3)]
     a, b, c = group[mesh.faces].T
-    proper = (a != b) & (b != c) & (c != a)
-    faces = np.stack([a, b, c], axis=1)[proper]
-    # A thin fold collapses onto two sheets with the same corners: drop what occurs in pairs.
+    faces = group[mesh.faces][(a != b) & (b != c) & (c != a)]
+    # A thin fold collapses to two sheets with the same corners: drop faces that occur in pairs.
     _, kind, times = np.unique(
         np.sort(faces, axis=1), axis=0, return_inverse=True, return_counts=True
     )
@@ -136,7 +133,7 @@ def _surface(part: str, mesh: Mesh) -> dict[str, Any]:
 
 
 def _outline(part: str, mesh: Mesh) -> dict[str, Any]:
-    """The true surface cut by three planes through its middle: pairs of points, a line each."""
+    """The true surface cut by three planes through its centre: a line for each pair of points."""
     middle_mm = mesh.box_mm.mean(0)
     cuts = [plane_section(mesh.vertices_mm, mesh.faces, axis, middle_mm) for axis in np.eye(3)]
     lines = np.concatenate(cuts).reshape(-1, 3)
@@ -154,18 +151,17 @@ def _base64(content: bytes) -> str:
 
 
 def _about(entry: dict[str, Any]) -> dict[str, Any]:
-    """A scene's name, verdict and reason, and its errors in a few words."""
-    good = f"{NO_CHECK_FAILED}; {UNVERIFIED}"
-    reason = good if entry["quality"] == "good" else entry["reason"]
-    said = {"name": entry["name"], "verdict": entry["quality"], "reason": reason}
-    return {**said, "note": scene_note(entry)}
+    """A scene's name, verdict, reason, and errors in one line."""
+    reason = f"{NO_CHECK_FAILED}; {UNVERIFIED}" if entry["quality"] == "good" else entry["reason"]
+    about = {"name": entry["name"], "verdict": entry["quality"], "reason": reason}
+    return {**about, "note": scene_note(entry)}
 
 
 def _typical_and_worst(entries: list[dict[str, Any]]) -> dict[str, int]:
-    """Places of the scene whose farthest tumor is as far off as in the median scene, and of the
-    scene where it is farthest; without an answer the first."""
-    far = [(worst_center(entry)[0], n) for n, entry in enumerate(entries)]
-    answers = sorted(one for one in far if entries[one[1]]["quality"] != "none") or far[:1]
+    """Indices of the scenes with the median and the largest error of a tumor's centre; without any
+    answer, of the first scene."""
+    errors = [(worst_center(entry)[0], n) for n, entry in enumerate(entries)]
+    answers = sorted((mm, n) for mm, n in errors if entries[n]["quality"] != "none") or errors[:1]
     return {"typical": answers[(len(answers) - 1) // 2][1], "worst": answers[-1][1]}
 
 
@@ -175,7 +171,7 @@ def _verdict_colours() -> str:
 
 
 def _verdicts(summary: dict[str, Any]) -> str:
-    """A card for each verdict: how many, and how far off their tumors are."""
+    """A card for each verdict: the number of scenes, and their errors."""
     cards = []
     for verdict in VERDICTS:
         group = summary["errors"].get(verdict, {}).get("estimate", {})
@@ -191,11 +187,11 @@ def _rivals(report: dict[str, Any]) -> str:
     meaning = report["rivals"]
     if "not_available" in meaning:
         return html.escape(meaning["not_available"])
-    said = [f"{RIVALS[name].capitalize()}: {meaning[name]}." for name in RIVALS]
-    left = {e["name"]: r["not_available"] for e in report["scenes"]
-            for r in e["rivals"].values() if "not_available" in r}  # fmt: skip
-    said += [f"Not available of {name}: {why}." for name, why in left.items()]
-    return html.escape(" ".join(said))
+    sentences = [f"{RIVALS[name].capitalize()}: {meaning[name]}." for name in RIVALS]
+    missing = {e["name"]: r["not_available"] for e in report["scenes"]
+               for r in e["rivals"].values() if "not_available" in r}  # fmt: skip
+    sentences += [f"Not available of {name}: {why}." for name, why in missing.items()]
+    return html.escape(" ".join(sentences))
 
 
 def _error_table(summary: dict[str, Any]) -> str:
@@ -216,7 +212,7 @@ def _error_table(summary: dict[str, Any]) -> str:
 
 
 def _scene_table(entries: list[dict[str, Any]]) -> str:
-    """One row a scene; its name opens it."""
+    """One row per scene."""
     head = ["scene", "verdict", "reason", "tumor or organ farthest off", "centre off, mm"]
     head += [f"{name}: centre off, mm" for name in RIVALS.values()]
     head += ["targets: mean, mm", "largest, mm"]
@@ -235,7 +231,7 @@ def _scene_table(entries: list[dict[str, Any]]) -> str:
 
 
 def _part_table(parts: dict[str, dict[str, Any]]) -> str:
-    """Of a scene's parts, or the summary's: medians, with the worst Hausdorff distance."""
+    """Metrics of a scene's parts, or the summary's medians with the worst Hausdorff distance."""
     columns = dict(_COLUMNS)
     if any("registration_mm" in part for part in parts.values()):
         columns["registration_mm"] = "expected error of the truth itself, mm"

@@ -1,7 +1,7 @@
-"""Pictures that a surgeon can read: the estimate over the truth, and a prepared case.
+"""Pictures of an estimate over the truth, and of a prepared case.
 
-Every part has its own colour (core/colours.py); dark blue outlines are the truth. Nothing needs a
-display.
+Every part has its own colour (core/colours.py); dark blue outlines are the truth. No display is
+needed.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from tumortrack.core.types import Anatomy, LabelVolume, Mesh, Volume
 from tumortrack.report import drawing
 from tumortrack.report.drawing import CENTRED, OBSERVED, ORGAN, TRUE
 from tumortrack.report.renderer import RGB, Body, Frame, ParallelView, rgb
-from tumortrack.report.summary import scene_note
+from tumortrack.report.summary import scene_note, words
 from tumortrack.simulate.scene_folder import Scene
 
 FROM_CAMERA = ParallelView("seen from the camera", (1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
@@ -43,7 +43,7 @@ PLANES = (
 )
 _SOFT_TISSUE_HU = (-160.0, 240.0)
 _MARGIN_MM, _ASPECT = 18.0, 1.22
-_MOST_ROWS = 6  # tumors with slices of their own
+_MAX_ROWS = 6  # tumors with slices of their own
 _NEAR_BORDER = {
     **{"left": (0.025, 0.5), "right": (0.975, 0.5)},
     **{"top": (0.5, 0.965), "bottom": (0.5, 0.035)},
@@ -53,11 +53,9 @@ _NEAR_BORDER = {
 def scene_picture(
     scene: Scene, estimate: Estimate | None, entry: dict[str, Any], path: Path
 ) -> None:
-    """Estimate over truth: two 3-D views, and two slices through each true tumor's centre; a PNG,
-    written atomically.
-
-    Where nothing was found (None) the truth is shown alone. ``entry``: of the scene in the report.
-    """
+    """Write a PNG, atomically: the estimate over the truth in two 3-D views, and in two slices
+    through each true tumor's centre. Without an estimate, the truth alone. ``entry``: of the scene
+    in the report."""
     shown = estimate.meshes if estimate else {}
     slices = [(name, view) for name in scene.reference.names[1:] for view in _SLICES]
     rows = -(-len(slices) // 4)
@@ -71,23 +69,18 @@ def scene_picture(
     for n, (name, view) in enumerate(slices):
         axes = figure.add_subplot(below[n // 4, n % 4])
         _draw_slice(axes, scene, shown, name, view)
-        what = f"{name.replace('_', ' ')}: {_SLICES[view]}"
-        part = entry["parts"][name]
-        found = (
-            f"Hausdorff {part['hausdorff_mm']:.1f} mm\ncentre {part['center_mm']:.1f} mm, "
-            f"IoU {part['iou']:.2f}"
-            if part["found"]
-            else "not found"
-        )
-        axes.set_title(f"{what}\n{found}", fontsize=9.5)
+        part, errors = entry["parts"][name], "not found"
+        if part["found"]:
+            errors = f"Hausdorff {part['hausdorff_mm']:.1f} mm\ncentre {part['center_mm']:.1f} mm, "
+            errors += f"IoU {part['iou']:.2f}"
+        axes.set_title(f"{words(name)}: {_SLICES[view]}\n{errors}", fontsize=9.5)
     good = entry["quality"] == "good"
     reason = f"{NO_CHECK_FAILED}; {UNVERIFIED}" if good else entry["reason"]
     verdict = f"{entry['quality'].upper()}: {reason}"
     title = f"{entry['name']}   {verdict}" if good else entry["name"]
     handles = scene_legend(*scene.reference.names)
-    failed = entry["failed"]
-    told = failed is None or entry["quality"] == "none"  # then it is the reason
-    warnings = [] if told else [f"FAILED: {failed}"]
+    failed = entry["failed"] if entry["quality"] != "none" else None  # else it is the reason
+    warnings = [] if failed is None else [f"FAILED: {failed}"]
     warnings += [] if good else [verdict]
     drawing.add_words(figure, title, warnings, [scene_note(entry)], handles)
     drawing.save(figure, path)
@@ -138,11 +131,10 @@ def _draw_slice(
 
 
 def scene_legend(organ: str = "kidney", *tumors: str) -> list[Any]:
-    """Handles of what ``draw_solid_view`` shows, by the parts' names: the truth's and the points'
-    last."""
+    """Handles for ``draw_solid_view``: the parts by name, then the truth and the points."""
     return [
-        Patch(facecolor=(*ORGAN, 0.5), label=f"estimated {organ.replace('_', ' ')}"),
-        *(Patch(facecolor=rgb(name_colour(t)), label=t.replace("_", " ")) for t in tumors),
+        Patch(facecolor=(*ORGAN, 0.5), label=f"estimated {words(organ)}"),
+        *(Patch(facecolor=rgb(name_colour(tumor)), label=words(tumor)) for tumor in tumors),
         Line2D([], [], color=TRUE, linewidth=2, label="truth (outline)"),
         Line2D([], [], color=OBSERVED, marker=".", linestyle="", label="observed point"),
     ]
@@ -159,12 +151,12 @@ def qc_picture(
     """Orthogonal slices with outlines, a row through each tumor, and a 3-D view: is everything
     outlined, and on the right side?
 
-    All in the patient's frame (LPS, mm). The labels are shown as grey where there is no CT. Of
-    more than six tumors the six largest have rows. ``patient``: stands in the title; the
-    ``warnings`` over it. The PNG is written atomically.
+    All in the patient's frame (LPS, mm). Without a CT the labels are shown in grey. Of more than
+    six tumors the six largest have rows. ``patient`` is in the title, the ``warnings`` above it.
+    The PNG is written atomically.
     """
     order = sorted(range(len(anatomy.tumors)), key=lambda n: -abs(anatomy.tumors[n].volume_mm3))
-    rows = {anatomy.names[n + 1]: anatomy.tumors[n] for n in sorted(order[:_MOST_ROWS])}
+    rows = {anatomy.names[n + 1]: anatomy.tumors[n] for n in sorted(order[:_MAX_ROWS])}
     rows = rows or {anatomy.names[0]: anatomy.organ}
     height = 3.85 * len(rows) + 0.4
     borders = {"left": 0.025, "right": 0.99, "bottom": 0.05 / height}
@@ -178,22 +170,21 @@ def qc_picture(
             through_mm = in_voxels(part.box_mm.mean(0), shown.lps_from_index)
             _draw_plane(axes, (shown, window), anatomy, view, through_mm)
             if column == 0:
-                title = f"through {name.replace('_', ' ')}"
-                axes.set_ylabel(title, fontsize=12, fontweight="bold")
+                axes.set_ylabel(f"through {words(name)}", fontsize=12, fontweight="bold")
     axes, view = figure.add_subplot(grid[:, 3]), PLANES[1]
     frame = view.frame_around(anatomy.organ.vertices_mm, 8.0).widened(_ASPECT)
     colors = _part_colors(anatomy)
-    tumors = [Body(*one) for one in zip(anatomy.tumors, colors[1:], strict=True)]
+    tumors = [Body(*tumor) for tumor in zip(anatomy.tumors, colors[1:], strict=True)]
     drawing.show_bodies(axes, view, [*tumors, Body(anatomy.organ, ORGAN, 0.38)], frame)
     drawing.finish_view(axes, frame)
     _write_letters(axes, view, "black")
     axes.set_title("3-D, seen from the front", fontsize=10.5)
     what = "CT" if ct is not None else "label map"
-    dropped = len(order) > _MOST_ROWS
-    more = f" (slices through the {_MOST_ROWS} largest of {len(order)} tumors)" if dropped else ""
-    title = f"Prepared case over its {what}{more}" + (f": {patient}" if patient else "")
+    dropped = len(order) > _MAX_ROWS
+    note = f" (slices through the {_MAX_ROWS} largest of {len(order)} tumors)" if dropped else ""
+    title = f"Prepared case over its {what}{note}" + (f": {patient}" if patient else "")
     handles = [
-        Patch(facecolor=color, label=f"{name.replace('_', ' ')} {part.volume_ml:.1f} ml")
+        Patch(facecolor=color, label=f"{words(name)} {part.volume_ml:.1f} ml")
         for color, name, part in zip(colors, anatomy.names, anatomy.parts, strict=True)
     ]
     drawing.add_words(figure, title, warnings, (), handles)
@@ -207,7 +198,7 @@ def _draw_plane(
     view: ParallelView,
     through_mm: Float[np.ndarray, " 3"],
 ) -> None:
-    """A slice, equally large in all planes, so that lengths compare."""
+    """A slice, at the same scale in all planes."""
     half = anatomy.organ.longest_mm / 2 + _MARGIN_MM
     right, down, _ = view.project(anatomy.organ.box_mm.mean(0)[None])[0].tolist()
     frame = Frame(right - _ASPECT * half, right + _ASPECT * half, down - half, down + half)
@@ -228,8 +219,8 @@ def _draw_plane(
 def in_voxels(
     point_mm: Float[np.ndarray, " 3"], lps_from_index: Float[np.ndarray, "4 4"]
 ) -> Float[np.ndarray, " 3"]:
-    """The middle of the nearest voxel: a plane through it shows voxels that lie in it, not half a
-    voxel beside it, so that slice and outline belong together."""
+    """The centre of the nearest voxel: a plane through it cuts voxels in their middle, so that the
+    slice and the outlines match."""
     index = np.rint(transform_points(np.linalg.inv(lps_from_index), point_mm[None]))
     return transform_points(lps_from_index, index)[0]
 
@@ -256,7 +247,7 @@ def slice_volume(
 
 
 def _window(shown: Volume | LabelVolume, anatomy: Anatomy) -> tuple[float, float]:
-    """Grey range: soft tissue, opened upwards as far as the organ and its tumors need."""
+    """Grey range: soft tissue, extended upwards to the organ's and tumors' values."""
     if isinstance(shown, LabelVolume):
         return 0.0, float(shown.labels.max()) * 1.6 + 1e-6
     low, high = _SOFT_TISSUE_HU
@@ -268,7 +259,7 @@ def _window(shown: Volume | LabelVolume, anatomy: Anatomy) -> tuple[float, float
 
 
 def border_letters(view: ParallelView) -> dict[str, str]:
-    """Where the patient's sides lie: left, right, top, bottom of the picture -> L R A P S I."""
+    """The picture's left, right, top, bottom -> the patient's side there: L R A P S I."""
     right, down, _ = view.axes
     towards = {"right": right, "left": -right, "bottom": down, "top": -down}
     names = {tuple(np.array(v)): n[0].upper() for n, v in DIRECTIONS_LPS.items()}

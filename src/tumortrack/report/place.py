@@ -1,4 +1,4 @@
-"""The folder of an evaluation's report: what may be replaced there, and what belongs to it."""
+"""The folder of an evaluation's report: whether it may be replaced, and its removal."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ _OURS = {"scenes", "index.html", "report.json"}
 
 
 def check_place(out: Path, overwrite: bool) -> None:
-    """InputError for a place where something lies that must stay: ``overwrite`` replaces an empty
-    folder or an earlier report in which nothing else lies."""
+    """Raises InputError if a report cannot be written there: ``overwrite`` replaces only an empty
+    folder, or an earlier report without other files in it."""
     if not out.exists():
         return
     if not overwrite:
@@ -39,10 +39,10 @@ def check_place(out: Path, overwrite: bool) -> None:
 
 
 def clear(out: Path) -> None:
-    """Take away what lies there of a report, and the folders if nothing else is in them."""
+    """Remove a report's files, and the folders if nothing else is in them."""
     with writing(out):
-        for path in ((out / name) for name in ("report.json", "index.html")):
-            path.unlink(missing_ok=True)  # never an old table beside new pictures
+        for name in ("report.json", "index.html"):
+            (out / name).unlink(missing_ok=True)  # never an old table beside new pictures
         for picture in (out / "scenes").glob("*.png"):
             picture.unlink()
     for folder in (out / "scenes", out):

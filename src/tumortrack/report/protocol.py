@@ -21,7 +21,7 @@ from tumortrack.report.page import page_scene, write_page
 from tumortrack.report.pictures import scene_picture
 from tumortrack.report.place import clear
 from tumortrack.report.rivals import rivals_of
-from tumortrack.report.summary import MEANING, summarise
+from tumortrack.report.summary import MEANING, summarise, worst_center
 from tumortrack.simulate.scene_folder import Scene, list_scenes, read_scene
 from tumortrack.tracking.model_files import load_model
 from tumortrack.tracking.options import model_folder
@@ -53,8 +53,8 @@ def evaluate_model(
     device: str = "auto",
     progress: Callable[[], None] = lambda: None,
 ) -> dict[str, Any]:
-    """``evaluate_scenes`` with a tracker, or the model of a folder; the report says which it was.
-    Raises InputError also for scenes of another case."""
+    """``evaluate_scenes`` with a tracker, or the model of a folder, which the report then names.
+    Also raises InputError for scenes of another case."""
     folders, digest = list_scenes(scenes_dir), {}
     if isinstance(model, Path):
         folder = model_folder(model)
@@ -74,8 +74,8 @@ def evaluate_model(
 
 
 def check_case(model: Model, folders: list[Path]) -> None:
-    """Raises InputError for a scene that `simulate` made of another case than the model's. Scenes
-    of other programs do not say which case they show; they pass."""
+    """Raises InputError for a scene that `simulate` made from another case than the model's. Scenes
+    of other programs, which do not name their case, pass."""
     wanted = model.provenance.get("case_sha256")
     for folder in folders:
         path = folder / "meta.json"
@@ -98,17 +98,16 @@ def evaluate_scenes(
 ) -> dict[str, Any]:
     """Evaluate ``locate`` on every scene of a folder.
 
-    Writes OUT/scenes/NAME.png, OUT/index.html and, last, OUT/report.json. A report that lies there
-    is replaced: ``place.check_place`` says whether it may be. Nothing of this one stays where it
-    does not come to its end. Raises InputError: no scenes, or a scene that cannot be read;
-    StorageError: the disk refused.
+    Writes OUT/scenes/NAME.png, OUT/index.html and, last, OUT/report.json. Replaces a report that is
+    there (``place.check_place`` says whether that is allowed), and removes an unfinished one.
+    Raises InputError: no scenes, or a scene that cannot be read; StorageError: the disk refused.
 
     Args:
-        locate: observed cloud (camera frame, mm) -> estimate; raises NoEstimate or InputError
-            where it can say nothing, which counts as a failed scene.
+        locate: observed cloud (camera frame, mm) -> estimate; raises NoEstimate or InputError if it
+            has none, which counts as a failed scene.
         progress: called after each scene.
-        about: plain JSON that the report repeats: the model and options behind ``locate``.
-        rivals: what rigid registration answers in a scene, see ``report.rivals.Rivals``.
+        about: plain JSON for the report: the model and options behind ``locate``.
+        rivals: rigid registration of a scene, see ``report.rivals.Rivals``.
     """
     folders = list_scenes(scenes_dir)
     clear(out)
@@ -138,7 +137,7 @@ def evaluate_scenes(
         }
         write_page(report, shown, out / "index.html")
         write_json(out / "report.json", report)
-    except BaseException:  # Ctrl-C, too: what stays would keep the next command from starting
+    except BaseException:  # Ctrl-C, too: an unfinished report would block the next command
         clear(out)
         raise
     return report
@@ -150,8 +149,8 @@ def evaluate_scene(
     """One scene's entry: name, quality (good, poor or none) and its reason, parts -> metrics, miou,
     seconds, timings, and failed (or null).
 
-    ``tre_mm`` is there where the scene has targets and the estimate a motion; null where the scene
-    has targets and nothing was found.
+    With ``tre_mm`` if the scene has targets and the estimate a motion; null if the scene has
+    targets and nothing was found.
     """
     start = time.perf_counter()
     try:
@@ -183,16 +182,15 @@ def evaluate_scene(
 
 
 def failure(parts: dict[str, dict[str, Any]]) -> str | None:
-    """Why an answer with these metrics counts as failed; None: it does not."""
+    """Why an answer with these metrics counts as failed, if it does."""
     if missing := [name for name, part in parts.items() if not part["found"]]:
         return f"not found: {', '.join(missing)}"
-    name = max(list(parts)[1:] or parts, key=lambda part: parts[part]["center_mm"])
-    far_mm = parts[name]["center_mm"]
+    far_mm, name = worst_center({"parts": parts})
     return f"far off: the centre of {name} by {far_mm:.1f} mm" if far_mm > FAR_MM else None
 
 
 def compare(estimate: Estimate, scene: Scene) -> dict[str, dict[str, Any]]:
-    """Metrics of every part of the truth; a part that was not found has only found and iou."""
+    """Metrics of every true part; one that was not found has only ``found`` and ``iou``."""
     assert estimate.volume is not None
     ious = metrics.label_ious(estimate.volume, scene.reference)
     parts: dict[str, dict[str, Any]] = {}

@@ -1,8 +1,8 @@
 """Shaded pictures of meshes without a display: stills in mm, and the frames of a film.
 
-A z-buffer in perspective or parallel, normals that are smooth but for creases, one light, and
-translucent bodies over the opaque ones. (matplotlib's own 3-D surfaces sort triangles by their
-middle, which shows tumors in front of the organ that hides them.)
+A z-buffer in perspective or parallel projection, normals that are smooth except at creases, one
+light, and translucent bodies over opaque ones. (matplotlib's 3-D surfaces sort triangles by
+centroid, which shows tumors in front of the organ that hides them.)
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ from tumortrack.core.geometry import transform_points, triangles_of
 from tumortrack.core.types import Mesh
 from tumortrack.report.renderer_kernels import Triangles, mean_normals, nearest, shade
 
-_SHARPER = 2  # pixels drawn per pixel shown, each way: smooth edges
+_OVERSAMPLING = 2  # pixels drawn per pixel shown, along each axis: antialiasing
 _CREASE_RAD = np.radians(40.0)  # faces that meet at a sharper angle keep their edge
 _WORLD_LIGHT = np.array([-0.42, -0.5, 1.0])  # towards it: from the left, the front and above
 _VIEW_LIGHT = np.array([-0.35, -0.55, -1.0])  # right, down, away: over the viewer's left shoulder
-_SAME_MM = 0.6  # a translucent surface that close over an opaque one is the same one
+_SAME_MM = 0.6  # a translucent surface this close to an opaque one counts as the same
 _DRAWN_MM = 0.3  # a pixel of a parallel view
 _FAR_MM = 10_000.0  # the viewer of a parallel view
 
@@ -49,11 +49,11 @@ class Body:
 
 @dataclass(frozen=True, eq=False)
 class Viewpoint:
-    """From where one looks; world frame, mm. ``axes``: rows right, down and forward.
+    """A viewer's position and projection; world frame, mm. ``axes``: rows right, down and forward.
 
-    The picture's width spans ``width_mm`` of the plane at ``distance_mm``; what is nearer to the
-    viewer than that by more than ``before_mm`` is not shown. ``light``: towards it; ``up``: where
-    the rest of the light comes from. ``parallel``: without perspective.
+    The picture's width spans ``width_mm`` of the plane at ``distance_mm``; surfaces more than
+    ``before_mm`` in front of that plane are not shown. ``light``: direction towards it; ``up``:
+    direction of the ambient light. ``parallel``: without perspective.
     """
 
     place_mm: Float[np.ndarray, " 3"]
@@ -173,10 +173,10 @@ class ParallelView:
     def depth_of(
         self, mesh: Mesh, frame: Frame, pixel_mm: float = 0.25
     ) -> Float[np.ndarray, "h w"]:
-        """Of what is seen, mm away from the viewer as ``project`` has it; infinite: nothing."""
+        """Depth of each pixel, mm away from the viewer as in ``project``; infinite: nothing."""
         viewpoint, size = self.viewpoint(frame, pixel_mm), frame.size(pixel_mm)
-        seen = viewpoint.project(mesh.vertices_mm, size).astype(np.float32)[mesh.faces]
-        near, _ = nearest(seen, *size, np.inf, False)
+        corners = viewpoint.project(mesh.vertices_mm, size).astype(np.float32)[mesh.faces]
+        near, _ = nearest(corners, *size, np.inf, False)
         return -near.astype(float) - _FAR_MM
 
     def silhouette(
@@ -189,16 +189,16 @@ class ParallelView:
 def render(
     bodies: list[Body], viewpoint: Viewpoint, size: tuple[int, int], backdrop: RGB = WHITE
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """The bodies as they are seen; ``size`` is width and height in pixels.
+    """A picture of the bodies; ``size``: width and height in pixels.
 
-    Opaque bodies hide each other by depth; translucent ones tint what lies behind them.
+    Opaque bodies hide each other by depth; translucent ones tint what is behind them.
     """
-    width, height = (_SHARPER * n for n in size)
+    width, height = (_OVERSAMPLING * n for n in size)
     solid = _join([body for body in bodies if body.opacity >= 1])
     picture = np.empty((height, width, 3), np.float32)
     picture[:] = np.array(backdrop)
     near = np.full((height, width), -np.inf, np.float32)
-    near = _lay(picture, near, solid, viewpoint, 1.0)
+    near = _paint(picture, near, solid, viewpoint, 1.0)
 
     def far_first(body: Body) -> float:
         middle = body.mesh.box_mm.mean(0)[None]
@@ -207,9 +207,9 @@ def render(
         return -float(np.linalg.norm(middle[0] - viewpoint.place_mm))
 
     for body in sorted((body for body in bodies if body.opacity < 1), key=far_first):
-        _lay(picture, near, _join([body]), viewpoint, body.opacity)
+        _paint(picture, near, _join([body]), viewpoint, body.opacity)
     sharp = Image.fromarray(np.rint(255 * picture).astype(np.uint8))
-    return np.asarray(sharp.reduce(_SHARPER))
+    return np.asarray(sharp.reduce(_OVERSAMPLING))
 
 
 def _join(bodies: list[Body]) -> Triangles:
@@ -230,11 +230,11 @@ def _join(bodies: list[Body]) -> Triangles:
     )
 
 
-_NORMALS: WeakKeyDictionary[Mesh, np.ndarray] = WeakKeyDictionary()  # a link's never change
+_NORMALS: WeakKeyDictionary[Mesh, np.ndarray] = WeakKeyDictionary()
 
 
 def corner_normals(mesh: Mesh) -> Float32[np.ndarray, "f 3 3"]:
-    """Unit normal at each face's corners: the mean of the faces about the same place, but for those
+    """Unit normal at each face's corners: the mean over the faces that meet there, except those
     beyond a crease."""
     if (known := _NORMALS.get(mesh)) is not None:
         return known
@@ -250,11 +250,11 @@ def corner_normals(mesh: Mesh) -> Float32[np.ndarray, "f 3 3"]:
     return normals
 
 
-def _lay(
+def _paint(
     picture: Float32[np.ndarray, "h w 3"], below: Float32[np.ndarray, "h w"],
     triangles: Triangles, viewpoint: Viewpoint, opacity: float,
 ) -> Float32[np.ndarray, "h w"]:  # fmt: skip
-    """Paint them where nothing in ``below`` is nearer; returns their nearness (-inf: nothing)."""
+    """Paint triangles where nothing in ``below`` is nearer; returns their nearness (-inf: none)."""
     size = picture.shape[1], picture.shape[0]
     seen = viewpoint.project(triangles.corners.astype(float), size).astype(np.float32)
     perspective = not viewpoint.parallel

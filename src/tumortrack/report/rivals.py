@@ -1,10 +1,9 @@
-"""What rigid registration would have answered in a scene, beside what was estimated.
+"""Rigid registration of a scene, as a baseline for the estimate.
 
-``best_rigid_pose``: an oracle. It knows the truth and may not deform the organ: no rigid method can
-do better in its norm, the squared displacement.
-``rigid_fit``: the organ of the CT, undeformed, fitted to the same points as the estimate by robust
-point-to-plane least squares, from the best rigid pose: the best that a user of rigid registration
-could hope for.
+``best_rigid_pose``: an oracle, which knows the truth but does not deform the organ: no rigid method
+has a smaller mean squared displacement.
+``rigid_fit``: the undeformed organ of the CT, fitted to the same points as the estimate by robust
+point-to-plane least squares from the best rigid pose: the best case of rigid registration.
 """
 
 from __future__ import annotations
@@ -30,24 +29,24 @@ from tumortrack.report.summary import RIVALS, judged_parts
 from tumortrack.sense.cloud import thin_cloud
 from tumortrack.simulate.scene_folder import Scene, Targets
 
-_POINTS = 1000  # of the cloud: as many as the estimate uses
-_WIDTH_MM = 5.0  # of the robust kernel: as wide as that of the elastic fit begins
-_STEPS, _ENOUGH = 60, 1e-3  # mm and rad: a step that moves less is the last
+_POINTS = 1000  # of the cloud, as many as the estimate uses
+_WIDTH_MM = 5.0  # of the robust kernel, the initial one of the elastic fit
+_STEPS, _TOLERANCE = 60, 1e-3  # mm and rad of a step
 _FEWEST_TARGETS = 10
-_SOURCE_POINTS = 4000  # of the surfaces that are fitted to the true ones
+_SOURCE_POINTS = 4000  # of the surfaces at rest
 _TURNS = tuple(np.diag([a, b, a * b]) for a, b in product((1.0, -1.0), repeat=2))
 
 
 @dataclass(frozen=True, eq=False)
 class Rivals:
-    """Rigid answers to scenes of one organ, whose shape at rest a model knows."""
+    """Rigid registrations of scenes of one organ, whose shape at rest a model knows."""
 
     rest: RestShape
 
     def __call__(self, scene: Scene) -> dict[str, Any]:
         """By rival (JSON): ``parts`` (tumors; without one, the organ) with surface and centre
-        distances, ``tre_mm`` where the scene has targets, both as ``report.protocol`` states them
-        of an estimate, and ``camera_from_ct``; or ``not_available``, the reason in words."""
+        distances, ``tre_mm`` if the scene has targets, both as in ``report.protocol``, and
+        ``camera_from_ct``; or ``not_available``, the reason in words."""
         try:
             pose, by = best_rigid_pose(self.rest.anatomy_ct, scene)
         except InputError as error:
@@ -73,15 +72,15 @@ class Rivals:
 
 
 def rivals_of(model: Model | None) -> Rivals | None:
-    """None for a model that does not keep the organ at rest, and without one."""
+    """None without a model, and for one that does not keep the organ at rest."""
     return Rivals(model.shape) if isinstance(model, RegistrationModel) else None
 
 
 def best_rigid_pose(rest: Anatomy, scene: Scene) -> tuple[Affine, str]:
-    """``camera_from_ct`` with which the undeformed organ lies on the true one best, and what that
-    rests on: the true surface's own triangles, where they are the case's; else the targets, whose
-    place in the CT the scene states; else the nearest points of organ and tumors. Raises
-    InputError: the scene has other parts than the case."""
+    """The ``camera_from_ct`` that best moves the undeformed organ onto the true one, and how it was
+    found: by the surface's triangles, if they are the case's; else by the targets, whose place in
+    the CT the scene states; else by nearest points of organ and tumors. Raises InputError: the
+    scene has other parts than the case."""
     true = scene.reference
     if true.names != rest.names:
         raise InputError(
@@ -101,42 +100,42 @@ def _on_targets(targets: Targets) -> Affine:
 
 
 def _on_surfaces(rest: tuple[Mesh, ...], true: tuple[Mesh, ...]) -> Affine:
-    """By iterated closest points, part on part, from all four ways in which principal axes agree;
-    the one that leaves the least mean squared distance."""
+    """By iterative closest points, part onto part, from the four alignments of the principal axes;
+    the result with the smallest mean squared distance."""
     from_mm, onto_mm = ([part.spread_mm() for part in parts] for parts in (rest, true))
     trees = [cKDTree(points) for points in onto_mm]
     step = max(1, sum(map(len, from_mm)) // _SOURCE_POINTS)
     thin = [points[::step] for points in from_mm]
 
     def descend(pose: Affine, source: list[np.ndarray]) -> tuple[float, Affine]:
-        left2, everything = np.inf, np.concatenate(source)
+        error2, everything = np.inf, np.concatenate(source)
         while True:
             placed = [transform_points(pose, points) for points in source]
             pairs = zip(trees, onto_mm, placed, strict=True)
             nearest = np.concatenate([onto[tree.query(at)[1]] for tree, onto, at in pairs])
-            before = left2
-            left2 = float(((nearest - np.concatenate(placed)) ** 2).sum(1).mean())
-            if left2 > before * (1 - 1e-3):
-                return left2, pose
+            before = error2
+            error2 = float(((nearest - np.concatenate(placed)) ** 2).sum(1).mean())
+            if error2 > before * (1 - 1e-3):
+                return error2, pose
             pose = kabsch(everything, nearest, np.ones(len(everything)))
 
     (centre, axes), (true_centre, true_axes) = _principal(from_mm[0]), _principal(onto_mm[0])
     turns = [true_axes.T @ turn @ axes for turn in _TURNS]
     few = [points[::8] for points in thin]
-    found = [descend(rigid(turn, true_centre - turn @ centre), few) for turn in turns]
-    return descend(min(found, key=lambda one: one[0])[1], thin)[1]
+    coarse = [descend(rigid(turn, true_centre - turn @ centre), few) for turn in turns]
+    return descend(min(coarse, key=lambda result: result[0])[1], thin)[1]
 
 
 def _principal(points_mm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Middle of the points, and their principal axes as rows of a rotation."""
+    """Centroid of the points, and their principal axes as rows of a rotation."""
     middle = points_mm.mean(0)
     axes = np.linalg.svd(points_mm - middle, full_matrices=False)[2]
     return middle, axes * [[1.0], [1.0], [np.linalg.det(axes)]]
 
 
 def rigid_fit(rest: RestShape, cloud: SensorCloud, camera_from_ct: Affine) -> Affine:
-    """The rigid motion near a start that lays the organ at rest on a cloud: Gauss-Newton on the
-    points' distances to its surface, under Geman and McClure's robust kernel."""
+    """Fit the organ at rest to a cloud, rigidly, from a start: Gauss-Newton on the points'
+    distances to its surface, with the Geman-McClure kernel."""
     points_mm = thin_cloud(cloud, _POINTS, np.random.default_rng(0)).points_mm
     body, rotation = rest.body, camera_from_ct[:3, :3]
     centre_mm = transform_points(camera_from_ct, body.center_ct[None])[0]
@@ -151,6 +150,6 @@ def rigid_fit(rest: RestShape, cloud: SensorCloud, camera_from_ct: Affine) -> Af
             rotation=motion.rotation @ Rotation.from_rotvec(change[3:]).as_matrix(),
             centre_mm=motion.centre_mm + motion.rotation @ change[:3],
         )
-        if np.abs(change).max() < _ENOUGH:
+        if np.abs(change).max() < _TOLERANCE:
             break
     return motion.camera_from_ct

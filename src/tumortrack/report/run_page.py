@@ -1,6 +1,6 @@
-"""What `locate` found, to look at: a picture and a page that loads nothing from anywhere.
+"""Picture and self-contained page of a run of `locate`.
 
-Without matplotlib, whose import would take as long as all of this.
+Without matplotlib, whose import would take as long as drawing both.
 """
 
 from __future__ import annotations
@@ -34,22 +34,22 @@ from tumortrack.sense.camera import deproject
 from tumortrack.tracking.margins import margin_words
 
 PICTURE = "picture.png"
-_WIDE, _ASPECT = 512, 1.25  # pixels of a view
-_SLICE = 480
-_ROW, _ACROSS, _EDGE = 375, 2200, 24  # pixels of the picture: a row's height, all across, borders
-_RLE = 3  # zlib's strategy: flat colours become as small as by a search, in less time
+_VIEW_WIDTH, _ASPECT = 512, 1.25  # pixels
+_SLICE = 480  # pixels
+_ROW_HEIGHT, _PICTURE_WIDTH, _BORDER = 375, 2200, 24  # pixels
+_RLE = 3  # zlib's strategy: compresses flat colours as well as the default, in less time
 _MOST_POINTS = 6000
 _MOST_TUMORS = 6  # with slices
-_NEAR_MM = 1.0  # points so near to a slice are shown in it
+_NEAR_MM = 1.0  # points this near to a slice are shown in it
 _BAR_MM = 20.0
 _TITLES = {"good": "GOOD", "poor": "POOR", "none": "NONE: no estimate"}
-Panel = tuple[str, Image.Image]  # a caption and what it says
+Panel = tuple[str, Image.Image]  # with its caption
 
 
 def write_run_page(
     folder: Path, report: dict[str, Any], estimate: Estimate | None, seen: Seen
 ) -> None:
-    """index.html and picture.png; without an estimate what the camera saw, and why there is none.
+    """Write index.html and picture.png; without an estimate, the camera's view and the reason.
 
     ``report``: as in report.json. Raises StorageError: the disk refused.
     """
@@ -80,15 +80,15 @@ def write_run_page(
 def _figures(panels: list[Panel]) -> str:
     figures = ""
     for caption, image in panels:
-        said, jpeg = html.escape(caption), _encoded(image, "JPEG", quality=92, subsampling=0)
+        text, jpeg = html.escape(caption), _encoded(image, "JPEG", quality=92, subsampling=0)
         source = f"data:image/jpeg;base64,{base64.b64encode(jpeg).decode()}"
-        figures += f'<figure><img alt="{said}" src="{source}">'
-        figures += f"<figcaption>{said}</figcaption></figure>"
+        figures += f'<figure><img alt="{text}" src="{source}">'
+        figures += f"<figcaption>{text}</figcaption></figure>"
     return f'<section class="panels">{figures}</section>' if panels else ""
 
 
 def _lines(report: dict[str, Any], estimate: Estimate | None) -> Iterator[str]:
-    """What is said below the verdict."""
+    """The lines below the verdict."""
     patient = _sentence(str(patient_in(report.get("patient"), "report")))
     yield f"{patient}. Camera frame: x right, y down, z away."
     margin = None if estimate is None else estimate.report.margin
@@ -103,10 +103,8 @@ def _sentence(words: str) -> str:
 
 
 def _table(rows: list[dict[str, str]]) -> str:
-    titles = {
-        **{"part": "", "centre": "centre (x, y, z)", "std": "1 standard deviation"},
-        **{"volume": "volume", "margin": "margin"},
-    }
+    titles = {"part": "", "centre": "centre (x, y, z)", "std": "1 standard deviation"}
+    titles |= {"volume": "volume", "margin": "margin"}
     shown = {key: title for key, title in titles.items() if any(row[key] for row in rows)}
     head = "".join(f"<th>{title}</th>" for title in shown.values())
     body = ""
@@ -122,7 +120,7 @@ def _table(rows: list[dict[str, str]]) -> str:
 
 
 def _views(estimate: Estimate | None, seen: Seen) -> Iterator[Panel]:
-    """The camera's picture, and three views."""
+    """The depth image, and three views."""
     if isinstance(seen.content, DepthFrame):
         taken = "; tinted: taken for the organ" if seen.taken is not None else ""
         size = f"{seen.content.intrinsics.width} x {seen.content.intrinsics.height} pixels"
@@ -152,7 +150,7 @@ def _slices(estimate: Estimate, seen: Seen) -> Iterator[Panel]:
 
 
 def _thinned(content: DepthFrame | SensorCloud | None) -> Float[np.ndarray, "n 3"]:
-    """Some of its points, but for the farthest."""
+    """Some of its points, without outliers."""
     if content is None:
         return np.zeros((0, 3))
     all_mm = content.points_mm if isinstance(content, SensorCloud) else deproject(content)
@@ -167,11 +165,11 @@ def _thinned(content: DepthFrame | SensorCloud | None) -> Float[np.ndarray, "n 3
 def _view(
     view: ParallelView, estimate: Estimate | None, points_mm: Float[np.ndarray, "n 3"]
 ) -> Image.Image:
-    """Surfaces, the organ's translucent, under the points."""
+    """Surfaces (the organ translucent), and points over them."""
     meshes = {} if estimate is None else estimate.meshes
     shown = [points_mm, *(mesh.vertices_mm for mesh in meshes.values())]
     frame = view.frame_around(np.concatenate(shown), 6.0).widened(_ASPECT)
-    pixel_mm = (frame.right - frame.left) / _WIDE
+    pixel_mm = frame.width_mm / _VIEW_WIDTH
     bodies = [
         Body(mesh, rgb(colours.name_colour(name)), 1.0 if is_tumor(name) else 0.36)
         for name, mesh in meshes.items()
@@ -197,7 +195,7 @@ def _view(
 
 
 def _slice(estimate: Estimate, seen: Seen, part: str, orientation: str) -> Image.Image:
-    """The CT as it lies now, else the labels, through a part's middle, with all outlines."""
+    """The CT moved to the organ, or else the labels, through a part's centre, with outlines."""
     plane = plane_through(estimate.meshes, part, orientation)
     assert plane is not None  # there is an organ, and this part
     half = _SLICE // 2
@@ -219,7 +217,7 @@ def _slice(estimate: Estimate, seen: Seen, part: str, orientation: str) -> Image
 
 
 def _labelled(estimate: Estimate, places_mm: Float[np.ndarray, "n 3"]) -> UInt8[np.ndarray, "n 3"]:
-    """Dim colours of the labels at places before the camera; dark where there are none."""
+    """Dim colours of the labels at places in the camera frame; dark outside."""
     picture = np.full((len(places_mm), 3), 20, np.uint8)
     if (volume := estimate.volume) is not None:
         at = np.rint(transform_points(np.linalg.inv(volume.camera_from_index), places_mm))
@@ -245,7 +243,7 @@ def _depth_picture(frame: DepthFrame, taken: UInt8[np.ndarray, "h w"] | None) ->
         organ = known & (taken[:height, :width] == 0)
         picture[organ] = 0.5 * picture[organ] + 0.5 * np.array(colours.part_colour(1))
     image = Image.fromarray(picture.astype(np.uint8))
-    return image.resize((_WIDE, round(_WIDE * image.height / image.width)))
+    return image.resize((_VIEW_WIDTH, round(_VIEW_WIDTH * image.height / image.width)))
 
 
 def _dots(picture: np.ndarray, places: Float[np.ndarray, "n 2"], colour: colours.Colour) -> None:
@@ -259,31 +257,31 @@ def _dots(picture: np.ndarray, places: Float[np.ndarray, "n 2"], colour: colours
 
 
 def _picture(verdict: Quality, lines: list[str], panels: list[Panel]) -> Image.Image:
-    """Verdict, what is said of it, and the panels in rows; no line is cut."""
-    room = _ACROSS - 2 * _EDGE
+    """Verdict, lines of text, and the panels in rows; no line is cut."""
+    room = _PICTURE_WIDTH - 2 * _BORDER
     head = _lines_of(lines[0], 36, room)
     below = [row for line in lines[1:] for row in _lines_of(line, 24, room)]
     images = [
-        (caption, image.resize((round(image.width * _ROW / image.height), _ROW)))
+        (caption, image.resize((round(image.width * _ROW_HEIGHT / image.height), _ROW_HEIGHT)))
         for caption, image in panels
     ]
-    places, x, y = [], _EDGE, 60 + 46 * len(head) + 32 * len(below)
+    places, x, y = [], _BORDER, 60 + 46 * len(head) + 32 * len(below)
     for _, image in images:
-        if x > _EDGE and x + image.width > _ACROSS - _EDGE:
-            x, y = _EDGE, y + _ROW + 64
+        if x > _BORDER and x + image.width > _PICTURE_WIDTH - _BORDER:
+            x, y = _BORDER, y + _ROW_HEIGHT + 64
         places.append((x, y))
         x += image.width + 16
-    picture = Image.new("RGB", (_ACROSS, y + (_ROW + 64 if images else 0)), "white")
+    picture = Image.new("RGB", (_PICTURE_WIDTH, y + (_ROW_HEIGHT + 64 if images else 0)), "white")
     draw = ImageDraw.Draw(picture)
-    draw.rectangle((0, 0, _ACROSS, 32 + 46 * len(head)), fill=colours.VERDICTS[verdict])
+    draw.rectangle((0, 0, _PICTURE_WIDTH, 32 + 46 * len(head)), fill=colours.VERDICTS[verdict])
     for n, row in enumerate(head):
-        draw.text((_EDGE, 14 + 46 * n), row, fill=_text_colour(verdict), font_size=36)
+        draw.text((_BORDER, 14 + 46 * n), row, fill=_text_colour(verdict), font_size=36)
     for n, row in enumerate(below):
-        draw.text((_EDGE, 44 + 46 * len(head) + 32 * n), row, fill="black", font_size=24)
+        draw.text((_BORDER, 44 + 46 * len(head) + 32 * n), row, fill="black", font_size=24)
     for (caption, image), (left, top) in zip(images, places, strict=True):
         picture.paste(image, (left, top))
         for n, row in enumerate(_lines_of(caption, 20, image.width)):
-            draw.text((left, top + _ROW + 4 + 26 * n), row, fill="black", font_size=20)
+            draw.text((left, top + _ROW_HEIGHT + 4 + 26 * n), row, fill="black", font_size=20)
     return picture
 
 

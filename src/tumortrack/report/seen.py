@@ -1,5 +1,5 @@
-"""What a run's page shows besides the estimate, and its parts in words. The page itself is
-``run_page``, which loads what only pictures need."""
+"""Inputs of a run's page, and an estimate's parts in words; light to import, unlike ``run_page``,
+which draws the page."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ class Seen:
     Attributes:
         cloud: the organ's points, in which it was located.
         content: all that the camera saw.
-        taken: of a depth image, as of ``sense.region.Region``: 0 where it was taken for the organ.
-        ct: for slices of the CT where it lies now; None: slices show labels.
+        taken: class of each pixel of a depth image (``sense.region.Region``); 0: the organ.
+        ct: for slices of the CT, moved to the organ; without it, slices show labels.
     """
 
     cloud: SensorCloud | None = None
@@ -37,8 +37,8 @@ class Seen:
 
 
 def part_rows(report: FitReport, good: bool) -> list[dict[str, str]]:
-    """Of each part: its name, centre, standard deviation, volume and margin, in words with units;
-    empty where that is not known, and the deviation where the answer is poor."""
+    """For each part its name, centre, standard deviation, volume and margin, with units; empty if
+    not known. A poor estimate has no deviations: they would be read as bounds of its error."""
     rows = []
     for name, part in report.parts.items():
         row = {"part": name, "centre": "not found", "std": "", "volume": "", "margin": ""}
@@ -46,7 +46,6 @@ def part_rows(report: FitReport, good: bool) -> list[dict[str, str]]:
             x, y, z = part.center_mm
             row |= {"centre": f"({x:.1f}, {y:.1f}, {z:.1f}) mm"}
             row |= {"volume": f"{part.volume_ml:.1f} ml"}
-            # Of a poor one it would be read as how wrong it may be, which nobody knows.
             if part.center_std_mm is not None and good:
                 row |= {"std": f"{part.center_std_mm:.1f} mm"}
             if radius := stated_radius(report.margin, name):
@@ -58,5 +57,5 @@ def part_rows(report: FitReport, good: bool) -> list[dict[str, str]]:
 def row_words(row: dict[str, str]) -> str:
     """A part's row as one line."""
     std = row["std"] and f"standard deviation {row['std']}"
-    said = (f"centre {row['centre']}", std, row["volume"], row["margin"])
-    return f"{row['part']}: {', '.join(filter(None, said)).replace('centre not', 'not')}"
+    words = (f"centre {row['centre']}", std, row["volume"], row["margin"])
+    return f"{row['part']}: {', '.join(filter(None, words)).replace('centre not', 'not')}"

@@ -1,4 +1,4 @@
-"""Entries of scenes, summarised: medians beside the worst, good answers apart from poor ones."""
+"""Summary of an evaluation's scenes: medians and worst cases, good and poor estimates apart."""
 
 from __future__ import annotations
 
@@ -30,12 +30,11 @@ Entry = dict[str, Any]
 
 
 def summarise(entries: list[Entry]) -> dict[str, Any]:
-    """All that is said of scenes together; docs/conventions.md lists it.
+    """The report's summary; docs/conventions.md lists its fields.
 
-    By part medians over scenes, and ``worst`` and ``p95`` over scenes; ``errors``: of ``all``
-    answers, and of the ``good`` and the ``poor`` ones, those of the estimate and of its rivals,
-    pooled over scenes, tumors and targets, each worst one with its scene and part. A part that was
-    not found is infinitely far: null.
+    For each part medians, ``worst`` and ``p95`` over scenes; ``errors``: of ``all``, ``good`` and
+    ``poor`` answers, the errors of the estimate and its rivals, pooled over scenes, tumors and
+    targets, the worst with its scene and part. A part that was not found is infinitely far: null.
     """
     summary: dict[str, Any] = {}
     for name in dict.fromkeys(part for entry in entries for part in entry["parts"]):
@@ -66,8 +65,8 @@ def summarise(entries: list[Entry]) -> dict[str, Any]:
 
 
 def worst_center(entry: Entry) -> tuple[float, str]:
-    """How far the centre of the tumor (without one: of the organ) that is farthest off lies from
-    its true place, mm, and which it is; infinite where it was not found."""
+    """The largest error of a tumor's centre (without tumors: of the organ's), mm, and its part;
+    infinite if it was not found."""
     parts = judged_parts(entry["parts"])
     return max((row.get("center_mm", np.inf), name) for name, row in parts.items())
 
@@ -95,7 +94,7 @@ def _of_part(rows: dict[str, Any]) -> dict[str, Any]:
 
 
 def _pooled(entries: list[Entry]) -> dict[str, Any]:
-    """Errors of answers by method, over those scenes that have an answer of it."""
+    """Errors by method, over the scenes with an answer of that method."""
     group: dict[str, Any] = {"scenes": len(entries)}
     for method in METHODS:
         answers = [(entry, _answer(entry, method)) for entry in entries]
@@ -113,7 +112,7 @@ def _pooled(entries: list[Entry]) -> dict[str, Any]:
         known = [(e["name"], a["tre_mm"], list(e["parts"])) for e, a in answers if a.get("tre_mm")]
         if known:
             values = [mm for _, errors, _ in known for mm in errors["each"]]
-            scene, errors, names = max(known, key=lambda one: one[1]["max"])
+            scene, errors, names = max(known, key=lambda row: row[1]["max"])
             label = errors["max_label"]
             part = names[label - 1] if label <= len(names) else f"label {label}"
             group[method]["target_mm"] = _spread(values, (errors["max"], scene, part))
@@ -121,20 +120,20 @@ def _pooled(entries: list[Entry]) -> dict[str, Any]:
 
 
 def _answer(entry: Entry, method: str) -> dict[str, Any]:
-    """The parts that are judged, and errors of targets."""
+    """A method's errors of the judged parts and of targets."""
     if method == "estimate":
         return {**entry, "parts": judged_parts(entry["parts"])}
     return dict(entry.get("rivals", {}).get(method, {}))
 
 
 def _spread(values: list[float], worst: tuple[float, str, str]) -> dict[str, Any]:
-    """Median, 95th percentile, and the worst (mm, scene, part) with where it is."""
+    """Median, 95th percentile and the worst. ``worst``: mm, scene, part."""
     about = {"count": len(values), "median": _median(values), "p95": _p95(values)}
     return {**about, "worst": _finite(worst[0]), "scene": worst[1], "part": worst[2]}
 
 
 def _median(values: list[float]) -> float | None:
-    """The median, None where it is infinite (more than half the scenes without the part)."""
+    """The median; None if infinite (at least half the scenes without the part)."""
     ordered = np.sort(np.array(values, float))
     low, high = ordered[(len(ordered) - 1) // 2], ordered[len(ordered) // 2]
     return float((low + high) / 2) if np.isfinite(high) else None
@@ -153,7 +152,7 @@ def _finite(value: float) -> float | None:
 
 
 def number(value: float | None, digits: int = 2) -> str:
-    """``not found``: a part that was not found is infinitely far."""
+    """None: the part was not found."""
     return "not found" if value is None else f"{value:.{digits}f}"
 
 
@@ -162,14 +161,13 @@ def words(part: str) -> str:
 
 
 def verdict_counts(summary: dict[str, Any]) -> str:
-    """How many answers are what."""
     n = summary["scenes"]
     scenes = f"{n} scene{'s' * (n != 1)}"
     return f"{scenes}: {summary['good']} good, {summary['poor']} poor, {summary['none']} none"
 
 
 def failures(summary: dict[str, Any]) -> str:
-    """How many scenes failed, and of what."""
+    """How many scenes failed, and why."""
     missed = summary["failed"] - summary["far"]
     return (
         f"{summary['failed']} failed: {missed} without an answer or a part, {summary['far']} with "
@@ -178,15 +176,14 @@ def failures(summary: dict[str, Any]) -> str:
 
 
 def spread_words(spread: dict[str, Any]) -> str:
-    """Of one error: median, 95 % and the worst, and where that is."""
     median, p95, worst = (number(spread[key], 1) for key in ("median", "p95", "worst"))
     where = f"{words(spread['part'])} of {spread['scene']}"
     return f"median {median} mm, 95 % within {p95} mm, worst {worst} mm ({where})"
 
 
 def headlines(summary: dict[str, Any]) -> list[str]:
-    """What a reader must know first: verdicts, then errors of good and of poor answers and of the
-    rivals, pooled over all scenes, tumors and targets."""
+    """Verdicts, then errors of good answers, of poor ones and of the rivals, pooled over all
+    scenes, tumors and targets."""
     lines = [f"{verdict_counts(summary)}. {failures(summary)}."]
     groups = summary["errors"]
     for verdict in ("good", "poor"):
@@ -199,7 +196,7 @@ def headlines(summary: dict[str, Any]) -> list[str]:
 
 
 def measures(group: dict[str, Any]) -> list[str]:
-    """Errors of centres and targets, a line each; of an empty group none."""
+    """A line each for errors of centres and of targets, if the group has them."""
     lines = []
     if "center_mm" in group:
         spread = group["center_mm"]
@@ -249,7 +246,7 @@ def triple(spread: dict[str, Any] | None) -> str:
 
 
 def error_rows(summary: dict[str, Any]) -> list[tuple[str, str, dict[str, Any]]]:
-    """Verdict, method and errors: what the table of errors has, in its order."""
+    """Rows of the table of errors: verdict, method, errors."""
     return [
         (verdict, method, group[method])
         for verdict, group in summary.get("errors", {}).items()
@@ -259,23 +256,22 @@ def error_rows(summary: dict[str, Any]) -> list[tuple[str, str, dict[str, Any]]]
 
 
 def part_rows(summary: dict[str, Any]) -> dict[str, dict[str, Any]]:
-    """What the summary says of parts, by name."""
+    """The summary's entries of parts, by name."""
     return {k: row for k, row in summary.items() if isinstance(row, dict) and "found" in row}
 
 
 def scene_lines(entries: list[Entry]) -> list[str]:
-    """The scenes without a good answer, and the good ones that failed, with the reason."""
+    """A line for each scene without a good answer, or with a good one that failed."""
     lines = []
     for entry in entries:
-        reasons = [r for r in (entry["reason"], entry["failed"]) if r]
         if entry["quality"] != "good" or entry["failed"]:
-            said = "; ".join(dict.fromkeys(reasons))
-            lines.append(f"{entry['name']}: {entry['quality']}: {said}")
+            reasons = dict.fromkeys(r for r in (entry["reason"], entry["failed"]) if r)
+            lines.append(f"{entry['name']}: {entry['quality']}: {'; '.join(reasons)}")
     return lines
 
 
 def scene_note(entry: dict[str, Any]) -> str:
-    """A scene's errors in a few words, with names and units."""
+    """A scene's errors in one line."""
     if entry["quality"] == "none":
         return "no estimate, so there is nothing to measure"
     far_mm, part = worst_center(entry)
@@ -290,7 +286,6 @@ def scene_note(entry: dict[str, Any]) -> str:
 
 
 def target_text(errors: dict[str, Any]) -> str:
-    """A scene's target errors in a few words."""
     return (
         f"target error {errors['mean']:.1f} mm (mean of {errors['count']}, "
         f"largest {errors['max']:.1f} mm)"

@@ -1,4 +1,4 @@
-"""Words in lines that fit."""
+"""Wrapping of text to a width."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 def wrapped(text: str, width: float, length_of: Callable[[str], float]) -> list[str]:
     """The text in lines no longer than ``width`` (in the unit of ``length_of``), broken between
-    words, and within a word that is longer. Nothing is left out."""
+    words, or within a word that is longer."""
     lines = []
     for paragraph in text.splitlines() or [""]:
         line = ""

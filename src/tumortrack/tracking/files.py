@@ -29,7 +29,8 @@ from tumortrack.tracking.margins import stated_radius
 from tumortrack.tracking.points import PointTable, camera_table
 from tumortrack.tracking.shells import exact_margin
 
-MARGIN = "_margin"  # ends the names of shells
+MARGIN = "_margin"  # suffix of the names of shells
+CENTRES, CT = "tumors", "ct"  # names of the tumor centres and of the organ's pose in 3D Slicer
 
 
 def write_estimate(
@@ -40,12 +41,14 @@ def write_estimate(
     add: Callable[[Path], None] = lambda folder: None,
     about: Mapping[str, Any] = MappingProxyType({}),
 ) -> None:
-    """occupancy.ply (points with label and probability and, where the estimate knows the way back,
-    their place in the CT), labels.nii.gz (voxel -> camera frame, mm), labels.seg.nrrd (the same for
-    3D Slicer), kidney.ply (or of the organ's name), tumor_1.ply, ..., structures and report.json;
-    tumor_1_margin.ply, ..., the shells of the highest confidence, where margins are stated;
-    points.csv, the given ``points`` of the CT and where they are now; and what ``add`` writes into
-    the folder that it is called with; all or nothing. ``about``: further entries of report.json.
+    """Write a run's folder, all or nothing:
+
+    - occupancy.ply: points with label, probability and, if known, their place in the CT
+    - labels.nii.gz (voxel -> camera frame, mm), labels.seg.nrrd (the same for 3D Slicer)
+    - kidney.ply (or the organ's name), tumor_1.ply, ..., and structures
+    - tumor_1_margin.ply, ...: shells of the highest confidence, if margins are stated
+    - points.csv: the given ``points`` of the CT and where they are now
+    - report.json, with the further entries ``about``; and what ``add`` writes into the folder
 
     Raises InputError: the folder exists and ``overwrite`` is False; points without a motion; an
     estimate without a volume;
@@ -56,37 +59,36 @@ def write_estimate(
             "this estimate is of a live frame and has no labelled volume to write; give one of "
             "`locate`, or keep live ones with the sink recording."
         )
-    with store.new_folder(folder, overwrite) as aside, ThreadPoolExecutor(1) as beside:
-        added = beside.submit(add, aside)  # takes about as long as the rest
+    with store.new_folder(folder, overwrite) as new, ThreadPoolExecutor(1) as thread:
+        added = thread.submit(add, new)  # takes about as long as the rest
         values = {"label": cloud.labels, "probability": cloud.probability}
         values |= _places_in_ct(estimate)
-        write_cloud_ply(aside / "occupancy.ply", cloud.points_mm, **values)
-        labels, way = volume.labels, volume.camera_from_index
-        write_nifti(aside / "labels.nii.gz", labels, way, lps=False)
+        write_cloud_ply(new / "occupancy.ply", cloud.points_mm, **values)
+        labels, affine = volume.labels, volume.camera_from_index
+        write_nifti(new / "labels.nii.gz", labels, affine, lps=False)
         parts = segments(estimate.report.parts, estimate.patient.side, estimate.organ)
-        write_seg_nrrd(aside / "labels.seg.nrrd", labels, way, parts)
+        write_seg_nrrd(new / "labels.seg.nrrd", labels, affine, parts)
         for name, mesh in estimate.meshes.items():
-            write_mesh(aside / f"{name}.ply", mesh)
+            write_mesh(new / f"{name}.ply", mesh)
             margin = stated_radius(estimate.report.margin, name)
             if margin is not None and is_tumor(name):
-                write_mesh(aside / f"{name}{MARGIN}.ply", exact_margin(mesh, margin.mm))
+                write_mesh(new / f"{name}{MARGIN}.ply", exact_margin(mesh, margin.mm))
         for name, mesh in estimate.structures.items():
-            write_mesh(aside / f"{name}.ply", mesh)
+            write_mesh(new / f"{name}.ply", mesh)
         if points is not None:
-            table = camera_table(points, estimate.motion)
-            store.write_atomically(aside / "points.csv", table)
+            store.write_atomically(new / "points.csv", camera_table(points, estimate.motion))
         added.result()
-        _seal(aside, {**report_entry(estimate), **about}, estimate.quality)
+        _seal(new, {**report_entry(estimate), **about}, estimate.quality)
 
 
 def report_head(stamp_ns: int) -> dict[str, Any]:
-    """What every report begins with."""
+    """The first entries of every report."""
     about = {"tumortrack": tumortrack.__version__, "units": "mm", "frame": "camera"}
     return {**about, "stamp_ns": stamp_ns}
 
 
 def report_entry(estimate: Estimate) -> dict[str, Any]:
-    """report.json: what the estimate says of itself, as JSON types."""
+    """The entries of report.json about an estimate, as JSON types."""
     finding = estimate.finding
     quality = {
         "verdict": estimate.quality,
@@ -97,10 +99,10 @@ def report_entry(estimate: Estimate) -> dict[str, Any]:
     }
     return {
         **report_head(estimate.cloud.stamp_ns),
-        **{"seed": estimate.report.seed, "points": estimate.report.points},  # also where they are 0
+        **{"seed": estimate.report.seed, "points": estimate.report.points},  # even if they are 0
         **msgspec.to_builtins(estimate.report),
         "quality": quality,
-        "causes": [one.entry() for one in estimate.causes],
+        "causes": [cause.entry() for cause in estimate.causes],
         "organ": organ_entry(estimate.organ),
         "patient": to_builtins(estimate.patient),
     }
@@ -114,11 +116,11 @@ def finding_entry(finding: Finding | None) -> dict[str, Any] | None:
 def write_no_estimate(
     folder: Path, report: dict[str, Any], overwrite: bool, add: Callable[[Path], None]
 ) -> None:
-    """The folder of a cloud in which nothing was located: report.json, whose ``quality`` says why,
-    and what ``add`` writes into it. Raises as ``write_estimate``."""
-    with store.new_folder(folder, overwrite) as aside:
-        add(aside)
-        _seal(aside, report, "none")
+    """Write the folder of a run without an estimate: report.json, whose ``quality`` says why, and
+    what ``add`` writes into it. Raises as ``write_estimate``."""
+    with store.new_folder(folder, overwrite) as new:
+        add(new)
+        _seal(new, report, "none")
 
 
 def _seal(folder: Path, report: dict[str, Any], verdict: Quality) -> None:
@@ -127,14 +129,14 @@ def _seal(folder: Path, report: dict[str, Any], verdict: Quality) -> None:
 
 
 def has_no_estimate(folder: Path) -> bool:
-    """Whether a run's folder says only that nothing was located; the next run may replace it."""
+    """Whether the folder is of a run without an estimate, which the next run may replace."""
     path = folder / store.MANIFEST
     return path.is_file() and store.read_json(path).get("verdict") == "none"
 
 
 def read_report(folder: Path) -> dict[str, Any]:
-    """report.json of a run's folder. Raises ArtifactError: no such folder, or damaged; or nothing
-    was located in it."""
+    """report.json of a run's folder. Raises ArtifactError: no such folder, damaged, or without an
+    estimate."""
     store.read_manifest(folder, "run")
     report = store.read_json(folder / "report.json")
     if has_no_estimate(folder):
@@ -144,8 +146,8 @@ def read_report(folder: Path) -> dict[str, Any]:
 
 
 def read_estimate(folder: Path) -> Estimate:
-    """What ``write_estimate`` wrote, all but its motion, which is the model's to know. Raises
-    ArtifactError: no such folder, damaged, or nothing was located in it."""
+    """Read what ``write_estimate`` wrote; the motion, which needs the model, is not in it. Raises
+    ArtifactError: no such folder, damaged, or without an estimate."""
     stored, path = read_report(folder), folder / "occupancy.ply"
     try:
         report = msgspec.convert(stored, FitReport)
@@ -153,7 +155,7 @@ def read_estimate(folder: Path) -> Estimate:
         if (finding is None) != (stored["quality"]["verdict"] == "good"):
             raise ArtifactError("its verdict and its finding contradict each other")
         if finding is not None:
-            _ = finding.words  # its numbers are there
+            _ = finding.words  # raises if a value is missing
         names = [name for name, part in report.parts.items() if part.found]
         table = parse_ply_properties(
             path.read_bytes(), str(path), ("x", "y", "z", "label", "probability")
@@ -176,8 +178,8 @@ def read_estimate(folder: Path) -> Estimate:
 
 
 def _places_in_ct(estimate: Estimate) -> dict[str, np.ndarray]:
-    """ct_x, ct_y, ct_z (LPS, mm) of the cloud's points and how unsure their places are, std_mm
-    and largest_std_mm; empty where that is not known."""
+    """Columns ct_x, ct_y, ct_z (LPS, mm) of the cloud's points, and the standard deviations std_mm
+    and largest_std_mm of their places; those that are known."""
     if estimate.motion is None:
         return {}
     points_ct = estimate.motion.back(estimate.cloud.points_mm.astype(np.float64))

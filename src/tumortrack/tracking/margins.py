@@ -1,4 +1,5 @@
-"""The margins that a model states: radii found by calibration, and all that they rest on."""
+"""The margins that a model states: calibrated radii, the limits within which they hold, and what
+they were calibrated on."""
 
 from __future__ import annotations
 
@@ -18,7 +19,7 @@ from tumortrack.core.organ import is_tumor
 from tumortrack.core.report import Finding, FitReport, MarginReport, StatedMargin
 
 # Raise it with every change that gives another estimate, or other figures (``measured``), for the
-# same cloud: margins that were found before are then refused.
+# same cloud: margins calibrated before are then refused.
 METHOD = 4
 NAME = "margins.json"
 Kind = Literal["tumor", "organ", "map"]
@@ -27,11 +28,11 @@ UNKNOWN = "the model was not calibrated (tumortrack margins)"
 
 
 class Radius(Config, frozen=True):
-    """A radius: ``scaled`` times a part's size, or ``constant_mm`` for any size; ``used`` says
-    which, the one with the smaller mean over the states it was chosen on. The size is ``offset_mm``
-    + s + ``bend_mm`` times the square root of the elastic state's rarity: s (mm) is the largest
-    estimated standard deviation over the surface; the farther an organ is bent, the less a library
-    of states tells about it. ``scaled`` is None if the method knows no s."""
+    """A radius: ``scaled`` times a part's size, or ``constant_mm`` for any size; ``used`` is the
+    one with the smaller mean over the states it was chosen on. The size is ``offset_mm`` + s +
+    ``bend_mm`` times the square root of the elastic state's rarity, where s (mm) is the largest
+    estimated standard deviation over the surface: the more an organ is bent, the less a library of
+    states says about it. ``scaled`` is None if the method knows no s."""
 
     used: Literal["scaled", "constant"]
     constant_mm: float
@@ -49,8 +50,8 @@ class Radius(Config, frozen=True):
 
     def size_mm(self, std_mm: float, figures: dict[str, float]) -> float:
         """``figures``: of the estimate (``measured``); without rarity the size is unbounded."""
-        bent = math.sqrt(figures.get("rarity", math.inf)) if self.bend_mm else 0.0
-        return self.offset_mm + std_mm + self.bend_mm * bent
+        bending = math.sqrt(figures.get("rarity", math.inf)) if self.bend_mm else 0.0
+        return self.offset_mm + std_mm + self.bend_mm * bending
 
     def at(self, std_mm: float | None, figures: dict[str, float]) -> float | None:
         """mm; None if it depends on a standard deviation that is not known."""
@@ -61,8 +62,7 @@ class Radius(Config, frozen=True):
 
 
 class Shells(Config, frozen=True):
-    """The radii that hold with one ``confidence``: of each tumor, of the organ's surface, and of
-    any point that is mapped."""
+    """The radii at one ``confidence``: of tumors, of the organ's surface and of mapped points."""
 
     confidence: float
     radii: dict[Kind, Radius]
@@ -72,8 +72,9 @@ class Shells(Config, frozen=True):
 
 
 class Group(Config, frozen=True):
-    """States of one family, visible share and organ: all, with a good estimate, accepted; and how
-    many of the accepted ones were left for the test and for the radii."""
+    """Numbers of states of one family, visible share and organ: all, with a good estimate, accepted
+    by the limits, and of the accepted ones those that tested the limits and calibrated the radii.
+    """
 
     label: tuple[str, str, str]
     states: int
@@ -84,18 +85,18 @@ class Group(Config, frozen=True):
 
 
 class ModelMargins(Config, frozen=True):
-    """What a model's margins are, and what they rest on.
+    """A model's margins, and what they were calibrated on.
 
     Attributes:
-        model_sha256: of the manifest of the model that they are of.
+        model_sha256: of the model's manifest.
         table_sha256: of the calibration's results, scene by scene.
-        limits: an estimate has a margin only where none of these is exceeded (``measured``); of
-            those that pass, no more than may miss by more than ``widest_mm``, with 95 % confidence.
+        limits: of ``measured`` figures; an estimate has a margin only if it exceeds none. They are
+            chosen so that few accepted estimates err by more than ``widest_mm`` (``risk_bound``).
         shells: by rising confidence.
-        groups: what was calibrated on, as it was given; ``joined``: of those, the ones that were
-            too small to stand alone, and the larger one that spoke for each.
-        risk_bound: upper bound of the share of accepted answers outside the widest margin of a
-            tumor, in the worst group of the tested states, with 95 % confidence.
+        groups: what was calibrated on, as given; ``joined``: small group -> the larger group whose
+            results count for it.
+        risk_bound: upper bound, with 95 % confidence, of the share of accepted answers outside the
+            widest margin of a tumor, in the worst group of the tested states.
         accepted, missed: shares of all tested states: accepted; accepted and outside the margin.
     """
 
@@ -119,14 +120,14 @@ class ModelMargins(Config, frozen=True):
 
 
 def write_sealed(path: Path, margins: ModelMargins) -> None:
-    """A file that ``read_sealed`` reads; atomically. Raises StorageError."""
+    """Write a file for ``read_sealed``, atomically. Raises StorageError."""
     content = to_builtins(margins)
     store.write_json(path, {"sha256": _digest(content), "margins": content})
 
 
 def read_margins(folder: Path) -> ModelMargins | None:
-    """A model's margins; None where it has none. ArtifactError: they were changed, or are another
-    model's or of another version of the method."""
+    """A model's margins, if it has any. Raises ArtifactError: they were changed, or belong to
+    another model or another version of the method."""
     path = folder / NAME
     if not path.exists():
         return None
@@ -137,7 +138,7 @@ def read_margins(folder: Path) -> ModelMargins | None:
 
 
 def read_sealed(path: Path) -> ModelMargins:
-    """``read_margins`` of a file, without asking which model it belongs to."""
+    """``read_margins`` of a file, without checking which model it belongs to."""
     stored = store.read_json(path)
     content = stored.get("margins")
     if not isinstance(content, dict) or stored.get("sha256") != _digest(content):
@@ -161,7 +162,7 @@ def _digest(content: dict[str, Any]) -> str:
 
 
 def measured(report: FitReport) -> dict[str, float]:
-    """Figures of an estimate that limits are set on; of each, larger is worse."""
+    """The figures of an estimate that have limits; larger is worse."""
     deviations = [part.surface_std_mm for part in report.tumors.values()]
     known, cost = [std_mm for std_mm in deviations if std_mm is not None], report.fit_cost
     values = {
@@ -175,20 +176,19 @@ def measured(report: FitReport) -> dict[str, float]:
 
 
 def figures(report: FitReport, margins: ModelMargins) -> dict[str, float]:
-    """``measured``, and the largest size of a tumor."""
-    form = margins.shells[-1].radii["tumor"]
+    """``measured``, and the largest size of a tumor (``Radius``)."""
     deviations = [part.surface_std_mm for part in report.tumors.values()]
-    return sized(measured(report), deviations, form)
+    return sized(measured(report), deviations, margins.shells[-1].radii["tumor"])
 
 
 def sized(
-    figures: dict[str, float], deviations: Sequence[float | None], form: Radius
+    figures: dict[str, float], deviations: Sequence[float | None], radius: Radius
 ) -> dict[str, float]:
-    """The figures with ``size_mm``, the largest of a tumor; unchanged if the form has no size."""
+    """The figures with ``size_mm``, the largest of a tumor; unchanged if the radius has no size."""
     known = [std_mm for std_mm in deviations if std_mm is not None]
-    if form.scaled is None or len(known) < len(deviations):
+    if radius.scaled is None or len(known) < len(deviations):
         return figures
-    return {**figures, "size_mm": max(form.size_mm(std_mm, figures) for std_mm in known)}
+    return {**figures, "size_mm": max(radius.size_mm(std_mm, figures) for std_mm in known)}
 
 
 def exceeded(limits: dict[str, float], figures: dict[str, float]) -> Finding | None:
@@ -200,8 +200,8 @@ def exceeded(limits: dict[str, float], figures: dict[str, float]) -> Finding | N
 
 
 def stated_margin(report: FitReport, margins: ModelMargins | None, good: bool) -> MarginReport:
-    """The margins stated with an estimate, or why none are. ``good``: no check failed, and none of
-    the ``limits`` is exceeded."""
+    """The margins stated with an estimate, or why there are none. ``good``: no check failed, and
+    no limit is exceeded."""
     if report.looks is not None:
         return MarginReport(reason="margins are of single views, not of several")
     if margins is None:
@@ -240,7 +240,7 @@ class StatedRadius(msgspec.Struct, frozen=True):
 def stated_radius(
     margin: MarginReport | None, name: str, confidence: float | None = None
 ) -> StatedRadius | None:
-    """Of a part or ``map``, with this or else the highest confidence; None if none is stated."""
+    """The radius of a part or of ``map``, with this or else the highest confidence, if stated."""
     for stated in reversed(() if margin is None else margin.stated):
         if confidence in (None, stated.confidence) and name in stated.mm:
             return StatedRadius(stated.confidence, stated.mm[name])
@@ -248,7 +248,7 @@ def stated_radius(
 
 
 def margin_words(margin: MarginReport | None) -> str:
-    """The tumors' margins in words, or why there are none."""
+    """The tumors' margins, or why there are none."""
     if margin is None or not margin.stated:
         return f"no margin: {UNKNOWN if margin is None else margin.reason}"
     highest = margin.stated[-1]
@@ -257,15 +257,25 @@ def margin_words(margin: MarginReport | None) -> str:
     return f"{100 * highest.confidence:g} % margin: {sizes}"
 
 
+def centre_label(report: FitReport, name: str, poor: bool) -> str:
+    """A tumor's name, with its standard deviation and margin as far as they are known."""
+    radius, std_mm = stated_radius(report.margin, name), report.parts[name].center_std_mm
+    words = [
+        f"{name} POOR" if poor else name,
+        *([] if std_mm is None else [f"std {std_mm:.1f} mm"]),
+    ]
+    return ", ".join([*words, radius.words if radius else "no margin stated"])
+
+
 def keep_margins(folder: Path, margins: ModelMargins) -> Path:
-    """Write them as the margins of the model in this folder. Raises StorageError."""
+    """Store them as the margins of the model in this folder. Raises StorageError."""
     digest = store.sha256_of(folder / store.MANIFEST)
     write_sealed(folder / NAME, msgspec.structs.replace(margins, model_sha256=digest))
     return folder / NAME
 
 
 def described(margins: ModelMargins) -> list[str]:
-    """Lines for the screen: radii, what they rest on, and the limits."""
+    """Lines for the screen: radii, what they were calibrated on, and the limits."""
     lines = []
     for shells in margins.shells:
         for kind, radius in shells.radii.items():

@@ -1,5 +1,5 @@
-"""Options that commands and the functions of the public API share; the command line shows these
-texts. Nothing heavy is imported here."""
+"""Options that commands and the public API share; the command line shows their docstrings as help.
+Imports nothing heavy."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ class PatientOptions:
     """Options of commands that work on one patient.
 
     Attributes:
-        patient: the patient you mean; what belongs to another or an unknown one is refused.
-        side: the side you mean, the patient's own; the other or an unknown one is refused.
+        patient: the expected patient; data of another or an unknown one are refused.
+        side: the expected side of the patient; the other or an unknown one is refused.
     """
 
     patient: str | None = None
@@ -35,8 +35,8 @@ class PatientOptions:
 
     @property
     def stated(self) -> Patient:
-        """Raises InputError for an identifier that is none: of an empty variable in a script, say,
-        which must not pass for nothing stated."""
+        """Raises InputError for ``unknown`` as an identifier, and for an invalid one: an empty
+        variable in a script, for example, must not count as no patient stated."""
         if self.patient == UNKNOWN:
             raise InputError(f"--patient {UNKNOWN} is nobody. Leave it out, or say who it is.")
         return Patient(UNKNOWN if self.patient is None else self.patient, self.side or UNKNOWN)
@@ -47,9 +47,9 @@ class RegionOptions(PatientOptions):
     """Options of commands that look for an organ in depth images.
 
     Attributes:
-        range: keep depths between NEAR and FAR mm (default: those that the model has learned).
-        box: keep what lies in a box: two opposite corners X Y Z X Y Z, camera frame, mm.
-        whole: what is in range and box is the organ alone; do not look for it among other things.
+        range: keep depths between NEAR and FAR mm (default: the range the model was trained on).
+        box: keep what is in a box: two opposite corners X Y Z X Y Z, camera frame, mm.
+        whole: take everything in range and box for the organ, without searching for it.
     """
 
     range: tuple[float, float] | None = None
@@ -57,7 +57,7 @@ class RegionOptions(PatientOptions):
     whole: bool = False
 
     def region(self, model: Model) -> RegionConfig:
-        """Raises InputError: a range or box that is none."""
+        """Raises InputError: an invalid range or box."""
         from tumortrack.tracking.tracker import region_for
 
         box = None if self.box is None else (self.box[:3], self.box[3:])
@@ -70,20 +70,20 @@ class LocateOptions(RegionOptions):
 
     Attributes:
         poses: JSON with fixed_from_camera (4 x 4 rows for each view, in their order), unit (mm or
-            m) and frame_id: where the camera was, in a robot's base, say.
+            m) and frame_id: where the camera was, for example in a robot's base frame.
         at: COLUMN ROW of a pixel of the depth image that shows the organ, from 0 at the upper left.
-        mask: image of the depth image's size, 0 where the organ is not.
+        mask: image of the depth image's size, 0 outside the organ.
         grid: voxels along the longest side of the labelled volume, up to 400.
         seed: of the random points and queries.
-        unit: of a cloud's numbers.
-        depth_unit: of a depth image: mm a step. Default: what the intrinsics file says
-            (depth_unit_mm), else 0.1 (a D405's), of floats 1000 (metres). Many cameras have 1.
-        intrinsics: JSON with width, height, fx, fy, cx, cy in pixels: once for all views, or again
-            and again, once for each in their order.
-        map: points of the CT whose present places to write (OUT/points.csv): a .csv with columns
+        unit: of a cloud's coordinates.
+        depth_unit: mm per step of a depth image. Default: depth_unit_mm of the intrinsics file,
+            else 0.1 (a D405's), of floats 1000 (metres). Many cameras have 1.
+        intrinsics: JSON with width, height, fx, fy, cx, cy in pixels: once for all views, or once
+            for each, in their order.
+        map: points of the CT to map to the camera frame (OUT/points.csv): a .csv with columns
             x,y,z (LPS, mm), or 3D Slicer's .mrk.json or .fcsv. Needs a model of preset clinic.
-        case: the model's case, whose CT the page's slices then show where it lies now (preset
-            clinic); a second or two longer.
+        case: the model's case; the page's slices then show its CT moved to the organ (preset
+            clinic). Takes a second or two longer.
         device: auto takes CUDA if there is a GPU.
     """
 
@@ -119,23 +119,23 @@ class TrackOptions(CameraOptions):
     """Options of `track`.
 
     Attributes:
-        frame: JSON file that says where the camera is; results are then in the robot's frame.
-        views: further cameras that stand still; what all see at about one moment is laid together.
-        poses: JSON that says where all cameras stand, as for `locate`, SOURCE's first; results are
-            in its frame, unless --frame gives another.
-        moving: SOURCE's camera moves; where it is in each frame comes from file:POSES.csv, tf
-            (ros2:FIXED_FRAME) or a robot (ur:HOST). Where that gives poses of a
-            tool, --frame has tool_from_camera.
-        scan: with --moving: begin with three looks at the organ at rest, from 30 degrees apart,
-            within 5 s; what they show together is what the following starts from.
+        frame: JSON file with the camera's pose; results are then in the robot's frame.
+        views: further cameras that do not move; frames taken at about the same time are combined.
+        poses: JSON with the poses of all cameras, as for `locate`, SOURCE's first; results are in
+            its frame, unless --frame gives another.
+        moving: SOURCE's camera moves; its pose in each frame comes from file:POSES.csv, tf
+            (ros2:FIXED_FRAME) or a robot (ur:HOST). If those are poses of a tool, --frame has
+            tool_from_camera.
+        scan: with --moving: begin with three looks at the organ at rest, 30 degrees apart, within
+            5 s; tracking starts from all three together.
         smoothing: time constant in s of a mean over past estimates; the lag is in the report.
-        rescan: every so many s, search for the organ as in a first frame.
-        stale: frames older than so many s are refused; a pause is reported after four fifths of it.
-        frozen: an image that repeats bit for bit for so many s is refused; 0: it may repeat, as
-            of a simulated camera without noise.
+        rescan: search for the organ as in a first frame after so many s.
+        stale: refuse frames older than so many s; a pause is reported after four fifths of it.
+        frozen: refuse an image that repeats bit for bit for so many s; 0: it may repeat, as from a
+            simulated camera without noise.
         give_up: end after so many s without a frame.
-        seconds: end so many s after the first frame, and without one after as many (but 5 at
-            least: cameras take time to open); 0: never.
+        seconds: end so many s after the first frame, or after as long without one (at least 5 s:
+            cameras take time to open); 0: never.
         report: file for latencies, counts and reasons (default: runs/track-TIME.json).
         seed: of the random points.
     """
@@ -251,18 +251,18 @@ def check_grid(grid: int) -> None:
 def model_folder(
     given: Path, making: Callable[[], AbstractContextManager[Any]] = nullcontext
 ) -> Path:
-    """The folder of a given model; of a case the one that it holds, made now where there is none,
-    within ``making()``, which yields what ``case_model`` takes as progress. Raises as ``load_case``
-    and ``case_model`` do."""
+    """A given model's folder, or that of the model in a given case. A missing one is made, within
+    ``making()``, which yields the ``progress`` of ``case_model``. Raises as ``load_case`` and
+    ``case_model`` do."""
     from tumortrack.imaging.case import Case, holds_case, load_case
     from tumortrack.models.folder import is_model_of
 
     if not holds_case(given):
         return given
-    kept = given / Case.MODEL
-    if not is_model_of(kept, given):
+    folder = given / Case.MODEL
+    if not is_model_of(folder, given):
         with making() as progress:
             from tumortrack.tracking.model_files import case_model
 
             case_model(load_case(given), progress=progress)
-    return kept
+    return folder

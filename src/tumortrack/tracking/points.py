@@ -1,11 +1,12 @@
-"""Points of the CT that a user asks about (vessels, margins, planned cuts): read, check, answer.
+"""Points of the CT that a user asks about (vessels, margins, planned cuts): reading them, checking
+them, and writing where they are now.
 
-points.csv: a header, columns separated by commas, coordinates in mm in one of four namings:
-ct_x, ct_y, ct_z or x, y, z or l, p, s (all LPS), or r, a, s (RAS, turned to LPS here). Further
-columns (label, name, ...) are kept as they are.
+points.csv: a header, comma-separated columns, coordinates in mm in one of four namings: ct_x, ct_y,
+ct_z or x, y, z or l, p, s (all LPS), or r, a, s (RAS, converted to LPS here). Further columns
+(label, name, ...) are kept.
 
-Markups of 3D Slicer (.mrk.json, .fcsv): it shows RAS and writes LPS; either may stand in a file,
-which says so. Format:
+Markups of 3D Slicer (.mrk.json, .fcsv): the program shows RAS and writes LPS; a file says which of
+them it holds. Format:
 https://slicer.readthedocs.io/en/latest/developer_guide/modules/markups.html
 """
 
@@ -26,9 +27,9 @@ from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.estimate import Motion
 from tumortrack.core.store import read_file
 
-FAR_MM = 100.0  # from the organ's box: such a point is hardly meant
-_NEAR_MM = 20.0  # a point about the organ, where another reading of the file is weighed
-_FARTHEST_MM = 1e7  # of any scanner's origin
+FAR_MM = 100.0  # from the organ's box: hardly a point that the user means
+_NEAR_MM = 20.0  # of the organ's box, where points in other units or axes are looked for
+_LARGEST_MM = 1e7  # coordinate in any scanner's frame
 _MOST_BYTES = 64 * 2**20
 _NAMINGS: dict[tuple[str, str, str], tuple[int, int, int]] = {
     ("ct_x", "ct_y", "ct_z"): (1, 1, 1),
@@ -36,20 +37,18 @@ _NAMINGS: dict[tuple[str, str, str], tuple[int, int, int]] = {
     ("l", "p", "s"): (1, 1, 1),
     ("r", "a", "s"): (-1, -1, 1),
 }
-_ANSWER = ("camera_x", "camera_y", "camera_z", "std_mm")
+_ADDED = ("camera_x", "camera_y", "camera_z", "std_mm")
 _Signs = tuple[float, float, float]
 _LPS_FROM: dict[str, _Signs] = {"LPS": (1.0, 1.0, 1.0), "RAS": (-1.0, -1.0, 1.0)}
 _OLD_NUMBERS = {"0": "RAS", "1": "LPS"}  # how .fcsv named them before Slicer 4.11
-_Placed = tuple[str, str, list[str], bool, _Signs]  # label, description, position, whether placed
-_STATUS, _PLACED = 14, "2"  # a field that .fcsv has without naming it, and what it should say
+_Fiducial = tuple[str, str, list[str], bool, _Signs]  # label, description, position, is it placed
+_STATUS, _PLACED = 14, "2"  # an unnamed field of .fcsv, and its value for a placed point
 
 
 @dataclass(frozen=True, eq=False)
 class PointTable:
-    """Points of the CT (LPS, mm) and what their file says of each, as text.
-
-    ``notes`` tell what a user must know of how the file was read.
-    """
+    """Points of the CT (LPS, mm) with the columns of their file as text, and ``notes`` for the user
+    on how it was read."""
 
     points_ct: Float64[np.ndarray, "n 3"]
     columns: tuple[str, ...]
@@ -59,7 +58,7 @@ class PointTable:
 
 def read_points(path: Path) -> PointTable:
     """Read points.csv, or a 3D Slicer markups file (.fcsv, .mrk.json). Raises InputError: no such
-    file, another format or unit, no points, a value that is no finite number, or a Slicer file
+    file, another format or unit, no points, a value that is not a finite number, or a Slicer file
     whose coordinate system is neither LPS nor RAS."""
     content = read_file(path, _MOST_BYTES, "Give the points in several files.")
     name = path.name.lower()
@@ -96,14 +95,14 @@ def _parse_csv(content: bytes, name: str) -> PointTable:
         if len(row) != len(header):
             raise InputError(f"{name}, line {line}: {len(row)} values in {len(header)} columns.")
         points[number] = _numbers_of([row[n] for n in where], f"{name}, line {line}")
-    # An answer to an earlier frame may be asked again: the old one gives way.
-    stay = [n for n, column in enumerate(lower) if column not in _ANSWER]
-    gone = [column for column in header if column.lower() in _ANSWER]
+    # The file may be the output for an earlier frame, whose results are replaced.
+    kept = [n for n, column in enumerate(lower) if column not in _ADDED]
+    replaced = ", ".join(column for column in header if column.lower() in _ADDED)
     return PointTable(
         points * np.array(_NAMINGS[naming], float),
-        tuple(header[n] for n in stay),
-        tuple(tuple(row[n] for n in stay) for _, row in lines[1:]),
-        (f"{name}: its columns {', '.join(gone)} give way to the answer's.",) if gone else (),
+        tuple(header[n] for n in kept),
+        tuple(tuple(row[n] for n in kept) for _, row in lines[1:]),
+        (f"{name}: its columns {replaced} give way to the answer's.",) if replaced else (),
     )
 
 
@@ -125,12 +124,12 @@ class _Markups(msgspec.Struct):
 
 
 def _parse_markups(content: bytes, name: str) -> PointTable:
-    """Every control point of every markup in the file."""
+    """All control points of all markups in the file."""
     try:
         data = msgspec.json.decode(content, type=_Markups)
     except (msgspec.DecodeError, RecursionError, UnicodeDecodeError) as error:
         raise InputError(f"{name} is no markups file of 3D Slicer: {error}.") from error
-    points: list[_Placed] = []
+    points: list[_Fiducial] = []
     for markup in data.markups:
         if set(np.atleast_1d(markup.coordinate_units).tolist()) != {"mm"}:
             raise InputError(f"{name}: the unit is {markup.coordinate_units!r}; it must be mm.")
@@ -143,7 +142,7 @@ def _parse_markups(content: bytes, name: str) -> PointTable:
 
 
 def _parse_fcsv(content: bytes, name: str) -> PointTable:
-    """The points of a fiducial list, whose header names columns and coordinate system."""
+    """The points of a fiducial list; its header names the columns and the coordinate system."""
     text = _text_of(content, name)
     system = re.search(r"^#\s*CoordinateSystem\s*=\s*(\w+)", text, re.MULTILINE)
     columns = re.search(r"^#\s*columns\s*=(.+)$", text, re.MULTILINE)
@@ -156,12 +155,12 @@ def _parse_fcsv(content: bytes, name: str) -> PointTable:
         rows = list(csv.reader(io.StringIO("\n".join(body))))
     except csv.Error as error:
         raise InputError(f"{name} is damaged: {error}. Save it again.") from error
-    points: list[_Placed] = []
+    points: list[_Fiducial] = []
     for row in rows:
-        of = dict(zip(names, row, strict=False))
+        cells = dict(zip(names, row, strict=False))
         placed = len(row) <= _STATUS or row[_STATUS] == _PLACED
-        position = [of.get(axis, "") for axis in "xyz"]
-        points.append((of.get("label", ""), of.get("desc", ""), position, placed, signs))
+        position = [cells.get(axis, "") for axis in "xyz"]
+        points.append((cells.get("label", ""), cells.get("desc", ""), position, placed, signs))
     return _fiducials(points, name)
 
 
@@ -175,16 +174,16 @@ def _signs(system: str, name: str) -> _Signs:
     return _LPS_FROM[known]
 
 
-def _fiducials(points: list[_Placed], name: str) -> PointTable:
+def _fiducials(points: list[_Fiducial], name: str) -> PointTable:
     missing = [label for label, _, _, placed, _ in points if not placed]
-    rows, places = [], []
+    rows, points_ct = [], []
     for label, description, position, placed, signs in points:
         if placed:
-            place = np.multiply(_numbers_of(position, f"{name}, point {label!r}"), signs)
-            places.append(place)
-            rows.append((label, description, *(f"{number:.5f}" for number in place)))
+            point_ct = np.multiply(_numbers_of(position, f"{name}, point {label!r}"), signs)
+            points_ct.append(point_ct)
+            rows.append((label, description, *(f"{number:.5f}" for number in point_ct)))
     return PointTable(
-        np.array(places).reshape(-1, 3),
+        np.array(points_ct).reshape(-1, 3),
         ("label", "description", "ct_x", "ct_y", "ct_z"),
         tuple(rows),
         (f"{name}: left out what has no place yet: {', '.join(missing)}.",) if missing else (),
@@ -203,15 +202,15 @@ def _text_of(content: bytes, name: str) -> str:
 
 
 def _numbers_of(texts: list[str], where: str) -> tuple[float, float, float]:
-    """Three finite numbers; ``where`` names the place in the file."""
+    """Three finite numbers; ``where``: in the file, for messages."""
     shown = ", ".join(texts)[:80]
     try:
         x, y, z = (float(text) for text in texts)
     except ValueError as error:
         raise InputError(f"{where}: {shown!r} is no point: it takes x, y, z as numbers.") from error
-    if not np.abs([x, y, z]).max() < _FARTHEST_MM:  # nor NaN
+    if not np.abs([x, y, z]).max() < _LARGEST_MM:  # also false for NaN
         raise InputError(
-            f"{where}: {shown!r} is NaN, infinite or more than {_FARTHEST_MM / 1e6:g} km away. "
+            f"{where}: {shown!r} is NaN, infinite or more than {_LARGEST_MM / 1e6:g} km away. "
             "Correct or remove the point."
         )
     return x, y, z
@@ -220,19 +219,19 @@ def _numbers_of(texts: list[str], where: str) -> tuple[float, float, float]:
 def check_near_organ(
     points_ct: Float[np.ndarray, "n 3"], organ_box_ct: Float[np.ndarray, "2 3"], name: str
 ) -> tuple[str, ...]:
-    """Notes on points that lie far from the organ in the CT. Raises InputError: all do, or they lie
-    about the organ only if read as RAS or as metres."""
+    """Notes on points far from the organ in the CT. Raises InputError: all are, or they are near
+    the organ only if read as RAS or as metres."""
     lower, upper = organ_box_ct
 
     def distance(scale: Any = 1.0) -> np.ndarray:
-        read = points_ct * scale
-        return np.linalg.norm(read - np.clip(read, lower, upper), axis=1)
+        scaled = points_ct * scale
+        return np.linalg.norm(scaled - np.clip(scaled, lower, upper), axis=1)
 
     def share_near(scale: Any = 1.0) -> float:
         return float((distance(scale) <= _NEAR_MM).mean())
 
     box = f"the organ in the CT, {lower.round().tolist()} to {upper.round().tolist()} mm (LPS)"
-    tiny = len(points_ct) > 1 and np.abs(points_ct).max() < 1  # as metres are, round the origin
+    tiny = len(points_ct) > 1 and np.abs(points_ct).max() < 1  # metres, near the origin
     if (tiny or share_near() == 0) and share_near(1000) >= 0.5:
         raise InputError(
             f"{name}: the points are in metres, it seems: times 1000 they lie at {box}. Give mm."
@@ -249,24 +248,24 @@ def check_near_organ(
             f"{name}: every point lies {away}. Points must be in the frame of the CT that the case "
             "was made from, LPS, mm."
         )
-    said = (
-        f"{name}: {far.sum()} of {len(far)} points lie {away}; nothing is known of how they moved."
-    )
-    return (said,) if far.any() else ()
+    if not far.any():
+        return ()
+    count = f"{far.sum()} of {len(far)} points"
+    return (f"{name}: {count} lie {away}; nothing is known of how they moved.",)
 
 
 def camera_table(table: PointTable, motion: Motion | None) -> bytes:
-    """The table as CSV with camera_x, camera_y, camera_z and, where the motion knows it, std_mm.
-    Raises InputError: there is no motion; NoEstimate: the motion has no answer for a point."""
+    """The table as CSV with camera_x, camera_y, camera_z and, if the motion knows it, std_mm.
+    Raises InputError: there is no motion; NoEstimate: a point's place is not finite."""
     if motion is None:
         raise InputError("this estimate does not know where points of the CT are.")
     camera_mm, std_mm = motion.carry(table.points_ct), motion.std_mm(table.points_ct)
-    answer = camera_mm if std_mm is None else np.column_stack([camera_mm, std_mm])
-    if not np.isfinite(answer).all():
+    added = camera_mm if std_mm is None else np.column_stack([camera_mm, std_mm])
+    if not np.isfinite(added).all():
         raise NoEstimate("the motion carries some of the points to no place that is a number.")
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
-    writer.writerow([*table.columns, *_ANSWER[: answer.shape[1]]])
-    for row, numbers in zip(table.rows, answer, strict=True):
+    writer.writerow([*table.columns, *_ADDED[: added.shape[1]]])
+    for row, numbers in zip(table.rows, added, strict=True):
         writer.writerow([*row, *(f"{number:.4f}" for number in numbers)])
     return stream.getvalue().encode()

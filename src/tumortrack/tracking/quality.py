@@ -1,10 +1,9 @@
-"""Whether an estimate should be relied on: the same judgement of files and of live frames."""
+"""Checks of an estimate, the same for files and live frames: good, or poor for a stated reason."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from jaxtyping import Bool
@@ -19,71 +18,73 @@ from tumortrack.sense.noise import CAMERA_STD
 from tumortrack.sense.render import render_depth
 from tumortrack.tracking.margins import ModelMargins, exceeded, figures, stated_margin
 
-# Standard deviation of a tumor's middle, and how far from it another fit, nearly as likely, may
-# have it.
-_UNSURE_MM = 3.0
-# Shares of the organ's picture. Right estimates have up to 0.03 (moving and pushed, on tables, in
-# beds and cavities, among instruments and hands), an organ upside down 0.12 to 0.16, one laid on
-# the points of a hand 0.2 to 0.4, a model laid on another patient's kidney mostly 0.1 to 0.24.
+# Largest standard deviation of a tumor's centre, and largest distance to it in another fit that is
+# nearly as likely.
+_MAX_UNCERTAINTY_MM = 3.0
+# Shares of the organ's image that are seen through. Right estimates have up to 0.03 (moving and
+# pushed, on tables, in beds and cavities, among instruments and hands), an organ upside down 0.12
+# to 0.16, one fitted to a hand 0.2 to 0.4, a model fitted to another patient's kidney mostly 0.1 to
+# 0.24.
 _LIMITS = 0.05, 0.09  # doubtful, impossible
-# Without a motion surfaces are rougher: where centres are 2 to 8 mm off, 0.09 to 0.15 are usual.
+# Without a motion surfaces are rougher: with centres 2 to 8 mm off, 0.09 to 0.15 are usual.
 _ROUGH_LIMITS = 0.1, 0.2
-_WIDTH = 212  # pixels: so coarse a picture tells
-# Of a state that was doubted: less of what was in sight then may hide the doubt; moved by more from
-# one frame to the next, it is another state.
-_AS_MUCH, _ELSEWHERE_MM = 0.9, 10.0
-_THROUGH_MM = 6.0  # behind the estimated surface: what is seen there lies behind, not beside
-# Where the camera sees something round the organ, in more than this share of a rim so many pixels
-# (some 3 mm) wide, a wrong place is mostly seen through. Strays are no part of the judged fit then,
-# and it may cost ``FIT_FACTOR`` times what is usual: in a wider world than training's (make world)
-# the cost alone, without strays up to 1.5 times the usual one, spoke against 18 answers, all right.
-_TOLD, _RIM = 0.5, 2
-_MOST_STRAYS = 0.5  # of the points: no robust estimate bears more (the breakdown point)
-_FARTHEST = 3.0  # standard deviations of where cameras are
+_WIDTH = 212  # pixels of the depth image in which the organ is compared
+# The doubt about an earlier estimate stays if less than this share of what was in sight then is in
+# sight now, unless the organ moved by more than this from one frame to the next.
+_AS_MUCH, _MOVED_MM = 0.9, 10.0
+_THROUGH_MM = 6.0  # points so far behind the estimated surface are behind the organ
+# If the camera sees the surroundings in more than this share of a rim so many pixels (some 3 mm)
+# wide round the organ, most wrong places are seen through. The fit is then judged without strays
+# and may cost ``FIT_FACTOR`` times the usual cost: in a wider world than training's (make world)
+# the cost alone, without strays up to 1.5 times the usual one, rejected 18 answers, all right.
+_RIM_SHARE, _RIM = 0.5, 2
+_MAX_STRAYS = 0.5  # share of the points: the breakdown point of robust estimates
+_MAX_CAMERA_ERROR = 3.0  # standard deviations of a camera's pose
 _FAR_TILTED, _UPSIDE_DOWN = 60.0, 110.0  # degrees
-_UNSURE = 0.6  # mean probability of a tumor's points
-_PIXEL_MM = 1.5  # of the picture that a cloud is compared in
-_MOST_PIXELS = 1024  # along a side
-_MOST_POINTS = 20_000  # of a cloud that tell enough: a frame must not wait for all of 400,000
-# Share of the organ's picture where a cloud has no point: up to 0.03 where the whole side that the
-# camera sees was scanned (80 scenes, two kinds of deformation); more, and there is no telling what
-# lies there: an organ upside down reaches so far beyond the points that it fits.
-_UNSEEN = 0.1
-_NEAR_MM = 6.0  # of a point, or twice the points' usual distance: seen
+_MIN_PROBABILITY = 0.6  # mean over a tumor's points
+_PIXEL_MM = 1.5  # of the image in which a cloud is compared
+_MAX_PIXELS = 1024  # along a side
+_MAX_POINTS = 20_000  # of a cloud: enough for the shares, where all of 400,000 would delay a frame
+# Largest share of the organ's image without points of a cloud: up to 0.03 if the whole side that
+# faces the camera was scanned (80 scenes, two kinds of deformation). An organ upside down reaches
+# far beyond the points that it fits.
+_MAX_UNSEEN = 0.1
+_SEEN_WITHIN_MM = 6.0  # of a point, or twice the points' usual distance
 
 
 def judged(estimate: Estimate, looks: Sequence[Look], strictly: bool = False) -> Estimate:
-    """The estimate with what speaks against it, and in its report the shares of the organ that are
-    seen through, in sight and, of a cloud, not seen.
+    """The estimate with the finding that makes it poor, if any, and in its report the shares of the
+    organ that are seen through, in sight and, of a cloud, not seen.
 
-    Poor is an estimate that fits the points worse than usual in validation, through which the
-    camera sees, that lies where a cloud has no points, that lacks a tumor, or that says itself that
-    a tumor's place is unsure. Good means no more than that none holds. Raises NotThisOrgan: a depth
-    image sees through so much of it that the organ cannot lie there. Clouds refuse nothing: they
-    may be joined from several views.
+    An estimate is poor if it fits the points worse than usual in validation, if the camera sees
+    through it, if it lies where a cloud has no points, if it lacks a tumor, or if a tumor's place
+    is uncertain; good means only that none of these holds. Raises NotThisOrgan: a depth image sees
+    through so much of it that the organ cannot be there. Clouds never raise it: they may be joined
+    from several views.
 
     Args:
-        looks: at it; the one that says most against the estimate counts.
+        looks: at the organ; of each share, the worst counts.
         strictly: the fit must be no worse than usual, whatever the camera sees round the organ.
     """
     views = _organ_before_cameras(estimate, looks)
-    by_image = [seen_through(there, view) for there, view in views if isinstance(view, DepthFrame)]
-    clouds = [cloud_shares(there, view) for there, view in views if isinstance(view, SensorCloud)]
+    images = [seen_through(organ, view) for organ, view in views if isinstance(view, DepthFrame)]
+    clouds = [cloud_shares(organ, view) for organ, view in views if isinstance(view, SensorCloud)]
     unseen = max((share for _, share in clouds), default=0.0)
-    told = min((share for _, share, _ in by_image), default=0.0) if not clouds else 0.0
-    by_depth = max((share for share, _, _ in by_image), default=0.0)
+    rim_share = min((share for _, share, _ in images), default=0.0) if not clouds else 0.0
+    by_depth = max((share for share, _, _ in images), default=0.0)
     through = max(by_depth, *(share for share, _ in clouds), 0.0)
     doubtful, impossible = _LIMITS if estimate.motion is not None else _ROUGH_LIMITS
     if by_depth > impossible:
         raise NotThisOrgan(Finding("organ_seen_through", {"percent": 100 * by_depth}))
     report = estimate.report
-    finding = _misplaced(report.looks) or _misfit(report, told > _TOLD and not strictly)
+    finding = _misplaced_camera(report.looks)
+    finding = finding or _misfit(report, rim_share > _RIM_SHARE and not strictly)
     finding = finding or _doubt(report)
-    in_sight = by_image[0][2] if by_image else None
+    in_sight = images[0][2] if images else None
     if through > doubtful:
-        finding = _found("seen_through", percent=100 * through)
-    elif unseen > _UNSEEN and finding is None:
-        finding = _found("unseen", percent=100 * unseen)
+        finding = Finding("seen_through", {"percent": 100 * through})
+    elif unseen > _MAX_UNSEEN and finding is None:
+        finding = Finding("unseen", {"percent": 100 * unseen})
     return replace(estimate, finding=finding).reporting(
         unseen=unseen if clouds else report.unseen,
         seen_through=through,
@@ -95,35 +96,34 @@ def judged(estimate: Estimate, looks: Sequence[Look], strictly: bool = False) ->
 def _organ_before_cameras(
     estimate: Estimate, looks: Sequence[Look]
 ) -> list[tuple[Mesh, DepthFrame | SensorCloud]]:
-    """The organ in the frame of each camera, as its place was corrected, and all that it saw."""
+    """For each camera, the organ in its (corrected) frame, and all that it saw."""
     organ, corrected = estimate.organ_mesh, estimate.report.looks
     views = [(organ, looks[0].seen)]
     if corrected is not None:
         for look, pose in zip(looks[1:], corrected.camera_from_look[1:], strict=True):
             look_from_camera = np.linalg.inv(np.array(pose))
-            there_mm = transform_points(look_from_camera, organ.vertices_mm)
-            views.append((organ.moved(there_mm), look.seen))
+            vertices_mm = transform_points(look_from_camera, organ.vertices_mm)
+            views.append((organ.moved(vertices_mm), look.seen))
     return views
 
 
 def doubt_if_hidden(estimate: Estimate, last: Estimate) -> Estimate:
-    """The estimate, poor where the camera saw through the ``last`` one, which lay there too, and
-    sees less of it now: whatever came before it is no evidence that the organ lies there."""
+    """The estimate, poor if the camera saw through the ``last`` one at the same place and sees less
+    of it now: what hides the organ since then is no evidence that it is there."""
     doubted_at, report = last.report.doubted_in_sight, estimate.report
     if doubted_at is None or report.doubted_in_sight is not None:
         return estimate
     in_sight = 1.0 if report.in_sight is None else report.in_sight
     moved_mm = np.abs(estimate.organ_mesh.box_mm - last.organ_mesh.box_mm).max()
-    if in_sight >= _AS_MUCH * doubted_at or moved_mm > _ELSEWHERE_MM:
+    if in_sight >= _AS_MUCH * doubted_at or moved_mm > _MOVED_MM:
         return estimate
     estimate = estimate.reporting(doubted_in_sight=doubted_at)
     return replace(estimate, finding=estimate.finding or Finding("hidden_now"))
 
 
 def with_margin(estimate: Estimate, cloud: SensorCloud, margins: ModelMargins | None) -> Estimate:
-    """The estimate with what its model's ``margins`` say in its report; where they say nothing of
-    such a one it is ``poor``: within the margin, or no answer. ``cloud``: in which it was located.
-    """
+    """The estimate with its model's ``margins`` in its report; poor if it exceeds a limit within
+    which they hold. ``cloud``: in which it was located."""
     if margins is not None and estimate.finding is None:
         if estimate.report.unseen is None:
             estimate = estimate.reporting(unseen=cloud_shares(estimate.organ_mesh, cloud)[1])
@@ -133,90 +133,90 @@ def with_margin(estimate: Estimate, cloud: SensorCloud, margins: ModelMargins | 
     return estimate.reporting(margin=margin)
 
 
-def _found(kind: Kind, **values: Any) -> Finding:
-    return Finding(kind, values)
-
-
-def _misplaced(looks: LooksReport | None) -> Finding | None:
-    """Whether a camera was found too far from where its pose says."""
+def _misplaced_camera(looks: LooksReport | None) -> Finding | None:
+    """Whether a camera was found too far from its stated pose."""
     if looks is None:
         return None
-    most_mm, most_degrees = _FARTHEST * CAMERA_STD[0], np.rad2deg(_FARTHEST * CAMERA_STD[-1])
+    most_mm, most_rad = _MAX_CAMERA_ERROR * CAMERA_STD[0], _MAX_CAMERA_ERROR * CAMERA_STD[-1]
     errors = zip(looks.shift_mm, looks.turn_degrees, strict=True)
-    for number, (shift_mm, degrees) in enumerate(errors, start=1):
-        if shift_mm > most_mm or degrees > most_degrees:
-            return _found("poses", view=number, shift_mm=shift_mm, degrees=degrees)
+    for view, (shift_mm, degrees) in enumerate(errors, start=1):
+        if shift_mm > most_mm or degrees > np.rad2deg(most_rad):
+            return Finding("poses", {"view": view, "shift_mm": shift_mm, "degrees": degrees})
     return None
 
 
 def _misfit(report: FitReport, surroundings_seen: bool) -> Finding | None:
-    """What the fit says against it; ``surroundings_seen``: a wrong place would be seen through."""
+    """Too many strays, or too high a cost. ``surroundings_seen``: a wrong place would be seen
+    through."""
     cost = report.fit_cost
     if cost is None:
         return None
-    if surroundings_seen and cost.strays > _MOST_STRAYS:
-        return _found("strays", percent=100 * cost.strays)
-    now, most = (cost.without_strays, FIT_FACTOR) if surroundings_seen else (cost.now, 1.0)
-    if now > most * cost.usual:
-        return _found("fit", times=now / cost.usual)
+    if surroundings_seen and cost.strays > _MAX_STRAYS:
+        return Finding("strays", {"percent": 100 * cost.strays})
+    now, factor = (cost.without_strays, FIT_FACTOR) if surroundings_seen else (cost.now, 1.0)
+    if now > factor * cost.usual:
+        return Finding("fit", {"times": now / cost.usual})
     return None
 
 
 def _doubt(report: FitReport) -> Finding | None:
-    """What else the estimate itself says against it."""
+    """Another size, pose or fit that is as likely; a part that is missing or uncertain."""
     size, cost = report.size, report.fit_cost
     if size is not None and size.gain > RIVAL_COST:
-        return _found("size", times=size.times)
+        return Finding("size", {"times": size.times})
     if cost is not None and cost.beyond is not None:
-        return _found(_other_side(cost.beyond.tilt_degrees), degrees=cost.beyond.tilt_degrees)
+        degrees = cost.beyond.tilt_degrees
+        return Finding(_tilt_finding(degrees), {"degrees": degrees})
     for other in () if cost is None else cost.others:
         name, apart_mm = max(other.apart_mm.items(), key=lambda item: item[1])
-        if apart_mm > _UNSURE_MM:
-            return _found("rival", part=name, apart_mm=apart_mm)
+        if apart_mm > _MAX_UNCERTAINTY_MM:
+            return Finding("rival", {"part": name, "apart_mm": apart_mm})
     for name, part in report.parts.items():
         if not part.found:
-            return _found("missing", part=name)
-        if part.center_std_mm is not None and part.center_std_mm > _UNSURE_MM:
-            return _found("unsure", part=name, std_mm=part.center_std_mm)
-        if part.probability is not None and part.probability < _UNSURE:
-            return _found("improbable", part=name, probability=part.probability)
+            return Finding("missing", {"part": name})
+        if part.center_std_mm is not None and part.center_std_mm > _MAX_UNCERTAINTY_MM:
+            return Finding("unsure", {"part": name, "std_mm": part.center_std_mm})
+        if part.probability is not None and part.probability < _MIN_PROBABILITY:
+            return Finding("improbable", {"part": name, "probability": part.probability})
     return None
 
 
-def _other_side(tilt_degrees: float) -> Kind:
-    """``tilt_degrees``: in which the organ fits, against what is allowed or was found."""
+def _tilt_finding(tilt_degrees: float) -> Kind:
+    """``tilt_degrees``: of the other pose in which the organ fits."""
     if tilt_degrees > _UPSIDE_DOWN:
         return "upside_down"
     return "tilted" if tilt_degrees > _FAR_TILTED else "not_turned"
 
 
 def seen_through(organ: Mesh, frame: DepthFrame) -> tuple[float, float, float]:
-    """The share of the estimated organ's picture behind whose surface the camera sees something,
-    a table, say, which it could not see if the organ lay there. Pixels without return, and those
-    where something lies before the organ, say nothing. 0 where no pixel says anything. And the
-    share of a rim round the picture where something lies behind the organ's nearest point: a wrong
-    organ reaches beyond the true one, and is seen through where there is something to be seen. And
-    the share of its picture that nothing hides."""
+    """Three shares of the estimated organ's image, all 0 if no pixel has a return there.
+
+    1. Where the camera sees something behind the surface, such as a table, which the organ would
+       hide; of the pixels with a return.
+    2. Of a rim round the image: where something lies behind the organ's nearest point. A wrong
+       organ reaches beyond the true one, and is seen through if something can be seen there.
+    3. Where nothing hides the organ.
+    """
     every = max(1, round(frame.intrinsics.width / _WIDTH))
     seen_mm = frame.depth_mm[::every, ::every]
-    given = frame.intrinsics
-    scaled = (number / every for number in (given.fx, given.fy, given.cx, given.cy))
-    few = Intrinsics(*seen_mm.shape[::-1], *scaled)
-    organ_mm = render_depth(organ.vertices_mm, organ.faces, few).depth_mm
-    both = np.isfinite(organ_mm) & np.isfinite(seen_mm)
+    full = frame.intrinsics
+    scaled = (number / every for number in (full.fx, full.fy, full.cx, full.cy))
+    reduced = Intrinsics(*seen_mm.shape[::-1], *scaled)
+    organ_mm = render_depth(organ.vertices_mm, organ.faces, reduced).depth_mm
+    image = np.isfinite(organ_mm)
+    both = image & np.isfinite(seen_mm)
     if not both.any():
         return 0.0, 0.0, 0.0
-    picture = np.isfinite(organ_mm)
-    in_sight = (seen_mm[both] > organ_mm[both] - _THROUGH_MM).sum() / picture.sum()
-    rim = _within(_RIM, picture) & ~picture
-    told = (seen_mm[rim] > organ_mm[picture].min()).sum() / max(rim.sum(), 1)
+    in_sight = (seen_mm[both] > organ_mm[both] - _THROUGH_MM).sum() / image.sum()
+    rim = _within(_RIM, image) & ~image
+    rim_share = (seen_mm[rim] > organ_mm[image].min()).sum() / max(rim.sum(), 1)
     through = (seen_mm[both] > organ_mm[both] + _THROUGH_MM).mean()
-    return float(through), float(told), float(in_sight)
+    return float(through), float(rim_share), float(in_sight)
 
 
 def cloud_shares(organ: Mesh, cloud: SensorCloud) -> tuple[float, float]:
-    """By a cloud, whose camera is at its origin: the share of the points in the organ's picture
-    that lie behind its surface, and the share of the picture that has no points."""
+    """Of a cloud, whose camera is at its origin: the share of the points in the organ's image that
+    lie behind its surface, and the share of the image without points."""
     nearest_mm = organ.vertices_mm[:, 2].min()
     if nearest_mm <= _PIXEL_MM:  # round the camera
         return 0.0, 1.0
@@ -224,11 +224,11 @@ def cloud_shares(organ: Mesh, cloud: SensorCloud) -> tuple[float, float]:
     outline = focal * organ.vertices_mm[:, :2] / organ.vertices_mm[:, 2:]
     low, high = np.floor(outline.min(0)), np.ceil(outline.max(0))
     width, height = (int(n) for n in high - low + 1)
-    if max(width, height) > _MOST_PIXELS:
+    if max(width, height) > _MAX_PIXELS:
         return 0.0, 1.0
     camera = Intrinsics(width, height, focal, focal, *(-low).tolist())
     organ_mm = render_depth(organ.vertices_mm, organ.faces, camera).depth_mm
-    points_mm = cloud.points_mm[:: len(cloud.points_mm) // _MOST_POINTS + 1]
+    points_mm = cloud.points_mm[:: len(cloud.points_mm) // _MAX_POINTS + 1]
     points_mm = points_mm[points_mm[:, 2] > 0].astype(np.float64)
     column, row = np.rint(focal * points_mm[:, :2] / points_mm[:, 2:] - low).astype(int).T
     within = (column >= 0) & (column < width) & (row >= 0) & (row < height)
@@ -240,21 +240,21 @@ def cloud_shares(organ: Mesh, cloud: SensorCloud) -> tuple[float, float]:
     through = float((z_mm[on] > surface_mm[on] + _THROUGH_MM).mean())
     filled = np.zeros(organ_mm.shape, bool)
     filled[row, column] = True
-    picture = np.isfinite(organ_mm)
-    apart = np.sqrt(picture.sum() / on.sum())  # pixels between neighbours
-    near = _within(max(_NEAR_MM / _PIXEL_MM, 2 * apart), filled)
-    return through, float(1 - near[picture].mean())
+    image = np.isfinite(organ_mm)
+    spacing = np.sqrt(image.sum() / on.sum())  # pixels between neighbouring points
+    near = _within(max(_SEEN_WITHIN_MM / _PIXEL_MM, 2 * spacing), filled)
+    return through, float(1 - near[image].mean())
 
 
 def _within(reach: float, filled: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
-    """Which pixels have a filled one within so many pixels' distance. (Row by row: SciPy's
-    distances are slow to import, for which a verdict would wait.)"""
-    room, (height, width) = int(min(reach, np.hypot(*filled.shape))), filled.shape
-    before = np.cumsum(np.pad(filled, ((room, room), (room + 1, room))), axis=1)
+    """Pixels with a filled one within so many pixels' distance, by sums along rows (SciPy's
+    distance transform is slow to import, which would delay the first verdict)."""
+    pad, (height, width) = int(min(reach, np.hypot(*filled.shape))), filled.shape
+    sums = np.cumsum(np.pad(filled, ((pad, pad), (pad + 1, pad))), axis=1)
     near = np.zeros(filled.shape, bool)
-    for down in range(-room, room + 1):
-        across = min(int(np.sqrt(reach**2 - down**2)), room)
-        rows = before[room + down : room + down + height]
-        ends = rows[:, room + across + 1 :][:, :width]
-        near |= ends > rows[:, room - across : room - across + width]
+    for down in range(-pad, pad + 1):
+        across = min(int(np.sqrt(reach**2 - down**2)), pad)
+        rows = sums[pad + down : pad + down + height]
+        ends = rows[:, pad + across + 1 :][:, :width]
+        near |= ends > rows[:, pad - across : pad - across + width]
     return near

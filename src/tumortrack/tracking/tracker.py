@@ -1,4 +1,4 @@
-"""Sensor cloud -> estimate by any kind of model, and from frame to frame."""
+"""Sensor cloud -> estimate, with any kind of model: Tracker for one cloud, Follower for frames."""
 
 from __future__ import annotations
 
@@ -34,23 +34,23 @@ from tumortrack.tracking.model_files import case_model
 from tumortrack.tracking.presets import occupancy
 from tumortrack.tracking.quality import doubt_if_hidden, judged, with_margin
 
-_ALONE = FollowOptions()
-# So long after it was found good the organ is also looked for with its other side up. In first
-# looks of strangers that called 18 of 46 kidneys of others, or mirrored, good; none without it.
+_DEFAULTS = FollowOptions()
+# For so long after a good estimate the organ is also searched for upside down. In first looks, that
+# search called 18 of 46 kidneys of other patients, or mirrored ones, good; none without it.
 _TURNED_OVER_S = 30.0
-# Causes are sought so often at most, for each check that fails: that takes the time of some frames.
-_SOUGHT_S = 1.0
-_OF_POSES = "none", "poses", "fit", "strays", "seen_through"  # checks, where views are several
+# Causes are searched for at most this often for each failed check, as that takes several frames.
+_CAUSES_EVERY_S = 1.0
+_OF_POSES = "none", "poses", "fit", "strays", "seen_through"  # checks that wrong poses fail
 
 
 @runtime_checkable
 class Locator(Protocol):
-    """What a method has to offer."""
+    """What a method provides."""
 
     anatomy_ct: Anatomy | None
 
     def locate(self, looks: Sequence[Look], grid: int, seed: int) -> Estimate:
-        """See ``Tracker.locate``; in the frame of the first look's camera."""
+        """See ``Tracker.locate``; in the frame of the first camera."""
 
     def follow(self, looks: Sequence[Look], last: Estimate | None, how: FollowOptions) -> Estimate:
         """See ``Tracker.follow``; likewise."""
@@ -60,10 +60,10 @@ class Locator(Protocol):
 
 
 class Tracker:
-    """Locates the organ and tumors of one case, or of a model, in sensor clouds (camera frame, mm).
-    A case that has no model yet gets one first, which takes some seconds.
+    """Locates the organ and tumors of a case, or of a model, in sensor clouds (camera frame, mm).
+    A case without a model gets one first, which takes some seconds.
 
-    A process that has one keeps what memory a frame frees for the next one.
+    Its process keeps the memory that a frame frees for the next one.
     """
 
     def __init__(self, model: Model | Case) -> None:
@@ -81,7 +81,7 @@ class Tracker:
 
     @property
     def anatomy_ct(self) -> Anatomy | None:
-        """The organ in the CT (LPS, mm); None for models that know no correspondences."""
+        """The organ in the CT (LPS, mm); None for models without correspondences."""
         return self._locator.anatomy_ct
 
     def locate(
@@ -92,18 +92,18 @@ class Tracker:
         seen: DepthFrame | SensorCloud | None = None,
         others: Sequence[Look] = (),
     ) -> Estimate:
-        """Everything about one cloud; the same cloud and seed give the same answer.
+        """The full estimate from one cloud; the same cloud and seed give the same result.
 
         Args:
             grid: voxels along the longest side of the dense volume.
-            seen: all that the camera saw, by which the estimate is judged; None: the cloud.
-            others: more looks at the same organ, still in between, from other places.
+            seen: all that the camera saw, by which the estimate is judged; default: the cloud.
+            others: further looks at the organ from other places, between which it did not move.
 
         Raises:
-            NoEstimate: too few points, no organ found in them, they do not show this model's, or
-                the camera sees through where it would lie.
-            InputError: the cloud is in metres; the seed is not allowed; more than one look, where
-                the model knows no motion.
+            NoEstimate: too few points, no organ found in them, not the organ of this model, or the
+                camera sees through the place where it would be.
+            InputError: the cloud is in metres; the seed is not allowed; more than one look, with a
+                model that knows no motion.
         """
         check_seed(seed)
         if not isinstance(cloud, SensorCloud):
@@ -112,27 +112,26 @@ class Tracker:
                 "SensorCloud(points_mm) of an n x 3 array in the camera frame."
             )
         looks = Look(cloud, seen or cloud, HERE), *others
-        with self._explaining(looks, _ALONE):
+        with self._explaining_errors(looks, _DEFAULTS):
             estimate = self._locator.locate(looks, grid, seed)
             estimate = self._judged(estimate, looks, False)
-        return self._explained(estimate, looks, _ALONE)
+        return self._explained(estimate, looks, _DEFAULTS)
 
     def follow(
         self,
         cloud: SensorCloud,
         last: Estimate | None = None,
-        how: FollowOptions = _ALONE,
+        how: FollowOptions = _DEFAULTS,
         seen: DepthFrame | SensorCloud | None = None,
         others: Sequence[Look] = (),
     ) -> Estimate:
-        """The same, fast, for one frame of many: no volume, and a search that starts at the
-        ``last`` estimate, if there is one a moment old. Models that know no motion smooth nothing.
-        Raises NoEstimate: as ``locate``; InputError: the cloud is in metres; more than one look, as
-        ``locate``."""
-        # What fits worse all of a sudden may be something else that was put there.
+        """A fast estimate for one frame of many: without a volume, from a search that starts at the
+        ``last`` estimate, if there is a recent one. Models that know no motion cannot smooth.
+        Raises as ``locate``."""
+        # A fit that is suddenly worse may be to another object.
         strictly = how.either_side if last is None else last.quality != "good" or not _unusual(last)
         looks = Look(cloud, seen or cloud, HERE), *others
-        with self._explaining(looks, how):
+        with self._explaining_errors(looks, how):
             estimate = self._locator.follow(looks, last, how)
             estimate = self._judged(estimate, looks, strictly, last)
         return self._explained(estimate, looks, how)
@@ -150,14 +149,13 @@ class Tracker:
             estimate = doubt_if_hidden(estimate, last)
         if self._weakness:
             estimate = replace(estimate, finding=Finding("model", {"words": self._weakness}))
-        # Margins are calibrated on single looks.
-        margins = self.model.margins if len(looks) == 1 else None
+        margins = self.model.margins if len(looks) == 1 else None  # calibrated on single looks
         estimate = with_margin(estimate, looks[0].cloud, margins)
         estimate = replace(estimate, patient=self._patient, organ=self._organ)
         return _timed(estimate, "judge", start)
 
     def _explained(self, estimate: Estimate, looks: Sequence[Look], how: FollowOptions) -> Estimate:
-        """With the likely causes of a poor one, and what to do."""
+        """A poor estimate with its likely causes and advice."""
         start = time.perf_counter()
         if estimate.finding is not None and not self._weakness:
             causes = self._causes(looks, how, estimate)
@@ -174,8 +172,8 @@ class Tracker:
         return how.known.get(check) or likely_causes(self.model, looks[0].cloud, estimate)
 
     @contextmanager
-    def _explaining(self, looks: Sequence[Look], how: FollowOptions) -> Iterator[None]:
-        """Adds its likely causes to what is not this organ."""
+    def _explaining_errors(self, looks: Sequence[Look], how: FollowOptions) -> Iterator[None]:
+        """Adds the likely causes to NotThisOrgan."""
         try:
             yield
         except NotThisOrgan as error:
@@ -184,7 +182,7 @@ class Tracker:
             raise NotThisOrgan(error.finding or str(error), causes, advice) from error
 
     def warm(self) -> None:
-        """Load and compile what ``follow`` needs, which its first call would otherwise wait for."""
+        """Load and compile what the first call of ``follow`` would otherwise wait for."""
         self._locator.warm()
 
 
@@ -202,23 +200,23 @@ def _unusual(estimate: Estimate) -> bool:
 
 
 def _timed(estimate: Estimate, stage: str, start_s: float) -> Estimate:
-    """With the seconds that a stage took."""
-    took_s, seconds = time.perf_counter() - start_s, estimate.report.timings
-    total_s = seconds["total"] + took_s
-    return estimate.reporting(timings={**seconds, stage: took_s, "total": total_s})
+    """The estimate with the duration of a stage in its report."""
+    took_s, timings = time.perf_counter() - start_s, estimate.report.timings
+    total_s = timings["total"] + took_s
+    return estimate.reporting(timings={**timings, stage: took_s, "total": total_s})
 
 
 def _check_of(estimate: Estimate | None) -> str:
-    """The check that it failed; ``none``: there is no estimate."""
+    """The check that it failed; ``none`` without an estimate."""
     if estimate is None:
         return "none"
     return "" if estimate.finding is None else estimate.finding.check
 
 
 class FollowerConfig(Config, frozen=True, kw_only=True):
-    """``rescan_s``: so often the organ is also looked for as in a first frame. ``forget_s``: an
-    estimate older than that says nothing about the next frame. ``smoothing_s``: time constant of
-    the mean over past estimates; 0: none; the lag it adds stands in every report."""
+    """``rescan_s``: interval of searches as in a first frame. ``forget_s``: an older estimate is
+    not used for the next frame. ``smoothing_s``: time constant of the mean over past estimates, 0:
+    none; the lag it adds is in every report."""
 
     rescan_s: float = 1.0
     forget_s: float = 1.0
@@ -233,8 +231,8 @@ class FollowerConfig(Config, frozen=True, kw_only=True):
 
 
 class Follower:
-    """Locates in one frame after the other, each helped by the one before. Raises InputError:
-    smoothing, where the model knows no motion."""
+    """Locates in frame after frame, each search starting at the last estimate. Raises InputError:
+    smoothing with a model that knows no motion."""
 
     def __init__(self, tracker: Tracker, config: FollowerConfig) -> None:
         if config.smoothing_s > 0 and tracker.anatomy_ct is None:
@@ -244,27 +242,27 @@ class Follower:
             )
         self._tracker, self._config = tracker, config
         self._last: Estimate | None = None
-        self._scanned_ns, self._rests = 0, False
+        self._scanned_ns, self._at_rest = 0, False
         self._good_ns: int | None = None
-        self._known_ns, self._known = 0, dict[str, tuple[Likely, ...]]()
+        self._causes_ns, self._causes = 0, dict[str, tuple[Likely, ...]]()
 
     def warm(self) -> None:
         """See ``Tracker.warm``."""
         self._tracker.warm()
 
     def forget(self) -> None:
-        """Nothing is known of where the organ is: a new clock, a new pick."""
+        """Drop the last estimate: after a new clock, or a new pick."""
         self._last = None
 
     def begin(self, estimate: Estimate) -> None:
-        """The organ rests there: the next search starts at it, however long it took."""
-        self._last, self._rests, self._scanned_ns = estimate, True, estimate.cloud.stamp_ns
+        """Start the next search at this estimate of an organ at rest, however old it is by then."""
+        self._last, self._at_rest, self._scanned_ns = estimate, True, estimate.cloud.stamp_ns
 
     def last_box_mm(
         self, stamp_ns: int, camera_from_last: Affine = HERE
     ) -> Float64[np.ndarray, "2 3"] | None:
         """The organ's box in the last estimate, if that is recent enough; camera frame.
-        ``camera_from_last``: from the frame of the camera that it was made by."""
+        ``camera_from_last``: from the camera frame of that estimate."""
         last = self._recent(stamp_ns)
         if last is None:
             return None
@@ -280,33 +278,33 @@ class Follower:
         others: Sequence[Look] = (),
         camera_from_last: Affine = HERE,
     ) -> Estimate:
-        """The estimate of this frame. ``others``: further looks at the same moment;
-        ``camera_from_last``: as in ``last_box_mm``. Raises NoEstimate: see ``Tracker.follow``; the
-        last estimate is forgotten then."""
-        last, self._last, self._rests = self._recent(cloud.stamp_ns), None, False
+        """The estimate of this frame. ``others``: further looks at the same time;
+        ``camera_from_last``: as in ``last_box_mm``. Raises NoEstimate, as ``Tracker.follow``; the
+        last estimate is then dropped."""
+        last, self._last, self._at_rest = self._recent(cloud.stamp_ns), None, False
         if last is not None and camera_from_last is not HERE:
             last = _seen_from(last, camera_from_last)
         thorough = (cloud.stamp_ns - self._scanned_ns) * 1e-9 >= self._config.rescan_s
         if last is None or thorough:
             self._scanned_ns = cloud.stamp_ns
         since_ns = np.inf if self._good_ns is None else cloud.stamp_ns - self._good_ns
-        turned = bool(0 <= since_ns <= _TURNED_OVER_S * 1e9)
-        if not 0 <= (cloud.stamp_ns - self._known_ns) * 1e-9 < _SOUGHT_S:
-            self._known_ns, self._known = cloud.stamp_ns, {}
+        if not 0 <= (cloud.stamp_ns - self._causes_ns) * 1e-9 < _CAUSES_EVERY_S:
+            self._causes_ns, self._causes = cloud.stamp_ns, {}
         how = FollowOptions(
             thorough=thorough,
-            either_side=turned,
+            either_side=bool(0 <= since_ns <= _TURNED_OVER_S * 1e9),
             smoothing_s=self._config.smoothing_s,
             seed=self._config.seed,
-            known=self._known,
+            known=self._causes,
         )
         try:
             self._last = self._tracker.follow(cloud, last, how, seen, others)
         except NoEstimate as error:
-            self._known = {**self._known, "none": error.causes} if error.causes else self._known
+            if error.causes:
+                self._causes = {**self._causes, "none": error.causes}
             raise
         if causes := self._last.causes:
-            self._known = {**self._known, _check_of(self._last): causes}
+            self._causes = {**self._causes, _check_of(self._last): causes}
         if self._last.quality == "good":
             self._good_ns = cloud.stamp_ns
         return self._last
@@ -315,16 +313,16 @@ class Follower:
         if self._last is None:
             return None
         age_s = (stamp_ns - self._last.cloud.stamp_ns) * 1e-9
-        recent = 0 <= age_s <= self._config.forget_s or self._rests
+        recent = 0 <= age_s <= self._config.forget_s or self._at_rest
         return self._last if recent else None
 
 
 def _seen_from(estimate: Estimate, camera_from_last: Affine) -> Estimate:
-    """What the next search needs of it, before a camera that stands elsewhere."""
+    """The parts that the next search needs, in the frame of a camera that has moved."""
     points_mm = transform_points(camera_from_last, estimate.cloud.points_mm)
     motion, unsmoothed = (
-        seen_from_first(one, camera_from_last) if isinstance(one, ElasticMotion) else one
-        for one in (estimate.motion, estimate.unsmoothed)
+        seen_from_first(motion, camera_from_last) if isinstance(motion, ElasticMotion) else motion
+        for motion in (estimate.motion, estimate.unsmoothed)
     )
     cloud, meshes = replace(estimate.cloud, points_mm=points_mm), estimate.meshes.items()
     moved = {n: m.moved(transform_points(camera_from_last, m.vertices_mm)) for n, m in meshes}
@@ -338,10 +336,11 @@ def region_for(
     box_mm: tuple[tuple[float, float, float], tuple[float, float, float]] | None = None,
     whole: bool = False,
 ) -> RegionConfig:
-    """Depths that training showed, unless others are given; where it showed any distance, its
-    farthest organ still lies in them whole. Pieces of about the organ's size, if that is known.
+    """Where to search for the organ, and for pieces of which size (if the model knows it).
 
-    ``box_mm``: opposite corners, camera frame. ``whole``: everything in range is the organ.
+    The range of depths defaults to that of training, extended so that training's farthest organ is
+    wholly in it. ``box_mm``: opposite corners, camera frame. ``whole``: everything in range is the
+    organ.
     """
     if model is None:
         near, far = range_mm or (CloudConfig().near_mm, CloudConfig().far_mm)
@@ -361,6 +360,6 @@ def region_for(
     axes = np.linalg.svd(vertices - vertices.mean(0), full_matrices=False)[2]
     extents_mm = np.ptp(vertices @ axes.T, axis=0)
     size_mm = (0.7 * float(extents_mm.min()), 1.25 * float(extents_mm.max()))
-    # A surface as uneven as a noisy sensor shows it is not many pieces.
+    # A noisy sensor's uneven surface must not fall into many pieces.
     noise_mm = max(RegionConfig().noise_mm, scene.noise.axial_mm)
     return RegionConfig(crop=crop, box_mm=box_mm, organ_mm=size_mm, noise_mm=noise_mm)

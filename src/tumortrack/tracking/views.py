@@ -1,4 +1,4 @@
-"""The views that `locate` reads, where their cameras were, and the organ in them."""
+"""The views that `locate` reads, the poses of their cameras, and the organ in them."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from tumortrack.sense.files import DEPTH_SUFFIXES, read_cloud, read_depth, read_
 from tumortrack.sense.region import Hints, organ_points
 from tumortrack.tracking.options import LocateOptions
 
-_NEAR = range(-3, 4)  # pixels from the one that was pointed at
+_NEAR = range(-3, 4)  # pixels from the one of --at
 
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """What a file of `locate` holds; ``unit``: of a depth image, the mm of one step and what states
-    it; ``notes``: on what was dropped."""
+    """The content of an input file of `locate`. ``unit``: of a depth image, mm per step and where
+    that is stated; ``notes``: on what was dropped."""
 
     path: Path
     content: SensorCloud | DepthFrame
@@ -35,7 +35,7 @@ class View:
     unit: tuple[float, str] | None = None
 
     def hints(self, at: tuple[int, int] | None, mask: Path | None) -> Hints:
-        """A pixel on the organ, and an image that is 0 where it is not. Raises InputError: no such
+        """From a pixel on the organ, and an image that is 0 outside it. Raises InputError: no such
         pixel, no return there, no such image, or this is a cloud."""
         if at is None and mask is None:
             return Hints()
@@ -48,9 +48,9 @@ class View:
     def organ(
         self, model: Model, options: LocateOptions, hints: Hints
     ) -> tuple[SensorCloud, dict[str, Any], UInt8[np.ndarray, "h w"] | None]:
-        """The organ's points; what was done, for the report, with ``words`` for people; and what
-        became of each pixel (``sense.region.Region``). A cloud shows the organ alone, unless a box
-        is given.
+        """The organ's points; an entry for the report on how they were chosen, with a sentence for
+        people as ``words``; and the class of each pixel (``sense.region.Region``). A cloud is taken
+        for the organ alone, unless a box is given.
 
         Raises NoEstimate: nothing can be the organ; InputError: the depth's unit cannot be right.
         """
@@ -62,42 +62,42 @@ class View:
             f"--mask {options.mask}": options.mask,
             "--whole": options.whole,
         }
-        by = " and ".join(name for name, value in given.items() if value)
-        by = by or "shape, size and place alone"
-        region, what = options.region(model), f"{self.path.name}: "
-        about: dict[str, Any] = {"file": self.path.name, "hint": by}
+        hint = " and ".join(name for name, value in given.items() if value)
+        hint = hint or "shape, size and place alone"
+        region, words = options.region(model), f"{self.path.name}: "
+        entry: dict[str, Any] = {"file": self.path.name, "hint": hint}
         if self.unit is not None and isinstance(self.content, DepthFrame):
             unit_mm, stated_by = self.unit
-            crop = region.crop
-            check_depth_unit(self.content, unit_mm, crop.near_mm, crop.far_mm)
-            about["depth_unit_mm"] = unit_mm
+            check_depth_unit(self.content, unit_mm, region.crop.near_mm, region.crop.far_mm)
+            entry["depth_unit_mm"] = unit_mm
             unit = "in metres" if unit_mm == 1000 else f"in steps of {unit_mm:g} mm"
-            what += f"depth {unit} ({stated_by}); "
+            words += f"depth {unit} ({stated_by}); "
         found = organ_points(self.content, region, hints, np.random.default_rng(options.seed))
         counts = {name: n for name, n in found.counts.items() if n}
-        of = sum(n for name, n in counts.items() if name != "no return")
-        rest = ", ".join(f"{name} {n}" for name, n in counts.items()
-                         if name not in ("organ", "no return"))  # fmt: skip
-        what += f"{counts['organ']} of {of} pixels with a return were taken for the organ, by {by}"
-        about |= {"organ": counts["organ"], "of": of, "pixels": counts}
-        about["words"] = f"{what}{f' (others: {rest})' if rest else ''}."
-        return found.cloud, about, found.taken
+        returns = sum(n for name, n in counts.items() if name != "no return")
+        others = ", ".join(f"{name} {n}" for name, n in counts.items()
+                           if name not in ("organ", "no return"))  # fmt: skip
+        words += f"{counts['organ']} of {returns} pixels with a return were taken for the organ, "
+        words += f"by {hint}{f' (others: {others})' if others else ''}."
+        entry |= {"organ": counts["organ"], "of": returns, "pixels": counts, "words": words}
+        return found.cloud, entry, found.taken
 
     def _cropped(
         self, cloud: SensorCloud, range_mm: tuple[float, float] | None
     ) -> tuple[SensorCloud, dict[str, Any]]:
-        of, by = len(cloud.points_mm), "--range" if range_mm else ""
+        count, hint = len(cloud.points_mm), "--range" if range_mm else ""
         if range_mm:
             cloud = crop_cloud(cloud, *range_mm)
         kept = len(cloud.points_mm)
-        words = f"{self.path.name}: {kept} of {of} points were taken for the organ"
-        words += f", by {by}." if by else ": a cloud is taken for the organ alone."
-        return cloud, {"file": self.path.name, "hint": by, "organ": kept, "of": of, "words": words}
+        words = f"{self.path.name}: {kept} of {count} points were taken for the organ"
+        words += f", by {hint}." if hint else ": a cloud is taken for the organ alone."
+        entry = {"file": self.path.name, "hint": hint, "organ": kept, "of": count, "words": words}
+        return cloud, entry
 
 
 def read_views(paths: Sequence[Path], options: LocateOptions) -> list[View]:
-    """Clouds, or depth images with their intrinsics. Raises InputError: one cannot be read, or an
-    option is of the other kind."""
+    """Read clouds, or depth images with their intrinsics. Raises InputError: one cannot be read, or
+    an option is for the other kind."""
     cameras: tuple[Path | None, ...] = options.intrinsics or (None,)
     count = len(paths)
     if len(cameras) not in (1, count):
@@ -137,7 +137,7 @@ def _read_view(path: Path, intrinsics: Path | None, options: LocateOptions) -> V
 
 
 def read_places(poses: Path | None, views: int) -> tuple[str, tuple[Affine, ...]]:
-    """The fixed frame's name, and where the views' cameras were in it; of one view nothing."""
+    """The fixed frame's name, and fixed_from_camera of each view; empty for a single view."""
     if poses is None and views == 1:
         return "", ()
     if poses is None or views == 1:
@@ -151,7 +151,7 @@ def read_places(poses: Path | None, views: int) -> tuple[str, tuple[Affine, ...]
 def further_looks(
     organs: Sequence[SensorCloud], views: Sequence[View], fixed_from_camera: Sequence[Affine]
 ) -> list[Look]:
-    """All views but the first, whose frame is the answer's."""
+    """All views but the first, in whose frame the estimate is."""
     return [
         Look(organ, view.content, np.linalg.inv(fixed_from_camera[0]) @ pose)
         for organ, view, pose in list(zip(organs, views, fixed_from_camera, strict=False))[1:]
@@ -159,17 +159,17 @@ def further_looks(
 
 
 def _picked_mm(frame: DepthFrame, column: int, row: int) -> Float[np.ndarray, " 3"]:
-    """Where a pixel's surface is; where it has no return, that of a neighbour. InputError: no such
-    pixel, or no return."""
+    """The surface point at a pixel, or at the nearest one with a return. Raises InputError: no such
+    pixel, or no return near it."""
     camera = frame.intrinsics
     if not (0 <= column < camera.width and 0 <= row < camera.height):
         raise InputError(
             f"--at {column} {row} is outside the depth image; COLUMN is 0 to {camera.width - 1}, "
             f"ROW 0 to {camera.height - 1}."
         )
-    around = [(column + x, row + y) for x in _NEAR for y in _NEAR]
-    around.sort(key=lambda at: (at[0] - column) ** 2 + (at[1] - row) ** 2)
-    index = np.array([y * camera.width + x for x, y in around
+    pixels = [(column + x, row + y) for x in _NEAR for y in _NEAR]
+    pixels.sort(key=lambda pixel: (pixel[0] - column) ** 2 + (pixel[1] - row) ** 2)
+    index = np.array([y * camera.width + x for x, y in pixels
                       if 0 <= x < camera.width and 0 <= y < camera.height])  # fmt: skip
     depth_mm = frame.depth_mm.ravel()[index].astype(float)
     index, depth_mm = index[np.isfinite(depth_mm)], depth_mm[np.isfinite(depth_mm)]

@@ -23,10 +23,9 @@ from tumortrack.live.igtl.message import Message, Polydata
 from tumortrack.live.meter import Rate
 from tumortrack.live.network import is_loopback
 from tumortrack.live.values import SinkConfig, SinkContext, TrackingResult
-from tumortrack.tracking.files import MARGIN
-from tumortrack.tracking.margins import stated_radius
+from tumortrack.tracking.files import CENTRES, CT, MARGIN
+from tumortrack.tracking.margins import centre_label, stated_radius
 from tumortrack.tracking.shells import rough_margin
-from tumortrack.tracking.slicer_scene import CENTRES, CT, centre_label
 
 STATUS_DEVICE, CLOUD_DEVICE, ARMS_DEVICE = "tumortrack", "occupancy", "arms"
 _TIP = "/tip"  # the end of the names of shapes at tool tips

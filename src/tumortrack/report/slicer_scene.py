@@ -1,7 +1,7 @@
-"""Scenes of 3D Slicer (.mrb): a zip of a scene in MRML, Slicer's XML, and of the files it shows.
+"""Scenes for 3D Slicer (.mrb): a zip of a scene in MRML, Slicer's XML, and the files it shows.
 
-Written after the source code of Slicer (what ``ReadXMLAttributes`` of the nodes in Libs/MRML/Core
-takes) and of SlicerOpenIGTLink (vtkMRMLIGTLConnectorNode.cxx).
+Follows the source code of Slicer (``ReadXMLAttributes`` of the nodes in Libs/MRML/Core) and of
+SlicerOpenIGTLink (vtkMRMLIGTLConnectorNode.cxx).
 """
 
 from __future__ import annotations
@@ -28,25 +28,16 @@ from tumortrack.core.report import FitReport
 from tumortrack.core.types import FIRST_TUMOR, ORGAN
 from tumortrack.imaging.case import Case, load_case
 from tumortrack.imaging.segmentation_files import segments, write_dicom_seg, write_seg_nrrd
-from tumortrack.tracking.files import MARGIN, read_report
-from tumortrack.tracking.margins import stated_radius
+from tumortrack.tracking.files import CENTRES, CT, MARGIN, read_report
+from tumortrack.tracking.margins import centre_label
 from tumortrack.tracking.options import ExportOptions
 
 _SCHEMA = (
     "https://raw.githubusercontent.com/slicer/slicer/master/Modules/Loadable/Markups/Resources/"
     "Schema/markups-schema-v1.0.3.json#"
 )
-CENTRES, CT = "tumors", "ct"  # what the sink `openigtlink` calls the centres and the organ's pose
 _ORGAN_OPACITY, _SHELL_OPACITY = 0.4, 0.25
-_File = tuple[str, str, bytes]  # kind of node that reads it, name, content
-
-
-def centre_label(report: FitReport, name: str, poor: bool) -> str:
-    """A tumor's label: its name and, as far as known, how certain its centre is."""
-    radius, std_mm = stated_radius(report.margin, name), report.parts[name].center_std_mm
-    words = [f"{name} POOR" if poor else name]
-    words += [] if std_mm is None else [f"std {std_mm:.1f} mm"]
-    return ", ".join([*words, radius.words if radius else "no margin stated"])
+_File = tuple[str, str, bytes]  # kind of its storage node, name, content
 
 
 def export(given: Path, out: Path, options: ExportOptions) -> tuple[str, ...]:
@@ -118,7 +109,7 @@ def _report_with_motion(run: Path, case: Case, folder: Path) -> dict[str, Any]:
 
 
 class Scene:
-    """Collects nodes and their files. Those of the camera's frame are shown as if it were LPS."""
+    """Collects nodes and their files. Content in the camera frame is shown as if it were LPS."""
 
     def __init__(self) -> None:
         self._root = ElementTree.Element("MRML", version="Slicer4.4.0", userTags="")
@@ -135,26 +126,26 @@ class Scene:
         store.write_atomically(path, buffer.getvalue())
 
     def add_case(self, folder: Path, case: Case, segmentation: bytes, moved: bool) -> None:
-        """Its CT and segmentation; ``moved``: by the transform ``ct``, which is to be added too;
-        else with its surfaces and the tumors' centres."""
-        under = CT if moved else ""
+        """CT and segmentation. ``moved``: under the transform ``ct``, which the caller adds; if
+        not, with surfaces and the tumors' centres."""
+        parent = CT if moved else ""
         if case.ct is not None:
             file = ("VolumeArchetypeStorage", "ct.nii.gz", (folder / "ct.nii.gz").read_bytes())
             grey = {"colorNodeID": "vtkMRMLColorTableNodeGrey", "autoWindowLevel": "1"}
-            self._add("Volume", "CT", grey, file, under)
+            self._add("Volume", "CT", grey, file, parent)
         file = ("SegmentationStorage", "case.seg.nrrd", segmentation)
-        self._add("Segmentation", "CT segmentation", {}, file, under)
+        self._add("Segmentation", "CT segmentation", {}, file, parent)
         if not moved:
             for label, name in enumerate(case.anatomy.names, ORGAN):
                 self._add_model(name, label, (folder / f"{name}.ply").read_bytes())
             self._add_structures(folder, case.anatomy.structures)
-            named = zip(case.anatomy.names[1:], case.anatomy.tumors, strict=True)
-            middles = [(name, mesh.box_mm.mean(0).tolist()) for name, mesh in named]
-            self._add_points(CENTRES, middles)
+            tumors = zip(case.anatomy.names[1:], case.anatomy.tumors, strict=True)
+            centres = [(name, mesh.box_mm.mean(0).tolist()) for name, mesh in tumors]
+            self._add_points(CENTRES, centres)
 
     def add_run(self, folder: Path, stored: dict[str, Any]) -> None:
-        """What `locate` found: segmentation, surfaces, margins, the tumors' centres labelled with
-        how sure they are, and mapped points; camera frame. ``stored``: its report.json."""
+        """The result of `locate`: segmentation, surfaces, margins, tumor centres labelled with
+        their uncertainty, and mapped points; camera frame. ``stored``: its report.json."""
         report, poor = msgspec.convert(stored, FitReport), stored["quality"]["verdict"] != "good"
         voxels = (folder / "labels.seg.nrrd").read_bytes()
         self._add("Segmentation", "located", {}, ("SegmentationStorage", "labels.seg.nrrd", voxels))
@@ -174,22 +165,22 @@ class Scene:
             self._add_points("mapped_points", list(zip(names, places, strict=True)))
 
     def add_ct_transform(self, camera_from_ct: list[list[float]] | None) -> None:
-        """The transform ``ct``: what is under it lies where the organ is; None: as in the CT."""
+        """The transform ``ct``, which moves its children to the organ; None: the identity."""
         matrix = np.eye(4) if camera_from_ct is None else np.array(camera_from_ct)
         matrix = RAS_FROM_LPS @ matrix @ RAS_FROM_LPS
         numbers = " ".join(f"{number:.9g}" for number in matrix.ravel())
         self._node("LinearTransform", CT, id=f"{CT}Transform", matrixTransformToParent=numbers)
 
     def add_live(self, names: Iterable[str], host: str, port: int) -> None:
-        """A connection to the sink `openigtlink`, which starts when the scene is open (with
-        SlicerOpenIGTLink), and models that wait for its surfaces, with their look."""
+        """A connection to the sink `openigtlink`, which starts when the scene is opened (with
+        SlicerOpenIGTLink), and empty models with the display properties of its surfaces."""
         for label, name in enumerate(names, ORGAN):
             for shown in (name,) if label == ORGAN else (name, name + MARGIN):
                 self._add_model(shown, label)
         client = {"connectorType": "CLIENT", "serverHostname": host, "serverPort": str(port)}
-        # What is persistent and not off (1: waits for the server) is started by Slicer.
-        going = {"persistent": "1", "state": "1", "checkCRC": "1"}
-        self._node("IGTLConnector", "tumortrack", **client, **going)
+        # Slicer starts connectors that are persistent and not off (1: waits for the server).
+        active = {"persistent": "1", "state": "1", "checkCRC": "1"}
+        self._node("IGTLConnector", "tumortrack", **client, **active)
 
     def _add_structures(self, folder: Path, names: Iterable[str]) -> None:
         for number, name in enumerate(names):
@@ -201,7 +192,7 @@ class Scene:
     ) -> None:
         shell = name.endswith(MARGIN)
         opacity = _SHELL_OPACITY if shell else _ORGAN_OPACITY if label == ORGAN else 1.0
-        look = {
+        display = {
             "color": " ".join(f"{channel / 255:.4g}" for channel in colour or part_colour(label)),
             "opacity": f"{opacity:g}",
             "visibility2D": "true",
@@ -210,7 +201,7 @@ class Scene:
             "scalarVisibility": "false",
         }
         file = None if content is None else ("ModelStorage", f"{name}.ply", content)
-        self._add("Model", name, look, file)
+        self._add("Model", name, display, file)
 
     def _add_points(self, name: str, points: list[tuple[str, list[float]]]) -> None:
         if not points:
@@ -225,24 +216,24 @@ class Scene:
         self._add("MarkupsFiducial", name, {}, file)
 
     def _add(
-        self, kind: str, name: str, look: dict[str, str], file: _File | None, under: str = ""
+        self, kind: str, name: str, display: dict[str, str], file: _File | None, parent: str = ""
     ) -> None:
-        """A node with its display, the file that it's read from and the transform it lies under."""
-        references = {"display": self._node(f"{kind}Display", f"{name} display", **look)}
+        """A node with its display, the file it is read from and its parent transform."""
+        references = {"display": self._node(f"{kind}Display", f"{name} display", **display)}
         if file is not None:
             storage, file_name, content = file
             self._files[file_name] = content
-            place = {"fileName": f"Data/{file_name}"}
+            attributes = {"fileName": f"Data/{file_name}"}
             if kind in ("Model", "MarkupsFiducial"):
-                place["coordinateSystem"] = "LPS"
-            references["storage"] = self._node(storage, f"{name} storage", **place)
-        if under:
-            references["transform"] = f"{under}Transform"
-        text = "".join(f"{role}:{node};" for role, node in references.items())
-        self._node(kind, name, references=text)
+                attributes["coordinateSystem"] = "LPS"
+            references["storage"] = self._node(storage, f"{name} storage", **attributes)
+        if parent:
+            references["transform"] = f"{parent}Transform"
+        listed = "".join(f"{role}:{node};" for role, node in references.items())
+        self._node(kind, name, references=listed)
 
     def _node(self, kind: str, name: str, **attributes: str) -> str:
-        """Its id."""
-        known = {"id": f"vtkMRML{kind}Node{len(self._root) + 1}", "name": name} | attributes
-        ElementTree.SubElement(self._root, kind, known)
-        return known["id"]
+        """Add a node; returns its id."""
+        attributes = {"id": f"vtkMRML{kind}Node{len(self._root) + 1}", "name": name} | attributes
+        ElementTree.SubElement(self._root, kind, attributes)
+        return attributes["id"]
