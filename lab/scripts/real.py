@@ -28,7 +28,7 @@ from tumortrack.core.types import Mesh
 from tumortrack.imaging.case import Case, load_case
 from tumortrack.tracking.tracker import Tracker
 from tumortrack_lab.real import kidneys, lungs, silicone
-from tumortrack_lab.real.judging import DRAGGED, by_tumor, judge, quantiles, scene_of
+from tumortrack_lab.real.judging import DRAGGED, by_tumor, judge, scene_of
 from tumortrack_lab.study import scripts
 from tumortrack_lab.study.document import ReportWriter, spread_mm, spread_words, table_of
 from tumortrack_lab.study.methods import named_folders
@@ -144,9 +144,8 @@ def _dragged(organ: Organ) -> list[dict]:
     def measure() -> list[dict]:
         case, tracker = organ.case, organ.tracker()
         make = api.scene_maker(case, DRAGGED, organ.options.seed)
-        rows = [judge(tracker, case.anatomy, make(number)) for number in range(count)]
-        say(f"{organ.name}, dragged: {quantiles(by_tumor(rows).middle_mm)}")
-        return rows
+        say(f"{organ.name}, dragged: {count} scenes")
+        return [judge(tracker, case.anatomy, make(number)) for number in range(count)]
 
     folder = organ.options.out / "dragged"
     folder.mkdir(exist_ok=True)

@@ -190,10 +190,10 @@ class _Fleet:
         """A task's result, and before it those of its inputs, where the store lacks them."""
         if (known := await self._known(task, found)) is not None:
             return known
-        needs, reasons = task.needs, tuple[str, ...]()
+        memory_mb, reasons = task.memory_mb, tuple[str, ...]()
         lacking = await self._lacking_input(task)
         while lacking is None:
-            job = job_of(task, needs, self.store.url, self._run, reasons)
+            job = job_of(task, memory_mb, self.store.url, self._run, reasons)
             self.status.running += 1
             report = await self.executor.do(job)
             self.status.running -= 1
@@ -217,7 +217,7 @@ class _Fleet:
                 lacking = await self._lacking_input(task)
                 continue
             if report.state == "memory":
-                needs = replace(needs, memory_mb=2 * needs.memory_mb)
+                memory_mb *= 2
             await asyncio.sleep(min(_FIRST_PAUSE_S * 2 ** (len(reasons) - 1), _LONGEST_PAUSE_S))
         return replace(lacking, task=task)
 

@@ -86,12 +86,11 @@ class OnRay:
         task that can't report, what Ray says of its end."""
         machines, errors = self._largest(), self._ray.exceptions
         most = {name: max(one.get(name, 0) for one in machines) for name in ("CPU", "memory")}
-        function = self._large if job.needs.memory_mb >= _LARGE_MB else self._small
+        function = self._large if job.memory_mb >= _LARGE_MB else self._small
         options = function.options(
             name=job.name,
-            num_cpus=min(job.needs.cores, most["CPU"]),
-            memory=min(job.needs.memory_mb * 2**20, int(0.95 * most["memory"])),
-            num_gpus=job.needs.gpus,
+            num_cpus=min(1, most["CPU"]),
+            memory=min(job.memory_mb * 2**20, int(0.95 * most["memory"])),
         )
         try:
             report: Report = await asyncio.wrap_future(options.remote(job).future())

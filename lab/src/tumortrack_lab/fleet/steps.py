@@ -17,7 +17,7 @@ from tumortrack.core import store
 from tumortrack.core.errors import InputError, TumortrackError
 from tumortrack_lab.fleet import checks
 from tumortrack_lab.fleet.list import Patient, hashed
-from tumortrack_lab.fleet.task import File, Needs, Task
+from tumortrack_lab.fleet.task import File, Task
 
 # Eight families of physics have the wider world; cut organs are none that is still to be located.
 FAMILIES = ("rest", "plate", "clamp", "twist", "pull", "tether", "roll")
@@ -41,9 +41,8 @@ def chain(patient: Patient) -> dict[str, Task]:
     def add(
         name: str, work: Any, options: Given, inputs: Mapping[str, Task | File], memory_mb: int
     ) -> Task:
-        needs = Needs(memory_mb=memory_mb)
         kind = name.rstrip("0123456789-")
-        steps[name] = Task(patient.name, kind, 2, work, dict(options), inputs, needs)
+        steps[name] = Task(patient.name, kind, 2, work, dict(options), inputs, memory_mb)
         return steps[name]
 
     kind = "" if patient.source.is_dir() else "".join(patient.source.suffixes[-2:])
@@ -72,7 +71,7 @@ def chain(patient: Patient) -> dict[str, Task]:
     return steps
 
 
-def prepare(inputs: Inputs, options: Given, out: Path, cores: int) -> None:
+def prepare(inputs: Inputs, options: Given, out: Path) -> None:
     """A case with its model, as `tumortrack prepare` makes it; its source has no name."""
     from dataclasses import replace
 
@@ -92,7 +91,7 @@ def prepare(inputs: Inputs, options: Given, out: Path, cores: int) -> None:
     case_model(load_case(out))
 
 
-def check(inputs: Inputs, options: Given, out: Path, cores: int) -> None:
+def check(inputs: Inputs, options: Given, out: Path) -> None:
     """check.json: the anatomy in numbers, and ``doubts``: what a person should look at. Raises
     InputError: what nothing should be located with."""
     from tumortrack.imaging.case import load_case
@@ -105,7 +104,7 @@ def check(inputs: Inputs, options: Given, out: Path, cores: int) -> None:
     store.write_json(out / "check.json", {**found, "doubts": checks.doubts(case, found)})
 
 
-def states(inputs: Inputs, options: Given, out: Path, cores: int) -> None:
+def states(inputs: Inputs, options: Given, out: Path) -> None:
     """Scene folders of so many states of the wider world from the ``first`` on, in so many views,
     and failures.json: states without an equilibrium, views without an organ."""
     from tumortrack.imaging.case import load_case
@@ -138,7 +137,7 @@ def states(inputs: Inputs, options: Given, out: Path, cores: int) -> None:
     store.write_json(out / "failures.json", failures)
 
 
-def margins(inputs: Inputs, options: Given, out: Path, cores: int) -> None:
+def margins(inputs: Inputs, options: Given, out: Path) -> None:
     """margins.jsonl, a line a state, as `tumortrack margins` writes it; result.json; and where the
     states are enough margins.json, which belongs into the model's folder.
 
@@ -193,7 +192,7 @@ def margins(inputs: Inputs, options: Given, out: Path, cores: int) -> None:
     store.write_json(out / "result.json", result)
 
 
-def evaluate(inputs: Inputs, options: Given, out: Path, cores: int) -> None:
+def evaluate(inputs: Inputs, options: Given, out: Path) -> None:
     """rows.json: what is said of every scene, and how far it is off, beside the best rigid pose."""
     from dataclasses import replace
 
@@ -225,7 +224,7 @@ def evaluate(inputs: Inputs, options: Given, out: Path, cores: int) -> None:
     store.write_json(out / "rows.json", {"rows": rows, "failures": failures})
 
 
-def summary(inputs: Inputs, options: Given, out: Path, cores: int) -> None:
+def summary(inputs: Inputs, options: Given, out: Path) -> None:
     """summary.json: all that the fleet's tables hold of the patient; case.webp and, of the worst
     answer, worst.webp."""
     from tumortrack.imaging.case import Case

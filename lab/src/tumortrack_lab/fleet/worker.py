@@ -22,7 +22,7 @@ from typing import Any, Literal
 import tumortrack
 from tumortrack.core.errors import InputError, StorageError, TumortrackError
 from tumortrack_lab.fleet.store import DamagedError, Store, scratch
-from tumortrack_lab.fleet.task import File, Needs, Task, Work
+from tumortrack_lab.fleet.task import File, Task, Work
 
 _RENEWED_S = 15.0  # between renewals of a claim
 
@@ -36,7 +36,7 @@ class Job:
     work: str
     options: Mapping[str, Any]
     inputs: Mapping[str, str | File]  # keys of results in the store; users' files
-    needs: Needs
+    memory_mb: int
     store: str
     run: str  # its name, for claims
     reasons: tuple[str, ...] = ()
@@ -60,14 +60,14 @@ class Report:
     cost: Mapping[str, Any] = field(default_factory=dict)
 
 
-def job_of(task: Task, needs: Needs, store: str, run: str, reasons: tuple[str, ...]) -> Job:
+def job_of(task: Task, memory_mb: int, store: str, run: str, reasons: tuple[str, ...]) -> Job:
     """Raises TypeError: the work cannot be imported by its name."""
     name = f"{task.work.__module__}:{task.work.__qualname__}"  # type: ignore[attr-defined]
     if resolve_name(name) is not task.work or name.startswith("__main__"):
         raise TypeError(f"{name} is another object than the work of {task.step}")
     inputs = {name: one if isinstance(one, File) else one.key for name, one in task.inputs.items()}
     who = f"{task.patient} {task.step}"
-    return Job(task.key, who, name, dict(task.options), inputs, needs, store, run, reasons)
+    return Job(task.key, who, name, dict(task.options), inputs, memory_mb, store, run, reasons)
 
 
 def perform(job: Job) -> Report:
@@ -123,9 +123,9 @@ def _measured(job: Job, store: Store, inputs: Mapping[str, Path], out: Path) -> 
     """Do the work and put away what came of it, with what it cost."""
     meter = _Meter()
     work: Work = resolve_name(job.work)
-    _set_threads(job.needs.cores)
+    _use_one_core()
     try:
-        work(inputs, job.options, out, job.needs.cores)
+        work(inputs, job.options, out)
     except StorageError as error:  # the disk's, not the patient's
         return _attempt_failed(error)
     except TumortrackError as error:
@@ -156,14 +156,11 @@ def _store(url: str) -> Store:
     return Store(url)
 
 
-def _set_threads(cores: int) -> None:
-    """For libraries that are loaded, and for those that the work loads or starts."""
-    os.environ["OMP_NUM_THREADS"] = str(cores)
-    if "torch" in sys.modules:
-        sys.modules["torch"].set_num_threads(cores)
+def _use_one_core() -> None:
+    """Limit libraries that are loaded, and those that the work loads or starts."""
+    os.environ["OMP_NUM_THREADS"] = "1"
     if "numba" in sys.modules:
-        numba = sys.modules["numba"]
-        numba.set_num_threads(min(cores, numba.config.NUMBA_NUM_THREADS))
+        sys.modules["numba"].set_num_threads(1)
 
 
 class _Meter:
@@ -182,7 +179,6 @@ class _Meter:
             "cpu_s": round(_cpu_s() - self._start_cpu_s, 3),
             "peak_mb": round(_peak_mb(), 1),
             "bytes": sum(path.stat().st_size for path in out.rglob("*") if path.is_file()),
-            "cores": job.needs.cores,
             "host": socket.gethostname(),
             "attempts": [*job.reasons, ""],
         }

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from tumortrack.core.config import Config
 from tumortrack.core.errors import NoEstimate
-from tumortrack.core.geometry import rigid, rotation_onto, transform_points
+from tumortrack.core.geometry import rigid, rotation_onto, transform_points, triangles_of
 from tumortrack.core.types import Anatomy, Mesh, SensorCloud
 from tumortrack.sense.render import Visibility
 
@@ -64,12 +64,18 @@ def surface_points(mesh: Mesh, spacing_mm: float) -> SurfacePoints:
     cube = np.floor(mesh.vertices_mm / spacing_mm).astype(np.int64)
     _, first = np.unique(cube, axis=0, return_index=True)
     kept = np.sort(first)
-    a, b, c = (mesh.vertices_mm[mesh.faces[:, k]] for k in range(3))
-    normals = np.zeros_like(mesh.vertices_mm)  # the mean of each vertex's triangles, by area
-    for corner in range(3):
-        np.add.at(normals, mesh.faces[:, corner], np.cross(b - a, c - a))
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-    return SurfacePoints(mesh.vertices_mm[kept], normals[kept])
+    return SurfacePoints(mesh.vertices_mm[kept], vertex_normals(mesh)[kept])
+
+
+def vertex_normals(mesh: Mesh) -> Points:
+    """Outward unit normals: the mean of each vertex's triangles, by area."""
+    normals, doubled = (
+        np.zeros_like(mesh.vertices_mm),
+        triangles_of(mesh.vertices_mm, mesh.faces)[1],
+    )
+    for corner in mesh.faces.T:
+        np.add.at(normals, corner, doubled)
+    return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
 
 
 def seen_from(

@@ -128,10 +128,3 @@ def by_tumor(rows: Iterable[dict[str, Any]]) -> pd.DataFrame:
     lines = [{**row, **tumor} for row in rows for tumor in row["tumors"] or [{}]]
     found = pd.DataFrame(lines)
     return found.reindex(columns=[*dict.fromkeys([*_FIRST, *found.columns])])
-
-
-def quantiles(values: Iterable[float]) -> str:
-    """Median / 90 % / 95 % / worst."""
-    given = pd.Series(list(values), dtype=float).dropna()
-    shown = [*given.quantile([0.5, 0.9, 0.95]), given.max()]
-    return " / ".join(f"{value:.1f}" for value in shown) if len(given) else "–"

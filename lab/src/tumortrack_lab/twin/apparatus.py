@@ -40,6 +40,7 @@ from tumortrack_lab.twin.solid import NeoHookeanSolid
 GRAVITY_KPA_PER_MM = 9.81e-6  # of 1 kg/m^3
 STATES = ("D0", "D1", "D2", "D3", "G1", "P1")
 _LARGEST_VOLUME_CHANGE = 0.02
+_STEEPEST = 1.5  # slope of the underside, which packing bears
 _SINK_STEPS = 15
 _SINK_TOLERANCE_MM = 0.4
 
@@ -144,14 +145,12 @@ def contact_points(
     return points_mm[first], np.bincount(cube.ravel(), areas_mm2)
 
 
-def _faces_down(
-    organ: Mesh, points_mm: Float64[np.ndarray, "m 3"], steepest: float = 1.5
-) -> Bool[np.ndarray, " m"]:
-    """Which points of the surface lie on its underside, where the slope is at most so much."""
+def _faces_down(organ: Mesh, points_mm: Float64[np.ndarray, "m 3"]) -> Bool[np.ndarray, " m"]:
+    """Which points of the surface lie on its underside, where it is not too steep."""
     from scipy.spatial import cKDTree
 
     middle, normal = triangles_of(organ.vertices_mm, organ.faces)
-    down = -normal[:, 2] > np.linalg.norm(normal, axis=1) / np.hypot(1, steepest)
+    down = -normal[:, 2] > np.linalg.norm(normal, axis=1) / np.hypot(1, _STEEPEST)
     return np.asarray(down[cKDTree(middle).query(points_mm)[1]])
 
 

@@ -100,16 +100,20 @@ def add_background(
     return out, got / (got + organ)
 
 
-def _lumps(frame: DepthFrame, support_mm: float, rng: Generator) -> Iterator[Mesh]:
-    """Half ellipsoids on the support beside the organ, ever larger."""
+def ellipsoid(middle_mm: np.ndarray, half_mm: np.ndarray) -> Mesh:
     import trimesh
 
-    ball = trimesh.creation.icosphere(3, 1.0)
+    ball = trimesh.creation.icosphere(3)
+    return Mesh(ball.vertices * half_mm + middle_mm, ball.faces)
+
+
+def _lumps(frame: DepthFrame, support_mm: float, rng: Generator) -> Iterator[Mesh]:
+    """Half ellipsoids on the support beside the organ, ever larger."""
     for size_mm in (14.0, 18.0, 24.0, 32.0):
         for angle in rng.uniform(0, 2 * np.pi, 8):
             beside = _beside(frame, angle, support_mm, 0.5 * size_mm)
             half = size_mm * np.array([1.0, 1.0, 0.6])
-            yield Mesh(ball.vertices * half + np.array([*beside, support_mm]), ball.faces)
+            yield ellipsoid(np.array([*beside, support_mm]), half)
 
 
 def _tips(frame: DepthFrame, support_mm: float, rng: Generator) -> Iterator[Mesh]:

@@ -20,11 +20,12 @@ from tumortrack.imaging.meshes import mesh_of, solid_of
 from tumortrack.simulate.scene_folder import InnerPoints, Scene, Targets, draw_targets
 from tumortrack_lab.tets import TetMesh, tetrahedralise
 from tumortrack_lab.twin.apparatus import bench_from_ct, moved
+from tumortrack_lab.twin.occluders import ellipsoid
 from tumortrack_lab.world import segmentation
 from tumortrack_lab.world.families import FAMILIES, Deformed, solve
 from tumortrack_lab.world.kidneys import random_anatomy
 from tumortrack_lab.world.organ import Organ
-from tumortrack_lab.world.views import View, look, lump, organ_cloud
+from tumortrack_lab.world.views import View, look, organ_cloud
 
 Disturbance = Literal[
     "none", "hidden", "strays", "fat", "white", "scale", "side", "mirrored", "foreign", "nothing"
@@ -229,7 +230,7 @@ def _replaced(
         return replace(state, wound=None), moved(other, bench_from_ct(other.organ, up)), ()
     if kind == "nothing":
         half = (high - low) / 2 * rng.uniform(0.6, 1.1, 3)
-        ball = lump(np.zeros(3), np.ones(3))
+        ball = ellipsoid(np.zeros(3), np.ones(3))
         waves = rng.normal(0, 1.5, (3, 8))
         bumps = np.cos(ball.vertices_mm @ waves + rng.uniform(0, 6.3, 8)).mean(1, keepdims=True)
         thing = Mesh((ball.vertices_mm * (1 + 0.5 * bumps)) * half + [0, 0, half[2]], ball.faces)
@@ -240,7 +241,7 @@ def _replaced(
         edge = truth.organ.vertices_mm[(truth.organ.vertices_mm @ way).argmax()]
         place = edge + 0.3 * half.mean() * way
         place[2] = low[2] + rng.uniform(0.5, 0.9) * (high[2] - low[2]) - 0.7 * half[2]
-        return state, truth, (lump(place, half),)
+        return state, truth, (ellipsoid(place, half),)
     return state, truth, ()
 
 

@@ -11,19 +11,17 @@ from __future__ import annotations
 from typing import Literal, get_args
 
 import numpy as np
-from jaxtyping import Float64
 
-from tumortrack.core.geometry import rotation_onto, triangles_of
+from tumortrack.core.geometry import rotation_onto
 from tumortrack.core.mesh_query import contains
 from tumortrack.core.types import Anatomy, Mesh
+from tumortrack_lab.peers.pose_search import vertex_normals
 
 Kind = Literal["none", "voxel", "slices", "reader"]
 KINDS: tuple[Kind, ...] = get_args(Kind)
 VOXEL_MM = (0.7, 1.5)  # of clinical CT
 READER_MM, READER_REACH_MM = 1.0, (8.0, 25.0)  # standard deviation, how far it goes one way
 _GRID_MM, _REACH_MM = 1.5, 4.5
-
-Vertices = Float64[np.ndarray, "v 3"]
 
 
 def perturbed(
@@ -48,19 +46,11 @@ def perturbed(
         shifts = [_disagreement(part, reach, rng) for part in anatomy.parts]
         about = {"reach_mm": reach}
     parts = tuple(
-        part.moved(part.vertices_mm + shift[:, None] * normals(part))
+        part.moved(part.vertices_mm + shift[:, None] * vertex_normals(part))
         for part, shift in zip(anatomy.parts, shifts, strict=True)
     )
     rms = [float(np.sqrt((shift**2).mean())) for shift in shifts]
     return anatomy.of(parts), {"kind": kind, **about, "rms_mm": rms}
-
-
-def normals(mesh: Mesh) -> Vertices:
-    """Unit normals of the vertices, outward."""
-    out, area = np.zeros_like(mesh.vertices_mm), triangles_of(mesh.vertices_mm, mesh.faces)[1]
-    for corner in mesh.faces.T:
-        np.add.at(out, corner, area)
-    return out / np.maximum(np.linalg.norm(out, axis=1, keepdims=True), 1e-12)
 
 
 def _disagreement(mesh: Mesh, reach_mm: float, rng: np.random.Generator) -> np.ndarray:
@@ -88,7 +78,7 @@ def _sliced(mesh: Mesh, thick_mm: float, phase: float, axis: np.ndarray) -> np.n
     smooth = gaussian_filter1d(stairs, thick_mm / 2 / _GRID_MM, axis=2)
     for across in (0, 1):  # the drawn line's own pixels
         smooth = gaussian_filter1d(smooth, 1.0 / _GRID_MM, axis=across)
-    out = normals(mesh) @ turn.T
+    out = vertex_normals(mesh) @ turn.T
     steps = np.arange(-_REACH_MM, _REACH_MM + 0.1, 0.25)
     places = (there[:, None] + steps[:, None] * out[:, None] - low) / _GRID_MM
     value = map_coordinates(smooth, places.reshape(-1, 3).T, order=1).reshape(len(there), -1)

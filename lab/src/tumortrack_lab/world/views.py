@@ -18,7 +18,7 @@ from tumortrack.sense.cloud import CloudConfig
 from tumortrack.sense.region import Hints, RegionConfig, organ_points
 from tumortrack.sense.render import render_depth
 from tumortrack_lab.twin.equilibrium import Rod
-from tumortrack_lab.twin.occluders import rod_mesh
+from tumortrack_lab.twin.occluders import ellipsoid, rod_mesh
 from tumortrack_lab.world.families import Deformed, log_uniform
 from tumortrack_lab.world.noise import StereoCamera, StereoConfig
 
@@ -175,18 +175,11 @@ def _beside(organ: Mesh, rng: Generator) -> list[Mesh]:
         place[2] = low[2] + rng.uniform(0.2, 0.6) * (high[2] - low[2])
         if rng.uniform() < 0.5:
             half = rng.uniform([8.0, 8.0, 4.0], [25.0, 25.0, 14.0])
-            things.append(lump(place, half))
+            things.append(ellipsoid(place, half))
         else:
             axis = unit(np.cross(way, [0, 0, 1.0]) + 0.4 * way + rng.normal(0, 0.2, 3))
             things.append(rod_mesh(Rod(place - 60 * axis, axis, rng.uniform(2.5, 6.0), 160.0)))
     return things
-
-
-def lump(middle_mm: np.ndarray, half_mm: np.ndarray) -> Mesh:
-    import trimesh
-
-    ball = trimesh.creation.icosphere(3)
-    return Mesh(ball.vertices * half_mm + middle_mm, ball.faces)
 
 
 def covering(
