@@ -70,7 +70,8 @@ def main(options: Options) -> None:
 
 
 def cases_of(options: Options) -> Iterator[StudyCase]:
-    folders = {n: phantom_case(options.out / "cases" / n, one) for n, one in PHANTOMS.items()}
+    place = options.out / "cases"
+    folders = {name: phantom_case(place / name, phantom) for name, phantom in PHANTOMS.items()}
     folders |= named_folders(options.case, folders)
     for name, folder in folders.items():
         yield study_case(name, folder, options.out / "scenes" / name)

@@ -65,6 +65,6 @@ class Task:
             "step": self.step,
             "version": self.version,
             "options": dict(self.options),
-            "inputs": {name: one.key for name, one in sorted(self.inputs.items())},
+            "inputs": {name: source.key for name, source in sorted(self.inputs.items())},
         }
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()

@@ -84,9 +84,9 @@ def seen_from(
     """Which surface points the camera sees: turned towards it and not hidden by the organ."""
     eye_ct = np.linalg.inv(camera_from_ct)[:3, 3]
     towards = surface.faces(eye_ct)
-    seen = np.zeros(len(towards), bool)
-    seen[towards] = visibility(surface.points_mm[towards], eye_ct)
-    return seen
+    visible = np.zeros(len(towards), bool)
+    visible[towards] = visibility(surface.points_mm[towards], eye_ct)
+    return visible
 
 
 def trimmed_mean(values: Float[np.ndarray, " n"], kept_share: float) -> float:
@@ -162,8 +162,8 @@ class PoseSearch:
     def seen(self, points: Points, camera_from_ct: Transform) -> Points:
         """Points of the undeformed surface that the camera should see and that lie nearer than the
         depth where the cloud was cropped; camera frame."""
-        seen = seen_from(self.visibility, self.surface, camera_from_ct)
-        placed = transform_points(camera_from_ct, self.surface.points_mm[seen])
+        visible = seen_from(self.visibility, self.surface, camera_from_ct)
+        placed = transform_points(camera_from_ct, self.surface.points_mm[visible])
         return placed[placed[:, 2] < np.percentile(points[:, 2], CROP_PERCENT)]
 
     def _start(self, rotation: Rotation3) -> tuple[Rotation3, Point]:
@@ -172,8 +172,8 @@ class PoseSearch:
         turned = self.surface.points_mm @ rotation.T
         middle = (turned.min(0) + turned.max(0)) / 2
         shift = np.array([*-middle[:2], self.config.distance_mm - turned[:, 2].min()])
-        seen = seen_from(self.visibility, self.surface, rigid(rotation, shift))
-        return rotation, _anchor(turned[seen]) @ rotation
+        visible = seen_from(self.visibility, self.surface, rigid(rotation, shift))
+        return rotation, _anchor(turned[visible]) @ rotation
 
     def _icp(self, points: Points, camera_from_ct: Transform, reach_mm: float) -> Transform:
         import small_gicp

@@ -1,7 +1,7 @@
 """How the true organ differs from the model's case: errors of the CT's segmentation.
 
-The case is what somebody segmented; the patient has something else. Surfaces keep their triangles,
-vertices move along their normals; scenes are made of the moved ones, the model knows the others.
+The case is a segmentation; the patient's organ differs. Surfaces keep their triangles, vertices
+move along their normals; scenes show the moved surfaces, the model knows the others.
 Two readers of one CT agree to a Dice score of 0.98 on kidneys and 0.92 on tumors (Heller et al.
 2021, doi 10.1016/j.media.2020.101821): about a millimetre on such surfaces.
 """
@@ -27,8 +27,8 @@ _GRID_MM, _REACH_MM = 1.5, 4.5
 def perturbed(
     anatomy: Anatomy, kind: Kind, axis: np.ndarray, rng: np.random.Generator
 ) -> tuple[Anatomy, dict]:
-    """The true anatomy, and what was done. ``axis``: the slices' normal, unit. Tumors and organ err
-    apart, as they are outlined apart."""
+    """The true anatomy, and the errors. ``axis``: the slices' normal, unit. Tumors and organ have
+    independent errors, as they are outlined apart."""
     if kind == "none":
         return anatomy, {"kind": kind}
     if kind == "voxel":
@@ -62,8 +62,8 @@ def _disagreement(mesh: Mesh, reach_mm: float, rng: np.random.Generator) -> np.n
 
 
 def _sliced(mesh: Mesh, thick_mm: float, phase: float, axis: np.ndarray) -> np.ndarray:
-    """How far each vertex moves if the shape is known in slices alone: each shows the mean over its
-    thickness, the steps between them are smoothed along the slices' normal."""
+    """Each vertex's shift if the shape is known only in slices: each shows the mean over its
+    thickness, and the steps between them are smoothed along the slices' normal."""
     from scipy.ndimage import gaussian_filter1d, map_coordinates
 
     turn = rotation_onto(axis, np.array([0.0, 0.0, 1.0]))
@@ -87,5 +87,5 @@ def _sliced(mesh: Mesh, thick_mm: float, phase: float, axis: np.ndarray) -> np.n
     best = away.argmin(1)
     row = np.arange(len(there))
     a, b = value[row, best], value[row, best + 1]
-    found = steps[best] + 0.25 * (a - 0.5) / np.maximum(a - b, 1e-6)
-    return np.where(np.isfinite(away.min(1)), found, 0.0)
+    shift = steps[best] + 0.25 * (a - 0.5) / np.maximum(a - b, 1e-6)
+    return np.where(np.isfinite(away.min(1)), shift, 0.0)
