@@ -99,7 +99,7 @@ test-hard: setup  ## tests on narrow vector units beside two busy processes (ARG
 	trap "kill $$one $$two" EXIT; ONEDNN_MAX_CPU_ISA=AVX2 ATEN_CPU_CAPABILITY=avx2 \
 	NUMBA_CPU_NAME=haswell OMP_NUM_THREADS=1 $(BIN)/pytest $(ARGS)
 
-bench: setup  ## speed of every part beside its naive form; fills docs/performance.md and docs/data/speed*.csv (10 to 13 minutes; ARGS=--quick)
+bench: setup  ## speed of every part; fills docs/performance.md and docs/data/speed*.csv (5 minutes; ARGS=--quick)
 	$(BIN)/tumortrack bench --document docs/performance.md $(ARGS)
 
 soak: setup  ## an hour of tracking with faults of eleven kinds (ARGS="MODEL CASE --minutes 5"; after make demo)

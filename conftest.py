@@ -56,7 +56,6 @@ SLOWEST = (
     "test_track.py",
     "test_wheel.py",
     "test_attacks.py",
-    "test_bench_gpu.py",
     "test_margins.py",
     "test_twin_physics.py",
 )

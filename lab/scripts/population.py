@@ -7,8 +7,8 @@
 DATA is a folder with your copies, kits19/case_NNNNN/segmentation.nii.gz. The rule: of the 210 cases
 with a label map all but those set aside for judging (00091, 00093, 00096, 00146, 00155) and those
 used in development (00000, 00002, 00003), in order of their numbers; of each the kidney that
-`tumortrack prepare` takes, which bears most tumor, as it comes. None is left out by hand or for its
-result: what fails `prepare` or the fleet's quality check is listed as failed, with the reason.
+`tumortrack prepare` takes, the one with most tumor. None is left out by hand or for its result:
+what fails `prepare` or the fleet's quality check is listed as failed, with the reason.
 """
 
 from __future__ import annotations
@@ -86,19 +86,19 @@ def main(options: Options) -> None:
 
 
 def label_maps(data: Path) -> list[Path]:
-    """The user's copies that the rule takes, in order. Raises InputError: there is none."""
-    found = []
+    """The user's copies that the rule selects, in order. Raises InputError: there is none."""
+    paths = []
     for path in sorted((data / "kits19").glob("case_*/segmentation.nii.gz")):
         number = re.fullmatch(r"case_(\d{5})", path.parent.name)
         if number and int(number[1]) not in (*SET_ASIDE, *DEVELOPMENT):
-            found.append(path)
-    if not found:
+            paths.append(path)
+    if not paths:
         raise InputError(f"{data}/kits19 holds no label maps: put copies of {WHERE} there.")
-    return found
+    return paths
 
 
 def block(fleet: Path, writer: ReportWriter) -> str:
-    """What stands in the document; tables and plot go beside it."""
+    """The document's block; tables and plot go beside it."""
     people, scenes = (pd.read_parquet(fleet / name) for name in (PATIENTS, SCENES))
     looks = pd.read_csv(fleet / LOOK)
     done = people[people.state == "done"]
@@ -107,7 +107,7 @@ def block(fleet: Path, writer: ReportWriter) -> str:
     scenes = scenes.merge(people[["patient", "slice_mm"]], on="patient")
     draw(scenes, writer.image(BLOCK))
     rows, alone = grouped(scenes), len(done[~done.patient.isin(looks.patient)])
-    said = (
+    summary = (
         f"{len(people)} patients, {len(done)} done, {alone} with nothing for a person to look at. "
         f"{int(done.scenes.sum())} scenes; {int(done.lost.sum())} more could not be made. Within "
         f"the largest miss of a patient's margin states: {done.within_largest.mean():.0%} of good "
@@ -125,12 +125,11 @@ def block(fleet: Path, writer: ReportWriter) -> str:
         writer.data(f"{BLOCK}-wrong", wrong(scenes), "Good answers that are over 5 mm off"),
         writer.data(f"{BLOCK}-look", looks, "What a person should look at"),
     ]
-    return "\n\n".join([f"`{writer.command}`: {said}", table_of(short), *links])
+    return "\n\n".join([f"`{writer.command}`: {summary}", table_of(short), *links])
 
 
 def grouped(scenes: pd.DataFrame) -> pd.DataFrame:
-    """Verdicts and errors, by what was done to the organ and how tumors lie; a scene counts once a
-    tumor."""
+    """Verdicts and errors by load and by tumor; a scene counts once for each tumor."""
     bands = pd.Categorical(scenes.hidden_share.map(band_of), BANDS)
     given = {"all": pd.Series("all", scenes.index), "state": scenes.family}
     given |= {"hidden": pd.Series(bands, scenes.index), "kind": scenes.kind, "at": scenes.position}

@@ -1,4 +1,4 @@
-"""More organs and deformations that nature made: the tables of docs/real.md and docs/data/.
+"""Real organs and real deformations: the tables of docs/real.md and docs/data/.
 
     make real ARGS='DATA'         (hours; go on with the same command after an interruption)
 
@@ -29,7 +29,7 @@ from tumortrack.imaging.case import Case, load_case
 from tumortrack.simulate.dataset import scene_maker
 from tumortrack.tracking.tracker import Tracker
 from tumortrack_lab.real import kidneys, lungs, silicone
-from tumortrack_lab.real.judging import DRAGGED, by_tumor, judge, quantiles, scene_of
+from tumortrack_lab.real.judging import DRAGGED, by_tumor, judge, scene_of
 from tumortrack_lab.study import scripts
 from tumortrack_lab.study.document import ReportWriter, spread_mm, spread_words, table_of
 from tumortrack_lab.study.methods import named_folders
@@ -71,7 +71,7 @@ class Organ:
         return load_case(self.folder)
 
     def by_kind(self, rows: list[dict]) -> list[dict]:
-        """The rows, and of each tumor its kind."""
+        """The rows with each tumor's kind."""
         return kidneys.with_kinds(rows, self.case.anatomy)
 
     def tracker(self) -> Tracker:
@@ -112,7 +112,7 @@ def main(options: Options) -> None:
 
 
 def kidneys_block(listed: list[dict], organs: list[Organ], writer: ReportWriter) -> str:
-    """How well the kidneys are found dragged, squeezed and bent: by kind, and by kidney."""
+    """Errors in dragged, squeezed and bent kidneys: by kind, and by kidney."""
     about = {
         kidneys.name_of(row["case"]): {
             "side": row["side"], "kind": row["kind"], "outer share": f"{row['outer_share']:.2f}",
@@ -121,9 +121,9 @@ def kidneys_block(listed: list[dict], organs: list[Organ], writer: ReportWriter)
         }
         for row in listed
     }  # fmt: skip
-    found = dict(sorted((organ.name, organ.by_kind(_dragged(organ))) for organ in organs))
-    every = [row for rows in found.values() for row in rows]
-    by_kidney = [{"kidney": name, **about[name], **summary(rows)} for name, rows in found.items()]
+    rows_of = dict(sorted((organ.name, organ.by_kind(_dragged(organ))) for organ in organs))
+    every = [row for rows in rows_of.values() for row in rows]
+    by_kidney = [{"kidney": name, **about[name], **summary(rows)} for name, rows in rows_of.items()]
     by_kind = [
         {"kidney": "all", "kind": kind, **summary(mine)}
         for kind in KINDS
@@ -133,7 +133,7 @@ def kidneys_block(listed: list[dict], organs: list[Organ], writer: ReportWriter)
 
 
 def _of(kind: str, rows: list[dict]) -> list[dict]:
-    """What the rows say of tumors of this kind."""
+    """The rows with only the tumors of this kind."""
     some = [{**row, "tumors": [t for t in row["tumors"] if t["kind"] == kind]} for row in rows]
     return [row for row in some if row["tumors"]]
 
@@ -145,9 +145,8 @@ def _dragged(organ: Organ) -> list[dict]:
     def measure() -> list[dict]:
         case, tracker = organ.case, organ.tracker()
         make = scene_maker(case, DRAGGED, organ.options.seed)
-        rows = [judge(tracker, case.anatomy, make(number)) for number in range(count)]
-        say(f"{organ.name}, dragged: {quantiles(by_tumor(rows).middle_mm)}")
-        return rows
+        say(f"{organ.name}, dragged: {count} scenes")
+        return [judge(tracker, case.anatomy, make(number)) for number in range(count)]
 
     folder = organ.options.out / "dragged"
     folder.mkdir(exist_ok=True)
@@ -181,11 +180,11 @@ def lungs_block(organs: list[Organ], options: Options, writer: ReportWriter) -> 
             "most local volume": mine.most_stretch.max(),
             "folded states": (mine.verdict == "folded").sum(), "smallest scale": mine.scale.min(),
         })  # fmt: skip
-    seen = [row for row in rows if row["verdict"] != "folded"]
-    groups = [("tumors", kind, _of(kind, seen)) for kind in KINDS] + [
-        (by, one, [row for row in seen if row[by] == one])
+    located = [row for row in rows if row["verdict"] != "folded"]
+    groups = [("tumors", kind, _of(kind, located)) for kind in KINDS] + [
+        (by, value, [row for row in located if row[by] == value])
         for by in ("organ", "patient")
-        for one in dict.fromkeys(row[by] for row in seen)
+        for value in dict.fromkeys(row[by] for row in located)
     ]
     lines = [
         {"by": by, "of": of, "deformation": name, **summary(mine)}
@@ -268,7 +267,7 @@ def _block(writer: ReportWriter, name: str, rows: list[dict], short: list[dict],
 
 
 def silicone_block(options: Options, writer: ReportWriter) -> str:
-    """The bent casts: how far the scan lies from the estimated surface, seen and unseen."""
+    """The bent casts: distances of the scan to the estimated surface, seen and unseen."""
     data = options.data
     top = silicone.read_surface(data, silicone.REST)
     files = {cast: silicone.file(data, name) for cast, name in silicone.BENT.items()}
@@ -280,7 +279,7 @@ def silicone_block(options: Options, writer: ReportWriter) -> str:
 
 
 def slab_block(options: Options, writer: ReportWriter) -> str:
-    """The bent slab: the same, and how far the curve on it lies from its trace."""
+    """The bent slab: the same, and distances of the curve on it to its trace."""
     data = options.data
     files = {what: silicone.file(data, name) for what, name in silicone.SLAB.items()}
     given = {what: silicone.read_slab(data, what) for what in files}
@@ -318,8 +317,8 @@ def _bent(
         rows = []
         for number, (which, read) in enumerate(scans.items()):
             rng = np.random.default_rng([options.seed, number])
-            found = silicone.measured(tracker, anatomy, rest[0], read(), rng, curves)
-            rows += [{"cast": which, **row} for row in found]
+            views = silicone.measured(tracker, anatomy, rest[0], read(), rng, curves)
+            rows += [{"cast": which, **row} for row in views]
             say(f"{name} {which}: {rows[-1]}")
         return rows
 
@@ -327,7 +326,7 @@ def _bent(
 
 
 def _bent_rows(first: str, rows: list[dict], of: str = "") -> Iterator[dict]:
-    """A row a view: what was said of it, and how far the surfaces (or what ``of`` says) lie off."""
+    """A row for each view: verdict, and distances of surfaces (or of what ``of`` names)."""
     kinds = {"": (of, " mm"), "best rigid pose ": (f"rigid_{of}", " mm")}
     kinds |= {"error / stated ": ("ratio_", "")} if of else {}
     for row in rows:

@@ -1,9 +1,9 @@
-"""The experiment of docs/bench.md, rehearsed on a bench that does not exist.
+"""The experiment of docs/bench.md, rehearsed on a simulated bench.
 
     make rehearsal ARGS='CASE MODEL OUT'      (five minutes; goes on where it was stopped)
 
-All commands run as a laboratory would give them; OUT keeps every file. --document fills its block
-and writes tables beside it.
+The commands are those of a laboratory; OUT keeps every file. --document fills its block and writes
+tables beside it.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class Options:
     out: tyro.conf.Positional[Path]
     """Everything goes here."""
     mishaps: bool = True
-    """Also act what goes wrong on a bench."""
+    """Also act out mishaps."""
     document: Path | None = None
     """Its block `rehearsal` is replaced."""
 

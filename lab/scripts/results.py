@@ -7,15 +7,12 @@ Scenes and measurements are kept under --out; what is there already is not made 
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from tumortrack.cli.console import say
-from tumortrack.core.errors import TumortrackError
 from tumortrack.phantom.digital import PhantomParameters
 from tumortrack_lab.study import scripts, tables
 from tumortrack_lab.study.document import ReportWriter, table_of
@@ -31,6 +28,7 @@ from tumortrack_lab.study.methods import (
     study_case,
 )
 from tumortrack_lab.study.tumor_sites import tumor_sites_of
+from tumortrack_lab.twin.dataset import TwinRun, make_scenes
 from tumortrack_lab.twin.views import VARIANTS
 
 PHANTOMS = {"phantom": PhantomParameters(), "second_phantom": second_phantom()}
@@ -61,7 +59,8 @@ def main(options: Options) -> None:
     writer, rows = options.begin("results", BLOCK), []
     cases = list(cases_of(options))
     for case in cases:
-        make_scenes(case, options.variants)
+        run = TwinRun(case.folder)
+        make_scenes(run, case.scenes, options.variants, (VIEW,), lambda now: say(now.text))
         for method in methods_of(case, options):
             say(f"{case.name}: {method.name}, seed {method.seed}")
             about = case, method, options.variants, VIEW, options.grid, options.out / "rows"
@@ -71,18 +70,11 @@ def main(options: Options) -> None:
 
 
 def cases_of(options: Options) -> Iterator[StudyCase]:
-    folders = {n: phantom_case(options.out / "cases" / n, one) for n, one in PHANTOMS.items()}
+    place = options.out / "cases"
+    folders = {name: phantom_case(place / name, phantom) for name, phantom in PHANTOMS.items()}
     folders |= named_folders(options.case, folders)
     for name, folder in folders.items():
         yield study_case(name, folder, options.out / "scenes" / name)
-
-
-def make_scenes(case: StudyCase, variants: tuple[str, ...]) -> None:
-    """The twin's scenes; those that are there stay."""
-    command = [sys.executable, "-m", "tumortrack.cli.main", "twin", str(case.folder)]
-    command += [str(case.scenes), "--states", *variants, "--views", VIEW]
-    if subprocess.run(command, check=False).returncode != 0:
-        raise TumortrackError(f"the scenes of {case.name} could not be made (see above).")
 
 
 def methods_of(case: StudyCase, options: Options) -> Iterator[Method]:

@@ -1,10 +1,10 @@
-"""Sequences of an organ on the move, with truth at every frame; and how followers do in them.
+"""Sequences of a moving organ, with truth at every frame; and how followers do in them.
 
     make sequences ARGS='CASE OUT --count 3 --views 3 --model MODEL'
 
 Writes a folder a sequence into OUT (``tumortrack_lab.world.films``; about 30 s each, and 0.1 s a
 frame and camera). The same command goes on where it was stopped, and --count may grow. With --model
-every method judges every frame; the tables OUT/*.csv also count what --others hold.
+every method locates the organ in every frame; the tables OUT/*.csv also count what --others hold.
 """
 
 from __future__ import annotations
@@ -94,7 +94,7 @@ def main(options: Options) -> None:
 
 
 def _opened(options: Options, config: FilmConfig) -> tuple[World, Callable[[], list[State]]]:
-    """The world of the folder, stated there, and the solved states to go through."""
+    """The folder's world, whose inputs are written there, and the solved states to go through."""
     identity = {
         "case_sha256": store.sha256_of(options.case / store.MANIFEST),
         "config": to_builtins(config),
@@ -118,8 +118,8 @@ def _follow(options: Options, model: Path, films: list[Film]) -> None:
             errors = pd.DataFrame(rows).reindex(columns=["center_mm"])["center_mm"]
             say(f"{done}/{len(films)} {film.folder.name}, {method}: {errors.median():.1f} mm off")
     rows = [row for out in (options.out, *options.others) for row in tables.rows_in(out)]
-    found = pd.DataFrame(rows)
-    made = tables.tables(found)
+    frame = pd.DataFrame(rows)
+    made = tables.tables(frame)
     for name, table in made.items():
         store.write_atomically(options.out / f"{name}.csv", table.to_csv(index=False).encode())
         print(f"{tables.WORDS[name]}\n{table.to_string(index=False)}\n")
@@ -127,7 +127,7 @@ def _follow(options: Options, model: Path, films: list[Film]) -> None:
         writer = ReportWriter(options.document, scripts.make_command("sequences"))
         plot, moving = writer.image("sequences_press"), writer.image("sequences_film")
         moving = moving.with_suffix(".gif")
-        pictures.draw(found, plot)
+        pictures.draw(frame, plot)
         presses = (film for film in films if film.meta["kind"] == "press")
         press = max(presses, key=lambda film: film.bend_mm.max())
         pictures.show(following.METHODS["track"](tracker), press, moving)

@@ -1,4 +1,4 @@
-"""An hour of tracking with everything going wrong round it.
+"""An hour of tracking with injected faults.
 
     make soak ARGS="MODEL CASE [--minutes 60] [--seed 0] [--table FILE]"
 

@@ -2,8 +2,8 @@
 
     make trust ARGS='MODEL/margins.jsonl ...'     (a minute: nothing but the worst cases is located)
 
-Fills a block of docs/trust.md, and writes its tables and pictures. A table that is not finished is
-used as far as it is.
+Fills a block of docs/trust.md, and writes its tables and pictures. An unfinished table is
+used as far as it goes.
 """
 
 from __future__ import annotations
@@ -47,17 +47,17 @@ def main(options: Options) -> None:
     states = trust.states_of([row for table in tables for row in table.rows])
     fifth = np.random.default_rng(options.seed).permutation(len(states)) % 5 + 1
     parts = {"family": states.family, "organ": states.organ, "fifth": pd.Series(fifth).astype(str)}
-    found = {}
+    left_out = {}
     for what, part in parts.items():
-        found[what] = trust.left_out(states, part, options.seed, widest_mm=options.widest)
+        left_out[what] = trust.left_out(states, part, options.seed, widest_mm=options.widest)
         say(f"calibrated without each {what}")
-    family = found["family"]
+    family = left_out["family"]
     hidden = family[family.refused == ""]
     coverage = trust.coverage(
-        found | {"family, by hidden surface": hidden.assign(part=hidden.hidden)}
+        left_out | {"family, by hidden surface": hidden.assign(part=hidden.hidden)}
     )
     trust.reliability_picture(
-        {f"each {what} left out": one for what, one in found.items()},
+        {f"each {what} left out": judged for what, judged in left_out.items()},
         writer.image("trust_reliability"),
     )
     trust.risk_picture(family, writer.image("trust_risk"))

@@ -1,13 +1,14 @@
-"""Scenes of a wider world, to calibrate and test margins on; and how a model does in them.
+"""Scenes of a wider world, to calibrate and test margins on, and a model's estimates in them.
 
     make world ARGS='CASE OUT --count 320 --model MODEL'     (about 4 s a scene)
 
 Writes scene folders into OUT, which `tumortrack evaluate` reads. The same command goes on where it
 was stopped. OUT/world.json states case, seed and configuration, OUT/failures.json the states that
-found no equilibrium and the views in which no organ was found, OUT/measured.json what a model makes
-of them. `--disturb strays fat ...` makes scenes that should be met with silence, and with `--states
-FOLDER` in states that are solved already (0.3 s a scene). Tables of several organs: the same for
-each, and the last with `--beside` the others. `--plans MODEL` cuts tumors out (4 s a scene).
+found no equilibrium and the views in which no organ was found, OUT/measured.json a model's
+estimates. `--disturb strays fat ...` makes scenes that should not get a good estimate, with
+`--states FOLDER` in states that are solved already (0.3 s a scene). Tables of several organs: the
+same for each, and the last with `--beside` the others. `--plans MODEL` cuts tumors out (4 s a
+scene).
 """
 
 from __future__ import annotations
@@ -76,7 +77,7 @@ class Options:
 
 
 def main(options: Options) -> None:
-    """Make what is missing, then measure what is."""
+    """Make missing scenes, then measure."""
     for names, known in ((options.families, FAMILIES), (options.disturb, DISTURBANCES)):
         if unknown := sorted(set(names) - set(known)):
             raise InputError(f"{unknown[0]!r} is not known; allowed: {', '.join(known)}.")
@@ -127,8 +128,8 @@ def _estimates(options: Options, world: World, model: Path, made: list[str]) -> 
     lost = [why for path in paths for why in store.read_json(path).values()]
     rows = estimates.read_rows(folders)
     lines, count = estimates.verdicts(rows), Counter(why.partition(":")[0] for why in lost)
-    said = ", ".join(f"{name} {n}" for name, n in count.most_common())
-    return f"{estimates.summary(lines)}\n\nNot made: {said or 'none'}.", {
+    reasons = ", ".join(f"{name} {n}" for name, n in count.most_common())
+    return f"{estimates.summary(lines)}\n\nNot made: {reasons or 'none'}.", {
         "verdicts": ("Verdicts and errors", lines),
         "wrong": ("Good answers that are wrong", estimates.wrong_ones(rows)),
     }
@@ -146,8 +147,8 @@ def _plans(options: Options, world: World, model: Path, made: list[str]) -> Made
     for row in rows:
         row["case"] = "an answer" if row["variant"] in good else "no answer"
     cuts, refused = resection.tables_of(rows)
-    said = f"Scenes: {len(made)}, with an answer: {len(good)}."
-    return f"{said}\n\n{resection.summary(cuts)}", {
+    counts = f"Scenes: {len(made)}, with an answer: {len(good)}."
+    return f"{counts}\n\n{resection.summary(cuts)}", {
         "cuts": ("What the cuts did", cuts), "refused": ("Why there was no plan", refused)
     }  # fmt: skip
 
@@ -172,7 +173,7 @@ def _scenes(options: Options, world: World) -> dict[str, Callable[[], Scene]]:
 
 
 def _open(options: Options, config: WorldConfig) -> World:
-    """The world of the folder; stated there, with its tetrahedra, when it is new."""
+    """The folder's world; a new one's inputs and tetrahedra are written there."""
     out = options.out
     sha256 = store.sha256_of(options.case / store.MANIFEST)
     identity = {"case_sha256": sha256, "config": to_builtins(config)}

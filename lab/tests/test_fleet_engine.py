@@ -178,8 +178,8 @@ def test_memory_is_doubled_where_it_was_too_little(folder):
         """A machine on which a task that asks for less than 300 MB has too little."""
 
         async def do(self, job: Job) -> Report:
-            asked.append(job.needs.memory_mb)
-            if job.needs.memory_mb < 300:
+            asked.append(job.memory_mb)
+            if job.memory_mb < 300:
                 return Report("memory", "too little")
             return await super().do(job)
 

@@ -23,7 +23,7 @@ from tumortrack_lab.twin.equilibrium import (
     Hold,
     Rod,
     Support,
-    settle,
+    find_equilibrium,
 )
 from tumortrack_lab.twin.solid import NeoHookeanSolid
 
@@ -106,7 +106,7 @@ def test_a_block_between_plates_follows_theory(poisson: float) -> None:
     contacts = ((contact, (Support(), above)),)
     problem = EquilibriumProblem(solid, contacts, nothing, Hold(mesh.nodes_mm, share))
     start = mesh.nodes_mm * [1.05, 1.05, 0.9]
-    nodes, about = settle(problem, start)
+    nodes, about = find_equilibrium(problem, start)
     assert about.residual < 1e-3
 
     axial = float(np.ptp(nodes[:, 2])) / side
@@ -191,10 +191,10 @@ def test_plates_close_by_what_the_state_says(bench: Apparatus, squeezed) -> None
 
 
 def test_nothing_moves_until_something_is_added(bench: Apparatus) -> None:
-    nodes, about = bench.settle(bench.mesh.nodes_mm, ())
+    nodes, about = bench.find_equilibrium(bench.mesh.nodes_mm, ())
     assert about.iterations == 0
     np.testing.assert_array_equal(nodes, bench.mesh.nodes_mm)
-    heavier, about = bench.settle(bench.mesh.nodes_mm, (), weight=1.0)
+    heavier, about = bench.find_equilibrium(bench.mesh.nodes_mm, (), weight=1.0)
     assert about.iterations > 0
     lowered = (bench.mesh.nodes_mm - heavier)[:, 2]
     assert 0 < lowered.mean() < 1.0  # the packing bears it
@@ -261,7 +261,7 @@ def test_a_load_that_finds_no_rest_is_an_error(bench: Apparatus) -> None:
     weight_mn = 1e4 * bench.solid.node_volumes_mm3  # a million times its own
     problem = EquilibriumProblem(bench.solid, ((bench.contact, (Support(), trap)),), weight_mn)
     with pytest.raises(TumortrackError, match="no equilibrium: after 150 iterations"):
-        settle(problem, bench.mesh.nodes_mm, 150)
+        find_equilibrium(problem, bench.mesh.nodes_mm, 150)
 
 
 def test_the_twin_shares_no_code_with_the_training_deformations() -> None:

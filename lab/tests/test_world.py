@@ -22,7 +22,7 @@ from tumortrack.sense.camera import d405
 from tumortrack.simulate.scene_folder import read_scene
 from tumortrack.tracking.tracker import Tracker
 from tumortrack_lab.tets import TetMesh, tetrahedralise
-from tumortrack_lab.twin.equilibrium import Rod, settle
+from tumortrack_lab.twin.equilibrium import Rod, find_equilibrium
 from tumortrack_lab.twin.solid import NeoHookeanSolid
 from tumortrack_lab.world import estimates, segmentation
 from tumortrack_lab.world.families import FAMILIES, Deformed, solve
@@ -81,12 +81,12 @@ def test_an_organ_at_rest_stays_and_one_that_is_lifted_falls_back_into_its_bed()
     solid = soft(organ().mesh)
     stage, rest = Stage(organ(), solid), organ().mesh.nodes_mm
     bed = stage.touch(organ().bed.under(organ().points_mm, 10.0), 1.0)
-    nodes, about = settle(LoadedBody(solid, (bed,)), rest)
+    nodes, about = find_equilibrium(LoadedBody(solid, (bed,)), rest)
     assert about.iterations == 0
     np.testing.assert_array_equal(nodes, rest)
     np.testing.assert_array_equal(state("rest", 3).carry(organ().points_mm), organ().points_mm)
     weight = Weight(np.full(rest.shape, [0.0, 0, -1e-5]) * solid.node_volumes_mm3[:, None])
-    fallen, _ = settle(LoadedBody(solid, (bed, weight)), rest + [0, 0, 3.0], 400)
+    fallen, _ = find_equilibrium(LoadedBody(solid, (bed, weight)), rest + [0, 0, 3.0], 400)
     assert -1.0 < (fallen - rest)[:, 2].mean() < 0.2
 
 

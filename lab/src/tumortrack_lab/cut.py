@@ -24,8 +24,8 @@ Points = Float[np.ndarray, "_ 3"]
 Mask = Bool[np.ndarray, "i j"]
 Voxels = Bool[np.ndarray, "i j k"]
 
-# In voxels: with this offset no line that anyone draws runs exactly through a voxel's centre, where
-# rounding would decide on which side it passes. So closed lines separate inside from outside.
+# In voxels: with this offset no line runs exactly through a voxel's centre, where rounding would
+# decide on which side it passes. So closed lines separate inside from outside.
 _ASIDE = 1e-7 * np.sqrt([2.0, 3.0])
 VOXEL_MM = 0.5
 SAMPLES_MM = 0.4  # between points of the cut's surface
@@ -73,7 +73,7 @@ def _closed(ring: Flat) -> Flat:
 
 
 def _crossings(path: Flat, shape: tuple[int, int]) -> Int[np.ndarray, "i j"]:
-    """How often a line passes each row j just before point i; (shape[0] + 1, shape[1])."""
+    """How often a line crosses each row j just before point i; (shape[0] + 1, shape[1])."""
     start, end = path[:-1], path[1:]
     low, high = np.minimum(start[:, 1], end[:, 1]), np.maximum(start[:, 1], end[:, 1])
     first = np.clip(np.ceil(low), 0, shape[1]).astype(int)
@@ -125,7 +125,7 @@ def _ends(axis: int) -> tuple[tuple[slice, ...], tuple[slice, ...]]:
 
 @dataclass(frozen=True)
 class CutResult:
-    """What a cut did to the true anatomy. The piece is what the layers enclose."""
+    """Effects of a cut on the true anatomy. The piece is what the layers enclose."""
 
     tumor_ml: float  # true volume of the tumor that was to come away
     removed_share: float  # of it, what came away within the piece
@@ -169,9 +169,9 @@ def cut(truth: Anatomy, plan: ResectionPlan, voxel_mm: float = VOXEL_MM) -> CutR
     largest = int(np.bincount(pieces[enclosed], minlength=1).argmax())  # 0: nothing enclosed
     piece = pieces == largest if largest > 1 else np.zeros_like(tissue)
     surface = cutting.surface()
-    found = cutting.at(surface)
-    surface, found = surface[found > 0], found[found > 0]
-    deep, margin_mm = surface[found == ORGAN + number], None
+    labels_there = cutting.at(surface)
+    surface, labels_there = surface[labels_there > 0], labels_there[labels_there > 0]
+    deep, margin_mm = surface[labels_there == ORGAN + number], None
     if len(deep):
         margin_mm = -float(distance_to_surface(deep, truth.parts[number]).max())
     elif len(surface):
@@ -190,7 +190,7 @@ def cut(truth: Anatomy, plan: ResectionPlan, voxel_mm: float = VOXEL_MM) -> CutR
         hurt=tuple(
             truth.names[n]
             for n in range(1, len(truth.names))
-            if n != number and (found == ORGAN + n).any()
+            if n != number and (labels_there == ORGAN + n).any()
         ),
     )
 

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from scipy.sparse import spmatrix
 
 _FACES = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])  # of a tetrahedron, by corners
-_CANDIDATES = 24  # tetrahedra round a point among which its own is looked for
+_CANDIDATES = 24  # nearest tetrahedra of a point, among which its own is searched
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +38,7 @@ class TetMesh:
         return tet_volumes(self.nodes_mm, self.tets)
 
     def lump(self, per_tet: Float[np.ndarray, " t"]) -> Float64[np.ndarray, " n"]:
-        """Per node, the sum of what each tetrahedron gives to its four in equal parts."""
+        """Per node, the sum of the tetrahedra's values, each divided among its four nodes."""
         return np.bincount(self.tets.ravel(), np.repeat(per_tet / 4, 4), len(self.nodes_mm))
 
 

@@ -19,10 +19,10 @@ from pathlib import Path
 from typing import Any
 
 from tumortrack.core.errors import NoEstimate, TumortrackError
-from tumortrack_lab.fleet.task import File, Needs, Task
+from tumortrack_lab.fleet.task import File, Task
 
 
-def mix(inputs: Mapping[str, Path], options: Mapping[str, Any], out: Path, cores: int) -> None:
+def mix(inputs: Mapping[str, Path], options: Mapping[str, Any], out: Path) -> None:
     note("begun", options["name"])
     value = hashlib.sha256(repr(sorted(options.items())).encode()).digest()
     for name in sorted(inputs):
@@ -47,7 +47,7 @@ def chain(number: int, impossible: bool = False, source: File | None = None) -> 
         options: dict[str, Any] = {"name": f"P{number}-{step}", "rounds": 1000}
         if impossible and step == 1:
             options["impossible"] = True
-        task = Task(f"P{number}", f"step{step}", 1, mix, options, inputs, Needs(1, 100))
+        task = Task(f"P{number}", f"step{step}", 1, mix, options, inputs, 100)
         inputs = {"before": task}
     assert task is not None
     return task

@@ -1,1 +1,1 @@
-"""Speed on this machine: every part beside the naive form of it, in turns, in one run."""
+"""How fast the default method, the commands and the planner are on this machine."""

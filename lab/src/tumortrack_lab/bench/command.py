@@ -1,4 +1,4 @@
-"""Workloads of the command line: `tumortrack locate` as its own process, files on a warm disk."""
+"""Timing of the command line: `tumortrack` in its own process, files on a warm disk."""
 
 from __future__ import annotations
 
@@ -13,46 +13,45 @@ from tumortrack.core.errors import TumortrackError
 from tumortrack.imaging.nifti import write_nifti
 from tumortrack.phantom.digital import PhantomParameters, phantom_labels
 from tumortrack.sense.ply import write_cloud_ply
-from tumortrack_lab.bench.rows import COMMAND, LARGE, PATIENT, PEAK, PRESETS, Workload, timing_of
+from tumortrack_lab.bench.rows import COMMAND, LARGE, METHOD, PATIENT, Workload, timing_of
 from tumortrack_lab.bench.subject import BenchSubject
 
 _GRIDS = {COMMAND: 160, LARGE: 400}
 _FEWEST = 3
-# Runs the command line; notes the process's peak memory (what the system tells of ended children
-# counts the memory of the parent that they were born of).
+# Runs the command line and writes down the process's peak memory (getrusage of an ended child
+# includes the memory of the parent that it was forked from).
 _PROBE = """
 import os, sys
 report, leave = sys.argv.pop(), os._exit
-def tell_and_leave(code):
+def report_and_leave(code):
     if os.path.exists("/proc/self/status"):
         lines = [line for line in open("/proc/self/status") if "VmHWM" in line]
         open(report, "w").writelines(lines)
     leave(code)
-os._exit = tell_and_leave  # which is how `locate` ends
+os._exit = report_and_leave  # which is how `locate` ends
 from tumortrack.cli.main import main
 main()
 """
 
 
 def workloads(subject: BenchSubject, budget_s: float) -> Iterator[Workload]:
-    """From the start of the process to its end, all files written; there is no naive form."""
+    """`locate`, from the start of the process to its end, all files written."""
     with tempfile.TemporaryDirectory() as folder:
         cloud, out = Path(folder) / "cloud.ply", Path(folder) / "out"
         write_cloud_ply(cloud, subject.cloud.points_mm)
-        for preset in PRESETS:
-            words = ["locate", subject.model_folder(preset), cloud, out, "--overwrite"]
-            arguments = [*map(str, words), "--device", "cpu"]
-            run_command(arguments)  # into the disk's cache
-            for name, grid in _GRIDS.items():
-                yield _workload(name, preset, [*arguments, "--grid", str(grid)], budget_s)
+        words = ["locate", subject.model_folder, cloud, out, "--overwrite", "--device", "cpu"]
+        arguments = [*map(str, words)]
+        run_command(arguments)  # into the disk's cache
+        for name, grid in _GRIDS.items():
+            yield _workload(name, [*arguments, "--grid", str(grid)], budget_s)
 
 
 def patient(subject: BenchSubject, budget_s: float) -> Iterator[Workload]:
     """A new patient's labels to the first estimate: `prepare` and `locate`, a process each."""
     with tempfile.TemporaryDirectory() as folder:
         labels, cloud = Path(folder) / "labels.nii.gz", Path(folder) / "cloud.ply"
-        made = phantom_labels(PhantomParameters(), voxel_mm=1.0)
-        write_nifti(labels, made.labels, made.lps_from_index, lps=True)
+        phantom = phantom_labels(PhantomParameters(), voxel_mm=1.0)
+        write_nifti(labels, phantom.labels, phantom.lps_from_index, lps=True)
         write_cloud_ply(cloud, subject.cloud.points_mm)
         runs: list[list[float]] = []
         begun = time.perf_counter()
@@ -60,13 +59,13 @@ def patient(subject: BenchSubject, budget_s: float) -> Iterator[Workload]:
             case, out = (Path(folder) / f"{name}-{len(runs)}" for name in ("case", "out"))
             steps = ("prepare", labels, case), ("locate", case, cloud, out)
             runs.append([run_command([*map(str, step)])[0] for step in steps])
-        each = [timing_of([*seconds]).median_s for seconds in zip(*runs[1:], strict=True)]
-        note = " s, ".join(f"{what[0]} {s:.1f}" for what, s in zip(steps, each, strict=True))
-        took = timing_of([sum(run) for run in runs[1:]])  # the first one compiled
-        yield Workload(PATIENT, "clinic", "patient", took, facts=lambda: {"note": f"{note} s"})
+        medians_s = [timing_of([*seconds]).median_s for seconds in zip(*runs[1:], strict=True)]
+        note = " s, ".join(f"{step[0]} {s:.1f}" for step, s in zip(steps, medians_s, strict=True))
+        timing = timing_of([sum(run) for run in runs[1:]])  # the first one compiled
+        yield Workload(PATIENT, METHOD, "patient", timing, facts=lambda: {"note": f"{note} s"})
 
 
-def _workload(name: str, preset: str, arguments: list[str], budget_s: float) -> Workload:
+def _workload(name: str, arguments: list[str], budget_s: float) -> Workload:
     runs: list[tuple[float, int]] = []
     begun = time.perf_counter()
     while len(runs) < _FEWEST or (
@@ -74,14 +73,14 @@ def _workload(name: str, preset: str, arguments: list[str], budget_s: float) -> 
     ):
         runs.append(run_command(arguments))
     seconds, peaks = zip(*runs, strict=True)
-    facts = {"others": {PEAK: max(peaks)}, "note": f"{max(peaks) / 2**30:.2f} GiB at most"}
-    return Workload(name, preset, "run", timing_of([*seconds]), facts=lambda: facts)
+    facts = {"peak_bytes": max(peaks), "note": f"{max(peaks) / 2**30:.2f} GiB at most"}
+    return Workload(name, METHOD, "run", timing_of([*seconds]), facts=lambda: facts)
 
 
 def run_command(arguments: list[str]) -> tuple[float, int]:
     """Run `tumortrack` with these arguments in a process of its own: seconds, and peak memory in
-    bytes (0: the system does not say). Raises TumortrackError: the command failed, the message says
-    its last words."""
+    bytes (0: unknown on this system). Raises TumortrackError: the command failed; the message
+    quotes its last line."""
     with tempfile.NamedTemporaryFile("r") as report:
         start = time.monotonic()
         done = subprocess.run(
@@ -89,8 +88,8 @@ def run_command(arguments: list[str]) -> tuple[float, int]:
             stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=False,
         )  # fmt: skip
         seconds = time.monotonic() - start
-        if done.returncode not in (0, 4):  # 4: `locate` answered, and calls it poor
+        if done.returncode not in (0, 4):  # 4: the estimate is poor
             words = done.stdout.strip().splitlines()[-1:] or ["nothing was said"]
             raise TumortrackError(f"`tumortrack {' '.join(arguments)}` failed: {words[0]}")
-        peak = report.read().split()  # VmHWM: so many kB
+        peak = report.read().split()  # VmHWM: N kB
     return seconds, 1024 * int(peak[1]) if peak else 0

@@ -1,4 +1,4 @@
-"""What the figures were measured on, in words."""
+"""A description of the machine that figures were measured on."""
 
 from __future__ import annotations
 
@@ -10,32 +10,19 @@ from pathlib import Path
 
 from tumortrack.core.process import available_cores
 
-_FEATURES = {
-    "avx2": "AVX2",
-    "avx512": "AVX-512",
-    "avx512_vnni": "VNNI",
-    "avx512_bf16": "bf16",
-    "amx_bf16": "AMX bf16",
-    "amx_int8": "AMX int8",
-}
-NO_GPU = "none at hand"
 _CPU_INFO = Path("/proc/cpuinfo")
-_LIBRARIES = ("tumortrack", "torch", "numba", "numpy", "scipy")
+_LIBRARIES = ("tumortrack", "numba", "numpy", "scipy")
 
 
 def describe_machine() -> dict[str, str]:
-    """Processor, cores, caches, memory, GPU, versions, date: for people, in their order."""
-    import torch
-
-    info, has = _cpu_info(), torch.cpu.get_capabilities()
+    """Processor, cores, caches, memory, versions, date, in the order in which they are shown."""
+    info = _cpu_info()
     model = f" (family {info['cpu family']}, model {info.get('model')})"
     return {
         "processor": cpu_name() + (model if "cpu family" in info else ""),
         "cores": f"{available_cores()}",
-        "matrix products": ", ".join(name for key, name in _FEATURES.items() if has.get(key)),
         "caches": _caches(),
         "memory": f"{os.sysconf('SC_PAGE_SIZE') * os.sysconf('SC_PHYS_PAGES') / 2**30:.0f} GiB",
-        "GPU": torch.cuda.get_device_name() if torch.cuda.is_available() else NO_GPU,
         "system": f"{platform.system()} {platform.machine()}, Python {platform.python_version()}",
         "libraries": ", ".join(f"{name} {version(name)}" for name in _LIBRARIES),
         "date": datetime.now(UTC).strftime("%Y-%m-%d"),
@@ -49,22 +36,18 @@ def cpu_name() -> str:
 
 
 def _cpu_info() -> dict[str, str]:
-    """Of the first core, as Linux tells it."""
+    """The first core's entries of /proc/cpuinfo; empty on other systems than Linux."""
     text = _CPU_INFO.read_text(encoding="utf-8") if _CPU_INFO.exists() else ""
-    return _fields(text.partition("\n\n")[0])
-
-
-def _fields(text: str) -> dict[str, str]:
-    lines = (line.partition(":") for line in text.splitlines())
+    lines = (line.partition(":") for line in text.partition("\n\n")[0].splitlines())
     return {key.strip(): value.strip() for key, _, value in lines}
 
 
 def _caches() -> str:
-    """Level and size of the first core's caches, as Linux tells them."""
+    """Level and size of the first core's caches, from Linux's /sys."""
     folders = sorted(Path("/sys/devices/system/cpu/cpu0/cache").glob("index*"))
-    found = [
+    caches = [
         [(folder / name).read_text(encoding="utf-8").strip() for name in ("level", "type", "size")]
         for folder in folders
     ]
-    data = ", ".join(f"L{level} {size}" for level, kind, size in found if kind != "Instruction")
+    data = ", ".join(f"L{level} {size}" for level, kind, size in caches if kind != "Instruction")
     return data or "not known"

@@ -1,101 +1,78 @@
-"""Workloads of a registration model with a cloud."""
+"""Timing of the default method: a first look, frames that follow one another, the volume."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from functools import partial
+from itertools import cycle
 
 import numpy as np
 
-from tumortrack.core.mesh_query import labels_of
+from tumortrack.core.estimate import FollowOptions
 from tumortrack.core.types import Anatomy, SensorCloud
 from tumortrack.imaging.raster import label_grid
 from tumortrack.models.report import grid_over
 from tumortrack.registration.looks import Looks
-from tumortrack.registration.model import RegistrationModel
 from tumortrack.tracking.tracker import Tracker
-from tumortrack_lab.bench import occupancy, rows
-from tumortrack_lab.bench.naive import flowed
-from tumortrack_lab.bench.rows import Uncounted, Workload
+from tumortrack_lab.bench import rows
+from tumortrack_lab.bench.rows import METHOD, Uncounted, Workload
+from tumortrack_lab.bench.subject import BenchSubject
 
-_NO_VOLUME = 8  # voxels along the longest side: whoever asks for a frame wants no volume
+GRID = 400  # voxels along the volume's longest side
+_NO_VOLUME = 8  # the same, where the volume is not of interest
+_MOVES_MM = 0.5  # of the cloud, from frame to frame
 
 
-class RegistrationForms:
-    """Of preset ``clinic``; the workloads are those of ``OccupancyForms``."""
+class LiveFrames:
+    """The live loop's frames, one a call: a cloud that moves to and fro."""
 
-    def __init__(self, model: RegistrationModel, cloud: SensorCloud) -> None:
-        self._cloud, self._shape = cloud, model.shape
-        self._registration, self._tracker = model.registration, Tracker(model)
-        self._estimate = self._tracker.locate(cloud, _NO_VOLUME, 0)
-        self._anatomy = Anatomy(tuple(self._estimate.meshes.values()))  # where it was found
+    def __init__(self, tracker: Tracker, points_mm: np.ndarray) -> None:
+        swing = np.array([_MOVES_MM / 2, 0.0, 0.0], np.float32)
+        self._tracker = tracker
+        self._frames = cycle([SensorCloud(points_mm + swing), SensorCloud(points_mm - swing)])
+        self.last = tracker.follow(next(self._frames), None, FollowOptions())
 
-    def frames(self) -> Iterator[Workload]:
-        """A first look: the search alone, with its refinement, and all that `locate` does."""
-        cloud, looks = self._estimate.cloud, Looks.of([self._cloud.points_mm])
-        search = partial(self._registration.search.starts, looks)
-        yield Workload(rows.SEARCH, "clinic", "look", search)
-        register = partial(self._registration.register, looks)
-        yield Workload(rows.FIRST_LOOK, "clinic", "look", register)
+    def __call__(self) -> None:
+        self.last = self._tracker.follow(next(self._frames), self.last, FollowOptions())
 
-        def ours() -> Uncounted:
-            estimate = self._tracker.locate(self._cloud, _NO_VOLUME, 0)
-            return Uncounted(estimate.report.timings["volume"])
 
-        def facts() -> dict:
-            # Of the points inside, at our motion, where inside tests say the same.
-            assert self._estimate.motion is not None
-            back = self._estimate.motion.back(cloud.points_mm.astype(float))
-            assert back is not None
-            return {
-                "agreement": float((self._labels(back) == cloud.labels).mean()),
-                "note": "`locate` without its volume: labels, probabilities, surfaces, report; "
-                "agreement: points inside, at our motion, against inside tests",
-            }
+def frames(subject: BenchSubject, _: float) -> Iterator[Workload]:
+    """A first look: the search alone, with its refinement, and all that `locate` does."""
+    registration, looks = subject.model.registration, Looks.of([subject.cloud.points_mm])
+    search = partial(registration.search.starts, looks)
+    yield Workload(rows.SEARCH, METHOD, "look", search)
+    register = partial(registration.register, looks)
+    yield Workload(rows.FIRST_LOOK, METHOD, "look", register)
+    tracker = Tracker(subject.model)
 
-        yield Workload(rows.FRAME, "clinic", "frame", ours, facts=facts)
+    def locate() -> Uncounted:
+        estimate = tracker.locate(subject.cloud, _NO_VOLUME, 0)
+        return Uncounted(estimate.report.timings["volume"])
 
-    def tracking(self) -> Iterator[Workload]:
-        ours = occupancy.LiveFrames(self._tracker, self._cloud.points_mm)
+    note = "`locate` without its volume: labels, probabilities, surfaces, report"
+    yield Workload(rows.FRAME, METHOD, "frame", locate, facts=lambda: {"note": note})
 
-        def facts() -> dict:
-            motion = ours.last.report.motion
-            assert motion is not None
-            steps = motion.steps
-            note = f"steady state: {steps} refinement steps, points carried, surfaces, report"
-            return {"note": note}
 
-        yield Workload(rows.TRACKING, "clinic", "frame", ours, facts=facts)
+def tracking(subject: BenchSubject, _: float) -> Iterator[Workload]:
+    """From frame to frame."""
+    follow = LiveFrames(Tracker(subject.model), subject.cloud.points_mm)
 
-    def volumes(self) -> Iterator[Workload]:
-        grid = grid_over(self._anatomy.organ.vertices_mm, occupancy.GRID)
-        index, points = occupancy.slab(grid)
-        voxels = int(np.prod(grid[1]))
-        motion = self._estimate.report.motion
+    def facts() -> dict:
+        motion = follow.last.report.motion
         assert motion is not None
-        camera_from_ct, state = np.array(motion.camera_from_ct), np.array(motion.coefficients)
+        return {
+            "note": f"steady state: {motion.steps} refinement steps, points carried, surfaces, "
+            "report"
+        }
 
-        def naive() -> np.ndarray:
-            rest = (points - camera_from_ct[:3, 3]) @ camera_from_ct[:3, :3]
-            return self._labels(flowed(self._shape.body, -state, rest))
+    yield Workload(rows.TRACKING, METHOD, "frame", follow, facts=facts)
 
-        def facts() -> dict:
-            labels = label_grid(self._anatomy, *grid)[tuple(index.T)]
-            return {
-                "agreement": float((naive() == labels).mean()),
-                "others": {"voxels": voxels},
-                "note": "the moved surfaces filled",
-            }
 
-        yield Workload(
-            rows.VOLUME, "clinic", "volume",
-            ours=partial(label_grid, self._anatomy, *grid),
-            naive=naive,
-            naive_is=f"every voxel carried back, inside tests; {len(points):,} voxels, scaled",
-            naive_share=voxels / len(points),
-            facts=facts,
-        )  # fmt: skip
-
-    def _labels(self, places_ct: np.ndarray) -> np.ndarray:
-        """Inside tests on the surfaces of the CT."""
-        return labels_of(self._shape.anatomy_ct, places_ct.astype(np.float32))
+def volumes(subject: BenchSubject, _: float) -> Iterator[Workload]:
+    """From an estimate's surfaces to a label in every voxel."""
+    estimate = Tracker(subject.model).locate(subject.cloud, _NO_VOLUME, 0)
+    anatomy = Anatomy(tuple(estimate.meshes.values()))
+    grid = grid_over(anatomy.organ.vertices_mm, GRID)
+    note = f"the moved surfaces filled: {int(np.prod(grid[1])):,} voxels"
+    fill = partial(label_grid, anatomy, *grid)
+    yield Workload(rows.VOLUME, METHOD, "volume", fill, facts=lambda: {"note": note})

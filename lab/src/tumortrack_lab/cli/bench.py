@@ -1,4 +1,4 @@
-"""`tumortrack bench`: how fast every part is here; fills a document."""
+"""`tumortrack bench`: how fast every part is on this machine; fills a document."""
 
 from __future__ import annotations
 
@@ -10,28 +10,23 @@ from rich.console import Console
 
 from tumortrack.core import store
 
-MODELS = Path("runs/bench")  # made to be measured
+MODELS = Path("runs/bench")  # where the model to measure is kept
 _WIDE = 150  # characters of a table that goes to a file
 
 
 @dataclass(frozen=True, kw_only=True)
 class Bench:
-    """Measure the speed of every part on this machine, each beside its naive form, in turns.
+    """Measure the speed of every part on this machine.
 
     Attributes:
         only: which parts; default: all.
-        quick: shorter measurements, about a minute in all once there are models (in runs/bench).
+        quick: shorter measurements, about a minute in all once there is a model (in runs/bench).
         out: JSON file to write.
         document: Markdown file whose marked block is to be filled, such as docs/performance.md;
             tables go to data/*.csv beside it.
     """
 
-    only: tuple[
-        Literal[
-            "frame", "tracking", "volume", "command", "patient", "planning", "training", "gpu"
-        ],
-        ...,
-    ] = ()  # fmt: skip
+    only: tuple[Literal["frame", "tracking", "volume", "command", "patient", "planning"], ...] = ()
     quick: bool = False
     out: Path = Path("runs/bench.json")
     document: Path | None = None
@@ -55,8 +50,8 @@ class Bench:
         with console.status("starting ...") as status:
             report = status.update if console.is_terminal else say
             report("starting ...")
-            found = measure(tasks, command, report, lambda row, left: say(line(row, left)))
+            result = measure(tasks, command, report, lambda row, left: say(line(row, left)))
         shown = console if console.is_terminal else Console(width=_WIDE)
-        shown.print(rich_table(found))
-        for path in write_bench(found, self.out, self.document):
+        shown.print(rich_table(result))
+        for path in write_bench(result, self.out, self.document):
             say(f"written to {path}")

@@ -1,4 +1,4 @@
-"""The laboratory's commands: `tumortrack` finds them by its entry points' names."""
+"""The laboratory's commands, which `tumortrack` finds through entry points."""
 
 from tumortrack_lab.cli.bench import Bench
 from tumortrack_lab.cli.fleet import Fleet

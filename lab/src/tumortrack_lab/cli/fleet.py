@@ -51,8 +51,8 @@ class Fleet:
     serial: bool = False
 
     def run(self) -> None:
-        """Raises InputError: options that exclude each other, a list, store or cluster that can't
-        be used; TumortrackError: patients failed that another run may succeed with."""
+        """Raises InputError: options that exclude each other, or an unusable list, store or
+        cluster; TumortrackError: patients failed for reasons that may pass."""
         self._check()
         say("starting ...")
         from tumortrack_lab.fleet.engine import run
@@ -63,7 +63,7 @@ class Fleet:
         patients = read_list(self.list)
         inside = {p.name for p in self.out.iterdir()} if self.out.is_dir() else {""}
         if inside - {self.list.name} and not inside & {"store", PATIENTS}:
-            check_place(self.out, "", None)  # what lies there is no fleet's
+            check_place(self.out, "", None)  # files there that no fleet wrote
         self.out.mkdir(parents=True, exist_ok=True)
         store = Store(self.store or str(self.out / "store"))
         store.open()
@@ -71,16 +71,16 @@ class Fleet:
         wanted = [partial(_wanted, patient) for patient in patients]
         executor = self._executor()
         _say_dashboard(getattr(executor, "dashboard", ""))
-        signal.signal(signal.SIGTERM, signal.default_int_handler)  # Ray has one that dies
+        signal.signal(signal.SIGTERM, signal.default_int_handler)  # Ray's handler ends the process
         with _screen() as show:
             try:
-                for one in run(wanted, store, executor, self.tries, self.again, show):
-                    outcomes[one.task.patient] = one
-                    if one.reason:
-                        say(f"{one.task.patient}: {one.step}: {one.reason}")
-            finally:  # also of what was done until Ctrl-C
+                for outcome in run(wanted, store, executor, self.tries, self.again, show):
+                    outcomes[outcome.task.patient] = outcome
+                    if outcome.reason:
+                        say(f"{outcome.task.patient}: {outcome.step}: {outcome.reason}")
+            finally:  # after Ctrl-C, too
                 write_results(self.out, patients, outcomes, store)
-        states = [one.state for one in outcomes.values()]
+        states = [outcome.state for outcome in outcomes.values()]
         say(
             f"{len(patients)} patients in {self.out}: {states.count('done')} done, "
             f"{states.count('there')} before, {states.count('cannot')} impossible."
@@ -117,8 +117,8 @@ class Fleet:
 
 
 def _say_dashboard(address: str) -> None:
-    """Where Ray shows its tasks, if it can. The run's token lets others start programs here: it is
-    shown on a terminal alone."""
+    """Say where Ray's dashboard is, if it has one. Its token lets others start programs here, so it
+    is shown only on a terminal."""
     if not address or find_spec("aiohttp_cors") is None:  # of ray[default]
         return
     token = os.environ.get("RAY_AUTH_TOKEN", "")
@@ -134,7 +134,7 @@ def _wanted(patient: Patient) -> Task:
 
 @contextmanager
 def _screen() -> Iterator[Callable[[Status], None]]:
-    """Yields a function that shows how far it is."""
+    """Yields a function that shows progress."""
     noted = ""
 
     def show(status: Status) -> None:

@@ -1,4 +1,4 @@
-"""`tumortrack margins`: how far a tumor may be from where a model says that it is."""
+"""`tumortrack margins`: how far tumors may be from their estimates."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ class Margins:
     def _located(
         self, folder: Path, listed: list[Listed], known: list[Row], add: Callable[[Row], None]
     ) -> list[Row]:
-        """A row for every state; those that are known are not located again."""
+        """A row for every state; known ones are not located again."""
         from tumortrack.report.protocol import check_case
         from tumortrack.simulate.scene_folder import read_scene
         from tumortrack.tracking.model_files import load_model

@@ -1,2 +1,2 @@
-"""Many patients at once: what is done for each (``steps``), by whom (``engine``), and what came of
-it (``results``)."""
+"""Many patients at once: the steps for each (``steps``), how they are run (``engine``), and the
+tables made of them (``results``)."""

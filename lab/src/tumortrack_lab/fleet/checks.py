@@ -1,4 +1,4 @@
-"""A prepared case in numbers: what nothing should be located with, and what a person should see."""
+"""Quality checks of a prepared case: what rules it out, and what a person should look at."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from tumortrack_lab.real.kidneys import ORGAN_ML, TUMOR_ML, kind_of, outer_share
 _ORGAN_AT_ALL_ML = {True: (30.0, 1500.0), False: (10.0, 4000.0)}  # a kidney, another
 _POLE = 1 / 3  # of the organ's length, at either end
 _SLICE_MM = 5.0
-# What `prepare` notes of most inputs; all else is for a person's eye.
+# Notes of `prepare` on most inputs; any other note is for a person to look at.
 _USUAL = re.compile(
     r"few distinct whole numbers|the patient's \w+ [\w ]+ was chosen: it bears most tumor"
     r"|\d+ specks beside the organ dropped \(0\.|holes of 0\.|the organ; table, blocks"
@@ -35,8 +35,8 @@ def is_cut_off(case: Case, source: Path, series: str | None) -> bool:
     if case.report["kind"] == "meshes":
         return False
     raw = read_raw(source, series)
-    found = np.argwhere(case.labels.labels > 0)
-    corners = np.array(list(product(*zip(found.min(0), found.max(0), strict=True))), float)
+    labelled = np.argwhere(case.labels.labels > 0)
+    corners = np.array(list(product(*zip(labelled.min(0), labelled.max(0), strict=True))), float)
     index_from_index = np.linalg.inv(raw.lps_from_index) @ case.labels.lps_from_index
     there = transform_points(index_from_index, corners)
     last = np.array(raw.array.shape[:3]) - 1
@@ -58,7 +58,7 @@ def described(case: Case) -> dict[str, Any]:
         "organ_ml": round(organ_ml, 2),
         "spacing_mm": [round(mm, 3) for mm in spacing],
         "slice_mm": round(max(spacing), 3),
-        "half_turn_mm": round(min((one["mean_mm"] for one in turns), default=0.0), 2),
+        "half_turn_mm": round(min((turn["mean_mm"] for turn in turns), default=0.0), 2),
         "tumors": [
             {"ml": round(ml, 3), **_placed(tumor, organ)}
             for ml, tumor in zip(tumors_ml, tumors, strict=True)
@@ -83,28 +83,28 @@ def _placed(tumor: Mesh, organ: Mesh) -> dict[str, Any]:
     }
 
 
-def failures(found: dict[str, Any], cut_off: bool) -> list[str]:
-    """What nothing should be located with."""
-    low, high = _ORGAN_AT_ALL_ML[found["organ"] == KIDNEY.name]
+def failures(numbers: dict[str, Any], cut_off: bool) -> list[str]:
+    """Why the case must not be used; empty: it passes."""
+    low, high = _ORGAN_AT_ALL_ML[numbers["organ"] == KIDNEY.name]
     reasons = {
         "organ or tumor reach the border of the volume: they are cut off": cut_off,
-        f"the organ has {found['organ_ml']:.0f} ml; allowed: {low:g} to {high:g}": not (
-            low <= found["organ_ml"] <= high
+        f"the organ has {numbers['organ_ml']:.0f} ml; allowed: {low:g} to {high:g}": not (
+            low <= numbers["organ_ml"] <= high
         ),
-        "there is no tumor": not found["tumors"],
+        "there is no tumor": not numbers["tumors"],
     }
     return [words for words, failed in reasons.items() if failed]
 
 
-def doubts(case: Case, found: dict[str, Any]) -> list[str]:
+def doubts(case: Case, numbers: dict[str, Any]) -> list[str]:
     """What a person should look at."""
-    largest = max(one["ml"] for one in found["tumors"])
+    largest = max(tumor["ml"] for tumor in numbers["tumors"])
     reasons = {
-        "the side is unknown": case.anatomy.kind.in_pairs and found["side"] == UNKNOWN,
-        f"the organ has {found['organ_ml']:.0f} ml": case.anatomy.kind.name == KIDNEY.name
-        and not (ORGAN_ML[0] <= found["organ_ml"] <= ORGAN_ML[1]),
+        "the side is unknown": case.anatomy.kind.in_pairs and numbers["side"] == UNKNOWN,
+        f"the organ has {numbers['organ_ml']:.0f} ml": case.anatomy.kind.name == KIDNEY.name
+        and not (ORGAN_ML[0] <= numbers["organ_ml"] <= ORGAN_ML[1]),
         f"the largest tumor has {largest:.1f} ml": not TUMOR_ML[0] <= largest <= TUMOR_ML[1],
-        f"slices of {found['slice_mm']:g} mm": found["slice_mm"] > _SLICE_MM,
+        f"slices of {numbers['slice_mm']:g} mm": numbers["slice_mm"] > _SLICE_MM,
     }
     notes = [note for note in case.report["notes"] if not _USUAL.search(note)]
     return [words for words, doubted in reasons.items() if doubted] + notes

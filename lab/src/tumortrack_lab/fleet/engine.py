@@ -1,8 +1,8 @@
-"""From wanted tasks to results in the store: what is missing is made, inputs first, by an executor.
-What fails is tried again and never stops the others.
+"""From wanted tasks to results in the store: an executor makes what is missing, inputs first. A
+failed task is tried again and never stops the others.
 
-A patient's chain is a coroutine; as many are under way as the executor has room for, so that the
-memory needed does not grow with their number.
+A patient's chain is a coroutine. Only as many are under way as the executor has room for, so memory
+does not grow with their number.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from tumortrack_lab.fleet.store import Store
 from tumortrack_lab.fleet.task import Task
 from tumortrack_lab.fleet.worker import Job, Report, job_of
 
-_LOOKED_AHEAD = 64  # wanted tasks that the store is asked about before their turn
+_LOOKED_AHEAD = 64  # wanted tasks that are looked up in the store before their turn
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.5, 60.0  # between attempts
-_ELSEWHERE_S = 2.0  # between looks at what another run is doing
+_ELSEWHERE_S = 2.0  # between looks at a task that another run is doing
 _SHOWN_S = 0.5
 
 # Reports after which a task is not tried again in this run, and what becomes of it.
@@ -31,16 +31,16 @@ _FINAL: dict[str, Literal["done", "cannot", "failed"]] = {
 }  # fmt: skip
 
 Wanted = Task | Callable[[], Task]
-Found = tuple[bool, str | None]  # what the store has of a task (``Store.found``)
+Stored = tuple[bool, str | None]  # what the store has of a task (``Store.found``)
 
 
 @runtime_checkable
 class Executor(Protocol):
-    """Who does the tasks."""
+    """Runs tasks."""
 
     def room(self) -> int:
-        """How many patients may be under way. Called often; TumortrackError: nobody is left who
-        could do anything."""
+        """How many patients may be under way. Called often. Raises TumortrackError: no machine is
+        left."""
 
     async def do(self, job: Job) -> Report: ...
 
@@ -50,9 +50,9 @@ class Executor(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """What became of a task. there: it was done before. cannot: its patient's data do not allow it
-    (kept in the store); failed: after all attempts, or since the patient's file was changed; the
-    next run tries again. ``step``: where."""
+    """How a task ended. there: it was done before. cannot: the patient's data rule it out (kept in
+    the store). failed: after all attempts, or because the patient's file was changed; the next run
+    tries again. ``step``: where it failed."""
 
     task: Task
     state: Literal["there", "done", "cannot", "failed"]
@@ -65,7 +65,7 @@ class Status:
     """Progress of a run. Counts are of tasks, but for ``wanted`` ones."""
 
     total: int | None = None  # wanted
-    wanted: int = 0  # settled
+    wanted: int = 0  # that have ended
     there: int = 0  # of them, before this run
     failed: int = 0  # of them
     done: int = 0
@@ -76,7 +76,7 @@ class Status:
 
     @property
     def per_hour(self) -> float:
-        """Wanted tasks settled in this run, an hour."""
+        """Wanted tasks that have ended in this run, an hour."""
         return 3600 * (self.wanted - self.there) / max(time.monotonic() - self.started_s, 1e-3)
 
     @property
@@ -94,22 +94,23 @@ def run(
     again: bool = False,
     show: Callable[[Status], None] = lambda status: None,
 ) -> Iterator[Outcome]:
-    """Do the wanted tasks, and what they need that the store lacks; yields each when it is settled.
+    """Do the wanted tasks, and those that they depend on and the store lacks; yields an outcome of
+    each wanted one when it has ended.
 
-    A wanted task may also be a function that makes it, which is called when its turn is near, on
-    another thread: reading a patient's files for their hash takes its time.
-    ``tries``: how often a task may fail for reasons that are not its own. ``again``: try also what
-    the store says can't be done. ``show`` is called about twice a second.
+    A wanted task may also be a function that makes it. It is called on another thread shortly
+    before its turn, since hashing a patient's files takes a while. ``tries``: how often a task may
+    fail for reasons that are not its own. ``again``: also try what the store says can't be done.
+    ``show`` is called about twice a second.
     """
     store.open()
     fleet = _Fleet(store, executor, tries, again)
     fleet.status.total = len(wanted) if isinstance(wanted, Sized) else None
     loop = asyncio.new_event_loop()
-    loop.set_exception_handler(lambda *_: None)  # whoever waits for a task gets its error
+    loop.set_exception_handler(lambda *_: None)  # the error is raised where the task is awaited
     try:
         with ThreadPoolExecutor(8, "store") as pool:
-            settled = fleet.settled(_looked_up(wanted, store, pool), show)
-            while (outcome := loop.run_until_complete(anext(settled, None))) is not None:
+            outcomes = fleet.outcomes(_looked_up(wanted, store, pool), show)
+            while (outcome := loop.run_until_complete(anext(outcomes, None))) is not None:
                 yield outcome
     finally:
         executor.close()
@@ -123,16 +124,16 @@ def run(
 
 def _looked_up(
     wanted: Iterable[Wanted], store: Store, pool: ThreadPoolExecutor
-) -> Iterator[tuple[Task, Found]]:
-    """Wanted tasks with what the store has of them, asked ahead: object storage takes its time."""
+) -> Iterator[tuple[Task, Stored]]:
+    """Wanted tasks with what the store has of them, looked up ahead: object storage is slow."""
 
-    def look_up(one: Wanted) -> tuple[Task, Found]:
-        task = one if isinstance(one, Task) else one()
+    def look_up(item: Wanted) -> tuple[Task, Stored]:
+        task = item if isinstance(item, Task) else item()
         return task, store.found(task.key)
 
-    asked: deque[Future[tuple[Task, Found]]] = deque()
-    for one in wanted:
-        asked.append(pool.submit(look_up, one))
+    asked: deque[Future[tuple[Task, Stored]]] = deque()
+    for item in wanted:
+        asked.append(pool.submit(look_up, item))
         if len(asked) >= _LOOKED_AHEAD:
             yield asked.popleft().result()
     while asked:
@@ -140,8 +141,8 @@ def _looked_up(
 
 
 class _Fleet:
-    """``under_way``: of every task that is being made the coroutine that makes it, by key, so that
-    all who need it wait for the same one."""
+    """``under_way``: the coroutine of every task that is being made, by key, so that all tasks that
+    need its result wait for the same one."""
 
     def __init__(self, store: Store, executor: Executor, tries: int, again: bool) -> None:
         self.store, self.executor, self.tries, self.again = store, executor, tries, again
@@ -150,19 +151,19 @@ class _Fleet:
         self._tried_again: set[str] = set()
         self._run = secrets.token_hex(8)
 
-    async def settled(
-        self, wanted: Iterator[tuple[Task, Found]], show: Callable[[Status], None]
+    async def outcomes(
+        self, wanted: Iterator[tuple[Task, Stored]], show: Callable[[Status], None]
     ) -> AsyncIterator[Outcome]:
-        """Each of the wanted tasks, once nothing more is to be done for it."""
+        """Outcomes of the wanted tasks, as they end."""
         pending: set[asyncio.Task[Outcome]] = set()
         is_last = False
         while not is_last or pending or self.under_way:
             room = self.executor.room()
             while not is_last and len(pending) < room:
-                if (one := next(wanted, None)) is None:
+                if (item := next(wanted, None)) is None:
                     is_last = True
                 else:
-                    pending.add(asyncio.create_task(self._settle(*one)))
+                    pending.add(asyncio.create_task(self._wanted(*item)))
             if waited_for := pending | {*self.under_way.values()}:
                 first = asyncio.FIRST_COMPLETED
                 await asyncio.wait(waited_for, timeout=_SHOWN_S, return_when=first)
@@ -171,29 +172,29 @@ class _Fleet:
                 pending.remove(task)
                 yield task.result()
 
-    async def _settle(self, task: Task, found: Found) -> Outcome:
-        outcome = replace(await self._begin(task, found), task=task)
+    async def _wanted(self, task: Task, stored: Stored) -> Outcome:
+        outcome = replace(await self._begin(task, stored), task=task)
         self.status.wanted += 1
         self.status.there += outcome.state == "there"
         self.status.failed += outcome.state in ("cannot", "failed")
         return outcome
 
-    def _begin(self, task: Task, found: Found | None = None) -> asyncio.Task[Outcome]:
+    def _begin(self, task: Task, stored: Stored | None = None) -> asyncio.Task[Outcome]:
         """Make a task's result, unless that is under way."""
         making = self.under_way.get(task.key)
         if making is None:
-            making = self.under_way[task.key] = asyncio.create_task(self._make(task, found))
+            making = self.under_way[task.key] = asyncio.create_task(self._make(task, stored))
             making.add_done_callback(lambda _: self.under_way.pop(task.key))
         return making
 
-    async def _make(self, task: Task, found: Found | None) -> Outcome:
+    async def _make(self, task: Task, stored: Stored | None) -> Outcome:
         """A task's result, and before it those of its inputs, where the store lacks them."""
-        if (known := await self._known(task, found)) is not None:
+        if (known := await self._known(task, stored)) is not None:
             return known
-        needs, reasons = task.needs, tuple[str, ...]()
+        memory_mb, reasons = task.memory_mb, tuple[str, ...]()
         lacking = await self._lacking_input(task)
         while lacking is None:
-            job = job_of(task, needs, self.store.url, self._run, reasons)
+            job = job_of(task, memory_mb, self.store.url, self._run, reasons)
             self.status.running += 1
             report = await self.executor.do(job)
             self.status.running -= 1
@@ -217,15 +218,15 @@ class _Fleet:
                 lacking = await self._lacking_input(task)
                 continue
             if report.state == "memory":
-                needs = replace(needs, memory_mb=2 * needs.memory_mb)
+                memory_mb *= 2
             await asyncio.sleep(min(_FIRST_PAUSE_S * 2 ** (len(reasons) - 1), _LONGEST_PAUSE_S))
         return replace(lacking, task=task)
 
-    async def _known(self, task: Task, found: Found | None) -> Outcome | None:
-        """What the store says of a task; None: it is to be done."""
-        if found is None:
-            found = await asyncio.to_thread(self.store.found, task.key)
-        there, failure = found
+    async def _known(self, task: Task, stored: Stored | None) -> Outcome | None:
+        """The outcome according to the store; None: the task is still to be done."""
+        if stored is None:
+            stored = await asyncio.to_thread(self.store.found, task.key)
+        there, failure = stored
         if failure is None:
             return Outcome(task, "there") if there else None
         if not self.again or task.key in self._tried_again:
@@ -235,7 +236,7 @@ class _Fleet:
         return None
 
     async def _lacking_input(self, task: Task) -> Outcome | None:
-        """Make all inputs; the first that can't be made."""
-        inputs = [one for one in task.inputs.values() if isinstance(one, Task)]
+        """Make all inputs; returns the first that can't be made."""
+        inputs = [item for item in task.inputs.values() if isinstance(item, Task)]
         outcomes = await asyncio.gather(*map(self._begin, inputs))
-        return next((one for one in outcomes if one.state in ("cannot", "failed")), None)
+        return next((item for item in outcomes if item.state in ("cannot", "failed")), None)

@@ -1,4 +1,4 @@
-"""Who does a fleet's tasks: this process, one after the other, or Ray on any number of machines."""
+"""Executors of a fleet's tasks: this process, one at a time, or Ray on any number of machines."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ from tumortrack_lab.fleet.store import is_running
 from tumortrack_lab.fleet.worker import Job, Report, perform
 
 _LOOK_S = 5.0  # between looks at which machines there are
-_SILENT_S = 8.0  # without a word from the cluster's head: it is gone
+_SILENT_S = 8.0  # without an answer from the cluster's head, which then counts as gone
 _LARGE_MB = 2000
-_STORE_BYTES = 80 * 2**20  # Ray's least for its object store, which carries no data of ours
+_STORE_BYTES = 80 * 2**20  # the smallest object store that Ray allows; we put nothing in it
 
 
 class Serial:
@@ -49,7 +49,7 @@ class OnRay:
 
     def __init__(self, address: str | None = None, cores: int | None = None) -> None:
         os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
-        if address is None:  # ours alone, on a machine with other users; not kept in their home
+        if address is None:  # protect it from other users of the machine
             os.environ["RAY_AUTH_MODE"] = "token"
             os.environ.setdefault("RAY_AUTH_TOKEN", secrets.token_hex(32))
         import ray
@@ -59,7 +59,7 @@ class OnRay:
         if self._folder is not None:
             options = {"num_cpus": cores or available_cores(), "_temp_dir": str(self._folder)}
             options["object_store_memory"] = _STORE_BYTES
-        # It has no switch for pages about lost machines; our own lines say what is done about them.
+        # Silences pages about lost machines, which no option does; we report them in one line.
         ray._private.worker.print_to_stdstream = lambda *data, **how: None
         try:
             context: Any = ray.init(log_to_driver=False, logging_level=logging.ERROR, **options)
@@ -79,25 +79,24 @@ class OnRay:
     def room(self) -> int:
         if time.monotonic() - self._heard_s > 1.0:
             self._look_for_head()
-        return int(sum(one.get("CPU", 0) for one in self._largest())) + 4
+        return int(sum(machine.get("CPU", 0) for machine in self._largest())) + 4
 
     async def do(self, job: Job) -> Report:
-        """Its needs are held to what the largest machine has: there it runs alone, and slower. Of a
-        task that can't report, what Ray says of its end."""
+        """A task that needs more than the largest machine has runs there alone. If a task ends
+        without a report, one is made of Ray's error."""
         machines, errors = self._largest(), self._ray.exceptions
-        most = {name: max(one.get(name, 0) for one in machines) for name in ("CPU", "memory")}
-        function = self._large if job.needs.memory_mb >= _LARGE_MB else self._small
+        most = {key: max(each.get(key, 0) for each in machines) for key in ("CPU", "memory")}
+        function = self._large if job.memory_mb >= _LARGE_MB else self._small
         options = function.options(
             name=job.name,
-            num_cpus=min(job.needs.cores, most["CPU"]),
-            memory=min(job.needs.memory_mb * 2**20, int(0.95 * most["memory"])),
-            num_gpus=job.needs.gpus,
+            num_cpus=min(1, most["CPU"]),
+            memory=min(job.memory_mb * 2**20, int(0.95 * most["memory"])),
         )
         try:
             report: Report = await asyncio.wrap_future(options.remote(job).future())
         except errors.OutOfMemoryError:
             return Report("memory", "ended by Ray: its machine ran out of memory")
-        except errors.WorkerCrashedError:  # as after the kernel's own choice when memory runs out
+        except errors.WorkerCrashedError:  # as when the kernel runs out of memory
             return Report("memory", "its process ended unexpectedly (killed, or out of memory)")
         except errors.NodeDiedError:
             return Report("failed", "its machine was lost")
@@ -107,7 +106,7 @@ class OnRay:
         return report
 
     def close(self) -> None:
-        if self._is_lost:  # it would wait for its head, or crash
+        if self._is_lost:  # a shutdown would wait for the head, or crash
             atexit.register(_leave)
         else:
             self._ray.shutdown()
@@ -115,8 +114,8 @@ class OnRay:
             shutil.rmtree(self._folder, ignore_errors=True)
 
     def _look_for_head(self) -> bool:
-        """Whether the cluster's head answers. TumortrackError: it has not for a while; Ray itself
-        would wait a minute and then end this process."""
+        """Whether the cluster's head answers. Raises TumortrackError: it has not for a while (Ray
+        itself would wait a minute and then end this process)."""
         try:
             socket.create_connection((self._head[0], int(self._head[1])), 2.0).close()
         except OSError as error:
@@ -131,22 +130,22 @@ class OnRay:
         return True
 
     def _largest(self) -> list[dict[str, float]]:
-        """What each machine has, as of a few seconds ago. TumortrackError: the cluster is gone."""
+        """Each machine's resources, seconds ago. Raises TumortrackError: the cluster is gone."""
         if time.monotonic() - self._looked_s > _LOOK_S and self._look_for_head():
             nodes = self._ray.nodes()
-            self._machines = [one["Resources"] for one in nodes if one["Alive"]] or [{}]
+            self._machines = [node["Resources"] for node in nodes if node["Alive"]] or [{}]
             self._looked_s = time.monotonic()
         return self._machines
 
 
 def _leave() -> None:
-    """End this process at once, before Ray's own end."""
+    """End this process at once, without Ray's exit handlers."""
     sys.stdout.flush()
     os._exit(TumortrackError.exit_code)
 
 
 def _own_folder() -> Path:
-    """For the sockets and logs of a Ray of our own; those of processes that were killed go."""
+    """A folder for the sockets and logs of a local Ray; removes those of killed processes."""
     place = Path(tempfile.gettempdir())
     for old in place.glob("tumortrack-ray-*-*"):
         with suppress(OSError, ValueError):

@@ -1,5 +1,5 @@
-"""LIST: a CSV table of patients, a row each: a name, an input, and options where they differ from
-the defaults."""
+"""LIST: a CSV table with a row for each patient: a name, an input, and options that differ from the
+defaults."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def _up(cell: str) -> str:
     return cell
 
 
-# Options of `prepare`, as there; then of all that follows.
+# Options of `prepare`; then those of the later steps.
 _OF_PREPARE: dict[str, Callable[[str], Any]] = {
     "organ_name": str,
     "side": str, "up": _up, "patient": str, "organ": int, "tumor": int, "series": str,
@@ -64,8 +64,8 @@ class Patient:
         source: what `prepare` takes.
         prepare: its options.
         seed: of states.
-        margin_states: states of the twin that margins are found with.
-        test_states: others, on which the model is evaluated.
+        margin_states: simulated states for calibrating margins.
+        test_states: other states, for evaluating the model.
         views: of each of these.
     """
 
@@ -79,10 +79,10 @@ class Patient:
 
 
 def read_list(path: Path) -> list[Patient]:
-    """The patients of a list; paths are relative to it. Whether the inputs exist is not asked here.
+    """The patients of a list; paths are relative to it. Whether inputs exist is not checked here.
 
     Raises:
-        InputError: no such file, or rows that cannot be used: all of them, with their lines.
+        InputError: no such file, or unusable rows: all of them are named, with their lines.
     """
     try:
         text = store.read_file(path, _LARGEST, "Split the list.").decode("utf-8-sig")
@@ -98,10 +98,10 @@ def read_list(path: Path) -> list[Patient]:
             if not any(cells):
                 continue
             try:
-                one = _patient(head, cells, path.parent)
-                if one.name in patients:
-                    raise InputError(f"{one.name} has a row already")
-                patients[one.name] = one
+                patient = _patient(head, cells, path.parent)
+                if patient.name in patients:
+                    raise InputError(f"{patient.name} has a row already")
+                patients[patient.name] = patient
             except InputError as error:
                 wrong.append(f"line {reader.line_num}: {str(error).rstrip('.')}")
     except csv.Error as error:
@@ -148,8 +148,8 @@ def _patient(head: list[str], cells: list[str], folder: Path) -> Patient:
 
 
 def hashed(path: Path) -> File:
-    """A user's file or folder with its content's sha256, computed each time (a folder of CT slices
-    takes a second or so); where it cannot be read, with none that any content has."""
+    """A user's file or folder with its content's sha256, computed each time (about a second for a
+    folder of CT slices); where it cannot be read, with ``MISSING``."""
     try:
         return File(str(path.absolute()), store.sha256_of(path))
     except OSError:

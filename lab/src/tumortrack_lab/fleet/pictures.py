@@ -1,4 +1,4 @@
-"""Small pictures for the page of a fleet."""
+"""Thumbnails for the page of a fleet."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ def thumbnail(source: Path, out: Path) -> None:
 def worst_picture(
     case: Path, groups: Sequence[Path], rows: Sequence[dict[str, Any]], out: Path
 ) -> None:
-    """The answer that is farthest off, good ones first, over the truth; without any answer the
-    first scene's truth. Nothing is drawn where there is no scene."""
+    """The estimate with the largest error, good ones first, over the truth; without estimates the
+    first scene's truth; without scenes nothing."""
     from tumortrack.report.pictures import scene_picture
     from tumortrack.report.protocol import evaluate_scene
     from tumortrack.simulate.scene_folder import read_scene

@@ -1,4 +1,4 @@
-"""What came of a fleet: tables of patients and scenes, whom a person should look at, and a page."""
+"""A fleet's results: tables of patients and scenes, patients to look at, and a page."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 SCENES, PATIENTS, LOOK, PAGE, PICTURES = (
     "scenes.parquet", "patients.parquet", "look.csv", "index.html", "pictures"
 )  # fmt: skip
-FAR_MM = (3.0, 5.0)  # an answer called good with a tumor's middle farther off is named
+FAR_MM = (3.0, 5.0)  # larger errors of good estimates' tumor centres are counted
 _MOST_WITHOUT = 0.5  # share of the scenes without a good answer
 _ERRORS = ("middle_mm", "hausdorff_mm", "surface_mm", "outside_mm")
 _FIRST = ("patient", "state", "step", "reason", "doubts")
@@ -48,7 +48,7 @@ _STYLE = (  # beside that of an evaluation's page
 def write_results(
     out: Path, patients: Sequence[Patient], outcomes: Mapping[str, Outcome], held: Store
 ) -> None:
-    """Write a fleet's tables, page and pictures into ``out``, over those that lie there. Patients
+    """Write a fleet's tables, page and pictures into ``out``, replacing earlier ones. Patients
     without an outcome are not done yet. Raises StorageError."""
     with writing(out):
         (out / PICTURES).mkdir(parents=True, exist_ok=True)
@@ -76,16 +76,16 @@ def reasons_to_look(row: Mapping[str, Any]) -> list[str]:
         return [f"{row['step']}: {row['reason']}"]
     if row["state"] == "open":
         return []
-    found = list(row["doubts"].split("\n")) if row["doubts"] else []
+    reasons = list(row["doubts"].split("\n")) if row["doubts"] else []
     without = row["poor"] + row["refused"]
     if row["scenes"] == 0:
-        found.append("no state of the twin could be made")
+        reasons.append("no state of the twin could be made")
     elif without > _MOST_WITHOUT:
-        found.append(f"{without:.0%} of {row['scenes']} scenes without a good answer")
+        reasons.append(f"{without:.0%} of {row['scenes']} scenes without a good answer")
     if row["over_5_mm"]:
         worst = f"the worst {row['middle_worst_mm']:.1f} mm off"
-        found.append(f"{row['over_5_mm']} answers called good over 5 mm off, {worst}")
-    return found
+        reasons.append(f"{row['over_5_mm']} answers called good over 5 mm off, {worst}")
+    return reasons
 
 
 def _read(
@@ -103,8 +103,8 @@ def _read(
 
 
 def tumor_lines(content: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
-    """A line of each scene and tumor, with how the tumor lies; ``over_3_mm``, ``over_5_mm``: called
-    good, and its middle farther off."""
+    """A line of each scene and tumor, with the tumor's position; ``over_3_mm``, ``over_5_mm``: a
+    good estimate, but its centre is farther off."""
     for row in content["rows"]:
         about = {key: value for key, value in row.items() if key != "tumors"}
         pairs = zip(content["check"]["tumors"], row["tumors"], strict=True)
@@ -118,7 +118,7 @@ def patient_row(content: Mapping[str, Any], lines: Sequence[Mapping[str, Any]]) 
     """A patient's figures: of the largest tumor; errors are medians over all tumors of the scenes
     that were answered good (the best rigid pose's: of all scenes); shares are of scenes."""
     check, margin, rows = content["check"], content["margins"], content["rows"]
-    largest = max(check["tumors"], key=lambda one: one["ml"])
+    largest = max(check["tumors"], key=lambda tumor: tumor["ml"])
     verdicts = [row["verdict"] for row in rows]
     every = pd.DataFrame(lines).reindex(columns=[*_SCENE])
     good = every[every.verdict == "good"]
@@ -150,7 +150,7 @@ def patient_row(content: Mapping[str, Any], lines: Sequence[Mapping[str, Any]]) 
 
 
 def _pictures(name: str, outcome: Outcome, held: Store, out: Path) -> None:
-    """NAME.webp, of the case, and NAME-worst.webp; of a patient whose chain ended, the case."""
+    """NAME.webp of the case, and NAME-worst.webp; for a patient that failed, only the case."""
     task = outcome.task
     with writing(out):
         if outcome.state in ("done", "there"):
@@ -172,7 +172,7 @@ def _page(
     body = []
     for row in rows:
         name = row["patient"]
-        why = [one["reason"] for one in looks if one["patient"] == name]
+        why = [entry["reason"] for entry in looks if entry["patient"] == name]
         cells = "".join(f"<td>{html.escape(_cell(row.get(key)))}</td>" for key in _COLUMNS)
         images = "".join(
             f'<a href="{PICTURES}/{path.name}"><img loading="lazy" src="{PICTURES}/{path.name}"'
@@ -180,15 +180,15 @@ def _page(
             for path in (pictures / f"{name}.webp", pictures / f"{name}-worst.webp")
             if path.exists()
         )
-        said = f"<br>{'<br>'.join(map(html.escape, why))}" if why else ""
+        reasons = f"<br>{'<br>'.join(map(html.escape, why))}" if why else ""
         mark = ' class="look"' if why else ""
         body.append(f"<tr{mark} id={name!r}>{cells}</tr>")
-        body.append(f'<tr{mark}><td colspan="{len(_COLUMNS)}">{images}{said}</td></tr>')
+        body.append(f'<tr{mark}><td colspan="{len(_COLUMNS)}">{images}{reasons}</td></tr>')
     head = "".join(f"<th>{words}</th>" for words in _COLUMNS.values())
     lines = "\n".join(body)
     report = resources.files("tumortrack.report").joinpath("page.html").read_text("utf-8")
     style = report.split("<style>")[1].split("</style>")[0] + _STYLE
-    people = len({one["patient"] for one in looks})
+    people = len({entry["patient"] for entry in looks})
     return (
         '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'

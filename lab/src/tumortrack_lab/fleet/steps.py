@@ -1,9 +1,8 @@
-"""What is done for one patient: prepare -> check -> states of the twin -> margins and evaluation ->
-summary.
+"""Steps for one patient: prepare -> check -> simulated states -> margins and evaluation -> summary.
 
 Each function is a ``Work``: it calls what the commands call, and writes the same bits wherever and
-whenever it runs: on one core, and without times, paths and file names, which tables of margins
-state elsewhere. Costs are the engine's to keep.
+whenever it runs, so no times, paths or file names (which `tumortrack margins` writes). The engine
+records costs.
 """
 
 from __future__ import annotations
@@ -17,9 +16,9 @@ from tumortrack.core import store
 from tumortrack.core.errors import InputError, TumortrackError
 from tumortrack_lab.fleet import checks
 from tumortrack_lab.fleet.list import Patient, hashed
-from tumortrack_lab.fleet.task import File, Needs, Task
+from tumortrack_lab.fleet.task import File, Task
 
-# Eight families of physics have the wider world; cut organs are none that is still to be located.
+# Those of the wider world but for cut organs, which are not located any more.
 FAMILIES = ("rest", "plate", "clamp", "twist", "pull", "tether", "roll")
 _TEST = len(FAMILIES) * 100_000  # number of the first state that is evaluated on
 CONFIDENCES = (0.9, 0.95)
@@ -28,12 +27,11 @@ Given = Mapping[str, Any]
 
 
 def chain(patient: Patient) -> dict[str, Task]:
-    """The patient's tasks by step, each after those that it needs; ``summary`` is what is wanted.
+    """The patient's tasks by step, each after those that it needs; ``summary`` is the wanted one.
 
-    States are made in groups of one of each family, a task a group: more states later leave those
-    that were there as they are. Those of evaluation are never those of margins. A state's number
-    alone would draw the same load, view and sensor errors in every patient, so that many patients
-    would be few draws: the input's content is part of the seed.
+    A task makes a group of states, one of each family, so that a later run with more states keeps
+    the earlier groups. Evaluation and margins never share a state. The input's content is part of
+    the seed: a state's number alone would give every patient the same load, view and sensor errors.
     """
     steps: dict[str, Task] = {}
     source = hashed(patient.source)
@@ -41,9 +39,8 @@ def chain(patient: Patient) -> dict[str, Task]:
     def add(
         name: str, work: Any, options: Given, inputs: Mapping[str, Task | File], memory_mb: int
     ) -> Task:
-        needs = Needs(memory_mb=memory_mb)
         kind = name.rstrip("0123456789-")
-        steps[name] = Task(patient.name, kind, 2, work, dict(options), inputs, needs)
+        steps[name] = Task(patient.name, kind, 2, work, dict(options), inputs, memory_mb)
         return steps[name]
 
     kind = "" if patient.source.is_dir() else "".join(patient.source.suffixes[-2:])
@@ -67,13 +64,13 @@ def chain(patient: Patient) -> dict[str, Task]:
     known = {"case": case, **groups["margins"]}
     margin = add("margins", margins, {"seed": patient.seed}, known, 1500)
     judged = add("evaluate", evaluate, {}, {"case": case, **groups["test"]}, 1500)
-    found = {**after, "margins": margin, "evaluate": judged}
-    add("summary", summary, {}, {**found, **groups["test"]}, 1500)
+    results = {**after, "margins": margin, "evaluate": judged}
+    add("summary", summary, {}, {**results, **groups["test"]}, 1500)
     return steps
 
 
-def prepare(inputs: Inputs, options: Given, out: Path, cores: int) -> None:
-    """A case with its model, as `tumortrack prepare` makes it; its source has no name."""
+def prepare(inputs: Inputs, options: Given, out: Path) -> None:
+    """A case with its model, as from `tumortrack prepare`, but without its source's name."""
     from dataclasses import replace
 
     from tumortrack.imaging import prepare as preparing
@@ -93,22 +90,22 @@ def prepare(inputs: Inputs, options: Given, out: Path, cores: int) -> None:
     case_model(load_case(out))
 
 
-def check(inputs: Inputs, options: Given, out: Path, cores: int) -> None:
+def check(inputs: Inputs, options: Given, out: Path) -> None:
     """check.json: the anatomy in numbers, and ``doubts``: what a person should look at. Raises
-    InputError: what nothing should be located with."""
+    InputError: the case fails the quality check."""
     from tumortrack.imaging.case import load_case
 
     case = load_case(inputs["case"])
     cut = checks.is_cut_off(case, inputs["source"], options["series"])
-    found = checks.described(case)
-    if failures := checks.failures(found, cut):
+    numbers = checks.described(case)
+    if failures := checks.failures(numbers, cut):
         raise InputError(f"the quality check failed: {'; '.join(failures)}. Look at qc.png.")
-    store.write_json(out / "check.json", {**found, "doubts": checks.doubts(case, found)})
+    store.write_json(out / "check.json", {**numbers, "doubts": checks.doubts(case, numbers)})
 
 
-def states(inputs: Inputs, options: Given, out: Path, cores: int) -> None:
-    """Scene folders of so many states of the wider world from the ``first`` on, in so many views,
-    and failures.json: states without an equilibrium, views without an organ."""
+def states(inputs: Inputs, options: Given, out: Path) -> None:
+    """Scene folders of ``count`` states of the wider world from number ``first`` on, in ``views``
+    views each, and failures.json: states without an equilibrium, views without an organ."""
     from tumortrack.imaging.case import load_case
     from tumortrack_lab.tets import lattice
     from tumortrack_lab.twin.apparatus import bench_from_ct
@@ -139,15 +136,14 @@ def states(inputs: Inputs, options: Given, out: Path, cores: int) -> None:
     store.write_json(out / "failures.json", failures)
 
 
-def margins(inputs: Inputs, options: Given, out: Path, cores: int) -> None:
-    """margins.jsonl, a line a state, as `tumortrack margins` writes it; result.json; and where the
-    states are enough margins.json, which belongs into the model's folder.
+def margins(inputs: Inputs, options: Given, out: Path) -> None:
+    """margins.jsonl, a line for each state, as `tumortrack margins` writes it; result.json; and
+    with enough states margins.json, which belongs into the model's folder.
 
-    result.json: ``states``, ``answers`` called good, ``reason`` why no margin is stated (empty: one
-    is), ``margin_mm`` by confidence (medians over these answers), and what the states say in any
-    case: ``largest_miss_mm`` over the answers, ``holds_for``, the chance that another answer of
-    such a state misses by no more, n / (n + 1), were the model and the answers' checks fixed
-    beforehand, as they are.
+    result.json: ``states``; ``answers``, the good estimates; ``reason`` why no margin is stated
+    (empty: one is); ``margin_mm`` by confidence (medians over the answers); ``largest_miss_mm`` of
+    the answers; ``holds_for``, the chance that one more exchangeable answer misses by no more than
+    that: n / (n + 1).
     """
     import msgspec
     import numpy as np
@@ -165,9 +161,9 @@ def margins(inputs: Inputs, options: Given, out: Path, cores: int) -> None:
     tracker, rows = Tracker(load_model(model)), []
     groups = [folder for name, folder in inputs.items() if name.startswith("states_")]
     listed = list_states([folder for folder in groups if _scenes(folder)], seed)
-    for one in sorted(listed, key=lambda one: one.folder.name):
-        row = row_of(tracker, read_scene(one.folder), one, seed)
-        rows.append(msgspec.structs.replace(row, scene=one.folder.name))
+    for state in sorted(listed, key=lambda state: state.folder.name):
+        row = row_of(tracker, read_scene(state.folder), state, seed)
+        rows.append(msgspec.structs.replace(row, scene=state.folder.name))
     head = head_of(digest, seed)
     with open_table(out / "margins.jsonl", head) as (_, add):
         for row in rows:
@@ -181,9 +177,9 @@ def margins(inputs: Inputs, options: Given, out: Path, cores: int) -> None:
     }  # fmt: skip
     try:
         table = store.sha256_of(out / "margins.jsonl")
-        found = margins_of(rows, table, CONFIDENCES, seed=seed)
-        write_sealed(out / NAME, msgspec.structs.replace(found, model_sha256=digest))
-        for shells in found.shells:
+        stated = margins_of(rows, table, CONFIDENCES, seed=seed)
+        write_sealed(out / NAME, msgspec.structs.replace(stated, model_sha256=digest))
+        for shells in stated.shells:
             at = [
                 shells.radii["tumor"].at(s, r.measured) for r in good for _, s in r.misses["tumor"]
             ]
@@ -194,8 +190,8 @@ def margins(inputs: Inputs, options: Given, out: Path, cores: int) -> None:
     store.write_json(out / "result.json", result)
 
 
-def evaluate(inputs: Inputs, options: Given, out: Path, cores: int) -> None:
-    """rows.json: what is said of every scene, and how far it is off, beside the best rigid pose."""
+def evaluate(inputs: Inputs, options: Given, out: Path) -> None:
+    """rows.json: verdict and errors of every scene, beside those of the best rigid pose."""
     from dataclasses import replace
 
     from tumortrack.core.rigid_fit import matched_vertices
@@ -213,11 +209,11 @@ def evaluate(inputs: Inputs, options: Given, out: Path, cores: int) -> None:
         failures |= store.read_json(folder / "failures.json")
         for path in _scenes(folder):
             scene = read_scene(path)
-            seen = [
+            ordered = [
                 rest.moved(matched_vertices(rest, part))  # in the order of the case's vertices
                 for rest, part in zip(anatomy.parts, scene.reference.parts, strict=True)
             ]
-            scene = replace(scene, reference=anatomy.of(seen))
+            scene = replace(scene, reference=anatomy.of(ordered))
             number, family, view = path.name.split("-")
             about = {"scene": path.name, "state": int(number), "family": family, "view": int(view)}
             about |= {name: scene.meta[name] for name in ("hidden_share", "visible_share")}
@@ -226,9 +222,9 @@ def evaluate(inputs: Inputs, options: Given, out: Path, cores: int) -> None:
     store.write_json(out / "rows.json", {"rows": rows, "failures": failures})
 
 
-def summary(inputs: Inputs, options: Given, out: Path, cores: int) -> None:
-    """summary.json: all that the fleet's tables hold of the patient; case.webp and, of the worst
-    answer, worst.webp."""
+def summary(inputs: Inputs, options: Given, out: Path) -> None:
+    """summary.json: what the fleet's tables say of the patient; case.webp and, of the worst
+    estimate, worst.webp."""
     from tumortrack.imaging.case import Case
     from tumortrack_lab.fleet.pictures import thumbnail, worst_picture
 

@@ -1,14 +1,13 @@
 """Where a fleet's results lie: folders by key, in a plain folder or in any of fsspec's storages.
 
     KK/KEY/files/...      what a task wrote (KK: the first two letters of its key)
-    KK/KEY/manifest.json  their sha256, written last: without it there is no result; or, of a task
-                          that can't be done, why
+    KK/KEY/manifest.json  their sha256, written last: without it there is no result; or the reason
+                          why the task can't be done
     costs/KK/KEY.json     what it cost: apart, since results are equal bit for bit and costs are not
-    claims/KEY.json       who is doing it: a hint alone, that two runs don't do the same
+    claims/KEY.json       which run is doing it: only a hint, so that two runs don't do the same
 
-In a plain folder a result is used where it lies; from elsewhere it is fetched into a cache on this
-machine. Whatever is written by halves, the next reader finds out: by the manifest, which is written
-last, or by a checksum.
+Results in a plain folder are used in place; others are fetched into a cache on this machine. A
+reader notices an unfinished result: its manifest is missing, or a checksum is wrong.
 """
 
 from __future__ import annotations
@@ -29,8 +28,8 @@ from tumortrack.core.errors import InputError
 from tumortrack.core.store import MANIFEST, sha256_of
 from tumortrack_lab.fleet.task import File
 
-_CLAIMED_S = 60.0  # a claim that was not renewed for so long is void
-_KEPT_S = 24 * 3600  # what was cached and not asked for so long is removed
+_CLAIMED_S = 60.0  # older claims are void unless renewed
+_KEPT_S = 24 * 3600  # unused cache entries are removed after this
 
 
 class DamagedError(Exception):
@@ -79,17 +78,17 @@ class Store:
             raise InputError(f"the store {self.url} cannot be written: {error}") from error
 
     def has(self, key: str) -> bool:
-        """Whether a whole result lies there, of a task that could be done."""
+        """Whether there is a whole result."""
         return self.found(key) == (True, None)
 
     def found(self, key: str) -> tuple[bool, str | None]:
-        """Whether something lies there; and if the task can't be done, why."""
+        """Whether there is an entry; and if the task can't be done, why."""
         manifest = self._manifest(key)
         return bool(manifest), manifest.get("failure")
 
     def get(self, key: str) -> Path:
         """A folder on this machine with the result, not to be altered; every file's sha256 is
-        checked. DamagedError: it is not whole, or not there any more."""
+        checked. Raises DamagedError: it is not whole, or gone."""
         files = self._manifest(key).get("files")
         if files is None:
             raise DamagedError(key, "it has no manifest")
@@ -112,7 +111,7 @@ class Store:
         return folder
 
     def put(self, key: str, folder: Path) -> None:
-        """Keep what lies in ``folder``; nothing, where ``key`` is there already."""
+        """Keep the files of ``folder``, unless ``key`` is there already."""
         if self.has(key):
             return
         paths = sorted(path for path in folder.rglob("*") if path.is_file())
@@ -137,14 +136,13 @@ class Store:
             shutil.rmtree(self._kept / key, ignore_errors=True)
 
     def claim(self, key: str, run: str) -> bool:
-        """Say, again and again, that ``run`` is doing this; False: another run is, or was a minute
-        ago. Two that ask in the same moment may both hear True: then both do it, to the same
-        bits."""
+        """Claim a task for ``run``, or renew the claim; False: another run holds it. Two runs that
+        ask at the same moment may both get True, and then both do it, with the same bits."""
         now, here = time.time(), socket.gethostname()
         try:
-            found = json.loads(self._files.cat_file(self._claim(key)))
-            gone = found["host"] == here and not is_running(found["process"])
-            if found["run"] != run and abs(now - found["time"]) < _CLAIMED_S and not gone:
+            holder = json.loads(self._files.cat_file(self._claim(key)))
+            gone = holder["host"] == here and not is_running(holder["process"])
+            if holder["run"] != run and abs(now - holder["time"]) < _CLAIMED_S and not gone:
                 return False
         except (FileNotFoundError, ValueError):
             pass
@@ -153,17 +151,17 @@ class Store:
         return True
 
     def release(self, key: str) -> None:
-        """Nobody is doing it any more."""
+        """Give up a claim."""
         with suppress(FileNotFoundError):
             self._files.rm_file(self._claim(key))
 
     def cost(self, key: str) -> dict[str, Any]:
         """What a task cost, as the engine wrote it; empty: unknown."""
         try:
-            found: dict[str, Any] = json.loads(self._files.cat_file(self._cost(key)))
+            cost: dict[str, Any] = json.loads(self._files.cat_file(self._cost(key)))
         except (FileNotFoundError, ValueError):
             return {}
-        return found
+        return cost
 
     def put_cost(self, key: str, cost: dict[str, Any]) -> None:
         self._files.pipe_file(self._cost(key), json.dumps(cost, indent=1).encode())
@@ -192,13 +190,13 @@ class Store:
     def _manifest(self, key: str) -> dict[str, Any]:
         """Empty: there is none that can be read."""
         try:
-            found = json.loads(self._files.cat_file(f"{self._place(key)}/{MANIFEST}"))
+            manifest = json.loads(self._files.cat_file(f"{self._place(key)}/{MANIFEST}"))
         except (FileNotFoundError, NotADirectoryError, ValueError):
             return {}
-        if not isinstance(found, dict) or not isinstance(found.get("files"), dict):
+        if not isinstance(manifest, dict) or not isinstance(manifest.get("files"), dict):
             return {}
-        inside = all(".." not in name.split("/") and name[:1] != "/" for name in found["files"])
-        return found if found.get("key") == key and inside else {}
+        inside = all(".." not in name.split("/") and name[:1] != "/" for name in manifest["files"])
+        return manifest if manifest.get("key") == key and inside else {}
 
     def _claim(self, key: str) -> str:
         return f"{self.root}/claims/{key}.json"
@@ -211,7 +209,7 @@ class Store:
 
     @cached_property
     def _kept(self) -> Path:
-        """This machine's cache of this store, freed of what is old."""
+        """This machine's cache of this store; old entries are removed."""
         name = hashlib.sha256(self.url.encode()).hexdigest()[:12]
         kept = self._cache or scratch() / name
         _clear_old(kept)
@@ -219,8 +217,7 @@ class Store:
 
 
 def is_running(process: int) -> bool:
-    """Whether a process of this machine is; one that has ended and only waits to be noticed by its
-    parent is not."""
+    """Whether a process is running on this machine; zombies do not count."""
     with suppress(OSError, IndexError):  # Linux
         return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] not in "ZX"
     try:
@@ -241,14 +238,14 @@ def _fetch(files: Any, source: str, target: Path) -> None:
 
 
 def scratch() -> Path:
-    """A folder on this machine for what is only passing through, freed of what is old."""
+    """A folder on this machine for temporary files; old ones are removed."""
     folder = Path(tempfile.gettempdir()) / f"tumortrack-fleet-{os.getuid()}"
     _clear_old(folder)
     return folder
 
 
 def _clear_old(folder: Path) -> None:
-    """Make the folder, or remove from it what nobody has touched for a day."""
+    """Make the folder, or remove what was not touched for a day."""
     folder.mkdir(parents=True, exist_ok=True)
     for old in folder.iterdir():
         if time.time() - old.stat().st_mtime > _KEPT_S:
@@ -256,7 +253,7 @@ def _clear_old(folder: Path) -> None:
 
 
 def _check(folder: Path, key: str, files: dict[str, str]) -> None:
-    """DamagedError unless all files are there with these sha256."""
+    """Raises DamagedError unless all files are there with these sha256."""
     for name, digest in files.items():
         if not (folder / name).is_file():
             raise DamagedError(key, f"it lacks {name}")

@@ -1,7 +1,7 @@
 """What a fleet computes: tasks, each a pure function of its options and of other tasks' results.
 
-A task's key is a hash of all that decides its result, so that what lies in the store under that key
-is never computed again, by whichever run, machine or user.
+A task's key is a hash of everything that its result depends on, so that no run, machine or user
+computes a result that is already in the store.
 """
 
 from __future__ import annotations
@@ -17,29 +17,20 @@ from typing import Any, Protocol, runtime_checkable
 
 @runtime_checkable
 class Work(Protocol):
-    """What a step does. Importable by name, so that another process can do it.
+    """What a step does, on one core. Importable by name, so that another process can do it.
 
-    Given the folders of its inputs by name, its options, a folder to write into (empty, there
-    already) and its number of cores. The same inputs and options give the same files to the last
-    bit, on any number of machines: nothing written states a time, a path or a host.
+    Arguments are the folders of its inputs by name, its options, and an empty folder to write into.
+    The same inputs and options give the same files bit for bit, on any machine: no file states a
+    time, a path or a host.
 
     Raises:
-        TumortrackError: it cannot be done with these inputs, and never will be; any other error may
-            be the machine's, and the task is tried again.
+        TumortrackError: it cannot be done with these inputs, now or later; any other error may be
+            the machine's, and the task is tried again.
     """
 
     def __call__(
-        self, inputs: Mapping[str, Path], options: Mapping[str, Any], out: Path, cores: int
+        self, inputs: Mapping[str, Path], options: Mapping[str, Any], out: Path
     ) -> None: ...
-
-
-@dataclass(frozen=True)
-class Needs:
-    """What a task takes while it runs."""
-
-    cores: int = 1
-    memory_mb: int = 1500
-    gpus: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +47,8 @@ class File:
 
 @dataclass(frozen=True, eq=False)
 class Task:
-    """One step of one patient. ``version`` rises when a step's result changes."""
+    """One step of one patient. ``version`` rises when a step's result changes; ``memory_mb``: what
+    it takes while it runs."""
 
     patient: str
     step: str
@@ -64,15 +56,15 @@ class Task:
     work: Work
     options: Mapping[str, Any]  # of JSON's kinds
     inputs: Mapping[str, Task | File]
-    needs: Needs = Needs()
+    memory_mb: int = 1500
 
     @cached_property
     def key(self) -> str:
-        """sha256 of all that decides the result; the patient's name does not."""
+        """sha256 of all that the result depends on; the patient's name is not part of it."""
         content = {
             "step": self.step,
             "version": self.version,
             "options": dict(self.options),
-            "inputs": {name: one.key for name, one in sorted(self.inputs.items())},
+            "inputs": {name: source.key for name, source in sorted(self.inputs.items())},
         }
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()

@@ -1,5 +1,4 @@
-"""What is done where a task runs: its inputs fetched, its work called, its result put into the
-store. The same for every engine."""
+"""What happens where a task runs: fetch its inputs, call its work, store its result."""
 
 from __future__ import annotations
 
@@ -22,21 +21,21 @@ from typing import Any, Literal
 import tumortrack
 from tumortrack.core.errors import InputError, StorageError, TumortrackError
 from tumortrack_lab.fleet.store import DamagedError, Store, scratch
-from tumortrack_lab.fleet.task import File, Needs, Task, Work
+from tumortrack_lab.fleet.task import File, Task, Work
 
 _RENEWED_S = 15.0  # between renewals of a claim
 
 
 @dataclass(frozen=True)
 class Job:
-    """A task as it travels: names and keys, no data. ``reasons``: why earlier attempts failed."""
+    """A task as sent to a worker: names and keys, no data. ``reasons``: why attempts failed."""
 
     key: str
     name: str
     work: str
     options: Mapping[str, Any]
     inputs: Mapping[str, str | File]  # keys of results in the store; users' files
-    needs: Needs
+    memory_mb: int
     store: str
     run: str  # its name, for claims
     reasons: tuple[str, ...] = ()
@@ -45,13 +44,12 @@ class Job:
 
 @dataclass(frozen=True)
 class Report:
-    """What became of an attempt.
+    """How an attempt ended.
 
-    elsewhere: another run is doing it now. there, done: the result lies in the store, before and
-    now. cannot: it never can be done, which the store says from now on. changed: a user's file is
-    another by now. The others may do better in another attempt: damaged (the result ``damaged``
-    must be made again first), memory (there was too little), failed (anything else of the machine,
-    or a defect of ours).
+    elsewhere: another run is doing it now. there, done: the result is in the store, from before or
+    from now. cannot: it can never be done, as the store says from now on. changed: a user's file
+    was changed. Another attempt may succeed after: damaged (the result ``damaged`` must be made
+    again first), memory (too little), failed (the machine, or a defect of ours).
     """
 
     state: Literal["elsewhere", "there", "done", "cannot", "changed", "damaged", "memory", "failed"]
@@ -60,19 +58,19 @@ class Report:
     cost: Mapping[str, Any] = field(default_factory=dict)
 
 
-def job_of(task: Task, needs: Needs, store: str, run: str, reasons: tuple[str, ...]) -> Job:
+def job_of(task: Task, memory_mb: int, store: str, run: str, reasons: tuple[str, ...]) -> Job:
     """Raises TypeError: the work cannot be imported by its name."""
     name = f"{task.work.__module__}:{task.work.__qualname__}"  # type: ignore[attr-defined]
     if resolve_name(name) is not task.work or name.startswith("__main__"):
         raise TypeError(f"{name} is another object than the work of {task.step}")
-    inputs = {name: one if isinstance(one, File) else one.key for name, one in task.inputs.items()}
+    inputs = {key: of if isinstance(of, File) else of.key for key, of in task.inputs.items()}
     who = f"{task.patient} {task.step}"
-    return Job(task.key, who, name, dict(task.options), inputs, needs, store, run, reasons)
+    return Job(task.key, who, name, dict(task.options), inputs, memory_mb, store, run, reasons)
 
 
 def perform(job: Job) -> Report:
-    """Do a task, unless somebody has done it meanwhile. Never raises what another attempt could
-    mend: the report says it."""
+    """Do a task, unless it has been done meanwhile. Errors that another attempt may avoid are
+    reported, not raised."""
     if job.tumortrack != tumortrack.__version__:
         words = f"{socket.gethostname()} has tumortrack {tumortrack.__version__}"
         return Report("failed", f"{words}, the command {job.tumortrack}: install the same")
@@ -86,8 +84,8 @@ def perform(job: Job) -> Report:
             if there:
                 return Report("there") if failure is None else Report("cannot", failure)
             inputs = {
-                name: store.user_file(one) if isinstance(one, File) else store.get(one)
-                for name, one in job.inputs.items()
+                name: store.user_file(source) if isinstance(source, File) else store.get(source)
+                for name, source in job.inputs.items()
             }
             return _measured(job, store, inputs, Path(folder))
     except DamagedError as error:
@@ -100,7 +98,7 @@ def perform(job: Job) -> Report:
 
 @contextmanager
 def _claimed(job: Job, store: Store) -> Iterator[None]:
-    """Renews the claim now and then, and gives it up in the end."""
+    """Renews the claim regularly, and gives it up in the end."""
     over = threading.Event()
 
     def renew() -> None:
@@ -120,18 +118,18 @@ def _claimed(job: Job, store: Store) -> Iterator[None]:
 
 
 def _measured(job: Job, store: Store, inputs: Mapping[str, Path], out: Path) -> Report:
-    """Do the work and put away what came of it, with what it cost."""
+    """Do the work and store its result and cost."""
     meter = _Meter()
     work: Work = resolve_name(job.work)
-    _set_threads(job.needs.cores)
+    _use_one_core()
     try:
-        work(inputs, job.options, out, job.needs.cores)
+        work(inputs, job.options, out)
     except StorageError as error:  # the disk's, not the patient's
         return _attempt_failed(error)
     except TumortrackError as error:
         reason = f"{type(error).__name__}: {error}"
         for name, path in (*inputs.items(), ("OUT", out)):
-            reason = reason.replace(str(path), name)  # says the same wherever it is found
+            reason = reason.replace(str(path), name)  # the same on every machine
         store.put_failure(job.key, reason)
         report = Report("cannot", reason, cost=meter.cost(job, out))
     else:
@@ -145,7 +143,7 @@ def _attempt_failed(error: BaseException) -> Report:
     words = f"{type(error).__name__}: {error}"
     if isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError":
         return Report("memory", words)
-    if not isinstance(error, OSError | TumortrackError):  # a defect, perhaps: where
+    if not isinstance(error, OSError | TumortrackError):  # perhaps a defect: say where
         last = traceback.extract_tb(error.__traceback__)[-1]
         words += f" ({Path(last.filename).name}, line {last.lineno})"
     return Report("failed", words)
@@ -156,18 +154,15 @@ def _store(url: str) -> Store:
     return Store(url)
 
 
-def _set_threads(cores: int) -> None:
-    """For libraries that are loaded, and for those that the work loads or starts."""
-    os.environ["OMP_NUM_THREADS"] = str(cores)
-    if "torch" in sys.modules:
-        sys.modules["torch"].set_num_threads(cores)
+def _use_one_core() -> None:
+    """Limit libraries that are loaded, and those that the work loads or starts."""
+    os.environ["OMP_NUM_THREADS"] = "1"
     if "numba" in sys.modules:
-        numba = sys.modules["numba"]
-        numba.set_num_threads(min(cores, numba.config.NUMBA_NUM_THREADS))
+        sys.modules["numba"].set_num_threads(1)
 
 
 class _Meter:
-    """What passes between its making and ``cost``."""
+    """Measures from its creation to ``cost``."""
 
     def __init__(self) -> None:
         with suppress(OSError):  # Linux: the peak is this task's, not of those before it
@@ -175,14 +170,13 @@ class _Meter:
         self._start_s, self._start_cpu_s = time.monotonic(), _cpu_s()
 
     def cost(self, job: Job, out: Path) -> dict[str, Any]:
-        """Seconds, seconds of all cores, megabytes of memory at most, bytes of the result."""
+        """Seconds, CPU seconds, peak memory in megabytes, bytes of the result."""
         return {
             "task": job.name,
             "seconds": round(time.monotonic() - self._start_s, 3),
             "cpu_s": round(_cpu_s() - self._start_cpu_s, 3),
             "peak_mb": round(_peak_mb(), 1),
             "bytes": sum(path.stat().st_size for path in out.rglob("*") if path.is_file()),
-            "cores": job.needs.cores,
             "host": socket.gethostname(),
             "attempts": [*job.reasons, ""],
         }

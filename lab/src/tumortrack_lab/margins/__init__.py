@@ -1,1 +1,1 @@
-"""Margins found: scenes of known truth -> the ``ModelMargins`` that a model states."""
+"""Calibration of margins: scenes of known truth -> the ``ModelMargins`` that a model states."""

@@ -44,9 +44,9 @@ _Turn = Literal["choose", "test", "calibrate"]
 CONFIDENCES = (0.9, 0.95)
 WIDEST_MM = 8.0  # as plans assume for estimates without a stated error
 SHARES = (1 / 3, 2 / 3)  # of visible surface: bounds between groups
-# Limits are tried at these quantiles (of the size, of every other figure) of the states they are
-# chosen on, in two sequences. The first can keep out what fits badly; the second limits the size
-# alone, which keeps out much at little loss.
+# Candidate limits are these quantiles (of the size, of every other figure) of the states they are
+# chosen on, in two sequences. The first can exclude poor fits; the second limits the size
+# alone, which excludes much at little loss.
 _LEVELS = {
     "all": ((0.8, 0.8), (0.9, 0.9), (0.95, 0.95), (1.0, 1.0)),
     "size": ((0.8, 1.0), (0.9, 1.0), (0.95, 1.0)),
@@ -54,8 +54,8 @@ _LEVELS = {
 _ERROR = conformal.ERROR / len(_LEVELS)
 _OFFSETS_MM = (0.1, 0.5, 1.0, 2.0, 4.0, 8.0)
 _BENDS_MM = (0.0, 2.0, 4.0, 8.0, 16.0)
-# What a state is used for: choosing form and limits, testing limits, finding radii. The states of
-# each group take these turns, in an order drawn by the seed.
+# What a state is used for: choosing form and limits, testing limits, computing radii. The states
+# of each group take these turns, in an order drawn by the seed.
 _TURNS: tuple[_Turn, ...] = ("test", "calibrate", "choose", "test", "calibrate")
 _SIZE = "size_mm"
 _GRID = 8  # voxels: the labelled volume is not used
@@ -161,7 +161,7 @@ def margins_of(
     rules = _rules([row for row in by_turn["choose"] if not row.doubt])
     limits = _tested(rules, by_turn["test"], kinds[0], widest_mm, 1 - highest)
     accepted = {turn: [row for row in by_turn[turn] if _accepted(row, limits)] for turn in by_turn}
-    least = conformal.least_scores(highest)  # fewer than the test of limits asks for
+    least = conformal.least_scores(highest)  # fewer than testing limits needs
     groups, joined = _grouped(accepted["calibrate"], _ALONE * least)
     shells: list[Shells] = []
     for confidence in sorted(confidences):
@@ -189,14 +189,14 @@ def margins_of(
 
 
 def least_states(confidence: float, misses: int = 0) -> int:
-    """How many states, all answered, it takes to show that margins hold with this confidence if so
-    many of the tested answers miss them."""
+    """How many states, all with a good estimate, it takes to show that margins hold with this
+    confidence if so many of the tested ones miss them."""
     tested = conformal.least_tested(1 - confidence, _ERROR, misses=misses)
     return math.ceil(tested * len(_TURNS) / _TURNS.count("test"))
 
 
 def _dealt(labels: Sequence[conformal.Label], seed: int) -> list[_Turn]:
-    """What each state is used for; drawn within its group."""
+    """What each state is used for, drawn within its group."""
     turns: dict[int, _Turn] = {}
     dealt = dict.fromkeys(labels, 0)
     for n in np.random.default_rng(seed).permutation(len(labels)):
@@ -239,8 +239,8 @@ def _accepted(row: Row, limits: dict[str, float]) -> bool:
 
 
 def _form(rows: Sequence[Row], kind: Kind) -> Radius:
-    """The form that gives these misses the largest likelihood, if they are exponential in the size;
-    constant if that is about as likely. Its factors are still to be found."""
+    """The form of largest likelihood, if misses are exponentially distributed in the size; constant
+    if that is about as likely. Its factors are computed later."""
     constant = Radius(used="constant", constant_mm=1.0)
     deviations = [(s, row.measured) for row in rows for _, s in row.misses[kind]]
     if any(s is None for s, _ in deviations):
@@ -296,7 +296,7 @@ def _misses(rows: Sequence[Row], kind: Kind, radius: Radius) -> int:
 
 
 def _grouped(rows: Sequence[Row], least: int) -> tuple[dict[str, list[Row]], dict[str, str]]:
-    """The members of each group; and of groups too small to stand alone, the one they joined."""
+    """The members of each group; and for groups that were too small, the one they joined."""
     labels = [row.label for row in rows]
     groups = conformal.groups_of(labels, least)
     members = {_name(label): [rows[n] for n in numbers] for label, numbers in groups.items()}

@@ -1,4 +1,4 @@
-"""The table of a calibration: one line per state, on disk before the next is located."""
+"""The table of a calibration: a line per state, on disk before the next state is located."""
 
 from __future__ import annotations
 

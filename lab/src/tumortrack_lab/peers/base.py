@@ -1,8 +1,8 @@
-"""What a peer is, and the rigid ones.
+"""The interface of peers (methods to compare with), and the rigid ones.
 
 A peer moves the pre-operative anatomy onto one observed cloud: it is made for one patient and
 fitted to scenes one by one. Its answer is a map of points, from which organ, tumors and labels
-follow; so peers and network are compared by the same ``report.protocol.compare``.
+follow, so that peers are evaluated exactly as the default method.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class Fit:
     """A peer's answer for one scene.
 
     ``carry``: points of the undeformed CT frame (LPS, mm) -> the camera frame (mm); ``report``
-    (JSON): whatever explains it.
+    (JSON): details of the fit.
     """
 
     carry: Carry
@@ -46,7 +46,7 @@ class Fit:
 
 @dataclass(frozen=True, eq=False)
 class OneWay:
-    """The motion of a method that knows only the way from the CT to the camera."""
+    """The motion of a method without an inverse and without uncertainty."""
 
     carry: Carry
 
@@ -86,7 +86,7 @@ def estimate_of(fit: Fit, anatomy_ct: Anatomy, stamp_ns: int = 0, grid: int = 16
 
 
 class Rigid:
-    """The pose of least error as a peer."""
+    """The best pose of ``PoseSearch``."""
 
     def __init__(self, anatomy_ct: Anatomy, up_lps: Direction, config: RigidConfig) -> None:
         self._search = PoseSearch(anatomy_ct, up_lps, config)
@@ -97,9 +97,9 @@ class Rigid:
 
 
 class RigidBound:
-    """The best rigid pose there is, found with the truth in hand: least squares over the organ's
-    whole volume, from the truth's own correspondence. Not a method anyone could use; no rigid
-    method can beat it in that norm. Errors as of ``matched_vertices``."""
+    """The best rigid pose, computed from the truth: least squares over the organ's whole volume,
+    with true correspondences. An oracle, not a method: no rigid method can beat it in that norm.
+    Errors as of ``matched_vertices``."""
 
     def __init__(self, anatomy_ct: Anatomy, up_lps: Direction) -> None:
         self._organ = anatomy_ct.organ

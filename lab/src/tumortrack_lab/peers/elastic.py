@@ -242,15 +242,16 @@ class ElasticPeer:
         toward = np.flatnonzero(shape.faces(eye_ct))
         index = toward[cKDTree(shape.points_mm[toward]).query(placed)[1]]
         deepest = np.percentile(points[:, 2], CROP_PERCENT)
-        seen = self._surface.seen(shape, state.camera_from_ct, deepest)
-        nearest = cKDTree(placed).query(shape.points_mm[seen])[1]
-        index = np.concatenate([index, seen])
+        visible = self._surface.seen(shape, state.camera_from_ct, deepest)
+        nearest = cKDTree(placed).query(shape.points_mm[visible])[1]
+        index = np.concatenate([index, visible])
         partner = np.concatenate([placed, placed[nearest]])
         apart, normal = partner - shape.points_mm[index], shape.normals[index]
         residual = np.einsum("ij,ij->i", normal, apart)
         # Partners beside the surface's end have no place on it: their distance counts too.
         off = np.maximum(np.abs(residual), np.linalg.norm(apart, axis=1) - _BESIDE_MM)
-        alike = np.full(len(seen), len(placed) / max(len(seen), 1))  # both ways weigh the same
+        ratio = len(placed) / max(len(visible), 1)  # both ways weigh the same
+        alike = np.full(len(visible), ratio)
         turn = np.cross(shape.points_mm[index] - self._surface.middle, normal)
         bend = np.einsum("ij,ijk->ik", normal, self._surface.modes[index])
         rows = np.concatenate([turn, normal, bend], axis=1)
@@ -300,8 +301,8 @@ class EmbeddedSurface:
     ) -> Int[np.ndarray, " m"]:
         """Some of the points that the camera should see above a depth, evenly spread; occlusion is
         that of the undeformed organ, orientation that of the deformed one."""
-        seen = seen_from(self._visibility, self._rest, camera_from_ct)
-        seen &= shape.faces(np.linalg.inv(camera_from_ct)[:3, 3])
+        visible = seen_from(self._visibility, self._rest, camera_from_ct)
+        visible &= shape.faces(np.linalg.inv(camera_from_ct)[:3, 3])
         axis = camera_from_ct[2]
-        index = np.flatnonzero(seen & (shape.points_mm @ axis[:3] + axis[3] < deepest_mm))
+        index = np.flatnonzero(visible & (shape.points_mm @ axis[:3] + axis[3] < deepest_mm))
         return index[:: max(1, len(index) // _SEEN_POINTS)]

@@ -1,5 +1,5 @@
-"""Peers by name: ours, and those of other installed packages: each is an entry point of the group
-``tumortrack.peers`` that names a ``PeerKind``."""
+"""Peers by name: ours, and those of installed packages, which have entry points of the group
+``tumortrack.peers`` that name a ``PeerKind``."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class PeerKind:
     # make(anatomy_ct, up_lps, config), or make(anatomy_ct, up_lps) without config, gives a Peer.
     make: Callable[..., Any]
     config: Config | None = None
-    packages: tuple[str, ...] = ()  # distributions; an entry point's own is added to them
+    packages: tuple[str, ...] = ()  # distributions; an entry point's own is added
 
     @property
     def versions(self) -> dict[str, str]:

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from tumortrack.core.config import Config
 from tumortrack.core.errors import NoEstimate
-from tumortrack.core.geometry import rigid, rotation_onto, transform_points
+from tumortrack.core.geometry import rigid, rotation_onto, transform_points, triangles_of
 from tumortrack.core.types import Anatomy, Mesh, SensorCloud
 from tumortrack.sense.render import Visibility
 
@@ -64,12 +64,18 @@ def surface_points(mesh: Mesh, spacing_mm: float) -> SurfacePoints:
     cube = np.floor(mesh.vertices_mm / spacing_mm).astype(np.int64)
     _, first = np.unique(cube, axis=0, return_index=True)
     kept = np.sort(first)
-    a, b, c = (mesh.vertices_mm[mesh.faces[:, k]] for k in range(3))
-    normals = np.zeros_like(mesh.vertices_mm)  # the mean of each vertex's triangles, by area
-    for corner in range(3):
-        np.add.at(normals, mesh.faces[:, corner], np.cross(b - a, c - a))
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-    return SurfacePoints(mesh.vertices_mm[kept], normals[kept])
+    return SurfacePoints(mesh.vertices_mm[kept], vertex_normals(mesh)[kept])
+
+
+def vertex_normals(mesh: Mesh) -> Points:
+    """Outward unit normals: the mean of each vertex's triangles, by area."""
+    normals, doubled = (
+        np.zeros_like(mesh.vertices_mm),
+        triangles_of(mesh.vertices_mm, mesh.faces)[1],
+    )
+    for corner in mesh.faces.T:
+        np.add.at(normals, corner, doubled)
+    return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
 
 
 def seen_from(
@@ -78,9 +84,9 @@ def seen_from(
     """Which surface points the camera sees: turned towards it and not hidden by the organ."""
     eye_ct = np.linalg.inv(camera_from_ct)[:3, 3]
     towards = surface.faces(eye_ct)
-    seen = np.zeros(len(towards), bool)
-    seen[towards] = visibility(surface.points_mm[towards], eye_ct)
-    return seen
+    visible = np.zeros(len(towards), bool)
+    visible[towards] = visibility(surface.points_mm[towards], eye_ct)
+    return visible
 
 
 def trimmed_mean(values: Float[np.ndarray, " n"], kept_share: float) -> float:
@@ -156,8 +162,8 @@ class PoseSearch:
     def seen(self, points: Points, camera_from_ct: Transform) -> Points:
         """Points of the undeformed surface that the camera should see and that lie nearer than the
         depth where the cloud was cropped; camera frame."""
-        seen = seen_from(self.visibility, self.surface, camera_from_ct)
-        placed = transform_points(camera_from_ct, self.surface.points_mm[seen])
+        visible = seen_from(self.visibility, self.surface, camera_from_ct)
+        placed = transform_points(camera_from_ct, self.surface.points_mm[visible])
         return placed[placed[:, 2] < np.percentile(points[:, 2], CROP_PERCENT)]
 
     def _start(self, rotation: Rotation3) -> tuple[Rotation3, Point]:
@@ -166,8 +172,8 @@ class PoseSearch:
         turned = self.surface.points_mm @ rotation.T
         middle = (turned.min(0) + turned.max(0)) / 2
         shift = np.array([*-middle[:2], self.config.distance_mm - turned[:, 2].min()])
-        seen = seen_from(self.visibility, self.surface, rigid(rotation, shift))
-        return rotation, _anchor(turned[seen]) @ rotation
+        visible = seen_from(self.visibility, self.surface, rigid(rotation, shift))
+        return rotation, _anchor(turned[visible]) @ rotation
 
     def _icp(self, points: Points, camera_from_ct: Transform, reach_mm: float) -> Transform:
         import small_gicp

@@ -1,1 +1,1 @@
-"""Organs and deformations that nature made, from the user's own copies of public data."""
+"""Real organs and real deformations, from the user's own copies of public data."""

@@ -1,7 +1,6 @@
-"""A deformed organ before the camera, located, and held against the truth and the best rigid pose.
+"""Locates a deformed organ and compares it with the truth and with the best rigid pose.
 
-The rigid pose is an oracle's: least squares over the organ's volume, with the true deformation in
-hand. No method that sees one side can know it.
+That pose is an oracle's: least squares over the organ's volume, with the true deformation known.
 """
 
 from __future__ import annotations
@@ -27,8 +26,8 @@ from tumortrack.simulate.scene import PoseConfig, SceneConfig, sample_pose
 from tumortrack.simulate.scene_folder import Scene, Targets
 from tumortrack.tracking.tracker import Tracker
 
-CAMERA = d405(424, 240)  # as training's
-# As no training scene of `clinic` is.
+CAMERA = d405(424, 240)
+# Unlike any scene that a model is calibrated on.
 DRAGGED = SceneConfig(
     deform=(ChainConfig(links=(DragConfig(), StretchConfig())),), noise=D405_NOISE
 )
@@ -47,7 +46,7 @@ def scene_of(
     parts = [part.moved(deformation.apply(part.vertices_mm)) for part in anatomy_ct.parts]
     config = PoseConfig()
     pose = sample_pose(config, parts[0], up_lps, config.nearest_mm, rng)
-    there = anatomy_ct.of(_laid(part, pose) for part in parts)
+    there = anatomy_ct.of(_posed(part, pose) for part in parts)
     frame = render_depth(there.organ.vertices_mm, there.organ.faces, CAMERA)
     frame = add_noise(frame, D405_NOISE, rng)
     return Scene(cloud_from_depth(frame, CloudConfig(), rng), there, frame)
@@ -60,16 +59,16 @@ def judge(
     seen: DepthFrame | None = None,
     surfaces: bool = True,
 ) -> dict[str, Any]:
-    """What is said of a scene whose surfaces have the CT's triangles in their order; ``seen``: the
-    image that the estimate is judged by.
+    """Locate a scene whose surfaces have the CT's triangles in their order, and compare; ``seen``:
+    the image that the estimate's quality is checked with.
 
     Returns:
         ``verdict`` (refused, poor, good), ``reason``, and ``tumors``: of each the error of its
         middle and, with ``surfaces``, the Hausdorff and the mean surface distance and how far the
-        true one sticks out of the one found, of the estimate and of the best rigid pose; the
-        middle's error were the estimate moved rigidly onto the truth (``shape_``), and the
-        deviation that is stated of it; mm. No tumors where the scene shows another organ. Where it
-        has targets, ``target_mm`` and ``rigid_target_mm`` are their mean errors.
+        true tumor sticks out of the estimated one, of the estimate and of the best rigid pose; the
+        middle's error after moving the estimate rigidly onto the truth (``shape_``); and the stated
+        standard deviation; mm. No tumors where the scene shows another organ. Where it has targets,
+        ``target_mm`` and ``rigid_target_mm`` are their mean errors.
     """
     row: dict[str, Any] = {"tumors": [], "verdict": "refused", "reason": ""}
     motion = None
@@ -89,14 +88,14 @@ def judge(
         if motion is not None:
             row["target_mm"] = _mean_off(motion.carry(targets.points_ct), targets)
     if motion is not None:
-        found = anatomy_ct.organ.moved(motion.carry(anatomy_ct.organ.vertices_mm))
-        onto = fit_over_volume(found, scene.reference.organ)[0]
+        estimated = anatomy_ct.organ.moved(motion.carry(anatomy_ct.organ.vertices_mm))
+        onto = fit_over_volume(estimated, scene.reference.organ)[0]
     for rest, true in zip(anatomy_ct.tumors, scene.reference.tumors, strict=True):
-        tumor = _errors(_laid(rest, pose), true, "rigid_", surfaces)
+        tumor = _errors(_posed(rest, pose), true, "rigid_", surfaces)
         if motion is not None:
-            found = rest.moved(motion.carry(rest.vertices_mm))
-            tumor |= _errors(found, true, "", surfaces)
-            tumor |= _errors(_laid(found, onto), true, "shape_", False)
+            estimated = rest.moved(motion.carry(rest.vertices_mm))
+            tumor |= _errors(estimated, true, "", surfaces)
+            tumor |= _errors(_posed(estimated, onto), true, "shape_", False)
             std_mm = motion.std_mm(rest.vertices_mm.mean(0, keepdims=True))
             assert std_mm is not None
             tumor["std_mm"] = float(std_mm[0])
@@ -108,30 +107,23 @@ def _mean_off(found_mm: np.ndarray, targets: Targets) -> float:
     return float(np.linalg.norm(found_mm - targets.points_mm, axis=1).mean())
 
 
-def _laid(mesh: Mesh, pose: np.ndarray) -> Mesh:
+def _posed(mesh: Mesh, pose: np.ndarray) -> Mesh:
     return mesh.moved(transform_points(pose, mesh.vertices_mm))
 
 
-def _errors(found: Mesh, true: Mesh, prefix: str, surfaces: bool) -> dict[str, float]:
-    off_mm = found.vertices_mm.mean(0) - true.vertices_mm.mean(0)  # the same vertices
+def _errors(estimated: Mesh, true: Mesh, prefix: str, surfaces: bool) -> dict[str, float]:
+    off_mm = estimated.vertices_mm.mean(0) - true.vertices_mm.mean(0)  # the same vertices
     errors = {f"{prefix}middle_mm": float(np.linalg.norm(off_mm))}
     if surfaces:
-        far = surface_distances(found, true, spacing_mm=2.0)
+        far = surface_distances(estimated, true, spacing_mm=2.0)
         errors[f"{prefix}hausdorff_mm"] = far.hausdorff_mm
         errors[f"{prefix}surface_mm"] = far.surface_mm
-        errors[f"{prefix}outside_mm"] = outward_miss(found, true)
+        errors[f"{prefix}outside_mm"] = outward_miss(estimated, true)
     return errors
 
 
 def by_tumor(rows: Iterable[dict[str, Any]]) -> pd.DataFrame:
-    """A line a tumor, with what holds for its scene; one where there is none."""
+    """A line for each tumor, with its scene's values; one line for a scene without tumors."""
     lines = [{**row, **tumor} for row in rows for tumor in row["tumors"] or [{}]]
-    found = pd.DataFrame(lines)
-    return found.reindex(columns=[*dict.fromkeys([*_FIRST, *found.columns])])
-
-
-def quantiles(values: Iterable[float]) -> str:
-    """Median / 90 % / 95 % / worst."""
-    given = pd.Series(list(values), dtype=float).dropna()
-    shown = [*given.quantile([0.5, 0.9, 0.95]), given.max()]
-    return " / ".join(f"{value:.1f}" for value in shown) if len(given) else "–"
+    frame = pd.DataFrame(lines)
+    return frame.reindex(columns=[*dict.fromkeys([*_FIRST, *frame.columns])])

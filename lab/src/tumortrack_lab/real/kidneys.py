@@ -1,10 +1,10 @@
-"""Kidneys of KiTS19: which are taken was decided by geometry alone, before anything was located.
+"""Kidneys of KiTS19, selected by geometry alone before any was located.
 
 The rule: in order of case numbers, leaving out those in use (00000, 00002, 00003) and those set
 aside for judging (``SET_ASIDE``), the first six of each kind whose tumor-bearing kidney passes all:
 `tumortrack prepare` takes the label map as it is and knows the side; no label touches the map's
 border; the kidney with its tumors has 100 to 400 ml, its largest tumor 1 to 100 ml. The kind is
-told by the share of the largest tumor's surface within 2 mm of the organ's outer surface:
+given by the share of the largest tumor's surface within 2 mm of the organ's outer surface:
 endophytic below 0.25, exophytic from 0.5 up; between them neither.
 
 ``kits19.json`` is what the rule gave: numbers only. Label maps: Heller et al. 2019
@@ -58,7 +58,7 @@ def outer_share(tumor: Mesh, organ: Mesh) -> float:
 
 
 def described(case: Case, path: Path) -> dict[str, Any]:
-    """A case in numbers, and what it fails by (``fails``: empty where it passes)."""
+    """A case in numbers, and the checks that it fails (``fails``)."""
     labels = read_labels(path).labels
     cut = labels.any() and np.count_nonzero(labels) > np.count_nonzero(labels[1:-1, 1:-1, 1:-1])
     organ_ml, *tumors_ml = case.report["volumes_ml"].values()
@@ -108,7 +108,7 @@ def prepared(data: Path, number: int, folder: Path) -> Case:
 
 
 def in_turn(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """The two kinds in turn, so that a part of the list has both."""
+    """The two kinds alternating, so that any part of the list has both."""
     kinds = [[row for row in rows if row["kind"] == kind] for kind in KINDS]
     return [row for pair in zip(*kinds, strict=True) for row in pair]
 
@@ -119,7 +119,7 @@ def frozen() -> list[dict[str, Any]]:
 
 
 def check(data: Path, cases: Path, rows: Sequence[dict[str, Any]]) -> dict[str, Path]:
-    """Prepare the listed kidneys from the user's copies, and hold them against the list.
+    """Prepare the listed kidneys from the user's copies, and compare them with the list.
 
     Returns:
         Case folders by name.

@@ -1,4 +1,4 @@
-"""Breathing lungs: measured displacement fields, laid on kidneys.
+"""Breathing lungs: measured displacement fields, applied to kidneys.
 
 Landmark pairs of ten patients (DIR-QA: Fu et al. 2019, doi 10.1002/mp.13726; GPL-3, they stay with
 the user): the same vessel branches at the ends of exhalation and inhalation, as voxel indices
@@ -7,8 +7,8 @@ doi 10.1088/0031-9155/54/7/001); with them the 300 pairs of the older set have t
 displacements to 0.01 mm, and lungs are wider from left to right than from front to back. Which way
 a column runs is not stated; the patient's left is taken, as in most CTs.
 
-Lungs are compressible and full of air, and lobes slide: kidneys do neither. So this asks what a
-method does with real deformations of another kind than its own, not how well it does on kidneys.
+Lungs are compressible and full of air, and lobes slide; kidneys do neither. So this tests how a
+method copes with real deformations of another kind than its own, not how well it does on kidneys.
 """
 
 from __future__ import annotations
@@ -67,14 +67,14 @@ def read_landmarks(path: Path, patient: int) -> Landmarks:
     if not path.is_file():
         raise InputError(f"{path} is missing: put a copy of {WHERE} there, as {path.parent}.")
     try:
-        found = loadmat(path)
-        both = [np.asarray(found[f"landmark_{phase}"], float) for phase in ("EE", "EI")]
+        tables = loadmat(path)
+        both = [np.asarray(tables[f"landmark_{phase}"], float) for phase in ("EE", "EI")]
     except (OSError, ValueError, KeyError, NotImplementedError) as error:
         raise InputError(f"{path} has no landmark_EE and landmark_EI: {error}.") from error
-    one, other = both
-    if one.shape != other.shape or one.shape[1:] != (3,) or not np.isfinite(both).all():
+    exhaled, inhaled = both
+    if exhaled.shape != inhaled.shape or exhaled.shape[1:] != (3,) or not np.isfinite(both).all():
         raise InputError(
-            f"{path}: landmarks of shapes {one.shape} and {other.shape}, or not finite."
+            f"{path}: landmarks of shapes {exhaled.shape} and {inhaled.shape}, or not finite."
         )
     across_mm = IN_PLANE_MM[patient - 1]
     # row: to the back; column: to the left; slice: to the feet
@@ -84,8 +84,8 @@ def read_landmarks(path: Path, patient: int) -> Landmarks:
 
 @dataclass(frozen=True, eq=False)
 class Field:
-    """A patient's smooth displacement from exhalation to inhalation: a thin-plate spline that
-    passes by its landmarks as closely as ``smoothing`` lets it."""
+    """A patient's smooth displacement from exhalation to inhalation: a thin-plate spline through
+    its landmarks, smoothed."""
 
     landmarks: Landmarks
     smoothing: float = SMOOTHING
@@ -104,7 +104,7 @@ class Field:
 def held_out_mm(
     landmarks: Landmarks, smoothing: float, rng: np.random.Generator
 ) -> Float[np.ndarray, " n"]:
-    """Errors, mm, at a tenth of the pairs, of a field that was made from the others."""
+    """Errors, mm, at a tenth of the pairs, of a field fitted to the others."""
     out = np.zeros(len(landmarks.exhaled_mm), bool)
     out[rng.choice(len(out), round(HELD_OUT * len(out)), replace=False)] = True
     field = Field(Landmarks(*(points_mm[~out] for points_mm in landmarks)), smoothing)
@@ -140,7 +140,7 @@ class LungState:
         return points_ct + self.field.at(lung_mm) @ turned.T
 
     def stretch(self, points_ct: Points) -> Float[np.ndarray, " n"]:
-        """By how much volume grows at each point; 0 and below: space is folded over."""
+        """The volume ratio at each point; 0 and below: space is folded over."""
         columns = [
             (self.apply(points_ct + step) - self.apply(points_ct - step)) / (2 * _STEP_MM)
             for step in _STEP_MM * np.eye(3)
@@ -163,7 +163,7 @@ def states(field: Field, organ: Mesh, rng: np.random.Generator) -> dict[str, Lun
 
 
 def place(landmarks_mm: Points, organ: Mesh, rng: np.random.Generator) -> Float[np.ndarray, "4 4"]:
-    """A random pose of the organ among the landmarks, as large as it is if it has room."""
+    """A random pose of the organ among the landmarks, scaled down if there is no room."""
     tree, middle = cKDTree(landmarks_mm), organ.box_mm.mean(0)
     some = organ.vertices_mm[:: max(1, len(organ.vertices_mm) // 500)]
     for scale in SCALES:

@@ -1,8 +1,8 @@
-"""Bent silicone, scanned: one side in, the rest out.
+"""Bent silicone, scanned: one part is given, the rest is predicted.
 
 A kidney on its plate, bent over a stand and scanned by CT, and a slab, bent and laser-scanned.
-vu-arma-dev/cpd-registration states no licence: the files stay with the user, who looks and
-measures. Of six casts of one mould there is the bent top surface (STL, mm), cut out of a CT; of the
+vu-arma-dev/cpd-registration states no licence: the files stay with the user.
+Of six casts of one mould there is the bent top surface (STL, mm), cut out of a CT; of the
 mould the flat top surface (PLY, mm; flat down to z = -7, the kidney up to z = -19). How thick the
 plate is is not said; ``kidney_and_base.stl`` has 10 mm. Spheres and arteries inside some casts have
 no known place in the flat state, and the fiducials are the stand's: no point is known twice.
@@ -93,7 +93,7 @@ def surface_over(points_mm: Points, hole_mm: float) -> Mesh:
 
 
 def closed(top: Mesh, bottom_z_mm: float) -> Mesh:
-    """An open surface over a plane, and all below it down to ``bottom_z_mm``, as one solid."""
+    """The solid between an open surface and the plane z = ``bottom_z_mm``."""
     vertices, faces = top.vertices_mm, top.faces
     below = vertices * [1, 1, 0] + [0, 0, bottom_z_mm]
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
@@ -109,7 +109,7 @@ def closed(top: Mesh, bottom_z_mm: float) -> Mesh:
 
 
 def facing_pose(scan: Mesh, rng: np.random.Generator) -> np.ndarray:
-    """``camera_from_scan``, its outer side to the camera."""
+    """``camera_from_scan`` with the scan's outer side towards the camera."""
     x, y, z = triangles_of(scan.vertices_mm, scan.faces)[1].sum(0)
     return sample_pose(PoseConfig(), scan, (x, y, z), PoseConfig().nearest_mm, rng)
 
@@ -122,9 +122,9 @@ def measured(
     rng: np.random.Generator,
     curves: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> list[dict[str, Any]]:
-    """A row a share of the scan that the camera is given (one side of a line through the picture):
-    what is said, and how far the estimated and the best rigid top surface lie from the scan, where
-    the camera saw and where not (median, 95 %, worst; mm).
+    """A row for each share of the scan that the camera is given (one side of a line in the image):
+    verdict, and distances of the estimated and the best rigid top surface to the scan, where the
+    camera saw and where not (median, 95 %, worst; mm).
 
     ``curves``: the points of one, at rest (the longer) and in a scan that lacks parts of the
     surface. Distances are then from the scan, and from its curve to the other carried there, and
@@ -145,11 +145,11 @@ def measured(
     rows = []
     for share in SHARES:
         limit = np.quantile(_places(whole, along), share)
-        seen = frame.with_depth(np.where(rays <= limit, frame.depth_mm, np.float32("nan")))
-        cloud = cloud_from_depth(seen, CloudConfig(near_mm=1.0, far_mm=1e4), rng)
-        said, motion = located(tracker, cloud)
+        visible = frame.with_depth(np.where(rays <= limit, frame.depth_mm, np.float32("nan")))
+        cloud = cloud_from_depth(visible, CloudConfig(near_mm=1.0, far_mm=1e4), rng)
+        verdict, motion = located(tracker, cloud)
         std_mm = float(np.median(motion.std_mm(top.vertices_mm)))
-        found = {"share": share, **said, "std_mm": std_mm}
+        result = {"share": share, **verdict, "std_mm": std_mm}
         for name, carry in {"": motion.carry, "rigid_": partial(transform_points, pose)}.items():
             mesh = top.moved(carry(top.vertices_mm))
             points_mm, onto = surface_samples(mesh, 3.0)[0], there
@@ -167,18 +167,18 @@ def measured(
                 for part, which in {"seen": ~hidden, "unseen": hidden}.items():
                     if which.any():
                         spread = np.percentile(size[which], [50, 95, 100])
-                        found[f"{what}{part}_mm"] = spread.tolist()
-        rows.append(found)
+                        result[f"{what}{part}_mm"] = spread.tolist()
+        rows.append(result)
     return rows
 
 
 def _places(points_mm: Points, along: np.ndarray) -> np.ndarray:
-    """Along a direction of the picture."""
+    """Coordinates along a direction of the image."""
     return points_mm[:, :2] / points_mm[:, 2:] @ along
 
 
 def located(tracker: Tracker, cloud: SensorCloud) -> tuple[dict[str, Any], Any]:
-    """Verdict, reason and cost, and the motion, also where it is refused."""
+    """Verdict, reason and cost, and the motion, even if the estimate is refused."""
     try:
         estimate = tracker.follow(cloud)
     except NoEstimate as error:

@@ -1,4 +1,4 @@
-"""A bench that does not exist: a kit's phantom in a state, as a CT scanner and a camera see it.
+"""A simulated bench: a kit's phantom in a state, as a CT scanner and a camera see it.
 
 Base frame, mm (``tumortrack_experiment.kit_file``). The organ is the twin's, at rest in its state;
 base, stands and plates are the kit's printed parts, beads are balls in their dimples. Attenuations:
@@ -33,7 +33,7 @@ _CELL_MM = 0.5  # of what is scanned: finer than any scanner's voxel
 
 @dataclass(frozen=True, eq=False)
 class Setup:
-    """What lies on the bench in one state; base frame, mm."""
+    """The objects on the bench in one state; base frame, mm."""
 
     state: str
     anatomy: Anatomy
@@ -53,7 +53,7 @@ def set_up(
     moved_mm: dict[str, tuple[float, float, float]] | None = None,
 ) -> Setup:
     """The kit of ``folder`` with the organ in a state that the kit calls ``name``. ``moved_mm``:
-    beads that lie so far from their dimples; None of a bead's numbers finite: it is missing."""
+    offsets of beads from their dimples; not finite: the bead is missing."""
     base_from_bench = np.array(kit.base_from_ct) @ np.linalg.inv(state.bench_from_ct)
     printed = []
     for part in kit.parts:
@@ -77,7 +77,7 @@ def scan_bench(
     seed: int,
     printed_hu: float = PRINTED_HU,
 ) -> Volume:
-    """A CT of the bench, which lies so in the scanner (LPS, mm)."""
+    """A CT of the bench in this pose in the scanner (LPS, mm)."""
     corners = np.concatenate([mesh.box_mm for mesh in setup.meshes])
     low = corners.min(0) - 2
     shape = tuple(np.ceil((corners.max(0) + 2 - low) / _CELL_MM).astype(int).tolist())
@@ -94,7 +94,7 @@ def scan_bench(
 def see_bench(
     setup: Setup, camera_from_base: Float64[np.ndarray, "4 4"], camera: Intrinsics
 ) -> DepthFrame:
-    """The depth image, without any error, of a camera that stands so; the base is on a table."""
+    """The error-free depth image of a camera in this pose; the base is on a table."""
     nearest = np.full((camera.height, camera.width), np.nan, np.float32)
     lowest_mm = min(float(mesh.box_mm[0, 2]) for mesh in setup.meshes)
     table = trimesh.creation.box((*_TABLE_MM, 10.0))

@@ -1,5 +1,5 @@
-"""The calibrations of a rehearsal: a board that is held before the camera, and one on a robot's
-tool, as files that a real camera and a real robot would give."""
+"""Calibration data of a rehearsal: a board held before the camera, and one on a robot's tool, as
+files that a real camera and a real robot would give."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from tumortrack_lab.rehearsal.hands import Hands
 
 # Of a commanded pose; a data sheet's repeatability (0.05 mm of a UR10e) is less than its accuracy.
 ROBOT_MM, ROBOT_DEG = 0.1, 0.03
-_TWICE = 2  # images of each pose: the noise shows in their difference
+_TWICE = 2  # images of each pose; their difference shows the noise
 
 
 def hold_board(hands: Hands, board: Board, folder: Path, count: int, seed: int) -> None:
@@ -40,7 +40,7 @@ def move_board(
     hands: Hands, board: Board, robot_from_camera: Affine, folder: Path, count: int, seed: int
 ) -> None:
     """Pictures of a board on the tool of a robot, and the robot's own poses, for `calibrate
-    hand-eye --eye-to-hand`. The robot is where it says, but for its accuracy."""
+    hand-eye --eye-to-hand`. The robot's poses have the errors of its accuracy."""
     rng = np.random.default_rng(seed)
     tool_from_board = rigid(
         Rotation.from_euler("xyz", rng.uniform(-20, 20, 3), degrees=True).as_matrix(),
@@ -50,10 +50,10 @@ def move_board(
     looks = looks_at_board(board, count, rng, (130.0, 230.0))
     for number, camera_from_board in enumerate(looks):
         _shoot(hands, board, camera_from_board, folder / f"{number:02d}", rng, depth=False)
-        said = robot_from_camera @ camera_from_board @ np.linalg.inv(tool_from_board)
+        stated = robot_from_camera @ camera_from_board @ np.linalg.inv(tool_from_board)
         wrong = Rotation.from_rotvec(np.radians(rng.normal(0, ROBOT_DEG, 3))).as_matrix()
-        said = said @ rigid(wrong, rng.normal(0, ROBOT_MM, 3))
-        rows.append(said.tolist())
+        stated = stated @ rigid(wrong, rng.normal(0, ROBOT_MM, 3))
+        rows.append(stated.tolist())
     poses = folder.with_suffix(".json")
     store.write_json(poses, {"frame_id": "base_link", "unit": "mm", "base_from_tool": rows})
 

@@ -1,7 +1,7 @@
 """The rehearsal's depth camera as a source for commands: ``rehearsal:FOLDER``.
 
-FOLDER has ``camera.json``, what the device believes of itself, and ``now.npy``, the depth image
-that it would measure without noise, mm. Whoever plays the laboratory's hands replaces that file.
+FOLDER has ``camera.json``, the device's own intrinsics, and ``now.npy``, the depth image that it
+would measure without noise, mm, which ``rehearsal.hands`` replaces.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class BenchSourceConfig(SourceConfig, frozen=True, kw_only=True, tag="rehearsal"
 
 
 class BenchSource:
-    """What lies there now, with a D405's noise."""
+    """The present depth image, with a D405's noise."""
 
     host_clock = True
     lossless = False
@@ -54,7 +54,7 @@ class BenchSource:
         self._closed = threading.Event()
 
     def read(self, timeout_s: float) -> Observation | None:
-        """The next frame, when it is due. Raises SourceLost: closed; InputError: nothing there."""
+        """The next frame, when it is due. Raises SourceLost: closed; InputError: no image."""
         wait_s = self._due - time.monotonic()
         if self._closed.wait(max(min(wait_s, timeout_s), 0)):
             raise SourceLost("the rehearsal's camera is closed; open it again.")

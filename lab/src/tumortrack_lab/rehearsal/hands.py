@@ -1,5 +1,5 @@
-"""What a laboratory's hands do on the bench that does not exist: lay the organ down in a state,
-stand the camera there, show it the bench, and carry the phantom to the scanner."""
+"""Manual steps on the simulated bench: put the organ into a state, show it to the camera, and take
+the phantom to the scanner."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ from tumortrack_lab.rehearsal.bench import PRINTED_HU, Setup, scan_bench, see_be
 
 
 class BenchErrors(Config, frozen=True, kw_only=True):
-    """What is wrong with the apparatus, and known to nobody but the rehearsal: the camera's focal
-    length and principal point against what the device says of itself; its depth, by a factor and an
-    offset. Within what D405 owners report at 70 to 200 mm (librealsense #12236, #14204).
-    ``distortion``: what rectification left, as OpenCV has it (k1, k2, p1, p2, k3)."""
+    """True errors of the apparatus, which the commands do not know: of the camera's focal length
+    and principal point against its own intrinsics, and of its depth, by a factor and an offset.
+    Within what D405 owners report at 70 to 200 mm (librealsense #12236, #14204). ``distortion``:
+    residual of the rectification, as in OpenCV (k1, k2, p1, p2, k3)."""
 
     focal: float = 1.004
     centre_px: tuple[float, float] = (1.5, -1.0)
@@ -44,12 +44,12 @@ class Hands:
 
     @property
     def believed(self) -> Intrinsics:
-        """As the device says."""
+        """The device's own intrinsics."""
         return d405()
 
     @property
     def true(self) -> Intrinsics:
-        """As it is."""
+        """The true intrinsics."""
         camera, (right, down) = self.believed, self.errors.centre_px
         return Intrinsics(
             camera.width,
@@ -61,12 +61,12 @@ class Hands:
         )
 
     def plug_in(self) -> None:
-        """The camera is there, and shows nothing yet."""
+        """Connect the camera; it shows nothing yet."""
         self.folder.mkdir(parents=True, exist_ok=True)
         store.write_json(self.folder / "camera.json", intrinsics_json(self.believed))
 
     def show(self, setup: Setup) -> None:
-        """The camera sees the bench as it is now."""
+        """Let the camera see the bench as it is now."""
         frame = see_bench(setup, self.camera_from_base, self.true)
         depth_mm = frame.depth_mm * self.errors.depth_scale + self.errors.depth_offset_mm
         aside = self.folder / "next.npy"
@@ -76,7 +76,7 @@ class Hands:
     def scanned(
         self, setup: Setup, out: Path, seed: int, printed_hu: float = PRINTED_HU
     ) -> Float64[np.ndarray, "4 4"]:
-        """A DICOM series of the bench, which was carried to the scanner: ``scanner_from_base``."""
+        """Write a DICOM series of the bench in the scanner; returns ``scanner_from_base``."""
         rng = np.random.default_rng(seed)
         turn = Rotation.from_euler("xyz", rng.uniform(-6, 6, 3) + [90, 0, 0], degrees=True)
         scanner_from_base = rigid(turn.as_matrix(), rng.uniform(-30, 30, 3))

@@ -1,5 +1,5 @@
-"""What goes wrong on a bench, and whether the commands notice: each mishap is acted, and what is
-said of it kept."""
+"""Mishaps on the bench, and whether the commands notice them: each is acted out, and the commands'
+words are kept."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _CAMERA_MM = 6.0
 
 
 class Mishap(NamedTuple):
-    """``noticed``: refused, or named by a word that must be said; ``said``: the line that does."""
+    """``noticed``: refused, or named by the expected word; ``said``: the line that names it."""
 
     what: str
     noticed: bool
@@ -35,7 +35,7 @@ class Mishap(NamedTuple):
 
 
 class Mishaps:
-    """Of a rehearsal that has run; files go to ``out``/mishaps, and away again."""
+    """Of a rehearsal that has run; temporary files go to ``out``/mishaps."""
 
     def __init__(self, rehearsal: Rehearsal) -> None:
         self._of, self._out = rehearsal, rehearsal.out / "mishaps"
@@ -63,17 +63,17 @@ class Mishaps:
             ),
             "the camera was moved by 6 mm between states": (self._camera_moved, ""),
         }  # fmt: skip
-        found = []
+        mishaps = []
         for what, (act, word) in acts.items():
             refused = False
             try:
-                said = act()
-                said = next((line for line in said.splitlines() if word and word in line), "")
+                words = act()
+                words = next((line for line in words.splitlines() if word and word in line), "")
             except TumortrackError as error:
-                refused, said = True, str(error)
-            found.append(Mishap(what, refused or bool(said), refused, said))
-            say(f"{what}: {'refused' if refused else 'named' if said else 'NOT NOTICED'}: {said}")
-        return found
+                refused, words = True, str(error)
+            mishaps.append(Mishap(what, refused or bool(words), refused, words))
+            say(f"{what}: {'refused' if refused else 'named' if words else 'NOT NOTICED'}: {words}")
+        return mishaps
 
     def _beads(self, moved_mm: dict[str, tuple[float, float, float]]) -> str:
         of = self._of
@@ -114,7 +114,7 @@ class Mishaps:
         moved = looking_down(hands.camera_from_base[2, 3] + _CAMERA_MM, (8.0, -5.0))
         recording = self._out / "recording"
         states = {"rest": hands, _STATE: replace(hands, camera_from_base=moved)}
-        said = self._of.record_into(recording, states)
-        warned = [line.strip() for line in said.splitlines() if "moved" in line]
+        output = self._of.record_into(recording, states)
+        warned = [line.strip() for line in output.splitlines() if "moved" in line]
         say("; ".join(warned))
         return self._compare(self._of.out / "ct" / _STATE, recording)

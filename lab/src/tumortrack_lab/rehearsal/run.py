@@ -1,5 +1,5 @@
-"""The paper's experiment rehearsed: the commands from kit to table, as a laboratory gives them, on
-a bench that does not exist, and what each states of its own error beside what that error is."""
+"""A rehearsal of the paper's experiment: a laboratory's commands from kit to table on a simulated
+bench, and the error that each states beside its true error."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ _BOARDS, _POSES = 24, 20
 
 
 class Row(NamedTuple):
-    """An error of the chain in mm, as a command states it and as it is; ``what`` in words."""
+    """An error in the chain, as a command states it and the true one, mm."""
 
     what: str
     stated_mm: float
@@ -47,7 +47,7 @@ class Row(NamedTuple):
 
 @dataclass(frozen=True)
 class Rehearsal:
-    """Of a case and its model, into ``out``; what lies there is not done again."""
+    """Of a case and its model, into ``out``; finished steps are not repeated."""
 
     case: Path
     model: Path
@@ -74,8 +74,8 @@ class Rehearsal:
         return set_up(self.kit, self.out / "kit", self.states[state], state)
 
     def run(self) -> tuple[list[Row], dict[str, Any]]:
-        """All of it, in order: the errors, and what `evaluate` found by the second CTs and by the
-        truth."""
+        """All steps in order: the errors, and `evaluate`'s reports against the second CTs and
+        against the truth."""
         self._once("kit", lambda: self._do("phantom-kit", self.case, self.out / "kit"))
         rows = [*self.calibrate_camera(), *self.calibrate_hand_eye()]
         self._once("recording", self.record)
@@ -115,10 +115,11 @@ class Rehearsal:
         poses = ("--poses", folder.with_suffix(".json"))
         words = "calibrate", "hand-eye", folder, out, *options, *poses
         self._once(out.name, lambda: self._do(*words))
-        found = np.array(store.read_json(out / "calibration.json")["robot_from_camera"])
-        there = transform_points(found, point) - transform_points(self.robot_from_camera, point)
+        true = self.robot_from_camera
+        calibrated = np.array(store.read_json(out / "calibration.json")["robot_from_camera"])
+        off_mm = transform_points(calibrated, point) - transform_points(true, point)
         stated_mm = store.read_json(out / "report.json")["bound_mm"]
-        return [Row("hand-eye, at the organ", stated_mm, float(np.linalg.norm(there)))]
+        return [Row("hand-eye, at the organ", stated_mm, float(np.linalg.norm(off_mm)))]
 
     @cached_property
     def robot_from_camera(self) -> Affine:
@@ -128,11 +129,11 @@ class Rehearsal:
         return robot_from_base @ np.linalg.inv(self.hands.camera_from_base)
 
     def record(self) -> None:
-        """`record` asks for a state; the hands set it up meanwhile."""
+        """`record` asks for each state, which is then set up."""
         self.record_into(self.out / "recording", {state: self.hands for state in STATES})
 
     def record_into(self, folder: Path, hands: dict[str, Hands]) -> str:
-        """Record these states, the camera held by these hands in each; what `record` says."""
+        """Record these states, each with these hands; returns the output of `record`."""
         states, (first, *_) = list(hands), hands.values()
         first.plug_in()
         first.show(self.setup(states[0]))
@@ -141,21 +142,21 @@ class Rehearsal:
             "--kit", self.out / "kit", "--seconds", _SECONDS, "--countdown", 3, "--yes",
             "--intrinsics", self.out / "camera-calibration" / "intrinsics.json",
         )  # fmt: skip
-        said = []
+        output = []
         with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
             assert process.stdout is not None
             for line in process.stdout:
-                said.append(line.rstrip())
-                say(said[-1])
+                output.append(line.rstrip())
+                say(output[-1])
                 words = line.split()
                 if words[:1] == ["state"]:
                     hands[words[4].rstrip(";")].show(self.setup(words[4].rstrip(";")))
         if process.returncode:
             raise TumortrackError(f"record ended with {process.returncode}.")
-        return "\n".join(said)
+        return "\n".join(output)
 
     def scan(self, state: str) -> None:
-        """The phantom is carried to the scanner in this state."""
+        """Scan the phantom in this state."""
         out = self.out / "ct" / state
         out.parent.mkdir(exist_ok=True)
         seed = 10 + list(STATES).index(state)
@@ -167,18 +168,18 @@ class Rehearsal:
         self.compare(self.out / "ct" / state, self.out / "recording", self.out / "scenes", state)
 
     def compare(self, ct: Path, recording: Path, scenes: Path, state: str) -> str:
-        """`reference`; what it says. Raises TumortrackError: it refuses."""
+        """Run `reference`; returns its output. Raises TumortrackError: it refuses."""
         return self._do(
             "reference", ct, recording, scenes, "--kit", self.out / "kit", "--case", self.case,
             "--state", state,
         )  # fmt: skip
 
     def truth(self, state: str) -> Anatomy:
-        """Where everything is; camera frame."""
+        """The true anatomy; camera frame."""
         return moved(self.setup(state).anatomy, self.hands.camera_from_base)
 
     def registered(self, state: str) -> list[Row]:
-        """The reference against the truth: registration alone at each tumor, and with the
+        """Errors of the reference: of the registration alone at each tumor, and with the
         segmentation of the second CT."""
         scene, truth = read_scene(self.out / "scenes" / state), self.truth(state)
         registration = scene.meta["registration"]
@@ -186,21 +187,21 @@ class Rehearsal:
             store.read_json(self.out / "ct" / f"{state}.json")["scanner_from_base"]
         )
         true = self.hands.camera_from_base @ np.linalg.inv(scanner_from_base)
-        found = np.array(registration["rows"])
+        camera_from_ct = np.array(registration["rows"])
         rows = []
         names = zip(truth.names[1:], truth.tumors, scene.reference.tumors, strict=True)
-        for name, tumor, seen in names:
+        for name, tumor, reference in names:
             middle = tumor.vertices_mm.mean(0, keepdims=True)
             in_ct = transform_points(np.linalg.inv(true), middle)
-            off_mm = float(np.linalg.norm(transform_points(found, in_ct) - middle))
+            off_mm = float(np.linalg.norm(transform_points(camera_from_ct, in_ct) - middle))
             stated_mm = registration["tre_mm"][name]
             rows.append(Row(f"{state}: registration at {name}", stated_mm, off_mm))
-            apart = surface_distances(seen, tumor)
+            apart = surface_distances(reference, tumor)
             rows.append(Row(f"{state}: surface of {name}, mean", stated_mm, apart.surface_mm))
         return rows
 
     def evaluated(self) -> dict[str, Any]:
-        """`evaluate` by the second CTs, and the same clouds by the truth: report by report."""
+        """`evaluate` against the second CTs, and on the same clouds against the truth."""
         for state in STATES:
             self._once(f"true-scenes/{state}", partial(self._write_truth, state))
         for scenes in ("scenes", "true-scenes"):
@@ -223,7 +224,7 @@ class Rehearsal:
         return [sys.executable, "-m", "tumortrack", *map(str, words)]
 
     def _do(self, *words: object) -> str:
-        """A command; what it says. Raises TumortrackError: it failed."""
+        """Run a command; returns its output. Raises TumortrackError: it failed."""
         say("$ tumortrack " + " ".join(map(str, words)))
         done = subprocess.run(self._command(*words), capture_output=True, text=True, check=False)
         say(done.stdout.rstrip())
@@ -233,7 +234,7 @@ class Rehearsal:
 
 
 def errors_mm(report: dict[str, Any]) -> dict[str, dict[str, float]]:
-    """The tumors' errors in an evaluation: scene -> tumor -> mm between the boxes' centres."""
+    """Tumors' errors in an evaluation: scene -> tumor -> mm between the boxes' centres."""
     return {
         scene["name"]: {
             name: part["center_mm"] for name, part in scene["parts"].items() if is_tumor(name)

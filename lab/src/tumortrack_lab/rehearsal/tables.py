@@ -17,7 +17,7 @@ _SHOWN = "D2"
 
 
 def evaluation_rows(reports: dict[str, dict[str, Any]]) -> pd.DataFrame:
-    """Each state's tumors: how far off the estimates are by the second CT, and by the truth."""
+    """Each state's tumors: errors of estimates against the second CT and against the truth."""
     by_ct, by_truth = (errors_mm(reports[name]) for name in ("scenes", "true-scenes"))
     verdicts = {
         scene["name"]: scene.get("quality", "none") for scene in reports["scenes"]["scenes"]

@@ -1,1 +1,1 @@
-"""Tracking for an hour while everything round it goes wrong: faults, and who judges the answers."""
+"""A soak test: an hour of tracking with injected faults, and the judge of its estimates."""

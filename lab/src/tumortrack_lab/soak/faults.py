@@ -1,4 +1,4 @@
-"""Faults at random moments: in a camera whose scene is simulated, and in sinks."""
+"""Faults at random times: in a camera whose scene is simulated, and in sinks."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from tumortrack.live.sources.virtual import VirtualSource
 from tumortrack.live.values import Observation, Sink, SinkContext, SourceLost, TrackingResult
 from tumortrack.simulate.player import ScenePlayer
 
-# What must be said of each, as a regular expression.
+# What must be reported of each, as a regular expression.
 SOURCE_FAULTS = {
     "frames late": "the frame is stale|no frame for",
     "frozen": "frozen: the same image",
@@ -43,7 +43,7 @@ _TAPE_S = 20.0  # an hour of depth images would be 40 GB: older tapes are delete
 
 @dataclass(eq=False)
 class Fault:
-    """One injection. ``begun_s``: when it took effect (``time.monotonic``); NaN: not yet."""
+    """One injected fault. ``begun_s``: when it took effect (``time.monotonic``); NaN: not yet."""
 
     kind: str
     planned_s: float  # since the first frame
@@ -58,7 +58,7 @@ class Fault:
 
 
 class Schedule:
-    """Rounds of all kinds in random order, with pauses between, from a seed."""
+    """Rounds of all kinds in random order, with pauses between them, from a seed."""
 
     def __init__(
         self, seed: int, seconds: float, stale_s: float, sinks: list[str], kinds: list[str]
@@ -87,7 +87,7 @@ class Schedule:
         return self._origin_s + fault.planned_s + fault.lasts_s
 
     def now(self) -> Fault | None:
-        """The fault that is on."""
+        """The present fault."""
         since_s = time.monotonic() - self._origin_s
         for fault in self.faults:
             if fault.planned_s <= since_s < fault.planned_s + fault.lasts_s:
@@ -97,16 +97,16 @@ class Schedule:
 
 @dataclass(frozen=True, eq=False)
 class Staged(Observation):
-    """With what the loop cannot know: when its image was taken (``time.time_ns``), and what was
-    done to it."""
+    """An observation with what the loop cannot know: when its image was taken (``time.time_ns``),
+    and its fault."""
 
     exposed_ns: int = 0
     fault: str = ""
 
 
 class FaultyCamera:
-    """A virtual source whose frames and life the schedule spoils. ``truth`` stays that of the true
-    organ at the time that the stamp says."""
+    """A virtual source with scheduled faults in its frames and its connection. ``truth`` stays that
+    of the true organ at the stamp's time."""
 
     host_clock, lossless, dropped = True, False, 0
 
@@ -146,14 +146,14 @@ class FaultyCamera:
             self._last = self._staged(self._real)
             return self._last
         fault.begin()
-        return self._spoilt(fault)
+        return self._faulty(fault)
 
     def _staged(self, camera: VirtualSource) -> Staged:
         stamp_ns, t_s = time.time_ns(), time.monotonic() - self._begin_s
-        seen = camera.at(t_s, stamp_ns)
-        return Staged(seen.content, seen.arrived_ns, truth=seen.truth, exposed_ns=stamp_ns)
+        frame = camera.at(t_s, stamp_ns)
+        return Staged(frame.content, frame.arrived_ns, truth=frame.truth, exposed_ns=stamp_ns)
 
-    def _spoilt(self, fault: Fault) -> Observation | None:
+    def _faulty(self, fault: Fault) -> Observation | None:
         if fault.kind == "source gone":
             raise SourceLost("the camera is unplugged")
         true = replace(self._staged(self._real), fault=fault.kind)
@@ -195,7 +195,7 @@ class FaultyCamera:
 
 
 class FaultySink:
-    """A sink that the schedule makes slow or dead for a time."""
+    """A sink that is slow or dead at scheduled times."""
 
     def __init__(self, name: str, inner: Sink, schedule: Schedule) -> None:
         self._name, self._inner, self._schedule = name, inner, schedule
@@ -216,11 +216,10 @@ class FaultySink:
 
 
 class Tapes:
-    """The recorder: a new tape every 20 s, on a disk that fills when the schedule says so.
+    """The recorder: a new tape every 20 s, on a disk that is full at scheduled times.
 
-    No file of this process may then grow (RLIMIT_FSIZE: no rights are needed for it, unlike for a
-    small disk). ``refused`` are the tapes that it cut off, each with its fault
-    and with how many seconds it had run by then.
+    No file of this process may grow then (RLIMIT_FSIZE, which unlike a small disk needs no rights).
+    ``refused``: the tapes that were cut off, each with its fault and its length by then, s.
     """
 
     def __init__(self, folder: Path, context: SinkContext, schedule: Schedule) -> None:

@@ -1,4 +1,4 @@
-"""What became of each fault, and of every estimate that was called good."""
+"""How each fault was handled, and errors of every estimate that was called good."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from tumortrack.live.values import TrackingResult
 from tumortrack.live.workers import SinkWorker
 from tumortrack_lab.soak.faults import FAULTS, SINK_FAULTS, Fault, Schedule, Staged
 
-_KEPT = 20  # wrong answers told in full
+_KEPT = 20  # wrong estimates that are listed
 
 
 @dataclass(eq=False)
 class Answer:
-    """To one fault: after how many seconds, in which words, and when there was a good estimate
-    again after its end. NaN: not (yet)."""
+    """The reaction to one fault: after how many seconds, in which words, and how long after its end
+    there was a good estimate again. NaN: not (yet)."""
 
     fault: Fault
     named_s: float = np.nan
@@ -33,7 +33,7 @@ class Answer:
 
 @dataclass(eq=False)
 class Judge:
-    """Sees every result in the moment at which the sinks have it.
+    """Sees every result when the sinks do.
 
     A good estimate is ``wrong`` where the middle of a part lies over ``wrong_mm`` from the truth at
     the frame's stamp, and ``stale`` where its image is older than ``stale_s``.
@@ -72,22 +72,22 @@ class Judge:
                 say(f"{self._since_s() / 60:.0f} minutes: {counts}")
 
     def _check(self, result: TrackingResult) -> None:
-        seen = result.observation
-        if not isinstance(seen, Staged) or seen.truth is None or result.latency_ms is None:
+        frame, latency_ms = result.observation, result.latency_ms
+        if not isinstance(frame, Staged) or frame.truth is None or latency_ms is None:
             raise TypeError("a good estimate without a frame of the camera's")
-        age_s = result.latency_ms / 1000 + (seen.stamp_ns - seen.exposed_ns) * 1e-9
+        age_s = latency_ms / 1000 + (frame.stamp_ns - frame.exposed_ns) * 1e-9
         off_mm = max(
             float(np.linalg.norm(center - true.box_mm.mean(0)))
             if (center := result.center_mm(name)) is not None
             else np.inf
-            for name, true in zip(seen.truth.names, seen.truth.parts, strict=True)
+            for name, true in zip(frame.truth.names, frame.truth.parts, strict=True)
         )
         self.error_mm.add(off_mm)
         for kind, is_so in (("stale", age_s > self.stale_s), ("wrong", off_mm > self.wrong_mm)):
             if is_so:
                 self.counts[kind] += 1
-                told = f"{off_mm:.1f} mm off, {age_s:.2f} s old, frame {seen.fault or 'as it was'}"
-                self.wrong.append(f"{kind} at {self._since_s():.1f} s: {told}")
+                what = f"{kind} at {self._since_s():.1f} s: {off_mm:.1f} mm off, {age_s:.2f} s old"
+                self.wrong.append(f"{what}, frame {frame.fault or 'as it was'}")
                 del self.wrong[_KEPT:]
 
     def _answer(self, fault: Fault, is_on: bool, result: TrackingResult, now_s: float) -> None:
@@ -97,31 +97,31 @@ class Judge:
         elif np.isnan(answer.back_s) and result.quality == "good":
             answer.back_s = now_s - self.schedule.ended_s(fault)
         if np.isnan(answer.named_s):
-            said = [result.reason or result.warning]
+            texts = [result.reason or result.warning]
             if fault.kind in SINK_FAULTS:
-                said = [worker.trouble for worker in self.workers if worker.name == fault.victim]
-            if found := next((text for text in said if re.search(FAULTS[fault.kind], text)), ""):
-                answer.named_s, answer.words = now_s - fault.begun_s, found
+                texts = [worker.trouble for worker in self.workers if worker.name == fault.victim]
+            if words := next((text for text in texts if re.search(FAULTS[fault.kind], text)), ""):
+                answer.named_s, answer.words = now_s - fault.begun_s, words
 
     def _since_s(self) -> float:
         return time.monotonic() - self._begin_s
 
     def problems(self) -> list[str]:
         """Violations; none if all is well."""
-        found = list(self.wrong)
+        problems = list(self.wrong)
         for answer in self.answers.values():
             kind, at_s = answer.fault.kind, answer.fault.planned_s
             if np.isnan(answer.named_s):
-                found.append(f"{kind} at {at_s:.0f} s was never named")
+                problems.append(f"{kind} at {at_s:.0f} s was never named")
             elif answer.named_s > self.within_s:
-                found.append(f"{kind} at {at_s:.0f} s was named after {answer.named_s:.2f} s")
+                problems.append(f"{kind} at {at_s:.0f} s was named after {answer.named_s:.2f} s")
             if np.isnan(answer.back_s):
-                found.append(f"{kind} at {at_s:.0f} s: no good estimate came after it")
-        found += [f"{fault.kind}: never begun" for fault in self.schedule.faults
+                problems.append(f"{kind} at {at_s:.0f} s: no good estimate came after it")
+        problems += [f"{fault.kind}: never begun" for fault in self.schedule.faults
                   if np.isnan(fault.begun_s)]  # fmt: skip
         if not self.counts["good"]:
-            found.append("there was no good estimate")
-        return found
+            problems.append("there was no good estimate")
+        return problems
 
 
 def resident_mb() -> float:

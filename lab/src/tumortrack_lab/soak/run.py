@@ -1,4 +1,4 @@
-"""One run: the loop as `track` builds it, a faulty camera, faulty sinks, and the judge."""
+"""One run: the loop of `track`, a faulty camera, faulty sinks, and the judge."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ while peer.recv(1 << 20):
 
 @dataclass(frozen=True, kw_only=True)
 class SoakConfig:
-    """Track while everything round it goes wrong.
+    """Track with injected faults.
 
     Attributes:
         model: of the case, or the case again.
@@ -67,7 +67,7 @@ class SoakConfig:
 
 
 def soak(config: SoakConfig, folder: Path) -> tuple[str, list[str]]:
-    """The tables (Markdown), and what was wrong; tapes go to the folder."""
+    """The tables (Markdown), and problems; tapes go to the folder."""
     seconds = 60 * config.minutes
     model = api.load_model(config.model)
     tracker = Tracker(model)
@@ -88,12 +88,12 @@ def soak(config: SoakConfig, folder: Path) -> tuple[str, list[str]]:
         closing(SourceWorker(camera.open)) as reader,
     ):
         judge = Judge(schedule, workers, config.stale_s, config.wrong_mm, config.within_s)
-        with suppress(KeyboardInterrupt):  # what there is until then is judged
+        with suppress(KeyboardInterrupt):  # the results until then are judged
             loop.run(reader, workers, judge.see)
-        found = summary(loop, reader, workers)
+        report = summary(loop, reader, workers)
     problems = judge.problems()
     problems += [text for cut_off in tapes.refused if (text := _unread(*cut_off))]
-    problems += [f"internal error: {defect}" for defect in found["defects"]]
+    problems += [f"internal error: {defect}" for defect in report["defects"]]
     marks = memory_marks(judge)
     if marks["end"] - marks["1 min"] > _GROWN_MB:
         problems.append(f"memory grew from {marks['1 min']:.0f} to {marks['end']:.0f} MB")
@@ -103,7 +103,7 @@ def soak(config: SoakConfig, folder: Path) -> tuple[str, list[str]]:
         f"{platform.python_version()}. {len(tapes.refused)} tapes cut off by a full disk were "
         "read to their last second."
     )
-    return document(judge, found, about), problems
+    return document(judge, report, about), problems
 
 
 @contextmanager
@@ -130,14 +130,14 @@ def _sinks(
 
 
 def _unread(tape: Path, fault: Fault, ran_s: float) -> str:
-    """What is wrong with a tape that a full disk cut off after so long; nothing, if it lasts until
+    """The problem of a tape that a full disk cut off after ``ran_s``; empty: it lasts until
     then."""
     began_ns = time.time_ns() - int((time.monotonic() - fault.begun_s) * 1e9)
     last_ns = began_ns - int(ran_s * 1e9)
     try:
         with closing(SOURCES.parse(f"recording:{tape}?rate=0").open()) as source:
-            while (seen := source.read(1.0)) is not None:
-                last_ns = seen.stamp_ns
+            while (observation := source.read(1.0)) is not None:
+                last_ns = observation.stamp_ns
     except (SourceEnded, InputError):  # the end, or nothing was written yet
         pass
     lost_s = (began_ns - last_ns) * 1e-9

@@ -1,1 +1,1 @@
-"""The study behind docs/results.md: what is measured, kept, tabulated and drawn."""
+"""The studies behind docs/results.md and others: measurements, tables, pictures."""

@@ -1,5 +1,4 @@
-"""Tables in Markdown and as CSV, and a document whose marked blocks are replaced while the rest
-stays."""
+"""Tables in Markdown and as CSV, and documents with marked blocks that are replaced."""
 
 from __future__ import annotations
 
@@ -32,19 +31,16 @@ def table_of(frame: pd.DataFrame, left: int = 1) -> str:
 
 
 def spread_mm(of: str, values: pd.Series) -> dict[str, str]:
-    """Columns of a row: median, 90 %, 95 % and worst of the values that there are, mm."""
-    known, each = (
-        values.dropna().astype(float),
-        dict(zip(_SPREAD, (0.5, 0.9, 0.95, 1), strict=True)),
-    )
+    """Columns of a row: median, 90 %, 95 % and worst of the known values, mm."""
+    known = values.dropna().astype(float)
     return {
         f"{of} {name} mm": f"{known.quantile(share):.1f}" if len(known) else ""
-        for name, share in each.items()
+        for name, share in zip(_SPREAD, (0.5, 0.9, 0.95, 1), strict=True)
     }
 
 
 def spread_words(rows: pd.DataFrame, of: str) -> pd.Series:
-    """Of each row with these columns: median / 95 % / worst."""
+    """Median / 95 % / worst of each row with the columns of ``spread_mm``."""
     shown = [f"{of} {name} mm" for name in _SPREAD if name != "90 %"]
     return rows[shown].agg(" / ".join, axis=1).replace(" /  / ", "–")
 
@@ -86,8 +82,8 @@ class ReportWriter:
         store.write_atomically(self.document, self._filled(blocks).encode())
 
     def check(self, names: Iterable[str]) -> None:
-        """Before anything is measured: these blocks can be filled. Raises InputError: no document,
-        or a marker missing."""
+        """Check, before anything is measured, that these blocks can be filled. Raises InputError:
+        no document, or a marker missing."""
         self._filled(dict.fromkeys(names, ""))
 
     def _filled(self, blocks: dict[str, str]) -> str:
@@ -97,8 +93,8 @@ class ReportWriter:
             raise InputError(f"{self.document} cannot be read: {error.strerror}.") from error
 
     def data(self, name: str, rows: pd.DataFrame, words: str) -> str:
-        """Write data/NAME.csv beside the document; the paragraph that links to it, which the site
-        shows as a table."""
+        """Write data/NAME.csv beside the document; returns the paragraph that links to it, which
+        the site shows as a table."""
         path = self.document.parent / "data" / f"{name}.csv"
         make_folder(path.parent)
         store.write_atomically(path, rows.to_csv(index=False).encode())

@@ -1,4 +1,4 @@
-"""Measurements: one method on a case's scenes, made once and kept as JSON, a row a part."""
+"""Measurements: one method on a case's scenes, kept as JSON, a row for each part."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ One = Callable[[StudyCase, Method, str, str, int], list[dict[str, Any]]]
 
 def measured(
     case: StudyCase, method: Method, variants: Sequence[str], view: str, grid: int, folder: Path,
-    one: One | None = None, **also: Any,
+    measure_scene: One | None = None, **also: Any,
 ) -> list[dict[str, Any]]:  # fmt: skip
-    """Of each variant's scene the rows that ``one`` makes (``measure_one``). They are kept in
-    ``folder``, and made again where a scene, the case, the method, the grid or ``also`` (JSON) has
-    changed. Raises InputError: a scene is missing or cannot be read."""
+    """The rows that ``measure_scene`` (default: ``measure_one``) makes of each variant's scene.
+    They are kept in ``folder``, and made again if a scene, the case, the method, the grid or
+    ``also`` (JSON) has changed. Raises InputError: a scene is missing or cannot be read."""
     about = {
         "case": store.sha256_of(case.folder / store.MANIFEST),
         "scenes": {variant: store.sha256_of(case.scene(variant, view)) for variant in variants},
@@ -35,19 +35,19 @@ def measured(
         "grid": grid,
         **also,
     }
-    one = one or measure_one
+    measure_scene = measure_scene or measure_one
 
     def measure() -> list[dict[str, Any]]:
         known = {"case": case.name, "method": method.name, "seed": method.seed, "view": view}
         known |= {"grid": grid}
         rows = []
         for variant in variants:
-            made = one(case, method, variant, view, grid)
+            made = measure_scene(case, method, variant, view, grid)
             rows += [{**known, "variant": variant, **_machine(), **row} for row in made]
         return rows
 
     make_folder(folder)
-    name = f"{case.name}-{method.name}-{method.seed}-{view}-{one.__name__}.json"
+    name = f"{case.name}-{method.name}-{method.seed}-{view}-{measure_scene.__name__}.json"
     return scripts.kept(folder / name, about, measure)
 
 
@@ -62,7 +62,7 @@ def _machine() -> dict[str, Any]:
 def measure_one(
     case: StudyCase, method: Method, variant: str, view: str, grid: int
 ) -> list[dict[str, Any]]:
-    """One scene: the protocol's metrics and target errors; a row a part."""
+    """One scene: the protocol's metrics and target errors; a row for each part."""
     scene = read_scene(case.scene(variant, view))
 
     def locate(_: object) -> Estimate:

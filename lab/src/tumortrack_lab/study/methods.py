@@ -1,4 +1,4 @@
-"""What can be measured: cases with their scenes; models and peers, as methods that locate.
+"""Cases with their scenes, and methods to measure on them: the default method and peers.
 
 Nothing heavy is made or loaded before a measurement needs it.
 """
@@ -79,7 +79,7 @@ def study_case(name: str, folder: Path, scenes: Path) -> StudyCase:
 
 
 def phantom_case(folder: Path, parameters: PhantomParameters) -> Path:
-    """Write a phantom's case folder; one that is there stays."""
+    """Write a phantom's case folder, unless it is there."""
     if not folder.exists():
         labels = phantom_labels(parameters, _VOXEL_MM)
         patient = Patient("PHANTOM", parameters.side)
@@ -90,7 +90,7 @@ def phantom_case(folder: Path, parameters: PhantomParameters) -> Path:
 
 
 def named_folders(texts: Iterable[str], taken: Iterable[str]) -> dict[str, Path]:
-    """Folders by name, of options NAME=FOLDER; InputError for a name that is none, or double."""
+    """Folders by name, of options NAME=FOLDER. Raises InputError: an invalid or double name."""
     folders: dict[str, Path] = {}
     for text in texts:
         name, _, folder = text.partition("=")
@@ -104,7 +104,7 @@ def named_folders(texts: Iterable[str], taken: Iterable[str]) -> dict[str, Path]
 class Method:
     """One way to locate, for one patient.
 
-    ``identity``: everything else that decides the answers (JSON). ``locate(scene, grid)``: the
+    ``identity``: everything else that the answers depend on (JSON). ``locate(scene, grid)``: the
     anatomy in a scene; ``grid``: voxels along the longest side of the volume. Raises NoEstimate:
     nothing can be said of the scene; InputError: the cloud cannot be used.
     """
@@ -146,5 +146,5 @@ def peer(name: str, case: StudyCase) -> Method:
 
 
 def code_sha256(paths: Iterable[Path]) -> str:
-    """Of files of code: after a change of it, what it measures is measured anew."""
+    """Of source files: after a change, their measurements are made again."""
     return hashlib.sha256(b"\0".join(path.read_bytes() for path in sorted(paths))).hexdigest()

@@ -1,5 +1,5 @@
-"""Does it cut the tumor out? Plans made on a calibrated model's estimates, and on the truth itself,
-cut the true organs of the wider world."""
+"""Simulated resections: plans made from a calibrated model's estimates, and from the truth, cut the
+true organs of the wider world."""
 
 from __future__ import annotations
 
@@ -52,9 +52,9 @@ _NUMBER = re.compile(r"\d+(\.\d+)?")
 
 
 class Planner(Config, frozen=True):
-    """One way to plan: how many standard deviations of the estimate are added to the margin, or
-    with which ``confidence`` all errors are, as `plan --confidence` does it. ``still``: of these
-    the tumor's radius alone, for nothing else is off in a simulated cut."""
+    """One way to plan: ``sigmas`` standard deviations of the estimate are added to the margin, or
+    all errors with a ``confidence``, as by `plan --confidence`. ``still``: of these only the
+    tumor's radius, as a simulated cut has no other error."""
 
     sigmas: float = 0.0
     margin_mm: float = MARGIN_MM
@@ -69,16 +69,16 @@ class Planner(Config, frozen=True):
             more = f" + {100 * self.confidence:g} % {what}"
         return f"{self.margin_mm:g} mm{more}"
 
-    def plan(self, found: Located, tumor: str) -> ResectionPlan:
+    def plan(self, located: Located, tumor: str) -> ResectionPlan:
         """Raises InputError and NoPlan as ``plan_within``."""
 
         def budget_of(plan: ResectionPlan) -> ErrorBudget:
-            budget = planned_budget(plan, found, confidence=self.confidence or None)
+            budget = planned_budget(plan, located, confidence=self.confidence or None)
             others = {"hand_eye_mm": 0.0, "tool_mm": 0.0, "motion_mm": 0.0, "assumed": ()}
             return msgspec.structs.replace(budget, **(others if self.still else {}))
 
         config = ResectionConfig(tumor=tumor, margin_mm=self.margin_mm, sigmas=self.sigmas)
-        return plan_within(found, config, budget_of, self.confidence > 0)[0]
+        return plan_within(located, config, budget_of, self.confidence > 0)[0]
 
 
 # All but the last keep the same healthy tissue.
@@ -102,7 +102,7 @@ def calibrated(folder: Path) -> Method:
 
 
 def truth() -> Method:
-    """Answers what is so: the bound of every planner."""
+    """Answers with the truth: the bound of every planner."""
 
     def locate(scene: Scene, grid: int) -> Estimate:
         still = Fit(lambda points: points)
@@ -114,22 +114,22 @@ def truth() -> Method:
 
 
 def scattered(estimate: Estimate) -> Estimate:
-    """With a cloud as the tracker's: points at random in the organ's box, as many as it asks."""
+    """With a cloud like the tracker's: as many random points in the organ's box."""
     assert estimate.volume is not None
     labels, camera_from_index = estimate.volume.labels, estimate.volume.camera_from_index
     low, high = estimate.meshes[estimate.organ.name].box_mm
     points_mm = np.random.default_rng(0).uniform(low, high, (QUERIES, 3))
     index = np.rint(transform_points(np.linalg.inv(camera_from_index), points_mm)).astype(int)
-    found = labels[tuple(np.clip(index, 0, np.array(labels.shape) - 1).T)]
-    inside = found > 0
+    point_labels = labels[tuple(np.clip(index, 0, np.array(labels.shape) - 1).T)]
+    inside = point_labels > 0
     cloud = OccupancyCloud(
-        points_mm[inside], found[inside], np.ones(inside.sum()), estimate.cloud.stamp_ns
+        points_mm[inside], point_labels[inside], np.ones(inside.sum()), estimate.cloud.stamp_ns
     )
     return replace(estimate, cloud=cloud)
 
 
 def cutting() -> dict[str, Any]:
-    """What else decides a measurement whose estimate is planned on and cut."""
+    """What measurements of planned cuts also depend on."""
     planning = Path(tumortrack_resection.__file__).parent.glob("*.py")
     code = code_sha256([*planning, Path(tumortrack_lab.cut.__file__)])
     planners = [to_builtins(planner) for planner in PLANNERS]
@@ -157,19 +157,21 @@ def cut_one(
     except (NoEstimate, InputError) as error:
         refused = {"refused": str(error)}
         return [{"tumor": name, "planner": p.name, **refused} for name in tumors for p in PLANNERS]
-    found = of_estimate(estimate).moved(table_from_camera)
+    located = of_estimate(estimate).moved(table_from_camera)
     about = {"good": estimate.quality == "good"}
     return [
-        {"tumor": name, "planner": p.name, **about, **_planned_and_cut(true, found, p, name)}
+        {"tumor": name, "planner": p.name, **about, **_planned_and_cut(true, located, p, name)}
         for name in tumors
         for p in PLANNERS
-        if not (p.sigmas or p.confidence) or found.std_mm  # others know no uncertainty
+        if not (p.sigmas or p.confidence) or located.std_mm  # others know no uncertainty
     ]
 
 
-def _planned_and_cut(true: Anatomy, found: Located, planner: Planner, tumor: str) -> dict[str, Any]:
+def _planned_and_cut(
+    true: Anatomy, located: Located, planner: Planner, tumor: str
+) -> dict[str, Any]:
     try:
-        plan = planner.plan(found, tumor)
+        plan = planner.plan(located, tumor)
     except (NoPlan, InputError) as error:
         return {"refused": str(error)}
     result = cut(true, plan)

@@ -1,4 +1,4 @@
-"""What scripts share: options, kept rows, the command line."""
+"""Shared by scripts: options, kept rows, the command line."""
 
 from __future__ import annotations
 
@@ -28,7 +28,8 @@ class KeptOptions:
     """Whose marked blocks are replaced."""
 
     def begin(self, target: str, *blocks: str) -> ReportWriter:
-        """Make the folder; what writes the document's blocks. Raises InputError: it lacks one."""
+        """Make the folder; returns the writer of the document's blocks. Raises InputError: it
+        lacks one."""
         writer = ReportWriter(self.document, make_command(target))
         writer.check(blocks)
         self.out.mkdir(parents=True, exist_ok=True)
@@ -36,7 +37,7 @@ class KeptOptions:
 
 
 def kept(path: Path, about: dict, measure: Callable[[], list[dict]]) -> list[dict]:
-    """The rows in a file if they were measured by what ``about`` says; else measured now."""
+    """The rows in a file if they were measured with the same ``about``; else measured now."""
     known = store.read_json(path) if path.is_file() else {}
     if known.get("about") == about and "rows" in known:
         return known["rows"]
@@ -46,7 +47,7 @@ def kept(path: Path, about: dict, measure: Callable[[], list[dict]]) -> list[dic
 
 
 def make_command(target: str) -> str:
-    """What a block names: the call of make that this run is."""
+    """The present call of make, which blocks name."""
     given = f" ARGS='{shlex.join(sys.argv[1:])}'" if sys.argv[1:] else ""
     return f"make {target}{given}"
 

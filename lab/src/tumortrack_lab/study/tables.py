@@ -1,7 +1,7 @@
-"""Measurements as one tidy table (a row for each scene and part), and what is said of it.
+"""Measurements as one tidy table (a row for each scene and part), and statistics of it.
 
-Accuracy is told by organ, tumor and state: never pooled over organs, and with the worst. In the
-table, and in every figure, infinite means not found. Every number comes from a measurement.
+Accuracy is given by organ, tumor and state: never pooled over organs, and with the worst. Infinite
+means not found.
 """
 
 from __future__ import annotations
@@ -84,12 +84,12 @@ def accuracy(frame: pd.DataFrame, sites: dict[str, Sites]) -> pd.DataFrame:
         about = {"organ": case, "state": state, "method": METHODS.get(method, method)}
         about |= {"scenes": mine.variant.nunique(), "seeds": mine.seed.nunique()}
         about |= {"scenes with a part not found": whole.failed.sum()}
-        for (part,), one in groups(tumors(mine), "part"):
+        for (part,), part_rows in groups(tumors(mine), "part"):
             site = sites[case][part]
             lies = {"part": part, "kind": site.kind, "cover mm": f"{site.cover_mm:.1f}"}
             lies["on the surface %"] = f"{100 * site.exposed_share:.0f}"
-            rows.append(about | lies | {"figure": HD} | spread(one.hausdorff_mm))
-            rows.append(about | lies | {"figure": CENTER} | spread(one.center_mm))
+            rows.append(about | lies | {"figure": HD} | spread(part_rows.hausdorff_mm))
+            rows.append(about | lies | {"figure": CENTER} | spread(part_rows.center_mm))
         carried, overlap = spread(whole[whole.carries].target_mm), spread(whole.miou, 2, high=True)
         rows.append(about | {"part": "organ", "figure": "target error, mm"} | carried)
         rows.append(about | {"part": "all", "figure": "mIoU"} | overlap)
@@ -108,7 +108,7 @@ def accuracy_summary(rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def caption(rows: list[dict[str, Any]], command: str) -> str:
-    """What stands below a block: of what, where and when."""
+    """The line below a block: what was measured, where and when."""
     frame = pd.DataFrame(rows)
     count = len(frame.drop_duplicates(["case", "method", "seed", "variant"]))
     loads, seeds = frame.load.dropna(), _listed(frame.seed)

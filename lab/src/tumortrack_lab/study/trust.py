@@ -1,5 +1,5 @@
-"""How far margins can be trusted: what tables of `tumortrack margins` say of states, physics and
-organs that no radius rests on. docs/trust.md says what came of it."""
+"""How far margins can be trusted: tables of `tumortrack margins`, tested on states, physics and
+organs that were left out of the calibration. The results are in docs/trust.md."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Table:
 
 
 def read_tables(paths: Sequence[Path]) -> list[Table]:
-    """Organs are called as their models' folders; `margins` writes into these by default. Raises
+    """Organs have the names of their models' folders, where `margins` writes by default. Raises
     InputError: a table of another version of the method."""
     tables = []
     for path in paths:
@@ -79,36 +79,36 @@ def band_of(hidden_share: float) -> str:
 
 
 def left_out(states: pd.DataFrame, parts: pd.Series, seed: int, **how: Any) -> pd.DataFrame:
-    """The states with what a calibration on the others says of them, part by part: ``accepted``;
-    of every good estimate by confidence ``mm`` (the largest radius of its tumors) and ``within``
-    (all of them); ``refused``: why there is no calibration without this part."""
-    found = states.assign(part=parts, accepted=False, refused="")
+    """The states judged part by part with a calibration on the other parts: ``accepted``; of every
+    good estimate by confidence ``mm`` (the largest radius of its tumors) and ``within`` (all of
+    them); ``refused``: why there is no calibration without this part."""
+    judged = states.assign(part=parts, accepted=False, refused="")
     for part in sorted(parts.unique()):
-        mine = found.index[parts == part]
+        mine = judged.index[parts == part]
         try:
             rest = [*states.row[parts != part]]
             margins = margins_of(rest, "", tuple(_CURVE), seed=seed, **how)
         except InputError as error:
-            found.loc[mine, "refused"] = str(error)
+            judged.loc[mine, "refused"] = str(error)
             continue
         for n in mine:
-            for name, value in _judged(found.row[n], margins).items():
-                found.loc[n, name] = value
-    if found.refused.all():
-        raise InputError(found.refused.iloc[0])
-    return found
+            for name, value in _judged(judged.row[n], margins).items():
+                judged.loc[n, name] = value
+    if judged.refused.all():
+        raise InputError(judged.refused.iloc[0])
+    return judged
 
 
 def _judged(row: Row, margins: ModelMargins) -> dict[str, Any]:
     if row.doubt:
         return {}
-    said: dict[str, Any] = {"accepted": answered(row, margins)}
+    result: dict[str, Any] = {"accepted": answered(row, margins)}
     for shells in margins.shells:
         radius = shells.radii["tumor"]
         radii = [radius.at(s, row.measured) for _, s in row.misses["tumor"]]
-        said[f"mm {shells.confidence}"] = max(np.inf if at is None else at for at in radii)
-        said[f"within {shells.confidence}"] = row.within("tumor", radius)
-    return said
+        result[f"mm {shells.confidence}"] = max(np.inf if at is None else at for at in radii)
+        result[f"within {shells.confidence}"] = row.within("tumor", radius)
+    return result
 
 
 def share_words(hits: int, cases: int) -> str:
@@ -120,12 +120,13 @@ def share_words(hits: int, cases: int) -> str:
 
 
 def coverage(kinds: dict[str, pd.DataFrame]) -> pd.DataFrame:
-    """A row a part of each way of leaving out: answers, and by stated confidence who lies within it
-    and its sizes. Parts without a calibration have no answers, and all of them do not count."""
+    """A row for each part of each way of leaving out: share of answers, and by stated confidence
+    the coverage and the margins' sizes. Parts without a calibration have no answers and are not
+    counted."""
     rows = []
-    for what, found in kinds.items():
-        every = ("all of these", found[found.refused == ""])
-        for name, mine in [*found.groupby("part", sort=True), every]:
+    for what, judged in kinds.items():
+        every = ("all of these", judged[judged.refused == ""])
+        for name, mine in [*judged.groupby("part", sort=True), every]:
             row = {"left out": what, "part": name, "states": len(mine), "good": mine.good.sum()}
             taken = mine[mine.accepted.astype(bool)]
             row["answers %"] = f"{100 * len(taken) / len(mine):.0f}" if len(taken) else ""
@@ -138,10 +139,10 @@ def coverage(kinds: dict[str, pd.DataFrame]) -> pd.DataFrame:
     return pd.DataFrame(rows).fillna("")
 
 
-def ranks(found: pd.DataFrame) -> pd.DataFrame:
+def ranks(judged: pd.DataFrame) -> pd.DataFrame:
     """Of good estimates, limits or not: misses, and their rank correlation with the standard
     deviation, and with the 95 % radius by a calibration without the state's part."""
-    rows, good, radius = [], found[found.good], f"mm {STATED[-1]}"
+    rows, good, radius = [], judged[judged.good], f"mm {STATED[-1]}"
     for name, mine in [*good.groupby("family"), *good.groupby("organ"), ("all", good)]:
         known = mine[mine[radius].notna()]
         row = {"family or organ": name, "good": len(mine), **spread_mm("miss", mine.miss)}
@@ -154,19 +155,19 @@ def ranks(found: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def risk_picture(found: pd.DataFrame, path: Path) -> None:
+def risk_picture(judged: pd.DataFrame, path: Path) -> None:
     """Share of answers that are farther off than some mm, as answers are given down to a limit on
     the stated 95 % radius; a dot: with the limits that the calibrations found."""
     drawing = new_figure(8.6, 4.4, left=0.09, right=0.98, top=0.9, bottom=0.13)
-    found = found[found.refused == ""]
-    axes, good = drawing.add_subplot(), found[found.good]
+    judged = judged[judged.refused == ""]
+    axes, good = drawing.add_subplot(), judged[judged.good]
     order = good.sort_values(f"mm {STATED[-1]}")
-    share = 100 * np.arange(1, len(order) + 1) / len(found)
-    taken = found[found.accepted.astype(bool)]
+    share = 100 * np.arange(1, len(order) + 1) / len(judged)
+    taken = judged[judged.accepted.astype(bool)]
     for far_mm, color in _BEYOND_MM.items():
         beyond = 100 * np.cumsum(order.miss > far_mm) / np.arange(1, len(order) + 1)
         axes.plot(share, beyond, color=color, lw=2, label=f"over {far_mm:g} mm off")
-        axes.plot(100 * len(taken) / len(found), 100 * (taken.miss > far_mm).mean(), "o", c=color)
+        axes.plot(100 * len(taken) / len(judged), 100 * (taken.miss > far_mm).mean(), "o", c=color)
     axes.set(xlabel="answered: share of all states, %", ylabel="of these farther off, %")
     axes.set(xlim=(0, 100), ylim=(0, None))
     _finish(axes, "Risk against coverage: the surest answers first; dots: with the limits")
@@ -178,8 +179,8 @@ def reliability_picture(kinds: dict[str, pd.DataFrame], path: Path) -> None:
     drawing = new_figure(6.4, 5.4, left=0.12, right=0.97, top=0.91, bottom=0.11)
     axes = drawing.add_subplot()
     axes.plot([50, 95], [50, 95], color="0.5", lw=1, ls="--", label="as stated")
-    for (name, found), color in zip(kinds.items(), _BEYOND_MM.values(), strict=False):
-        taken = found[found.accepted.astype(bool)]
+    for (name, judged), color in zip(kinds.items(), _BEYOND_MM.values(), strict=False):
+        taken = judged[judged.accepted.astype(bool)]
         hits = [int(taken[f"within {stated}"].sum()) for stated in _CURVE]
         bands = [binomtest(n, len(taken)).proportion_ci(0.95, "exact") for n in hits]
         x, y = 100 * np.array(_CURVE), 100 * np.array(hits) / len(taken)
@@ -195,13 +196,13 @@ def reliability_picture(kinds: dict[str, pd.DataFrame], path: Path) -> None:
 
 
 def worst_picture(
-    found: pd.DataFrame, tables: Sequence[Table], count: int, path: Path
+    judged: pd.DataFrame, tables: Sequence[Table], count: int, path: Path
 ) -> pd.DataFrame:
-    """The accepted answers that are farthest off, drawn over the truth, a row each; and what
-    happened, as a table."""
+    """Draw the accepted answers with the largest errors over the truth, a row each; returns their
+    table."""
     from tumortrack.tracking.model_files import load_model
 
-    taken = found[found.accepted.astype(bool)].nlargest(count, "miss")
+    taken = judged[judged.accepted.astype(bool)].nlargest(count, "miss")
     models, trackers = {table.organ: table.model for table in tables}, {}
     height = 2.75 * len(taken) + 0.5
     drawing = new_figure(8.4, height)
@@ -231,8 +232,8 @@ def worst_picture(
 
 
 def _moved_rigidly(motion: Any, scene: Scene) -> dict[str, str]:
-    """How the true organ lies to the estimated one, and what would be left in the mean had it been
-    moved there as it was."""
+    """The rigid motion between the estimated and the true organ, and the mean error that remains
+    after it."""
     assert scene.targets is not None
     there = motion.carry(scene.targets.points_ct)
     best = kabsch(there, scene.targets.points_mm, np.ones(len(there)))

@@ -1,4 +1,4 @@
-"""How a tumor lies in its organ, by measure: tables never mix the kinds."""
+"""How a tumor lies in its organ, as measured; tables never mix the kinds."""
 
 from __future__ import annotations
 
@@ -25,9 +25,6 @@ class TumorSite(NamedTuple):
     @property
     def kind(self) -> Kind:
         return "exophytic" if self.exposed_share >= EXOPHYTIC_SHARE else "endophytic"
-
-    def text(self, tumor: str) -> str:
-        return f"{tumor.rpartition('_')[2]}, {self.kind}"
 
 
 def tumor_sites_of(anatomy: Anatomy) -> dict[str, TumorSite]:

@@ -12,7 +12,7 @@ midsection pressed to 4, 8, 12 mm less between a plate and the bed. G1: turgor l
 incision, softened tissue sinks under its weight by 8 mm at the midsection. P1: a rod of 8 mm with a
 round end pressed 10 mm into the side that faces the camera, away from the tumors.
 
-Nothing here is shared with the deformations that networks are trained on.
+It shares nothing with the elastic body of the default method.
 """
 
 from __future__ import annotations
@@ -40,6 +40,7 @@ from tumortrack_lab.twin.solid import NeoHookeanSolid
 GRAVITY_KPA_PER_MM = 9.81e-6  # of 1 kg/m^3
 STATES = ("D0", "D1", "D2", "D3", "G1", "P1")
 _LARGEST_VOLUME_CHANGE = 0.02
+_STEEPEST = 1.5  # slope of the underside, which packing bears
 _SINK_STEPS = 15
 _SINK_TOLERANCE_MM = 0.4
 
@@ -55,7 +56,7 @@ class ApparatusConfig(Config, frozen=True, kw_only=True):
     density_kg_m3: float = 1050.0
     edge_mm: float = 5.5  # of the tetrahedra
     contact_kpa_mm: float = 300.0  # penalty per depth; few kPa sink in by about 0.1 mm
-    packing_kpa_mm: float = 3.0  # of what bears the underside: fat, foam
+    packing_kpa_mm: float = 3.0  # under the organ: fat, foam
     plate_mm: float = 36.0  # width along the organ
     rounding_mm: float = 4.0  # of the plate's edges
     load_step_mm: float = 2.0  # the plate advances by this much at a time, the rod by half
@@ -106,10 +107,10 @@ class Apparatus:
     ) -> Float64[np.ndarray, "m 3"]:
         """Points in or on the organ (CT frame) at their place on the bench, mm."""
         points = transform_points(self.bench_from_ct, np.asarray(points_ct, np.float64))
-        # The displacement is carried, not the point: D0 is then exact to the last digit.
+        # The displacement is interpolated, not the point, so that D0 is exact to the last digit.
         return points + embed(self.mesh, points).carry(state.nodes_mm - self.mesh.nodes_mm)
 
-    def settle(
+    def find_equilibrium(
         self, nodes_mm: np.ndarray, obstacles: Obstacles, weight: float = 0.0
     ) -> tuple[np.ndarray, equilibrium.Convergence]:
         """One load step: the nodes at rest in their bed among obstacles, under so many weights more
@@ -117,7 +118,7 @@ class Apparatus:
         contacts = ((self.contact, (Support(), *obstacles)), self._packing)
         load_mn = weight * self._weight_mn
         problem = equilibrium.EquilibriumProblem(self.solid, contacts, load_mn, self._hold)
-        return equilibrium.settle(problem, nodes_mm)
+        return equilibrium.find_equilibrium(problem, nodes_mm)
 
     def midsection(self, nodes_mm: np.ndarray, axis: int = 2) -> tuple[float, float]:
         """Lowest and highest z (or y) of the surface under the middle half of the plate, mm."""
@@ -144,14 +145,12 @@ def contact_points(
     return points_mm[first], np.bincount(cube.ravel(), areas_mm2)
 
 
-def _faces_down(
-    organ: Mesh, points_mm: Float64[np.ndarray, "m 3"], steepest: float = 1.5
-) -> Bool[np.ndarray, " m"]:
-    """Which points of the surface lie on its underside, where the slope is at most so much."""
+def _faces_down(organ: Mesh, points_mm: Float64[np.ndarray, "m 3"]) -> Bool[np.ndarray, " m"]:
+    """Which points of the surface lie on its underside, where it is not too steep."""
     from scipy.spatial import cKDTree
 
     middle, normal = triangles_of(organ.vertices_mm, organ.faces)
-    down = -normal[:, 2] > np.linalg.norm(normal, axis=1) / np.hypot(1, steepest)
+    down = -normal[:, 2] > np.linalg.norm(normal, axis=1) / np.hypot(1, _STEEPEST)
     return np.asarray(down[cKDTree(middle).query(points_mm)[1]])
 
 
@@ -187,7 +186,7 @@ def solve(
         return State(name, bench.mesh.nodes_mm, {"state": name, "volume_change": 0.0})
 
     def step(nodes: Nodes, obstacles: Obstacles, text: str, weight: float = 0.0) -> Nodes:
-        nodes, convergence = bench.settle(nodes, obstacles, weight)
+        nodes, convergence = bench.find_equilibrium(nodes, obstacles, weight)
         log.append(convergence)
         progress(f"{text}: {convergence.iterations} iterations")
         return nodes

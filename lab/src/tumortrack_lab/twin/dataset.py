@@ -1,7 +1,7 @@
 """A case -> the folder of its twin's scenes, state by state, resumable at any point.
 
 SCENES/
-  twin.json                     what everything here was made from
+  twin.json                     the inputs of everything here
   states/STATE.safetensors      the anatomy at rest in each state (bench frame), with its report
   VARIANT-VIEW/                 a scene each, with targets.csv and scene.png
   manifest.json                 the seal, last: sha256 of every scene
@@ -23,23 +23,30 @@ from tumortrack.core.config import to_builtins
 from tumortrack.core.errors import ArtifactError, InputError
 from tumortrack.core.types import Anatomy
 from tumortrack.imaging.case import Case, load_case
-from tumortrack.simulate.scene_folder import TARGETS, InnerPoints, draw_targets, write_scene_files
+from tumortrack.report import drawing
+from tumortrack.report.pictures import FROM_CAMERA, FROM_SIDE, draw_solid_view, scene_legend
+from tumortrack.simulate.scene_folder import (
+    TARGETS,
+    InnerPoints,
+    Scene,
+    draw_targets,
+    write_scene_files,
+)
 from tumortrack_lab.study.document import make_folder
 from tumortrack_lab.twin import views as viewing
 from tumortrack_lab.twin.apparatus import Apparatus, ApparatusConfig, State, solve
-from tumortrack_lab.twin.pictures import twin_picture
 from tumortrack_lab.twin.views import VARIANTS, VIEWS, EquilibriumState
 
 KIND = "twin"
 _STATES = "states"
 _STATE_SHARE = 15.0  # a state takes about as long as so many scenes
-# More compression goes on from less: the same answer in fewer load steps.
+# More compression starts from less: the same answer in fewer load steps.
 _GOES_ON_FROM = {"D2": "D1", "D3": "D2"}
 
 
 @dataclass(frozen=True)
 class TwinRun:
-    """What decides every file: a case, the bench, the views, one seed (of views and targets)."""
+    """Inputs of all files: a case, the bench, the views, one seed (of views and targets)."""
 
     case_folder: Path
     bench: ApparatusConfig = field(default_factory=ApparatusConfig)
@@ -50,7 +57,7 @@ class TwinRun:
 
 
 class TwinStatus(NamedTuple):
-    """Where the work stands: share of it done (a guess), and what was done last."""
+    """Progress: the share done (a guess), and the last step."""
 
     share: float
     text: str
@@ -63,8 +70,8 @@ def make_scenes(
     views: Sequence[viewing.View] = VIEWS,
     report: Callable[[TwinStatus], None] = lambda status: None,
 ) -> list[Path]:
-    """The scenes' folders, of these variants in these views; those that are there already stay. A
-    state is solved once and kept; a run that is killed loses the state or scene at work.
+    """Make the scenes of these variants in these views, unless they are there; returns their
+    folders. A state is solved once and kept; a killed run loses only the present state or scene.
 
     Raises InputError: no case, an unknown variant or view, ``out`` holds something else, or scenes
     made from another case, seed or configuration; ArtifactError: a kept state is damaged;
@@ -95,7 +102,7 @@ def make_scenes(
         state = cache.get(name, say)
         if name in unsolved:
             done += _STATE_SHARE
-            say(f"{name}: settled")
+            say(f"{name}: solved")
         for variant, view in todo:
             if VARIANTS[variant].state == name:
                 height_mm = float(np.ptp(rest_ct.vertices_mm @ state.bench_from_ct[2, :3]))
@@ -114,6 +121,24 @@ def make_scenes(
     return [out / f"{v}-{w}" for v, w in wanted]
 
 
+def twin_picture(scene: Scene, path: Path) -> None:
+    """Depth image, and the cloud over the truth's outlines from the camera and from the side."""
+    assert scene.depth is not None
+    figure = drawing.new_figure(16.0, 4.4, top=0.8)
+    axes = figure.add_subplot(1, 3, 1)
+    depth_mm, (near, far) = scene.depth.depth_mm, scene.meta["crop_mm"]
+    kept = np.where((depth_mm > near) & (depth_mm < far), depth_mm, np.nan)
+    bar = figure.colorbar(axes.imshow(kept, cmap="viridis_r"), ax=axes, fraction=0.026, pad=0.015)
+    bar.set_label("depth, mm", fontsize=9)
+    bar.ax.invert_yaxis()
+    axes.set(xticks=[], yticks=[], title=f"depth image, cropped to {near:g} .. {far:g} mm")
+    for number, view in enumerate((FROM_CAMERA, FROM_SIDE), start=2):
+        draw_solid_view(figure.add_subplot(1, 3, number), scene, None, view)
+    words = f"{scene.meta['variant']}, {scene.meta['view']}"
+    drawing.add_words(figure, words, handles=scene_legend()[-2:])
+    drawing.save(figure, path)
+
+
 def _known(names: Sequence[Any], allowed: Iterable[str]) -> list:
     for name in names:
         if name not in allowed:
@@ -124,8 +149,8 @@ def _known(names: Sequence[Any], allowed: Iterable[str]) -> list:
 
 
 def claim(out: Path, name: str, identity: dict) -> None:
-    """State what a folder of scenes is made from, in a file of it, or check that it is the same.
-    Raises InputError: it is not, or the folder holds other files; StorageError."""
+    """Write the inputs of a folder of scenes into a file there, or check that they are the same.
+    Raises InputError: they are not, or the folder holds other files; StorageError."""
     path = out / name
     if path.exists():
         differ = [k for k, v in identity.items() if store.read_json(path).get(k) != v]
@@ -154,7 +179,7 @@ class StateCache:
         return self._path(name).exists()
 
     def get(self, name: str, say: Callable[[str], None]) -> EquilibriumState:
-        """The state, solved and kept if it is not there yet; ``say`` gets a line per load step."""
+        """The state, which is solved and kept if it is new; ``say`` gets a line per load step."""
         if not self.has(name):
             self._solve(name, say)
         tensors, report, _ = self._read(name)

@@ -1,4 +1,4 @@
-"""Where a loaded solid comes to rest: the minimum of its energy among rigid obstacles.
+"""The equilibrium of a loaded solid: the minimum of its energy among rigid obstacles.
 
 Contact is frictionless, evaluated at points of the anatomy's own fine surface, which are embedded
 in the tetrahedra: a penalty of stiffness x depth^2 / 2 per area (kPa/mm). Quasi-Newton (L-BFGS) on
@@ -28,7 +28,7 @@ _TOUCHING_MM = 1e-6  # what only touches counts in the stiffness
 TOLERANCE = 1e-3  # largest unbalanced force (2-norm over nodes), share of the load
 _LEAST_LOAD_MN = 1.0  # a tenth of a gram: less is no load
 _ITERATIONS = 1500
-_REFRESH_AFTER = 60  # iterations: by then other points touch than when it was factorised
+_REFRESH_AFTER = 60  # iterations, after which the contact points have changed
 _MEMORY = 10
 _LONGEST_MM, _SHORTEST_MM = 2.0, 1e-9  # step of any node
 
@@ -145,9 +145,9 @@ class Contact:
 
 @dataclass(frozen=True, eq=False)
 class Hold:
-    """Keeps the body from sliding sideways and from rolling to its next stable side, without
-    deforming it: stiff springs hold the mean sideways displacement and the mean rotation, their
-    forces spread over the whole mass as a rigid motion is (inertia relief)."""
+    """Prevents sliding sideways and rolling to the next stable side without deforming the body:
+    stiff springs hold the mean sideways displacement and the mean rotation, with forces spread over
+    the whole mass as in a rigid motion (inertia relief)."""
 
     rest_mm: Nodes
     share: Float64[np.ndarray, " n"]  # of the volume at each node
@@ -169,7 +169,7 @@ class Hold:
 
 @runtime_checkable
 class Equilibrium(Protocol):
-    """What ``settle`` brings to rest: an energy (uJ) with its gradient (mN), an approximate
+    """The problem of ``find_equilibrium``: an energy (uJ) with its gradient (mN), an approximate
     Hessian (3 n, 3 n; mN/mm), and the load (mN) that unbalanced forces are measured against."""
 
     def energy(self, nodes_mm: Nodes) -> tuple[float, Nodes]: ...
@@ -220,11 +220,11 @@ class Convergence:
     residual: float  # unbalanced force / load
 
 
-def settle(
+def find_equilibrium(
     problem: Equilibrium, start_mm: Nodes, most: int = _ITERATIONS
 ) -> tuple[Nodes, Convergence]:
-    """Nodes at rest, from a start in which no element is turned over. Raises TumortrackError: no
-    equilibrium within so many iterations."""
+    """Nodes in equilibrium, from a start without inverted elements. Raises TumortrackError: none
+    within ``most`` iterations."""
     nodes, evaluations = start_mm, 0
     energy, gradient = problem.energy(nodes)
     precondition = _factorised(problem, nodes)
@@ -244,7 +244,7 @@ def settle(
             evaluations += 1
             trial = nodes + share * step
             trial_energy, trial_gradient = problem.energy(trial)
-            # Near the minimum differences of energy drown in rounding: 1e-12 of it is let pass.
+            # Near the minimum, energy differences drown in rounding: an increase of 1e-12 passes.
             if trial_energy <= energy + 1e-4 * share * slope + 1e-12 * abs(energy):
                 break
             share /= 2
@@ -275,7 +275,7 @@ def _factorised(problem: Equilibrium, nodes: Nodes) -> Solve:
     from scipy.sparse import eye
 
     matrix = problem.stiffness(nodes)
-    # A little on the diagonal stands for the hold: it alone has no motion free of force.
+    # A small diagonal stands for the hold, without which rigid motions are free of force.
     ground = 1e-3 * matrix.diagonal().mean()
     return factorised(matrix + ground * eye(matrix.shape[0]))
 

@@ -1,8 +1,8 @@
-"""What else lies before the camera: instruments, fat, background.
+"""Other objects before the camera: instruments, fat, background.
 
-All of it acts on the depth image of the organ (camera frame, mm), so that the cloud still comes
-from ``sense.cloud`` alone. Occluders are taken to be segmented out: where they hide the organ there
-is no return, and they give none of their own. Background is what a segmentation has left.
+All act on the depth image of the organ (camera frame, mm), so that the cloud still comes from
+``sense.cloud``. Occluders count as segmented out: where they hide the organ there is no return.
+Background is what a segmentation has left.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from tumortrack_lab.twin.equilibrium import Rod
 SHAFT_CLEARANCE_MM = 3.0  # between a shaft's tip and the organ, towards the camera
 SHAFT_RISE_DEGREES = 30.0  # of a shaft above the image plane
 _TOUCH_MM = 1.0  # a shaft keeps this far from all of the organ that is seen
-_RING_MM = 4.0  # a rod is cut into rings: a triangle that reaches behind the camera is not drawn
+_RING_MM = 4.0  # between a rod's rings: triangles that reach behind the camera are not drawn
 _LAST_DEPTH_MM = 5.0  # a rod that comes straight at the camera ends here
 _LUMP_SHARE = 2 / 3  # of the background; the rest is an instrument's tip
 
@@ -100,16 +100,20 @@ def add_background(
     return out, got / (got + organ)
 
 
-def _lumps(frame: DepthFrame, support_mm: float, rng: Generator) -> Iterator[Mesh]:
-    """Half ellipsoids on the support beside the organ, ever larger."""
+def ellipsoid(middle_mm: np.ndarray, half_mm: np.ndarray) -> Mesh:
     import trimesh
 
-    ball = trimesh.creation.icosphere(3, 1.0)
+    ball = trimesh.creation.icosphere(3)
+    return Mesh(ball.vertices * half_mm + middle_mm, ball.faces)
+
+
+def _lumps(frame: DepthFrame, support_mm: float, rng: Generator) -> Iterator[Mesh]:
+    """Half ellipsoids on the support beside the organ, ever larger."""
     for size_mm in (14.0, 18.0, 24.0, 32.0):
         for angle in rng.uniform(0, 2 * np.pi, 8):
             beside = _beside(frame, angle, support_mm, 0.5 * size_mm)
             half = size_mm * np.array([1.0, 1.0, 0.6])
-            yield Mesh(ball.vertices * half + np.array([*beside, support_mm]), ball.faces)
+            yield ellipsoid(np.array([*beside, support_mm]), half)
 
 
 def _tips(frame: DepthFrame, support_mm: float, rng: Generator) -> Iterator[Mesh]:
@@ -126,18 +130,18 @@ def _tips(frame: DepthFrame, support_mm: float, rng: Generator) -> Iterator[Mesh
 def _filled(
     frame: DepthFrame, solids: Iterator[Mesh], count: int, support_mm: float, nearest: bool
 ) -> DepthFrame:
-    """The frame with the nearest or the farthest ``count`` pixels of the first solid that shows so
-    many where nothing else is seen, and nearer than the support."""
+    """The frame with the nearest or the farthest ``count`` pixels of the first solid that has so
+    many in free pixels, nearer than the support."""
     for solid in solids:
-        seen = render_depth(solid.vertices_mm, solid.faces, frame.intrinsics).depth_mm
+        depth = render_depth(solid.vertices_mm, solid.faces, frame.intrinsics).depth_mm
         with np.errstate(invalid="ignore"):
-            free = np.flatnonzero((seen < support_mm) & np.isnan(frame.depth_mm))
+            free = np.flatnonzero((depth < support_mm) & np.isnan(frame.depth_mm))
         if len(free) >= count:
-            depths = seen.ravel()[free]
+            depths = depth.ravel()[free]
             order = np.argsort(depths if nearest else -depths, kind="stable")
             chosen = free[order[:count]]
             depth_mm = frame.depth_mm.copy()
-            depth_mm.flat[chosen] = seen.flat[chosen]
+            depth_mm.flat[chosen] = depth.flat[chosen]
             return replace(frame, depth_mm=depth_mm)
     raise InputError(
         "the image has no room for background beside the organ; the organ must be wholly in "

@@ -1,4 +1,4 @@
-"""The scenes of one case: which states are seen, turned how, and what the camera gets of them."""
+"""The scenes of one case: states, their turns about the camera's axis, and the camera's views."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ VARIANTS |= {name: Variant(name) for name in ("G1", "P1")}
 
 
 class ViewConfig(Config, frozen=True, kw_only=True):
-    """Camera, crop and what disturbs the view."""
+    """Camera, crop and disturbances."""
 
     # Above the support; the camera looks straight down at the middle of the organ in D0.
     camera_above_mm: float = 150.0
@@ -63,7 +63,7 @@ class ViewConfig(Config, frozen=True, kw_only=True):
 
 
 def for_organ(config: ViewConfig, height_mm: float) -> ViewConfig:
-    """The views of an organ that stands so high undeformed."""
+    """The views of an organ of this height, undeformed."""
     raised_mm = max(0.0, height_mm + config.nearest_mm - config.camera_above_mm)
     return structs.replace(
         config, camera_above_mm=config.camera_above_mm + raised_mm, far_mm=config.far_mm + raised_mm
@@ -106,21 +106,21 @@ def make_scene(
     frame = render_depth(reference.organ.vertices_mm, reference.organ.faces, camera)
     pixels, _ = project(reference.organ.vertices_mm, camera)
     size = np.array([camera.width, camera.height])
-    seen = {"in_image_share": float(((pixels > -0.5) & (pixels < size - 0.5)).all(1).mean())}
+    shares = {"in_image_share": float(((pixels > -0.5) & (pixels < size - 0.5)).all(1).mean())}
     if poke := state.report.get("poke"):  # the bench's rod
         tip_mm = transform_points(to_camera, np.array([poke["tip_mm"]], float))[0]
         axis = to_camera[:3, :3] @ np.array(poke["axis"], float)
         rod = Rod(tip_mm, axis, float(poke["radius_mm"]))
-        frame, seen["rod_covers_share"] = occlude(frame, rod)
+        frame, shares["rod_covers_share"] = occlude(frame, rod)
     rng = np.random.default_rng([seed, list(VARIANTS).index(name), VIEWS.index(view)])
     if view == "noise":
         frame = add_noise(frame, config.noise, rng)
     elif view == "shaft":
         shaft = shaft_over(frame, config.shaft_radius_mm, rng)
-        frame, seen["shaft_covers_share"] = occlude(frame, shaft)
+        frame, shares["shaft_covers_share"] = occlude(frame, shaft)
     elif view == "clutter":
         frame, share = add_background(frame, config.clutter_share, config.far_mm, rng)
-        seen["background_share"] = share
+        shares["background_share"] = share
     cloud = cloud_from_depth(frame, config.crop, rng)
     meta = {
         "variant": name,
@@ -130,7 +130,7 @@ def make_scene(
         "camera_from_ct": (to_camera @ state.bench_from_ct).tolist(),
         "camera_from_bench": to_camera.tolist(),
         "crop_mm": [config.near_mm, config.far_mm],
-        "seen": seen,
+        "seen": shares,
         "view_config": to_builtins(config),
     }
     return Scene(cloud, reference, frame, meta), transform_points(to_camera, state.targets_mm)

@@ -1,4 +1,4 @@
-"""What a model makes of a world's scenes: kept rows, and the tables of docs/trust.md."""
+"""A model's estimates in a world's scenes: kept rows, and the tables of docs/trust.md."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ _ROWS, _SAVE_EVERY = "measured.json", 20
 
 
 def measure(model: Path, anatomy_ct: Anatomy, out: Path, names: Sequence[str]) -> None:
-    """A row a scene, as `track` finds them in a first look; kept in the scenes' folder by
-    model and method, so that what is there is not located again."""
+    """A row for each scene, located as by `track` in a first look; kept in the scenes' folder by
+    model and method, so that no scene is located again."""
     path = out / _ROWS
     about = {"model_sha256": store.sha256_of(model / store.MANIFEST), "method": METHOD}
     kept = store.read_json(path) if path.exists() else {}
@@ -43,8 +43,8 @@ def measure(model: Path, anatomy_ct: Anatomy, out: Path, names: Sequence[str]) -
 
 
 def read_rows(folders: Sequence[Path]) -> pd.DataFrame:
-    """A line a tumor of all scenes; organs are called as the folders. Raises InputError: measured
-    with another version of the method, or none at all."""
+    """A line for each tumor of all scenes; organs have the folders' names. Raises InputError:
+    measured with another version of the method, or no scenes."""
     rows = []
     for folder in folders:
         kept = store.read_json(folder / _ROWS)
@@ -98,9 +98,9 @@ def summary(lines: pd.DataFrame) -> str:
 
 
 def wrong_ones(rows: pd.DataFrame) -> pd.DataFrame:
-    """Every wrong good answer, and what is wrong with it: ``wrong pose`` if its tumor would be
-    within half of its error, were the estimate moved rigidly onto the truth; else bent ``too
-    little`` or ``wrongly``, as the best rigid pose is farther off or nearer."""
+    """Every good answer that is wrong, and how: ``wrong pose`` if moving the estimate rigidly onto
+    the truth halves the tumor's error; else bent ``too little`` or ``wrongly``, as the best rigid
+    pose is farther off or nearer."""
     wrong = rows[rows.wrong].sort_values("off", ascending=False)
     wrong = wrong.drop_duplicates(["organ", "scene"])
     causes = {

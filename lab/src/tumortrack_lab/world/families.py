@@ -1,7 +1,7 @@
-"""One organ on the bench and the states that it is brought into: families of loads, each state one
-random draw of material, bed and load.
+"""Deformed states of one organ on the bench: families of loads, each state one random draw of
+material, bed and load.
 
-What the twin's bench does not do: soft to hard beds with a rim, friction, an organ that is free to
+Beyond the twin's bench: soft to hard beds with a rim, friction, an organ that is free to
 roll, vessels, grips that twist, clamp or pull, a slit that is pulled open, tissue that is uneven
 and has a capsule. Ranges are assumptions, wide on purpose, where no source stands beside them.
 """
@@ -40,7 +40,7 @@ _BED_DEPTH_MM = 15.0  # of fat under the organ: what turns the bed's modulus int
 _GRIP_MN_MM = 4000.0  # of a grip, over all its points
 _STEP_MM = 6.0  # of a load, at a time
 _GRAVITY = 1050.0 * GRAVITY_KPA_PER_MM  # of soft tissue, mN/mm3
-_ITERATIONS = 400  # a step: one that needs more mostly finds none
+_ITERATIONS = 400  # a step; with more it mostly does not converge either
 _CLEAR_MM = 6.0  # between a slit and every tumor: as wide as a tetrahedron
 
 
@@ -122,10 +122,10 @@ def _pull(stage: Stage, rng: Generator) -> Load:
         middle = organ.place(rng, 0.3)
         held = np.argsort(np.linalg.norm(mesh.nodes_mm - middle, axis=1))[:12]
     out = unit(unit(middle - organ.middle_mm) + rng.normal(0, 0.6, 3) + [0, 0, 0.4])
-    far_mm, one = rng.uniform(4.0, 16.0), np.zeros((len(held), 4))
-    one[:, 0] = 1.0
+    far_mm, corners = rng.uniform(4.0, 16.0), np.zeros((len(held), 4))
+    corners[:, 0] = 1.0
     rows = rows_of(
-        Embedding(np.tile(held[:, None], (1, 4)).astype(np.int32), one), len(mesh.nodes_mm)
+        Embedding(np.tile(held[:, None], (1, 4)).astype(np.int32), corners), len(mesh.nodes_mm)
     )
 
     def at(share: float) -> list[Force]:
@@ -223,7 +223,7 @@ FAMILIES: dict[str, Callable[[Stage, Generator], Load] | None] = {
 
 @dataclass(frozen=True, eq=False)
 class Deformed:
-    """A state: where the organ's tissue lies now (bench frame, mm)."""
+    """A state: the organ's deformed tissue (bench frame, mm)."""
 
     organ: Organ
     nodes_mm: Nodes
@@ -235,7 +235,7 @@ class Deformed:
     def carry(self, points_mm: Points) -> Points:
         """Points in or on the organ at rest at their place now."""
         owner, weights = find(self.organ.mesh.nodes_mm[self.organ.mesh.tets], points_mm)
-        if self.wound is not None:  # lips are strained: what lies outside them moves as they do
+        if self.wound is not None:  # no extrapolation from strained lips
             weights = np.maximum(weights, 0)
             weights /= weights.sum(1, keepdims=True)
         moved = self.nodes_mm[self.tets] - self.organ.mesh.nodes_mm[self.organ.mesh.tets]
@@ -296,23 +296,22 @@ def bedded(
 def equilibria(
     solid: NeoHookeanSolid, loads: Iterable[tuple[Force, ...]]
 ) -> tuple[list[Nodes], int]:
-    """Where the solid comes to rest under one set of forces after the other, each found from the
-    one before, against which it rubs; and how many iterations that took. Raises TumortrackError:
-    no equilibrium was found."""
+    """The solid's equilibria under one set of forces after the other, each from the one before,
+    against which it rubs; and the number of iterations. Raises TumortrackError: none was found."""
     nodes, iterations, keys = solid.mesh.nodes_mm, 0, []
     for forces in loads:
         for force in forces:
             if isinstance(force, Touch):
                 force.remember(nodes)
-        nodes, convergence = equilibrium.settle(LoadedBody(solid, forces), nodes, _ITERATIONS)
+        body = LoadedBody(solid, forces)
+        nodes, convergence = equilibrium.find_equilibrium(body, nodes, _ITERATIONS)
         iterations += convergence.iterations
         keys.append(nodes)
     return keys, iterations
 
 
 def volume_change(solid: NeoHookeanSolid, nodes_mm: Nodes) -> float:
-    """Share by which the volume is larger than at rest. Raises TumortrackError: by more than
-    tissue's is."""
+    """Relative change of the volume. Raises TumortrackError: more than tissue's."""
     change = float(np.average(solid.stretch(nodes_mm), weights=solid.mesh.volumes_mm3) - 1)
     limit = LARGEST_CHANGE if solid.poisson < 0.49 else NEARLY_NONE
     if abs(change) > limit:

@@ -1,11 +1,11 @@
-"""Sequences on disk: what one or three cameras see of an organ on the move, and the truth of it.
+"""Sequences on disk: depth images of a moving organ by one or three cameras, and the truth.
 
 SEQUENCES/
-  sequences.json, tets.safetensors   what everything here was made from
+  sequences.json, tets.safetensors   the inputs of everything here
   press-000/
     view_0/, view_1/, view_2/   depth images named by their stamps, and intrinsics.json: recordings
                                 that `tumortrack track --source recording:PATH` plays
-    poses.json                  first_from_camera of each view: as it is, and as a calibration says
+    poses.json                  first_from_camera of each view: the true one, and a calibration's
     truth.safetensors           see ``Film``
     meta.json                   kind, material, load, phases, camera
 """
@@ -51,7 +51,7 @@ _MOST_TILT = 25.0  # of the first camera, degrees
 _BEGIN_NS = 1_700_000_000_000_000_000
 ALL_KINDS = (*KINDS, *STATE_KINDS)
 COVERED_S = 0.3  # until what hides the organ has come, or gone
-_BESIDE = 0.8  # where it comes from: as ``views.covering`` counts
+_BESIDE = 0.8  # how far away it starts, in units of ``views.covering``
 _ATTEMPTS = 4  # loads, until one has equilibria all along
 # Of a calibration between cameras, one standard deviation each: an assumption.
 _POSE_MM, _POSE_DEGREES = 0.5, 0.2
@@ -104,10 +104,10 @@ class Film:
     def looks(self, frame: int) -> tuple[DepthFrame, ...]:
         """What each camera saw, with the stamp."""
         loaded = [view[frame].load().content for view in self._frames]
-        return tuple(replace(one, stamp_ns=int(self.stamps_ns[frame])) for one in loaded)
+        return tuple(replace(image, stamp_ns=int(self.stamps_ns[frame])) for image in loaded)
 
     def first_from_camera(self, as_it_is: bool = False) -> Float64[np.ndarray, "views 4 4"]:
-        """Of each view, as a calibration with its errors says, or exactly."""
+        """Of each view, with a calibration's errors, or exact."""
         poses = store.read_json(self.folder / "poses.json")
         return np.array(poses["first_from_camera" + ("" if as_it_is else "_stated")])
 
@@ -122,9 +122,9 @@ def write_film(
     world: World, config: FilmConfig, kind: str, number: int, folder: Path,
     states: Callable[[], list[State]] = list,
 ) -> None:  # fmt: skip
-    """Solve, look and write one sequence, all or nothing; ``states``: for the kinds that go through
-    solved ones. Raises TumortrackError: none of several loads has equilibria all along its path;
-    StorageError."""
+    """Solve, render and write one sequence, all or nothing; ``states``: solved states, for the
+    kinds that use them. Raises TumortrackError: none of several loads has equilibria all along its
+    path; StorageError."""
     from scipy.spatial.transform import Rotation
 
     seed = [config.seed, ALL_KINDS.index(kind), number]
@@ -148,7 +148,7 @@ def write_film(
             for n, pose in enumerate(poses)
         ]
         exact = np.array([poses[0] @ np.linalg.inv(pose) for pose in poses])
-        stated = [exact[0], *(one @ _small_error(rng) for one in exact[1:])]
+        stated = [exact[0], *(pose @ _small_error(rng) for pose in exact[1:])]
         store.write_json(
             aside / "poses.json",
             {
@@ -157,8 +157,8 @@ def write_film(
                 "first_from_camera_stated": np.array(stated).tolist(),
             },
         )
-        seen = [transform_points(poses[0], places) for places in there]
-        _write_truth(aside, world, stamps_ns, np.array(seen), views[0])
+        in_camera = [transform_points(poses[0], places) for places in there]
+        _write_truth(aside, world, stamps_ns, np.array(in_camera), views[0])
         meta = {
             "kind": kind, "number": number, "seed": config.seed, "failed_loads": failed,
             "phases_s": path.phases_s, **path.about,
@@ -186,13 +186,14 @@ def _tools(
     path: LoadPath, organ: list[Mesh], times_s: np.ndarray, pose: np.ndarray,
     rng: np.random.Generator,
 ) -> Callable[[float], list[Mesh]]:  # fmt: skip
-    """What hides the organ by and by, as it lies in the middle of the stay (bench frame)."""
+    """Meshes that hide the organ, by time (bench frame), placed for the middle of their stay."""
     camera, placed, back = d405(*SIZE_PX), [], np.linalg.inv(pose)
     for cover in path.covers:
         middle = int(np.searchsorted(times_s, (cover.since_s + cover.until_s) / 2))
-        seen = render(organ[min(middle, len(organ) - 1)], pose, camera)
-        if np.isfinite(seen).any():
-            placed.append((cover, *covering(seen, np.isfinite(seen), camera, cover.share, rng)))
+        depth = render(organ[min(middle, len(organ) - 1)], pose, camera)
+        own = np.isfinite(depth)
+        if own.any():
+            placed.append((cover, *covering(depth, own, camera, cover.share, rng)))
 
     def tools(time_s: float) -> list[Mesh]:
         shown = []

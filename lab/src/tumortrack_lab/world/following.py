@@ -1,7 +1,7 @@
-"""How followers do in sequences: every frame's error, stated spread and verdict.
+"""Followers in sequences: every frame's error, stated deviation and verdict.
 
-A method is made for a tracker and a sequence, and then sees one look after the other: what each
-camera saw at that moment, and where the cameras are, as a calibration says.
+A method is made for a tracker and a sequence, and then gets one moment after the other: the depth
+image of each camera, and the cameras' poses with a calibration's errors.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from tumortrack_lab.study.tumor_sites import TumorSite
 from tumortrack_lab.world.films import Film
 
 _SURFACES_EVERY = 3  # frames: a Hausdorff distance takes as long as locating
-_COARSE = 16  # of the volume, which is not looked at
+_COARSE = 16  # of the volume, which is not used
 _NOTHING_KNOWN = Hints()
 
 
@@ -78,8 +78,9 @@ def several_looks(tracker: Tracker) -> Locate:
 
     def locate(look: Moment) -> Estimate:
         clouds = [_organ(frame, region) for frame in look.frames]
-        seen = zip(clouds[1:], look.frames[1:], look.first_from_camera[1:], strict=True)
-        return tracker.locate(clouds[0], _COARSE, 0, look.frames[0], [Look(*one) for one in seen])
+        others = zip(clouds[1:], look.frames[1:], look.first_from_camera[1:], strict=True)
+        looks = [Look(*other) for other in others]
+        return tracker.locate(clouds[0], _COARSE, 0, look.frames[0], looks)
 
     return locate
 
@@ -95,9 +96,9 @@ METHODS: dict[str, Callable[[Tracker], Locate]] = {
 
 
 def judge(locate: Locate, film: Film, sites: dict[str, TumorSite]) -> list[dict[str, Any]]:
-    """A row a frame and tumor: quality, error of its centre and, in every third frame of all but
-    random sequences, its surface (Hausdorff), stated deviations, and how far the best rigid pose
-    has the centre off; mm. What needs an estimate is absent where there is none."""
+    """A row for each frame and tumor: quality, errors of its centre and, in every third frame of
+    all but random sequences, of its surface (Hausdorff), stated deviations, and the centre's error
+    in the best rigid pose; mm. Without an estimate, what needs one is absent."""
     poses, rows = film.first_from_camera(), []
     every = _SURFACES_EVERY if film.meta["kind"] != "random" else len(film.stamps_ns) + 1
     for number, time_s in enumerate(film.seconds.tolist()):
@@ -124,10 +125,10 @@ def judge(locate: Locate, film: Film, sites: dict[str, TumorSite]) -> list[dict[
             row = {**about, "tumor": name, "site": sites[name].kind}
             row["rigid_center_mm"] = _center_mm(transform_points(pose, rest.vertices_mm), true)
             if motion is not None:
-                found = rest.moved(motion.carry(rest.vertices_mm))
-                row["center_mm"] = _center_mm(found.vertices_mm, true)
+                estimated = rest.moved(motion.carry(rest.vertices_mm))
+                row["center_mm"] = _center_mm(estimated.vertices_mm, true)
                 if (number + 1) % every == 0:
-                    row["hausdorff_mm"] = surface_distances(found, true, 2.0).hausdorff_mm
+                    row["hausdorff_mm"] = surface_distances(estimated, true, 2.0).hausdorff_mm
                 stds = ("center_std_mm", "surface_std_mm")
                 row |= {key: getattr(parts[name], key) for key in stds}
             rows.append(row)

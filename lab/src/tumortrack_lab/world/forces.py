@@ -1,6 +1,6 @@
-"""What acts on an organ of the wider world, each as an energy (uJ), its gradient (mN) and an
-approximate Hessian (mN/mm); and the organ under them, which ``twin.equilibrium.settle`` brings to
-rest. Units: mm, kPa, mN.
+"""Forces on an organ of the wider world, each an energy (uJ) with its gradient (mN) and an
+approximate Hessian (mN/mm); and the organ under them, whose equilibrium is found by
+``twin.equilibrium``. Units: mm, kPa, mN.
 """
 
 from __future__ import annotations
@@ -93,7 +93,7 @@ class Touch:
         return energy, self.rows.T @ force
 
     def remember(self, nodes_mm: Nodes) -> None:
-        """A load step ended here: what touches now rubs in the next one."""
+        """The end of a load step: points in contact have friction in the next one."""
         points = self.rows @ nodes_mm
         distance, normal = self.obstacle.distance(points)
         limit = self.friction * self.stiffness_kpa_mm * self.areas_mm2 * np.maximum(-distance, 0)
@@ -131,7 +131,7 @@ class Springs:
 
 @dataclass(frozen=True, eq=False)
 class Capsule:
-    """A skin of springs along the surface's edges (pairs of nodes); it only pulls."""
+    """Springs along the surface's edges (pairs of nodes) that only pull."""
 
     edges: Int[np.ndarray, "e 2"]
     rest_mm: Float64[np.ndarray, " e"]
@@ -172,7 +172,7 @@ class Capsule:
 
 
 class _Soft:
-    """Adds nothing to the stiffness that quasi-Newton steps start from."""
+    """Adds nothing to the approximate Hessian."""
 
     def stiffness(self, nodes_mm: Nodes) -> csr_matrix:
         from scipy.sparse import csr_matrix
@@ -239,9 +239,9 @@ class Turned:
 
 @dataclass(frozen=True, eq=False)
 class Bed:
-    """The hollow that the organ at rest has in what lies round it, up to a rim: everything that is
-    outside the organ and below z = ``rim_mm``. Distances to the organ: a cubic B-spline over
-    a grid, which is as smooth as quasi-Newton steps need it."""
+    """The tissue round the organ at rest, up to a rim: everything outside the organ and below z =
+    ``rim_mm``. Distances to the organ: a cubic B-spline over a grid, smooth enough for quasi-Newton
+    steps."""
 
     values: Float64[np.ndarray, "i j k"]  # distance to the organ at rest, mm, negative inside
     origin_mm: Float64[np.ndarray, " 3"]
@@ -258,7 +258,7 @@ class Bed:
         return cls(distance.reshape(tuple(shape)), low)
 
     def under(self, rest_mm: Points, rim_mm: float) -> Bed:
-        """The bed as these points feel it: none of them is pushed at rest."""
+        """The bed for these points, none of which it pushes at rest."""
         bare = replace(self, rim_mm=rim_mm, sunk_mm=0.0)
         return replace(bare, sunk_mm=np.minimum(bare.distance(rest_mm)[0], 0))
 

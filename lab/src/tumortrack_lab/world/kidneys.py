@@ -1,4 +1,4 @@
-"""Random kidneys with random tumors, as many as wanted: organs of others, and for tests.
+"""Random kidneys with random tumors: other organs than the model's, and for tests.
 
 Each is the built-in phantom's implicit surface with parameters of its own, turned at random in the
 CT and seen from a random side. Nothing in them comes from a patient.
@@ -16,24 +16,19 @@ from tumortrack.phantom import digital
 _STEP_MM = 2.0  # of the grid that surfaces are drawn from
 _MARGIN_MM = 6.0
 _MOST_TUMORS = 3
-_SIDEWAYS_DEG = 60.0  # the side that faces the camera lies so far from anterior at most
+_LENGTH_MM, _TUMOR_MM = (90.0, 130.0), (10.0, 45.0)  # of the kidney; diameters
+_SIDEWAYS_DEG = 60.0  # between anterior and the side that faces the camera, at most
 _ATTEMPTS = 100
 _FIELD_LIMIT_MM = 2 * _STEP_MM  # vertices lie where neighbouring nodes differ in sign
 
 
-def random_anatomy(
-    seed: int,
-    lengths_mm: tuple[float, float] = (90.0, 130.0),
-    tumors_mm: tuple[float, float] = (10.0, 45.0),
-    rises_deg: float = 0.0,
-) -> tuple[Anatomy, tuple[float, float, float]]:
-    """A kidney of a length in this range with one to three tumors of such diameters, deep or
-    bulging, and the direction that faces the camera, to which the long axis rises or falls by up to
-    ``rises_deg``: CT frame (LPS), mm; closed surfaces, tumors in label order.
+def random_anatomy(seed: int) -> tuple[Anatomy, tuple[float, float, float]]:
+    """A kidney of 90 to 130 mm with one to three tumors of 10 to 45 mm, deep or bulging, and the
+    direction that faces the camera: CT frame (LPS), mm; closed surfaces, tumors in label order.
 
     The same seed gives the same kidney. Raises InputError: a negative seed."""
     rng = np.random.default_rng([seed, 0x81D])
-    parameters = _random_parameters(rng, lengths_mm, tumors_mm)
+    parameters = _random_parameters(rng)
     turn = Rotation.random(rng=rng).as_matrix()
     if rng.uniform() < 0.5:  # a left kidney: the mirror image
         turn = turn @ np.diag([-1.0, 1.0, 1.0])
@@ -45,16 +40,13 @@ def random_anatomy(
         faces = mesh.faces if np.linalg.det(turn) > 0 else mesh.faces[:, ::-1]  # outward again
         parts.append(Mesh(mesh.vertices_mm @ turn.T + centre, faces))
     aside = Rotation.from_euler("z", rng.uniform(-_SIDEWAYS_DEG, _SIDEWAYS_DEG), degrees=True)
-    rise = np.radians(rng.uniform(-rises_deg, rises_deg))
-    x, y, z = turn @ aside.apply([0.0, -np.cos(rise), np.sin(rise)])
+    x, y, z = turn @ aside.apply([0.0, -1.0, 0.0])
     return Anatomy(tuple(parts)), (float(x), float(y), float(z))
 
 
-def _random_parameters(
-    rng: np.random.Generator, lengths_mm: tuple[float, float], tumors_mm: tuple[float, float]
-) -> digital.PhantomParameters:
+def _random_parameters(rng: np.random.Generator) -> digital.PhantomParameters:
     """The shape of a random kidney and its tumors."""
-    length = rng.uniform(*lengths_mm)
+    length = rng.uniform(*_LENGTH_MM)
     size = (length * rng.uniform(0.45, 0.62), length * rng.uniform(0.38, 0.52), length)
     return digital.PhantomParameters(
         size_mm=size,
@@ -63,23 +55,21 @@ def _random_parameters(
         hilum_depth_mm=rng.uniform(6, 24),
         lump_mm=rng.uniform(0.3, 2.0),
         shape_seed=int(rng.integers(1 << 31)),
-        tumors=_random_tumors(size, tumors_mm, rng),
+        tumors=_random_tumors(size, rng),
     )
 
 
 def _random_tumors(
-    size_mm: tuple[float, float, float],
-    diameters_mm: tuple[float, float],
-    rng: np.random.Generator,
+    size_mm: tuple[float, float, float], rng: np.random.Generator
 ) -> tuple[digital.TumorParameters, ...]:
-    """Tumors that keep apart: centres anywhere from the middle out to the organ's surface."""
+    """Tumors that do not touch, with centres anywhere from the middle to the organ's surface."""
     wanted = int(rng.integers(1, _MOST_TUMORS + 1))
     tumors: list[digital.TumorParameters] = []
     for _ in range(_ATTEMPTS):
         direction = rng.normal(size=3)
         depth = rng.uniform(0.1, 0.95) * np.array(size_mm) / 2
         x, y, z = direction / np.linalg.norm(direction) * depth
-        diameter = float(np.exp(rng.uniform(*np.log(diameters_mm))))
+        diameter = float(np.exp(rng.uniform(*np.log(_TUMOR_MM))))
         tumor = digital.TumorParameters(diameter_mm=diameter, center_mm=(x, y, z))
         if all(digital.gap_mm(tumor, other) >= digital.SMALLEST_GAP_MM for other in tumors):
             tumors.append(tumor)
@@ -89,7 +79,7 @@ def _random_tumors(
 
 
 def _fields(parameters: digital.PhantomParameters) -> tuple[list[np.ndarray], digital.Axes]:
-    """About the signed distance to the whole organ and to each tumor, on a grid round them."""
+    """Approximate signed distances to the whole organ and to each tumor, on a grid round them."""
     reach = np.array(parameters.size_mm) / 2
     for tumor in parameters.tumors:
         reach = np.maximum(reach, np.abs(tumor.center_mm) + 0.6 * tumor.diameter_mm)

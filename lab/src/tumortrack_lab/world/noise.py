@@ -1,6 +1,6 @@
-"""A stereo camera's errors, a second model beside the one that training uses, and sharing no code
-with it: errors arise in disparity, near pixels and successive frames err together, lenses are not
-quite rectified, and wet tissue gives highlights.
+"""A stereo camera's errors, a model that shares no code with ``sense.noise``: errors arise in
+disparity and are correlated between near pixels and successive frames, rectification leaves some
+distortion, and wet tissue gives highlights.
 
 Depth is z = f b / d, so an error of e pixels of disparity moves it by z^2 e / (f b): growth with
 distance squared. Constants and where they come from:
@@ -19,8 +19,8 @@ distance squared. Constants and where they come from:
   assumption, with either sign.
 - ``edges``: a matching window sees what is nearer a pixel too wide, and beside it lies a band that
   one of both cameras alone sees: geometry.
-- ``gloss_degrees`` 5: what mirrors the lamp into the camera so nearly has no texture, and three of
-  four such pixels no return; the film of fluid tilts by 6 degrees: assumptions.
+- ``gloss_degrees`` 5: surfaces within this angle of mirroring the lamp have no texture, and three
+  of four such pixels no return; the film of fluid tilts by 6 degrees: assumptions.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ class StereoConfig(Config, frozen=True, kw_only=True):
 
 
 class StereoCamera:
-    """One camera before one scene: ``see`` gives a frame after the other."""
+    """One camera before one scene; ``see`` simulates successive frames."""
 
     def __init__(self, camera: Intrinsics, config: StereoConfig, rng: np.random.Generator) -> None:
         self._camera, self._config, self._rng = camera, config, rng
@@ -78,7 +78,7 @@ class StereoCamera:
         )
 
     def see(self, depth_mm: Float32[np.ndarray, "h w"], stamp_ns: int = 0) -> DepthFrame:
-        """What it measures where the true depths are these (NaN: nothing)."""
+        """The measured frame for these true depths (NaN: nothing)."""
         config, rng = self._config, self._rng
         true = np.asarray(depth_mm, float)
         true = self._half_seen(_fattened(true)) if config.edges else true
@@ -104,8 +104,8 @@ class StereoCamera:
         return DepthFrame(out.astype(np.float32), self._camera, stamp_ns)
 
     def _half_seen(self, true: Image) -> Image:
-        """Without what the second camera, to the right, does not see past something nearer: a band
-        along that one's left edge."""
+        """Without what the second camera, to the right, does not see behind a nearer object: a band
+        along that object's left edge."""
         columns = np.arange(true.shape[1]) * self._matched
         there = np.nan_to_num(columns - self._focal_baseline / true, nan=np.inf)
         right = np.minimum.accumulate(there[:, ::-1], axis=1)[:, ::-1]
@@ -113,7 +113,7 @@ class StereoCamera:
         return np.where(np.pad(hidden, ((0, 0), (0, 1))), np.nan, true)
 
     def _bent(self, true: Image) -> Image:
-        """The image through lenses whose distortion is not quite known."""
+        """The image with the residual distortion of the lenses."""
         from scipy.ndimage import map_coordinates
 
         if self._config.lens_px == 0:
@@ -155,13 +155,13 @@ def _field(shape: tuple[int, int], reach_px: float, rng: np.random.Generator) ->
     if reach_px < 0.3:
         return rng.normal(size=shape)
     field = gaussian_filter(rng.normal(size=shape), reach_px, mode="wrap")
-    one = np.zeros(shape)
-    one[0, 0] = 1.0
-    return field / np.linalg.norm(gaussian_filter(one, reach_px, mode="wrap"))
+    impulse = np.zeros(shape)
+    impulse[0, 0] = 1.0
+    return field / np.linalg.norm(gaussian_filter(impulse, reach_px, mode="wrap"))
 
 
 def _fattened(true: Image) -> Image:
-    """What lies in front grows by a pixel: a window that sees its edge matches there."""
+    """Near objects grow by a pixel: a matching window that contains their edge matches there."""
     from scipy.ndimage import minimum_filter
 
     near = minimum_filter(np.nan_to_num(true, nan=np.inf), 3)
@@ -195,5 +195,5 @@ def _slope(points: np.ndarray, axis: int) -> np.ndarray:
     first, last = ((0, 1), (0, 0), (0, 0)), ((1, 0), (0, 0), (0, 0))
     pads = [np.roll(np.array(pad), axis, axis=0) for pad in (first, last)]
     after, before = (np.pad(step, pad, mode="edge") for pad in pads)
-    jump = [np.nan_to_num(np.abs(one[..., 2:]), nan=np.inf) for one in (after, before)]
+    jump = [np.nan_to_num(np.abs(way[..., 2:]), nan=np.inf) for way in (after, before)]
     return np.where(jump[0] <= jump[1], after, before)

@@ -1,4 +1,4 @@
-"""One organ on the bench, of one material, perhaps slit: what loads act on."""
+"""One organ on the bench, of one material, perhaps slit, to which loads are applied."""
 
 from __future__ import annotations
 

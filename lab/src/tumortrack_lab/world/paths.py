@@ -1,11 +1,11 @@
-"""An organ on the move: equilibria along a load path are key frames, and what lies between them.
+"""A moving organ: equilibria along a load path as key frames, and interpolation between them.
 
-Quasi-static: every key frame is found from the one before, against which the bed rubs, so where the
-organ comes to lie depends on its way. Nothing but bed and weight holds it while it is pressed,
-pushed, rolled or breathes: it is free to roll. Ranges are assumptions, wide on purpose.
+Quasi-static: every key frame is solved from the one before, with friction, so the organ's place
+depends on its path. Only bed and weight hold it while it is pressed, pushed, rolled or breathes: it
+is free to roll. Ranges are assumptions, wide on purpose.
 
-Key frames are parted into their best rigid motion over the volume and the displacement that it
-leaves. Between them the first goes along by slerp, displacement and place by monotone cubics.
+Key frames are split into their best rigid motion over the volume and the remaining displacement.
+Rotations are interpolated by slerp, displacements and positions by monotone cubics.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ def _no_tools(time_s: float) -> list[Mesh]:
 
 
 class Cover(NamedTuple):
-    """A hand or instruments hide this share of the organ's picture (first camera) meanwhile."""
+    """A time in which a hand or instruments hide this share of the organ (first camera)."""
 
     since_s: float
     until_s: float
@@ -86,7 +86,7 @@ class LoadPath:
         return float(self.times_s[-1])
 
     def parted(self, points_mm: Points) -> tuple[np.ndarray, np.ndarray]:
-        """Of each key frame the rigid motion, and what it leaves at these points."""
+        """Each key frame's rigid motion, and the remaining displacement of these points."""
         mesh, rest = self.organ.mesh, self.organ.mesh.nodes_mm
         share = mesh.lump(mesh.volumes_mm3)
         owner, weights = find(rest[mesh.tets], points_mm)
@@ -186,7 +186,7 @@ def _loaded(
     bench: _Bench, course: _Course, at: Callable[[float], list[Force]], about: dict[str, Any],
     **besides: Any,
 ) -> LoadPath:  # fmt: skip
-    """The path of one load that comes and goes."""
+    """The path of one load that is applied and removed."""
     loads = (bench.forces + tuple(at(share) if share > 0 else ()) for share in course.shares)
     return _path(bench, course, loads, about, **besides)
 
@@ -197,11 +197,11 @@ def _path(
 ) -> LoadPath:  # fmt: skip
     keys, iterations = equilibria(bench.stage.solid, loads)
     change = max((volume_change(bench.stage.solid, nodes) for nodes in keys), key=abs)
-    told = {"material": bench.about, "rim_mm": bench.rim_mm, "load": about}
-    told |= {"volume_change": change, "iterations": iterations}
+    recipe = {"material": bench.about, "rim_mm": bench.rim_mm, "load": about}
+    recipe |= {"volume_change": change, "iterations": iterations}
     shown = [keys[n] for n in course.which]
     return LoadPath(
-        bench.stage.organ, course.times_s, shown, bench.rim_mm, course.phases_s, told, **besides
+        bench.stage.organ, course.times_s, shown, bench.rim_mm, course.phases_s, recipe, **besides
     )
 
 

@@ -1,5 +1,4 @@
-"""What was judged in sequences, as a plot; and a film of one organ under a press, truth against
-estimate."""
+"""A plot of errors in sequences, and a film of one organ under a press: truth and estimate."""
 
 from __future__ import annotations
 
@@ -38,8 +37,8 @@ def draw(rows: pd.DataFrame, path: Path) -> None:
     """Error of centres against time under a press, phases made equally long: medians over organs of
     medians over sequences that all methods saw; and how far the organs are bent."""
     rows = rows[(rows["kind"] == "press") & rows["method"].isin(list(_STYLES))]
-    seen = rows.groupby(["organ", "sequence"])["method"].transform("nunique")
-    rows = rows[seen == seen.max()].assign(step=np.floor(rows["phase"] * 4) / 4 + 0.125)
+    methods = rows.groupby(["organ", "sequence"])["method"].transform("nunique")
+    rows = rows[methods == methods.max()].assign(step=np.floor(rows["phase"] * 4) / 4 + 0.125)
     figure, top = drawing.new_figure(9.4, 4.0), 0.0
     for number, (site, mine) in enumerate(rows.groupby("site")):
         axes = figure.add_axes((0.065 + 0.475 * number, 0.1, 0.405, 0.68))
@@ -82,21 +81,21 @@ def show(locate: Locate, film: Film, path: Path) -> None:
     errors: list[float] = []
     pictures = []
     for n, truth in enumerate(truths):
-        found: tuple[Mesh, ...] = ()
+        estimated: tuple[Mesh, ...] = ()
         try:
             motion = locate(Moment(film.looks(n), film.first_from_camera())).motion
             if motion is not None:
-                found = tuple(p.moved(motion.carry(p.vertices_mm)) for p in film.rest.parts)
+                estimated = tuple(p.moved(motion.carry(p.vertices_mm)) for p in film.rest.parts)
         except NoEstimate:
             pass
-        middles = [parts[tumor].vertices_mm.mean(0) for parts in (truth, found) if parts]
-        errors.append(float(np.linalg.norm(middles[0] - middles[-1])) if found else np.nan)
+        middles = [parts[tumor].vertices_mm.mean(0) for parts in (truth, estimated) if parts]
+        errors.append(float(np.linalg.norm(middles[0] - middles[-1])) if estimated else np.nan)
         if n % _EVERY == 0:
             figure = drawing.new_figure(7.2, 3.0)
             left = figure.add_axes((0.01, 0.03, 0.56, 0.84))
-            _section(left, view, middles[0], ((truth, TRUE), (found, ESTIMATED)))
-            seen = view.project(deproject(film.looks(n)[0]).astype(float) - middles[0])
-            near = seen[np.abs(seen[:, 2]) < _NEAR_MM] + view.project(middles[0][None])
+            _section(left, view, middles[0], ((truth, TRUE), (estimated, ESTIMATED)))
+            points = view.project(deproject(film.looks(n)[0]).astype(float) - middles[0])
+            near = points[np.abs(points[:, 2]) < _NEAR_MM] + view.project(middles[0][None])
             left.plot(near[:, 0], near[:, 1], ".", color="0.6", markersize=2, zorder=0)
             drawing.finish_view(left, Frame(low[0], high[0], low[1], high[1]))
             _curve(figure.add_axes((0.65, 0.16, 0.33, 0.71)), film, errors)
@@ -107,7 +106,7 @@ def show(locate: Locate, film: Film, path: Path) -> None:
             figure.savefig(buffer, format="png")
             pictures.append(Image.open(buffer).convert("RGB"))
     palette, plain = pictures[0].quantize(_COLOURS), Image.Dither.NONE
-    first, *others = (one.quantize(palette=palette, dither=plain) for one in pictures)
+    first, *others = (picture.quantize(palette=palette, dither=plain) for picture in pictures)
     buffer, lasts = io.BytesIO(), [_FRAME_MS] * len(others) + [5 * _FRAME_MS]
     first.save(buffer, "GIF", save_all=True, append_images=others, duration=lasts, loop=0)
     write_atomically(path, buffer.getvalue())

@@ -1,4 +1,4 @@
-"""A world's scenes, by number: state, true anatomy, view, cloud, and what disturbs it."""
+"""A world's scenes, by number: state, true anatomy, view, cloud, disturbance."""
 
 from __future__ import annotations
 
@@ -20,21 +20,22 @@ from tumortrack.imaging.meshes import mesh_of, solid_of
 from tumortrack.simulate.scene_folder import InnerPoints, Scene, Targets, draw_targets
 from tumortrack_lab.tets import TetMesh, tetrahedralise
 from tumortrack_lab.twin.apparatus import bench_from_ct, moved
+from tumortrack_lab.twin.occluders import ellipsoid
 from tumortrack_lab.world import segmentation
 from tumortrack_lab.world.families import FAMILIES, Deformed, solve
 from tumortrack_lab.world.kidneys import random_anatomy
 from tumortrack_lab.world.organ import Organ
-from tumortrack_lab.world.views import View, look, lump, organ_cloud
+from tumortrack_lab.world.views import View, look, organ_cloud
 
 Disturbance = Literal[
     "none", "hidden", "strays", "fat", "white", "scale", "side", "mirrored", "foreign", "nothing"
 ]
 DISTURBANCES: tuple[Disturbance, ...] = get_args(Disturbance)
-OTHERS = ("mirrored", "foreign", "nothing")  # not the model's organ: nothing true can be said
+OTHERS = ("mirrored", "foreign", "nothing")  # not the model's organ: no estimate is right
 TETS = "tets.safetensors"  # of a folder's world: filling an organ is not reproducible
 _FINE_MM, _EDGE_MM = 0.1, 7.0  # surfaces are simplified by this, edges halved beyond
 _HIDDEN = (0.3, 0.7)  # share of what is seen of the organ, where hiding is the disturbance
-_SAME_MM = 0.05  # between a state that was kept and the same, solved again
+_SAME_MM = 0.05  # allowed between a kept state and the same, solved again
 
 Generator = np.random.Generator
 
@@ -140,8 +141,8 @@ class World:
         return self._seen(shown, number, disturbance, rng)
 
     def kept(self, scene: Scene) -> Shown:
-        """What an undisturbed scene of this case and these tetrahedra shows, without solving it
-        again; all but slits, whose walls are not kept. Raises InputError: it is another's."""
+        """The state of an undisturbed scene of this case and these tetrahedra; only slits, whose
+        walls are not kept, are solved again. Raises InputError: it shows another organ."""
         meta, parts = scene.meta, ("material", "load", "volume_change", "least_stretch")
         if meta.get("case_sha256", self.case_sha256) != self.case_sha256 or scene.targets is None:
             raise InputError("the scene to be seen again shows another organ than the case.")
@@ -156,7 +157,7 @@ class World:
             there = state.carry(transform_points(self.bench_from_ct, scene.targets.points_ct))
             if (off_mm := float(np.abs(there - points).max())) > _SAME_MM:
                 raise InputError(f"the state, solved again, is another by {off_mm:.2f} mm.")
-        else:  # nodes at rest: nobody looks inside
+        else:  # nodes at rest: they are not used
             mesh, rim_mm = self.organ.mesh, meta["material"]["rim_mm"]
             state = Deformed(self.organ, mesh.nodes_mm, mesh.tets, rim_mm, None, {})
         return Shown(state, truth, targets, f"{seed}-{number}", about)
@@ -181,9 +182,9 @@ class World:
         elif disturbance == "white":
             view, cloud, how = _with_white_noise(view, cloud, rng)
         reference = moved(truth, view.camera_from_bench)
-        seen = cloud.points_mm[:, None]
+        points = cloud.points_mm[:, None]
         tumor_mm = [
-            float(np.linalg.norm(seen - part.vertices_mm.mean(0), axis=2).min())
+            float(np.linalg.norm(points - part.vertices_mm.mean(0), axis=2).min())
             for part in reference.tumors
         ]
         meta = {
@@ -211,7 +212,7 @@ def simplified(anatomy_ct: Anatomy) -> Anatomy:
     pairs = zip(anatomy_ct.names, anatomy_ct.parts, strict=True)
     solids = (solid_of(part, name) for name, part in pairs)
     return anatomy_ct.of(
-        mesh_of(one.simplify(_FINE_MM).refine_to_length(_EDGE_MM)) for one in solids
+        mesh_of(solid.simplify(_FINE_MM).refine_to_length(_EDGE_MM)) for solid in solids
     )
 
 
@@ -229,7 +230,7 @@ def _replaced(
         return replace(state, wound=None), moved(other, bench_from_ct(other.organ, up)), ()
     if kind == "nothing":
         half = (high - low) / 2 * rng.uniform(0.6, 1.1, 3)
-        ball = lump(np.zeros(3), np.ones(3))
+        ball = ellipsoid(np.zeros(3), np.ones(3))
         waves = rng.normal(0, 1.5, (3, 8))
         bumps = np.cos(ball.vertices_mm @ waves + rng.uniform(0, 6.3, 8)).mean(1, keepdims=True)
         thing = Mesh((ball.vertices_mm * (1 + 0.5 * bumps)) * half + [0, 0, half[2]], ball.faces)
@@ -240,7 +241,7 @@ def _replaced(
         edge = truth.organ.vertices_mm[(truth.organ.vertices_mm @ way).argmax()]
         place = edge + 0.3 * half.mean() * way
         place[2] = low[2] + rng.uniform(0.5, 0.9) * (high[2] - low[2]) - 0.7 * half[2]
-        return state, truth, (lump(place, half),)
+        return state, truth, (ellipsoid(place, half),)
     return state, truth, ()
 
 
@@ -269,7 +270,7 @@ def _disturbed_frame(
 def _with_white_noise(
     view: View, cloud: SensorCloud, rng: Generator
 ) -> tuple[View, SensorCloud, dict[str, Any]]:
-    """1 to 2 mm along each ray, in image and points alike; the organ was found without it."""
+    """1 to 2 mm along each ray, in image and points alike, after the organ was segmented."""
     std_mm, depth = rng.uniform(1.0, 2.0), view.frame.depth_mm
     noisy = depth + rng.normal(0, std_mm, depth.shape).astype(np.float32)
     z = cloud.points_mm[:, 2:].astype(float)

@@ -1,7 +1,7 @@
 """How the true organ differs from the model's case: errors of the CT's segmentation.
 
-The case is what somebody segmented; the patient has something else. Surfaces keep their triangles,
-vertices move along their normals; scenes are made of the moved ones, the model knows the others.
+The case is a segmentation; the patient's organ differs. Surfaces keep their triangles, vertices
+move along their normals; scenes show the moved surfaces, the model knows the others.
 Two readers of one CT agree to a Dice score of 0.98 on kidneys and 0.92 on tumors (Heller et al.
 2021, doi 10.1016/j.media.2020.101821): about a millimetre on such surfaces.
 """
@@ -11,11 +11,11 @@ from __future__ import annotations
 from typing import Literal, get_args
 
 import numpy as np
-from jaxtyping import Float64
 
-from tumortrack.core.geometry import rotation_onto, triangles_of
+from tumortrack.core.geometry import rotation_onto
 from tumortrack.core.mesh_query import contains
 from tumortrack.core.types import Anatomy, Mesh
+from tumortrack_lab.peers.pose_search import vertex_normals
 
 Kind = Literal["none", "voxel", "slices", "reader"]
 KINDS: tuple[Kind, ...] = get_args(Kind)
@@ -23,14 +23,12 @@ VOXEL_MM = (0.7, 1.5)  # of clinical CT
 READER_MM, READER_REACH_MM = 1.0, (8.0, 25.0)  # standard deviation, how far it goes one way
 _GRID_MM, _REACH_MM = 1.5, 4.5
 
-Vertices = Float64[np.ndarray, "v 3"]
-
 
 def perturbed(
     anatomy: Anatomy, kind: Kind, axis: np.ndarray, rng: np.random.Generator
 ) -> tuple[Anatomy, dict]:
-    """The true anatomy, and what was done. ``axis``: the slices' normal, unit. Tumors and organ err
-    apart, as they are outlined apart."""
+    """The true anatomy, and the errors. ``axis``: the slices' normal, unit. Tumors and organ have
+    independent errors, as they are outlined apart."""
     if kind == "none":
         return anatomy, {"kind": kind}
     if kind == "voxel":
@@ -48,19 +46,11 @@ def perturbed(
         shifts = [_disagreement(part, reach, rng) for part in anatomy.parts]
         about = {"reach_mm": reach}
     parts = tuple(
-        part.moved(part.vertices_mm + shift[:, None] * normals(part))
+        part.moved(part.vertices_mm + shift[:, None] * vertex_normals(part))
         for part, shift in zip(anatomy.parts, shifts, strict=True)
     )
     rms = [float(np.sqrt((shift**2).mean())) for shift in shifts]
     return anatomy.of(parts), {"kind": kind, **about, "rms_mm": rms}
-
-
-def normals(mesh: Mesh) -> Vertices:
-    """Unit normals of the vertices, outward."""
-    out, area = np.zeros_like(mesh.vertices_mm), triangles_of(mesh.vertices_mm, mesh.faces)[1]
-    for corner in mesh.faces.T:
-        np.add.at(out, corner, area)
-    return out / np.maximum(np.linalg.norm(out, axis=1, keepdims=True), 1e-12)
 
 
 def _disagreement(mesh: Mesh, reach_mm: float, rng: np.random.Generator) -> np.ndarray:
@@ -72,8 +62,8 @@ def _disagreement(mesh: Mesh, reach_mm: float, rng: np.random.Generator) -> np.n
 
 
 def _sliced(mesh: Mesh, thick_mm: float, phase: float, axis: np.ndarray) -> np.ndarray:
-    """How far each vertex moves if the shape is known in slices alone: each shows the mean over its
-    thickness, the steps between them are smoothed along the slices' normal."""
+    """Each vertex's shift if the shape is known only in slices: each shows the mean over its
+    thickness, and the steps between them are smoothed along the slices' normal."""
     from scipy.ndimage import gaussian_filter1d, map_coordinates
 
     turn = rotation_onto(axis, np.array([0.0, 0.0, 1.0]))
@@ -88,7 +78,7 @@ def _sliced(mesh: Mesh, thick_mm: float, phase: float, axis: np.ndarray) -> np.n
     smooth = gaussian_filter1d(stairs, thick_mm / 2 / _GRID_MM, axis=2)
     for across in (0, 1):  # the drawn line's own pixels
         smooth = gaussian_filter1d(smooth, 1.0 / _GRID_MM, axis=across)
-    out = normals(mesh) @ turn.T
+    out = vertex_normals(mesh) @ turn.T
     steps = np.arange(-_REACH_MM, _REACH_MM + 0.1, 0.25)
     places = (there[:, None] + steps[:, None] * out[:, None] - low) / _GRID_MM
     value = map_coordinates(smooth, places.reshape(-1, 3).T, order=1).reshape(len(there), -1)
@@ -97,5 +87,5 @@ def _sliced(mesh: Mesh, thick_mm: float, phase: float, axis: np.ndarray) -> np.n
     best = away.argmin(1)
     row = np.arange(len(there))
     a, b = value[row, best], value[row, best + 1]
-    found = steps[best] + 0.25 * (a - 0.5) / np.maximum(a - b, 1e-6)
-    return np.where(np.isfinite(away.min(1)), found, 0.0)
+    shift = steps[best] + 0.25 * (a - 0.5) / np.maximum(a - b, 1e-6)
+    return np.where(np.isfinite(away.min(1)), shift, 0.0)

@@ -1,10 +1,10 @@
-"""An organ on the move through states that are solved already: a sequence costs what looking at it
-does, so there can be a thousand, with jumps and hands before it.
+"""An organ that moves through solved states: such a sequence costs only its rendering, so there can
+be thousands, with jumps and hands before it.
 
-Between the organ at rest and a solved state a share of the state's displacement counts, the rigid
-part by slerp: no equilibrium, but close to those of a growing load, with the volume kept to some
-per cent. From one state to another it goes through rest. Laid down elsewhere, the organ keeps its
-state, and sinks into no bed.
+Between rest and a solved state the displacement is scaled, the rigid part by slerp: not an
+equilibrium, but close to those of a growing load, with the volume kept to some per cent. One state
+leads to another through rest. An organ that is moved to another place keeps its state there, and
+does not sink into a bed.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ from tumortrack_lab.world.paths import Cover, LoadPath, Transform, turned
 from tumortrack_lab.world.scenes import World
 
 JUMPS = ("elsewhere", "by a hand", "turned over")
-AWAY_S = 1.0  # so long the organ is gone before it is laid back turned over
-FAR_MM = 1000.0  # where it is meanwhile
+AWAY_S = 1.0  # how long the organ is gone before it is put back turned over
+FAR_MM = 1000.0  # how far away it is meanwhile
 _LIFT_MM = 25.0  # of an organ that a hand turns over
 _LEAST_MM = 10.0  # of a jump: mean over the organ
 
@@ -38,7 +38,7 @@ Way = Callable[[float], Transform]
 
 
 class State(NamedTuple):
-    """A solved state: its rigid motion, and what that leaves at ``World.points``."""
+    """A solved state: its rigid motion, and the remaining displacement of ``World.points``."""
 
     name: str
     pose: Transform
@@ -46,7 +46,7 @@ class State(NamedTuple):
 
 
 def world_of(world: World, folder: Path) -> World:
-    """With the inner points of a folder's scenes, which may have been drawn otherwise."""
+    """The world with the inner points of a folder's scenes, which may differ."""
     inner = read_targets(list_scenes(folder)[0] / "targets.csv")
     return replace(world, targets=InnerPoints(inner.points_ct, inner.labels))
 
@@ -54,13 +54,13 @@ def world_of(world: World, folder: Path) -> World:
 def read_states(world: World, folder: Path) -> list[State]:
     """Of scenes of this case that `make world` made, with its very anatomy and no slit. Raises
     InputError: there is none, or they are another organ's."""
-    found, rest = [], world.points
+    states, rest = [], world.points
     for path in list_scenes(folder):
         meta = store.read_json(path / "meta.json")
         if meta.get("segmentation", {}).get("kind") != "none" or meta["family"] in ("rest", "cut"):
             continue
         pairs = zip(world.organ.anatomy.parts, read_anatomy(path).parts, strict=True)
-        vertices = [matched_vertices(part, seen) for part, seen in pairs]
+        vertices = [matched_vertices(part, moved) for part, moved in pairs]
         inner = read_targets(path / "targets.csv")
         if not np.array_equal(inner.points_ct, world.targets.points_ct):
             raise InputError(f"{path} has other inner points than the first scene of its folder.")
@@ -68,10 +68,10 @@ def read_states(world: World, folder: Path) -> list[State]:
         there = transform_points(np.linalg.inv(np.array(meta["camera_from_bench"])), there)
         pose = kabsch(rest, there, np.ones(len(rest)))
         bend = transform_points(np.linalg.inv(pose), there) - rest
-        found.append(State(path.name, pose, bend))
-    if not found:
+        states.append(State(path.name, pose, bend))
+    if not states:
         raise InputError(f"{folder} has no state that could be used; make some: make world.")
-    return found
+    return states
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,7 +92,7 @@ class StatePath(LoadPath):
 
 
 class _Events:
-    """What befalls an organ besides its elastic state, drawn one after the other."""
+    """An organ's motions and occlusions besides its elastic state, drawn one after the other."""
 
     def __init__(self, organ: Organ, rng: Generator) -> None:
         self._organ, self._rng = organ, rng
@@ -109,8 +109,8 @@ class _Events:
         self.bed = lambda time_s: rigid(np.eye(3), way * np.sin(np.pi * time_s / period_s) ** 2)
 
     def jump(self, kind: str, since_s: float) -> float:
-        """The organ lies elsewhere from one frame to the next, in the open or beneath a hand; or is
-        taken away and laid back turned over. When that has ended."""
+        """Move the organ to another place from one frame to the next, in the open or beneath a
+        hand; or take it away and put it back turned over. Returns when that has ended."""
         rng, before = self._rng, self._places[-1][1](np.inf)
         if kind == "turned over":
             away_s, since_s = since_s, since_s + AWAY_S
@@ -133,7 +133,8 @@ class _Events:
         return since_s + 0.5
 
     def turn(self, since_s: float) -> float:
-        """A hand lifts the organ, turns it about its length and lays it down. When it has gone."""
+        """A hand lifts the organ, turns it about its length and puts it down. Returns when the hand
+        has gone."""
         rng = self._rng
         turn_s, degrees = rng.uniform(1.2, 3.0), rng.uniform(60.0, 180.0) * rng.choice([-1.0, 1.0])
 
@@ -182,7 +183,7 @@ def _hidden(events: _Events, rng: Generator) -> tuple[list[float], list[float]]:
 
 
 def _random(events: _Events, rng: Generator) -> tuple[list[float], list[float]]:
-    """Three seconds of anything: a load comes and goes and another comes; breath, jumps, hands."""
+    """Three seconds of random events: two loads, breath, jumps, hands."""
     if rng.uniform() < 0.5:
         events.breathe()
     time_s, jumps = rng.uniform(0.2, 0.8), rng.choice(3, p=[0.35, 0.4, 0.25])

@@ -1,4 +1,4 @@
-"""What was judged in sequences, as tables."""
+"""Tables of the errors in sequences."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 
 from tumortrack.core import store
-from tumortrack_lab.study.document import table
+from tumortrack_lab.study.document import table_of
 from tumortrack_lab.world.paths import KINDS
 from tumortrack_lab.world.states import JUMPS
 
@@ -17,7 +17,7 @@ from tumortrack_lab.world.states import JUMPS
 # organs; largest displacement of the surface). Bounds lie half way.
 STATES = {"at rest": 1.5, "D1": 5.8, "D2": 8.8, "D3": np.inf}
 WRONG_MM, FAILED_MM = 3.0, 5.0  # a centre farther off must not be called good
-KEPT_S = 1.0  # a wrong state that lasts so long was kept
+KEPT_S = 1.0  # a wrong state that lasts longer counts as kept
 _AS_GOOD_MM = 0.5  # more than a first look at the same frame has
 _OPEN, _HIDDEN = 0.05, (0.3, 0.5)  # shares of the organ that something hides
 _FRAME = ["organ", "sequence", "time_s"]
@@ -33,7 +33,7 @@ WORDS = {
 
 
 def rows_in(out: Path) -> list[dict[str, Any]]:
-    """Of all sequences and methods that were judged in a folder."""
+    """Rows of all sequences and methods in a folder."""
     rows = []
     for path in sorted(out.glob("*-[0-9]*/*.json")):
         kept = store.read_json(path)
@@ -44,21 +44,21 @@ def rows_in(out: Path) -> list[dict[str, Any]]:
             phases, jumps = meta["phases_s"], [(-np.inf, "none"), *meta.get("jumps", [])]
             for row in kept["rows"]:
                 phase = np.interp(row["time_s"], phases, range(len(phases)))
-                since_s, jump = [one for one in jumps if one[0] <= row["time_s"] + 1e-6][-1]
+                since_s, jump = [event for event in jumps if event[0] <= row["time_s"] + 1e-6][-1]
                 rows.append({**about, **row, "phase": phase, "jump": jump, "since_s": since_s})
     return rows
 
 
 def tables(rows: pd.DataFrame) -> dict[str, pd.DataFrame]:
-    """Those of ``WORDS`` that there is anything to say in: medians over organs of the median over
-    frames or sequences, with the worst organ's."""
-    one = rows["method"].isin(["track", "first-look"])
-    also = rows.merge(rows.loc[~one, ["organ", "sequence"]].drop_duplicates())
+    """The tables of ``WORDS`` that are not empty: medians over organs of the median over frames or
+    sequences, with the worst organ's."""
+    single = rows["method"].isin(["track", "first-look"])
+    also = rows.merge(rows.loc[~single, ["organ", "sequence"]].drop_duplicates())
     frames = _frames(rows)
-    errors = [*_errors(rows[one], "all"), *_errors(also, "with three cameras")]
+    errors = [*_errors(rows[single], "all"), *_errors(also, "with three cameras")]
     jumps, hidden = (frames[frames["kind"] == kind] for kind in ("jump", "hidden"))
-    found = [errors, *_verdicts(frames), _jumps(jumps), _hiding(hidden)]
-    made = zip(WORDS, found, strict=True)
+    lists = [errors, *_verdicts(frames), _jumps(jumps), _hiding(hidden)]
+    made = zip(WORDS, lists, strict=True)
     return {name: pd.DataFrame(its).round(1).convert_dtypes() for name, its in made if its}
 
 
@@ -72,7 +72,7 @@ def overview(errors: pd.DataFrame) -> str:
     rows = errors[errors["sequences"] == "all"]
     keys, rows = ["state", "tumor", "organs", "frames"], rows.assign(off=rows.apply(off, axis=1))
     wide = rows.pivot_table("off", keys, "method", "first", sort=False).reset_index()
-    return table(list(wide), wide.astype(str).to_numpy().tolist(), 2)
+    return table_of(wide, 2)
 
 
 def _errors(rows: pd.DataFrame, sequences: str) -> list[dict[str, Any]]:
@@ -80,7 +80,7 @@ def _errors(rows: pd.DataFrame, sequences: str) -> list[dict[str, Any]]:
     rows = rows[rows["kind"].isin(KINDS)]
     state = np.array(list(STATES))[np.searchsorted(list(STATES.values()), rows["bend_mm"])]
     rows = rows.assign(state=pd.Categorical(state, list(STATES)))
-    found, methods = [], sorted(set(rows["method"]))
+    lines, methods = [], sorted(set(rows["method"]))
     for (severity, site), mine in rows.groupby(["state", "site"], observed=True):
         each = {method: mine[mine["method"] == method] for method in methods}
         first = each[methods[0]]
@@ -88,8 +88,8 @@ def _errors(rows: pd.DataFrame, sequences: str) -> list[dict[str, Any]]:
         about = {"sequences": sequences, "state": severity, "tumor": site}
         about |= {"organs": mine["organ"].nunique(), "frames": len(first)}
         for method, its in {"best rigid pose": rigid, **each}.items():
-            found.append({**about, "method": method, **_of_organs(its, _OFF)})
-    return found
+            lines.append({**about, "method": method, **_of_organs(its, _OFF)})
+    return lines
 
 
 def _frames(rows: pd.DataFrame) -> pd.DataFrame:
@@ -106,12 +106,12 @@ def _frames(rows: pd.DataFrame) -> pd.DataFrame:
 
 def _verdicts(frames: pd.DataFrame) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
     """By method and kind; and where a wrong state was called good for over a second."""
-    found, kept = [], []
+    lines, kept = [], []
     for (method, kind), mine in frames.groupby(["method", "kind"]):
         spans = []
-        for (organ, name), one in mine.groupby(["organ", "sequence"]):
-            times, its = one["time_s"].tolist(), one[one["wrong"]]
-            spans.append([longest_s(times, one[key].tolist()) for key in ("wrong", "failed")])
+        for (organ, name), sequence in mine.groupby(["organ", "sequence"]):
+            times, its = sequence["time_s"].tolist(), sequence[sequence["wrong"]]
+            spans.append([longest_s(times, sequence[key].tolist()) for key in ("wrong", "failed")])
             if spans[-1][0] > KEPT_S:
                 row = {"method": method, "organ": organ, "sequence": name}
                 row |= zip(["over 3 mm, s", "over 5 mm, s"], spans[-1], strict=True)
@@ -124,16 +124,16 @@ def _verdicts(frames: pd.DataFrame) -> tuple[list[dict[str, Any]], list[dict[str
         row["longest of these, s"] = max(span[0] for span in spans)
         for n, mm in enumerate((WRONG_MM, FAILED_MM)):
             row[f"over {mm:g} mm for over 1 s"] = sum(span[n] > KEPT_S for span in spans)
-        found.append(row)
-    return found, kept
+        lines.append(row)
+    return lines, kept
 
 
 def _jumps(frames: pd.DataFrame) -> list[dict[str, Any]]:
-    """How long after a jump the follower is worse than a first look at the same frames."""
+    """How long the follower is worse than a first look at the same frames after a jump."""
     both = {method: mine.set_index(_FRAME) for method, mine in frames.groupby("method")}
     if not {"track", "first-look"} <= set(both):
         return []
-    track, found = both["track"], []
+    track, lines = both["track"], []
     first = both["first-look"].reindex(track.index)
     near = track["center_mm"] <= first["center_mm"] + _AS_GOOD_MM
     track = track.assign(as_good=near | (first["quality"] == "none"), first=first["wrong"])
@@ -149,13 +149,13 @@ def _jumps(frames: pd.DataFrame) -> list[dict[str, Any]]:
             row |= {"frames until as good as a first look": np.median(counts), "worst": max(counts)}
             row["within three frames, %"] = 100 * np.mean(np.array(counts) <= 3)
             row |= {f"{wrong} until then": meanwhile, f"{wrong}: track": mine["wrong"].sum()}
-            found.append(row | {f"{wrong}: first-look": mine["first"].sum()})
+            lines.append(row | {f"{wrong}: first-look": mine["first"].sum()})
     row = {
         "jump": "organ gone",
         "frames": gone.sum(),
         f"{wrong}: track": track[gone]["wrong"].sum(),
     }
-    return [*found, row] if gone.any() else found
+    return [*lines, row] if gone.any() else lines
 
 
 def _hiding(frames: pd.DataFrame) -> list[dict[str, Any]]:
@@ -163,19 +163,17 @@ def _hiding(frames: pd.DataFrame) -> list[dict[str, Any]]:
     rows, times = [], "hidden / open"
     for method, mine in frames.groupby("method"):
         ratios = []
-        for (organ, _), one in mine.groupby(["organ", "sequence"]):
-            behind = one[one["hidden_share"].between(*_HIDDEN)]["targets_mm"].median()
-            bare = one[one["hidden_share"] < _OPEN]["targets_mm"].median()
+        for (organ, _), sequence in mine.groupby(["organ", "sequence"]):
+            behind = sequence[sequence["hidden_share"].between(*_HIDDEN)]["targets_mm"].median()
+            bare = sequence[sequence["hidden_share"] < _OPEN]["targets_mm"].median()
             ratios.append((organ, bare, behind, behind / bare))
         of = ["targets when open, mm", "targets when hidden, mm", times]
-        found = pd.DataFrame(ratios, columns=["organ", *of])
+        each = pd.DataFrame(ratios, columns=["organ", *of])
         behind = mine[mine["hidden_share"].between(*_HIDDEN)]
-        row = {
-            "method": method,
-            "sequences": len(found),
-            **_of_organs(found, dict(zip(of, of, strict=True))),
-        }
-        row |= {f"{times}, worst sequence": found[times].max(), **_shares(behind, "good", "none")}
+        row = {"method": method, "sequences": len(each)}
+        row |= _of_organs(each, dict(zip(of, of, strict=True)))
+        row[f"{times}, worst sequence"] = each[times].max()
+        row |= _shares(behind, "good", "none")
         rows.append(row | {"good and over 3 mm": behind["wrong"].sum(), "frames": len(behind)})
     return rows
 
@@ -197,8 +195,8 @@ def _shares(frames: pd.DataFrame, *qualities: str) -> dict[str, float]:
 
 def _of_organs(rows: pd.DataFrame, columns: dict[str, str]) -> dict[str, float]:
     """Of each column, under its name: median and largest of the organs' medians."""
-    found: dict[str, float] = {}
+    spread: dict[str, float] = {}
     for name, key in columns.items():
         medians = rows.groupby("organ")[key].median()
-        found |= {name: medians.median(), f"{name}, worst organ": medians.max()}
-    return found
+        spread |= {name: medians.median(), f"{name}, worst organ": medians.max()}
+    return spread

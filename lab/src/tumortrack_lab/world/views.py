@@ -1,5 +1,5 @@
-"""What the camera sees of a state: the organ among fat, drape, hands and instruments, through the
-noise of ``noise``; the organ's points as the live path finds them; and what disturbs a scene.
+"""A camera's view of a state: the organ among fat, drape, hands and instruments, with the noise of
+``noise``; and the organ's points as the live path finds them.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from tumortrack.sense.cloud import CloudConfig
 from tumortrack.sense.region import Hints, RegionConfig, organ_points
 from tumortrack.sense.render import render_depth
 from tumortrack_lab.twin.equilibrium import Rod
-from tumortrack_lab.twin.occluders import rod_mesh
+from tumortrack_lab.twin.occluders import ellipsoid, rod_mesh
 from tumortrack_lab.world.families import Deformed, log_uniform
 from tumortrack_lab.world.noise import StereoCamera, StereoConfig
 
@@ -33,9 +33,9 @@ Transform = Float64[np.ndarray, "4 4"]
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """A frame as measured, and what is known of it. ``hidden_share``: of what would be seen of the
-    organ in its bed, in the picture, without hand or instruments; ``visible_share``: of the
-    organ's whole picture, what has a return."""
+    """A measured frame, and data about it. ``hidden_share``: the share of the organ's visible
+    pixels that hand or instruments hide; ``visible_share``: of the whole organ's pixels, in or
+    outside the image, the share with a return."""
 
     frame: DepthFrame
     camera_from_bench: Transform
@@ -45,8 +45,8 @@ class View:
 def look(
     state: Deformed, organ: Mesh, hidden: float, rng: Generator, beside: tuple[Mesh, ...] = ()
 ) -> View:
-    """One random view of the state's true surface (bench frame), and of what else lies there.
-    ``hidden``: the share of the organ's picture that a hand or instruments hide."""
+    """One random view of the state's true surface (bench frame) and of other objects. ``hidden``:
+    the share of the organ's pixels that a hand or instruments hide."""
     camera = d405(*SIZE_PX)
     to_camera, about = _camera_pose(organ, rng)
     alone = _organ_depth(state, organ, to_camera, camera)
@@ -57,7 +57,7 @@ def look(
     if hidden > 0 and own.any():
         at, share, about["occluder"] = covering(alone, own, camera, hidden, rng)
         scene = np.fmin(scene, render(at(share), np.eye(4), camera))
-    seen = own & (alone <= scene)
+    visible = own & (alone <= scene)
     scene[scene > FAR_MM] = np.nan
     sensor = StereoConfig(subpixel_px=rng.uniform(0.03, 0.12), gloss_degrees=rng.uniform(2.0, 7.0))
     frame = StereoCamera(camera, sensor, rng).see(scene.astype(np.float32))
@@ -68,8 +68,8 @@ def look(
     every = max(int(np.isfinite(render(organ, to_camera, wide)).sum()), 1)
     about |= {
         "hidden_wanted": hidden,
-        "hidden_share": 1 - float(seen.sum() / max(own.sum(), 1)),
-        "visible_share": float((seen & np.isfinite(frame.depth_mm)).sum() / every),
+        "hidden_share": 1 - float(visible.sum() / max(own.sum(), 1)),
+        "visible_share": float((visible & np.isfinite(frame.depth_mm)).sum() / every),
         "subpixel_px": sensor.subpixel_px,
         "gloss_degrees": sensor.gloss_degrees,
     }
@@ -92,8 +92,8 @@ def organ_cloud(view: View, organ: Mesh, rng: Generator) -> tuple[SensorCloud, f
 
 
 def _camera_pose(organ: Mesh, rng: Generator) -> tuple[Transform, dict[str, Any]]:
-    """From a random direction above, turned about its axis at random, the organ about in the
-    picture's middle."""
+    """From a random direction above, turned at random about its axis, the organ near the image's
+    middle."""
     tilt = min(abs(rng.normal(0, 25.0)), _MOST_TILT)
     turn, roll = rng.uniform(0, 2 * np.pi, 2)
     near = log_uniform(rng, *_NEAR_MM)
@@ -104,7 +104,7 @@ def _camera_pose(organ: Mesh, rng: Generator) -> tuple[Transform, dict[str, Any]
 
 
 def direction(tilt_degrees: float, turn: float) -> np.ndarray:
-    """A unit vector so far from straight up."""
+    """A unit vector at this angle from straight up."""
     lean = np.deg2rad(tilt_degrees)
     return np.array([np.sin(lean) * np.cos(turn), np.sin(lean) * np.sin(turn), np.cos(lean)])
 
@@ -117,7 +117,7 @@ def facing(back: np.ndarray, roll: float) -> np.ndarray:
 
 
 def pose_before(organ: Mesh, rotation: np.ndarray, nearest_mm: float) -> Transform:
-    """The pose of a camera so turned, with the organ in the middle of its picture."""
+    """The pose of a camera with this rotation, with the organ in the middle of its image."""
     there = organ.vertices_mm @ rotation.T
     return rigid(rotation, np.array([*-there[:, :2].mean(0), nearest_mm - there[:, 2].min()]))
 
@@ -131,7 +131,7 @@ def render(mesh: Mesh, to_camera: Transform, camera: Intrinsics) -> np.ndarray:
 def _organ_depth(
     state: Deformed, organ: Mesh, to_camera: Transform, camera: Intrinsics
 ) -> np.ndarray:
-    """Of a slit organ: with the slit's walls, instead of the film that triangles span over it."""
+    """Of a slit organ: with the slit's walls instead of the triangles that span it."""
     film = render(organ, to_camera, camera)
     if state.wound is None:
         return film
@@ -175,25 +175,18 @@ def _beside(organ: Mesh, rng: Generator) -> list[Mesh]:
         place[2] = low[2] + rng.uniform(0.2, 0.6) * (high[2] - low[2])
         if rng.uniform() < 0.5:
             half = rng.uniform([8.0, 8.0, 4.0], [25.0, 25.0, 14.0])
-            things.append(lump(place, half))
+            things.append(ellipsoid(place, half))
         else:
             axis = unit(np.cross(way, [0, 0, 1.0]) + 0.4 * way + rng.normal(0, 0.2, 3))
             things.append(rod_mesh(Rod(place - 60 * axis, axis, rng.uniform(2.5, 6.0), 160.0)))
     return things
 
 
-def lump(middle_mm: np.ndarray, half_mm: np.ndarray) -> Mesh:
-    import trimesh
-
-    ball = trimesh.creation.icosphere(3)
-    return Mesh(ball.vertices * half_mm + middle_mm, ball.faces)
-
-
 def covering(
     organ: np.ndarray, own: np.ndarray, camera: Intrinsics, hidden: float, rng: Generator
 ) -> tuple[Callable[[float], Mesh], float, str]:
-    """A hand or instruments that come in from a side (camera frame), by how far; where they hide
-    this share of what is seen of the organ; and which of them."""
+    """A hand or instruments that come in from a side (camera frame), as a function of how far; how
+    far they hide the share ``hidden`` of the visible organ; and which of them."""
     kind, angle = str(rng.choice(["hand", "instruments"])), rng.uniform(0, 2 * np.pi)
     back = np.array([np.cos(angle), np.sin(angle), 0.0])  # where they come from
     side = np.array([-back[1], back[0], 0.0])
@@ -244,10 +237,7 @@ def _joined(rods: list[Rod]) -> Mesh:
     """Of rods in local coordinates: ``rod_mesh`` ends what reaches behind a camera at z = 0."""
     away = np.array([0.0, 0.0, 1000.0])
     meshes = [rod_mesh(replace(rod, tip_mm=rod.tip_mm + away)) for rod in rods]
-    return joined([Mesh(mesh.vertices_mm - away, mesh.faces) for mesh in meshes])
-
-
-def joined(meshes: list[Mesh]) -> Mesh:
     starts = np.cumsum([0, *(len(mesh.vertices_mm) for mesh in meshes)])
     faces = [mesh.faces + start for mesh, start in zip(meshes, starts, strict=False)]
-    return Mesh(np.concatenate([mesh.vertices_mm for mesh in meshes]), np.concatenate(faces))
+    vertices = np.concatenate([mesh.vertices_mm - away for mesh in meshes])
+    return Mesh(vertices, np.concatenate(faces))
