@@ -12,11 +12,6 @@ import torch
 from clock import Clock
 from stories import tumortrack
 from tumortrack.core.errors import InputError, TumortrackError
-from tumortrack.occupancy.config import MlpDecoderConfig, NetworkConfig
-from tumortrack.occupancy.encoders.pointnet2 import PointNet2Config, SetAbstraction
-from tumortrack.occupancy.network import OccupancyNetwork
-from tumortrack.occupancy.normalisation import CloudBox
-from tumortrack.occupancy.presets import quick_network
 from tumortrack_lab.bench import rows as interleaving
 from tumortrack_lab.bench import run as running
 from tumortrack_lab.bench import subject as subject_module
@@ -35,6 +30,11 @@ from tumortrack_lab.bench.run import GROUPS, Task, TaskMessage, carry_out, tasks
 from tumortrack_lab.bench.subject import BenchSubject
 from tumortrack_lab.cli.bench import Bench
 from tumortrack_lab.study.document import closing, opening
+from tumortrack_occupancy.config import MlpDecoderConfig, NetworkConfig
+from tumortrack_occupancy.encoders.pointnet2 import PointNet2Config, SetAbstraction
+from tumortrack_occupancy.network import OccupancyNetwork
+from tumortrack_occupancy.normalisation import CloudBox
+from tumortrack_occupancy.presets import quick_network
 
 
 def timing(median_s: float) -> InterleavedTiming:

@@ -29,11 +29,12 @@ class Command(Protocol):
 _MODULES = {  # of ours, in the order of --help; only the chosen one is imported
     "demo": "demo", "prepare": "cases", "export": "cases", "train": "training",
     "locate": "locate", "track": "track", "simulate": "cases",
-    "evaluate": "evaluate", "compile": "models", "onnx": "models",
+    "evaluate": "evaluate", "compile": "models",
     "inspect": "inspection", "doctor": "doctor",
 }  # fmt: skip
 # Whose they are: where that is not installed, they are no typing errors.
 _OF_OTHERS = {
+    "onnx": "tumortrack-occupancy",
     **dict.fromkeys(("plan", "resect"), "tumortrack-resection"),
     **dict.fromkeys(("twin", "bench", "fleet", "margins"), "tumortrack-lab"),
     **dict.fromkeys(("phantom-kit", "calibrate", "record", "reference"), "tumortrack-experiment"),

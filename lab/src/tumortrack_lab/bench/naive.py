@@ -20,10 +20,11 @@ from scipy.ndimage import map_coordinates
 from torch import Tensor
 from torch.nn import functional
 
-from tumortrack.occupancy.config import MlpDecoderConfig
-from tumortrack.occupancy.encoders.pointnet2 import PointNet2Config
-from tumortrack.occupancy.network import Latent, OccupancyNetwork, octave_features
-from tumortrack.occupancy.normalisation import (
+from tumortrack.simulate.elastic.body import ElasticBody
+from tumortrack_occupancy.config import MlpDecoderConfig
+from tumortrack_occupancy.encoders.pointnet2 import PointNet2Config
+from tumortrack_occupancy.network import Latent, OccupancyNetwork, octave_features
+from tumortrack_occupancy.normalisation import (
     Aligned,
     CloudBox,
     alignment,
@@ -31,7 +32,6 @@ from tumortrack.occupancy.normalisation import (
     turned,
     without_strays,
 )
-from tumortrack.simulate.elastic.body import ElasticBody
 
 FLOW_STEPS = 12
 

@@ -13,14 +13,14 @@ from tumortrack.core.estimate import FollowOptions
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import SensorCloud
 from tumortrack.models.report import grid_over
-from tumortrack.occupancy.inference import Inference
-from tumortrack.occupancy.locator import steps_over
-from tumortrack.occupancy.model import OccupancyModel
-from tumortrack.occupancy.sparse import organ_lattice, sparse_logits, sparse_margins
 from tumortrack.tracking.tracker import Tracker
 from tumortrack_lab.bench import rows
 from tumortrack_lab.bench.naive import NaiveOccupancy
 from tumortrack_lab.bench.rows import Call, InterleavedTiming, Workload
+from tumortrack_occupancy.inference import Inference
+from tumortrack_occupancy.locator import steps_over
+from tumortrack_occupancy.model import OccupancyModel
+from tumortrack_occupancy.sparse import organ_lattice, sparse_logits, sparse_margins
 
 QUERIES = 40_000  # of a frame
 IN_ONE_PIECE = 40_000  # queries of the naive form: of more the latent's copies fill the memory

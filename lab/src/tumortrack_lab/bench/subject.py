@@ -24,22 +24,28 @@ from tumortrack.imaging.surface import surfaces
 from tumortrack.models.folder import save_model
 from tumortrack.models.in_distribution import InDistributionRange
 from tumortrack.models.model import Model
-from tumortrack.occupancy.hardware import has_fast_bfloat16
-from tumortrack.occupancy.model import OccupancyModel
-from tumortrack.occupancy.network import OccupancyNetwork
-from tumortrack.occupancy.presets import paper
 from tumortrack.phantom.digital import PhantomParameters, phantom_labels
 from tumortrack.registration.build import build_model
 from tumortrack.registration.model import RegistrationModel
 from tumortrack.registration.presets import clinic
 from tumortrack.sense.cloud import thin_cloud
 from tumortrack.simulate.deform import DragConfig
-from tumortrack.simulate.occupancy import OccupancyConfig, OccupancyPool
-from tumortrack.simulate.scene import RenderedScene, SceneConfig, SceneRecipe, Simulator
+from tumortrack.simulate.scene import (
+    OccupancyConfig,
+    RenderedScene,
+    SceneConfig,
+    SceneRecipe,
+    Simulator,
+)
 from tumortrack.tracking.model_files import load_model
 from tumortrack_lab.bench.occupancy import OccupancyForms
 from tumortrack_lab.bench.registration import RegistrationForms
 from tumortrack_lab.bench.rows import PRESETS, Workload
+from tumortrack_occupancy.hardware import has_fast_bfloat16
+from tumortrack_occupancy.model import OccupancyModel
+from tumortrack_occupancy.network import OccupancyNetwork
+from tumortrack_occupancy.presets import paper
+from tumortrack_occupancy.training.query_points import OccupancyPool
 
 _PER_SIDE = 600  # points in and outside of each part in a step
 _RATE = 1.5e-3

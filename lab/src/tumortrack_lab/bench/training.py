@@ -12,13 +12,14 @@ from typing import Literal
 import torch
 from msgspec.structs import replace
 
-from tumortrack.occupancy.model import OccupancyModel
-from tumortrack.occupancy.presets import paper, quick
-from tumortrack.occupancy.training.train import TrainingRun, TrainingStatus, train
+from tumortrack.models.method import TrainingStatus
 from tumortrack.tracking.model_files import load_model
 from tumortrack_lab.bench.occupancy import OccupancyForms
 from tumortrack_lab.bench.rows import TRAINING, Workload, timing_of
 from tumortrack_lab.bench.subject import SEED, UP, BenchSubject
+from tumortrack_occupancy.model import OccupancyModel
+from tumortrack_occupancy.presets import paper, quick
+from tumortrack_occupancy.training.train import TrainingRun, train
 
 _TRAINED = {"quick": quick, "paper": paper}
 
