@@ -1,4 +1,4 @@
-"""Model folders: what both methods write and read."""
+"""Model folders: what all methods write and read."""
 
 from __future__ import annotations
 
