@@ -67,6 +67,7 @@ class TrainingStatus:
     warming_up: bool = False  # the learning rate still rises: hardly anything is learnt so far
 
 
+@runtime_checkable
 class Method(Protocol):
     """A method: its presets, its models, how they are trained and how they locate."""
 
