@@ -69,13 +69,13 @@ def test_the_papers_method_names_its_package_in_one_line(hidden, phantom_case, t
     assert not (tmp_path / "model").exists()
 
 
-def test_a_model_of_another_method_names_its_package(clinic_model, tmp_path):
-    manifest = store.read_json(clinic_model / store.MANIFEST)
+def test_a_model_of_another_method_names_its_package(slim_model, tmp_path):
+    manifest = store.read_json(slim_model / store.MANIFEST)
     del manifest["files"]["shape.safetensors"]
-    shutil.copytree(clinic_model, tmp_path / "model")
+    shutil.copytree(slim_model, tmp_path / "model")
     store.write_json(tmp_path / "model" / store.MANIFEST, manifest)
-    locate = ("locate", tmp_path / "model", "cloud.ply", tmp_path / "run")
-    assert "tumortrack-occupancy" in refusal(without_pytorch(COMMAND, *locate))
+    refused = refusal(without_pytorch(COMMAND, "compile", tmp_path / "model"))
+    assert "pip install tumortrack-occupancy" in refused
 
 
 @pytest.mark.slow
