@@ -1,7 +1,7 @@
 """Locate the organ and its tumors in what a depth camera sees. Nothing has to be trained.
 
 Run after 01: python examples/03_locate.py [FOLDER] [STEPS]
-The paper's method is trained for STEPS steps instead, with `pip install 'tumortrack[occupancy]'`;
+The paper's method is trained for STEPS steps instead, with `pip install tumortrack-occupancy`;
 a few show that it works, and some thousands give a model worth using.
 """
 

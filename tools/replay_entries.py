@@ -22,22 +22,22 @@ from tumortrack.core.types import SensorCloud
 from tumortrack.imaging.case import Case, load_case, save_case
 from tumortrack.imaging.surface import surfaces
 from tumortrack.live.sources.virtual import VirtualSourceConfig
-from tumortrack.occupancy.inference import Inference
-from tumortrack.occupancy.presets import paper as paper_config
-from tumortrack.occupancy.presets import quick as quick_config
-from tumortrack.occupancy.training.task import OccupancyTask
-from tumortrack.occupancy.training.train import TrainingRun, train
 from tumortrack.phantom.digital import PhantomParameters, phantom_labels
 from tumortrack.sense.cloud import CloudConfig
 from tumortrack.sense.files import read_cloud
 from tumortrack.sense.region import Hints, RegionConfig, organ_points
-from tumortrack.simulate.scene import SceneStream
 from tumortrack.simulate.scene_folder import draw_targets
 from tumortrack.tracking.files import report_entry
 from tumortrack.tracking.model_files import load_model
 from tumortrack.tracking.tracker import Follower, FollowerConfig, Tracker
 from tumortrack_lab.twin.dataset import StateCache, TwinRun
 from tumortrack_lab.twin.views import VIEWS, ViewConfig, make_scene
+from tumortrack_occupancy.inference import Inference
+from tumortrack_occupancy.presets import paper as paper_config
+from tumortrack_occupancy.presets import quick as quick_config
+from tumortrack_occupancy.training.stream import SceneStream
+from tumortrack_occupancy.training.task import OccupancyTask
+from tumortrack_occupancy.training.train import TrainingRun, train
 
 Entries = Iterable[tuple[str, object]]
 COMMANDS = (

@@ -10,6 +10,7 @@ from __future__ import annotations
 import logging
 import warnings
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -35,10 +36,8 @@ from tumortrack.tracking.options import (
 if TYPE_CHECKING:
     from tumortrack.live.session import Arms, Session
     from tumortrack.live.values import TrackingResult
-    from tumortrack.models.model import Model
-    from tumortrack.occupancy.config import TrainConfig
-    from tumortrack.occupancy.training.train import TrainingStatus
-    from tumortrack.registration.config import RegistrationConfig
+    from tumortrack.models.method import TrainingStatus
+    from tumortrack.models.model import Model, ModelConfig
     from tumortrack.report.locating import Located
     from tumortrack.sense.region.tissue import TissueClassifier
     from tumortrack.simulate.scene_folder import Scene
@@ -227,56 +226,76 @@ def export(case: StrPath, folder: StrPath, **options: Any) -> tuple[str, ...]:
 
 
 def train(
-    case: StrPath,
+    case: StrPath | Case,
     folder: StrPath,
     *,
     preset: Literal["clinic", "quick", "paper"] = "clinic",
-    config: TrainConfig | RegistrationConfig | None = None,
+    config: ModelConfig | None = None,
+    rotations: Literal["limited", "full"] | None = None,
+    sensor: Literal["d405", "stereo"] | None = None,
     minutes: float | None = None,
     steps: int | None = None,
     seed: int = 0,
     device: Device = "auto",
     workers: int | None = None,
+    checkpoint_every_s: float = 30.0,
     report: Callable[[TrainingStatus], None] | None = None,
+    progress: Callable[[int, int], None] | None = None,
 ) -> Model:
     """A model of its own folder. The default preset, ``clinic``, has nothing to learn: a case holds
     its model. For ``quick`` and ``paper`` the same call resumes after Ctrl-C or a crash.
 
     Args:
-        case: folder that ``prepare`` wrote.
+        case: or the folder that ``prepare`` wrote.
         folder: the model's, to write.
         preset: ``clinic`` registers the organ of the CT, ``quick`` and ``paper`` label points.
         config: a changed preset instead: ``msgspec.structs.replace(presets.quick(anatomy), ...)``.
+        rotations: of the preset: how the organ may lie (default: as the case says; ``quick`` and
+            ``paper``: limited).
+        sensor: of the preset: whose errors the scenes have (default: as the case says).
         minutes: of training, from the end of its first step (default: to the preset's end).
         steps: likewise; give at most one of the two.
         workers: processes that make scenes (default: as the machine allows).
-        report: called every few seconds.
+        checkpoint_every_s: a crash loses at most the steps since.
+        report: of a training: called every few seconds.
+        progress: of making a model that learns nothing: steps done, of how many.
 
     Raises:
         InputError: an option is not allowed, a part is too small to be learnt.
-        PackageError: ``quick`` and ``paper``, without PyTorch.
+        PackageError: ``quick`` and ``paper``, without tumortrack-occupancy.
         InputError, ArtifactError: no case, or ``folder`` holds another model or run.
         StorageError: the disk is full; the last checkpoint is whole.
     """
+    from tumortrack.models.folder import check_trainable
+    from tumortrack.models.method import TrainOptions, method_of_config, method_of_preset
     from tumortrack.registration.config import RegistrationConfig
     from tumortrack.tracking.model_files import write_model
-    from tumortrack.tracking.presets import PRESETS, occupancy
+    from tumortrack.tracking.presets import PRESETS, seen_by
 
     if minutes is not None and steps is not None:
         raise InputError("minutes and steps both say when to stop; give one of them.")
     if preset not in PRESETS:
         raise InputError(f"there is no preset {preset!r}; allowed: {', '.join(PRESETS)}.")
-    of = load_case(case)
+    if config is not None and (rotations or sensor):
+        raise InputError("rotations and sensor are a preset's; a configuration says them itself.")
+    known = case if isinstance(case, Case) else load_case(case)
+    check_trainable(Path(folder))
     if isinstance(config, RegistrationConfig) or (config is None and preset == "clinic"):
-        return write_model(of, Path(folder), config, seed)
-    training = occupancy("training.train")
-    run = training.TrainingRun(
-        anatomy_ct=of.anatomy, up_lps=of.up_lps, case_sha256=of.sha256,
-        config=config or PRESETS[preset](of.anatomy, "limited"), patient=of.patient,
+        known = replace(
+            known, rotations=rotations or known.rotations, sensor=sensor or known.sensor
+        )
+        return write_model(known, Path(folder), config, seed, progress)
+    if config is None:
+        method = method_of_preset(preset)
+        config = PRESETS[preset](known.anatomy, rotations or "limited")
+        config = seen_by(config, sensor or known.sensor)
+    else:
+        method = method_of_config(config)
+    options = TrainOptions(
         seed=seed, steps=steps, minutes=minutes, device=device, workers=workers,
+        checkpoint_every_s=checkpoint_every_s,
     )  # fmt: skip
-    made: Model = training.train(run, Path(folder), report or (lambda status: None))
-    return made
+    return method.train(known, Path(folder), config, options, report or (lambda status: None))
 
 
 def load_model(folder: StrPath, device: Device = "auto") -> Model:
@@ -286,7 +305,7 @@ def load_model(folder: StrPath, device: Device = "auto") -> Model:
     Raises:
         ArtifactError: missing, unfinished, of another schema, damaged or changed.
         InputError: CUDA was asked for and is not available.
-        PackageError: it has a network, and PyTorch is not installed.
+        PackageError: the method that made it is not installed.
     """
     from tumortrack.tracking import model_files
 
@@ -450,8 +469,6 @@ def estimate_from_surfaces(surfaces: Mapping[str, Mesh], grid: int = 160) -> Est
     includes its tumors. They are taken as right: nothing judges them. ``grid``: voxels along the
     longest side of the labelled volume.
     """
-    from dataclasses import replace
-
     from tumortrack.models.report import estimate_of
 
     return replace(estimate_of(dict(surfaces), grid), finding=None)

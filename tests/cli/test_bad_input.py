@@ -199,16 +199,16 @@ def test_an_unreadable_input_is_named_and_no_folder_stays(tmp_path, monkeypatch)
 @pytest.mark.parametrize(
     "arguments", [["demo", "--preset", "quick"], ["train", "--preset", "paper"]]
 )
-def test_without_pytorch_the_papers_method_names_its_extra(
+def test_the_papers_method_names_its_package_where_it_is_not_installed(
     arguments, phantom_case, tmp_path, monkeypatch, capsys
 ):
-    monkeypatch.setattr("tumortrack.tracking.presets.find_spec", lambda name: None)
+    monkeypatch.setattr("tumortrack.models.method.entry_points", lambda group: [])
     out = str(tmp_path / "out")
     places = ["--out", out] if arguments[0] == "demo" else [str(phantom_case), out]
     assert run([*arguments, *places]) == 2
     said = capsys.readouterr()
     assert said.err.count("\n") == 1
-    assert "pip install 'tumortrack[occupancy]'" in said.err
+    assert "pip install tumortrack-occupancy" in said.err
     assert said.out == ""
     assert list(tmp_path.iterdir()) == []
 

@@ -9,23 +9,10 @@ from importlib.metadata import EntryPoint
 import numpy as np
 import pytest
 
-from stories import COMMAND, cloud_by_rays, environment, looking_down
+from stories import cloud_by_rays, looking_down, with_imports
 from tumortrack.cli import main
 from tumortrack.imaging.case import load_case
 from tumortrack.sense.ply import write_cloud_ply
-
-
-def answered(
-    *arguments: object, run: list[str] = COMMAND[1:]
-) -> tuple[subprocess.CompletedProcess[str], set[str]]:
-    """A command's end, and every module that it imported."""
-    words = [sys.executable, "-X", "importtime", *run, *map(str, arguments)]
-    buffered = {name: is_ for name, is_ in environment().items() if name != "PYTHONUNBUFFERED"}
-    done = subprocess.run(words, capture_output=True, text=True, timeout=300, env=buffered)
-    rows = [line.split("|") for line in done.stderr.splitlines() if line.startswith("import time:")]
-    imported = {row[-1].strip() for row in rows}
-    assert "tyro" in imported
-    return done, imported
 
 
 @pytest.fixture
@@ -48,9 +35,6 @@ def cloud(tmp_path, phantom_case):
         ("locate MODEL CASE OUT", "CASE is a folder. Give a cloud in it"),
         ("evaluate MODEL NONE OUT", "NONE"),
         ("train NONE OUT", "NONE is not a tumortrack case"),
-        ("onnx NONE OUT.onnx", "NONE is not a tumortrack model"),
-        ("onnx MODEL OUT.onnx", "MODEL has no network"),
-        ("onnx CASE OUT.onnx", "CASE has no network"),
     ],
 )
 def test_what_is_wrong_is_said_before_pytorch_is_loaded(
@@ -60,19 +44,11 @@ def test_what_is_wrong_is_said_before_pytorch_is_loaded(
     places |= {"CLOUD": cloud, "OUT": tmp_path / "out"}
     for name, place in places.items():
         command, wrong = (text.replace(name, str(place)) for text in (command, wrong))
-    done, imported = answered(*command.split())
+    done, imported = with_imports(*command.split())
     assert done.returncode == 2, done.stderr
     assert wrong in done.stderr
     assert "torch" not in imported
     assert not (tmp_path / "out").exists()
-
-
-def test_a_missing_package_is_told_before_pytorch_is_loaded(quick_model, tmp_path):
-    without = "import sys; sys.modules['onnx'] = None; from tumortrack.cli.main import main; main()"
-    done, imported = answered("onnx", quick_model, tmp_path / "out.onnx", run=["-c", without])
-    assert done.returncode == 2, done.stderr
-    assert "pip install 'tumortrack[onnx]'" in done.stderr
-    assert "torch" not in imported
 
 
 def test_an_answer_needs_none_of_the_slow_libraries(slim_model, tmp_path):
@@ -81,7 +57,7 @@ def test_an_answer_needs_none_of_the_slow_libraries(slim_model, tmp_path):
     surface = placed(3).carry(placed(3).shape.anatomy_ct.organ.vertices_mm)
     file = tmp_path / "cloud.ply"
     write_cloud_ply(file, surface[surface[:, 2] < np.median(surface[:, 2])].astype(np.float32))
-    done, imported = answered("locate", slim_model, file, tmp_path / "out", "--grid", 32)
+    done, imported = with_imports("locate", slim_model, file, tmp_path / "out", "--grid", 32)
     assert done.returncode in (0, 4), done.stderr[-2000:]
     assert (tmp_path / "out" / "labels.nii.gz").exists()
     assert "written to" in done.stdout.splitlines()[-1]  # though the process ends at once

@@ -73,12 +73,13 @@ def test_commands_and_an_example_run_from_the_wheel(environment, tmp_path):
     assert run(*command, "--version", env=clean) == f"tumortrack {version('tumortrack')}\n"
     said = run(*command, "doctor", env=clean)
     assert re.search(r"ok       tumortrack: .* numba \d", said)
-    assert re.search(r"ok       tumortrack\[occupancy\]: .* torch \d", said)
+    assert re.search(r"absent   tumortrack-occupancy: the paper's method", said)
     assert "BROKEN" not in said
     listed = run(*command, "--help", env=clean)
     assert "locate" in listed
     assert "twin" not in listed  # the laboratory's
     for name, package in (
+        ("onnx", "tumortrack-occupancy"),
         ("plan", "tumortrack-resection"),
         ("twin", "tumortrack-lab"),
         ("margins", "tumortrack-lab"),
@@ -101,7 +102,7 @@ def test_the_wheel_holds_the_package_alone(wheel):
     assert any(name.endswith("LICENSE") for name in names)
 
 
-@pytest.mark.parametrize("folder", [".", "resection", "experiment", "lab"])
+@pytest.mark.parametrize("folder", [".", "occupancy", "resection", "experiment", "lab"])
 def test_a_description_holds_on_pypi_where_links_into_the_repository_lead_nowhere(folder):
     project = tomllib.loads((ROOT / folder / "pyproject.toml").read_text())["project"]
     text = (ROOT / folder / project["readme"]).read_text()

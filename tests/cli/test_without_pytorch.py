@@ -1,13 +1,15 @@
-"""The default method where PyTorch is not installed."""
+"""The tracker where neither the paper's method nor PyTorch is installed."""
 
 from __future__ import annotations
 
+import shutil
 import subprocess
 import sys
 
 import pytest
 
 from stories import answered, cloud_by_rays, environment, looking_down, refusal, succeeded
+from tumortrack.core import store
 from tumortrack.imaging.case import load_case
 from tumortrack.sense.ply import write_cloud_ply
 
@@ -15,40 +17,65 @@ WITHOUT = """
 import sys
 from importlib.machinery import PathFinder
 
-class WithoutTorch(PathFinder):
+HIDDEN = {hidden}
+
+class Without(PathFinder):
     @classmethod
     def find_spec(cls, name, *place):
-        return None if name == "torch" else super().find_spec(name, *place)
+        return None if name in HIDDEN else super().find_spec(name, *place)
 
-sys.meta_path[sys.meta_path.index(PathFinder)] = WithoutTorch
+    @classmethod
+    def find_distributions(cls, *context):
+        for found in super().find_distributions(*context):
+            if (found.name or "").replace("-", "_") not in HIDDEN:
+                yield found
+
+sys.meta_path[sys.meta_path.index(PathFinder)] = Without
 """
+PAPERS = "torch", "tumortrack_occupancy"
 COMMAND = "from tumortrack.cli.main import main; main()"
 EVERYTHING = """
 import pkgutil
+import sys
 from importlib import import_module
 import tumortrack as tt
 
 for name in tt.__all__:
     getattr(tt, name)
 for module in pkgutil.walk_packages(tt.__path__, "tumortrack.", onerror=print):
-    if "occupancy" not in module.name and not module.name.endswith("__main__"):
+    if not module.name.endswith("__main__"):
         import_module(module.name)
+assert "torch" not in sys.modules
 """
 
 
-def without_pytorch(program: str, *arguments: object) -> subprocess.CompletedProcess[str]:
-    words = [sys.executable, "-c", WITHOUT + program, *map(str, arguments)]
+def without_pytorch(
+    program: str, *arguments: object, hidden: tuple[str, ...] = PAPERS
+) -> subprocess.CompletedProcess[str]:
+    code = WITHOUT.format(hidden=hidden) + program
+    words = [sys.executable, "-c", code, *map(str, arguments)]
     return subprocess.run(words, capture_output=True, text=True, timeout=600, env=environment())
 
 
-def test_everything_but_the_papers_method_can_be_imported():
+def test_every_module_can_be_imported():
     succeeded(without_pytorch(EVERYTHING))
 
 
-def test_the_papers_method_names_its_extra_in_one_line(phantom_case, tmp_path):
+@pytest.mark.parametrize("hidden", [PAPERS, PAPERS[:1], PAPERS[1:]])
+def test_the_papers_method_names_its_package_in_one_line(hidden, phantom_case, tmp_path):
     train = ("train", phantom_case, tmp_path / "model", "--preset", "quick")
-    assert "pip install 'tumortrack[occupancy]'" in refusal(without_pytorch(COMMAND, *train))
+    refused = refusal(without_pytorch(COMMAND, *train, hidden=hidden))
+    assert "pip install tumortrack-occupancy" in refused
     assert not (tmp_path / "model").exists()
+
+
+def test_a_model_of_another_method_names_its_package(slim_model, tmp_path):
+    manifest = store.read_json(slim_model / store.MANIFEST)
+    del manifest["files"]["shape.safetensors"]
+    shutil.copytree(slim_model, tmp_path / "model")
+    store.write_json(tmp_path / "model" / store.MANIFEST, manifest)
+    refused = refusal(without_pytorch(COMMAND, "compile", tmp_path / "model"))
+    assert "pip install tumortrack-occupancy" in refused
 
 
 @pytest.mark.slow

@@ -31,8 +31,9 @@ SIGNATURES = {
     "simulate_scenes": "case count=1 seed=0 elastic=True noise=True",
     "teach": "frame picture organ beside",
     "track": "tracker source sinks=() until=None seconds=0.0 range_mm=None options",
-    "train": "case folder preset='clinic' config=None minutes=None steps=None seed=0 "
-    "device='auto' workers=None report=None",
+    "train": "case folder preset='clinic' config=None rotations=None sensor=None minutes=None "
+    "steps=None seed=0 device='auto' workers=None checkpoint_every_s=30.0 report=None "
+    "progress=None",
     "write_scenes": "case folder prefix='' progress=None options",
 }
 VALUES = {"Case", "DepthFrame", "Estimate", "Intrinsics", "Look", "SensorCloud", "Tracker"}

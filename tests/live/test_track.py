@@ -186,14 +186,6 @@ def test_a_report_that_cannot_be_written_ends_nothing(world, tmp_path):
     assert "estimates" in said
 
 
-def test_smoothing_needs_a_model_with_a_motion(world, quick_model, tmp_path):
-    done = tumortrack(
-        *("track", quick_model, virtual(world), "--smoothing", "0.2"),
-        *("--report", tmp_path / "r.json"),
-    )
-    assert "needs a motion" in refusal(done)
-
-
 def test_a_source_that_vanishes_ends_with_a_reason(world, tmp_path):
     done = tumortrack(
         "track",

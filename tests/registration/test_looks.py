@@ -19,7 +19,6 @@ from tumortrack.core.geometry import rigid, transform_points
 from tumortrack.core.types import DepthFrame, Look, SensorCloud
 from tumortrack.live.values import CameraView, Observation
 from tumortrack.live.views import Scan, ViewsLocator
-from tumortrack.occupancy.locator import OccupancyLocator
 from tumortrack.registration import looks as module
 from tumortrack.registration.config import GaussNewtonConfig
 from tumortrack.registration.discrepancy import fit_discrepancy
@@ -218,12 +217,6 @@ def test_a_view_that_sees_through_refuses(tracker):
     with pytest.raises(NoEstimate, match=r"sees through \d+ %.* check the poses") as refused:
         located(tracker, first, replace(second, seen=DepthFrame(half, CAMERA)))
     assert [one.cause for one in refused.value.causes] == [Cause.POSES]
-
-
-def test_a_method_that_knows_no_motion_takes_one_look():
-    one = view(placed(), around(0))
-    with pytest.raises(InputError, match="preset clinic"):
-        OccupancyLocator.locate(None, [one, one], 16, 0)
 
 
 # --- files ---

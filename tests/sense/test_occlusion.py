@@ -11,19 +11,15 @@ from render_objects import anatomy
 from tumortrack.core.config import from_builtins, to_builtins
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import DepthFrame
-from tumortrack.occupancy.presets import paper, quick
 from tumortrack.sense import kernels
 from tumortrack.sense.clutter import ClutterConfig
 from tumortrack.sense.noise import D405_NOISE, CalibrationConfig, miscalibrate
 from tumortrack.sense.occlusion import OcclusionConfig, occlude
-from tumortrack.simulate import scene as scene_module
-from tumortrack.simulate.occupancy import OccupancyConfig, OccupancyPool
-from tumortrack.simulate.scene import SceneConfig, SceneRecipe, SceneStream, Simulator
+from tumortrack.simulate.scene import SceneConfig, SceneRecipe, Simulator
 
 HIDING = OcclusionConfig(scenes=1.0, largest_share=0.6)
 ANATOMY = anatomy(3)
 UP = (0.0, -1.0, 0.0)
-SMALL_POOL = OccupancyConfig(per_side=16, pool=1000)
 
 
 def hidden(seed, config=HIDING, frame=None):
@@ -179,25 +175,8 @@ def recipe(index):
     return SceneRecipe(5, "train", index)
 
 
-@pytest.mark.parametrize("preset", [paper, quick])
-def test_presets_draw_the_scenes_they_drew_before_these_faults_existed(preset, monkeypatch):
-    config = preset(ANATOMY).scene
-    simulator = Simulator(ANATOMY, UP, config)
-    now = [simulator.render(recipe(i)) for i in range(6)]
-    for name in ("occlude", "miscalibrate"):
-        monkeypatch.setattr(scene_module, name, lambda frame, config, rng: frame)
-    uncropped = scene_module.CloudConfig(near_mm=1.0, far_mm=1e4)
-    monkeypatch.setattr(
-        Simulator, "_crop", lambda self, free, rng: uncropped if free else config.cloud
-    )
-    for index, stage in enumerate(now):
-        before = simulator.render(recipe(index))
-        np.testing.assert_array_equal(stage.cloud.points_mm, before.cloud.points_mm)
-        np.testing.assert_array_equal(stage.frame.depth_mm, before.frame.depth_mm)
-
-
 def test_hidden_scenes_lie_where_they_lay_and_their_clouds_lose_points():
-    plain = SceneConfig(occupancy=SMALL_POOL)
+    plain = SceneConfig()
     on = msgspec.structs.replace(plain, occlusion=HIDING)
     one, two = (Simulator(ANATOMY, UP, config) for config in (plain, on))
     lost = 0
@@ -212,23 +191,17 @@ def test_hidden_scenes_lie_where_they_lay_and_their_clouds_lose_points():
     assert lost > 5000
 
 
-def test_clouds_have_a_random_number_of_points_and_batches_stay_whole():
-    config = SceneConfig(occupancy=SMALL_POOL, cloud_points=(300, 3000), free_range=0.5)
+def test_clouds_have_a_random_number_of_points():
+    config = SceneConfig(cloud_points=(300, 3000), free_range=0.5)
     simulator = Simulator(ANATOMY, UP, config)
     counts = np.array([len(simulator.render(recipe(i)).cloud.points_mm) for i in range(60)])
     assert counts.min() >= 300
     assert counts.max() <= 3000
     assert 15 < (counts < math.sqrt(300 * 3000)).sum() < 45  # even on a logarithmic scale
-    pool = OccupancyPool(ANATOMY, SMALL_POOL, 1)
-    batch = SceneStream(ANATOMY, UP, config, pool, 5, "train", 6).batch(0)
-    assert batch.clouds_mm.shape == (6, 1000, 3)
-    different = [len(np.unique(cloud, axis=0)) for cloud in batch.clouds_mm]
-    assert different == [min(1000, count) for count in counts[:6].tolist()]
 
 
 def test_everything_at_once_replays():
     config = SceneConfig(
-        occupancy=SMALL_POOL,
         clutter=ClutterConfig(scenes=1.0, largest_share=0.05),
         occlusion=OcclusionConfig(scenes=1.0, largest_share=0.6, left_in=0.2),
         calibration=CalibrationConfig(offset_mm=2.0),

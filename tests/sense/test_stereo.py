@@ -19,7 +19,14 @@ from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import DepthFrame
 from tumortrack.imaging.case import load_case
-from tumortrack.sense.noise import D405_NOISE, STEREO_NOISE, NoiseConfig, add_noise, stereo_noise
+from tumortrack.sense.noise import (
+    CLEAN,
+    D405_NOISE,
+    STEREO_NOISE,
+    NoiseConfig,
+    add_noise,
+    stereo_noise,
+)
 from tumortrack.sense.stereo import StereoRig, read_calibration
 from tumortrack.tracking import presets
 from tumortrack.tracking.tracker import Tracker, region_for
@@ -204,5 +211,6 @@ def test_a_preset_s_scenes_can_be_those_of_stereo(phantom_case):
     stereo = presets.seen_by(clinic, "stereo")
     assert stereo.scene.noise == STEREO_NOISE != D405_NOISE
     assert msgspec.structs.replace(stereo.scene, noise=D405_NOISE) == clinic.scene
+    clean = msgspec.structs.replace(clinic.scene, noise=CLEAN)
     with pytest.raises(InputError, match="preset quick"):
-        presets.seen_by(presets.paper(anatomy), "stereo")
+        presets.seen_by(msgspec.structs.replace(clinic, scene=clean), "stereo")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import pickle
 from dataclasses import replace
 from pathlib import Path
 
@@ -37,21 +36,17 @@ from tumortrack.simulate.elastic.loads import (
     state_of,
 )
 from tumortrack.simulate.elastic.modes import ReducedModel, modes_of, patches_of, random_loads
-from tumortrack.simulate.occupancy import OccupancyConfig, OccupancyPool
 from tumortrack.simulate.scene import (
     PoseConfig,
     SceneConfig,
     SceneRecipe,
-    SceneStream,
     Simulator,
     body_for,
 )
 
 ANATOMY = organ()
 ORGAN = ANATOMY.organ
-ELASTIC = SceneConfig(
-    deform=(ElasticConfig(body=SMALL),), occupancy=OccupancyConfig(per_side=16, pool=4000)
-)
+ELASTIC = SceneConfig(deform=(ElasticConfig(body=SMALL),))
 
 
 @pytest.fixture(scope="module")
@@ -455,14 +450,3 @@ def test_simulate_makes_elastic_scenes_on_request():
     assert simulate.scene_config().deform == (ElasticConfig(),)
     (chain,) = replace(simulate, squeeze=True).scene_config().deform
     assert chain == ChainConfig(links=(ElasticConfig(), StretchConfig()))
-
-
-def test_a_stream_takes_its_body_along(body):
-    pool = OccupancyPool(ANATOMY, ELASTIC.occupancy, 0)
-    stream = SceneStream(ANATOMY, UP, ELASTIC, pool, 0, "train", 2, body)
-    here, there = stream.batch(1), pickle.loads(pickle.dumps(stream)).batch(1)
-    np.testing.assert_array_equal(here.clouds_mm, there.clouds_mm)
-    np.testing.assert_array_equal(here.points_mm, there.points_mm)
-    scene = Simulator(ANATOMY, UP, ELASTIC, body).render(SceneRecipe(0, "train", 2))
-    assert scene.deformation.record()["kind"] == "elastic"
-    assert len(scene.deformation.record()["coefficients"]) == 20

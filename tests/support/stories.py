@@ -39,6 +39,19 @@ def environment() -> dict[str, str]:
     return {**os.environ, "PYTHONUNBUFFERED": "1"}
 
 
+def with_imports(
+    *arguments: object, run: list[str] = COMMAND[1:]
+) -> tuple[subprocess.CompletedProcess[str], set[str]]:
+    """A command's end, and every module that it imported."""
+    words = [sys.executable, "-X", "importtime", *run, *map(str, arguments)]
+    buffered = {name: is_ for name, is_ in environment().items() if name != "PYTHONUNBUFFERED"}
+    done = subprocess.run(words, capture_output=True, text=True, timeout=300, env=buffered)
+    rows = [line.split("|") for line in done.stderr.splitlines() if line.startswith("import time:")]
+    imported = {row[-1].strip() for row in rows}
+    assert "tyro" in imported
+    return done, imported
+
+
 def succeeded(done: subprocess.CompletedProcess[str]) -> str:
     """The output of a command that must have worked."""
     assert done.returncode == 0, done.stdout + done.stderr
@@ -95,8 +108,8 @@ def train_learnt(case_folder: Path, model: Path) -> None:
     """Write a model folder of a ``quick`` with small pictures, trained for a minute."""
     from msgspec.structs import replace
 
-    from tumortrack.occupancy.presets import quick
-    from tumortrack.occupancy.training.train import TrainingRun, train
+    from tumortrack_occupancy.presets import quick
+    from tumortrack_occupancy.training.train import TrainingRun, train
 
     case = load_case(case_folder)
     preset = quick(case.anatomy)

@@ -27,7 +27,7 @@ PRELOADED = (
     "tumortrack.registration.build",
     "tumortrack.report.protocol",
     "tumortrack.imaging.case",
-    "tumortrack.occupancy.training.train",
+    "tumortrack_occupancy.training.train",
     "tumortrack.simulate.scene",
     "tumortrack.tracking.tracker",
 )

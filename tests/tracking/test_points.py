@@ -13,18 +13,12 @@ import trimesh
 
 from motions import CAMERA_FROM_CT, Wave
 from reports import report_of
-from stories import refusal, tumortrack
 from tumortrack.cli.locate import Locate
 from tumortrack.core import store
 from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.estimate import Estimate, Motion
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import Anatomy, CameraLabels, Mesh, OccupancyCloud
-from tumortrack.models.folder import save_model
-from tumortrack.models.in_distribution import InDistributionRange
-from tumortrack.occupancy.model import OccupancyModel
-from tumortrack.occupancy.network import OccupancyNetwork
-from tumortrack.occupancy.presets import quick
 from tumortrack.sense.files import read_cloud
 from tumortrack.sense.ply import write_cloud_ply
 from tumortrack.tracking.files import write_estimate
@@ -338,41 +332,11 @@ def test_a_motion_without_an_answer_is_no_answer(tmp_path):
 # --- the command ---
 
 
-@pytest.fixture(scope="module")
-def model(tmp_path_factory):
-    """A model of the kind that `quick` trains, untrained."""
-    folder = tmp_path_factory.mktemp("points") / "model"
-    config = quick(anatomy())
-    network = OccupancyNetwork(config.network)
-    in_distribution = InDistributionRange(spread_mm=(1.0, 100.0), fit_mm=5.0)
-    box = np.array([[-80.0] * 3, [80.0] * 3])
-    with store.new_folder(folder) as aside:
-        save_model(
-            OccupancyModel(
-                network=network,
-                config=config,
-                parts=anatomy().names,
-                query_box_mm=box,
-                in_distribution=in_distribution,
-            ),
-            aside,
-        )
-    return folder
-
-
 @pytest.fixture
 def cloud(tmp_path):
     points = Wave().carry(anatomy().organ.vertices_mm).astype(np.float32)
     write_cloud_ply(tmp_path / "cloud.ply", points)
     return tmp_path / "cloud.ply"
-
-
-def test_a_model_without_correspondences_refuses_before_any_work(model, tmp_path):
-    line = refusal(
-        tumortrack("locate", model, "no_cloud.ply", tmp_path / "out", "--map", "no_points.csv")
-    )
-    assert "give CASE in place of MODEL" in line
-    assert not (tmp_path / "out").exists()
 
 
 def _block(box_mm):
@@ -394,13 +358,12 @@ class Knowing:
         return located(Wave(sure=True))
 
 
-def test_locate_writes_where_the_points_are(model, cloud, tmp_path, monkeypatch, capsys):
+def test_locate_writes_where_the_points_are(slim_model, cloud, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("tumortrack.tracking.tracker.Tracker", Knowing)
-    monkeypatch.setattr("tumortrack.models.folder.has_shape", lambda _: True)
     points = np.concatenate([some_points(4), MIDDLE[None] + [0, 0, 131.0]])
     lines = [f"{n},{','.join(map(str, p))}" for n, p in enumerate(points)]
     asked = written(tmp_path / "asked.csv", "\n".join(["label,ct_x,ct_y,ct_z", *lines]))
-    locate = Locate(model=model, cloud=cloud, out=tmp_path / "out", map=asked)
+    locate = Locate(model=slim_model, cloud=cloud, out=tmp_path / "out", map=asked)
     locate.run()
     rows = rows_of((tmp_path / "out" / "points.csv").read_text())
     np.testing.assert_allclose(places(rows), Wave().carry(points), atol=6e-5)
@@ -418,25 +381,24 @@ def test_locate_writes_where_the_points_are(model, cloud, tmp_path, monkeypatch,
     assert rows_of((tmp_path / "out" / "points.csv").read_text()) == rows
 
 
-def test_points_that_cannot_be_meant_cost_no_locating(model, cloud, tmp_path, monkeypatch):
+def test_points_that_cannot_be_meant_cost_no_locating(slim_model, cloud, tmp_path, monkeypatch):
     monkeypatch.setattr("tumortrack.tracking.tracker.Tracker", Knowing)
-    monkeypatch.setattr("tumortrack.models.folder.has_shape", lambda _: True)
     monkeypatch.setattr(Knowing, "asked", 0)
     asked = written(tmp_path / "asked.csv", "x,y,z\n-60,-40,-300\n")
     with pytest.raises(InputError, match="RAS"):
-        Locate(model=model, cloud=cloud, out=tmp_path / "out", map=asked).run()
+        Locate(model=slim_model, cloud=cloud, out=tmp_path / "out", map=asked).run()
     assert Knowing.asked == 0
     assert not (tmp_path / "out").exists()
 
 
-def test_python_takes_the_commands_options(model, cloud, tmp_path):
+def test_python_takes_the_commands_options(slim_model, cloud, tmp_path):
     import tumortrack as tt
 
     with pytest.raises(InputError, match=r"knows no 'crop'; allowed: .*box"):
-        tt.locate(model, cloud, crop=1)
+        tt.locate(slim_model, cloud, crop=1)
     depth = tmp_path / "depth.png"
     depth.write_bytes(cloud.read_bytes())
     with pytest.raises(InputError, match=r"absent\.json"):  # one camera, as text
-        tt.locate(str(model), str(depth), intrinsics=str(tmp_path / "absent.json"))
+        tt.locate(str(slim_model), str(depth), intrinsics=str(tmp_path / "absent.json"))
     with pytest.raises(InputError, match="2 times for 1 view"):
-        tt.locate(model, [cloud], intrinsics=["a.json", "b.json"])
+        tt.locate(slim_model, [cloud], intrinsics=["a.json", "b.json"])

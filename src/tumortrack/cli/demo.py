@@ -49,9 +49,9 @@ class Demo:
         if not 0 < self.minutes < float("inf"):
             raise InputError(f"--minutes {self.minutes:g} must be more than 0.")
         if self.preset != "clinic":
-            from tumortrack.tracking.presets import occupancy
+            from tumortrack.models.method import method_of_preset
 
-            occupancy("training.train")  # what is missing is said first
+            method_of_preset(self.preset)  # what is missing is said first
             command("plan")
         if self.scenes < 1:
             raise InputError(f"--scenes {self.scenes} must be at least 1.")

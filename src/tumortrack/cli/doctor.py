@@ -6,6 +6,7 @@ import platform
 import shutil
 import sys
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from importlib import import_module
 from importlib.metadata import PackageNotFoundError, entry_points, requires, version
@@ -18,6 +19,7 @@ from packaging.requirements import Requirement
 from tumortrack.cli.console import say
 from tumortrack.core.errors import TumortrackError
 from tumortrack.core.process import available_cores
+from tumortrack.models.method import GROUP
 
 # By distribution and extra ("": what it always needs).
 PURPOSES = {
@@ -26,9 +28,9 @@ PURPOSES = {
     ("tumortrack", "stereo"): "depth from two pictures",
     ("tumortrack", "ur"): "a camera that an arm of Universal Robots holds",
     ("tumortrack", "pcd"): ".pcd clouds",
-    ("tumortrack", "occupancy"): "the paper's method: networks and their training",
-    ("tumortrack", "onnx"): "networks as ONNX files",
-    ("tumortrack", "tensorboard"): "training curves",
+    ("tumortrack-occupancy", ""): "the paper's method: networks and their training",
+    ("tumortrack-occupancy", "onnx"): "networks as ONNX files",
+    ("tumortrack-occupancy", "tensorboard"): "training curves",
     ("tumortrack-resection", ""): "plans of a resection",
     ("tumortrack-resection", "arms"): "motions of two arms",
     ("tumortrack-resection", "ur"): "a real arm of Universal Robots",
@@ -80,29 +82,15 @@ class Doctor:
             say(f"{state:8} {text}")
             broken += state == "BROKEN"
 
-        if find_spec("torch"):
-            _say_processors()
+        for point in entry_points(group=GROUP):
+            with suppress(Exception):  # what fails is among the findings
+                for line in point.load().hardware():
+                    say(line)
         if broken:
             raise TumortrackError(
                 f"{broken} of what is installed here does not work: see BROKEN above. All else can "
                 "be used."
             )
-
-
-def _say_processors() -> None:
-    """Processors for networks."""
-    import torch
-
-    from tumortrack.occupancy.hardware import has_fast_bfloat16
-
-    has = torch.cpu.get_capabilities()
-    names = {"AVX2": "avx2", "AVX-512": "avx512_f", "AMX": "amx_tile"}
-    units = [f"{'' if has.get(flag) else 'no '}{unit}" for unit, flag in names.items()]
-    fast = has_fast_bfloat16(torch.device("cpu"))
-    bf16 = "in hardware, used" if fast else "not in hardware; fp32 is used (slower)"
-    say(f"CPU: {', '.join(units)}; bf16: {bf16}")
-    cuda = torch.cuda.get_device_name() if torch.cuda.is_available() else "none"
-    say(f"CUDA: {cuda}{'' if torch.cuda.is_available() else '; everything runs on the CPU'}")
 
 
 def _statuses() -> Iterator[Status]:
@@ -121,17 +109,19 @@ def _statuses() -> Iterator[Status]:
 
 
 def _plug_ins() -> Iterator[Status]:
-    """Sources, sinks, deformations and broken commands of other packages; each is imported."""
+    """What other packages add; each is imported. Working commands are in ``--help``, working
+    methods above."""
     from tumortrack.live import spec
     from tumortrack.simulate.deform import installed
 
     added = [(f"{e.what} {e.kind}", e.package, e.fault) for e in spec.extensions()]
     added += [(f"deformation {e.name}", e.package, e.fault) for e in installed.extensions()]
-    for point in entry_points(group="tumortrack.commands"):
-        try:
-            point.load()
-        except Exception as error:  # a foreign package raises anything
-            added.append((f"command {point.name}", point.value, str(error)))
+    for what in ("command", "method"):
+        for point in entry_points(group=f"tumortrack.{what}s"):
+            try:
+                point.load()
+            except Exception as error:  # a foreign package raises anything
+                added.append((f"{what} {point.name}", point.value, str(error)))
     for what, package, fault in added:
         text = f"{what} of the package {package}"
         yield ("BROKEN", f"{text}: {fault}") if fault else ("ok", text)

@@ -29,11 +29,12 @@ class Command(Protocol):
 _MODULES = {  # in the order of --help; only the chosen command's is imported
     "demo": "demo", "prepare": "cases", "export": "cases", "train": "training",
     "locate": "locate", "track": "track", "simulate": "cases",
-    "evaluate": "evaluate", "compile": "models", "onnx": "models",
+    "evaluate": "evaluate", "compile": "models",
     "inspect": "inspect", "doctor": "doctor",
 }  # fmt: skip
 # Commands of other distributions: if one is missing, the message names its distribution.
 _DISTRIBUTIONS = {
+    "onnx": "tumortrack-occupancy",
     **dict.fromkeys(("plan", "resect"), "tumortrack-resection"),
     **dict.fromkeys(("twin", "bench", "fleet", "margins"), "tumortrack-lab"),
     **dict.fromkeys(("phantom-kit", "calibrate", "record", "reference"), "tumortrack-experiment"),

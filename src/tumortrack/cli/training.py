@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -15,7 +16,8 @@ from tumortrack.core.errors import InputError
 
 if TYPE_CHECKING:
     from tumortrack.imaging.case import Case
-    from tumortrack.occupancy.training.train import TrainingStatus
+    from tumortrack.models.method import TrainingStatus
+    from tumortrack.models.model import Model
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,7 +58,7 @@ class Train:
     checkpoint_every: float = 30.0
 
     def run(self) -> None:
-        from tumortrack.imaging.case import load_case
+        from tumortrack import api
         from tumortrack.models import folder
 
         if self.minutes is not None and not self.minutes >= 0:
@@ -67,58 +69,54 @@ class Train:
             raise InputError("--minutes and --steps both say when to stop; give one of them.")
         if self.workers is not None and self.workers < 0:
             raise InputError(f"--workers {self.workers} must be 0 or more.")
-        case = load_case(self.case)
-        folder.check_trainable(self.model)
+        case = api.load_case(self.case)
+        train = partial(
+            api.train, case, self.model, preset=self.preset, rotations=self.rotations,
+            sensor=self.sensor, minutes=self.minutes, steps=self.steps, seed=self.seed,
+            device=self.device, workers=self.workers, checkpoint_every_s=self.checkpoint_every,
+        )  # fmt: skip
         if self.preset == "clinic":
-            self._make(case)
+            self._make(train)
+        elif folder.is_finished(self.model):
+            done = train().provenance  # read, where it is of the same command
+            say(f"{self.model} is trained already ({done['steps']} steps).")
+            say_notes(filter(None, [folder.weakness_of(done)]))
         else:
-            self._train(case)
+            self._train(train, case)
 
-    def _make(self, case: Case) -> None:
+    def _make(self, make: Callable[..., Model]) -> None:
         """A model of the default method."""
         from tumortrack.models import folder
-        from tumortrack.tracking.model_files import write_model
 
-        rotations, sensor = self.rotations or case.rotations, self.sensor or case.sensor
-        case = replace(case, rotations=rotations, sensor=sensor)
         say("nothing needs to be learnt: the case itself can stand wherever a MODEL is asked for.")
         with progress_of("making the model") as progress:
-            made = write_model(case, self.model, seed=self.seed, progress=progress)
+            made = make(progress=progress)
         say(f"{self.model} holds the model: {folder.training_words(made.provenance)}.")
         say_notes(filter(None, [folder.weakness_of(made.provenance)]))
 
-    def _train(self, case: Case) -> None:
+    def _train(self, train: Callable[..., Model], case: Case) -> None:
         """A network."""
         from tumortrack.models import folder
-        from tumortrack.tracking.presets import PRESETS, occupancy, seen_by
+        from tumortrack.models.method import method_of_preset
 
-        training = occupancy("training.train")
+        method_of_preset(self.preset)  # what is missing is said first
         say("starting ...")
         if case.anatomy.structures:
             say_notes([f"{self.preset} knows no motion: structures are left out; clinic has them"])
-        keep_loaded()
-        config = PRESETS[self.preset](case.anatomy, self.rotations or "limited")
-        run = training.TrainingRun(
-            anatomy_ct=case.anatomy, up_lps=case.up_lps, case_sha256=case.sha256,
-            config=seen_by(config, self.sensor or case.sensor), seed=self.seed, steps=self.steps,
-            minutes=self.minutes, device=self.device, workers=self.workers,
-            checkpoint_every_s=self.checkpoint_every, patient=case.patient,
-        )  # fmt: skip
-        if folder.is_finished(self.model):
-            done = folder.read_model_manifest(self.model)["provenance"]
-            if differ := run.differences(done.get("decided_by", {})):
-                raise InputError(
-                    f"{self.model} holds a finished model (seed {done['seed']}), whose command "
-                    f"differs from this one in {differ}. A finished training is not extended: "
-                    "choose another MODEL folder."
-                )
-            say(f"{self.model} is trained already ({done['steps']} steps).")
-            say_notes(filter(None, [folder.weakness_of(done)]))
-            return
+        last: TrainingStatus | None = None
+
         with training_screen() as show:
-            about = training.train(run, self.model, show).provenance
+
+            def report(status: TrainingStatus) -> None:
+                nonlocal last
+                if last is None:  # all is loaded
+                    keep_loaded()
+                last = status
+                show(status)
+
+            about = train(report=report).provenance
         say(f"model written to {self.model}: {folder.training_words(about)}.")
-        few = bool(self.minutes) and about["steps"] < config.schedule.warmup_steps
+        few = self.minutes is not None and last is not None and last.warming_up
         hint = "so few steps teach nearly nothing; train longer, or on a machine with less to do"
         say_notes(filter(None, [hint if few else "", folder.weakness_of(about)]))
 

@@ -1,4 +1,4 @@
-"""Model folders: what both methods write and read."""
+"""Model folders: what all methods write and read."""
 
 from __future__ import annotations
 
@@ -18,7 +18,6 @@ if TYPE_CHECKING:
 
 KIND = "model"
 SHAPE = "shape.safetensors"
-WEIGHTS = "weights.safetensors"
 # Of the simulated scenes on which a model was checked. Fifteen patients' kidneys had 0 to 0.06, a
 # liver of 1.7 l 0.16 and a ball with bumps 0.22: what is seen of these does not say how they lie.
 _MOST_FAR = 0.1

@@ -1,20 +1,28 @@
-"""What models of both methods have in common, and what each of them adds."""
+"""What models of all methods have in common, and what each of them adds."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
+from tumortrack.core.config import Config
 from tumortrack.core.organ import Organ, organ_in
 from tumortrack.core.patient import Patient, patient_in
 from tumortrack.models.in_distribution import InDistributionRange
 
 if TYPE_CHECKING:
-    from tumortrack.occupancy.config import TrainConfig
-    from tumortrack.registration.config import RegistrationConfig
+    from tumortrack.simulate.scene import SceneConfig
     from tumortrack.tracking.margins import ModelMargins
+
+
+class ModelConfig(Config, frozen=True):
+    """All that decides a model of any method, apart from case and seed."""
+
+    @property
+    def scene(self) -> SceneConfig:
+        """What is seen of the organ; a field of each method's configuration."""
+        raise NotImplementedError
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -22,7 +30,7 @@ class Model(ABC):
     """What locates one patient's organ. ``provenance``: seeds, steps, hashes; ``margins``: None
     where it was not calibrated."""
 
-    config: RegistrationConfig | TrainConfig  # all that decides it, apart from case and seed
+    config: ModelConfig
     parts: tuple[str, ...]
     in_distribution: InDistributionRange
     provenance: dict[str, Any] = field(default_factory=dict)
@@ -49,12 +57,3 @@ class Model(ABC):
     @abstractmethod
     def synchronise(self) -> None:
         """Wait for what runs beside; for clocks."""
-
-    @classmethod
-    @abstractmethod
-    def from_folder(cls: type[M], folder: Path, manifest: dict[str, Any], **known: Any) -> M:
-        """The model of a folder whose fields ``known`` are read already; InputError, KeyError,
-        ValueError, RuntimeError or OSError where the folder lacks something."""
-
-
-M = TypeVar("M", bound=Model)

@@ -1,4 +1,4 @@
-"""What both kinds of locator do with a frame, and what both report."""
+"""What every kind of locator does with a frame, and what all of them report."""
 
 from __future__ import annotations
 

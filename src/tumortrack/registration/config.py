@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from tumortrack.core.config import Config
+from tumortrack.models.model import ModelConfig
 from tumortrack.simulate.scene import SceneConfig
 
 
@@ -38,7 +39,7 @@ class GaussNewtonConfig(Config, frozen=True):
         )
 
 
-class RegistrationConfig(Config, frozen=True):
+class RegistrationConfig(ModelConfig, frozen=True):
     """Everything that decides a model that registers an elastic body, apart from case and seed.
 
     Attributes:

@@ -1,4 +1,4 @@
-"""One scene from a recipe (pose, deformation, depth image, cloud, labelled points), and streams.
+"""One scene from a recipe: pose, deformation, depth image, cloud.
 
 A recipe is (seed, stream, index); with the case and the configuration it replays bit for bit on
 the same machine and versions. On others the last digits may differ: compiled code may reorder sums
@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
-from typing import Any, Literal, NamedTuple
+from functools import lru_cache
+from typing import Literal
 
 import msgspec
 import numpy as np
-from jaxtyping import Float32, Float64, Num, UInt8
+from jaxtyping import Float64
 
 from tumortrack.core.config import Config, check_seed
 from tumortrack.core.errors import InputError, NoEstimate, TumortrackError
@@ -29,7 +29,6 @@ from tumortrack.sense.render import Visibility, render_depth
 from tumortrack.simulate.deform import ChainConfig, DragConfig, installed, links_of
 from tumortrack.simulate.deform.base import Deformation, Points, View
 from tumortrack.simulate.elastic.body import BodyConfig, ElasticBody, build_body, length_over_kidney
-from tumortrack.simulate.occupancy import OccupancyConfig, OccupancyPool
 
 STREAMS = ("train", "validation", "test")
 _FARTHEST_MM = 500.0  # range of depth cameras for close work
@@ -51,6 +50,17 @@ class PoseConfig(Config, frozen=True):
 
     def __post_init__(self) -> None:
         self.check_between("pose", tilt_deg=(0, 180))
+
+
+class OccupancyConfig(Config, frozen=True):
+    """Labelled points of scenes, for methods that learn from them (``tumortrack_occupancy``)."""
+
+    per_side: int = 256  # k: points kept inside and outside of each part
+    box_factor: float = 1.5
+    wall_mm: float = 0.2
+    far_share: float = 0.15
+    far_reach: float = 1.2  # half of the far points: a cube of +- this times the organ's diagonal
+    pool: int = 100_000  # points per part that are labelled once
 
 
 class SceneConfig(Config, frozen=True):
@@ -151,24 +161,17 @@ class Simulator:
         corners = vertices[ConvexHull(vertices).vertices]  # include the extremes in any direction
         self._hull_ct = Mesh(corners, np.empty((0, 3)))
 
-    def pair(
-        self, recipe: SceneRecipe, pool: OccupancyPool
-    ) -> tuple[RenderedScene, Float32[np.ndarray, "n 3"], UInt8[np.ndarray, " n"]]:
-        """The scene, and its labelled points, camera frame."""
-        scene, rng = self._render(recipe)
-        points_ct, labels = pool.draw(rng)
-        return scene, scene.carry(points_ct).astype(np.float32, copy=False), labels
-
     def render(self, recipe: SceneRecipe) -> RenderedScene:
         """Pose, deformation, depth image and cloud of a recipe."""
-        return self._render(recipe)[0]
+        return self.draw(recipe)[0]
 
     def reference(self, scene: RenderedScene) -> Anatomy:
         """The anatomy as it lies in the scene, camera frame."""
         parts = (part.moved(scene.carry(part.vertices_mm)) for part in self.anatomy_ct.parts)
         return self.anatomy_ct.of(parts)
 
-    def _render(self, recipe: SceneRecipe) -> tuple[RenderedScene, np.random.Generator]:
+    def draw(self, recipe: SceneRecipe) -> tuple[RenderedScene, np.random.Generator]:
+        """``render``, and the recipe's generator, for what else is drawn of the scene."""
         config, organ = self.config, self.anatomy_ct.organ
         for attempt in range(_ATTEMPTS):
             rng = recipe.generator(attempt)
@@ -255,53 +258,6 @@ def _facing(up_lps: tuple[float, float, float]) -> Float64[np.ndarray, "3 3"]:
     turn = rotation_onto(np.array(up_lps), np.array([0.0, 0.0, -1.0]))
     turn.flags.writeable = False
     return turn
-
-
-class Batch(NamedTuple):
-    """Scenes stacked; camera frame, mm."""
-
-    clouds_mm: Float32[np.ndarray, "b n 3"]
-    points_mm: Float32[np.ndarray, "b q 3"]
-    labels: UInt8[np.ndarray, "b q"]
-
-
-@dataclass(frozen=True, eq=False)
-class SceneStream:
-    """Batch ``i`` holds the recipes ``i * size ... i * size + size - 1``, so that worker processes
-    and resumed runs see the same data. Picklable."""
-
-    anatomy_ct: Anatomy
-    up_lps: tuple[float, float, float]
-    config: SceneConfig
-    pool: OccupancyPool
-    seed: int
-    stream: Literal["train", "validation", "test"]
-    batch_size: int
-    body: ElasticBody | None = None  # built once by the caller, for elastic deformations
-
-    @cached_property
-    def simulator(self) -> Simulator:
-        """Built in the process that uses it, as ray trees cannot be pickled."""
-        return Simulator(self.anatomy_ct, self.up_lps, self.config, self.body)
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {k: v for k, v in self.__dict__.items() if k != "simulator"}
-
-    def batch(self, index: int) -> Batch:
-        """The batch with this number."""
-        first, rows = index * self.batch_size, []
-        for number in range(first, first + self.batch_size):
-            recipe = SceneRecipe(self.seed, self.stream, number)
-            scene, points_mm, labels = self.simulator.pair(recipe, self.pool)
-            cloud_mm = refill(scene.cloud.points_mm, self.config.cloud.n_points)
-            rows.append((cloud_mm, points_mm, labels))
-        return Batch(*map(np.stack, zip(*rows, strict=True)))
-
-
-def refill(points_mm: Num[np.ndarray, m * row], n: int) -> Num[np.ndarray, n * row]:
-    """A cloud of fewer than ``n`` points repeats them, so that clouds stack; max pooling is not
-    affected."""
-    return points_mm[np.arange(n) % len(points_mm)]
 
 
 def body_for(

@@ -1,4 +1,4 @@
-"""Model folders of both methods, and the model that every case holds."""
+"""Model folders of any method, and the model that every case holds."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from tumortrack.core.types import part_names
 from tumortrack.imaging.case import Case, holds_case, load_case
 from tumortrack.models.folder import (
     KIND,
+    has_shape,
     is_finished,
     is_model_of,
     organ_of,
@@ -22,10 +23,11 @@ from tumortrack.models.folder import (
     save_model,
 )
 from tumortrack.models.in_distribution import InDistributionRange
+from tumortrack.models.method import method_of_folder
 from tumortrack.models.model import Model
 from tumortrack.registration.model import RegistrationModel
 from tumortrack.tracking.margins import read_margins
-from tumortrack.tracking.presets import clinic, occupancy, seen_by
+from tumortrack.tracking.presets import clinic, seen_by
 
 if TYPE_CHECKING:
     from tumortrack.registration.config import RegistrationConfig
@@ -44,7 +46,7 @@ def load_model(folder: Path, device: str = "auto", with_margins: bool = True) ->
         ArtifactError: missing, of another schema, damaged, or changed since; its margins are
             another model's, or of another version of the method.
         InputError: CUDA is requested where there is none.
-        PackageError: a network, and PyTorch is not installed.
+        PackageError: the method that made it is not installed.
     """
     if holds_case(folder):
         return case_model(load_case(folder), with_margins)
@@ -59,11 +61,10 @@ def load_model(folder: Path, device: str = "auto", with_margins: bool = True) ->
             "margins": read_margins(folder) if with_margins else None,
         }
         model: Model
-        if "network" in manifest["config"]:
-            kind = occupancy("model").OccupancyModel
-            model = kind.from_folder(folder, manifest, device=device, **known)
-        else:
+        if has_shape(manifest):
             model = RegistrationModel.from_folder(folder, manifest, **known)
+        else:
+            model = method_of_folder(manifest).load(folder, manifest, device, **known)
         model.patient  # noqa: B018 - nonsense is told here
         return model
     except (ArtifactError, PackageError):

@@ -2,54 +2,33 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from importlib import import_module
-from importlib.util import find_spec
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 import msgspec
 
-from tumortrack.core.errors import InputError, PackageError
+from tumortrack.core.errors import InputError
 from tumortrack.core.types import Anatomy
-from tumortrack.registration.config import RegistrationConfig
+from tumortrack.models.method import Preset, method_of_preset
+from tumortrack.models.model import ModelConfig
 from tumortrack.registration.presets import Rotations, clinic
 from tumortrack.sense.noise import CLEAN, SENSORS, Sensor
 
-if TYPE_CHECKING:
-    from tumortrack.occupancy.config import TrainConfig
-
-    C = TypeVar("C", RegistrationConfig, TrainConfig)
-else:
-    C = TypeVar("C")  # the other one's module needs PyTorch
+C = TypeVar("C", bound=ModelConfig)
 
 __all__ = ["PRESETS", "clinic", "paper", "quick", "seen_by"]
 
 
-def occupancy(module: str) -> Any:
-    """A module of the paper's method. Raises PackageError: its extra is not installed."""
-    if find_spec("torch") is None:
-        raise PackageError(
-            "the presets quick and paper need PyTorch, which the default method does not: "
-            "pip install 'tumortrack[occupancy]'."
-        )
-    return import_module(f"tumortrack.occupancy.{module}")
+def quick(anatomy: Anatomy, rotations: Rotations = "limited") -> Any:
+    """The ``TrainConfig`` of a slim network, of tumortrack-occupancy; PackageError without it."""
+    return method_of_preset("quick").presets["quick"](anatomy, rotations)
 
 
-def quick(anatomy: Anatomy, rotations: Rotations = "limited") -> TrainConfig:
-    """See ``occupancy.presets``; PackageError without its extra."""
-    return occupancy("presets").quick(anatomy, rotations)
+def paper(anatomy: Anatomy, rotations: Rotations = "limited") -> Any:
+    """The ``TrainConfig`` of the paper's network; likewise."""
+    return method_of_preset("paper").presets["paper"](anatomy, rotations)
 
 
-def paper(anatomy: Anatomy, rotations: Rotations = "limited") -> TrainConfig:
-    """See ``occupancy.presets``; PackageError without its extra."""
-    return occupancy("presets").paper(anatomy, rotations)
-
-
-PRESETS: dict[str, Callable[[Anatomy, Rotations], Any]] = {
-    "clinic": clinic,
-    "quick": quick,
-    "paper": paper,
-}
+PRESETS: dict[str, Preset] = {"clinic": clinic, "quick": quick, "paper": paper}
 
 
 def seen_by(config: C, sensor: Sensor) -> C:

@@ -6,7 +6,6 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float64
@@ -21,6 +20,7 @@ from tumortrack.core.report import Finding
 from tumortrack.core.types import Anatomy, DepthFrame, Look, SensorCloud
 from tumortrack.imaging.case import Case
 from tumortrack.models.folder import weakness_of
+from tumortrack.models.method import Locator, method_of_config
 from tumortrack.models.model import Model
 from tumortrack.registration.locator import RegistrationLocator
 from tumortrack.registration.looks import seen_from_first
@@ -31,7 +31,6 @@ from tumortrack.sense.region import RegionConfig
 from tumortrack.tracking.advice import where_to_look
 from tumortrack.tracking.causes import likely_causes, words
 from tumortrack.tracking.model_files import case_model
-from tumortrack.tracking.presets import occupancy
 from tumortrack.tracking.quality import doubt_if_hidden, judged, with_margin
 
 _DEFAULTS = FollowOptions()
@@ -41,22 +40,6 @@ _TURNED_OVER_S = 30.0
 # Causes are searched for at most this often for each failed check, as that takes several frames.
 _CAUSES_EVERY_S = 1.0
 _OF_POSES = "none", "poses", "fit", "strays", "seen_through"  # checks that wrong poses fail
-
-
-@runtime_checkable
-class Locator(Protocol):
-    """What a method provides."""
-
-    anatomy_ct: Anatomy | None
-
-    def locate(self, looks: Sequence[Look], grid: int, seed: int) -> Estimate:
-        """See ``Tracker.locate``; in the frame of the first camera."""
-
-    def follow(self, looks: Sequence[Look], last: Estimate | None, how: FollowOptions) -> Estimate:
-        """See ``Tracker.follow``; likewise."""
-
-    def warm(self) -> None:
-        """See ``Tracker.warm``."""
 
 
 class Tracker:
@@ -189,8 +172,7 @@ class Tracker:
 def _locator(model: Model) -> Locator:
     if isinstance(model, RegistrationModel):
         return RegistrationLocator(model)
-    made: Locator = occupancy("locator").OccupancyLocator(model)
-    return made
+    return method_of_config(model.config).locator(model)
 
 
 def _unusual(estimate: Estimate) -> bool:

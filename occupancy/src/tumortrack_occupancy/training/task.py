@@ -1,0 +1,121 @@
+"""What an occupancy network learns, how it is validated, and the model it leaves."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import cached_property, partial
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float32, Float64, UInt8
+
+from tumortrack.core.errors import NoEstimate
+from tumortrack.imaging.symmetry import ambiguous, half_turns
+from tumortrack.models.in_distribution import InDistributionRange, fit_mm, spread_mm
+from tumortrack.simulate.scene import SceneRecipe, Simulator, body_for
+from tumortrack_occupancy.model import OccupancyModel
+from tumortrack_occupancy.network import Latent, OccupancyNetwork
+from tumortrack_occupancy.training.query_points import OccupancyPool
+from tumortrack_occupancy.training.state import TrainingRun
+from tumortrack_occupancy.training.stream import refill
+from tumortrack_occupancy.volume import FIT_STEPS, lattice_over, surface_distances
+
+_AT_ONCE = 32  # scenes
+_FIT_ON = 32  # scenes
+_QUERIES = 2**13  # at once: bounds the memory
+
+
+class OccupancyTask:
+    """Labels of points near surfaces, as in the paper. ``points``: of the training scenes;
+    ``body``: the organ's, where scenes need it. Raises InputError: a part too small to be learnt.
+    """
+
+    def __init__(self, run: TrainingRun, device: torch.device) -> None:
+        self._run, self._device = run, device
+        self.points = OccupancyPool(run.anatomy_ct, run.config.scene.occupancy, run.seed)
+        self.body = body_for(run.anatomy_ct, run.up_lps, run.config.scene, run.seed)
+
+    @torch.no_grad()
+    def miou(self, network: OccupancyNetwork) -> float:
+        """On the validation scenes: mean over the parts (organ, tumors; not the outside) of the IoU
+        of labels over all their points."""
+        network.eval()
+        arrays = self._scenes.clouds_mm, self._scenes.points_mm
+        batches = (torch.from_numpy(v).to(self._device).split(_AT_ONCE) for v in arrays)
+        guess = torch.cat([network(*pair).argmax(-1) for pair in zip(*batches, strict=True)])
+        labels = guess.to(torch.uint8).cpu().numpy()
+        n_classes = len(self._run.anatomy_ct.parts) + 1
+        pairs = labels.astype(np.int64).ravel() * n_classes + self._scenes.labels.ravel()
+        table = np.bincount(pairs, minlength=n_classes**2).reshape(n_classes, n_classes)
+        both = table.diagonal()
+        either = table.sum(0) + table.sum(1) - both
+        return float((both / np.maximum(either, 1))[1:].mean())
+
+    @torch.no_grad()
+    def model(self, network: OccupancyNetwork, provenance: dict[str, Any]) -> OccupancyModel:
+        """The finished model of the network."""
+        network.eval()
+        scenes, spreads, fits = self._scenes, list[float](), list[float]()
+        for points_mm, box_mm in zip(scenes.clouds_mm[:_FIT_ON], scenes.boxes_mm, strict=False):
+            latent = network.encode(torch.from_numpy(points_mm).to(self._device)[None])
+            around = grown_box(box_mm[None] + np.median(points_mm, axis=0))
+            fit = spread = spread_mm(points_mm)
+            with suppress(NoEstimate):  # after a few steps a network finds no organ
+                lattice = lattice_over(partial(self._logits, network, latent), around, FIT_STEPS)
+                fit = fit_mm(surface_distances(lattice, points_mm))
+            spreads.append(spread)
+            fits.append(fit)
+        if same := ambiguous(half_turns(self._run.anatomy_ct)):
+            provenance = {**provenance, "half_turn_mm": same[0].mean_mm}
+        known = InDistributionRange(
+            spread_mm=(min(spreads), max(spreads)), fit_mm=float(np.percentile(fits, 95))
+        )
+        return OccupancyModel(
+            network=network,
+            config=self._run.config,
+            parts=self._run.anatomy_ct.names,
+            query_box_mm=grown_box(scenes.boxes_mm),
+            in_distribution=known,
+            provenance=provenance,
+        )
+
+    @cached_property
+    def _scenes(self) -> ValidationScenes:
+        """The first scenes of the ``validation`` stream."""
+        run, config, pool, rows = self._run, self._run.config, self.points.parts[0], []
+        simulator = Simulator(run.anatomy_ct, run.up_lps, config.scene, self.body)
+        for index in range(config.validation_pairs):
+            recipe = SceneRecipe(run.seed, "validation", index)
+            scene = simulator.render(recipe)
+            drawn, answer = pool.draw_evenly(recipe.generator(999), config.validation_points)
+            observed = scene.cloud.points_mm
+            organ = scene.carry(run.anatomy_ct.organ.vertices_mm) - np.median(observed, axis=0)
+            box = np.array([organ.min(0), organ.max(0)], float)
+            cloud = refill(observed, config.scene.cloud.n_points)
+            rows.append((cloud, scene.carry(drawn), answer, box))
+        return ValidationScenes(*(np.stack(column) for column in zip(*rows, strict=True)))
+
+    def _logits(
+        self, network: OccupancyNetwork, latent: Latent, queries_mm: np.ndarray
+    ) -> torch.Tensor:
+        parts = torch.from_numpy(queries_mm).to(self._device)[None].split(_QUERIES, dim=1)
+        return torch.cat([network.query(latent, part)[0] for part in parts])
+
+
+@dataclass(frozen=True, eq=False)
+class ValidationScenes:
+    """Scenes of the ``validation`` stream with points spread evenly over the organ's enlarged
+    box, so that numbers of points are volumes; camera frame, mm."""
+
+    clouds_mm: Float32[np.ndarray, "s n 3"]
+    points_mm: Float32[np.ndarray, "s q 3"]
+    labels: UInt8[np.ndarray, "s q"]
+    boxes_mm: Float64[np.ndarray, "s 2 3"]  # the organ's, relative to the points' median
+
+
+def grown_box(boxes_mm: Float64[np.ndarray, "s 2 3"]) -> Float64[np.ndarray, "2 3"]:
+    """The box of all the boxes, 10 % larger."""
+    lower, upper = boxes_mm[:, 0].min(0), boxes_mm[:, 1].max(0)
+    return np.stack([lower - 0.05 * (upper - lower), upper + 0.05 * (upper - lower)])
