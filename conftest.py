@@ -17,6 +17,7 @@ os.environ |= {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": "0123456789abcdef" * 
 ROOT = Path(__file__).parent
 PACKAGES = (
     ROOT / "src" / "tumortrack",
+    ROOT / "devices" / "src" / "tumortrack_devices",
     ROOT / "resection" / "src" / "tumortrack_resection",
     ROOT / "lab" / "src" / "tumortrack_lab",
     ROOT / "experiment" / "src" / "tumortrack_experiment",

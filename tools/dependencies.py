@@ -28,7 +28,13 @@ from packaging.utils import canonicalize_name
 ROOT = Path(__file__).parents[1]
 LOCKS = ROOT / "requirements"
 TABLE = ROOT / "docs" / "data" / "dependencies.csv"
-OWN = ("tumortrack", "tumortrack-resection", "tumortrack-lab", "tumortrack-experiment")
+OWN = (
+    "tumortrack",
+    "tumortrack-devices",
+    "tumortrack-resection",
+    "tumortrack-lab",
+    "tumortrack-experiment",
+)
 _APART = {"ur-rtde": "ur"}  # in a file of its own: `make setup` leaves it out
 
 # Licences that ask for no more than to be named, and those that bind only changes of the package
@@ -61,7 +67,13 @@ STATED = {
 
 def lock(upgrade: list[str]) -> None:
     """Resolve everything for every platform, and keep what is pinned unless told to upgrade."""
-    folders = (ROOT, ROOT / "resection", ROOT / "lab", ROOT / "experiment")
+    folders = (
+        ROOT,
+        ROOT / "devices",
+        ROOT / "resection",
+        ROOT / "lab",
+        ROOT / "experiment",
+    )
     everything = "".join(f"-e {folder}[{_extras(folder)}]\n" for folder in folders)
     resolved = _resolved(everything, "".join(_locks().values()), upgrade)
     build = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["build-system"]["requires"]

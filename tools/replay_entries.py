@@ -21,7 +21,7 @@ from tumortrack.core import store
 from tumortrack.core.types import SensorCloud
 from tumortrack.imaging.case import Case, load_case, save_case
 from tumortrack.imaging.surface import surfaces
-from tumortrack.live.sources.virtual import VirtualSourceConfig
+from tumortrack.live.virtual_source import VirtualSourceConfig
 from tumortrack.occupancy.inference import Inference
 from tumortrack.occupancy.presets import paper as paper_config
 from tumortrack.occupancy.presets import quick as quick_config

@@ -17,12 +17,12 @@ from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import HERE
 from tumortrack.core.mesh_files import write_mesh
 from tumortrack.core.types import DepthFrame, Mesh
-from tumortrack.live.recording.mcap import McapBag, camera_messages
-from tumortrack.live.ros.messages import Messages
 from tumortrack.live.values import Observation
 from tumortrack.sense.camera import d405
 from tumortrack.sense.files import depth_png, intrinsics_json
 from tumortrack.sense.ply import write_cloud_ply
+from tumortrack_devices.recording.mcap import McapBag, camera_messages
+from tumortrack_devices.ros.messages import Messages
 
 PATIENT = {"id": "P1", "side": "left"}
 PARTS = {

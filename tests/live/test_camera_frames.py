@@ -14,11 +14,11 @@ from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.types import DepthFrame, SensorCloud
 from tumortrack.live.calibration_file import read_frames
 from tumortrack.live.frames import UNNAMED, FrameCheck
-from tumortrack.live.sources.recording import RecordingSourceConfig
 from tumortrack.live.values import Observation, PublishedFrame
 from tumortrack.sense.camera import d405, deproject
 from tumortrack.sense.region.picture import RegionConfig
 from tumortrack.sense.region.watch import TableWatch
+from tumortrack_devices.sources.recording import RecordingSourceConfig
 
 CAMERA = d405(424, 240)
 CONFIG = RegionConfig()

@@ -16,8 +16,6 @@ from tumortrack.live.calibration_file import read_frames
 from tumortrack.live.cameras import Cameras, camera_setup
 from tumortrack.live.loop import Loop, LoopConfig, summary
 from tumortrack.live.poses import CameraPoses, FilePoses, PoseBuffer
-from tumortrack.live.sinks.recording import RecordingSinkConfig
-from tumortrack.live.sources.recording import RecordingSourceConfig
 from tumortrack.live.values import (
     Observation,
     PublishedFrame,
@@ -28,6 +26,8 @@ from tumortrack.live.values import (
 from tumortrack.live.workers import SourceWorker
 from tumortrack.sense.region import RegionConfig
 from tumortrack.tracking.tracker import Tracker
+from tumortrack_devices.sinks.recording import RecordingSinkConfig
+from tumortrack_devices.sources.recording import RecordingSourceConfig
 
 MS = 1_000_000
 ALL = RegionConfig(plane=False, flying=False, pieces=False)

@@ -11,7 +11,7 @@ from igtl_objects import polydata_by_the_book, slow_crc
 from igtl_reader import IgtlStatus, unpack, unpack_polydata, unpack_status, unpack_transform
 from live_objects import STAMP_NS
 from tumortrack.core.geometry import rigid
-from tumortrack.live.igtl.message import (
+from tumortrack_devices.igtl.message import (
     HEADER_SIZE,
     Message,
     Polydata,

@@ -17,9 +17,9 @@ from motions import Wave
 from reports import NOWHERE, reporting
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import rigid
-from tumortrack.live.igtl.message import Message, pack
-from tumortrack.live.sinks.openigtlink import OpenIgtLinkSink, OpenIgtLinkSinkConfig
 from tumortrack.live.values import PublishedFrame, SinkContext, TrackingResult
+from tumortrack_devices.igtl.message import Message, pack
+from tumortrack_devices.sinks.openigtlink import OpenIgtLinkSink, OpenIgtLinkSinkConfig
 
 
 @pytest.fixture

@@ -21,11 +21,11 @@ from clock import PATIENCE_S, until
 from hostile_clients import MANY, crowd, drip, noise, resident_mb
 from igtl_objects import hear
 from live_objects import empty_update, small_setting, small_update
-from tumortrack.live.igtl.link import MOST_RECEIVERS
-from tumortrack.live.network import Pace, is_loopback
-from tumortrack.live.sinks.openigtlink import OpenIgtLinkSinkConfig
-from tumortrack.live.sinks.viewer import ViewerSink, ViewerSinkConfig
-from tumortrack.live.viewer.guard import MOST_CONNECTIONS, MOST_PAGES
+from tumortrack_devices.igtl.link import MOST_RECEIVERS
+from tumortrack_devices.network import Pace, is_loopback
+from tumortrack_devices.sinks.openigtlink import OpenIgtLinkSinkConfig
+from tumortrack_devices.sinks.viewer import ViewerSink, ViewerSinkConfig
+from tumortrack_devices.viewer.guard import MOST_CONNECTIONS, MOST_PAGES
 
 PROTOCOL = f"viser-v{viser.__version__}"
 _ALLOWED_MB = 200  # of growth: 64 connections may each wait for the page's 0.8 MB, 8 for surfaces

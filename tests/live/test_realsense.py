@@ -12,9 +12,9 @@ from clock import PATIENCE_S, until
 from realsense_objects import HEIGHT, WIDTH, Camera, raw_depth, record
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import Intrinsics
-from tumortrack.live.sources.realsense import RealSenseSource, RealSenseSourceConfig
 from tumortrack.live.spec import SOURCES
 from tumortrack.live.values import SourceEnded, SourceLost
+from tumortrack_devices.sources.realsense import RealSenseSource, RealSenseSourceConfig
 
 
 def test_a_cameras_frame_comes_out_bit_for_bit():

@@ -34,11 +34,11 @@ from tumortrack.core.errors import InputError, StorageError
 from tumortrack.core.geometry import rigid
 from tumortrack.core.mesh_files import write_anatomy
 from tumortrack.core.types import DepthFrame, SensorCloud
-from tumortrack.live.recording.mcap import CHUNK_S
-from tumortrack.live.sinks.recording import RecordingSinkConfig as RecordTo
-from tumortrack.live.sources.recording import RecordingSourceConfig
 from tumortrack.live.values import Observation, PublishedFrame, SourceEnded, SourceLost
 from tumortrack.sense.ply import write_cloud_ply
+from tumortrack_devices.recording.mcap import CHUNK_S
+from tumortrack_devices.sinks.recording import RecordingSinkConfig as RecordTo
+from tumortrack_devices.sources.recording import RecordingSourceConfig
 
 TURNED = PublishedFrame("table", rigid(np.diag([-1.0, -1.0, 1.0]), np.array([50.0, -20, 9])))
 
@@ -422,7 +422,7 @@ def test_what_is_no_recording_is_refused(tmp_path):
 def clock(monkeypatch):
     """The recording's, which the test turns."""
     one = Clock()
-    monkeypatch.setattr("tumortrack.live.sources.recording.time", one)
+    monkeypatch.setattr("tumortrack_devices.sources.recording.time", one)
     return one
 
 
@@ -462,7 +462,7 @@ def test_a_long_pause_is_cut_short_of_a_frozen_source(tmp_path, clock):
 
 
 def test_close_ends_a_read_that_waits(tmp_path, monkeypatch):
-    monkeypatch.setattr("tumortrack.live.sources.recording._LONGEST_WAIT_S", 10 * PATIENCE_S)
+    monkeypatch.setattr("tumortrack_devices.sources.recording._LONGEST_WAIT_S", 10 * PATIENCE_S)
     folder = cloud_files(tmp_path / "c", ["1000000000000.ply", "9000000000000.ply"])
     source = RecordingSourceConfig(path=folder).open()
     source.read(0)

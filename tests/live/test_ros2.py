@@ -27,18 +27,18 @@ from ros2_objects import Frames, own_graph, read_until, sending
 from ros2_peer import points_mm
 from tumortrack.core.errors import InputError, TumortrackError
 from tumortrack.core.types import SensorCloud
-from tumortrack.live.ros import sensors
-from tumortrack.live.ros.bus import Bus
-from tumortrack.live.ros.dds import dds_name, domain_id, idl_type, ros_name
-from tumortrack.live.ros.messages import Messages
-from tumortrack.live.ros.results import JOINTS, MARKERS, ResultMessages
-from tumortrack.live.ros.ros2 import open_bus
-from tumortrack.live.ros.sensors import messages_seen, plain_cloud
-from tumortrack.live.sinks.ros import Ros2SinkConfig as SinkRos2
-from tumortrack.live.sources.ros import Ros2SourceConfig as SourceRos2
 from tumortrack.live.spec import POSES, SINKS, SOURCES, Registry
 from tumortrack.live.values import Observation, Source
 from tumortrack.live.workers import SourceWorker
+from tumortrack_devices.ros import sensors
+from tumortrack_devices.ros.bus import Bus
+from tumortrack_devices.ros.dds import dds_name, domain_id, idl_type, ros_name
+from tumortrack_devices.ros.messages import Messages
+from tumortrack_devices.ros.results import JOINTS, MARKERS, ResultMessages
+from tumortrack_devices.ros.ros2 import open_bus
+from tumortrack_devices.ros.sensors import messages_seen, plain_cloud
+from tumortrack_devices.sinks.ros import Ros2SinkConfig as SinkRos2
+from tumortrack_devices.sources.ros import Ros2SourceConfig as SourceRos2
 from workcell_objects import with_arms, working
 
 needs.module("cyclonedds", "tumortrack[live], x86-64, Python up to 3.13")
@@ -112,7 +112,7 @@ def test_a_topic_that_nobody_publishes_is_said_with_those_there_are(bus, monkeyp
     source = SourceRos2(topic="/camera/depht/image").open()
     try:
         assert source.read(0.0) is None  # it may not be heard of yet
-        monkeypatch.setattr("tumortrack.live.sources.ros._ALONE_S", 0.0)
+        monkeypatch.setattr("tumortrack_devices.sources.ros._ALONE_S", 0.0)
         with pytest.raises(InputError, match="/camera/depht/image; nor any image or cloud"):
             source.read(0.0)
         publishers = [bus.publisher("/camera/depth/image", sensors.IMAGE)]

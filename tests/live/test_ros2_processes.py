@@ -32,19 +32,19 @@ from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.estimate import Estimate
 from tumortrack.core.geometry import rigid
 from tumortrack.core.types import OccupancyCloud, SensorCloud
-from tumortrack.live.ros import sensors
-from tumortrack.live.ros.bus import Bus
-from tumortrack.live.ros.dds import dds_name
-from tumortrack.live.ros.messages import Messages
-from tumortrack.live.ros.results import DIAGNOSTICS, ResultMessages
-from tumortrack.live.ros.ros2 import open_bus
-from tumortrack.live.ros.sensors import messages_seen, plain_cloud
-from tumortrack.live.ros.tf import TRANSFORMS, pose_of, transform_fields
-from tumortrack.live.sinks.moveit import SCENE, MoveItSinkConfig
-from tumortrack.live.sinks.ros import Ros2SinkConfig as SinkRos2
-from tumortrack.live.sources.ros import Ros2SourceConfig as SourceRos2
 from tumortrack.live.spec import POSES
 from tumortrack.live.values import Observation, PublishedFrame, Sink, Source, TrackingResult
+from tumortrack_devices.ros import sensors
+from tumortrack_devices.ros.bus import Bus
+from tumortrack_devices.ros.dds import dds_name
+from tumortrack_devices.ros.messages import Messages
+from tumortrack_devices.ros.results import DIAGNOSTICS, ResultMessages
+from tumortrack_devices.ros.ros2 import open_bus
+from tumortrack_devices.ros.sensors import messages_seen, plain_cloud
+from tumortrack_devices.ros.tf import TRANSFORMS, pose_of, transform_fields
+from tumortrack_devices.sinks.moveit import SCENE, MoveItSinkConfig
+from tumortrack_devices.sinks.ros import Ros2SinkConfig as SinkRos2
+from tumortrack_devices.sources.ros import Ros2SourceConfig as SourceRos2
 
 needs.module("cyclonedds", "tumortrack[live], x86-64, Python up to 3.13")
 

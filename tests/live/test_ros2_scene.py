@@ -26,14 +26,14 @@ from tumortrack.core.errors import InputError
 from tumortrack.core.estimate import Estimate
 from tumortrack.core.geometry import rigid
 from tumortrack.core.types import Mesh
-from tumortrack.live.ros.messages import Messages
-from tumortrack.live.ros.results import ResultMessages
-from tumortrack.live.ros.ros2 import open_bus
-from tumortrack.live.ros.sensors import COMPRESSED, image_of
-from tumortrack.live.ros.tf import TRANSFORMS, pose_of
-from tumortrack.live.sinks.moveit import SCENE, coarser, widened_hull
 from tumortrack.live.spec import SINKS
 from tumortrack.live.values import PublishedFrame, TrackingResult
+from tumortrack_devices.ros.messages import Messages
+from tumortrack_devices.ros.results import ResultMessages
+from tumortrack_devices.ros.ros2 import open_bus
+from tumortrack_devices.ros.sensors import COMPRESSED, image_of
+from tumortrack_devices.ros.tf import TRANSFORMS, pose_of
+from tumortrack_devices.sinks.moveit import SCENE, coarser, widened_hull
 
 MESSAGES = Messages()
 QUARTER = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
@@ -177,7 +177,7 @@ def test_the_scene_s_options_are_checked():
 
 def test_moveit_s_types_are_those_that_a_second_library_makes():
     needs.module("cyclonedds", "tumortrack[live], x86-64, Python up to 3.13")
-    from tumortrack.live.ros.dds import idl_type
+    from tumortrack_devices.ros.dds import idl_type
 
     scene = MESSAGES.make(SCENE, name="theatre", is_diff=True, robot_state={"is_diff": True})
     cdr = bytes(MESSAGES.to_bytes(scene))

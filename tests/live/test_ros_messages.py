@@ -27,9 +27,10 @@ from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import rigid
 from tumortrack.core.types import SensorCloud
 from tumortrack.live.meter import Rate
-from tumortrack.live.ros.messages import Messages, stamp_of
-from tumortrack.live.ros.results import MARKERS, ResultMessages
-from tumortrack.live.ros.sensors import (
+from tumortrack.live.values import Observation, PublishedFrame, Workcell
+from tumortrack_devices.ros.messages import Messages, stamp_of
+from tumortrack_devices.ros.results import MARKERS, ResultMessages
+from tumortrack_devices.ros.sensors import (
     CAMERA_INFO,
     CLOUD,
     IMAGE,
@@ -39,7 +40,6 @@ from tumortrack.live.ros.sensors import (
     messages_seen,
     picture_of,
 )
-from tumortrack.live.values import Observation, PublishedFrame, Workcell
 from workcell_objects import virtual, with_arms, working
 
 HUMBLE, NOETIC = Messages("humble"), Messages("noetic")

@@ -23,10 +23,10 @@ from recording_objects import frame_number, record, update_number
 from theatre_objects import small_theatre
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import DepthFrame, SensorCloud
-from tumortrack.live.sources.realsense import RealSenseSource, RealSenseSourceConfig
-from tumortrack.live.sources.recording import RecordingSourceConfig
-from tumortrack.live.sources.virtual import VirtualSource
 from tumortrack.live.values import Observation, Source, SourceEnded, SourceLost
+from tumortrack.live.virtual_source import VirtualSource
+from tumortrack_devices.sources.realsense import RealSenseSource, RealSenseSourceConfig
+from tumortrack_devices.sources.recording import RecordingSourceConfig
 
 SLACK_S = 0.5  # that the quickest of some reads may take longer
 
@@ -73,7 +73,7 @@ def ros2_clouds(_folder: Path) -> Iterator[Source]:
 def _ros2(kind: str) -> Iterator[Source]:
     needs.module("cyclonedds", "tumortrack[live], x86-64, Python up to 3.13")
     from ros2_objects import own_graph, sending
-    from tumortrack.live.sources.ros import Ros2SourceConfig
+    from tumortrack_devices.sources.ros import Ros2SourceConfig
 
     with own_graph(), sending(kind) as topic:
         source = Ros2SourceConfig(topic=topic).open()

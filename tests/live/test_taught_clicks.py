@@ -18,7 +18,6 @@ from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import DepthFrame
 from tumortrack.live.loop import Loop, LoopConfig
-from tumortrack.live.sinks.viewer import ViewerSinkConfig
 from tumortrack.live.values import (
     Controls,
     Observation,
@@ -32,6 +31,7 @@ from tumortrack.sense.cloud import CloudConfig
 from tumortrack.sense.region import RegionConfig
 from tumortrack.tracking.model_files import load_model
 from tumortrack.tracking.tracker import Tracker
+from tumortrack_devices.sinks.viewer import ViewerSinkConfig
 from warp_objects import ANATOMY
 
 REGION = RegionConfig(crop=CloudConfig(near_mm=60.0, far_mm=400.0))

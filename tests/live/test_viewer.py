@@ -24,15 +24,15 @@ from tumortrack.core.patient import Patient
 from tumortrack.core.store import new_folder
 from tumortrack.core.types import Anatomy, LabelVolume, Mesh, Volume
 from tumortrack.imaging.case import Case, save_case
-from tumortrack.live.display import seen_points
-from tumortrack.live.sinks import viewer
-from tumortrack.live.sinks.viewer import ViewerSink, ViewerSinkConfig
 from tumortrack.live.values import PublishedFrame, SinkContext, TrackingResult
-from tumortrack.live.viewer.look import point_under
-from tumortrack.live.viewer.panel import StatusPanel
-from tumortrack.live.viewer.scene import bare_faces
-from tumortrack.live.viewer.slices import CarriedCt, SlicePlane, plane_through, slice_picture
 from tumortrack.tracking.shells import exact_margin, rough_margin
+from tumortrack.tracking.slices import CarriedCt, SlicePlane, plane_through, slice_picture
+from tumortrack_devices.display import seen_points
+from tumortrack_devices.sinks import viewer
+from tumortrack_devices.sinks.viewer import ViewerSink, ViewerSinkConfig
+from tumortrack_devices.viewer.look import point_under
+from tumortrack_devices.viewer.panel import StatusPanel
+from tumortrack_devices.viewer.scene import bare_faces
 from workcell_objects import virtual, with_arms, workcell, working
 
 TURN = Rotation.from_euler("xyz", [20, -35, 50], degrees=True).as_matrix()
@@ -247,7 +247,7 @@ def test_click_means_the_foremost_point_under_it():
 def clock(monkeypatch):
     """The viewer's, which the test turns."""
     one = Clock()
-    monkeypatch.setattr("tumortrack.live.sinks.viewer.time", one)
+    monkeypatch.setattr("tumortrack_devices.sinks.viewer.time", one)
     return one
 
 

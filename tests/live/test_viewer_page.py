@@ -24,8 +24,8 @@ from clock import until
 from live_objects import empty_update, small_setting, small_update
 from stories import COMMAND, environment, live_resection
 from tumortrack.core.geometry import rigid, transform_points
-from tumortrack.live.sinks.viewer import ViewerSink, ViewerSinkConfig
 from tumortrack.live.values import PublishedFrame, SinkContext, TrackingResult
+from tumortrack_devices.sinks.viewer import ViewerSink, ViewerSinkConfig
 from workcell_objects import virtual, workcell
 
 TURN = Rotation.from_euler("xyz", [20, -35, 50], degrees=True).as_matrix()
@@ -72,7 +72,7 @@ def arm(browser: Browser) -> int:
 @pytest.mark.slow
 def test_page_in_a_browser(monkeypatch):
     # A feed that a loaded machine holds up for seconds isn't stale yet.
-    monkeypatch.setattr("tumortrack.live.sinks.viewer._STALE_S", 5.0)
+    monkeypatch.setattr("tumortrack_devices.sinks.viewer._STALE_S", 5.0)
     setting = replace(small_setting(), published_frame=ROBOT, arms=True)
     sink = ViewerSinkConfig(port=0).open(setting)
     shown = small_update(frames=ROBOT)

@@ -14,8 +14,8 @@ from clock import until
 from live_objects import small_setting, small_update
 from tumortrack.core import colours
 from tumortrack.core.estimate import Quality
-from tumortrack.live.sinks.viewer import ViewerSinkConfig
 from tumortrack.live.values import TrackingResult
+from tumortrack_devices.sinks.viewer import ViewerSinkConfig
 
 _SHOTS = 20
 

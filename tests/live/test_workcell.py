@@ -18,13 +18,13 @@ from igtl_reader import IgtlStatus, unpack_status, unpack_transform
 from live_objects import small_setting, small_update
 from recording_objects import frame_number
 from tumortrack.core.geometry import rigid, transform_points
-from tumortrack.live.ros.messages import Messages, stamp_of
-from tumortrack.live.ros.results import ResultMessages
-from tumortrack.live.ros.sensors import cloud_of
-from tumortrack.live.sinks.openigtlink import OpenIgtLinkSinkConfig
-from tumortrack.live.sinks.recording import RecordingSinkConfig as RecordTo
-from tumortrack.live.sources.recording import RecordingSourceConfig
 from tumortrack.live.values import Observation, SinkContext, SourceEnded, TrackingResult
+from tumortrack_devices.ros.messages import Messages, stamp_of
+from tumortrack_devices.ros.results import ResultMessages
+from tumortrack_devices.ros.sensors import cloud_of
+from tumortrack_devices.sinks.openigtlink import OpenIgtLinkSinkConfig
+from tumortrack_devices.sinks.recording import RecordingSinkConfig as RecordTo
+from tumortrack_devices.sources.recording import RecordingSourceConfig
 from workcell_objects import CUT, REASON, TABLE, virtual, with_arms, workcell, working
 
 HUMBLE = Messages("humble")

@@ -20,9 +20,9 @@ from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import DepthFrame
 from tumortrack.imaging.case import load_case
 from tumortrack.sense.noise import D405_NOISE, STEREO_NOISE, NoiseConfig, add_noise, stereo_noise
-from tumortrack.sense.stereo import StereoRig, read_calibration
 from tumortrack.tracking import presets
 from tumortrack.tracking.tracker import Tracker, region_for
+from tumortrack_devices.stereo import StereoRig, read_calibration
 
 
 @pytest.fixture(scope="module")

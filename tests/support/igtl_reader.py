@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int, Num, UInt32
 
-from tumortrack.live.igtl.message import (
+from tumortrack_devices.igtl.message import (
     Header,
     Message,
     Polydata,

@@ -20,10 +20,10 @@ from clock import PATIENCE_S, until
 from live_objects import PARTS, small_anatomy, small_frame
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import SensorCloud
-from tumortrack.live.ros.bus import Bus
-from tumortrack.live.ros.ros2 import open_bus
-from tumortrack.live.ros.sensors import messages_seen
 from tumortrack.live.values import Observation, Source
+from tumortrack_devices.ros.bus import Bus
+from tumortrack_devices.ros.ros2 import open_bus
+from tumortrack_devices.ros.sensors import messages_seen
 
 HERE = Path(__file__).parent
 N_TOPICS = 3 + len(PARTS)

@@ -19,14 +19,14 @@ from scipy.spatial.transform import Rotation
 from live_objects import empty_update, small_frame, small_setting
 from tumortrack.core.geometry import rigid
 from tumortrack.core.types import DepthFrame, SensorCloud
-from tumortrack.live.ros.bus import Publisher
-from tumortrack.live.ros.dds import DdsBus
-from tumortrack.live.ros.messages import stamp_of
-from tumortrack.live.ros.results import DIAGNOSTICS, MARKERS, ResultMessages
-from tumortrack.live.ros.ros2 import open_bus
-from tumortrack.live.ros.sensors import CLOUD, messages_seen, plain_cloud
-from tumortrack.live.ros.tf import TRANSFORMS
 from tumortrack.live.values import Observation
+from tumortrack_devices.ros.bus import Publisher
+from tumortrack_devices.ros.dds import DdsBus
+from tumortrack_devices.ros.messages import stamp_of
+from tumortrack_devices.ros.results import DIAGNOSTICS, MARKERS, ResultMessages
+from tumortrack_devices.ros.ros2 import open_bus
+from tumortrack_devices.ros.sensors import CLOUD, messages_seen, plain_cloud
+from tumortrack_devices.ros.tf import TRANSFORMS
 
 N_POINTS = 40_000
 TOOL_FROM_CAMERA = rigid(np.diag([-1.0, -1, 1]), np.array([0.01, 0.02, 0.06]))  # m

@@ -9,13 +9,13 @@ import tumortrack as tt
 from live_objects import ball, empty_update, small_anatomy, small_setting, small_update
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import Mesh, SensorCloud
-from tumortrack.live.ros.messages import Messages
-from tumortrack.live.ros.results import ResultMessages
-from tumortrack.live.sinks.openigtlink import OpenIgtLinkSinkConfig
 from tumortrack.registration.rest_shape import RestShape
 from tumortrack.tracking.files import write_estimate
 from tumortrack.tracking.model_files import load_model
 from tumortrack.tracking.tracker import Tracker
+from tumortrack_devices.ros.messages import Messages
+from tumortrack_devices.ros.results import ResultMessages
+from tumortrack_devices.sinks.openigtlink import OpenIgtLinkSinkConfig
 
 
 @pytest.fixture(scope="module")
