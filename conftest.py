@@ -55,6 +55,7 @@ SLOWEST = (
     "test_gauss_newton.py",
     "test_registration.py",
     "test_track.py",
+    "test_track_devices.py",
     "test_wheel.py",
     "test_attacks.py",
     "test_bench_gpu.py",

@@ -5,7 +5,12 @@ from graphlib import TopologicalSorter
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
-SOURCES = (ROOT / "src", ROOT / "lab" / "src", ROOT / "experiment" / "src")
+SOURCES = (
+    ROOT / "src",
+    ROOT / "devices" / "src",
+    ROOT / "lab" / "src",
+    ROOT / "experiment" / "src",
+)
 
 
 def imports() -> dict[str, set[tuple[str, str]]]:

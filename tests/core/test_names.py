@@ -10,7 +10,11 @@ ROOT = Path(__file__).parents[2]
 LISTED = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["tumortrack"]
 SOURCES = sorted(
     path
-    for package in ("src/tumortrack", "resection/src/tumortrack_resection")
+    for package in (
+        "src/tumortrack",
+        "devices/src/tumortrack_devices",
+        "resection/src/tumortrack_resection",
+    )
     for path in (ROOT / package).rglob("*.py")
 )
 

@@ -29,11 +29,11 @@ _METHODS = {  # by whether they have a network
     False: "lays the organ of the CT on the points; `locate --map` says where points of the CT are",
     True: "labels points; it does not know which point of the CT lies where (no `--map`)",
 }
-_BAGS = (".mcap", ".db3", ".bag", "metadata.yaml")
+_BAGS = (".mcap", ".db3", ".bag")
 _KNOWN = (
-    "folders that commands write (cases, models, runs, plans, scenes, recordings, evaluations, "
-    "fleets, kits, calibrations), their reports, calibration and intrinsics files, clouds, depth "
-    "images beside intrinsics.json, meshes, CTs and label maps"
+    "folders that commands write (cases, models, runs, plans, scenes, evaluations, fleets, kits, "
+    "calibrations), their reports, calibration and intrinsics files, clouds, depth images beside "
+    "intrinsics.json, meshes, CTs, label maps, and with tumortrack-devices recordings"
 )
 
 
@@ -219,7 +219,8 @@ def _folder(path: Path) -> Iterable[str]:
         return _scene(path)
     if "report.json" in inside:
         return _json(path / "report.json")
-    if any(name.lower().endswith(_BAGS) and (path / name).is_file() for name in inside):
+    bags = [name for name in inside if name == "metadata.yaml" or name.lower().endswith(_BAGS)]
+    if any((path / name).is_file() for name in bags):
         return _recording(path)
     if scenes:
         return [f"{scenes} scene{'s' * (scenes != 1)}; `tumortrack evaluate` reads them"]

@@ -113,8 +113,8 @@ class Session:
             self._store()
             return
         for sink in self._named.values():
-            if isinstance(sink, SinkConfig) and sink.folder is not None:
-                store.remove(sink.folder)
+            if isinstance(sink, SinkConfig) and (path := sink.made_path()) is not None:
+                store.remove(path)
         if self.report is not None:
             store.remove(self.report)
 

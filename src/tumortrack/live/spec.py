@@ -78,7 +78,8 @@ class Registry(Generic[C]):
             )
         if not matches and kind in self.packages:
             raise InputError(
-                f"{where}: {kind!r} is not installed here: pip install {self.packages[kind]!r}."
+                f"{where}: {kind!r} is not installed here: pip install {self.packages[kind]!r} "
+                "(in a checkout: make setup)."
             )
         if not matches:
             installed = {entry.name for entry in entries}

@@ -418,8 +418,7 @@ class SinkConfig(Config, frozen=True, kw_only=True, tag_field="kind"):
     target: ClassVar[str] = ""
     queue_size: ClassVar[int] = 1
 
-    @property
-    def folder(self) -> Path | None:
+    def made_path(self) -> Path | None:
         """What ``open`` makes on the disk; it is removed if the run's start fails."""
         return None
 

@@ -41,8 +41,7 @@ class RecordingSinkConfig(SinkConfig, frozen=True, kw_only=True, tag="recording"
     def __post_init__(self) -> None:
         self.check_between("recording:", meshes_hz=(0, 1000))
 
-    @property
-    def folder(self) -> Path:
+    def made_path(self) -> Path:
         return self.path
 
     def open(self, context: SinkContext) -> RecordingSink:

@@ -196,7 +196,7 @@ for n in range(1000):
 
 
 def test_a_killed_recorder_loses_less_than_a_second(tmp_path):
-    here = str(Path(__file__).parents[1] / "support")
+    here = str(Path(__file__).parents[2] / "tests" / "support")
     command = [sys.executable, "-c", CHILD, str(tmp_path / "r"), here]
     with subprocess.Popen(command, stdout=subprocess.PIPE, start_new_session=True) as child:
         lines = []
@@ -480,3 +480,18 @@ def test_the_second_of_two_that_begin_to_record_into_one_folder_is_refused(tmp_p
     first.publish(update_number(0))
     first.close()
     assert stamps(play(tmp_path / "tape")) == [frame_number(0).stamp_ns]
+
+
+@pytest.mark.parametrize(
+    "published", [PublishedFrame(), PublishedFrame("base", np.diag([-1, -1, 1, 1.0]))]
+)
+@pytest.mark.parametrize(("name", "kept"), [("left_optical", "left_optical"), ("", "camera")])
+def test_a_recorded_bag_keeps_the_name_of_its_camera(tmp_path, published, name, kept):
+    """By which the calibration knows it, when the recording is played."""
+    updates = [update_number(n, frame_id=name) for n in range(2)]
+    path = record(tmp_path / "bag", [replace(one, published_frame=published) for one in updates])
+    source = RecordingSourceConfig(path=path, rate=0).open()
+    got = source.read(1.0)
+    source.close()
+    assert got is not None
+    assert got.frame_id == kept

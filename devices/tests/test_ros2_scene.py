@@ -176,7 +176,7 @@ def test_the_scene_s_options_are_checked():
 
 
 def test_moveit_s_types_are_those_that_a_second_library_makes():
-    needs.module("cyclonedds", "tumortrack[live], x86-64, Python up to 3.13")
+    needs.module("cyclonedds", "tumortrack-devices, x86-64, Python up to 3.13")
     from tumortrack_devices.ros.dds import idl_type
 
     scene = MESSAGES.make(SCENE, name="theatre", is_diff=True, robot_state={"is_diff": True})
@@ -186,7 +186,7 @@ def test_moveit_s_types_are_those_that_a_second_library_makes():
 
 
 def test_obstacles_arrive_of_good_estimates_and_cameras_are_kept_for_latecomers():
-    needs.module("cyclonedds", "tumortrack[live], x86-64, Python up to 3.13")
+    needs.module("cyclonedds", "tumortrack-devices, x86-64, Python up to 3.13")
     setting = replace(small_setting(), published_frame=PLACED)
     good = small_update(frames=PLACED)
     with own_graph():

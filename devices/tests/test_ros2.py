@@ -41,9 +41,9 @@ from tumortrack_devices.sinks.ros import Ros2SinkConfig as SinkRos2
 from tumortrack_devices.sources.ros import Ros2SourceConfig as SourceRos2
 from workcell_objects import with_arms, working
 
-needs.module("cyclonedds", "tumortrack[live], x86-64, Python up to 3.13")
+needs.module("cyclonedds", "tumortrack-devices, x86-64, Python up to 3.13")
 
-HERE = Path(__file__).parents[1] / "support"
+HERE = Path(__file__).parent / "support"
 CLOUD_DDS = "sensor_msgs::msg::dds_::PointCloud2_"
 
 
@@ -239,7 +239,7 @@ def test_the_view_for_rviz_shows_what_is_published(
     name: str, frame: str, topics: list[str], messages: Messages
 ) -> None:
     """Topics, frame and reliability of the views are the sink's."""
-    folder = HERE.parents[1] / "integrations" / "ros2" / "tumortrack_ros" / "rviz"
+    folder = HERE.parents[2] / "integrations" / "ros2" / "tumortrack_ros" / "rviz"
     view = (folder / name).read_text(encoding="utf-8")
     out = ResultMessages(messages, with_arms()).of(empty_update())
     sent = {one.topic("/tumortrack") for one in out}

@@ -45,7 +45,7 @@ def in_mm(pose_m):
 
 
 def test_tf_of_another_process_places_the_camera_at_the_frames_stamp():
-    needs.module("cyclonedds", "tumortrack[live], x86-64, Python up to 3.13")
+    needs.module("cyclonedds", "tumortrack-devices, x86-64, Python up to 3.13")
     from ros2_objects import own_graph, peer
     from ros2_peer import TOOL_FROM_CAMERA, tool_pose
 

@@ -46,9 +46,9 @@ from tumortrack_devices.sinks.moveit import SCENE, MoveItSinkConfig
 from tumortrack_devices.sinks.ros import Ros2SinkConfig as SinkRos2
 from tumortrack_devices.sources.ros import Ros2SourceConfig as SourceRos2
 
-needs.module("cyclonedds", "tumortrack[live], x86-64, Python up to 3.13")
+needs.module("cyclonedds", "tumortrack-devices, x86-64, Python up to 3.13")
 
-HERE = Path(__file__).parents[1] / "support"
+HERE = Path(__file__).parent / "support"
 CLOUD_DDS = "sensor_msgs::msg::dds_::PointCloud2_"
 TURNED = rigid(np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), np.array([50.0, -20, 300]))
 SHIFTED = rigid(np.diag([1.0, -1, -1]), np.array([0.0, 10, 60]))

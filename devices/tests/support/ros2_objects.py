@@ -26,6 +26,7 @@ from tumortrack_devices.ros.ros2 import open_bus
 from tumortrack_devices.ros.sensors import messages_seen
 
 HERE = Path(__file__).parent
+PATHS = (HERE.parents[2] / "tests" / "support", os.environ.get("PYTHONPATH", ""))
 N_TOPICS = 3 + len(PARTS)
 # Each of a run's workers has domains of its own; which, is drawn, for another run may be under way.
 # Ports of domains beyond 100 reach into the ephemeral ones.
@@ -107,6 +108,7 @@ class Other:
             stdout=subprocess.PIPE,
             text=True,
             cwd=HERE,
+            env={**os.environ, "PYTHONPATH": os.pathsep.join(map(str, PATHS))},
             start_new_session=True,
         )
         self._said: queue.Queue[str] = queue.Queue()

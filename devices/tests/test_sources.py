@@ -71,7 +71,7 @@ def ros2_clouds(_folder: Path) -> Iterator[Source]:
 
 @contextmanager
 def _ros2(kind: str) -> Iterator[Source]:
-    needs.module("cyclonedds", "tumortrack[live], x86-64, Python up to 3.13")
+    needs.module("cyclonedds", "tumortrack-devices, x86-64, Python up to 3.13")
     from ros2_objects import own_graph, sending
     from tumortrack_devices.sources.ros import Ros2SourceConfig
 

@@ -168,7 +168,7 @@ def test_what_is_not_there_is_said(tmp_path, monkeypatch):
     with pytest.raises(SourceLost):
         RealSenseSourceConfig(device="000000000000").open()  # no camera has it
     monkeypatch.setitem(sys.modules, "pyrealsense2", None)
-    with pytest.raises(InputError, match=r"pip install 'tumortrack\[live\]'"):
+    with pytest.raises(InputError, match=r"pip install 'tumortrack-devices\[realsense\]'"):
         RealSenseSourceConfig().open()
 
 
