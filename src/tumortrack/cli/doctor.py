@@ -22,13 +22,15 @@ from tumortrack.core.process import available_cores
 # What each distribution and its extras are for; "" is what it always needs.
 PURPOSES = {
     ("tumortrack", ""): "cases, locating, tracking",
-    ("tumortrack", "live"): "cameras, ROS 2, the web viewer, 3D Slicer, DICOM segmentations",
-    ("tumortrack", "stereo"): "depth from two pictures",
-    ("tumortrack", "ur"): "a camera that an arm of Universal Robots holds",
+    ("tumortrack", "dicom"): "DICOM segmentations",
     ("tumortrack", "pcd"): ".pcd clouds",
     ("tumortrack", "occupancy"): "the paper's method: networks and their training",
     ("tumortrack", "onnx"): "networks as ONNX files",
     ("tumortrack", "tensorboard"): "training curves",
+    ("tumortrack-devices", ""): "recordings, ROS 2, the web viewer, 3D Slicer",
+    ("tumortrack-devices", "realsense"): "RealSense cameras",
+    ("tumortrack-devices", "stereo"): "depth from two pictures",
+    ("tumortrack-devices", "ur"): "a camera that an arm of Universal Robots holds",
     ("tumortrack-resection", ""): "plans of a resection",
     ("tumortrack-resection", "arms"): "motions of two arms",
     ("tumortrack-resection", "ur"): "a real arm of Universal Robots",
@@ -45,14 +47,13 @@ _MODULES = {  # where it is not named as its package
     "scikit-image": "skimage",
     "ur_rtde": "rtde_control",
 }
-# Packages of an extra that serve a part of it alone: without them the rest works.
+# Packages that serve a part alone: without them the rest works.
 _PARTS = {
     "rosbags": "recordings, and messages of ROS",
     "cyclonedds": "ROS 2",
     "viser": "the web viewer",
     "fastcrc": "OpenIGTLink to 3D Slicer",
     "pyrealsense2": "RealSense cameras",
-    "highdicom": "DICOM segmentations",
 }
 _ABSENT = " is not installed"
 Finding = tuple[Literal["ok", "absent", "BROKEN"], str]  # the state of a part, and what is said
@@ -121,7 +122,8 @@ def _findings() -> Iterator[Finding]:
 
 
 def _plug_ins() -> Iterator[Finding]:
-    """What other packages add; each is imported. Commands that work are in ``--help``."""
+    """What other packages add; each is imported. Commands that work are in ``--help``, and of our
+    own distributions only what does not work is said."""
     from tumortrack.live import spec
     from tumortrack.simulate.deform import installed
 
@@ -134,7 +136,10 @@ def _plug_ins() -> Iterator[Finding]:
             added.append((f"command {point.name}", point.value, str(error)))
     for what, package, fault in added:
         text = f"{what} of the package {package}"
-        yield ("BROKEN", f"{text}: {fault}") if fault else ("ok", text)
+        if fault:
+            yield "BROKEN", f"{text}: {fault}"
+        elif (package, "") not in PURPOSES:
+            yield "ok", text
 
 
 def part(name: str, extra: str, purpose: str) -> Iterator[Finding]:
@@ -149,11 +154,12 @@ def part(name: str, extra: str, purpose: str) -> Iterator[Finding]:
         return
     faults = {one.name: fault for one in needed if (fault := _fault(one))}
     works = [one.name for one in needed if one.name not in faults]
-    alone = {name: fault for name, fault in faults.items() if name in _PARTS} if works else {}
+    parts = _PARTS if works else _SYSTEM
+    alone = {name: fault for name, fault in faults.items() if name in parts}
     if rest := [fault for name, fault in faults.items() if name not in alone]:
         absent = extra and all(fault.endswith(_ABSENT) for fault in rest)
         yield "absent" if absent else "BROKEN", f"{what}: {purpose}; {', '.join(rest)}; {install}"
-    else:
+    elif works:
         there = ", ".join(f"{name} {version(name)}" for name in works)
         yield "ok", f"{what}: {purpose}{', but for what follows' if alone else ''}; {there}"
     for package, fault in alone.items():
