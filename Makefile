@@ -22,7 +22,7 @@ endef
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 10
 
-setup: $(SETUP)  ## install everything into .venv: tracker, the paper's method with PyTorch, resection, laboratory, experiment, what tests and the site need
+setup: $(SETUP)  ## install everything into .venv: tracker, devices, the paper's method with PyTorch, resection, laboratory, experiment, what tests and the site need
 
 $(TRACKER): pyproject.toml requirements/core.txt requirements/uv.txt
 	@$(PYTHON) -c 'import sys; sys.exit(not (3, 11) <= sys.version_info < (3, 15) and "tumortrack needs Python 3.11 to 3.14, and this is " + sys.version.split()[0] + "; give make PYTHON=python3.12, or another of these")'
@@ -35,12 +35,12 @@ $(TRACKER): pyproject.toml requirements/core.txt requirements/uv.txt
 	@touch $@
 
 # PyTorch's CPU build is taken where pip knows of it, else PyPI's, which on x86-64 needs CUDA's packages.
-$(SETUP): $(TRACKER) occupancy/pyproject.toml resection/pyproject.toml lab/pyproject.toml experiment/pyproject.toml requirements/rest.txt requirements/cuda.txt requirements/torch-cpu.txt
+$(SETUP): $(TRACKER) devices/pyproject.toml occupancy/pyproject.toml resection/pyproject.toml lab/pyproject.toml experiment/pyproject.toml requirements/rest.txt requirements/cuda.txt requirements/torch-cpu.txt
 	@$(BIN)/$(PIP) --require-hashes -r requirements/torch-cpu.txt 2>/dev/null || echo "PyTorch: PyPI's build"
 	@$(call INSTALL,requirements/rest.txt)
 	@if $(BIN)/python -c 'from importlib.metadata import requires; print(requires("torch"))' | grep -q nvidia; then \
 	echo "PyTorch's CUDA packages: some 3 GB"; $(call INSTALL,requirements/cuda.txt); fi
-	$(BIN)/$(PIP) --no-build-isolation -e occupancy -e resection -e experiment -e lab
+	$(BIN)/$(PIP) --no-build-isolation -e devices -e occupancy -e resection -e experiment -e lab
 	$(BIN)/python -I -m pip check
 	@touch $@
 
@@ -53,8 +53,8 @@ demo: $(TRACKER)  ## install the tracker (without PyTorch), then CT -> tumors lo
 	$(BIN)/tumortrack demo $(ARGS)
 
 check: setup  ## lint, types, import order, licences
-	$(BIN)/ruff check src occupancy resection lab experiment tests examples tools notebooks conftest.py
-	$(BIN)/ruff format --check src occupancy resection lab experiment tests examples tools notebooks conftest.py
+	$(BIN)/ruff check src devices occupancy resection lab experiment tests examples tools notebooks conftest.py
+	$(BIN)/ruff format --check src devices occupancy resection lab experiment tests examples tools notebooks conftest.py
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 	$(BIN)/python tools/dependencies.py licences
@@ -71,7 +71,7 @@ site: setup  ## the documentation's site, strictly: build/site/index.html (`.ven
 test: check site kernels  ## check, then the tracker's tests (those of Chromium and Fast DDS after `make debian`)
 	$(MAKE) pytest ARGS=tests
 
-test-all: check site kernels pytest  ## the same with those of the paper's method, resection, laboratory and experiment, as CI does
+test-all: check site kernels pytest  ## the same with those of devices, the paper's method, resection, laboratory and experiment, as CI does
 
 quick: setup  ## the quickest tests of the tracker (a minute)
 	OMP_NUM_THREADS=1 $(BIN)/pytest -q -n 2 -m 'not slow' tests/core tests/sense/test_render.py
@@ -132,13 +132,13 @@ pictures: demo debian  ## the pictures in docs/images that the demo shows (docs/
 	$(BIN)/tumortrack plan runs/pictures/run runs/pictures/plan --margin 9 --overwrite
 	cp runs/pictures/plan/plan.png docs/images/plan.png
 	$(BIN)/tumortrack resect runs/pictures/plan --film docs/images/resection.gif
-	TUMORTRACK_PICTURES=docs/images TUMORTRACK_DEMO=runs/demo TUMORTRACK_PLAN=runs/pictures/plan $(BIN)/pytest -n0 tests/live/test_viewer_page.py
+	TUMORTRACK_PICTURES=docs/images TUMORTRACK_DEMO=runs/demo TUMORTRACK_PLAN=runs/pictures/plan $(BIN)/pytest -n0 devices/tests/test_viewer_page.py
 
-wheel: setup $(TOOLS)  ## build the wheels of tracker, the paper's method, resection, experiment and laboratory into dist/, with their dependencies (SBOM)
-	rm -rf dist build/lib occupancy/build resection/build lab/build experiment/build  # modules that are gone would be packed from there
-	$(BIN)/pip wheel --quiet --no-deps --no-build-isolation --wheel-dir dist . ./occupancy ./resection ./experiment ./lab
+wheel: setup $(TOOLS)  ## build the wheels of tracker, devices, the paper's method, resection, experiment and laboratory into dist/, with their dependencies (SBOM)
+	rm -rf dist build/lib devices/build occupancy/build resection/build lab/build experiment/build  # modules that are gone would be packed from there
+	$(BIN)/pip wheel --quiet --no-deps --no-build-isolation --wheel-dir dist . ./devices ./occupancy ./resection ./experiment ./lab
 	.tools/bin/twine check --strict dist/*.whl
-	$(BIN)/python tools/dependencies.py sbom dist/tumortrack-*.whl dist/tumortrack_occupancy-*.whl dist/tumortrack_resection-*.whl dist/tumortrack_experiment-*.whl dist/tumortrack_lab-*.whl
+	$(BIN)/python tools/dependencies.py sbom dist/tumortrack-*.whl dist/tumortrack_devices-*.whl dist/tumortrack_occupancy-*.whl dist/tumortrack_resection-*.whl dist/tumortrack_experiment-*.whl dist/tumortrack_lab-*.whl
 
 lock: setup $(TOOLS)  ## pin the dependencies by hash (ARGS=--upgrade: newest; ARGS="--upgrade-package NAME")
 	PATH="$(CURDIR)/.tools/bin:$$PATH" $(BIN)/python tools/dependencies.py lock $(ARGS)

@@ -17,6 +17,7 @@ os.environ |= {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": "0123456789abcdef" * 
 ROOT = Path(__file__).parent
 PACKAGES = (
     ROOT / "src" / "tumortrack",
+    ROOT / "devices" / "src" / "tumortrack_devices",
     ROOT / "occupancy" / "src" / "tumortrack_occupancy",
     ROOT / "resection" / "src" / "tumortrack_resection",
     ROOT / "lab" / "src" / "tumortrack_lab",
@@ -55,6 +56,7 @@ SLOWEST = (
     "test_gauss_newton.py",
     "test_registration.py",
     "test_track.py",
+    "test_track_devices.py",
     "test_wheel.py",
     "test_attacks.py",
     "test_margins.py",

@@ -30,6 +30,7 @@ LOCKS = ROOT / "requirements"
 TABLE = ROOT / "docs" / "data" / "dependencies.csv"
 OWN = (
     "tumortrack",
+    "tumortrack-devices",
     "tumortrack-occupancy",
     "tumortrack-resection",
     "tumortrack-lab",

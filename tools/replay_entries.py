@@ -21,7 +21,7 @@ from tumortrack.core import store
 from tumortrack.core.types import SensorCloud
 from tumortrack.imaging.case import Case, load_case, save_case
 from tumortrack.imaging.surface import surfaces
-from tumortrack.live.sources.virtual import VirtualSourceConfig
+from tumortrack.live.virtual_source import VirtualSourceConfig
 from tumortrack.phantom.digital import PhantomParameters, phantom_labels
 from tumortrack.sense.cloud import CloudConfig
 from tumortrack.sense.files import read_cloud

@@ -17,11 +17,11 @@ from tumortrack.core.geometry import rigid, transform_points
 from tumortrack.core.types import DepthFrame
 from tumortrack.live.calibration_file import read_frames
 from tumortrack.live.poses import COLUMNS, pose_row
-from tumortrack.live.recording.mcap import STRING, McapBag, camera_messages
-from tumortrack.live.ros.messages import Messages, Outgoing
 from tumortrack.live.values import Observation
 from tumortrack.sense.camera import deproject
 from tumortrack.sense.files import depth_png, intrinsics_json, read_depth_png
+from tumortrack_devices.recording.mcap import STRING, McapBag, camera_messages
+from tumortrack_devices.ros.messages import Messages, Outgoing
 from tumortrack_experiment.calibrate.board import Board, Corners, draw_board, find_boards
 from tumortrack_experiment.calibrate.depth import PlaneErrors, depth_report
 from tumortrack_experiment.calibrate.hand_eye import HandEyeData, solve

@@ -19,9 +19,9 @@ from record_objects import SPEC, SmallBenchConfig
 from tumortrack.cli.main import run
 from tumortrack.core.errors import InputError
 from tumortrack.live.poses import COLUMNS
-from tumortrack.live.recording import mcap
 from tumortrack.live.spec import SOURCES
 from tumortrack.live.values import SourceEnded
+from tumortrack_devices.recording import mcap
 from tumortrack_experiment.record.attachments import attachments_of
 from tumortrack_experiment.record.folder import RecordingFolder
 from tumortrack_experiment.record.read import WHOLE, read_recorded

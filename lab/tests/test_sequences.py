@@ -20,11 +20,11 @@ from reports import report_of
 from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import Anatomy, Mesh
-from tumortrack.live.sources.recording import RecordingSourceConfig
 from tumortrack.report.drawing import ESTIMATED, TRUE
 from tumortrack.report.metrics import surface_samples
 from tumortrack.sense.camera import deproject
 from tumortrack.simulate.scene_folder import draw_targets, read_scene
+from tumortrack_devices.sources.recording import RecordingSourceConfig
 from tumortrack_lab.peers.base import OneWay
 from tumortrack_lab.study.tumor_sites import tumor_sites_of
 from tumortrack_lab.world import following, pictures, tables

@@ -2,10 +2,10 @@
 
 import nibabel
 import pytest
-from tumortrack.cli.inspection import describe
 
 from stories import succeeded, tumortrack
 from tumortrack.core import store
+from tumortrack.report.inspection import describe
 
 pytestmark = pytest.mark.slow
 

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from tumortrack.live.ros.messages import Messages
+from tumortrack_devices.ros.messages import Messages
 from tumortrack_resection.files import ros_trajectories
 from tumortrack_resection.motions import JOINTS, Motions, MotionStage
 

@@ -29,7 +29,7 @@ def test_it_finds_everything_on_one_screen_also_where_the_system_tells_no_affini
     assert len(said.splitlines()) <= 24
 
 
-@pytest.mark.parametrize("folder", [".", "occupancy", "experiment", "lab"])
+@pytest.mark.parametrize("folder", [".", "devices", "occupancy", "experiment", "lab"])
 def test_it_knows_what_every_extra_is_for(folder):
     project = tomllib.loads((ROOT / folder / "pyproject.toml").read_text())["project"]
     needs = project.get("optional-dependencies", {})
@@ -84,7 +84,8 @@ def test_a_library_that_is_missing_costs_only_the_part_that_needs_it(monkeypatch
     without(monkeypatch, "pyrealsense2", missing)
     Doctor().run()  # what is absent is no fault
     said = capsys.readouterr().out
-    assert re.search(r"^ok       tumortrack\[live\]: .*but for what follows; .*viser ", said, re.M)
+    assert re.search(r"^ok       tumortrack-devices: .*; .*viser ", said, re.M)
+    assert "tumortrack-devices[realsense]:" not in said
     assert re.search(
         rf"^absent   RealSense cameras: pyrealsense2 \S+: {missing}; apt-get install libusb-1.0-0$",
         said,

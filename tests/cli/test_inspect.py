@@ -13,12 +13,8 @@ import pytest
 from stories import refusal, tumortrack
 from tumortrack.core import store
 from tumortrack.core.errors import InputError
-from tumortrack.core.geometry import HERE
 from tumortrack.core.mesh_files import write_mesh
 from tumortrack.core.types import DepthFrame, Mesh
-from tumortrack.live.recording.mcap import McapBag, camera_messages
-from tumortrack.live.ros.messages import Messages
-from tumortrack.live.values import Observation
 from tumortrack.report.inspection import describe
 from tumortrack.sense.camera import d405
 from tumortrack.sense.files import depth_png, intrinsics_json
@@ -150,26 +146,6 @@ def test_clouds_depth_images_meshes_and_frames(tmp_path):
     store.write_json(frames / "intrinsics.json", intrinsics_json(camera))
     assert "424 x 240 pixels, nearly all at 150 to 150 mm" in say(frames / "1.png")
     assert f"recording:{frames}" in say(frames)
-
-
-@pytest.mark.parametrize("ended", [True, False])
-def test_a_recording_its_length_rate_and_whether_its_depths_were_corrected(tmp_path, ended):
-    """Also one without its end, as a killed recorder leaves it."""
-    folder, messages = tmp_path / "seen", Messages()
-    bag = McapBag(folder, messages, "")
-    for n in range(11):
-        depth = DepthFrame(np.full((240, 424), 150.0, np.float32), d405(424, 240), 10**18 + n)
-        seen = Observation(depth, 10**18 + n * 10**8)
-        bag.write(seen.arrived_ns, camera_messages(seen, HERE, "camera", messages))
-    bag.flush()
-    if ended:
-        bag.close()
-    store.write_json(folder / "recording.json", {"patient": PATIENT, "corrected": True})
-    said = say(folder if ended else folder / "seen.mcap")
-    assert "a recording of 1.0 s" in said
-    assert "/camera/depth/image_rect: 11 frames, 10.0 a second" in said
-    assert "patient P1, side left" in said
-    assert "its depths were corrected" in said
 
 
 def test_what_lies_in_a_folder_says_what_it_is(tmp_path):

@@ -16,6 +16,7 @@ from tumortrack.core.errors import InputError
 ROOT = Path(__file__).parents[2]
 PACKAGES = (
     "src/tumortrack",
+    "devices/src/tumortrack_devices",
     "occupancy/src/tumortrack_occupancy",
     "resection/src/tumortrack_resection",
     "lab/src/tumortrack_lab",

@@ -88,6 +88,10 @@ def test_commands_and_an_example_run_from_the_wheel(environment, tmp_path):
         without = subprocess.run([*command, name], capture_output=True, text=True, env=clean)
         assert without.returncode == 2
         assert f"tumortrack: the command {name} belongs to {package}" in without.stderr
+    (bag := tmp_path / "seen.mcap").touch()
+    without = subprocess.run([*command, "inspect", bag], capture_output=True, text=True, env=clean)
+    assert without.returncode == 2
+    assert "is not installed here: pip install 'tumortrack-devices'" in without.stderr
     example = ROOT / "examples" / "01_prepare_and_look.py"
     assert "kidney: 1" in run(python, example, tmp_path, env=clean, cwd=tmp_path)
     assert (tmp_path / "case" / "qc.png").stat().st_size > 10_000
@@ -102,7 +106,7 @@ def test_the_wheel_holds_the_package_alone(wheel):
     assert any(name.endswith("LICENSE") for name in names)
 
 
-@pytest.mark.parametrize("folder", [".", "occupancy", "resection", "experiment", "lab"])
+@pytest.mark.parametrize("folder", [".", "devices", "occupancy", "resection", "experiment", "lab"])
 def test_a_description_holds_on_pypi_where_links_into_the_repository_lead_nowhere(folder):
     project = tomllib.loads((ROOT / folder / "pyproject.toml").read_text())["project"]
     text = (ROOT / folder / project["readme"]).read_text()

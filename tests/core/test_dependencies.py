@@ -27,7 +27,7 @@ def tool() -> ModuleType:
 
 def asked_for() -> list[Requirement]:
     lines: list[str] = []
-    for folder in (ROOT, ROOT / "occupancy", ROOT / "lab", ROOT / "experiment"):
+    for folder in (ROOT, ROOT / "devices", ROOT / "occupancy", ROOT / "lab", ROOT / "experiment"):
         project = tomllib.loads((folder / "pyproject.toml").read_text("utf-8"))["project"]
         lines += project["dependencies"]
         for extra in project.get("optional-dependencies", {}).values():

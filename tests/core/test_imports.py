@@ -7,6 +7,7 @@ from pathlib import Path
 ROOT = Path(__file__).parents[2]
 SOURCES = (
     ROOT / "src",
+    ROOT / "devices" / "src",
     ROOT / "occupancy" / "src",
     ROOT / "lab" / "src",
     ROOT / "experiment" / "src",

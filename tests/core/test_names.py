@@ -12,6 +12,7 @@ SOURCES = sorted(
     path
     for package in (
         "src/tumortrack",
+        "devices/src/tumortrack_devices",
         "occupancy/src/tumortrack_occupancy",
         "resection/src/tumortrack_resection",
     )

@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from live_objects import STAMP_NS, small_frame
-from recording_objects import record, update_number
 from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.types import DepthFrame, SensorCloud
 from tumortrack.live.calibration_file import read_frames
 from tumortrack.live.frames import UNNAMED, FrameCheck
-from tumortrack.live.sources.recording import RecordingSourceConfig
 from tumortrack.live.values import Observation, PublishedFrame
 from tumortrack.sense.camera import d405, deproject
 from tumortrack.sense.region import RegionConfig
@@ -220,18 +217,3 @@ def test_a_calibration_names_the_camera_and_the_table(tmp_path):
         path.write_text(json.dumps(given | {"table_in_camera": wrong}))
         with pytest.raises(InputError, match="table_in_camera"):
             read_frames(path)
-
-
-@pytest.mark.parametrize(
-    "published", [PublishedFrame(), PublishedFrame("base", np.diag([-1, -1, 1, 1.0]))]
-)
-@pytest.mark.parametrize(("name", "kept"), [("left_optical", "left_optical"), ("", "camera")])
-def test_a_recorded_bag_keeps_the_name_of_its_camera(tmp_path, published, name, kept):
-    """By which the calibration knows it, when the recording is played."""
-    updates = [update_number(n, frame_id=name) for n in range(2)]
-    path = record(tmp_path / "bag", [replace(one, published_frame=published) for one in updates])
-    source = RecordingSourceConfig(path=path, rate=0).open()
-    got = source.read(1.0)
-    source.close()
-    assert got is not None
-    assert got.frame_id == kept

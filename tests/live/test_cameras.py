@@ -9,97 +9,16 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from live_objects import PARTS, STAMP_NS, small_estimate, small_frame, small_setting
+from camera_objects import ALL, ASIDE, BASE, MS, Led, Located, Tape, played, seen_at
+from live_objects import STAMP_NS, small_estimate, small_setting
 from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.geometry import HERE, rigid
 from tumortrack.live.calibration_file import read_frames
 from tumortrack.live.cameras import Cameras, camera_setup
-from tumortrack.live.loop import Loop, LoopConfig, summary
-from tumortrack.live.poses import CameraPoses, FilePoses, PoseBuffer
-from tumortrack.live.sinks.recording import RecordingSinkConfig
-from tumortrack.live.sources.recording import RecordingSourceConfig
-from tumortrack.live.values import (
-    Observation,
-    PublishedFrame,
-    SinkContext,
-    SourceEnded,
-    SourceLost,
-)
+from tumortrack.live.loop import Loop, LoopConfig
+from tumortrack.live.poses import FilePoses, PoseBuffer
+from tumortrack.live.values import PublishedFrame, SourceLost
 from tumortrack.live.workers import SourceWorker
-from tumortrack.sense.region import RegionConfig
-from tumortrack.tracking.tracker import Tracker
-
-MS = 1_000_000
-ALL = RegionConfig(plane=False, flying=False, pieces=False)
-ASIDE = rigid(Rotation.from_euler("y", 3, degrees=True).as_matrix(), np.array([5.0, -2, 3]))
-BASE = rigid(Rotation.from_euler("x", 170, degrees=True).as_matrix(), np.array([400.0, 30, 500]))
-
-
-class Tape:
-    """A source that waits for its reader: frames at these milliseconds, errors, things to do."""
-
-    host_clock, lossless, dropped = False, True, 0
-
-    def __init__(self, *items, of=0.0):
-        self._left, self._of = list(items), of
-
-    def read(self, timeout_s):
-        while self._left and callable(self._left[0]):
-            self._left.pop(0)()
-        if not self._left:
-            raise SourceEnded("that was all")
-        item = self._left.pop(0)
-        if isinstance(item, Exception):
-            raise item
-        return seen_at(item, self._of)
-
-    def close(self):
-        self._left = []
-
-
-def seen_at(ms, more_mm=0.0):
-    frame = small_frame(STAMP_NS + round(ms * MS))
-    frame = replace(frame, depth_mm=frame.depth_mm + np.float32(more_mm + ms / 1000))
-    return Observation(frame, frame.stamp_ns)
-
-
-class Located(Tracker):
-    """Finds the small organ before whichever camera, and keeps what it was asked."""
-
-    anatomy_ct = None
-
-    def __init__(self):  # no model
-        self.asked = []
-
-    def follow(self, cloud, last=None, how=None, seen=None, others=()):
-        self.asked.append((last, others))
-        estimate = small_estimate(cloud.stamp_ns)
-        return replace(estimate, finding=None)
-
-
-def played(sources, places, published=None, tracker=None):
-    """The loop's results over sources (one try each), and its report."""
-    workers = []
-    for source in sources:
-        tries = iter([source])
-
-        def once(tries=tries):
-            one = next(tries, None)
-            if one is None:
-                raise SourceEnded("not again")
-            return one
-
-        workers.append(SourceWorker(once))
-    published = published or PublishedFrame("base", places[0], calibrated=True)
-    still = () if hasattr(places, "at") else tuple(places)
-    context = SinkContext(PARTS, published, cameras=still)
-    loop = Loop(tracker or Located(), context, LoopConfig(region=ALL))
-    cameras, told = Cameras(workers, places), []
-    try:
-        loop.run(cameras, [], told.append)
-        return told, summary(loop, cameras, [])
-    finally:
-        cameras.close()
 
 
 def test_frames_of_about_one_moment_go_together():
@@ -181,22 +100,6 @@ def test_a_source_that_can_never_work_ends_the_run():
     cameras.close()
 
 
-class Led(CameraPoses):
-    """A camera that is led sideways at a constant rate; unknown from ``until_ns`` on."""
-
-    frame_id = "base"
-
-    def __init__(self, until_ns=10**30):
-        self._until_ns = until_ns
-
-    def pose(self, seen):
-        if seen.stamp_ns >= self._until_ns:
-            raise NoEstimate("where the camera was is unknown: no pose has come")
-        way = BASE.copy()
-        way[0, 3] += (seen.stamp_ns - STAMP_NS) / (10 * MS)  # mm
-        return way
-
-
 def test_results_of_a_camera_that_moves_are_in_the_fixed_frame_and_missing_poses_are_said():
     published = PublishedFrame("base", HERE, calibrated=True, moves=True)
     tracker = Located()
@@ -240,49 +143,6 @@ def test_poses_between_stamps_turn_at_a_constant_rate():
         buffer.at(STAMP_NS - 2 * 10**9)
 
 
-def test_a_recording_of_a_moving_camera_keeps_its_poses(tmp_path):
-    published = PublishedFrame("base", HERE, calibrated=True, moves=True)
-    told, _ = played([Tape(0, 33, 66, 99)], Led(), published)
-    context = replace(small_setting(), published_frame=published)
-    sink = RecordingSinkConfig(path=tmp_path / "run").open(context)
-    for one in told:
-        sink.publish(one)
-    sink.close()
-    source = RecordingSourceConfig(path=tmp_path / "run", rate=0).open()
-    again, _ = played([source], FilePoses(tmp_path / "run" / "poses.csv"), published)
-    assert len(again) == 4
-    for one, other in zip(told, again, strict=True):
-        assert other.stamp_ns == one.stamp_ns
-        np.testing.assert_allclose(
-            other.published_frame.published_from_camera,
-            one.published_frame.published_from_camera,
-            atol=1e-5,
-        )
-
-
-def test_a_recording_of_several_cameras_is_played_as_several(tmp_path):
-    places = (BASE, BASE @ ASIDE)
-    told, _ = played([Tape(0, 33, 66), Tape(5, 38, 71, of=5.0)], places)
-    context = replace(small_setting(), published_frame=told[0].published_frame, cameras=places)
-    sink = RecordingSinkConfig(path=tmp_path / "run").open(context)
-    for one in told:
-        sink.publish(one)
-    sink.close()
-    topics = [f"/camera{n}/depth/image_rect" for n in ("", "_2")]
-    texts = [f"recording:{tmp_path / 'run'}?rate=0&topic={topic}" for topic in topics]
-    setup = camera_setup(texts, tmp_path / "run" / "poses.json", "", None)
-    assert setup.published.frame_id == "base"
-    np.testing.assert_allclose(setup.still, places, atol=1e-9)
-    again, _ = played([one.open() for one in setup.sources.values()], setup.still)
-    assert [one.cameras for one in again] == ["cameras 1, 2"] * 3
-    for one, other in zip(told, again, strict=True):
-        for mine, its in zip(one.views, other.views, strict=True):
-            assert mine.seen.stamp_ns == its.seen.stamp_ns
-            np.testing.assert_allclose(
-                its.seen.content.depth_mm, mine.seen.content.depth_mm, atol=0.06
-            )
-
-
 HEAD = "stamp_ns,frame_id,x_mm,y_mm,z_mm,qw,qx,qy,qz\n"
 
 
@@ -314,7 +174,7 @@ def test_a_camera_on_a_tool_is_placed_by_its_calibration(tmp_path):
     content = {"frame_id": "base", "unit": "mm", "tool_from_camera": ASIDE.tolist()}
     tool.write_text(json.dumps(content))
     poses.write_text(HEAD + f"{STAMP_NS},base,10,20,30,0,1,0,0\n")
-    setup = camera_setup(["recording:x"], None, f"file:{poses}", tool)
+    setup = camera_setup(["virtual:x"], None, f"file:{poses}", tool)
     tool_pose = rigid(np.diag([1.0, -1, -1]), np.array([10.0, 20, 30]))
     np.testing.assert_allclose(setup.poses.at(seen_at(0)), tool_pose @ ASIDE, atol=1e-9)
     assert setup.published.moves
@@ -323,11 +183,11 @@ def test_a_camera_on_a_tool_is_placed_by_its_calibration(tmp_path):
     content["frame_id"] = "other"
     tool.write_text(json.dumps(content))
     with pytest.raises(InputError, match="must be of the frame of these poses, 'base'"):
-        camera_setup(["recording:x"], None, f"file:{poses}", tool)
+        camera_setup(["virtual:x"], None, f"file:{poses}", tool)
     content["robot_from_camera"] = content.pop("tool_from_camera")
     tool.write_text(json.dumps(content))
     with pytest.raises(InputError, match="tool_from_camera is of a camera"):
-        camera_setup(["recording:x"], None, f"file:{poses}", tool)
+        camera_setup(["virtual:x"], None, f"file:{poses}", tool)
 
 
 def test_options_that_do_not_go_together_are_refused(tmp_path):
@@ -335,14 +195,14 @@ def test_options_that_do_not_go_together_are_refused(tmp_path):
     rows = [BASE.tolist(), (BASE @ ASIDE).tolist()]
     poses.write_text(json.dumps({"unit": "mm", "frame_id": "base", "fixed_from_camera": rows}))
     for views, file, moving in (
-        (("recording:y",), None, ""),
+        (("virtual:y",), None, ""),
         ((), poses, ""),
-        (("recording:x",), poses, ""),
-        (("recording:y",), poses, "file:z.csv"),
+        (("virtual:x",), poses, ""),
+        (("virtual:y",), poses, "file:z.csv"),
     ):
         with pytest.raises(InputError, match="--views needs --poses"):
-            camera_setup(["recording:x", *views], file, moving, None)
+            camera_setup(["virtual:x", *views], file, moving, None)
     with pytest.raises(InputError, match="2 poses for 3 views"):
-        camera_setup([f"recording:{n}" for n in "xyz"], poses, "", None)
+        camera_setup([f"virtual:{n}" for n in "xyz"], poses, "", None)
     with pytest.raises(InputError, match="no kind 'tea'"):
-        camera_setup(["recording:x"], None, "tea:x", None)
+        camera_setup(["virtual:x"], None, "tea:x", None)

@@ -16,8 +16,9 @@ from live_objects import small_frame, small_setting, small_update
 from stories import COMMAND, environment, succeeded
 from tumortrack.core.errors import InputError, StorageError
 from tumortrack.live.session import named_sinks, open_sinks
-from tumortrack.live.spec import SINKS, SOURCES, extensions
+from tumortrack.live.spec import POSES, SINKS, SOURCES, extensions
 from tumortrack.live.values import Sink, Source
+from tumortrack.report.inspection import describe
 
 
 @pytest.fixture
@@ -74,8 +75,8 @@ def test_a_sink_that_cannot_open_its_file_is_a_clear_line(example, tmp_path):
         open_sinks(named, small_setting()),
     ):
         pass
-    with pytest.raises(InputError, match="sink 'viewer' is given twice"):
-        named_sinks(["viewer", "viewer"])
+    with pytest.raises(InputError, match=r"sink 'csv:a\.csv' is given twice"):
+        named_sinks(["csv:a.csv", "csv:a.csv"])
 
 
 def test_track_uses_it_by_its_text(phantom_case, clinic_model, tmp_path):
@@ -95,11 +96,11 @@ def test_a_broken_package_breaks_its_own_kind_alone(example, tmp_path, monkeypat
             "lost": "no_such_module:Sink",
             "number": "math:pi",
             "renamed": "tumortrack_example.csv:CsvSinkConfig",
-            "viewer": "tumortrack_example.csv:CsvSinkConfig",
-        }
+        },
+        "tumortrack.sources": {"virtual": "tumortrack_example.image:ImageSourceConfig"},
     }
     monkeypatch.syspath_prepend(str(distribution(tmp_path / "other", "acme-sinks", broken)))
-    assert SINKS.parse("viewer:9000").port == 9000
+    assert SOURCES.parse("virtual:case").case == Path("case")
     assert SINKS.parse(f"csv:{tmp_path}/a.csv").digits == 2
     for kind, said in {
         "lost": "acme-sinks offers 'lost', but it cannot be imported .*no_such_module",
@@ -114,8 +115,26 @@ def test_a_broken_package_breaks_its_own_kind_alone(example, tmp_path, monkeypat
         SINKS.parse("screen")
     faults = {(one.package, one.kind): one.fault for one in extensions()}
     assert faults["tumortrack-example", "csv"] == faults["tumortrack-example", "image"] == ""
-    assert "is built in" in faults["acme-sinks", "viewer"]
+    assert "'virtual' is built in, and cannot be" in faults["acme-sinks", "virtual"]
     assert all(fault for (package, _), fault in faults.items() if package == "acme-sinks")
+
+
+def test_a_kind_of_ours_that_is_not_installed_is_named_with_its_package(monkeypatch, tmp_path):
+    monkeypatch.setattr("tumortrack.live.spec.entry_points", lambda group: [])
+    for registry, kind, package in (
+        (SOURCES, "realsense", "tumortrack-devices[realsense]"),
+        (SINKS, "viewer", "tumortrack-devices"),
+        (SINKS, "ur", "tumortrack-resection[ur]"),
+        (POSES, "ur", "tumortrack-devices[ur]"),
+    ):
+        with pytest.raises(InputError) as refused:
+            registry.parse(f"{kind}:x")
+        line = f"{registry.what} '{kind}:x': {kind!r} is not installed here: pip install"
+        assert str(refused.value) == f"{line} '{package}' (in a checkout: make setup)."
+    (tmp_path / "a.mcap").touch()
+    for path in (tmp_path, tmp_path / "a.mcap"):
+        with pytest.raises(InputError, match=r"'recording' is not installed here: pip install"):
+            describe(path)
 
 
 def test_two_packages_with_one_kind_are_both_named(example, tmp_path, monkeypatch):

@@ -18,8 +18,8 @@ from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import LabelVolume, Mesh
 from tumortrack.imaging.case import Case, save_case
-from tumortrack.live.sources.virtual import VirtualSource, VirtualSourceConfig
 from tumortrack.live.spec import SOURCES
+from tumortrack.live.virtual_source import VirtualSource, VirtualSourceConfig
 from tumortrack.sense.noise import CLEAN
 from tumortrack.simulate.elastic.body import BodyConfig
 from tumortrack.simulate.player import SHAFT_MM, ScenePlayer, ScenePlayerConfig, rod
@@ -215,7 +215,7 @@ def test_too_many_places_and_times_before_the_beginning_are_refused():
 
 def test_frames_missed_are_counted(monkeypatch):
     clock = Clock()
-    monkeypatch.setattr("tumortrack.live.sources.virtual.time", clock)
+    monkeypatch.setattr("tumortrack.live.virtual_source.time", clock)
     source = clock.of(VirtualSource(small_theatre(), fps=50))
     assert source.read(1.0) is not None
     clock.sleep(0.31)  # frame 15 is due, 1 to 14 were

@@ -80,7 +80,7 @@ def _images() -> dict[str, Target]:
     from attack_clouds import png_of
     from stereo_objects import endoscope
     from tumortrack.sense.files import read_depth_png, read_intrinsics
-    from tumortrack.sense.stereo import read_calibration
+    from tumortrack_devices.stereo import read_calibration
 
     yaml = (
         "%YAML:1.0\n---\nK1: !!opencv-matrix\n   rows: 1\n   cols: 1\n   dt: d\n   data: [ 1. ]\n"
@@ -192,9 +192,15 @@ def _command_line() -> dict[str, Target]:
 
 
 def _wire() -> dict[str, Target]:
-    from tumortrack.live.igtl.message import HEADER_SIZE, Message, check_body, pack, unpack_header
-    from tumortrack.live.ros import sensors
-    from tumortrack.live.ros.messages import Messages
+    from tumortrack_devices.igtl.message import (
+        HEADER_SIZE,
+        Message,
+        check_body,
+        pack,
+        unpack_header,
+    )
+    from tumortrack_devices.ros import sensors
+    from tumortrack_devices.ros.messages import Messages
 
     def igtl(data: bytes) -> None:
         check_body(unpack_header(data[:HEADER_SIZE]), data[HEADER_SIZE:])
@@ -272,8 +278,8 @@ def _configurations() -> dict[str, Target]:
 def _recordings() -> dict[str, Target]:
     from recording_objects import frame_number, record, update_number, write_bag
     from tumortrack.core.errors import InputError
-    from tumortrack.live.sources.recording import RecordingSourceConfig
     from tumortrack.live.values import SourceEnded
+    from tumortrack_devices.sources.recording import RecordingSourceConfig
 
     def play(path: Path) -> None:
         source = RecordingSourceConfig(path=path, rate=0).open()

@@ -13,10 +13,10 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, W
 from live_objects import STAMP_NS, small_frame, small_setting, small_update
 from tumortrack.core.types import DepthFrame, SensorCloud
 from tumortrack.live import values as live
-from tumortrack.live.ros.messages import Messages
-from tumortrack.live.ros.sensors import messages_seen
-from tumortrack.live.sinks.recording import RecordingSinkConfig as RecordTo
 from tumortrack.live.values import Observation
+from tumortrack_devices.ros.messages import Messages
+from tumortrack_devices.ros.sensors import messages_seen
+from tumortrack_devices.sinks.recording import RecordingSinkConfig as RecordTo
 
 PERIOD_NS = 40_000_000
 

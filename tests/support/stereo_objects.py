@@ -17,7 +17,7 @@ from tumortrack.core.geometry import rigid, rotation_onto, transform_points
 from tumortrack.core.types import DepthFrame, Intrinsics, Mesh
 from tumortrack.sense.camera import deproject_pixels
 from tumortrack.sense.render import render_depth
-from tumortrack.sense.stereo import StereoCalibration
+from tumortrack_devices.stereo import StereoCalibration
 
 _GRID_MM, _SIDE = 1.2, 96  # of the texture, which repeats
 _MARGIN_PX = 60  # rendered around a picture, for its lens to bend in

@@ -295,7 +295,7 @@ def test_without_highdicom_it_says_what_to_install(
     monkeypatch.setitem(sys.modules, "highdicom", None)
     affine = affine_lps("LPS", (1.0, 1.0, 1.0), np.eye(3))
     ct = ct_series(tmp_path / "ct", affine)
-    with pytest.raises(InputError, match=r"pip install 'tumortrack\[live\]'"):
+    with pytest.raises(InputError, match=r"pip install 'tumortrack\[dicom\]'"):
         write_dicom_seg(tmp_path / "seg.dcm", blob_labels(affine), segments(PARTS), ct)
 
 

@@ -6,12 +6,8 @@ import numpy as np
 import pytest
 
 import tumortrack as tt
-from live_objects import ball, empty_update, small_anatomy, small_setting, small_update
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import Mesh, SensorCloud
-from tumortrack.live.ros.messages import Messages
-from tumortrack.live.ros.results import ResultMessages
-from tumortrack.live.sinks.openigtlink import OpenIgtLinkSinkConfig
 from tumortrack.registration.rest_shape import RestShape
 from tumortrack.tracking.files import write_estimate
 from tumortrack.tracking.model_files import load_model
@@ -59,23 +55,3 @@ def test_it_is_written_and_read_as_what_it_is(carried, tmp_path):
     assert set(back.meshes) == set(estimate.meshes)
     written, read = (np.sort(e.structures["cut"].vertices_mm, 0) for e in (estimate, back))
     assert read == pytest.approx(written, abs=1e-3)
-
-
-def test_every_sink_gets_it():
-    vessel = ball((0.0, 0.0, 125.0), 3.0)
-    update = small_update()
-    estimate = replace(update.estimate, structures={"vessel": vessel})
-    update = replace(update, estimate=estimate)
-    anatomy = replace(small_anatomy(), structures={"vessel": vessel})
-    context = replace(small_setting(), anatomy_ct=anatomy)
-    messages = {out.suffix: out.message for out in ResultMessages(Messages(), context).of(update)}
-    marker = next(one for one in messages["meshes"].markers if one.ns == "vessel")
-    assert len(marker.points) == 3 * len(vessel.faces)
-    sink = OpenIgtLinkSinkConfig(port=0).open(context)
-    try:
-        sent = {name: more for _, name, _, more in sink._surfaces(update)}
-        assert "vessel" in sent
-        gone = {name for _, name, _, _ in sink._surfaces(empty_update())}
-        assert "vessel" in gone  # emptied, so that no old surface stays
-    finally:
-        sink.close()

@@ -24,13 +24,15 @@ from tumortrack.models.method import GROUP
 # By distribution and extra ("": what it always needs).
 PURPOSES = {
     ("tumortrack", ""): "cases, locating, tracking",
-    ("tumortrack", "live"): "cameras, ROS 2, the web viewer, 3D Slicer, DICOM segmentations",
-    ("tumortrack", "stereo"): "depth from two pictures",
-    ("tumortrack", "ur"): "a camera that an arm of Universal Robots holds",
+    ("tumortrack", "dicom"): "DICOM segmentations",
     ("tumortrack", "pcd"): ".pcd clouds",
     ("tumortrack-occupancy", ""): "the paper's method: networks and their training",
     ("tumortrack-occupancy", "onnx"): "networks as ONNX files",
     ("tumortrack-occupancy", "tensorboard"): "training curves",
+    ("tumortrack-devices", ""): "recordings, ROS 2, the web viewer, 3D Slicer",
+    ("tumortrack-devices", "realsense"): "RealSense cameras",
+    ("tumortrack-devices", "stereo"): "depth from two pictures",
+    ("tumortrack-devices", "ur"): "a camera that an arm of Universal Robots holds",
     ("tumortrack-resection", ""): "plans of a resection",
     ("tumortrack-resection", "arms"): "motions of two arms",
     ("tumortrack-resection", "ur"): "a real arm of Universal Robots",
@@ -54,7 +56,6 @@ _PARTS = {
     "viser": "the web viewer",
     "fastcrc": "OpenIGTLink to 3D Slicer",
     "pyrealsense2": "RealSense cameras",
-    "highdicom": "DICOM segmentations",
 }
 _ABSENT = " is not installed"
 Status = tuple[Literal["ok", "absent", "BROKEN"], str]  # with its text
@@ -110,7 +111,7 @@ def _statuses() -> Iterator[Status]:
 
 def _plug_ins() -> Iterator[Status]:
     """What other packages add; each is imported. Working commands are in ``--help``, working
-    methods above."""
+    methods above; of our own distributions only faults are told."""
     from tumortrack.live import spec
     from tumortrack.simulate.deform import installed
 
@@ -124,7 +125,10 @@ def _plug_ins() -> Iterator[Status]:
                 added.append((f"{what} {point.name}", point.value, str(error)))
     for what, package, fault in added:
         text = f"{what} of the package {package}"
-        yield ("BROKEN", f"{text}: {fault}") if fault else ("ok", text)
+        if fault:
+            yield "BROKEN", f"{text}: {fault}"
+        elif (package, "") not in PURPOSES:
+            yield "ok", text
 
 
 def part(name: str, extra: str, purpose: str) -> Iterator[Status]:
@@ -139,11 +143,12 @@ def part(name: str, extra: str, purpose: str) -> Iterator[Status]:
         return
     faults = {package.name: fault for package in needed if (fault := _fault(package))}
     works = [package.name for package in needed if package.name not in faults]
-    alone = {name: fault for name, fault in faults.items() if name in _PARTS} if works else {}
+    parts = _PARTS if works else _SYSTEM
+    alone = {name: fault for name, fault in faults.items() if name in parts}
     if rest := [fault for name, fault in faults.items() if name not in alone]:
         absent = extra and all(fault.endswith(_ABSENT) for fault in rest)
         yield "absent" if absent else "BROKEN", f"{what}: {purpose}; {', '.join(rest)}; {install}"
-    else:
+    elif works:
         there = ", ".join(f"{name} {version(name)}" for name in works)
         yield "ok", f"{what}: {purpose}{', but for what follows' if alone else ''}; {there}"
     for package, fault in alone.items():

@@ -214,7 +214,7 @@ def _segmentation(
         import highdicom as hd
     except ImportError as error:
         raise InputError(
-            "--dicom needs highdicom: pip install 'tumortrack[live]' (Python up to 3.13)."
+            "--dicom needs highdicom: pip install 'tumortrack[dicom]' (Python up to 3.13)."
         ) from error
     from pydicom.uid import generate_uid
 

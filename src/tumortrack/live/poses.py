@@ -1,9 +1,8 @@
-"""The pose of a moving camera at a frame's stamp: interpolated poses from a file or a UR arm."""
+"""The pose of a moving camera at a frame's stamp, interpolated; and poses from a file."""
 
 from __future__ import annotations
 
 import threading
-import time
 from abc import abstractmethod
 from bisect import bisect_left
 from pathlib import Path
@@ -17,7 +16,6 @@ from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.geometry import HERE, Affine, rigid
 from tumortrack.core.report import Finding
 from tumortrack.core.store import read_file
-from tumortrack.live.display import wxyz_of
 from tumortrack.live.values import Observation
 
 # Between two poses an arm that accelerates by 1 m/s2 deviates from linear interpolation by at most
@@ -26,8 +24,6 @@ _GAP_NS = 100_000_000
 _BACK_NS = 1_000_000_000
 _KEPT = 2000  # poses of a live source: 4 s at 500 Hz
 _NOT_UNIT = 1e-3  # tolerance of a quaternion's length: files have few digits
-_TICK_S = 0.004  # UR controllers send at 500 Hz (e-Series) or 125 Hz (CB3)
-_WAIT_S = 0.05  # for a UR pose after the frame's stamp
 _LARGEST_TABLE = 256 * 2**20  # bytes
 COLUMNS = "stamp_ns,frame_id,x_mm,y_mm,z_mm,qw,qx,qy,qz"
 
@@ -153,51 +149,6 @@ class FilePoses(CameraPoses):
 
 def pose_row(stamp_ns: int, frame_id: str, pose: Affine) -> str:
     """A line of a table of poses."""
-    numbers = [*pose[:3, 3].tolist(), *wxyz_of(pose[:3, :3]).tolist()]
+    turn = Rotation.from_matrix(pose[:3, :3]).as_quat(scalar_first=True)
+    numbers = [*pose[:3, 3].tolist(), *turn.tolist()]
     return ",".join([str(stamp_ns), frame_id, *(f"{number:.9f}" for number in numbers)]) + "\n"
-
-
-class UrPosesConfig(PosesConfig, frozen=True, kw_only=True, tag="ur"):
-    """The tool of the arm of Universal Robots at ``host`` in its base's frame, by the controller's
-    tool centre point, which must be as at the hand-eye calibration. It only reads."""
-
-    target: ClassVar[str] = "host"
-
-    host: str
-
-    def open(self) -> UrPoses:
-        return UrPoses(self.host)
-
-
-class UrPoses(CameraPoses):
-    """Through ur_rtde. Poses have the time of their arrival: milliseconds late. Raises InputError:
-    ur_rtde is missing, or the arm cannot be reached."""
-
-    def __init__(self, host: str) -> None:
-        try:
-            import rtde_receive
-
-            self._receive = rtde_receive.RTDEReceiveInterface(host)
-        except (ImportError, RuntimeError) as error:
-            raise InputError(
-                f"ur: the arm at {host} cannot be read ({error}). That needs ur_rtde (pip install "
-                "'tumortrack[ur]') and an arm that is on, and reachable on port 30004."
-            ) from error
-        self._poses, self._closed = PoseBuffer(), threading.Event()
-        threading.Thread(target=self._read, name="ur poses", daemon=True).start()
-
-    def pose(self, seen: Observation) -> Affine:
-        return self._poses.at(seen.stamp_ns, _WAIT_S)
-
-    def close(self) -> None:
-        self._closed.set()
-
-    def _read(self) -> None:
-        """An arm that falls silent repeats its clock: no pose is added, and frames find none."""
-        last_s = -1.0
-        while not self._closed.wait(_TICK_S):
-            if (clock_s := self._receive.getTimestamp()) != last_s and self._receive.isConnected():
-                last_s, numbers = clock_s, np.array(self._receive.getActualTCPPose(), float)
-                turn = Rotation.from_rotvec(numbers[3:]).as_matrix()
-                self._poses.add(time.time_ns(), rigid(turn, 1000 * numbers[:3]))
-        self._receive.disconnect()

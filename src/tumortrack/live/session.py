@@ -17,7 +17,6 @@ from tumortrack.core.errors import InputError, StorageError
 from tumortrack.core.patient import Patient
 from tumortrack.live.cameras import Cameras, CameraSetup, camera_setup
 from tumortrack.live.loop import Loop, LoopConfig, summary
-from tumortrack.live.sinks.recording import RecordingSinkConfig
 from tumortrack.live.spec import SINKS
 from tumortrack.live.values import (
     ArmsController,
@@ -114,8 +113,8 @@ class Session:
             self._store()
             return
         for sink in self._named.values():
-            if isinstance(sink, RecordingSinkConfig):
-                store.remove(sink.path)
+            if isinstance(sink, SinkConfig) and (path := sink.made_path()) is not None:
+                store.remove(path)
         if self.report is not None:
             store.remove(self.report)
 

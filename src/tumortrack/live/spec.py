@@ -1,14 +1,15 @@
 """``kind:target?key=value&key=value`` -> the configuration of a source or sink.
 
-A kind is a configuration class: one listed here, or one that an installed package offers by an
-entry point in ``tumortrack.sources``, ``tumortrack.sinks`` or ``tumortrack.poses``, named as the
-class's ``tag``. Only the requested kind is imported, so a broken package affects no other.
+A kind is a configuration class: one listed here, or one that an installed package, such as
+tumortrack-devices, offers by an entry point in ``tumortrack.sources``, ``tumortrack.sinks`` or
+``tumortrack.poses``, named as the class's ``tag``. Only the requested kind is imported, so a broken
+package affects no other.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Any, Generic, NamedTuple, TypeVar
@@ -35,12 +36,14 @@ class Extension(NamedTuple):
 @dataclass(frozen=True)
 class Registry(Generic[C]):
     """All kinds of source, sink, or poses: ``built_in`` (``module:class`` by kind), and those of
-    the entry points' ``group``. ``what`` names one in messages; ``base`` is the base class."""
+    the entry points' ``group``. ``what`` names one in messages; ``base`` is the base class;
+    ``packages``: what to install for the kinds of our other distributions."""
 
     what: str
     group: str
     base: Any
     built_in: Mapping[str, str]
+    packages: Mapping[str, str] = field(default_factory=dict)
 
     def parse(self, text: str) -> C:
         """The configuration that ``text`` describes. Raises InputError for an unknown kind, key or
@@ -48,22 +51,22 @@ class Registry(Generic[C]):
         head, _, options = text.partition("?")
         kind, _, target = head.partition(":")
         where = f"{self.what} {text!r}"
-        return _filled(self._class(kind, where), target, options, where)
+        return _filled(self.config(kind, where), target, options, where)
 
     def extensions(self) -> Iterator[Extension]:
         """The kinds of other packages; each class is imported."""
         for entry in self._entry_points():
             fault = ""
             try:
-                self._class(entry.name, f"{self.what} {entry.name!r}")
+                self.config(entry.name, f"{self.what} {entry.name!r}")
                 if entry.name in self.built_in:
                     fault = f"{entry.name!r} is built in, and cannot be replaced"
             except InputError as error:
                 fault = str(error)
             yield Extension(self.what, entry.name, _package_of(entry), fault)
 
-    def _class(self, kind: str, where: str) -> type[C]:
-        """Raises InputError, which begins with ``where``."""
+    def config(self, kind: str, where: str) -> type[C]:
+        """The configuration class of a kind. Raises InputError, which begins with ``where``."""
         if kind in self.built_in:
             return EntryPoint(kind, self.built_in[kind], self.group).load()
         entries = self._entry_points()
@@ -73,8 +76,14 @@ class Registry(Generic[C]):
                 f"{where}: ROS 1 was removed after its end of life, May 2025. Bridge its topics to "
                 "ROS 2 (ros1_bridge) and say ros2, or play a .bag: recording:PATH."
             )
+        if not matches and kind in self.packages:
+            raise InputError(
+                f"{where}: {kind!r} is not installed here: pip install {self.packages[kind]!r} "
+                "(in a checkout: make setup)."
+            )
         if not matches:
-            allowed = sorted({*self.built_in, *(entry.name for entry in entries)})
+            installed = {entry.name for entry in entries}
+            allowed = sorted({*self.built_in, *installed, *self.packages})
             raise InputError(f"{where}: there is no kind {kind!r}. Allowed: {', '.join(allowed)}.")
         if len(matches) > 1:
             packages = " and ".join(sorted(map(_package_of, matches)))
@@ -100,40 +109,36 @@ class Registry(Generic[C]):
         return sorted(entry_points(group=self.group), key=lambda entry: entry.name)
 
 
-_LIVE = "tumortrack.live"
+_DEVICES = "tumortrack-devices"
 SOURCES = Registry[SourceConfig](
     "source",
     "tumortrack.sources",
     SourceConfig,
+    {"virtual": "tumortrack.live.virtual_source:VirtualSourceConfig"},
     {
-        "virtual": f"{_LIVE}.sources.virtual:VirtualSourceConfig",
-        "realsense": f"{_LIVE}.sources.realsense:RealSenseSourceConfig",
-        "stereo": f"{_LIVE}.sources.stereo:StereoSourceConfig",
-        "recording": f"{_LIVE}.sources.recording:RecordingSourceConfig",
-        "ros2": f"{_LIVE}.sources.ros:Ros2SourceConfig",
+        "realsense": f"{_DEVICES}[realsense]",
+        "stereo": f"{_DEVICES}[stereo]",
+        "recording": _DEVICES,
+        "ros2": _DEVICES,
+        "rehearsal": "tumortrack-lab",
     },
 )
 SINKS = Registry[SinkConfig](
     "sink",
     "tumortrack.sinks",
     SinkConfig,
+    {},
     {
-        "viewer": f"{_LIVE}.sinks.viewer:ViewerSinkConfig",
-        "recording": f"{_LIVE}.sinks.recording:RecordingSinkConfig",
-        "ros2": f"{_LIVE}.sinks.ros:Ros2SinkConfig",
-        "moveit": f"{_LIVE}.sinks.moveit:MoveItSinkConfig",
-        "openigtlink": f"{_LIVE}.sinks.openigtlink:OpenIgtLinkSinkConfig",
+        **dict.fromkeys(("viewer", "recording", "ros2", "moveit", "openigtlink"), _DEVICES),
+        "ur": "tumortrack-resection[ur]",
     },
 )
 POSES = Registry[PosesConfig](
     "camera's pose",
     "tumortrack.poses",
     PosesConfig,
-    {
-        "file": f"{_LIVE}.poses:PosesFileConfig",
-        "ros2": f"{_LIVE}.ros.tf:Ros2PosesConfig",
-        "ur": f"{_LIVE}.poses:UrPosesConfig",
-    },
+    {"file": "tumortrack.live.poses:PosesFileConfig"},
+    {"ros2": _DEVICES, "ur": f"{_DEVICES}[ur]"},
 )
 
 

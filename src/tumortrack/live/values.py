@@ -13,6 +13,7 @@ from abc import abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol, runtime_checkable
 
 import numpy as np
@@ -405,6 +406,12 @@ class SourceConfig(Config, frozen=True, kw_only=True, tag_field="kind"):
         """The patient, where the source states one. Raises TumortrackError: it cannot be read."""
         return NOBODY
 
+    @classmethod
+    def describe(cls, path: Path) -> list[str]:
+        """What a file or folder that this kind plays holds, for `inspect`. Raises InputError: it
+        cannot be played."""
+        raise InputError(f"{path} cannot be played.")
+
     @abstractmethod
     def open(self) -> Source:
         """Raises SourceLost if something is missing now, InputError if it can never work."""
@@ -416,6 +423,10 @@ class SinkConfig(Config, frozen=True, kw_only=True, tag_field="kind"):
 
     target: ClassVar[str] = ""
     queue_size: ClassVar[int] = 1
+
+    def made_path(self) -> Path | None:
+        """What ``open`` makes on the disk; it is removed if the run's start fails."""
+        return None
 
     @abstractmethod
     def open(self, context: SinkContext) -> Sink:

@@ -25,10 +25,11 @@ _METHODS = {  # by whether the model has a network
     False: "lays the organ of the CT on the points; `locate --map` says where points of the CT are",
     True: "labels points; it does not know which point of the CT lies where (no `--map`)",
 }
+_BAGS = (".mcap", ".db3", ".bag")
 _KINDS = (
-    "folders that commands write (cases, models, runs, plans, scenes, recordings, evaluations, "
-    "fleets, kits, calibrations), their reports, calibration and intrinsics files, clouds, depth "
-    "images beside intrinsics.json, meshes, CTs and label maps"
+    "folders that commands write (cases, models, runs, plans, scenes, evaluations, fleets, kits, "
+    "calibrations), their reports, calibration and intrinsics files, clouds, depth images beside "
+    "intrinsics.json, meshes, CTs, label maps, and with tumortrack-devices recordings"
 )
 
 
@@ -186,8 +187,6 @@ def _sealed_scenes(folder: Path, scenes: Mapping[str, str]) -> Iterable[str]:
 
 def _folder(path: Path) -> Iterable[str]:
     from tumortrack.imaging.dicom import NoSeries
-    from tumortrack.live.recording.bags import bag_files
-    from tumortrack.live.recording.folders import folder_frames
 
     inside = {p.name for p in path.iterdir()}
     if store.MANIFEST in inside:
@@ -201,29 +200,27 @@ def _folder(path: Path) -> Iterable[str]:
         return _scene(path)
     if "report.json" in inside:
         return _json(path / "report.json")
-    if bag_files(path):
+    bags = [name for name in inside if name == "metadata.yaml" or name.lower().endswith(_BAGS)]
+    if any((path / name).is_file() for name in bags):
         return _recording(path)
     if scenes:
         return [f"{scenes} scene{'s' * (scenes != 1)}; `tumortrack evaluate` reads them"]
     if meshes := sum(_is_mesh(path / name) for name in inside):
         return [f"a folder of meshes ({meshes}); `tumortrack prepare` makes a case of them"]
     with suppress(InputError):
-        frames = len(folder_frames(path, 30.0, "mm"))
-        return [f"{frames} frames, a file each; `track` plays them from recording:{path}"]
+        return _recording(path)
     with suppress(NoSeries):
         return list(_volume(path))
     return []
 
 
 def _file(path: Path) -> Iterable[str]:
-    from tumortrack.live.recording.bags import SUFFIXES
-
     name = path.name.lower()
     if name.endswith(".json"):
         return _json(path)
     if name.endswith((".nii", ".nii.gz", ".nrrd")):
         return _volume(path)
-    if name.endswith(SUFFIXES):
+    if name.endswith(_BAGS):
         return _recording(path)
     return _points(path)
 
@@ -238,22 +235,11 @@ def _scene(folder: Path) -> list[str]:
     return [f"a scene with {len(scene.cloud.points_mm)} points; truth: {volumes}{targets}"]
 
 
-def _recording(path: Path) -> Iterable[str]:
-    from tumortrack.live.recording.bags import bag_contents
-    from tumortrack.live.recording.folders import ABOUT
+def _recording(path: Path) -> list[str]:
+    """Raises InputError: it is none, or nothing is installed that plays recordings."""
+    from tumortrack.live.spec import SOURCES
 
-    about = (path if path.is_dir() else path.parent) / ABOUT
-    frames, seconds = bag_contents(path)
-    files = [path] if path.is_file() else path.rglob("*")
-    size_mb = sum(file.stat().st_size for file in files) / 2**20
-    yield f"a recording of {seconds:.1f} s, {size_mb:.1f} MB"
-    said = store.read_json(about) if about.is_file() else {}
-    yield from _words(said, ["patient {patient[id]}, side {patient[side]}"])
-    if said.get("corrected"):
-        yield "its depths were corrected by --intrinsics"
-    for topic, count in frames.items():
-        rate = f", {(count - 1) / seconds:.1f} a second" if seconds else ""
-        yield f"{topic}: {count} frame{'s' * (count != 1)}{rate}"
+    return SOURCES.config("recording", str(path)).describe(path)
 
 
 def _volume(path: Path) -> Iterable[str]:

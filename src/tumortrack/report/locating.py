@@ -19,8 +19,8 @@ from tumortrack.tracking.views import View, further_looks, read_places, read_vie
 if TYPE_CHECKING:
     from tumortrack.core.estimate import Estimate
     from tumortrack.core.types import Anatomy
-    from tumortrack.live.viewer.slices import CarriedCt
     from tumortrack.models.model import Model
+    from tumortrack.tracking.slices import CarriedCt
 
 _ASK = "say where the organ is: --at COLUMN ROW, --box or --mask"
 
@@ -175,7 +175,7 @@ def _ct(folder: Path | None, model: Model, anatomy_ct: Anatomy | None) -> Carrie
     if folder is None:
         return None
     from tumortrack.imaging.case import load_case
-    from tumortrack.live.viewer.slices import CarriedCt
+    from tumortrack.tracking.slices import CarriedCt
 
     case = load_case(folder)
     same = store.sha256_of(folder / store.MANIFEST) == model.provenance.get("case_sha256")

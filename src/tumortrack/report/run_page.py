@@ -26,12 +26,12 @@ from tumortrack.core.patient import patient_in
 from tumortrack.core.process import parallel_map
 from tumortrack.core.store import write_atomically
 from tumortrack.core.types import DepthFrame, SensorCloud
-from tumortrack.live.viewer.slices import ORIENTATIONS, outlined, plane_through
 from tumortrack.report.renderer import Body, ParallelView, corner_normals, render, rgb
 from tumortrack.report.seen import PAGE, Seen, part_rows, row_words
 from tumortrack.report.wrapping import wrapped
 from tumortrack.sense.camera import deproject
 from tumortrack.tracking.margins import margin_words
+from tumortrack.tracking.slices import ORIENTATIONS, outlined, plane_through
 
 PICTURE = "picture.png"
 _VIEW_WIDTH, _ASPECT = 512, 1.25  # pixels

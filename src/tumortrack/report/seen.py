@@ -14,7 +14,7 @@ from tumortrack.core.types import DepthFrame, SensorCloud
 from tumortrack.tracking.margins import stated_radius
 
 if TYPE_CHECKING:
-    from tumortrack.live.viewer.slices import CarriedCt
+    from tumortrack.tracking.slices import CarriedCt
 
 PAGE = "index.html"
 

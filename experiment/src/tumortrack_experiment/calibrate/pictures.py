@@ -19,9 +19,9 @@ from tumortrack.core.geometry import Affine, read_rigid
 from tumortrack.core.store import read_file, read_json
 from tumortrack.core.types import DepthFrame, SensorCloud
 from tumortrack.live.poses import FilePoses
-from tumortrack.live.recording.folders import ABOUT, DEPTH, INTRINSICS, META
 from tumortrack.live.values import Observation
 from tumortrack.sense.files import read_depth_png
+from tumortrack_devices.recording.folders import ABOUT, DEPTH, INTRINSICS, META
 from tumortrack_experiment.record.read import read_recorded
 
 _NAMES = ("colour", "color", "infrared")  # .png or .jpg, in a frame's folder

@@ -20,9 +20,9 @@ import tumortrack
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import HERE, Affine
 from tumortrack.core.store import read_json, write_json, writing
-from tumortrack.live.recording.mcap import STRING, McapBag, camera_messages
-from tumortrack.live.ros.messages import Messages, Outgoing
 from tumortrack.live.values import Observation
+from tumortrack_devices.recording.mcap import STRING, McapBag, camera_messages
+from tumortrack_devices.ros.messages import Messages, Outgoing
 from tumortrack_experiment.record.attachments import attach
 from tumortrack_experiment.record.read import IMAGE, STATE, TF, WHOLE, messages_in
 

@@ -64,9 +64,9 @@ class Recorded:
     def moments(self, state: str) -> Iterator[Moment]:
         """All of a state, one after the other; none is read before its turn. Raises InputError:
         there is no such state, or it is damaged."""
-        from tumortrack.live.ros import sensors
-        from tumortrack.live.ros.messages import stamp_of
-        from tumortrack.live.ros.tf import pose_of
+        from tumortrack_devices.ros import sensors
+        from tumortrack_devices.ros.messages import stamp_of
+        from tumortrack_devices.ros.tf import pose_of
 
         if state not in self.takes:
             known = ", ".join(self.states) or "none"
@@ -106,7 +106,7 @@ def messages_in(
     file: Path, start_ns: int = 0, stop_ns: int = 2**63 - 1, of: str = ""
 ) -> Iterator[tuple[str, int, Any]]:
     """Topic, time of recording and message, of all topics or one."""
-    from tumortrack.live.ros.messages import Messages
+    from tumortrack_devices.ros.messages import Messages
 
     messages = Messages()
     with _opened(file) as reader:

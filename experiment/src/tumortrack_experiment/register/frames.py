@@ -12,8 +12,8 @@ from tumortrack.core.config import from_builtins
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import DepthFrame
-from tumortrack.live.recording.folders import folder_frames
 from tumortrack.sense.files import read_depth_png
+from tumortrack_devices.recording.folders import folder_frames
 from tumortrack_experiment.kit_file import KIT_FILE, Kit
 from tumortrack_experiment.record.read import Moment, Recorded, read_recorded
 from tumortrack_experiment.register.beads import CAMERA, NamedBeads, name_beads

@@ -13,12 +13,12 @@ from pathlib import Path
 import numpy as np
 
 from tumortrack.core.types import DepthFrame
-from tumortrack.live.ros.messages import Messages
-from tumortrack.live.ros.sensors import depth_of, messages_seen
-from tumortrack.live.sinks.recording import RecordingSinkConfig
-from tumortrack.live.sources.virtual import VirtualSource
 from tumortrack.live.values import Observation, Sink, SinkContext, SourceLost, TrackingResult
+from tumortrack.live.virtual_source import VirtualSource
 from tumortrack.simulate.player import ScenePlayer
+from tumortrack_devices.ros.messages import Messages
+from tumortrack_devices.ros.sensors import depth_of, messages_seen
+from tumortrack_devices.sinks.recording import RecordingSinkConfig
 
 # What must be reported of each, as a regular expression.
 SOURCE_FAULTS = {

@@ -18,9 +18,9 @@ from tumortrack import api
 from tumortrack.cli.console import keep_loaded
 from tumortrack.core.errors import InputError
 from tumortrack.live.loop import Loop, LoopConfig, summary
-from tumortrack.live.sources.virtual import VirtualSourceConfig
 from tumortrack.live.spec import SINKS, SOURCES
 from tumortrack.live.values import Controls, PublishedFrame, SinkContext, SourceEnded
+from tumortrack.live.virtual_source import VirtualSourceConfig
 from tumortrack.live.workers import SinkWorker, SourceWorker
 from tumortrack.simulate.player import ScenePlayer, ScenePlayerConfig
 from tumortrack.tracking.tracker import Tracker, region_for

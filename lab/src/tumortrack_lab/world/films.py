@@ -27,9 +27,9 @@ from tumortrack.core.errors import TumortrackError
 from tumortrack.core.geometry import rigid, transform_points
 from tumortrack.core.rigid_fit import fit_over_volume
 from tumortrack.core.types import Anatomy, DepthFrame, Mesh
-from tumortrack.live.recording.folders import INTRINSICS, folder_frames
 from tumortrack.sense.camera import d405
 from tumortrack.sense.files import depth_png, intrinsics_json
+from tumortrack_devices.recording.folders import INTRINSICS, folder_frames
 from tumortrack_lab.world.noise import StereoCamera, StereoConfig
 from tumortrack_lab.world.paths import KINDS, LoadPath, random_path
 from tumortrack_lab.world.scenes import World

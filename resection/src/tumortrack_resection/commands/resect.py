@@ -443,7 +443,7 @@ def _organ_shapes(stored: PlanFolder) -> tuple[RigidShape, ...]:
     from tumortrack.core.colours import part_colour
     from tumortrack.core.types import Anatomy, Mesh
     from tumortrack.live.values import RigidShape
-    from tumortrack.live.viewer.scene import bare_faces
+    from tumortrack_devices.viewer.scene import bare_faces
 
     names = organ_first(stored.meshes)
     meshes = [stored.meshes[name] for name in names]

@@ -1,0 +1,178 @@
+"""OpenIGTLink messages as bytes: header, extended header, content, metadata and checksum.
+
+Header version 2 (protocol 3), which 3D Slicer (since 4.7), PLUS and pyigtl read: version 1 has no
+metadata for frames and missing transforms. Headers of version 1 are read too, since clients use it
+for requests. All numbers are big-endian.
+Source: the protocol's Documents/Protocol: header.md, timestamp.md, transform.md, status.md,
+polydata.md, point.md.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Float, Int, Num
+
+from tumortrack.core.colours import Colour
+from tumortrack.core.errors import InputError
+
+HEADER_SIZE = 58
+LONGEST_DEVICE = 20  # ASCII characters
+_HEADER = struct.Struct("> H 12s 20s Q Q Q")
+_EXTENDED = struct.Struct("> H H I I")
+_ENTRY = struct.Struct("> H H I")
+_ASCII, _UTF8 = 3, 106  # IANA's numbers of character sets
+_NS = 1_000_000_000
+# STATUS codes
+OK, NOT_FOUND, CHECKSUM_ERROR, NOT_READY, NOT_PRESENT, EXITING = 1, 4, 9, 13, 16, 19
+_STATUS = struct.Struct("> H q 20s")
+_POLYDATA = struct.Struct("> 10I")
+_ATTRIBUTE = struct.Struct("> B B I")
+_POINT_SCALARS = 0x00
+_POINT = struct.Struct("> 64s 32s 4B 4f 20s")
+
+
+class ProtocolError(InputError):
+    """Bytes that are no message, or a message that does not fit the protocol."""
+
+
+@dataclass(frozen=True)
+class Message:
+    """``type``: TRANSFORM, STATUS, POLYDATA, GET_STATUS, ..., at most 12 ASCII characters;
+    ``device``: at most 20. ``stamp_ns``: since 1970, UTC; 0: unknown. Kept to 1/4 ns. ``content``:
+    the type's own bytes. ``metadata``: texts by name."""
+
+    type: str
+    device: str
+    stamp_ns: int = 0
+    content: bytes = b""
+    metadata: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Header:
+    """The first 58 bytes; ``body_size`` bytes follow."""
+
+    version: int
+    type: str
+    device: str
+    stamp_ns: int
+    body_size: int
+    crc: int
+
+
+def pack(message: Message) -> bytes:
+    """The message's bytes. Raises ProtocolError for a name too long or not ASCII, and a stamp
+    before 1970 or after 2106."""
+    index, texts = [struct.pack("> H", len(message.metadata))], []
+    for key, value in message.metadata.items():
+        name, text = key.encode("ascii"), value.encode("utf-8")
+        index.append(_ENTRY.pack(len(name), _ASCII if value.isascii() else _UTF8, len(text)))
+        texts += [name, text]
+    keys, values = b"".join(index), b"".join(texts)
+    extended = _EXTENDED.pack(_EXTENDED.size, len(keys), len(values), 0)
+    body = b"".join((extended, message.content, keys, values))
+    limits = ("type", message.type, 12), ("device name", message.device, LONGEST_DEVICE)
+    for what, given, size in limits:
+        if not given.isascii() or len(given) > size:
+            raise ProtocolError(f"{what} {given!r}: at most {size} ASCII characters are allowed.")
+    names = message.type.encode("ascii"), message.device.encode("ascii")
+    # Seconds in the upper 32 bits, their fraction in the lower ones.
+    stamp = ((message.stamp_ns << 32) + _NS // 2) // _NS
+    if not 0 <= stamp < 1 << 64:
+        raise ProtocolError(f"stamp {message.stamp_ns} ns lies before 1970 or after 2106.")
+    return _HEADER.pack(2, *names, stamp, len(body), crc64(body)) + body
+
+
+def unpack_header(data: bytes) -> Header:
+    """Raises ProtocolError: not 58 bytes, an unknown version, names that are no text."""
+    if len(data) != HEADER_SIZE:
+        raise ProtocolError(f"an OpenIGTLink header has {HEADER_SIZE} bytes, not {len(data)}.")
+    version, kind, device, stamp, size, crc = _HEADER.unpack(data)
+    if version not in (1, 2, 3):
+        raise ProtocolError(f"header version {version} is unknown; 1, 2 and 3 are read.")
+    try:
+        names = [raw.split(b"\0")[0].decode("ascii") for raw in (kind, device)]
+    except UnicodeDecodeError as error:
+        raise ProtocolError(
+            f"the header's type or device name is no ASCII text: {error}."
+        ) from error
+    return Header(version, names[0], names[1], (stamp * _NS + (1 << 31)) >> 32, size, crc)
+
+
+def check_body(header: Header, body: bytes) -> None:
+    """Raises ProtocolError if the body that followed a header has a wrong length or checksum."""
+    if len(body) != header.body_size:
+        raise ProtocolError(
+            f"{header.type}: the body has {len(body)} bytes; its header says {header.body_size}."
+        )
+    if crc64(body) != header.crc:
+        raise ProtocolError(f"{header.type} of {header.device!r}: its checksum is wrong (damaged).")
+
+
+def crc64(data: bytes) -> int:
+    """CRC-64 of ECMA-182 (1992), annex B: register 0 at the start, nothing reversed."""
+    try:
+        from fastcrc.crc64 import ecma_182
+    except ImportError as error:
+        raise InputError(
+            "OpenIGTLink needs the package fastcrc: pip install tumortrack-devices."
+        ) from error
+    return ecma_182(data)
+
+
+def pack_transform(b_from_a: Float[np.ndarray, "4 4"]) -> bytes:
+    """Its upper three rows, column by column, float32."""
+    return np.asarray(b_from_a)[:3].T.astype(">f4").tobytes()
+
+
+def pack_status(code: int, name: str, text: str) -> bytes:
+    """``name`` is cut to 20 characters. The text ends with a zero byte, as the protocol's own
+    library writes it; the sub code is 0."""
+    return _STATUS.pack(code, 0, name.encode("ascii", "replace")[:20]) + text.encode() + b"\0"
+
+
+@dataclass(frozen=True, eq=False)
+class Polydata:
+    """Points and cells of point numbers; ``scalars``: one per point, by name."""
+
+    points: Float[np.ndarray, "n 3"]
+    triangles: Int[np.ndarray, "f 3"]
+    segments: Int[np.ndarray, "s 2"] = field(default_factory=lambda: np.zeros((0, 2), np.int32))
+    scalars: dict[str, Num[np.ndarray, " n"]] = field(default_factory=dict)
+
+
+def pack_polydata(data: Polydata) -> bytes:
+    """Triangles are sent as polygons, segments as lines."""
+    lines, polygons = _cells(data.segments), _cells(data.triangles)
+    head = _POLYDATA.pack(
+        len(data.points),
+        *(0, 0),  # vertices: 3D Slicer's reader writes past its memory at the second one
+        *(len(data.segments), len(lines)),
+        *(len(data.triangles), len(polygons)),
+        *(0, 0),  # triangle strips
+        len(data.scalars),
+    )
+    points = np.asarray(data.points).astype(">f4").tobytes()
+    kinds = [_ATTRIBUTE.pack(_POINT_SCALARS, 1, len(values)) for values in data.scalars.values()]
+    names = b"".join(name.encode("ascii") + b"\0" for name in data.scalars)
+    values = [np.asarray(values).astype(">f4").tobytes() for values in data.scalars.values()]
+    padding = bytes(len(names) % 2)
+    return b"".join((head, points, lines, polygons, *kinds, names, padding, *values))
+
+
+def pack_points(
+    points_mm: Float[np.ndarray, "n 3"], labels: Sequence[str], colours: Sequence[Colour]
+) -> bytes:
+    """Fiducials; labels are cut to 63 bytes: the protocol's own library reads beyond one of 64."""
+    return b"".join(
+        _POINT.pack(label.encode("ascii", "replace")[:63], b"Fiducial", *rgb, 255, *point, 0.0, b"")
+        for label, rgb, point in zip(labels, colours, points_mm, strict=True)
+    )
+
+
+def _cells(cells: np.ndarray) -> bytes:
+    return np.insert(cells, 0, cells.shape[1], axis=1).astype(">u4").tobytes()

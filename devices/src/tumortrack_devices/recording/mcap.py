@@ -1,0 +1,129 @@
+"""Writing ROS 2 messages to an MCAP that a crash or a full disk leaves readable up to there."""
+
+from __future__ import annotations
+
+import io
+import os
+import time
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tumortrack.core.errors import InputError, StorageError
+from tumortrack.core.geometry import Affine
+from tumortrack.live.values import Observation
+from tumortrack_devices.ros.messages import Messages, Outgoing
+from tumortrack_devices.ros.sensors import CAMERA_FRAME, messages_seen
+from tumortrack_devices.ros.tf import TRANSFORMS, transform_fields
+
+CHUNK_S = 0.25  # a crash loses messages that are not in a chunk yet
+STRING = "std_msgs/msg/String"
+
+
+class McapBag:
+    """A new rosbag2 folder with one MCAP.
+
+    Messages are filed by time of arrival, which never goes back; headers have the stamps. When the
+    disk is full, whole chunks stay, in a file without an end, and each later write raises the same
+    StorageError, which ends with ``advice``.
+    """
+
+    def __init__(self, folder: Path, messages: Messages, advice: str) -> None:
+        from rosbags.rosbag2 import StoragePlugin, Writer, WriterError
+
+        self._messages, self._advice = messages, advice
+        self._connections: dict[str, Any] = {}
+        self._last_ns, self._chunk_s = 0, time.monotonic()
+        self._refused = ""
+        try:
+            # Version 8 is Humble's.
+            writer: Any = Writer(folder, version=8, storage_plugin=StoragePlugin.MCAP)
+            writer.open()
+        except WriterError as error:
+            raise InputError(f"{folder} exists already. Choose another path.") from error
+        self._writer, self._storage = writer, writer.storage
+        self._storage.bio.close()  # a buffer could not be truncated on a full disk
+        self._storage.bio = self._file = _WholeWrites(self._storage.path)
+        self._whole = self._file.tell()  # the end of the last whole chunk
+
+    def write(self, arrived_ns: int, out: Iterable[Outgoing]) -> None:
+        """Messages with full topic names; they are on the disk 0.25 s later."""
+        if self._refused:
+            raise StorageError(self._refused)
+        self._last_ns = max(self._last_ns, arrived_ns)
+        for topic, message_type, message in out:
+            if topic not in self._connections:
+                self._connections[topic] = self._writer.add_connection(
+                    topic, message_type, typestore=self._messages.store
+                )
+            data = self._messages.to_bytes(message)
+            with self._on_disk():
+                self._writer.write(self._connections[topic], self._last_ns, data)
+        if time.monotonic() - self._chunk_s >= CHUNK_S:
+            self.flush()
+
+    def close(self) -> None:
+        """Write the index and metadata.yaml."""
+        if not self._file.closed:
+            if self._storage.chunk.msgs:
+                self.flush()
+            with self._on_disk():
+                self._writer.close()
+
+    def flush(self) -> None:
+        with self._on_disk():
+            self._storage.close_chunk()
+
+    @contextmanager
+    def _on_disk(self) -> Iterator[None]:
+        """For calls that may write a chunk: if one fails, only whole chunks are left."""
+        try:
+            yield
+        except OSError as error:
+            if not self._file.closed:
+                os.ftruncate(self._file.fileno(), self._whole)
+                self._file.close()
+            self._refused = f"cannot write {self._file.name}: {error.strerror}. {self._advice}"
+            raise StorageError(self._refused) from error
+        if not self._file.closed and (end := self._file.tell()) > self._whole:
+            self._whole, self._chunk_s = end, time.monotonic()
+
+
+def camera_messages(
+    seen: Observation, fixed_from_camera: Affine, frame_id: str, messages: Messages, number: int = 1
+) -> list[Outgoing]:
+    """A camera's observation and, if the frames differ, its pose in ``frame_id`` on ``/tf``, with
+    full topic names. ``number``: of the camera, from 1."""
+    suffix = f"_{number}" if number > 1 else ""
+    same = np.array_equal(fixed_from_camera, np.eye(4))
+    other = CAMERA_FRAME + ("_optical" if frame_id == CAMERA_FRAME else "") + suffix
+    # The source's name, which a calibration may refer to when this is played.
+    camera = seen.frame_id or (frame_id if same else other)
+    if camera == frame_id and not same:
+        camera = other
+    out = [
+        message._replace(suffix=f"/camera{suffix}/{message.suffix}")
+        for message in messages_seen(seen, messages, camera)
+    ]
+    if camera != frame_id:
+        pose = transform_fields(messages, seen.stamp_ns, frame_id, camera, fixed_from_camera)
+        out.append(Outgoing("/tf", TRANSFORMS, messages.make(TRANSFORMS, transforms=[pose])))
+    return out
+
+
+class _WholeWrites(io.FileIO):
+    """Appends without a buffer; each write is complete or raises."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path, "r+")
+        self.seek(0, io.SEEK_END)
+
+    def write(self, data: Any) -> int:
+        left = memoryview(data).cast("B")
+        size = len(left)
+        while left:
+            left = left[super().write(left) or 0 :]
+        return size

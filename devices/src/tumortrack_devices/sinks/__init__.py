@@ -1,0 +1,1 @@
+"""Sinks of live tracking, one file each; pyproject.toml lists them as entry points."""

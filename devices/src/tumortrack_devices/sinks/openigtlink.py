@@ -1,0 +1,225 @@
+"""OpenIGTLink: positions of tumors, surfaces and status for 3D Slicer, PLUS and other receivers.
+
+Slicer takes what it receives as RAS. Our files are LPS and declared so; to coincide with them,
+x and y are sent negated (``space="lps"``: as they are).
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from typing import ClassVar, Literal
+
+import numpy as np
+
+from tumortrack.core.colours import name_colour
+from tumortrack.core.errors import InputError
+from tumortrack.core.geometry import RAS_FROM_LPS, transform_points
+from tumortrack.core.report import FitReport
+from tumortrack.core.types import Mesh
+from tumortrack.live.meter import Rate
+from tumortrack.live.values import SinkConfig, SinkContext, TrackingResult
+from tumortrack.tracking.files import CENTRES, CT, MARGIN
+from tumortrack.tracking.margins import centre_label, stated_radius
+from tumortrack.tracking.shells import rough_margin
+from tumortrack_devices.igtl import message as igtl
+from tumortrack_devices.igtl.link import Link
+from tumortrack_devices.igtl.message import Message, Polydata
+from tumortrack_devices.network import is_loopback
+
+STATUS_DEVICE, CLOUD_DEVICE, ARMS_DEVICE = "tumortrack", "occupancy", "arms"
+_TIP = "/tip"  # the end of the names of shapes at tool tips
+_NOTHING = Polydata(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32))
+_Content = tuple[str, str, bytes, dict[str, str]]  # type, device, content, own metadata
+
+
+class OpenIgtLinkSinkConfig(SinkConfig, frozen=True, kw_only=True, tag="openigtlink"):
+    """A server that 3D Slicer connects to, or, with ``connect``, a client of one.
+
+    Attributes:
+        port: the protocol's default is 18944; 0: a free one.
+        host: which of this machine's addresses to serve; 0.0.0.0: all, for other machines.
+        connect: host of a server to connect to instead.
+        mesh_hz: limit for surfaces; 0: none.
+        cloud_hz: limit for the labelled cloud; 0: none.
+        space: ras negates x and y, for 3D Slicer; lps sends what is published.
+    """
+
+    target: ClassVar[str] = "port"
+
+    port: int = 18944
+    host: str = "127.0.0.1"
+    connect: str = ""
+    mesh_hz: float = 10.0
+    cloud_hz: float = 0.0
+    space: Literal["ras", "lps"] = "ras"
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.port <= 65535 or (self.connect and not self.port):
+            raise InputError(f"openigtlink: port {self.port} must lie in 1..65535.")
+        self.check_ranges("openigtlink:", "0 (none)", mesh_hz=1000, cloud_hz=1000)
+
+    def open(self, context: SinkContext) -> OpenIgtLinkSink:
+        if long := [name for name in context.parts if len(name) > igtl.LONGEST_DEVICE]:
+            raise InputError(
+                f"openigtlink: {long[0]!r} has {len(long[0])} letters, and OpenIGTLink allows "
+                f"{igtl.LONGEST_DEVICE}. Prepare the case with a shorter --name."
+            )
+        return OpenIgtLinkSink(self, context)
+
+
+class OpenIgtLinkSink:
+    """Per result: STATUS ``tumortrack``, TRANSFORM of each tumor, POINT ``tumors`` (their centres,
+    labelled with their uncertainty), and POLYDATA of each part and of each stated margin.
+
+    With a motion TRANSFORM ``ct`` is the organ's pose, and vertices of tumors have the scalar
+    ``std_mm``: one standard deviation along the least certain axis. Without an estimate STATUS says
+    why, transforms are the identity with ``TransformStatus`` MISSING, and all else is empty.
+
+    With arms also STATUS ``arms`` (OK: its name is their state; not ready: halted, and why; not
+    present: unknown), and a TRANSFORM of each tool tip, named as its shape (``cutter/tip``): from
+    the tip's own frame, and MISSING once it is gone.
+    """
+
+    def __init__(self, config: OpenIgtLinkSinkConfig, context: SinkContext) -> None:
+        self._config, self._context = config, context
+        self._axes = RAS_FROM_LPS if config.space == "ras" else np.eye(4)
+        self.link = Link(config.host, config.port, config.connect)
+        self._mesh_rate, self._cloud_rate = Rate(config.mesh_hz), Rate(config.cloud_hz)
+        self._tips: set[str] = set()  # all so far
+        self._margins: set[str] = set()  # all so far
+        self._next, self._closed = 0, False
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        host, port = self._config.host, self.link.port
+        if self._config.connect:
+            return ()
+        if is_loopback(host):
+            return (f"serving on {host}:{port}, this machine alone",)
+        return (f"anyone in this network can see the patient's organ on port {port} of {host}",)
+
+    def publish(self, result: TrackingResult) -> None:
+        self._send(result, igtl.OK if result.estimate is not None else igtl.NOT_FOUND)
+        self._next = result.sequence + 1
+
+    def close(self) -> None:
+        """Send that tracking has ended, so that nothing looks current."""
+        if not self._closed:
+            self._closed = True
+            frame, why = self._context.published_frame, "tracking has ended"
+            over = TrackingResult(self._next, time.time_ns(), reason=why, published_frame=frame)
+            self._send(over, igtl.EXITING)
+            self.link.close()
+
+    def _send(self, result: TrackingResult, code: int) -> None:
+        about = {"frame_id": result.published_frame.frame_id, "sequence": str(result.sequence)}
+        about |= {"patient": self._context.patient.id, "side": self._context.patient.side}
+        contents = [
+            *self._statuses(result, code),
+            *self._transforms(result),
+            *self._centres(result),
+            *self._surfaces(result),
+        ]
+        self.link.send(
+            [
+                Message(kind, device, result.stamp_ns, content, about | more)
+                for kind, device, content, more in contents
+            ]
+        )
+
+    def _statuses(self, result: TrackingResult, code: int) -> Iterator[_Content]:
+        name, text = str(result.quality), result.describe()
+        if result.estimate is None:
+            name, text = "no estimate", result.reason
+        more = {"quality": str(result.quality)}
+        if result.latency_ms is not None:
+            more["latency_ms"] = f"{result.latency_ms:.1f}"
+        yield "STATUS", STATUS_DEVICE, igtl.pack_status(code, name, text), more
+        cell = result.workcell
+        if not self._context.arms:
+            return
+        status, more = (igtl.NOT_PRESENT, "unknown", "nothing is known of the arms"), {}
+        if cell is not None:
+            code = igtl.NOT_READY if cell.halted else igtl.OK
+            status, more = (code, cell.state, cell.halted), {"state": cell.state}
+        yield "STATUS", ARMS_DEVICE, igtl.pack_status(*status), more
+
+    def _transforms(self, result: TrackingResult) -> Iterator[_Content]:
+        poses = {name: result.part_pose(name) for name in self._context.parts[1:]}
+        if self._context.anatomy_ct is not None:
+            poses[CT] = result.published_from_ct
+        cell = result.workcell if self._context.arms else None
+        shapes = () if cell is None else cell.shapes
+        tips = {s.name: s.published_from_shape for s in shapes if s.name.endswith(_TIP)}
+        self._tips |= tips.keys()
+        poses |= {name: tips.get(name) for name in sorted(self._tips)}
+        for name, pose in poses.items():
+            sent = np.eye(4) if pose is None else self._axes @ pose @ self._axes
+            status = {"TransformStatus": "MISSING" if pose is None else "OK"}
+            yield "TRANSFORM", name, igtl.pack_transform(sent), status
+
+    def _centres(self, result: TrackingResult) -> Iterator[_Content]:
+        report = FitReport() if result.estimate is None else result.estimate.report
+        tumors = self._context.parts[1:]
+        centres = {n: mm for n in tumors if (mm := result.center_mm(n)) is not None}
+        labels = [centre_label(report, name, result.quality != "good") for name in centres]
+        points_mm = transform_points(self._axes, np.reshape([*centres.values()], (-1, 3)))
+        if tumors:
+            colours = [name_colour(name) for name in centres]
+            yield "POINT", CENTRES, igtl.pack_points(points_mm, labels, colours), {}
+
+    def _surfaces(self, result: TrackingResult) -> Iterator[_Content]:
+        estimate = result.transformed
+        contents: dict[str, Polydata] = {}
+        if self._config.mesh_hz:
+            # Surfaces that are gone are deleted at once; others wait until they are due.
+            due = estimate is None or self._mesh_rate.due()
+            meshes = {**estimate.meshes, **estimate.structures} if estimate else {}
+            for name in (*self._context.parts, *self._context.structures):
+                if (mesh := meshes.get(name)) is None:
+                    contents[name] = _NOTHING
+                elif due:
+                    contents[name] = self._surface(mesh, self._deviations(result, name))
+            contents |= self._shells(result, meshes, due)
+        if self._config.cloud_hz:
+            if estimate is None:
+                contents[CLOUD_DEVICE] = _NOTHING
+            elif self._cloud_rate.due():
+                # Each point is a line of length 0: Slicer shows only points of cells, and its
+                # reader does not support cells of one point.
+                segments = np.repeat(np.arange(len(estimate.points_mm))[:, None], 2, axis=1)
+                scalars = {"label": estimate.labels, "probability": estimate.probability}
+                points = transform_points(self._axes, estimate.points_mm)
+                contents[CLOUD_DEVICE] = Polydata(points, _NOTHING.triangles, segments, scalars)
+        for name, content in contents.items():
+            yield "POLYDATA", name, igtl.pack_polydata(content), {}
+
+    def _shells(
+        self, result: TrackingResult, meshes: dict[str, Mesh], due: bool
+    ) -> dict[str, Polydata]:
+        """The surfaces of the tumors' stated margins; empty for one that is no longer stated."""
+        margin = None if result.estimate is None else result.estimate.report.margin
+        contents: dict[str, Polydata] = {}
+        for name in self._context.parts[1:]:
+            mesh, radius, shell = meshes.get(name), stated_radius(margin, name), name + MARGIN
+            if mesh is None or radius is None:
+                contents |= {shell: _NOTHING} if shell in self._margins else {}
+            elif due:
+                self._margins.add(shell)
+                contents[shell] = self._surface(rough_margin(mesh, radius.mm))
+        return contents
+
+    def _surface(self, mesh: Mesh, scalars: dict[str, np.ndarray] | None = None) -> Polydata:
+        points_mm = transform_points(self._axes, mesh.vertices_mm)
+        return Polydata(points_mm, mesh.faces, scalars=scalars or {})
+
+    def _deviations(self, result: TrackingResult, name: str) -> dict[str, np.ndarray]:
+        """``std_mm`` of each vertex of a tumor, where the method knows it."""
+        parts, anatomy = self._context.parts, self._context.anatomy_ct
+        motion = None if result.estimate is None else result.estimate.motion
+        if motion is None or anatomy is None or name not in parts[1:]:
+            return {}
+        vertices_ct = anatomy.parts[parts.index(name)].vertices_mm
+        std_mm = motion.largest_std_mm(vertices_ct)
+        return {} if std_mm is None else {"std_mm": std_mm}

@@ -1,0 +1,1 @@
+"""Sources of live tracking, one file each; pyproject.toml lists them as entry points."""

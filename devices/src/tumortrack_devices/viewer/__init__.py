@@ -1,0 +1,1 @@
+"""Parts of the web viewer: scene, panel, access control."""

@@ -1,0 +1,292 @@
+"""The viewer's panel: status as HTML, slice, buttons, switches."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from html import escape
+from importlib.resources import files
+from string import Template
+from typing import TYPE_CHECKING, Any, Literal, get_args
+
+import numpy as np
+from jaxtyping import UInt8
+
+from tumortrack.core import colours
+from tumortrack.core.colours import Colour, css, part_colour
+from tumortrack.core.estimate import NO_CHECK_FAILED, UNVERIFIED
+from tumortrack.core.patient import NOBODY
+from tumortrack.core.report import FitReport
+from tumortrack.live.values import Controls, TrackingResult, Workcell
+from tumortrack.tracking.margins import margin_words, stated_radius
+from tumortrack.tracking.slices import ORIENTATIONS
+from tumortrack_devices.viewer.look import View
+from tumortrack_devices.viewer.scene import DisplayOptions
+
+if TYPE_CHECKING:
+    from viser import ViserServer
+
+State = Literal["waiting", "good", "poor", "none", "stale", "playback"]
+
+_WIDTH = 360  # pixels, which overlays of the scene leave free
+ABORT, ABORTED = "Stop the arms for good", "The arms were stopped for good"
+CLICKS = {True: "Point at the organ", False: "Point beside it"}
+CANCEL = {
+    True: "Now click on the organ (again: cancel)",
+    False: "Now click beside it (again: cancel)",
+}
+_CLICK_HINTS = {
+    True: "Choose the thing that is the organ; a picture teaches its colour",
+    False: "Teach the colour of fat, a hand, a drape",
+}
+SILENCE_S = 2  # without a message from the server, after which the page itself says so
+
+# Shape and colour of each state, over the scene and in the panel.
+_SIGNS: dict[State, tuple[str, Colour]] = {
+    "waiting": ("○", colours.STALE),
+    "good": ("●", colours.GOOD),  # a tick would promise too much
+    "poor": ("▲", colours.POOR),
+    "none": ("✕", colours.NONE),
+    "stale": ("◆", colours.STALE),
+    "playback": ("►", colours.ARMS),
+}
+_EMPTY: tuple[State, ...] = ("waiting", "none", "stale")
+
+# Styles and places of the status. Surfaces reach the screen one frame after their message, so the
+# status waits as long (status.html).
+_PAGE = Template(files(__package__).joinpath("status.html").read_text("utf-8")).substitute(
+    stale=css(colours.STALE), silence_s=SILENCE_S, right=_WIDTH + 18
+)
+# The page's own watch: every message replaces this element and so restarts its animation. When
+# none comes (the program was killed, the network is down) the browser shows it, as a popover over
+# everything.
+_SILENCE = (
+    '<div class="tumortrack-silence" onanimationend="this.popover = \'manual\'; '
+    f'this.showPopover()"><div>◆ STALE<small>tumortrack has been silent for {SILENCE_S} s, or its '
+    "panel was closed; what is said here is old</small></div></div>"
+)
+
+
+@dataclass(frozen=True, eq=False)
+class StatusPanel:
+    """The status of the shown result. ``age_s``: since its frame; ``counter``: of messages;
+    ``arms``: there may be some; ``parts``: the model's, the organ first."""
+
+    state: State
+    result: TrackingResult | None
+    age_s: float
+    counter: int
+    arms: bool = False
+    parts: tuple[str, ...] = ()
+
+    @property
+    def alarming(self) -> bool:
+        """There is no estimate. Arms that go on without one are meant to, as in a playback: else
+        they would be halted."""
+        cell = self._cell
+        return self.state in _EMPTY and (cell is None or bool(cell.halted))
+
+    @property
+    def _cell(self) -> Workcell | None:
+        """What the arms do, if that is current."""
+        if self.result is None or self.state in ("waiting", "stale"):
+            return None
+        return self.result.workcell
+
+    def stage(self) -> str:
+        """Everything, in one piece that the page shows at once: in the panel (``flag``,
+        ``numbers``) and over the scene (``over``)."""
+        parts = {"flag": self.flag(), "numbers": self.numbers(), "over": self._over_scene()}
+        inside = "".join(f'<div class="{name}">{html}</div>' for name, html in parts.items())
+        return f'<div class="tumortrack-stage" hidden data-n="{self.counter}">{inside}</div>'
+
+    def flag(self) -> str:
+        """Quality and frame number; the arms' state."""
+        heading, colour = self._heading
+        return _box(heading, colour, self._number()) + (self._arms()[0] if self.arms else "")
+
+    @property
+    def _heading(self) -> tuple[str, Colour]:
+        shape, colour = _SIGNS[self.state]
+        return f"{shape} {self.state.upper()}", colour
+
+    def _over_scene(self) -> str:
+        """A banner with the reason; if alarming, the whole page in its colour; the watch."""
+        heading, colour = self._heading
+        tint, size = "", "quiet" if self.state == "good" else "plain"
+        if self.alarming:
+            size = "loud"
+            style = f"background:{css(colour)}48;color:{css(colour)}"
+            tint = f"<div class='tumortrack-tint' style='{style}'></div>"
+        why = f"{self._number()}: {self._reason()}"
+        banner = _over("top", size, colour, heading, why.removeprefix(": "))
+        return tint + banner + (self._arms()[1] if self.arms else "") + _SILENCE
+
+    def _number(self) -> str:
+        return "" if self.result is None else f"frame no. {self.result.sequence}"
+
+    def _arms(self) -> tuple[str, str]:
+        """Their state, or why they are halted: in the panel, and over the scene."""
+        cell = self._cell
+        if cell is None:
+            return _box("ARMS: nothing is known of them", colours.STALE), ""
+        colour = colours.NONE if cell.halted else colours.ARMS
+        text = f"{cell.state}: HALTED" if cell.halted else cell.state
+        left = "" if cell.left_mm is None else f"{cell.left_mm:.1f} mm of the margin are left"
+        box = _box(f"ARMS: {text}", colour, cell.halted or left)
+        return box, _over("bottom", "plain", colour, text, cell.halted)
+
+    def _reason(self) -> str:
+        if self.state == "waiting":
+            return "no frame has come yet"
+        if self.state == "stale":
+            return f"nothing has come for {self.age_s:.1f} s; the last estimate is hidden"
+        if self.state == "playback":
+            return "not a live estimate: a stored plan is shown, nothing is tracked"
+        assert self.result is not None
+        if self.state == "good":
+            return f"{NO_CHECK_FAILED}; {UNVERIFIED}"
+        return f"no estimate: {self.result.reason}" if self.state == "none" else self.result.warning
+
+    def numbers(self) -> str:
+        """Each part's volume, standard deviation and margin; latency and age."""
+        result = self.result
+        if result is None:
+            return ""
+        latency = "–" if result.latency_ms is None else f"{result.latency_ms:.0f} ms"
+        report = FitReport()
+        if result.estimate is not None and self.state in ("good", "poor"):
+            report = result.estimate.report
+            lag_ms = 0.0 if report.smoothing is None else report.smoothing.lag_ms
+            latency += f" + {lag_ms:.0f} smoothing" if lag_ms >= 0.5 else ""
+        parts = "" if self.state == "playback" else self._parts(report)
+        return (
+            f"<div class='tumortrack-numbers'>{parts}"
+            f"<div class='tumortrack-row'><span>latency <b>{latency}</b></span>"
+            f"<span>last frame <b>{self.age_s:.1f} s</b> ago</span></div>"
+            f"<div>{escape(result.cameras)}</div></div>"
+        )
+
+    def _parts(self, report: FitReport) -> str:
+        """A row for each part, with and without an estimate: nothing below must jump. After a
+        failed check the standard deviation is not valid, and left out."""
+        margins, good = report.margin, self.state == "good"
+        stated = margins.stated[-1].confidence if margins and margins.stated else None
+        heads = ["", "volume", "standard deviation of place"]
+        heads += [f"{100 * stated:g} % margin"] if stated else []
+        rows = []
+        for label, name in enumerate(self.parts, start=1):
+            part, margin = report.parts.get(name), stated_radius(margins, name)
+            volume_ml, std_mm = (part.volume_ml, part.center_std_mm) if part else (None, None)
+            std_mm = std_mm if good else None
+            cells = [
+                f"<i style='background:{css(part_colour(label))}'></i>"
+                + escape(name.replace("_", " "))
+                + (" (not found)" if part is not None and not part.found else ""),
+                "–" if volume_ml is None else f"{volume_ml:.1f} ml",
+                "–" if std_mm is None else f"{std_mm:.1f} mm",
+            ]
+            cells += [f"{margin.mm:.1f} mm" if margin else "–"] if stated else []
+            rows.append(f"<tr><td>{'</td><td>'.join(cells)}</td></tr>")
+        table = f"<table><tr><th>{'</th><th>'.join(heads)}</th></tr>{''.join(rows)}</table>"
+        none = escape(margin_words(margins)) if report.parts and not stated else ""
+        return f"{table}<div class='tumortrack-none'>{none}</div>"
+
+
+def _over(edge: str, size: str, colour: Colour, text: str, why: str) -> str:
+    return (
+        f"<div class='tumortrack-over tumortrack-{size}' style='{edge}:18px'>"
+        f"<div style='background:{css(colour)}'>{escape(text)}<small>{escape(why)}</small></div>"
+        "</div>"
+    )
+
+
+def _box(text: str, colour: Colour, why: str = "") -> str:
+    return (
+        f"<div class='tumortrack-box' style='background:{css(colour)}'>{escape(text)}"
+        f"<small>{escape(why)}</small></div>"
+    )
+
+
+class Panel:
+    """The elements, shared by all clients; the sink sets their callbacks. The result comes first,
+    then what shows it, then what changes it. ``slices``: of what; empty: there are none; ``arms``:
+    there may be some; ``patient``: in words."""
+
+    def __init__(
+        self,
+        server: ViserServer,
+        parts: tuple[str, ...],
+        slices: str = "",
+        arms: bool = False,
+        patient: str = str(NOBODY),
+    ) -> None:
+        gui = server.gui
+        gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
+        gui.main_panel.dock_right()
+        gui.main_panel.set_width(_WIDTH)
+        self.patient = gui.add_html(
+            f"<div class='tumortrack-row tumortrack-whose'><b>{escape(patient)}</b>"
+            "<label><input type='checkbox' id='tumortrack-more'> more</label></div>"
+        )
+        gui.add_html(_PAGE)  # of constant height: buttons must not jump
+        self.stage = gui.add_html("")
+        if arms:
+            self.abort = gui.add_button(
+                ABORT, color="red", hint="The arms stop, and move no more in this run"
+            )
+        gui.add_html('<div id="tumortrack-numbers"></div>')
+        if arms:
+            self.views = gui.add_button_group("Look at", get_args(View))
+        self.slice = None
+        default = DisplayOptions()
+        shown: dict[str, Any] = {}  # by the option's name
+        label = parts[0].replace("_", " ").capitalize()
+        if slices:
+            with gui.add_folder(f"{slices} at the present position"):
+                self.slice = gui.add_image(np.zeros((8, 8, 3), np.uint8), format="jpeg")
+                self.slice.visible = False
+                self.through = gui.add_dropdown("Through", parts[1:] or parts)
+                self.plane = gui.add_dropdown("Plane", tuple(ORIENTATIONS))
+                shown["slice_plane"] = gui.add_checkbox("In the scene", default.slice_plane)
+        with gui.add_folder("Is something else tracked?"):
+            self.clicks = {
+                organ: gui.add_button(CLICKS[organ], color="gray", hint=_CLICK_HINTS[organ])
+                for organ in (True, False)
+            }
+            self.colour = gui.add_html("")
+            self.forget = gui.add_button("Forget", color="gray", visible=False)
+        with gui.add_folder("Show"):
+            shown |= {
+                "organ": gui.add_slider(label, 0.0, 1.0, 0.05, default.organ),
+                "margin": gui.add_checkbox("Margins", default.margin),
+                "structures": gui.add_checkbox("Structures", default.structures),
+                "ellipsoids": gui.add_checkbox(
+                    "95 % ellipsoids (diagnostic)",
+                    default.ellipsoids,
+                    hint="95 % ellipsoid of each tumor's centre by the fit's own covariance, 2.80 "
+                    "standard deviations: a diagnostic, not the margin",
+                ),
+                "observed": gui.add_checkbox("Observed points", default.observed),
+                "points": gui.add_dropdown("Labelled points", ("none", "tumors", "all")),
+                "helpers": gui.add_checkbox("Axes, region", default.helpers),
+            }
+        self._shown = shown
+        self.switches = [*shown.values(), *((self.through, self.plane) if slices else ())]
+
+    @property
+    def options(self) -> DisplayOptions:
+        return DisplayOptions(**{name: element.value for name, element in self._shown.items()})
+
+    def say_clicks(self, asked: bool | None, controls: Controls) -> None:
+        """``asked``: for a click on the organ (True), beside it (False), or for none."""
+        for organ, button in self.clicks.items():
+            button.label = (CANCEL if organ is asked else CLICKS)[organ]
+        self.forget.visible = controls.picked_mm is not None or bool(controls.clicks)
+        words = escape(controls.colour)
+        self.colour.content = words and f"<div class='tumortrack-numbers'>{words}</div>"
+
+    def put_slice(self, picture: UInt8[np.ndarray, "h w 3"] | None) -> None:
+        if self.slice is not None:
+            if picture is not None:
+                self.slice.image = picture
+            self.slice.visible = picture is not None

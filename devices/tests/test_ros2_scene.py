@@ -1,0 +1,266 @@
+"""What ROS 2's users expect beside topics: frames on tf, /diagnostics, MoveIt's scene and
+trajectories, and a package for their workspace."""
+
+from __future__ import annotations
+
+import io
+import struct
+import sys
+import xml.etree.ElementTree as ET
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tyro
+from PIL import Image
+
+import needs
+import tumortrack
+from clock import until
+from live_objects import PARTS, ball, empty_update, small_setting, small_update
+from reports import NOWHERE, reporting
+from ros2_objects import own_graph
+from tumortrack.cli.track import Track
+from tumortrack.core.errors import InputError
+from tumortrack.core.estimate import Estimate
+from tumortrack.core.geometry import rigid
+from tumortrack.core.types import Mesh
+from tumortrack.live.spec import SINKS
+from tumortrack.live.values import PublishedFrame, TrackingResult
+from tumortrack_devices.ros.messages import Messages
+from tumortrack_devices.ros.results import ResultMessages
+from tumortrack_devices.ros.ros2 import open_bus
+from tumortrack_devices.ros.sensors import COMPRESSED, image_of
+from tumortrack_devices.ros.tf import TRANSFORMS, pose_of
+from tumortrack_devices.sinks.moveit import SCENE, coarser, widened_hull
+
+MESSAGES = Messages()
+QUARTER = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+PLACED = PublishedFrame("table", rigid(QUARTER, np.array([10.0, 20, 30])))
+PACKAGE = Path(__file__).parents[2] / "integrations" / "ros2" / "tumortrack_ros"
+
+
+def sent(results: ResultMessages, update: TrackingResult) -> dict:
+    return {one.suffix: one.message for one in results.of(update)}
+
+
+def estimate_with(update: TrackingResult, meshes: dict[str, Mesh], **report: object) -> Estimate:
+    known = update.estimate
+    assert known is not None
+    return reporting(replace(known, meshes={**known.meshes, **meshes}), **report)
+
+
+def test_each_part_has_a_frame_turned_as_the_organ_is():
+    update = small_update(frames=PLACED)
+    turned = rigid(np.diag([1.0, -1, -1]), np.zeros(3))
+    motion = {**NOWHERE, "camera_from_ct": turned.tolist()}
+    known = estimate_with(update, {"artery": ball((1, 2, 130), 3)}, motion=motion)
+    update = replace(update, estimate=known)
+    frames = sent(ResultMessages(MESSAGES, small_setting(), namespace="/or_2"), update)["/tf"]
+    assert [one.child_frame_id for one in frames.transforms] == [
+        f"or_2/{name}" for name in (*PARTS, "artery")
+    ]
+    for one, name in zip(frames.transforms, (*PARTS, "artery"), strict=True):
+        expected = rigid(QUARTER @ turned[:3, :3], update.center_mm(name))
+        np.testing.assert_allclose(pose_of(one), expected, atol=1e-9)
+        assert one.header.frame_id == "table"
+
+
+def test_tf_is_silent_where_the_estimate_is_not_good():
+    results = ResultMessages(MESSAGES, small_setting())
+    poor = replace(small_update(), quality="poor", warning="one side alone is seen")
+    assert [len(sent(results, one)["/tf"].transforms) for one in (poor, empty_update())] == [0, 0]
+
+
+def test_further_surfaces_are_shown_as_the_parts_are():
+    update = small_update()
+    update = replace(update, estimate=estimate_with(update, {"artery": ball((1, 2, 130), 3)}))
+    markers = sent(ResultMessages(MESSAGES, small_setting()), update)["meshes"].markers
+    assert [one.ns for one in markers] == [*PARTS, "artery", "quality"]
+
+
+def test_diagnostics_come_each_second_and_at_once_where_the_level_changes():
+    results = ResultMessages(MESSAGES, small_setting())
+    results._status_rate._period_s = 1000.0  # whatever the machine's load
+    updates = [small_update(0), small_update(1), empty_update(2), empty_update(3), small_update(4)]
+    came = [sent(results, one).get("/diagnostics") for one in updates]
+    assert [None if one is None else one.status[0].level for one in came] == [0, None, 2, None, 0]
+    dropped = replace(small_update(5), dropped=7)
+    said = sent(results, dropped)["diagnostics"].status[0]
+    values = {one.key: one.value for one in said.values}
+    assert (values["dropped"], values["quality"]) == ("7", "good")
+    assert float(values["rate_hz"]) > 0
+
+
+# --- compressedDepth
+
+
+def packed(values: np.ndarray, kind: str, a: float = 0.0, b: float = 0.0) -> object:
+    """As image_transport's plugin packs it."""
+    png = io.BytesIO()
+    Image.fromarray(values).save(png, format="PNG")
+    data = np.frombuffer(struct.pack("<i2f", 1, a, b) + png.getvalue(), np.uint8)
+    return MESSAGES.make(COMPRESSED, header=MESSAGES.header(5, "arm"), format=kind, data=data)
+
+
+def test_packed_depths_are_those_that_were_packed():
+    steps = np.array([[0, 120, 65535], [7, 8, 9]], np.uint16)
+    for kind in ("16UC1; compressedDepth png", "16UC1; compressedDepth"):
+        image = image_of(packed(steps, kind), MESSAGES)
+        assert (image.encoding, image.height, image.width) == ("16UC1", 2, 3)
+        assert np.array_equal(image.data.view(np.uint16).reshape(2, 3), steps)
+        assert image.header.frame_id == "arm"
+    # The plugin's numbers for a far limit of 10 m and a quantisation of 100 (a = 100 * 101).
+    a, b = 100 * 101.0, 1 - 100 * 101.0 / 10
+    metres = np.array([[0.2, 0.5, 2.0]])
+    image = image_of(packed((a / metres + b).astype(np.uint16), "32FC1; compressedDepth png",
+                            a, b), MESSAGES)  # fmt: skip
+    np.testing.assert_allclose(image.data.view(np.float32), metres[0], rtol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("kind", "cut"), [("bgr8; jpeg compressed bgr8", 0), ("16UC1; compressedDepth rvl", 0),
+                      ("16UC1; compressedDepth png", 20), ("16UC1; compressedDepth png", 70)]
+)  # fmt: skip
+def test_other_packings_and_damaged_ones_are_refused(kind, cut):
+    message = packed(np.ones((20, 30), np.uint16), kind)
+    message.data = message.data[: cut or None]
+    with pytest.raises(InputError, match="packed"):
+        image_of(message, MESSAGES)
+
+
+# --- MoveIt
+
+
+def test_a_margin_holds_all_that_is_so_near_and_little_else():
+    tumor = ball((14.0, -3.0, 120.0), 6.0)
+    wide = widened_hull(tumor, 5.0)
+    normals = np.cross(*(wide.vertices_mm[wide.faces[:, n]] - wide.vertices_mm[wide.faces[:, 0]]
+                         for n in (1, 2)))  # fmt: skip
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    heights = np.einsum("ij,ij->i", normals, wide.vertices_mm[wide.faces[:, 0]])
+    # Every plane of the hull is at least the margin beyond every point of the tumor.
+    beyond_mm = heights - (tumor.vertices_mm @ normals.T).max(0)
+    assert beyond_mm.min() >= 5 - 1e-6
+    assert beyond_mm.max() < 5.6
+    assert 4 / 3 * np.pi * 10.9**3 < wide.volume_mm3 < 4 / 3 * np.pi * 11.6**3
+
+
+def test_a_coarser_surface_stays_near_and_keeps_its_holes():
+    fine = Mesh(*_disc(60))
+    few = coarser(fine, 4.0)
+    assert len(few.faces) < len(fine.faces) / 5
+    assert np.abs(few.vertices_mm[:, 2]).max() == 0
+    corners = few.vertices_mm[few.faces]
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
+    assert area > 0
+    assert np.ptp(few.vertices_mm[:, 0]) == pytest.approx(60, abs=4)
+
+
+def _disc(n: int) -> tuple[np.ndarray, np.ndarray]:
+    """An open sheet of n x n squares of 1 mm."""
+    rows, columns = np.mgrid[: n + 1, : n + 1]
+    vertices = np.stack([columns.ravel(), rows.ravel(), 0 * rows.ravel()], axis=1).astype(float)
+    first = (rows[:-1, :-1] * (n + 1) + columns[:-1, :-1]).ravel()
+    squares = first[:, None] + np.array([0, 1, n + 2, 0, n + 2, n + 1])
+    return vertices, squares.reshape(-1, 3)
+
+
+def test_the_scene_s_options_are_checked():
+    assert SINKS.parse("moveit").topic == "/planning_scene"
+    with pytest.raises(InputError, match="margin_mm"):
+        SINKS.parse("moveit:/planning_scene?margin_mm=-1")
+    with pytest.raises(InputError, match="no full topic name"):
+        SINKS.parse("moveit:scene")
+
+
+def test_moveit_s_types_are_those_that_a_second_library_makes():
+    needs.module("cyclonedds", "tumortrack-devices, x86-64, Python up to 3.13")
+    from tumortrack_devices.ros.dds import idl_type
+
+    scene = MESSAGES.make(SCENE, name="theatre", is_diff=True, robot_state={"is_diff": True})
+    cdr = bytes(MESSAGES.to_bytes(scene))
+    type_ = idl_type(SCENE)
+    assert type_.deserialize(cdr).serialize(use_version_2=False)[: len(cdr)] == cdr
+
+
+def test_obstacles_arrive_of_good_estimates_and_cameras_are_kept_for_latecomers():
+    needs.module("cyclonedds", "tumortrack-devices, x86-64, Python up to 3.13")
+    setting = replace(small_setting(), published_frame=PLACED)
+    good = small_update(frames=PLACED)
+    with own_graph():
+        bus = open_bus("dds")
+        heard = bus.subscriber("/scene", SCENE)
+        scene = SINKS.parse("moveit:/scene?margin_mm=5&hz=0").open(setting)
+        sink = SINKS.parse("ros2:/theatre?camera_tf=true").open(setting)
+        try:
+            sink.publish(good)
+            late = bus.subscriber("/tf_static", TRANSFORMS, latched=True)
+
+            def came() -> list:
+                scene.publish(replace(good, quality="poor", warning="seen from one side"))
+                scene.publish(good)
+                return heard.take()
+
+            said = MESSAGES.from_bytes(until(came)[-1], SCENE)
+            (camera,) = MESSAGES.from_bytes(until(late.take)[-1], TRANSFORMS).transforms
+            while heard.take():
+                bus.wait(0.1)
+            scene.publish(empty_update())
+            scene.close()  # nothing is taken away
+            assert not heard.take()
+        finally:
+            for one in (scene, sink, bus):
+                one.close()
+    assert said.is_diff
+    assert said.robot_state.is_diff
+    objects = {one.id: one for one in said.world.collision_objects}
+    names = {f"tumortrack/{name}" for name in PARTS}
+    assert objects.keys() == names | {f"{name}/margin" for name in names if "tumor_" in name}
+    assert {one.operation for one in objects.values()} == {0}  # ADD
+    for name in PARTS:
+        (mesh,) = objects[f"tumortrack/{name}"].meshes
+        points_mm = 1000 * np.array([[p.x, p.y, p.z] for p in mesh.vertices])
+        corners = np.array([one.vertex_indices for one in mesh.triangles])
+        expected = coarser(good.transformed.meshes[name], 3.0)
+        np.testing.assert_allclose(points_mm, expected.vertices_mm, atol=1e-9)
+        assert np.array_equal(corners, expected.faces)
+        assert objects[f"tumortrack/{name}"].header.frame_id == "table"
+    assert (camera.header.frame_id, camera.child_frame_id) == ("table", "camera")
+    np.testing.assert_allclose(pose_of(camera), PLACED.published_from_camera, atol=1e-9)
+
+
+# --- the package for a ROS 2 workspace; its node, launch file and build need ROS, and are not run
+
+
+@pytest.fixture
+def options(monkeypatch):
+    monkeypatch.syspath_prepend(str(PACKAGE))
+    from tumortrack_ros import options
+
+    yield options
+    sys.modules.pop("tumortrack_ros.options")
+
+
+def test_parameters_are_options_of_track_and_have_their_defaults(options):
+    asked = {"model": "MODEL", "source": "ros2:/depth", "range": "100 400", "whole": True}
+    asked |= {"box": "-1 -2 3 4 5 6", "give_up": 7.0, "sinks": ["viewer", "moveit"]}
+    program, name, *arguments = options.command(asked)
+    assert (program, name) == ("tumortrack", "track")
+    parsed = tyro.cli(Track, args=arguments)
+    assert (parsed.source, parsed.sinks) == ("ros2:/depth", ("viewer", "moveit"))
+    assert (parsed.range, parsed.box) == ((100, 400), (-1, -2, 3, 4, 5, 6))
+    assert (parsed.whole, parsed.give_up) == (True, 7)
+    plain = tyro.cli(Track, args=options.command({"model": "M", "source": "s"})[2:])
+    for name, option in options.OPTIONS.items():
+        if name not in ("executable", "model", "source", "sinks"):
+            assert (getattr(plain, name) or "") == (option.default or ""), name
+    with pytest.raises(ValueError, match="source is not set"):
+        options.command({"model": "MODEL"})
+
+
+def test_the_package_names_this_version():
+    about = ET.parse(PACKAGE / "package.xml").getroot()
+    assert about.findtext("version") == tumortrack.__version__
+    assert f'version="{tumortrack.__version__}"' in (PACKAGE / "setup.py").read_text()

@@ -1,0 +1,216 @@
+"""Depth from two pictures, against rendered truth; its noise, which simulation uses."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import cv2
+import msgspec
+import numpy as np
+import pytest
+from scipy.ndimage import distance_transform_edt
+from scipy.special import ndtr
+
+from depth_objects import SMALL, pixels
+from stereo_objects import endoscope, over_a_table, placed_before
+from tumortrack import api
+from tumortrack.core.errors import InputError
+from tumortrack.core.geometry import transform_points
+from tumortrack.core.types import DepthFrame
+from tumortrack.imaging.case import load_case
+from tumortrack.sense.noise import (
+    CLEAN,
+    D405_NOISE,
+    STEREO_NOISE,
+    NoiseConfig,
+    add_noise,
+    stereo_noise,
+)
+from tumortrack.tracking import presets
+from tumortrack.tracking.tracker import Tracker, region_for
+from tumortrack_devices.stereo import StereoRig, read_calibration
+
+
+@pytest.fixture(scope="module")
+def seen(phantom_case) -> SimpleNamespace:
+    """The phantom before an endoscope: what the pair shows, and what is true."""
+    case, calibration = load_case(phantom_case), endoscope()
+    left_from_ct = placed_before(case.anatomy.organ, case.up_lps, 105.0, 20.0)
+    scene = over_a_table(case.anatomy.organ, left_from_ct)
+    rig = StereoRig(calibration)
+    way = np.eye(4)
+    way[:3, :3] = rig.rectified_from_left
+    left, right = rig.rectified(*scene.pictures(calibration))
+    true_mm = scene.depth(rig.intrinsics, way).depth_mm
+    organ_mm = scene.depth_of(0, rig.intrinsics, way).depth_mm
+    return SimpleNamespace(
+        **{"case": case, "rig": rig, "left": left, "right": right, "true_mm": true_mm},
+        frame=rig.depth(left, right, 7),
+        on=organ_mm <= true_mm,
+        rectified_from_ct=way @ left_from_ct,
+    )
+
+
+def test_depth_is_true_to_a_fraction_of_a_pixel(seen):
+    rig, frame = seen.rig, seen.frame
+    assert rig.baseline_mm == pytest.approx(np.linalg.norm(endoscope().T))
+    assert frame.stamp_ns == 7
+    found = seen.on & np.isfinite(frame.depth_mm)
+    assert found.sum() > 0.97 * seen.on.sum()
+    per_mm = rig.intrinsics.fx * rig.baseline_mm
+    off_px = (per_mm / frame.depth_mm - per_mm / seen.true_mm)[found]
+    assert abs(np.median(off_px)) < 0.1
+    assert np.median(np.abs(off_px)) < 0.25
+    assert (np.abs(off_px) > 2).mean() < 0.02
+    # What docs/method.md says of the noise: 0.2 to 0.35 px, shared by neighbours.
+    inner = distance_transform_edt(seen.on) > 12
+    noise = np.where(inner, per_mm / frame.depth_mm - per_mm / seen.true_mm, np.nan)
+    noise -= np.nanmean(noise)
+    assert 0.15 < np.nanstd(noise) < 0.4
+    shared = np.nanmean(noise[:, 5:] * noise[:, :-5]) / np.nanvar(noise)
+    assert shared > 0.6
+
+
+def test_the_nearer_surface_spreads_as_the_noise_model_says(seen):
+    spread_px = 4.5  # docs/method.md, at this focal length
+    distance = distance_transform_edt(~seen.on)
+    fat = seen.frame.depth_mm < seen.true_mm - 8
+    for k in (2, 4, 6):
+        there = (distance >= k - 1) & (distance < k + 1)
+        assert fat[there].mean() == pytest.approx(2 * ndtr(-k / spread_px), abs=0.12)
+
+
+def test_pictures_of_another_size_are_refused(seen, unchecked):
+    with pytest.raises(InputError, match="640 x 480"):
+        seen.rig.rectified(seen.left[1:], seen.right)
+
+
+@pytest.mark.slow
+def test_the_organ_is_located_by_it(seen, clinic_model):
+    """The model learnt for seconds, and for a D405; only the unevenness to expect is stereo's."""
+    model = api.load_model(clinic_model, "cpu")
+    scene = msgspec.structs.replace(model.config.scene, noise=STEREO_NOISE)
+    model = replace(model, config=msgspec.structs.replace(model.config, scene=scene))
+    assert region_for(model).noise_mm == STEREO_NOISE.axial_mm
+    organ = api.find_organ(seen.frame, model=model)
+    estimate = Tracker(model).locate(organ, 16, 0, seen.frame)
+    for name, part in zip(model.parts, seen.case.anatomy.parts, strict=True):
+        true_mm = transform_points(seen.rectified_from_ct, part.vertices_mm).mean(0)
+        assert np.linalg.norm(estimate.meshes[name].vertices_mm.mean(0) - true_mm) < 3.0, name
+
+
+@pytest.mark.parametrize("suffix", ["yaml", "json", "plain.json"])
+def test_a_calibration_of_opencv_s_is_read(tmp_path, suffix):
+    file, calibration = tmp_path / f"stereo.{suffix}", endoscope()
+    if suffix == "plain.json":
+        file.write_bytes(msgspec.json.encode(calibration))
+    else:
+        storage = cv2.FileStorage(str(file), cv2.FILE_STORAGE_WRITE)
+        storage.write("width", calibration.width)
+        storage.write("height", calibration.height)
+        storage.write("E", np.eye(3))  # what else cv2.stereoCalibrate gives
+        for name in ("K1", "D1", "K2", "D2", "R", "T"):
+            value = np.array(getattr(calibration, name))
+            storage.write(name, value.reshape(len(value), -1))
+        storage.release()
+    assert read_calibration(file) == calibration
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("", "no calibration in JSON"),
+        ("{", "no calibration in JSON"),
+        ('<?xml version="1.0"?><opencv_storage></opencv_storage>', "as .json or .yaml"),
+        ("%YAML:1.0\n---\nwidth: 640\n", "missing required field"),
+        ('{"K1": 3}', "K1"),
+        ('{"K1": {"a": 1}}', "no calibration in JSON"),
+        ('{"D1": [1, [2, 3]]}', "D1|no calibration"),
+        ('{"K1": ' + "[" * 100_000, "no calibration in JSON"),
+        (
+            "%YAML:1.0\n---\nK1: !!opencv-matrix\n   rows: 30000\n   cols: 30000\n   dt: d\n"
+            "   data: [ 1. ]\n",
+            "no calibration in JSON",
+        ),
+    ],
+)
+def test_a_file_that_is_no_calibration_is_refused(tmp_path, text, words):
+    file = tmp_path / "stereo.yaml"
+    file.write_text(text)
+    with pytest.raises(InputError, match=words):
+        read_calibration(file)
+
+
+@pytest.mark.parametrize(
+    ("changed", "words"),
+    [
+        ({"T": (-0.0044, 0.0, 0.0)}, "looks like metres"),
+        ({"T": (-4.4, 0.0, 0.0), "unit": "m"}, "is it in mm"),
+        ({"T": (4.4, 0.0, 0.0)}, "exchange the two"),
+        ({"T": (0.0, -4.4, 0.0)}, "above each other"),
+        ({"R": ((1.0, 0, 0), (0, 0, -1.0), (0, 1.0, 0))}, "29 degrees"),
+        ({"R": ((2.0, 0, 0), (0, 1.0, 0), (0, 0, 1.0))}, "orthonormal"),
+        ({"K1": ((5.0, 0, 320), (0, 5.0, 240), (0, 0, 1.0))}, "focal lengths"),
+        ({"D1": (0.1, 0.2)}, "rectified by OpenCV"),
+    ],
+)
+def test_a_pair_that_cannot_be_is_refused(changed, words):
+    with pytest.raises(InputError, match=words):
+        StereoRig(msgspec.structs.replace(endoscope(), **changed))
+
+
+def test_things_too_near_to_be_matched_are_refused():
+    with pytest.raises(InputError, match="near_mm=2 "):
+        StereoRig(endoscope(), near_mm=2.0)
+
+
+def test_noise_follows_from_baseline_focal_length_and_matches():
+    """A disparity of z f b errs by s, so depth errs by z^2 s / (f b)."""
+    noise = stereo_noise(500.0, 5.0, 0.2)
+    assert noise.axial_mm == pytest.approx(150.0**2 * 0.2 / 2500)
+    depth_mm = np.full((SMALL.height, SMALL.width), 100.0)
+    alone = NoiseConfig(axial_mm=noise.axial_mm, correlated_share=0.5)
+    seen = add_noise(DepthFrame(depth_mm, SMALL), alone, np.random.default_rng(0)).depth_mm
+    assert np.std(seen) == pytest.approx(100.0**2 * 0.2 / 2500, rel=0.03)
+
+
+def test_a_nearer_surface_spreads_over_an_edge_and_a_slope_does_not():
+    u, _ = pixels(SMALL)
+    noise = NoiseConfig(fatten_px=3.0)
+    frame = DepthFrame(np.where(u < 200, 120.0, 160.0), SMALL)
+    fat = np.mean(
+        [add_noise(frame, noise, np.random.default_rng(n)).depth_mm == 120.0 for n in range(20)],
+        axis=(0, 1),
+    )
+    assert (fat[:200] == 1).all()
+    for k in (1, 3, 6):  # pixels beyond the edge
+        assert fat[199 + k] == pytest.approx(2 * ndtr(-(k - 0.5) / 3.0), abs=0.08)
+    slope = DepthFrame(100.0 + 1.5 * u, SMALL)
+    np.testing.assert_array_equal(
+        add_noise(slope, noise, np.random.default_rng(0)).depth_mm, slope.depth_mm
+    )
+
+
+def test_what_the_right_camera_does_not_see_is_lost():
+    """Disparities of 1200 px mm are 12 px on a wall 100 mm away and 6 px at 200 mm: the nearer one
+    hides the columns to its left, those that it reaches by half a pixel and more; and the leftmost
+    6 lie outside the right picture."""
+    u, _ = pixels(SMALL)
+    frame = DepthFrame(np.where((u >= 200) & (u < 300), 100.0, 200.0), SMALL)
+    noise = NoiseConfig(shadow_px_mm=1200.0)
+    lost = np.isnan(add_noise(frame, noise, np.random.default_rng(0)).depth_mm)
+    assert (lost == lost[0]).all()
+    np.testing.assert_array_equal(lost[0].nonzero()[0], [*range(6), *range(195, 200)])
+
+
+def test_a_preset_s_scenes_can_be_those_of_stereo(phantom_case):
+    anatomy = load_case(phantom_case).anatomy
+    clinic = presets.clinic(anatomy)
+    assert presets.seen_by(clinic, "d405") == clinic
+    stereo = presets.seen_by(clinic, "stereo")
+    assert stereo.scene.noise == STEREO_NOISE != D405_NOISE
+    assert msgspec.structs.replace(stereo.scene, noise=D405_NOISE) == clinic.scene
+    clean = msgspec.structs.replace(clinic.scene, noise=CLEAN)
+    with pytest.raises(InputError, match="preset quick"):
+        presets.seen_by(msgspec.structs.replace(clinic, scene=clean), "stereo")

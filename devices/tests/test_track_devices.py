@@ -1,0 +1,211 @@
+"""`tumortrack track` as a user runs it: recorded, played again, and sent."""
+
+from __future__ import annotations
+
+import json
+import signal
+import socket
+
+import numpy as np
+import pytest
+from rosbags.highlevel import AnyReader
+
+from stories import refusal, succeeded, tumortrack
+from track_objects import PATIENT, World, start, told, virtual, wait_for
+from tumortrack.sense.camera import d405
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture
+def world(phantom_case, clinic_model):
+    return World(phantom_case, clinic_model)
+
+
+def reports(recording):
+    """What an MCAP says of every result."""
+    with AnyReader([recording]) as reader:
+        wanted = [c for c in reader.connections if c.topic == "/tumortrack/report"]
+        messages = [reader.deserialize(raw, c.msgtype) for c, _, raw in reader.messages(wanted)]
+    return [json.loads(message.data) for message in messages]
+
+
+def test_a_recording_is_played_back_to_the_same_estimates(world, tmp_path):
+    live, replay = tmp_path / "live", tmp_path / "replay"
+    first = tumortrack(
+        "track",
+        world.model,
+        virtual(world, fps=10),
+        f"recording:{live}",
+        *("--seconds", 4, *PATIENT),
+        "--report",
+        tmp_path / "live.json",
+    )
+    succeeded(first)
+    frames = [one for one in reports(live) if one["seen"]]
+    assert len(frames) >= 3
+    again = tumortrack(
+        "track",
+        world.model,
+        f"recording:{live}?rate=0",
+        f"recording:{replay}",
+        "--report",
+        tmp_path / "replay.json",
+    )
+    succeeded(again)
+    found = told(tmp_path / "replay.json")
+    assert found["dropped"] == 0  # at rate 0 every frame counts
+    assert sum(found["estimates"].values()) > len(frames) / 2
+    assert {one["stamp_ns"] for one in reports(replay) if one["seen"]} == {
+        one["stamp_ns"] for one in frames
+    }
+
+
+def test_depths_that_were_corrected_are_not_corrected_again(world, tmp_path):
+    camera = tmp_path / "camera.json"
+    fields = ("width", "height", "fx", "fy", "cx", "cy")
+    values = {name: getattr(d405(424, 240), name) for name in fields}
+    camera.write_text(json.dumps({**values, "depth_scale": 1.002, "depth_offset_mm": -0.3}))
+    given = ("--intrinsics", camera, "--report")
+    first = ("track", world.model, virtual(world, fps=10), f"recording:{tmp_path / 'live'}")
+    succeeded(tumortrack(*first, "--seconds", 1, *PATIENT, *given, tmp_path / "live.json"))
+    assert told(tmp_path / "live" / "recording.json")["corrected"] is True
+    again = ("track", world.model, f"recording:{tmp_path / 'live'}?rate=0", *given)
+    line = refusal(tumortrack(*again, tmp_path / "again.json"))
+    assert "were corrected as they were recorded. Leave --intrinsics out" in line
+    camera.write_text(json.dumps(values))
+    succeeded(tumortrack(*again, tmp_path / "again.json"))
+
+
+def test_ctrl_c_ends_cleanly_and_flushes(world, tmp_path):
+    folder, report = tmp_path / "kept", tmp_path / "report.json"
+    process = start(world, virtual(world, fps=10), f"recording:{folder}", "--report", report)
+    wait_for(process, "no check failed|poor")
+    process.send_signal(signal.SIGINT)
+    said, _ = process.communicate(timeout=300)
+    assert process.returncode == 0, said
+    assert "Traceback" not in said
+    found = told(report)
+    name = next(iter(found["sinks"]))
+    assert found["sinks"][name]["delivered"] == found["updates"]
+    assert (folder / "metadata.yaml").is_file()
+
+
+def test_a_robot_gets_its_own_frame(world, tmp_path):
+    turn = np.diag([1.0, -1.0, -1.0, 1.0])
+    turn[:3, 3] = [0.4, 0.1, 0.7]
+    calibration = tmp_path / "hand_eye.json"
+    calibration.write_text(
+        json.dumps({"frame_id": "base_link", "unit": "m", "robot_from_camera": turn.tolist()})
+    )
+    out = tmp_path / "out"
+    report = tmp_path / "report.json"
+    done = tumortrack(
+        "track",
+        world.model,
+        virtual(world, fps=5),
+        f"recording:{out}",
+        "--frame",
+        calibration,
+        *("--seconds", 2, *PATIENT),
+        "--report",
+        report,
+    )
+    assert "in frame 'base_link'" in succeeded(done)
+    found = told(report)
+    assert found["frame"]["frame_id"] == "base_link"
+    assert found["frame"]["published_from_camera"][2][3] == pytest.approx(700)
+    about = told(out / "recording.json")
+    assert about["frame_id"] == "base_link"
+    whose = {"id": "P1", "side": "right"}
+    assert about["patient"] == found["patient"] == whose
+    estimate = next(one["estimate"] for one in reports(out) if one["estimate"])
+    assert estimate["patient"] == whose
+
+
+def test_a_source_that_vanishes_ends_with_a_reason(world, tmp_path):
+    done = tumortrack(
+        "track",
+        world.model,
+        f"recording:{tmp_path / 'nothing'}",
+        "--give-up",
+        1,
+        "--report",
+        tmp_path / "r.json",
+    )
+    assert "nothing" in refusal(done)
+
+
+@pytest.mark.parametrize(
+    ("sinks", "said"),
+    [
+        (["viewer:abc"], "Write viewer[:port]"),
+        (["viewer", "viewer"], "'viewer' is given twice"),
+    ],
+)
+def test_bad_options_of_sinks_are_answered_in_one_line(world, tmp_path, sinks, said):
+    done = tumortrack(
+        *("track", world.model, virtual(world), *sinks), *("--report", tmp_path / "r.json")
+    )
+    assert said in refusal(done)
+
+
+def test_a_port_that_is_taken_is_refused(world, tmp_path):
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        port = other.getsockname()[1]
+        done = tumortrack(
+            "track",
+            world.model,
+            virtual(world),
+            f"openigtlink:{port}",
+            "--report",
+            tmp_path / "r.json",
+        )
+    assert str(port) in refusal(done)
+
+
+def test_several_cameras_and_one_that_moves_are_tracked_from_recordings(world, tmp_path):
+    tape, poses = tmp_path / "tape", tmp_path / "poses.json"
+    source = f"recording:{tape}?rate=0"
+    first = tumortrack(
+        *("track", world.model, virtual(world, fps=10, camera_motion="false")),
+        *(f"recording:{tape}", "--seconds", 3, *PATIENT),
+        *("--report", tmp_path / "live.json"),
+    )
+    succeeded(first)
+    rows = np.eye(4).tolist()
+    poses.write_text(
+        json.dumps({"unit": "mm", "frame_id": "base", "fixed_from_camera": [rows, rows]})
+    )
+    two = tumortrack(
+        *("track", world.model, source, f"recording:{tmp_path / 'two'}"),
+        *("--views", f"{source}&fps=30", "--poses", poses, "--report", tmp_path / "two.json"),
+        *PATIENT,
+    )
+    assert "cameras 1, 2" in succeeded(two)
+    found = told(tmp_path / "two.json")
+    assert found["cameras"]["1"] == found["cameras"]["2"] >= 2
+    assert found["frame"]["frame_id"] == "base"
+    with AnyReader([tmp_path / "two"]) as reader:
+        assert "/camera_2/depth/image_rect" in reader.topics
+    stamps = [one["stamp_ns"] for one in reports(tape) if one["seen"]]
+    table = "stamp_ns,frame_id,x_mm,y_mm,z_mm,qw,qx,qy,qz\n" + "".join(
+        f"{stamp},base,{n},0,0,0,1,0,0\n" for n, stamp in enumerate(stamps[:-1])
+    )
+    (tmp_path / "poses.csv").write_text(table)
+    moved = tumortrack(
+        *("track", world.model, source, f"recording:{tmp_path / 'moved'}"),
+        *("--moving", f"file:{tmp_path / 'poses.csv'}", "--report", tmp_path / "moved.json"),
+        *PATIENT,
+    )
+    succeeded(moved)
+    found = told(tmp_path / "moved.json")
+    assert found["frame"] == {"frame_id": "base", "published_from_camera": None}
+    assert sum(found["estimates"].values()) >= 2
+    assert any("last pose is older than the frame" in reason for reason in found["reasons"])
+    kept = (tmp_path / "moved" / "poses.csv").read_text().splitlines()
+    assert [line.split(",")[0] for line in kept[1:]] == [str(one) for one in stamps[:-1]]
+    alone = tumortrack("track", world.model, source, "--views", f"{source}&fps=30")
+    assert "--views needs --poses" in refusal(alone)

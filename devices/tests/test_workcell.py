@@ -1,0 +1,251 @@
+"""What arms do, on every sink: messages, recordings, OpenIGTLink."""
+
+from __future__ import annotations
+
+import socket
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rosbags.highlevel import AnyReader
+from scipy.spatial.transform import Rotation
+
+from clock import until
+from igtl_objects import hear_all
+from igtl_reader import IgtlStatus, unpack_status, unpack_transform
+from live_objects import small_setting, small_update
+from recording_objects import frame_number
+from tumortrack.core.geometry import rigid, transform_points
+from tumortrack.live.values import Observation, SinkContext, SourceEnded, TrackingResult
+from tumortrack_devices.ros.messages import Messages, stamp_of
+from tumortrack_devices.ros.results import ResultMessages
+from tumortrack_devices.ros.sensors import cloud_of
+from tumortrack_devices.sinks.openigtlink import OpenIgtLinkSinkConfig
+from tumortrack_devices.sinks.recording import RecordingSinkConfig as RecordTo
+from tumortrack_devices.sources.recording import RecordingSourceConfig
+from workcell_objects import CUT, REASON, TABLE, virtual, with_arms, workcell, working
+
+HUMBLE = Messages("humble")
+NAMES = [shape.name for shape in workcell().shapes]
+
+
+def sent(update: TrackingResult, results: ResultMessages | None = None) -> dict:
+    results = results or ResultMessages(HUMBLE, with_arms())
+    return {out.suffix: out.message for out in results.of(update)}
+
+
+def less(update: TrackingResult, *names: str) -> TrackingResult:
+    """Without these shapes and lines."""
+    cell = update.workcell
+    assert cell is not None
+    shapes = tuple(shape for shape in cell.shapes if shape.name not in names)
+    lines = tuple(line for line in cell.lines if line.name not in names)
+    return replace(update, workcell=replace(cell, shapes=shapes, lines=lines))
+
+
+# ROS
+
+
+def test_joints_and_markers_say_where_everything_stands():
+    update = working(3, 0.3)
+    out, cell = sent(update), update.workcell
+    joints = out["joint_states"]
+    assert dict(zip(joints.name, joints.position, strict=True)) == cell.joints_rad
+    assert (stamp_of(joints.header), joints.header.frame_id) == (update.stamp_ns, "table")
+
+    markers = {m.ns: m for m in out["workcell"].markers}
+    assert list(markers) == [*NAMES, "cut/1", "cut/2", "state"]
+    assert {stamp_of(m.header) for m in markers.values()} == {update.stamp_ns}
+    assert all(m.action == m.ADD and m.lifetime.sec > 0 for m in markers.values())
+    for shape in cell.shapes:
+        marker, way = markers[shape.name], shape.published_from_shape
+        p, q = marker.pose.position, marker.pose.orientation
+        shown = rigid(
+            Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix(), np.array([p.x, p.y, p.z]) * 1000
+        )
+        corners_mm = transform_points(shown, np.vstack(list(marker.points)) * 1000)
+        expected = transform_points(way, shape.mesh.vertices_mm[shape.mesh.faces.ravel()])
+        np.testing.assert_allclose(corners_mm, expected, atol=1e-6)
+        assert marker.type == marker.TRIANGLE_LIST
+        assert (marker.color.r, marker.color.a) == (shape.colour[0] / 255, 1.0)
+    cut = markers["cut/1"]
+    np.testing.assert_allclose(np.vstack(list(cut.points)) * 1000, cell.lines[0].points_mm)
+    assert (cut.type, cut.scale.x) == (cut.LINE_STRIP, 0.002)
+    assert [cut.color.r, cut.color.g, cut.color.b] == pytest.approx(np.array(CUT) / 255)
+    text = markers["state"]
+    assert (text.text, text.type) == ("sweep 1", text.TEXT_VIEW_FACING)
+    everything = np.concatenate(
+        [transform_points(s.published_from_shape, s.mesh.vertices_mm) for s in cell.shapes]
+    )
+    np.testing.assert_allclose(cell.box_mm, [everything.min(0), everything.max(0)], atol=1e-9)
+    place, middle = text.pose.position, everything.min(0) / 2 + everything.max(0) / 2
+    assert [place.x * 1000, place.y * 1000] == pytest.approx(middle[:2])
+    assert place.z * 1000 == pytest.approx(everything[:, 2].max())
+
+
+def test_arms_are_told_of_without_an_estimate_and_why_they_stand():
+    results = ResultMessages(HUMBLE, with_arms())
+    out = sent(virtual(halted="the tumor moved by 6 mm"), results)
+    assert len(out["workcell"].markers) == len(NAMES) + 3
+    assert [m.action for m in out["meshes"].markers] == [3]  # DELETEALL: no estimate
+    first, *more = out["workcell"].markers[-1].text.splitlines()
+    below = sent(working())["workcell"].markers[-1].pose.position.z
+    below -= out["workcell"].markers[-1].pose.position.z  # its first line is at the same height
+    assert below == pytest.approx((0.025 + 0.012) / 2 * len(more))
+    assert (first, " ".join(more)) == (
+        "sweep 1, halted: the tumor moved by 6 mm", f"none, no estimate: {REASON}"
+    )  # fmt: skip
+    estimate, arms = out["diagnostics"].status
+    assert (estimate.level, arms.level, arms.name) == (2, 1, "tumortrack: arms")
+    assert {v.key: v.value for v in arms.values} == {
+        "state": "sweep 1", "halted": "the tumor moved by 6 mm",
+    }  # fmt: skip
+    assert sent(working())["diagnostics"].status[1].level == 0
+
+
+def test_markers_keep_their_rate_and_changes_come_at_once():
+    cell = ResultMessages(HUMBLE, with_arms(), hz=0.01)
+    assert len(sent(working(0), cell)["workcell"].markers) == len(NAMES) + 3
+    later = sent(working(1, 0.2), cell)
+    assert "workcell" not in later
+    assert later["joint_states"].position[0] == pytest.approx(0.04)  # joints come each time
+    # Whoever is slow gets the newest message alone: each is whole.
+    markers = sent(less(working(2, 0.3), "holder/tip", "cut/2"), cell)["workcell"].markers
+    assert [(m.ns, m.action) for m in markers[:2]] == [("cut/2", 2), ("holder/tip", 2)]
+    assert [m.ns for m in markers[2:]] == [*NAMES[:-1], "cut/1", "state"]
+    halted = less(working(3, 0.3, "hidden"), "holder/tip", "cut/2")
+    assert sent(halted, cell)["workcell"].markers[-1].text == "sweep 1, halted: hidden"
+    assert "workcell" not in sent(halted, cell)
+    (all_gone,) = sent(small_update(2, frames=TABLE), cell)["workcell"].markers
+    assert all_gone.action == all_gone.DELETEALL
+    nothing = sent(replace(working(3), workcell=None), cell)
+    assert len(nothing["joint_states"].name) == 0
+    assert nothing["diagnostics"].status[1].level == 3  # STALE
+
+
+def test_what_the_camera_saw_is_sent_in_the_frame_of_the_arms():
+    update = working()
+    assert update.observation is not None
+    points_mm = cloud_of(sent(update)["observed"]).points_mm
+    depth_mm = update.observation.content.depth_mm
+    assert len(points_mm) == np.isfinite(depth_mm).sum()
+    # The camera looks down from 160 mm: a depth of d is a height of 160 - d.
+    assert np.sort(points_mm[:, 2]) == pytest.approx(
+        np.sort(160 - depth_mm[np.isfinite(depth_mm)]), abs=1e-3
+    )
+    slow = ResultMessages(HUMBLE, with_arms(), hz=0.01)
+    assert "observed" in sent(update, slow)
+    assert "observed" not in sent(update, slow)
+    assert sent(virtual(), slow)["observed"].width == 0
+
+
+def test_without_arms_nothing_of_them_is_announced():
+    topics = {out.suffix for out in ResultMessages(HUMBLE, small_setting()).of(working())}
+    assert not topics & {"workcell", "joint_states", "observed"}
+
+
+# Recordings
+
+
+def record(path: Path, updates: list[TrackingResult], **options) -> Path:
+    sink = RecordTo(path=path, **options).open(with_arms())
+    for update in updates:
+        sink.publish(update)
+    sink.close()
+    return path
+
+
+def played(path: Path) -> list[Observation]:
+    source, got = RecordingSourceConfig(path=path, rate=0).open(), []
+    try:
+        while True:
+            if seen := source.read(0.2):
+                got.append(seen)
+    except SourceEnded:
+        return got
+    finally:
+        source.close()
+
+
+def three() -> list[TrackingResult]:
+    """With an estimate, without one, and without a camera's picture."""
+    frames = [frame_number(n) for n in (0, 1)]
+    seen = [Observation(frame, frame.stamp_ns) for frame in frames]
+    one = replace(working(0, 0.1), observation=seen[0], stamp_ns=frames[0].stamp_ns)
+    two = replace(virtual(1, 0.2, "stale"), observation=seen[1], stamp_ns=frames[1].stamp_ns)
+    return [one, two, less(virtual(2, 0.3), "table")]
+
+
+def test_an_mcap_holds_the_arms_and_plays_again(tmp_path):
+    path = record(tmp_path / "r", three(), meshes_hz=0.0)
+    with AnyReader([path]) as reader:
+        said: dict[str, list] = {}
+        for connection, _, raw in reader.messages():
+            message = reader.deserialize(raw, connection.msgtype)
+            said.setdefault(connection.topic, []).append(message)
+    joints = [m.position[0] for m in said["/tumortrack/joint_states"]]
+    assert joints == pytest.approx([0.02, 0.04, 0.06])
+    markers = [[m.ns for m in one.markers] for one in said["/tumortrack/workcell"]]
+    assert markers[0] == [*NAMES, "cut/1", "cut/2", "state"]
+    assert markers[2][0] == "table"  # its deletion
+    assert said["/tumortrack/workcell"][2].markers[0].action == 2
+    assert "/tumortrack/observed" not in said  # the picture itself is there
+    assert [seen.stamp_ns for seen in played(path)] == [u.stamp_ns for u in three()[:2]]
+
+
+# OpenIGTLink
+
+
+@pytest.fixture
+def slicer() -> Iterator:
+    """A sink and a receiver of it."""
+    used: list = []
+
+    def opened(setting: SinkContext, **options):
+        sink = OpenIgtLinkSinkConfig(port=0, **options).open(setting)
+        receiver = socket.create_connection(("127.0.0.1", sink.link.port))
+        used.extend((receiver, sink))
+        until(lambda: sink.link.receivers)
+        return sink, receiver
+
+    yield opened
+    for one in used:
+        one.close()
+
+
+def test_tips_and_the_arms_state_go_to_slicer(slicer):
+    sink, receiver = slicer(with_arms())
+    update = working(4, 0.25)
+    sink.publish(update)
+    heard = hear_all(receiver, 6 + 3)
+    assert unpack_status(heard["STATUS", "arms"].content) == IgtlStatus(1, "sweep 1", "")
+    shapes = {shape.name: shape for shape in update.workcell.shapes}
+    for name in ("cutter/tip", "holder/tip"):
+        place = unpack_transform(heard["TRANSFORM", name].content)
+        x, y, z = shapes[name].published_from_shape[:3, 3]
+        np.testing.assert_allclose(place[:3, 3], [-x, -y, z], atol=1e-4)  # RAS
+        assert heard["TRANSFORM", name].metadata["frame_id"] == "table"
+    sink.publish(less(virtual(5, halted="it is hidden"), "cutter/tip"))
+    heard = hear_all(receiver, 6 + 3)
+    assert unpack_status(heard["STATUS", "tumortrack"].content).text == REASON
+    assert unpack_status(heard["STATUS", "arms"].content) == IgtlStatus(
+        13, "sweep 1", "it is hidden"
+    )
+    states = {n: heard["TRANSFORM", n].metadata["TransformStatus"] for n in shapes if "tip" in n}
+    assert states == {"cutter/tip": "MISSING", "holder/tip": "OK"}
+    sink.close()
+    heard = hear_all(receiver, 6 + 3)
+    assert unpack_status(heard["STATUS", "arms"].content).code == 16
+    assert heard["TRANSFORM", "holder/tip"].metadata["TransformStatus"] == "MISSING"
+
+
+def test_without_arms_slicer_hears_nothing_of_them(slicer):
+    sink, receiver = slicer(small_setting())
+    sink.publish(working())
+    sink.close()
+    heard = hear_all(receiver, 6)
+    with pytest.raises((EOFError, ConnectionError)):
+        heard |= hear_all(receiver, 100)
+    assert not [device for _, device in heard if device == "arms" or "tip" in device]

@@ -1,1 +1,0 @@
-"""Sinks of live tracking, one file each; ``live.spec`` lists them."""

@@ -1,1 +1,0 @@
-"""Sources of live tracking, one file each; ``live.spec`` lists them."""

@@ -1,0 +1,50 @@
+"""`tumortrack track` as a user runs it."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import time
+from pathlib import Path
+from typing import NamedTuple
+
+from stories import COMMAND, environment
+
+PATIENT = ("--stale", 30)  # with a loaded machine: its answers may be late
+
+
+class World(NamedTuple):
+    case: Path
+    model: Path
+
+
+def start(world, *arguments):
+    return subprocess.Popen(
+        [*COMMAND, "track", str(world.model), *map(str, (*arguments, *PATIENT))],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        env=environment(),
+    )
+
+
+def virtual(world, **options):
+    text = "&".join(f"{key}={value}" for key, value in options.items())
+    return f"virtual:{world.case}" + (f"?{text}" if text else "")
+
+
+def told(path):
+    return json.loads(path.read_text())
+
+
+def wait_for(process, words, seconds=300):
+    """Read the output until one of the words stands in it."""
+    until = time.monotonic() + seconds
+    os.set_blocking(process.stdout.fileno(), True)
+    while time.monotonic() < until:
+        line = process.stdout.readline()
+        if any(word in line for word in words.split("|")):
+            return
+        assert process.poll() is None, line
+    raise AssertionError(f"{words!r} was never said")
