@@ -15,6 +15,7 @@ from tumortrack.core.report import Finding
 from tumortrack.core.types import DepthFrame, SensorCloud
 from tumortrack.sense.cloud import FEWEST_POINTS
 from tumortrack.sense.region.choose import choose_pieces
+from tumortrack.sense.region.hints import Hints
 from tumortrack.sense.region.pieces import remove_flying
 from tumortrack.sense.region.plane import remove_plane
 from tumortrack.sense.region.tissue import colours_of
@@ -23,7 +24,6 @@ from tumortrack.sense.region.working_image import (
     COLOUR,
     LAST_BOX,
     RANGE,
-    Hints,
     RegionConfig,
     WorkingImage,
     image_of_cloud,

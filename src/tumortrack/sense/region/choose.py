@@ -9,13 +9,13 @@ import numpy as np
 
 from tumortrack.core.errors import NoEstimate
 from tumortrack.core.report import Finding
+from tumortrack.sense.region.hints import Hints
 from tumortrack.sense.region.pieces import find_edges, find_pieces
 from tumortrack.sense.region.working_image import (
     FLYING,
     LAST_BOX,
     PIECES,
     THIN,
-    Hints,
     RegionConfig,
     WorkingImage,
     jit,

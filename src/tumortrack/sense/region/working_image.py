@@ -1,14 +1,12 @@
-"""What the steps of finding the organ work on: settings, hints, and the working image, made from a
+"""What the steps of finding the organ work on: settings, and the working image, made from a
 depth image or a cloud and mapped back to points."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
 
 from tumortrack.core.compiled import njit
 from tumortrack.core.config import Config
@@ -16,9 +14,6 @@ from tumortrack.core.errors import InputError
 from tumortrack.core.types import DepthFrame, SensorCloud
 from tumortrack.sense.camera import Pinhole, deproject_pixels
 from tumortrack.sense.cloud import CloudConfig
-
-if TYPE_CHECKING:
-    from tumortrack.sense.region.tissue import TissueClassifier
 
 MOST_PIXELS = 110_000  # 424 x 240 as it is, of 848 x 480 every second pixel
 _POINTS_PER_PIXEL = 2
@@ -96,26 +91,6 @@ class RegionConfig(Config, frozen=True, kw_only=True):
                 f"region box_mm is {self.box_mm}; give two opposite corners (x y z, camera frame, "
                 "mm) at least 1 mm apart along each axis."
             )
-
-
-@dataclass(frozen=True, eq=False)
-class Hints:
-    """What is known about a frame besides its depth.
-
-    Attributes:
-        mask: of a depth image's pixels, True where the organ may be.
-        picked_mm: a point on the organ, camera frame; selects the piece. Organs move: once there is
-            an estimate, give its box instead.
-        last_box_mm: lower and upper corner of the last estimate's organ, camera frame.
-        picture: colour or grey image in the depth image's pixels, for ``taught``.
-        taught: tells the organ from other tissue by colour. None: only geometry counts.
-    """
-
-    mask: Bool[np.ndarray, "h w"] | None = None
-    picked_mm: Float[np.ndarray, " 3"] | None = None
-    last_box_mm: Float[np.ndarray, "2 3"] | None = None
-    picture: UInt8[np.ndarray, "h w *rgb"] | None = None
-    taught: TissueClassifier | None = None
 
 
 @dataclass(frozen=True, eq=False)
