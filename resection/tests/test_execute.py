@@ -503,10 +503,10 @@ def test_while_it_is_planned_the_loop_goes_on():
 def test_an_abort_by_the_user_is_final():
     world = World()
     world.until("sweep 1")
-    world.operation.abort("aborted by the user")
+    world.operation.abort(Halt("interrupted"))
     cell = world.frames(30)
     assert plain(cell) == ABORTED
-    assert cell.halted == "aborted by the user"
+    assert cell.halted == "stopped by the user"
     assert world.operation.ended
 
 

@@ -176,9 +176,14 @@ class Operation:
         self._counted = reason
         return replace(update, workcell=self.workcell())
 
-    def abort(self, reason: str) -> None:
-        """Stop for good, from whatever state."""
-        self._execution.abort(Halt("stopped", {"words": reason}))
+    @property
+    def halt(self) -> Halt | None:
+        """Why the arms stand or slow down; None: they don't."""
+        return self._execution.halted
+
+    def abort(self, halt: Halt) -> None:
+        """Stop for good, from any state."""
+        self._execution.abort(halt)
 
     def workcell(self) -> Workcell:
         """State, joints and drawing of the arms."""

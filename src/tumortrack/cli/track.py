@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from tumortrack.live.workers import SinkWorker
 
 _SAY_S, _SAY_PLAIN_S = 1.0, 5.0  # between two lines of state: on a terminal, in a file
-STOPPED = "stopped by the user"  # why arms halt
 _END_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
@@ -49,6 +48,7 @@ class Track(TrackOptions):
     def run(self, arms: Arms | None = None) -> None:
         """Until the source ends, the time is up, the arms have ended, or Ctrl-C."""
         from tumortrack import api
+        from tumortrack.core.halt import Halt
 
         if arms is None:
             from tumortrack.live import session  # noqa: F401 - to be loaded by then
@@ -61,7 +61,7 @@ class Track(TrackOptions):
 
         def stop() -> None:
             if arms is not None:
-                arms.operation.abort(STOPPED)
+                arms.operation.abort(Halt("interrupted"))
             run.loop.stop()
 
         say("warming up ...")

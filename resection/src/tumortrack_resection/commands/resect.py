@@ -19,6 +19,7 @@ from tumortrack.cli.console import model_folder, options_of, progress_of, say, w
 from tumortrack.core import store
 from tumortrack.core.config import to_builtins
 from tumortrack.core.errors import Aborted, ArtifactError, InputError
+from tumortrack.core.halt import Halt
 from tumortrack.core.organ import KIDNEY, Organ, organ_first, organ_name
 from tumortrack.core.patient import Patient
 from tumortrack.tracking.options import CameraOptions
@@ -262,7 +263,7 @@ class _Procedure:
         report = self.asked.report or track.default_report("resect")
         session.check_report(report)
         context = SinkContext(tuple(stored.meshes), frames, None, controls, True, stored.patient)
-        stop = track.stopping(lambda: operation.abort(track.STOPPED))
+        stop = track.stopping(lambda: operation.abort(Halt("interrupted")))
         with stop, session.open_sinks(session.named_sinks(self.asked.sinks), context) as sinks:
             track.say_opened(sinks)
             seconds = self.motions.seconds / self.config.speed
@@ -271,7 +272,7 @@ class _Procedure:
             shown, started = "", time.monotonic()
             for sequence in itertools.count():
                 if controls.aborted.is_set():
-                    operation.abort("stopped by the viewer, or a real arm gave up")
+                    operation.abort(Halt("aborted"))
                 now_ns = time.time_ns()
                 nothing = TrackingResult(
                     sequence, now_ns, reason=_NOTHING, published_frame=frames, playback=True
@@ -343,7 +344,7 @@ class _Procedure:
     def _say_end(self, operation: operations.Operation) -> None:
         summary = operation.summary()
         if summary["state"] != "done":
-            if summary["halted"] == track.STOPPED:
+            if operation.halt is not None and operation.halt.kind == "interrupted":
                 raise KeyboardInterrupt
             raise Aborted(f"the resection was {summary['state']}: {summary['halted']}.")
         if any(arm.execute for arm in self.arms):
