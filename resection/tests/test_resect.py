@@ -29,20 +29,19 @@ from stories import (
 )
 from tumortrack.core import store
 from tumortrack.core.config import to_builtins
-from tumortrack.core.errors import NoPlan
+from tumortrack.core.errors import InputError, NoPlan
 from tumortrack.core.estimate import Estimate
 from tumortrack.core.patient import Patient
 from tumortrack.core.types import CameraLabels, OccupancyCloud
 from tumortrack.imaging.case import load_case
 from tumortrack.sense.ply import parse_ply_properties, write_cloud_ply
 from tumortrack.tracking.files import write_estimate
-from tumortrack_resection import plan_resection
+from tumortrack_resection import begin_resection, plan_resection
 from tumortrack_resection.files import read_plan
 from tumortrack_resection.motions import JOINTS
 
 pytestmark = pytest.mark.slow
 
-CASE = "c" * 64
 WIDE = ("--margin", 8)
 CASE, WHOSE = "c" * 64, {"id": "P1", "side": "left"}
 STATED = ("--patient", "P1", "--side", "left")
@@ -583,3 +582,28 @@ def test_a_live_world_that_lies_elsewhere_is_planned_anew_and_cut(
     budgets = found["resection"]["budget"]
     assert budgets["worst"]["left_mm"] < 0  # accepted when it was planned
     assert budgets["worst"]["tracking_mm"] >= 4.2
+
+
+@pytest.fixture
+def begun(given, monkeypatch):
+    """A session that passed all checks for a real arm, of which nothing is connected."""
+    monkeypatch.setattr("sys.stdin.isatty", lambda: True, raising=False)
+    return begin_resection(
+        given / "plan", [REAL], live=(given / "model", "realsense"), patient="P1", side="left"
+    )
+
+
+def test_from_python_too_a_real_arm_needs_the_live_loop_and_a_person(
+    begun, given, monkeypatch, unchecked
+):
+    with pytest.raises(InputError, match="real arms move only beside the live loop"):
+        begun.opened().__enter__()
+    monkeypatch.setattr("termios.tcflush", lambda *_: None)
+    monkeypatch.setattr("sys.stdin.fileno", lambda: 0, raising=False)
+    monkeypatch.setattr("builtins.input", lambda _: "yes")
+    with pytest.raises(InputError, match=r"127\.0\.0\.1 was not confirmed"):
+        begun.following().__enter__()
+    with pytest.raises(InputError, match="It needs: --live MODEL SOURCE"):
+        begin_resection(given / "plan", [REAL])
+    with pytest.raises(InputError, match="give sinks as on the command line"):
+        begin_resection(given / "plan", [object()])
