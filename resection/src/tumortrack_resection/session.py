@@ -70,7 +70,10 @@ class _Live(NamedTuple):
     patient: Patient
     source_text: str
     source: SourceConfig
-    source_kind: str
+
+    @property
+    def source_kind(self) -> str:
+        return str(self.source.__struct_config__.tag)
 
 
 class ResectionSession:
@@ -163,13 +166,9 @@ class ResectionSession:
             setup = CameraSetup(frames, {live.source_text: live.source})
             about = {"plan_config": to_builtins(self._config)}
             arms = Arms(self.operation, setup, about, tip_places(cell.config), bool(self.arms))
-            options = {
-                field.name: getattr(self._options, field.name) for field in fields(CameraOptions)
-            }
-            report = self._options.report
-            yield api.session(
-                live.model, live.source_text, self._given_sinks, arms, report=report, **options
-            )
+            names = ("report", *(field.name for field in fields(CameraOptions)))
+            options = {name: getattr(self._options, name) for name in names}
+            yield api.session(live.model, live.source_text, self._given_sinks, arms, **options)
 
     @contextmanager
     def opened(self) -> Iterator[None]:
@@ -178,7 +177,7 @@ class ResectionSession:
         if self.moving:
             raise InputError("real arms move only beside the live loop, not in a playback.")
         stored, operation, report = self.stored, self.operation, self._options.report
-        operation.still_life = _organ_shapes(stored)
+        operation.static_shapes = _organ_shapes(stored)
         if report is not None:
             check_report(report)
         self._controls = Controls()
@@ -188,11 +187,10 @@ class ResectionSession:
         with open_sinks(named_sinks(self._given_sinks), context) as self.sinks:
             yield
         if report is not None:
+            plan = stored.plan
             content = {
                 "patient": to_builtins(stored.patient),
-                "plan": {
-                    name: getattr(stored.plan, name) for name in ("tumor", "method", "warnings")
-                },
+                "plan": {"tumor": plan.tumor, "method": plan.method, "warnings": plan.warnings},
                 "frame": stored.frames.frame_id,
                 "resection": operation.summary(),
                 "sinks": {sink.name: sink.summary() for sink in self.sinks},
@@ -206,15 +204,10 @@ class ResectionSession:
         for sequence in itertools.count():
             if self._controls.aborted.is_set():
                 self.operation.abort(Halt("aborted"))
-            result = self.operation.act(
-                TrackingResult(
-                    sequence,
-                    time.time_ns(),
-                    reason=_PLAYBACK,
-                    published_frame=frames,
-                    playback=True,
-                )
+            untracked = TrackingResult(
+                sequence, time.time_ns(), reason=_PLAYBACK, published_frame=frames, playback=True
             )
+            result = self.operation.act(untracked)
             for sink in self.sinks:
                 sink.put(result)
             on_result(result)
@@ -247,14 +240,12 @@ class ResectionSession:
                 assert cell is not None
                 yield cell
 
-        number = itertools.count(1)
-        film(
-            frames(),
-            as_located(self.stored),
-            path,
-            progress=lambda: progress(next(number), len(times_s)),
-            plan=plan,
-        )
+        count = itertools.count(1)
+
+        def advance() -> None:
+            progress(next(count), len(times_s))
+
+        film(frames(), as_located(self.stored), path, progress=advance, plan=plan)
         return len(times_s) / FPS
 
     def _operation(self, plan: ResectionPlan, config: OperationConfig, *live: Any) -> Operation:
@@ -398,9 +389,7 @@ def _live_of(model: Path, source: str, stored: PlanFolder) -> _Live:
             f"{model} is of another case than the one that was planned on. Give a model "
             "of that case, or plan on what this model locates."
         )
-    config = SOURCES.parse(source)
-    kind = str(config.__struct_config__.tag)
-    return _Live(Path(model), case, patient, source, config, kind)
+    return _Live(Path(model), case, patient, source, SOURCES.parse(source))
 
 
 def _organ_shapes(stored: PlanFolder) -> tuple[RigidShape, ...]:

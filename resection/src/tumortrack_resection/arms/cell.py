@@ -53,8 +53,8 @@ class ArmCell:
             names.append(ORGAN)
         index = {name: n for n, name in enumerate(names)}
         self._pairs = [pair for pair in _pairs() if index.keys() >= set(pair)]
-        for one, other in self._pairs:
-            self.solids.addCollisionPair(pin.CollisionPair(index[one], index[other]))
+        for first, second in self._pairs:
+            self.solids.addCollisionPair(pin.CollisionPair(index[first], index[second]))
         self._states: dict[tuple[Any, ...], Any] = {}
 
     def levers_mm(self, start_rad: Joints, goal_rad: Joints) -> Joints:
@@ -117,9 +117,9 @@ class ArmCell:
         pin.updateGeometryPlacements(self.model, self._data, self.solids, state, joints_rad)
         if not pin.computeCollisions(self.solids, state, True):
             return None
-        # It stops at the first; results beyond that are of earlier calls.
+        # It stops at the first collision; later results are of earlier calls.
         results = zip(self._pairs, state.activeCollisionPairs, state.collisionResults, strict=True)
-        return next(pair for pair, active, one in results if active and one.isCollision())
+        return next(pair for pair, active, result in results if active and result.isCollision())
 
     def _state(self, touching: tuple[str, ...], moving: str | None) -> Any:
         """Collision buffers in which only the pairs that matter are active."""
@@ -145,8 +145,8 @@ class ArmCell:
 def tip_places(
     config: CellConfig,
 ) -> Callable[[str, Float64[np.ndarray, " 6"]], Float64[np.ndarray, " 3"]]:
-    """Where an arm's tip is by its six joints: table frame, mm. Each arm may be asked in a thread
-    of its own."""
+    """A function from an arm's six joints to its tip: table frame, mm. Arms may be queried in
+    different threads."""
     cells = {arm: ArmCell(config) for arm in ARMS}
 
     def tip_mm(arm: str, own_rad: Float64[np.ndarray, " 6"]) -> Float64[np.ndarray, " 3"]:

@@ -37,7 +37,7 @@ _TISSUE_BIN_MM = 3.0  # differences in cut tissue below this do not count
 _MOST_LEGS = 8  # of a pass
 _FAR_RAD = 2.0  # the arm turns a joint farther than that only if nothing else is possible
 _SEARCHED = 4  # directions for which a path is searched at length
-# Between passes the tip may go back and up first, mm: what most often is free
+# Between passes the tip may go back and up first, mm: most often that is free
 DETOURS_MM = ((60.0, 0.0), (0.0, 70.0), (60.0, 70.0), (0.0, 140.0))
 
 
@@ -61,24 +61,24 @@ def _cut_leg(builder: TrajectoryBuilder, path_mm: np.ndarray, around: Surroundin
     reasons: list[Blocked] = []
     later: list[tuple[float, Leg, np.ndarray]] = []
     for yaw, last in _directions(path_mm, around, inside):
-        one = leg(path_mm[: last + 1], yaw, around)
+        candidate = leg(path_mm[: last + 1], yaw, around)
         try:
-            joints = follow(inside, one.poses)
+            joints = follow(inside, candidate.poses)
             turn = float(np.abs(joints[0] - away.current_rad).max())
-            later.append((turn, one, joints))
+            later.append((turn, candidate, joints))
             if turn > _FAR_RAD:
                 continue
-            approach = connect(away, joints[0], detours=_detours(away, one))
+            approach = connect(away, joints[0], detours=_detours(away, candidate))
         except Blocked as blocked:
             reasons.append(blocked)
         else:
-            return _execute(builder, one, approach, joints)
-    for _, one, joints in sorted(later, key=lambda each: each[0])[:_SEARCHED]:
+            return _execute(builder, candidate, approach, joints)
+    for _, candidate, joints in sorted(later, key=lambda each: each[0])[:_SEARCHED]:
         try:
-            approach = connect(away, joints[0], builder.rng, _detours(away, one))
+            approach = connect(away, joints[0], builder.rng, _detours(away, candidate))
         except Blocked:
             continue
-        return _execute(builder, one, approach, joints)
+        return _execute(builder, candidate, approach, joints)
     if reasons:
         often = Counter(str(blocked) for blocked in reasons).most_common(1)[0][0]
         raise next(blocked for blocked in reasons if str(blocked) == often)
@@ -112,9 +112,9 @@ def _directions(
     return [(yaw, int(probes[-run])) for run, _, _, yaw in sorted(scores)]
 
 
-def _detours(group: PlanningGroup, one: Leg) -> list[np.ndarray]:
+def _detours(group: PlanningGroup, leg: Leg) -> list[np.ndarray]:
     """Corners of detours: back and up, across, and down again."""
-    there = level_pose(one.enter_mm[0], one.yaw_rad)
+    there = level_pose(leg.enter_mm[0], leg.yaw_rad)
     here = group.cell.tips(group.joints_rad)[CUTTER]
     detours = [[aside(group, pose, *by) for pose in (here, there)] for by in DETOURS_MM]
     return [np.array(corners) for corners in detours if all(len(corner) for corner in corners)]
@@ -126,19 +126,19 @@ def aside(
     """The moving arm with its tip so far back and up from a pose; empty if that is out of reach."""
     moved = table_from_tip.copy()
     moved[:3, 3] += [0.0, 0.0, up_mm] - back_mm * table_from_tip[:3, 0]
-    found = group.inverse_kinematics(moved)
-    if not len(found):
+    solutions = group.inverse_kinematics(moved)
+    if not len(solutions):
         return np.zeros(0)
-    return found[np.abs(found - group.current_rad).max(1).argmin()]
+    return solutions[np.abs(solutions - group.current_rad).max(1).argmin()]
 
 
 def _execute(
-    builder: TrajectoryBuilder, one: Leg, approach_rad: np.ndarray, joints_rad: np.ndarray
+    builder: TrajectoryBuilder, leg: Leg, approach_rad: np.ndarray, joints_rad: np.ndarray
 ) -> int:
     builder.go(CUTTER, approach_rad)
-    for run, cutting in one.runs:
+    for run, cutting in leg.runs:
         builder.go(CUTTER, joints_rad[run], builder.cell.config.cutting_mm_s, cutting)
-    return len(one.cut_mm) - 1
+    return len(leg.cut_mm) - 1
 
 
 def passes(cuts: Iterable[Cut]) -> list[Float64[np.ndarray, "n 3"]]:

@@ -149,9 +149,9 @@ def along(
     for finer in _FINER:
         grid = np.linspace(0, knots[-1], round(finer * max(_GRID, keep.sum())))
         solver = toppra.algorithm.TOPPRA(limits, curve, grid, parametrizer="ParametrizeConstAccel")
-        found = solver.compute_trajectory(0, 0)
-        if found is not None and (best is None or found.duration < best.duration):
-            best = found
+        trajectory = solver.compute_trajectory(0, 0)
+        if trajectory is not None and (best is None or trajectory.duration < best.duration):
+            best = trajectory
         if best is not None and best.duration < _CRAWL * least_s + _CRAWL_S:
             break
     if best is None:
@@ -178,12 +178,12 @@ def together(
     wish.max_velocity = [float((speeds_rad_s / turns).min())]
     wish.max_acceleration = [ACCELERATION_RAD_S2 / longest]
     wish.max_jerk = [JERK_RAD_S3 / longest]
-    found = ruckig.Trajectory(1)
-    outcome = ruckig.Ruckig(1).calculate(wish, found)
+    motion = ruckig.Trajectory(1)
+    outcome = ruckig.Ruckig(1).calculate(wish, motion)
     if outcome not in (ruckig.Result.Working, ruckig.Result.Finished):
         raise Blocked(f"no synchronous motion ({outcome})")
-    times = _samples(found.duration)
-    share = np.array([found.at_time(time)[0] for time in times]).reshape(-1, 1)
+    times = _samples(motion.duration)
+    share = np.array([motion.at_time(time)[0] for time in times]).reshape(-1, 1)
     return times, start_rad + share * (goal_rad - start_rad)
 
 
@@ -208,16 +208,18 @@ def first_hit(motions: Motions, config: CellConfig, organ: Mesh, begun: bool = F
         moved_mm = np.concatenate([[0.0], np.cumsum(turns)])  # at most, of any point
         steps = int(np.ceil(moved_mm[-1] / (2 * cell.config.least_clearance_mm(touching))))
         at_mm = np.linspace(0, moved_mm[-1], steps + 1)
-        joints = np.stack([np.interp(at_mm, moved_mm, one) for one in stage.joints_rad.T], axis=1)
+        joints = np.stack(
+            [np.interp(at_mm, moved_mm, joint) for joint in stage.joints_rad.T], axis=1
+        )
         times_s = np.interp(at_mm, moved_mm, stage.times_s)
-        tips = np.array([[cell.tips(one)[arm][:3, 3] for arm in ARMS] for one in joints])
+        tips = np.array([[cell.tips(each)[arm][:3, 3] for arm in ARMS] for each in joints])
         speeds = np.linalg.norm(np.diff(tips, axis=0), axis=2) / np.diff(times_s)[:, None]
         edge = np.full((1, len(ARMS)), np.inf)
         slow = np.minimum(np.r_[edge, speeds], np.r_[speeds, edge]) <= slow_mm_s
         slow |= steps == 0
-        for one, time_s, both in zip(joints, times_s, slow, strict=True):
+        for joints_rad, time_s, both in zip(joints, times_s, slow, strict=True):
             now = [arm for arm, is_slow in zip(ARMS, both, strict=True) if is_slow]
-            if pair := cell.collisions(one, [arm for arm in touching if arm in now]):
+            if pair := cell.collisions(joints_rad, [arm for arm in touching if arm in now]):
                 return f"{pair[0]} would meet {pair[1]} {time_s:.1f} s after {stage.name} begins"
     return ""
 

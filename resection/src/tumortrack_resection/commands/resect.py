@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -52,7 +50,10 @@ class Resect(ResectOptions):
             _film(resection, self.film)
             return
         resection.confirm()
-        with _dry_run(resection):
+        dry_run = _dry_run_lines(resection)
+        for line in dry_run:
+            say(line)
+        try:
             say(str(resection.stored.patient))
             warn(resection.stored.plan.warnings)
             if self.live is None:
@@ -63,6 +64,9 @@ class Resect(ResectOptions):
                 with resection.following() as run:
                     track.follow(run)
             _say_end(resection)
+        finally:
+            for line in dry_run:
+                say(line)
 
 
 def _play(resection: ResectionSession) -> None:
@@ -109,18 +113,8 @@ def _say_end(resection: ResectionSession) -> None:
     check_closed(resection.sinks)
 
 
-@contextmanager
-def _dry_run(resection: ResectionSession) -> Iterator[None]:
-    """Say first and last which arms are not connected."""
-    lines = ["DRY RUN: no arm is connected"] if resection.dry and not resection.moving else []
-    if resection.moving:
-        lines = [
-            f"DRY RUN of the {arm.arm} at {arm.host}: it is not connected" for arm in resection.dry
-        ]
-    for line in lines:
-        say(line)
-    try:
-        yield
-    finally:
-        for line in lines:
-            say(line)
+def _dry_run_lines(resection: ResectionSession) -> list[str]:
+    """Which arms are not connected: the first and the last words of a run."""
+    if resection.dry and not resection.moving:
+        return ["DRY RUN: no arm is connected"]
+    return [f"DRY RUN of the {arm.arm} at {arm.host}: it is not connected" for arm in resection.dry]
