@@ -225,9 +225,8 @@ class ResectionSession:
         from tumortrack_resection.film import FPS, film, moments_s
 
         times_s, plan = moments_s(self.motions, _FILM_FRAMES), self.stored.plan
-        operation = self._operation(
-            replace(plan, notes=()), OperationConfig()
-        )  # it draws the notes
+        without_notes = replace(plan, notes=())  # the film shows them itself
+        operation = self._operation(without_notes, OperationConfig())
         result = TrackingResult(0, 0, reason=_PLAYBACK)
 
         def frames() -> Iterator[Workcell]:
@@ -309,43 +308,25 @@ def _check_real(
     stated: Patient,
 ) -> None:
     """Raises InputError that lists what is missing for real arms to move."""
-    model, source = (live.model, live.source_text) if live else ("", "")
     budget, kind = stored.budget, Organ(name=organ_name(stored.meshes) or KIDNEY.name)
     needs = {
         "--live MODEL SOURCE, so that they stop where the tumor moves": live,
-        f"a source that shows the present ({', '.join(_LIVE_SOURCES)}; not {source})": (
-            live is None
-            or (
-                live.source_kind in _LIVE_SOURCES
-                and not Path(getattr(live.source, "device", "")).suffix  # a recording
-            )
-        ),
-        f"a model that says which case it is of ({model} does not)": (
-            live is None or live.case_sha256
-        ),
-        "a plan that says which case it was made on (locate and plan again)": (stored.case_sha256),
+        "a plan that says which case it was made on (locate and plan again)": stored.case_sha256,
         "--patient ID and --side, as you know them": kind.identified(stated),
         f"a plan that says whose organ it is (this one's: {stored.patient})": (
             kind.identified(stored.patient)
         ),
-        f"a model that says whose organ it is (not {model})": live is None
-        or kind.identified(live.patient),
         "a plan made on a good estimate (this one's was poor)": (
             not any(note.startswith(POOR_ESTIMATE) for note in stored.plan.notes)
         ),
         "a plan made with --frame FILE (this one's frame is invented)": (
             stored.frame_source != INVENTED
         ),
-        "a plan made with --frame FILE that has camera_frame_id, as this source has": (
-            live is None or stored.frames.camera_frame_id or live.source_kind != "ros2"
-        ),
         "a plan made with --cell FILE that gives both bases, and keeps to them": (
             stored.cell_source != INVENTED
         ),
         f"--speed up to 1, not {config.speed:g}": config.speed <= 1,
-        "a plan whose margin covers its errors (plan again with a wider one)": (
-            budget.left_mm >= 0
-        ),
+        "a plan whose margin covers its errors (plan again with a wider one)": budget.left_mm >= 0,
         "a plan by a model that says how unsure it is (preset clinic)": (
             "tracking" not in budget.assumed
         ),
@@ -361,6 +342,20 @@ def _check_real(
         ),
         "a person at a terminal who confirms it": sys.stdin.isatty(),
     }
+    if live is not None:
+        model = live.model
+        is_recording = bool(Path(getattr(live.source, "device", "")).suffix)
+        sources = f"{', '.join(_LIVE_SOURCES)}; not {live.source_text}"
+        needs |= {
+            f"a source that shows the present ({sources})": (
+                live.source_kind in _LIVE_SOURCES and not is_recording
+            ),
+            f"a model that says which case it is of ({model} does not)": live.case_sha256,
+            f"a model that says whose organ it is (not {model})": kind.identified(live.patient),
+            "a plan made with --frame FILE that has camera_frame_id, as this source has": (
+                stored.frames.camera_frame_id or live.source_kind != "ros2"
+            ),
+        }
     if lacking := [what for what, met in needs.items() if not met]:
         names = " and ".join(arm.host for arm in arms)
         raise InputError(f"the arm at {names} may not move. It needs: {'; '.join(lacking)}.")
