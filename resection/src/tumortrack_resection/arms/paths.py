@@ -154,9 +154,9 @@ def connect(
     for room in _ROOM_RAD:
         lower = np.maximum(np.minimum(start_rad, goal_rad) - room, -group.limits_rad)
         upper = np.minimum(np.maximum(start_rad, goal_rad) + room, group.limits_rad)
-        corners = _grow(group, goal_rad, (lower, upper), rng)
-        if corners is not None:
-            path = _smooth(group, _shortcut(group, corners, rng))
+        grown = _grow(group, goal_rad, (lower, upper), rng)
+        if grown is not None:
+            path = _smooth(group, _shortcut(group, grown, rng))
             if path is not None:
                 return path
     raise Blocked(f"no way round was found where {pair[0]} would meet {pair[1]}", pair)
