@@ -309,7 +309,7 @@ def test_a_cut_round_the_cup_is_made_from_several_sides(cell):
 
 
 @pytest.mark.parametrize(
-    ("altered", "said"),
+    ("altered", "message"),
     [
         (lambda p: replace(p, grasp_mm=p.grasp_mm + [0, 2000, 0]), "holder does not reach"),
         (lambda p: replace(p, grasp_mm=p.grasp_mm - [12, 8, 25]), "below the organ's surface"),
@@ -319,8 +319,8 @@ def test_a_cut_round_the_cup_is_made_from_several_sides(cell):
         ),
     ],
 )
-def test_no_plan_says_why(cell, altered, said):
-    with pytest.raises(NoPlan, match=said):
+def test_no_plan_says_why(cell, altered, message):
+    with pytest.raises(NoPlan, match=message):
         plan_motions(altered(plan()), cell, cell.organ)
 
 
@@ -394,9 +394,9 @@ def test_places_for_the_bases_are_searched():
     config = msgspec.structs.replace(CellConfig(), holder_base=far)
     with pytest.raises(NoPlan, match="does not reach"):
         plan_motions(plan(shift), ArmCell(config), organ(shift))
-    cell, motions, said = search_bases(plan(shift), config, organ(shift))
+    cell, motions, message = search_bases(plan(shift), config, organ(shift))
     assert cell.config.holder_base != far
-    assert f"{cell.config.holder_base.position_mm[0]:g}" in said
+    assert f"{cell.config.holder_base.position_mm[0]:g}" in message
     assert motions.stages[-1].name == "home"
     tip = cell.tips(motions.stages[2].joints_rad[0])[HOLDER]
     assert np.abs(tip[:3, 3] - plan(shift).grasp_mm).max() < 0.01

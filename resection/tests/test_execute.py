@@ -33,8 +33,8 @@ from tumortrack_resection.values import OVER_BUDGET, POOR_ESTIMATE, ResectionCon
 STATES = ("approach", "grasp", "hold", "sweep 1", "sweep 2", "lift", "release", "home")
 FRAME_S = 1 / 30
 GOOD = replace(small_update(), quality="good")
-SEEN = located(n=8_000)
-PLAN = plan_resection(SEEN, ResectionConfig(method="published"))
+LOCATED = located(n=8_000)
+PLAN = plan_resection(LOCATED, ResectionConfig(method="published"))
 
 
 def motions(states=STATES, first=None):
@@ -57,14 +57,14 @@ def run_until(execution, state):
 
 
 def test_the_stages_follow_each_other_in_their_time():
-    execution, seen = Execution(motions()), []
+    execution, states = Execution(motions()), []
     for _ in range(2000):
-        if not seen or seen[-1] != execution.state:
-            seen.append(execution.state)
+        if not states or states[-1] != execution.state:
+            states.append(execution.state)
         if execution.state == DONE:
             break
         execution.step(0.01)
-    assert tuple(seen) == (*STATES, DONE)
+    assert tuple(states) == (*STATES, DONE)
     assert execution.ended
     assert execution.joints_rad == pytest.approx(motions().stages[-1].joints_rad[-1])
 
@@ -98,9 +98,9 @@ def test_a_cut_is_one_once_an_arm_has_had_the_time_to_come_up_with_it():
         cutting.append((execution.state, execution.cutting))
         execution.step(0.01)
     for state in STATES:
-        found = [is_cut for name, is_cut in cutting if name == state]
-        first = found.index(True) if any(found) else len(found)
-        assert all(found[first:])
+        flags = [is_cut for name, is_cut in cutting if name == state]
+        first = flags.index(True) if any(flags) else len(flags)
+        assert all(flags[first:])
         # All of these sweeps is cut: but for their first 0.3 s, by the samples 0.1 s apart.
         assert (25 <= first <= 42) == state.startswith("sweep")
     assert not execution.cutting
@@ -170,8 +170,8 @@ class World:
     """An organ that the tests move, an operation on it, and a clock."""
 
     def __init__(self, replan=None, config=None, plan=PLAN, budget=None):
-        self.seen = SEEN
-        self.planned = Planned(plan, self.seen.meshes, motions())
+        self.located = LOCATED
+        self.planned = Planned(plan, self.located.meshes, motions())
         self.calls = []
         self.made = replan or self.replan
         self.pool = ThreadPoolExecutor(1)
@@ -190,22 +190,22 @@ class World:
     def locate(self, update):
         meshes = {
             name: mesh.moved(mesh.vertices_mm + self.shift)
-            for name, mesh in self.seen.meshes.items()
+            for name, mesh in self.located.meshes.items()
         }
-        return replace(self.seen, points_mm=self.seen.points_mm + self.shift, meshes=meshes)
+        return replace(self.located, points_mm=self.located.points_mm + self.shift, meshes=meshes)
 
     def begin(self, update, joints_rad, progress):
         self.plans.append(self.pool.submit(self.made, self.locate(update), joints_rad, progress))
         return self.plans[-1]
 
-    def replan(self, seen, joints_rad, progress):
+    def replan(self, organ, joints_rad, progress):
         before = self.planned.plan
         config = ResectionConfig(method=before.method, margin_mm=before.margin_mm)
-        plan = plan_resection(seen, config)
-        sweep = progress.first_sweep(plan, seen.meshes["tumor_1"])
-        self.calls.append((seen.meshes["tumor_1"].box_mm.mean(0), sweep))
+        plan = plan_resection(organ, config)
+        sweep = progress.first_sweep(plan, organ.meshes["tumor_1"])
+        self.calls.append((organ.meshes["tumor_1"].box_mm.mean(0), sweep))
         states = STATES if sweep is None else STATES[STATES.index(f"sweep {sweep}") :]
-        return Planned(plan, seen.meshes, motions(states, joints_rad))
+        return Planned(plan, organ.meshes, motions(states, joints_rad))
 
     def frame(self, seconds=FRAME_S, **changes):
         """One frame later; returns what sinks get of the arms."""
@@ -234,14 +234,14 @@ class World:
 
 def test_a_whole_procedure_on_an_organ_that_keeps_still():
     world = World()
-    seen = []
+    states = []
     while not world.operation.ended:
         cell = world.frame()
-        if not seen or seen[-1] != plain(cell):
-            seen.append(plain(cell))
+        if not states or states[-1] != plain(cell):
+            states.append(plain(cell))
         assert cell.halted == ""
         assert set(cell.joints_rad) == set(JOINTS)
-    assert tuple(seen) == (*STATES, DONE)
+    assert tuple(states) == (*STATES, DONE)
     log = world.operation.summary()["log"]
     assert [entry["state"] for entry in log] == [*STATES, DONE]
     assert 7.8 < log[-1]["at_s"] < 8.6  # eight stages of a second, and a soft start
@@ -252,18 +252,18 @@ NO_ESTIMATE = {"estimate": None, "reason": "no frame for 0.6 s", "quality": "non
 
 @pytest.mark.parametrize("state", [s for s in STATES if s not in ("lift", "release", "home")])
 @pytest.mark.parametrize(
-    ("doubt", "said"),
+    ("doubt", "words"),
     [
         (NO_ESTIMATE, "no estimate: no frame for"),
         ({"quality": "poor", "warning": "the camera sees through it"}, "poor estimate: the camera"),
     ],
     ids=["stale", "flagged"],
 )
-def test_every_doubt_halts_the_arms_and_they_go_on_after_it(state, doubt, said):
+def test_every_doubt_halts_the_arms_and_they_go_on_after_it(state, doubt, words):
     world = World()
     world.until(state)
     cell = world.frames(15, **doubt)
-    assert cell.halted.startswith(said)
+    assert cell.halted.startswith(words)
     still = world.frame(**doubt)
     assert still.joints_rad == cell.joints_rad
     assert plain(still) == state
@@ -333,22 +333,22 @@ def test_after_the_first_sweep_began_results_are_marked_and_nothing_is_planned_u
 def test_a_part_that_is_not_found_halts_the_arms(part):
     world = World()
     world.until("approach")
-    whole = world.seen
+    whole = world.located
     left = {name: mesh for name, mesh in whole.meshes.items() if name != part}
-    world.seen = replace(whole, meshes=left)
+    world.located = replace(whole, meshes=left)
     cell = world.frames(10)
     assert cell.halted == f"{part} was not found"
     assert world.frame().joints_rad == cell.joints_rad
-    world.seen = whole
+    world.located = whole
     world.until(DONE)
 
 
 def tilted(degrees):
     turn = Rotation.from_euler("y", degrees, degrees=True).as_matrix()
-    seen = located(n=8_000)
+    organ = located(n=8_000)
     move = lambda points: (points - MIDDLE_MM) @ turn.T + MIDDLE_MM + [0, 0, 4.0]  # noqa: E731
-    meshes = {name: mesh.moved(move(mesh.vertices_mm)) for name, mesh in seen.meshes.items()}
-    return replace(seen, points_mm=move(seen.points_mm), meshes=meshes)
+    meshes = {name: mesh.moved(move(mesh.vertices_mm)) for name, mesh in organ.meshes.items()}
+    return replace(organ, points_mm=move(organ.points_mm), meshes=meshes)
 
 
 @pytest.mark.parametrize("order", ["down", "up"])
@@ -390,10 +390,10 @@ def test_after_the_last_sweep_no_estimate_is_needed_any_more():
 def test_another_part_that_moved_far_halts_the_arms_too():
     world = World()
     world.until("approach")
-    kidney = world.seen.meshes["kidney"]
-    world.seen = replace(
-        world.seen,
-        meshes={**world.seen.meshes, "kidney": kidney.moved(kidney.vertices_mm + [0, 0, 5.0])},
+    kidney = world.located.meshes["kidney"]
+    world.located = replace(
+        world.located,
+        meshes={**world.located.meshes, "kidney": kidney.moved(kidney.vertices_mm + [0, 0, 5.0])},
     )
     assert world.frames(2).halted == "kidney has moved by 5.0 mm"
 
@@ -414,7 +414,7 @@ def test_a_tumor_that_keeps_moving_is_waited_for_and_its_return_is_enough():
 
 def budgeted(margin_mm, deviation_mm=0.5):
     """A world whose arms heed an error budget, and how unsure its estimates are."""
-    plan = plan_resection(SEEN, ResectionConfig(margin_mm=margin_mm))
+    plan = plan_resection(LOCATED, ResectionConfig(margin_mm=margin_mm))
     unsure = Deviating(deviation_mm)
     planned = ErrorBudget(margin_mm=margin_mm, tracking_mm=4.2, hand_eye_mm=1.0, tool_mm=2.0)
     world = World(plan=plan, budget=LiveBudget(planned))
@@ -435,10 +435,10 @@ def test_arms_stand_while_the_errors_exceed_the_margin_and_go_on_when_they_shrin
     unsure.deviation_mm = 1.5
     assert world.frames(2, **changes).halted == ""
     world.until(DONE, **changes)
-    found = world.operation.summary()["budget"]
-    assert found["planned"]["sum_mm"] == pytest.approx(np.hypot(4.2, np.sqrt(5)))
-    assert found["worst"]["tracking_mm"] == 4.5  # of those on which the arms went on
-    assert found["worst"]["left_mm"] > 0
+    budgets = world.operation.summary()["budget"]
+    assert budgets["planned"]["sum_mm"] == pytest.approx(np.hypot(4.2, np.sqrt(5)))
+    assert budgets["worst"]["tracking_mm"] == 4.5  # of those on which the arms went on
+    assert budgets["worst"]["left_mm"] > 0
     (halt,) = world.operation.halts
     assert halt == " mm of error, most of it tracking (), against a margin of  mm"
 
@@ -466,7 +466,7 @@ def test_after_the_last_sweep_the_tumor_may_go():
 
 
 def test_where_no_new_plan_can_be_made_the_arms_stop_for_good_and_say_why():
-    def refuses(seen, joints_rad, progress):
+    def refuses(organ, joints_rad, progress):
         raise NoPlan("the holder can't reach it")
 
     world = World(refuses)
@@ -485,7 +485,7 @@ def test_where_no_new_plan_can_be_made_the_arms_stop_for_good_and_say_why():
 def test_while_it_is_planned_the_loop_goes_on():
     gate = threading.Event()
 
-    def slow(seen, joints_rad, progress):
+    def slow(organ, joints_rad, progress):
         gate.wait(PATIENCE_S)
         raise NoPlan("never mind")
 
@@ -503,10 +503,10 @@ def test_while_it_is_planned_the_loop_goes_on():
 def test_an_abort_by_the_user_is_final():
     world = World()
     world.until("sweep 1")
-    world.operation.abort("aborted by the user")
+    world.operation.abort(Halt("interrupted"))
     cell = world.frames(30)
     assert plain(cell) == ABORTED
-    assert cell.halted == "aborted by the user"
+    assert cell.halted == "stopped by the user"
     assert world.operation.ended
 
 

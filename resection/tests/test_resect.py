@@ -29,20 +29,19 @@ from stories import (
 )
 from tumortrack.core import store
 from tumortrack.core.config import to_builtins
-from tumortrack.core.errors import NoPlan
+from tumortrack.core.errors import InputError, NoPlan
 from tumortrack.core.estimate import Estimate
 from tumortrack.core.patient import Patient
 from tumortrack.core.types import CameraLabels, OccupancyCloud
 from tumortrack.imaging.case import load_case
 from tumortrack.sense.ply import parse_ply_properties, write_cloud_ply
 from tumortrack.tracking.files import write_estimate
-from tumortrack_resection import plan_resection
+from tumortrack_resection import begin_resection, plan_resection
 from tumortrack_resection.files import read_plan
 from tumortrack_resection.motions import JOINTS
 
 pytestmark = pytest.mark.slow
 
-CASE = "c" * 64
 WIDE = ("--margin", 8)
 CASE, WHOSE = "c" * 64, {"id": "P1", "side": "left"}
 STATED = ("--patient", "P1", "--side", "left")
@@ -51,13 +50,13 @@ CAMERA_FROM_TABLE = np.array([[1.0, 0, 0, 5.0], [0, -1, 0, -8.0], [0, 0, -1, 300
 
 def write_run(folder, motion=None):
     """What `locate` would write of a half-sunk tumor, the camera straight above."""
-    seen = located(n=20_000)
+    organ = located(n=20_000)
     camera = {
         name: mesh.moved(mesh.vertices_mm @ CAMERA_FROM_TABLE[:3, :3].T + CAMERA_FROM_TABLE[:3, 3])
-        for name, mesh in seen.meshes.items()
+        for name, mesh in organ.meshes.items()
     }
-    points = seen.points_mm @ CAMERA_FROM_TABLE[:3, :3].T + CAMERA_FROM_TABLE[:3, 3]
-    cloud = OccupancyCloud(points, seen.labels, np.ones(len(points)))
+    points = organ.points_mm @ CAMERA_FROM_TABLE[:3, :3].T + CAMERA_FROM_TABLE[:3, 3]
+    cloud = OccupancyCloud(points, organ.labels, np.ones(len(points)))
     volume = CameraLabels(np.ones((3, 3, 3), np.uint8), np.eye(4))
     parts = {
         name: {
@@ -70,7 +69,7 @@ def write_run(folder, motion=None):
     estimate = Estimate(cloud, volume, camera, report_of(parts=parts), motion, finding=None)
     estimate = replace(estimate, patient=Patient(**WHOSE))
     write_estimate(folder, estimate, about={"model": {"case_sha256": CASE}})
-    return seen
+    return organ
 
 
 @pytest.fixture(scope="module")
@@ -78,14 +77,14 @@ def story(tmp_path_factory):
     """A run, and the plan that the command made of it."""
     folder = tmp_path_factory.mktemp("resect")
     write_run(folder / "run", Deviating(0.9))
-    said = succeeded(tumortrack("plan", folder / "run", folder / "plan", *WIDE))
-    return folder, said
+    output = succeeded(tumortrack("plan", folder / "run", folder / "plan", *WIDE))
+    return folder, output
 
 
 def test_a_plan_is_written_in_the_tables_frame(story):
-    folder, said = story
-    assert "tumor_1 (7" in said
-    assert "ml healthy tissue" in said
+    folder, output = story
+    assert "tumor_1 (7" in output
+    assert "ml healthy tissue" in output
     stored = read_plan(folder / "plan")
     assert stored.frames.frame_id == "table"
     # Straight above, 120 mm over the table by default, its middle over the origin.
@@ -121,8 +120,8 @@ def test_a_plan_is_written_in_the_tables_frame(story):
 def test_a_margin_that_does_not_cover_the_errors_is_no_plan_unless_a_person_accepts_it(
     story, tmp_path
 ):
-    folder, said = story
-    lines = said.splitlines()
+    folder, output = story
+    lines = output.splitlines()
     assert lines[:2] == ["patient P1, left side", "errors that the margin has to cover, mm:"]
     assert lines[2:7] == [
         "  tracking   4.2  not calibrated", "  hand-eye   2.0  assumed",
@@ -169,7 +168,7 @@ def test_a_run_that_does_not_say_how_unsure_it_is_needs_a_wide_margin(tmp_path):
 def test_a_plan_is_carried_out_and_recorded(story, tmp_path):
     folder, _ = story
     report = tmp_path / "report.json"
-    said = succeeded(
+    output = succeeded(
         tumortrack(
             "resect", folder / "plan", f"recording:{tmp_path / 'seen'}", "--speed", 20,
             "--report", report,
@@ -178,12 +177,12 @@ def test_a_plan_is_carried_out_and_recorded(story, tmp_path):
     stages = [stage.name for stage in read_plan(folder / "plan").motions.stages]
     assert stages[:4] == ["approach", "grasp", "hold", "sweep 1"]
     assert stages[-3:] == ["lift", "release", "home"]
-    lines = said.splitlines()
+    lines = output.splitlines()
     assert lines[-1] == "done: both virtual arms are home."
-    found = json.loads(report.read_text())["resection"]
-    assert found["state"] == "done"
-    assert found["halts"] == {}
-    passed = [entry["state"] for entry in found["log"]]
+    content = json.loads(report.read_text())["resection"]
+    assert content["state"] == "done"
+    assert content["halts"] == {}
+    passed = [entry["state"] for entry in content["log"]]
     assert passed == [
         stage for stage in [*stages, "done"] if stage in passed
     ]  # short ones are missed
@@ -192,7 +191,7 @@ def test_a_plan_is_carried_out_and_recorded(story, tmp_path):
     from rosbags.typesys import Stores, get_typestore
 
     store, joints = get_typestore(Stores.ROS2_JAZZY), []
-    with Reader(tmp_path / "seen") as reader:
+    with Reader(tmp_path / "organ") as reader:
         for connection, _, raw in reader.messages():
             if connection.msgtype == "sensor_msgs/msg/JointState":
                 joints.append(store.deserialize_cdr(raw, connection.msgtype))
@@ -231,7 +230,7 @@ NEEDS = {
 def missing(done):
     line = refusal(done)
     assert "the arm at 127.0.0.1 may not move. It needs: " in line
-    return {name for name, said in NEEDS.items() if said in line}
+    return {name for name, output in NEEDS.items() if output in line}
 
 
 def model_of(folder, case, whose):
@@ -274,8 +273,8 @@ def test_a_real_arm_moves_only_with_all_that_it_needs_and_nothing_is_connected_b
     assert everything == asked | unstated
     assert resect(given / "anywhere", REAL, *STATED) == {"live", "cell", "person", "tool"}
     for half in (STATED[:2], STATED[2:]):
-        found = resect(given / "anywhere", REAL, *half)
-        assert found == {"live", "cell", "person", "tool", "stated"}
+        content = resect(given / "anywhere", REAL, *half)
+        assert content == {"live", "cell", "person", "tool", "stated"}
     live = (plan, REAL, *STATED, "--live")
     assert resect(*live, given / "nobody", "realsense") == {"model's", "person"}
     for name in ("patient", "side"):
@@ -395,15 +394,15 @@ def test_a_person_types_the_address_of_the_arm_that_will_move(given, typed):
         stderr=subprocess.PIPE, text=True, env=environment(),
     )  # fmt: skip
     assert process.stdout is not None
-    said = ""
-    while not said.endswith("to let it begin: "):
-        said += process.stdout.read(1)
+    output = ""
+    while not output.endswith("to let it begin: "):
+        output += process.stdout.read(1)
     os.write(terminal, f"{typed}\n".encode())
     rest, error = process.communicate(timeout=300)
     os.close(terminal)
     os.close(stdin)
-    assert "The cutter at 127.0.0.1 is about to move: as soon as an estimate is good" in said
-    assert "It cuts in patient P1, left side: is that who lies here?" in said
+    assert "The cutter at 127.0.0.1 is about to move: as soon as an estimate is good" in output
+    assert "It cuts in patient P1, left side: is that who lies here?" in output
     assert ("127.0.0.1 was not confirmed" in error) == (typed != "127.0.0.1")
     dry = "DRY RUN of the holder at 10.0.0.9: it is not connected"
     assert rest.count(dry) == (2 if typed == "127.0.0.1" else 0)
@@ -412,16 +411,16 @@ def test_a_person_types_the_address_of_the_arm_that_will_move(given, typed):
 
 def test_without_an_arm_it_is_a_dry_run_from_the_first_line_to_the_last(story, tmp_path):
     folder, _ = story
-    said = succeeded(
+    output = succeeded(
         tumortrack(
             "resect", folder / "plan", "ur:10.0.0.9", "--speed", 20,
             "--report", tmp_path / "report.json",
         )
     )  # fmt: skip
-    lines = said.splitlines()
+    lines = output.splitlines()
     assert lines[0] == lines[-1] == "DRY RUN: no arm is connected"
     assert "done: nothing moved." in lines
-    assert "home" not in said
+    assert "home" not in output
 
 
 def test_motions_that_were_edited_are_neither_carried_out_nor_filmed(story, tmp_path):
@@ -454,17 +453,17 @@ def test_ctrl_c_stops_the_arms_and_says_so(story, tmp_path):
         if line.strip() == "grasp":
             break
     process.send_signal(signal.SIGINT)
-    _, said = process.communicate(timeout=300)
+    _, output = process.communicate(timeout=300)
     assert process.returncode == 130
-    assert said == "tumortrack: stopped.\n"
-    found = json.loads(report.read_text())["resection"]
-    assert (found["state"], found["halted"]) == ("aborted", "stopped by the user")
+    assert output == "tumortrack: stopped.\n"
+    content = json.loads(report.read_text())["resection"]
+    assert (content["state"], content["halted"]) == ("aborted", "stopped by the user")
 
 
 def test_a_film_is_an_animation(story, tmp_path):
     folder, _ = story
-    said = succeeded(tumortrack("resect", folder / "plan", "--film", tmp_path / "film.gif"))
-    assert "written to" in said
+    output = succeeded(tumortrack("resect", folder / "plan", "--film", tmp_path / "film.gif"))
+    assert "written to" in output
     with Image.open(tmp_path / "film.gif") as film:
         assert film.n_frames > 50
         first = np.asarray(film.convert("RGB"), float)
@@ -474,7 +473,7 @@ def test_a_film_is_an_animation(story, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "output"),
     [
         (["--margin", 40], "margin_mm is 40; allowed: 1 to 20"),
         (["--config", "CONFIG"], "unknown field `margn`"),
@@ -488,7 +487,7 @@ def test_a_film_is_an_animation(story, tmp_path):
     ],
 )
 def test_what_cannot_be_planned_is_said_in_one_line_and_nothing_is_written(
-    story, tmp_path, arguments, said
+    story, tmp_path, arguments, output
 ):
     folder, _ = story
     (tmp_path / "CELL").write_text('{"legs": 4}')
@@ -502,7 +501,7 @@ def test_what_cannot_be_planned_is_said_in_one_line_and_nothing_is_written(
     )
     arguments = [tmp_path / a if str(a).isupper() else a for a in arguments]
     done = tumortrack("plan", folder / "run", tmp_path / "plan", *arguments)
-    assert said in refusal(done)
+    assert output in refusal(done)
     assert not (tmp_path / "plan").exists()
 
 
@@ -520,7 +519,7 @@ def test_arms_that_cannot_reach_are_no_plan(story, tmp_path):
 
 
 def test_with_a_calibration_plan_and_arms_are_in_the_robots_frame(story, tmp_path):
-    """The same cell, told in another frame: the same motions."""
+    """The same cell in another frame has the same motions."""
     folder, _ = story
     here = read_plan(folder / "plan")
     robot_from_table = np.eye(4)
@@ -564,22 +563,38 @@ def test_a_live_world_that_lies_elsewhere_is_planned_anew_and_cut(
     succeeded(tumortrack(*command, "--accept-poor", "--accept-budget"))
     world = f"virtual:{phantom_case}?breathing=false&instrument=false&camera_motion=false&fps=10"
     report = tmp_path / "report.json"
-    said = succeeded(
+    output = succeeded(
         tumortrack(
             "resect", tmp_path / "plan", "--live", clinic_model, world, "--speed", 10,
             "--report", report, "--replan-cut",
         )
     )  # fmt: skip
-    assert "done: both virtual arms are home." in said
-    found = json.loads(report.read_text())
-    passed = found["resection"]["log"]
+    assert "done: both virtual arms are home." in output
+    content = json.loads(report.read_text())
+    passed = content["resection"]["log"]
     assert passed[-1]["state"] == "done"
-    note = found["resection"]["note"]
+    note = content["resection"]["note"]
     assert note.startswith("PLANNED OVER ITS ERROR BUDGET; ")  # what the plan warned of stays
     assert note.endswith("cut: estimates are of the intact organ")
     assert any(entry.get("event") == "planned anew" for entry in passed)
-    assert any("has moved by" in halt for halt in found["resection"]["halts"])
-    assert found["frame"]["frame_id"] == "table"
-    budgets = found["resection"]["budget"]
+    assert any("has moved by" in halt for halt in content["resection"]["halts"])
+    assert content["frame"]["frame_id"] == "table"
+    budgets = content["resection"]["budget"]
     assert budgets["worst"]["left_mm"] < 0  # accepted when it was planned
     assert budgets["worst"]["tracking_mm"] >= 4.2
+
+
+def test_from_python_too_a_real_arm_needs_the_live_loop_and_a_person(given, monkeypatch, unchecked):
+    monkeypatch.setattr("sys.stdin.isatty", lambda: True, raising=False)
+    monkeypatch.setattr("termios.tcflush", lambda *_: None)
+    monkeypatch.setattr("builtins.input", lambda _: "yes")
+    live = {"live": (given / "model", "realsense"), "patient": "P1", "side": "left"}
+    resection = begin_resection(given / "plan", [REAL], **live)
+    with pytest.raises(InputError, match="real arms move only beside the live loop"):
+        resection.opened().__enter__()
+    with pytest.raises(InputError, match=r"127\.0\.0\.1 was not confirmed"):
+        resection.following().__enter__()
+    with pytest.raises(InputError, match="It needs: --live MODEL SOURCE"):
+        begin_resection(given / "plan", [REAL])
+    with pytest.raises(InputError, match="give sinks as on the command line"):
+        begin_resection(given / "plan", [object()])

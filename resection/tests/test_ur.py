@@ -19,14 +19,14 @@ from tumortrack.live.workers import SinkWorker
 from tumortrack_resection.ur_sink import SILENT_S, UR_JOINTS, UrSink, UrSinkConfig
 from workcell_objects import with_arms, workcell, working
 
-# A real arm, whose controller is made up: it notes what it is told, and when.
+# A fake controller of a real arm, which records its calls.
 
 
 class FakeArm:
     """One controller behind both of ur_rtde's interfaces."""
 
     def __init__(self) -> None:
-        self.told: list[tuple] = []
+        self.calls: list[tuple] = []
         self.opened: list[str] = []
         self.actual = list(angles(0.0))
         self.running, self.safety_mode, self.fails = True, 1, ""
@@ -42,7 +42,7 @@ class FakeArm:
                 arm.opened.append(f"control {hostname}")
 
             def setWatchdog(self, min_frequency: float) -> bool:  # noqa: N802
-                arm.told.append(("watchdog", min_frequency))
+                arm.calls.append(("watchdog", min_frequency))
                 return True
 
             def kickWatchdog(self) -> bool:  # noqa: N802
@@ -55,19 +55,19 @@ class FakeArm:
             def servoJ(self, q, speed, acceleration, time, lookahead_time, gain) -> bool:  # noqa: N802
                 if arm.fails == "servo":
                     raise RuntimeError("connection lost")
-                arm.told.append(("servo", q, time, lookahead_time, gain))
+                arm.calls.append(("servo", q, time, lookahead_time, gain))
                 arm.actual = list(q) if arm.follows else arm.actual
                 return arm.fails != "refuse"
 
             def servoStop(self, a: float = 10.0) -> bool:  # noqa: N802
-                arm.told.append(("stop", a))
+                arm.calls.append(("stop", a))
                 return True
 
             def stopScript(self) -> None:  # noqa: N802
-                arm.told.append(("script ends",))
+                arm.calls.append(("script ends",))
 
             def disconnect(self) -> None:
-                arm.told.append(("bye",))
+                arm.calls.append(("bye",))
 
         class RTDEReceiveInterface:
             def __init__(self, hostname: str) -> None:
@@ -97,7 +97,7 @@ class FakeArm:
         return {"rtde_control": control, "rtde_receive": receive}
 
     def what(self) -> list[str]:
-        return [one[0] for one in self.told if one[0] != "watchdog"]
+        return [call[0] for call in self.calls if call[0] != "watchdog"]
 
 
 def angles(progress: float) -> list[float]:
@@ -141,7 +141,7 @@ def test_by_default_nothing_is_connected_and_targets_are_counted(arm, monkeypatc
     sink.publish(small_update(6))
     sink.close()
     assert sink.counts == {"would send": 5, "halted": 1, "no arms": 1}
-    assert arm.opened == arm.told == []
+    assert arm.opened == arm.calls == []
 
 
 def test_an_outlet_reports_the_counts():
@@ -179,13 +179,13 @@ def test_targets_that_an_arm_must_not_follow_are_refused(monkeypatch, joints, wo
 def test_an_arm_follows_the_targets_and_is_stopped_at_the_end(arm, moving):
     sink = moving(gain=400.0)
     assert arm.opened == ["receive 10.0.0.9", "control 10.0.0.9"]
-    assert arm.told == [("watchdog", 5.0)]
+    assert arm.calls == [("watchdog", 5.0)]
     for n in range(4):
         sink.publish(working(n, n * 0.02))
     until(lambda: arm.kicks)
     sink.close()
     assert arm.what() == ["servo"] * 4 + ["stop", "script ends", "bye"]
-    for n, (_, q, follow_s, lookahead_s, gain) in enumerate(arm.told[1:5]):
+    for n, (_, q, follow_s, lookahead_s, gain) in enumerate(arm.calls[1:5]):
         assert q == pytest.approx(angles(n * 0.02))
         assert (lookahead_s, gain) == (0.1, 400.0)
         assert (follow_s == 0.1) if n == 0 else (0.032 < follow_s <= 0.1)
@@ -211,7 +211,7 @@ def test_an_arm_that_begins_beside_its_target_joins_the_plan_slowly(arm, moving,
     sent = []
     for n in range(61):
         sink.publish(working(n, 0.002 * n))
-        sent.append(np.degrees(arm.told[-1][1][0] - angles(0.002 * n)[0]))
+        sent.append(np.degrees(arm.calls[-1][1][0] - angles(0.002 * n)[0]))
         clock.sleep(0.02)
     assert sent[0] == pytest.approx(1.5)
     assert np.diff(sent[:51]) == pytest.approx(-0.03)  # 1.5 degrees in a second
@@ -393,4 +393,4 @@ def test_what_cannot_work_is_refused(arm, monkeypatch):
     monkeypatch.setitem(sys.modules, "rtde_control", None)
     with pytest.raises(InputError, match=r"tumortrack-resection"):
         UrSinkConfig(host="10.0.0.9", execute=True).open(with_arms())
-    assert arm.told == []
+    assert arm.calls == []

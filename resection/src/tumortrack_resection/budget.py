@@ -1,8 +1,7 @@
 """The error budget: how much nearer to the tumor than planned a cut may come.
 
-Motion and lag are displacements of the tumor against the plan: they point the same way all the
-time, so they add up. Tracking, hand-eye calibration and tool are bounds of independent errors,
-whose directions have nothing to do with each other: they add in quadrature.
+Motion and lag displace the tumor against the plan in the same direction, so they add up. Tracking,
+hand-eye calibration and tool are bounds of independent errors: they add in quadrature.
 """
 
 from __future__ import annotations
@@ -44,9 +43,9 @@ HAND_EYE_MM = 2.0
 # Data sheets state repeatability alone, 0.05 mm (UR10e) and 0.1 mm (UR5); commanded poses of arms
 # that are not calibrated are off by some 20 times that.
 TOOL_MM = 1.0
-MOVED_MM = 2.0  # allowed for at planning: the tumor may move so far before the arms halt
+MOVED_MM = 2.0  # allowed for in a plan: the arms halt once the tumor has moved farther
 TERMS = ("tracking", "hand-eye", "tool", "motion", "lag")
-_SPACING_MM = 0.25  # of points on the planned cut
+_SPACING_MM = 0.25  # between points on the planned cut
 
 
 class ErrorBudget(Config, frozen=True, kw_only=True):
@@ -57,12 +56,12 @@ class ErrorBudget(Config, frozen=True, kw_only=True):
             negative where the cut goes through the tumor.
         tracking_mm: of the tumor's located surface.
         hand_eye_mm: of the camera's place in the arms' frame, at the tumor.
-        tool_mm: of the tool's tip: the arm's accuracy, what gives way, and how far the arm may be
-            from its target.
+        tool_mm: of the tool's tip: the arm's accuracy, compliance, and its tolerated distance from
+            its target.
         motion_mm: of the tumor since the plan; when planned, what is allowed for.
-        lag_mm: what the tumor moves until the arms act on an estimate.
-        assumed: terms that nobody measured or stated.
-        confidence: of the tracking term, where that is a calibrated margin; 0: it is not.
+        lag_mm: how far the tumor moves before the arms act on an estimate.
+        assumed: terms that were neither measured nor stated.
+        confidence: of the tracking term if it is a calibrated margin, else 0.
     """
 
     margin_mm: float
@@ -98,7 +97,7 @@ class ErrorBudget(Config, frozen=True, kw_only=True):
 
     @property
     def as_halt(self) -> Halt:
-        """Why arms halt where nothing is left of the margin."""
+        """Why arms halt when no margin is left."""
         term, term_mm = max(self.terms.items(), key=lambda item: item[1])
         values: dict[str, float | str] = {"sum_mm": self.sum_mm, "margin_mm": self.margin_mm}
         return Halt("over_budget", {**values, "term": term, "term_mm": term_mm})
@@ -119,12 +118,11 @@ class ErrorBudget(Config, frozen=True, kw_only=True):
         lines.append(f"  {'together':<9}{self.sum_mm:5.1f}  of a margin of {self.margin_mm:.1f}")
         return lines
 
-    def seen(
+    def updated(
         self, std_mm: np.ndarray | None, stated: StatedRadius | None = None, **terms: float
     ) -> ErrorBudget:
-        """With ``margin_mm``, ``motion_mm`` and ``lag_mm`` as they are now, and the tracking of an
-        estimate that states this margin of the tumor or, where it states none, whose tumor has
-        these standard deviations."""
+        """With new ``margin_mm``, ``motion_mm`` and ``lag_mm``, and the tracking error that an
+        estimate states of the tumor or, without one, its standard deviations."""
         others = tuple(name for name in self.assumed if name != "tracking")
         terms["confidence"] = stated.confidence if stated else 0.0
         if stated is not None:
@@ -144,9 +142,9 @@ def planned_budget(
     moved_mm: float = MOVED_MM,
     confidence: float | None = None,
 ) -> ErrorBudget:
-    """The budget of a plan; ``hand_eye_mm`` and ``tool_error_mm`` are assumed where nobody states
-    them. The organ is taken to lie still, apart from ``moved_mm``: there is no lag yet. The tumor's
-    margin is the one with this or else the highest ``confidence``. InputError: none has it."""
+    """The budget of a plan; ``hand_eye_mm`` and ``tool_error_mm`` are assumed if not stated. Apart
+    from ``moved_mm`` the organ lies still: there is no lag yet. The tumor's margin is the one with
+    this or else the highest ``confidence``. InputError: none has it."""
     stated_mm = stated_radius(located.margin, plan.tumor, confidence)
     if confidence is not None and stated_mm is None:
         raise InputError(
@@ -161,13 +159,12 @@ def planned_budget(
         motion_mm=moved_mm,
         assumed=tuple(name for name, value in stated.items() if value is None),
     )
-    return budget.seen(located.std_mm.get(plan.tumor), stated_mm)
+    return budget.updated(located.std_mm.get(plan.tumor), stated_mm)
 
 
 def widened(config: ResectionConfig, budget: ErrorBudget) -> ResectionConfig:
-    """With the margin of healthy tissue that ``config`` asks for beyond all errors. Raises
-    InputError: the method keeps no margin below the tumor, or ``sigmas`` count errors twice;
-    NoPlan: it is wider than any that is planned."""
+    """With all errors added to the margin of ``config``. Raises InputError: the method keeps no
+    margin below the tumor, or ``sigmas`` would count errors twice; NoPlan: it becomes too wide."""
     if config.method != "margin" or config.sigmas > 0:
         raise InputError("--confidence needs the method margin, and no --sigmas.")
     wide_mm = config.margin_mm + budget.sum_mm
@@ -180,8 +177,8 @@ def widened(config: ResectionConfig, budget: ErrorBudget) -> ResectionConfig:
 
 
 def checked_against(plan: ResectionPlan, budget: ErrorBudget, accept: bool) -> ResectionPlan:
-    """The plan with a note on its budget. NoPlan: the margin doesn't cover the errors, and nobody
-    said that it is to be planned all the same."""
+    """The plan with a note on its budget. NoPlan: the margin doesn't cover the errors, and that was
+    not accepted."""
     words = f"{budget.left_mm:.1f} mm of the margin are left after {budget.sum_mm:.1f} mm of error"
     if budget.left_mm < 0:
         words = f"{OVER_BUDGET}: {budget.words}"
@@ -200,9 +197,8 @@ def plan_within(
     budget_of: Callable[[ResectionPlan], ErrorBudget],
     beyond_errors: bool = False,
 ) -> tuple[ResectionPlan, ResectionConfig, ErrorBudget]:
-    """A plan, as it was asked for in the end, and its budget. ``beyond_errors``: the margin is of
-    healthy tissue, and all errors are added to it; a note says what it is made of. Raises as
-    ``widened``."""
+    """A plan, its configuration in the end, and its budget. ``beyond_errors``: all errors are added
+    to the margin, and a note says so. Raises as ``widened``."""
     plan = plan_resection(located, config)
     budget = budget_of(plan)
     if not beyond_errors:
@@ -219,9 +215,8 @@ def plan_within(
 
 
 def kept_mm(layers: tuple[CutLayer, ...], points_mm: Float[np.ndarray, "n 3"]) -> float:
-    """The least distance between the planned cut and a tumor's surface, by points of it; where some
-    are outside the piece, how deep the cut goes into the tumor, negative. What is open at the top
-    is no cut."""
+    """The least distance between the planned cut and points of a tumor's surface; if the cut goes
+    into the tumor, how deep, negative. The open top is no cut."""
     nearest_mm = np.full(len(points_mm), np.inf)
     below = shapely.Polygon()
     x, y, z = np.asarray(points_mm, float).T
@@ -240,7 +235,7 @@ def kept_mm(layers: tuple[CutLayer, ...], points_mm: Float[np.ndarray, "n 3"]) -
 
 
 def kept_words(plan: ResectionPlan, located: Located) -> str:
-    """The margin that is kept, and, where it differs, what was asked for."""
+    """The margin kept and, if it differs, the one asked for."""
     kept = kept_mm(plan.layers, tumor_points(plan, located))
     asked = f"{plan.margin_mm:g} mm asked for"
     if kept < 0:
@@ -256,7 +251,7 @@ def tumor_points(plan: ResectionPlan, located: Located) -> Float64[np.ndarray, "
 
 
 def _remedy(plan: ResectionPlan, budget: ErrorBudget) -> str:
-    """A margin that would do, if there is one."""
+    """A margin that suffices, if there is one."""
     enough_mm = math.ceil(2 * (plan.margin_mm - budget.left_mm) + 0.2) / 2
     if plan.method != "margin":
         return "The method keeps no margin below the tumor; take the method margin."

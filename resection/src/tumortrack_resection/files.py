@@ -1,7 +1,5 @@
-"""The folder of a plan: numbers as JSON, strokes and surfaces as PLY, motions as safetensors and,
-for MoveIt, in ROS's own words (moveit_msgs/RobotTrajectory).
-
-Everything in it is in the table's frame, mm; ``plan.json`` has ``table_from_camera``.
+"""The folder of a plan: JSON, strokes and surfaces as PLY, motions as safetensors and, for MoveIt,
+moveit_msgs/RobotTrajectory. All in the table's frame, mm; ``plan.json`` has ``table_from_camera``.
 """
 
 from __future__ import annotations
@@ -31,18 +29,17 @@ from tumortrack_resection.values import Located, ResectionConfig, ResectionPlan
 KIND = "plan"
 _NAME, _STROKES, _MOTIONS = "plan.json", "strokes.ply", "motions.safetensors"
 INVENTED = "invented"  # a frame or cell that no file of the user's gave
-_OVER = 1.01  # speeds: the timing keeps its limits at grid points only
+_OVER = 1.01  # of speeds: their limits are kept at grid points only
 _GAP_RAD = 1e-6
 _LONGEST_S = 4 * 3600.0  # no resection takes so long
 
 
 @dataclass(frozen=True, eq=False)
 class PlanFolder:
-    """What a plan's folder holds. ``cell``: the workcell that the motions are for; motions and cell
-    are None where no arms were planned. ``case_sha256``: of the case that the organ was located by;
-    empty where unknown. ``frame_source``, ``cell_source``: the sha256 of the user's file that gave
-    the frame, and the places of the arms; or ``INVENTED``. ``patient``: whose organ, as far as it
-    is known. ``frames``: where a live run publishes that carries the plan out."""
+    """The content of a plan's folder. ``frames``: in which a live run that carries it out
+    publishes. ``cell``: the workcell of the motions; both are None if no arms were planned.
+    ``case_sha256``: of the case by which the organ was located; empty: unknown. ``frame_source``,
+    ``cell_source``: sha256 of the user's file with the frame, with the bases; or ``INVENTED``."""
 
     plan: ResectionPlan
     config: ResectionConfig
@@ -57,7 +54,7 @@ class PlanFolder:
     patient: Patient = NOBODY
 
 
-# What stands in plan.json under its own name.
+# Fields that plan.json holds under their own names.
 _STORED: dict[str, Any] = {
     "config": ResectionConfig,
     "budget": ErrorBudget,
@@ -77,11 +74,11 @@ def write_plan(
     overwrite: bool = False,
 ) -> None:
     """All or nothing. ``inputs``: sha256 of what it was made from; ``more`` adds files (pictures)
-    to the folder given to it. Raises InputError: the folder exists and ``overwrite`` is False;
-    NoPlan: motions that would be refused when read; StorageError: the disk refused."""
+    to a folder. Raises InputError: the folder exists and ``overwrite`` is False; NoPlan: motions
+    that would be refused when read; StorageError: the disk refused."""
     plan, motions, frames = content.plan, content.motions, content.frames
     if motions is not None:
-        assert content.cell is not None  # the one that the motions are for
+        assert content.cell is not None
         for fault in _faults(motions, content.cell, plan.sweeps):
             raise NoPlan(f"the arms can't carry this out: {fault}.")
     data = {
@@ -113,7 +110,7 @@ def write_plan(
 
 
 def as_located(content: PlanFolder) -> Located:
-    """What the plan was made on, without its cloud: for pictures."""
+    """What the plan was made on, without its cloud, for pictures."""
     points, labels = np.zeros((0, 3)), np.zeros(0, np.uint8)
     stamp_ns, patient = content.plan.stamp_ns, content.patient
     return Located(points, labels, content.meshes, stamp_ns=stamp_ns, patient=patient)
@@ -121,7 +118,7 @@ def as_located(content: PlanFolder) -> Located:
 
 def read_plan(folder: Path) -> PlanFolder:
     """Raises ArtifactError: no plan, damaged, of another version, or with motions that the planner
-    would not have made."""
+    would not make."""
     manifest = store.read_manifest(folder, KIND)
     data, path = store.read_json(folder / _NAME), folder / _MOTIONS
     surfaces = {Path(file).stem for file in manifest["files"] if file.endswith(".ply")}
@@ -156,16 +153,15 @@ def as_builtins(plan: ResectionPlan) -> dict[str, Any]:
         return (array.round(4) if array.ndim == 2 else array).tolist()  # of lines: 0.1 micrometres
 
     data: dict[str, Any] = msgspec.to_builtins(plan, enc_hook=plain)
-    for cut, its in zip(plan.cuts, data["cuts"], strict=True):
-        its |= {"closed": cut.closed, "length_mm": round(cut.length_mm, 1)}
+    for cut, stored in zip(plan.cuts, data["cuts"], strict=True):
+        stored |= {"closed": cut.closed, "length_mm": round(cut.length_mm, 1)}
     for layer in data["layers"]:
         layer["top_mm"] = layer["top_mm"] if np.isfinite(layer["top_mm"]) else None
     return {**data, "approach": [0.0, 0.0, -1.0]}
 
 
 def from_plain(data: dict[str, Any]) -> ResectionPlan:
-    """The inverse of ``as_builtins``; raises KeyError, TypeError, ValueError or ValidationError for
-    other data."""
+    """The inverse of ``as_builtins``; raises KeyError, TypeError, ValueError, ValidationError."""
     layers = [dict(layer) for layer in data["layers"]]
     for layer in layers:
         layer["top_mm"] = np.inf if layer["top_mm"] is None else layer["top_mm"]
@@ -174,8 +170,8 @@ def from_plain(data: dict[str, Any]) -> ResectionPlan:
 
 
 def _strokes(plan: ResectionPlan) -> bytes:
-    """The strokes' points in their order, each with its sweep, its stroke and whether it is one of
-    the floor; the grasp point last, with sweep 0."""
+    """The strokes' points in order, each with its sweep, its stroke and whether that is of the
+    floor; the grasp point last, with sweep 0."""
     points = [*(cut.path_mm for cut in plan.cuts), plan.grasp_mm[None]]
     rows = [(cut.sweep, n, cut.kind == "floor") for n, cut in enumerate(plan.cuts, start=1)]
     columns = np.repeat([*rows, (0, 0, 0)], [len(each) for each in points], axis=0).T
@@ -222,9 +218,8 @@ def _read_motions(path: Path) -> Motions:
 
 
 def ros_trajectories(motions: Motions, frame_id: str) -> bytes:
-    """Motions for MoveIt as JSON, which ROS 2 reads as YAML: ``stages``, each with its ``name``,
-    ``seconds`` and the ``trajectory`` of all joints, where any moves; radians, seconds. Each begins
-    where the one before ended."""
+    """Motions for MoveIt as JSON, which ROS 2 reads as YAML: ``stages`` with ``name``, ``seconds``
+    and the ``trajectory`` of all joints, without stages in which none moves; radians, seconds."""
     stages = [
         {"name": stage.name, "seconds": stage.seconds, "trajectory": _trajectory(stage, frame_id)}
         for stage in motions.stages
@@ -252,7 +247,7 @@ def _trajectory(stage: MotionStage, frame_id: str) -> dict[str, Any]:
 
 
 def _faults(motions: Motions, cell: CellConfig, sweeps: int) -> Iterator[str]:
-    """What the planner would not have done."""
+    """What the planner would not do."""
     names = [stage.name for stage in motions.stages]
     cuts = [f"sweep {n}" for n in range(1, sweeps + 1)]
     if names != ["approach", "grasp", "hold", *cuts, LIFT, RELEASE, "home"]:

@@ -38,15 +38,15 @@ _FROM = np.array([-0.36, -0.8, 0.48])  # where the viewer is: to the left, in fr
 _CLOSE_FROM = np.array([-0.36, -0.72, 0.6])
 _AWAY = 2.6  # the viewer's distance in radii of what is seen: a natural perspective
 _CLOSE = 0.47, 0.42  # the close-up's share of width and height, in the lower right corner
-_ARMS = 0.97, 0.62  # and that of the arms, above it
-_CLOSE_MM = 40.0  # the close-up cuts away what is nearer to the viewer than the organ by this
+_ARMS = 0.97, 0.62  # the arms' share, above it
+_CLOSE_MM = 40.0  # the close-up hides what is nearer to the viewer than the organ by this
 _ORGAN_OPACITY = 0.42
 _FRAME = (90, 96, 106)
 _BACKDROP = rgb((238, 241, 244))
 _LEAST_PIXELS = 2.0  # width of a line
 _COLOURS = 255  # and one for what did not change
 _SAMPLES = 8  # frames from which the colours are chosen
-_LOOKED_AT, _EVERY = 40, 3  # frames, and every which vertex, that the viewpoint is chosen from
+_SAMPLED, _EVERY = 40, 3  # the viewpoint is chosen by so many frames, and every third vertex
 _LEAST_FRAMES = 2  # of a stage
 _LAST_S = 1.5  # the last picture stays
 _PLAYBACK = "PLAYBACK of a stored plan, SIMULATED: nothing is tracked"
@@ -64,22 +64,22 @@ def film(
     progress: Callable[[], None] = lambda: None,
     plan: ResectionPlan | None = None,
 ) -> None:
-    """Write the frames as an animated GIF that begins again when it has ended.
+    """Write the frames as an animated GIF that loops.
 
-    Over every frame stand, whole, that it is a playback, simulated; the plan's warnings; the state
-    and why the arms halt; the patient. Once the holder lifts, the piece goes with it, and after the
-    release it is gone.
+    Above every frame, never cut off: that it is a simulated playback; the plan's warnings; the
+    state and why the arms halt; the patient. The piece moves with the holder once that lifts, and
+    disappears after the release.
 
-    Seen obliquely from the front: whatever has a slash in its name (an arm's parts) is in the
-    picture in all frames; in the corner the organ from near by. The same frames give the same
-    bytes; frames that look the same are one that lasts longer. Raises InputError: no frame, nothing
-    in them, or another kind of file; StorageError: the disk refused.
+    The view is obliquely from the front, and contains whatever has a slash in its name (the parts
+    of arms) in all frames; an inset shows the organ from near by. The same frames give the same
+    bytes. Raises InputError: no frame, nothing in them, or another kind of file; StorageError: the
+    disk refused.
 
     Args:
         frames, located: table frame, mm; ``FPS`` frames a second.
         path: ``.gif``, written atomically.
-        size: of the scene, pixels; the words come on top.
-        plan: what is carried out: its warnings and its piece; None: the organ stays whole.
+        size: of the scene without the text, pixels.
+        plan: for its warnings and its piece; None: the organ stays whole.
         progress: called after each frame.
     """
     if path.suffix.lower() != ".gif":
@@ -116,9 +116,8 @@ def film(
 
 
 def moments_s(motions: Motions, frames: int) -> Float64[np.ndarray, " n"]:
-    """Times since the beginning, about so many, that show every stage: a stage gets frames by the
-    square root of its duration, for sweeps take minutes and the grasp seconds; the end is among
-    them."""
+    """About so many times since the beginning, the end included, that show every stage: frames go
+    by the square root of its duration, as sweeps take minutes and the grasp seconds."""
     seconds = np.array([stage.seconds for stage in motions.stages])
     share = np.sqrt(seconds) / max(float(np.sqrt(seconds).sum()), 1e-9)
     counts = np.maximum(np.rint(frames * share).astype(int), _LEAST_FRAMES)
@@ -129,7 +128,7 @@ def moments_s(motions: Motions, frames: int) -> Float64[np.ndarray, " n"]:
 
 
 class _FramePainter:
-    """Draws frame by frame; viewpoints, organ and letters stay the same."""
+    """Draws frame by frame, with fixed viewpoints and text size."""
 
     def __init__(
         self, frames: list[Workcell], located: Located, size: tuple[int, int],
@@ -152,26 +151,26 @@ class _FramePainter:
         self._spot = (*(flat.min(0) - 4).round().tolist(), *(flat.max(0) + 4).round().tolist())
         self._tubes: dict[tuple[int, float], tuple[Polyline, Mesh]] = {}
         self._warnings = () if plan is None else plan.warnings
-        self._whose = str(located.patient)
-        told = {(cell.state, cell.halted): cell for cell in frames}
-        self._room = max(words_strip(self._words(cell), size)[0].height for cell in told.values())
+        self._patient_words = str(located.patient)
+        shown = {(cell.state, cell.halted): cell for cell in frames}
+        self._room = max(words_strip(self._words(cell), size)[0].height for cell in shown.values())
         self._lifted_from = next((n for n, c in enumerate(frames) if c.state == LIFT), len(frames))
         self._stays, self._goes = self._organ, list[Body]()
         if plan is not None and self._lifted_from < len(frames):
             self._stays, self._goes = _divided(located, plan)
 
     def _words(self, cell: Workcell) -> list[Paragraph]:
-        """What stands over a frame, the weightiest first."""
+        """The text above a frame, most important first."""
         return [
             Paragraph(_PLAYBACK, WHITE, ARMS),
             *(Paragraph(f"{SIGN} WARNING: {text}", WHITE, NONE) for text in self._warnings),
             Paragraph(cell.state + _MEANING.get(cell.state, ""), BACKGROUND, large=True),
             *([Paragraph(f"halted: {cell.halted}", NONE)] if cell.halted else []),
-            Paragraph(self._whose, BACKGROUND),
+            Paragraph(self._patient_words, BACKGROUND),
         ]
 
     def _bodies(self, n: int) -> list[Body]:
-        """Organ, tumors and the piece, which goes where the holder does."""
+        """Organ, tumors and the piece, which moves with the holder."""
         if n < self._lifted_from:
             return self._organ
         before, now = (_holder(self._frames[k]) for k in (max(self._lifted_from - 1, 0), n))
@@ -219,10 +218,10 @@ class _FramePainter:
         return self._tubes[key][1]
 
     def _draw_progress(self, draw: ImageDraw.ImageDraw, n: int) -> None:
-        """A bar of all states, filled as far as the procedure is; red where the arms stand."""
+        """A progress bar of all states, red where the arms stand."""
         cell, (width, height) = self._frames[n], self._size
         done = 0
-        for state, group in groupby(self._frames, lambda one: one.state):
+        for state, group in groupby(self._frames, lambda cell: cell.state):
             first, done = done, done + len(list(group))
             x = [8 + (width - 16) * k / len(self._frames) for k in (first, min(done, n + 1), done)]
             box = height - 11, height - 6
@@ -233,7 +232,7 @@ class _FramePainter:
 
 
 class Paragraph(NamedTuple):
-    """Words of one colour, on another where that is given."""
+    """Text in a colour, perhaps on a background."""
 
     text: str
     ink: Colour
@@ -244,8 +243,8 @@ class Paragraph(NamedTuple):
 def words_strip(
     paragraphs: Sequence[Paragraph], size: tuple[int, int]
 ) -> tuple[Image.Image, list[tuple[float, float, float, float]]]:
-    """All the words, wrapped, under each other on white: as wide as the scene of this size, and as
-    high as they need; and each line's box (left, top, right, bottom), pixels."""
+    """The paragraphs, wrapped, on white: as wide as a scene of this size, as high as needed; and
+    each line's box (left, top, right, bottom), pixels."""
     file = f"{matplotlib.get_data_path()}/fonts/ttf/DejaVuSans.ttf"
     lines, y = [], 6
     for paragraph in paragraphs:
@@ -257,7 +256,7 @@ def words_strip(
         y += 6
     strip = Image.new("RGB", (size[0], y), WHITE)
     draw, boxes = ImageDraw.Draw(strip), []
-    for paragraph, _, font, top in lines:  # first, so that none covers a word
+    for paragraph, _, font, top in lines:  # first, so that none covers text
         if paragraph.paper is not None:
             around = 6, top - 2, size[0] - 7, top + round(1.35 * font.size) + 1
             draw.rectangle(around, fill=paragraph.paper)
@@ -286,8 +285,8 @@ def _holder(cell: Workcell) -> Float64[np.ndarray, "4 4"] | None:
 
 
 def _reach(frames: list[Workcell]) -> Float[np.ndarray, "n 3"]:
-    """Points of all parts of arms in frames of all stages; of everything, where there are none."""
-    some = frames[:: max(1, len(frames) // _LOOKED_AT)]
+    """Points of the arms' parts in frames of all stages; without arms, of everything."""
+    some = frames[:: max(1, len(frames) // _SAMPLED)]
     shapes = [shape for cell in some for shape in cell.shapes]
     if not shapes:
         raise InputError("the frames show no arms and no table: nothing to film.")
@@ -304,7 +303,8 @@ def _viewpoint_of(
     size: tuple[int, int],
     share: tuple[float, float] = (0.9, 0.9),
 ) -> Viewpoint:
-    """In this direction, all points as large as can be in the picture's uppermost ``share``."""
+    """From this direction, with all points as large as possible in the image's uppermost
+    ``share``."""
     target = (points_mm.min(0) + points_mm.max(0)) / 2
     radius = float(np.linalg.norm(points_mm - target, axis=1).max())
     away = _AWAY * radius * direction / np.linalg.norm(direction)

@@ -1,4 +1,4 @@
-"""The error budget of the moment: what the errors are beside the live loop, update for update."""
+"""The error budget of each live update."""
 
 from __future__ import annotations
 
@@ -16,41 +16,41 @@ from tumortrack.live.values import TrackingResult
 from tumortrack.tracking.margins import stated_radius
 from tumortrack_resection.budget import ErrorBudget
 
-_SPEED_S = 0.3  # that a speed is taken over: estimates jitter from frame to frame
-_GAP_S = 0.5  # a place so old says nothing of the speed
-_EVERY = 8  # of a tumor's vertices, whose deviation is looked at
+_SPEED_S = 0.3  # time over which a speed is averaged: estimates jitter from frame to frame
+_GAP_S = 0.5  # an older position does not count for the speed
+_EVERY = 8  # the deviation is evaluated at every so many vertices
 
 
 class LiveBudget:
     """Adds up the errors of every update.
 
     Args:
-        planned: of the plan. Where the margin did not cover those, and a person accepted that, the
-            errors are added up, and nothing follows from them.
-        servo_s: the arms come so much later than they are told.
+        planned: the plan's. If a person accepted a margin that does not cover it, the errors are
+            reported only: they never halt the arms.
+        servo_s: how far the arms lag behind their targets.
 
     Attributes:
-        now: of the last estimate; ``worst``: the one that left the least of the margin and did not
-            make the arms halt.
+        now: of the last estimate. ``worst``: the one with the least margin left while the arms
+            were allowed to move.
     """
 
     def __init__(self, planned: ErrorBudget, servo_s: float = 0.0) -> None:
         self._planned, self._servo_s = planned, servo_s
         self.now: ErrorBudget | None = None
         self.worst: ErrorBudget | None = None
-        # Of the tumor's middle, by stamps
+        # Of the tumor's centroid, by stamp
         self._places: deque[tuple[int, Float64[np.ndarray, " 3"]]] = deque()
 
     def add_up(
         self, update: TrackingResult, part: str, tumor: Mesh, motion_mm: float, margin_mm: float
     ) -> tuple[Halt | None, bool]:
-        """Why the arms must stand, None if they need not, and whether a new plan would help.
+        """Why the arms must halt (None: they need not), and whether a new plan would help.
 
         Args:
             update: with an estimate.
             part: the tumor's name; ``tumor``: its surface, table frame.
-            motion_mm: how far that is from where it was planned, at most.
-            margin_mm: the least distance of the planned cut from it.
+            motion_mm: its largest distance from where it was planned.
+            margin_mm: the least distance between the planned cut and the tumor.
         """
         estimate = update.estimate
         assert estimate is not None
@@ -62,7 +62,7 @@ class LiveBudget:
         if stated is None and motion is not None:
             places = motion.back(estimate.meshes[part].vertices_mm[::_EVERY])
             std_mm = None if places is None else motion.largest_std_mm(places)
-        self.now = now = self._planned.seen(
+        self.now = now = self._planned.updated(
             std_mm,
             stated,
             margin_mm=margin_mm,
@@ -90,13 +90,13 @@ class LiveBudget:
         """For the report: as planned, and at its worst."""
         budgets = {"planned": self._planned, "worst": self.worst}
         return {
-            name: {**to_builtins(one), "sum_mm": one.sum_mm, "left_mm": one.left_mm}
-            for name, one in budgets.items()
-            if one is not None
+            name: {**to_builtins(budget), "sum_mm": budget.sum_mm, "left_mm": budget.left_mm}
+            for name, budget in budgets.items()
+            if budget is not None
         }
 
     def _speed_mm_s(self, stamp_ns: int, tumor: Mesh) -> float:
-        """Of the tumor's middle, over the last moments; 0 where it was not seen before."""
+        """Recent speed of the tumor's centroid; 0 for the first estimate."""
         places = self._places
         if places and not 0 < stamp_ns - places[-1][0] <= 1e9 * _GAP_S:
             places.clear()

@@ -1,4 +1,4 @@
-"""What the planner sees: an estimate, or the folder that `locate` wrote; and the table's frame."""
+"""The planner's input: an estimate or the folder that `locate` wrote; and the table's frame."""
 
 from __future__ import annotations
 
@@ -23,23 +23,21 @@ from tumortrack.sense.ply import parse_ply_properties
 from tumortrack.tracking.files import MARGIN, read_report
 from tumortrack_resection.values import POOR_ESTIMATE, Located, name_of, organ_surface
 
-STAND_MM = 120.0  # the organ's lowest point over the table, where it is not known
+STAND_MM = 120.0  # height of the organ's lowest point over the table, if unknown
 
 
 def table_under(meshes: Mapping[str, Mesh], stand_mm: float) -> Float64[np.ndarray, "4 4"]:
-    """``table_from_camera`` of a camera that looks straight down on the organ (its surface in the
-    camera's frame), whose lowest point stands ``stand_mm`` over the table.
-
-    x goes to the right in the picture, y to its top, z towards the camera; the origin lies on the
-    table below the organ's middle. NoPlan: there is no organ.
-    """
+    """``table_from_camera`` of a camera that looks straight down on the organ (surfaces in its
+    frame), whose lowest point is ``stand_mm`` above the table. x points to the right of the image,
+    y to its top, z towards the camera; the origin lies on the table below the organ's centre.
+    NoPlan: there is no organ."""
     low, high = organ_surface(meshes).box_mm
     x, y, _ = (low + high) / 2
     return rigid(np.diag([1.0, -1.0, -1.0]), np.array([-x, y, high[2] + stand_mm]))
 
 
 def of_estimate(estimate: Estimate, unsure: bool = True) -> Located:
-    """What planning needs of it, camera frame. ``unsure``: with the tumors' deviations."""
+    """In the camera frame. ``unsure``: with standard deviations of the tumors' surfaces."""
     deviations, motion = {}, estimate.motion if unsure else None
     for name, mesh in estimate.meshes.items():
         if motion is None or not is_tumor(name):
@@ -60,9 +58,8 @@ def of_estimate(estimate: Estimate, unsure: bool = True) -> Located:
     )
 
 
-def notes_of_doubt(doubt: str, accept_poor: bool) -> tuple[str, ...]:
-    """What a plan says of the estimate it is made on. InputError: that is poor, and nobody said
-    that it is to be planned on all the same."""
+def poor_estimate_notes(doubt: str, accept_poor: bool) -> tuple[str, ...]:
+    """A plan's notes on its estimate. InputError: the estimate is poor, and was not accepted."""
     if not doubt:
         return ()
     if not accept_poor:
@@ -79,7 +76,7 @@ class _Quality(msgspec.Struct):
 
 
 class _Report(msgspec.Struct):
-    """What planning needs of a run's report.json."""
+    """The part of a run's report.json that planning needs."""
 
     quality: _Quality
     patient: Patient = NOBODY
@@ -89,8 +86,8 @@ class _Report(msgspec.Struct):
 
 
 def read_run(folder: Path) -> Located:
-    """What `locate` wrote, camera frame; a surface's uncertainty is that of the nearest points.
-    Raises ArtifactError: no such run, damaged, or without its cloud."""
+    """A run's folder, camera frame; a surface's uncertainty is that of the nearest points. Raises
+    ArtifactError: no such run, damaged, or without its cloud."""
     stored, manifest = read_report(folder), read_json(folder / MANIFEST)
     path = folder / "occupancy.ply"
     try:
@@ -111,17 +108,17 @@ def read_run(folder: Path) -> Located:
     }
     structures = {name: meshes.pop(name) for name in list(meshes) if name in report.structures}
     organ = organ_name(meshes) or KIDNEY.name
-    found = [
+    parts = [
         organ if label == ORGAN else name_of(label) for label in np.unique(cloud.labels) if label
     ]
-    lacking = [name for name in found if name not in meshes]
+    lacking = [name for name in parts if name not in meshes]
     if lacking:
         raise ArtifactError(
             f"{folder} has points of {', '.join(lacking)} and no {lacking[0]}.ply; locate again."
         )
     try:
         std_mm = parse_ply_properties(content, str(path), ("largest_std_mm",))[:, 0]
-    except InputError:  # of the methods that do not know it
+    except InputError:  # the method states none
         deviations = {}
     else:
         nearest = cKDTree(cloud.points_mm)

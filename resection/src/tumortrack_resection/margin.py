@@ -32,14 +32,13 @@ from tumortrack_resection.values import (
     name_of,
 )
 
-# Balls round the corners of a triangle whose edges are sqrt(6 gap margin) long leave so much of the
-# margin uncovered between them.
+# Balls of the margin at a triangle's corners, sqrt(6 gap margin) apart, leave this gap between.
 _GAP_MM = 0.1
-# Of outlines, which are interpolated; and one surface point in each cube of that size. Both finer
-# where the margin is narrow, so that it is kept to a tenth of a millimetre.
+# Cells of outlines, which are interpolated; and of surface points, one in each. Both are finer for
+# a narrow margin, so that it is kept to a tenth of a millimetre.
 _CELL_MM, _CELL_SHARE = 1.0, 0.4
 _THIN_MM, _THIN_SHARE = 0.7, 0.2
-_SLACK_MM = 2.0  # the organ may reach so much higher, or lower, than was estimated
+_SLACK_MM = 2.0  # the organ may reach so much higher, or lower, than estimated
 _COLUMN_MM = 2.0  # of the organ's upper and lower surface
 _EDGE_MM = 3.0  # of triangles: so few columns between vertices take their neighbours' heights
 _SMOOTH_MM = 0.05  # outlines lose corners smaller than this
@@ -62,7 +61,7 @@ def margin_plan(located: Located, label: int, config: ResectionConfig) -> Method
         cuts += _in_turn(_strokes(layer, below, columns, config), sweep, last, config.direction)
     if not cuts:
         raise NoPlan("the organ does not reach the tumor's margin; there is nothing to cut.")
-    # Held is the surface straight above the tumor's centre of mass: there the cup finds something.
+    # The cup holds the surface straight above the tumor's centre of mass.
     x, y, _ = tumor.mean(0)
     high = columns.at(np.array([[x, y]], float))[1][0]
     top = tumor[:, 2].max() if np.isnan(high) else high
@@ -70,7 +69,7 @@ def margin_plan(located: Located, label: int, config: ResectionConfig) -> Method
 
 
 def _grown_tumor(located: Located, label: int, config: ResectionConfig) -> _Grown:
-    """Of the tumor's surface."""
+    """Points of the tumor's surface, and their margins."""
     name = name_of(label)
     mesh = located.meshes[name]
     margins = np.full(len(mesh.vertices_mm), config.margin_mm)
@@ -165,13 +164,13 @@ def _outlines(grown: _Grown, levels_mm: np.ndarray) -> list[Rings]:
     shape = np.ceil((points[:, :2].max(0) + room - first) / cell).astype(int) + 1
     fields = np.full((len(levels_mm), *shape), _FAR_MM)
     _outline_fields(points, margins, levels_mm, first, cell, fields)
-    found = []
+    outlines = []
     for field in fields:
-        # Far cells hold no distance: next to the outline all are nearer than this.
+        # Far cells hold no distance, but all next to the outline are nearer than this.
         contours = find_contours(np.minimum(field, 2 * cell), 0.0)
         area = polygon_of(first + c * cell for c in contours if len(c) > 3)
-        found.append(rings_of(shapely.simplify(area, _SMOOTH_MM, preserve_topology=False)))
-    return found
+        outlines.append(rings_of(shapely.simplify(area, _SMOOTH_MM, preserve_topology=False)))
+    return outlines
 
 
 def _strokes(
@@ -250,7 +249,7 @@ def _outline_fields(points, margins, levels, first, cell, fields):  # type: igno
                     square = across * across + along * along
                     if square >= reach * reach:
                         continue
-                    # Deep inside it is enough to say so: only the outline's surroundings count.
+                    # Deep inside no exact distance is needed.
                     off = core - radius if square < core * core else np.sqrt(square) - radius
                     if off < fields[level, a, b]:
                         fields[level, a, b] = off

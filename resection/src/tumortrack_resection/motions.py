@@ -1,7 +1,5 @@
-"""What both arms do, in stages, as joint angles over time; and the state machine that executes it.
-
-The execution can be halted smoothly at any moment, and it has no clock of its own.
-"""
+"""Motions of both arms, stage by stage, as joint angles over time; and their execution, a state
+machine without a clock of its own that halts smoothly at any time."""
 
 from __future__ import annotations
 
@@ -20,9 +18,9 @@ Joints = Float64[np.ndarray, " 12"]  # radians, in the order of ``JOINTS``
 JOINTS = tuple(f"{arm}_{joint}" for arm in ARMS for joint in UR_JOINTS)
 DONE, ABORTED = "done", "aborted"
 LIFT, RELEASE = "lift", "release"
-_BRAKE_RAD_S2 = 4.0  # of the fastest joint, where arms are halted in the middle of a motion
+_BRAKE_RAD_S2 = 4.0  # deceleration of the fastest joint when arms halt during a motion
 _SHORTEST_BRAKE_S = 0.1
-_COME_UP_S = 0.3  # three times what servoing looks ahead; the way in to a cut takes longer
+_CATCH_UP_S = 0.3  # three times the servo's lookahead; the way in to a cut takes longer
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,11 +53,11 @@ class MotionStage:
 
     @property
     def sweep(self) -> int:
-        """The number of the sweep that this stage is, from 1; 0: it is none."""
+        """The sweep's number, from 1; 0: the stage is no sweep."""
         return int(self.name.removeprefix("sweep ")) if self.name.startswith("sweep ") else 0
 
     def at(self, time_s: float) -> Joints:
-        """Joint angles so long after the stage began."""
+        """Joint angles at a time after the stage began."""
         return np.array([np.interp(time_s, self.times_s, joint) for joint in self.joints_rad.T])
 
 
@@ -75,11 +73,11 @@ class Motions:
 
 
 class Execution:
-    """Executes motions. ``step`` lets time go by; ``halt`` has the arms slow down and stand, on
-    their path, and ``go`` lets them go on; ``abort`` is a halt for good.
+    """Executes motions. ``step`` advances time; ``halt`` slows the arms down to a stop on their
+    path, ``go`` resumes; ``abort`` is a halt for good.
 
     ``state`` is the name of the stage, ``done`` or ``aborted``; ``halted`` is why the arms stand or
-    slow down, None where they don't.
+    slow down, else None.
     """
 
     def __init__(self, motions: Motions) -> None:
@@ -106,8 +104,8 @@ class Execution:
 
     @property
     def sweep(self) -> int:
-        """Number of the sweep under way; 0 before the first, and one more than there are after the
-        last."""
+        """Number of the current sweep; 0 before the first; after the last, the number of sweeps
+        plus 1."""
         past = max(stage.sweep for stage in self._motions.stages[: self._number + 1])
         after = self._over or not self._stage.sweep
         return past + 1 if past and after else past
@@ -120,8 +118,8 @@ class Execution:
 
     @property
     def cutting(self) -> bool:
-        """The instrument is on a cut, and has been for so long that an arm has come up with it."""
-        times_s, since_s = self._stage.times_s, self._time_s - _COME_UP_S
+        """The instrument is on a cut, and has been for long enough that the arm has caught up."""
+        times_s, since_s = self._stage.times_s, self._time_s - _CATCH_UP_S
         first = int(np.searchsorted(times_s, since_s, side="right")) - 1
         last = int(np.searchsorted(times_s, self._time_s, side="left"))
         return first >= 0 and not self._over and bool(self._stage.cutting[first : last + 1].all())
@@ -131,23 +129,23 @@ class Execution:
         return self._stage.at(self._time_s)
 
     def go(self) -> None:
-        """Take up the motion again, or begin."""
+        """Resume the motion, or begin."""
         if not self._aborted:
             self.halted = None
 
     def halt(self, reason: Halt) -> None:
-        """Slow down and stand."""
+        """Slow down to a stop."""
         if not self._aborted:
             self.halted = reason
 
     def abort(self, reason: Halt) -> None:
-        """Slow down and stand, and never go on; no effect once everything has ended."""
+        """Slow down to a stop for good; no effect once everything has ended."""
         if not self._over:
             self.halt(reason)
             self._aborted = True
 
     def replace(self, motions: Motions) -> None:
-        """Go on with other motions; InputError where they do not begin where the arms stand now, or
+        """Continue with other motions; InputError: they begin elsewhere than where the arms are, or
         the arms are moving."""
         if not self.still:
             raise InputError("motions can be replaced only while the arms stand.")
@@ -157,22 +155,22 @@ class Execution:
         self._motions, self._number, self._time_s = motions, 0, 0.0
 
     def step(self, seconds: float) -> None:
-        """Let so much time go by."""
+        """Advance time."""
         if not seconds >= 0:
             raise InputError(f"time goes forward; {seconds:g} s does not.")
         while seconds > 0 and not self._over:
-            change = min(seconds, 0.02)  # the speed changes in steps as short as that
+            change = min(seconds, 0.02)  # the speed changes in such small steps
             seconds -= change
-            wanted, before = 0.0 if self.halted else 1.0, self._speed
+            target, before = 0.0 if self.halted else 1.0, self._speed
             most = change / self._brake_s()
-            self._speed += float(np.clip(wanted - before, -most, most))
+            self._speed += float(np.clip(target - before, -most, most))
             self._time_s += change * (before + self._speed) / 2
             while not self._over and self._time_s >= (length_s := self._stage.seconds):
                 self._number += 1
                 self._time_s = length_s if self._over else self._time_s - length_s
 
     def _brake_s(self) -> float:
-        """Time in which the motion comes to rest without more than the brake's acceleration."""
+        """Time to come to rest at the brake's deceleration."""
         stage = self._stage
         here = int(np.searchsorted(stage.times_s, self._time_s, side="right"))
         around = slice(max(0, here - 3), here + 3)

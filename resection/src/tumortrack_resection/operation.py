@@ -1,6 +1,6 @@
-"""A plan carried out beside the live loop: halted by every doubt, replanned where the tumor moved.
+"""A plan carried out beside the live loop: halted by every doubt, replanned if the tumor moved.
 
-No torch here, and no clock but the updates' own arrival: ``act`` is called with every update.
+It has no clock but the arrival of updates: ``act`` is called with every one.
 """
 
 from __future__ import annotations
@@ -29,23 +29,23 @@ from tumortrack_resection.live_budget import LiveBudget
 from tumortrack_resection.motions import ABORTED, JOINTS, Execution, Joints, Motions
 from tumortrack_resection.values import Located, ResectionPlan
 
-_SAME_MM = 0.2  # of heights
-_OTHERS = 2.0  # other parts may have moved so many times as far as the tumor
-_COMPARED = 500  # points of surfaces whose triangles differ
-_BLIND_S = 0.2  # without an update for longer, the arms halt by themselves
+_SAME_MM = 0.2  # tolerance of heights
+_OTHER_PARTS = 2.0  # they may move so many times as far as the tumor
+_COMPARED = 500  # points of surfaces with different triangles
+_SILENT_S = 0.2  # without an update for longer, the arms halt
 
 
 class OperationConfig(Config, frozen=True, kw_only=True):
-    """When the arms halt and when it is replanned.
+    """When to halt the arms and when to replan.
 
     Attributes:
-        moved_mm: the tumor has moved if its surface is so far from where it was planned (root mean
-            square).
-        settled_mm, settled_s: it is replanned once the tumor has moved no more than that for so
-            long; until then the arms wait.
-        replan_cut: it is planned anew on the intact organ's model even after the first sweep has
-            begun; otherwise the arms stand then.
-        speed: of the arms' time.
+        moved_mm: the tumor has moved if its surface is this far from where it was planned (root
+            mean square).
+        settled_mm, settled_s: a new plan waits until the tumor has moved no more than that for so
+            long.
+        replan_cut: replan on the intact organ's model even after the first sweep has begun;
+            otherwise the arms halt then.
+        speed: factor on the motions' speed.
     """
 
     moved_mm: float = MOVED_MM
@@ -78,29 +78,27 @@ class Planned:
 
 @dataclass(frozen=True)
 class ResectionProgress:
-    """How far a plan was carried out: whether the grasper holds, and the height of the last
-    finished sweep over the tumor's lowest point (None: none is finished)."""
+    """How far a plan was carried out: whether the grasper holds, and how high above the tumor's
+    lowest point the last finished sweep was (None: none is finished)."""
 
     holds: bool = False
     done_mm: float | None = None
 
     def first_sweep(self, planned: ResectionPlan, tumor: Mesh) -> int | None:
-        """The sweep with which another plan goes on: the first that lies beyond what is finished,
-        in the order in which it cuts, and never past the last; None: from the approach.
-
-        Sweeps are not the same from plan to plan, so they are matched by their height.
-        """
+        """The sweep at which another plan continues: the first past what is finished, in cutting
+        order, at most its last; None: it begins with the approach. Sweeps differ from plan to plan,
+        so they are matched by height."""
         if not self.holds:
             return None
         if self.done_mm is None:
             return 1
         done_mm = float(tumor.box_mm[0, 2]) + self.done_mm
         onward = 1 if planned.cuts[-1].height_mm > planned.cuts[0].height_mm else -1
-        left = [c.sweep for c in planned.cuts if onward * (c.height_mm - done_mm) > _SAME_MM]
-        return min(left, default=planned.sweeps)
+        ahead = [c.sweep for c in planned.cuts if onward * (c.height_mm - done_mm) > _SAME_MM]
+        return min(ahead, default=planned.sweeps)
 
 
-# The estimate to plan on, the arms' joints, and how far they came
+# The estimate to plan on, the arms' joints, and their progress
 Replan = Callable[[TrackingResult, Joints, ResectionProgress], "Future[Planned]"]
 Locate = Callable[[TrackingResult], Located]
 Draw = Callable[[Joints], tuple[RigidShape, ...]]
@@ -110,16 +108,15 @@ class Operation:
     """``live.values.ArmsController``: arms that act on estimates.
 
     Args:
-        planned: what to begin with.
-        draw: the arms, table and tools as shapes, for twelve joint angles.
-        locate: an update's estimate in the table's frame; None: a stored plan is carried out
-            without regard to estimates.
-        replan: begins a new plan in another process, so that the loop goes on meanwhile.
-        budget: adds up the errors of every update; None: they are not looked at.
+        planned: the plan to begin with.
+        draw: arms, table and tools as shapes, from twelve joint angles.
+        locate: an update's estimate in the table's frame; None: estimates are ignored.
+        replan: begins a new plan in another process, so that the loop continues meanwhile.
+        budget: adds up the errors of every update; None: they are ignored.
 
     Attributes:
-        planned: what is carried out now.
-        still_life: shapes that are shown all the time.
+        planned: the current plan.
+        static_shapes: drawn with every update.
         log: states and when they began. ``halts``: how often each reason halted the arms.
     """
 
@@ -133,19 +130,19 @@ class Operation:
         budget: LiveBudget | None = None,
     ) -> None:
         self.planned, self._config = planned, config
-        self._warnings = planned.plan.warnings  # of another plan too: the budget stays accepted
+        self._warnings = planned.plan.warnings  # also of later plans: the budget stays accepted
         self._draw, self._locate, self._replan = draw, locate, replan
         self._budget = budget
         self._execution = Execution(planned.motions)
         self._last_s: float | None = None
         self._first_s = 0.0
-        self._settled: tuple[Mesh, float] | None = None  # where the tumor is, and since when
+        self._settled: tuple[Mesh, float] | None = None  # the tumor's surface, and since when
         self._work: Future[Planned] | None = None
-        self._cut = False  # whether the first sweep has begun, of whatever plan
-        self.still_life: tuple[RigidShape, ...] = ()
+        self._cut = False  # whether the first sweep of any plan has begun
+        self.static_shapes: tuple[RigidShape, ...] = ()
         self.log: list[dict[str, Any]] = []
         self.halts: Counter[str] = Counter()
-        self._counted: object = None  # the reason, but for its numbers, that was counted last
+        self._counted: object = None  # the last counted reason, without its numbers
 
     @property
     def ended(self) -> bool:
@@ -153,7 +150,6 @@ class Operation:
 
     @property
     def progress(self) -> ResectionProgress:
-        """How far it came."""
         plan, sweep = self.planned.plan, self._execution.sweep
         done = [cut.height_mm for cut in plan.cuts if cut.sweep < sweep]
         if not (self._execution.holds and done):
@@ -163,7 +159,7 @@ class Operation:
         )
 
     def act(self, update: TrackingResult, now_s: float | None = None) -> TrackingResult:
-        """The update with what the arms do now. ``now_s``: a steady clock's time."""
+        """The update with the arms' present state. ``now_s``: time of a monotonic clock."""
         now_s = time.monotonic() if now_s is None else now_s
         self._advance(now_s)
         self._decide(update, now_s)
@@ -176,9 +172,14 @@ class Operation:
         self._counted = reason
         return replace(update, workcell=self.workcell())
 
-    def abort(self, reason: str) -> None:
-        """Stop for good, from whatever state."""
-        self._execution.abort(Halt("stopped", {"words": reason}))
+    @property
+    def halt(self) -> Halt | None:
+        """Why the arms stand or slow down; None: they don't."""
+        return self._execution.halted
+
+    def abort(self, halt: Halt) -> None:
+        """Stop for good, from any state."""
+        self._execution.abort(halt)
 
     def workcell(self) -> Workcell:
         """State, joints and drawing of the arms."""
@@ -191,7 +192,7 @@ class Operation:
         above = plan.grasp_mm + np.array([[0.0, 0.0, 40.0], [0.0, 0.0, 0.0]])
         lines.append(Polyline("grasp", above, (90, 200, 255), 0.8))
         named = dict(zip(JOINTS, joints.tolist(), strict=True))
-        shapes = (*self.still_life, *self._draw(joints))
+        shapes = (*self.static_shapes, *self._draw(joints))
         state = f"{execution.state} ({self._note})" if self._note else execution.state
         now = None if self._budget is None else self._budget.now
         left_mm = None if now is None else now.left_mm
@@ -200,7 +201,7 @@ class Operation:
 
     @property
     def _note(self) -> str:
-        """What is wrong with the plan, and with all estimates by now."""
+        """Warnings on the plan, and on estimates of an organ that is being cut."""
         heads = [warning.split(":")[0].rstrip(".") for warning in self._warnings]
         return "; ".join([*heads, *([CUT_NOTE] if self._cut and self._locate is not None else [])])
 
@@ -216,19 +217,19 @@ class Operation:
         }
 
     def _advance(self, now_s: float) -> None:
-        """Let the time since the last update go by."""
+        """Advance by the time since the last update."""
         if self._last_s is None:
             self._last_s = self._first_s = now_s
-        passed_s, speed = max(0.0, now_s - self._last_s), self._config.speed
+        elapsed_s, speed = max(0.0, now_s - self._last_s), self._config.speed
         self._last_s = now_s
-        self._execution.step(min(passed_s, _BLIND_S) * speed)
-        if passed_s > _BLIND_S:
+        self._execution.step(min(elapsed_s, _SILENT_S) * speed)
+        if elapsed_s > _SILENT_S:
             self._execution.halt(Halt("silent"))
-            self._execution.step((passed_s - _BLIND_S) * speed)
+            self._execution.step((elapsed_s - _SILENT_S) * speed)
         self._cut |= self._execution.sweep > 0
 
     def _decide(self, update: TrackingResult, now_s: float) -> None:
-        """Go on, or halt and why."""
+        """Go on or halt."""
         execution = self._execution
         if self._budget is not None:
             self._budget.forget()
@@ -236,31 +237,31 @@ class Operation:
             self._take_work(self._work, now_s)
         over = execution.ended or execution.state == ABORTED
         if self._locate is None or over or execution.sweep > self.planned.plan.sweeps:
-            execution.go()  # nothing is compared, nothing moves any more, or all is cut
+            execution.go()  # nothing to compare, nothing moves any more, or all is cut
         elif update.estimate is None:
-            self._halt_in_doubt(Halt("no_estimate", {"words": update.reason}, update.finding))
+            self._halt_unsettled(Halt("no_estimate", {"words": update.reason}, update.finding))
         elif update.quality != "good":
-            self._halt_in_doubt(Halt("poor", {"words": update.warning}, update.finding))
+            self._halt_unsettled(Halt("poor", {"words": update.warning}, update.finding))
         elif self._work is not None:
             execution.halt(Halt("planning"))
         else:
             self._compare(update, self._locate(update), now_s)
 
-    def _halt_in_doubt(self, halt: Halt) -> None:
-        """Halt where it is not known where the tumor is."""
+    def _halt_unsettled(self, halt: Halt) -> None:
+        """Halt; the tumor's place is unknown or a new plan would not help, so none is begun."""
         self._settled = None
         self._execution.halt(halt)
 
     def _compare(self, update: TrackingResult, located: Located, now_s: float) -> None:
-        """Go on where everything lies as planned; else halt, and replan once it has settled."""
+        """Go on if everything lies as planned; else halt, and replan once the tumor has settled."""
         execution, config = self._execution, self._config
         name = self.planned.plan.tumor
         for part in (name, *self.planned.meshes):
             if part not in located.meshes:
-                self._halt_in_doubt(Halt("missing", {"part": part}))
+                self._halt_unsettled(Halt("missing", {"part": part}))
                 return
         tumor = located.meshes[name]
-        halt, plan_anew = self._objection(update, located)
+        halt, plan_anew = self._reason_to_halt(update, located)
         if halt is None:
             self._settled = None
             execution.go()
@@ -268,7 +269,7 @@ class Operation:
                 self._budget.went_on()
             return
         if not plan_anew:
-            self._halt_in_doubt(halt)
+            self._halt_unsettled(halt)
             return
         if self._cut and not config.replan_cut:
             execution.halt(msgspec.structs.replace(halt, cut=True))
@@ -281,25 +282,25 @@ class Operation:
             if self._replan is not None:
                 self._work = self._replan(update, execution.joints_rad, self.progress)
 
-    def _objection(self, update: TrackingResult, located: Located) -> tuple[Halt | None, bool]:
-        """Why the arms must stand, None if they need not, and whether a new plan would help."""
-        name, far = self.planned.plan.tumor, []
-        over: tuple[Halt | None, bool] = None, False
+    def _reason_to_halt(self, update: TrackingResult, located: Located) -> tuple[Halt | None, bool]:
+        """Why the arms must halt (None: they need not), and whether a new plan would help."""
+        name, moved = self.planned.plan.tumor, []
+        over_budget: tuple[Halt | None, bool] = None, False
         for part, mesh in self.planned.meshes.items():
             off_mm = apart_mm(located.meshes[part], mesh)
-            if off_mm > self._config.moved_mm * (1.0 if part == name else _OTHERS):
-                far.append((part == name, off_mm, part))
+            if off_mm > self._config.moved_mm * (1.0 if part == name else _OTHER_PARTS):
+                moved.append((part == name, off_mm, part))
         if self._budget is not None:
             tumor, kept = located.meshes[name], self.planned.kept_mm
             motion_mm = float(_distances_mm(tumor, self.planned.meshes[name]).max())
-            over = self._budget.add_up(update, name, tumor, motion_mm, kept)
-        if far:
-            _, off_mm, part = max(far)  # the tumor, or else what moved farthest
+            over_budget = self._budget.add_up(update, name, tumor, motion_mm, kept)
+        if moved:
+            _, off_mm, part = max(moved)  # the tumor, or else what moved farthest
             return Halt("moved", {"part": part, "off_mm": off_mm}), True
-        return over
+        return over_budget
 
     def _take_work(self, work: Future[Planned], now_s: float) -> None:
-        """The new plan, if it is ready; where there is none, stop for good."""
+        """Take over the new plan once it is ready; stop for good if planning failed."""
         execution = self._execution
         if execution.state == ABORTED:
             self._work = None
@@ -325,8 +326,8 @@ class Operation:
 
 
 def apart_mm(a: Mesh, b: Mesh) -> float:
-    """How far a surface has moved, root mean square: of its vertices where both have the same
-    triangles, else between the surfaces, for which sliding along itself is no motion."""
+    """How far a surface has moved, root mean square: of its vertices if the triangles are the same,
+    else between the surfaces, which ignores sliding along the surface."""
     return float(np.sqrt((_distances_mm(a, b) ** 2).mean()))
 
 

@@ -1,4 +1,4 @@
-"""Options of `plan`; the command line shows these texts. Nothing heavy is imported here."""
+"""Options of `plan` and `resect`, shown by the command line. Nothing heavy is imported here."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Literal
 from tumortrack.core import store
 from tumortrack.core.config import from_builtins
 from tumortrack.core.errors import InputError
-from tumortrack.tracking.options import PatientOptions
+from tumortrack.tracking.options import CameraOptions, PatientOptions
 
 if TYPE_CHECKING:
     from tumortrack_resection.values import ResectionConfig
@@ -70,6 +70,28 @@ class PlanOptions(PatientOptions):
         if self.keep_away:
             given["keep_away"] = dict(map(_structure_mm, self.keep_away))
         return from_builtins({**written, **given}, ResectionConfig, str(self.config or "options"))
+
+
+@dataclass(frozen=True, kw_only=True)
+class ResectOptions(CameraOptions):
+    """How to carry a plan out.
+
+    Attributes:
+        live: MODEL SOURCE: follow the organ meanwhile, as `track` does. The arms halt while there
+            is no good estimate, and the plan is made anew once the tumor has moved.
+        replan_cut: plan anew even after the first sweep has begun, though the model knows only the
+            intact organ; otherwise the arms halt instead.
+        speed: of the arms; 2 is twice as fast as planned.
+        moved: the tumor counts as moved once its surface is so many mm from where it was planned
+            (root mean square; default: what the plan allows for).
+        report: file for states, halts and the budget of errors (default: runs/resect-TIME.json).
+    """
+
+    live: tuple[Path, str] | None = None
+    replan_cut: bool = False
+    speed: float = 1.0
+    moved: float | None = None
+    report: Path | None = None
 
 
 def _structure_mm(option: str) -> tuple[str, float]:

@@ -15,25 +15,25 @@ from shapely.geometry.polygon import orient
 
 from tumortrack.core.errors import NoPlan
 
-_CELL = 2.0  # of a grid that parts inner points from outer ones, in sqrt(area / number of points)
+_CELL = 2.0  # of a grid that separates inner from outer points, in sqrt(area / number of points)
 _EDGE = 5.0  # longest edge of a hull, in sqrt(area / number of points)
-_SPARSE = 6  # of inner points, one in each block of so many cells stays
-_MOST = 10_000  # points that are used
+_SPARSE = 6  # one inner point stays in each block of so many cells
+_MOST = 10_000  # points used
 _SAME_MM = 0.01  # points nearer to each other are one
-_LEAST_MM2 = 1.0  # smaller pieces of an outline are none
+_LEAST_MM2 = 1.0  # smaller pieces of an outline are left out
 _SMOOTH = 16  # corners of a quarter circle: 5 mm of margin are exact to 0.01 mm
 
 
 def concave_hull(points_mm: Float[np.ndarray, "n 2"]) -> Polygon:
     """The outline of a cloud's largest cluster.
 
-    Edges may be as long as 5 sqrt(A / n), A being the convex hull's area: a fixed ratio, which GEOS
-    takes, would mean another length at every density. Raises NoPlan: fewer than three points, or
-    all on a line."""
+    Edges are at most 5 sqrt(A / n) long, with the convex hull's area A: GEOS's fixed ratio would
+    mean another length at every density. Raises NoPlan: fewer than three points, or all on a
+    line."""
     points = np.asarray(points_mm, float)
     if len(points) > _MOST:
         points = points[np.linspace(0, len(points) - 1, _MOST).astype(int)]
-    # Points of a grid lie on each other when they are projected, and would count as many.
+    # Points of a grid coincide when projected, and would count several times.
     points = points[first_in_cell(np.round(points / _SAME_MM).astype(np.int64))]
     try:
         typical_mm = float(np.sqrt(ConvexHull(points).volume / len(points)))
@@ -55,7 +55,7 @@ def grown(outline: Polygon, margin_mm: float) -> Polygon:
 
 
 def common(a: Polygon, b: Polygon) -> Polygon:
-    """The largest piece that both have; NoPlan where there is none."""
+    """The largest common piece; NoPlan: there is none."""
     return _largest(a.intersection(b))
 
 
@@ -74,8 +74,8 @@ def evenly_round(ring: Float[np.ndarray, "n 2"], spacing: float) -> Float64[np.n
 def arcs(
     ring_mm: Float[np.ndarray, "n 2"], wanted: Bool[np.ndarray, " n"], lead: int
 ) -> list[Float64[np.ndarray, "m 2"]]:
-    """The runs of a closed ring's wanted points, each longer by ``lead`` points at both ends; the
-    whole ring, closed, where that leaves no gap. ``ring_mm``: evenly spaced, the first point not
+    """The runs of a closed ring's wanted points, each extended by ``lead`` points at both ends; the
+    whole ring, closed, if that leaves no gap. ``ring_mm``: evenly spaced, the first point not
     repeated."""
     n = len(ring_mm)
     if not wanted.any():
@@ -86,7 +86,7 @@ def arcs(
     if grown_to.all():
         return [np.concatenate([ring_mm, ring_mm[:1]])]
     first = int(np.flatnonzero(~grown_to)[0])
-    turned = np.roll(grown_to, -first)  # begins with a gap, so that no run goes over the end
+    turned = np.roll(grown_to, -first)  # begins with a gap, so that no run wraps round
     edges = np.flatnonzero(np.diff(np.concatenate([turned, [False]]).astype(int)))
     runs = zip(edges[::2] + 1, edges[1::2] + 1, strict=True)
     return [ring_mm[(np.arange(start, stop) + first) % n] for start, stop in runs]
@@ -116,7 +116,7 @@ def _polygons(area: Any) -> list[Polygon]:
 
 
 def _largest(area: Any) -> Polygon:
-    """Without its holes: what lies in them comes away too."""
+    """The largest polygon, without its holes: what lies in them comes away too."""
     largest = max(_polygons(area), key=lambda piece: piece.area, default=Polygon())
     if largest.area < _LEAST_MM2:
         raise NoPlan("the outline has no area; there is no contour to cut along.")
@@ -131,11 +131,8 @@ def first_in_cell(cells: Int[np.ndarray, "n d"]) -> Int[np.ndarray, " m"]:
 
 
 def _outer(points: np.ndarray, cell_mm: float) -> np.ndarray:
-    """Of the largest cluster, the points that matter for its outline: those in cells next to an
-    empty one, and a few of the others.
-
-    A cell holds about four points; clusters are cells that touch each other.
-    """
+    """Points of the largest cluster (cells that touch each other, about four points each) that
+    matter for its outline: those in cells next to an empty one, and a few others."""
     i, j = ((points - points.min(0)) / cell_mm).astype(int).T
     some = np.zeros((i.max() + 1, j.max() + 1), bool)
     some[i, j] = True

@@ -1,5 +1,5 @@
 """Pictures of a resection plan, from above and from the side, in the table's frame; and surfaces of
-what was located and planned: organ, tumors, the piece that comes away."""
+the organ, its tumors and the piece that comes away."""
 
 from __future__ import annotations
 
@@ -50,12 +50,11 @@ def draw_plan(plan: ResectionPlan, located: Located, path: Path) -> None:
 
 
 def plan_figure(plan: ResectionPlan, located: Located) -> Figure:
-    """Warnings first; organ, tumors, what comes away, strokes with their directions, and where it
-    is held.
+    """Warnings; organ, tumors, the piece, strokes with their directions, and the grasp point.
 
     Two axes in mm at one scale, down pointing down: from above x and -y, from the side x and -z.
-    Strokes are bold where they pass through the organ. 1200 pixels wide, as high as it needs.
-    Raises InputError: what was located has no surface, or one that is not closed."""
+    Strokes are bold in the organ. 1200 pixels wide, as high as needed. Raises InputError: the tumor
+    or organ has no surface, or one that is not closed."""
     surfaces = organ_surfaces(located)
     if plan.label not in surfaces:
         raise InputError(f"{plan.tumor} was not located, so its plan can't be drawn.")
@@ -96,7 +95,7 @@ def plan_figure(plan: ResectionPlan, located: Located) -> Figure:
 def _behind(
     cut: Cut, depth: Float[np.ndarray, "h w"], view: ParallelView, frame: Frame
 ) -> Bool[np.ndarray, " n"]:
-    """Which points of a stroke are hidden by what lies at that depth."""
+    """Which points of a stroke are hidden by surfaces at that depth."""
     x, y = frame.pixel_centres()
     flat = view.project(cut.path_mm)
     column = np.rint((flat[:, 0] - x[0]) / (x[1] - x[0])).astype(int)
@@ -111,10 +110,10 @@ def _draw_cuts(
     hidden: list[Bool[np.ndarray, " _"]],
     view: ParallelView,
 ) -> None:
-    """The lowest first and, from above, widest, so that strokes above each other all show; what
-    lies behind a tumor is faint."""
+    """The lowest first and, from above, widest, so that strokes above each other all show; those
+    behind a tumor are faint."""
     every = -(-plan.sweeps // _MOST_ARROWED)
-    every += 1 - every % 2  # odd: strokes go to and fro, and that is to be seen
+    every += 1 - every % 2  # odd, to show that strokes alternate in direction
     for cut, inside, behind in reversed(list(zip(plan.cuts, in_organ, hidden, strict=True))):
         flat = view.project(cut.path_mm)
         colour = rgb(sweep_colour(cut.sweep, plan.sweeps))
@@ -131,7 +130,7 @@ def _draw_cuts(
 
 
 def _draw_arrows(axes: Axes, flat: Float[np.ndarray, "n 3"], colour: RGB) -> None:
-    """Heads along a stroke, where it is on the side towards the viewer."""
+    """Arrow heads along a stroke, on the side towards the viewer."""
     style = "simple,head_width=0.85,head_length=0.9,tail_width=0.01"
     arrow = {"arrowstyle": style, "mutation_scale": 13, "shrinkA": 0, "shrinkB": 0}
     arrow |= {"facecolor": colour, "edgecolor": "white", "linewidth": 0.6}
@@ -146,8 +145,8 @@ def _draw_arrows(axes: Axes, flat: Float[np.ndarray, "n 3"], colour: RGB) -> Non
 
 
 def _draw_numbers(axes: Axes, plan: ResectionPlan, view: ParallelView, frame: Frame) -> None:
-    """Where sweeps start, seen from above; beside the picture, at their heights, from the side.
-    The first and the last, and those between with room."""
+    """Numbers of sweeps: from above where they start, from the side at their heights. The first,
+    the last, and those between that have room."""
     first = {cut.sweep: cut for cut in reversed(plan.cuts)}
     taken: list[Float[np.ndarray, " 2"]] = []
     for sweep in sorted(first, key=lambda sweep: (sweep not in (1, plan.sweeps), sweep)):
@@ -166,7 +165,7 @@ def _draw_numbers(axes: Axes, plan: ResectionPlan, view: ParallelView, frame: Fr
 
 
 def _draw_grasp(axes: Axes, plan: ResectionPlan, view: ParallelView) -> None:
-    """The cup, and from the side the way it comes."""
+    """The cup, and from the side its approach."""
     u, v, _ = view.project(plan.grasp_mm[None])[0]
     if view is FROM_ABOVE:
         for radius, width in ((_CUP_MM, 1.8), (0.35, 2.4)):
@@ -181,7 +180,7 @@ def _draw_grasp(axes: Axes, plan: ResectionPlan, view: ParallelView) -> None:
 
 
 def _words(figure: Figure, plan: ResectionPlan, located: Located) -> None:
-    """Warnings, title, legend; what comes away, and all other notes."""
+    """Warnings, title, legend, volumes and all other notes."""
     ml, tumor = plan.volumes_ml, plan.tumor.replace("_", " ")
     sweeps = f"{plan.sweeps} sweep" + ("s" if plan.sweeps > 1 else "")
     title = f"Plan to resect {tumor}, {located.patient}: {_METHODS[plan.method]}, {sweeps}"
@@ -213,7 +212,7 @@ def organ_surfaces(located: Located) -> dict[int, Mesh]:
 
 
 def parted(organ: Mesh, layers: tuple[CutLayer, ...]) -> tuple[Mesh, Mesh]:
-    """The piece that comes away, and what stays."""
+    """The piece that comes away, and the rest."""
     solid = solid_of(organ, "the located organ")
     above_mm = organ.box_mm[1, 2] + 1.0
     slabs = []

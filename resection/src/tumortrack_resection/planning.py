@@ -28,7 +28,7 @@ from tumortrack_resection.budget import (
     tumor_points,
 )
 from tumortrack_resection.files import INVENTED, PlanFolder, write_plan
-from tumortrack_resection.located import notes_of_doubt, read_run, table_under
+from tumortrack_resection.located import poor_estimate_notes, read_run, table_under
 from tumortrack_resection.operation import OperationConfig
 from tumortrack_resection.options import PlanOptions
 from tumortrack_resection.values import Located, ResectionConfig, ResectionPlan
@@ -39,11 +39,11 @@ class Planning:
     """A plan, step by step: the cuts are there; ``checked``, ``with_motions`` and ``save`` follow.
 
     Attributes:
-        content: of the plan's folder, as far as it is made.
-        located: what it is planned on, in the plan's frame.
-        cell: the workcell that was asked for.
-        bases_source: of the arms' places in it, as ``PlanFolder.cell_source``.
-        note: what was changed of it for the motions; empty: nothing.
+        content: of the plan's folder, so far.
+        located: organ and tumors, in the plan's frame.
+        cell: the requested workcell.
+        bases_source: of the arms' bases in it, as ``PlanFolder.cell_source``.
+        note: what was changed in it for the motions; empty: nothing.
     """
 
     content: PlanFolder
@@ -141,9 +141,9 @@ def plan_cuts(
     tool_error_mm: float | None = None,
     moved_mm: float = MOVED_MM,
 ) -> tuple[ResectionPlan, ResectionConfig, ErrorBudget, Located]:
-    """The cuts, what was asked for in the end (see ``budget.plan_within``), the budget, and the run
-    in the frame of the plan."""
-    doubts = notes_of_doubt(run.doubt, accept_poor)
+    """The cuts, the configuration in the end (see ``budget.plan_within``), the budget, and the run
+    in the plan's frame."""
+    doubts = poor_estimate_notes(run.doubt, accept_poor)
     located = run.moved(frames.published_from_camera)
 
     def budget_of(plan: ResectionPlan) -> ErrorBudget:
@@ -157,7 +157,7 @@ def plan_cuts(
 
 
 def check_arms_installed() -> None:
-    """Raises InputError where a library that motions need is missing."""
+    """Raises InputError: a library that motions need is missing."""
     needed = ("pinocchio", "coal", "toppra", "ruckig")
     if missing := [name for name in needed if find_spec(name) is None]:
         raise InputError(
@@ -167,7 +167,7 @@ def check_arms_installed() -> None:
 
 
 def _frames(meshes: Mapping[str, Mesh], options: PlanOptions, stand_mm: float) -> PublishedFrame:
-    """The frame of the calibration, or of a camera that looks straight down on the table."""
+    """The calibration's frame, or that of a camera that looks straight down on the table."""
     if options.frame is None:
         return PublishedFrame("table", table_under(meshes, stand_mm))
     frames = read_frames(options.frame)
@@ -186,7 +186,7 @@ def _frames(meshes: Mapping[str, Mesh], options: PlanOptions, stand_mm: float) -
 
 
 def _below(organ: Mesh, config: CellConfig) -> CellConfig:
-    """With the table below the organ, unless the cell's file says where it is."""
+    """With the table below the organ, if the cell's file does not place it."""
     if any(config.middle_mm):
         return config
     x, y = organ.box_mm.mean(0)[:2].tolist()

@@ -1,6 +1,6 @@
-"""From what was located to what is cut: which tumor, where to hold it, along which lines.
+"""From a located organ to a plan: which tumor to cut out, where to hold it, along which lines.
 
-Two methods: the paper's (its section "Integration with Robotic Resection") and ``plan.margin``.
+Two methods: the paper's (its section "Integration with Robotic Resection") and ``margin``.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _WHOLE = 0.99  # of another tumor's points
 
 def plan_resection(located: Located, config: ResectionConfig) -> ResectionPlan:
     """The plan, table frame, mm. Raises InputError: no such tumor; NoPlan: nothing to cut, or not
-    as asked; why."""
+    as asked."""
     label, share = _chosen_tumor(located, config)
     method = published_plan if config.method == "published" else margin_plan
     layers, cuts, grasp_mm = method(located, label, config)
@@ -91,7 +91,7 @@ def _chosen_tumor(located: Located, config: ResectionConfig) -> tuple[int, float
         raise InputError(f"there is no {config.tumor!r}; located were {', '.join(names)}.")
     candidates = [names[config.tumor]] if config.tumor else list(names.values())
     shares = exophytic_shares(located, candidates)
-    label = max(shares, key=lambda one: shares[one])
+    label = max(shares, key=lambda tumor: shares[tumor])
     name, n = name_of(label), len(located.of(label))
     if n < _FEWEST:
         raise NoPlan(f"{name} has only {n} points; {_FEWEST} are needed. Locate with more points.")
@@ -135,7 +135,7 @@ def exophytic_shares(located: Located, labels: list[int]) -> dict[int, float]:
 
 def inside(layers: tuple[CutLayer, ...], points_mm: Float[np.ndarray, "n 3"]) -> np.ndarray:
     """Which points lie in the piece that the layers make up (n,)."""
-    found = np.zeros(len(points_mm), bool)
+    within = np.zeros(len(points_mm), bool)
     for layer in layers:
         area = polygon_of(layer.rings_mm)
         left, low, right, high = area.bounds
@@ -145,15 +145,15 @@ def inside(layers: tuple[CutLayer, ...], points_mm: Float[np.ndarray, "n 3"]) ->
             & (x > left) & (x < right) & (y > low) & (y < high)
         )  # fmt: skip
         shapely.prepare(area)
-        found[near] = shapely.contains_xy(area, x[near], y[near])
-    return found
+        within[near] = shapely.contains_xy(area, x[near], y[near])
+    return within
 
 
 def _kept_away(
     located: Located, layers: tuple[CutLayer, ...], cuts: tuple[Cut, ...], config: ResectionConfig
 ) -> tuple[str, ...]:
-    """Structures that nobody asked to keep away from. InputError: one that was not located; NoPlan:
-    a stroke, or the wall of the piece, comes nearer to one than it may."""
+    """A note on structures without a distance to keep. InputError: one was not located; NoPlan: a
+    stroke, or the wall of the piece, comes too near to one."""
     if lacking := sorted(config.keep_away.keys() - located.structures.keys()):
         raise InputError(
             f"--keep-away {lacking[0]}: there is no such structure in this estimate. It has: "
@@ -164,7 +164,7 @@ def _kept_away(
         np.column_stack([ring, np.full(len(ring), z)])
         for layer in layers
         for z in np.arange(layer.bottom_mm, min(layer.top_mm, high) + _WALL_MM, _WALL_MM)
-        for ring in (evenly(np.concatenate([one, one[:1]]), _WALL_MM) for one in layer.rings_mm)
+        for ring in (evenly(np.concatenate([flat, flat[:1]]), _WALL_MM) for flat in layer.rings_mm)
     ]
     cut_mm = np.concatenate([*(cut.path_mm for cut in cuts), *walls])
     for name, least_mm in config.keep_away.items():

@@ -1,8 +1,8 @@
-"""A real arm of Universal Robots': ``ur:192.168.1.10?arm=cutter&execute=false``.
+"""A real arm of Universal Robots: ``ur:192.168.1.10?arm=cutter&execute=false``.
 
-By default nothing is connected and nothing is sent: each joint target is checked, and counted as
-one that would be sent. With ``execute=true`` an arm moves. The checks here are no safety system:
-that is in the arm's own controller, whose limits and planes must be set for this use.
+By default nothing is connected: each joint target is checked and counted. With ``execute=true`` the
+arm moves. The checks here are no safety system: that is in the arm's own controller, whose limits
+and planes must be set for this use.
 """
 
 from __future__ import annotations
@@ -24,24 +24,24 @@ UR_JOINTS = (
     *("shoulder_pan_joint", "shoulder_lift_joint", "elbow_joint"),
     *("wrist_1_joint", "wrist_2_joint", "wrist_3_joint"),
 )
-_WATCHDOG_S = SILENT_S = 0.2  # of silence: the controller stops the arm by itself, and the sink
-OFF_DEG = 2.0  # between the arm and the plan, before it may move
-# Between the tool's tip and its target on a cut: at 10 mm/s servoing is 1.3 mm late. The joints'
-# tolerance would be 40 mm there.
+_WATCHDOG_S = SILENT_S = 0.2  # of silence, after which the controller and the sink stop the arm
+OFF_DEG = 2.0  # tolerated between the arm and the plan before it may move
+# Tolerated between the tool's tip and its target on a cut: at 10 mm/s servoing is 1.3 mm late. The
+# joints' tolerance would be 40 mm there.
 OFF_MM = 2.0
-# An arm that begins beside its first target joins the plan in this time: 2 degrees at the shoulder
-# are 4 cm at the tool, which it would otherwise make good in 0.1 s.
+# An arm that begins off its first target joins the plan in this time: 2 degrees at the shoulder are
+# 4 cm at the tool, which it would otherwise cover in 0.1 s.
 EASE_S = 1.0
 _STOP_M_S2 = 10.0  # servoStop's deceleration: ur_rtde's own
-# Of UR5, UR5e, UR10 and UR10e (data sheets): a turn either way; the larger ones' first two joints
-# are the slower ones, and their limits hold for all here.
+# Of UR5, UR5e, UR10 and UR10e (data sheets): a turn either way; the first two joints of the larger
+# arms are slower, and their limits are used for all.
 LIMIT_RAD = 2 * np.pi
 SPEED_RAD_S = np.radians([120.0, 120.0, 180.0, 180.0, 180.0, 180.0])
 
 _TICK_S = 0.02  # of the watchdog
-_MUTE_S = 0.1  # without news from the arm, which sends its state 125 times a second or more
-# Safety modes of the controller (RTDE guide of the maker). It follows in normal and reduced mode;
-# every other one stops, those of a later controller too.
+_MUTE_S = 0.1  # without a new state from the arm, which sends 125 a second or more
+# Safety modes of the controller (the maker's RTDE guide). It follows in normal and reduced mode; in
+# every other mode, also of later controllers, the sink stops.
 _FOLLOWS = 1, 2
 _SAFETY = {
     3: "in a protective stop",
@@ -52,7 +52,7 @@ _SAFETY = {
     8: "stopped by a safety violation",
     9: "stopped by a fault",
 }
-_SHORTEST_S, _LONGEST_S = 0.008, 0.1  # that the controller follows one target
+_SHORTEST_S, _LONGEST_S = 0.008, 0.1  # for which the controller follows one target
 
 
 Joints = Float64[np.ndarray, " 6"]
@@ -62,12 +62,12 @@ class UrSinkConfig(SinkConfig, frozen=True, kw_only=True, tag="ur"):
     """One arm at ``host``.
 
     Attributes:
-        arm: whose joints: ``cutter_shoulder_pan_joint``, ...
-        execute: false: say what would be sent. true: move it.
+        arm: which arm's joints it follows: ``cutter_shoulder_pan_joint``, ...
+        execute: false: only count what would be sent. true: move the arm.
         jump_deg: the largest step of a joint from one target to the next.
-        force_n: at the tool; more of it stops the arms. 40 is an own choice, above what a tool's
-            weight and the sensor's offset read; it is no limit for tissue, which may tear at less.
-        lookahead_s, gain: of servoJ: longer and less is smoother and later.
+        force_n: at the tool; more stops the arms. 40 is above what a tool's weight and the sensor's
+            offset read; it is no limit for tissue, which may tear at less.
+        lookahead_s, gain: of servoJ: a longer time and a lower gain are smoother and later.
     """
 
     target: ClassVar[str] = "host"
@@ -95,8 +95,7 @@ class UrSinkConfig(SinkConfig, frozen=True, kw_only=True, tag="ur"):
 
 
 class _Sent(NamedTuple):
-    """A target: as planned, as it was sent, when, its stamp, and how far each joint may be behind
-    it."""
+    """A target as planned and as sent, when, its stamp, and how far each joint may lag behind."""
 
     planned: Joints
     joints: Joints
@@ -106,16 +105,15 @@ class _Sent(NamedTuple):
 
 
 class UrSink:
-    """Sends one arm's joints as they come, and stops it (servoStop) where the arms are halted,
-    there is no workcell, a target is refused, 0.2 s pass without a result, or it is closed. With
-    every target, and 50 times a second between them, it looks whether the arm is heard of, stands
-    under no safety stop, meets no force, and is where the targets have led it; if not, all arms
-    stop for good.
+    """Sends one arm's joint targets, and stops the arm (servoStop) if the arms are halted, there is
+    no workcell, a target is refused, 0.2 s pass without a result, or the sink is closed. With every
+    target, and 50 times a second between them, it checks that the arm responds, is under no safety
+    stop, meets no force, and is where the targets have led it; if not, all arms stop for good.
 
-    Whenever it stood still, it begins only where the arm is within 2 degrees of the target, which
-    it then reaches within a second. On a cut, where 2 degrees are centimetres, the tool's tip must
-    be within 2 mm of its target. Should this process die, the arm's controller stops it within
-    0.2 s by itself (setWatchdog).
+    From a standstill it begins only if the arm is within 2 degrees of the target, which it then
+    reaches within a second. On a cut, where 2 degrees are centimetres, the tool's tip must be
+    within 2 mm of its target. If this process dies, the arm's controller stops the arm within 0.2 s
+    (setWatchdog).
     """
 
     def __init__(self, config: UrSinkConfig, link: UrLink | None, context: SinkContext) -> None:
@@ -124,24 +122,27 @@ class UrSink:
         self._cutting = False
         self._names = tuple(f"{config.arm}_{joint}" for joint in UR_JOINTS)
         self._last: _Sent | None = None  # None: the arm stands still
-        self._ease: tuple[Joints, float] = np.zeros(6), 0.0  # where it began beside its target
+        self._offset: tuple[Joints, float] = (
+            np.zeros(6),
+            0.0,
+        )  # from its first target, and since when
         self._lock = threading.Lock()
         self._closed = threading.Event()
         self._counts: Counter[str] = Counter()
-        self._fault = self._trouble = ""  # for good; once, found between two results
+        self._fault = self._trouble = ""  # permanent; found between two results, raised once
         self._watch = threading.Thread(target=self._keep_watch, name="ur", daemon=True)
         if link is not None:
             self._watch.start()
 
     @property
     def counts(self) -> dict[str, int]:
-        """Results by what became of them: sent (in a dry run: would send), halted, no arms,
-        refused; and silences."""
+        """Results by outcome: sent (in a dry run: would send), halted, no arms, refused; and
+        silences."""
         with self._lock:
             return dict(self._counts)
 
     def publish(self, result: TrackingResult) -> None:
-        """Send the target, or check it; TumortrackError: it is refused, and the arm stands."""
+        """Send the target, or check it; TumortrackError: it is refused, and the arm stops."""
         with self._lock:
             if self._closed.is_set():
                 return
@@ -149,18 +150,18 @@ class UrSink:
                 self._trouble = ""
                 raise TumortrackError(trouble)
             cell = result.workcell
-            with self._giving_up():
+            with self._failing_safe():
                 if cell is None or cell.halted:
                     self._counts["no arms" if cell is None else "halted"] += 1
                     self._stop()
                 else:
-                    self._heed_silence()
-                    # Where it stood still on a cut, what follows begins there, cut or not.
+                    self._stop_if_silent()
+                    # After a standstill on a cut, the next motion begins on the cut.
                     self._cutting = cell.cutting or (self._cutting and self._last is None)
-                    self._go(_target(cell.joints_rad, self._names), result.stamp_ns)
+                    self._send(_target(cell.joints_rad, self._names), result.stamp_ns)
 
     def close(self) -> None:
-        """Stop the arm, and let it go."""
+        """Stop the arm and disconnect."""
         if self._closed.is_set():
             return
         self._closed.set()
@@ -174,45 +175,45 @@ class UrSink:
                 self._link.close()
 
     @contextmanager
-    def _giving_up(self) -> Iterator[None]:
-        """Where what is inside fails, this arm no longer does what was planned: all arms stop for
-        good, and TumortrackError says why."""
+    def _failing_safe(self) -> Iterator[None]:
+        """If the body fails, this arm no longer follows the plan: all arms stop for good, and
+        TumortrackError says why."""
         try:
             yield
         except Exception as error:
             if self._link is not None:
                 self._controls.aborted.set()
             if not isinstance(error, TumortrackError):  # of ur_rtde, which raises anything
-                self._break(error)
+                self._lose_link(error)
                 raise TumortrackError(self._fault) from error
             self._counts["refused"] += 1
             self._stop()
             raise TumortrackError(f"ur {self._config.arm}: {error}") from error
 
-    def _go(self, planned: Joints, stamp_ns: int) -> None:
+    def _send(self, planned: Joints, stamp_ns: int) -> None:
         now_s, last, link = time.monotonic(), self._last, self._link
         if link is not None:
-            joints_rad = self._look_at(link, planned)
+            joints_rad = self._check_arm(link, planned)
             if last is None:
-                self._ease = joints_rad - planned, now_s
-        beside_rad, begun_s = self._ease
-        target = planned + beside_rad * max(1 - (now_s - begun_s) / EASE_S, 0.0)
+                self._offset = joints_rad - planned, now_s
+        offset_rad, begun_s = self._offset
+        target = planned + offset_rad * max(1 - (now_s - begun_s) / EASE_S, 0.0)
         follow_s, lag_rad = _LONGEST_S, np.zeros(6)
         if last is not None:
-            # Targets are as far apart as their stamps say, or came: a thread may have waited.
+            # By arrival or by stamps, whichever is longer: a thread may have waited.
             seconds = max(now_s - last.when_s, (stamp_ns - last.stamp_ns) * 1e-9, _SHORTEST_S)
             _check_step(target - last.joints, seconds, self._config.jump_deg)
             follow_s = min(seconds, _LONGEST_S)
-            # servoJ comes after its targets by the time it looks ahead, and one target.
+            # servoJ lags behind by its lookahead time and one target.
             lag_rad = np.abs(target - last.joints) * (1 + self._config.lookahead_s / seconds)
         if link is not None:
             link.servo(target, follow_s, self._config.lookahead_s, self._config.gain)
         self._last = _Sent(planned, target, now_s, stamp_ns, lag_rad)
         self._counts["would send" if link is None else "sent"] += 1
 
-    def _look_at(self, link: UrLink, planned: Joints) -> Joints:
-        """Where the arm is. Raises TumortrackError where it cannot follow, meets something, or is
-        elsewhere than at the last target or, before the first one, at this."""
+    def _check_arm(self, link: UrLink, planned: Joints) -> Joints:
+        """Where the arm is. Raises TumortrackError: it cannot follow, meets something, or is not at
+        the last target or, before the first one, at this."""
         link.check(self._config.force_n)
         last = self._last or _Sent(planned, planned, 0.0, 0, np.zeros(6))
         joints_rad = link.compare(last.joints, np.radians(OFF_DEG) + last.lag_rad)
@@ -232,16 +233,15 @@ class UrSink:
             try:
                 self._link.stop()
             except Exception as error:
-                self._break(error)
+                self._lose_link(error)
 
-    def _heed_silence(self) -> None:
+    def _stop_if_silent(self) -> None:
         if self._last is not None and time.monotonic() - self._last.when_s > SILENT_S:
             self._counts["silences"] += 1
             self._stop()
 
-    def _break(self, error: Exception) -> None:
-        """The link is broken for good. Nobody kicks the controller's watchdog any more, so that it
-        stops the arm."""
+    def _lose_link(self, error: Exception) -> None:
+        """Give the link up. The controller's watchdog, no longer kicked, stops the arm."""
         self._last = None
         self._fault = (
             f"ur {self._config.arm}: the arm at {self._config.host} is lost ({error}); look after "
@@ -251,25 +251,25 @@ class UrSink:
     def _keep_watch(self) -> None:
         while not self._closed.wait(_TICK_S):
             with self._lock:
-                self._heed_silence()
+                self._stop_if_silent()
                 if self._fault or self._link is None:
                     return
                 try:
-                    with self._giving_up():
+                    with self._failing_safe():
                         if self._last is not None:
-                            self._look_at(self._link, self._last.planned)
+                            self._check_arm(self._link, self._last.planned)
                         self._link.kick()
                 except TumortrackError as error:
                     self._trouble = str(error)
 
 
 def _target(joints_rad: Mapping[str, float], names: tuple[str, ...]) -> Joints:
-    """One arm's joints in the maker's order; TumortrackError: one is missing, no number, or beyond
-    its limit."""
+    """One arm's joints in the maker's order; TumortrackError: one is missing, not a number, or
+    beyond its limit."""
     if missing := [name for name in names if name not in joints_rad]:
         raise TumortrackError(f"there is no joint {missing[0]}; there are {', '.join(joints_rad)}")
     target = np.array([float(joints_rad[name]) for name in names])
-    wrong = ~(np.abs(target) <= LIMIT_RAD)  # also where it is no number
+    wrong = ~(np.abs(target) <= LIMIT_RAD)  # also if it is not a number
     if wrong.any():
         joint = int(wrong.argmax())
         raise TumortrackError(
@@ -280,7 +280,7 @@ def _target(joints_rad: Mapping[str, float], names: tuple[str, ...]) -> Joints:
 
 
 def _check_step(step: Joints, seconds: float, jump_deg: float) -> None:
-    """Raises TumortrackError for a step too large, or too large for the time that it has."""
+    """Raises TumortrackError for a step too large, or too fast."""
     jump, speed = np.degrees(np.abs(step)), np.abs(step) / seconds / SPEED_RAD_S
     if jump.max() > jump_deg:
         joint = int(jump.argmax())
@@ -296,8 +296,8 @@ def _check_step(step: Joints, seconds: float, jump_deg: float) -> None:
 
 
 class UrLink:
-    """ur_rtde's two interfaces to the controller of one arm. Not for two threads at once. Raises
-    InputError: ur_rtde is missing, or the arm cannot be reached or controlled."""
+    """ur_rtde's two interfaces to the controller of one arm; not thread-safe. Raises InputError:
+    ur_rtde is missing, or the arm cannot be reached or controlled."""
 
     def __init__(self, host: str) -> None:
         try:
@@ -317,14 +317,14 @@ class UrLink:
                 "remote control, and reachable on port 30004?"
             ) from error
         self._control.setWatchdog(1 / _WATCHDOG_S)
-        self._heard = (-1.0, 0.0)  # the arm's clock, and when it changed by ours
+        self._last_state = (-1.0, 0.0)  # the arm's clock, and when it changed by ours
 
     def check(self, force_n: float) -> None:
-        """Raises TumortrackError where the arm is not heard of, cannot follow, or meets a force."""
+        """Raises TumortrackError: the arm does not respond, cannot follow, or meets a force."""
         now_s, stamp_s = time.monotonic(), self._receive.getTimestamp()
-        if stamp_s != self._heard[0]:
-            self._heard = stamp_s, now_s
-        if not self._receive.isConnected() or now_s - self._heard[1] > _MUTE_S:
+        if stamp_s != self._last_state[0]:
+            self._last_state = stamp_s, now_s
+        if not self._receive.isConnected() or now_s - self._last_state[1] > _MUTE_S:
             raise TumortrackError("nothing is heard of the arm; is its network well?")
         if (mode := self._receive.getSafetyMode()) not in _FOLLOWS:
             fault = _SAFETY.get(mode, "in no mode in which it may be moved")
@@ -336,7 +336,7 @@ class UrLink:
             raise TumortrackError(f"the tool meets {force:.0f} N; allowed: {force_n:g}")
 
     def compare(self, target: Joints, allowed_rad: Joints) -> Joints:
-        """Where the arm is. Raises TumortrackError where that is not where the plan has it."""
+        """Where the arm is. Raises TumortrackError: it is not where the plan has it."""
         joints_rad = np.array(self._receive.getActualQ(), float)
         off_rad = np.abs(joints_rad - target)
         if not (off_rad <= allowed_rad).all():
@@ -357,7 +357,7 @@ class UrLink:
             raise TumortrackError("the arm did not take the order to stop")
 
     def kick(self) -> None:
-        """Tell the controller's watchdog that this program is well."""
+        """Reset the controller's watchdog."""
         self._control.kickWatchdog()
 
     def close(self) -> None:

@@ -1,4 +1,4 @@
-"""The values of planning: what was asked for, what was located, where to cut, what comes away.
+"""The values of planning: configuration, located organ, cuts, the piece that comes away.
 
 All in the ``table`` frame, mm: z up against gravity, its origin on the table's top. The paper's
 'transverse plane' is the table's plane, its 'superior' is up and its 'posterior' is down.
@@ -27,14 +27,14 @@ Direction = Literal["shortest", "clockwise", "anticlockwise"]
 StrokeKind = Literal["wall", "floor"]
 Rings = tuple[Float64[np.ndarray, "_ 2"], ...]
 MARGIN_MM = (1.0, 20.0)  # allowed
-# How the notes begin that a plan must never lose: pictures and screens show them first.
+# Beginnings of the notes that pictures and screens must always show, first.
 POOR_ESTIMATE = "PLANNED ON A POOR ESTIMATE"
 OVER_BUDGET = "PLANNED OVER ITS ERROR BUDGET"
 UNGUARDED = "Nothing keeps the cuts away from"
 
 
 class ResectionConfig(Config, frozen=True, kw_only=True):
-    """How a tumor is to be cut out.
+    """How to cut a tumor out.
 
     Attributes:
         method: published: the paper's two sweeps round the tumor's projection; margin: layers that
@@ -84,7 +84,7 @@ def name_of(label: int) -> str:
 
 
 def organ_surface(meshes: Mapping[str, Mesh]) -> Mesh:
-    """The organ's surface; NoPlan where there is none."""
+    """The organ's surface; NoPlan: there is none."""
     if (name := organ_name(meshes)) is None:
         raise NoPlan("no organ was located, so nothing can be planned. Locate it first.")
     return meshes[name]
@@ -99,8 +99,8 @@ class Located:
         meshes: closed surfaces: the organ's name (tumors included), tumor_1, ...
         std_mm: per tumor, the standard deviation of each of its mesh's vertices along the axis that
             is least sure; left out where the estimate has none.
-        margin: what margins the estimate states (``tracking.margins``).
-        structures: further surfaces that were carried along, closed or open.
+        margin: the estimate's margins (``tracking.margins``).
+        structures: further surfaces that move with the organ, closed or open.
         doubt: why the estimate is poor; empty: it is good.
     """
 
@@ -128,14 +128,14 @@ class Located:
 
     @property
     def organ(self) -> Mesh:
-        """The organ's surface; NoPlan where it was not located."""
+        """The organ's surface; NoPlan: it was not located."""
         return organ_surface(self.meshes)
 
     @property
     def tumors(self) -> tuple[int, ...]:
-        """Labels of the tumors that were found."""
-        found = np.flatnonzero(np.bincount(self.labels)).tolist()
-        return tuple(label for label in found if label >= FIRST_TUMOR)
+        """Labels of the located tumors."""
+        labels = np.flatnonzero(np.bincount(self.labels)).tolist()
+        return tuple(label for label in labels if label >= FIRST_TUMOR)
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,15 +188,15 @@ class Cut:
 
 @dataclass(frozen=True, eq=False)
 class ResectionPlan:
-    """Where to grasp, where to cut, and what comes away if the estimate is right.
+    """Where to grasp and to cut, and what comes away if the estimate is right.
 
     Attributes:
         tumor: its part's name (tumor_1, ...) and ``label``.
-        grasp_mm: where the grasper's cup touches; it comes from straight above.
-        cuts: strokes in the order in which they are made.
+        grasp_mm: where the grasper's cup touches, coming from straight above.
+        cuts: strokes in their order.
         layers: what the cuts enclose, top first: the wall is each layer's outline, and where a
             layer is wider than the one below it, or has none below, the tissue is cut level.
-        margin_mm: the least distance that was asked for between tumor and cut.
+        margin_mm: the requested least distance between tumor and cut.
         volumes_ml: organ, parenchyma (of that, no tumor), tumor, piece (all that comes away),
             healthy (of that, parenchyma).
         exophytic: share of the tumor outside the organ's hull.
@@ -217,14 +217,14 @@ class ResectionPlan:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """The notes that forbid to rely on it."""
-        alarming = (POOR_ESTIMATE, OVER_BUDGET, UNGUARDED)
-        return tuple(note for note in self.notes if note.startswith(alarming))
+        """Notes that say not to rely on the plan."""
+        beginnings = (POOR_ESTIMATE, OVER_BUDGET, UNGUARDED)
+        return tuple(note for note in self.notes if note.startswith(beginnings))
 
     @property
     def sweeps(self) -> int:
         return max(cut.sweep for cut in self.cuts)
 
 
-# What a method of planning returns: layers, cuts, and where to grasp (table frame, mm)
+# Of a planning method: layers, cuts, and the grasp point (table frame, mm)
 MethodResult = tuple[tuple[CutLayer, ...], tuple[Cut, ...], Float64[np.ndarray, " 3"]]

@@ -17,12 +17,11 @@ from tumortrack.cli.console import console, keep_loaded, model_folder, options_o
 from tumortrack.tracking.options import TrackOptions
 
 if TYPE_CHECKING:
-    from tumortrack.live.session import Arms, Session
+    from tumortrack.live.session import Session
     from tumortrack.live.values import TrackingResult
     from tumortrack.live.workers import SinkWorker
 
 _SAY_S, _SAY_PLAIN_S = 1.0, 5.0  # between two lines of state: on a terminal, in a file
-STOPPED = "stopped by the user"  # why arms halt
 _END_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
@@ -46,34 +45,36 @@ class Track(TrackOptions):
     source: Positional[str]
     sinks: Positional[tuple[str, ...]] = ()
 
-    def run(self, arms: Arms | None = None) -> None:
-        """Until the source ends, the time is up, the arms have ended, or Ctrl-C."""
+    def run(self) -> None:
         from tumortrack import api
+        from tumortrack.live import session  # noqa: F401 - to be loaded by then
 
-        if arms is None:
-            from tumortrack.live import session  # noqa: F401 - to be loaded by then
-
-            keep_loaded()
+        keep_loaded()
         model_folder(self.model)
         report = self.report or default_report("track")
         asked = options_of(replace(self, report=report), TrackOptions)
-        run = api.session(self.model, self.source, self.sinks, arms, **asked)
+        follow(api.session(self.model, self.source, self.sinks, **asked))
 
-        def stop() -> None:
-            if arms is not None:
-                arms.operation.abort(STOPPED)
-            run.loop.stop()
 
-        say("warming up ...")
-        run.loop.warm()
-        screen = _Screen(run, report)
-        with stopping(stop), ExitStack() as ending:
-            ending.push(screen.end)
-            with run.opened():
-                say_opened(run.sinks)
-                say(f"{run.tracker.model.patient}: tracking {', '.join(run.setup.sources)} in "
-                    f"frame {run.setup.published.frame_id!r}; Ctrl-C ends it.")  # fmt: skip
-                run.run(screen.show)
+def follow(run: Session) -> None:
+    """Until the source ends, the time is up, the arms have ended, or Ctrl-C."""
+    from tumortrack.core.halt import Halt
+
+    def stop() -> None:
+        if run.arms is not None:
+            run.arms.operation.abort(Halt("interrupted"))
+        run.loop.stop()
+
+    say("warming up ...")
+    run.loop.warm()
+    screen = _Screen(run)
+    with stopping(stop), ExitStack() as ending:
+        ending.push(screen.end)
+        with run.opened():
+            say_opened(run.sinks)
+            say(f"{run.tracker.model.patient}: tracking {', '.join(run.setup.sources)} in "
+                f"frame {run.setup.published.frame_id!r}; Ctrl-C ends it.")  # fmt: skip
+            run.run(screen.show)
 
 
 def say_opened(sinks: list[SinkWorker]) -> None:
@@ -121,8 +122,8 @@ def stopping(end: Callable[[], None]) -> Iterator[None]:
 class _Screen:
     """Prints a line of state now and then, every change of quality, and a summary."""
 
-    def __init__(self, run: Session, report: Path) -> None:
-        self._run, self._report = run, report
+    def __init__(self, run: Session) -> None:
+        self._run = run
         self._began = self._shown = time.monotonic()
         self._before, self._changed, self._unwritten = 0, 0.0, ""
         self._state: list[object] = []  # as last printed, without its numbers
@@ -181,7 +182,7 @@ class _Screen:
             off = errors.summary()
             say(f"{name}: centre off by {off['p50']:.1f} mm (median; 95 %: {off['p95']:.1f} mm).")
         if not self._run.unwritten:
-            say(f"written to {self._report}.")
+            say(f"written to {self._run.report}.")
         elif not self._unwritten:
             say(f"report: {self._run.unwritten}")
         check_closed(self._run.sinks)

@@ -11,7 +11,7 @@ from tumortrack.core.report import Finding
 
 HaltKind = Literal[
     "no_estimate", "poor", "missing", "moved", "over_budget", "no_margin", "planning", "silent",
-    "no_plan", "defect", "stopped",
+    "no_plan", "defect", "interrupted", "aborted", "stopped",
 ]  # fmt: skip
 _SENTENCES: dict[HaltKind, str] = {
     "no_estimate": "no estimate: {words}",
@@ -27,6 +27,8 @@ _SENTENCES: dict[HaltKind, str] = {
     "silent": "no word from the loop",
     "no_plan": "no new plan: {words}",
     "defect": "internal error, {words}",
+    "interrupted": "stopped by the user",
+    "aborted": "stopped by the viewer, or a real arm gave up",
     "stopped": "{words}",
 }
 CUT_NOTE = "cut: estimates are of the intact organ"

@@ -20,6 +20,7 @@ import numpy as np
 from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError, NoEstimate, TumortrackError
 from tumortrack.core.estimate import Estimate, Quality
+from tumortrack.core.halt import Halt
 from tumortrack.core.report import Finding
 from tumortrack.core.types import DepthFrame, Intrinsics
 from tumortrack.live import values as live
@@ -141,7 +142,7 @@ class Loop:
                     return
         finally:
             if self._arms is not None and not self._arms.ended:
-                self._arms.abort("tracking has ended")
+                self._arms.abort(Halt("stopped", {"words": "tracking has ended"}))
                 self._publish(
                     self._without_frame("tracking has ended"),
                     sink_workers,
@@ -308,11 +309,11 @@ class Loop:
     def _act(self, arms: live.ArmsController, result: TrackingResult) -> TrackingResult:
         try:
             if self._context.controls.aborted.is_set():
-                arms.abort("stopped by the viewer, or a real arm gave up")
+                arms.abort(Halt("aborted"))
             return arms.act(result)
         except Exception as error:  # a defect there stops the arms, but not tracking
             self.statistics.add_defect(error)
-            arms.abort(f"internal error, {type(error).__name__}: {error}")
+            arms.abort(Halt("defect", {"words": f"{type(error).__name__}: {error}"}))
             return result
 
 

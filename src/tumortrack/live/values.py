@@ -309,7 +309,7 @@ class ArmsController(Protocol):
         """The result with the present workcell, for the sinks. Called with every result, with and
         without an estimate."""
 
-    def abort(self, reason: str) -> None:
+    def abort(self, halt: Halt) -> None:
         """Stop the arms for good."""
 
     def summary(self) -> dict[str, Any]:

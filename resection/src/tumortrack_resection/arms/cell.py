@@ -53,8 +53,8 @@ class ArmCell:
             names.append(ORGAN)
         index = {name: n for n, name in enumerate(names)}
         self._pairs = [pair for pair in _pairs() if index.keys() >= set(pair)]
-        for one, other in self._pairs:
-            self.solids.addCollisionPair(pin.CollisionPair(index[one], index[other]))
+        for first, second in self._pairs:
+            self.solids.addCollisionPair(pin.CollisionPair(index[first], index[second]))
         self._states: dict[tuple[Any, ...], Any] = {}
 
     def levers_mm(self, start_rad: Joints, goal_rad: Joints) -> Joints:
@@ -87,8 +87,8 @@ class ArmCell:
         return body.display_surfaces(self.config)
 
     def shapes(self, joints_rad: Joints) -> tuple[RigidShape, ...]:
-        """Everything as surfaces in the table frame, and a bead at each tip (``cutter/tip``); the
-        organ is not among them."""
+        """Everything but the organ as surfaces in the table frame, and a bead at each tip
+        (``cutter/tip``)."""
         places = self._frames(joints_rad, {part.link for part, _ in self._surfaces})
         return tuple(
             RigidShape(part.name_in_cell, mesh, places[part.link], part.colour)
@@ -110,19 +110,19 @@ class ArmCell:
         """Names of the first pair that comes nearer than its clearance, or None.
 
         Args:
-            touching: arms whose electrode or cup may be on or in the organ now.
-            moving: the arm that moves, if the rest is known to be free; None: test everything.
+            touching: arms whose electrode or cup may touch the organ.
+            moving: the moving arm, if the rest is known to be free; None: test everything.
         """
         state = self._state(tuple(sorted(touching)), moving)
         pin.updateGeometryPlacements(self.model, self._data, self.solids, state, joints_rad)
         if not pin.computeCollisions(self.solids, state, True):
             return None
-        # It stops at the first; results beyond that are of earlier calls.
+        # It stops at the first collision; later results are of earlier calls.
         results = zip(self._pairs, state.activeCollisionPairs, state.collisionResults, strict=True)
-        return next(pair for pair, active, one in results if active and one.isCollision())
+        return next(pair for pair, active, result in results if active and result.isCollision())
 
     def _state(self, touching: tuple[str, ...], moving: str | None) -> Any:
-        """Collision buffers in which only the pairs that matter are active."""
+        """Collision buffers with only the relevant pairs active."""
         if (touching, moving) not in self._states:
             state, ends = pin.GeometryData(self.solids), {TOUCHES[arm] for arm in touching}
             for n, pair in enumerate(self._pairs):
@@ -135,7 +135,7 @@ class ArmCell:
         return self._states[touching, moving]
 
     def _margin_mm(self, pair: CollidingPair, touching: tuple[str, ...]) -> float:
-        """How near these two may come."""
+        """The least distance of a pair."""
         if ORGAN in pair or (body.STAND in pair and TOUCHES[CUTTER] in pair):
             return self.config.organ_clearance_mm
         tools = pair[0] == TOUCHES[CUTTER] and pair[1].removeprefix("holder/") in TOOLS[HOLDER]
@@ -145,8 +145,8 @@ class ArmCell:
 def tip_places(
     config: CellConfig,
 ) -> Callable[[str, Float64[np.ndarray, " 6"]], Float64[np.ndarray, " 3"]]:
-    """Where an arm's tip is by its six joints: table frame, mm. Each arm may be asked in a thread
-    of its own."""
+    """A function from an arm's six joints to its tip: table frame, mm. Arms may be queried in
+    different threads."""
     cells = {arm: ArmCell(config) for arm in ARMS}
 
     def tip_mm(arm: str, own_rad: Float64[np.ndarray, " 6"]) -> Float64[np.ndarray, " 3"]:
@@ -158,8 +158,8 @@ def tip_places(
 
 
 class Blocked(NoPlan):
-    """This motion is impossible; perhaps another is not. The text says where and why; ``pair``:
-    what would collide, if that is the reason."""
+    """This motion is impossible, another may not be. The text says where and why; ``pair``: what
+    would collide, if that is the reason."""
 
     def __init__(self, text: str, pair: CollidingPair | None = None) -> None:
         super().__init__(text)
@@ -212,8 +212,8 @@ class PlanningGroup:
         return joints
 
     def inverse_kinematics(self, table_from_tip: Pose) -> Float64[np.ndarray, "k 6"]:
-        """All branches that bring the moving arm's tip to a pose, collisions not regarded, each
-        joint turned to be near where it is."""
+        """All branches that bring the moving arm's tip to a pose, regardless of collisions, each
+        joint turned near its present angle."""
         base_from_table, tip_from_flange = self._frames
         flange = base_from_table @ table_from_tip @ tip_from_flange
         return nearest_turn(self.model, inverse_kinematics(self.model, flange), self.current_rad)
@@ -226,7 +226,7 @@ class PlanningGroup:
         return np.linalg.inv(poses[0]), np.linalg.inv(poses[1])
 
     def collides(self, own_rad: Float64[np.ndarray, " d"]) -> CollidingPair | None:
-        """What comes nearer than allowed to what."""
+        """A pair that comes nearer than allowed."""
         return self.cell.collisions(self.all_joints(own_rad), self.touching, self.arm)
 
     def segment_collides(
@@ -241,7 +241,7 @@ class PlanningGroup:
         levers_mm = self.cell.levers_mm(self.all_joints(start_rad), self.all_joints(goal_rad))
         moved_mm = float(np.abs(goal_rad - start_rad) @ levers_mm[self.own])
         n = int(np.ceil(moved_mm / (2 * least_mm * spacing)))
-        # From the middle outward: what blocks is rarely near the ends.
+        # From the middle outward: collisions are rarely near the ends.
         for k in sorted(range(1, n), key=lambda k: abs(2 * k - n)):
             if pair := self.collides(start_rad + (goal_rad - start_rad) * (k / n)):
                 return pair
@@ -249,7 +249,7 @@ class PlanningGroup:
 
 
 def _solid_names(solids: Any, parts: tuple[body.Part, ...]) -> list[str]:
-    """Our names in pinocchio's order, which is that of each link's collision elements."""
+    """Our names in pinocchio's order, that of each link's collision elements."""
     by_link: dict[str, list[str]] = defaultdict(list)
     for part in parts:
         if part.use != "picture":
@@ -258,8 +258,8 @@ def _solid_names(solids: Any, parts: tuple[body.Part, ...]) -> list[str]:
 
 
 def _pairs() -> list[CollidingPair]:
-    """All that could ever meet. Links next to each other are left out, and of an arm with itself
-    what its joints' offsets keep apart."""
+    """All pairs that could ever collide: not neighbouring links, nor parts of an arm that its
+    joints' offsets keep apart."""
     moving = {arm: [f"{arm}/{name}" for name in (*body.LINKS[2:], *TOOLS[arm])] for arm in ARMS}
     pairs = list(product(moving[CUTTER], moving[HOLDER]))
     for arm, other in (ARMS, ARMS[::-1]):

@@ -1,4 +1,4 @@
-"""How the instrument goes through a plan's cuts: from which sides, how deep, in which pieces."""
+"""The instrument's way through a plan's cuts: directions, leads in and out, legs."""
 
 from __future__ import annotations
 
@@ -27,26 +27,26 @@ from tumortrack_resection.values import Cut, ResectionPlan
 _STEP_MM = 2.0  # between poses on a cut
 _AIR_STEP_MM = 5.0  # on the straight lead-in and lead-out
 _LINK_MM = 12.0  # strokes whose ends are no farther apart are one pass
-_CLEAR_MM = 6.0  # the tip is this far from the organ before it goes elsewhere
-_CORNER = np.cos(np.radians(40.0))  # sharper ones are not rounded: the tip stops there
-_WALL_MM = 1.5  # the outline itself counts as part of the piece
+_CLEAR_MM = 6.0  # distance of the tip from the organ before it moves elsewhere
+_CORNER = np.cos(np.radians(40.0))  # at sharper corners the tip stops
+_WALL_MM = 1.5  # the outline counts as part of the piece
 _FAR_MM = 1000.0
 _YAWS = 24
-_PROBE_STEP = 3  # every so many points of a pass, directions are compared
-_TISSUE_BIN_MM = 3.0  # differences in cut tissue below this do not count
+_PROBE_STEP = 3  # points of a pass between comparisons of directions
+_TISSUE_BIN_MM = 3.0  # smaller differences in cut tissue do not count
 _MOST_LEGS = 8  # of a pass
-_FAR_RAD = 2.0  # the arm turns a joint farther than that only if nothing else is possible
-_SEARCHED = 4  # directions for which a path is searched at length
-# Between passes the tip may go back and up first, mm: what most often is free
+_FAR_RAD = 2.0  # a joint turns farther only if nothing else is possible
+_SEARCHED = 4  # directions for which a path is searched by trees
+# Between passes the tip may go back and up first, mm: most often that is free
 DETOURS_MM = ((60.0, 0.0), (0.0, 70.0), (60.0, 70.0), (0.0, 140.0))
 
 
 def cut_pass(
     builder: TrajectoryBuilder, path_mm: Float64[np.ndarray, "n 3"], around: Surroundings
 ) -> None:
-    """The instrument along a pass: in one direction throughout if that is possible, else in as few
-    legs as are; between them it leaves and comes from another side. Raises Blocked: no direction is
-    possible somewhere; the reason is the most frequent one."""
+    """The instrument along a pass, in as few legs as possible: between two it leaves and comes from
+    another side. Raises Blocked: somewhere no direction is possible; with the most frequent
+    reason."""
     for _ in range(_MOST_LEGS):
         done = _cut_leg(builder, path_mm, around)
         if done == len(path_mm) - 1:
@@ -56,29 +56,29 @@ def cut_pass(
 
 
 def _cut_leg(builder: TrajectoryBuilder, path_mm: np.ndarray, around: Surroundings) -> int:
-    """The first leg, as long as it can be; returns the number of the point where it ended."""
+    """The longest first leg; returns the number of the point where it ends."""
     away, inside = builder.group(CUTTER, (HOLDER,)), builder.group(CUTTER, (CUTTER, HOLDER))
     reasons: list[Blocked] = []
     later: list[tuple[float, Leg, np.ndarray]] = []
     for yaw, last in _directions(path_mm, around, inside):
-        one = leg(path_mm[: last + 1], yaw, around)
+        candidate = leg(path_mm[: last + 1], yaw, around)
         try:
-            joints = follow(inside, one.poses)
+            joints = follow(inside, candidate.poses)
             turn = float(np.abs(joints[0] - away.current_rad).max())
-            later.append((turn, one, joints))
+            later.append((turn, candidate, joints))
             if turn > _FAR_RAD:
                 continue
-            approach = connect(away, joints[0], detours=_detours(away, one))
+            approach = connect(away, joints[0], detours=_detours(away, candidate))
         except Blocked as blocked:
             reasons.append(blocked)
         else:
-            return _execute(builder, one, approach, joints)
-    for _, one, joints in sorted(later, key=lambda each: each[0])[:_SEARCHED]:
+            return _execute(builder, candidate, approach, joints)
+    for _, candidate, joints in sorted(later, key=lambda each: each[0])[:_SEARCHED]:
         try:
-            approach = connect(away, joints[0], builder.rng, _detours(away, one))
+            approach = connect(away, joints[0], builder.rng, _detours(away, candidate))
         except Blocked:
             continue
-        return _execute(builder, one, approach, joints)
+        return _execute(builder, candidate, approach, joints)
     if reasons:
         often = Counter(str(blocked) for blocked in reasons).most_common(1)[0][0]
         raise next(blocked for blocked in reasons if str(blocked) == often)
@@ -92,9 +92,9 @@ def _cut_leg(builder: TrajectoryBuilder, path_mm: np.ndarray, around: Surroundin
 def _directions(
     path_mm: np.ndarray, around: Surroundings, group: PlanningGroup
 ) -> list[tuple[float, int]]:
-    """Where the instrument may point (yaw, radians) and up to which point of the path, the best
-    first: what goes farthest, then what cuts least healthy tissue beside the outline, then what
-    turns the arm's joints least from where they are."""
+    """Possible directions of the instrument (yaw, radians), each with the last point of the path it
+    reaches; the best first: farthest, then least healthy tissue cut beside the outline, then least
+    turning of joints."""
     probes = np.unique(np.r_[np.arange(0, len(path_mm), _PROBE_STEP), len(path_mm) - 1])
     now = yaw_of(group.cell.tips(group.joints_rad)[CUTTER])
     yaws = now + np.linspace(0, 2 * np.pi, _YAWS, endpoint=False)
@@ -112,9 +112,9 @@ def _directions(
     return [(yaw, int(probes[-run])) for run, _, _, yaw in sorted(scores)]
 
 
-def _detours(group: PlanningGroup, one: Leg) -> list[np.ndarray]:
+def _detours(group: PlanningGroup, leg: Leg) -> list[np.ndarray]:
     """Corners of detours: back and up, across, and down again."""
-    there = level_pose(one.enter_mm[0], one.yaw_rad)
+    there = level_pose(leg.enter_mm[0], leg.yaw_rad)
     here = group.cell.tips(group.joints_rad)[CUTTER]
     detours = [[aside(group, pose, *by) for pose in (here, there)] for by in DETOURS_MM]
     return [np.array(corners) for corners in detours if all(len(corner) for corner in corners)]
@@ -123,27 +123,27 @@ def _detours(group: PlanningGroup, one: Leg) -> list[np.ndarray]:
 def aside(
     group: PlanningGroup, table_from_tip: Pose, back_mm: float, up_mm: float
 ) -> Float64[np.ndarray, " d"]:
-    """The moving arm with its tip so far back and up from a pose; empty if that is out of reach."""
+    """The moving arm's joints with its tip back and up from a pose; empty if out of reach."""
     moved = table_from_tip.copy()
     moved[:3, 3] += [0.0, 0.0, up_mm] - back_mm * table_from_tip[:3, 0]
-    found = group.inverse_kinematics(moved)
-    if not len(found):
+    solutions = group.inverse_kinematics(moved)
+    if not len(solutions):
         return np.zeros(0)
-    return found[np.abs(found - group.current_rad).max(1).argmin()]
+    return solutions[np.abs(solutions - group.current_rad).max(1).argmin()]
 
 
 def _execute(
-    builder: TrajectoryBuilder, one: Leg, approach_rad: np.ndarray, joints_rad: np.ndarray
+    builder: TrajectoryBuilder, leg: Leg, approach_rad: np.ndarray, joints_rad: np.ndarray
 ) -> int:
     builder.go(CUTTER, approach_rad)
-    for run, cutting in one.runs:
+    for run, cutting in leg.runs:
         builder.go(CUTTER, joints_rad[run], builder.cell.config.cutting_mm_s, cutting)
-    return len(one.cut_mm) - 1
+    return len(leg.cut_mm) - 1
 
 
 def passes(cuts: Iterable[Cut]) -> list[Float64[np.ndarray, "n 3"]]:
-    """The tip's paths, closely spaced: strokes one after the other, joined where the next begins
-    beside the end of the last."""
+    """The tip's paths, closely spaced: strokes in order, joined if one begins beside the end of the
+    last."""
     paths: list[np.ndarray] = []
     for cut in cuts:
         if paths and np.linalg.norm(paths[-1][-1] - cut.path_mm[0]) <= _LINK_MM:
@@ -164,11 +164,11 @@ class Surroundings:
         self._solid = solid_of(organ, "the organ's surface")
         self._layers, self._grasp_mm, self._config = plan.layers, plan.grasp_mm, config
         electrode_mm = ELECTRODE_RADIUS_MM + config.contact_mm
-        # A little less than what collides: the exact test comes later.
+        # A little less than what collides: the exact test follows.
         pencil_mm = 0.8 * (PENCIL_RADIUS_MM + config.organ_clearance_mm)
         pencil_cup_mm = PENCIL_RADIUS_MM + config.clearance_mm
         clear_cup_mm = ELECTRODE_RADIUS_MM + config.clearance_mm + 1.0
-        # By height; a plan asks for the same few again and again.
+        # By height: a plan has few different ones.
         self._organ = cache(self._section)
         self._healthy = cache(self._without_piece)
         self._bars_electrode = cache(lambda z: self._cup(z, electrode_mm))
@@ -176,13 +176,13 @@ class Surroundings:
         self._not_clear = cache(lambda z: self._near(z, _CLEAR_MM, clear_cup_mm))
 
     def depth_mm(self, point_mm: Float64[np.ndarray, " 3"]) -> float:
-        """How much organ there is straight above a point."""
+        """Thickness of the organ straight above a point."""
         x, y, z = (float(value) for value in point_mm)
         above = [h for h in range(2, 200, 2) if shapely.contains_xy(self._organ(z + h), x, y)]
         return float(max(above, default=0))
 
     def back_out_mm(self, tip_mm: Float64[np.ndarray, " 3"], yaw_rad: float) -> float:
-        """How far straight back until the tip is clear of organ and grasper for good."""
+        """Distance straight back until the tip is clear of organ and grasper for good."""
         ray = _lines(tip_mm[None], np.array([yaw_rad]), _FAR_MM)[0, 0]
         within = shapely.intersection(ray, self._not_clear(float(tip_mm[2])))
         inside = shapely.get_coordinates(within)
@@ -191,7 +191,7 @@ class Surroundings:
     def tissue_mm(
         self, tips_mm: Float64[np.ndarray, "n 3"], yaws_rad: Float64[np.ndarray, " y"]
     ) -> Float64[np.ndarray, "y n"]:
-        """Length of the instrument in healthy tissue, outside of the piece, at these places."""
+        """Length of the instrument in healthy tissue, outside the piece, at these places."""
         lines = _lines(tips_mm, yaws_rad, self._config.electrode_mm + self._config.pencil_mm)
         return shapely.length(shapely.intersection(lines, _at(self._healthy, tips_mm)))
 
@@ -225,15 +225,14 @@ class Surroundings:
         return self._organ(height_mm).difference(shapely.union_all(rings))
 
     def _cup(self, height_mm: float, around_mm: float) -> Any:
-        """All that lies around the grasper at this height."""
+        """The grasper's surroundings at this height."""
         if height_mm + around_mm < self._grasp_mm[2]:
             return shapely.Polygon()
         radius = self._config.cup_radius_mm + around_mm
         return shapely.Point(self._grasp_mm[:2]).buffer(radius, 6)
 
     def _near(self, height_mm: float, organ_mm: float, cup_mm: float) -> Any:
-        """All that lies within a margin of the organ at this height, and a little more, or of the
-        grasper."""
+        """All within a margin of the organ (slightly more) or of the grasper at this height."""
         heights = (height_mm - organ_mm, height_mm, height_mm + organ_mm)
         organ = shapely.union_all([self._organ(h) for h in heights]).buffer(organ_mm, 4)
         return shapely.union(organ, self._cup(height_mm, cup_mm))
@@ -256,8 +255,8 @@ class Leg:
 
     @property
     def runs(self) -> list[tuple[slice, bool]]:
-        """Pieces of ``poses`` to go through without a stop, and whether they cut; each begins
-        where the one before ends. At sharp corners of the cut the tip stops."""
+        """Slices of ``poses`` without a stop, and whether they cut; each begins where the last
+        ends. At sharp corners of the cut the tip stops."""
         edges = np.diff(self.cut_mm, axis=0)
         edges /= np.linalg.norm(edges, axis=1, keepdims=True)
         corners = np.flatnonzero((edges[1:] * edges[:-1]).sum(1) < _CORNER) + 1
@@ -271,7 +270,7 @@ class Leg:
 
 def leg(cut_mm: Float64[np.ndarray, "n 3"], yaw_rad: float, around: Surroundings) -> Leg:
     """With a straight lead-in to the first point and lead-out from the last, along the instrument's
-    own axis: it opens no more than it occupies."""
+    axis, where it cuts nothing more."""
     ahead = np.array([np.cos(yaw_rad), np.sin(yaw_rad), 0.0])
     leads = []
     for tip in (cut_mm[0], cut_mm[-1]):
@@ -295,7 +294,7 @@ def _at(section: Any, tips_mm: np.ndarray) -> list[Any]:
 def _lines(
     tips_mm: np.ndarray, yaws_rad: np.ndarray, to_mm: float, from_mm: float = 0.0
 ) -> np.ndarray:
-    """Lines (y, n) that go back from each tip against each direction, seen from above."""
+    """Lines (y, n) back from each tip against each direction, seen from above."""
     ahead = np.stack([np.cos(yaws_rad), np.sin(yaws_rad)], 1)[:, None]
     ends = [tips_mm[None, :, :2] - far * ahead for far in (from_mm, to_mm)]
     return shapely.linestrings(np.stack(ends, axis=2))

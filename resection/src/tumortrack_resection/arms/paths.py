@@ -1,8 +1,8 @@
 """Collision-free paths in joint space: of a tip along poses, and from one configuration to another.
 
 Kuffner and LaValle 2000, 'RRT-Connect: an efficient approach to single-query path planning',
-DOI 10.1109/ROBOT.2000.844730. Own and short because it must be repeatable from a seed: OMPL's
-generators take theirs from one global seed that can be set once per process.
+DOI 10.1109/ROBOT.2000.844730. Our own, as it must be repeatable from a
+seed: OMPL's generators share one global seed that can be set once per process.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ def follow(
     collides = cache(lambda n, branch: group.collides(joints[n, branch]))
     pair: CollidingPair | None = None
     while (choice := _cheapest(joints, barred, near)) is not None:
-        # Coarsely first, since what blocks rarely blocks one pose alone
+        # Coarsely first: obstacles rarely block a single pose
         order = (n for stride in (16, 4, 1) for n in range(0, len(choice), stride))
         hit = next((n for n in order if collides(n, choice[n])), None)
         if hit is None:
@@ -62,7 +62,7 @@ def follow(
 
 
 def _reject_early(group: PlanningGroup, poses: np.ndarray) -> None:
-    """Most paths that are blocked show it at a few of their poses: no branch is free there."""
+    """Raises Blocked: at one of a few poses no branch is free, as on most blocked paths."""
     for branches in _branches(group, poses[_FEW // 2 :: _FEW]):
         pair: CollidingPair | None = None
         for joints in branches[~np.isnan(branches[:, 0])]:
@@ -74,9 +74,9 @@ def _reject_early(group: PlanningGroup, poses: np.ndarray) -> None:
 
 def _branches(group: PlanningGroup, poses: np.ndarray) -> np.ndarray:
     """All branches of the inverse kinematics of all poses (n, most, 6), filled up with NaN."""
-    found = [group.inverse_kinematics(pose) for pose in poses]
-    joints = np.full((len(poses), max(map(len, found), default=0), 6), np.nan)
-    for row, branches, pose in zip(joints, found, poses, strict=True):
+    solutions = [group.inverse_kinematics(pose) for pose in poses]
+    joints = np.full((len(poses), max(map(len, solutions), default=0), 6), np.nan)
+    for row, branches, pose in zip(joints, solutions, poses, strict=True):
         if not len(branches):
             raise out_of_reach(group, pose)
         row[: len(branches)] = branches
@@ -92,18 +92,18 @@ def out_of_reach(group: PlanningGroup, table_from_tip: Pose) -> Blocked:
 def _cheapest(joints: np.ndarray, barred: np.ndarray, near_rad: np.ndarray) -> np.ndarray | None:
     """Which branch at each pose (n,), by dynamic programming; None if there is no path."""
     cost = np.where(barred[0], np.inf, (wrapped(joints[0] - near_rad) ** 2).sum(-1))
-    came = np.zeros(joints.shape[:2], int)
+    previous = np.zeros(joints.shape[:2], int)
     for n in range(1, len(joints)):
         step = wrapped(joints[n][:, None] - joints[n - 1][None])
         edge = np.where(np.abs(step).max(-1) <= _JUMP_RAD, (step**2).sum(-1), np.inf)
         total = cost[None] + edge
-        came[n] = total.argmin(1)
+        previous[n] = total.argmin(1)
         cost = np.where(barred[n], np.inf, total.min(1))
     if not np.isfinite(cost).any():
         return None
     choice = [int(cost.argmin())]
     for n in range(len(joints) - 1, 0, -1):
-        choice.append(int(came[n][choice[-1]]))
+        choice.append(int(previous[n][choice[-1]]))
     return np.array(choice[::-1])
 
 
@@ -154,9 +154,9 @@ def connect(
     for room in _ROOM_RAD:
         lower = np.maximum(np.minimum(start_rad, goal_rad) - room, -group.limits_rad)
         upper = np.minimum(np.maximum(start_rad, goal_rad) + room, group.limits_rad)
-        found = _grow(group, goal_rad, (lower, upper), rng)
-        if found is not None:
-            path = _smooth(group, _shortcut(group, found, rng))
+        grown = _grow(group, goal_rad, (lower, upper), rng)
+        if grown is not None:
+            path = _smooth(group, _shortcut(group, grown, rng))
             if path is not None:
                 return path
     raise Blocked(f"no way round was found where {pair[0]} would meet {pair[1]}", pair)
@@ -196,13 +196,13 @@ def _grow(
 ) -> np.ndarray | None:
     """Corners of a free path (k, d), or None: two trees that grow towards each other."""
     start_rad = group.current_rad
-    one, other = _Tree(start_rad), _Tree(goal_rad)
+    tree, other = _Tree(start_rad), _Tree(goal_rad)
     for _ in range(_SAMPLES):
-        one.extend(rng.uniform(*box), group)
-        if other.extend(one.nodes[-1], group):
-            path = one.branch()[::-1] + other.branch()[1:]
+        tree.extend(rng.uniform(*box), group)
+        if other.extend(tree.nodes[-1], group):
+            path = tree.branch()[::-1] + other.branch()[1:]
             return np.array(path if path[0] is start_rad else path[::-1])
-        one, other = other, one
+        tree, other = other, tree
     return None
 
 

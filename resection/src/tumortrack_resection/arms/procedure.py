@@ -1,7 +1,7 @@
 """From a resection plan to motions of both arms: approach, grasp, hold, sweeps, lift, release,
 home.
 
-Also the worker that plans anew beside the live loop: a process of its own, which holds up no frame.
+Also the worker that replans beside the live loop, in a process of its own.
 """
 
 from __future__ import annotations
@@ -37,13 +37,13 @@ from tumortrack_resection.operation import Planned, ResectionProgress
 from tumortrack_resection.resection import plan_resection
 from tumortrack_resection.values import Located, ResectionConfig, ResectionPlan
 
-_SETTLE_S = 0.5  # until the vacuum holds
+_VACUUM_S = 0.5  # until the cup holds
 _LET_GO_S = 0.3
 _ABOVE_MM = 60.0  # the cup comes from here, and goes back
 _STEP_MM = 5.0
 _GRIPS = 4  # ways of holding that are tried
-# Round the organ: how far off the base stands, as a share of the arm's reach, and on which side
-# (degrees from where it stands now). The first are tried first.
+# Places of a base round the organ: distance as a share of the arm's reach, and direction (degrees
+# from the present one), in the order of trying.
 _DISTANCES = (0.65, 0.5, 0.8)
 _SIDES_DEG = (0.0, 30.0, -30.0, 60.0, -60.0)
 _YAWS = 8  # in which the instrument is asked to reach
@@ -92,7 +92,7 @@ def plan_motions(
 def _grasp_and_cut(
     builder: TrajectoryBuilder, plan: ResectionPlan, around: Surroundings
 ) -> Motions:
-    """By whichever grip leaves the instrument its path; the reason is the first grip's."""
+    """By the first grip that leaves the instrument a path; Blocked: the first grip's reason."""
     deep_mm = around.depth_mm(plan.grasp_mm)
     if deep_mm > builder.cell.config.cup_mm:
         raise Blocked(f"the grasp point lies {deep_mm:.0f} mm below the organ's surface")
@@ -128,17 +128,17 @@ def _grips(builder: TrajectoryBuilder, grasp_mm: np.ndarray) -> Iterator[np.ndar
     if not len(starts):
         raise out_of_reach(group, poses[0])
     reason: Blocked | None = None
-    found = 0
+    count = 0
     for start in sorted(starts, key=lambda start: np.abs(start - group.current_rad).max()):
         try:
             path = follow(group, poses, start)
         except Blocked as blocked:
             reason = reason or blocked
             continue
-        if np.abs(path[0] - start).max() < 1e-6 and found < _GRIPS:
-            found += 1
+        if np.abs(path[0] - start).max() < 1e-6 and count < _GRIPS:
+            count += 1
             yield path
-    if not found and reason is not None:
+    if not count and reason is not None:
         raise reason
 
 
@@ -148,7 +148,7 @@ def _grasp(builder: TrajectoryBuilder, grip_rad: np.ndarray) -> None:
     builder.close("approach")
     builder.go(HOLDER, grip_rad, builder.cell.config.grasping_mm_s)
     builder.close("grasp")
-    builder.wait(_SETTLE_S)
+    builder.wait(_VACUUM_S)
     builder.close("hold")
 
 
@@ -287,13 +287,13 @@ _setting: list[tuple[ResectionConfig, ArmCell]] = []  # of the worker
 
 
 def begin_worker(config: ResectionConfig, cell: CellConfig) -> None:
-    """Called once in the new process. Ctrl-C is for the live loop to handle, not for the worker."""
+    """Called once in the new process, which ignores Ctrl-C: the live loop handles it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     _setting.append((config, ArmCell(cell)))
 
 
 def warm_up() -> None:
-    """Returns when the process has begun and has loaded what is slow to load."""
+    """Loads in the worker what is slow to load."""
     import ruckig  # noqa: F401
     import toppra  # noqa: F401
 
@@ -309,5 +309,5 @@ def replan(located: Located, joints_rad: Joints, progress: ResectionProgress) ->
     if hit := first_hit(motions, cell.config, organ, begun=True):
         raise NoPlan(f"the arms can't carry this out: {hit}")
     planned = Planned(plan, located.meshes, motions)
-    _ = planned.kept_mm  # which takes time: here, not in the live loop
+    _ = planned.kept_mm  # computed here, as it takes time
     return planned

@@ -1,4 +1,4 @@
-"""From paths to trajectories: as fast as joints may turn and accelerate, and no faster than asked.
+"""From paths to trajectories: as fast as the joints' and tips' limits allow.
 
 Pham and Pham 2018, 'A new approach to time-optimal path parameterization based on reachability
 analysis' (toppra), DOI 10.1109/TRO.2018.2819195; Berscheid and Kroeger 2021, 'Jerk-limited
@@ -25,12 +25,12 @@ from tumortrack_resection.motions import ARMS, CUTTER, HOLDER, Joints, Motions, 
 _STEP_S = 0.02  # between two samples; straight segments between them stay within 0.05 mm
 _TIP_SPEED_UP_S = 0.2  # until a tip has its speed
 _GRID = 80
-_FINER = (1.0, 1.7, 2.9, 4.3)  # grids that are tried, in points of the first
-_CRAWL, _CRAWL_S = 2.0, 3.0  # a motion longer than so many times the least, and so much, crawls
+_FINER = (1.0, 1.7, 2.9, 4.3)  # numbers of grid points tried, relative to the first
+_CRAWL, _CRAWL_S = 2.0, 3.0  # a motion crawls if longer than this factor times the least + this
 _SLACK = 0.97  # of the acceleration: toppra keeps its limits at grid points only
 _THERE_RAD = 1e-6  # a thousandth of a millimetre at the tip: no motion to be timed
 
-# Who may touch the organ, but in sweeps, lift and release, where both may
+# Which tools may touch the organ; in sweeps, lift and release both
 _TOUCHING: dict[str, tuple[str, ...]] = {
     "approach": (),
     "grasp": (HOLDER,),
@@ -43,10 +43,8 @@ Timed = tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, "n d"]]
 
 
 class TrajectoryBuilder:
-    """Where both arms are by now (``joints_rad``), and how they came there, stage by stage.
-
-    What is added to a copy (``copy.copy``) is not in the original.
-    """
+    """The arms' present joints (``joints_rad``), and their motion so far, stage by stage. Additions
+    to a copy (``copy.copy``) leave the original as it is."""
 
     def __init__(self, cell: ArmCell, start_rad: Joints, rng: np.random.Generator) -> None:
         self.cell, self.joints_rad, self.rng = cell, start_rad, rng
@@ -97,7 +95,7 @@ class TrajectoryBuilder:
         self.joints_rad = joints[-1]
 
     def close(self, name: str) -> None:
-        """What was added since the last stage is the stage of this name."""
+        """Make a stage of this name of everything added since the last one."""
         pieces = self._pieces
         times = [np.zeros(1)]
         joints = [pieces[0][1][:1] if pieces else self.joints_rad[None]]
@@ -149,9 +147,9 @@ def along(
     for finer in _FINER:
         grid = np.linspace(0, knots[-1], round(finer * max(_GRID, keep.sum())))
         solver = toppra.algorithm.TOPPRA(limits, curve, grid, parametrizer="ParametrizeConstAccel")
-        found = solver.compute_trajectory(0, 0)
-        if found is not None and (best is None or found.duration < best.duration):
-            best = found
+        trajectory = solver.compute_trajectory(0, 0)
+        if trajectory is not None and (best is None or trajectory.duration < best.duration):
+            best = trajectory
         if best is not None and best.duration < _CRAWL * least_s + _CRAWL_S:
             break
     if best is None:
@@ -178,22 +176,22 @@ def together(
     wish.max_velocity = [float((speeds_rad_s / turns).min())]
     wish.max_acceleration = [ACCELERATION_RAD_S2 / longest]
     wish.max_jerk = [JERK_RAD_S3 / longest]
-    found = ruckig.Trajectory(1)
-    outcome = ruckig.Ruckig(1).calculate(wish, found)
+    motion = ruckig.Trajectory(1)
+    outcome = ruckig.Ruckig(1).calculate(wish, motion)
     if outcome not in (ruckig.Result.Working, ruckig.Result.Finished):
         raise Blocked(f"no synchronous motion ({outcome})")
-    times = _samples(found.duration)
-    share = np.array([found.at_time(time)[0] for time in times]).reshape(-1, 1)
+    times = _samples(motion.duration)
+    share = np.array([motion.at_time(time)[0] for time in times]).reshape(-1, 1)
     return times, start_rad + share * (goal_rad - start_rad)
 
 
 def first_hit(motions: Motions, config: CellConfig, organ: Mesh, begun: bool = False) -> str:
-    """What would meet what, and when, if these motions were carried out; empty: nothing.
+    """The first collision of these motions, and when; empty: none.
 
-    Tested as densely as the planner tests, with half of its clearances: between the places that it
-    tests, its own motions come nearer than the whole ones. An electrode or cup may touch the organ
-    only where its tip is as slow as it is planned there. ``begun``: the arms do not come from home;
-    both tools may be at the organ in the first stage, too.
+    Tested as densely as by the planner, with half of its clearances: between the tested places its
+    motions come nearer than the whole ones. An electrode or cup may touch the organ only where its
+    tip is as slow as planned there. ``begun``: the arms do not come from home, so both tools may be
+    at the organ in the first stage too.
     """
     halves = {
         name: max(getattr(config, name) / 2, 0.5)
@@ -208,16 +206,18 @@ def first_hit(motions: Motions, config: CellConfig, organ: Mesh, begun: bool = F
         moved_mm = np.concatenate([[0.0], np.cumsum(turns)])  # at most, of any point
         steps = int(np.ceil(moved_mm[-1] / (2 * cell.config.least_clearance_mm(touching))))
         at_mm = np.linspace(0, moved_mm[-1], steps + 1)
-        joints = np.stack([np.interp(at_mm, moved_mm, one) for one in stage.joints_rad.T], axis=1)
+        joints = np.stack(
+            [np.interp(at_mm, moved_mm, joint) for joint in stage.joints_rad.T], axis=1
+        )
         times_s = np.interp(at_mm, moved_mm, stage.times_s)
-        tips = np.array([[cell.tips(one)[arm][:3, 3] for arm in ARMS] for one in joints])
+        tips = np.array([[cell.tips(each)[arm][:3, 3] for arm in ARMS] for each in joints])
         speeds = np.linalg.norm(np.diff(tips, axis=0), axis=2) / np.diff(times_s)[:, None]
         edge = np.full((1, len(ARMS)), np.inf)
         slow = np.minimum(np.r_[edge, speeds], np.r_[speeds, edge]) <= slow_mm_s
         slow |= steps == 0
-        for one, time_s, both in zip(joints, times_s, slow, strict=True):
+        for joints_rad, time_s, both in zip(joints, times_s, slow, strict=True):
             now = [arm for arm, is_slow in zip(ARMS, both, strict=True) if is_slow]
-            if pair := cell.collisions(one, [arm for arm in touching if arm in now]):
+            if pair := cell.collisions(joints_rad, [arm for arm in touching if arm in now]):
                 return f"{pair[0]} would meet {pair[1]} {time_s:.1f} s after {stage.name} begins"
     return ""
 
