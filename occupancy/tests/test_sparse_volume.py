@@ -116,7 +116,7 @@ def test_labels_of_points_are_those_of_asking_all():
     few, all_logits = field.asked, field(points).numpy()
     assert (logits.argmax(1) != all_logits.argmax(1)).sum() <= 20
     assert 100 < few < 4000
-    plain = lattice.between(points).argmax(1) != all_logits.argmax(1)
+    plain = lattice.interpolate(points).argmax(1) != all_logits.argmax(1)
     assert plain.mean() > 0.001  # so many would be wrong if none were asked
 
 
@@ -128,9 +128,9 @@ def test_a_lattice_is_linear_between_its_points_and_constant_outside():
 
     lattice = lattice_over(plane, np.array([[-5.0, 0, 10], [7, 8, 19]]), 4)
     points = np.random.default_rng(0).uniform([-5, 0, 10], [7, 8, 19], (50, 3)).astype(np.float32)
-    assert lattice.between(points)[:, 0] == pytest.approx(points @ slope, abs=1e-4)
+    assert lattice.interpolate(points)[:, 0] == pytest.approx(points @ slope, abs=1e-4)
     corner = np.array([[-5.0, 0, 10], [-50, -9, 0]], np.float32)
-    assert lattice.between(corner)[1] == pytest.approx(lattice.between(corner)[0])
+    assert lattice.interpolate(corner)[1] == pytest.approx(lattice.interpolate(corner)[0])
 
 
 def test_a_halved_lattice_has_the_labels_of_asking_all():
