@@ -42,7 +42,7 @@ def label_of(points: Tensor) -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class Learnt:
-    """A network that knows one cloud's organ, and what to ask it."""
+    """A network trained on one cloud's organ, and queries."""
 
     network: OccupancyNetwork
     cloud: np.ndarray

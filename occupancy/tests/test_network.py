@@ -54,7 +54,7 @@ def seeded(config: NetworkConfig, seed: int = 0) -> OccupancyNetwork:
 
 
 def scene(batch: int = 2, n: int = 300, q: int = 50) -> tuple[torch.Tensor, torch.Tensor]:
-    """Half ellipsoids seen from above and queries round them; camera frame, mm."""
+    """Upper halves of ellipsoids, and queries around them; camera frame, mm."""
     rng = np.random.default_rng(3)
     directions = rng.normal(size=(batch, n, 3))
     directions /= np.linalg.norm(directions, axis=2, keepdims=True)

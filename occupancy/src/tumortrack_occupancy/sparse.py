@@ -222,8 +222,8 @@ def _voxels(level: _Level, limit: InterpolationLimit) -> tuple[volume.Margins, v
         if limit.limit <= threshold:
             break
         threshold = 2 * limit.limit  # voxels that lead by less were filled
-    more, found = _around_mispredicted(level, limit.limit, flat[queried], expected[queried])
-    flat, logits = np.concatenate([flat, more]), np.concatenate([expected, found])
+    more, more_logits = _around_mispredicted(level, limit.limit, flat[queried], expected[queried])
+    flat, logits = np.concatenate([flat, more]), np.concatenate([expected, more_logits])
     labels.reshape(-1)[flat] = leading(logits)[0]
     margins = np.empty((logits.shape[1] - 1, *labels.shape), np.float16)
     most = volume.LARGEST_MARGIN
