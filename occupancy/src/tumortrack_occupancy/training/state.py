@@ -96,8 +96,8 @@ class TrainingRun:
             if isinstance(there or here, str):  # a sha256
                 options.append(name)
             else:
-                values = ["not given" if value is None else value for value in (there, here)]
-                options.append("{} ({} there, {} here)".format(name, *values))
+                there, here = ("not given" if value is None else value for value in (there, here))
+                options.append(f"{name} ({there} there, {here} here)")
         return ", and in ".join(options)
 
 
