@@ -42,7 +42,7 @@ def label_of(points: Tensor) -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class Learnt:
-    """A network that knows one cloud's organ, and what to ask it."""
+    """A network trained on one cloud's organ, and queries."""
 
     network: OccupancyNetwork
     cloud: np.ndarray
@@ -80,9 +80,9 @@ def known(request) -> Learnt:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("numbers", dict.fromkeys(("network", fastest(CPU))))
-def test_fast_arithmetic_gives_the_labels_of_single_precision(numbers, known):
-    inference = Inference(known.network, numbers)
+@pytest.mark.parametrize("arithmetic", dict.fromkeys(("network", fastest(CPU))))
+def test_fast_arithmetic_gives_the_labels_of_single_precision(arithmetic, known):
+    inference = Inference(known.network, arithmetic)
     latent = inference.encode(known.cloud)
     with torch.inference_mode():
         queries = torch.from_numpy(known.queries)[None]
@@ -118,4 +118,4 @@ def test_compile_leaves_the_model_as_it_is_and_older_choices_are_nothing(
     Compile(model=folder, device="cpu").run()
     assert "kernels: compiled" in capsys.readouterr().out
     assert sorted(folder.rglob("*")) == before
-    assert OccupancyLocator(load_model(folder, "cpu")).inference.numbers == fastest(CPU)
+    assert OccupancyLocator(load_model(folder, "cpu")).inference.arithmetic == fastest(CPU)

@@ -1,4 +1,4 @@
-"""From a cloud that another program rendered to tumors in the camera's frame, by labels."""
+"""Localisation with a network, of clouds that another program rendered."""
 
 from __future__ import annotations
 
@@ -80,8 +80,8 @@ def evaluated(work: Path, scenes: Path) -> Path:
 
 
 def test_a_moving_organ_is_followed_by_labels(tracker, seen):
-    """The last organ's box stands for the coarse queries; the answer is that of a first frame."""
-    # As many as the encoder takes: nothing is left to the choice of points.
+    """The last organ's box replaces the coarse queries; the estimate is that of a first frame."""
+    # As many points as the encoder takes, so that none are chosen at random.
     points = np.random.default_rng(0).permutation(seen[0].astype(np.float32))[:512]
     follower = Follower(tracker, FollowerConfig(rescan_s=10))
     for n in range(4):
@@ -104,7 +104,7 @@ def test_a_moving_organ_is_followed_by_labels(tracker, seen):
 
 @pytest.mark.parametrize("jump_mm", [40.0, 300.0])
 def test_an_organ_that_jumps_is_found_in_the_same_frame(tracker, seen, jump_mm):
-    """It reaches the border of the last one's box, or is not in it: then it is looked for."""
+    """It reaches the border of the last box, or is not in it, and is searched for."""
     points = np.random.default_rng(0).permutation(seen[0].astype(np.float32))[:512]
     last = tracker.follow(SensorCloud(points, 1))
     jumped = SensorCloud(points + np.float32([jump_mm, 0, 0]), 2)
@@ -141,7 +141,7 @@ def test_a_part_that_vanishes_and_returns_is_seen_at_once(tracker, seen, monkeyp
 
 @pytest.mark.skipif(not STATM.exists(), reason="this system does not count pages so")
 def test_following_does_not_gather_memory(tracker, seen):
-    """Frames of different clouds, each with its own number of questions."""
+    """Frames of different clouds, each with another number of queries."""
     rng, last, pages = np.random.default_rng(0), None, []
     points = seen[0].astype(np.float32)
     for n in range(90):
@@ -149,7 +149,7 @@ def test_following_does_not_gather_memory(tracker, seen):
         last = tracker.follow(cloud, last, FollowOptions(thorough=n % 30 == 0))
         pages.append(int(STATM.read_text().split()[1]))
     grown_mb = (np.median(pages[-10:]) - np.median(pages[30:40])) * 4096 / 1e6
-    assert grown_mb < 30  # a kernel for every number of questions would be 100
+    assert grown_mb < 30  # a kernel for every number of queries would take 100
 
 
 def test_tumors_are_found_within_millimetres_in_the_camera_frame(work, seen, out):
@@ -215,7 +215,7 @@ def test_clouds_in_other_formats_and_units_agree(work, seen, out):
 
 
 @pytest.mark.parametrize("numbers", ["network", "float32", "bfloat16"])
-def test_the_answer_does_not_hang_on_the_arithmetic(tracker, seen, monkeypatch, numbers):
+def test_the_estimate_does_not_depend_on_the_arithmetic(tracker, seen, monkeypatch, numbers):
     points, _ = seen
     cpu = torch.device("cpu")
     if not (numbers in ("network", fastest(cpu)) or (numbers == "float32" and can_pack(cpu))):
@@ -282,7 +282,7 @@ def test_what_is_no_organ_is_refused(tracker, points, error, words):
 
 @pytest.mark.parametrize("distance_mm", [5.0, 10.0, 15.0])
 def test_an_organ_deformed_as_never_in_training_is_not_refused(tracker, work, distance_mm):
-    """One end of the organ is pushed sideways, as a whole; scenes of training never do that."""
+    """One end of the organ is pushed sideways as a whole, which training scenes never do."""
     case = load_case(work / "case")
     parts = []
     for part in case.anatomy.parts:

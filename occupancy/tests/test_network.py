@@ -10,14 +10,14 @@ from tumortrack.core.errors import InputError
 from tumortrack_occupancy import sampling
 from tumortrack_occupancy.config import MlpDecoderConfig, NetworkConfig
 from tumortrack_occupancy.encoders.pointnet2 import PointNet2Config, SetAbstraction, _Level
-from tumortrack_occupancy.layers import greatest_above_zero
+from tumortrack_occupancy.layers import max_over_neighbours
 from tumortrack_occupancy.network import MlpDecoder, OccupancyNetwork, octave_features
 from tumortrack_occupancy.normalisation import (
     Aligned,
     CloudBox,
     alignment,
-    turned,
-    without_strays,
+    rotated,
+    without_outliers,
 )
 from tumortrack_occupancy.presets import paper_network, quick_network
 from tumortrack_occupancy.sampling import ball_query, farthest_points, strided_points, take
@@ -54,7 +54,7 @@ def seeded(config: NetworkConfig, seed: int = 0) -> OccupancyNetwork:
 
 
 def scene(batch: int = 2, n: int = 300, q: int = 50) -> tuple[torch.Tensor, torch.Tensor]:
-    """Half ellipsoids seen from above and queries round them; camera frame, mm."""
+    """Upper halves of ellipsoids, and queries around them; camera frame, mm."""
     rng = np.random.default_rng(3)
     directions = rng.normal(size=(batch, n, 3))
     directions /= np.linalg.norm(directions, axis=2, keepdims=True)
@@ -195,34 +195,34 @@ def test_set_abstraction_equals_the_plain_concatenation(norm: str) -> None:
 
 
 @pytest.mark.parametrize("kind", [torch.float32, torch.bfloat16])
-def test_compiled_maximum_and_its_gradient_are_those_of_the_plain_form(kind: torch.dtype) -> None:
+def test_the_maximum_has_the_values_and_gradients_of_pooling_after_relu(kind: torch.dtype) -> None:
     torch.manual_seed(1)
     values = torch.randn(2, 5, 4, 33).to(kind)
-    values[:, 0] = -values[:, 0].abs()  # nobody is above zero
-    values[0, 1, 2] = values[0, 1, 0] = 2.0  # equal ones
+    values[:, 0] = -values[:, 0].abs()  # none is above zero
+    values[0, 1, 2] = values[0, 1, 0] = 2.0  # ties
     values[1, 2, 1], values[1, 2, 3, 5] = -0.0, torch.inf
-    compiled, plain = values.clone().requires_grad_(), values.clone().requires_grad_()
-    # What needs no gradient takes the plain form.
-    expected = greatest_above_zero(plain.detach())
-    out = greatest_above_zero(compiled)
-    assert torch.equal(out, expected)
+    after, before = values.clone().requires_grad_(), values.clone().requires_grad_()
+    out = torch.relu(max_over_neighbours(after))
     assert torch.equal(out, values.clamp_min(0).amax(2))
     weights = torch.randn_like(out)
     out.backward(weights)
-    channels_first = torch.relu(plain).permute(0, 3, 1, 2)
+    channels_first = torch.relu(before).permute(0, 3, 1, 2)
     torch.nn.functional.max_pool2d(channels_first, (1, 4)).backward(
         weights.transpose(1, 2)[..., None]
     )
-    assert torch.equal(compiled.grad, plain.grad)
-    assert compiled.grad.count_nonzero() > 100
+    assert torch.equal(after.grad, before.grad)
+    assert after.grad.count_nonzero() > 100
+    assert not after.grad[0, 1, 2].any()  # of equal ones the first
 
 
 @pytest.mark.parametrize("sign", [1, -1])
-def test_what_is_no_number_stays_none(sign: int) -> None:
+def test_the_maximum_keeps_nan(sign: int) -> None:
     values = torch.ones(1, 2, 3, 4)
     values[0, 1, 1, 2] = sign * torch.tensor(torch.nan)
-    out = greatest_above_zero(values.requires_grad_())
+    out = torch.relu(max_over_neighbours(values))
     assert out.isnan().nonzero().tolist() == [[0, 1, 2]]
+    in_training = torch.relu(max_over_neighbours(values.requires_grad_()))
+    assert in_training.isnan().nonzero().tolist() == [[0, 1, 2]]
 
 
 def test_folded_batch_norms_change_nothing() -> None:
@@ -278,17 +278,17 @@ def test_alignment_finds_the_longest_direction_and_its_heavier_tail() -> None:
     along = torch.stack([0.6 * x, 0.8 * x, torch.zeros(5)], dim=-1)
     torch.testing.assert_close(alignment(along[None])[:, 0, 0], torch.tensor([0.6, 0.8]))
     torch.testing.assert_close(alignment(-along[None])[:, 0, 0], torch.tensor([-0.6, -0.8]))
-    aligned = turned(along[None], alignment(along[None]))
+    aligned = rotated(along[None], alignment(along[None]))
     torch.testing.assert_close(aligned[0, :, 0], x)
 
 
-def test_strays_are_replaced_by_points_within_reach_and_the_rest_keeps_its_order() -> None:
+def test_outliers_are_replaced_by_points_within_reach_and_the_rest_keeps_its_order() -> None:
     points_mm, _ = scene(n=300)
-    clean = without_strays(points_mm, 80.0)
+    clean = without_outliers(points_mm, 80.0)
     assert torch.equal(clean, points_mm)
     spoiled = points_mm.clone()
     spoiled[0, 5::10] += torch.tensor([0.0, 200.0, 300.0])  # a tenth of one cloud
-    out = without_strays(spoiled, 80.0)
+    out = without_outliers(spoiled, 80.0)
     assert torch.equal(out[1], points_mm[1])
     kept = torch.ones(300, dtype=torch.bool)
     kept[5::10] = False
@@ -296,14 +296,9 @@ def test_strays_are_replaced_by_points_within_reach_and_the_rest_keeps_its_order
     assert torch.equal(out[0, 270:], points_mm[0, kept][:30])
 
 
-def test_compiled_and_plain_forms_replace_the_same_strays() -> None:
+def test_of_a_cloud_of_outliers_alone_the_first_remains() -> None:
     points_mm, _ = scene(n=301)
-    points_mm[0, ::7] += torch.tensor([150.0, 0.0, 60.0])
-    points_mm[1] *= 3.0  # the second round's middle is another
-    for reach_mm in (40.0, 80.0, 1e-3):  # the last: all are strays
-        plain = without_strays(points_mm.clone().requires_grad_(), reach_mm).detach()
-        assert torch.equal(without_strays(points_mm, reach_mm), plain)
-        assert not torch.equal(plain, points_mm)
+    assert torch.equal(without_outliers(points_mm, 1e-3), points_mm[:, :1].expand(-1, 301, -1))
 
 
 def test_ten_per_cent_of_background_change_quick_by_little() -> None:
@@ -314,7 +309,7 @@ def test_ten_per_cent_of_background_change_quick_by_little() -> None:
     spoiled = torch.cat([points_mm[:, :460], points_mm[:, 460:] + far], dim=1)
     after = network.encode(spoiled)
     assert (after.centre_mm - before.centre_mm).norm(dim=2).max() < 1.0
-    cosine = (before.turn * after.turn).sum(0).abs()  # an ellipsoid has no heavier tail
+    cosine = (before.rotation * after.rotation).sum(0).abs()  # an ellipsoid has no heavier tail
     assert cosine.min() > 0.999
     plain = spoiled.mean(dim=1, keepdim=True) - points_mm.mean(dim=1, keepdim=True)
     assert plain.norm(dim=2).min() > 10  # what the mean of all points would have done

@@ -1,4 +1,4 @@
-"""`onnx`: ONNX Runtime answers as PyTorch does, and what is wrong is said at once."""
+"""`onnx`: ONNX Runtime gives the same logits as PyTorch; wrong arguments fail at once."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""The organ's lattice from few questions: what asking everywhere gives, wherever it matters."""
+"""The organ's lattice from few queries: equal to querying everywhere, where it matters."""
 
 from __future__ import annotations
 
@@ -13,23 +13,23 @@ BOX = np.array([[-90.0, -90, -90], [90, 90, 90]])
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_labels_are_those_of_asking_everywhere(seed):
+def test_labels_are_those_of_querying_everywhere(seed):
     field = Field(seed)
-    found, few = organ_lattice(field, BOX, 40), field.asked
-    field.asked = 0
+    lattice, few = organ_lattice(field, BOX, 40), field.queries
+    field.queries = 0
     every = lattice_over(field, BOX, 40)
-    assert found.step_mm == pytest.approx(every.step_mm)
-    labels, all_labels = (v.logits.argmax(-1).astype(np.uint8) for v in (found, every))
+    assert lattice.step_mm == pytest.approx(every.step_mm)
+    labels, all_labels = (v.logits.argmax(-1).astype(np.uint8) for v in (lattice, every))
     assert np.array_equal(keep_largest_pieces(labels, 3), keep_largest_pieces(all_labels, 3))
-    assert few < field.asked / 2
+    assert few < field.queries / 2
     inside = all_labels > 0
-    assert found.logits[inside] == pytest.approx(every.logits[inside], abs=1e-4)
+    assert lattice.logits[inside] == pytest.approx(every.logits[inside], abs=1e-4)
 
 
-def test_a_small_tumor_is_met_wherever_it_lies_in_the_organ():
+def test_a_small_tumor_is_found_wherever_it_lies_in_the_organ():
     field = Field(5)
     for off in np.random.default_rng(0).uniform(-6, 6, (10, 3)):
-        field.balls[1] = (off, 4.5 * 3**0.5 / 2 + 1e-6)  # holds a lattice point, just so
+        field.balls[1] = (off, 4.5 * 3**0.5 / 2 + 1e-6)  # just contains a lattice point
         assert (organ_lattice(field, BOX, 40).logits.argmax(-1) == 3).any()
 
 
@@ -46,5 +46,5 @@ def test_an_island_at_the_border_is_not_the_organ():
     logits[3:6, 3:6, 3:6, 1] = 2
     logits[0, 0, 0, 1] = logits[8, 4, 4, 1] = 2
     assert not LogitLattice(np.zeros(3), 4.0, logits).cut_off()
-    logits[5:, 4, 4, 1] = 2  # now the organ hangs together with it
+    logits[5:, 4, 4, 1] = 2  # now it is connected to the organ
     assert LogitLattice(np.zeros(3), 4.0, logits).cut_off()

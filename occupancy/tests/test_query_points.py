@@ -1,4 +1,4 @@
-"""Labelled points: right, spread as asked, and carried along by deformations."""
+"""Labelled points: correct, distributed as configured, and carried along by deformations."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""The volume from few questions: the dense one, voxel by voxel."""
+"""The volume from few queries equals the dense one, voxel by voxel."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ NAMES = ("kidney", "tumor_1", "tumor_2")
 
 
 class Field:
-    """Logits of a wavy organ with two balls in or at it; counts what it is asked."""
+    """Logits of a wavy organ with two balls in or at it; counts the queries."""
 
     def __init__(self, seed, small_mm=8.0):
         rng = np.random.default_rng(seed)
@@ -32,14 +32,14 @@ class Field:
         self.half_mm = rng.uniform([40, 22, 18], [60, 32, 26])
         self.waves = rng.normal(size=(4, 3)) / 12
         self.balls = [(self._near(rng), 12.0), (self._near(rng), small_mm / 2)]
-        self.asked = 0
+        self.queries = 0
 
     def _near(self, rng):
         way = rng.normal(size=3)
         return self.turn @ (self.half_mm * way / np.linalg.norm(way) * rng.uniform(0.2, 1.0))
 
     def __call__(self, points):
-        self.asked += len(points)
+        self.queries += len(points)
         points = points.astype(np.float64)
         at = points @ self.turn / self.half_mm
         organ = 25 * (1 - np.linalg.norm(at, axis=1))
@@ -54,9 +54,9 @@ def both(field, grid, start_mm=START_MM):
     box = np.array([[-66.0, -66, -66], [66, 66, 66]])
     camera_from_index, shape = grid_over(box, grid)
     sparse = sparse_margins(field, camera_from_index, shape, start_mm)
-    few, field.asked = field.asked, 0
+    few, field.queries = field.queries, 0
     dense = dense_margins(field, camera_from_index, shape)
-    return sparse, dense, few, field.asked, camera_from_index
+    return sparse, dense, few, field.queries, camera_from_index
 
 
 @pytest.mark.slow
@@ -71,7 +71,7 @@ def test_voxels_are_those_of_the_dense_volume(seed, grid):
 
 
 @pytest.mark.slow
-def test_at_the_paper_s_grid_most_questions_are_saved():
+def test_at_the_paper_s_grid_most_queries_are_saved():
     (_, labels), (_, all_labels), few, many, _ = both(Field(3), 200)
     assert np.array_equal(labels, all_labels)
     assert many > 10 * few
@@ -84,7 +84,7 @@ def test_surfaces_are_those_of_the_dense_volume():
     for name in NAMES:
         assert np.array_equal(mine[name].faces, theirs[name].faces)
         off_mm = np.linalg.norm(mine[name].vertices_mm - theirs[name].vertices_mm, axis=1)
-        assert np.median(off_mm) < 1e-4  # most voxels beside a surface are asked
+        assert np.median(off_mm) < 1e-4  # most voxels beside a surface are queried
         assert off_mm.max() < camera_from_index[0, 0] / 4  # linear over a kink
 
 
@@ -107,17 +107,17 @@ def test_without_a_coarse_lattice_it_is_the_dense_volume():
     assert np.array_equal(margins, all_margins)
 
 
-def test_labels_of_points_are_those_of_asking_all():
+def test_labels_of_points_are_those_of_querying_all():
     field, rng = Field(4), np.random.default_rng(0)
     lattice = lattice_over(field, np.array([[-66.0, -66, -66], [66, 66, 66]]), 24)
     points = rng.uniform(*lattice.box_mm, (40_000, 3)).astype(np.float32)
-    field.asked = 0
+    field.queries = 0
     logits = sparse_logits(field, lattice, points)
-    few, all_logits = field.asked, field(points).numpy()
+    few, all_logits = field.queries, field(points).numpy()
     assert (logits.argmax(1) != all_logits.argmax(1)).sum() <= 20
     assert 100 < few < 4000
-    plain = lattice.between(points).argmax(1) != all_logits.argmax(1)
-    assert plain.mean() > 0.001  # so many would be wrong if none were asked
+    plain = lattice.interpolate(points).argmax(1) != all_logits.argmax(1)
+    assert plain.mean() > 0.001  # so many would be wrong without queries
 
 
 def test_a_lattice_is_linear_between_its_points_and_constant_outside():
@@ -128,18 +128,18 @@ def test_a_lattice_is_linear_between_its_points_and_constant_outside():
 
     lattice = lattice_over(plane, np.array([[-5.0, 0, 10], [7, 8, 19]]), 4)
     points = np.random.default_rng(0).uniform([-5, 0, 10], [7, 8, 19], (50, 3)).astype(np.float32)
-    assert lattice.between(points)[:, 0] == pytest.approx(points @ slope, abs=1e-4)
+    assert lattice.interpolate(points)[:, 0] == pytest.approx(points @ slope, abs=1e-4)
     corner = np.array([[-5.0, 0, 10], [-50, -9, 0]], np.float32)
-    assert lattice.between(corner)[1] == pytest.approx(lattice.between(corner)[0])
+    assert lattice.interpolate(corner)[1] == pytest.approx(lattice.interpolate(corner)[0])
 
 
-def test_a_halved_lattice_has_the_labels_of_asking_all():
+def test_a_halved_lattice_has_the_labels_of_querying_all():
     field = Field(6)
     box = np.array([[-66.0, -66, -66], [66, 66, 66]])
     lattice = lattice_over(field, box, 24)
-    field.asked = 0
+    field.queries = 0
     finer = halved_lattice(field, lattice)
-    assert field.asked < finer.logits[..., 0].size / 2
+    assert field.queries < finer.logits[..., 0].size / 2
     assert finer.box_mm == pytest.approx(lattice.box_mm)
     margins, labels, camera_from_index = margins_on(finer)
     all_margins, all_labels = dense_margins(field, camera_from_index, labels.shape)
@@ -147,8 +147,8 @@ def test_a_halved_lattice_has_the_labels_of_asking_all():
     assert np.array_equal(margins > 0, all_margins > 0)
 
 
-def test_what_was_settled_before_is_neither_a_measure_nor_asked():
-    """Few points are open, and fewer than are asked to begin with: the others stay believed."""
+def test_what_is_known_already_is_neither_a_measure_nor_queried():
+    """Fewer points are unknown than the first queries take: the known ones are not among them."""
     leads = np.full(1000, np.inf, np.float32)
     leads[:100] = np.linspace(0, 1, 100)
     expected = np.zeros((1000, 2), np.float32)
@@ -160,7 +160,7 @@ def test_what_was_settled_before_is_neither_a_measure_nor_asked():
     assert limit.limit == 1
 
 
-def test_no_point_of_the_coarse_lattice_is_asked_again():
+def test_no_point_of_the_coarse_lattice_is_queried_again():
     field, places = Field(1), []
 
     def noted(points_mm):

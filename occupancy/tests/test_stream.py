@@ -1,4 +1,4 @@
-"""Scenes with labelled points, and their batches: replayed bit for bit, whoever asks."""
+"""Scenes with labelled points, and their batches: replayed bit for bit in any process."""
 
 import multiprocessing
 import pickle
@@ -109,7 +109,7 @@ def test_a_batch_holds_its_recipes(pool):
         np.testing.assert_array_equal(batch.labels[row], labels)
 
 
-def test_batches_do_not_depend_on_who_asks(pool):
+def test_batches_do_not_depend_on_the_process(pool):
     used = stream(pool)
     expected = used.batch(1)
     batches_agree(stream(pool).batch(1), expected)

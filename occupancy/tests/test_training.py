@@ -52,7 +52,6 @@ def case(phantom_case: Path) -> Path:
 
 
 def kill_at_first_checkpoint(command: list[object], model: Path) -> None:
-    """Long before its end."""
     with subprocess.Popen(
         [str(word) for word in command],
         stdout=subprocess.DEVNULL,
@@ -105,8 +104,8 @@ def test_ctrl_c_keeps_the_state_and_says_how_to_go_on(case, tmp_path):
 
 @pytest.mark.slow
 def test_ctrl_c_while_processes_start_ends_the_training(case, tmp_path):
-    """As a terminal sends it, to all of them: it ended one that was loading, and the training
-    waited for good to write to it."""
+    """A terminal sends it to all processes. It once ended one that was still starting, and the
+    training waited forever to write to it."""
     options = ["--preset", "quick", "--steps", "100000", "--workers", "1"]
     command = [*COMMAND, "train", str(case), str(tmp_path / "stopped"), *options]
     with subprocess.Popen(
@@ -136,7 +135,7 @@ def _commands_below(pid: int) -> str:
 
 @pytest.mark.slow
 def test_a_script_need_not_guard_its_main_part(case, tmp_path):
-    """Processes that make scenes ran it again, failed, and it waited for good."""
+    """Worker processes once ran the script again and failed, and it waited forever."""
     script = tmp_path / "mine.py"
     given = f"{str(case)!r}, {str(tmp_path / 'model')!r}, preset='quick', steps=2, workers=1"
     script.write_text(f"import tumortrack as tt\ntt.train({given})\nprint(__file__)")

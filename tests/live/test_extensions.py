@@ -87,7 +87,7 @@ def test_track_uses_it_by_its_text(phantom_case, clinic_model, tmp_path):
     succeeded(with_packages(folders, "track", clinic_model, *arguments, *report))
     rows = [line.split(",") for line in table.read_text().splitlines()[1:]]
     assert {row[2] for row in rows} >= {"kidney", "tumor_1"}
-    assert len({row[0] for row in rows}) > 1  # of frames after one another, however slow the machine
+    assert len({row[0] for row in rows}) > 1  # several frames, however slow the machine
 
 
 def test_a_broken_package_breaks_its_own_kind_alone(example, tmp_path, monkeypatch):

@@ -1,4 +1,4 @@
-"""A network and its training as frozen values: every preset is one ``TrainConfig``."""
+"""Configuration of a network and its training; every preset is a ``TrainConfig``."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from tumortrack.simulate.scene import SceneConfig
 from tumortrack_occupancy.encoders import EncoderConfig
 from tumortrack_occupancy.normalisation import Aligned, CloudBox
 
-_WIDEST = 4096  # of a layer: far beyond use, and a layer's weights still have room
+_WIDEST = 4096  # units of a layer: far beyond use, and its weights still fit into memory
 
 
 class MlpDecoderConfig(Config, frozen=True, tag="mlp"):
-    """``hidden_layers`` of ``width`` with ReLU, then one linear layer to the classes' logits.
-    ``skip_layer``: this hidden layer (counted from 1) sees [latent, query] again; None: no skip.
-    ``norm_layers``: hidden layers (from 1) with batch norm between linear part and ReLU.
-    ``octaves``: k of sin and cos(2^k pi q) that join each raw coordinate q; () for raw alone."""
+    """``hidden_layers`` of ``width`` with ReLU, then a linear layer to the classes' logits. Hidden
+    layers are numbered from 1. ``skip_layer``: takes [latent, query] again; None: no skip.
+    ``norm_layers``: with batch norm before ReLU. ``octaves``: positional encoding, the k of sin and
+    cos(2^k pi q) beside each raw coordinate q; () for raw coordinates alone."""
 
     n_classes: int
     width: int
@@ -30,16 +30,17 @@ class MlpDecoderConfig(Config, frozen=True, tag="mlp"):
     def __post_init__(self) -> None:
         self.check_between("decoder", width=(1, _WIDEST), hidden_layers=(1, 32))
         allowed = range(1, self.hidden_layers + 1)
-        named = (*self.norm_layers, *(() if self.skip_layer is None else (self.skip_layer,)))
-        if self.n_classes < 2 or not set(named) <= set(allowed):
+        skip = () if self.skip_layer is None else (self.skip_layer,)
+        layers = (*self.norm_layers, *skip)
+        if self.n_classes < 2 or not set(layers) <= set(allowed):
             raise InputError(
-                f"decoder: layers {named} must lie in 1..{self.hidden_layers}, and there must be "
+                f"decoder: layers {layers} must lie in 1..{self.hidden_layers}, and there must be "
                 "at least 2 classes."
             )
 
 
 class NetworkConfig(Config, frozen=True):
-    """A network as data."""
+    """Encoder, decoder, and the frame in which they see points."""
 
     encoder: EncoderConfig
     decoder: MlpDecoderConfig
@@ -47,8 +48,8 @@ class NetworkConfig(Config, frozen=True):
 
 
 class Schedule(Config, frozen=True):
-    """Learning rate. ``decay``: linear warm-up, then constant, then cosine to zero over the last
-    ``tail`` of the steps; ``exponential``: times ``gamma`` after each ``epoch_pairs`` samples."""
+    """Learning rate. ``decay``: linear warm-up, constant, then cosine decay over the last ``tail``
+    of the steps; ``exponential``: times ``gamma`` after every ``epoch_pairs`` samples."""
 
     kind: Literal["decay", "exponential"] = "decay"
     learning_rate: float = 2e-3
@@ -59,16 +60,16 @@ class Schedule(Config, frozen=True):
 
 
 class TrainConfig(ModelConfig, frozen=True):
-    """Everything that decides the weights, apart from case, seed and number of steps."""
+    """All that determines the weights, apart from case, seed and number of steps."""
 
     network: NetworkConfig
     scene: SceneConfig
     schedule: Schedule
     batch_size: int
-    steps: int  # the preset's end
-    drop_points: float = 0.0  # each batch loses a random fraction, up to this, of what is encoded
-    ema: float = 0.999  # 0: the plain weights are kept
-    training_pairs: int = 0  # 0: endless; else scenes repeat after so many
+    steps: int  # where neither steps nor minutes are given
+    drop_points: float = 0.0  # largest fraction of a batch's encoded points dropped at random
+    ema: float = 0.999  # of the weights; 0: no average
+    training_pairs: int = 0  # scenes repeat after so many; 0: never
     validation_pairs: int = 64
     validation_points: int = 2048
     validate_every: int = 250  # steps

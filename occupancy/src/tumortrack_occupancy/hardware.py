@@ -8,7 +8,7 @@ from tumortrack.core.errors import InputError
 
 
 def choose_device(device: str) -> torch.device:
-    """``auto`` takes CUDA if it is available; ``cuda`` where it is not is an InputError."""
+    """``auto`` takes CUDA if available. InputError: ``cuda`` without a GPU."""
     if device == "cuda" and not torch.cuda.is_available():
         raise InputError("--device cuda: PyTorch sees no CUDA GPU here. Use --device cpu or auto.")
     if device == "auto":
@@ -17,10 +17,10 @@ def choose_device(device: str) -> torch.device:
 
 
 def has_fast_bfloat16(device: torch.device) -> bool:
-    """Whether bf16 matrix products run in hardware."""
+    """Whether the device has instructions for bf16 matrix products."""
     if device.type == "cuda":
         return torch.cuda.is_bf16_supported(including_emulation=False)
     capability = torch.cpu.get_capabilities()
     has = bool(capability.get("avx512_bf16") or capability.get("amx_bf16"))
-    # What the processor has, oneDNN may be forbidden to use (ONEDNN_MAX_CPU_ISA).
+    # oneDNN may be restricted to fewer instructions (ONEDNN_MAX_CPU_ISA).
     return has and bool(torch.ops.mkldnn._is_mkldnn_bf16_supported())

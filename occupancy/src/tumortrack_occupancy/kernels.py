@@ -9,7 +9,7 @@ from tumortrack.core.compiled import njit
 
 @njit(nogil=True, inline="always")
 def _linear(coarse, low, high, n):  # type: ignore[no-untyped-def]
-    """Logit ``n`` in the middle of two coarse points, equal along axes where it lies on one."""
+    """Logit ``n`` halfway between two coarse points; along an axis both may be the same."""
     i, j, k = low
     i1, j1, k1 = high
     near = coarse[i, j, k, n] + coarse[i, j, k1, n]
@@ -21,8 +21,8 @@ def _linear(coarse, low, high, n):  # type: ignore[no-untyped-def]
 
 @njit(nogil=True)
 def halved(coarse, fine, first, last):  # type: ignore[no-untyped-def]
-    """Logits at half the step, linear between the coarse ones (a, b, c, classes), into ``fine``
-    (2a - 1, 2b - 1, 2c - 1, classes), float32; planes ``first`` to ``last``."""
+    """Logits at half the step, linear between the coarse ones (a, b, c, classes), into planes
+    ``first`` to ``last`` of ``fine`` (2a - 1, 2b - 1, 2c - 1, classes), float32."""
     for i in range(first, last):
         for j in range(fine.shape[1]):
             for k in range(fine.shape[2]):
@@ -34,7 +34,7 @@ def halved(coarse, fine, first, last):  # type: ignore[no-untyped-def]
 
 @njit(nogil=True)
 def leading(logits):  # type: ignore[no-untyped-def]
-    """The label that leads in every row (n, classes), and by how much."""
+    """The label of the largest logit in every row (n, classes), and its lead over the second."""
     labels, leads = np.empty(len(logits), np.uint8), np.empty(len(logits), np.float32)
     for row in range(len(logits)):
         first, second, label = np.float32(-np.inf), np.float32(-np.inf), 0
@@ -50,100 +50,100 @@ def leading(logits):  # type: ignore[no-untyped-def]
 
 
 @njit(nogil=True)
-def surprising(coarse, shape, flat, found, limit):  # type: ignore[no-untyped-def]
+def mispredicted(coarse, shape, flat, logits, limit):  # type: ignore[no-untyped-def]
     """Which points (n,) of the lattice of half the step, flat indices, have another label than
-    linear logits let expect, the difference of the two labels' logits being off by more than the
-    limit. ``found``: their logits (n, classes)."""
-    surprises = np.zeros(len(flat), np.bool_)
+    linear interpolation predicts, where the prediction of the two labels' difference is off by more
+    than the limit. ``logits``: those queried at the points (n, classes)."""
+    wrong = np.zeros(len(flat), np.bool_)
     expected = np.empty(coarse.shape[3], np.float32)
     for m in range(len(flat)):
         i, rest = divmod(flat[m], shape[1] * shape[2])
         j, k = divmod(rest, shape[2])
         low, high = (i // 2, j // 2, k // 2), ((i + 1) // 2, (j + 1) // 2, (k + 1) // 2)
-        thought, label = 0, 0
+        predicted, label = 0, 0
         for n in range(len(expected)):
             expected[n] = _linear(coarse, low, high, n)
-            if expected[n] > expected[thought]:
-                thought = n
-            if found[m, n] > found[m, label]:
+            if expected[n] > expected[predicted]:
+                predicted = n
+            if logits[m, n] > logits[m, label]:
                 label = n
-        before = expected[thought] - expected[label]
-        now = found[m, label] - found[m, thought]
-        surprises[m] = thought != label and before + now > limit
-    return flat[surprises]
+        before = expected[predicted] - expected[label]
+        now = logits[m, label] - logits[m, predicted]
+        wrong[m] = predicted != label and before + now > limit
+    return flat[wrong]
 
 
 @njit(nogil=True)
-def spread(labels, inside, outside, margins, first, last):  # type: ignore[no-untyped-def]
-    """Per part one of two values (bits of half precision) into ``margins`` (parts, i, j, k) by the
-    labels (i, j, k); the first part is inside wherever there is one. Planes first to last."""
+def fill_margins(labels, inside, outside, margins, first, last):  # type: ignore[no-untyped-def]
+    """Set the ``margins`` (parts, i, j, k) in planes ``first`` to ``last`` to one of two values
+    (half precision, as integers) by the labels (i, j, k). All parts are inside the first one."""
     for i in range(first, last):
         for j in range(labels.shape[1]):
             row = labels[i, j]
             for part in range(len(margins)):
                 out = margins[part, i, j]
                 for k in range(len(row)):
-                    mine = row[k] > 0 if part == 0 else row[k] == part + 1
-                    out[k] = inside if mine else outside
+                    within = row[k] > 0 if part == 0 else row[k] == part + 1
+                    out[k] = inside if within else outside
 
 
 @njit(nogil=True, inline="always")
-def _confident_row(plain, i, j, labels):  # type: ignore[no-untyped-def]
-    """The label on which the eight corners of each cell agree, 255 where there is none."""
-    i1, j1 = min(i + 1, plain.shape[0] - 1), min(j + 1, plain.shape[1] - 1)
-    for k in range(plain.shape[2]):
-        one = plain[i, j, k]
-        same = one == plain[i, j1, k] and one == plain[i1, j, k] and one == plain[i1, j1, k]
-        labels[k] = one if same else 255
-    for k in range(plain.shape[2] - 1):
+def _certain_row(certain, i, j, labels):  # type: ignore[no-untyped-def]
+    """The label on which the eight corners of each cell of a row agree, 255 if they do not."""
+    i1, j1 = min(i + 1, certain.shape[0] - 1), min(j + 1, certain.shape[1] - 1)
+    for k in range(certain.shape[2]):
+        label = certain[i, j, k]
+        same = label == certain[i, j1, k] == certain[i1, j, k] == certain[i1, j1, k]
+        labels[k] = label if same else 255
+    for k in range(certain.shape[2] - 1):
         if labels[k] != labels[k + 1]:
             labels[k] = 255
 
 
 @njit(nogil=True)
-def filled(coarse, labels, plain, fine, first, last):  # type: ignore[no-untyped-def]
-    """The voxels between the points of the last lattice but one, cell by cell, from coarse plane
-    ``first`` to ``last``. A cell whose corners agree and all lead by the limit holds no voxel that
-    leads by less: it is filled with their label in ``fine`` (i, j, k). All other cells' voxels are
-    listed: flat indices (n,), linear logits (n, classes), and whether they lie between coarse
-    points. ``coarse`` (a, b, c, classes) has these ``labels``; ``plain``: those that lead by the
-    limit, 255 for the others."""
+def fill_cells(coarse, labels, certain, fine, first, last):  # type: ignore[no-untyped-def]
+    """Fill the voxels ``fine`` (i, j, k), of half the step, from the lattice ``coarse`` (a, b, c,
+    classes), its ``labels`` (a, b, c) and the ``certain`` ones, 255 elsewhere; cell by cell, coarse
+    planes ``first`` to ``last``. A cell whose corners have the same certain label is filled with
+    it: by linear interpolation none of its voxels is less certain. The voxels of all other cells
+    are returned: flat indices (n,), linear logits (n, classes), and whether they lie between coarse
+    points."""
     _, n_j, n_k = fine.shape
-    confident = np.empty(coarse.shape[2], np.uint8)
+    agreed = np.empty(coarse.shape[2], np.uint8)
     cells = 0
     for i in range(first, last):
         for j in range(coarse.shape[1]):
-            _confident_row(plain, i, j, confident)
-            cells += (confident == 255).sum()
-    listed = np.empty(8 * cells, np.int64)
+            _certain_row(certain, i, j, agreed)
+            cells += (agreed == 255).sum()
+    flat = np.empty(8 * cells, np.int64)
     expected = np.empty((8 * cells, coarse.shape[3]), np.float32)
     between = np.empty(8 * cells, np.bool_)
     count = 0
     for i in range(first, last):
         for j in range(coarse.shape[1]):
-            _confident_row(plain, i, j, confident)
+            _certain_row(certain, i, j, agreed)
             for k in range(coarse.shape[2]):
                 for a in range(2 * i, min(2 * i + 2, fine.shape[0])):
                     for b in range(2 * j, min(2 * j + 2, n_j)):
                         for c in range(2 * k, min(2 * k + 2, n_k)):
                             fine[a, b, c] = labels[i, j, k]
-                            if confident[k] != 255:
+                            if agreed[k] != 255:
                                 continue
                             high = (a + 1) // 2, (b + 1) // 2, (c + 1) // 2
                             for n in range(coarse.shape[3]):
                                 expected[count, n] = _linear(coarse, (i, j, k), high, n)
-                            listed[count] = (a * n_j + b) * n_k + c
+                            flat[count] = (a * n_j + b) * n_k + c
                             between[count] = a % 2 + b % 2 + c % 2 > 0
                             count += 1
-    return listed[:count].copy(), expected[:count].copy(), between[:count].copy()
+    return flat[:count].copy(), expected[:count].copy(), between[:count].copy()
 
 
 @njit(nogil=True)
 def neighbours(shape, frontier, known):  # type: ignore[no-untyped-def]
-    """The voxels that touch these and are not known yet: flat indices. They are marked as known,
+    """The voxels that touch these and are not known yet, as flat indices. They are marked as known,
     since the caller queries them next."""
     n_i, n_j, n_k = shape
-    found = np.empty(max(26 * len(frontier), 1), np.int64)
+    flat = np.empty(max(26 * len(frontier), 1), np.int64)
     count = 0
     for n in range(len(frontier)):
         i, rest = divmod(frontier[n], n_j * n_k)
@@ -154,23 +154,23 @@ def neighbours(shape, frontier, known):  # type: ignore[no-untyped-def]
                     at = (a * n_j + b) * n_k + c
                     if not known[at]:
                         known[at] = True
-                        found[count] = at
+                        flat[count] = at
                         count += 1
-    return found[:count].copy()
+    return flat[:count].copy()
 
 
 @njit(nogil=True, inline="always")
 def _cell(at, size):  # type: ignore[no-untyped-def]
-    """The cell of a coordinate along one axis, and the fraction of the cell up to it."""
+    """The cell of a coordinate along one axis, and the position within it, 0 to 1."""
     at = min(max(at, np.float32(0)), np.float32(size - 1))
     low = min(int(at), size - 2)
     return low, at - np.float32(low)
 
 
 @njit(nogil=True)
-def between(values, place):  # type: ignore[no-untyped-def]
-    """Trilinear values (m, n) of a lattice (a, b, c, n) at places (m, 3), in its steps; outside
-    those of the nearest border."""
+def trilinear(values, place):  # type: ignore[no-untyped-def]
+    """Trilinear interpolation of a lattice (a, b, c, n) at places (m, 3), in its steps: (m, n);
+    outside the value at the nearest border."""
     out = np.empty((len(place), values.shape[3]), np.float32)
     for m in range(len(place)):
         i, x = _cell(place[m, 0], values.shape[0])

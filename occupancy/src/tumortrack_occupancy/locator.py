@@ -1,4 +1,4 @@
-"""Locating with an occupancy network: labels of queries, coarse first, then where it matters."""
+"""Localisation with an occupancy network: coarse queries, then a lattice, then voxels."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ from tumortrack_occupancy.sparse import halved_lattice, organ_lattice, sparse_lo
 
 COARSE_QUERIES = 10_000
 FINE_QUERIES = 40_000
-FEWEST_INSIDE = 20  # of the coarse queries: fewer are no organ
-_LATTICE_MM = 4.5  # at most: always within a ball of 7.8 mm
-_LIVE_MARGIN = 0.1  # of the organ's extent: how far it may move from one live frame to the next
+FEWEST_INSIDE = 20  # of the coarse queries: with fewer there is no organ
+_LATTICE_MM = 4.5  # largest step: every ball of 7.8 mm contains a lattice point
+_LIVE_MARGIN = 0.1  # of the organ's extent: the largest motion between live frames
 
 
 class OccupancyLocator:
@@ -41,8 +41,8 @@ class OccupancyLocator:
 
     def locate(self, looks: Sequence[Look], grid: int, seed: int) -> Estimate:
         """See ``tracking.tracker.Tracker.locate``. The two passes of queries are those of the
-        follow-up (LUDO): 10,000 coarse ones where the organ can be, then labels of 40,000 points
-        in the enlarged box of those inside."""
+        follow-up (LUDO): 10,000 coarse ones where the organ can be, then 40,000 in the enlarged box
+        of those inside."""
         frame = _Frame(self, _only_cloud(looks), seed, np.random.default_rng(seed))
         lattice = frame.lattice(frame.coarse_box())
         distances_mm = frame.checked(lattice)
@@ -54,11 +54,10 @@ class OccupancyLocator:
 
     def follow(self, looks: Sequence[Look], last: Estimate | None, how: FollowOptions) -> Estimate:
         """See ``tracking.tracker.Tracker.follow``. The enlarged box of the last organ replaces the
-        coarse queries, and its lattice is queried only where the organ is (``organ_lattice``).
-        Where this frame's organ reaches the box's border, without a last estimate, or with
-        ``thorough``, the organ is searched for as in a first frame, and the lattice queried
-        everywhere. The surfaces' grid is twice as fine as the lattice, and queried only about
-        surfaces."""
+        coarse queries, and its lattice is queried only where the organ is (``organ_lattice``). If
+        the organ reaches the box's border, there is no last estimate, or with ``thorough``, it is
+        searched for as in a first frame, with every lattice point queried. The surfaces' grid is
+        twice as fine as the lattice, and queried only near surfaces."""
         cloud = _only_cloud(looks)
         rng = np.random.default_rng((how.seed, cloud.stamp_ns))
         frame = _Frame(self, cloud, how.seed, rng)
@@ -83,7 +82,7 @@ class OccupancyLocator:
         box = self.model.query_box_mm + np.median(points, axis=0)
         finer = halved_lattice(frame.logits_at, frame.lattice(box))
         for step in (frame.inside, frame.checked):
-            with suppress(NoEstimate):  # it is no organ
+            with suppress(NoEstimate):  # this is no organ
                 step(finer)
         ball = np.linalg.norm(np.indices((16, 16, 16)).T - 7.5, axis=-1) < 5
         margins = np.where(ball, 1, -1).astype(np.float16)[None]
@@ -99,13 +98,8 @@ def _only_cloud(looks: Sequence[Look]) -> SensorCloud:
     return looks[0].cloud
 
 
-def steps_over(box: volume.Box) -> int:
-    """Steps of the lattice along a box's longest side."""
-    return max(volume.FIT_STEPS, math.ceil(float((box[1] - box[0]).max()) / _LATTICE_MM))
-
-
 class _Frame(Frame):
-    """The work on one cloud, from its latent to the estimate."""
+    """One cloud, from its latent code to the estimate."""
 
     def __init__(self, locator: OccupancyLocator, cloud: SensorCloud, seed: int, rng: Rng) -> None:
         super().__init__(locator.model, cloud, seed, rng)
@@ -118,7 +112,7 @@ class _Frame(Frame):
         return self._inference.logits(self._latent, points_mm)
 
     def coarse_box(self) -> volume.Box:
-        """Where the organ is, by coarse random queries."""
+        """The organ's box, from coarse random queries."""
         lower, upper = self._box_mm + np.median(self.cloud.points_mm, axis=0)
         points = self.rng.uniform(lower, upper, (COARSE_QUERIES, 3)).astype(np.float32)
         with self.stage("coarse"):
@@ -132,19 +126,21 @@ class _Frame(Frame):
         return np.stack([low - margin, high + margin])
 
     def lattice(self, box: volume.Box, everywhere: bool = False) -> volume.LogitLattice:
+        """Over a box, queried everywhere or only where the organ is."""
+        steps = max(volume.FIT_STEPS, math.ceil(float((box[1] - box[0]).max()) / _LATTICE_MM))
         over = volume.lattice_over if everywhere else organ_lattice
         with self.stage("lattice"):
-            return over(self.logits_at, box, steps_over(box))
+            return over(self.logits_at, box, steps)
 
     def checked(self, lattice: volume.LogitLattice) -> Float32[np.ndarray, " n"]:
-        """How far the points lie from the surface, if this can be the organ."""
+        """The observed points' distances from the surface; NoEstimate if this is not the organ."""
         with self.stage("fit"):
             distances_mm = volume.surface_distances(lattice, self.points_mm)
             check_in_distribution(self.model.in_distribution, self.points_mm, distances_mm)
         return distances_mm
 
     def inside(self, lattice: volume.LogitLattice) -> OccupancyCloud:
-        """Those of 40,000 random points in the lattice's box that lie inside."""
+        """The points inside the organ, of 40,000 random ones in the lattice's box."""
         with self.stage("fine"):
             low, high = lattice.box_mm
             points = self.rng.uniform(low, high, (FINE_QUERIES, 3)).astype(np.float32)
@@ -162,15 +158,15 @@ class _Frame(Frame):
         distances_mm: Float32[np.ndarray, " n"],
         inside: OccupancyCloud,
         margins: volume.Margins,
-        found: volume.Labels,
+        labels: volume.Labels,
         camera_from_index: volume.Affine,
     ) -> Estimate:
-        """Everything read off margins and labels of a grid."""
+        """The estimate from margins and labels on a grid."""
         names = self.model.parts
         with self.stage("surfaces"):
-            labels = volume.keep_largest_pieces(found, len(names))
-            inside = volume.drop_islands(inside, found, labels, camera_from_index)
-            meshes = volume.part_surfaces(margins, labels, camera_from_index, names)
+            kept = volume.keep_largest_pieces(labels, len(names))
+            inside = volume.drop_islands(inside, labels, kept, camera_from_index)
+            meshes = volume.part_surfaces(margins, kept, camera_from_index, names)
         parts = describe_parts(names, meshes, inside)
         report = self.report(distances_mm, parts, voxel_mm=float(camera_from_index[0, 0]))
-        return Estimate(inside, CameraLabels(labels, camera_from_index), meshes, report)
+        return Estimate(inside, CameraLabels(kept, camera_from_index), meshes, report)

@@ -1,6 +1,6 @@
-"""The paper's method as tumortrack finds it: an entry point of ``tumortrack.methods``.
+"""The entry point in ``tumortrack.methods``, by which tumortrack finds the paper's method.
 
-This module imports no PyTorch, which takes seconds; the functions do.
+Importing this module does not import PyTorch, which takes seconds; its functions do.
 """
 
 from __future__ import annotations
@@ -89,14 +89,14 @@ class OccupancyMethod:
 
         from tumortrack_occupancy.hardware import has_fast_bfloat16
 
-        has = torch.cpu.get_capabilities()
+        capability = torch.cpu.get_capabilities()
         names = {"AVX2": "avx2", "AVX-512": "avx512_f", "AMX": "amx_tile"}
-        units = [f"{'' if has.get(flag) else 'no '}{unit}" for unit, flag in names.items()]
+        units = [f"{'' if capability.get(key) else 'no '}{unit}" for unit, key in names.items()]
         fast = has_fast_bfloat16(torch.device("cpu"))
         bf16 = "in hardware, used" if fast else "not in hardware; fp32 is used (slower)"
         cuda = torch.cuda.get_device_name() if torch.cuda.is_available() else "none"
-        where = "" if torch.cuda.is_available() else "; everything runs on the CPU"
-        return f"CPU: {', '.join(units)}; bf16: {bf16}", f"CUDA: {cuda}{where}"
+        note = "" if torch.cuda.is_available() else "; everything runs on the CPU"
+        return f"CPU: {', '.join(units)}; bf16: {bf16}", f"CUDA: {cuda}{note}"
 
 
 METHOD = OccupancyMethod()

@@ -28,8 +28,8 @@ _LARGEST_BOX_MM = 1000.0
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class OccupancyModel(Model):
-    """See ``Model``; ``network`` is in evaluation mode. ``query_box_mm``: where the organ can lie
-    (lower and upper corner), relative to the median of the observed points, camera frame."""
+    """A trained network, in evaluation mode. ``query_box_mm``: where the organ can lie (lower and
+    upper corner), relative to the median of the observed points, camera frame."""
 
     config: TrainConfig
     network: OccupancyNetwork
@@ -51,28 +51,34 @@ class OccupancyModel(Model):
     def from_folder(
         cls, folder: Path, manifest: dict[str, Any], *, device: str = "auto", **known: Any
     ) -> OccupancyModel:
-        where = choose_device(device)
         config = from_builtins(manifest["config"], TrainConfig, f"{folder}: config")
         network = OccupancyNetwork(config.network)
         network.load_state_dict(read_tensors(folder / WEIGHTS, load))
         box_mm = np.array(manifest["query_box_mm"], float).reshape(2, 3)
         if not ((box_mm[0] < box_mm[1]).all() and (np.abs(box_mm) < _LARGEST_BOX_MM).all()):
             raise InputError(f"query_box_mm {box_mm.tolist()} is not a box about an organ.")
-        network = network.eval().requires_grad_(False).to(where)
+        network = network.eval().requires_grad_(False).to(choose_device(device))
         return cls(config=config, network=network, query_box_mm=box_mm, **known)
 
 
 def onnx_bytes(model: OccupancyModel) -> bytes:
-    """A model's network as an ONNX file, in single precision, for other programs. Farthest points
-    and balls are written out in plain operators; the number of queries is free, the number of
-    points is the one that the model was trained with (repeat the points of a smaller cloud).
-    ``cloud_mm`` (1, N, 3) and ``queries_mm`` (1, Q, 3) -> ``logits`` (1, Q, classes); camera frame,
-    mm, float32."""
-    points, generator = model.config.scene.cloud.n_points, torch.Generator().manual_seed(0)
-    cloud = torch.randn(1, points, 3, generator=generator) * 20 + torch.tensor([0.0, 0.0, 130.0])
-    module, inputs, names = model.network.onnx_parts(cloud)
+    """A model's network as an ONNX file, in single precision, for other programs. Sampling and
+    ball queries are plain operators. Any number of queries is allowed; the number of points is
+    that of the training scenes (repeat the points of a smaller cloud). ``cloud_mm`` (1, N, 3) and
+    ``queries_mm`` (1, Q, 3) -> ``logits`` (1, Q, classes); camera frame, mm, float32."""
+    n_points, generator = model.config.scene.cloud.n_points, torch.Generator().manual_seed(0)
+    cloud = torch.randn(1, n_points, 3, generator=generator) * 20 + torch.tensor([0.0, 0.0, 130.0])
     content: Any = io.BytesIO()  # the annotation lacks files, which work as well
     with torch.no_grad(), warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # shapes are constants here: on purpose
-        torch.onnx.export(module, inputs, content, dynamo=False, opset_version=_OPSET, **names)
+        warnings.simplefilter("ignore")  # shapes are constants here, on purpose
+        torch.onnx.export(
+            model.network.folded().cpu(),
+            (cloud, cloud[:, :7]),
+            content,
+            dynamo=False,
+            opset_version=_OPSET,
+            input_names=["cloud_mm", "queries_mm"],
+            output_names=["logits"],
+            dynamic_axes={"queries_mm": {1: "queries"}, "logits": {1: "queries"}},
+        )
     return content.getvalue()

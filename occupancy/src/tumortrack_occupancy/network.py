@@ -1,6 +1,6 @@
 """The occupancy network: encode a cloud once, query many points.
 
-Clouds and queries are in the camera frame, in mm; inside, everything is relative to a centre taken
+Clouds and queries are in the camera frame, mm. Inside, everything is relative to a centre taken
 from the cloud, so that nothing depends on where the camera is.
 """
 
@@ -9,7 +9,6 @@ from __future__ import annotations
 import copy
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -17,29 +16,29 @@ from torch.nn import functional
 
 from tumortrack_occupancy.config import MlpDecoderConfig, NetworkConfig
 from tumortrack_occupancy.layers import Layer, Norm
-from tumortrack_occupancy.normalisation import normalised, turned
+from tumortrack_occupancy.normalisation import normalised, rotated
 
 
 @dataclass(frozen=True, eq=False)
 class Latent:
-    """B encoded clouds; valid only for the weights (and the mode) that made it."""
+    """The latent codes of B clouds; valid only for the weights (and the mode) that made them."""
 
     vector: Tensor  # (B, L)
     centre_mm: Tensor  # (B, 1, 3), camera frame
     scale_mm: Tensor  # (B, 1, 1)
-    turn: Tensor | None  # (2, B, 1): cosine and sine of the turn about z; None: no turn
-    terms: tuple[Tensor, ...]  # the decoder's part, computed once per cloud
+    rotation: Tensor | None  # (2, B, 1): cosine and sine of the angle about z
+    terms: tuple[Tensor, ...]  # ``MlpDecoder.prepare``, once per cloud
 
     def normalised(self, queries_mm: Tensor) -> Tensor:
         """Queries (B, Q, 3), camera frame, mm -> the decoder's input."""
         queries = (queries_mm - self.centre_mm) / self.scale_mm
-        return queries if self.turn is None else turned(queries, self.turn)
+        return queries if self.rotation is None else rotated(queries, self.rotation)
 
 
 class MlpDecoder(nn.Module):
-    """An MLP on [latent, query] (Mescheder et al., CVPR 2019), the latent's part computed once per
-    cloud. Inputs of a hidden layer are ordered [hidden, query, latent]; W [h, q, z] + b is computed
-    as W_hq [h, q] + (W_z z + b): the bracket is one vector per cloud."""
+    """An MLP on [latent, query] (Mescheder et al., CVPR 2019). A hidden layer's inputs are ordered
+    [hidden, query, latent]; W [h, q, z] + b is computed as W_hq [h, q] + (W_z z + b), and the
+    bracket once per cloud."""
 
     def __init__(self, config: MlpDecoderConfig, latent_size: int) -> None:
         super().__init__()
@@ -58,7 +57,7 @@ class MlpDecoder(nn.Module):
         return number in (1, self.config.skip_layer)
 
     def hidden_layers(self) -> list[Layer]:
-        """In their order."""
+        """All layers but the output, typed."""
         return [layer for layer in self.layers if isinstance(layer, Layer)]
 
     def prepare(self, latent: Tensor) -> tuple[Tensor, ...]:
@@ -99,7 +98,7 @@ def octave_features(queries: Tensor, octaves: tuple[int, ...]) -> Tensor:
 
 
 class OccupancyNetwork(nn.Module):
-    """Labels of query points from one cloud (the paper, section "Localization")."""
+    """Classifies query points given one cloud (the paper, section "Localization")."""
 
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__()
@@ -109,9 +108,9 @@ class OccupancyNetwork(nn.Module):
 
     def encode(self, points_mm: Tensor) -> Latent:
         """Clouds (B, N, 3), camera frame, mm, float32, points in random order -> Latent."""
-        points, centre_mm, scale_mm, turn = normalised(points_mm, self.config.normalisation)
+        points, centre_mm, scale_mm, rotation = normalised(points_mm, self.config.normalisation)
         vector = self.encoder(points)
-        return Latent(vector, centre_mm, scale_mm, turn, self.decoder.prepare(vector))
+        return Latent(vector, centre_mm, scale_mm, rotation, self.decoder.prepare(vector))
 
     def query(self, latent: Latent, queries_mm: Tensor) -> Tensor:
         """Queries (B, Q, 3), camera frame, mm, float32 -> logits (B, Q, classes)."""
@@ -119,20 +118,13 @@ class OccupancyNetwork(nn.Module):
         return logits
 
     def forward(self, points_mm: Tensor, queries_mm: Tensor) -> Tensor:
-        """Both at once: (B, N, 3) and (B, Q, 3) -> logits (B, Q, classes)."""
+        """Clouds (B, N, 3) and queries (B, Q, 3) -> logits (B, Q, classes)."""
         return self.query(self.encode(points_mm), queries_mm)
 
     def loss(self, clouds_mm: Tensor, points_mm: Tensor, labels: Tensor) -> Tensor:
-        """Cross-entropy of the points' labels, all points equal (the paper)."""
+        """Cross-entropy of the points' labels, all weighted equally (the paper)."""
         logits = self(clouds_mm, points_mm)
         return functional.cross_entropy(logits.float().flatten(0, 1), labels.long().flatten())
-
-    def onnx_parts(self, cloud_mm: Tensor) -> tuple[nn.Module, tuple[Tensor, ...], dict[str, Any]]:
-        """What to trace for an ONNX file of clouds like this one, (1, N, 3), on which inputs, and
-        the names for ``torch.onnx.export``: clouds and queries in, logits out."""
-        free = {"queries_mm": {1: "queries"}, "logits": {1: "queries"}}
-        names = {"input_names": ["cloud_mm", "queries_mm"], "output_names": ["logits"]}
-        return self.folded().cpu(), (cloud_mm, cloud_mm[:, :7]), {**names, "dynamic_axes": free}
 
     def folded(self) -> OccupancyNetwork:
         """A copy for inference: batch norms folded into their linear layers, no gradients."""

@@ -1,25 +1,17 @@
-"""The paper's network and training, and a slim one: Python values of a case."""
+"""The presets: the paper's network and training, and a slim one."""
 
 from __future__ import annotations
 
-from typing import Literal
-
 from tumortrack.core.types import Anatomy
+from tumortrack.registration.presets import Rotations
 from tumortrack.sense.clutter import ClutterConfig
 from tumortrack.sense.noise import D405_NOISE
 from tumortrack.simulate.deform import ChainConfig, DragConfig, StretchConfig
 from tumortrack.simulate.deform.drag import CONFIGURATIONS
 from tumortrack.simulate.scene import OccupancyConfig, PoseConfig, SceneConfig
-from tumortrack_occupancy.config import (
-    MlpDecoderConfig,
-    NetworkConfig,
-    Schedule,
-    TrainConfig,
-)
+from tumortrack_occupancy.config import MlpDecoderConfig, NetworkConfig, Schedule, TrainConfig
 from tumortrack_occupancy.encoders.pointnet2 import PointNet2Config, SetAbstraction
 from tumortrack_occupancy.normalisation import Aligned, CloudBox
-
-Rotations = Literal["full", "limited"]
 
 
 def paper(anatomy: Anatomy, rotations: Rotations = "limited") -> TrainConfig:
@@ -68,7 +60,7 @@ def paper_network(n_classes: int) -> NetworkConfig:
     fifth, batch norm on "the skip and the final layer": the fifth and the last hidden one. From
     the follow-up (LUDO, IEEE T-RO 2025): the levels' ratios, radii, neighbours and widths, and the
     cloud's bounding box as normalisation. From PointNet++: batch norm in the encoder. Ours: raw
-    query coordinates (the follow-up adds octaves; the paper names none), He's start of the weights.
+    query coordinates (the follow-up adds octaves; the paper names none), He initialisation.
     """
     return NetworkConfig(
         encoder=PointNet2Config(
@@ -90,10 +82,10 @@ def quick_network(n_classes: int, scale_mm: float) -> NetworkConfig:
 
     All numbers are ours. Width: 256-d latent and 5 x 128 decoder as in our prototype. The rest
     by mIoU after 600 steps on a toy (dented ellipsoid, two spheres, bending, one seed each):
-    octaves 0.55 against 0.39 for raw coordinates; radii 0.4 and 0.9 0.62, farthest points as
-    well 0.63, a skip as well 0.65; batch norm lost 0.03, and its running statistics make short
-    runs' validation erratic. ``scale_mm``: about half the organ's longest side; with a reach of
-    1.35 of it at most 0.6 % of the points of strongly deformed kidneys are strays.
+    octaves 0.55 against 0.39 for raw coordinates; with radii 0.4 and 0.9 0.62, with farthest
+    points 0.63, with a skip 0.65; batch norm lost 0.03, and its running statistics make validation
+    erratic in short runs. ``scale_mm``: about half the organ's longest side; with a reach of
+    1.35 of it at most 0.6 % of the points of strongly deformed kidneys count as outliers.
     """
     return NetworkConfig(
         encoder=PointNet2Config(

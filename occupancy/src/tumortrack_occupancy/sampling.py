@@ -1,6 +1,6 @@
-"""Choosing points and neighbours, deterministic: compiled for a CPU, in plain torch elsewhere.
+"""Choosing points and neighbours, deterministically: compiled on a CPU, in plain torch elsewhere.
 
-The plain forms are the reference, run on every device and can be exported; both choose the same
+The plain form is the reference, runs on every device and can be exported; both choose the same
 points. Points come in batches (B, N, 3). Lengths are in whatever unit the points have.
 """
 
@@ -11,12 +11,12 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from tumortrack.core.compiled import njit
 from tumortrack.core.mesh_kernels import farthest
-from tumortrack_occupancy.point_kernels import balls
 
 
 def farthest_points(points: Tensor, k: int) -> Tensor:
-    """Farthest point sampling; the first point is the one farthest from the centroid. The fixed
+    """Farthest point sampling, from the point that is farthest from the centroid. This fixed
     start makes the chosen set independent of the points' order (but for exact ties); a random one
     alone changes about 0.8 % of the labels. Sequential in ``k``. Points (B, N, 3) -> indices (B,
     k), int64, in the order of choice. Source: Eldar et al. 1997; Qi et al., PointNet++, NIPS 2017,
@@ -38,9 +38,9 @@ def farthest_points(points: Tensor, k: int) -> Tensor:
 
 
 def strided_points(points: Tensor, k: int) -> Tensor:
-    """Every (N / k)-th point, k at most N: for points (B, N, 3) in random order as good as a random
-    choice, and free (rows of a depth image also do, being spread evenly). Indices (B, k),
-    rising."""
+    """Every (N / k)-th point, k at most N, as ascending indices (B, k). For points (B, N, 3) in
+    random order this is a random choice at no cost; rows of a depth image, spread evenly, also
+    do."""
     n = points.shape[1]
     row = torch.arange(k, device=points.device) * n // k
     return row.expand(len(points), k)
@@ -48,24 +48,48 @@ def strided_points(points: Tensor, k: int) -> Tensor:
 
 def ball_query(points: Tensor, centres: Tensor, radius: float, k: int) -> Tensor:
     """The first ``k`` points (B, N, 3), by index, within ``radius`` of each centre (B, M, 3):
-    indices (B, M, k), int64. Where fewer are found the first found is repeated, so that a maximum
-    over the neighbours is not changed. A centre that is one of the points always finds itself; an
-    empty ball gives index 0. Source: Qi et al., PointNet++, NIPS 2017, section 3.2."""
+    indices (B, M, k), int64. If a ball holds fewer, its first is repeated, so that a maximum over
+    the neighbours is unchanged. A centre that is one of the points always finds itself; an empty
+    ball gives index 0. Source: Qi et al., PointNet++, NIPS 2017, section 3.2."""
     if compiled(points):
-        found = torch.empty((*centres.shape[:2], k), dtype=torch.int64)
+        indices = torch.empty((*centres.shape[:2], k), dtype=torch.int64)
         rows = _rows(points).numpy(), _rows(centres).numpy()
-        balls(*rows, np.float32(radius**2), found.numpy())
-        return found
+        _ball_query(*rows, np.float32(radius**2), indices.numpy())
+        return indices
     across, down = _rows(points)[:, :, None].unbind(1), _rows(centres)[..., None].unbind(1)
     inside = _distance_2(*across, *down) <= radius**2
-    slot = inside.long().cumsum(dim=2)  # 1 for the first found; ONNX sums no truths
+    slot = inside.long().cumsum(dim=2)  # 1 for the first inside; ONNX does not sum booleans
     count = slot[:, :, -1:].clone()
-    slot.sub_(1).masked_fill_(~inside, k).clamp_(max=k)  # slot k takes all that is not wanted
+    slot.sub_(1).masked_fill_(~inside, k).clamp_(max=k)  # slot k takes all that are not wanted
     batch, n_centres, n = inside.shape
-    found = torch.zeros((batch, n_centres, k + 1), dtype=torch.int64, device=points.device)
-    found.scatter_(2, slot, torch.arange(n, device=points.device).expand_as(slot))
+    indices = torch.zeros((batch, n_centres, k + 1), dtype=torch.int64, device=points.device)
+    indices.scatter_(2, slot, torch.arange(n, device=points.device).expand_as(slot))
     missing = torch.arange(k, device=points.device) >= count
-    return torch.where(missing, found[:, :, :1], found[:, :, :k])
+    return torch.where(missing, indices[:, :, :1], indices[:, :, :k])
+
+
+@njit(nogil=True)
+def _ball_query(points, centres, radius_2, indices):  # type: ignore[no-untyped-def]
+    """``ball_query`` of points (B, 3, N) and centres (B, 3, M), float32, into ``indices``."""
+    n_clouds, _, n = points.shape
+    k = indices.shape[2]
+    square = np.empty(n, np.float32)
+    for cloud in range(n_clouds):
+        x, y, z = points[cloud, 0], points[cloud, 1], points[cloud, 2]
+        for m in range(centres.shape[2]):
+            cx, cy, cz = centres[cloud, 0, m], centres[cloud, 1, m], centres[cloud, 2, m]
+            for i in range(n):
+                dx, dy, dz = x[i] - cx, y[i] - cy, z[i] - cz
+                square[i] = dx * dx + dy * dy + dz * dz
+            row = indices[cloud, m]
+            count = 0
+            for i in range(n):
+                if square[i] <= radius_2:
+                    row[count] = i
+                    count += 1
+                    if count == k:
+                        break
+            row[count:] = row[0] if count else 0
 
 
 def take(values: Tensor, indices: Tensor) -> Tensor:
@@ -84,7 +108,7 @@ def compiled(points: Tensor) -> bool:
 
 
 def traced() -> bool:
-    """Whether torch records what is done, to export or compile it."""
+    """Whether torch records operations, to export or compile them."""
     return torch.compiler.is_compiling() or torch.jit.is_tracing()
 
 
@@ -94,5 +118,5 @@ def _rows(points: Tensor) -> Tensor:
 
 
 def _distance_2(x: Tensor, y: Tensor, z: Tensor, cx: Tensor, cy: Tensor, cz: Tensor) -> Tensor:
-    """Squared, of broadcastable coordinates; exactly 0 of a point and itself."""
+    """Squared, of broadcastable coordinates; exactly 0 between a point and itself."""
     return (x - cx).square_().add_((y - cy).square_()).add_((z - cz).square_())

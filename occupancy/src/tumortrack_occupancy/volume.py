@@ -1,4 +1,4 @@
-"""What is read off logits on a grid: labels, smooth closed surfaces, distances."""
+"""Labels, smooth closed surfaces and distances from logits on a grid."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from tumortrack.core.mesh_query import surface_distance
 from tumortrack.core.report import Finding
 from tumortrack.core.types import FIRST_TUMOR, ORGAN, OUTSIDE, Mesh, OccupancyCloud
 from tumortrack.imaging.grid import grown_box, tight_box
-from tumortrack_occupancy.kernels import between
+from tumortrack_occupancy.kernels import trilinear
 
 AT_ONCE = 2**18  # queries; bounds the memory for any grid
 _SMALLEST_MARGIN = 1e-3  # a surface exactly through a grid point would not be closed
 FIT_STEPS = 24  # of a lattice for surface_distances, along the box's longest side
-LARGEST_MARGIN = 30.0  # larger logits say no more about where a surface lies
+LARGEST_MARGIN = 30.0  # larger logits do not change where a surface lies
 
 Points = Float32[np.ndarray, "n 3"]  # camera frame, mm
 Rows = Float32[np.ndarray, "n classes"]
@@ -47,15 +47,15 @@ class LogitLattice:
         size = np.array(self.logits.shape[:3]) - 1
         return np.stack([self.origin_mm, self.origin_mm + self.step_mm * size])
 
-    def between(self, points_mm: Points) -> Rows:
-        """Trilinear logits at points; outside the lattice those of its border."""
+    def interpolate(self, points_mm: Points) -> Rows:
+        """Trilinear logits at points; outside the lattice those at its border."""
         place = ((points_mm - self.origin_mm) / self.step_mm).astype(np.float32)
-        return between(self.logits, place)
+        return trilinear(self.logits, place)
 
     def cut_off(self) -> bool:
-        """Whether the organ, the largest piece of what lies inside, reaches the border or is not
-        there at all."""
-        organ = _largest_piece(self.logits.argmax(-1) != OUTSIDE)
+        """Whether the organ, the largest connected component of what is not outside, reaches the
+        border or is missing."""
+        organ = _largest_component(self.logits.argmax(-1) != OUTSIDE)
         return not organ.any() or bool(organ.sum() > organ[1:-1, 1:-1, 1:-1].sum())
 
 
@@ -80,50 +80,51 @@ def margins_on(lattice: LogitLattice) -> tuple[Margins, Labels, Affine]:
 
 
 def margins_of(logits: torch.Tensor) -> Float16[np.ndarray, "n parts"]:
-    """By how much each part's logit wins (positive inside): (n, classes) -> (n, parts). Half
-    precision: 2 bytes a voxel and part, 0.4 GB at 400^3 with two tumors. The organ's margin is that
-    of the best label inside against the outside, so that its zero set is the whole organ's surface;
-    a tumor's is against the best other label."""
+    """By how much each part's logit wins (positive inside): (n, classes) -> (n, parts). The organ's
+    margin is that of the best label inside over the outside, so that its zero set is the surface of
+    the whole organ; a tumor's is over the best other label. In half precision, 2 bytes per voxel
+    and part: 0.4 GB at 400^3 with two tumors."""
     columns = [logits[:, 1:].amax(1) - logits[:, 0]]
     for label in range(FIRST_TUMOR, logits.shape[1]):
         others = torch.cat([logits[:, :label], logits[:, label + 1 :]], 1).amax(1)
         columns.append(logits[:, label] - others)
-    won = torch.stack(columns, 1).clamp(-LARGEST_MARGIN, LARGEST_MARGIN)
-    return won.half().cpu().numpy()
+    margins = torch.stack(columns, 1).clamp(-LARGEST_MARGIN, LARGEST_MARGIN)
+    return margins.half().cpu().numpy()
 
 
 def keep_largest_pieces(labels: Labels, n_parts: int) -> Labels:
-    """One piece of each part: islands of the organ become outside, those of a tumor organ."""
-    kept = np.where(_largest_piece(labels > 0), labels, 0).astype(np.uint8)
+    """Only the largest connected component of each part: other pieces of the organ become outside,
+    those of a tumor organ."""
+    kept = np.where(_largest_component(labels > 0), labels, 0).astype(np.uint8)
     for label in range(FIRST_TUMOR, n_parts + 1):
         mask = kept == label
-        kept[mask & ~_largest_piece(mask)] = ORGAN
+        kept[mask & ~_largest_component(mask)] = ORGAN
     return kept
 
 
 def drop_islands(
-    cloud: OccupancyCloud, found: Labels, kept: Labels, camera_from_index: Affine
+    cloud: OccupancyCloud, labels: Labels, kept: Labels, camera_from_index: Affine
 ) -> OccupancyCloud:
-    """The cloud without what ``keep_largest_pieces`` dropped from ``found``: points of an island of
-    the organ are left out, those of a tumor become organ. A point belongs to a piece if one of the
-    voxels next to it does."""
-    if np.array_equal(found, kept):
+    """The cloud without what ``keep_largest_pieces`` dropped from the labels: points in an island
+    of the organ are left out, those in a tumor's become organ. A point belongs to a piece if one of
+    the voxels next to it does."""
+    if np.array_equal(labels, kept):
         return cloud
     index_from_camera = np.linalg.inv(camera_from_index)
     index = np.rint(transform_points(index_from_camera, cloud.points_mm.astype(np.float64)))
-    labels = cloud.labels.copy()
-    same, stays = np.zeros(len(labels), bool), np.zeros(len(labels), bool)
+    point_labels = cloud.labels.copy()
+    same, stays = np.zeros(len(index), bool), np.zeros(len(index), bool)
     for off in np.ndindex(3, 3, 3):
         voxel = np.clip(index.astype(int) + off - 1, 0, np.array(kept.shape) - 1)
         beside = kept[tuple(voxel.T)]
-        same |= beside == labels
+        same |= beside == point_labels
         stays |= beside > 0
-    labels[(labels >= FIRST_TUMOR) & ~same] = ORGAN
+    point_labels[(point_labels >= FIRST_TUMOR) & ~same] = ORGAN
     points, probability = cloud.points_mm[stays], cloud.probability[stays]
-    return OccupancyCloud(points, labels[stays], probability, cloud.stamp_ns)
+    return OccupancyCloud(points, point_labels[stays], probability, cloud.stamp_ns)
 
 
-def _largest_piece(mask: Mask) -> Mask:
+def _largest_component(mask: Mask) -> Mask:
     if not mask.any():
         return mask
     box = tight_box(mask)
@@ -138,7 +139,7 @@ def _largest_piece(mask: Mask) -> Mask:
 def part_surfaces(
     margins: Margins, labels: Labels, camera_from_index: Affine, names: tuple[str, ...]
 ) -> dict[str, Mesh]:
-    """Each part, in one piece, as a closed surface; parts without a voxel are left out."""
+    """Each part as a closed surface (marching cubes); parts without a voxel are left out."""
     from skimage import measure
 
     meshes = {}
@@ -146,11 +147,11 @@ def part_surfaces(
         mask = labels > 0 if n == 0 else labels == n + 1
         if not mask.any():
             continue
-        # One voxel more on each side: the surface lies between voxels of either sign.
+        # One more voxel on each side: the surface lies between voxels of opposite sign.
         box = grown_box(tight_box(mask), mask.shape, np.ones(3, int))
         field = np.where(mask[box], margins[n][box], -np.abs(margins[n][box])).astype(np.float32)
         field = np.where(field > 0, 1, -1) * np.maximum(np.abs(field), _SMALLEST_MARGIN)
-        # Padding closes what the grid's edge cuts.
+        # Padding closes surfaces at the grid's edge.
         padded = np.pad(field, 1, constant_values=-float(np.abs(field).max()))
         vertices, faces, _, _ = measure.marching_cubes(padded, 0.0, gradient_direction="ascent")
         index = vertices.astype(np.float64) - 1 + [part.start for part in box]
@@ -161,9 +162,9 @@ def part_surfaces(
 
 
 def surface_distances(lattice: LogitLattice, points_mm: Points) -> Float32[np.ndarray, " n"]:
-    """How far points (n, 3) lie from the organ's surface, camera frame, mm; NoEstimate where there
-    is none in the lattice's box. It is the zero of the margin, linear between the lattice's points:
-    accurate to about half a mm for an organ on ``FIT_STEPS``."""
+    """Distances of points (n, 3), camera frame, mm, from the organ's surface; NoEstimate if there
+    is none in the lattice's box. The surface is the zero set of the margin, linear between the
+    lattice's points: accurate to about half a mm for an organ on ``FIT_STEPS``."""
     from skimage import measure
 
     logits = lattice.logits

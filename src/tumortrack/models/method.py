@@ -1,10 +1,13 @@
-"""What a method other than the default one offers, and how an installed package adds it.
+"""The interface of methods beside the default one, which installed packages add.
+
+A package names an object with the interface ``Method`` in its pyproject.toml:
 
     [project.entry-points."tumortrack.methods"]
     occupancy = "tumortrack_occupancy.method:METHOD"
 
-The object is a ``Method``. It is loaded where a preset, configuration or model folder of such a
-method is used, and nowhere else.
+It also defines a ``ModelConfig``, a ``Model`` and a ``Locator``. The object is loaded only when a
+preset, configuration or model folder is not of the default method; its module should import
+nothing slow.
 """
 
 from __future__ import annotations
@@ -22,20 +25,20 @@ from tumortrack.imaging.case import Case
 from tumortrack.models.model import Model, ModelConfig
 
 GROUP = "tumortrack.methods"
-Preset = Callable[[Anatomy, Literal["limited", "full"]], Any]  # -> a configuration
+Preset = Callable[[Anatomy, Literal["limited", "full"]], Any]  # rotations -> a ``ModelConfig``
 
 
 @runtime_checkable
 class Locator(Protocol):
-    """What locates with one model."""
+    """Locates with one model. ``anatomy_ct``: what the model moves; None if it knows no motion."""
 
     anatomy_ct: Anatomy | None
 
     def locate(self, looks: Sequence[Look], grid: int, seed: int) -> Estimate:
-        """See ``Tracker.locate``; in the frame of the first look's camera."""
+        """See ``Tracker.locate``. The estimate is in the frame of the first look's camera."""
 
     def follow(self, looks: Sequence[Look], last: Estimate | None, how: FollowOptions) -> Estimate:
-        """See ``Tracker.follow``; likewise."""
+        """See ``Tracker.follow``. The frame is that of ``locate``."""
 
     def warm(self) -> None:
         """See ``Tracker.warm``."""
@@ -43,7 +46,7 @@ class Locator(Protocol):
 
 @dataclass(frozen=True, kw_only=True)
 class TrainOptions:
-    """How a model is trained; ``api.train`` says what each option means."""
+    """Options of training; see ``api.train``."""
 
     seed: int = 0
     steps: int | None = None
@@ -55,29 +58,30 @@ class TrainOptions:
 
 @dataclass(frozen=True)
 class TrainingStatus:
-    """What a training reports while it runs; ``end`` is None while minutes decide."""
+    """Progress of a training."""
 
     step: int
-    end: int | None
+    end: int | None  # the last step; None while a limit in minutes has not fixed it
     seconds_left: float
     samples_per_s: float
     loss: float
     miou: float | None  # of the last validation
-    waiting: float = 0.0  # fraction of the time that was spent waiting for scenes
-    warming_up: bool = False  # the learning rate still rises: hardly anything is learnt so far
+    waiting: float = 0.0  # fraction of the time spent waiting for scenes
+    warming_up: bool = False  # the learning rate still rises: hardly anything is learnt yet
 
 
 @runtime_checkable
 class Method(Protocol):
-    """A method: its presets, its models, how they are trained and how they locate."""
+    """A method: its presets and models, their training, and localisation with them."""
 
     presets: Mapping[str, Preset]
 
     def has_config(self, config: object) -> bool:
-        """Whether a configuration is one of this method's."""
+        """Whether a configuration belongs to this method."""
 
     def has_model(self, manifest: Mapping[str, Any]) -> bool:
-        """Whether a model folder's manifest describes one of this method's models."""
+        """Whether a model folder belongs to this method. Its manifest's ``config`` is what
+        ``has_config`` accepts, as JSON. Folders with ``folder.SHAPE`` are the default method's."""
 
     def train(
         self,
@@ -87,35 +91,43 @@ class Method(Protocol):
         options: TrainOptions,
         report: Callable[[TrainingStatus], None],
     ) -> Model:
-        """Train into ``folder``, resuming what lies there; see ``api.train``."""
+        """Train into ``folder``, resuming an unfinished training there, and save the model with
+        ``folder.save_model``; see ``api.train``."""
 
     def load(self, folder: Path, manifest: dict[str, Any], device: str, **known: Any) -> Model:
-        """The model of a folder whose fields ``known`` are read already; InputError, KeyError,
-        ValueError, RuntimeError or OSError where the folder lacks something."""
+        """The model of a folder. ``known``: the fields of ``Model`` but for ``config``, read
+        already. InputError, KeyError, ValueError, RuntimeError or OSError: the folder is not
+        complete."""
 
     def locator(self, model: Model) -> Locator:
-        """Locates with one of this method's models."""
+        """For one of this method's models."""
 
     def hardware(self) -> Sequence[str]:
-        """Lines for `doctor`: what of this machine the method can use."""
+        """Lines for `doctor`: which of this machine's hardware the method can use."""
 
 
 def method_of_preset(preset: str) -> Method:
-    """The method that a preset belongs to. Raises PackageError: it is not installed."""
-    return _installed(lambda method: preset in method.presets)
+    """The method of a preset; raises as ``method_of_config``."""
+    return _installed(f"the preset {preset}", lambda method: preset in method.presets)
 
 
 def method_of_config(config: ModelConfig) -> Method:
-    """The method that a configuration belongs to. Raises PackageError: it is not installed."""
-    return _installed(lambda method: method.has_config(config))
+    """The method of a configuration.
+
+    Raises:
+        PackageError: no method is installed, or one that may be the right one is broken.
+        InputError: it is of none of the installed methods.
+    """
+    name = type(config).__name__
+    return _installed(f"the configuration {name}", lambda method: method.has_config(config))
 
 
 def method_of_folder(manifest: Mapping[str, Any]) -> Method:
-    """The method of a model folder. Raises PackageError: it is not installed."""
-    return _installed(lambda method: method.has_model(manifest))
+    """The method of a model folder, by its manifest; raises as ``method_of_config``."""
+    return _installed("the model", lambda method: method.has_model(manifest))
 
 
-def _installed(wanted: Callable[[Method], bool]) -> Method:
+def _installed(what: str, belongs_to: Callable[[Method], bool]) -> Method:
     faults, methods = list[str](), list[str]()
     for point in entry_points(group=GROUP):
         try:
@@ -126,13 +138,13 @@ def _installed(wanted: Callable[[Method], bool]) -> Method:
             fault = f"the method {point.name} ({point.value}) cannot be imported: {error}"
             faults.append(f"{fault}. Repair or uninstall its package.")
         else:
-            if wanted(method):
+            if belongs_to(method):
                 return method
             methods.append(point.name)
     if faults:
         raise PackageError(faults[0])
     if methods:
-        raise InputError(f"this is of no method that is installed here ({', '.join(methods)}).")
+        raise InputError(f"{what} is of no method that is installed here ({', '.join(methods)}).")
     raise PackageError(
         "the presets quick and paper need PyTorch, which the default method does not: "
         "pip install tumortrack-occupancy."

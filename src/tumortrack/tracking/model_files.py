@@ -36,16 +36,15 @@ Progress = Callable[[int, int], None]
 
 
 def load_model(folder: Path, device: str = "auto", with_margins: bool = True) -> Model:
-    """Read a model folder, or the model of a case folder, which is made where it has none yet.
+    """Read a model folder, or the model of a case folder, which is made if there is none yet.
 
     Args:
-        device: of a network.
-        with_margins: and its margins, where it was calibrated.
+        device: where a network runs.
+        with_margins: read the margins too, if the model was calibrated.
 
     Raises:
-        ArtifactError: missing, of another schema, damaged, or changed since; its margins are
-            another model's, or of another version of the method.
-        InputError: CUDA is requested where there is none.
+        ArtifactError: missing, of another schema, damaged or changed; its margins are of another
+            model or version of the method; CUDA is requested without a GPU.
         PackageError: the method that made it is not installed.
     """
     if holds_case(folder):
@@ -65,7 +64,7 @@ def load_model(folder: Path, device: str = "auto", with_margins: bool = True) ->
             model = RegistrationModel.from_folder(folder, manifest, **known)
         else:
             model = method_of_folder(manifest).load(folder, manifest, device, **known)
-        model.patient  # noqa: B018 - nonsense is told here
+        model.patient  # noqa: B018 - raises InputError if it is not valid
         return model
     except (ArtifactError, PackageError):
         raise
@@ -81,13 +80,13 @@ def load_model(folder: Path, device: str = "auto", with_margins: bool = True) ->
 
 
 def case_model(case: Case, with_margins: bool = True, progress: Progress | None = None) -> Model:
-    """The model of a case: the one in its folder, or, where that has none of this case, a new one,
-    which is kept there. ``progress``: of making one.
+    """The model in a case's folder; if that has none of this case, a new one, which is saved there.
+    ``progress``: of making one.
 
     Raises:
-        StorageError: it cannot be kept.
-        InputError: what lies in its place would be lost.
-        ArtifactError: as of ``load_model``.
+        StorageError: it cannot be saved.
+        InputError: something else in its place would be lost.
+        ArtifactError: as ``load_model``.
     """
     if case.folder is None:
         return make_model(case, progress=progress)
@@ -106,7 +105,7 @@ def case_model(case: Case, with_margins: bool = True, progress: Progress | None 
         with store.new_folder(kept, overwrite=another or None) as aside:
             save_model(model, aside)
     except InputError:
-        if not is_model_of(kept, case.folder):  # by another process, which was faster
+        if not is_model_of(kept, case.folder):  # another process saved it first
             raise
     return model
 
@@ -118,8 +117,8 @@ def write_model(
     seed: int = 0,
     progress: Progress | None = None,
 ) -> Model:
-    """``make_model``, into a folder of its own. The same model that lies there already is read.
-    Raises InputError: another one, or something else, would be lost."""
+    """``make_model`` into a folder of its own; if that holds the same model, it is read. Raises
+    InputError: another model, or something else, would be lost."""
     config = config or _config_of(case)
     store.check_place(folder, KIND, True)
     if is_finished(folder):
@@ -143,18 +142,18 @@ def make_model(
     seed: int = 0,
     progress: Progress | None = None,
 ) -> RegistrationModel:
-    """The model of the default method, by what the case says of poses and camera; some seconds.
-    Raises InputError: deformations of ``config`` that are not elastic."""
+    """A model of the default method, by default configured by the case's poses and camera; takes
+    some seconds. Raises InputError: ``config`` has deformations that are not elastic."""
     from tumortrack.registration.build import build_model
 
     config = config or _config_of(case)
-    about = {
+    provenance = {
         "case_sha256": case.sha256,
         "patient": to_builtins(case.patient),
         "organ": organ_entry(case.anatomy.kind),
     }
     more = {} if progress is None else {"progress": progress}
-    return build_model(case.anatomy, case.up_lps, config, seed, about, **more)
+    return build_model(case.anatomy, case.up_lps, config, seed, provenance, **more)
 
 
 def _config_of(case: Case) -> RegistrationConfig:

@@ -1,4 +1,4 @@
-"""The presets by name: `clinic` registers the organ of the CT, `quick` and `paper` label points."""
+"""The presets by name: `clinic` registers the CT's organ, `quick` and `paper` classify points."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ __all__ = ["PRESETS", "clinic", "paper", "quick", "seen_by"]
 
 
 def quick(anatomy: Anatomy, rotations: Rotations = "limited") -> Any:
-    """The ``TrainConfig`` of a slim network, of tumortrack-occupancy; PackageError without it."""
+    """A slim network's ``TrainConfig``, from tumortrack-occupancy; PackageError without it."""
     return method_of_preset("quick").presets["quick"](anatomy, rotations)
 
 
@@ -32,8 +32,8 @@ PRESETS: dict[str, Preset] = {"clinic": clinic, "quick": quick, "paper": paper}
 
 
 def seen_by(config: C, sensor: Sensor) -> C:
-    """The same preset for scenes as another sensor sees them. Raises InputError: its scenes have no
-    noise of a sensor."""
+    """The configuration with the noise of another sensor. Raises InputError: its scenes have no
+    sensor noise."""
     noise = config.scene.noise
     if noise == SENSORS[sensor] or (noise == CLEAN and sensor == "d405"):
         return config

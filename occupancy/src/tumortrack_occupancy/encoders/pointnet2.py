@@ -9,16 +9,16 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from tumortrack.core.config import Config
-from tumortrack_occupancy.layers import Layer, Norm, greatest, greatest_above_zero, stack
+from tumortrack_occupancy.layers import Layer, Norm, max_over_neighbours, stack
 from tumortrack_occupancy.sampling import ball_query, farthest_points, strided_points, take, traced
 
 _AT_ONCE = 128  # centres
 
 
 class SetAbstraction(Config, frozen=True):
-    """One level: choose centres among the points, describe each by its neighbours. ``ratio``:
-    centres per point (rounded up). ``radius``: of the ball, in normalised units. ``neighbours``: at
-    most so many in a ball. ``widths``: of the MLP, whose maximum over them is the feature."""
+    """One level: choose centres among the points, and encode the neighbourhood of each. ``ratio``:
+    centres per point (rounded up). ``radius``: of the ball, in normalised units. ``neighbours``:
+    most points in a ball. ``widths``: of the MLP, whose maximum over them is the feature."""
 
     ratio: float
     radius: float
@@ -27,9 +27,9 @@ class SetAbstraction(Config, frozen=True):
 
 
 class PointNet2Config(Config, frozen=True, tag="pointnet2"):
-    """``levels``, then an MLP of ``widths`` on [position, feature] and its maximum: the latent.
-    ``n_points``: larger clouds, in random order, are first thinned to so many, by stride (None:
-    take all)."""
+    """``levels``, then a global one: an MLP of ``widths`` on [position, feature], whose maximum is
+    the latent code. ``n_points``: larger clouds, in random order, are first thinned to this number
+    by stride; None: never."""
 
     levels: tuple[SetAbstraction, ...]
     widths: tuple[int, ...]
@@ -72,9 +72,9 @@ class PointNet2(nn.Module):
 
 class _Level(nn.Module):
     """Points (B, N, 3) and features (B, N, F) or none -> centres (B, M, 3), features (B, M, G).
-    The first linear layer on [p_j - c_i, f_j] is W_p (p_j - c_i) + W_f f_j: the second product
-    is made once per point, before the neighbours are gathered. Offsets are taken in full
-    precision and divided by the radius."""
+    The first linear layer on [p_j - c_i, f_j] is W_p (p_j - c_i) + W_f f_j; the second product is
+    computed once per point, before neighbours are gathered. Offsets are computed in full precision
+    and divided by the radius."""
 
     def __init__(self, level: SetAbstraction, n_features: int, norm: Norm) -> None:
         super().__init__()
@@ -90,12 +90,12 @@ class _Level(nn.Module):
         if features is not None:
             projected = functional.linear(features, weight[:, 3:])
         if torch.is_grad_enabled() or traced() or points.device.type != "cpu":
-            return centres, self._describe(points, centres, neighbours, projected)
-        # In inference, by parts of the centres that fit in the cache.
-        pairs = zip(centres.split(_AT_ONCE, 1), neighbours.split(_AT_ONCE, 1), strict=True)
-        return centres, torch.cat([self._describe(points, *pair, projected) for pair in pairs], 1)
+            return centres, self._encode(points, centres, neighbours, projected)
+        # In inference, in chunks of centres that fit in the cache.
+        chunks = zip(centres.split(_AT_ONCE, 1), neighbours.split(_AT_ONCE, 1), strict=True)
+        return centres, torch.cat([self._encode(points, *chunk, projected) for chunk in chunks], 1)
 
-    def _describe(
+    def _encode(
         self, points: Tensor, centres: Tensor, neighbours: Tensor, projected: Tensor | None
     ) -> Tensor:
         """Features (B, M, G) of centres (B, M, 3) from their neighbours (B, M, K)."""
@@ -105,11 +105,11 @@ class _Level(nn.Module):
         if projected is not None:
             grouped = grouped + take(projected, neighbours)
         hidden = self.first.activate(grouped)
-        layers = [layer for layer in self.rest if isinstance(layer, Layer)]
-        training = torch.is_grad_enabled() and len(layers) == len(self.rest)
-        if not training:  # in inference, packed layers may replace these
-            return greatest(self.rest(hidden))
-        for layer in layers[:-1]:
+        *layers, last = self.rest
+        for layer in layers:
             hidden = layer(hidden)
-        last = layers[-1]
-        return greatest_above_zero(last.normalise(last.linear(hidden)))
+        if not isinstance(last, Layer):  # packed, for inference
+            return max_over_neighbours(last(hidden))
+        # ReLU after the maximum gives the same numbers and gradients, for a K-th of the work.
+        out = last.normalise(last.linear(hidden))
+        return functional.relu(max_over_neighbours(out))

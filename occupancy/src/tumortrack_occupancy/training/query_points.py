@@ -1,10 +1,10 @@
 """Query points of training and their labels: SortSample.
 
-Source: LOOC (IEEE Access 2025, doi 10.1109/ACCESS.2025.3543736), the improved form: per part
-draw uniformly in its box x 1.5 until at least k points lie inside and k outside, drop those in
-a thin wall about the surface, keep the k nearest of each; add 15 % far points. Points are drawn
-in the undeformed CT frame, where labels are known, and moved by the deformation together with
-their labels. Distances are those before the deformation.
+Source: LOOC (IEEE Access 2025, doi 10.1109/ACCESS.2025.3543736), the improved form: per part, draw
+uniformly in its box x 1.5 until at least k points lie inside and k outside, drop those closer to
+the surface than a threshold, and keep the k nearest on each side; add 15 % far points. Points are
+drawn in the undeformed CT frame, where labels are known, and carried along by the deformation.
+Distances are those before the deformation.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from tumortrack.simulate.scene import OccupancyConfig
 
 Points = Float[np.ndarray, "n 3"]
 Labels = UInt8[np.ndarray, " n"]
-_POOL = 0x5047  # of the generator
+_POOL_SEED = 0x5047
 
 
 @dataclass(frozen=True, eq=False)
 class PartPool:
-    """Points around one part, in random order, so that neighbours are a random draw, without its
-    cost: CT frame, distance to its surface, inside it or not, label."""
+    """Points around one part, CT frame: distance to its surface, whether inside it, label. They are
+    in random order, so that consecutive ones are a random draw at no cost."""
 
     points_ct: Points
     distance_mm: Float[np.ndarray, " n"]
@@ -36,22 +36,23 @@ class PartPool:
     labels: Labels
 
     def draw_evenly(self, rng: np.random.Generator, count: int) -> tuple[Points, Labels]:
-        """Points uniform in the part's enlarged box: fractions of them measure volumes."""
-        chosen = _following(int(rng.integers(len(self.labels))), count, len(self.labels))
+        """Points uniform in the part's enlarged box, so that fractions of them measure volumes."""
+        chosen = _consecutive(int(rng.integers(len(self.labels))), count, len(self.labels))
         return self.points_ct[chosen], self.labels[chosen]
 
     def nearest(self, k: int, rng: np.random.Generator) -> Int64[np.ndarray, " m"]:
-        """Of the points from a random one on, so many that ``k`` lie on either side, the ``k``
-        inside that are nearest to the surface, and ``k`` outside; on a side in any order."""
-        drawn, chosen = _following(*self._window(k, rng), len(self.labels)), []
+        """Of consecutive points, at least ``k`` on each side of the surface: the ``k`` nearest to
+        it inside, then the ``k`` nearest outside, each in any order."""
+        drawn, chosen = _consecutive(*self._window(k, rng), len(self.labels)), []
         inside = self.inside[drawn]
         for side in (drawn[inside], drawn[~inside]):
-            every = len(side) == k
-            chosen.append(side if every else side[np.argpartition(self.distance_mm[side], k)[:k]])
+            if len(side) > k:
+                side = side[np.argpartition(self.distance_mm[side], k)[:k]]
+            chosen.append(side)
         return np.concatenate(chosen)
 
     def _window(self, k: int, rng: np.random.Generator) -> tuple[int, int]:
-        """A random first point, and how many from it on."""
+        """A random first point and a count, such that ``k`` points lie on each side."""
         before, rarer = self._counts
         count = int(k / rarer * 1.1)
         while True:
@@ -64,16 +65,16 @@ class PartPool:
 
     @cached_property
     def _counts(self) -> tuple[Int64[np.ndarray, " m"], float]:
-        """How many points before each lie inside; the fraction on the side that has fewer."""
+        """How many points before each one lie inside; the fraction on the rarer side."""
         inside = float(self.inside.mean())
         return np.concatenate([[0], np.cumsum(self.inside)]), min(inside, 1 - inside)
 
 
 class OccupancyPool:
-    """Labelled points of one undeformed anatomy, computed once; every scene draws from them."""
+    """Labelled points of an undeformed anatomy, computed once; every scene draws from them."""
 
     def __init__(self, anatomy_ct: Anatomy, config: OccupancyConfig, seed: int) -> None:
-        rng = np.random.default_rng([seed, _POOL])
+        rng = np.random.default_rng([seed, _POOL_SEED])
         self.config = config
         self.parts = tuple(_part_pool(anatomy_ct, part, config, rng) for part in anatomy_ct.parts)
         lower, upper = anatomy_ct.organ.box_mm
@@ -90,15 +91,15 @@ class OccupancyPool:
         k, share = self.config.per_side, self.config.far_share
         chosen = [(part, part.nearest(k, rng)) for part in self.parts]
         count = round(2 * k * len(self.parts) * share / (1 - share))
-        far = _following(int(rng.integers(len(self.far_labels))), count, len(self.far_labels))
+        far = _consecutive(int(rng.integers(len(self.far_labels))), count, len(self.far_labels))
         return (
             np.concatenate([*(p.points_ct[c] for p, c in chosen), self.far_points_ct[far]]),
             np.concatenate([*(p.labels[c] for p, c in chosen), self.far_labels[far]]),
         )
 
 
-def _following(first: int, count: int, n: int) -> Int64[np.ndarray, " count"]:
-    """Indices of ``count`` of ``n`` points from ``first`` on; after the last comes the first."""
+def _consecutive(first: int, count: int, n: int) -> Int64[np.ndarray, " count"]:
+    """Indices of ``count`` of ``n`` points from ``first`` on, cyclically."""
     return (first + np.arange(count)) % n
 
 

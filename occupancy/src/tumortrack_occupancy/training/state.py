@@ -1,5 +1,5 @@
-"""What a training is (configuration, seed, length, schedule) and all that changes while it runs:
-weights, their average, the optimizer, the best so far; and the checkpoint that holds that.
+"""What a training is (configuration, seed, length), all that changes while it runs (weights, their
+average, optimizer, best so far), and the checkpoint that holds the latter.
 
 A checkpoint is one file, written atomically: kill -9 loses the steps since the last one.
 """
@@ -67,15 +67,15 @@ class TrainingRun:
 
     @property
     def end(self) -> int | None:
-        """The last step; None where minutes settle it on the way."""
+        """The last step; None if a limit in minutes fixes it later."""
         if self.steps is not None:
             return self.steps
         return None if self.minutes is not None else self.config.steps
 
     @property
     def decided_by(self) -> dict[str, Any]:
-        """All that decides the weights, by the options that say it (long ones as a sha256), so that
-        a resumed run is the same run."""
+        """All that determines the weights, by the options that set it (long values as a sha256).
+        Only a run with equal entries may be resumed."""
         config = json.dumps([store.SCHEMA, to_builtins(self.config)], sort_keys=True).encode()
         return {
             "--preset, --rotations, --sensor or the version": hashlib.sha256(config).hexdigest(),
@@ -85,22 +85,25 @@ class TrainingRun:
             "--minutes": self.minutes,
         }
 
-    def differences(self, kept: Mapping[str, Any]) -> str:
-        """What the run that was ``decided_by`` these was given differently; empty: it is this
-        one."""
-        found = []
+    def differences(self, other: Mapping[str, Any]) -> str:
+        """In which options the run that was ``decided_by`` the other ones differs; empty if in
+        none."""
+        options = []
         for name, here in self.decided_by.items():
-            there = kept.get(name)
-            values = ["not given" if value is None else str(value) for value in (there, here)]
-            hashed = isinstance(there or here, str)
-            if there != here:
-                found += [name if hashed else f"{name} ({values[0]} there, {values[1]} here)"]
-        return ", and in ".join(found)
+            there = other.get(name)
+            if there == here:
+                continue
+            if isinstance(there or here, str):  # a sha256
+                options.append(name)
+            else:
+                there, here = ("not given" if value is None else value for value in (there, here))
+                options.append(f"{name} ({there} there, {here} here)")
+        return ", and in ".join(options)
 
 
 @dataclass
 class TrainingProgress:
-    """Where a run stands. ``end`` is the step it will stop at; None while minutes decide."""
+    """How far a run is. ``end``: its last step; None while a limit in minutes has not fixed it."""
 
     step: int = 0
     elapsed_s: float = 0.0
@@ -128,8 +131,8 @@ def provenance(
 
 
 def fix_last_step(config: TrainConfig, progress: TrainingProgress, minutes: float | None) -> bool:
-    """With a limit in minutes: fix the last step, from the pace so far, once the schedule's tail
-    has to begin; True when that happened now. From then on the schedule depends on steps alone, so
+    """With a limit in minutes: once the schedule's tail has to begin, fix the last step from the
+    pace so far; True if that happened now. From then on the schedule depends on steps alone, so
     that a resumed run repeats it."""
     if progress.end is not None or minutes is None:
         return False
@@ -142,17 +145,17 @@ def fix_last_step(config: TrainConfig, progress: TrainingProgress, minutes: floa
 
 
 def learning_rate(config: TrainConfig, progress: TrainingProgress) -> float:
-    """The learning rate of the step that comes next."""
+    """The learning rate of the next step."""
     schedule, step = config.schedule, progress.step
     peak = schedule.learning_rate
     if schedule.kind == "exponential":
         return peak * schedule.gamma ** (step * config.batch_size // schedule.epoch_pairs)
-    warm = min(1.0, (step + 1) / schedule.warmup_steps)
+    warmup = min(1.0, (step + 1) / schedule.warmup_steps)
     if progress.end is None:
-        return peak * warm
+        return peak * warmup
     begin = progress.end * (1 - schedule.tail)
-    through = min(max((step - begin) / max(progress.end - begin, 1), 0.0), 1.0)
-    return peak * warm * (_FLOOR + (1 - _FLOOR) * (1 + math.cos(math.pi * through)) / 2)
+    tail = min(max((step - begin) / max(progress.end - begin, 1), 0.0), 1.0)
+    return peak * warmup * (_FLOOR + (1 - _FLOOR) * (1 + math.cos(math.pi * tail)) / 2)
 
 
 class Diverged(TumortrackError):
@@ -182,7 +185,7 @@ class TrainingState:
 
     @cached_property
     def optimizer(self) -> torch.optim.Optimizer:
-        """Made for the first step: PyTorch loads its compiler for it, which takes 2 s."""
+        """Created at the first step: PyTorch loads its compiler for it, which takes 2 s."""
         config = self.run.config
         return torch.optim.Adam(
             self.network.parameters(),
@@ -191,7 +194,7 @@ class TrainingState:
         )
 
     def resume(self, work: Path) -> None:
-        """Restore the last checkpoint, if there is one; ArtifactError where it is damaged or of
+        """Restore the last checkpoint, if there is one; ArtifactError if it is damaged or of
         another run."""
         path = work / _FILE
         if not path.exists():
@@ -201,7 +204,7 @@ class TrainingState:
             with safe_open(path, framework="pt") as file:
                 metadata = file.metadata() or {}
                 progress = TrainingProgress(**json.loads(metadata["progress"]))
-                kept = dict(json.loads(metadata["decided_by"]))
+                decided_by = dict(json.loads(metadata["decided_by"]))
                 for key in file.keys():  # noqa: SIM118 - safe_open is no dict
                     group, name = key.split("/", 1)
                     groups.setdefault(group, {})[name] = file.get_tensor(key)
@@ -209,7 +212,7 @@ class TrainingState:
             raise ArtifactError(
                 f"{path} is damaged: {error}. Remove {work.parent} and train again."
             ) from error
-        if differences := self.run.differences(kept):
+        if differences := self.run.differences(decided_by):
             raise ArtifactError(
                 f"{work.parent} holds a run that differs from this command in {differences}. Give "
                 "the same command to resume it, or another MODEL folder to start a new one."
@@ -225,7 +228,7 @@ class TrainingState:
         self._best = groups.get("best", {})
 
     def save(self, work: Path) -> None:
-        """Write the checkpoint. The one before stays where a weight is not finite (Diverged) or the
+        """Write the checkpoint. The previous one stays if a weight is not finite (Diverged) or the
         disk is full (StorageError)."""
         if not all(bool(p.isfinite().all()) for p in self.network.parameters()):
             raise Diverged(self.progress.step)
@@ -248,8 +251,8 @@ class TrainingState:
         store.write_atomically(work / _FILE, save(tensors, metadata))
 
     def step(self, batch: Tensors) -> float:
-        """One optimizer step; returns the batch's loss. Where that is not finite the weights stay
-        as they were, and Diverged is raised."""
+        """One optimizer step; returns the batch's loss. Raises Diverged, with the weights
+        unchanged, if that is not finite."""
         progress = self.progress
         clouds, points, labels = (part.to(self._device, non_blocking=True) for part in batch)
         clouds = clouds[:, : self.points_kept(clouds.shape[1])]
@@ -270,8 +273,8 @@ class TrainingState:
         return value
 
     def points_kept(self, n_points: int) -> int:
-        """How many of a batch's points this step sees: those that the encoder takes, less a
-        random fraction. Clouds are in random order, so that the first ones are a random draw."""
+        """How many points of each cloud this step sees: those that the encoder takes, less a random
+        fraction. Clouds are in random order, so that the first points are a random draw."""
         config = self.run.config
         rng = np.random.default_rng([self.run.seed, 0xD20, self.progress.step])
         dropped = rng.uniform(0, config.drop_points)
@@ -280,7 +283,8 @@ class TrainingState:
 
     @torch.no_grad()
     def _update_average(self) -> None:
-        """Exponential moving average of weights and running statistics; short memory at first."""
+        """Exponential moving average of weights and running statistics, with a short memory at
+        first."""
         decay = min(self.run.config.ema, (1 + self.progress.step) / (10 + self.progress.step))
         networks = (network.state_dict().values() for network in (self.average, self.network))
         pairs = (pair for pair in zip(*networks, strict=True) if pair[0].is_floating_point())

@@ -18,7 +18,7 @@ from tumortrack_occupancy.training.query_points import OccupancyPool
 def labelled_scene(
     simulator: Simulator, recipe: SceneRecipe, pool: OccupancyPool
 ) -> tuple[RenderedScene, Float32[np.ndarray, "n 3"], UInt8[np.ndarray, " n"]]:
-    """The scene, and its labelled points, camera frame."""
+    """The scene, its points (camera frame, mm) and their labels."""
     scene, rng = simulator.draw(recipe)
     points_ct, labels = pool.draw(rng)
     return scene, scene.carry(points_ct).astype(np.float32, copy=False), labels
@@ -34,8 +34,8 @@ class Batch(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class SceneStream:
-    """Batch ``i`` holds the recipes ``i * size ... i * size + size - 1``, so that worker processes
-    and resumed runs see the same data. Picklable."""
+    """Batch ``i`` holds the recipes ``i * batch_size`` to ``(i + 1) * batch_size - 1``, so that
+    worker processes and resumed runs see the same data. Picklable."""
 
     anatomy_ct: Anatomy
     up_lps: tuple[float, float, float]
@@ -48,14 +48,13 @@ class SceneStream:
 
     @cached_property
     def simulator(self) -> Simulator:
-        """Built where it is used: ray trees cannot be pickled."""
+        """Built in the process that uses it: ray trees cannot be pickled."""
         return Simulator(self.anatomy_ct, self.up_lps, self.config, self.body)
 
     def __getstate__(self) -> dict[str, Any]:
         return {k: v for k, v in self.__dict__.items() if k != "simulator"}
 
     def batch(self, index: int) -> Batch:
-        """The batch with this number."""
         first, n = index * self.batch_size, self.config.cloud.n_points
         rows = []
         for number in range(first, first + self.batch_size):
@@ -67,6 +66,6 @@ class SceneStream:
 
 
 def refill(points_mm: Num[np.ndarray, m * row], n: int) -> Num[np.ndarray, n * row]:
-    """A cloud of fewer than ``n`` points repeats them, so that clouds stack; max pooling is not
-    affected."""
+    """``n`` points of a cloud, repeated if there are fewer, so that clouds stack; max pooling is
+    not affected."""
     return points_mm[np.arange(n) % len(points_mm)]

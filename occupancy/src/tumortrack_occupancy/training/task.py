@@ -1,4 +1,4 @@
-"""What an occupancy network learns, how it is validated, and the model it leaves."""
+"""What an occupancy network learns, how it is validated, and the model that results."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ _QUERIES = 2**13  # at once: bounds the memory
 
 
 class OccupancyTask:
-    """Labels of points near surfaces, as in the paper. ``points``: of the training scenes;
-    ``body``: the organ's, where scenes need it. Raises InputError: a part too small to be learnt.
-    """
+    """Labels of points near surfaces, as in the paper. ``points``: labelled points for training
+    scenes; ``body``: the elastic body, if scenes need it. Raises InputError: a part is too small to
+    be learnt."""
 
     def __init__(self, run: TrainingRun, device: torch.device) -> None:
         self._run, self._device = run, device
@@ -39,19 +39,18 @@ class OccupancyTask:
 
     @torch.no_grad()
     def miou(self, network: OccupancyNetwork) -> float:
-        """On the validation scenes: mean over the parts (organ, tumors; not the outside) of the IoU
-        of labels over all their points."""
+        """Mean IoU of the parts (organ, tumors; not the outside) over all points of the validation
+        scenes."""
         network.eval()
         arrays = self._scenes.clouds_mm, self._scenes.points_mm
         batches = (torch.from_numpy(v).to(self._device).split(_AT_ONCE) for v in arrays)
-        guess = torch.cat([network(*pair).argmax(-1) for pair in zip(*batches, strict=True)])
-        labels = guess.to(torch.uint8).cpu().numpy()
+        predicted = torch.cat([network(*pair).argmax(-1) for pair in zip(*batches, strict=True)])
         n_classes = len(self._run.anatomy_ct.parts) + 1
-        pairs = labels.astype(np.int64).ravel() * n_classes + self._scenes.labels.ravel()
-        table = np.bincount(pairs, minlength=n_classes**2).reshape(n_classes, n_classes)
-        both = table.diagonal()
-        either = table.sum(0) + table.sum(1) - both
-        return float((both / np.maximum(either, 1))[1:].mean())
+        pairs = predicted.cpu().numpy().ravel() * n_classes + self._scenes.labels.ravel()
+        confusion = np.bincount(pairs, minlength=n_classes**2).reshape(n_classes, n_classes)
+        intersection = confusion.diagonal()
+        union = confusion.sum(0) + confusion.sum(1) - intersection
+        return float((intersection / np.maximum(union, 1))[1:].mean())
 
     @torch.no_grad()
     def model(self, network: OccupancyNetwork, provenance: dict[str, Any]) -> OccupancyModel:
@@ -69,15 +68,14 @@ class OccupancyTask:
             fits.append(fit)
         if same := ambiguous(half_turns(self._run.anatomy_ct)):
             provenance = {**provenance, "half_turn_mm": same[0].mean_mm}
-        known = InDistributionRange(
-            spread_mm=(min(spreads), max(spreads)), fit_mm=float(np.percentile(fits, 95))
-        )
         return OccupancyModel(
             network=network,
             config=self._run.config,
             parts=self._run.anatomy_ct.names,
             query_box_mm=grown_box(scenes.boxes_mm),
-            in_distribution=known,
+            in_distribution=InDistributionRange(
+                spread_mm=(min(spreads), max(spreads)), fit_mm=float(np.percentile(fits, 95))
+            ),
             provenance=provenance,
         )
 
@@ -89,12 +87,12 @@ class OccupancyTask:
         for index in range(config.validation_pairs):
             recipe = SceneRecipe(run.seed, "validation", index)
             scene = simulator.render(recipe)
-            drawn, answer = pool.draw_evenly(recipe.generator(999), config.validation_points)
+            points_ct, labels = pool.draw_evenly(recipe.generator(999), config.validation_points)
             observed = scene.cloud.points_mm
             organ = scene.carry(run.anatomy_ct.organ.vertices_mm) - np.median(observed, axis=0)
             box = np.array([organ.min(0), organ.max(0)], float)
             cloud = refill(observed, config.scene.cloud.n_points)
-            rows.append((cloud, scene.carry(drawn), answer, box))
+            rows.append((cloud, scene.carry(points_ct), labels, box))
         return ValidationScenes(*(np.stack(column) for column in zip(*rows, strict=True)))
 
     def _logits(
@@ -106,8 +104,8 @@ class OccupancyTask:
 
 @dataclass(frozen=True, eq=False)
 class ValidationScenes:
-    """Scenes of the ``validation`` stream with points spread evenly over the organ's enlarged
-    box, so that numbers of points are volumes; camera frame, mm."""
+    """Scenes with points uniform in the organ's enlarged box, so that numbers of points measure
+    volumes; camera frame, mm."""
 
     clouds_mm: Float32[np.ndarray, "s n 3"]
     points_mm: Float32[np.ndarray, "s q 3"]
@@ -116,6 +114,6 @@ class ValidationScenes:
 
 
 def grown_box(boxes_mm: Float64[np.ndarray, "s 2 3"]) -> Float64[np.ndarray, "2 3"]:
-    """The box of all the boxes, 10 % larger."""
+    """The bounding box of all boxes, 10 % larger."""
     lower, upper = boxes_mm[:, 0].min(0), boxes_mm[:, 1].max(0)
     return np.stack([lower - 0.05 * (upper - lower), upper + 0.05 * (upper - lower)])

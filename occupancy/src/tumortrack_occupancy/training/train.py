@@ -1,8 +1,7 @@
-"""The training loop, read top to bottom, and what surrounds it: the folder's lock, cores, time,
-Ctrl-C, the history.
+"""The training loop, and what surrounds it: the folder's lock, cores, time, Ctrl-C, the history.
 
-Data are addressed by step, the only randomness is drawn from (seed, step), and the state is one
-atomic file: a run that is killed and started again ends with the weights of one that was not.
+Data are addressed by step, all randomness is drawn from (seed, step), and the state is one atomic
+file: a run that is killed and started again ends with the weights of one that was not.
 """
 
 from __future__ import annotations
@@ -41,21 +40,21 @@ from tumortrack_occupancy.training.task import OccupancyTask
 __all__ = ["Interrupted", "TrainingRun", "train"]
 
 REPORT_EVERY_S = 5.0
-_MOST = 16  # processes that make scenes; and threads: more only wait, in layers this small
+_MOST = 16  # processes that make scenes, and threads: layers this small cannot use more
 _LOCK = ".lock"
 _Item = TypeVar("_Item")
-# Of a validation: names and digits in history.jsonl, and tags of TensorBoard
+# Of each validation: name in history.jsonl, tag in TensorBoard, digits in history.jsonl
 _SCALARS = (
     ("loss", "loss/train", ".5f"),
     ("validation_miou", "miou/validation", ".4f"),
     ("samples_per_s", "speed/samples_per_s", ".1f"),
     ("learning_rate", "learning_rate", ".4g"),
-    ("waiting", "speed/waiting", ".3f"),  # fraction of the time that was spent waiting for scenes
+    ("waiting", "speed/waiting", ".3f"),  # fraction of the time spent waiting for scenes
 )
 
 
 class Interrupted(TumortrackError):
-    """Ctrl-C: the state is saved, the same command goes on."""
+    """Ctrl-C: the state is saved, and the same command resumes."""
 
     exit_code = 130
 
@@ -70,14 +69,14 @@ Report = Callable[[TrainingStatus], None]
 
 
 def train(run: TrainingRun, folder: Path, report: Report) -> OccupancyModel:
-    """Train until the end, resuming what lies in ``folder``; leaves a model folder. Where that
-    holds the finished model of the same run, it is read.
+    """Train to the end, resuming an unfinished training in ``folder``, and save the model there. A
+    finished model of the same run is read instead.
 
     Raises:
         ArtifactError: ``folder`` holds another run, or a damaged one.
-        InputError: another process trains in ``folder``, or it holds another model; a part too
+        InputError: another process trains in ``folder``, or it holds another model; a part is too
             small to be learnt.
-        StorageError: the disk is full; the last checkpoint is whole.
+        StorageError: the disk is full; the last checkpoint is intact.
         Diverged: the loss is not finite any more; the last checkpoint is from before.
         Interrupted: Ctrl-C; a checkpoint is written.
     """
@@ -86,14 +85,12 @@ def train(run: TrainingRun, folder: Path, report: Report) -> OccupancyModel:
     config, device = run.config, choose_device(run.device)
     with work_folder(folder) as work:
         workers = divide_cores(device, run.workers)
-        TrainingState(run, device).resume(work)  # another run's: refused before the long part
-        task = OccupancyTask(run, device)
         state = TrainingState(run, device)
-        state.resume(work)
+        state.resume(work)  # another run's is refused before the scenes' slow preparation
+        task = OccupancyTask(run, device)
         end = config.steps if state.progress.end is None else state.progress.end
-        run_steps(
-            state, _scenes(run, task, range(state.progress.step, end), workers), work, report, task
-        )
+        steps = range(state.progress.step, end)
+        run_steps(state, _scenes(run, task, steps, workers), work, report, task)
         origin = {**provenance(run, state.progress, device), "scenes": f"{workers} processes"}
         model = task.model(state.best_network(), origin)
         save_model(model, folder)
@@ -101,7 +98,7 @@ def train(run: TrainingRun, folder: Path, report: Report) -> OccupancyModel:
 
 
 def _finished(run: TrainingRun, folder: Path) -> OccupancyModel:
-    """The model in a folder; InputError where it is not this run's."""
+    """The model in a folder; InputError if it is of another run."""
     done = read_model_manifest(folder)["provenance"]
     if differ := run.differences(done.get("decided_by", {})):
         raise InputError(
@@ -110,7 +107,7 @@ def _finished(run: TrainingRun, folder: Path) -> OccupancyModel:
             "folder."
         )
     model = load_model(folder, run.device)
-    assert isinstance(model, OccupancyModel)  # a run decided it
+    assert isinstance(model, OccupancyModel)  # as the run is the same
     return model
 
 
@@ -119,11 +116,12 @@ def _scenes(
 ) -> Generator[Tensors, None, None]:
     """The batches of these steps."""
     config = run.config
-    about = run.anatomy_ct, run.up_lps, config.scene, task.points, run.seed
-    stream = SceneStream(*about, "train", config.batch_size, task.body)
+    stream = SceneStream(
+        run.anatomy_ct, run.up_lps, config.scene, task.points, run.seed,
+        stream="train", batch_size=config.batch_size, body=task.body,
+    )  # fmt: skip
     period = config.training_pairs // config.batch_size
-    device = choose_device(run.device)
-    return batches(stream.batch, steps, period, workers, device)
+    return batches(stream.batch, steps, period, workers, choose_device(run.device))
 
 
 def run_steps(
@@ -133,8 +131,8 @@ def run_steps(
     report: Report,
     task: OccupancyTask | None = None,
 ) -> None:
-    """All steps to the end, with checkpoints in ``work``; with a ``task``, validated. Raises as
-    ``train``."""
+    """All steps to the end, with checkpoints in ``work``; validated if there is a ``task``. Raises
+    as ``train``."""
     run, progress = state.run, state.progress
     clock, miou = TrainingClock(progress), None
     with ExitStack() as stack:
@@ -144,15 +142,14 @@ def run_steps(
             loss = state.step(batch)
             clock.count_step()
             progress.elapsed_s, stop = clock.elapsed(), stopped()
-            settled = fix_last_step(run.config, progress, run.minutes)
+            end_fixed = fix_last_step(run.config, progress, run.minutes)
             done = progress.step == progress.end
             if task and write and (done or progress.step % run.config.validate_every == 0):
                 miou = task.miou(state.average)
                 state.keep_if_best(miou)
                 speed = clock.rate() * run.config.batch_size
                 write(loss, miou, speed, state.learning_rate, clock.waiting())
-            due = done or settled or stop
-            if due or clock.due("checkpoint", run.checkpoint_every_s):
+            if done or end_fixed or stop or clock.due("checkpoint", run.checkpoint_every_s):
                 state.save(work)
             if done or clock.due("report", REPORT_EVERY_S):
                 report(_status(state, clock, loss, miou))
@@ -169,16 +166,23 @@ def _status(
     left = ((progress.end or run.config.steps) - progress.step) / rate
     if progress.end is None and run.minutes is not None:
         left = min(left, run.minutes * 60 - progress.elapsed_s)
-    about = rate * run.config.batch_size, loss, miou, clock.waiting()
-    warming_up = progress.step < run.config.schedule.warmup_steps
-    return TrainingStatus(progress.step, progress.end, max(left, 0.0), *about, warming_up)
+    return TrainingStatus(
+        step=progress.step,
+        end=progress.end,
+        seconds_left=max(left, 0.0),
+        samples_per_s=rate * run.config.batch_size,
+        loss=loss,
+        miou=miou,
+        waiting=clock.waiting(),
+        warming_up=progress.step < run.config.schedule.warmup_steps,
+    )
 
 
 @contextmanager
 def work_folder(folder: Path) -> Iterator[Path]:
-    """MODEL/training, locked while in use; removed again if nothing was written into it. The lock
-    is the operating system's and ends with its process, however that ends. InputError where another
-    process trains in it, StorageError where it cannot be made."""
+    """MODEL/training, locked while in use, and removed again if it stays empty. The lock is the
+    operating system's and ends with its process, however that ends. InputError: another process
+    trains in it. StorageError: it cannot be made."""
     import fcntl
 
     work = folder / "training"
@@ -200,17 +204,14 @@ def work_folder(folder: Path) -> Iterator[Path]:
             if [path.name for path in work.iterdir()] == [_LOCK]:
                 (work / _LOCK).unlink()
                 work.rmdir()
-                with suppress(OSError):  # there was more in it before
+                with suppress(OSError):  # it is not empty
                     folder.rmdir()
 
 
 def divide_cores(device: torch.device, workers: int | None) -> int:
-    """How many processes make scenes, and set the network's number of threads: on a CPU it gets the
-    cores that the workers leave, half of them at least, within OMP_NUM_THREADS.
-
-    Without ``workers`` they are as many as there are cores, sixteen at most: their priority is low
-    (see ``scenes``).
-    """
+    """Return how many processes make scenes, and set PyTorch's number of threads: on a CPU the
+    cores that the workers leave, but at least half of them, within OMP_NUM_THREADS. Without
+    ``workers`` there are as many as cores, at most 16: their priority is low (see ``scenes``)."""
     cores = available_cores()
     if workers is None:
         workers = max(1, min(_MOST, cores))
@@ -224,7 +225,7 @@ def divide_cores(device: torch.device, workers: int | None) -> int:
 
 class TrainingClock:
     """Time spent in all sessions of a run, and when things are due again. A session's time begins
-    when its first step is done: before, processes start and kernels are compiled."""
+    after its first step, which includes starting processes and compiling kernels."""
 
     def __init__(self, progress: TrainingProgress) -> None:
         self._progress, self._first_step = progress, progress.step
@@ -234,7 +235,7 @@ class TrainingClock:
         self._waited = 0.0
 
     def timed(self, source: Iterator[_Item]) -> Iterator[_Item]:
-        """The same items; the time spent waiting for them counts."""
+        """The same items, counting the time spent waiting for them."""
         began = time.monotonic()
         for item in source:
             self._waited += time.monotonic() - began
@@ -251,11 +252,11 @@ class TrainingClock:
         return self._before + self._session_s()
 
     def waiting(self) -> float:
-        """Fraction of this session's time that was spent waiting."""
+        """Fraction of this session's time spent waiting."""
         return self._waited / self._session_s()
 
     def rate(self) -> float:
-        """Steps per second in this session; as long as there is only one, by that one's time."""
+        """Steps per second in this session; after a single step, by that step's time."""
         steps = self._progress.step - self._first_step
         return steps / self._session_s() if steps else 1 / max(self._first_s, 1e-9)
 
@@ -272,7 +273,7 @@ class TrainingClock:
 
 @contextmanager
 def ctrl_c() -> Iterator[Callable[[], bool]]:
-    """Turns Ctrl-C and SIGTERM into a flag that the loop checks after each step."""
+    """Turn Ctrl-C and SIGTERM into a flag that the loop checks after each step."""
     received: list[int] = []
     before = {
         number: signal.signal(number, lambda number, _: received.append(number))
@@ -287,9 +288,9 @@ def ctrl_c() -> Iterator[Callable[[], bool]]:
 
 @contextmanager
 def history(folder: Path, progress: TrainingProgress) -> Iterator[Callable[..., None]]:
-    """history.jsonl and, where TensorBoard is installed, its curves: yields a function that writes
-    a validation's ``_SCALARS``. On resuming, records after the checkpoint are dropped first. A full
-    disk raises StorageError, except on leaving after another error, which is kept."""
+    """history.jsonl and, if TensorBoard is installed, its curves: yields a function that writes a
+    validation's ``_SCALARS``. On resuming, records after the checkpoint are dropped first. A full
+    disk raises StorageError, unless another error is already on its way."""
     path, files = folder / "history.jsonl", ExitStack()
     with _history_errors(folder):
         if path.exists():
