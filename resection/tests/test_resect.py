@@ -191,7 +191,7 @@ def test_a_plan_is_carried_out_and_recorded(story, tmp_path):
     from rosbags.typesys import Stores, get_typestore
 
     store, joints = get_typestore(Stores.ROS2_JAZZY), []
-    with Reader(tmp_path / "organ") as reader:
+    with Reader(tmp_path / "seen") as reader:
         for connection, _, raw in reader.messages():
             if connection.msgtype == "sensor_msgs/msg/JointState":
                 joints.append(store.deserialize_cdr(raw, connection.msgtype))
