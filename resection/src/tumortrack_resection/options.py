@@ -78,8 +78,8 @@ class ResectOptions(CameraOptions):
 
     Attributes:
         live: MODEL SOURCE: follow the organ meanwhile, as `track` does. The arms halt while there
-            is no good estimate, and the plan is made anew once the tumor has moved.
-        replan_cut: plan anew even after the first sweep has begun, though the model knows only the
+            is no good estimate, and the plan is made again once the tumor has moved.
+        replan_cut: plan again even after the first sweep has begun, though the model knows only the
             intact organ; otherwise the arms halt instead.
         speed: of the arms; 2 is twice as fast as planned.
         moved: the tumor counts as moved once its surface is so many mm from where it was planned

@@ -11,7 +11,7 @@ from tumortrack.core.report import Finding
 
 HaltKind = Literal[
     "no_estimate", "poor", "missing", "moved", "over_budget", "no_margin", "planning", "silent",
-    "no_plan", "defect", "interrupted", "aborted", "stopped",
+    "no_plan", "defect", "interrupted", "aborted", "ended", "stopped",
 ]  # fmt: skip
 _SENTENCES: dict[HaltKind, str] = {
     "no_estimate": "no estimate: {words}",
@@ -29,6 +29,7 @@ _SENTENCES: dict[HaltKind, str] = {
     "defect": "internal error, {words}",
     "interrupted": "stopped by the user",
     "aborted": "stopped by the viewer, or a real arm gave up",
+    "ended": "tracking has ended",
     "stopped": "{words}",
 }
 CUT_NOTE = "cut: estimates are of the intact organ"

@@ -142,7 +142,7 @@ class Loop:
                     return
         finally:
             if self._arms is not None and not self._arms.ended:
-                self._arms.abort(Halt("stopped", {"words": "tracking has ended"}))
+                self._arms.abort(Halt("ended"))
                 self._publish(
                     self._without_frame("tracking has ended"),
                     sink_workers,
