@@ -63,6 +63,11 @@ class Machines:
         ]
         self.clusters[-1].wait_for_nodes()
 
+    def begun_on_last(self) -> list[str]:
+        """Names of tasks begun on the machine that ``kill_machine`` would take."""
+        (raylet,) = self.nodes[-1].all_processes["raylet"]
+        return executions(self.folder, raylet.process.pid)
+
     def kill_machine(self) -> None:
         self.clusters[-1].remove_node(self.nodes.pop(), allow_graceful=False)
 
@@ -98,7 +103,7 @@ def serial(machines, tmp_path) -> dict[str, bytes]:
     return results(tmp_path / "s")
 
 
-def wait_for(driver: subprocess.Popen[str], condition: Callable[[], bool]) -> None:
+def wait_for(driver: subprocess.Popen[str], condition: Callable[[], object]) -> None:
     while not condition():
         assert driver.poll() is None, "it ended too early"
         time.sleep(0.05)
@@ -110,9 +115,10 @@ def test_a_lost_machine_costs_what_ran_there_and_faults_are_tried_again(machines
     driver = machines.drive(store)
     seen = machines.folder
     wait_for(driver, lambda: all(executions(seen).count(name) > 1 for name in FAULTS))
-    machines.pace(6.0, FAULTS)  # what runs now is still running when its machine is missed
-    slow = len(executions(seen)) + 2 * CORES
-    wait_for(driver, lambda: len(executions(seen)) >= slow)
+    machines.pace(6.0, FAULTS)  # what begins there now is running when its machine is killed
+    before = len(machines.begun_on_last())
+    impossible = "P1-1"  # ends at once
+    wait_for(driver, lambda: {*machines.begun_on_last()[before:]} - {*FAULTS, impossible})
     machines.kill_machine()
     machines.pace(0.3, FAULTS)
     kept = stored(store)

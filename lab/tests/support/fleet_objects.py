@@ -61,14 +61,14 @@ def patients(count: int) -> list[Task]:
 def note(what: str, name: str) -> None:
     """A line in the log: one write, so that lines of several processes stay whole."""
     with open(Path(os.environ["FLEET_FOLDER"]) / "log", "ab", buffering=0) as stream:
-        stream.write(f"{what} {name}\n".encode())
+        stream.write(f"{what} {name} {os.getppid()}\n".encode())
 
 
-def executions(folder: Path, what: str = "begun") -> list[str]:
-    """Names of tasks as often as they were begun (or done)."""
+def executions(folder: Path, parent: int | None = None) -> list[str]:
+    """Names of tasks as often as they were begun, or were by children of this process."""
     log = folder / "log"
-    lines = log.read_text().splitlines() if log.exists() else []
-    return [name for kind, name in map(str.split, lines) if kind == what]
+    lines = map(str.split, log.read_text().splitlines() if log.exists() else [])
+    return [name for kind, name, of in lines if kind == "begun" and parent in (None, int(of))]
 
 
 def misbehave(name: str, out: Path) -> None:
