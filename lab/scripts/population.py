@@ -39,6 +39,8 @@ _ERRORS = {
     "best rigid pose's centre": "rigid_middle_mm",
     "Hausdorff": "hausdorff_mm",
     "best rigid pose's Hausdorff": "rigid_hausdorff_mm",
+    "rigid fit's centre": "rigid_fit_middle_mm",
+    "rigid fit's Hausdorff": "rigid_fit_hausdorff_mm",
 }
 # What errors are shown against: a column, its words, the limits of groups.
 _AGAINST: dict[str, tuple[str, tuple[float, ...]]] = {
@@ -105,6 +107,8 @@ def block(fleet: Path, writer: ReportWriter) -> str:
     if done.empty:
         raise InputError(f"{fleet} has no patient that is done.")
     scenes = scenes.merge(people[["patient", "slice_mm"]], on="patient")
+    scenes = scenes.reindex(columns=[*dict.fromkeys([*scenes, *_ERRORS.values()])])
+    without = scenes.rigid_fit_middle_mm.isna().all()
     draw(scenes, writer.image(BLOCK))
     rows, alone = grouped(scenes), len(done[~done.patient.isin(looks.patient)])
     summary = (
@@ -112,14 +116,16 @@ def block(fleet: Path, writer: ReportWriter) -> str:
         f"{int(done.scenes.sum())} scenes; {int(done.lost.sum())} more could not be made. Within "
         f"the largest miss of a patient's margin states: {done.within_largest.mean():.0%} of good "
         "answers; expected of one more among n alike, n / (n + 1): "
-        f"{done.holds_for.mean():.0%}."
+        f"{done.holds_for.mean():.0%}.{' This run has no rigid fits.' if without else ''}"
     )
     short = rows[rows.by.isin(["all", "state"])]
-    ours, rigid = (spread_words(short, of) for of in list(_ERRORS)[:2])
     short = short[["value", "scenes", "good %"]].assign(**{
-        "centre, mm: median / 95 % / worst": ours, "best rigid pose": rigid,
+        "centre, mm: median / 95 % / worst": spread_words(short, "centre"),
+        "best rigid pose": spread_words(short, "best rigid pose's centre"),
+        "rigid fit": spread_words(short, "rigid fit's centre"),
         "over 5 mm": short["over 5 mm"],
     })  # fmt: skip
+    short = short.drop(columns=["rigid fit"] if without else [])
     links = [
         writer.data(BLOCK, rows, "By state, hidden surface, tumor and slices"),
         writer.data(f"{BLOCK}-wrong", wrong(scenes), "Good answers that are over 5 mm off"),
@@ -153,6 +159,7 @@ def grouped(scenes: pd.DataFrame) -> pd.DataFrame:
 def wrong(scenes: pd.DataFrame) -> pd.DataFrame:
     """Every answer called good and over 5 mm off, the worst first."""
     shown = {"middle_mm": "centre mm", "rigid_middle_mm": "best rigid pose mm"}
+    shown["rigid_fit_middle_mm"] = "rigid fit mm"
     some = scenes[scenes.over_5_mm.astype(bool)].sort_values("middle_mm", ascending=False)
     return some[["patient", "scene", "tumor", *shown]].rename(columns=shown).round(1)
 

@@ -250,6 +250,7 @@ def summary(rows: list[dict]) -> dict[str, Any]:
         **spread_mm("best rigid pose's centre", answered.rigid_middle_mm),
         **spread_mm("Hausdorff", answered.hausdorff_mm),
         **spread_mm("best rigid pose's Hausdorff", answered.rigid_hausdorff_mm),
+        **spread_mm("rigid fit's centre", answered.rigid_fit_middle_mm),
         **spread_mm("good answers' centre", good.middle_mm),
         **{name.removesuffix(" mm"): value for name, value in ratio.items()},
     }
@@ -262,6 +263,7 @@ def _block(writer: ReportWriter, name: str, rows: list[dict], short: list[dict],
     shown = given[head].assign(**{
         "centre, mm: median / 95 % / worst": spread_words(given, "centre"),
         "best rigid pose": spread_words(given, "best rigid pose's centre"),
+        "rigid fit": spread_words(given, "rigid fit's centre"),
     })  # fmt: skip
     return f"{table_of(shown, 2)}\n\n{writer.data(name, pd.DataFrame(rows), what)}"
 

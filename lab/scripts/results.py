@@ -42,7 +42,7 @@ class Options(scripts.KeptOptions):
 
     case: tuple[str, ...] = ()
     """More organs than the two phantoms, each NAME=FOLDER (of `tumortrack prepare`)."""
-    peers: tuple[str, ...] = ("rigid_bound", "rigid", "elastic")
+    peers: tuple[str, ...] = ("rigid_bound", "rigid_fit", "rigid", "elastic")
     """Beside clinic (docs/peers.md)."""
     seeds: tuple[int, ...] = (0, 1, 2)
     """Of models: of elastic body and calibration."""

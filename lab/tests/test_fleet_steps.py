@@ -155,6 +155,8 @@ def test_evaluation_has_states_of_its_own_and_more_views_of_them(fleets):
     for row in rest:
         assert row["rigid_target_mm"] < 1.0
         assert row["tumors"][0]["rigid_middle_mm"] < 1.0
+        assert row["rigid_target_mm"] < row["rigid_fit_target_mm"] < 5.0
+        assert {"rigid_fit_middle_mm", "rigid_fit_outside_mm"} < set(row["tumors"][0])
 
 
 def test_few_states_state_no_margin_but_what_they_can(fleets):

@@ -18,6 +18,7 @@ from tumortrack_lab.peers.base import (
     Fit,
     Rigid,
     RigidBound,
+    RigidFit,
     estimate_of,
     rigid_carry,
 )  # fmt: skip
@@ -108,7 +109,25 @@ def test_bound_is_exact_for_rigid_motion(anatomy):
     scene = scene_of(anatomy, still, pose(anatomy))
     fit = RigidBound(anatomy, UP).fit(scene)
     assert max(errors(anatomy, scene, fit)) < 1e-9
-    assert fit.report["residual_mm"] < 1e-6
+    assert fit.report == {"by": "triangles"}
+
+
+def test_the_rigid_fit_follows_the_points_and_the_bound_the_truth(anatomy):
+    scene = scene_of(anatomy, still, pose(anatomy))
+    beside = Scene(SensorCloud(scene.cloud.points_mm + [0, 0, 3.0]), scene.reference)
+    organ, tumor = errors(anatomy, beside, RigidFit(anatomy, UP).fit(beside))
+    assert (organ, tumor) == (pytest.approx(3.0, abs=0.3), pytest.approx(3.0, abs=0.3))
+    assert max(errors(anatomy, beside, RigidBound(anatomy, UP).fit(beside))) < 1e-9
+
+
+def test_rigid_peers_take_another_programs_surface(anatomy):
+    scene = scene_of(anatomy, still, pose(anatomy))
+    others = (Mesh(part.vertices_mm, part.faces[::-1]) for part in scene.reference.parts)
+    scene = Scene(scene.cloud, Anatomy(tuple(others)))
+    for kind in (RigidBound, RigidFit):
+        fit = kind(anatomy, UP).fit(scene)
+        assert fit.report == {"by": "surfaces"}
+        assert max(errors(anatomy, scene, fit)) < 0.3
 
 
 def test_bound_knows_triangles_whose_vertices_were_reordered(anatomy):
@@ -275,7 +294,7 @@ def acme(tmp_path, monkeypatch):
 
 
 def test_another_package_adds_a_peer_by_an_entry_point(anatomy, acme, tmp_path):
-    assert list(peer_kinds())[:2] == ["rigid_bound", "rigid"]
+    assert list(peer_kinds())[:3] == ["rigid_bound", "rigid_fit", "rigid"]
     method = peer("shifted", StudyCase("x", tmp_path, tmp_path, anatomy, UP))
     assert method.identity["versions"] == {"acme-peers": "1.2"}
     scene = scene_of(anatomy, still, pose(anatomy))

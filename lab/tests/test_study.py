@@ -165,6 +165,23 @@ def test_known_errors_reach_the_table(case, tmp_path):
     assert said.startswith("`make results`: 7 measurements (view: clean), volumes of 24³")
 
 
+def test_rigid_poses_stand_beside_clinic_where_they_were_measured(case, tmp_path):
+    methods = {"clinic": 1.0, "rigid_bound": 2.0, "rigid_fit": 4.0}
+    found = [
+        {**row, "method": method}
+        for n, (method, shift) in enumerate(methods.items())
+        for row in rows_of(case, Shifted(shift_mm=shift, seed=n), tmp_path)
+    ]
+    for names in (list(methods), ["clinic", "rigid_bound"]):
+        some = [row for row in found if row["method"] in names]
+        short = tables.accuracy_summary(tables.accuracy(tidy(some), sites()))
+        shown = short.filter(like=tables.CENTER).iloc[0].to_dict()
+        fit = "4.0 / 4.0" if "rigid_fit" in names else tables.NOTHING
+        assert {name.split(": ")[1]: value for name, value in shown.items()} == {
+            "clinic": "1.0 / 1.0", "best rigid pose": "2.0 / 2.0", "rigid fit": fit,
+        }  # fmt: skip
+
+
 def test_shares_are_by_nearest_rank_and_never_in_our_favour():
     values = pd.Series([*range(1, 11), np.inf], dtype=float)
     assert [*tables.spread(values).values()] == ["6.0", "10.0", "not found", "not found"]
@@ -234,6 +251,30 @@ def test_documents_have_a_place_for_what_scripts_write(name):
     assert f"\n\nx\n\n{closing(block)}" in fill(document, {block: "x"})
 
 
+def test_a_population_shows_rigid_fits_or_says_that_a_run_lacks_them(tmp_path):
+    script = runpy.run_path(str(ROOT / "lab" / "scripts" / "population.py"))
+    people = {"patient": ["a"], "state": ["done"], "slice_mm": [1.0], "scenes": [1], "lost": [0]}
+    pd.DataFrame(people | {"within_largest": [1.0], "holds_for": [0.5]}).to_parquet(
+        tmp_path / "patients.parquet"
+    )
+    (tmp_path / "look.csv").write_text("patient,reason\n")
+    row = {"patient": "a", "tumor": "tumor_1", "scene": "1-pull-0", "family": "pull"}
+    row |= {"hidden_share": 0.0, "kind": "exophytic", "position": "lower", "ml": 5.0}
+    row |= {"depth_mm": 8.0, "outer_share": 0.3, "verdict": "good"}
+    row |= {"over_3_mm": False, "over_5_mm": False}
+    row |= dict.fromkeys(script["_ERRORS"].values(), 1.5) | {"rigid_fit_middle_mm": 2.5}
+    writer = ReportWriter(tmp_path / "page.md", "make population")
+    for fit_mm, shown in ((2.5, " 2.5 / 2.5 / 2.5 |"), (None, "")):
+        kept = {**row, "rigid_fit_middle_mm": fit_mm}
+        pd.DataFrame([kept]).to_parquet(tmp_path / "scenes.parquet")
+        text, ours = script["block"](tmp_path, writer), "1.5 / 1.5 / 1.5"
+        assert f"| pull | 1 | 100 | {ours} | {ours} |{shown} 0 |" in text
+        assert ("This run has no rigid fits." in text) == (fit_mm is None)
+    older = {name: value for name, value in row.items() if not name.startswith("rigid_fit")}
+    pd.DataFrame([older]).to_parquet(tmp_path / "scenes.parquet")
+    assert script["block"](tmp_path, writer) == text
+
+
 def test_a_table_goes_beside_the_document(tmp_path):
     errors = {"a": pd.Series([1.0, 2, 3, np.nan]), "b": pd.Series([], dtype=float)}
     rows = pd.DataFrame([{"who": k, **spread_mm("off", v)} for k, v in errors.items()])
@@ -280,7 +321,8 @@ def test_end_to_end_twice_gives_the_same_document(phantom, clinic_model, tmp_pat
 
     monkeypatch.setattr("tumortrack_lab.study.methods.make_model", make)
     options = script["Options"](
-        peers=("rigid_bound",), seeds=(7,), grid=24, variants=("D0", "D1"), document=document,
+        peers=("rigid_bound", "rigid_fit"), seeds=(7,), grid=24, variants=("D0", "D1"),
+        document=document,
         out=tmp_path,
     )  # fmt: skip
     writer = ReportWriter(document, "make results")
@@ -300,10 +342,11 @@ def test_end_to_end_twice_gives_the_same_document(phantom, clinic_model, tmp_pat
     for words in (
         "models by seed 0, 7",
         "worst: best rigid pose",
+        "worst: rigid fit",
         "(data/results-accuracy.csv)",
     ):
         assert words in first
     assert run() == first
     assert made == [7]
-    with pytest.raises(InputError, match="rigid_bound, rigid"):
+    with pytest.raises(InputError, match="rigid_bound, rigid_fit, rigid"):
         peer("rigidly", phantom)

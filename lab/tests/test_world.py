@@ -289,12 +289,17 @@ def test_estimates_are_held_against_truth_and_rigid_pose_once_and_wrong_ones_nam
     assert rows.off[0] == pytest.approx(10.0, abs=1.5)  # as segmentation errs
     assert rows["shape"][0] < 1.5
     assert rows.rigid[0] < 1.5
+    assert 0 < rows.fit[0] < 3.0
     assert list(rows.wrong) == [True, True]
     lines, off = estimates.verdicts(rows), f"{rows.off[0]:.1f}"
     known = lines.set_index(["by", "value"]).T
     assert list(known["family", "rest"])[:6] == [1, 0, 0, 1, 1, off]
     assert list(known["disturbance", "nothing"])[:6] == [1, 0, 0, 1, 1, ""]
-    assert f"| rest | 1 | 1 | 1 | {off} / {off} / {off} |" in estimates.summary(lines)
+    each = (f"{rows[name][0]:.1f}" for name in ("off", "rigid", "fit"))
+    shown = " | ".join(f"{mm} / {mm} / {mm}" for mm in each)
+    assert f"| rest | 1 | 1 | 1 | {shown} |" in estimates.summary(lines)
+    before = estimates.verdicts(rows.assign(fit=np.nan))
+    assert f"| {shown.rpartition(' |')[0]} | – |" in estimates.summary(before)
     wrong = estimates.wrong_ones(rows)
     assert list(wrong.wrong) == ["wrong pose", "not this organ"]
     assert list(wrong.scene) == names

@@ -58,7 +58,7 @@ def test_the_rigid_fit_goes_back_to_the_points(rest):
     aside = rigid(Rotation.from_rotvec([0, 0, np.radians(5)]).as_matrix(), np.zeros(3))
     start = CAMERA_FROM_CT @ aside
     start[:3, 3] += [4.0, 0, 0]
-    found = rigid_fit(rest, scene.cloud, start)
+    found = rigid_fit(rest.distances[0], scene.cloud, start)
     points = rest.anatomy_ct.organ.vertices_mm
     off_mm = transform_points(found, points) - transform_points(CAMERA_FROM_CT, points)
     assert np.linalg.norm(off_mm, axis=1).max() < 0.3

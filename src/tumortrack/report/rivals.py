@@ -8,7 +8,7 @@ point-to-plane least squares from the best rigid pose: the best case of rigid re
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import product
 from typing import Any
 
@@ -21,8 +21,8 @@ from tumortrack.core.geometry import Affine, rigid, transform_points
 from tumortrack.core.rigid_fit import fit_over_volume, kabsch, matched_vertices
 from tumortrack.core.types import Anatomy, Mesh, SensorCloud
 from tumortrack.models.model import Model
+from tumortrack.registration.kernels import POSE, DistanceField, Flow, Pose, residual_rows
 from tumortrack.registration.model import RegistrationModel
-from tumortrack.registration.motion import ElasticMotion
 from tumortrack.registration.rest_shape import RestShape
 from tumortrack.report import metrics
 from tumortrack.report.summary import RIVALS, judged_parts
@@ -51,7 +51,7 @@ class Rivals:
             pose, by = best_rigid_pose(self.rest.anatomy_ct, scene)
         except InputError as error:
             return {name: {"not_available": str(error)} for name in RIVALS}
-        fitted = rigid_fit(self.rest, scene.cloud, pose)
+        fitted = rigid_fit(self.rest.distances[0], scene.cloud, pose)
         return {
             "best_rigid_pose": {"by": by, **self._errors(pose, scene)},
             "rigid_fit": self._errors(fitted, scene),
@@ -133,23 +133,23 @@ def _principal(points_mm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return middle, axes * [[1.0], [1.0], [np.linalg.det(axes)]]
 
 
-def rigid_fit(rest: RestShape, cloud: SensorCloud, camera_from_ct: Affine) -> Affine:
-    """Fit the organ at rest to a cloud, rigidly, from a start: Gauss-Newton on the points'
-    distances to its surface, with the Geman-McClure kernel."""
+def rigid_fit(organ: DistanceField, cloud: SensorCloud, camera_from_ct: Affine) -> Affine:
+    """Fit the organ at rest (distances to its surface, CT frame) to a cloud, rigidly, from a start:
+    Gauss-Newton on the points' distances to the surface, with the Geman-McClure kernel."""
     points_mm = thin_cloud(cloud, _POINTS, np.random.default_rng(0)).points_mm
-    body, rotation = rest.body, camera_from_ct[:3, :3]
-    centre_mm = transform_points(camera_from_ct, body.center_ct[None])[0]
-    motion = ElasticMotion(rest, rotation, centre_mm, np.zeros(len(body.mean)))
+    still = Flow(np.zeros((2, 2, 2, 3), np.float32), organ.origin_mm, np.float32(1), 1)
+    no_modes = np.zeros((2, 2, 2, 3, 0), np.float32)
+    center_ct = organ.origin_mm + organ.spacing_mm * (np.array(organ.values_mm.shape) - 1) / 2
+    rotation = np.array(camera_from_ct[:3, :3])
+    centre_mm = transform_points(camera_from_ct, center_ct[None])[0]
+    rows = np.empty((len(points_mm), POSE + 1), np.float32)
     for _ in range(_STEPS):
-        rows = motion.residual_rows(points_mm).astype(float)
-        slopes, distances = rows[:, :6], rows[:, -1]
+        residual_rows(no_modes, organ, still, Pose(center_ct, rotation, centre_mm), points_mm, rows)
+        slopes, distances = rows[:, :POSE].astype(float), rows[:, -1].astype(float)
         weighed = slopes * (1 / (1 + (distances / _WIDTH_MM) ** 2) ** 2)[:, None]
         change = np.linalg.lstsq(weighed.T @ slopes, -(weighed.T @ distances), rcond=None)[0]
-        motion = replace(
-            motion,
-            rotation=motion.rotation @ Rotation.from_rotvec(change[3:]).as_matrix(),
-            centre_mm=motion.centre_mm + motion.rotation @ change[:3],
-        )
+        centre_mm = centre_mm + rotation @ change[:3]
+        rotation = rotation @ Rotation.from_rotvec(change[3:]).as_matrix()
         if np.abs(change).max() < _TOLERANCE:
             break
-    return motion.camera_from_ct
+    return rigid(rotation, centre_mm - rotation @ center_ct)

@@ -27,16 +27,18 @@ SCENES, PATIENTS, LOOK, PAGE, PICTURES = (
 FAR_MM = (3.0, 5.0)  # larger errors of good estimates' tumor centres are counted
 _MOST_WITHOUT = 0.5  # share of the scenes without a good answer
 _ERRORS = ("middle_mm", "hausdorff_mm", "surface_mm", "outside_mm")
+_RIGID = ("rigid_", "rigid_fit_")  # errors of the best rigid pose, and of a rigid fit
 _FIRST = ("patient", "state", "step", "reason", "doubts")
 _SCENE = (
     *("patient", "tumor", "scene", "family", "view", "verdict", "reason", *_ERRORS),
-    *(f"rigid_{name}" for name in _ERRORS),
-    *("std_mm", "target_mm", "rigid_target_mm", "over_3_mm", "over_5_mm"),
+    *(f"{prefix}{name}" for prefix in _RIGID for name in (*_ERRORS, "target_mm")),
+    *("std_mm", "target_mm", "over_3_mm", "over_5_mm"),
 )
 _COLUMNS = {
     "patient": "patient", "state": "", "kind": "tumor", "position": "at", "ml": "ml",
     "organ_ml": "organ ml", "good": "good", "poor": "poor", "refused": "refused",
-    "middle_mm": "centre mm", "rigid_middle_mm": "best rigid mm", "middle_worst_mm": "worst mm",
+    "middle_mm": "centre mm", "rigid_middle_mm": "best rigid mm",
+    "rigid_fit_middle_mm": "rigid fit mm", "middle_worst_mm": "worst mm",
     "largest_miss_mm": "largest miss mm", "holds_for": "holds for", "margin_95_mm": "95 % margin",
 }  # fmt: skip
 _STYLE = (  # beside that of an evaluation's page
@@ -116,7 +118,7 @@ def tumor_lines(content: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
 
 def patient_row(content: Mapping[str, Any], lines: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """A patient's figures: of the largest tumor; errors are medians over all tumors of the scenes
-    that were answered good (the best rigid pose's: of all scenes); shares are of scenes."""
+    that were answered good (of rigid poses: of all scenes); shares are of scenes."""
     check, margin, rows = content["check"], content["margins"], content["rows"]
     largest = max(check["tumors"], key=lambda tumor: tumor["ml"])
     verdicts = [row["verdict"] for row in rows]
@@ -130,8 +132,6 @@ def patient_row(content: Mapping[str, Any], lines: Sequence[Mapping[str, Any]]) 
         **largest, "tumors": len(check["tumors"]), **content["model"],
         "scenes": len(rows), "lost": len(content["failures"]),
         "middle_95_mm": good.middle_mm.quantile(0.95), "middle_worst_mm": good.middle_mm.max(),
-        "rigid_middle_mm": every.rigid_middle_mm.median(),
-        "rigid_hausdorff_mm": every.rigid_hausdorff_mm.median(),
         "target_mm": good.drop_duplicates("scene").target_mm.median(),
         "margin_states": margin["states"], "margin_answers": margin["answers"],
         "largest_miss_mm": limit, "holds_for": margin["holds_for"],
@@ -142,6 +142,7 @@ def patient_row(content: Mapping[str, Any], lines: Sequence[Mapping[str, Any]]) 
         row[name] = verdicts.count(name) / len(rows) if rows else 0.0
     for name in ("middle_mm", "hausdorff_mm"):
         row[name] = good[name].median()
+        row |= {f"{prefix}{name}": every[f"{prefix}{name}"].median() for prefix in _RIGID}
     for far in FAR_MM:
         row[f"over_{far:g}_mm"] = int(good[f"over_{far:g}_mm"].sum())
     for percent in (90, 95):

@@ -22,6 +22,7 @@ from tumortrack_lab.fleet.task import File, Task
 FAMILIES = ("rest", "plate", "clamp", "twist", "pull", "tether", "roll")
 _TEST = len(FAMILIES) * 100_000  # number of the first state that is evaluated on
 CONFIDENCES = (0.9, 0.95)
+_VERSIONS = {"evaluate": 3}  # of other steps: 2
 Inputs = Mapping[str, Path]
 Given = Mapping[str, Any]
 
@@ -40,7 +41,8 @@ def chain(patient: Patient) -> dict[str, Task]:
         name: str, work: Any, options: Given, inputs: Mapping[str, Task | File], memory_mb: int
     ) -> Task:
         kind = name.rstrip("0123456789-")
-        steps[name] = Task(patient.name, kind, 2, work, dict(options), inputs, memory_mb)
+        version = _VERSIONS.get(kind, 2)
+        steps[name] = Task(patient.name, kind, version, work, dict(options), inputs, memory_mb)
         return steps[name]
 
     kind = "" if patient.source.is_dir() else "".join(patient.source.suffixes[-2:])
@@ -191,7 +193,7 @@ def margins(inputs: Inputs, options: Given, out: Path) -> None:
 
 
 def evaluate(inputs: Inputs, options: Given, out: Path) -> None:
-    """rows.json: verdict and errors of every scene, beside those of the best rigid pose."""
+    """rows.json: verdict and errors of every scene, beside those of rigid poses."""
     from dataclasses import replace
 
     from tumortrack.core.rigid_fit import matched_vertices

@@ -1,4 +1,5 @@
-"""The interface of peers (methods to compare with), and the rigid ones.
+"""The interface of peers (methods to compare with), and the rigid ones, two of which know the
+truth: they show the best that rigid registration can do.
 
 A peer moves the pre-operative anatomy onto one observed cloud: it is made for one patient and
 fitted to scenes one by one. Its answer is a map of points, from which organ, tumors and labels
@@ -17,9 +18,10 @@ from jaxtyping import Float
 from tumortrack.core.errors import InputError
 from tumortrack.core.estimate import Estimate
 from tumortrack.core.geometry import transform_points
-from tumortrack.core.rigid_fit import fit_over_volume, matched_vertices
 from tumortrack.core.types import Anatomy
 from tumortrack.models.report import estimate_of as of_surfaces
+from tumortrack.registration.rest_shape import distance_of
+from tumortrack.report.rivals import best_rigid_pose, rigid_fit
 from tumortrack.simulate.scene_folder import Scene
 from tumortrack_lab.peers.pose_search import (
     Direction,
@@ -64,9 +66,9 @@ class Peer(Protocol):
     """A method made ready for one patient."""
 
     def fit(self, scene: Scene) -> Fit:
-        """Locate the anatomy in a scene. All but the bound use ``scene.cloud`` alone. Raises
-        NoEstimate: the cloud has too little information, such as fewer than 20 points; InputError:
-        the cloud or the peer's settings cannot be used."""
+        """Locate the anatomy in a scene. All but ``RigidBound`` and ``RigidFit`` use
+        ``scene.cloud`` alone. Raises NoEstimate: the cloud has too little information, such as
+        fewer than 20 points; InputError: the cloud or the peer's settings cannot be used."""
 
 
 def rigid_carry(camera_from_ct: Transform) -> Carry:
@@ -97,14 +99,24 @@ class Rigid:
 
 
 class RigidBound:
-    """The best rigid pose, computed from the truth: least squares over the organ's whole volume,
-    with true correspondences. An oracle, not a method: no rigid method can beat it in that norm.
-    Errors as of ``matched_vertices``."""
+    """``report.rivals.best_rigid_pose``: an oracle, not a method. Raises InputError: the scene has
+    other parts than the case."""
 
     def __init__(self, anatomy_ct: Anatomy, up_lps: Direction) -> None:
-        self._organ = anatomy_ct.organ
+        self._anatomy_ct = anatomy_ct
 
     def fit(self, scene: Scene) -> Fit:
-        reference = self._organ.moved(matched_vertices(self._organ, scene.reference.organ))
-        camera_from_ct, residual_mm = fit_over_volume(self._organ, reference)
-        return Fit(rigid_carry(camera_from_ct), {"residual_mm": residual_mm})
+        camera_from_ct, by = best_rigid_pose(self._anatomy_ct, scene)
+        return Fit(rigid_carry(camera_from_ct), {"by": by})
+
+
+class RigidFit(RigidBound):
+    """``report.rivals.rigid_fit`` from there: what rigid registration gives its users at best."""
+
+    def __init__(self, anatomy_ct: Anatomy, up_lps: Direction) -> None:
+        super().__init__(anatomy_ct, up_lps)
+        self._distance = distance_of(anatomy_ct.organ)
+
+    def fit(self, scene: Scene) -> Fit:
+        start, by = best_rigid_pose(self._anatomy_ct, scene)
+        return Fit(rigid_carry(rigid_fit(self._distance, scene.cloud, start)), {"by": by})

@@ -11,7 +11,7 @@ from typing import Any
 from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import Anatomy
-from tumortrack_lab.peers.base import Peer, Rigid, RigidBound
+from tumortrack_lab.peers.base import Peer, Rigid, RigidBound, RigidFit
 from tumortrack_lab.peers.elastic import ElasticPeer, ElasticPeerConfig
 from tumortrack_lab.peers.pose_search import Direction, RigidConfig
 
@@ -42,6 +42,7 @@ def peer_kinds() -> dict[str, PeerKind]:
     the name of a peer of ours."""
     kinds = {
         "rigid_bound": PeerKind(RigidBound),
+        "rigid_fit": PeerKind(RigidFit),
         "rigid": PeerKind(Rigid, RigidConfig(), ("small_gicp",)),
         "elastic": PeerKind(ElasticPeer, ElasticPeerConfig(), ("pytetwild", "scipy", "small_gicp")),
     }

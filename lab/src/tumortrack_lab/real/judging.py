@@ -1,11 +1,10 @@
-"""Locates a deformed organ and compares it with the truth and with the best rigid pose.
-
-That pose is an oracle's: least squares over the organ's volume, with the true deformation known.
-"""
+"""Locates a deformed organ and compares it with the truth, and with the best rigid pose and a rigid
+fit to the same points that starts there (``report.rivals``)."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -15,7 +14,9 @@ from tumortrack.core.errors import NoEstimate
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.rigid_fit import fit_over_volume
 from tumortrack.core.types import Anatomy, DepthFrame, Mesh
+from tumortrack.registration.rest_shape import distance_of
 from tumortrack.report.metrics import outward_miss, surface_distances
+from tumortrack.report.rivals import best_rigid_pose, rigid_fit
 from tumortrack.sense.camera import d405
 from tumortrack.sense.cloud import CloudConfig, cloud_from_depth
 from tumortrack.sense.noise import D405_NOISE, add_noise
@@ -31,7 +32,10 @@ CAMERA = d405(424, 240)
 DRAGGED = SceneConfig(
     deform=(ChainConfig(links=(DragConfig(), StretchConfig())),), noise=D405_NOISE
 )
-_FIRST = ["name", "verdict", "middle_mm", "hausdorff_mm", "std_mm"]
+# Columns that tables need; what was measured before rigid fits were has none of theirs.
+_FIRST = ["name", "verdict", "middle_mm", "hausdorff_mm", "std_mm", "rigid_fit_middle_mm"]
+_RIGID = ("rigid_", "rigid_fit_")  # prefixes of errors: of the best rigid pose, of the rigid fit
+_kept_distance = lru_cache(maxsize=1)(distance_of)  # of an organ: a second
 
 
 def scene_of(
@@ -65,10 +69,11 @@ def judge(
     Returns:
         ``verdict`` (refused, poor, good), ``reason``, and ``tumors``: of each the error of its
         middle and, with ``surfaces``, the Hausdorff and the mean surface distance and how far the
-        true tumor sticks out of the estimated one, of the estimate and of the best rigid pose; the
-        middle's error after moving the estimate rigidly onto the truth (``shape_``); and the stated
-        standard deviation; mm. No tumors where the scene shows another organ. Where it has targets,
-        ``target_mm`` and ``rigid_target_mm`` are their mean errors.
+        true tumor sticks out of the estimated one, of the estimate, of the best rigid pose
+        (``rigid_``) and of the rigid fit (``rigid_fit_``); the middle's error after moving the
+        estimate rigidly onto the truth (``shape_``); and the stated standard deviation; mm. No
+        tumors where the scene shows another organ. Where it has targets, ``target_mm`` and the
+        same of both rigid poses are their mean errors.
     """
     row: dict[str, Any] = {"tumors": [], "verdict": "refused", "reason": ""}
     motion = None
@@ -81,17 +86,23 @@ def judge(
         row["reason"] = str(error)
     if scene.meta.get("model_organ") is False:
         return row
-    pose = fit_over_volume(anatomy_ct.organ, scene.reference.organ)[0]
+    best, _ = best_rigid_pose(anatomy_ct, scene)
+    fitted = rigid_fit(_kept_distance(anatomy_ct.organ), scene.cloud, best)
+    poses = dict(zip(_RIGID, (best, fitted), strict=True))
     onto, targets = np.eye(4), scene.targets
     if targets is not None:
-        row["rigid_target_mm"] = _mean_off(transform_points(pose, targets.points_ct), targets)
+        for prefix, pose in poses.items():
+            placed = transform_points(pose, targets.points_ct)
+            row[f"{prefix}target_mm"] = _mean_off(placed, targets)
         if motion is not None:
             row["target_mm"] = _mean_off(motion.carry(targets.points_ct), targets)
     if motion is not None:
         estimated = anatomy_ct.organ.moved(motion.carry(anatomy_ct.organ.vertices_mm))
         onto = fit_over_volume(estimated, scene.reference.organ)[0]
     for rest, true in zip(anatomy_ct.tumors, scene.reference.tumors, strict=True):
-        tumor = _errors(_posed(rest, pose), true, "rigid_", surfaces)
+        tumor: dict[str, float] = {}
+        for prefix, pose in poses.items():
+            tumor |= _errors(_posed(rest, pose), true, prefix, surfaces)
         if motion is not None:
             estimated = rest.moved(motion.carry(rest.vertices_mm))
             tumor |= _errors(estimated, true, "", surfaces)

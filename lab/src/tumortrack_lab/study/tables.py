@@ -21,6 +21,7 @@ _DISTANCES = ["hausdorff_mm", "center_mm", "target_mm"]
 _NAMES = ["case", "method", "variant", "part"]
 METHODS = {
     "rigid_bound": "best rigid pose",
+    "rigid_fit": "rigid fit",
     "rigid": "rigid registration, many starts",
     "elastic": "linear-elastic surface fit",
 }
@@ -97,13 +98,15 @@ def accuracy(frame: pd.DataFrame, sites: dict[str, Sites]) -> pd.DataFrame:
 
 
 def accuracy_summary(rows: pd.DataFrame) -> pd.DataFrame:
-    """A row for each tumor of a deformed organ: clinic beside the best rigid pose."""
+    """A row for each tumor of a deformed organ: clinic beside the best rigid pose and a rigid fit
+    that starts there. Of what was not measured: ``NOTHING``."""
     some = rows[(rows.state == "deformed") & (rows.kind != EMPTY)]
     some = some.assign(shown=some["median"] + " / " + some["worst"])
     wide = some.pivot(index=["organ", "part", "kind"], columns=["figure", "method"], values="shown")
-    both = [(f, method) for f in (HD, CENTER) for method in ("clinic", METHODS["rigid_bound"])]
-    wide = wide.reindex(columns=pd.MultiIndex.from_tuples(both)).fillna(NOTHING)
-    wide.columns = [f"{figure}, median / worst: {method}" for figure, method in both]
+    methods = "clinic", METHODS["rigid_bound"], METHODS["rigid_fit"]
+    shown = [(figure, method) for figure in (HD, CENTER) for method in methods]
+    wide = wide.reindex(columns=pd.MultiIndex.from_tuples(shown)).astype(object).fillna(NOTHING)
+    wide.columns = [f"{figure}, median / worst: {method}" for figure, method in shown]
     return wide.reset_index()
 
 

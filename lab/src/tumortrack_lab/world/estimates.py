@@ -22,7 +22,8 @@ from tumortrack_lab.real.judging import by_tumor, judge
 from tumortrack_lab.study.document import spread_mm, spread_words, table_of
 from tumortrack_lab.study.trust import BANDS, band_of
 
-_ERRORS = {"middle_mm": "off", "rigid_middle_mm": "rigid", "shape_middle_mm": "shape"}
+_ERRORS = {"middle_mm": "off", "rigid_middle_mm": "rigid", "rigid_fit_middle_mm": "fit"}
+_ERRORS |= {"shape_middle_mm": "shape"}
 _ROWS, _SAVE_EVERY = "measured.json", 20
 
 
@@ -84,6 +85,7 @@ def verdicts(rows: pd.DataFrame) -> pd.DataFrame:
             line |= {v: (scenes.verdict == v).sum() for v in ("refused", "poor", "good")}
             line["wrong"] = mine[mine.wrong].groupby(["organ", "scene"]).ngroups
             line |= spread_mm("centre", good.off) | spread_mm("best rigid pose", good.rigid)
+            line |= spread_mm("rigid fit", good.fit)
             lines.append(line)
     return pd.DataFrame(lines)
 
@@ -93,7 +95,8 @@ def summary(lines: pd.DataFrame) -> str:
     short, by = lines[lines.by == lines.by[0]], lines.by[0]
     shown = short[["value", "scenes", "good", "wrong"]].rename(columns={"value": by})
     shown["centre, mm: median / 95 % / worst"] = spread_words(short, "centre")
-    shown["best rigid pose"] = spread_words(short, "best rigid pose")
+    for of in ("best rigid pose", "rigid fit"):
+        shown[of] = spread_words(short, of)
     return table_of(shown)
 
 
