@@ -137,7 +137,7 @@ def test_bound_knows_triangles_whose_vertices_were_reordered(anatomy):
     place = np.argsort(order)
     shuffled = Mesh(organ.vertices_mm[order], place[organ.faces])
     np.testing.assert_array_equal(matched_vertices(anatomy.organ, shuffled), organ.vertices_mm)
-    with pytest.raises(InputError, match="made from this case"):
+    with pytest.raises(InputError, match="were made from this case"):
         matched_vertices(anatomy.organ, Mesh(organ.vertices_mm, organ.faces[::-1]))
 
 

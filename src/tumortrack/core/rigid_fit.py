@@ -36,8 +36,8 @@ def matched_vertices(rest: Mesh, moved: Mesh) -> Float64[np.ndarray, "_ 3"]:
         same = bool((vertex[rest.faces] == moved.faces).all() and (vertex >= 0).all())
     if not same:
         raise InputError(
-            "the rigid bound needs a scene made from this case: its organ must have the "
-            "same triangles as the case's. Make scenes with this case, or leave the bound out."
+            "the scene's surfaces must have the same triangles as the case's; compare scenes that "
+            "were made from this case."
         )
     return moved.vertices_mm[vertex]
 
