@@ -23,7 +23,7 @@ from tumortrack.cli.console import model_folder, say
 from tumortrack.core import store
 from tumortrack.core.config import to_builtins
 from tumortrack.core.errors import InputError, TumortrackError
-from tumortrack.tracking.tracker import Tracker
+from tumortrack.tracking.tracker import Tracker, region_for
 from tumortrack_lab.study import scripts
 from tumortrack_lab.study.document import ReportWriter
 from tumortrack_lab.study.tumor_sites import tumor_sites_of
@@ -110,10 +110,11 @@ def _opened(options: Options, config: FilmConfig) -> tuple[World, Callable[[], l
 def _follow(options: Options, model: Path, films: list[Film]) -> None:
     tracker, sha256 = Tracker(api.load_model(model)), store.sha256_of(model / store.MANIFEST)
     about = {"model_sha256": sha256, "version": ""}
-    sites = tumor_sites_of(films[0].rest)
+    sites, region = tumor_sites_of(films[0].rest), region_for(tracker.model)
     for done, film in enumerate(films, start=1):
         for method in options.methods:
-            judge = partial(following.judge, following.METHODS[method](tracker), film, sites)
+            locate = following.METHODS[method](tracker)
+            judge = partial(following.judge, locate, film, sites, region)
             rows = scripts.kept(film.folder / f"{method}.json", about, judge)
             errors = pd.DataFrame(rows).reindex(columns=["center_mm"])["center_mm"]
             say(f"{done}/{len(films)} {film.folder.name}, {method}: {errors.median():.1f} mm off")

@@ -23,6 +23,7 @@ from tumortrack.core.types import Anatomy, Mesh
 from tumortrack.report.drawing import ESTIMATED, TRUE
 from tumortrack.report.metrics import surface_samples
 from tumortrack.sense.camera import deproject
+from tumortrack.sense.region import RegionConfig
 from tumortrack.simulate.scene_folder import draw_targets, read_scene
 from tumortrack_devices.sources.recording import RecordingSourceConfig
 from tumortrack_lab.peers.base import OneWay
@@ -159,7 +160,8 @@ def off_by(film, shift_mm: float, lost: set[int], doubted: set[int]):
 
 def test_a_followers_errors_are_judged_as_large_as_they_are(film) -> None:
     locate = off_by(film, 4.0, {1}, {2, 3})
-    rows = pd.DataFrame(following.judge(locate, film, tumor_sites_of(film.rest)))
+    sites = tumor_sites_of(film.rest)
+    rows = pd.DataFrame(following.judge(locate, film, sites, RegionConfig()))
     assert len(rows) == len(film.stamps_ns)
     assert rows["quality"].tolist()[:4] == ["good", "none", "poor", "poor"]
     found = rows[rows["quality"] != "none"]
@@ -169,12 +171,19 @@ def test_a_followers_errors_are_judged_as_large_as_they_are(film) -> None:
     assert found["hausdorff_mm"].notna().sum() > 1
     assert rows["center_mm"].isna().tolist() == (rows["quality"] == "none").tolist()
     assert (rows["rigid_center_mm"] < rows["bend_mm"] + 0.1).all()
+    fits_mm = rows["rigid_fit_center_mm"].dropna()
+    assert len(fits_mm) > len(rows) / 2
+    assert 0 < fits_mm.median() < 5.0
     about = {"method": "track", "organ": "a", "sequence": "push-000", "kind": "push"}
     made = tables.tables(rows.assign(**about))
     (verdict,) = made["verdicts"].to_dict("records")
     assert (verdict["sequences"], verdict["frames"]) == (1, len(rows))
     assert verdict["good, %"] == pytest.approx(100 * (len(rows) - 3) / len(rows), abs=0.05)
     assert "4.0 [4.0] / " in tables.overview(made["errors"])
+    methods = ["best rigid pose", "rigid fit", "track"]
+    assert list(made["errors"]["method"].unique()) == methods
+    older = tables.tables(rows.assign(**about).drop(columns="rigid_fit_center_mm"))
+    assert list(older["errors"]["method"].unique()) == ["best rigid pose", "track"]
     assert tables.longest_s([0.0, 1.0, 2.0, 3.0, 4.0], [True, False, True, True, False]) == 2.0
 
 

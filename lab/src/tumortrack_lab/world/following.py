@@ -7,6 +7,7 @@ image of each camera, and the cameras' poses with a calibration's errors.
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -20,7 +21,9 @@ from tumortrack.core.geometry import transform_points
 from tumortrack.core.report import Finding
 from tumortrack.core.types import DepthFrame, Look, Mesh, SensorCloud
 from tumortrack.live.loop import SURE_AFTER
+from tumortrack.registration.rest_shape import distance_of
 from tumortrack.report.metrics import surface_distances
+from tumortrack.report.rivals import rigid_fit
 from tumortrack.sense.region import Hints, RegionConfig, organ_points
 from tumortrack.tracking.tracker import Follower, FollowerConfig, Tracker, region_for
 from tumortrack_lab.study.tumor_sites import TumorSite
@@ -95,11 +98,14 @@ METHODS: dict[str, Callable[[Tracker], Locate]] = {
 }  # fmt: skip
 
 
-def judge(locate: Locate, film: Film, sites: dict[str, TumorSite]) -> list[dict[str, Any]]:
+def judge(
+    locate: Locate, film: Film, sites: dict[str, TumorSite], region: RegionConfig
+) -> list[dict[str, Any]]:
     """A row for each frame and tumor: quality, errors of its centre and, in every third frame of
     all but random sequences, of its surface (Hausdorff), stated deviations, and the centre's error
-    in the best rigid pose; mm. Without an estimate, what needs one is absent."""
-    poses, rows = film.first_from_camera(), []
+    in the best rigid pose and in a rigid fit to the organ that the first camera sees in ``region``;
+    mm. Without an estimate, or an organ, what needs one is absent."""
+    poses, rows, organ = film.first_from_camera(), [], distance_of(film.rest.organ)
     every = _SURFACES_EVERY if film.meta["kind"] != "random" else len(film.stamps_ns) + 1
     for number, time_s in enumerate(film.seconds.tolist()):
         about: dict[str, Any] = {
@@ -118,12 +124,17 @@ def judge(locate: Locate, film: Film, sites: dict[str, TumorSite]) -> list[dict[
         if motion is not None:
             off_mm = motion.carry(film.targets_ct) - film.targets_mm[number]
             about["targets_mm"] = float(np.linalg.norm(off_mm, axis=1).mean())
-        pose, truth = film.camera_from_ct[number], film.truth(number)
+        truth = film.truth(number)
+        rigid = {"rigid_center_mm": film.camera_from_ct[number]}
+        with suppress(NoEstimate):
+            cloud = _organ(film.looks(number)[0], region)
+            rigid["rigid_fit_center_mm"] = rigid_fit(organ, cloud, film.camera_from_ct[number])
         for name, rest, true in zip(
             film.rest.names[1:], film.rest.tumors, truth.tumors, strict=True
         ):
             row = {**about, "tumor": name, "site": sites[name].kind}
-            row["rigid_center_mm"] = _center_mm(transform_points(pose, rest.vertices_mm), true)
+            for key, pose in rigid.items():
+                row[key] = _center_mm(transform_points(pose, rest.vertices_mm), true)
             if motion is not None:
                 estimated = rest.moved(motion.carry(rest.vertices_mm))
                 row["center_mm"] = _center_mm(estimated.vertices_mm, true)

@@ -22,6 +22,7 @@ _AS_GOOD_MM = 0.5  # more than a first look at the same frame has
 _OPEN, _HIDDEN = 0.05, (0.3, 0.5)  # shares of the organ that something hides
 _FRAME = ["organ", "sequence", "time_s"]
 _OFF = {"centre, mm": "center_mm", "Hausdorff, mm": "hausdorff_mm"}
+_RIGID = {"best rigid pose": "rigid_center_mm", "rigid fit": "rigid_fit_center_mm"}
 # What each table has, for its link.
 WORDS = {
     "errors": "Errors by state, tumor and method",
@@ -84,10 +85,14 @@ def _errors(rows: pd.DataFrame, sequences: str) -> list[dict[str, Any]]:
     for (severity, site), mine in rows.groupby(["state", "site"], observed=True):
         each = {method: mine[mine["method"] == method] for method in methods}
         first = each[methods[0]]
-        rigid = first.assign(center_mm=first["rigid_center_mm"], hausdorff_mm=np.nan)
+        rigid = {
+            words: first.assign(center_mm=first[column], hausdorff_mm=np.nan)
+            for words, column in _RIGID.items()
+            if column in first  # older rows have no fits
+        }
         about = {"sequences": sequences, "state": severity, "tumor": site}
         about |= {"organs": mine["organ"].nunique(), "frames": len(first)}
-        for method, its in {"best rigid pose": rigid, **each}.items():
+        for method, its in {**rigid, **each}.items():
             lines.append({**about, "method": method, **_of_organs(its, _OFF)})
     return lines
 
