@@ -24,7 +24,7 @@ from tumortrack.imaging.raster import label_grid, winding_numbers
 from tumortrack.registration import gauss_newton_kernels as kernels
 from tumortrack.registration import registration
 from tumortrack.registration.config import GaussNewtonConfig
-from tumortrack.registration.gauss_newton import GaussNewton, _prior
+from tumortrack.registration.gauss_newton import GaussNewton, prior_precision
 from tumortrack.registration.kernels import look_up, probabilities
 from tumortrack.registration.locator import RegistrationLocator, nearest_lookup
 from tumortrack.registration.looks import Looks
@@ -114,7 +114,7 @@ def test_sums_are_those_of_the_rows_and_rows_those_of_plain_arithmetic(state):
     motion = replace(motion, coefficients=0.9 * motion.coefficients)
     rows = motion.residual_rows(points).astype(float)
     config = GaussNewtonConfig(first_mm=2.0, n_effective=1e6)  # each point weighs one
-    begun, precision = descent(points, motion, config), _prior(shape(), config)
+    begun, precision = descent(points, motion, config), prior_precision(shape(), config)
     begun.run(0)
     equations = begun._state
     np.testing.assert_array_equal(equations.distances_mm, rows[:, -1])
@@ -153,7 +153,7 @@ def test_the_kernels_weight_is_its_derivative():
 
 def plainly_refined(points, start, config):
     """``refine`` in a plain loop: pose, coefficients, cost and number of steps."""
-    body, precision = shape().body, _prior(shape(), config)
+    body, precision = shape().body, prior_precision(shape(), config)
     rotation, centre, coefficients = start.rotation, start.centre_mm, start.coefficients
     moved, weight = np.zeros(6), min(config.n_effective / len(points), 1) / config.sigma_mm**2
     step, settled = 0, False

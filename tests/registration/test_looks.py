@@ -21,7 +21,6 @@ from tumortrack.live.values import CameraView, Observation
 from tumortrack.live.views import Scan, ViewsLocator
 from tumortrack.registration import looks as module
 from tumortrack.registration.config import GaussNewtonConfig
-from tumortrack.registration.discrepancy import fit_discrepancy
 from tumortrack.registration.gauss_newton import refine
 from tumortrack.registration.looks import CAMERA_STD, Looks, seen_from_first
 from tumortrack.registration.search import PosePrior, Search
@@ -113,9 +112,8 @@ def test_two_looks_see_more_than_one(tracker):
         assert two.report.points == len(first.cloud.points_mm) + len(second.cloud.points_mm)
     one, two = np.median(errors, axis=0)
     assert two < 0.8 * one
-    assert all(
-        off < deviation for off, deviation in zip(np.array(errors)[:, 1], stated, strict=True)
-    )
+    off_mm_two, along_an_axis_mm = np.array(errors)[:, 1], np.array(stated)
+    assert (off_mm_two < np.sqrt(3) * along_an_axis_mm).all()
 
 
 def test_a_camera_that_stands_elsewhere_is_corrected(tracker, monkeypatch):
@@ -166,15 +164,7 @@ def test_one_look_is_what_it_was(tracker):
     alone = registration.best_fit(looks, registration.search.starts(looks))
     np.testing.assert_array_equal(fit.motion.carry(INNER), alone.motion.carry(INNER))
     assert fit.cost == alone.cost
-    config, motion, body = registration.config, alone.motion, alone.motion.shape.body
-    prior = np.diag([config.shift_mm**2] * 3 + [config.turn_rad**2] * 3 + [0.0] * len(body.mean))
-    prior[6:, 6:] = body.covariance
-    off = np.concatenate([np.zeros(6), body.mean - motion.coefficients])
-    rows, rest_ct = motion.residual_rows(points).astype(float), motion.back(points)
-    covariance, process = fit_discrepancy(rows, rest_ct, prior, off, config.last_mm)
-    judged = posterior(motion, looks, config)
-    np.testing.assert_array_equal(judged.covariance, covariance)
-    np.testing.assert_array_equal(judged.discrepancy.cross, process.cross)
+    assert posterior(fit.motion, looks, registration.config) is fit.motion.covariance
 
 
 def test_a_correction_undoes_a_cameras_error_and_leaves_the_rest():

@@ -21,7 +21,7 @@ from tumortrack.core.estimate import Motion
 from tumortrack.core.mesh_query import labels_of, surface_distance
 from tumortrack.core.types import Mesh
 from tumortrack.registration.config import GaussNewtonConfig
-from tumortrack.registration.gauss_newton import _prior
+from tumortrack.registration.gauss_newton import prior_precision
 from tumortrack.registration.looks import Looks
 from tumortrack.registration.motion import ElasticMotion
 from tumortrack.registration.rest_shape import RestShape, distance_of
@@ -329,7 +329,7 @@ def test_a_slow_general_optimiser_finds_the_same():
     config = GaussNewtonConfig(steps=60, enough_mm=1e-4)
     points = surface(placed(), 150) + np.random.default_rng(8).normal(0, 0.5, (150, 3))
     fit = refined(points, START, config)
-    root = np.linalg.cholesky(_prior(shape(), config)).T
+    root = np.linalg.cholesky(prior_precision(shape(), config)).T
     weight = min(config.n_effective / len(points), 1.0) / config.sigma_mm**2
 
     def moved(x):

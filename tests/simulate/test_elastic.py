@@ -35,7 +35,13 @@ from tumortrack.simulate.elastic.loads import (
     random_states,
     state_of,
 )
-from tumortrack.simulate.elastic.modes import ReducedModel, modes_of, patches_of, random_loads
+from tumortrack.simulate.elastic.modes import (
+    ReducedModel,
+    compliance_modes,
+    modes_of,
+    patches_of,
+    random_loads,
+)
 from tumortrack.simulate.scene import (
     PoseConfig,
     SceneConfig,
@@ -147,15 +153,22 @@ def test_modes_are_orthonormal_and_free_of_rigid_motion(solid, modes):
             np.testing.assert_allclose(modes.T @ (mass[:, 0] * motion), 0, atol=1e-6)
 
 
+def free_response(solid, loads, contrast=1.0):
+    """Of a solid that inertia holds, to forces at its nodes (f, n), without rigid motion."""
+    mass, arms = np.repeat(solid.volume_mm3, 3)[:, None], solid.nodes_mm - solid.center_mm
+    eye = np.eye(3)
+    shifts = (np.tile(axis, len(arms)) for axis in eye)
+    rigid = np.stack([*shifts, *(np.cross(axis, arms).ravel() for axis in eye)], 1)
+    moments = np.linalg.inv(rigid.T @ (mass * rigid))
+    factor = solid.factor(contrast)
+    responses = factor.solve(loads - mass * (rigid @ (moments @ (rigid.T @ loads))))
+    return responses - rigid @ (moments @ (rigid.T @ (mass * responses)))
+
+
 def test_modes_hold_most_of_the_response_to_another_load(solid, patches, modes):
     mass = np.repeat(solid.volume_mm3, 3)[:, None]
     loads = random_loads(solid, patches, np.array(UP), 20, np.random.default_rng(7))
-    arms, eye = solid.nodes_mm - solid.center_mm, np.eye(3)
-    shifts = [np.tile(axis, len(arms)) for axis in eye]
-    rigid = np.stack([*shifts, *(np.cross(axis, arms).ravel() for axis in eye)], 1)
-    moments = np.linalg.inv(rigid.T @ (mass * rigid))
-    responses = solid.factor(1.0).solve(loads - mass * (rigid @ (moments @ (rigid.T @ loads))))
-    responses -= rigid @ (moments @ (rigid.T @ (mass * responses)))
+    responses = free_response(solid, loads)
     held = modes.T @ (mass * responses) / np.sqrt(solid.volume_mm3.sum())
     fractions = (held**2).sum(0) / (mass * responses**2).sum(0)
     assert fractions.mean() > 0.9
@@ -247,6 +260,28 @@ def test_weight_that_is_no_longer_borne_makes_the_organ_sink_and_flatten(reduced
         weight_n = ORGAN.volume_mm3 * 1.05e-6 * 9.81
         assert springs @ np.clip(depth + rows @ z, 0, None) == pytest.approx(weight_n, rel=0.03)
     assert sunk[0] < 4 * sunk[1]  # tissue a tenth as stiff flattens more
+
+
+def test_compliance_is_what_forces_anywhere_do(solid, patches):
+    few, many = (compliance_modes(solid, patches, count) for count in (12, 60))
+    np.testing.assert_allclose(np.abs(few), np.abs(many[:, :12]), atol=1e-6 * np.abs(few).max())
+    mass = np.repeat(solid.volume_mm3, 3)
+    shifts = np.tile(np.eye(3), (len(solid.nodes), 1))
+    assert np.abs(shifts.T @ (mass[:, None] * many)).max() < 1e-6 * (mass @ np.abs(many)).max()
+    # Independent coefficients N(0, 1) move the surface by 1 mm rms along each axis, or a bit less.
+    weights = patches.areas_mm2 / patches.areas_mm2.sum()
+    squares = (solid.at(patches.points_mm, many) ** 2).sum(2)  # (p, 3)
+    assert 0.85 < (weights @ squares).mean() <= 1
+    # What any force does lies among them.
+    spot = patches.spot(patches.points_mm[0], 8.0) * patches.areas_mm2
+    forces = solid.weights(patches.points_mm).T @ (spot[:, None] * patches.normals[0])
+    response = free_response(solid, forces.reshape(-1, 1), 3.0)
+    left = [
+        np.linalg.norm(response - modes @ np.linalg.lstsq(modes, response, rcond=None)[0])
+        for modes in (few, many)
+    ]
+    assert left[1] < 0.6 * left[0]
+    assert left[1] < 0.35 * np.linalg.norm(response)
 
 
 @pytest.mark.parametrize("strain", [-0.02, 0.02])

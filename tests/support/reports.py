@@ -15,7 +15,7 @@ from tumortrack.core.types import DepthFrame, Look, SensorCloud
 
 NOWHERE = {
     "camera_from_ct": [[1.0, 0, 0, 0], [0, 1.0, 0, 0], [0, 0, 1.0, 0], [0, 0, 0, 1.0]],
-    **{"coefficients": [], "rarity": 0.3, "steps": 4, "discrepancy_mm": None, "noise_mm": None},
+    **{"coefficients": [], "rarity": 0.3, "steps": 4, "compliance_std_mm": None},
 }
 
 

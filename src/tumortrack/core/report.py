@@ -17,8 +17,8 @@ Check = Literal[
 ]
 Kind = Literal[
     "not_judged", "poses", "strays", "fit", "size", "upside_down", "tilted", "not_turned", "rival",
-    "missing", "unsure", "improbable", "seen_through", "unseen", "hidden_now", "beyond_margins",
-    "model", "frame_in_doubt", "good_again",
+    "missing", "unsure", "improbable", "seen_through", "unseen", "hidden_now",
+    "beyond_margins", "model", "frame_in_doubt", "good_again",
     # No estimate: the frame or its source.
     "no_frame", "source", "defect", "stamp_negative", "stamp_back", "stale", "future", "too_late",
     "frozen", "other_frame_id", "frame_id_changed", "intrinsics_changed", "moved", "cameras",
@@ -304,15 +304,15 @@ class AllowedPoses(_Value, frozen=True, kw_only=True):
 
 
 class MotionReport(_Value, frozen=True, kw_only=True):
-    """The fitted motion: pose, elastic ``coefficients`` and their ``rarity``, Gauss-Newton
-    ``steps``, and the model error beside it."""
+    """The fitted motion: pose, elastic ``coefficients``, Gauss-Newton ``steps``. ``rarity``: of the
+    library's state; ``compliance_std_mm``: of the compliance beside it, whose coefficients are the
+    last."""
 
     camera_from_ct: tuple[tuple[float, float, float, float], ...]
     coefficients: tuple[float, ...]
     rarity: float
     steps: int
-    discrepancy_mm: float | None
-    noise_mm: float | None
+    compliance_std_mm: float | None
 
 
 class StatedMargin(_Value, frozen=True, kw_only=True):

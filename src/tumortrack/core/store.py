@@ -19,7 +19,7 @@ from typing import Any
 import tumortrack
 from tumortrack.core.errors import ArtifactError, InputError, StorageError
 
-SCHEMA = 3  # raise it with every change of a folder's content or of what its numbers depend on
+SCHEMA = 4  # raise it with every change of a folder's content or of what its numbers depend on
 _MADE_BY = {  # by kind
     "case": "prepare INPUT CASE",
     "twin": "twin CASE SCENES",

@@ -23,11 +23,12 @@ from jaxtyping import Float, Float64
 
 from tumortrack.registration import gauss_newton_kernels as kernels
 from tumortrack.registration.config import GaussNewtonConfig
-from tumortrack.registration.discrepancy import FARTHEST
 from tumortrack.registration.looks import Looks
 from tumortrack.registration.motion import ElasticMotion
 from tumortrack.registration.rest_shape import RestShape
 from tumortrack.simulate.elastic.flow import LatticeField
+
+FARTHEST = 2.0  # widths of the robust kernel: what lies beyond weighs less than 1/25
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +38,7 @@ class RegistrationResult:
     Attributes:
         looks: with the places of further cameras as they are corrected for this motion.
         cost: robust data term, prior of the motion, and the further cameras' errors.
-        strays: share of the points farther off than ``discrepancy.FARTHEST`` widths;
+        strays: share of the points farther off than ``FARTHEST`` widths;
             ``cost_without_strays``: if all lay as the others do.
         distances_mm: the residuals, signed.
         moved: shift (mm) and turn (rad) from where the prior has the pose.
@@ -75,7 +76,8 @@ class GaussNewton:
     """A refinement that can be stopped on its way and continued. ``cost``: of the present state, as
     in ``RegistrationResult``; infinite before the first step. ``steps``: taken so far;
     ``converged``: more would not move it. ``moved``: the start's, as in ``RegistrationResult``;
-    None: the prior has the pose where it starts."""
+    None: the prior has the pose where it starts. ``precision``: of the prior of shift, turn and
+    coefficients; None: the library's."""
 
     def __init__(
         self,
@@ -84,8 +86,10 @@ class GaussNewton:
         start: ElasticMotion,
         config: GaussNewtonConfig,
         moved: Float64[np.ndarray, " 6"] | None = None,
+        precision: Float64[np.ndarray, "p p"] | None = None,
     ) -> None:
-        body, count, precision = rest.body, len(looks.points_mm), _prior(rest, config)
+        body, count = rest.body, len(looks.points_mm)
+        precision = prior_precision(rest, config) if precision is None else precision
         self._rest, self._looks = rest, looks
         # Copies in C's order, and floats, whatever was given: the kernel is compiled for that, and
         # would be once more for points that can't be written, or a whole number.
@@ -133,7 +137,7 @@ class GaussNewton:
         return RegistrationResult(motion, self._looks, *costs, *left)
 
 
-def _prior(rest: RestShape, config: GaussNewtonConfig) -> Float64[np.ndarray, "p p"]:
+def prior_precision(rest: RestShape, config: GaussNewtonConfig) -> Float64[np.ndarray, "p p"]:
     """The precision of shift, turn and coefficients."""
     pose = [1 / config.shift_mm**2] * 3 + [1 / config.turn_rad**2] * 3
     precision = np.diag(pose + [0.0] * len(rest.body.mean))

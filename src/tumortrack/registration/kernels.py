@@ -1,5 +1,5 @@
 """Kernels of a motion and of an organ at rest: points carried to the camera and back, distances,
-labels, probabilities, and derivatives by every unknown; and the discrepancy's amplitude.
+labels, probabilities, and derivatives by every unknown.
 
 Modes lie on the flow's lattice. Unknowns are shift, turn and coefficients, in this order.
 Derivatives by coefficients are to first order: the modes halfway along a point's path.
@@ -7,7 +7,6 @@ Derivatives by coefficients are to first order: the modes halfway along a point'
 
 from __future__ import annotations
 
-import math
 from statistics import NormalDist
 from typing import NamedTuple
 
@@ -215,27 +214,3 @@ def look_up(origin, nearest, points):  # type: ignore[no-untyped-def]
         k = int(max((points[p, 2] - origin[2]) / step + half, zero))
         out[p] = nearest[min(i, x_last), min(j, y_last), min(k, z_last)]
     return out
-
-
-@njit(nogil=True)
-def most_likely(explained, alike, per_noise, residuals, tried):  # type: ignore[no-untyped-def]
-    """The pair of ``tried`` amplitudes and noises under which residuals (m,) are most likely, if
-    they are normal, of covariance ``explained + amplitude^2 alike + noise^2 diag(per_noise)``."""
-    amplitudes, noises = tried
-    best, least = (amplitudes[0], noises[0]), np.inf
-    for amplitude in amplitudes:
-        for noise in noises:
-            covariance = explained + amplitude**2 * alike
-            for n in range(len(residuals)):
-                covariance[n, n] += noise**2 * per_noise[n]
-            root, unlikely = np.linalg.cholesky(covariance), 0.0
-            white = np.empty(len(residuals))
-            for n in range(len(residuals)):
-                rest = residuals[n]
-                for m in range(n):
-                    rest -= root[n, m] * white[m]
-                white[n] = rest / root[n, n]
-                unlikely += 0.5 * white[n] ** 2 + math.log(root[n, n])
-            if unlikely < least:
-                best, least = (amplitude, noise), unlikely
-    return best

@@ -18,6 +18,7 @@ from tumortrack.imaging.raster import label_grid
 from tumortrack.models.report import Frame, describe_parts, grid_over
 from tumortrack.registration import kernels
 from tumortrack.registration import report as entries
+from tumortrack.registration.bend import BentFit
 from tumortrack.registration.choose import likeliest
 from tumortrack.registration.gauss_newton import RegistrationResult
 from tumortrack.registration.looks import Looks
@@ -64,10 +65,12 @@ class _OrganPoints:
 
 @dataclass(frozen=True, eq=False)
 class _Placed:
-    """The organ before the camera: its motion with covariance, the moved surfaces (camera frame),
-    and the covariance (mm^2) at the samples and at the middle of each part's box."""
+    """The organ before the camera: the library's fit and the bent one, its motion with covariance,
+    the moved surfaces (camera frame), and the covariance (mm^2) at the samples and at the middle of
+    each part's box."""
 
     fit: RegistrationResult
+    bent: BentFit
     motion: ElasticMotion
     meshes: dict[str, Mesh]
     sample_mm2: Float[np.ndarray, "k 3 3"]
@@ -108,7 +111,7 @@ class RegistrationLocator:
         cloud = looks[0].cloud
         frame = Frame(self._model, cloud, seed, np.random.default_rng(seed))
         fit = self._registration.register(self._points(frame, looks), None, frame.stage)
-        size, placed = self._size(fit), self._checked(fit, frame)
+        size, placed = self._size(fit), self._checked(fit, self._bent(fit, frame), frame)
         organ = placed.meshes[self._model.parts[0]]
         with frame.stage("fine"):
             inside = self._drawn(placed, organ, cloud.stamp_ns, frame.rng)
@@ -130,14 +133,14 @@ class RegistrationLocator:
         # As many points in all as of one look: faster by half, and tumors within 0.05 mm as good.
         points = self._points(frame, looks, every=len(looks))
         fit, prior = self._fit_after(last, points, how, frame)
-        size, unsmoothed = self._size(fit), fit.motion
-        fit, lag_s = self._smoothed(fit, last, cloud.stamp_ns, how.smoothing_s)
-        placed = self._checked(fit, frame)
+        bent = self._bent(fit, frame)
+        bent, lag_s = self._smoothed(bent, last, cloud.stamp_ns, how.smoothing_s)
+        size, placed = self._size(fit), self._checked(fit, bent, frame)
         with frame.stage("carry"):
             inside = self._carry(placed, cloud.stamp_ns)
         smoothing = SmoothingReport(time_s=how.smoothing_s, lag_ms=1000 * lag_s)
         report = self._report(frame, looks, placed, inside, prior, size=size, smoothing=smoothing)
-        made = Estimate(inside, None, placed.meshes, report, placed.motion, unsmoothed)
+        made = Estimate(inside, None, placed.meshes, report, placed.motion, fit.motion)
         return replace(made, structures=placed.structures)
 
     def _fit_after(
@@ -163,19 +166,19 @@ class RegistrationLocator:
         return fit, method.prior
 
     def _smoothed(
-        self, fit: RegistrationResult, last: Estimate | None, stamp_ns: int, smoothing_s: float
-    ) -> tuple[RegistrationResult, float]:
+        self, bent: BentFit, last: Estimate | None, stamp_ns: int, smoothing_s: float
+    ) -> tuple[BentFit, float]:
         """With the mean over past motions, and by how many seconds that lags behind what moves
         steadily; a mean that lies too far behind is left out."""
         if last is None or not isinstance(last.motion, ElasticMotion) or smoothing_s <= 0:
-            return fit, 0.0
+            return bent, 0.0
         past_s = (stamp_ns - last.cloud.stamp_ns) * 1e-9
         share = -math.expm1(-past_s / smoothing_s)
-        mean = blend(last.motion, fit.motion, share)
-        behind_mm = mean.carry(self._samples_ct) - fit.motion.carry(self._samples_ct)
+        mean = blend(last.motion, bent.motion, share)
+        behind_mm = mean.carry(self._samples_ct) - bent.motion.carry(self._samples_ct)
         if np.linalg.norm(behind_mm, axis=1).max() >= _BEHIND_MM:
-            return fit, 0.0
-        return replace(fit, motion=mean), past_s * (1 - share) / share
+            return bent, 0.0
+        return replace(bent, motion=mean), past_s * (1 - share) / share
 
     def _points(self, frame: Frame, looks: Sequence[Look], every: int = 1) -> Looks:
         """What the fit takes of all looks; ``frame`` is the first one's."""
@@ -191,21 +194,25 @@ class RegistrationLocator:
         points = Frame(self._model, cloud, 0, np.random.default_rng(0)).points_mm
         looks = Looks.of([points])
         fit = self._registration.best_fit(looks, [*self._registration.search.starts(looks), rest])
-        self._carry(self._moved(fit), 0)
+        self._carry(self._moved(fit, self._registration.bend(fit)), 0)
 
     def _size(self, fit: RegistrationResult) -> SizeFit:
         times, gain = apparent_size(fit.motion, fit.looks, self._registration.config)
         return SizeFit(times=times, gain=gain)
 
-    def _checked(self, fit: RegistrationResult, frame: Frame) -> _Placed:
-        """The organ as a fit has it, if it can be this organ."""
+    def _bent(self, fit: RegistrationResult, frame: Frame) -> BentFit:
+        with frame.stage("bend"):
+            return self._registration.bend(fit)
+
+    def _checked(self, fit: RegistrationResult, bent: BentFit, frame: Frame) -> _Placed:
+        """The organ as ``bent`` has it, if it can be this organ by the library's fit."""
         self._registration.check(fit, self._model.in_distribution)
         with frame.stage("surfaces"):
-            return self._moved(fit)
+            return self._moved(fit, bent)
 
-    def _moved(self, fit: RegistrationResult) -> _Placed:
+    def _moved(self, fit: RegistrationResult, bent: BentFit) -> _Placed:
         calibration = self._model.config.scene.calibration
-        motion = self._registration.uncertain(fit, calibration, self._calibration.std_scale)
+        motion = self._registration.uncertain(bent, calibration, self._calibration.std_scale)
         anatomy = self._shape.anatomy_ct
         moved = motion.carry(self._vertices_ct)
         ends = np.cumsum([len(mesh.vertices_mm) for mesh in self._surfaces])[:-1]
@@ -218,7 +225,9 @@ class RegistrationLocator:
         )
         assert known_mm2 is not None
         count = len(self._samples_ct)
-        return _Placed(fit, motion, surfaces, known_mm2[:count], known_mm2[count:], structures)
+        return _Placed(
+            fit, bent, motion, surfaces, known_mm2[:count], known_mm2[count:], structures
+        )
 
     def _report(
         self,
@@ -229,17 +238,18 @@ class RegistrationLocator:
         prior: PosePrior,
         **more: Any,
     ) -> FitReport:
-        fit, surfaces_mm2 = placed.fit, np.split(placed.sample_mm2, self._sample_ends)
+        fit, bent = placed.fit, placed.bent
+        surfaces_mm2 = np.split(placed.sample_mm2, self._sample_ends)
         named = zip(self._model.parts, placed.middle_mm2, surfaces_mm2, strict=True)
         deviations = {name: entries.part_deviations(*covariances) for name, *covariances in named}
         usual_cost, last_mm = self._calibration.usual_cost, self._registration.config.last_mm
         report = frame.report(
-            np.abs(fit.distances_mm),
+            np.abs(bent.distances_mm),
             describe_parts(self._model.parts, placed.meshes, inside, deviations),
             structures=tuple(placed.structures),
             fit_cost=entries.cost_entry(fit, prior, usual_cost, last_mm),
             poses=entries.poses_entry(prior),
-            motion=entries.motion_entry(placed.motion, fit.steps),
+            motion=entries.motion_entry(placed.motion, fit, bent),
             looks=fit.looks.described() if len(looks) > 1 else None,
             **more,
         )

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float, Float64, Int64
 
-from tumortrack.core.geometry import Affine, Points, rigid, transform_points, turned_by
+from tumortrack.core.geometry import Affine, Points, rigid, transform_points
 from tumortrack.core.report import LooksReport
 from tumortrack.registration.config import GaussNewtonConfig
 from tumortrack.registration.kernels import POSE
@@ -127,10 +127,9 @@ class Looks:
         points_mm, poses = self.points_mm.copy(), list(self.camera_from_look)
         for n, change in enumerate(changes, start=1):
             # As if the organ moved before this camera alone: then the points move back by it.
-            turned = motion.rotation @ turned_by(change[3:])
-            centre_mm = motion.centre_mm + motion.rotation @ change[:3]
-            turn = motion.rotation @ turned.T
-            back = rigid(turn, motion.centre_mm - turn @ centre_mm)
+            moved = motion.changed(np.append(change, np.zeros(len(motion.coefficients))))
+            turn = motion.rotation @ moved.rotation.T
+            back = rigid(turn, motion.centre_mm - turn @ moved.centre_mm)
             mine = self.look == n
             points_mm[mine], poses[n] = _moved(back, points_mm[mine]), back @ poses[n]
         shifts = self.shifts + np.concatenate([np.zeros((1, POSE)), changes])

@@ -13,7 +13,6 @@ from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import Points, largest_std_of, rigid, std_of, turned_by
 from tumortrack.core.process import parallel_for
 from tumortrack.registration import kernels
-from tumortrack.registration.discrepancy import Discrepancy, products
 from tumortrack.registration.kernels import Flow, Pose
 from tumortrack.registration.rest_shape import RestShape
 from tumortrack.sense.noise import CALIBRATED, CalibrationConfig
@@ -32,7 +31,6 @@ class ElasticMotion:
         rotation, centre_mm: where the organ's axes and centre are before the camera.
         coefficients: of the body's modes; ``covariance``: of shift (mm), turn (rad; both in the
             CT's axes, about the centre) and coefficients, once fitted.
-        discrepancy: model error beside the modes, where it was estimated.
         rivals: other motions that explain the points nearly as well, each with its share of the
             probability.
         calibration: the largest errors of the camera's calibration, which no fit can see.
@@ -44,7 +42,6 @@ class ElasticMotion:
     centre_mm: Float64[np.ndarray, " 3"]
     coefficients: Float64[np.ndarray, " m"]
     covariance: Float64[np.ndarray, "p p"] | None = None
-    discrepancy: Discrepancy | None = None
     rivals: tuple[tuple[ElasticMotion, float], ...] = ()
     calibration: CalibrationConfig = CALIBRATED
     std_scale: float = 1.0
@@ -59,6 +56,16 @@ class ElasticMotion:
         """The state's squared Mahalanobis distance in the body's library, whose mean is 1."""
         off = self.coefficients - self.shape.body.mean
         return float(off @ self.shape.body.precision @ off) / len(off)
+
+    def changed(self, change: Float64[np.ndarray, " p"]) -> ElasticMotion:
+        """With this added to shift, turn and coefficients; still with its covariance."""
+        shift, turn = change[:3], change[3 : kernels.POSE]
+        return replace(
+            self,
+            rotation=self.rotation @ turned_by(turn),
+            centre_mm=self.centre_mm + self.rotation @ shift,
+            coefficients=self.coefficients + change[kernels.POSE :],
+        )
 
     def carry(self, points_ct: Points, /) -> Moved:
         """CT (LPS, mm) -> camera frame (mm)."""
@@ -80,7 +87,7 @@ class ElasticMotion:
 
     def covariance_mm2(self, points_ct: Points, /) -> Float64[np.ndarray, "n 3 3"] | None:
         """Of the places to which ``carry`` takes points, in the camera's axes: of pose and state to
-        first order, of the discrepancy, the rivals and the camera's calibration."""
+        first order, of the rivals and the camera's calibration."""
         if self.covariance is None:
             return None
         points = _given(points_ct)
@@ -97,15 +104,12 @@ class ElasticMotion:
     def _spread(
         self, points: Float32[np.ndarray, "n 3"], out: Float64[np.ndarray, "n 3 3"]
     ) -> None:
-        """The covariance of pose, state and discrepancy, organ's axes, not scaled."""
+        """The covariance of pose and state, organ's axes, not scaled."""
         assert self.covariance is not None
         body, effects = self.shape.body, np.empty((len(points), 3, len(self.covariance)))
         kernels.effects(self._flow, body.modes, body.center_ct, points, effects)
-        process = self.discrepancy
-        if process is None:
-            out[:] = products(effects, self.covariance)
-        else:
-            out[:] = process.widened(effects, self.covariance, points)
+        spread = effects.reshape(-1, effects.shape[2]) @ self.covariance
+        out[:] = spread.reshape(effects.shape) @ effects.transpose(0, 2, 1)
 
     def residual_rows(self, points_camera: Points) -> Float32[np.ndarray, "n q"]:
         """What shift, turn and coefficients each do to the signed distance (mm) of points, carried

@@ -11,7 +11,8 @@
    kept as rivals; one that explains them better in a pose that the case excludes makes the answer
    poor.
 5. Verdict (`models.in_distribution`): what cannot be this organ is refused.
-6. Uncertainty (`uncertainty`, `discrepancy`): what the points leave open.
+6. Bend (`bend`): what the library's states cannot follow, the body's compliance does.
+7. Uncertainty (`uncertainty`): what the points leave open.
 
 The result is a motion (`motion`): any point of the CT, carried to the camera's frame and back, with
 its uncertainty. `locator` makes surfaces, labels and a report of it.
@@ -34,6 +35,7 @@ from tumortrack.models.in_distribution import (
     check_in_distribution,
     check_likely,
 )
+from tumortrack.registration.bend import BentFit, bend
 from tumortrack.registration.choose import cost_with_prior, likeliest
 from tumortrack.registration.config import GaussNewtonConfig
 from tumortrack.registration.gauss_newton import GaussNewton, RegistrationResult, refine
@@ -98,6 +100,10 @@ class Registration:
         """The fit near a motion."""
         return self._correct_cameras(looks, refine(self.rest, looks, start, config))
 
+    def bend(self, fit: RegistrationResult) -> BentFit:
+        """A fit, continued in the body's compliance."""
+        return bend(fit, self.config)
+
     def check(self, fit: RegistrationResult, usual: InDistributionRange) -> None:
         """Raises NotThisOrgan: points or deformation are none of this organ's."""
         for n in range(fit.looks.count):
@@ -107,11 +113,15 @@ class Registration:
         check_likely(fit.motion.rarity)
 
     def uncertain(
-        self, fit: RegistrationResult, calibration: CalibrationConfig, std_scale: float = 1.0
+        self, bent: BentFit, calibration: CalibrationConfig, std_scale: float = 1.0
     ) -> ElasticMotion:
-        """The fitted motion with its covariance: see ``ElasticMotion``."""
-        motion = posterior(fit.motion, fit.looks, self.config)
-        return replace(motion, calibration=calibration, std_scale=std_scale)
+        """The motion of ``bend`` with its covariance: see ``ElasticMotion``."""
+        return replace(
+            bent.motion,
+            covariance=posterior(bent.motion, bent.looks, self.config),
+            calibration=calibration,
+            std_scale=std_scale,
+        )
 
     def best_fit(
         self,

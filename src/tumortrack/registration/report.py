@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Float
 
 from tumortrack.core.report import AllowedPoses, ExcludedFit, FitCost, MotionReport, RivalFit
-from tumortrack.registration.discrepancy import FARTHEST
-from tumortrack.registration.gauss_newton import RegistrationResult
+from tumortrack.registration.bend import BentFit
+from tumortrack.registration.gauss_newton import FARTHEST, RegistrationResult
 from tumortrack.registration.motion import ElasticMotion
 from tumortrack.registration.search import PosePrior
 
@@ -63,15 +63,14 @@ def poses_entry(prior: PosePrior) -> AllowedPoses:
     )
 
 
-def motion_entry(motion: ElasticMotion, steps: int) -> MotionReport:
-    process = motion.discrepancy
+def motion_entry(motion: ElasticMotion, fit: RegistrationResult, bent: BentFit) -> MotionReport:
+    """``motion``: of ``bent``, perhaps smoothed; ``fit``: of the library."""
     return MotionReport(
         camera_from_ct=motion.camera_from_ct.tolist(),
         coefficients=motion.coefficients.tolist(),
-        rarity=motion.rarity,
-        steps=steps,
-        discrepancy_mm=None if process is None else process.amplitude_mm,
-        noise_mm=None if process is None else process.noise_mm,
+        rarity=fit.motion.rarity,
+        steps=bent.steps,
+        compliance_std_mm=bent.compliance_std_mm,
     )
 
 

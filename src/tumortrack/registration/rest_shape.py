@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -45,6 +45,11 @@ class RestShape:
     anatomy_ct: Anatomy
     body: ElasticBody
     distances: tuple[DistanceField, ...]
+
+    @cached_property
+    def compliant(self) -> RestShape:
+        """The same organ with the body's compliance among its modes."""
+        return replace(self, body=self.body.compliant)
 
     @cached_property
     def long_axis_mm(self) -> Float64[np.ndarray, " 3"]:

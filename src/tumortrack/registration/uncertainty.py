@@ -1,37 +1,27 @@
-"""What the points leave uncertain once a motion is fitted to them: see also ``discrepancy``."""
+"""What the points leave uncertain once a motion is fitted to them, and the size that they show."""
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
+from jaxtyping import Float64
 
 from tumortrack.registration.config import GaussNewtonConfig
-from tumortrack.registration.discrepancy import fit_discrepancy
-from tumortrack.registration.kernels import POSE
 from tumortrack.registration.looks import Looks
 from tumortrack.registration.motion import ElasticMotion
-from tumortrack.sense.noise import CAMERA_STD
 
 
-def posterior(motion: ElasticMotion, looks: Looks, config: GaussNewtonConfig) -> ElasticMotion:
-    """A fitted motion with the covariance and the discrepancy that its residuals give it."""
-    body, unknowns = motion.shape.body, POSE + len(motion.coefficients)
-    from_mean = np.zeros(POSE), motion.coefficients - body.mean, looks.shifts[1:].ravel()
-    pose_std = np.repeat([config.shift_mm, config.turn_rad], 3)
-    cameras = np.tile(CAMERA_STD**2, looks.count - 1)
-    prior = np.diag(np.concatenate([pose_std**2, np.zeros(len(body.mean)), cameras]))
-    prior[POSE:unknowns, POSE:unknowns] = body.covariance
-    near = looks.residuals(motion, config)
-    covariance, process = fit_discrepancy(
-        np.column_stack([near.by_motion, near.by_cameras, near.distances_mm]),
-        motion.back(looks.points_mm),
-        prior,
-        -np.concatenate(from_mean),
-        config.last_mm,
-    )
-    process = replace(process, cross=process.cross[:unknowns])
-    return replace(motion, covariance=covariance[:unknowns, :unknowns], discrepancy=process)
+def posterior(
+    motion: ElasticMotion, looks: Looks, config: GaussNewtonConfig
+) -> Float64[np.ndarray, "p p"]:
+    """The covariance of a fitted motion: the inverse of the cost's curvature, widened by what the
+    further cameras' errors leave open (Schur complement)."""
+    covariance = motion.covariance
+    assert covariance is not None
+    if looks.count > 1:
+        precision, across = looks.residuals(motion, config).cameras_precision(covariance)
+        follows = covariance @ across
+        covariance = covariance + follows @ np.linalg.solve(precision, follows.T)
+    return covariance
 
 
 def apparent_size(

@@ -188,7 +188,8 @@ def located(tracker: Tracker, cloud: SensorCloud) -> tuple[dict[str, Any], Any]:
         usual = model.calibration.usual_cost
         looks = Looks.of([frame.points_mm])
         fit = model.registration.register(looks, None, frame.stage)
-        return {"verdict": "refused", "reason": str(error), "cost": fit.cost / usual}, fit.motion
+        words = {"verdict": "refused", "reason": str(error), "cost": fit.cost / usual}
+        return words, model.registration.bend(fit).motion
     costs = estimate.report.fit_cost
     assert costs is not None  # of the default method
     cost = costs.now / costs.usual

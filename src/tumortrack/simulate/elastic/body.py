@@ -7,7 +7,7 @@ which gives a library of states. See docs/method.md, section "The elastic body".
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -29,7 +29,8 @@ Moved = Float32[np.ndarray, "n 3"]
 Field = Float32[np.ndarray, "i j k 3"]
 _KIDNEY_MM = 115.0  # length
 _RIDGE = 1e-4  # mm2, added to the covariance's diagonal
-_ARRAYS = ("origin_mm", "spacing_mm", "center_ct", "modes", "states")
+_ARRAYS = ("origin_mm", "spacing_mm", "center_ct", "modes", "states", "compliance")
+_COMPLIANCE_MODES = 32  # 24 leave hardly larger errors, 48 and 120 the same
 
 
 class BodyConfig(Config, frozen=True):
@@ -61,6 +62,9 @@ class ElasticBody:
     # motion; the last one swells, the others keep volume.
     modes: Float32[np.ndarray, "i j k 3 m"]
     states: Float32[np.ndarray, "s m"]  # the library
+    # Displacements by forces anywhere on the surface (``modes.compliance_modes``); a scene's body
+    # has none.
+    compliance: Float32[np.ndarray, "i j k 3 c"] | None = None
 
     def __post_init__(self) -> None:
         shapes = (self.modes.ndim, self.states.ndim, self.modes.shape[-1])
@@ -69,8 +73,12 @@ class ElasticBody:
                 f"a body's modes {self.modes.shape} and states {self.states.shape} do not fit; "
                 "build it again."
             )
-        for name in ("origin_mm", "center_ct", "modes", "states"):
+        if self.compliance is not None and self.compliance.shape[:4] != self.modes.shape[:4]:
+            raise InputError(f"a body's compliance {self.compliance.shape} does not fit its modes.")
+        for name in ("origin_mm", "center_ct", "modes", "states", "compliance"):
             array = getattr(self, name)
+            if array is None:
+                continue
             if not np.isfinite(array).all():
                 raise InputError(f"a body's {name} has NaN or infinite values; build it again.")
             array.flags.writeable = False
@@ -84,6 +92,16 @@ class ElasticBody:
     def covariance(self) -> Float64[np.ndarray, "m m"]:
         """Covariance of the library, with a small ridge that keeps it invertible."""
         return np.cov(self.states.T.astype(float)) + _RIDGE * np.eye(self.states.shape[1])
+
+    @cached_property
+    def compliant(self) -> ElasticBody:
+        """The body with its compliance among the modes, as the last of them. Raises InputError: it
+        has none."""
+        if self.compliance is None:
+            raise InputError("the body has no compliance; build it again.")
+        modes = np.concatenate([self.modes, self.compliance], axis=-1)
+        none = np.zeros((len(self.states), self.compliance.shape[-1]), np.float32)
+        return replace(self, modes=modes, states=np.concatenate([self.states, none], axis=1))
 
     @cached_property
     def precision(self) -> Float64[np.ndarray, "m m"]:
@@ -118,7 +136,8 @@ class ElasticBody:
 
     def to_arrays(self) -> dict[str, np.ndarray]:
         """The body as named arrays, for a file."""
-        return {name: np.asarray(getattr(self, name)) for name in _ARRAYS}
+        arrays = {name: getattr(self, name) for name in _ARRAYS}
+        return {name: np.asarray(value) for name, value in arrays.items() if value is not None}
 
     @classmethod
     def from_arrays(cls, arrays: dict[str, np.ndarray]) -> ElasticBody:
@@ -127,10 +146,12 @@ class ElasticBody:
         missing = [name for name in _ARRAYS if name not in arrays]
         if missing:
             raise InputError(f"a body lacks {', '.join(missing)}; build it again.")
-        names = ("origin_mm", "modes", "states")
-        origin_mm, modes, states = (np.ascontiguousarray(arrays[n], np.float32) for n in names)
+        names = ("origin_mm", "modes", "states", "compliance")
+        origin_mm, modes, states, compliance = (
+            np.ascontiguousarray(arrays[name], np.float32) for name in names
+        )
         spacing_mm, center_ct = float(arrays["spacing_mm"]), np.asarray(arrays["center_ct"], float)
-        return cls(origin_mm, spacing_mm, center_ct, modes, states)
+        return cls(origin_mm, spacing_mm, center_ct, modes, states, compliance)
 
 
 def build_body(
@@ -145,6 +166,7 @@ def build_body(
         InputError: a surface that turns inward, or a configuration that allows no body.
     """
     from tumortrack.simulate.elastic.loads import random_states
+    from tumortrack.simulate.elastic.modes import compliance_modes
 
     rng = np.random.default_rng([seed, 0xE1A57])
     up = unit(np.asarray(up_lps, float))
@@ -155,7 +177,8 @@ def build_body(
             f"only {len(states)} of {2 * config.states} loads leave this organ at rest; its "
             "surface may be torn. Look at the case's pictures, and prepare it again."
         )
-    return body_of(reduced, np.array(states, np.float32))
+    compliance = compliance_modes(reduced.solid, reduced.patches, _COMPLIANCE_MODES)
+    return body_of(reduced, np.array(states, np.float32), compliance)
 
 
 def length_over_kidney(anatomy_ct: Anatomy) -> float:
@@ -198,9 +221,14 @@ def reduced_organ(
     return ReducedModel(solid, modes, patches, length_over_kidney(anatomy_ct))
 
 
-def body_of(reduced: ReducedModel, states: Float32[np.ndarray, "s m"]) -> ElasticBody:
+def body_of(
+    reduced: ReducedModel,
+    states: Float32[np.ndarray, "s m"],
+    compliance: Float64[np.ndarray, "f c"] | None = None,
+) -> ElasticBody:
     """The body of a reduced organ with these states as its library."""
     solid, lattice = reduced.solid, reduced.solid.lattice
+    place = lattice.origin_mm.astype(np.float32), lattice.spacing_mm, solid.center_mm
     modes = solid.spread(reduced.modes).astype(np.float32)
-    origin_mm = lattice.origin_mm.astype(np.float32)
-    return ElasticBody(origin_mm, lattice.spacing_mm, solid.center_mm, modes, states)
+    more = None if compliance is None else solid.spread(compliance).astype(np.float32)
+    return ElasticBody(*place, modes, states, more)

@@ -17,11 +17,14 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from tumortrack.core.geometry import triangles_of, unit
+from tumortrack.core.mesh_kernels import farthest
 from tumortrack.core.process import parallel_map
 from tumortrack.core.types import Mesh
 from tumortrack.simulate.elastic.finite import LatticeSolid
 
 LEVER_MM = 50.0  # a rotation's unknown is the motion at this lever arm
+_FORCED = 150  # places of forces for the compliance; 80 leave nearly the same errors
+_CONTRAST = 3.0  # of tumors for the compliance, the middle one of the library's responses
 _FREE = 1e-4  # N/mm: keeps rigid motions solvable without contacts
 
 
@@ -66,17 +69,8 @@ def modes_of(
     """``count`` modes of the responses to loads (f, n) with the tumors' contrasts in turn, as
     displacements of the solid's nodes: a unit coefficient moves the organ by 1 mm rms. The last
     mode swells the organ; the others keep its volume."""
-    arms, axes = solid.nodes_mm - solid.center_mm, np.eye(3)
-    turns = [np.cross(axis, arms).ravel() for axis in axes]
-    rigid = np.stack([*(np.tile(axis, len(arms)) for axis in axes), *turns], 1)
-    mass = np.repeat(solid.volume_mm3, 3)[:, None]
-    inverse = np.linalg.inv(rigid.T @ (mass * rigid))
-
-    def without_rigid(displacements: np.ndarray) -> np.ndarray:
-        return displacements - rigid @ (inverse @ (rigid.T @ (mass * displacements)))
-
-    forces = np.column_stack([loads, solid.swelling])
-    forces = forces - mass * (rigid @ (inverse @ (rigid.T @ forces)))  # inertia balances them
+    rigid = _RigidMotions.of(solid)
+    mass, forces = rigid.mass, rigid.balanced(np.column_stack([loads, solid.swelling]))
     responses = np.empty_like(forces)
 
     def respond(number: int) -> None:
@@ -86,7 +80,7 @@ def modes_of(
             responses[:, -1:] = factor.solve(forces[:, -1:])
 
     parallel_map(respond, range(len(contrasts)))
-    responses = without_rigid(responses)
+    responses = rigid.removed(responses)
     responses, swelling = responses[:, :-1], responses[:, -1:]
     moves = solid.at(patches.points_mm, responses)
     responses /= np.linalg.norm(moves, axis=1).max(0)  # the farthest patch moves by 1 mm
@@ -99,6 +93,63 @@ def modes_of(
     return shapes * np.sqrt(solid.volume_mm3.sum())
 
 
+def compliance_modes(
+    solid: LatticeSolid, patches: Patches, count: int
+) -> Float64[np.ndarray, "f k"]:
+    """How the organ yields to forces anywhere on its surface, as displacements of the solid's
+    nodes: the ``count`` principal components of its responses to independent forces along three
+    axes at ``_FORCED`` places, balanced by inertia. With independent coefficients N(0, 1) of all
+    components the surface moves by 1 mm rms along each axis. Source: forces anywhere, without
+    boundary conditions, as in BCF-FEM (Yang et al. 2024, arXiv 2403.09964)."""
+    points_mm, areas = patches.points_mm, patches.areas_mm2
+    chosen = np.empty((1, min(_FORCED, len(areas))), np.int64)
+    farthest(np.ascontiguousarray(points_mm.T[None], np.float32), np.zeros(1, np.int64), chosen)
+    radius_mm = np.sqrt(areas.sum() / chosen.size) / 2
+    spots = np.stack([patches.spot(place, radius_mm) * areas for place in points_mm[chosen[0]]], 1)
+    forces = np.einsum("pn,de->pdne", spots / spots.sum(0), np.eye(3)).reshape(len(areas), 3, -1)
+    rigid = _RigidMotions.of(solid)
+    factor = solid.factor(_CONTRAST)
+    responses = rigid.removed(factor.solve(rigid.balanced(_at_nodes(forces, solid, patches))))
+    shares = np.sqrt(areas / areas.sum())[:, None, None]
+    moved = (solid.at(points_mm, responses) * shares).reshape(3 * len(areas), -1)
+    squares, mixes = np.linalg.eigh(moved.T @ moved)
+    return responses @ mixes[:, : -count - 1 : -1] / np.sqrt(squares.sum() / 3)
+
+
+@dataclass(frozen=True, eq=False)
+class _RigidMotions:
+    """Of a solid's nodes."""
+
+    motions: Float64[np.ndarray, "f 6"]
+    mass: Float64[np.ndarray, "f 1"]  # of each unknown: its node's volume
+    inverse: Float64[np.ndarray, "6 6"]  # of the motions' inner products
+
+    @classmethod
+    def of(cls, solid: LatticeSolid) -> _RigidMotions:
+        arms, axes = solid.nodes_mm - solid.center_mm, np.eye(3)
+        turns = [np.cross(axis, arms).ravel() for axis in axes]
+        motions = np.stack([*(np.tile(axis, len(arms)) for axis in axes), *turns], 1)
+        mass = np.repeat(solid.volume_mm3, 3)[:, None]
+        return cls(motions, mass, np.linalg.inv(motions.T @ (mass * motions)))
+
+    def removed(self, displacements: np.ndarray) -> np.ndarray:
+        """Displacements without their rigid part."""
+        part = self.inverse @ (self.motions.T @ (self.mass * displacements))
+        return displacements - self.motions @ part
+
+    def balanced(self, forces: np.ndarray) -> np.ndarray:
+        """Forces with the inertia that balances them."""
+        return forces - self.mass * (self.motions @ (self.inverse @ (self.motions.T @ forces)))
+
+
+def _at_nodes(
+    forces: Float64[np.ndarray, "p 3 n"], solid: LatticeSolid, patches: Patches
+) -> Float64[np.ndarray, "f n"]:
+    """Forces on patches as forces at the solid's nodes."""
+    spread = solid.weights(patches.points_mm).T @ forces.reshape(len(forces), -1)
+    return spread.reshape(-1, forces.shape[2])
+
+
 def random_loads(
     solid: LatticeSolid, patches: Patches, up: np.ndarray, count: int, rng: np.random.Generator
 ) -> Float64[np.ndarray, "f n"]:
@@ -108,9 +159,7 @@ def random_loads(
     kinds = (draw.squeeze, draw.poke, draw.hang, draw.bend, draw.shear)
     shares = np.array([0.36, 0.28, 0.12, 0.16, 0.08])
     chosen = rng.choice(len(kinds), count, p=shares / shares.sum())
-    surface = np.stack([kinds[n]() for n in chosen], -1)  # (p, 3, n)
-    spread = solid.weights(patches.points_mm).T @ surface.reshape(len(surface), -1)
-    return spread.reshape(-1, count)
+    return _at_nodes(np.stack([kinds[n]() for n in chosen], -1), solid, patches)
 
 
 @dataclass(frozen=True, eq=False)
