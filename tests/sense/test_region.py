@@ -176,21 +176,79 @@ def test_parts_in_the_last_box_belong_to_the_organ():
     assert column.max() > 340
 
 
-def test_an_organ_behind_a_shaft_stays_one():
-    """A shaft without any depth noise cuts a dome in two; both halves are found, no shaft."""
-    frame = dome()
-    depth = frame.depth_mm.copy()
-    band = slice(200, 222)
-    depth[:, band] = 100.0
-    shafted = DepthFrame(depth, SMALL)
-    config = RegionConfig(crop=EVERY)
-    organ = np.isfinite(frame.depth_mm)
-    organ[:, band] = False
-    region = points(shafted, config)
-    assert not (region.taken == 0)[:, band].any()
-    assert (region.taken == 0)[organ].mean() > 0.95
-    one_side = points(shafted, RegionConfig(crop=EVERY, gap_mm=0.0))
-    assert (one_side.taken == 0)[organ].mean() < 0.6
+def banded(frame, along, width_px, depth_mm=100.0):
+    """The frame behind a band without noise, along x cos + y sin = offset in the picture, and the
+    pixels of the band."""
+    degrees, offset = along
+    u, v = pixels(SMALL)
+    across = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    band = np.abs(across[0] * (u - SMALL.cx) + across[1] * (v - SMALL.cy) - offset) < width_px / 2
+    return DepthFrame(np.where(band, depth_mm, frame.depth_mm), SMALL), band
+
+
+@pytest.mark.parametrize("width_px", [14, 30, 60])  # 8 to 34 mm: a shaft, a finger, two
+@pytest.mark.parametrize("along", [(0, 0), (10, -35), (-25, 25)])
+def test_an_organ_behind_an_occluder_stays_one(along, width_px):
+    """A band parts a dome, 50 to 50 to some 80 to 20; both parts are found, nothing of the band."""
+    organ = np.isfinite(dome().depth_mm)
+    frame, band = banded(dome(), along, width_px)
+    found = points(frame, RegionConfig(crop=EVERY)).taken == 0
+    assert not found[band].any()
+    assert found[organ & ~band].mean() > 0.95
+    alone = points(frame, RegionConfig(crop=EVERY, gap_mm=0.0)).taken == 0
+    assert alone[organ & ~band].mean() < 0.85
+
+
+def test_a_parted_organ_counts_as_a_whole():
+    """Beside something larger than each of its parts."""
+    u, v = pixels(SMALL)
+    frame, band = banded(dome(), (0, 0), 40)
+    organ = np.isfinite(dome().depth_mm) & ~band
+    beside = (np.abs(u - 385) < 37) & (np.abs(v - 120) < 75)
+    assert not (beside & organ).any()
+    depth = np.where(beside, 170 + 0.1 * np.abs(u - 385), frame.depth_mm)
+    found = points(DepthFrame(depth, SMALL), RegionConfig(crop=EVERY, plane=False)).taken == 0
+    assert found[organ].mean() > 0.95
+    assert not found[beside].any()
+
+
+def test_two_bodies_stay_two_behind_an_occluder():
+    """Two domes side by side, whose outlines a band hides: they would meet in a valley."""
+    u, v = pixels(SMALL)
+    depth = np.full(u.shape, np.nan)
+    for at, radius in ((165, 57), (270, 50)):
+        r2 = ((u - at) / radius) ** 2 + ((v - 120) / radius) ** 2
+        depth = np.where(r2 < 1, 150 - 25 * np.sqrt(np.clip(1 - r2, 0, 1)), depth)
+    frame, band = banded(DepthFrame(depth, SMALL), (0, 9), 26)
+    found = points(frame, RegionConfig(crop=EVERY)).taken == 0
+    left = np.isfinite(depth) & ~band & (u < 215)
+    assert found[left].mean() > 0.95
+    assert not found[~left].any()
+
+
+def test_what_lies_on_both_sides_of_an_organ_is_not_one():
+    """Parts of a bed, larger than the organ between them, which is nearer as an occluder is."""
+    u, v = pixels(SMALL)
+    r2 = ((u - 212) / 40.0) ** 2 + ((v - 120) / 90.0) ** 2
+    organ = r2 < 1
+    bed = ~organ & (np.abs(u - 212) < 85) & (np.abs(v - 120) < 70)
+    depth = np.where(bed, 150 + 0.05 * np.abs(u - 212), np.nan)
+    depth = np.where(organ, 135 - 20 * np.sqrt(np.clip(1 - r2, 0, 1)), depth)
+    assert np.count_nonzero(bed) > np.count_nonzero(organ)
+    found = points(DepthFrame(depth, SMALL), RegionConfig(crop=EVERY, plane=False)).taken == 0
+    assert found[organ].mean() > 0.95
+    assert not found[bed].any()
+
+
+def test_what_would_be_larger_than_an_organ_stays_apart():
+    u, v = pixels(SMALL)
+    wall = (np.abs(u - SMALL.cx) < 170) & (np.abs(v - SMALL.cy) < 60)
+    frame, band = banded(DepthFrame(np.where(wall, 140.0, np.nan), SMALL), (0, 40), 30)
+    for longest_mm, parts in ((140.0, 1), (300.0, 2)):
+        config = RegionConfig(crop=EVERY, plane=False, organ_mm=(30.0, longest_mm))
+        found = points(frame, config).taken == 0
+        assert found[wall & (u < SMALL.cx)].mean() > 0.9
+        assert found[wall & ~band & (u > SMALL.cx + 60)].any() == (parts == 2)
 
 
 def test_stray_points_go():

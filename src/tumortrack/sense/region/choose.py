@@ -1,5 +1,6 @@
-"""Choose the organ's pieces: the one that the user picked, that the last estimate points to, or the
-likeliest; what continues it behind an occluder; and what lies wholly in the last estimate's box."""
+"""Join pieces that continue each other behind an occluder, and choose the organ's: the one that the
+user picked, that the last estimate points to, or the likeliest; and what lies wholly in the last
+estimate's box."""
 
 from __future__ import annotations
 
@@ -9,10 +10,10 @@ import numpy as np
 
 from tumortrack.core.errors import NoEstimate
 from tumortrack.core.report import Finding
+from tumortrack.sense.region.gaps import lines_across_gaps
 from tumortrack.sense.region.hints import Hints
 from tumortrack.sense.region.pieces import find_edges, find_pieces
 from tumortrack.sense.region.working_image import (
-    FLYING,
     LAST_BOX,
     PIECES,
     THIN,
@@ -24,12 +25,15 @@ from tumortrack.sense.region.working_image import (
 _OPENINGS = (1.0, 1.7, 2.8)  # times ``opening_mm``: the last is wider than fingers
 _CLEARLY = 1.1  # a wider opening must raise the score by this factor
 _PICK_REACH_MM = 10.0  # from the picked point to its piece
-_STEEPEST_GAP = 0.5  # slope of a surface behind an occluder
+_STEEPEST_GAP = 0.7  # slope of a surface behind an occluder
+_BORDER, _SLOPE_MM = (
+    2,
+    5.0,
+)  # px left out at a gap's border, where stereo errs; slopes are over this
 _STEP_MM = 3.0  # an occluder is nearer, the background farther, by this much
 _SAME_MM = 5.0  # largest step in depth between neighbouring pixels of one surface
 _FEWEST_LINES = 0.4  # length along which pieces continue each other, over the smaller one's size
-_STRAY = 2  # false matches in a row that are no background
-_TIMES = 2  # occluders between the chosen piece and the last one that continues it
+_IN_A_ROW = 4  # gaps between the first and the last piece of an organ
 _CUT = 0.1  # ``_Sizes.cut`` from which a piece leaves the image
 _POOR = 0.5  # likeness of an organ below which a guess is doubtful
 _WHOLLY = 0.97  # share of a piece in the last box from which it is part of the organ
@@ -41,8 +45,8 @@ _THICK = 0.8  # of an organ's shortest extent: thinner pieces are likely fingers
 
 
 def choose_pieces(image: WorkingImage, config: RegionConfig, hints: Hints) -> None:
-    """Remove all but the organ's piece and what belongs to it. Raises NoEstimate: no piece lies
-    within 10 mm of the picked point.
+    """Join pieces behind occluders, and remove all but the organ's piece and what belongs to it.
+    Raises NoEstimate: no piece lies within 10 mm of the picked point.
 
     A hand that touches the organ makes one large piece with it that leaves the image. Then the
     opening is widened until fingers are too narrow to connect.
@@ -52,6 +56,10 @@ def choose_pieces(image: WorkingImage, config: RegionConfig, hints: Hints) -> No
     for wider in _OPENINGS:
         pieces, count = find_pieces(image, edges, config, wider)
         sizes = _measure(image.depth_mm, edges[1], image.taken, pieces, image.pinhole, count)
+        numbers = _joined(image, pieces, sizes, config)
+        if numbers.max() < count:
+            pieces, count = numbers[pieces], int(numbers.max())
+            sizes = _measure(image.depth_mm, edges[1], image.taken, pieces, image.pinhole, count)
         chosen, score, doubtful = _chosen(image, pieces, sizes, config, hints)
         if best is None or score > _CLEARLY * best[0]:
             best = score, pieces, sizes, chosen
@@ -74,25 +82,49 @@ def choose_pieces(image: WorkingImage, config: RegionConfig, hints: Hints) -> No
 
 class _Sizes(NamedTuple):
     """Measures of every piece (count + 1,); entry 0 is not used. ``area_mm2``: across the line of
-    sight. ``wide_mm``: longest extent. ``cut``: 0..1, how much of it continues outside the examined
+    sight. ``low_mm``, ``high_mm`` (count + 1, 4): its ends along four directions of the image;
+    ``wide_mm``: the longest extent. ``cut``: 0..1, how much of it continues outside the examined
     part: the width there over the square root of the area. ``thick_mm``: diameter of its largest
     inscribed disc. ``aside``: tangent of the angle between its middle and the optical axis."""
 
     area_mm2: np.ndarray
+    low_mm: np.ndarray
+    high_mm: np.ndarray
     wide_mm: np.ndarray
     cut: np.ndarray
     thick_mm: np.ndarray
     aside: np.ndarray
 
 
+def _joined(
+    image: WorkingImage, pieces: np.ndarray, sizes: _Sizes, config: RegionConfig
+) -> np.ndarray:
+    """New numbers (count + 1,) of all pieces, int32: the same for those that continue each other
+    behind occluders, directly or by way of others, and in pairs are no wider than an organ. Nothing
+    that leaves the image, as arms do, is joined."""
+    # What looks like an organ itself hides nothing: bed or drape go on behind the organ, too.
+    hides = _like_an_organ(sizes, config) < _POOR
+    lines_mm = lines_across_gaps(image, pieces, hides, config.gap_mm)
+    smaller_mm2 = np.minimum(sizes.area_mm2, sizes.area_mm2[:, None])
+    low_mm = np.minimum(sizes.low_mm, sizes.low_mm[:, None])
+    high_mm = np.maximum(sizes.high_mm, sizes.high_mm[:, None])
+    inside = sizes.cut <= _CUT
+    joined = lines_mm > _FEWEST_LINES * np.sqrt(smaller_mm2)
+    joined &= ((high_mm - low_mm).max(-1) <= config.organ_mm[1]) & inside & inside[:, None]
+    if not joined.any():
+        return np.arange(len(hides), dtype=np.int32)
+    np.fill_diagonal(joined, True)
+    joined = np.linalg.matrix_power(joined.astype(float), _IN_A_ROW) > 0
+    return np.unique(joined.argmax(1), return_inverse=True)[1].astype(np.int32)
+
+
 def _chosen(
     image: WorkingImage, pieces: np.ndarray, sizes: _Sizes, config: RegionConfig, hints: Hints
 ) -> tuple[np.ndarray, float, bool]:
-    """Which pieces (count + 1,) of one split of the image are the organ: the one that the hints
+    """Which piece (count + 1,) of one split of the image is the organ: the one that the hints
     select, else the likeliest (the largest of an organ's size; what leaves the image counts less,
-    as arms do), and those that continue it behind an occluder. Their score; and whether they are
-    doubtful, so that a wider opening may split them better: the piece leaves the image or is too
-    wide, or one that leaves the image seems to continue it."""
+    as arms do). Its score; and whether it is doubtful, so that a wider opening may split the image
+    better: it leaves the image or is too wide."""
     likeness = _like_an_organ(sizes, config)
     chosen = np.zeros(len(sizes.cut), bool)
     piece = _hinted(image, pieces, sizes, hints)
@@ -103,23 +135,13 @@ def _chosen(
             return chosen, -1.0, True
         piece = int(scores.argmax())
     leaves = sizes.cut > _CUT
-    gap = config.gap_mm / image.footprint
-    lines = _continuing(image.depth_mm, image.taken, pieces, gap, image.footprint, len(chosen))
-    lines = lines + lines.T
     chosen[piece] = True
-    refused = False
-    for _ in range(_TIMES):
-        more = lines[chosen].sum(0) > _FEWEST_LINES * np.sqrt(sizes.area_mm2)
-        more[0] = False
-        refused |= bool((more & leaves & ~chosen).any())
-        chosen |= more & ~leaves
-    score = sizes.area_mm2[chosen].sum() * likeness[piece]
+    score = sizes.area_mm2[piece] * likeness[piece]
     too_wide = sizes.wide_mm[piece] > config.organ_mm[1]
     # A poor guess beside something larger that leaves the image: a hand that holds the organ?
     larger = sizes.area_mm2[leaves].max(initial=0) > score
     held = guessed and likeness[piece] < _POOR and larger
-    doubtful = refused or leaves[piece] or too_wide or held
-    return chosen, float(score), bool(doubtful)
+    return chosen, float(score), bool(leaves[piece] or too_wide or held)
 
 
 def _hinted(image: WorkingImage, pieces: np.ndarray, sizes: _Sizes, hints: Hints) -> int | None:
@@ -209,7 +231,7 @@ def _measure(depth_mm, distance, taken, pieces, pinhole, count):  # type: ignore
             wide[piece] = (high[piece] - low[piece]).max()
             cut[piece] = min(border[piece] / np.sqrt(area[piece]), 1.0)
     aside = np.sqrt((middle**2).sum(1)) / np.maximum(pixels, 1)
-    return _Sizes(area, wide, cut, 2 * disc, aside)
+    return _Sizes(area, low, high, wide, cut, 2 * disc, aside)
 
 
 @jit
@@ -220,50 +242,3 @@ def _goes_on(depth_mm, taken, z, v, u):  # type: ignore[no-untyped-def]
     if not (0 <= v < height and 0 <= u < width):
         return True
     return taken[v, u] == LAST_BOX and abs(depth_mm[v, u] - z) < _SAME_MM
-
-
-@jit
-def _continuing(depth_mm, taken, pieces, gap, footprint, count):  # type: ignore[no-untyped-def]
-    """Length (count, count), mm, along which one piece continues as another behind an occluder."""
-    lines = np.zeros((count, count))
-    height, width = depth_mm.shape
-    for v in range(height):
-        for u in range(width):
-            piece = pieces[v, u]
-            if piece:
-                for step in ((0, 1), (1, 0)):
-                    other = _beyond_gap(depth_mm, taken, pieces, (v, u), step, (gap, footprint))
-                    if other:
-                        lines[piece, other] += depth_mm[v, u] * footprint
-    return lines
-
-
-@jit
-def _beyond_gap(depth_mm, taken, pieces, start, step, scale):  # type: ignore[no-untyped-def]
-    """The piece that continues the one at ``start`` after a gap with something nearer and nothing
-    farther in it; 0 for none. ``scale``: the longest gap in px at distance 1, and a pixel's width
-    there."""
-    gap, footprint = scale
-    y, x = start
-    z, piece = depth_mm[y, x], pieces[y, x]
-    nearer, farther, last = 0, 0, piece
-    for length in range(1, int(gap / z) + 2):
-        y, x = y + step[0], x + step[1]
-        if y >= depth_mm.shape[0] or x >= depth_mm.shape[1] or pieces[y, x] == piece:
-            return 0
-        if taken[y, x] == FLYING:  # anywhere in depth
-            continue
-        there, other = depth_mm[y, x], pieces[y, x]
-        most = _STEP_MM + _STEEPEST_GAP * length * footprint * z
-        if there > z + most:
-            farther += 1
-            if farther > _STRAY:
-                return 0
-            continue
-        farther = 0
-        # Only where another piece begins: one that is met in its midst is itself in front.
-        if other and other != last and nearer >= 2 and abs(there - z) < most:
-            return other
-        nearer += there < z - _STEP_MM
-        last = other
-    return 0

@@ -46,7 +46,7 @@ class RegionConfig(Config, frozen=True, kw_only=True):
         where a finger touches.
     crease_mm: a valley deeper than this over 4 mm to either side separates two pieces; zero: never.
     gap_mm: pieces that continue each other behind an occluder up to this wide are one: an organ
-        behind a shaft.
+        behind a shaft or two fingers.
     steepest_degrees: neighbouring pixels are separated if their depths differ by more than noise
         and a surface tilted by this much explain.
     noise_mm: standard deviation of depth at 150 mm; grows with z^2.
@@ -63,7 +63,7 @@ class RegionConfig(Config, frozen=True, kw_only=True):
     pieces: bool = True
     opening_mm: float = 3.0
     crease_mm: float = 1.2
-    gap_mm: float = 20.0
+    gap_mm: float = 60.0
     steepest_degrees: float = 75.0
     noise_mm: float = 0.2
     organ_mm: tuple[float, float] = (30.0, 160.0)
