@@ -17,7 +17,7 @@ define INSTALL
 endef
 
 .DEFAULT_GOAL := help
-.PHONY: help setup debian kernels demo test test-all quick pythons pytest test-hard check attack fuzz crash replay bench soak wheel lock licences audit results real world sequences trust rehearsal population site pictures clean
+.PHONY: help setup debian kernels demo test test-all quick pythons pytest test-hard check attack fuzz crash replay bench soak wheel lock licences audit results real world sequences trust misses rehearsal population site pictures clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 10
@@ -119,6 +119,9 @@ sequences: setup  ## an organ pressed, pushed, rolled, breathing, turned over, a
 
 trust: setup  ## what margins are worth for physics and organs left out (ARGS="MODEL/margins.jsonl ...": an organ each)
 	$(BIN)/python lab/scripts/trust.py $(ARGS)
+
+misses: setup  ## learns how far off tumors may be, from random kidneys (ARGS="OUT --write src/tumortrack/tracking/misses.json"; half an hour)
+	$(BIN)/python lab/scripts/misses.py $(ARGS)
 
 population: setup  ## KiTS19's kidneys with tumors: their list for a fleet, and what came of it (ARGS="DATA --list FILE", then --fleet OUT)
 	$(BIN)/python lab/scripts/population.py $(ARGS)

@@ -37,7 +37,10 @@ SPOILT = {
     "1 mm steps read as 0.1": (Cause.UNIT, lambda points: points / 10),
     "0.1 mm steps read as 1": (Cause.UNIT, lambda points: points * 10),
     "doubled focal length": (Cause.SCALE, lambda points: points * [0.5, 0.5, 1]),
-    "half of it": (Cause.HIDDEN, lambda points: points[points[:, 0] > np.median(points[:, 0])]),
+    "a third of it": (
+        Cause.HIDDEN,
+        lambda points: points[points[:, 0] > np.quantile(points[:, 0], 0.67)],
+    ),
     "a table": (Cause.OBJECT, lambda points: points * [1, 1, 0] + [0, 0, 150.0]),
     "a table behind": (
         Cause.BACKGROUND,

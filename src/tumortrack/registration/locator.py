@@ -240,8 +240,17 @@ class RegistrationLocator:
     ) -> FitReport:
         fit, bent = placed.fit, placed.bent
         surfaces_mm2 = np.split(placed.sample_mm2, self._sample_ends)
-        named = zip(self._model.parts, placed.middle_mm2, surfaces_mm2, strict=True)
-        deviations = {name: entries.part_deviations(*covariances) for name, *covariances in named}
+        deviations = {
+            name: entries.part_deviations(
+                center_mm2,
+                surface_mm2,
+                placed.meshes[name].box_mm.mean(0),
+                fit.looks.points_mm,
+            )
+            for name, center_mm2, surface_mm2 in zip(
+                self._model.parts, placed.middle_mm2, surfaces_mm2, strict=True
+            )
+        }
         usual_cost, last_mm = self._calibration.usual_cost, self._registration.config.last_mm
         report = frame.report(
             np.abs(bent.distances_mm),

@@ -75,13 +75,18 @@ def motion_entry(motion: ElasticMotion, fit: RegistrationResult, bent: BentFit) 
 
 
 def part_deviations(
-    center_mm2: Float[np.ndarray, "3 3"], surface_mm2: Float[np.ndarray, "n 3 3"]
+    center_mm2: Float[np.ndarray, "3 3"],
+    surface_mm2: Float[np.ndarray, "n 3 3"],
+    center_mm: Float[np.ndarray, " 3"],
+    points_mm: Float[np.ndarray, "m 3"],
 ) -> dict[str, Any]:
-    """Fields of a ``PartReport``, by the covariances of a part's centre and of places on it."""
+    """Fields of a ``PartReport``, by the covariances of a part's centre and of places on it;
+    ``points_mm``: what was seen."""
     squares, axes = np.linalg.eigh(center_mm2)
     return {
         "center_std_mm": float(np.sqrt(squares.mean())),
         "center_axes_std_mm": np.sqrt(squares[::-1]).tolist(),
         "center_axes": axes.T[::-1].tolist(),
         "surface_std_mm": float(np.sqrt(np.linalg.eigvalsh(surface_mm2).max())),
+        "nearest_mm": float(np.sqrt(((points_mm - center_mm) ** 2).sum(1).min())),
     }

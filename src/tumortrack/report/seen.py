@@ -46,8 +46,8 @@ def part_rows(report: FitReport, good: bool) -> list[dict[str, str]]:
             x, y, z = part.center_mm
             row |= {"centre": f"({x:.1f}, {y:.1f}, {z:.1f}) mm"}
             row |= {"volume": f"{part.volume_ml:.1f} ml"}
-            if part.center_std_mm is not None and good:
-                row |= {"std": f"{part.center_std_mm:.1f} mm"}
+            if (deviation := part.deviation_words) is not None and good:
+                row |= {"std": deviation}
             if radius := stated_radius(report.margin, name):
                 row |= {"margin": radius.words}
         rows.append(row)

@@ -259,10 +259,10 @@ def margin_words(margin: MarginReport | None) -> str:
 
 def centre_label(report: FitReport, name: str, poor: bool) -> str:
     """A tumor's name, with its standard deviation and margin as far as they are known."""
-    radius, std_mm = stated_radius(report.margin, name), report.parts[name].center_std_mm
+    radius, deviation = stated_radius(report.margin, name), report.parts[name].deviation_words
     words = [
         f"{name} POOR" if poor else name,
-        *([] if std_mm is None else [f"std {std_mm:.1f} mm"]),
+        *([] if deviation is None else [f"std {deviation}"]),
     ]
     return ", ".join([*words, radius.words if radius else "no margin stated"])
 

@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
+import msgspec
 import numpy as np
 from jaxtyping import Bool
 
 from tumortrack.core.errors import NotThisOrgan
-from tumortrack.core.estimate import Estimate
+from tumortrack.core.estimate import FAR_MM, Estimate
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.report import Finding, FitReport, Kind, LooksReport
 from tumortrack.core.types import DepthFrame, Intrinsics, Look, Mesh, SensorCloud
@@ -17,9 +18,10 @@ from tumortrack.models.in_distribution import FIT_FACTOR, RIVAL_COST
 from tumortrack.sense.noise import CAMERA_STD
 from tumortrack.sense.render import render_depth
 from tumortrack.tracking.margins import ModelMargins, exceeded, figures, stated_margin
+from tumortrack.tracking.misses import with_misses
 
-# Largest standard deviation of a tumor's centre, and largest distance to it in another fit that is
-# nearly as likely.
+# Where ``miss_mm`` is not known: largest standard deviation of a tumor's centre, and largest
+# distance to it in another fit that is nearly as likely.
 _MAX_UNCERTAINTY_MM = 3.0
 # Shares of the organ's image that are seen through. Right estimates have up to 0.03 (moving and
 # pushed, on tables, in beds and cavities, among instruments and hands), an organ upside down 0.12
@@ -76,17 +78,21 @@ def judged(estimate: Estimate, looks: Sequence[Look], strictly: bool = False) ->
     doubtful, impossible = _LIMITS if estimate.motion is not None else _ROUGH_LIMITS
     if by_depth > impossible:
         raise NotThisOrgan(Finding("organ_seen_through", {"percent": 100 * by_depth}))
-    report = estimate.report
+    report = msgspec.structs.replace(
+        estimate.report, unseen=unseen if clouds else estimate.report.unseen
+    )
+    report = with_misses(report)
     finding = _misplaced_camera(report.looks)
     finding = finding or _misfit(report, rim_share > _RIM_SHARE and not strictly)
     finding = finding or _doubt(report)
     in_sight = images[0][2] if images else None
     if through > doubtful:
         finding = Finding("seen_through", {"percent": 100 * through})
-    elif unseen > _MAX_UNSEEN and finding is None:
+    elif unseen > _MAX_UNSEEN and finding is None and not _misses_known(report):
         finding = Finding("unseen", {"percent": 100 * unseen})
     return replace(estimate, finding=finding).reporting(
-        unseen=unseen if clouds else report.unseen,
+        parts=report.parts,
+        unseen=report.unseen,
         seen_through=through,
         in_sight=in_sight,
         doubted_in_sight=(in_sight or 0.0) if through > doubtful else None,
@@ -160,20 +166,37 @@ def _misfit(report: FitReport, surroundings_seen: bool) -> Finding | None:
 
 
 def _doubt(report: FitReport) -> Finding | None:
-    """Another size, pose or fit that is as likely; a part that is missing or uncertain."""
+    """Another size or pose that is as likely; a part that is missing, or a tumor that may be far
+    off."""
     size, cost = report.size, report.fit_cost
     if size is not None and size.gain > RIVAL_COST:
         return Finding("size", {"times": size.times})
     if cost is not None and cost.beyond is not None:
         degrees = cost.beyond.tilt_degrees
         return Finding(_tilt_finding(degrees), {"degrees": degrees})
-    for other in () if cost is None else cost.others:
+    for name, part in report.parts.items():
+        if not part.found:
+            return Finding("missing", {"part": name})
+    if not _misses_known(report):
+        return _unsure(report)
+    misses_mm = {name: part.miss_mm or 0.0 for name, part in report.tumors.items()}
+    name = max(misses_mm, key=misses_mm.__getitem__)
+    far = misses_mm[name] > FAR_MM
+    return Finding("miss", {"part": name, "miss_mm": misses_mm[name]}) if far else None
+
+
+def _misses_known(report: FitReport) -> bool:
+    """Whether there are tumors, and it was learned how far off each may be."""
+    return bool(report.tumors) and all(p.miss_mm is not None for p in report.tumors.values())
+
+
+def _unsure(report: FitReport) -> Finding | None:
+    """Another fit that is as likely, or an uncertain part."""
+    for other in () if report.fit_cost is None else report.fit_cost.others:
         name, apart_mm = max(other.apart_mm.items(), key=lambda item: item[1])
         if apart_mm > _MAX_UNCERTAINTY_MM:
             return Finding("rival", {"part": name, "apart_mm": apart_mm})
     for name, part in report.parts.items():
-        if not part.found:
-            return Finding("missing", {"part": name})
         if part.center_std_mm is not None and part.center_std_mm > _MAX_UNCERTAINTY_MM:
             return Finding("unsure", {"part": name, "std_mm": part.center_std_mm})
         if part.probability is not None and part.probability < _MIN_PROBABILITY:

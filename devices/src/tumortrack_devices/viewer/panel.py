@@ -176,14 +176,14 @@ class StatusPanel:
         rows = []
         for label, name in enumerate(self.parts, start=1):
             part, margin = report.parts.get(name), stated_radius(margins, name)
-            volume_ml, std_mm = (part.volume_ml, part.center_std_mm) if part else (None, None)
-            std_mm = std_mm if good else None
+            volume_ml = part.volume_ml if part else None
+            deviation = part.deviation_words if part and good else None
             cells = [
                 f"<i style='background:{css(part_colour(label))}'></i>"
                 + escape(name.replace("_", " "))
                 + (" (not found)" if part is not None and not part.found else ""),
                 "–" if volume_ml is None else f"{volume_ml:.1f} ml",
-                "–" if std_mm is None else f"{std_mm:.1f} mm",
+                deviation or "–",
             ]
             cells += [f"{margin.mm:.1f} mm" if margin else "–"] if stated else []
             rows.append(f"<tr><td>{'</td><td>'.join(cells)}</td></tr>")

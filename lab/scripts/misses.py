@@ -1,0 +1,118 @@
+"""Learn how far off tumors are, from random kidneys in all families of the wider world's physics.
+
+    make misses ARGS='OUT --kidneys 16'     (about half an hour on two cores)
+
+Makes kidneys, their models and scenes in OUT, locates each scene, from its cloud alone and with its
+depth image, and fits ``tracking.misses`` to how far off the tumors are; writes it to ``--write``.
+Prints, or fills in a document's block, what it is worth for kidneys, and families of physics, that
+were left out. The same command goes on where it was stopped. No patient's anatomy is in it.
+"""
+
+from __future__ import annotations
+
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass
+from multiprocessing import get_context
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import pandas as pd
+import tyro
+
+import tumortrack as tt
+from tumortrack.cli.console import model_folder, say
+from tumortrack.core import store
+from tumortrack.core.config import to_builtins
+from tumortrack.core.errors import TumortrackError
+from tumortrack.core.mesh_files import write_anatomy
+from tumortrack.core.process import available_cores
+from tumortrack.simulate.scene_folder import list_scenes, read_scene
+from tumortrack.tracking.tracker import Tracker
+from tumortrack_lab.margins import misses
+from tumortrack_lab.study import scripts
+from tumortrack_lab.study.document import ReportWriter, table_of
+from tumortrack_lab.world.kidneys import random_anatomy
+from tumortrack_lab.world.scenes import TETS, World, WorldConfig
+
+_ROWS, _BLOCK = "misses.jsonl", "misses"
+
+
+@dataclass(frozen=True)
+class Options:
+    """Learn how far off tumors are."""
+
+    out: tyro.conf.Positional[Path]
+    """Folder of kidneys and scenes."""
+    kidneys: int = 16
+    """So many."""
+    states: int = 40
+    """Of each; families take turns."""
+    seed: int = 1
+    """Of everything."""
+    write: Path | None = None
+    """File for what was learned: src/tumortrack/tracking/misses.json."""
+    document: Path | None = None
+    """Its block is replaced; a table goes beside it."""
+
+
+def main(options: Options) -> None:
+    """Make what is missing, then fit."""
+    writer = ReportWriter(options.document or Path(), scripts.make_command("misses"))
+    if options.document is not None:
+        writer.check([_BLOCK])
+    numbers = range(options.seed * 1000, options.seed * 1000 + options.kidneys)
+    options.out.mkdir(parents=True, exist_ok=True)
+    with ProcessPoolExecutor(available_cores(), get_context("spawn")) as pool:
+        jobs = {pool.submit(_kidney, options.out, n, options.states): n for n in numbers}
+        for done, job in enumerate(as_completed(jobs), start=1):
+            say(f"{done}/{len(jobs)} kidney {jobs[job]}: {job.result()} scenes")
+    rows = pd.concat(
+        [pd.read_json(options.out / str(n) / _ROWS, lines=True) for n in numbers],
+        ignore_index=True,
+    )
+    short = table_of(misses.left_out(rows, "kidney", by="family"))
+    tables = [misses.left_out(rows, part) for part in ("kidney", "family")]
+    print(short, *map(table_of, tables), sep="\n\n")
+    if options.document is not None:
+        named = [table.rename(columns={table.columns[0]: "left out"}) for table in tables]
+        link = writer.data(_BLOCK, pd.concat(named), "Each kidney and each family left out")
+        writer.write({_BLOCK: "\n\n".join([f"`{writer.command}`", short, link])})
+    learned = misses.learned(rows, {"seed": options.seed, "kidneys": len(numbers)})
+    if options.write is not None:
+        store.write_json(options.write, to_builtins(learned))
+
+
+def _kidney(out: Path, number: int, states: int) -> int:
+    """A kidney's scenes and rows; how many scenes could be made."""
+    folder = out / str(number)
+    case, scenes = folder / "case", folder / "scenes"
+    if not case.exists():
+        anatomy_ct, up_lps = random_anatomy(number)
+        with TemporaryDirectory() as aside:
+            write_anatomy(Path(aside), anatomy_ct)
+            words = " ".join(f"{value:.6f}" for value in up_lps)
+            tt.prepare(aside, case, up=words)
+    if (folder / _ROWS).exists():
+        return len(list_scenes(scenes))
+    scenes.mkdir(exist_ok=True)
+    world = World.opened(case, WorldConfig(seed=number), scenes / TETS)
+    for n in range(states):
+        name = "-".join((f"{n:05d}", *world.recipe(n)))
+        try:
+            if not (scenes / name).exists():
+                world.scene(n).write(scenes / name)
+        except TumortrackError:  # no equilibrium, or no organ in the image
+            continue
+    tracker = Tracker(tt.load_model(model_folder(case), "cpu"))
+    rows = [
+        {"kidney": number, "scene": scene.name, **row}
+        for scene in list_scenes(scenes)
+        for row in misses.rows_of(tracker, read_scene(scene))
+    ]
+    text = pd.DataFrame(rows).to_json(orient="records", lines=True)
+    store.write_atomically(folder / _ROWS, text.encode())
+    return len(list_scenes(scenes))
+
+
+if __name__ == "__main__":
+    scripts.run(main, Options)

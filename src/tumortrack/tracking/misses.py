@@ -1,0 +1,78 @@
+"""How far off a tumor's centre may be, learned from kidneys whose truth is known.
+
+The logarithm of the radius within which 95 % of the misses lie is a sum of an answer's figures,
+with weights of 0 or more: no figure that gets worse makes an answer look better. Kidneys, tumors,
+physics and camera are simulated (``lab/scripts/misses.py``); none is a patient's. Source of
+quantiles of scaled residuals: Papadopoulos et al. 2011 (doi 10.1613/jair.3198).
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from functools import cache
+from importlib.resources import files
+from typing import Any
+
+import msgspec
+
+from tumortrack.core.config import Config, from_builtins
+from tumortrack.core.report import FitReport, PartReport
+
+_NAME = "misses.json"
+_MOST_STRAYS, _FARTHEST_RIVAL_MM = 0.3, 10.0  # more say no more
+
+
+class MissModel(Config, frozen=True):
+    """``constant``: logarithm of the radius, mm, if all figures are 0; ``method``: the version that
+    it was learned with, see ``margins.METHOD``; ``about``: on what."""
+
+    method: int
+    constant: float
+    weights: dict[str, float]
+    about: dict[str, Any]
+
+    def radius_mm(self, figures: dict[str, float]) -> float:
+        """Of the misses' 95 %."""
+        return math.exp(self.constant + sum(w * figures[name] for name, w in self.weights.items()))
+
+
+@cache
+def shipped() -> MissModel:
+    """What comes with this version."""
+    text = files("tumortrack.tracking").joinpath(_NAME).read_text()
+    return from_builtins(json.loads(text), MissModel, _NAME)
+
+
+def figures(report: FitReport, part: PartReport, name: str) -> dict[str, float] | None:
+    """Of a tumor; larger is worse. None: the method does not know them."""
+    cost, motion, axes_mm = report.fit_cost, report.motion, part.center_axes_std_mm
+    known = part.surface_std_mm, part.nearest_mm
+    if cost is None or motion is None or axes_mm is None or None in known:
+        return None
+    surface_std_mm, nearest_mm = known
+    assert surface_std_mm is not None
+    assert nearest_mm is not None
+    apart_mm = max((rival.apart_mm[name] for rival in cost.others), default=0.0)
+    return {
+        "center_std": math.log(axes_mm[0]),
+        "surface_std": math.log(surface_std_mm),
+        "nearest": math.log(max(nearest_mm, 1.0)),
+        "cost": math.log(max(cost.now / cost.usual, 0.1)),
+        "strays": min(cost.strays, _MOST_STRAYS),
+        "rarity": math.log1p(motion.rarity),
+        "compliance": math.log(motion.compliance_std_mm or 1.0),
+        "rival": min(apart_mm, _FARTHEST_RIVAL_MM),
+        "size": math.log1p(max(report.size.gain, 0.0)) if report.size is not None else 0.0,
+        "unseen": report.unseen or 0.0,
+    }
+
+
+def with_misses(report: FitReport, model: MissModel | None = None) -> FitReport:
+    """The report with ``miss_mm`` of its tumors, where the method knows enough."""
+    parts = dict(report.parts)
+    for name, part in report.tumors.items():
+        if (known := figures(report, part, name)) is not None:
+            miss_mm = (model or shipped()).radius_mm(known)
+            parts[name] = msgspec.structs.replace(part, miss_mm=miss_mm)
+    return msgspec.structs.replace(report, parts=parts)

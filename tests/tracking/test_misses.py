@@ -1,0 +1,70 @@
+"""How far off tumors may be: the shipped model, its laws, and the verdict that follows from it."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from reports import reporting
+from tumortrack.core.estimate import FAR_MM
+from tumortrack.core.types import SensorCloud
+from tumortrack.models.report import estimate_of
+from tumortrack.tracking import misses, quality
+from tumortrack.tracking.margins import METHOD
+from tumortrack.tracking.misses import MissModel, figures, shipped, with_misses
+from tumortrack.tracking.model_files import load_model
+from tumortrack.tracking.tracker import Tracker
+from warp_objects import ANATOMY, placed
+
+
+@pytest.fixture(scope="module")
+def estimate(slim_model):
+    cloud = visible()
+    return Tracker(load_model(slim_model, "cpu")).locate(cloud, 16, 0)
+
+
+def visible():
+    moved = placed(share=0.3).carry(ANATOMY.organ.vertices_mm)
+    normals = moved - moved.mean(0)
+    return SensorCloud(moved[(normals * moved).sum(1) < 0].astype(np.float32))
+
+
+def test_what_is_shipped_is_of_this_method_and_cannot_reward_what_gets_worse(estimate):
+    model = shipped()
+    assert model.method == METHOD
+    known = figures(estimate.report, estimate.report.parts["tumor_1"], "tumor_1")
+    assert set(model.weights) <= set(known)
+    assert min(model.weights.values()) >= 0
+    before = model.radius_mm(known)
+    assert before > 0
+    for name in known:
+        assert model.radius_mm({**known, name: known[name] + 0.5}) >= before
+
+
+def test_an_answer_says_how_far_off_its_tumors_may_be(estimate):
+    organ, tumor = (estimate.report.parts[name] for name in ("kidney", "tumor_1"))
+    assert organ.miss_mm is None
+    known = figures(estimate.report, tumor, "tumor_1")
+    assert tumor.miss_mm == pytest.approx(shipped().radius_mm(known))
+    nearest_mm = np.linalg.norm(visible().points_mm - tumor.center_mm, axis=1).min()
+    assert tumor.nearest_mm == pytest.approx(nearest_mm, abs=1.0)  # of the points that are fitted
+    assert known["nearest"] == pytest.approx(math.log(tumor.nearest_mm))
+
+
+def test_a_miss_that_may_be_large_makes_an_answer_poor(slim_model, monkeypatch):
+    tracker, cloud = Tracker(load_model(slim_model, "cpu")), visible()
+    for radius_mm, kind in ((FAR_MM - 0.1, None), (FAR_MM + 0.1, "miss")):
+        model = MissModel(METHOD, math.log(radius_mm), {}, {})
+        monkeypatch.setattr(misses, "shipped", lambda model=model: model)
+        found = tracker.locate(cloud, 16, 0).finding
+        assert (None if found is None else found.kind) == kind
+
+
+def test_a_method_that_does_not_know_enough_has_none_and_keeps_the_older_checks(estimate):
+    surfaces = estimate_of(estimate.meshes)
+    assert with_misses(surfaces.report).parts["tumor_1"].miss_mm is None
+    std_mm = quality._MAX_UNCERTAINTY_MM + 0.1
+    unsure = reporting(surfaces, parts={"tumor_1": {"center_std_mm": std_mm}})
+    assert quality._doubt(unsure.report).kind == "unsure"
