@@ -14,7 +14,7 @@ from tumortrack.core.mesh_files import read_mesh
 from tumortrack.report.metrics import outward_miss
 from tumortrack.simulate.scene_folder import list_scenes
 
-COUNT = 26  # 7 tested states without a gross miss show 50 %; two fifths are tested
+COUNT = 40  # 7 tested states without a gross miss show 50 %; two fifths of good ones are tested
 
 
 @pytest.fixture(scope="module")
@@ -85,7 +85,7 @@ def test_margins_are_found_stated_and_planned_with(ready_case, scenes, tmp_path)
     finally:
         meta.write_bytes(written)
     manifest = store.read_json(model / store.MANIFEST)
-    trust = {**manifest["trust"], "std_scale": 1.0}
+    trust = {**manifest["trust"], "std_scale": 1.25}
     store.write_json(model / store.MANIFEST, {**manifest, "trust": trust})
     said = refusal(tumortrack("locate", case, cloud, tmp_path / "after"))
     assert "margins.json is of another model, or this one was changed" in said
