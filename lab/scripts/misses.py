@@ -10,6 +10,7 @@ were left out. The same command goes on where it was stopped. No patient's anato
 
 from __future__ import annotations
 
+import time
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from multiprocessing import get_context
@@ -27,14 +28,16 @@ from tumortrack.core.errors import TumortrackError
 from tumortrack.core.mesh_files import write_anatomy
 from tumortrack.core.process import available_cores
 from tumortrack.simulate.scene_folder import list_scenes, read_scene
+from tumortrack.tracking.margins import METHOD
 from tumortrack.tracking.tracker import Tracker
 from tumortrack_lab.margins import misses
 from tumortrack_lab.study import scripts
 from tumortrack_lab.study.document import ReportWriter, table_of
+from tumortrack_lab.study.tables import NOTHING
 from tumortrack_lab.world.kidneys import random_anatomy
 from tumortrack_lab.world.scenes import TETS, World, WorldConfig
 
-_ROWS, _BLOCK = "misses.jsonl", "misses"
+_BLOCK = "misses"
 
 
 @dataclass(frozen=True)
@@ -64,22 +67,32 @@ def main(options: Options) -> None:
     options.out.mkdir(parents=True, exist_ok=True)
     with ProcessPoolExecutor(available_cores(), get_context("spawn")) as pool:
         jobs = {pool.submit(_kidney, options.out, n, options.states): n for n in numbers}
+        start = time.monotonic()
         for done, job in enumerate(as_completed(jobs), start=1):
-            say(f"{done}/{len(jobs)} kidney {jobs[job]}: {job.result()} scenes")
+            left_min = (time.monotonic() - start) / done * (len(jobs) - done) / 60
+            scenes = f"kidney {jobs[job]}, {job.result()} scenes"
+            say(f"{done}/{len(jobs)} {scenes}: {left_min:.0f} min left")
     rows = pd.concat(
-        [pd.read_json(options.out / str(n) / _ROWS, lines=True) for n in numbers],
+        [pd.read_json(_rows_path(options.out, n, options.states), lines=True) for n in numbers],
         ignore_index=True,
     )
-    short = table_of(misses.left_out(rows, "kidney", by="family"))
-    tables = [misses.left_out(rows, part) for part in ("kidney", "family")]
+    asked = ({"part": "kidney", "by": "family"}, {"part": "kidney"}, {"part": "family"})
+    all_three = [misses.left_out(rows, **each).astype(object).fillna(NOTHING) for each in asked]
+    short, tables = table_of(all_three[0]), all_three[1:]
     print(short, *map(table_of, tables), sep="\n\n")
     if options.document is not None:
         named = [table.rename(columns={table.columns[0]: "left out"}) for table in tables]
         link = writer.data(_BLOCK, pd.concat(named), "Each kidney and each family left out")
         writer.write({_BLOCK: "\n\n".join([f"`{writer.command}`", short, link])})
-    learned = misses.learned(rows, {"seed": options.seed, "kidneys": len(numbers)})
+    about = {"seed": options.seed, "kidneys": len(numbers), "states": options.states}
+    learned = misses.learned(rows, about)
     if options.write is not None:
         store.write_json(options.write, to_builtins(learned))
+
+
+def _rows_path(out: Path, number: int, states: int) -> Path:
+    """Rows are of one version of the method, and of so many states."""
+    return out / str(number) / f"misses-{METHOD}-{states}.jsonl"
 
 
 def _kidney(out: Path, number: int, states: int) -> int:
@@ -90,9 +103,9 @@ def _kidney(out: Path, number: int, states: int) -> int:
         anatomy_ct, up_lps = random_anatomy(number)
         with TemporaryDirectory() as aside:
             write_anatomy(Path(aside), anatomy_ct)
-            words = " ".join(f"{value:.6f}" for value in up_lps)
-            tt.prepare(aside, case, up=words)
-    if (folder / _ROWS).exists():
+            tt.prepare(aside, case, up=",".join(f"{value:.6f}" for value in up_lps))
+    rows_path = _rows_path(out, number, states)
+    if rows_path.exists():
         return len(list_scenes(scenes))
     scenes.mkdir(exist_ok=True)
     world = World.opened(case, WorldConfig(seed=number), scenes / TETS)
@@ -110,7 +123,7 @@ def _kidney(out: Path, number: int, states: int) -> int:
         for row in misses.rows_of(tracker, read_scene(scene))
     ]
     text = pd.DataFrame(rows).to_json(orient="records", lines=True)
-    store.write_atomically(folder / _ROWS, text.encode())
+    store.write_atomically(rows_path, text.encode())
     return len(list_scenes(scenes))
 
 

@@ -15,7 +15,9 @@ def rows(seed, count=2000, constant=-1.0):
     rng = np.random.default_rng(seed)
     figures = {name: rng.normal(1.0, 0.7, count) for name in TRUE}
     logs = constant + sum(TRUE[name] * figures[name] for name in TRUE) + rng.normal(0, 0.4, count)
-    about = {"kidney": rng.integers(0, 5, count), "family": rng.choice(["rest", "pull"], count)}
+    # One tumor an answer; each scene is judged twice.
+    about = {"scene": np.arange(count) // 2, "by": np.tile(["cloud", "image"], count // 2)}
+    about |= {"kidney": rng.integers(0, 5, count), "family": rng.choice(["rest", "pull"], count)}
     return pd.DataFrame(
         {**about, "miss_mm": np.exp(logs), "rigid_fit_mm": 2.0, "finding": None, **figures}
     )
@@ -49,6 +51,15 @@ def test_each_part_is_judged_by_what_was_learned_from_the_others():
     assert list(by_family.index) == ["pull", "rest", "all"]
     assert (by_family["rigid fit: median"] == 2.0).all()
     assert by_family.loc["all", "over 5 mm"] == table.loc["all", "over 5 mm"]
+
+
+def test_an_answer_is_good_if_all_its_tumors_are_near():
+    one, sure = rows(6), left_out(rows(6), "kidney").iloc[-1]["good %"]
+    farther = np.exp(TRUE["center_std"] * (9.0 - one.center_std))
+    far = one.assign(center_std=9.0, miss_mm=one.miss_mm * farther)
+    both = left_out(pd.concat([one, far], ignore_index=True), "kidney").iloc[-1]["good %"]
+    assert sure > 20
+    assert both == 0
 
 
 def test_weights_are_never_negative():

@@ -34,7 +34,7 @@ def visible():
 def test_what_is_shipped_is_of_this_method_and_cannot_reward_what_gets_worse(estimate):
     model = shipped()
     assert model.method == METHOD
-    known = figures(estimate.report, estimate.report.parts["tumor_1"], "tumor_1")
+    known = figures(estimate.report, "tumor_1")
     assert set(model.weights) <= set(known)
     assert min(model.weights.values()) >= 0
     before = model.radius_mm(known)
@@ -46,7 +46,7 @@ def test_what_is_shipped_is_of_this_method_and_cannot_reward_what_gets_worse(est
 def test_an_answer_says_how_far_off_its_tumors_may_be(estimate):
     organ, tumor = (estimate.report.parts[name] for name in ("kidney", "tumor_1"))
     assert organ.miss_mm is None
-    known = figures(estimate.report, tumor, "tumor_1")
+    known = figures(estimate.report, "tumor_1")
     assert tumor.miss_mm == pytest.approx(shipped().radius_mm(known))
     nearest_mm = np.linalg.norm(visible().points_mm - tumor.center_mm, axis=1).min()
     assert tumor.nearest_mm == pytest.approx(nearest_mm, abs=1.0)  # of the points that are fitted

@@ -17,7 +17,7 @@ from typing import Any
 import msgspec
 
 from tumortrack.core.config import Config, from_builtins
-from tumortrack.core.report import FitReport, PartReport
+from tumortrack.core.report import FitReport
 
 _NAME = "misses.json"
 _MOST_STRAYS, _FARTHEST_RIVAL_MM = 0.3, 10.0  # more say no more
@@ -44,20 +44,18 @@ def shipped() -> MissModel:
     return from_builtins(json.loads(text), MissModel, _NAME)
 
 
-def figures(report: FitReport, part: PartReport, name: str) -> dict[str, float] | None:
+def figures(report: FitReport, name: str) -> dict[str, float] | None:
     """Of a tumor; larger is worse. None: the method does not know them."""
-    cost, motion, axes_mm = report.fit_cost, report.motion, part.center_axes_std_mm
-    known = part.surface_std_mm, part.nearest_mm
-    if cost is None or motion is None or axes_mm is None or None in known:
+    part, cost, motion = report.parts[name], report.fit_cost, report.motion
+    if cost is None or motion is None or part.center_axes_std_mm is None:
         return None
-    surface_std_mm, nearest_mm = known
-    assert surface_std_mm is not None
-    assert nearest_mm is not None
+    if part.surface_std_mm is None or part.nearest_mm is None:
+        return None
     apart_mm = max((rival.apart_mm[name] for rival in cost.others), default=0.0)
     return {
-        "center_std": math.log(axes_mm[0]),
-        "surface_std": math.log(surface_std_mm),
-        "nearest": math.log(max(nearest_mm, 1.0)),
+        "center_std": math.log(part.center_axes_std_mm[0]),
+        "surface_std": math.log(part.surface_std_mm),
+        "nearest": math.log(max(part.nearest_mm, 1.0)),
         "cost": math.log(max(cost.now / cost.usual, 0.1)),
         "strays": min(cost.strays, _MOST_STRAYS),
         "rarity": math.log1p(motion.rarity),
@@ -68,11 +66,10 @@ def figures(report: FitReport, part: PartReport, name: str) -> dict[str, float] 
     }
 
 
-def with_misses(report: FitReport, model: MissModel | None = None) -> FitReport:
+def with_misses(report: FitReport) -> FitReport:
     """The report with ``miss_mm`` of its tumors, where the method knows enough."""
     parts = dict(report.parts)
     for name, part in report.tumors.items():
-        if (known := figures(report, part, name)) is not None:
-            miss_mm = (model or shipped()).radius_mm(known)
-            parts[name] = msgspec.structs.replace(part, miss_mm=miss_mm)
+        if (known := figures(report, name)) is not None:
+            parts[name] = msgspec.structs.replace(part, miss_mm=shipped().radius_mm(known))
     return msgspec.structs.replace(report, parts=parts)

@@ -22,21 +22,9 @@ from tumortrack.tracking.misses import MissModel, figures
 from tumortrack.tracking.tracker import Tracker
 
 _CONFIDENCE = 0.95
-_ABOUT = (
-    "kidney",
-    "scene",
-    "family",
-    "by",
-    "tumor",
-    "miss_mm",
-    "rigid_fit_mm",
-    "finding",
-    "radius_mm",
-)
 _LEAST_MM, _LOST_MM = 0.1, 30.0  # misses: less is noise; more are other minima, which fits refuse
-# An answer for which one of these speaks is poor whatever was learned.
-_HARD = ("poses", "strays", "fit", "size", "seen_through")
-_PLACE = ("upside_down", "tilted", "not_turned")
+_ANSWER = ["kidney", "scene", "by"]
+_ABOUT = {*_ANSWER, "family", "tumor", "miss_mm", "rigid_fit_mm", "finding", "radius_mm"}
 
 
 def rows_of(tracker: Tracker, scene: Scene) -> Iterator[dict[str, Any]]:
@@ -56,14 +44,10 @@ def rows_of(tracker: Tracker, scene: Scene) -> Iterator[dict[str, Any]]:
         except NoEstimate:
             continue
         assert estimate.motion is not None
-        moved, report, finding = (
-            estimate.motion.carry(targets.points_ct),
-            estimate.report,
-            estimate.finding,
-        )
+        moved, finding = estimate.motion.carry(targets.points_ct), estimate.finding
         for label, name in enumerate(names[1:], start=2):
             mine = targets.labels == label
-            known = figures(report, report.parts[name], name)
+            known = figures(estimate.report, name)
             if not mine.any() or known is None:
                 continue
             away_mm = (moved[mine] - targets.points_mm[mine]).mean(0)
@@ -96,14 +80,15 @@ def learned(rows: pd.DataFrame, about: dict[str, Any]) -> MissModel:
 
 def left_out(rows: pd.DataFrame, part: str, by: str | None = None) -> pd.DataFrame:
     """What it says of each kidney or family when it was learned from the others; a line for each of
-    these, or of ``by``, beside a rigid fit."""
+    these, or of ``by``, beside a rigid fit. An answer is good if that holds for all its tumors."""
     rows = rows.assign(radius_mm=np.nan)
     for name in rows[part].unique():
         mine = rows[part] == name
         model = learned(rows[~mine], {})
         each = rows[mine][[*model.weights]].to_dict("records")
         rows.loc[mine, "radius_mm"] = [model.radius_mm(known) for known in each]
-    good = _acceptable(rows) & (rows.radius_mm <= FAR_MM)
+    near = _acceptable(rows) & (rows.radius_mm <= FAR_MM)
+    good = near.groupby([rows[name] for name in _ANSWER]).transform("all")
     lines = []
     for name, some in [*rows.groupby(by or part), ("all", rows)]:
         calm, mine = some[_acceptable(some)], some[good[some.index]]
@@ -126,4 +111,4 @@ def left_out(rows: pd.DataFrame, part: str, by: str | None = None) -> pd.DataFra
 
 def _acceptable(rows: pd.DataFrame) -> pd.Series:
     """Whether nothing but what was learned speaks against an answer."""
-    return ~rows.finding.isin([*_HARD, *_PLACE])
+    return rows.finding.isna() | (rows.finding == "miss")

@@ -25,12 +25,6 @@ from tumortrack.sense.region.working_image import (
 _OPENINGS = (1.0, 1.7, 2.8)  # times ``opening_mm``: the last is wider than fingers
 _CLEARLY = 1.1  # a wider opening must raise the score by this factor
 _PICK_REACH_MM = 10.0  # from the picked point to its piece
-_STEEPEST_GAP = 0.7  # slope of a surface behind an occluder
-_BORDER, _SLOPE_MM = (
-    2,
-    5.0,
-)  # px left out at a gap's border, where stereo errs; slopes are over this
-_STEP_MM = 3.0  # an occluder is nearer, the background farther, by this much
 _SAME_MM = 5.0  # largest step in depth between neighbouring pixels of one surface
 _FEWEST_LINES = 0.4  # length along which pieces continue each other, over the smaller one's size
 _IN_A_ROW = 4  # gaps between the first and the last piece of an organ
