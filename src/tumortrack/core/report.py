@@ -61,7 +61,7 @@ _FINDINGS: dict[Kind, tuple[Check, str]] = {
     "rival": ("place", "{part} may as well lie {apart_mm:.1f} mm away, which fits too"),
     "missing": ("place", "{part} was not found"),
     "unsure": ("place", "the place of {part} is unsure by {std_mm:.1f} mm"),
-    "miss": ("place", "{part} may lie up to {miss_mm:.0f} mm off"),
+    "miss": ("place", "{part} may lie up to {miss_mm:.1f} mm off"),
     "improbable": ("place", "the points of {part} have a probability of {probability:.2f}"),
     "seen_through": (
         "seen_through",
