@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -17,8 +18,10 @@ from tumortrack.registration.bend import (
     bend,
 )
 from tumortrack.registration.config import GaussNewtonConfig
-from tumortrack.registration.gauss_newton import prior_precision
+from tumortrack.registration.gauss_newton import GaussNewton, prior_precision, refine
 from tumortrack.registration.kernels import POSE
+from tumortrack.registration.looks import Looks
+from tumortrack.registration.uncertainty import held_by_prior_mm
 from warp_objects import ANATOMY, nudged, placed, refined
 
 CONFIG = GaussNewtonConfig()
@@ -65,6 +68,26 @@ def test_forces_anywhere_are_followed_where_they_are_seen():
         left_mm.append([np.abs(each.distances_mm).mean() for each in (fit, bent)])
     of_library, of_bent = np.mean(left_mm, axis=0)
     assert of_bent < 0.7 * of_library
+
+
+def test_how_far_the_prior_holds_a_part_is_how_far_it_moves_without_some_of_it():
+    looks = Looks.of([seen(placed(share=1.5), 0.0)])
+    near = msgspec.structs.replace(CONFIG, first_mm=CONFIG.last_mm, enough_mm=1e-4)
+    fit = refine(START.shape, looks, START, near)
+    middles_ct, precision = fit.motion.shape.middles_ct, prior_precision(START.shape, CONFIG)
+    less = 0.05
+    freer = GaussNewton(START.shape, looks, fit.motion, near, fit.moved, (1 - less) * precision)
+    freer.run(40)
+    away_mm = freer.result().motion.carry(middles_ct) - fit.motion.carry(middles_ct)
+    slope = precision @ np.append(fit.moved, fit.motion.coefficients - START.shape.body.mean)
+    held_mm = held_by_prior_mm(fit.motion, slope)
+    assert min(held_mm) > 0.1
+    np.testing.assert_allclose(held_mm, np.linalg.norm(away_mm, axis=1) / less, rtol=0.4)
+    bent = bend(fit, CONFIG)
+    slopes = np.split(bent.prior_slope, [len(slope)])
+    np.testing.assert_allclose(slopes[0], slope, atol=0.2 * np.abs(slope).max())
+    forces = bent.motion.coefficients[len(fit.motion.coefficients) :]
+    np.testing.assert_allclose(slopes[1], forces / bent.compliance_std_mm**2)
 
 
 def test_what_is_not_seen_is_less_sure():

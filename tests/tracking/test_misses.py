@@ -8,12 +8,11 @@ import numpy as np
 import pytest
 
 from reports import reporting
-from tumortrack.core.estimate import FAR_MM
 from tumortrack.core.types import SensorCloud
 from tumortrack.models.report import estimate_of
 from tumortrack.tracking import misses, quality
 from tumortrack.tracking.margins import METHOD
-from tumortrack.tracking.misses import MissModel, figures, shipped, with_misses
+from tumortrack.tracking.misses import POOR_MM, MissModel, figures, shipped, with_misses
 from tumortrack.tracking.model_files import load_model
 from tumortrack.tracking.tracker import Tracker
 from warp_objects import ANATOMY, placed
@@ -55,7 +54,7 @@ def test_an_answer_says_how_far_off_its_tumors_may_be(estimate):
 
 def test_a_miss_that_may_be_large_makes_an_answer_poor(slim_model, monkeypatch):
     tracker, cloud = Tracker(load_model(slim_model, "cpu")), visible()
-    for radius_mm, kind in ((FAR_MM - 0.1, None), (FAR_MM + 0.1, "miss")):
+    for radius_mm, kind in ((POOR_MM - 0.1, None), (POOR_MM + 0.1, "miss")):
         model = MissModel(METHOD, math.log(radius_mm), {}, {})
         monkeypatch.setattr(misses, "shipped", lambda model=model: model)
         found = tracker.locate(cloud, 16, 0).finding

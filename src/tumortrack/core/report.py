@@ -227,7 +227,8 @@ class PartReport(_Value, frozen=True, kw_only=True, omit_defaults=True):
     """One part, camera frame. ``points``: of the labelled cloud, with their mean ``probability``;
     ``center_axes``: unit vectors along which the centre has the deviations
     ``center_axes_std_mm``, the least sure first; ``nearest_mm``: from the centre to the nearest
-    point that was seen; ``miss_mm``: within which 95 % of such tumors' centres lie, as learned from
+    point that was seen; ``held_by_prior_mm``: how far the elastic prior, against the points, holds
+    the centre; ``miss_mm``: within which 95 % of such tumors' centres lie, as learned from
     simulated kidneys. None: not found, or the method does not know."""
 
     label: int
@@ -242,6 +243,7 @@ class PartReport(_Value, frozen=True, kw_only=True, omit_defaults=True):
     center_axes: tuple[Point, Point, Point] | None = None
     surface_std_mm: float | None = None
     nearest_mm: float | None = None
+    held_by_prior_mm: float | None = None
     miss_mm: float | None = None
 
     @property

@@ -41,7 +41,7 @@ _DETERMINANTS = 0.3
 @dataclass(frozen=True, eq=False)
 class BentFit:
     """As ``RegistrationResult``; the motion's last coefficients are the compliance's, which have
-    this standard deviation."""
+    this standard deviation. ``prior_slope``: of half the prior's cost, by the unknowns."""
 
     motion: ElasticMotion
     looks: Looks
@@ -49,6 +49,7 @@ class BentFit:
     distances_mm: Float[np.ndarray, " n"]
     steps: int
     compliance_std_mm: float
+    prior_slope: Float64[np.ndarray, " p"]
 
 
 def bend(fit: RegistrationResult, config: GaussNewtonConfig) -> BentFit:
@@ -63,7 +64,8 @@ def bend(fit: RegistrationResult, config: GaussNewtonConfig) -> BentFit:
     descent.run(_STEPS)
     bent = descent.result()
     motion, steps = replace(bent.motion, rivals=fit.motion.rivals), fit.steps + bent.steps
-    return BentFit(motion, fit.looks, bent.cost, bent.distances_mm, steps, std_mm)
+    slope = precision @ np.append(bent.moved, motion.coefficients - start.shape.body.mean)
+    return BentFit(motion, fit.looks, bent.cost, bent.distances_mm, steps, std_mm, slope)
 
 
 def _with_compliance(motion: ElasticMotion) -> ElasticMotion:

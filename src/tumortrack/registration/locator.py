@@ -25,7 +25,7 @@ from tumortrack.registration.looks import Looks
 from tumortrack.registration.model import RegistrationModel
 from tumortrack.registration.motion import ElasticMotion, blend
 from tumortrack.registration.search import PosePrior, apart_mm
-from tumortrack.registration.uncertainty import apparent_size
+from tumortrack.registration.uncertainty import apparent_size, held_by_prior_mm
 
 QUERIES = 40_000  # as many as the paper asks
 CARRIED = 20_000  # points of the undeformed organ that live estimates carry along
@@ -240,15 +240,19 @@ class RegistrationLocator:
     ) -> FitReport:
         fit, bent = placed.fit, placed.bent
         surfaces_mm2 = np.split(placed.sample_mm2, self._sample_ends)
+        held_mm = held_by_prior_mm(placed.motion, bent.prior_slope)
         deviations = {
-            name: entries.part_deviations(
-                center_mm2,
-                surface_mm2,
-                placed.meshes[name].box_mm.mean(0),
-                fit.looks.points_mm,
-            )
-            for name, center_mm2, surface_mm2 in zip(
-                self._model.parts, placed.middle_mm2, surfaces_mm2, strict=True
+            name: {
+                "held_by_prior_mm": held,
+                **entries.part_deviations(
+                    center_mm2,
+                    surface_mm2,
+                    placed.meshes[name].box_mm.mean(0),
+                    fit.looks.points_mm,
+                ),
+            }
+            for name, held, center_mm2, surface_mm2 in zip(
+                self._model.parts, held_mm, placed.middle_mm2, surfaces_mm2, strict=True
             )
         }
         usual_cost, last_mm = self._calibration.usual_cost, self._registration.config.last_mm

@@ -9,6 +9,8 @@ from tumortrack.registration.config import GaussNewtonConfig
 from tumortrack.registration.looks import Looks
 from tumortrack.registration.motion import ElasticMotion
 
+_LESS = 0.05  # share of the prior's weight: first order, and no float32 noise
+
 
 def posterior(
     motion: ElasticMotion, looks: Looks, config: GaussNewtonConfig
@@ -22,6 +24,17 @@ def posterior(
         follows = covariance @ across
         covariance = covariance + follows @ np.linalg.solve(precision, follows.T)
     return covariance
+
+
+def held_by_prior_mm(motion: ElasticMotion, prior_slope: Float64[np.ndarray, " p"]) -> list[float]:
+    """How far the prior, against the points, holds the middle of each part: to first order, how far
+    each moves per share of the prior's weight that is taken away. ``prior_slope``: see
+    ``BentFit``."""
+    assert motion.covariance is not None
+    middles_ct = motion.shape.middles_ct
+    freer = motion.changed(_LESS * motion.covariance @ prior_slope)
+    away_mm = freer.carry(middles_ct) - motion.carry(middles_ct)
+    return (np.linalg.norm(away_mm, axis=1) / _LESS).tolist()
 
 
 def apparent_size(

@@ -20,7 +20,7 @@ from tumortrack.core.report import Finding, FitReport, MarginReport, StatedMargi
 
 # Raise it with every change that gives another estimate, or other figures (``measured``), for the
 # same cloud: margins calibrated before are then refused.
-METHOD = 5
+METHOD = 6
 NAME = "margins.json"
 Kind = Literal["tumor", "organ", "map"]
 _WHAT = {"tumor": "a tumor's surface", "organ": "the organ's surface", "map": "mapped points"}

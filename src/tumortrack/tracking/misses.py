@@ -20,7 +20,11 @@ from tumortrack.core.config import Config, from_builtins
 from tumortrack.core.report import FitReport
 
 _NAME = "misses.json"
+# An answer is poor from this radius on. Of kidneys left out, 65 % of answers are good then, and
+# 1.3 % of these are over 5 mm off; from 5 mm on 54 and 1.2 %.
+POOR_MM = 6.0
 _MOST_STRAYS, _FARTHEST_RIVAL_MM = 0.3, 10.0  # more say no more
+_LEAST_HELD_MM = 0.05  # nor does less
 
 
 class MissModel(Config, frozen=True):
@@ -49,13 +53,14 @@ def figures(report: FitReport, name: str) -> dict[str, float] | None:
     part, cost, motion = report.parts[name], report.fit_cost, report.motion
     if cost is None or motion is None or part.center_axes_std_mm is None:
         return None
-    if part.surface_std_mm is None or part.nearest_mm is None:
+    if part.surface_std_mm is None or part.nearest_mm is None or part.held_by_prior_mm is None:
         return None
     apart_mm = max((rival.apart_mm[name] for rival in cost.others), default=0.0)
     return {
         "center_std": math.log(part.center_axes_std_mm[0]),
         "surface_std": math.log(part.surface_std_mm),
         "nearest": math.log(max(part.nearest_mm, 1.0)),
+        "prior": math.log(max(part.held_by_prior_mm, _LEAST_HELD_MM)),
         "cost": math.log(max(cost.now / cost.usual, 0.1)),
         "strays": min(cost.strays, _MOST_STRAYS),
         "rarity": math.log1p(motion.rarity),

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from tumortrack.core.errors import NotThisOrgan
-from tumortrack.core.estimate import FAR_MM, Estimate
+from tumortrack.core.estimate import Estimate
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.report import Finding, FitReport, Kind, LooksReport
 from tumortrack.core.types import DepthFrame, Intrinsics, Look, Mesh, SensorCloud
@@ -18,7 +18,7 @@ from tumortrack.models.in_distribution import FIT_FACTOR, RIVAL_COST
 from tumortrack.sense.noise import CAMERA_STD
 from tumortrack.sense.render import render_depth
 from tumortrack.tracking.margins import ModelMargins, exceeded, figures, stated_margin
-from tumortrack.tracking.misses import with_misses
+from tumortrack.tracking.misses import POOR_MM, with_misses
 
 # Where ``miss_mm`` is not known: largest standard deviation of a tumor's centre, and largest
 # distance to it in another fit that is nearly as likely.
@@ -181,7 +181,7 @@ def _doubt(report: FitReport) -> Finding | None:
         return _unsure(report)
     misses_mm = {name: part.miss_mm or 0.0 for name, part in report.tumors.items()}
     name = max(misses_mm, key=misses_mm.__getitem__)
-    far = misses_mm[name] > FAR_MM
+    far = misses_mm[name] > POOR_MM
     return Finding("miss", {"part": name, "miss_mm": misses_mm[name]}) if far else None
 
 

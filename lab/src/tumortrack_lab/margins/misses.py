@@ -18,7 +18,7 @@ from tumortrack.registration.model import RegistrationModel
 from tumortrack.report.rivals import best_rigid_pose, rigid_fit
 from tumortrack.simulate.scene_folder import Scene
 from tumortrack.tracking.margins import METHOD
-from tumortrack.tracking.misses import MissModel, figures
+from tumortrack.tracking.misses import POOR_MM, MissModel, figures
 from tumortrack.tracking.tracker import Tracker
 
 _CONFIDENCE = 0.95
@@ -87,7 +87,7 @@ def left_out(rows: pd.DataFrame, part: str, by: str | None = None) -> pd.DataFra
         model = learned(rows[~mine], {})
         each = rows[mine][[*model.weights]].to_dict("records")
         rows.loc[mine, "radius_mm"] = [model.radius_mm(known) for known in each]
-    near = _acceptable(rows) & (rows.radius_mm <= FAR_MM)
+    near = _acceptable(rows) & (rows.radius_mm <= POOR_MM)
     good = near.groupby([rows[name] for name in _ANSWER]).transform("all")
     lines = []
     for name, some in [*rows.groupby(by or part), ("all", rows)]:
