@@ -21,18 +21,20 @@ from typing import Annotated
 import numpy as np
 import pandas as pd
 import tyro
+from PIL import Image
 
 from tumortrack.cli.console import say
 from tumortrack.core.errors import InputError
 from tumortrack.core.store import write_atomically
 from tumortrack.report import drawing
-from tumortrack_lab.fleet.results import LOOK, PATIENTS, SCENES
+from tumortrack_lab.fleet.results import LOOK, PATIENTS, PICTURES, SCENES
 from tumortrack_lab.real.kidneys import SET_ASIDE, WHERE
 from tumortrack_lab.study import scripts
 from tumortrack_lab.study.document import ReportWriter, spread_mm, spread_words, table_of
 from tumortrack_lab.study.trust import BANDS, band_of
 
 DEVELOPMENT = (0, 2, 3)
+_WORST = 3  # pictures
 BLOCK = "population"
 _ERRORS = {
     "centre": "middle_mm",
@@ -77,8 +79,9 @@ def main(options: Options) -> None:
         raise InputError("give --list FILE to make the list, or --fleet OUT for the tables of it.")
     if options.list is not None:
         maps = label_maps(options.data)[: options.count]
-        lines = [f"{path.parent.name},{path.absolute()}" for path in maps]
-        write_atomically(options.list, "\n".join(["name,input", *lines, ""]).encode())
+        lines = [f"{path.parent.name},{path.absolute()},1" for path in maps]
+        head = "name,input,margin_states"  # one state: the least
+        write_atomically(options.list, "\n".join([head, *lines, ""]).encode())
         say(f"{len(lines)} kidneys listed in {options.list}.")
     if options.fleet is not None:
         writer = ReportWriter(options.document, scripts.make_command("population"))
@@ -107,9 +110,10 @@ def block(fleet: Path, writer: ReportWriter) -> str:
     if done.empty:
         raise InputError(f"{fleet} has no patient that is done.")
     scenes = scenes.merge(people[["patient", "slice_mm"]], on="patient")
-    scenes = scenes.reindex(columns=[*dict.fromkeys([*scenes, *_ERRORS.values()])])
+    scenes = scenes.reindex(columns=[*dict.fromkeys([*scenes, *_ERRORS.values(), "radius_mm"])])
     without = scenes.rigid_fit_middle_mm.isna().all()
     draw(scenes, writer.image(BLOCK))
+    draw_worst(scenes, fleet / PICTURES, writer.image(f"{BLOCK}_worst"))
     rows, alone = grouped(scenes), len(done[~done.patient.isin(looks.patient)])
     summary = (
         f"{len(people)} patients, {len(done)} done, {alone} with nothing for a person to look at. "
@@ -123,7 +127,8 @@ def block(fleet: Path, writer: ReportWriter) -> str:
         "centre, mm: median / 95 % / worst": spread_words(short, "centre"),
         "best rigid pose": spread_words(short, "best rigid pose's centre"),
         "rigid fit": spread_words(short, "rigid fit's centre"),
-        "over 5 mm": short["over 5 mm"],
+        "over 5 mm": short["over 5 mm"], "good within radius %": short["of good"],
+        "rank correlation": short["rank correlation"],
     })  # fmt: skip
     short = short.drop(columns=["rigid fit"] if without else [])
     links = [
@@ -152,6 +157,12 @@ def grouped(scenes: pd.DataFrame) -> pd.DataFrame:
             for words, column in _ERRORS.items():
                 row |= spread_mm(words, good[column])
             row |= {f"over {mm} mm": int(good[f"over_{mm}_mm"].sum()) for mm in (3, 5)}
+            said = mine.dropna(subset=["radius_mm"])
+            row |= {
+                "within radius %": f"{100 * (said.middle_mm <= said.radius_mm).mean():.0f}",
+                "of good": f"{100 * (good.middle_mm <= good.radius_mm).mean():.0f}",
+                "rank correlation": f"{said.middle_mm.corr(said.radius_mm, method='spearman'):.2f}",
+            }
             rows.append(row)
     return pd.DataFrame(rows)
 
@@ -180,6 +191,21 @@ def draw(scenes: pd.DataFrame, path: Path) -> None:
         axes.set(xlabel=words, ylabel="" if number % 2 == 0 else "error of the centre, mm")
         axes.set_ylim(0, None)
     figure.axes[0].legend(frameon=False, fontsize=9)
+    drawing.save(figure, path)
+
+
+def draw_worst(scenes: pd.DataFrame, pictures: Path, path: Path) -> None:
+    """The worst good answers over the truth, each of another patient: as the fleet drew them."""
+    good = scenes[scenes.verdict == "good"].sort_values("middle_mm", ascending=False)
+    names = good.drop_duplicates("patient").patient.head(_WORST)
+    drawn = [place for name in names if (place := pictures / f"{name}-worst.webp").exists()]
+    if not drawn:
+        return
+    figure = drawing.new_figure(8.0, 4.2 * len(drawn), left=0.01, right=0.99, top=0.98, bottom=0.01)
+    for axes, place in zip(figure.subplots(len(drawn), 1, squeeze=False)[:, 0], drawn, strict=True):
+        axes.imshow(Image.open(place))
+        axes.set_title(place.stem.removesuffix("-worst"), fontsize=10, loc="left")
+        axes.set_axis_off()
     drawing.save(figure, path)
 
 

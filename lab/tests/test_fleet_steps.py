@@ -16,6 +16,7 @@ from tumortrack.core.errors import InputError
 from tumortrack.core.mesh_files import write_anatomy
 from tumortrack.core.types import Mesh
 from tumortrack.tracking import model_files
+from tumortrack.tracking.misses import POOR_MM
 from tumortrack_lab.fleet import checks, results
 from tumortrack_lab.fleet.engine import run
 from tumortrack_lab.fleet.executors import Serial
@@ -179,6 +180,7 @@ def test_tables_say_who_failed_and_who_needs_an_eye(fleets):
     assert len(scenes) == people.scenes["zweite"]
     good = scenes[scenes.verdict == "good"]
     assert people.good["zweite"] == pytest.approx(len(good) / len(scenes))
+    assert good.radius_mm.between(0.1, POOR_MM).all()
     looks = pd.read_csv(home / "out" / results.LOOK)
     assert "check: " in looks.reason[looks.patient == "cut"].item()
     assert "the side is unknown" in set(looks.reason[looks.patient == "zweite"])

@@ -22,7 +22,7 @@ from tumortrack_lab.fleet.task import File, Task
 FAMILIES = ("rest", "plate", "clamp", "twist", "pull", "tether", "roll")
 _TEST = len(FAMILIES) * 100_000  # number of the first state that is evaluated on
 CONFIDENCES = (0.9, 0.95)
-_VERSIONS = {"evaluate": 4, "margins": 3}  # of other steps: 2
+_VERSIONS = {"evaluate": 5, "margins": 3}  # of other steps: 2
 Inputs = Mapping[str, Path]
 Given = Mapping[str, Any]
 

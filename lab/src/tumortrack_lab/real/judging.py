@@ -71,9 +71,10 @@ def judge(
         middle and, with ``surfaces``, the Hausdorff and the mean surface distance and how far the
         true tumor sticks out of the estimated one, of the estimate, of the best rigid pose
         (``rigid_``) and of the rigid fit (``rigid_fit_``); the middle's error after moving the
-        estimate rigidly onto the truth (``shape_``); and the stated standard deviation; mm. No
-        tumors where the scene shows another organ. Where it has targets, ``target_mm`` and the
-        same of both rigid poses are their mean errors.
+        estimate rigidly onto the truth (``shape_``); the stated standard deviation, and the radius
+        within which 95 % of such tumors lie (``radius_mm``), if it is known; mm. No tumors where
+        the scene shows another organ. Where it has targets, ``target_mm`` and the same of both
+        rigid poses are their mean errors.
     """
     row: dict[str, Any] = {"tumors": [], "verdict": "refused", "reason": ""}
     motion = None
@@ -99,8 +100,9 @@ def judge(
     if motion is not None:
         estimated = anatomy_ct.organ.moved(motion.carry(anatomy_ct.organ.vertices_mm))
         onto = fit_over_volume(estimated, scene.reference.organ)[0]
-    for rest, true in zip(anatomy_ct.tumors, scene.reference.tumors, strict=True):
-        tumor: dict[str, float] = {}
+    tumors = zip(anatomy_ct.names[1:], anatomy_ct.tumors, scene.reference.tumors, strict=True)
+    for name, rest, true in tumors:
+        tumor: dict[str, float | None] = {}
         for prefix, pose in poses.items():
             tumor |= _errors(_posed(rest, pose), true, prefix, surfaces)
         if motion is not None:
@@ -110,6 +112,7 @@ def judge(
             std_mm = motion.std_mm(rest.vertices_mm.mean(0, keepdims=True))
             assert std_mm is not None
             tumor["std_mm"] = float(std_mm[0])
+            tumor["radius_mm"] = estimate.report.parts[name].miss_mm
         row["tumors"].append(tumor)
     return row
 
