@@ -16,6 +16,10 @@ if TYPE_CHECKING:
     from tumortrack.api import *  # noqa: F403
     from tumortrack.core import errors as errors
     from tumortrack.core.estimate import Estimate as Estimate
+    from tumortrack.core.evidence import Free as Free
+    from tumortrack.core.evidence import Landmark as Landmark
+    from tumortrack.core.evidence import Outline as Outline
+    from tumortrack.core.evidence import Touch as Touch
     from tumortrack.core.types import DepthFrame as DepthFrame
     from tumortrack.core.types import Intrinsics as Intrinsics
     from tumortrack.core.types import Look as Look
@@ -30,6 +34,7 @@ _NAMES = {  # by the module that has them
     "simulate_scenes teach track train write_scenes",
     "core": "errors",
     "core.estimate": "Estimate",
+    "core.evidence": "Free Landmark Outline Touch",
     "core.types": "DepthFrame Intrinsics Look SensorCloud",
     "imaging.case": "Case",
     "tracking.tracker": "Tracker",

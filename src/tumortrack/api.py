@@ -409,7 +409,7 @@ def locate(model: StrPath, clouds: StrPath | Sequence[StrPath], **options: Any) 
         model: folder of a case, or that ``train`` wrote.
         options: as on the command line: ``range``, ``box``, ``whole``, ``at``, ``mask``,
             ``poses``, ``intrinsics`` (one for each view), ``depth_unit``, ``unit``, ``grid``,
-            ``seed``, ``map``, ``case``, ``patient``, ``side``, ``device``.
+            ``seed``, ``evidence``, ``map``, ``case``, ``patient``, ``side``, ``device``.
 
     Returns:
         ``estimate``, which is None where nothing could be located; ``report``, as in report.json;

@@ -13,6 +13,7 @@ from jaxtyping import Float32
 
 from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.estimate import Estimate, FollowOptions
+from tumortrack.core.evidence import Evidence
 from tumortrack.core.report import Finding
 from tumortrack.core.types import Anatomy, CameraLabels, Look, OccupancyCloud, SensorCloud
 from tumortrack.models.in_distribution import check_in_distribution
@@ -39,11 +40,13 @@ class OccupancyLocator:
         self.model = model
         self.inference = Inference(model.network)
 
-    def locate(self, looks: Sequence[Look], grid: int, seed: int) -> Estimate:
+    def locate(
+        self, looks: Sequence[Look], grid: int, seed: int, evidence: Sequence[Evidence] = ()
+    ) -> Estimate:
         """See ``tracking.tracker.Tracker.locate``. The two passes of queries are those of the
         follow-up (LUDO): 10,000 coarse ones where the organ can be, then 40,000 in the enlarged box
         of those inside."""
-        frame = _Frame(self, _only_cloud(looks), seed, np.random.default_rng(seed))
+        frame = _Frame(self, _only_cloud(looks, evidence), seed, np.random.default_rng(seed))
         lattice = frame.lattice(frame.coarse_box())
         distances_mm = frame.checked(lattice)
         inside = frame.inside(lattice)
@@ -89,11 +92,11 @@ class OccupancyLocator:
         volume.part_surfaces(margins, ball.astype(np.uint8), np.eye(4), self.model.parts[:1])
 
 
-def _only_cloud(looks: Sequence[Look]) -> SensorCloud:
-    if len(looks) > 1:
+def _only_cloud(looks: Sequence[Look], evidence: Sequence[Evidence] = ()) -> SensorCloud:
+    if len(looks) > 1 or evidence:
         raise InputError(
-            "several looks need a model that knows a motion: preset clinic; quick and paper take "
-            "one cloud."
+            "several looks, and evidence, need a model that knows a motion: preset clinic; quick "
+            "and paper take one cloud."
         )
     return looks[0].cloud
 

@@ -18,7 +18,7 @@ Check = Literal[
 Kind = Literal[
     "not_judged", "poses", "strays", "fit", "size", "upside_down", "tilted", "not_turned", "rival",
     "missing", "unsure", "miss", "improbable", "seen_through", "unseen", "hidden_now",
-    "beyond_margins", "model", "frame_in_doubt", "good_again",
+    "evidence", "beyond_margins", "model", "frame_in_doubt", "good_again",
     # No estimate: the frame or its source.
     "no_frame", "source", "defect", "stamp_negative", "stamp_back", "stale", "future", "too_late",
     "frozen", "other_frame_id", "frame_id_changed", "intrinsics_changed", "moved", "cameras",
@@ -71,6 +71,10 @@ _FINDINGS: dict[Kind, tuple[Check, str]] = {
     "hidden_now": (
         "other",
         "a moment ago the camera saw through where the organ lies; what showed that is hidden",
+    ),
+    "evidence": (
+        "place",
+        "{name} {number} lies {off_mm:.1f} mm from where the rest has it, and was left out",
     ),
     "beyond_margins": ("other", "{figure} is {value:.3g}; margins are known up to {limit:.3g}"),
     "model": ("other", "{words}"),
@@ -310,6 +314,16 @@ class LooksReport(_Value, frozen=True, kw_only=True):
     turn_degrees: tuple[float, ...]
 
 
+class EvidenceReport(_Value, frozen=True, kw_only=True):
+    """One piece of evidence: its kind, how far it lies from the answer at most, and which share of
+    what it says is news beside all else (0 to 1). ``left_out``: it contradicts the rest."""
+
+    name: str
+    off_mm: float
+    news: float
+    left_out: bool
+
+
 class AllowedPoses(_Value, frozen=True, kw_only=True):
     """Poses that the case allows; ``up_lps``: what faces the camera."""
 
@@ -374,6 +388,7 @@ class FitReport(_Value, frozen=True, kw_only=True, omit_defaults=True):
     poses: AllowedPoses | None = None
     motion: MotionReport | None = None
     looks: LooksReport | None = None
+    evidence: tuple[EvidenceReport, ...] = ()
     fit_mm: Residuals | None = None
     timings: dict[str, float] = {}
     unseen: float | None = None

@@ -20,6 +20,7 @@ from typing import Any, Literal, Protocol, runtime_checkable
 
 from tumortrack.core.errors import InputError, PackageError
 from tumortrack.core.estimate import Estimate, FollowOptions
+from tumortrack.core.evidence import Evidence
 from tumortrack.core.types import Anatomy, Look
 from tumortrack.imaging.case import Case
 from tumortrack.models.model import Model, ModelConfig
@@ -34,7 +35,9 @@ class Locator(Protocol):
 
     anatomy_ct: Anatomy | None
 
-    def locate(self, looks: Sequence[Look], grid: int, seed: int) -> Estimate:
+    def locate(
+        self, looks: Sequence[Look], grid: int, seed: int, evidence: Sequence[Evidence] = ()
+    ) -> Estimate:
         """See ``Tracker.locate``. The estimate is in the frame of the first look's camera."""
 
     def follow(self, looks: Sequence[Look], last: Estimate | None, how: FollowOptions) -> Estimate:

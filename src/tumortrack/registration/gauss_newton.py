@@ -117,8 +117,23 @@ class GaussNewton:
         """Continue until ``steps`` are taken since the start, or it has converged."""
         if self.converged or (steps <= self.steps and np.isfinite(self.cost)):
             return
-        reached = kernels.descend(self._problem, self._state, self.steps, steps)
-        self.steps, self.converged, self.cost = reached
+        if self._looks.evidence is None:
+            reached = kernels.descend(self._problem, self._state, self.steps, steps)
+            self.steps, self.converged, self.cost = reached
+            return
+        if not np.isfinite(self.cost):
+            self._step(0, 0)
+        while self.steps < steps and not self.converged:
+            self._step(self.steps + 1, self.steps + 2)  # from 1 on: only then no equations first
+            self.steps += 1
+
+    def _step(self, first: int, last: int) -> None:
+        """With the evidence in the equations that it leaves."""
+        state, evidence = self._state, self._looks.evidence
+        _, self.converged, cost = kernels.descend(self._problem, state, first, last)
+        motion = ElasticMotion(self._rest, state.rotation, state.centre_mm, state.coefficients)
+        assert evidence is not None
+        self.cost = cost + evidence.at(motion).add_to(state.curvature, state.gradient)
 
     def result(self) -> RegistrationResult:
         """The present state."""

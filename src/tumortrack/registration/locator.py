@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Int32, Int64, UInt8
 
 from tumortrack.core.estimate import Estimate, FollowOptions
+from tumortrack.core.evidence import Evidence
 from tumortrack.core.report import FitReport, SizeFit, SmoothingReport
 from tumortrack.core.types import Anatomy, CameraLabels, Look, Mesh, OccupancyCloud, SensorCloud
 from tumortrack.imaging.raster import label_grid
@@ -20,6 +21,7 @@ from tumortrack.registration import kernels
 from tumortrack.registration import report as entries
 from tumortrack.registration.bend import BentFit
 from tumortrack.registration.choose import likeliest
+from tumortrack.registration.evidence import EvidenceTerms
 from tumortrack.registration.gauss_newton import RegistrationResult
 from tumortrack.registration.looks import Looks
 from tumortrack.registration.model import RegistrationModel
@@ -106,11 +108,14 @@ class RegistrationLocator:
         self._nearest_sample = nearest_lookup(self._samples_ct)
         self._carried: _OrganPoints | None = None
 
-    def locate(self, looks: Sequence[Look], grid: int, seed: int) -> Estimate:
+    def locate(
+        self, looks: Sequence[Look], grid: int, seed: int, evidence: Sequence[Evidence] = ()
+    ) -> Estimate:
         """See ``tracking.tracker.Tracker.locate``."""
         cloud = looks[0].cloud
         frame = Frame(self._model, cloud, seed, np.random.default_rng(seed))
-        fit = self._registration.register(self._points(frame, looks), None, frame.stage)
+        points = self._points(frame, looks, evidence=EvidenceTerms.of(evidence, self._model.parts))
+        fit = self._registration.register(points, None, frame.stage)
         size, placed = self._size(fit), self._checked(fit, self._bent(fit, frame), frame)
         organ = placed.meshes[self._model.parts[0]]
         with frame.stage("fine"):
@@ -120,6 +125,8 @@ class RegistrationLocator:
             labels = label_grid(Anatomy(tuple(placed.meshes.values())), camera_from_index, shape)
         voxel_mm = float(camera_from_index[0, 0])
         prior, more = self._registration.prior, {"size": size, "voxel_mm": voxel_mm}
+        if (terms := fit.looks.evidence) is not None:
+            more["evidence"] = terms.described(evidence, placed.motion)
         report = self._report(frame, looks, placed, inside, prior, **more)
         volume = CameraLabels(labels, camera_from_index)
         made = Estimate(inside, volume, placed.meshes, report, placed.motion)
@@ -180,11 +187,17 @@ class RegistrationLocator:
             return bent, 0.0
         return replace(bent, motion=mean), past_s * (1 - share) / share
 
-    def _points(self, frame: Frame, looks: Sequence[Look], every: int = 1) -> Looks:
+    def _points(
+        self,
+        frame: Frame,
+        looks: Sequence[Look],
+        every: int = 1,
+        evidence: EvidenceTerms | None = None,
+    ) -> Looks:
         """What the fit takes of all looks; ``frame`` is the first one's."""
         more = [Frame(self._model, look.cloud, frame.seed, frame.rng) for look in looks[1:]]
         points_mm = [each.points_mm[::every] for each in (frame, *more)]
-        return Looks.of(points_mm, [look.camera_from_look for look in looks[1:]])
+        return Looks.of(points_mm, [look.camera_from_look for look in looks[1:]], evidence)
 
     def warm(self) -> None:
         """See ``tracking.tracker.Tracker.warm``."""

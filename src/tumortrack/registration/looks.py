@@ -16,6 +16,7 @@ from jaxtyping import Float, Float64, Int64
 from tumortrack.core.geometry import Affine, Points, rigid, transform_points
 from tumortrack.core.report import LooksReport
 from tumortrack.registration.config import GaussNewtonConfig
+from tumortrack.registration.evidence import EvidenceTerms
 from tumortrack.registration.kernels import POSE
 from tumortrack.registration.motion import ElasticMotion
 from tumortrack.sense.noise import CAMERA_STD
@@ -58,22 +59,28 @@ class Looks:
         camera_from_look: where each look's camera is, the first one's being the identity.
         shifts: by how much the organ was found to lie elsewhere before each camera (mm, rad; its
             axes, about its centre): the camera's error, which points and places are rid of.
+        evidence: what is known beside the points.
     """
 
     points_mm: Points
     look: Int64[np.ndarray, " n"]
     camera_from_look: tuple[Affine, ...]
     shifts: Float64[np.ndarray, "k 6"]
+    evidence: EvidenceTerms | None = None
 
     @classmethod
     def of(
-        cls, points_mm: Sequence[Float[np.ndarray, "_ 3"]], camera_from_look: Sequence[Affine] = ()
+        cls,
+        points_mm: Sequence[Float[np.ndarray, "_ 3"]],
+        camera_from_look: Sequence[Affine] = (),
+        evidence: EvidenceTerms | None = None,
     ) -> Looks:
         """Points of each look in its own camera's frame; further ones with where it is."""
         moved = [*points_mm[:1], *map(_moved, camera_from_look, points_mm[1:])]
         numbers = np.repeat(np.arange(len(moved)), [len(points) for points in moved])
         together = moved[0] if len(moved) == 1 else np.concatenate(moved)
-        return cls(together, numbers, (np.eye(4), *camera_from_look), np.zeros((len(moved), POSE)))
+        poses, shifts = (np.eye(4), *camera_from_look), np.zeros((len(moved), POSE))
+        return cls(together, numbers, poses, shifts, evidence)
 
     @property
     def count(self) -> int:

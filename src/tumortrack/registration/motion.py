@@ -106,18 +106,24 @@ class ElasticMotion:
     ) -> None:
         """The covariance of pose and state, organ's axes, not scaled."""
         assert self.covariance is not None
-        body, effects = self.shape.body, np.empty((len(points), 3, len(self.covariance)))
-        kernels.effects(self._flow, body.modes, body.center_ct, points, effects)
+        effects = self.effects(points)
         spread = effects.reshape(-1, effects.shape[2]) @ self.covariance
         out[:] = spread.reshape(effects.shape) @ effects.transpose(0, 2, 1)
 
-    def residual_rows(self, points_camera: Points) -> Float32[np.ndarray, "n q"]:
+    def effects(self, points_ct: Points) -> Float64[np.ndarray, "n 3 p"]:
+        """What shift, turn and coefficients each do to the place of points, organ's axes."""
+        body, points = self.shape.body, np.array(points_ct, np.float32, order="C")
+        out = np.empty((len(points), 3, kernels.POSE + len(self.coefficients)))
+        kernels.effects(self._flow, body.modes, body.center_ct, points, out)
+        return out
+
+    def residual_rows(self, points_camera: Points, part: int = 0) -> Float32[np.ndarray, "n q"]:
         """What shift, turn and coefficients each do to the signed distance (mm) of points, carried
-        back, to the organ's surface at rest; that distance last."""
+        back, to the surface of a part at rest (the organ's); that distance last."""
         body, points = self.shape.body, np.array(points_camera, np.float32, order="C")
         pose = Pose(body.center_ct, self.rotation, self.centre_mm)
         out = np.empty((len(points), kernels.POSE + len(self.coefficients) + 1), np.float32)
-        distances = self.shape.distances[0]
+        distances = self.shape.distances[part]
         kernels.residual_rows(body.modes, distances, self._opposite, pose, points, out)
         return out
 

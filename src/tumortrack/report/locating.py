@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from tumortrack.core import store
 from tumortrack.core.config import to_builtins
 from tumortrack.core.errors import InputError, NoEstimate
+from tumortrack.core.evidence import read_evidence
 from tumortrack.report.seen import Seen
 from tumortrack.tracking.options import LocateOptions, check_grid, model_folder
 from tumortrack.tracking.points import PointTable, check_near_organ, read_points
@@ -76,6 +77,7 @@ def locate(given: Path, clouds: Sequence[Path], options: LocateOptions) -> Locat
     folder = model_folder(given)
     points = _points(given, folder, options)
     frame_id, fixed_from_camera = read_places(options.poses, len(clouds))
+    evidence = () if options.evidence is None else read_evidence(options.evidence)
     views = read_views(clouds, options)
     hints = views[0].hints(options.at, options.mask)
 
@@ -101,7 +103,8 @@ def locate(given: Path, clouds: Sequence[Path], options: LocateOptions) -> Locat
             if view is views[0]:
                 seen = replace(seen, cloud=organ, taken=taken)
         looks = further_looks(organs, views, fixed_from_camera)
-        estimate = tracker.locate(organs[0], options.grid, options.seed, views[0].content, looks)
+        seen_by_all = views[0].content, looks, evidence
+        estimate = tracker.locate(organs[0], options.grid, options.seed, *seen_by_all)
     except NoEstimate as error:
         about = {**_no_estimate(error, views[0], model, options), **about}
         return Located(None, about, seen, points, error)
@@ -116,6 +119,8 @@ def locate(given: Path, clouds: Sequence[Path], options: LocateOptions) -> Locat
             "poses_sha256": store.sha256_of(options.poses),
             "clouds_sha256": [store.sha256_of(path) for path in clouds],
         }
+    if options.evidence is not None:
+        about["evidence_sha256"] = store.sha256_of(options.evidence)
     if options.map is not None and points is not None:
         digest, count = store.sha256_of(options.map), len(points.points_ct)
         about["map"] = {"points": count, "from": "lps", "to": "camera", "sha256": digest}

@@ -204,6 +204,8 @@ def stated_margin(report: FitReport, margins: ModelMargins | None, good: bool) -
     no limit is exceeded."""
     if report.looks is not None:
         return MarginReport(reason="margins are of single views, not of several")
+    if report.evidence:
+        return MarginReport(reason="margins are of clouds alone, not of evidence beside them")
     if margins is None:
         return MarginReport(reason=UNKNOWN)
     if not good:

@@ -80,6 +80,8 @@ class LocateOptions(RegionOptions):
             else 0.1 (a D405's), of floats 1000 (metres). Many cameras have 1.
         intrinsics: JSON with width, height, fx, fy, cx, cy in pixels: once for all views, or once
             for each, in their order.
+        evidence: JSON with what else is known of where the organ lies: touched points, landmarks,
+            outlines (docs/evidence.md). Needs a model of preset clinic.
         map: points of the CT to map to the camera frame (OUT/points.csv): a .csv with columns
             x,y,z (LPS, mm), or 3D Slicer's .mrk.json or .fcsv. Needs a model of preset clinic.
         case: the model's case; the page's slices then show its CT moved to the organ (preset
@@ -95,6 +97,7 @@ class LocateOptions(RegionOptions):
     unit: Literal["mm", "m"] = "mm"
     depth_unit: float | None = None
     intrinsics: tuple[Path, ...] = ()
+    evidence: Path | None = None
     map: Path | None = None
     case: Path | None = None
     device: Device = "auto"

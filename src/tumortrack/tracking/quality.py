@@ -174,6 +174,9 @@ def _doubt(report: FitReport) -> Finding | None:
     if cost is not None and cost.beyond is not None:
         degrees = cost.beyond.tilt_degrees
         return Finding(_tilt_finding(degrees), {"degrees": degrees})
+    for number, each in enumerate(report.evidence, start=1):
+        if each.left_out:
+            return Finding("evidence", {"name": each.name, "number": number, "off_mm": each.off_mm})
     for name, part in report.parts.items():
         if not part.found:
             return Finding("missing", {"part": name})

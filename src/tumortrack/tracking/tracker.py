@@ -14,6 +14,7 @@ from tumortrack.core.causes import Cause, Likely
 from tumortrack.core.config import Config, check_seed
 from tumortrack.core.errors import InputError, NoEstimate, NotThisOrgan
 from tumortrack.core.estimate import Estimate, FollowOptions
+from tumortrack.core.evidence import Evidence
 from tumortrack.core.geometry import HERE, Affine, transform_points
 from tumortrack.core.process import keep_small_blocks
 from tumortrack.core.report import Finding
@@ -74,6 +75,7 @@ class Tracker:
         seed: int = 0,
         seen: DepthFrame | SensorCloud | None = None,
         others: Sequence[Look] = (),
+        evidence: Sequence[Evidence] = (),
     ) -> Estimate:
         """The full estimate from one cloud; the same cloud and seed give the same result.
 
@@ -81,12 +83,14 @@ class Tracker:
             grid: voxels along the longest side of the dense volume.
             seen: all that the camera saw, by which the estimate is judged; default: the cloud.
             others: further looks at the organ from other places, between which it did not move.
+            evidence: what else is known of where it lies then: ``Touch``, ``Landmark``,
+                ``Outline``, ``Free``, in the frame of ``cloud``.
 
         Raises:
             NoEstimate: too few points, no organ found in them, not the organ of this model, or the
                 camera sees through the place where it would be.
-            InputError: the cloud is in metres; the seed is not allowed; more than one look, with a
-                model that knows no motion.
+            InputError: the cloud is in metres; the seed is not allowed; evidence of a part that
+                the organ lacks; more than one look, or evidence, with a model that knows no motion.
         """
         check_seed(seed)
         if not isinstance(cloud, SensorCloud):
@@ -96,7 +100,7 @@ class Tracker:
             )
         looks = Look(cloud, seen or cloud, HERE), *others
         with self._explaining_errors(looks, _DEFAULTS):
-            estimate = self._locator.locate(looks, grid, seed)
+            estimate = self._locator.locate(looks, grid, seed, evidence)
             estimate = self._judged(estimate, looks, False)
         return self._explained(estimate, looks, _DEFAULTS)
 

@@ -1,0 +1,192 @@
+"""Evidence beside the points: terms against finite differences, what they do to an answer, and what
+contradicts it."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from elastic_objects import CENTER, RADII
+from stories import answered, refusal, tumortrack
+from tumortrack.core.errors import InputError
+from tumortrack.core.evidence import Free, Landmark, Outline, Touch, evidence_json, read_evidence
+from tumortrack.core.types import SensorCloud
+from tumortrack.registration.evidence import EvidenceTerms
+from tumortrack.registration.looks import Looks
+from tumortrack.sense.ply import write_cloud_ply
+from tumortrack.tracking.model_files import load_model
+from tumortrack.tracking.tracker import Tracker
+from warp_objects import ANATOMY, method, placed
+
+NAMES = ANATOMY.names
+TRUE = placed(share=0.3)
+VERTICES = ANATOMY.organ.vertices_mm
+NORMALS = (VERTICES - CENTER) / RADII**2
+NORMALS /= np.linalg.norm(NORMALS, axis=1, keepdims=True)
+MOVED = TRUE.carry(VERTICES)
+FACING = -((NORMALS @ TRUE.rotation.T) * MOVED).sum(1) / np.linalg.norm(MOVED, axis=1)
+SEEN = MOVED[FACING > 0.3]
+BEHIND = VERTICES[FACING < -0.4]
+TUMOR = ANATOMY.tumors[0].vertices_mm
+
+
+def at(point_ct):
+    """Where the true organ has it."""
+    return tuple(map(float, TRUE.carry(np.atleast_2d(point_ct))[0]))
+
+
+def touches(count, noise_mm=0.3, seed=0):
+    rng = np.random.default_rng(seed)
+    chosen = BEHIND[rng.choice(len(BEHIND), count, replace=False)]
+    return [Touch(place_mm=tuple(np.array(at(p)) + rng.normal(0, noise_mm, 3))) for p in chosen]
+
+
+def every_kind():
+    tumor = [at(p) for p in TUMOR[:: len(TUMOR) // 8]]
+    inside = at(CENTER + [0.0, 2.0, 5.0])
+    return [
+        Touch(place_mm=at(BEHIND[0] + 2 * NORMALS[FACING < -0.4][0]), tip_mm=2.0),
+        Touch(place_mm=at(TUMOR[3]), part="tumor_1", std_mm=0.5),
+        Landmark(point_ct=CENTER + [5, 1, -20], place_mm=at(CENTER + [5, 1, -20]), std_mm=1.5),
+        Outline(places_mm=tuple(tumor), part="tumor_1"),
+        Free(places_mm=(inside, (0.0, 0.0, 20.0)), std_mm=2.0),
+    ]
+
+
+def test_terms_change_as_their_derivatives_say():
+    terms = EvidenceTerms.of(every_kind(), NAMES)
+    motion = placed(share=0.0)
+    now, step = terms.at(motion), 1e-3
+    assert len(now.residuals_mm) == 1 + 1 + 8 + 2 + 3 + (len(TUMOR[:: len(TUMOR) // 8]) - 8)
+    for n in range(now.by_motion.shape[1]):
+        change = np.zeros(now.by_motion.shape[1])
+        change[n] = step
+        ahead, behind = (terms.at(motion.changed(sign * change)) for sign in (1, -1))
+        if 3 <= n < 6:  # a landmark's residual is in the organ's axes, which turn
+            for sign, each in ((1, ahead), (-1, behind)):
+                turned = motion.rotation.T @ motion.changed(sign * change).rotation
+                each.residuals_mm[-3:] = turned @ each.residuals_mm[-3:]
+        slopes = (ahead.residuals_mm - behind.residuals_mm) / (2 * step)
+        near = np.isclose(slopes, now.by_motion[:, n], atol=0.03, rtol=0.03)
+        assert near.mean() > 0.9  # but at the edges of the distance field's cells
+
+
+def test_a_place_without_tissue_counts_inside_the_organ_alone():
+    inside, outside = at(CENTER), (0.0, 0.0, 20.0)
+    terms = EvidenceTerms.of([Free(places_mm=(inside, outside), tip_mm=1.0)], NAMES).at(TRUE)
+    assert terms.residuals_mm[0] < -5
+    assert terms.residuals_mm[1] == 0
+    assert not terms.by_motion[1].any()
+    assert terms.contradicting.tolist() == [0]
+
+
+def off_mm(motion):
+    return np.linalg.norm(motion.carry(TUMOR).mean(0) - np.array(at_all(TUMOR)).mean(0))
+
+
+def at_all(points_ct):
+    return TRUE.carry(points_ct)
+
+
+def fitted(evidence):
+    looks = Looks.of([SEEN], (), EvidenceTerms.of(evidence, NAMES))
+    return method().register(looks)
+
+
+def test_evidence_where_nothing_is_seen_brings_the_answer_nearer_and_makes_it_surer():
+    alone = fitted([])
+    mean_mm = {}
+    for name, evidence in {
+        "nothing": [],
+        "touches": touches(12),
+        "outline": [Outline(places_mm=tuple(map(at, TUMOR[::20])), part="tumor_1", std_mm=0.5)],
+    }.items():
+        fit = fitted(evidence)
+        mean_mm[name] = np.linalg.norm(fit.motion.carry(VERTICES) - MOVED, axis=1).mean()
+        if evidence:
+            wide, narrow = (
+                replace(each.motion, rivals=()).std_mm(BEHIND).mean() for each in (alone, fit)
+            )
+            assert narrow < 0.95 * wide
+    assert mean_mm["touches"] < 0.9 * mean_mm["nothing"]
+    assert off_mm(fitted([every_kind()[3]]).motion) < max(off_mm(alone.motion), 0.3)
+
+
+def test_landmarks_tell_which_way_round_an_organ_lies():
+    """An ellipsoid fits as well turned by half a turn."""
+    turned = fitted(
+        [
+            Landmark(point_ct=p, place_mm=at(p))
+            for p in (CENTER + [20.0, 0, 30], CENTER + [0, 12.0, -30])
+        ]
+    )
+    assert np.linalg.norm(turned.motion.carry(VERTICES) - MOVED, axis=1).mean() < 3
+    assert turned.looks.evidence is not None
+
+
+def test_what_contradicts_the_rest_is_left_out_and_named(slim_model):
+    tracker = Tracker(load_model(slim_model, "cpu"))
+    away = tuple(np.array(at(BEHIND[0])) + [0, 0, 25.0])
+    evidence = [*touches(4), Touch(place_mm=away)]
+    cloud = SensorCloud(SEEN.astype(np.float32))
+    found = tracker.locate(cloud, 16, 0, evidence=evidence)
+    told = found.report.evidence
+    assert [each.left_out for each in told] == [False] * 4 + [True]
+    assert told[4].off_mm > 15
+    assert told[4].news == 0
+    assert all(0 < each.news <= 1 for each in told[:4])
+    assert found.finding.kind == "evidence"
+    assert found.reason.startswith("touch 5 lies")
+    rest = tracker.locate(cloud, 16, 0, evidence=evidence[:4])
+    apart = found.motion.carry(VERTICES) - rest.motion.carry(VERTICES)
+    assert np.linalg.norm(apart, axis=1).max() < 0.3
+    assert rest.report.margin.reason.startswith("margins are of clouds alone")
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: Touch(place_mm=(0.0, 0.0, 5000.0)), "in mm"),
+        (lambda: Touch(place_mm=(0.0, float("nan"), 100.0)), "in mm"),
+        (lambda: Outline(places_mm=(), part="kidney"), "place"),
+        (lambda: Touch(place_mm=(0.0, 0.0, 100.0), std_mm=0.0), "allowed: 0.05 to 50"),
+    ],
+)
+def test_what_is_not_allowed_is_said(make, words):
+    with pytest.raises(InputError, match=words):
+        make()
+    with pytest.raises(InputError, match="this organ has kidney, tumor_1"):
+        EvidenceTerms.of([Outline(places_mm=((0, 0, 100.0),), part="liver")], NAMES)
+
+
+def test_a_file_comes_back(tmp_path):
+    evidence = tuple(every_kind())
+    (tmp_path / "e.json").write_bytes(evidence_json(evidence))
+    assert read_evidence(tmp_path / "e.json") == evidence
+
+
+def test_the_command_takes_a_file_and_says_what_is_wrong_with_it(slim_model, tmp_path):
+    write_cloud_ply(tmp_path / "cloud.ply", SEEN.astype(np.float32))
+    file, out = tmp_path / "e.json", tmp_path / "out"
+    command = "locate", slim_model, tmp_path / "cloud.ply", out, "--grid", 32, "--device", "cpu"
+    content = json.loads(evidence_json(tuple(touches(6))))
+    wrong = {
+        "frame 'robot'": {**content, "frame": "robot"},
+        "unit 'm'": {**content, "unit": "m"},
+        "not a valid": {**content, "evidence": [{"kind": "smell", "place_mm": [0, 0, 1]}]},
+        "this organ has kidney": {
+            **content, "evidence": [{**content["evidence"][0], "part": "vessel"}]
+        },
+    }  # fmt: skip
+    for words, given in wrong.items():
+        file.write_text(json.dumps(given))
+        assert words in refusal(tumortrack(*command, "--evidence", file))
+        assert not out.exists()
+    file.write_text(json.dumps(content))
+    answered(tumortrack(*command, "--evidence", file))
+    report = json.loads((out / "report.json").read_text())
+    assert [each["name"] for each in report["evidence"]] == ["touch"] * 6
+    assert len(report["evidence_sha256"]) == 64
