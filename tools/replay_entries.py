@@ -21,7 +21,6 @@ from tumortrack.core import store
 from tumortrack.core.types import SensorCloud
 from tumortrack.imaging.case import Case, load_case, save_case
 from tumortrack.imaging.surface import surfaces
-from tumortrack.live.virtual_source import VirtualSourceConfig
 from tumortrack.phantom.digital import PhantomParameters, phantom_labels
 from tumortrack.sense.cloud import CloudConfig
 from tumortrack.sense.files import read_cloud
@@ -30,6 +29,7 @@ from tumortrack.simulate.scene_folder import draw_targets
 from tumortrack.tracking.files import report_entry
 from tumortrack.tracking.model_files import load_model
 from tumortrack.tracking.tracker import Follower, FollowerConfig, Tracker
+from tumortrack_devices.sources.virtual import VirtualSourceConfig
 from tumortrack_lab.twin.dataset import StateCache, TwinRun
 from tumortrack_lab.twin.views import VIEWS, ViewConfig, make_scene
 from tumortrack_occupancy.inference import Inference

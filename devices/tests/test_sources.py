@@ -24,9 +24,9 @@ from theatre_objects import small_theatre
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import DepthFrame, SensorCloud
 from tumortrack.live.values import Observation, Source, SourceEnded, SourceLost
-from tumortrack.live.virtual_source import VirtualSource
 from tumortrack_devices.sources.realsense import RealSenseSource, RealSenseSourceConfig
 from tumortrack_devices.sources.recording import RecordingSourceConfig
+from tumortrack_devices.sources.virtual import VirtualSource
 
 SLACK_S = 0.5  # that the quickest of some reads may take longer
 

@@ -97,10 +97,10 @@ def test_a_broken_package_breaks_its_own_kind_alone(example, tmp_path, monkeypat
             "number": "math:pi",
             "renamed": "tumortrack_example.csv:CsvSinkConfig",
         },
-        "tumortrack.sources": {"virtual": "tumortrack_example.image:ImageSourceConfig"},
+        "tumortrack.poses": {"file": "tumortrack_example.image:ImageSourceConfig"},
     }
     monkeypatch.syspath_prepend(str(distribution(tmp_path / "other", "acme-sinks", broken)))
-    assert SOURCES.parse("virtual:case").case == Path("case")
+    assert POSES.parse("file:poses.csv").path == Path("poses.csv")
     assert SINKS.parse(f"csv:{tmp_path}/a.csv").digits == 2
     for kind, said in {
         "lost": "acme-sinks offers 'lost', but it cannot be imported .*no_such_module",
@@ -115,7 +115,7 @@ def test_a_broken_package_breaks_its_own_kind_alone(example, tmp_path, monkeypat
         SINKS.parse("screen")
     faults = {(one.package, one.kind): one.fault for one in extensions()}
     assert faults["tumortrack-example", "csv"] == faults["tumortrack-example", "image"] == ""
-    assert "'virtual' is built in, and cannot be" in faults["acme-sinks", "virtual"]
+    assert "'file' is built in, and cannot be" in faults["acme-sinks", "file"]
     assert all(fault for (package, _), fault in faults.items() if package == "acme-sinks")
 
 

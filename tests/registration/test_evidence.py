@@ -149,8 +149,8 @@ def test_what_contradicts_the_rest_is_left_out_and_named(slim_model):
 @pytest.mark.parametrize(
     ("make", "words"),
     [
-        (lambda: Touch(place_mm=(0.0, 0.0, 5000.0)), "in mm"),
-        (lambda: Touch(place_mm=(0.0, float("nan"), 100.0)), "in mm"),
+        (lambda: Touch(place_mm=(0.0, 0.0, 5000.0)), "both in mm"),
+        (lambda: Touch(place_mm=(0.0, float("nan"), 100.0)), "both in mm"),
         (lambda: Outline(places_mm=(), part="kidney"), "place"),
         (lambda: Touch(place_mm=(0.0, 0.0, 100.0), std_mm=0.0), "allowed: 0.05 to 50"),
     ],

@@ -24,7 +24,6 @@ from tumortrack.core.types import (
     SensorCloud,
 )
 from tumortrack.imaging.case import load_case
-from tumortrack.live.virtual_source import VirtualSourceConfig
 from tumortrack.report.metrics import label_grid, target_errors
 from tumortrack.report.protocol import evaluate_scene, evaluate_scenes
 from tumortrack.report.summary import headlines, summarise, target_text
@@ -36,6 +35,7 @@ from tumortrack.simulate.scene_folder import (
     read_scene,
     read_targets,
 )
+from tumortrack_devices.sources.virtual import VirtualSourceConfig
 from tumortrack_lab.peers.base import OneWay
 
 

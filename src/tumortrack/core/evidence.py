@@ -36,8 +36,8 @@ class _Evidence(Config, frozen=True, kw_only=True, tag_field="kind"):
             if not (np.abs(places) <= _REACH_MM).all():
                 raise InputError(
                     f"{self.name}: {field} reaches {np.abs(places).max():g}; allowed: up to "
-                    f"{_REACH_MM:g}. Give places in the camera's frame and points of the CT in LPS, "
-                    "in mm."
+                    f"{_REACH_MM:g}. Places are in the camera's frame, points of the CT in LPS; "
+                    "both in mm."
                 )
             msgspec.structs.force_setattr(self, field, _tuples(given))
 

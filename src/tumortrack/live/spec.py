@@ -114,8 +114,9 @@ SOURCES = Registry[SourceConfig](
     "source",
     "tumortrack.sources",
     SourceConfig,
-    {"virtual": "tumortrack.live.virtual_source:VirtualSourceConfig"},
+    {},
     {
+        "virtual": _DEVICES,
         "realsense": f"{_DEVICES}[realsense]",
         "stereo": f"{_DEVICES}[stereo]",
         "recording": _DEVICES,

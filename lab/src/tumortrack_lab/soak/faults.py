@@ -14,11 +14,11 @@ import numpy as np
 
 from tumortrack.core.types import DepthFrame
 from tumortrack.live.values import Observation, Sink, SinkContext, SourceLost, TrackingResult
-from tumortrack.live.virtual_source import VirtualSource
-from tumortrack.simulate.player import ScenePlayer
+from tumortrack_devices.player import ScenePlayer
 from tumortrack_devices.ros.messages import Messages
 from tumortrack_devices.ros.sensors import depth_of, messages_seen
 from tumortrack_devices.sinks.recording import RecordingSinkConfig
+from tumortrack_devices.sources.virtual import VirtualSource
 
 # What must be reported of each, as a regular expression.
 SOURCE_FAULTS = {

@@ -20,10 +20,10 @@ from tumortrack.core.errors import InputError
 from tumortrack.live.loop import Loop, LoopConfig, summary
 from tumortrack.live.spec import SINKS, SOURCES
 from tumortrack.live.values import Controls, PublishedFrame, SinkContext, SourceEnded
-from tumortrack.live.virtual_source import VirtualSourceConfig
 from tumortrack.live.workers import SinkWorker, SourceWorker
-from tumortrack.simulate.player import ScenePlayer, ScenePlayerConfig
 from tumortrack.tracking.tracker import Tracker, region_for
+from tumortrack_devices.player import ScenePlayer, ScenePlayerConfig
+from tumortrack_devices.sources.virtual import VirtualSourceConfig
 from tumortrack_lab.soak.faults import FAULTS, Fault, FaultyCamera, FaultySink, Schedule, Tapes
 from tumortrack_lab.soak.judge import Judge
 from tumortrack_lab.soak.table import document, memory_marks

@@ -14,11 +14,11 @@ from tumortrack.live.values import Observation, SourceConfig, SourceLost
 from tumortrack.sense.noise import Sensor
 
 if TYPE_CHECKING:
-    from tumortrack.simulate.player import ScenePlayer
+    from tumortrack_devices.player import ScenePlayer
 
 
 class VirtualSourceConfig(SourceConfig, frozen=True, kw_only=True, tag="virtual"):
-    """A case folder in motion (``simulate.player``).
+    """A case folder in motion (``tumortrack_devices.player``).
 
     Attributes:
         case: the folder that ``prepare`` wrote.
@@ -59,7 +59,7 @@ class VirtualSourceConfig(SourceConfig, frozen=True, kw_only=True, tag="virtual"
         case, InputError if case or options make no scene."""
         from tumortrack.imaging.case import load_case
         from tumortrack.sense.noise import CLEAN, SENSORS
-        from tumortrack.simulate.player import ScenePlayer, ScenePlayerConfig
+        from tumortrack_devices.player import ScenePlayer, ScenePlayerConfig
 
         off = [
             *(() if self.breathing else ("breath_mm", "swell")),

@@ -19,10 +19,10 @@ from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import LabelVolume, Mesh
 from tumortrack.imaging.case import Case, save_case
 from tumortrack.live.spec import SOURCES
-from tumortrack.live.virtual_source import VirtualSource, VirtualSourceConfig
 from tumortrack.sense.noise import CLEAN
 from tumortrack.simulate.elastic.body import BodyConfig
-from tumortrack.simulate.player import SHAFT_MM, ScenePlayer, ScenePlayerConfig, rod
+from tumortrack_devices.player import SHAFT_MM, ScenePlayer, ScenePlayerConfig, rod
+from tumortrack_devices.sources.virtual import VirtualSource, VirtualSourceConfig
 
 HELD_S = (3.0, 9.0, 15.0)  # a push is at its deepest
 ROUND_S = 18.0  # all places were pushed once
@@ -215,7 +215,7 @@ def test_too_many_places_and_times_before_the_beginning_are_refused():
 
 def test_frames_missed_are_counted(monkeypatch):
     clock = Clock()
-    monkeypatch.setattr("tumortrack.live.virtual_source.time", clock)
+    monkeypatch.setattr("tumortrack_devices.sources.virtual.time", clock)
     source = clock.of(VirtualSource(small_theatre(), fps=50))
     assert source.read(1.0) is not None
     clock.sleep(0.31)  # frame 15 is due, 1 to 14 were

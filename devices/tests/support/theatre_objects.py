@@ -7,7 +7,7 @@ from typing import Any
 
 from elastic_objects import UP, organ
 from tumortrack.simulate.elastic.body import BodyConfig
-from tumortrack.simulate.player import ScenePlayer, ScenePlayerConfig
+from tumortrack_devices.player import ScenePlayer, ScenePlayerConfig
 
 COARSE = BodyConfig(cells=300, modes=24, responses=100, patches=250)
 
