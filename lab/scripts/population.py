@@ -34,7 +34,7 @@ from tumortrack_lab.study.document import ReportWriter, spread_mm, spread_words,
 from tumortrack_lab.study.trust import BANDS, band_of
 
 DEVELOPMENT = (0, 2, 3)
-_WORST = 3  # pictures
+_WORST = 4  # pictures
 BLOCK = "population"
 _ERRORS = {
     "centre": "middle_mm",
@@ -201,10 +201,12 @@ def draw_worst(scenes: pd.DataFrame, pictures: Path, path: Path) -> None:
     drawn = [place for name in names if (place := pictures / f"{name}-worst.webp").exists()]
     if not drawn:
         return
-    figure = drawing.new_figure(8.0, 4.2 * len(drawn), left=0.01, right=0.99, top=0.98, bottom=0.01)
-    for axes, place in zip(figure.subplots(len(drawn), 1, squeeze=False)[:, 0], drawn, strict=True):
+    lines = -(-len(drawn) // 2)
+    figure = drawing.new_figure(14.4, 7.4 * lines, left=0.0, right=1.0, top=0.98, bottom=0.0)
+    for number, place in enumerate(drawn, start=1):
+        axes = figure.add_subplot(lines, 2, number)
         axes.imshow(Image.open(place))
-        axes.set_title(place.stem.removesuffix("-worst"), fontsize=10, loc="left")
+        axes.set_title(place.stem.removesuffix("-worst"), fontsize=11, loc="left")
         axes.set_axis_off()
     drawing.save(figure, path)
 
