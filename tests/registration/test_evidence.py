@@ -16,6 +16,7 @@ from tumortrack.core.evidence import Free, Landmark, Outline, Touch, evidence_js
 from tumortrack.core.types import SensorCloud
 from tumortrack.registration.evidence import EvidenceTerms
 from tumortrack.registration.looks import Looks
+from tumortrack.registration.next_touch import next_touches
 from tumortrack.sense.ply import write_cloud_ply
 from tumortrack.tracking.model_files import load_model
 from tumortrack.tracking.tracker import Tracker
@@ -160,6 +161,30 @@ def test_what_is_not_allowed_is_said(make, words):
         make()
     with pytest.raises(InputError, match="this organ has kidney, tumor_1"):
         EvidenceTerms.of([Outline(places_mm=((0, 0, 100.0),), part="liver")], NAMES)
+
+
+def test_the_touches_that_would_tell_most_tell_as_much_as_they_say():
+    bent = method().bend(fitted([]))
+    planned = next_touches(bent.motion, 1, count=3, std_mm=0.5)
+    stds_mm = [planned[0].std_mm, *(each.then_std_mm for each in planned)]
+    assert np.all(np.diff(stds_mm) < 0)
+    places_mm = np.array([each.place_mm for each in planned])
+    apart_mm = np.linalg.norm(places_mm[:, None] - places_mm, axis=2)
+    assert apart_mm[np.triu_indices(3, 1)].min() > 10
+    touched = [Touch(place_mm=place, std_mm=0.5) for place in places_mm]
+    looks = replace(bent.looks, evidence=EvidenceTerms.of(touched, NAMES))
+    terms = looks.evidence.at(bent.motion)
+    precision = np.linalg.inv(bent.motion.covariance)
+    terms.add_to(precision, np.zeros(len(precision)))
+    middle = bent.motion.effects(bent.motion.shape.middles_ct[[1]])[0]
+    found = np.linalg.eigvalsh(middle @ np.linalg.inv(precision) @ middle.T)[-1] ** 0.5
+    assert found == pytest.approx(stds_mm[-1], rel=0.02)
+    rng = np.random.default_rng(0)
+    drawn = bent.motion.carry(VERTICES[rng.choice(len(VERTICES), 3, replace=False)])
+    other = EvidenceTerms.of([Touch(place_mm=p, std_mm=0.5) for p in drawn], NAMES)
+    precision = np.linalg.inv(bent.motion.covariance)
+    other.at(bent.motion).add_to(precision, np.zeros(len(precision)))
+    assert np.linalg.eigvalsh(middle @ np.linalg.inv(precision) @ middle.T)[-1] ** 0.5 > found
 
 
 def test_a_file_comes_back(tmp_path):

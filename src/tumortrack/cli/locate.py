@@ -91,6 +91,14 @@ def _say_estimate(estimate: Estimate, located: Located) -> None:
         say(row_words(row))
     if margin is None or not margin.stated:
         say(margin_words(margin))
+    for number, each in enumerate(report.evidence, start=1):
+        say(f"{each.name} {number}: {each.off_mm:.1f} mm off{', left out' * each.left_out}")
+    for touch in report.next_touches[:1]:
+        x, y, z = touch.place_mm
+        say(
+            f"touch the organ at {x:.0f}, {y:.0f}, {z:.0f} mm (camera) next: the deviation of "
+            f"{touch.part} would fall from {touch.std_mm:.1f} to {touch.then_std_mm:.1f} mm"
+        )
     for view in located.about["input"]:
         say(view["words"])
     say_notes(located.about["notes"])

@@ -324,6 +324,16 @@ class EvidenceReport(_Value, frozen=True, kw_only=True):
     left_out: bool
 
 
+class NextTouch(_Value, frozen=True, kw_only=True):
+    """A place of the organ's surface to touch next, and what one standard deviation of a part's
+    middle along its least sure axis is and would be ``then``."""
+
+    part: str
+    place_mm: Point
+    std_mm: float
+    then_std_mm: float
+
+
 class AllowedPoses(_Value, frozen=True, kw_only=True):
     """Poses that the case allows; ``up_lps``: what faces the camera."""
 
@@ -389,6 +399,7 @@ class FitReport(_Value, frozen=True, kw_only=True, omit_defaults=True):
     motion: MotionReport | None = None
     looks: LooksReport | None = None
     evidence: tuple[EvidenceReport, ...] = ()
+    next_touches: tuple[NextTouch, ...] = ()
     fit_mm: Residuals | None = None
     timings: dict[str, float] = {}
     unseen: float | None = None

@@ -26,6 +26,7 @@ from tumortrack.registration.gauss_newton import RegistrationResult
 from tumortrack.registration.looks import Looks
 from tumortrack.registration.model import RegistrationModel
 from tumortrack.registration.motion import ElasticMotion, blend
+from tumortrack.registration.next_touch import next_touches
 from tumortrack.registration.search import PosePrior, apart_mm
 from tumortrack.registration.uncertainty import apparent_size, held_by_prior_mm
 
@@ -127,6 +128,9 @@ class RegistrationLocator:
         prior, more = self._registration.prior, {"size": size, "voxel_mm": voxel_mm}
         if (terms := fit.looks.evidence) is not None:
             more["evidence"] = terms.described(evidence, placed.motion)
+        if len(self._model.parts) > 1:
+            least_sure = 1 + int(np.trace(placed.middle_mm2[1:], axis1=1, axis2=2).argmax())
+            more["next_touches"] = next_touches(placed.motion, least_sure)
         report = self._report(frame, looks, placed, inside, prior, **more)
         volume = CameraLabels(labels, camera_from_index)
         made = Estimate(inside, volume, placed.meshes, report, placed.motion)
