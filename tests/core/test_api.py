@@ -36,7 +36,10 @@ SIGNATURES = {
     "progress=None",
     "write_scenes": "case folder prefix='' progress=None options",
 }
-VALUES = {"Case", "DepthFrame", "Estimate", "Intrinsics", "Look", "SensorCloud", "Tracker"}
+VALUES = {
+    "Case", "DepthFrame", "Estimate", "Free", "Intrinsics", "Landmark", "Look", "Outline",
+    "SensorCloud", "Touch", "Tracker",
+}  # fmt: skip
 MODULES = {"errors", "presets"}
 
 
