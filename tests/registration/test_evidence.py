@@ -152,7 +152,11 @@ def test_what_contradicts_the_rest_is_left_out_and_named(slim_model):
     [
         (lambda: Touch(place_mm=(0.0, 0.0, 5000.0)), "both in mm"),
         (lambda: Touch(place_mm=(0.0, float("nan"), 100.0)), "both in mm"),
-        (lambda: Outline(places_mm=(), part="kidney"), "place"),
+        (lambda: Outline(places_mm=(), part="kidney"), "x, y, z"),
+        (lambda: Outline(places_mm=np.ones((3, 2)), part="kidney"), "x, y, z"),
+        (lambda: Touch(place_mm=((0.0, 0.0, 100.0),)), "x, y, z"),
+        (lambda: Touch(place_mm="abc"), "x, y, z"),
+        (lambda: Touch(place_mm=(0.0, 0.0, 100.0), tip_mm=-1.0), "allowed: 0 to 50"),
         (lambda: Touch(place_mm=(0.0, 0.0, 100.0), std_mm=0.0), "allowed: 0.05 to 50"),
     ],
 )

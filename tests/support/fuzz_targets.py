@@ -247,6 +247,7 @@ def _wire() -> dict[str, Target]:
 
 def _configurations() -> dict[str, Target]:
     from tumortrack.core.config import from_builtins, to_builtins
+    from tumortrack.core.evidence import Outline, Touch, evidence_json, read_evidence
     from tumortrack.core.store import read_json
     from tumortrack.live.calibration_file import read_frames
     from tumortrack.sense.files import read_poses
@@ -265,8 +266,11 @@ def _configurations() -> dict[str, Target]:
     hand_eye = {**frame, "robot_from_camera": TURN}
     marker = {**frame, "camera_from_marker": TURN, "robot_from_marker": TURN}
     poses = {"fixed_from_camera": [TURN, TURN], "unit": "m", "frame_id": "base_link"}
+    touch = Touch(place_mm=(1.0, 2.0, 150.0))
+    outline = Outline(places_mm=((1.0, 2.0, 150.0), (3.0, 4.0, 151.0)), part="tumor_1")
     return {
         "poses": of_file(lambda path: read_poses(path, 2), "in.json", poses),
+        "evidence": of_file(read_evidence, "in.json", evidence_json((touch, outline))),
         "calibration": of_file(read_frames, "in.json", hand_eye, marker),
         "cell": written(CellConfig()),
         "resection": written(ResectionConfig()),

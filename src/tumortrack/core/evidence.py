@@ -26,12 +26,18 @@ class _Evidence(Config, frozen=True, kw_only=True, tag_field="kind"):
 
     def __post_init__(self) -> None:
         self.check_between(self.name, std_mm=(0.05, 50.0))
+        if hasattr(self, "tip_mm"):
+            self.check_between(self.name, tip_mm=(0.0, 50.0))
         for field in ("place_mm", "places_mm", "point_ct"):
             if not hasattr(self, field):
                 continue
-            given = np.asarray(getattr(self, field), float)
-            places = given.reshape(-1, 3) if given.ndim == 1 + (field == "places_mm") else given
-            if places.ndim != 2 or places.shape[1] != 3 or not len(places):
+            try:
+                places = np.array(getattr(self, field))
+            except ValueError:  # rows of different lengths
+                places = np.zeros(0)
+            dimensions = 1 + (field == "places_mm")
+            right = places.ndim == dimensions and places.shape[-1] == 3 and places.size
+            if not right or places.dtype.kind not in "iuf":
                 raise InputError(f"{self.name}: {field} is x, y, z, and places_mm one or more.")
             if not (np.abs(places) <= _REACH_MM).all():
                 raise InputError(
@@ -39,7 +45,7 @@ class _Evidence(Config, frozen=True, kw_only=True, tag_field="kind"):
                     f"{_REACH_MM:g}. Places are in the camera's frame, points of the CT in LPS; "
                     "both in mm."
                 )
-            msgspec.structs.force_setattr(self, field, _tuples(given))
+            msgspec.structs.force_setattr(self, field, _tuples(places))
 
     @property
     def name(self) -> str:
