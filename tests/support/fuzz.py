@@ -156,7 +156,7 @@ def shares(chosen: dict[str, Target], inputs: int, seed: int, keep: Path) -> dic
 def go_on(chosen: dict[str, Target], inputs: int, seed: int, keep: Path) -> int:
     """Up to so many inputs over all targets, from where the last call ended; the faults."""
     keep.mkdir(parents=True, exist_ok=True)
-    path, run = keep / "done.json", f"{inputs} inputs, seed {seed}, {len(chosen)} targets"
+    path, run = keep / "done.json", f"{inputs} inputs, seed {seed}, of {', '.join(chosen)}"
     state = json.loads(path.read_text()) if path.is_file() else {}
     if state.get("run") != run:
         counts = shares(chosen, inputs, seed, keep)
