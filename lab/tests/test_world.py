@@ -13,6 +13,7 @@ import trimesh
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial.transform import Rotation
 
+from reports import report_of
 from tumortrack.core import store
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import transform_points
@@ -278,7 +279,8 @@ def test_estimates_are_held_against_truth_and_rigid_pose_once_and_wrong_ones_nam
         carry=lambda points: transform_points(shift @ made.bench_from_ct, points),
         std_mm=lambda points: np.ones(len(points)),
     )
-    answer, asked = SimpleNamespace(quality="good", reason="", motion=motion), []
+    told = report_of(parts={"kidney": {}, "tumor_1": {"miss_mm": 3.0}})
+    answer, asked = SimpleNamespace(quality="good", reason="", motion=motion, report=told), []
     monkeypatch.setattr(Tracker, "follow", lambda _, cloud, seen: asked.append(cloud) or answer)
     monkeypatch.setattr(estimates, "load_model", lambda *args, **how: None)
     monkeypatch.setattr(estimates, "Tracker", lambda model: Tracker.__new__(Tracker))

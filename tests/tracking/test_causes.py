@@ -37,9 +37,9 @@ SPOILT = {
     "1 mm steps read as 0.1": (Cause.UNIT, lambda points: points / 10),
     "0.1 mm steps read as 1": (Cause.UNIT, lambda points: points * 10),
     "doubled focal length": (Cause.SCALE, lambda points: points * [0.5, 0.5, 1]),
-    "a third of it": (
+    "a fifth of it": (  # of a third of it the answer is right, and good
         Cause.HIDDEN,
-        lambda points: points[points[:, 0] > np.quantile(points[:, 0], 0.67)],
+        lambda points: points[points[:, 0] > np.quantile(points[:, 0], 0.8)],
     ),
     "a table": (Cause.OBJECT, lambda points: points * [1, 1, 0] + [0, 0, 150.0]),
     "a table behind": (
@@ -105,7 +105,7 @@ def test_what_was_done_to_a_cloud_is_named_first(tracker, points, how):
     if cause is Cause.SCALE:
         assert causes[0].number == 2.0
     if cause is Cause.HIDDEN:
-        assert 0.3 < causes[0].number < 0.7
+        assert 0.5 < causes[0].number < 0.85
     tried = [one.fit for one in causes if one.fit is not None]
     assert not tried or min(tried) < 1.0
 
