@@ -215,7 +215,14 @@ def test_the_command_takes_a_file_and_says_what_is_wrong_with_it(slim_model, tmp
         assert words in refusal(tumortrack(*command, "--evidence", file))
         assert not out.exists()
     file.write_text(json.dumps(content))
-    answered(tumortrack(*command, "--evidence", file))
+    said = answered(tumortrack(*command, "--evidence", file))
+    assert "touch 6: " in said
+    assert "touch the organ at" in said  # only how far off the tumor may be speaks against it
     report = json.loads((out / "report.json").read_text())
     assert [each["name"] for each in report["evidence"]] == ["touch"] * 6
     assert len(report["evidence_sha256"]) == 64
+    away = [{**content["evidence"][0], "place_mm": [0.0, 0.0, 400.0]}]
+    file.write_text(json.dumps({**content, "evidence": away}))
+    said = answered(tumortrack(*command, "--evidence", file, "--overwrite"))
+    assert "touch 1 lies" in said
+    assert "touch the organ at" not in said

@@ -93,7 +93,9 @@ def _say_estimate(estimate: Estimate, located: Located) -> None:
         say(margin_words(margin))
     for number, each in enumerate(report.evidence, start=1):
         say(f"{each.name} {number}: {each.off_mm:.1f} mm off{', left out' * each.left_out}")
-    for touch in report.next_touches[:1]:
+    # Of an answer that may be another organ, or in another place, no place is worth touching.
+    placed = estimate.finding is None or estimate.finding.kind == "miss"
+    for touch in report.next_touches[:1] if placed else ():
         x, y, z = touch.place_mm
         say(
             f"touch the organ at {x:.0f}, {y:.0f}, {z:.0f} mm (camera) next: the deviation of "

@@ -17,6 +17,7 @@ from jaxtyping import Bool, Float64, Int64
 from tumortrack.core.errors import InputError
 from tumortrack.core.evidence import Evidence, Free, Landmark, Outline, Touch
 from tumortrack.core.report import EvidenceReport
+from tumortrack.registration.kernels import POSE
 from tumortrack.registration.motion import ElasticMotion
 
 _WIDTHS = 4.0  # of the robust kernel, in standard deviations
@@ -91,7 +92,7 @@ class EvidenceTerms:
 
     def at(self, motion: ElasticMotion) -> Terms:
         """The terms at a motion; landmarks' in the organ's axes."""
-        unknowns = 6 + len(motion.coefficients)
+        unknowns = POSE + len(motion.coefficients)
         rows = np.zeros((len(self.places_mm), unknowns + 1))
         for part in np.unique(self.part):
             mine = self.part == part
