@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from tumortrack.core import errors as errors
     from tumortrack.core.estimate import Estimate as Estimate
     from tumortrack.core.evidence import Free as Free
+    from tumortrack.core.evidence import Held as Held
     from tumortrack.core.evidence import Landmark as Landmark
     from tumortrack.core.evidence import Outline as Outline
     from tumortrack.core.evidence import Touch as Touch
@@ -34,7 +35,7 @@ _NAMES = {  # by the module that has them
     "simulate_scenes teach track train write_scenes",
     "core": "errors",
     "core.estimate": "Estimate",
-    "core.evidence": "Free Landmark Outline Touch",
+    "core.evidence": "Free Held Landmark Outline Touch",
     "core.types": "DepthFrame Intrinsics Look SensorCloud",
     "imaging.case": "Case",
     "tracking.tracker": "Tracker",

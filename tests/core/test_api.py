@@ -37,7 +37,7 @@ SIGNATURES = {
     "write_scenes": "case folder prefix='' progress=None options",
 }
 VALUES = {
-    "Case", "DepthFrame", "Estimate", "Free", "Intrinsics", "Landmark", "Look", "Outline",
+    "Case", "DepthFrame", "Estimate", "Free", "Held", "Intrinsics", "Landmark", "Look", "Outline",
     "SensorCloud", "Touch", "Tracker",
 }  # fmt: skip
 MODULES = {"errors", "presets"}

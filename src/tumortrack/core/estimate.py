@@ -13,6 +13,7 @@ from jaxtyping import Float
 from tumortrack.core.causes import Likely
 from tumortrack.core.config import Config, check_seed
 from tumortrack.core.errors import InputError
+from tumortrack.core.evidence import Evidence
 from tumortrack.core.geometry import Points
 from tumortrack.core.organ import KIDNEY, Organ
 from tumortrack.core.patient import NOBODY, Patient
@@ -62,13 +63,15 @@ class FollowOptions(Config, frozen=True, kw_only=True):
     estimate and keep the better fit, as a search near the last one would keep its error.
     ``either_side``: the organ may have been turned over. ``smoothing_s``: time constant of the mean
     over past estimates; 0: none. ``known``: recent causes by failed check (``none``: no estimate),
-    which are not searched for again."""
+    which are not searched for again. ``evidence``: what became known with this frame, in its camera
+    frame; what was known before is in the last estimate."""
 
     thorough: bool = False
     either_side: bool = False
     smoothing_s: float = 0.0
     seed: int = 0
     known: dict[str, tuple[Likely, ...]] = msgspec.field(default_factory=dict)
+    evidence: tuple[Evidence, ...] = ()
 
     def __post_init__(self) -> None:
         check_seed(self.seed)
@@ -92,6 +95,7 @@ class Estimate:
         advice: sentences after the finding's: what probably happened and what to do.
         patient: of the model; nothing verifies that this is what the camera sees.
         structures: other surfaces of the CT that move with it, by name; empty without a motion.
+        evidence: what was known beside the cloud, as it is by now; the next frame's starts there.
     """
 
     cloud: OccupancyCloud
@@ -106,6 +110,7 @@ class Estimate:
     patient: Patient = NOBODY
     organ: Organ = KIDNEY
     structures: Mapping[str, Mesh] = field(default_factory=dict)
+    evidence: tuple[Evidence, ...] = ()
 
     @property
     def quality(self) -> Quality:

@@ -20,14 +20,18 @@ _LARGEST_FILE = 10_000_000  # bytes
 
 
 class _Evidence(Config, frozen=True, kw_only=True, tag_field="kind"):
-    """``std_mm``: of each place along any axis, the tracking of the tool included."""
+    """``std_mm``: of each place along any axis, the tracking of the tool included. ``stamp_ns``:
+    when; 0: at the time of the cloud. ``tool``: the name of what it is from."""
 
     std_mm: float
+    stamp_ns: int = 0
+    tool: str = ""
 
     def __post_init__(self) -> None:
         self.check_between(self.name, std_mm=(0.05, 50.0))
-        if hasattr(self, "tip_mm"):
-            self.check_between(self.name, tip_mm=(0.0, 50.0))
+        for field in ("tip_mm", "point_std_mm"):
+            if hasattr(self, field):
+                self.check_between(self.name, **{field: (0.0, 50.0)})
         for field in ("place_mm", "places_mm", "point_ct"):
             if not hasattr(self, field):
                 continue
@@ -76,6 +80,16 @@ class Landmark(_Evidence, frozen=True, kw_only=True, tag="landmark"):
     std_mm: float = 2.0
 
 
+class Held(_Evidence, frozen=True, kw_only=True, tag="held"):
+    """A point of the CT (LPS, mm) that a tool holds, which is at a place by now. ``point_std_mm``:
+    of which point it is, as the estimate had it when the tool took it."""
+
+    point_ct: Point
+    place_mm: Point
+    point_std_mm: float = 1.0
+    std_mm: float = 1.0
+
+
 class Outline(_Evidence, frozen=True, kw_only=True, tag="outline"):
     """Places on the border of a part, as in an ultrasound image."""
 
@@ -92,7 +106,7 @@ class Free(_Evidence, frozen=True, kw_only=True, tag="free"):
     std_mm: float = 1.0
 
 
-Evidence: TypeAlias = Touch | Landmark | Outline | Free
+Evidence: TypeAlias = Touch | Landmark | Held | Outline | Free
 
 
 class EvidenceFile(Config, frozen=True, kw_only=True):

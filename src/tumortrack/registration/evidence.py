@@ -7,6 +7,7 @@ what lies far off counts little, and is named afterwards.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -15,7 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
 from tumortrack.core.errors import InputError
-from tumortrack.core.evidence import Evidence, Free, Landmark, Outline, Touch
+from tumortrack.core.evidence import Evidence, Free, Held, Landmark, Outline, Touch
 from tumortrack.core.report import EvidenceReport
 from tumortrack.registration.kernels import POSE
 from tumortrack.registration.motion import ElasticMotion
@@ -68,8 +69,10 @@ class EvidenceTerms:
         the organ lacks."""
         surfaces, points = list[tuple[Any, ...]](), list[tuple[Any, ...]]()
         for number, each in enumerate(evidence):
-            if isinstance(each, Landmark):
-                points.append((each.point_ct, each.place_mm, each.std_mm, number))
+            if isinstance(each, Landmark | Held):
+                which_mm = each.point_std_mm if isinstance(each, Held) else 0.0
+                std_mm = math.hypot(each.std_mm, which_mm)
+                points.append((each.point_ct, each.place_mm, std_mm, number))
                 continue
             name = each.part if isinstance(each, Touch | Outline) and each.part else parts[0]
             if name not in parts:

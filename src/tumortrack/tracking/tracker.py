@@ -263,10 +263,12 @@ class Follower:
         seen: DepthFrame | SensorCloud | None = None,
         others: Sequence[Look] = (),
         camera_from_last: Affine = HERE,
+        evidence: Sequence[Evidence] = (),
     ) -> Estimate:
         """The estimate of this frame. ``others``: further looks at the same time;
-        ``camera_from_last``: as in ``last_box_mm``. Raises NoEstimate, as ``Tracker.follow``; the
-        last estimate is then dropped."""
+        ``camera_from_last``: as in ``last_box_mm``; ``evidence``: what became known with this frame
+        (its camera frame), beside what was known before. Raises NoEstimate, as ``Tracker.follow``;
+        the last estimate is then dropped."""
         last, self._last, self._at_rest = self._recent(cloud.stamp_ns), None, False
         if last is not None and camera_from_last is not HERE:
             last = _seen_from(last, camera_from_last)
@@ -282,6 +284,7 @@ class Follower:
             smoothing_s=self._config.smoothing_s,
             seed=self._config.seed,
             known=self._causes,
+            evidence=tuple(evidence),
         )
         try:
             self._last = self._tracker.follow(cloud, last, how, seen, others)
