@@ -36,6 +36,7 @@ from tumortrack.simulate.elastic.body import (
 from tumortrack.simulate.elastic.loads import ReducedProblem, in_bed
 from tumortrack.simulate.elastic.modes import LEVER_MM
 from tumortrack.simulate.scene import PoseConfig, sample_pose
+from tumortrack_devices.pulled import PulledStates
 
 SHAFT_MM = 4.0  # an instrument's radius
 _SHAFT_LENGTH_MM = 200.0
@@ -110,7 +111,8 @@ class Indentation:
 
 class ScenePlayer:
     """One case in motion. The constructor solves the elastic states, which takes some seconds.
-    Raises InputError: a case without an elastic body, or a configuration that doesn't fit it."""
+    Raises InputError: a case without an elastic body, or a configuration that doesn't fit it, or
+    ``pulled`` of another case's vertices."""
 
     def __init__(
         self,
@@ -118,6 +120,7 @@ class ScenePlayer:
         up_lps: tuple[float, float, float],
         config: ScenePlayerConfig,
         seed: int,
+        pulled: PulledStates | None = None,
     ) -> None:
         rng = np.random.default_rng([seed, 0x57A6E])
         up = unit(np.asarray(up_lps, float))
@@ -140,6 +143,9 @@ class ScenePlayer:
         upright = np.linalg.norm(along) < 0.1  # then any horizontal direction
         self._down_the_body = perpendicular(up) if upright else unit(along)
         self._vertices = np.concatenate([part.vertices_mm for part in anatomy_ct.parts])
+        self._pulled = pulled
+        if pulled is not None and pulled.moved_mm.shape[1] != len(self._vertices):
+            raise InputError("the states of the pull are of another case; make them for this one.")
         self._table = Table(anatomy_ct.organ, up)
         self._drape = drape(self._table, rng) if config.drape else _NOTHING
         self._rod = rod(SHAFT_MM, _SHAFT_LENGTH_MM) if self._pushes else _NOTHING
@@ -180,11 +186,12 @@ class ScenePlayer:
         camera_from_organ = instant.camera_from_room @ instant.room_from_organ
         return transform_points(camera_from_organ, self._deformed(instant.velocity, points_ct))
 
-    def truth(self, instant: Instant) -> Anatomy:
-        """The true surfaces, camera frame."""
+    def truth(self, instant: Instant, pull_mm: float = 0.0) -> Anatomy:
+        """The true surfaces, camera frame. ``pull_mm``: of the tool that pulls, if one does."""
         parts = self.anatomy_ct.parts
         ends = np.cumsum([len(part.vertices_mm) for part in parts])
-        vertices = np.split(self.carry(instant, self._vertices), ends[:-1])
+        pulled_mm = 0.0 if self._pulled is None else self._pulled.at(pull_mm)
+        vertices = np.split(self.carry(instant, self._vertices + pulled_mm), ends[:-1])
         return self.anatomy_ct.of(part.moved(v) for part, v in zip(parts, vertices, strict=True))
 
     def frame(self, instant: Instant, truth: Anatomy, stamp_ns: int) -> DepthFrame:

@@ -23,7 +23,16 @@ from tumortrack.live.values import PublishedFrame
 from tumortrack.sense.ply import cloud_ply
 from tumortrack_resection.arms.config import CellConfig
 from tumortrack_resection.budget import ErrorBudget
-from tumortrack_resection.motions import JOINTS, LIFT, RELEASE, Motions, MotionStage
+from tumortrack_resection.motions import (
+    HOLD,
+    JOINTS,
+    LIFT,
+    PULL,
+    RELEASE,
+    TAUT,
+    Motions,
+    MotionStage,
+)
 from tumortrack_resection.values import Located, ResectionConfig, ResectionPlan
 
 KIND = "plan"
@@ -250,7 +259,8 @@ def _faults(motions: Motions, cell: CellConfig, sweeps: int) -> Iterator[str]:
     """What the planner would not do."""
     names = [stage.name for stage in motions.stages]
     cuts = [f"sweep {n}" for n in range(1, sweeps + 1)]
-    if names != ["approach", "grasp", "hold", *cuts, LIFT, RELEASE, "home"]:
+    pull = [PULL, TAUT] if cell.pull_mm else []
+    if names != ["approach", "grasp", HOLD, *pull, *cuts, LIFT, RELEASE, "home"]:
         yield f"its stages are {', '.join(names) or 'none'}"
     for stage in motions.stages:
         if not (np.isfinite(stage.times_s).all() and np.isfinite(stage.joints_rad).all()):

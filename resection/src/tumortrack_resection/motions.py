@@ -17,7 +17,8 @@ ARMS = (CUTTER, HOLDER)
 Joints = Float64[np.ndarray, " 12"]  # radians, in the order of ``JOINTS``
 JOINTS = tuple(f"{arm}_{joint}" for arm in ARMS for joint in UR_JOINTS)
 DONE, ABORTED = "done", "aborted"
-LIFT, RELEASE = "lift", "release"
+HOLD, LIFT, RELEASE = "hold", "lift", "release"
+PULL, TAUT = "pull", "taut"  # with a pull, between hold and the first sweep
 _BRAKE_RAD_S2 = 4.0  # deceleration of the fastest joint when arms halt during a motion
 _SHORTEST_BRAKE_S = 0.1
 _CATCH_UP_S = 0.3  # three times the servo's lookahead; the way in to a cut takes longer
@@ -25,8 +26,8 @@ _CATCH_UP_S = 0.3  # three times the servo's lookahead; the way in to a cut take
 
 @dataclass(frozen=True, eq=False)
 class MotionStage:
-    """One state of the procedure: approach, grasp, hold, sweep 1, sweep 2, ..., lift,
-    release, home.
+    """One state of the procedure: approach, grasp, hold, perhaps pull and taut, sweep 1, sweep 2,
+    ..., lift, release, home.
 
     Attributes:
         times_s: rising from 0; one entry where nothing moves.
@@ -77,7 +78,7 @@ class Execution:
     path, ``go`` resumes; ``abort`` is a halt for good.
 
     ``state`` is the name of the stage, ``done`` or ``aborted``; ``halted`` is why the arms stand or
-    slow down, else None.
+    slow down, else None; ``gripped_rad`` are the joints at the end of hold, None before.
     """
 
     def __init__(self, motions: Motions) -> None:
@@ -85,6 +86,7 @@ class Execution:
         self._number, self._time_s = 0, 0.0
         self._speed = 0.0  # of the motions' own time, 0..1
         self.halted: Halt | None = None
+        self.gripped_rad: Joints | None = None
         self._aborted = False
 
     @property
@@ -113,8 +115,17 @@ class Execution:
     @property
     def holds(self) -> bool:
         """The holder has been at the grasp point: the state is hold or later."""
-        names = [stage.name for stage in self._motions.stages]
-        return "hold" not in names or self._number >= names.index("hold")
+        return self._number >= self._first(HOLD, 0)
+
+    @property
+    def grips(self) -> bool:
+        """The cup has hold of the organ: from the end of hold until the piece is lifted."""
+        return self._first(HOLD, -1) < self._number < self._first(LIFT, len(self._motions.stages))
+
+    @property
+    def stage(self) -> str:
+        """The name of the stage, also of an aborted one."""
+        return self._stage.name
 
     @property
     def cutting(self) -> bool:
@@ -166,6 +177,8 @@ class Execution:
             self._speed += float(np.clip(target - before, -most, most))
             self._time_s += change * (before + self._speed) / 2
             while not self._over and self._time_s >= (length_s := self._stage.seconds):
+                if self._stage.name == HOLD:
+                    self.gripped_rad = self._stage.joints_rad[-1]
                 self._number += 1
                 self._time_s = length_s if self._over else self._time_s - length_s
 
@@ -179,6 +192,11 @@ class Execution:
             return _SHORTEST_BRAKE_S
         speed = np.abs(np.diff(joints, axis=0) / np.diff(times)[:, None]).max()
         return max(_SHORTEST_BRAKE_S, float(speed) / _BRAKE_RAD_S2)
+
+    def _first(self, name: str, without: int) -> int:
+        """The number of a stage; ``without``: where there is none."""
+        names = [stage.name for stage in self._motions.stages]
+        return names.index(name) if name in names else without
 
     @property
     def _over(self) -> bool:

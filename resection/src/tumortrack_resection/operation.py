@@ -21,12 +21,15 @@ from scipy.spatial import cKDTree
 from tumortrack.core.colours import CUT, NOW, TO_CUT
 from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError, TumortrackError
+from tumortrack.core.evidence import Evidence
+from tumortrack.core.geometry import Affine
 from tumortrack.core.halt import CUT_NOTE, Halt
 from tumortrack.core.types import Mesh
 from tumortrack.live.values import Polyline, RigidShape, TrackingResult, Workcell
 from tumortrack_resection.budget import MOVED_MM, kept_mm
+from tumortrack_resection.grip import Grip
 from tumortrack_resection.live_budget import LiveBudget
-from tumortrack_resection.motions import ABORTED, JOINTS, Execution, Joints, Motions
+from tumortrack_resection.motions import ABORTED, JOINTS, PULL, Execution, Joints, Motions
 from tumortrack_resection.values import Located, ResectionPlan
 
 _SAME_MM = 0.2  # tolerance of heights
@@ -113,6 +116,7 @@ class Operation:
         locate: an update's estimate in the table's frame; None: estimates are ignored.
         replan: begins a new plan in another process, so that the loop continues meanwhile.
         budget: adds up the errors of every update; None: they are ignored.
+        grip: what the holder holds, as evidence of where the organ is; None: it gives none.
 
     Attributes:
         planned: the current plan.
@@ -128,11 +132,12 @@ class Operation:
         locate: Locate | None = None,
         replan: Replan | None = None,
         budget: LiveBudget | None = None,
+        grip: Grip | None = None,
     ) -> None:
         self.planned, self._config = planned, config
         self._warnings = planned.plan.warnings  # also of later plans: the budget stays accepted
         self._draw, self._locate, self._replan = draw, locate, replan
-        self._budget = budget
+        self._budget, self._grip = budget, grip
         self._execution = Execution(planned.motions)
         self._last_s: float | None = None
         self._first_s = 0.0
@@ -163,6 +168,8 @@ class Operation:
         now_s = time.monotonic() if now_s is None else now_s
         self._advance(now_s)
         self._decide(update, now_s)
+        if self._grip is not None:
+            self._grip.update(self._execution, update)
         if not self.log or self.log[-1]["state"] != self._execution.state:
             self._log(now_s)
         halt = self._execution.halted
@@ -171,6 +178,10 @@ class Operation:
             self.halts[halt.words_without_numbers] += 1
         self._counted = reason
         return replace(update, workcell=self.workcell())
+
+    def evidence(self, camera_from_published: Affine, stamp_ns: int) -> tuple[Evidence, ...]:
+        """Where the holder has the tissue that it grips, in a frame of the camera."""
+        return () if self._grip is None else self._grip.evidence(camera_from_published, stamp_ns)
 
     @property
     def halt(self) -> Halt | None:
@@ -240,10 +251,14 @@ class Operation:
             execution.go()  # nothing to compare, nothing moves any more, or all is cut
         elif update.estimate is None:
             self._halt_unsettled(Halt("no_estimate", {"words": update.reason}, update.finding))
+        elif (halt := _slipped(update)) is not None:
+            self._halt_unsettled(halt)
         elif update.quality != "good":
             self._halt_unsettled(Halt("poor", {"words": update.warning}, update.finding))
         elif self._work is not None:
             execution.halt(Halt("planning"))
+        elif execution.stage == PULL:
+            execution.go()  # the tumor moves because it is pulled; the next stage compares
         else:
             self._compare(update, self._locate(update), now_s)
 
@@ -323,6 +338,15 @@ class Operation:
     def _log(self, now_s: float, **event: str) -> None:
         at_s = round(now_s - self._first_s, 3)
         self.log.append({"state": self._execution.state, "at_s": at_s, **event})
+
+
+def _slipped(update: TrackingResult) -> Halt | None:
+    """That the estimate contradicts what the holder holds; one of them is wrong."""
+    assert update.estimate is not None
+    for each in update.estimate.report.evidence:
+        if each.name == "held" and each.left_out:
+            return Halt("slipped", {"off_mm": each.off_mm})
+    return None
 
 
 def apart_mm(a: Mesh, b: Mesh) -> float:

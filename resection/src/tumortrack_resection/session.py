@@ -34,6 +34,7 @@ from tumortrack.live.values import (
     RigidShape,
     SinkConfig,
     SinkContext,
+    Source,
     SourceConfig,
     TrackingResult,
     Workcell,
@@ -41,8 +42,10 @@ from tumortrack.live.values import (
 from tumortrack.live.workers import SinkWorker
 from tumortrack.models.folder import patient_of
 from tumortrack.tracking.options import CameraOptions, model_folder, options_from
+from tumortrack_devices.sources.virtual import VirtualSourceConfig
 from tumortrack_devices.viewer.scene import bare_faces
 from tumortrack_resection.files import INVENTED, PlanFolder, as_located, read_plan
+from tumortrack_resection.grip import Grip, held_std_mm
 from tumortrack_resection.live_budget import LiveBudget
 from tumortrack_resection.located import of_estimate
 from tumortrack_resection.motions import Joints, Motions
@@ -74,6 +77,21 @@ class _Live(NamedTuple):
     @property
     def source_kind(self) -> str:
         return str(self.source.__struct_config__.tag)
+
+
+class _Pulled(SourceConfig, frozen=True, kw_only=True, tag="pulled"):
+    """A virtual source whose organ the holder pulls."""
+
+    virtual: VirtualSourceConfig
+    pull_mm: Callable[[], float]
+
+    def patient(self) -> Patient:
+        return self.virtual.patient()
+
+    def open(self) -> Source:
+        source = self.virtual.open()
+        source.pull_mm = self.pull_mm
+        return source
 
 
 class ResectionSession:
@@ -160,10 +178,15 @@ class ResectionSession:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
             warming_up.result()
             late_s = max((arm.lookahead_s for arm in self.arms), default=0.0)
+            budget = LiveBudget(stored.budget, late_s)
+            grip = Grip(tip_places(cell.config), held_std_mm(stored.budget))
             self.operation = self._operation(
-                stored.plan, self._config, locate, replan, LiveBudget(stored.budget, late_s)
+                stored.plan, self._config, locate, replan, budget, grip
             )
-            setup = CameraSetup(frames, {live.source_text: live.source})
+            source = live.source
+            if isinstance(source, VirtualSourceConfig) and source.pulled is not None:
+                source = _Pulled(virtual=source, pull_mm=lambda: grip.pulled_mm)
+            setup = CameraSetup(frames, {live.source_text: source})
             about = {"plan_config": to_builtins(self._config)}
             arms = Arms(self.operation, setup, about, tip_places(cell.config), bool(self.arms))
             names = ("report", *(field.name for field in fields(CameraOptions)))

@@ -11,7 +11,7 @@ from tumortrack.core.report import Finding
 
 HaltKind = Literal[
     "no_estimate", "poor", "missing", "moved", "over_budget", "no_margin", "planning", "silent",
-    "no_plan", "defect", "interrupted", "aborted", "ended", "stopped",
+    "no_plan", "defect", "interrupted", "aborted", "ended", "stopped", "slipped",
 ]  # fmt: skip
 _SENTENCES: dict[HaltKind, str] = {
     "no_estimate": "no estimate: {words}",
@@ -31,6 +31,7 @@ _SENTENCES: dict[HaltKind, str] = {
     "aborted": "stopped by the viewer, or a real arm gave up",
     "ended": "tracking has ended",
     "stopped": "{words}",
+    "slipped": "the grip slipped, or the estimate is wrong: they differ by {off_mm:.1f} mm",
 }
 CUT_NOTE = "cut: estimates are of the intact organ"
 _WITHOUT_NUMBERS = str.maketrans("", "", "0123456789.")

@@ -20,6 +20,7 @@ import numpy as np
 from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError, NoEstimate, TumortrackError
 from tumortrack.core.estimate import Estimate, Quality
+from tumortrack.core.evidence import Evidence
 from tumortrack.core.halt import Halt
 from tumortrack.core.report import Finding
 from tumortrack.core.types import DepthFrame, Intrinsics
@@ -209,7 +210,7 @@ class Loop:
             found, doubt = self.views.find(views, absent, seconds)
             organ = found[0][1]
             with timed(seconds, "locate"):
-                estimate = self.views.locate(found)
+                estimate = self.views.locate(found, self._evidence(found[0][0]))
             seconds |= {f"locate.{k}": v for k, v in estimate.report.timings.items()}
             if several:
                 estimate = estimate.reporting(cameras=tuple(view.number for view, _ in found))
@@ -305,6 +306,12 @@ class Loop:
             sink_worker.put(result)
         self.statistics.add(result)
         return result
+
+    def _evidence(self, lead: CameraView) -> tuple[Evidence, ...]:
+        if self._arms is None:
+            return ()
+        camera_from_published = np.linalg.inv(lead.published_from_camera)
+        return self._arms.evidence(camera_from_published, lead.seen.stamp_ns)
 
     def _act(self, arms: live.ArmsController, result: TrackingResult) -> TrackingResult:
         try:

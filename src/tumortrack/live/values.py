@@ -22,6 +22,7 @@ from jaxtyping import Bool, Float, Float32, Float64, UInt8
 from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError, TumortrackError
 from tumortrack.core.estimate import NO_CHECK_FAILED, UNVERIFIED, Estimate, Quality
+from tumortrack.core.evidence import Evidence
 from tumortrack.core.geometry import Affine, rigid, transform_points
 from tumortrack.core.halt import Halt
 from tumortrack.core.patient import NOBODY, Patient
@@ -308,6 +309,9 @@ class ArmsController(Protocol):
     def act(self, result: TrackingResult) -> TrackingResult:
         """The result with the present workcell, for the sinks. Called with every result, with and
         without an estimate."""
+
+    def evidence(self, camera_from_published: Affine, stamp_ns: int) -> tuple[Evidence, ...]:
+        """What the arms know of the organ's place in a frame; its camera's frame."""
 
     def abort(self, halt: Halt) -> None:
         """Stop the arms for good."""

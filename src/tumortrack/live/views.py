@@ -12,6 +12,7 @@ from jaxtyping import Float64
 
 from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.estimate import Estimate
+from tumortrack.core.evidence import Evidence
 from tumortrack.core.geometry import HERE, Affine, transform_points, unit
 from tumortrack.core.report import Finding, ScanReport
 from tumortrack.core.types import Look, SensorCloud
@@ -79,8 +80,9 @@ class ViewsLocator:
             raise NoEstimate(Finding("cameras", {"troubles": camera_words([], absent)}))
         return found, "; ".join(doubts)
 
-    def locate(self, found: list[OrganInView]) -> Estimate:
-        """In the frame of the first view's camera. Raises NoEstimate as ``Follower.locate``."""
+    def locate(self, found: list[OrganInView], evidence: Sequence[Evidence] = ()) -> Estimate:
+        """In the frame of the first view's camera, as is the evidence. Raises NoEstimate as
+        ``Follower.locate``."""
         (lead, organ), *more = found
         if self.scan is not None:
             estimate = self.scan.look(lead, organ)
@@ -91,7 +93,7 @@ class ViewsLocator:
             return estimate
         way = self._camera_from_last(lead)
         others = _further_looks(lead, more)
-        estimate = self._follower.locate(organ, lead.seen.content, others, way)
+        estimate = self._follower.locate(organ, lead.seen.content, others, way, evidence)
         self._published_from_last = lead.published_from_camera
         self._follow_pick(lead, organ)
         return estimate

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
 from tumortrack.core import store
 from tumortrack.core.config import check_seed
+from tumortrack.core.errors import InputError
 from tumortrack.core.patient import Patient, patient_in
 from tumortrack.live.values import Observation, SourceConfig, SourceLost
 from tumortrack.sense.noise import Sensor
@@ -29,6 +31,7 @@ class VirtualSourceConfig(SourceConfig, frozen=True, kw_only=True, tag="virtual"
         table, drape: around the organ.
         instrument: a shaft that comes and pushes; else nothing pushes.
         sensor: of the noise.
+        pulled: states of the organ under the pull of `resect`'s holder (``make pull``).
     """
 
     target: ClassVar[str] = "case"
@@ -46,6 +49,7 @@ class VirtualSourceConfig(SourceConfig, frozen=True, kw_only=True, tag="virtual"
     camera_motion: bool = True
     noise: bool = True
     sensor: Sensor = "d405"
+    pulled: Path | None = None
 
     def __post_init__(self) -> None:
         self.check_between("virtual:", fps=(0.1, 1000))
@@ -56,10 +60,11 @@ class VirtualSourceConfig(SourceConfig, frozen=True, kw_only=True, tag="virtual"
 
     def player(self) -> ScenePlayer:
         """The simulated room; building it takes some seconds. Raises ArtifactError if there is no
-        case, InputError if case or options make no scene."""
+        case, or no states of it, InputError if case or options make no scene."""
         from tumortrack.imaging.case import load_case
         from tumortrack.sense.noise import CLEAN, SENSORS
         from tumortrack_devices.player import ScenePlayer, ScenePlayerConfig
+        from tumortrack_devices.pulled import PulledStates
 
         off = [
             *(() if self.breathing else ("breath_mm", "swell")),
@@ -70,8 +75,12 @@ class VirtualSourceConfig(SourceConfig, frozen=True, kw_only=True, tag="virtual"
         options = {name: getattr(self, name) for name in copied} | dict.fromkeys(off, 0.0)
         noise = SENSORS[self.sensor] if self.noise else CLEAN
         config = ScenePlayerConfig(noise=noise, **options)
-        case = load_case(self.case)
-        return ScenePlayer(case.anatomy, case.up_lps, config, self.seed)
+        case, pulled = load_case(self.case), None
+        if self.pulled is not None:
+            pulled = PulledStates.read(self.pulled)
+            if pulled.case_sha256 != store.sha256_of(self.case / store.MANIFEST):
+                raise InputError(f"{self.pulled} is of another case than {self.case}.")
+        return ScenePlayer(case.anatomy, case.up_lps, config, self.seed, pulled)
 
     def open(self) -> VirtualSource:
         """Its time begins with the first read. Raises as ``player``."""
@@ -79,7 +88,8 @@ class VirtualSourceConfig(SourceConfig, frozen=True, kw_only=True, tag="virtual"
 
 
 class VirtualSource:
-    """Renders the scene ``fps`` times a second, with its true surfaces."""
+    """Renders the scene ``fps`` times a second, with its true surfaces. ``pull_mm``: how far a tool
+    pulls at the moment; whoever moves one replaces it."""
 
     host_clock = True
     lossless = False
@@ -91,6 +101,7 @@ class VirtualSource:
         self._begin: float | None = None  # of scene time, by time.monotonic
         self._next = 0  # number of the frame that is due next
         self._closed = threading.Event()
+        self.pull_mm: Callable[[], float] = lambda: 0.0
 
     def read(self, timeout_s: float) -> Observation | None:
         """The next frame, when it is due. Frames that were not read in time are dropped."""
@@ -110,7 +121,7 @@ class VirtualSource:
     def at(self, t_s: float, stamp_ns: int) -> Observation:
         """The scene at a time since its beginning."""
         instant = self.player.state_at(t_s)
-        truth = self.player.truth(instant)
+        truth = self.player.truth(instant, self.pull_mm())
         frame = self.player.frame(instant, truth, stamp_ns)
         return Observation(frame, arrived_ns=time.time_ns(), truth=truth)
 

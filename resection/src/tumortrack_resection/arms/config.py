@@ -62,6 +62,7 @@ class CellConfig(Config, frozen=True, kw_only=True):
         cutting_mm_s: the tip's maximum speed on a cut and in tissue; ``grasping_mm_s``: on the
             straight path to the grasp and back.
         speed_share: of the maker's maximum joint speeds.
+        pull_mm: the holder rises so far once it holds, so that the tissue is taut when it is cut.
         tool_error_mm: largest error of a tool's tip where its arm stands as planned, loads
             included: the arms' accuracy, and what gives way. None: not known.
     """
@@ -92,6 +93,7 @@ class CellConfig(Config, frozen=True, kw_only=True):
     cutting_mm_s: float = 10.0
     grasping_mm_s: float = 25.0
     speed_share: float = 0.5
+    pull_mm: float = 0.0
     tool_error_mm: float | None = None
 
     def __post_init__(self) -> None:
@@ -102,7 +104,7 @@ class CellConfig(Config, frozen=True, kw_only=True):
             if value is not None and not (0 < value < 1000 and low <= value <= high):
                 allowed = f"{low or 'over 0'} to {high}"
                 raise InputError(f"cell: {name} is {value:g}; allowed: {allowed}.")
-        self.check_between("cell:", table_mm=(100, 10_000))
+        self.check_between("cell:", table_mm=(100, 10_000), pull_mm=(0, 20))
         places = (*self.middle_mm, *self.camera_mm, *self.home_rad)
         for base in (self.cutter_base, self.holder_base):
             places += (*base.position_mm, base.yaw_deg)

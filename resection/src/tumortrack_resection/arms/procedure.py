@@ -26,10 +26,13 @@ from tumortrack_resection.arms.trajectory import TrajectoryBuilder, along, first
 from tumortrack_resection.motions import (
     ARMS,
     CUTTER,
+    HOLD,
     HOLDER,
     JOINTS,
     LIFT,
+    PULL,
     RELEASE,
+    TAUT,
     Joints,
     Motions,
 )
@@ -39,6 +42,7 @@ from tumortrack_resection.values import Located, ResectionConfig, ResectionPlan
 
 _VACUUM_S = 0.5  # until the cup holds
 _LET_GO_S = 0.3
+_TAUT_S = 1.0  # until the pulled tumor has been located
 _ABOVE_MM = 60.0  # the cup comes from here, and goes back
 _STEP_MM = 5.0
 _GRIPS = 4  # ways of holding that are tried
@@ -110,9 +114,9 @@ def _grasp_and_cut(
     raise reason
 
 
-def _lowering(grasp_mm: np.ndarray, yaw_rad: float) -> np.ndarray:
+def _lowering(grasp_mm: np.ndarray, yaw_rad: float, above_mm: float = _ABOVE_MM) -> np.ndarray:
     """Poses of the cup from above down to where it holds."""
-    heights = np.linspace(_ABOVE_MM, 0, int(_ABOVE_MM / _STEP_MM) + 1)
+    heights = np.linspace(above_mm, 0, max(2, int(above_mm / _STEP_MM)) + 1)
     return level_poses(grasp_mm + heights[:, None] * [0.0, 0.0, 1.0], yaw_rad)
 
 
@@ -143,13 +147,18 @@ def _grips(builder: TrajectoryBuilder, grasp_mm: np.ndarray) -> Iterator[np.ndar
 
 
 def _grasp(builder: TrajectoryBuilder, grip_rad: np.ndarray) -> None:
-    """Approach, grasp and hold."""
+    """Approach, grasp, hold and pull."""
     builder.go(HOLDER, connect(builder.group(HOLDER), grip_rad[0], builder.rng))
     builder.close("approach")
     builder.go(HOLDER, grip_rad, builder.cell.config.grasping_mm_s)
     builder.close("grasp")
     builder.wait(_VACUUM_S)
-    builder.close("hold")
+    builder.close(HOLD)
+    if pull_mm := builder.cell.config.pull_mm:
+        _rise(builder, pull_mm, builder.cell.config.cutting_mm_s)
+        builder.close(PULL)
+        builder.wait(_TAUT_S)
+        builder.close(TAUT)
 
 
 def _cut_and_finish(
@@ -182,11 +191,11 @@ def _withdraw(builder: TrajectoryBuilder, around: Surroundings, holding: bool) -
         _rise(builder)
 
 
-def _rise(builder: TrajectoryBuilder) -> None:
+def _rise(builder: TrajectoryBuilder, by_mm: float = _ABOVE_MM, mm_s: float | None = None) -> None:
     """The holder goes straight up, after the last cut with the piece."""
     tip = builder.tip(HOLDER)
-    rising = _lowering(tip[:3, 3], yaw_of(tip))[::-1]
-    builder.follow(HOLDER, rising, builder.cell.config.grasping_mm_s)
+    rising = _lowering(tip[:3, 3], yaw_of(tip), by_mm)[::-1]
+    builder.follow(HOLDER, rising, mm_s or builder.cell.config.grasping_mm_s)
 
 
 def _go_home(builder: TrajectoryBuilder) -> None:

@@ -20,7 +20,17 @@ from tumortrack_resection.arms.cell import ArmCell, Blocked, PlanningGroup
 from tumortrack_resection.arms.config import CellConfig
 from tumortrack_resection.arms.kinematics import ACCELERATION_RAD_S2, JERK_RAD_S3, Pose
 from tumortrack_resection.arms.paths import arc_lengths, follow
-from tumortrack_resection.motions import ARMS, CUTTER, HOLDER, Joints, Motions, MotionStage
+from tumortrack_resection.motions import (
+    ARMS,
+    CUTTER,
+    HOLD,
+    HOLDER,
+    PULL,
+    TAUT,
+    Joints,
+    Motions,
+    MotionStage,
+)
 
 _STEP_S = 0.02  # between two samples; straight segments between them stay within 0.05 mm
 _TIP_SPEED_UP_S = 0.2  # until a tip has its speed
@@ -34,7 +44,9 @@ _THERE_RAD = 1e-6  # a thousandth of a millimetre at the tip: no motion to be ti
 _TOUCHING: dict[str, tuple[str, ...]] = {
     "approach": (),
     "grasp": (HOLDER,),
-    "hold": (HOLDER,),
+    HOLD: (HOLDER,),
+    PULL: (HOLDER,),
+    TAUT: (HOLDER,),
     "home": (),
 }
 _OVER = 1.05  # tip speeds: toppra keeps them at grid points only

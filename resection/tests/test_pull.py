@@ -1,0 +1,282 @@
+"""The holder pulls at what it holds: its place is evidence, and the arms follow the tumor."""
+
+from __future__ import annotations
+
+from concurrent.futures import Future
+from dataclasses import replace
+
+import msgspec
+import numpy as np
+import pytest
+import trimesh
+
+from arm_objects import organ, plan
+from live_objects import small_estimate, small_update
+from plan_objects import Deviating, located
+from reports import reporting
+from stories import looking_down
+from tumortrack.core.evidence import Held
+from tumortrack.core.geometry import transform_points
+from tumortrack.core.types import SensorCloud
+from tumortrack.imaging.case import load_case
+from tumortrack.live.values import PublishedFrame
+from tumortrack.tracking.model_files import load_model
+from tumortrack.tracking.tracker import Tracker
+from tumortrack_resection.arms.cell import ArmCell
+from tumortrack_resection.arms.config import CellConfig
+from tumortrack_resection.arms.procedure import plan_motions
+from tumortrack_resection.budget import ErrorBudget
+from tumortrack_resection.files import PlanFolder, read_plan, write_plan
+from tumortrack_resection.grip import Grip, held_std_mm
+from tumortrack_resection.motions import (
+    ABORTED,
+    HOLDER,
+    LIFT,
+    PULL,
+    TAUT,
+    Execution,
+    Halt,
+    Motions,
+    MotionStage,
+)
+from tumortrack_resection.operation import Operation, OperationConfig, Planned
+from tumortrack_resection.values import ResectionConfig
+
+STATES = ("approach", "grasp", "hold", PULL, TAUT, "sweep 1", LIFT, "release", "home")
+GRIPPING = (PULL, TAUT, "sweep 1")
+PULL_MM = 4.0
+LOCATED = located(n=2_000)
+FRAMES = PublishedFrame(
+    "table", np.array([[1.0, 0, 0, 5.0], [0, -1, 0, -8.0], [0, 0, -1, 300.0], [0, 0, 0, 1]])
+)
+CAMERA_FROM_TABLE = np.linalg.inv(FRAMES.published_from_camera)
+
+
+def motions(states=STATES):
+    """The holder's first joint is its tip's height (mm): up by the pull, and far at the lift."""
+    ends, here, stages = {PULL: PULL_MM, LIFT: 60.0}, 0.0, []
+    for name in states:
+        there, joints = ends.get(name, here), np.zeros((2, 12))
+        joints[:, 6], here = (here, there), there
+        stages.append(MotionStage(name, np.array([0.0, 1.0]), joints, np.zeros(2, bool)))
+    return Motions(tuple(stages))
+
+
+def tip_mm(arm, own_rad):
+    assert arm == HOLDER
+    return np.array([10.0, 20.0, 150.0 + own_rad[0]])
+
+
+def seen(quality="good", **entries):
+    estimate = replace(small_estimate(), motion=Deviating(0.9))
+    estimate = reporting(estimate, **entries) if entries else estimate
+    return replace(small_update(frames=FRAMES), estimate=estimate, quality=quality)
+
+
+class Procedure:
+    """Its operation on a tumor that the test moves, frame by frame."""
+
+    def __init__(self, replan=None):
+        self.shift_mm, self.now_s = np.zeros(3), 0.0
+        config = OperationConfig(settled_s=0.1)
+        planned, grip = Planned(plan(), LOCATED.meshes, motions()), Grip(tip_mm, 1.2)
+        draw = lambda joints: ()  # noqa: E731
+        self.operation = Operation(planned, config, draw, self.locate, replan, grip=grip)
+
+    def locate(self, update):
+        meshes = {n: m.moved(m.vertices_mm + self.shift_mm) for n, m in LOCATED.meshes.items()}
+        return replace(LOCATED, meshes=meshes)
+
+    def frame(self, update=None):
+        self.now_s += 0.02
+        return self.operation.act(update or seen(), self.now_s).workcell
+
+    def until(self, state):
+        for _ in range(900):
+            if (cell := self.frame()).state.partition(" (")[0] == state:
+                return cell
+        raise AssertionError(f"never {state}")
+
+    @property
+    def held(self):
+        return self.operation.evidence(CAMERA_FROM_TABLE, 7)
+
+
+def test_what_the_cup_holds_is_evidence_from_the_grip_to_the_lift_and_no_longer():
+    procedure, told = Procedure(), {state: [] for state in STATES}
+    while not procedure.operation.ended:
+        state = procedure.frame().state.partition(" (")[0]
+        told.get(state, []).append(procedure.held)
+    for state, frames in told.items():
+        assert all(bool(held) == (state in GRIPPING) for held in frames[1:-1])
+    first, last = told[PULL][0][0], told["sweep 1"][-1][0]
+    assert first.point_ct == last.point_ct  # of the moment of gripping, wherever it is by now
+    assert first.point_ct == pytest.approx(
+        transform_points(CAMERA_FROM_TABLE, tip_mm(HOLDER, [0.0])[None])[0]  # Deviating carries so
+    )
+    assert last.place_mm == pytest.approx(
+        transform_points(CAMERA_FROM_TABLE, tip_mm(HOLDER, [PULL_MM])[None])[0]
+    )
+    assert (last.std_mm, last.stamp_ns, last.tool) == (1.2, 7, HOLDER)
+    assert last.point_std_mm == pytest.approx(0.9 / np.sqrt(3))
+
+
+def test_a_grip_whose_arms_were_stopped_still_holds():
+    procedure = Procedure()
+    procedure.until("sweep 1")
+    procedure.operation.abort(Halt("stopped", {"words": "for a test"}))
+    assert procedure.frame().state.startswith(ABORTED)
+    assert len(procedure.held) == 1
+
+
+def test_without_a_motion_or_a_good_estimate_nothing_is_known_of_what_is_held():
+    without = replace(small_update(frames=FRAMES), estimate=small_estimate())
+    for update in (without, seen("poor"), replace(without, estimate=None, quality="none")):
+        execution, grip = Execution(motions()), Grip(tip_mm, 1.2)
+        while execution.state != TAUT:
+            grip.update(execution, update)
+            execution.step(0.05)
+        grip.update(execution, seen())  # too late: the tissue has moved since
+        assert grip.evidence(CAMERA_FROM_TABLE, 0) == ()
+        assert grip.pulled_mm == pytest.approx(PULL_MM)  # that the arm knows all the same
+
+
+def test_a_tip_that_moves_is_less_sure_of_where_it_is():
+    execution, grip = Execution(motions()), Grip(tip_mm, 1.2)
+    grip.update(execution, seen())
+    while execution.state != PULL:
+        execution.step(0.05)
+    grip.update(execution, seen())
+    before_mm = execution.joints_rad[6]
+    execution.step(0.5)
+    grip.update(execution, seen())
+    (held,) = grip.evidence(CAMERA_FROM_TABLE, 0)
+    assert held.std_mm == pytest.approx(np.hypot(1.2, execution.joints_rad[6] - before_mm))
+    grip.update(execution, seen())
+    assert grip.evidence(CAMERA_FROM_TABLE, 0)[0].std_mm == pytest.approx(1.2)
+
+
+def test_the_pull_itself_halts_nothing_and_then_it_is_planned_on_the_pulled_tumor():
+    plans = []
+
+    def replan(update, joints_rad, progress):
+        plans.append((joints_rad[6], progress))
+        meshes = procedure.locate(update).meshes
+        later = Motions(motions(STATES[5:]).stages)
+        for stage in later.stages:
+            stage.joints_rad[:, 6] = np.maximum(stage.joints_rad[:, 6], PULL_MM)
+        work = Future()
+        work.set_result(Planned(plan(), meshes, later))
+        return work
+
+    procedure = Procedure(replan)
+    procedure.until(PULL)
+    for _ in range(20):
+        procedure.shift_mm = np.array([0.0, 0.0, procedure.operation._grip.pulled_mm])
+        assert not procedure.frame().halted
+    while procedure.frame().state == PULL:
+        pass
+    procedure.shift_mm = np.array([0.0, 0.0, PULL_MM])
+    assert "has moved by 4.0 mm" in procedure.frame().halted
+    procedure.until("sweep 1")
+    ((height_mm, progress),) = plans
+    assert height_mm == pytest.approx(PULL_MM)
+    assert progress.holds
+    assert progress.done_mm is None  # so the new plan begins with its first sweep
+    assert len(procedure.held) == 1  # with the same point, though no stage of the new plan took it
+    assert not procedure.frame().halted
+
+
+def test_a_grip_that_slips_halts_the_arms():
+    procedure = Procedure()
+    procedure.until("sweep 1")
+    slipped = [{"name": "held", "off_mm": 11.6, "news": 0.0, "left_out": True}]
+    for quality in ("good", "poor"):  # whatever else is thought of it
+        cell = procedure.frame(seen(quality, evidence=slipped))
+        assert cell.halt.kind == "slipped"
+        assert "11.6 mm" in cell.halted
+    assert not procedure.frame(seen(evidence=[{**slipped[0], "left_out": False}])).halted
+
+
+def test_bounds_count_as_three_deviations():
+    budget = ErrorBudget(margin_mm=9.0, hand_eye_mm=2.0, tool_mm=3.0, tracking_mm=5.0)
+    assert held_std_mm(budget) == pytest.approx(np.sqrt(13.0) / 3)
+
+
+def test_arms_are_planned_to_pull_and_a_plan_without_its_pull_is_refused(tmp_path):
+    config = CellConfig(pull_mm=PULL_MM)
+    cell = ArmCell(config, organ())
+    made = plan_motions(plan(), cell, cell.organ)
+    assert [stage.name for stage in made.stages][:6] == [
+        "approach", "grasp", "hold", PULL, TAUT, "sweep 1",
+    ]  # fmt: skip
+    named = {stage.name: stage for stage in made.stages}
+    begin, end = (cell.tips(named[PULL].joints_rad[n])[HOLDER][:3, 3] for n in (0, -1))
+    assert end - begin == pytest.approx([0.0, 0.0, PULL_MM], abs=0.02)
+    assert np.ptp(named[TAUT].joints_rad, axis=0).max() == 0
+    meshes = {"kidney": cell.organ, "tumor_1": cell.organ}
+    content = PlanFolder(
+        plan(), ResectionConfig(), PublishedFrame("table"), meshes, ErrorBudget(margin_mm=5.0),
+        config, made,
+    )  # fmt: skip
+    write_plan(tmp_path / "plan", content, {}, lambda folder: None)
+    assert [s.name for s in read_plan(tmp_path / "plan").motions.stages] == list(named)
+    still = replace(content, cell=msgspec.structs.replace(config, pull_mm=0.0))
+    with pytest.raises(Exception, match="its stages are approach, grasp, hold, pull"):
+        write_plan(tmp_path / "still", still, {}, lambda folder: None)
+
+
+@pytest.fixture(scope="module")
+def pulled(clinic_model, phantom_case):
+    """A tumor's top, drawn up by 8 mm with the tissue around it, as the camera sees it; what a cup
+    there says; and the estimate before."""
+    case, tracker = load_case(phantom_case), Tracker(load_model(clinic_model))
+    camera_from_ct = looking_down(case)
+    tumor = case.anatomy.tumors[1].vertices_mm
+    up_ct = -camera_from_ct[2, :3]
+    top = case.anatomy.organ.vertices_mm
+    off = top - tumor.mean(0)
+    over = np.linalg.norm(off - np.outer(off @ up_ct, up_ct), axis=1) < 5
+    grip_ct = top[over][(top[over] @ up_ct).argmax()]
+
+    def carry(points_ct, pull_mm):
+        share = np.exp(-0.5 * (np.linalg.norm(points_ct - grip_ct, axis=1) / 18.0) ** 2)
+        return transform_points(camera_from_ct, points_ct + pull_mm * share[:, None] * up_ct)
+
+    def cloud(pull_mm):
+        mesh = trimesh.Trimesh(carry(top, pull_mm), case.anatomy.organ.faces, process=False)
+        tangents = np.stack(np.meshgrid(*[np.arange(-0.8, 0.8, 0.008)] * 2), -1).reshape(-1, 2)
+        rays = np.column_stack([tangents, np.ones(len(tangents))])
+        hits = mesh.ray.intersects_location(np.zeros_like(rays), rays, multiple_hits=False)[0]
+        # Arm and cup hide what they hold, and much beside it.
+        arm = np.linalg.norm(hits[:, :2] - carry(grip_ct[None], pull_mm)[0, :2], axis=1) < 35
+        return SensorCloud(hits[~arm].astype(np.float32))
+
+    before = tracker.locate(cloud(0.0))
+    tip_mm = carry(grip_ct[None], 0.0)[0]
+    point_ct = before.motion.back(tip_mm[None])
+    held = Held(
+        point_ct=tuple(point_ct[0]), point_std_mm=float(before.motion.std_mm(point_ct)[0]),
+        place_mm=tuple(carry(grip_ct[None], 8.0)[0]), std_mm=1.2,
+    )  # fmt: skip
+    return tracker, cloud(8.0), held, tumor, carry(tumor, 8.0)
+
+
+def test_with_what_is_held_a_pulled_tumor_is_found_nearer_to_where_it_is(pulled):
+    tracker, cloud, held, tumor_ct, true_mm = pulled
+
+    def off_mm(evidence):
+        estimate = tracker.locate(cloud, evidence=evidence)
+        return float(np.linalg.norm(estimate.motion.carry(tumor_ct) - true_mm, axis=1).mean())
+
+    assert off_mm([held]) < 0.8 * off_mm([])
+
+
+def test_a_held_point_that_slipped_is_left_out_and_halts_the_arms(pulled):
+    tracker, cloud, held, *_ = pulled
+    away = tuple(np.array(held.place_mm) + [0.0, 0.0, -25.0])
+    estimate = tracker.locate(cloud, evidence=[msgspec.structs.replace(held, place_mm=away)])
+    procedure = Procedure()
+    procedure.until("sweep 1")
+    update = replace(seen(), estimate=estimate, quality=estimate.quality)
+    assert procedure.frame(update).halt.kind == "slipped"
