@@ -17,7 +17,7 @@ define INSTALL
 endef
 
 .DEFAULT_GOAL := help
-.PHONY: help setup debian kernels demo test test-all quick pythons pytest test-hard check attack fuzz crash replay bench soak wheel lock licences audit results real world sequences trust misses rehearsal population site pictures clean
+.PHONY: help setup debian kernels demo test test-all quick pythons pytest test-hard check attack fuzz crash replay bench soak wheel lock licences audit results real world sequences pull pulls trust misses rehearsal population site pictures clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 10
@@ -116,6 +116,12 @@ world: setup  ## scenes of wider physics, noise and views, and how a model does 
 
 sequences: setup  ## an organ pressed, pushed, rolled, breathing, turned over, and how it is followed (ARGS="CASE OUT --model MODEL")
 	$(BIN)/python lab/scripts/sequences.py $(ARGS)
+
+pull: setup  ## an organ under the pull of a plan's holder, for the virtual source (ARGS="PLAN virtual:CASE?... OUT")
+	$(BIN)/python lab/scripts/pull.py $(ARGS)
+
+pulls: setup  ## whether tumors that the holder pulls are cut out (ARGS="OUT CASE ... --count 40": 15 s a scene)
+	$(BIN)/python lab/scripts/pulls.py $(ARGS)
 
 trust: setup  ## what margins are worth for physics and organs left out (ARGS="MODEL/margins.jsonl ...": an organ each)
 	$(BIN)/python lab/scripts/trust.py $(ARGS)

@@ -46,7 +46,7 @@ TRUTH = "truth"
 _FINE = 256  # voxels along the true organ: its points' labels err by 0.2 mm
 MARGIN_MM = 5.0  # the paper's
 SIGMAS = 2.0
-_WHOLE = 0.999  # of a tumor: what is missing is a voxel's rounding
+WHOLE = 0.999  # of a tumor: what is missing is a voxel's rounding
 _RESULTS = ["detached", "removed_share", "left_ml", "margin_mm", "healthy_ml", "hurt"]
 _NUMBER = re.compile(r"\d+(\.\d+)?")
 
@@ -231,7 +231,7 @@ def _cut(plans: pd.DataFrame, planner: str) -> dict[str, Any]:
     parenchyma_ml = free.promised_ml.map(itemgetter("parenchyma")).astype(float)
     return {
         "asked": len(plans), "plans": len(made), "free": len(free),
-        "whole": (made.removed_share >= _WHOLE).sum(),
+        "whole": (made.removed_share >= WHOLE).sum(),
         "removed median %": _text(removed.median(), down=True),
         "removed worst %": _text(removed.min(), down=True),
         "left worst ml": _text(made.left_ml.max(), digits=2),

@@ -36,8 +36,8 @@ from tumortrack_lab.world.forces import (
 from tumortrack_lab.world.organ import Generator, Organ, Slit, Stage, Vector, Wound, cut_open
 
 LARGEST_CHANGE, NEARLY_NONE = 0.05, 0.02  # of volume; from Poisson's ratio 0.49 on the second
-_BED_DEPTH_MM = 15.0  # of fat under the organ: what turns the bed's modulus into stiffness
-_GRIP_MN_MM = 4000.0  # of a grip, over all its points
+BED_DEPTH_MM = 15.0  # of fat under the organ: what turns the bed's modulus into stiffness
+GRIP_MN_MM = 4000.0  # of a grip, over all its points
 _STEP_MM = 6.0  # of a load, at a time
 _GRAVITY = 1050.0 * GRAVITY_KPA_PER_MM  # of soft tissue, mN/mm3
 _ITERATIONS = 400  # a step; with more it mostly does not converge either
@@ -104,7 +104,7 @@ def _twist(stage: Stage, rng: Generator) -> Load:
         for end, middle, sign in zip(ends, middles, (-0.5, 0.5), strict=True):
             turn = Rotation.from_rotvec([sign * share * angle, 0, 0], degrees=True)
             arm = stage.organ.points_mm[end] - middle
-            grips.append(stage.grip(end, turn.apply(arm) - arm, _GRIP_MN_MM))
+            grips.append(stage.grip(end, turn.apply(arm) - arm, GRIP_MN_MM))
         return grips
 
     return Load(at, abs(np.deg2rad(angle)) * 20, {"degrees": angle})
@@ -130,7 +130,7 @@ def _pull(stage: Stage, rng: Generator) -> Load:
 
     def at(share: float) -> list[Force]:
         places = mesh.nodes_mm[held] + share * far_mm * out
-        return [Springs(rows, places, np.full(len(held), _GRIP_MN_MM / 2 / len(held)))]
+        return [Springs(rows, places, np.full(len(held), GRIP_MN_MM / 2 / len(held)))]
 
     return Load(at, far_mm, {"mm": far_mm, "direction": out.tolist()})
 
@@ -177,7 +177,7 @@ def _cut(stage: Stage, rng: Generator) -> Load:
     apart = (side * (1 - far[lips] ** 2) * open_mm)[:, None] * normal
 
     def at(share: float) -> list[Force]:
-        return [stage.grip(lips, share * apart, _GRIP_MN_MM)]
+        return [stage.grip(lips, share * apart, GRIP_MN_MM)]
 
     return Load(at, open_mm, {"open_mm": open_mm, "slit_radius_mm": radius})
 
@@ -289,16 +289,17 @@ def bedded(
 ) -> tuple[Touch, Weight]:
     """The organ's bed, and weight beyond what it bears in the CT (``down``: in weights)."""
     under = stage.organ.bed.under(stage.organ.points_mm, rim_mm)
-    bed = stage.touch(under, bed_kpa / _BED_DEPTH_MM, friction)
+    bed = stage.touch(under, bed_kpa / BED_DEPTH_MM, friction)
     return bed, Weight(_GRAVITY * stage.solid.node_volumes_mm3[:, None] * down)
 
 
 def equilibria(
-    solid: NeoHookeanSolid, loads: Iterable[tuple[Force, ...]]
+    solid: NeoHookeanSolid, loads: Iterable[tuple[Force, ...]], start_mm: Nodes | None = None
 ) -> tuple[list[Nodes], int]:
-    """The solid's equilibria under one set of forces after the other, each from the one before,
-    against which it rubs; and the number of iterations. Raises TumortrackError: none was found."""
-    nodes, iterations, keys = solid.mesh.nodes_mm, 0, []
+    """The solid's equilibria under one set of forces after the other, each from the one before
+    (default: at rest), against which it rubs; and the number of iterations. Raises TumortrackError:
+    none was found."""
+    nodes, iterations, keys = solid.mesh.nodes_mm if start_mm is None else start_mm, 0, []
     for forces in loads:
         for force in forces:
             if isinstance(force, Touch):

@@ -1,0 +1,80 @@
+"""Does a plan cut out a tumor that the holder pulls at?
+
+    make pulls ARGS='OUT CASE [CASE ...] --count 40'       (about 20 s a scene)
+
+Each case has its model. Kept in OUT, a file a scene; the same command goes on where it was
+stopped.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import tyro
+
+from tumortrack.cli.console import model_folder, say
+from tumortrack.core import store
+from tumortrack.tracking.model_files import load_model
+from tumortrack.tracking.tracker import Tracker
+from tumortrack_lab.study import pulls, scripts
+from tumortrack_lab.study.document import ReportWriter, table_of
+from tumortrack_lab.world.scenes import TETS, World, WorldConfig
+
+
+@dataclass(frozen=True)
+class Options:
+    """Pull, locate, plan, cut."""
+
+    out: tyro.conf.Positional[Path]
+    """Where rows are kept."""
+    cases: tyro.conf.Positional[tuple[Path, ...]]
+    """Folders that `tumortrack prepare` wrote, with their models."""
+    count: int = 40
+    """Scenes of each case."""
+    seed: int = 0
+    """Of everything."""
+    document: Path | None = None
+    """Its block is replaced."""
+
+
+def main(options: Options) -> None:
+    """Make missing rows, then the table."""
+    writer = ReportWriter(options.document or Path(), scripts.make_command("pulls"))
+    if options.document is not None:
+        writer.check(["pulls"])
+    rows, lost = [], 0
+    for number in range(options.count):
+        for case in options.cases:
+            sha256 = store.sha256_of(case / store.MANIFEST)
+            folder = options.out / sha256[:8]
+            path = folder / f"{number:05d}.json"
+            if not path.exists():
+                folder.mkdir(parents=True, exist_ok=True)
+                world = _world(case, folder, options.seed)
+                made, why = pulls.tried(_tracker(case), world, number)
+                store.write_json(path, {"rows": made, "why": why})
+                say(f"{case.name} {number}: {why or f'{len(made)} cuts'}")
+            known = store.read_json(path)
+            rows += [{"case": sha256[:8], **row} for row in known["rows"]]
+            lost += not known["rows"]
+    text = f"Scenes: {options.count * len(options.cases)}, without a plan: {lost}.\n\n"
+    text += table_of(pulls.table(rows), 3)
+    print(text)
+    if options.document is not None:
+        writer.write({"pulls": f"`{writer.command}`\n\n{text}"})
+
+
+@cache
+def _tracker(case: Path) -> Tracker:
+    return Tracker(load_model(model_folder(case)))
+
+
+@cache
+def _world(case: Path, folder: Path, seed: int) -> World:
+    return World.opened(case, WorldConfig(seed=seed), folder / TETS)
+
+
+if __name__ == "__main__":
+    scripts.run(main, Options)
