@@ -9,6 +9,7 @@ import pytest
 import trimesh
 from PIL import Image
 
+from live_objects import small_update
 from tumortrack.core.colours import sweep_colour
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import rigid
@@ -18,8 +19,8 @@ from tumortrack.core.types import Mesh
 from tumortrack.imaging.meshes import mesh_of, solid_of
 from tumortrack.live.values import Polyline, RigidShape, Workcell
 from tumortrack.report.renderer import Body, Viewpoint, corner_normals, render
-from tumortrack_resection.film import film, moments_s, tube
-from tumortrack_resection.motions import Motions, MotionStage
+from tumortrack_resection.film import Reel, Tracked, film, moments_s, tube
+from tumortrack_resection.motions import PULL, Motions, MotionStage
 from tumortrack_resection.pictures import (
     draw_plan,
     organ_surfaces,
@@ -263,6 +264,38 @@ def test_the_same_frames_are_the_same_film(
         picture = np.asarray(gif.convert("RGB")).astype(int)
     red = (picture[..., 0] > picture[..., 1] + 90) & (picture[..., 0] > picture[..., 2] + 90)
     assert red[:-160].sum() > 10  # that it stands still is said in red
+
+
+def test_the_film_of_a_run_shows_the_organ_where_it_was_tracked(
+    workcells: list[Workcell], located: Located, tmp_path: Path
+) -> None:
+    reel, up_mm = Reel(), (0.0, 0.0, 12.0)
+    cell = replace(
+        workcells[0], state=f"{PULL} (with a note)", lines=(), shapes=workcells[0].shapes
+    )
+    for n in range(3):
+        update = small_update(stamp_ns=n * 10**9)
+        meshes = {
+            name: mesh.moved(mesh.vertices_mm + [0.0, 0.0, up_mm[n]])
+            for name, mesh in located.meshes.items()
+        }
+        estimate = None if n == 1 else replace(update.estimate, meshes=meshes)  # type: ignore[type-var]
+        reel.publish(replace(update, workcell=cell, estimate=estimate))
+        reel.publish(replace(update, workcell=cell, estimate=estimate))  # too soon
+    reel.close()
+    cells, seen = reel.frames(3)
+    assert len(cells) == len(seen) == 3
+    assert seen[1] is seen[0]  # without an estimate as it was last
+    film(cells, located, tmp_path / "film.gif", (320, 240), tracked=Tracked("A RUN", seen))
+    with Image.open(tmp_path / "film.gif") as gif:
+        pictures = []
+        for n in range(gif.n_frames):  # type: ignore[attr-defined]
+            gif.seek(n)
+            pictures.append(np.asarray(gif.convert("RGB")).astype(int))
+    last, first = pictures[-1], pictures[0]
+    assert (np.abs(last - first).max(2) > 30).sum() > 100  # it has moved
+    with pytest.raises(InputError, match="never located"):
+        Reel().frames(3)
 
 
 def test_every_stage_has_its_moments() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from concurrent.futures import Future
 from dataclasses import replace
 
@@ -9,19 +10,25 @@ import msgspec
 import numpy as np
 import pytest
 import trimesh
+from PIL import Image
 
 from arm_objects import organ, plan
 from live_objects import small_estimate, small_update
 from plan_objects import Deviating, located
 from reports import reporting
-from stories import looking_down
+from stories import answered, looking_down, succeeded, tumortrack
+from tumortrack.core import store
 from tumortrack.core.evidence import Held
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import SensorCloud
 from tumortrack.imaging.case import load_case
+from tumortrack.live.spec import SOURCES
 from tumortrack.live.values import PublishedFrame
+from tumortrack.sense.ply import write_cloud_ply
+from tumortrack.sense.region import Hints, organ_points
 from tumortrack.tracking.model_files import load_model
-from tumortrack.tracking.tracker import Tracker
+from tumortrack.tracking.tracker import Tracker, region_for
+from tumortrack_devices.pulled import PulledStates
 from tumortrack_resection.arms.cell import ArmCell
 from tumortrack_resection.arms.config import CellConfig
 from tumortrack_resection.arms.procedure import plan_motions
@@ -280,3 +287,49 @@ def test_a_held_point_that_slipped_is_left_out_and_halts_the_arms(pulled):
     procedure.until("sweep 1")
     update = replace(seen(), estimate=estimate, quality=estimate.quality)
     assert procedure.frame(update).halt.kind == "slipped"
+
+
+@pytest.mark.slow
+def test_a_live_pull_is_followed_planned_on_cut_and_filmed(ready_case, tmp_path):
+    """The tumor goes up with the holder; everything else stays: the plan must follow."""
+    case = load_case(ready_case)
+    world = "breathing=false&instrument=false&camera_motion=false&fps=10&noise=false"
+    source = SOURCES.parse(f"virtual:{ready_case}?{world}")
+    player = source.player()
+    seen = source.open().at(0.0, 1)
+    cloud = organ_points(seen.content, region_for(), Hints(), np.random.default_rng(0)).cloud
+    write_cloud_ply(tmp_path / "cloud.ply", cloud.points_mm)
+    answered(
+        tumortrack("locate", ready_case, tmp_path / "cloud.ply", tmp_path / "run", "--grid", 64)
+    )
+    (tmp_path / "cell.json").write_text('{"pull_mm": 4}')
+    succeeded(
+        tumortrack(
+            "plan", tmp_path / "run", tmp_path / "plan", "--cell", tmp_path / "cell.json",
+            "--method", "published", "--accept-poor", "--accept-budget",
+        )
+    )  # fmt: skip
+    plan = read_plan(tmp_path / "plan")
+    up_ct = -player.state_at(0.0).camera_from_room[2, :3]
+    tumor = plan.plan.tumor
+    grip = case.anatomy.parts[case.anatomy.names.index(tumor)].vertices_mm.mean(0)
+    vertices = np.concatenate([part.vertices_mm for part in player.anatomy_ct.parts])
+    share = np.exp(-0.5 * (np.linalg.norm(vertices - grip, axis=1) / 30.0) ** 2)
+    moved_mm = np.array([0.0, 4.0])[:, None, None] * share[:, None] * up_ct
+    sha256 = store.sha256_of(ready_case / store.MANIFEST)
+    PulledStates(sha256, np.array([0.0, 4.0]), moved_mm).write(tmp_path / "pulled.safetensors")
+    live = f"virtual:{ready_case}?{world}&pulled={tmp_path / 'pulled.safetensors'}"
+    output = succeeded(
+        tumortrack(
+            "resect", tmp_path / "plan", "--live", ready_case, live, "--speed", 3,
+            "--report", tmp_path / "report.json", "--replan-cut", "--film", tmp_path / "film.gif",
+        )
+    )  # fmt: skip
+    assert "done: both virtual arms are home." in output
+    resected = json.loads((tmp_path / "report.json").read_text())["resection"]
+    assert {PULL, TAUT} <= {entry["state"] for entry in resected["log"]}
+    assert any(entry.get("event") == "planned anew" for entry in resected["log"])
+    assert any(f"{tumor} has moved by" in halt for halt in resected["halts"])
+    assert not any("slipped" in halt for halt in resected["halts"])
+    with Image.open(tmp_path / "film.gif") as film:
+        assert film.n_frames > 30

@@ -6,7 +6,7 @@ MP4 is not offered: no encoder among the Python packages comes under a permissiv
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
@@ -24,11 +24,11 @@ from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.store import write_atomically
 from tumortrack.core.types import ORGAN, Mesh
-from tumortrack.live.values import Polyline, Workcell
+from tumortrack.live.values import Polyline, TrackingResult, Workcell
 from tumortrack.report.drawing import SIGN
 from tumortrack.report.renderer import Body, Viewpoint, render, rgb
 from tumortrack.report.wrapping import wrapped
-from tumortrack_resection.motions import LIFT, RELEASE, Motions
+from tumortrack_resection.motions import LIFT, PULL, RELEASE, Motions
 from tumortrack_resection.pictures import organ_surfaces, parted
 from tumortrack_resection.resection import inside
 from tumortrack_resection.values import Located, ResectionPlan
@@ -48,12 +48,21 @@ _COLOURS = 255  # and one for what did not change
 _SAMPLES = 8  # frames from which the colours are chosen
 _SAMPLED, _EVERY = 40, 3  # the viewpoint is chosen by so many frames, and every third vertex
 _LEAST_FRAMES = 2  # of a stage
+_KEPT_EVERY_NS = 200_000_000  # of a live run: meshes of an hour are some gigabytes
 _LAST_S = 1.5  # the last picture stays
 _PLAYBACK = "PLAYBACK of a stored plan, SIMULATED: nothing is tracked"
 _MEANING = {
+    PULL: ": the holder pulls at the tumor",
     LIFT: ": the holder lifts the piece out",
     RELEASE: ": a person takes the piece from the cup",
 }
+
+
+class Tracked(NamedTuple):
+    """What a film of a live run says of itself, and the organ's parts in each of its frames."""
+
+    title: str
+    seen: Sequence[Mapping[str, Mesh]]
 
 
 def film(
@@ -63,10 +72,11 @@ def film(
     size: tuple[int, int] = (640, 480),
     progress: Callable[[], None] = lambda: None,
     plan: ResectionPlan | None = None,
+    tracked: Tracked | None = None,
 ) -> None:
     """Write the frames as an animated GIF that loops.
 
-    Above every frame, never cut off: that it is a simulated playback; the plan's warnings; the
+    Above every frame, never cut off: its title; the plan's warnings; the
     state and why the arms halt; the patient. The piece moves with the holder once that lifts, and
     disappears after the release.
 
@@ -80,13 +90,14 @@ def film(
         path: ``.gif``, written atomically.
         size: of the scene without the text, pixels.
         plan: for its warnings and its piece; None: the organ stays whole.
+        tracked: of a live run; None: it is a simulated playback, in which the organ lies still.
         progress: called after each frame.
     """
     if path.suffix.lower() != ".gif":
         raise InputError(f"{path}: a film is an animated GIF; give a name that ends in .gif.")
     if not (cells := list(frames)):
         raise InputError("there is no frame to film: the arms did nothing.")
-    painter = _FramePainter(cells, located, size, plan)
+    painter = _FramePainter(cells, located, size, plan, tracked)
     chosen = np.linspace(0, len(cells) - 1, min(_SAMPLES, len(cells))).astype(int).tolist()
     some = [np.asarray(painter.picture(n))[::2, ::2] for n in chosen]
     sheet, plain = Image.fromarray(np.concatenate(some)), Image.Dither.NONE
@@ -116,15 +127,64 @@ def film(
 
 
 def moments_s(motions: Motions, frames: int) -> Float64[np.ndarray, " n"]:
-    """About so many times since the beginning, the end included, that show every stage: frames go
-    by the square root of its duration, as sweeps take minutes and the grasp seconds."""
-    seconds = np.array([stage.seconds for stage in motions.stages])
-    share = np.sqrt(seconds) / max(float(np.sqrt(seconds).sum()), 1e-9)
+    """About so many times since the beginning, the end included, that show every stage."""
+    return _moments(np.array([stage.seconds for stage in motions.stages]), frames)
+
+
+def _moments(lengths: np.ndarray, frames: int) -> Float64[np.ndarray, " n"]:
+    """Frames go by the square root of a stage's length, as sweeps take minutes and the grasp
+    seconds."""
+    share = np.sqrt(lengths) / max(float(np.sqrt(lengths).sum()), 1e-9)
     counts = np.maximum(np.rint(frames * share).astype(int), _LEAST_FRAMES)
-    starts = np.cumsum(seconds) - seconds
-    stages = zip(starts, seconds, counts.tolist(), strict=True)
+    starts = np.cumsum(lengths) - lengths
+    stages = zip(starts, lengths, counts.tolist(), strict=True)
     each = [start + length * np.arange(n) / n for start, length, n in stages]
-    return np.append(np.concatenate(each), seconds.sum())
+    return np.append(np.concatenate(each), lengths.sum())
+
+
+class Reel:
+    """A sink that keeps what a film of a live run shows, some times a second. The organ stays as it
+    was seen last while there is no estimate; before there was one, nothing is kept."""
+
+    def __init__(self) -> None:
+        self._kept: list[tuple[Workcell, Mapping[str, Mesh]]] = []
+        self._kept_ns = 0
+
+    def publish(self, result: TrackingResult) -> None:
+        """Called by the sink's thread."""
+        seen = None if result.transformed is None else result.transformed.meshes
+        seen = seen or (self._kept[-1][1] if self._kept else None)
+        if result.workcell is None or seen is None:
+            return
+        new = not self._kept or _stage(self._kept[-1][0]) != _stage(result.workcell)
+        if new or result.stamp_ns - self._kept_ns >= _KEPT_EVERY_NS:
+            self._kept.append((result.workcell, seen))
+            self._kept_ns = result.stamp_ns
+
+    def close(self) -> None:
+        """Nothing is open."""
+
+    def frames(self, count: int) -> tuple[list[Workcell], list[Mapping[str, Mesh]]]:
+        """About so many of every stage's. Raises InputError: nothing was tracked."""
+        if not self._kept:
+            raise InputError("there is nothing to film: the organ was never located.")
+        groups = groupby(self._kept, lambda kept: _stage(kept[0]))
+        lengths = np.array([len(list(group)) for _, group in groups], float)
+        chosen = np.unique(_moments(lengths, count).astype(int).clip(max=len(self._kept) - 1))
+        cells, seen = zip(*(self._kept[n] for n in chosen.tolist()), strict=True)
+        return list(cells), list(seen)
+
+
+def _stage(cell: Workcell) -> str:
+    """The state without its note."""
+    return cell.state.partition(" (")[0]
+
+
+def _organ_bodies(located: Located) -> list[Body]:
+    return [
+        Body(mesh, rgb(part_colour(label)), _ORGAN_OPACITY if label == ORGAN else 1.0)
+        for label, mesh in sorted(organ_surfaces(located).items())
+    ]
 
 
 class _FramePainter:
@@ -132,13 +192,13 @@ class _FramePainter:
 
     def __init__(
         self, frames: list[Workcell], located: Located, size: tuple[int, int],
-        plan: ResectionPlan | None,
+        plan: ResectionPlan | None, tracked: Tracked | None,
     ) -> None:  # fmt: skip
         self._frames, self._size = frames, size
-        self._organ = [
-            Body(mesh, rgb(part_colour(label)), _ORGAN_OPACITY if label == ORGAN else 1.0)
-            for label, mesh in sorted(organ_surfaces(located).items())
-        ]
+        self._organ = _organ_bodies(located)
+        title, seen = (_PLAYBACK, ()) if tracked is None else tracked
+        self._title = title
+        self._seen = [replace(located, meshes=dict(meshes)) for meshes in seen]
         self._close_size = round(_CLOSE[0] * size[0]), round(_CLOSE[1] * size[1])
         self._far = _viewpoint_of(_reach(frames), _FROM, size, _ARMS)
         organ_mm = self._organ[0].mesh.vertices_mm
@@ -154,7 +214,8 @@ class _FramePainter:
         self._patient_words = str(located.patient)
         shown = {(cell.state, cell.halted): cell for cell in frames}
         self._room = max(words_strip(self._words(cell), size)[0].height for cell in shown.values())
-        self._lifted_from = next((n for n, c in enumerate(frames) if c.state == LIFT), len(frames))
+        lifted = (n for n, cell in enumerate(frames) if _stage(cell) == LIFT)
+        self._lifted_from = next(lifted, len(frames))
         self._stays, self._goes = self._organ, list[Body]()
         if plan is not None and self._lifted_from < len(frames):
             self._stays, self._goes = _divided(located, plan)
@@ -162,9 +223,9 @@ class _FramePainter:
     def _words(self, cell: Workcell) -> list[Paragraph]:
         """The text above a frame, most important first."""
         return [
-            Paragraph(_PLAYBACK, WHITE, ARMS),
+            Paragraph(self._title, WHITE, ARMS),
             *(Paragraph(f"{SIGN} WARNING: {text}", WHITE, NONE) for text in self._warnings),
-            Paragraph(cell.state + _MEANING.get(cell.state, ""), BACKGROUND, large=True),
+            Paragraph(cell.state + _MEANING.get(_stage(cell), ""), BACKGROUND, large=True),
             *([Paragraph(f"halted: {cell.halted}", NONE)] if cell.halted else []),
             Paragraph(self._patient_words, BACKGROUND),
         ]
@@ -172,9 +233,9 @@ class _FramePainter:
     def _bodies(self, n: int) -> list[Body]:
         """Organ, tumors and the piece, which moves with the holder."""
         if n < self._lifted_from:
-            return self._organ
+            return _organ_bodies(self._seen[n]) if self._seen else self._organ
         before, now = (_holder(self._frames[k]) for k in (max(self._lifted_from - 1, 0), n))
-        gone = all(cell.state not in (LIFT, RELEASE) for cell in self._frames[n:])
+        gone = all(_stage(cell) not in (LIFT, RELEASE) for cell in self._frames[n:])
         if gone or before is None or now is None:
             return self._stays
         moved = now @ np.linalg.inv(before)

@@ -58,6 +58,7 @@ from tumortrack_resection.values import POOR_ESTIMATE, Located, ResectionPlan
 if TYPE_CHECKING:
     from tumortrack_resection.arms.cell import ArmCell
     from tumortrack_resection.arms.config import CellConfig
+    from tumortrack_resection.film import Reel
 
 _FPS = 30.0  # of a playback
 _PLAYBACK = "PLAYBACK of a stored plan: nothing is tracked"
@@ -104,6 +105,7 @@ class ResectionSession:
         arms: the sinks of real arms; those that execute are ``moving``, the others ``dry``.
         operation: the controller of the arms.
         sinks: of a playback.
+        reel: set one before ``following`` for ``film_of_run``.
     """
 
     def __init__(
@@ -119,6 +121,7 @@ class ResectionSession:
         self.sinks: list[SinkWorker] = []
         self.operation = self._operation(stored.plan, config)
         self._confirmed = False
+        self.reel: Reel | None = None
 
     def confirm(self) -> None:
         """A person at the terminal types the address of each arm that will move; valid for one
@@ -145,7 +148,7 @@ class ResectionSession:
     @contextmanager
     def following(self) -> Iterator[Session]:
         """A live session that compares every estimate with the plan, and replans where the tumor
-        has moved. InputError: no ``live`` source was given."""
+        has moved. InputError: no ``live`` source was given. ``reel``, if it is one, gets all."""
         from tumortrack_resection.arms import procedure
         from tumortrack_resection.arms.cell import tip_places
 
@@ -191,7 +194,8 @@ class ResectionSession:
             arms = Arms(self.operation, setup, about, tip_places(cell.config), bool(self.arms))
             names = ("report", *(field.name for field in fields(CameraOptions)))
             options = {name: getattr(self._options, name) for name in names}
-            yield api.session(live.model, live.source_text, self._given_sinks, arms, **options)
+            sinks = self._given_sinks if self.reel is None else (*self._given_sinks, self.reel)
+            yield api.session(live.model, live.source_text, sinks, arms, **options)
 
     @contextmanager
     def opened(self) -> Iterator[None]:
@@ -269,6 +273,26 @@ class ResectionSession:
 
         film(frames(), as_located(self.stored), path, progress=advance, plan=plan)
         return len(times_s) / FPS
+
+    def film_of_run(
+        self, path: Path, progress: Callable[[int, int], None] = lambda n, of: None
+    ) -> float:
+        """What ``reel`` kept of the live run, as ``film``; the organ where it was tracked."""
+        from tumortrack_resection.film import FPS, Tracked, film
+
+        assert self.reel is not None
+        assert self._live is not None
+        cells, seen = self.reel.frames(_FILM_FRAMES)
+        arms = "arms moved" if self.moving else "arms SIMULATED"
+        title = f"A RUN of resect, organ tracked ({self._live.source_kind}), {arms}"
+        plan = replace(self.operation.planned.plan, notes=self.stored.plan.notes)
+        located = replace(as_located(self.stored), meshes=dict(self.operation.planned.meshes))
+        count = itertools.count(1)
+        film(
+            cells, located, path, progress=lambda: progress(next(count), len(cells)),
+            plan=plan, tracked=Tracked(title, seen),
+        )  # fmt: skip
+        return len(cells) / FPS
 
     def _operation(self, plan: ResectionPlan, config: OperationConfig, *live: Any) -> Operation:
         return Operation(
