@@ -95,7 +95,7 @@ class Estimate:
         advice: sentences after the finding's: what probably happened and what to do.
         patient: of the model; nothing verifies that this is what the camera sees.
         structures: other surfaces of the CT that move with it, by name; empty without a motion.
-        evidence: what was known beside the cloud, as it is by now; the next frame's starts there.
+        evidence: what is known beside the cloud, for the next frame.
     """
 
     cloud: OccupancyCloud
@@ -110,7 +110,7 @@ class Estimate:
     patient: Patient = NOBODY
     organ: Organ = KIDNEY
     structures: Mapping[str, Mesh] = field(default_factory=dict)
-    evidence: tuple[Evidence, ...] = ()
+    evidence: tuple[Any, ...] = ()
 
     @property
     def quality(self) -> Quality:

@@ -3,6 +3,8 @@ where there is no tissue. Camera frame, mm."""
 
 from __future__ import annotations
 
+import csv
+import io
 import json
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -13,9 +15,11 @@ import numpy as np
 from tumortrack.core import store
 from tumortrack.core.config import Config, from_builtins
 from tumortrack.core.errors import InputError
+from tumortrack.core.geometry import Points
 from tumortrack.core.report import Point
 
 _REACH_MM = 2000.0  # of anything that a camera above a patient sees
+_LEAST_MM = 3.0  # no camera has an organ nearer
 _LARGEST_FILE = 10_000_000  # bytes
 
 
@@ -49,6 +53,11 @@ class _Evidence(Config, frozen=True, kw_only=True, tag_field="kind"):
                     f"{_REACH_MM:g}. Places are in the camera's frame, points of the CT in LPS; "
                     "both in mm."
                 )
+            if field != "point_ct" and np.abs(places).max() < _LEAST_MM:
+                raise InputError(
+                    f"{self.name}: {field} lies within {_LEAST_MM:g} mm of the camera: is it in "
+                    "metres? Allowed: mm."
+                )
             msgspec.structs.force_setattr(self, field, _tuples(places))
 
     @property
@@ -60,6 +69,13 @@ class _Evidence(Config, frozen=True, kw_only=True, tag_field="kind"):
     def places(self) -> tuple[Point, ...]:
         """Camera frame, mm."""
         return self.places_mm if hasattr(self, "places_mm") else (self.place_mm,)  # type: ignore[attr-defined]
+
+    def at(self, places_mm: Points) -> Any:
+        """The same at other places."""
+        field = "places_mm" if hasattr(self, "places_mm") else "place_mm"
+        places = _tuples(places_mm)
+        value = places if field == "places_mm" else places[0]
+        return msgspec.structs.replace(self, **{field: value})
 
 
 class Touch(_Evidence, frozen=True, kw_only=True, tag="touch"):
@@ -110,11 +126,13 @@ Evidence: TypeAlias = Touch | Landmark | Held | Outline | Free
 
 
 class EvidenceFile(Config, frozen=True, kw_only=True):
-    """A file of it: what there is, in which ``frame`` and ``unit``."""
+    """A file of it: what there is, in which ``frame`` and ``unit``. ``still_since_ns``: since when
+    the organ has not moved; evidence with an earlier stamp is refused."""
 
     frame: str
     unit: str
     evidence: tuple[Evidence, ...]
+    still_since_ns: int = 0
 
 
 def _tuples(places: np.ndarray) -> Any:
@@ -122,19 +140,74 @@ def _tuples(places: np.ndarray) -> Any:
 
 
 def read_evidence(path: Path) -> tuple[Evidence, ...]:
-    """Of a JSON file, see ``EvidenceFile``. Raises InputError: missing, another frame or unit, a
-    value that is not allowed."""
+    """Of a JSON file, see ``EvidenceFile``, or a table (.csv), a row for each place. Raises
+    InputError: missing, another frame or unit, a value that is not allowed."""
     content = store.read_file(path, _LARGEST_FILE)
-    try:
-        known = from_builtins(json.loads(content), EvidenceFile, str(path))
-    except ValueError as error:
-        raise InputError(f"{path} is no JSON: {error}.") from error
+    if path.suffix.lower() == ".csv":
+        given = _table(content.decode(errors="replace"), path)
+    else:
+        try:
+            given = json.loads(content)
+        except ValueError as error:
+            raise InputError(f"{path} is no JSON: {error}.") from error
+    known = from_builtins(given, EvidenceFile, str(path))
     if (known.frame, known.unit) != ("camera", "mm"):
         raise InputError(
             f"{path} is in frame {known.frame!r} and unit {known.unit!r}; allowed: frame "
             "'camera' (x right, y down, z forward) and unit 'mm'. Transform it first."
         )
+    for number, each in enumerate(known.evidence, start=1):
+        if 0 < each.stamp_ns < known.still_since_ns:
+            raise InputError(
+                f"{path}: {each.name} {number} is of {each.stamp_ns} ns, before the organ lay "
+                f"still (still_since_ns: {known.still_since_ns}). Leave it out, or take it again."
+            )
     return known.evidence
+
+
+_PLACE, _POINT = ("x_mm", "y_mm", "z_mm"), ("x_ct_mm", "y_ct_mm", "z_ct_mm")
+_NUMBERS = {*_PLACE, *_POINT, "std_mm", "tip_mm", "point_std_mm", "stamp_ns"}
+_COLUMNS = {*_NUMBERS, "piece", "frame", "kind", "part", "tool"}
+
+
+def _table(text: str, path: Path) -> dict[str, Any]:
+    """The rows of a table as an ``EvidenceFile``; rows of one ``piece`` are places of one."""
+    rows = list(csv.DictReader(io.StringIO(text)))
+    names = list(rows[0]) if rows else []
+    if unknown := [name for name in names if name not in _COLUMNS]:
+        raise InputError(
+            f"{path}: there is no column {unknown[0]!r}. Allowed: {', '.join(sorted(_COLUMNS))}."
+        )
+    if missing := [n for n in ("piece", "frame", "kind", *_PLACE) if n not in names]:
+        raise InputError(f"{path} has no rows, or no column for {', '.join(missing)}.")
+    pieces: dict[str, dict[str, Any]] = {}
+    for row in rows:
+        given: dict[str, Any] = {n: _number(value, n, path) for n, value in row.items() if value}
+        number, place = str(given.pop("piece", "")), [given.pop(n, None) for n in _PLACE]
+        if _POINT[0] in given:
+            given["point_ct"] = [given.pop(n, None) for n in _POINT]
+        each = pieces.setdefault(number, {**given, "places_mm": []})
+        if {**given, "places_mm": each["places_mm"]} != each:
+            raise InputError(f"{path}: piece {number} has several rows that differ.")
+        each["places_mm"].append(place)
+    frames = {each.pop("frame", "") for each in pieces.values()}
+    for each in pieces.values():
+        if each.get("kind") not in ("outline", "free"):
+            each["place_mm"], *more = each.pop("places_mm")
+            if more:
+                raise InputError(
+                    f"{path}: a {each.get('kind')} has one place, not {1 + len(more)}."
+                )
+    return {"frame": ", ".join(sorted(frames)), "unit": "mm", "evidence": list(pieces.values())}
+
+
+def _number(text: str, name: str, path: Path) -> str | float:
+    if name not in _NUMBERS:
+        return text
+    try:
+        return int(text) if name == "stamp_ns" else float(text)
+    except ValueError as error:
+        raise InputError(f"{path}: {name} is {text!r}; it must be a number.") from error
 
 
 def evidence_json(evidence: tuple[Evidence, ...]) -> bytes:

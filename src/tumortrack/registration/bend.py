@@ -29,6 +29,7 @@ from tumortrack.registration.motion import ElasticMotion
 _STDS_MM = (0.5, 2.0, 6.0)
 _LINEAR_STEPS = 2
 _STEPS = 1  # true ones; two and six leave the same errors
+_STEPS_WITH_EVIDENCE = 4
 _EVERY = 3  # the choice takes one of so many points, and is as good as with all
 _GROUPS = 64  # of neighbouring points, some 8 mm apart
 _ALIKE_MM = 1.0  # points farther from their group's median count little in its mean
@@ -61,7 +62,7 @@ def bend(fit: RegistrationResult, config: GaussNewtonConfig) -> BentFit:
     precision = _blocks(prior_precision(fit.motion.shape, config), forces)
     near = msgspec.structs.replace(config, first_mm=config.last_mm)
     descent = GaussNewton(start.shape, fit.looks, start, near, fit.moved, precision)
-    descent.run(_STEPS)
+    descent.run(_STEPS if fit.looks.evidence is None else _STEPS_WITH_EVIDENCE)
     bent = descent.result()
     motion, steps = replace(bent.motion, rivals=fit.motion.rivals), fit.steps + bent.steps
     slope = precision @ np.append(bent.moved, motion.coefficients - start.shape.body.mean)
@@ -78,14 +79,14 @@ def _with_compliance(motion: ElasticMotion) -> ElasticMotion:
 
 @dataclass(frozen=True, eq=False)
 class _Groups:
-    """Mean distances of neighbouring points near a fit, linear in the unknowns.
+    """Mean distances of neighbouring points near a fit, and evidence, linear in the unknowns.
 
     Attributes:
         distances_mm: at the fit; ``at_mean_mm``: with the unknowns at their prior's mean.
         by_library_mm2: the distances' covariance by pose and library; ``by_compliance_mm2``: by the
             compliance with a standard deviation of 1 mm.
         weights: of the distances' squares in the cost.
-        last_mm: the robust kernel's width.
+        width_mm: the robust kernel's.
     """
 
     distances_mm: Float64[np.ndarray, " g"]
@@ -93,7 +94,7 @@ class _Groups:
     by_library_mm2: Float64[np.ndarray, "g g"]
     by_compliance_mm2: Float64[np.ndarray, "g g"]
     weights: Float64[np.ndarray, " g"]
-    last_mm: float
+    width_mm: Float64[np.ndarray, " g"]
 
     @classmethod
     def near(
@@ -102,6 +103,13 @@ class _Groups:
         """``start``: the fit's motion, with compliance."""
         points_mm, body = fit.looks.points_mm[::_EVERY], fit.motion.shape.body
         means, counts = _means_of_groups(start.residual_rows(points_mm), start.back(points_mm))
+        weights = _EVERY * fit.looks.weight(config) * counts
+        width_mm = np.full(len(counts), config.last_mm)
+        if fit.looks.evidence is not None:
+            terms = fit.looks.evidence.at(start)
+            means = np.concatenate([means, np.column_stack([terms.by_motion, terms.residuals_mm])])
+            weights = np.append(weights, terms.std_mm**-2.0)
+            width_mm = np.append(width_mm, terms.width_mm)
         by_library, by_compliance, distances_mm = np.split(means, [POSE + len(body.mean), -1], 1)
         pose_std = np.repeat([config.shift_mm, config.turn_rad], 3)
         prior = _blocks(np.diag(pose_std**2), body.covariance)
@@ -111,8 +119,8 @@ class _Groups:
             at_mean_mm=distances_mm[:, 0] - by_library @ off,
             by_library_mm2=by_library @ prior @ by_library.T,
             by_compliance_mm2=by_compliance @ by_compliance.T,
-            weights=_EVERY * fit.looks.weight(config) * counts,
-            last_mm=config.last_mm,
+            weights=weights,
+            width_mm=width_mm,
         )
 
     def likeliest_std_mm(self) -> float:
@@ -129,13 +137,13 @@ class _Groups:
         explained = self.by_library_mm2 + std_mm**2 * self.by_compliance_mm2
         residuals_mm = self.distances_mm
         for _ in range(_LINEAR_STEPS):
-            roots = np.sqrt(self.weights) / (1 + (residuals_mm / self.last_mm) ** 2)
+            roots = np.sqrt(self.weights) / (1 + (residuals_mm / self.width_mm) ** 2)
             system = roots[:, None] * explained * roots + np.eye(len(roots))
             pulls = roots * np.linalg.solve(system, roots * self.at_mean_mm)
             residuals_mm = self.at_mean_mm - explained @ pulls
-        width_mm = _JUDGED_WIDTH * self.last_mm
+        width_mm = _JUDGED_WIDTH * self.width_mm
         squares = (residuals_mm / width_mm) ** 2
-        misfit = width_mm**2 * self.weights @ (squares / (1 + squares))
+        misfit = (width_mm**2 * self.weights) @ (squares / (1 + squares))
         determinant = _DETERMINANTS * np.linalg.slogdet(system)[1]
         return float(misfit + pulls @ explained @ pulls + determinant)
 

@@ -145,7 +145,7 @@ def _compared_with_truth(
     """The factor for standard deviations, 1 or more, and how far off the answers were."""
     errors, nearest, ratios = [], [], []
     for scene, fit in zip(scenes, fits, strict=False):
-        bent = registration.bend(fit)
+        _, bent = registration.bend(fit)
         covariance_mm2 = registration.uncertain(bent, calibration).covariance_mm2(inner_ct)
         assert covariance_mm2 is not None
         away = bent.motion.carry(inner_ct) - scene.inner_mm

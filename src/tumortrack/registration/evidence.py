@@ -10,19 +10,27 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import groupby
 from typing import Any
 
+import msgspec
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
 from tumortrack.core.errors import InputError
 from tumortrack.core.evidence import Evidence, Free, Held, Landmark, Outline, Touch
+from tumortrack.core.geometry import Affine, transform_points
+from tumortrack.core.mesh_query import surface_distance
 from tumortrack.core.report import EvidenceReport
 from tumortrack.registration.kernels import POSE
-from tumortrack.registration.motion import ElasticMotion
+from tumortrack.registration.motion import ElasticMotion, seen_from_first
+from tumortrack.registration.rest_shape import RestShape
 
 _WIDTHS = 4.0  # of the robust kernel, in standard deviations
-_LEAST_WIDTH_MM = 4.0  # so that fits from starts some millimetres off are drawn
+LEAST_WIDTH_MM = 4.0
+_RIGID_MM = 4.0  # error of the undeformed organ at best
+_DRIFT = 0.2  # error of unseen tissue's motion per way
+_OLD_MM = 5.0  # what is less sure tells nothing any more
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,6 +41,7 @@ class Terms:
     by_motion: Float64[np.ndarray, "t p"]
     weights: Float64[np.ndarray, " t"]
     cost: float
+    std_mm: Float64[np.ndarray, " t"]
     width_mm: Float64[np.ndarray, " t"]  # of the robust kernel
     piece: Int64[np.ndarray, " t"]  # the number of the evidence that each belongs to
 
@@ -71,8 +80,8 @@ class EvidenceTerms:
         for number, each in enumerate(evidence):
             if isinstance(each, Landmark | Held):
                 which_mm = each.point_std_mm if isinstance(each, Held) else 0.0
-                std_mm = math.hypot(each.std_mm, which_mm)
-                points.append((each.point_ct, each.place_mm, std_mm, number))
+                whole_mm = math.hypot(each.std_mm, which_mm)
+                points.append((each.point_ct, each.place_mm, whole_mm, number))
                 continue
             name = each.part if isinstance(each, Touch | Outline) and each.part else parts[0]
             if name not in parts:
@@ -93,8 +102,9 @@ class EvidenceTerms:
             np.array([*std_mm, *point_std_mm], float), np.array([*piece, *point_piece], int),
         )  # fmt: skip
 
-    def at(self, motion: ElasticMotion) -> Terms:
-        """The terms at a motion; landmarks' in the organ's axes."""
+    def at(self, motion: ElasticMotion, least_width_mm: float = LEAST_WIDTH_MM) -> Terms:
+        """The terms at a motion; landmarks' in the organ's axes. ``least_width_mm``: of the robust
+        kernel."""
         unknowns = POSE + len(motion.coefficients)
         rows = np.zeros((len(self.places_mm), unknowns + 1))
         for part in np.unique(self.part):
@@ -110,11 +120,33 @@ class EvidenceTerms:
         times = np.repeat([1, 3], [len(self.places_mm), len(self.points_ct)])
         std_mm, piece = np.repeat(self.std_mm, times), np.repeat(self.piece, times)
         together = np.concatenate(residuals_mm)
-        width_mm = np.maximum(_WIDTHS * std_mm, _LEAST_WIDTH_MM)
+        width_mm = np.maximum(_WIDTHS * std_mm, least_width_mm)
         squares = (together / width_mm) ** 2
         cost = float(((width_mm / std_mm) ** 2 * squares / (1 + squares)).sum())
         weights = 1 / (std_mm * (1 + squares)) ** 2
-        return Terms(together, np.concatenate(by_motion), weights, cost, width_mm, piece)
+        return Terms(together, np.concatenate(by_motion), weights, cost, std_mm, width_mm, piece)
+
+    def rigid_costs(
+        self,
+        rest: RestShape,
+        rotations: Float64[np.ndarray, "s 3 3"],
+        centres: Float64[np.ndarray, "s 3"],
+    ) -> Float64[np.ndarray, " s"]:
+        """Of the undeformed organ in many poses, which may err by ``_RIGID_MM``."""
+        costs, center_ct = np.zeros(len(rotations)), rest.body.center_ct
+        stds_mm = np.split(np.hypot(self.std_mm, _RIGID_MM), [len(self.places_mm)])
+        for place, part, offset_mm, free, std_mm in zip(
+            self.places_mm, self.part, self.offset_mm, self.free, stds_mm[0], strict=True
+        ):
+            back = np.einsum("sij,si->sj", rotations, place - centres) + center_ct
+            off_mm = rest.distances_mm(back, part) - offset_mm
+            squares = ((np.minimum(off_mm, 0) if free else off_mm) / std_mm / _WIDTHS) ** 2
+            costs += _WIDTHS**2 * squares / (1 + squares)
+        for point_ct, place, std_mm in zip(self.points_ct, self.points_mm, stds_mm[1], strict=True):
+            away = rotations @ (point_ct - center_ct) + centres - place
+            squares = (away**2).sum(1) / (std_mm * _WIDTHS) ** 2
+            costs += _WIDTHS**2 * squares / (1 + squares)
+        return costs
 
     def without(self, pieces: Int64[np.ndarray, " k"]) -> EvidenceTerms:
         """The rest."""
@@ -126,9 +158,10 @@ class EvidenceTerms:
         )  # fmt: skip
 
     def described(
-        self, evidence: Sequence[Evidence], motion: ElasticMotion
+        self, evidence: Sequence[Evidence], motion: ElasticMotion, before: int
     ) -> tuple[EvidenceReport, ...]:
-        """For a report: all ``evidence``, of which these terms are what was not left out."""
+        """For a report: all ``evidence``, of which these terms are what was not left out; the first
+        pieces came ``before`` this frame."""
         assert motion.covariance is not None
         every = EvidenceTerms.of(evidence, motion.shape.anatomy_ct.names)
         assert every is not None
@@ -139,9 +172,58 @@ class EvidenceTerms:
             mine, kept = terms.piece == number, number in self.piece
             share = float((terms.weights[mine] * known[mine]).mean())
             off_mm = float(np.abs(terms.residuals_mm[mine]).max())
+            if not kept and isinstance(each, Touch | Outline):  # perhaps beyond the field
+                part = motion.shape.anatomy_ct.parts[every.part[every.piece == number][0]]
+                off_mm = float(surface_distance(part, motion.back(np.array(each.places))).max())
             news = min(share, 1.0) if kept else 0.0
-            told.append(EvidenceReport(name=each.name, off_mm=off_mm, news=news, left_out=not kept))
+            told.append(
+                EvidenceReport(
+                    name=each.name,
+                    tool=each.tool,
+                    std_mm=each.std_mm,
+                    off_mm=off_mm,
+                    news=news,
+                    left_out=not kept,
+                    before=number < before,
+                )
+            )
         return tuple(told)
+
+
+@dataclass(frozen=True, eq=False)
+class Known:
+    """A piece of evidence, and the motion as the points alone showed it when it came."""
+
+    piece: Evidence
+    motion: ElasticMotion
+
+    def seen_from(self, camera_from_last: Affine) -> Known:
+        """Before a camera that has moved."""
+        places_mm = transform_points(camera_from_last, np.array(self.piece.places))
+        return Known(self.piece.at(places_mm), seen_from_first(self.motion, camera_from_last))
+
+
+def still_known(
+    known: Sequence[Known], motion: ElasticMotion
+) -> tuple[tuple[Known, ...], tuple[Evidence, ...]]:
+    """What tells something yet at a later motion, as the points alone show that; and how it is by
+    now. What lies on tissue moves with it, and is less sure the farther from where it came. What a
+    tool holds, and where no tissue was, tell nothing but in their own frame."""
+    lasting = [each for each in known if not isinstance(each.piece, Held | Free)]
+    kept, pieces = list[Known](), list[Evidence]()
+    for before, some in groupby(lasting, key=lambda each: each.motion):
+        mine = list(some)
+        places_mm = np.concatenate([each.piece.places for each in mine])
+        moved_mm = motion.carry(before.back(places_mm))
+        away_mm = np.linalg.norm(moved_mm - places_mm, axis=1)
+        ends = np.cumsum([len(each.piece.places) for each in mine])[:-1]
+        parts = zip(mine, np.split(moved_mm, ends), np.split(away_mm, ends), strict=True)
+        for each, moved, away in parts:
+            std_mm = math.hypot(each.piece.std_mm, _DRIFT * float(away.mean()))
+            if std_mm <= _OLD_MM:
+                kept.append(each)
+                pieces.append(msgspec.structs.replace(each.piece.at(moved), std_mm=std_mm))
+    return tuple(kept), tuple(pieces)
 
 
 def _columns(rows: list[tuple[Any, ...]], count: int) -> list[tuple[Any, ...]]:

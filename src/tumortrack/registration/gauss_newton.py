@@ -16,13 +16,14 @@ shape prior, e.g. Heimann and Meinzer 2009 (doi 10.1016/j.media.2009.05.004).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float, Float64
 
 from tumortrack.registration import gauss_newton_kernels as kernels
 from tumortrack.registration.config import GaussNewtonConfig
+from tumortrack.registration.evidence import EvidenceTerms
 from tumortrack.registration.looks import Looks
 from tumortrack.registration.motion import ElasticMotion
 from tumortrack.registration.rest_shape import RestShape
@@ -56,6 +57,24 @@ class RegistrationResult:
     moved: Float64[np.ndarray, " 6"]
     rivals: tuple[RegistrationResult, ...] = ()
     beyond: RegistrationResult | None = None
+
+    @property
+    def points_cost(self) -> float:
+        """The cost without that of evidence."""
+        evidence = self.looks.evidence
+        return self.cost - (0.0 if evidence is None else evidence.at(self.motion).cost)
+
+    def beside(self, evidence: EvidenceTerms | None) -> RegistrationResult:
+        """A fit to points alone, judged by evidence as well."""
+        if evidence is None:
+            return self
+        more = evidence.at(self.motion).cost
+        return replace(
+            self,
+            looks=replace(self.looks, evidence=evidence),
+            cost=self.cost + more,
+            cost_without_strays=self.cost_without_strays + more,
+        )
 
     @property
     def others(self) -> tuple[RegistrationResult, ...]:

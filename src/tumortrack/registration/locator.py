@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from itertools import repeat
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
@@ -13,7 +14,7 @@ from jaxtyping import Float, Float32, Int32, Int64, UInt8
 
 from tumortrack.core.estimate import Estimate, FollowOptions
 from tumortrack.core.evidence import Evidence
-from tumortrack.core.report import FitReport, SizeFit, SmoothingReport
+from tumortrack.core.report import EvidenceReport, FitReport, SizeFit, SmoothingReport
 from tumortrack.core.types import Anatomy, CameraLabels, Look, Mesh, OccupancyCloud, SensorCloud
 from tumortrack.imaging.raster import label_grid
 from tumortrack.models.report import Frame, describe_parts, grid_over
@@ -21,7 +22,7 @@ from tumortrack.registration import kernels
 from tumortrack.registration import report as entries
 from tumortrack.registration.bend import BentFit
 from tumortrack.registration.choose import likeliest
-from tumortrack.registration.evidence import EvidenceTerms
+from tumortrack.registration.evidence import EvidenceTerms, Known, still_known
 from tumortrack.registration.gauss_newton import RegistrationResult
 from tumortrack.registration.looks import Looks
 from tumortrack.registration.model import RegistrationModel
@@ -88,6 +89,17 @@ class _Placed:
         return kernels.probabilities(mine.margin_mm, per_std, mine.sample)
 
 
+class _Found(NamedTuple):
+    """A frame's fit; the prior by which it is the likeliest; its motion as the points alone show
+    it; evidence by now, and that part of it, as it came, which is of earlier frames."""
+
+    fit: RegistrationResult
+    prior: PosePrior
+    shown: ElasticMotion
+    pieces: tuple[Evidence, ...] = ()
+    before: tuple[Known, ...] = ()
+
+
 class RegistrationLocator:
     """Locates by ``Registration``; its estimates have a motion."""
 
@@ -117,7 +129,8 @@ class RegistrationLocator:
         frame = Frame(self._model, cloud, seed, np.random.default_rng(seed))
         points = self._points(frame, looks, evidence=EvidenceTerms.of(evidence, self._model.parts))
         fit = self._registration.register(points, None, frame.stage)
-        size, placed = self._size(fit), self._checked(fit, self._bent(fit, frame), frame)
+        fit, bent = self._bent(fit, frame)
+        size, placed = self._size(fit), self._checked(fit, bent, frame)
         organ = placed.meshes[self._model.parts[0]]
         with frame.stage("fine"):
             inside = self._drawn(placed, organ, cloud.stamp_ns, frame.rng)
@@ -126,15 +139,15 @@ class RegistrationLocator:
             labels = label_grid(Anatomy(tuple(placed.meshes.values())), camera_from_index, shape)
         voxel_mm = float(camera_from_index[0, 0])
         prior, more = self._registration.prior, {"size": size, "voxel_mm": voxel_mm}
-        if (terms := fit.looks.evidence) is not None:
-            more["evidence"] = terms.described(evidence, placed.motion)
+        found = self._found(fit, prior=self._registration.prior, pieces=tuple(evidence))
+        told, known = self._told(placed, found)
         if len(self._model.parts) > 1:
             least_sure = 1 + int(np.trace(placed.middle_mm2[1:], axis1=1, axis2=2).argmax())
             more["next_touches"] = next_touches(placed.motion, least_sure)
-        report = self._report(frame, looks, placed, inside, prior, **more)
+        report = self._report(frame, looks, placed, inside, prior, evidence=told, **more)
         volume = CameraLabels(labels, camera_from_index)
-        made = Estimate(inside, volume, placed.meshes, report, placed.motion)
-        return replace(made, structures=placed.structures)
+        made = Estimate(inside, volume, placed.meshes, report, placed.motion, found.shown)
+        return replace(made, structures=placed.structures, evidence=known)
 
     def follow(self, looks: Sequence[Look], last: Estimate | None, how: FollowOptions) -> Estimate:
         """See ``tracking.tracker.Tracker.follow``."""
@@ -143,38 +156,79 @@ class RegistrationLocator:
         frame = Frame(self._model, cloud, how.seed, rng)
         # As many points in all as of one look: faster by half, and tumors within 0.05 mm as good.
         points = self._points(frame, looks, every=len(looks))
-        fit, prior = self._fit_after(last, points, how, frame)
-        bent = self._bent(fit, frame)
+        found = self._fit_after(last, points, how, frame)
+        fit, bent = self._bent(found.fit, frame)
         bent, lag_s = self._smoothed(bent, last, cloud.stamp_ns, how.smoothing_s)
         size, placed = self._size(fit), self._checked(fit, bent, frame)
         with frame.stage("carry"):
             inside = self._carry(placed, cloud.stamp_ns)
         smoothing = SmoothingReport(time_s=how.smoothing_s, lag_ms=1000 * lag_s)
-        report = self._report(frame, looks, placed, inside, prior, size=size, smoothing=smoothing)
-        made = Estimate(inside, None, placed.meshes, report, placed.motion, fit.motion)
-        return replace(made, structures=placed.structures)
+        told, known = self._told(placed, found)
+        more = {"size": size, "smoothing": smoothing, "evidence": told}
+        report = self._report(frame, looks, placed, inside, found.prior, **more)
+        made = Estimate(inside, None, placed.meshes, report, placed.motion, found.shown)
+        return replace(made, structures=placed.structures, evidence=known)
+
+    def _told(
+        self, placed: _Placed, found: _Found
+    ) -> tuple[tuple[EvidenceReport, ...], tuple[Known, ...]]:
+        """What a report says of the evidence, and what the next frame needs of it."""
+        if not found.pieces:
+            return (), ()
+        terms, before = placed.bent.looks.evidence, found.before
+        assert terms is not None
+        told = terms.described(found.pieces, placed.motion, len(before))
+        new = [Known(piece, found.shown) for piece in found.pieces[len(before) :]]
+        pairs = zip((*before, *new), told, strict=True)
+        return told, tuple(known for known, said in pairs if not said.left_out)
+
+    def _found(
+        self,
+        fit: RegistrationResult,
+        prior: PosePrior,
+        pieces: tuple[Evidence, ...],
+        before: tuple[Known, ...] = (),
+    ) -> _Found:
+        """Of a search, which heeds evidence."""
+        if not pieces:
+            return _Found(fit, prior, fit.motion)
+        points = replace(fit.looks, evidence=None)
+        shown = self._registration.follow(points, fit.motion, self._near).motion
+        return _Found(fit, prior, replace(shown, rivals=fit.motion.rivals), pieces, before)
 
     def _fit_after(
         self, last: Estimate | None, looks: Looks, how: FollowOptions, frame: Frame
-    ) -> tuple[RegistrationResult, PosePrior]:
+    ) -> _Found:
         """The fit near the last motion and its rivals; of a search, where there is no last motion,
-        or that fit is doubtful. And the prior by which it is the likeliest."""
+        or that fit is doubtful."""
         method = self._turned_over if how.either_side else self._registration
-        start = None if last is None else last.unsmoothed
-        if not isinstance(start, ElasticMotion):
-            return method.register(looks, None, frame.stage), method.prior
+        start, parts = None if last is None else last.unsmoothed, self._model.parts
+        if last is None or not isinstance(start, ElasticMotion):
+            looks = replace(looks, evidence=EvidenceTerms.of(how.evidence, parts))
+            fit = method.register(looks, None, frame.stage)
+            return self._found(fit, method.prior, how.evidence)
         with frame.stage("follow"):
             starts = [start, *(rival for rival, _ in start.rivals)]
             fits = [self._registration.follow(looks, near, self._near) for near in starts]
+            shown = fits[0].motion
+            before, pieces = still_known(last.evidence, shown)
+            pieces += how.evidence
+            looks = replace(looks, evidence=EvidenceTerms.of(pieces, parts))
+            fits = [fit.beside(looks.evidence) for fit in fits]
         fit, usual = likeliest(fits, method.prior), self._calibration.usual_cost * looks.count
-        doubtful = fit.cost > usual or apart_mm(fit.motion, start) > _JUMP_MM
+        doubtful = fit.points_cost > usual or apart_mm(fit.motion, start) > _JUMP_MM
         # From one frame to the next nobody turns an organ over.
         if not doubtful and not self._registration.prior.excludes(fit.motion.rotation):
             method = self._registration
             fit = likeliest(fits, method.prior)
-        if doubtful or how.thorough:
-            fit = method.register(looks, fit, frame.stage, again=not doubtful)
-        return fit, method.prior
+        if not doubtful and not how.thorough:
+            return _Found(fit, method.prior, fit.motion, pieces, before)
+        if pieces:
+            fit = self._registration.follow(looks, fit.motion, self._near)
+        fit = method.register(looks, fit, frame.stage, again=not doubtful)
+        if apart_mm(fit.motion, shown) > _JUMP_MM:  # the tissue hardly went there
+            before = tuple(map(Known, pieces[: len(before)], repeat(fit.motion)))
+        return self._found(fit, method.prior, pieces, before)
 
     def _smoothed(
         self, bent: BentFit, last: Estimate | None, stamp_ns: int, smoothing_s: float
@@ -211,13 +265,13 @@ class RegistrationLocator:
         points = Frame(self._model, cloud, 0, np.random.default_rng(0)).points_mm
         looks = Looks.of([points])
         fit = self._registration.best_fit(looks, [*self._registration.search.starts(looks), rest])
-        self._carry(self._moved(fit, self._registration.bend(fit)), 0)
+        self._carry(self._moved(*self._registration.bend(fit)), 0)
 
     def _size(self, fit: RegistrationResult) -> SizeFit:
         times, gain = apparent_size(fit.motion, fit.looks, self._registration.config)
         return SizeFit(times=times, gain=gain)
 
-    def _bent(self, fit: RegistrationResult, frame: Frame) -> BentFit:
+    def _bent(self, fit: RegistrationResult, frame: Frame) -> tuple[RegistrationResult, BentFit]:
         with frame.stage("bend"):
             return self._registration.bend(fit)
 

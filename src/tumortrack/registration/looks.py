@@ -143,15 +143,5 @@ class Looks:
         return replace(self, points_mm=points_mm, camera_from_look=tuple(poses), shifts=shifts)
 
 
-def seen_from_first(motion: ElasticMotion, camera_from_look: Affine) -> ElasticMotion:
-    """A motion before another camera, as the first one sees it."""
-    turn = camera_from_look[:3, :3]
-    centre_mm = turn @ motion.centre_mm + camera_from_look[:3, 3]
-    rivals = tuple(
-        (seen_from_first(rival, camera_from_look), share) for rival, share in motion.rivals
-    )
-    return replace(motion, rotation=turn @ motion.rotation, centre_mm=centre_mm, rivals=rivals)
-
-
 def _moved(pose: Affine, points: Points) -> Points:
     return transform_points(pose, points).astype(np.float32)

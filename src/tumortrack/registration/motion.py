@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float32, Float64
 
 from tumortrack.core.errors import InputError
-from tumortrack.core.geometry import Points, largest_std_of, rigid, std_of, turned_by
+from tumortrack.core.geometry import Affine, Points, largest_std_of, rigid, std_of, turned_by
 from tumortrack.core.process import parallel_for
 from tumortrack.registration import kernels
 from tumortrack.registration.kernels import Flow, Pose
@@ -156,6 +156,16 @@ def _given(points_mm: Points) -> Float32[np.ndarray, "n 3"]:
         bad = np.count_nonzero(~np.isfinite(points).all(axis=1))
         raise InputError(f"{bad} of {len(points)} points have NaN or infinity; leave them out.")
     return points
+
+
+def seen_from_first(motion: ElasticMotion, camera_from_look: Affine) -> ElasticMotion:
+    """A motion before another camera, as the first one sees it."""
+    turn = camera_from_look[:3, :3]
+    centre_mm = turn @ motion.centre_mm + camera_from_look[:3, 3]
+    rivals = tuple(
+        (seen_from_first(rival, camera_from_look), share) for rival, share in motion.rivals
+    )
+    return replace(motion, rotation=turn @ motion.rotation, centre_mm=centre_mm, rivals=rivals)
 
 
 def blend(a: ElasticMotion, b: ElasticMotion, share: float) -> ElasticMotion:

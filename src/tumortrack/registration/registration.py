@@ -88,8 +88,7 @@ class Registration:
         with timed("search"):
             starts = self.search.starts(looks, again)
         with timed("refine"):
-            best = self._without_contradictions(self.best_fit(looks, starts, known))
-            looks = best.looks
+            best = self.best_fit(looks, starts, known)
             if looks.count == 1:
                 return best
             fits = [self._correct_cameras(looks, fit) for fit in (best, *best.others)]
@@ -101,9 +100,18 @@ class Registration:
         """The fit near a motion."""
         return self._correct_cameras(looks, refine(self.rest, looks, start, config))
 
-    def bend(self, fit: RegistrationResult) -> BentFit:
-        """A fit, continued in the body's compliance."""
-        return bend(fit, self.config)
+    def bend(self, fit: RegistrationResult) -> tuple[RegistrationResult, BentFit]:
+        """A fit, continued in the body's compliance; both without the evidence that contradicts the
+        rest."""
+        bent = bend(fit, self.config)
+        evidence = fit.looks.evidence
+        if evidence is None or not len(wrong := evidence.at(bent.motion).contradicting):
+            return fit, bent
+        looks = replace(fit.looks, evidence=evidence.without(wrong))
+        near = msgspec.structs.replace(self.config, first_mm=self.config.last_mm)
+        fits = [refine(self.rest, looks, each.motion, near) for each in (fit, *fit.others)]
+        fit = likeliest(fits, self.prior)
+        return fit, bend(fit, self.config)
 
     def check(self, fit: RegistrationResult, usual: InDistributionRange) -> None:
         """Raises NotThisOrgan: points or deformation are none of this organ's."""
@@ -160,19 +168,6 @@ class Registration:
         promising = [descent for descent in descents if descent.cost <= most]
         parallel_map(lambda descent: descent.run(steps), promising)
         return [descent.result() for descent in promising]
-
-    def _without_contradictions(self, fit: RegistrationResult) -> RegistrationResult:
-        """The fit and its others without the evidence that contradicts it."""
-        evidence = fit.looks.evidence
-        if evidence is None:
-            return fit
-        wrong = evidence.at(fit.motion).contradicting
-        if not len(wrong):
-            return fit
-        looks = replace(fit.looks, evidence=evidence.without(wrong))
-        near = msgspec.structs.replace(self.config, first_mm=self.config.last_mm)
-        fits = [refine(self.rest, looks, each.motion, near) for each in (fit, *fit.others)]
-        return likeliest(fits, self.prior)
 
     def _correct_cameras(self, looks: Looks, fit: RegistrationResult) -> RegistrationResult:
         """Further cameras and the motion in turns, from a fit with the cameras as stated."""

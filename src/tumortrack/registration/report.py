@@ -19,8 +19,7 @@ def cost_entry(
 ) -> FitCost:
     """``usual_cost``: of one look; ``last_mm``: the robust kernel's last width. Of several looks
     the one with most strays counts."""
-    looks, strays, evidence = fit.looks, fit.strays, fit.looks.evidence
-    by_evidence = 0.0 if evidence is None else evidence.at(fit.motion).cost
+    looks, strays, now = fit.looks, fit.strays, fit.points_cost
     if looks.count > 1:
         far = np.abs(fit.distances_mm) > FARTHEST * last_mm
         strays = max(float(far[looks.look == n].mean()) for n in range(looks.count))
@@ -29,8 +28,8 @@ def cost_entry(
         for rival in fit.rivals
     ]
     return FitCost(
-        now=fit.cost - by_evidence,
-        without_strays=fit.cost_without_strays - by_evidence,
+        now=now,
+        without_strays=fit.cost_without_strays - (fit.cost - now),
         usual=usual_cost * looks.count,
         strays=strays,
         others=tuple(rivals),

@@ -76,6 +76,13 @@ class RestShape:
         parallel_for(mark_part, len(points_ct), _AT_ONCE)
         return labels, margin_mm
 
+    def distances_mm(self, points_ct: Float64[np.ndarray, "n 3"], part: int) -> np.ndarray:
+        """Of points to a part's surface, negative inside; right near it."""
+        points, inside = points_ct.astype(np.float32), np.zeros(len(points_ct), np.uint8)
+        away_mm = np.full(len(points), np.finfo(np.float32).max)
+        mark(self.distances[part], np.uint8(1), points, inside, away_mm)
+        return np.where(inside, -away_mm, away_mm)
+
     def to_arrays(self) -> dict[str, np.ndarray]:
         """Everything as named arrays, for a file."""
         arrays = {f"{_BODY}{name}": value for name, value in self.body.to_arrays().items()}

@@ -35,6 +35,9 @@ _STAGES = (
     (100, 15.0 * 0.8 ** np.arange(4), 1 / 4),
     (250, 6.0 * 0.8 ** np.arange(7), 1.0),
 )
+# Of their mean cost, beside evidence: as if some 30 points were independent of each other, and a
+# rigid body missed each by 2 mm.
+_POINTS_COST = 70.0
 _COMPARED_MM = 3.0  # the width by which starts are compared: a rigid body errs by that
 _DAMPING = np.repeat([0.02**2, 1.0], 3)  # of a shift (1/mm^2) and a turn
 _TURN_DEGREES = 15.0  # between starts, about the line of sight
@@ -137,7 +140,9 @@ class Search:
         beyond = self.prior.as_stated.excludes(rotations)
         for count, widths_mm, share in _STAGES:
             points_mm = every[:: max(1, len(every) // count)][:count].copy()
-            costs = self.descend(points_mm, widths_mm, rotations, centres)
+            costs = _POINTS_COST * self.descend(points_mm, widths_mm, rotations, centres)
+            if looks.evidence is not None:
+                costs += looks.evidence.rigid_costs(self.rest, rotations, centres)
             best = np.concatenate([_least(costs, group, share) for group in (~beyond, beyond)])
             rotations, centres, beyond = rotations[best], centres[best], beyond[best]
         most, others = (_KEPT_AGAIN, 1) if again else (_KEPT, _KEPT_BEYOND)

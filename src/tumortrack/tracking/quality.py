@@ -44,6 +44,7 @@ _MAX_STRAYS = 0.5  # share of the points: the breakdown point of robust estimate
 _MAX_CAMERA_ERROR = 3.0  # standard deviations of a camera's pose
 _FAR_TILTED, _UPSIDE_DOWN = 60.0, 110.0  # degrees
 _MIN_PROBABILITY = 0.6  # mean over a tumor's points
+_FEW = 3  # pieces of evidence of earlier frames
 _PIXEL_MM = 1.5  # of the image in which a cloud is compared
 _MAX_PIXELS = 1024  # along a side
 _MAX_POINTS = 20_000  # of a cloud: enough for the shares, where all of 400,000 would delay a frame
@@ -174,8 +175,10 @@ def _doubt(report: FitReport) -> Finding | None:
     if cost is not None and cost.beyond is not None:
         degrees = cost.beyond.tilt_degrees
         return Finding(_tilt_finding(degrees), {"degrees": degrees})
+    old = [each.left_out for each in report.evidence if each.before]
+    many_old = len(old) >= _FEW and sum(old) > len(old) / 2  # rather the answer is wrong
     for number, each in enumerate(report.evidence, start=1):
-        if each.left_out:
+        if each.left_out and (many_old or not each.before):
             return Finding("evidence", {"name": each.name, "number": number, "off_mm": each.off_mm})
     for name, part in report.parts.items():
         if not part.found:

@@ -24,9 +24,8 @@ from tumortrack.models.folder import weakness_of
 from tumortrack.models.method import Locator, method_of_config
 from tumortrack.models.model import Model
 from tumortrack.registration.locator import RegistrationLocator
-from tumortrack.registration.looks import seen_from_first
 from tumortrack.registration.model import RegistrationModel
-from tumortrack.registration.motion import ElasticMotion
+from tumortrack.registration.motion import ElasticMotion, seen_from_first
 from tumortrack.sense.cloud import CloudConfig
 from tumortrack.sense.region import RegionConfig
 from tumortrack.tracking.advice import where_to_look
@@ -315,7 +314,9 @@ def _seen_from(estimate: Estimate, camera_from_last: Affine) -> Estimate:
     )
     cloud, meshes = replace(estimate.cloud, points_mm=points_mm), estimate.meshes.items()
     moved = {n: m.moved(transform_points(camera_from_last, m.vertices_mm)) for n, m in meshes}
-    return replace(estimate, cloud=cloud, meshes=moved, motion=motion, unsmoothed=unsmoothed)
+    evidence = tuple(each.seen_from(camera_from_last) for each in estimate.evidence)
+    made = replace(estimate, cloud=cloud, meshes=moved, motion=motion, unsmoothed=unsmoothed)
+    return replace(made, evidence=evidence)
 
 
 def region_for(
