@@ -296,6 +296,9 @@ def test_the_film_of_a_run_shows_the_organ_where_it_was_tracked(
     assert (np.abs(last - first).max(2) > 30).sum() > 100  # it has moved
     with pytest.raises(InputError, match="never located"):
         Reel().frames(3)
+    for n in range(3000):  # however long a stage lasts
+        reel.publish(replace(update, stamp_ns=n * 10**9, workcell=cell))
+    assert 30 <= len(reel.frames(10**6)[0]) <= 61
 
 
 def test_every_stage_has_its_moments() -> None:

@@ -163,7 +163,10 @@ def test_a_tip_that_moves_is_less_sure_of_where_it_is():
     assert grip.evidence(CAMERA_FROM_TABLE, 0)[0].std_mm == pytest.approx(1.2)
 
 
-def test_the_pull_itself_halts_nothing_and_then_it_is_planned_on_the_pulled_tumor():
+@pytest.mark.parametrize(
+    ("far_mm", "words"), [(PULL_MM, "has moved by 4.0 mm"), (0.5, "planning anew")]
+)
+def test_the_pull_itself_halts_nothing_and_then_it_is_planned_on_the_pulled_tumor(far_mm, words):
     plans = []
 
     def replan(update, joints_rad, progress):
@@ -183,8 +186,8 @@ def test_the_pull_itself_halts_nothing_and_then_it_is_planned_on_the_pulled_tumo
         assert not procedure.frame().halted
     while procedure.frame().state == PULL:
         pass
-    procedure.shift_mm = np.array([0.0, 0.0, PULL_MM])
-    assert "has moved by 4.0 mm" in procedure.frame().halted
+    procedure.shift_mm = np.array([0.0, 0.0, far_mm])
+    assert words in procedure.frame().halted
     procedure.until("sweep 1")
     ((height_mm, progress),) = plans
     assert height_mm == pytest.approx(PULL_MM)
@@ -197,7 +200,7 @@ def test_the_pull_itself_halts_nothing_and_then_it_is_planned_on_the_pulled_tumo
 def test_a_grip_that_slips_halts_the_arms():
     procedure = Procedure()
     procedure.until("sweep 1")
-    slipped = [{"name": "held", "off_mm": 11.6, "news": 0.0, "left_out": True}]
+    slipped = [{"name": "held", "std_mm": 1.2, "off_mm": 11.6, "news": 0.0, "left_out": True}]
     for quality in ("good", "poor"):  # whatever else is thought of it
         cell = procedure.frame(seen(quality, evidence=slipped))
         assert cell.halt.kind == "slipped"
@@ -293,7 +296,7 @@ def test_a_held_point_that_slipped_is_left_out_and_halts_the_arms(pulled):
 def test_a_live_pull_is_followed_planned_on_cut_and_filmed(ready_case, tmp_path):
     """The tumor goes up with the holder; everything else stays: the plan must follow."""
     case = load_case(ready_case)
-    world = "breathing=false&instrument=false&camera_motion=false&fps=10&noise=false"
+    world = "breathing=false&instrument=false&camera_motion=false&fps=10"
     source = SOURCES.parse(f"virtual:{ready_case}?{world}")
     player = source.player()
     seen = source.open().at(0.0, 1)
@@ -329,7 +332,6 @@ def test_a_live_pull_is_followed_planned_on_cut_and_filmed(ready_case, tmp_path)
     resected = json.loads((tmp_path / "report.json").read_text())["resection"]
     assert {PULL, TAUT} <= {entry["state"] for entry in resected["log"]}
     assert any(entry.get("event") == "planned anew" for entry in resected["log"])
-    assert any(f"{tumor} has moved by" in halt for halt in resected["halts"])
     assert not any("slipped" in halt for halt in resected["halts"])
     with Image.open(tmp_path / "film.gif") as film:
         assert film.n_frames > 30

@@ -48,7 +48,8 @@ _COLOURS = 255  # and one for what did not change
 _SAMPLES = 8  # frames from which the colours are chosen
 _SAMPLED, _EVERY = 40, 3  # the viewpoint is chosen by so many frames, and every third vertex
 _LEAST_FRAMES = 2  # of a stage
-_KEPT_EVERY_NS = 200_000_000  # of a live run: meshes of an hour are some gigabytes
+_KEPT_EVERY_NS = 200_000_000  # of a live run, at first
+_MOST_KEPT = 60  # moments of a stage: some 15 MB of surfaces
 _LAST_S = 1.5  # the last picture stays
 _PLAYBACK = "PLAYBACK of a stored plan, SIMULATED: nothing is tracked"
 _MEANING = {
@@ -76,9 +77,9 @@ def film(
 ) -> None:
     """Write the frames as an animated GIF that loops.
 
-    Above every frame, never cut off: its title; the plan's warnings; the
-    state and why the arms halt; the patient. The piece moves with the holder once that lifts, and
-    disappears after the release.
+    Above every frame, never cut off: what it is; the plan's warnings; the state and why the arms
+    halt; the patient. The piece moves with the holder once that lifts, and disappears after the
+    release.
 
     The view is obliquely from the front, and contains whatever has a slash in its name (the parts
     of arms) in all frames; an inset shows the organ from near by. The same frames give the same
@@ -143,36 +144,41 @@ def _moments(lengths: np.ndarray, frames: int) -> Float64[np.ndarray, " n"]:
 
 
 class Reel:
-    """A sink that keeps what a film of a live run shows, some times a second. The organ stays as it
-    was seen last while there is no estimate; before there was one, nothing is kept."""
+    """A sink that keeps what a film of a live run shows, some moments of each stage. Without an
+    estimate the organ is as it was seen last; before the first one nothing is kept."""
 
     def __init__(self) -> None:
-        self._kept: list[tuple[Workcell, Mapping[str, Mesh]]] = []
-        self._kept_ns = 0
+        self._stages: list[list[tuple[Workcell, Mapping[str, Mesh]]]] = []
+        self._last_ns = self._every_ns = 0
 
     def publish(self, result: TrackingResult) -> None:
         """Called by the sink's thread."""
-        seen = None if result.transformed is None else result.transformed.meshes
-        seen = seen or (self._kept[-1][1] if self._kept else None)
+        last = self._stages[-1][-1] if self._stages else None
+        seen = result.transformed.meshes if result.transformed else last and last[1]
         if result.workcell is None or seen is None:
             return
-        new = not self._kept or _stage(self._kept[-1][0]) != _stage(result.workcell)
-        if new or result.stamp_ns - self._kept_ns >= _KEPT_EVERY_NS:
-            self._kept.append((result.workcell, seen))
-            self._kept_ns = result.stamp_ns
+        if last is None or _stage(last[0]) != _stage(result.workcell):
+            self._stages.append([])
+            self._every_ns = _KEPT_EVERY_NS
+        elif result.stamp_ns - self._last_ns < self._every_ns:
+            return
+        stage, self._last_ns = self._stages[-1], result.stamp_ns
+        stage.append((result.workcell, seen))
+        if len(stage) > _MOST_KEPT:
+            stage[:] = stage[::2]
+            self._every_ns *= 2
 
     def close(self) -> None:
         """Nothing is open."""
 
     def frames(self, count: int) -> tuple[list[Workcell], list[Mapping[str, Mesh]]]:
         """About so many of every stage's. Raises InputError: nothing was tracked."""
-        if not self._kept:
+        if not self._stages:
             raise InputError("there is nothing to film: the organ was never located.")
-        groups = groupby(self._kept, lambda kept: _stage(kept[0]))
-        lengths = np.array([len(list(group)) for _, group in groups], float)
-        chosen = np.unique(_moments(lengths, count).astype(int).clip(max=len(self._kept) - 1))
-        cells, seen = zip(*(self._kept[n] for n in chosen.tolist()), strict=True)
-        return list(cells), list(seen)
+        kept = [moment for stage in self._stages for moment in stage]
+        moments = _moments(np.array([len(stage) for stage in self._stages], float), count)
+        chosen = np.unique(moments.astype(int).clip(max=len(kept) - 1)).tolist()
+        return [kept[n][0] for n in chosen], [kept[n][1] for n in chosen]
 
 
 def _stage(cell: Workcell) -> str:

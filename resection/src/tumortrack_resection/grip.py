@@ -53,12 +53,11 @@ class Grip:
             self._taken, self._tip_mm, self.pulled_mm = None, None, 0.0
             self._before = result if result.quality == "good" else self._before
             return
-        tip_mm = self._place(execution.joints_rad)
-        last_mm = tip_mm if self._tip_mm is None else self._tip_mm
-        self._tip_mm, self._step_mm = tip_mm, float(np.linalg.norm(tip_mm - last_mm))
-        if execution.gripped_rad is None:  # these motions begin with what is held
+        if execution.gripped_rad is None:  # the first motions begin with what is held
             return
-        gripped_mm = self._place(execution.gripped_rad)
+        tip_mm, gripped_mm = map(self._place, (execution.joints_rad, execution.gripped_rad))
+        last_mm = gripped_mm if self._tip_mm is None else self._tip_mm
+        self._tip_mm, self._step_mm = tip_mm, float(np.linalg.norm(tip_mm - last_mm))
         self.pulled_mm = float(tip_mm[2] - gripped_mm[2])
         if self._taken is None and self._before is not None:
             self._taken = _point_at(gripped_mm, self._before)

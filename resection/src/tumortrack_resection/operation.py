@@ -29,7 +29,15 @@ from tumortrack.live.values import Polyline, RigidShape, TrackingResult, Workcel
 from tumortrack_resection.budget import MOVED_MM, kept_mm
 from tumortrack_resection.grip import Grip
 from tumortrack_resection.live_budget import LiveBudget
-from tumortrack_resection.motions import ABORTED, JOINTS, PULL, Execution, Joints, Motions
+from tumortrack_resection.motions import (
+    ABORTED,
+    JOINTS,
+    PULL,
+    TAUT,
+    Execution,
+    Joints,
+    Motions,
+)
 from tumortrack_resection.values import Located, ResectionPlan
 
 _SAME_MM = 0.2  # tolerance of heights
@@ -258,7 +266,7 @@ class Operation:
         elif self._work is not None:
             execution.halt(Halt("planning"))
         elif execution.stage == PULL:
-            execution.go()  # the tumor moves because it is pulled; the next stage compares
+            execution.go()  # the tumor moves because it is pulled; it is planned on when taut
         else:
             self._compare(update, self._locate(update), now_s)
 
@@ -312,6 +320,8 @@ class Operation:
         if moved:
             _, off_mm, part = max(moved)  # the tumor, or else what moved farthest
             return Halt("moved", {"part": part, "off_mm": off_mm}), True
+        if over_budget[0] is None and self._execution.stage == TAUT and self._replan is not None:
+            return Halt("planning"), True  # however little the pull has moved it
         return over_budget
 
     def _take_work(self, work: Future[Planned], now_s: float) -> None:
