@@ -110,6 +110,9 @@ class _Groups:
             means = np.concatenate([means, np.column_stack([terms.by_motion, terms.residuals_mm])])
             weights = np.append(weights, terms.std_mm**-2.0)
             width_mm = np.append(width_mm, terms.width_mm)
+        shared = np.zeros((len(means), len(means)))
+        if fit.looks.evidence is not None:
+            shared[len(counts) :, len(counts) :] = terms.by_shifts @ terms.by_shifts.T
         by_library, by_compliance, distances_mm = np.split(means, [POSE + len(body.mean), -1], 1)
         pose_std = np.repeat([config.shift_mm, config.turn_rad], 3)
         prior = _blocks(np.diag(pose_std**2), body.covariance)
@@ -117,7 +120,7 @@ class _Groups:
         return cls(
             distances_mm=distances_mm[:, 0],
             at_mean_mm=distances_mm[:, 0] - by_library @ off,
-            by_library_mm2=by_library @ prior @ by_library.T,
+            by_library_mm2=by_library @ prior @ by_library.T + shared,
             by_compliance_mm2=by_compliance @ by_compliance.T,
             weights=weights,
             width_mm=width_mm,
