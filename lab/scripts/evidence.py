@@ -30,7 +30,7 @@ from tumortrack.core.errors import InputError
 from tumortrack.core.process import available_cores
 from tumortrack.simulate.scene_folder import read_scene
 from tumortrack.tracking.tracker import Tracker
-from tumortrack_lab.study import evidence, scripts
+from tumortrack_lab.study import evidence, evidence_tables, scripts
 from tumortrack_lab.study.document import ReportWriter, table_of
 from tumortrack_lab.study.methods import code_sha256
 from tumortrack_lab.world.made import scenes_of_kidney
@@ -106,18 +106,18 @@ def main(options: Options) -> None:
 def _tables(name: str, rows: pd.DataFrame) -> Iterable[tuple[str, pd.DataFrame]]:
     scenes = len(rows[["kidney", "scene"]].drop_duplicates())
     of = f"{rows.kidney.nunique()} organs, {scenes} scenes"
-    yield f"{name}, {of}: errors of tumors' centres", evidence.errors(rows)
+    yield f"{name}, {of}: errors of tumors' centres", evidence_tables.errors(rows)
     if name == "twin":
         own = rows[rows.organ == "own"]
         for site, some in own.groupby("site"):
-            yield f"{name}, {site} tumors", evidence.errors(some)
-    yield f"{name}: what advice foresees", evidence.foresight(rows)
-    yield f"{name}: called good", evidence.verdicts(rows)
+            yield f"{name}, {site} tumors", evidence_tables.errors(some)
+    yield f"{name}: what advice foresees", evidence_tables.foresight(rows)
+    yield f"{name}: called good", evidence_tables.verdicts(rows)
 
 
 def _by_family(name: str, rows: pd.DataFrame) -> pd.DataFrame:
     families = rows[rows.organ == "own"].groupby("family")
-    tables = [evidence.errors(some).assign(family=family) for family, some in families]
+    tables = [evidence_tables.errors(some).assign(family=family) for family, some in families]
     each = pd.concat(tables).assign(organs=name)
     return each[["organs", "family", *(c for c in each if c not in ("organs", "family"))]]
 

@@ -14,7 +14,7 @@ from tumortrack.core.geometry import triangles_of
 from tumortrack.core.mesh_query import contains
 from tumortrack.report.metrics import distance_to_surface
 from tumortrack.simulate.scene_folder import Scene
-from tumortrack_lab.study.evidence import errors, foresight
+from tumortrack_lab.study.evidence_tables import errors, foresight
 from tumortrack_lab.world.evidence import (
     ALL_TRUE,
     ERRORS,
@@ -147,7 +147,15 @@ def test_a_share_is_hidden_and_the_organ_mirrored():
 
 
 def test_tables_count_pieces_by_scene_and_misses_by_tumor():
-    about = {"organ": "own", "kidney": 1, "kind": "3 touches", "family": "rest", "rigid_mm": 2.0}
+    about = {
+        "organ": "own",
+        "kidney": 1,
+        "kind": "3 touches",
+        "family": "rest",
+        "rigid_mm": 2.0,
+        "tumor": "tumor_1",
+        "held": "tumor_1",
+    }
     pieces = {"pieces": 3, "false": 1, "false_out": 1, "true_out": 1}
     told = {"std_mm": 2.0, "then_std_mm": 1.0, "off_before_mm": 3.0, "off_after_mm": 1.0}
     answers = [
@@ -160,4 +168,9 @@ def test_tables_count_pieces_by_scene_and_misses_by_tumor():
     line = errors(rows).iloc[0]
     assert (line["tumors"], line["answers %"], line["median, mm"]) == (3, "67", "1.5")
     assert (line["false left out %"], line["true left out %"]) == ("100", "50")
+    pulled = rows.assign(family="pull", kind="held tumor")
+    pulled.loc[0, "tumor"] = "tumor_2"  # not the one that is held
+    lines = errors(pd.concat([rows, pulled], ignore_index=True)).set_index("kind")
+    assert list(lines.index) == ["3 touches", "held tumor", "pulled, held tumor"]
+    assert lines.loc["pulled, held tumor", "median, mm"] == "2.0"
     assert foresight(rows).iloc[0]["found/foreseen gain: median"] == "2.00"

@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-import pandas as pd
 from scipy.spatial import cKDTree
 
 from tumortrack.core.errors import NoEstimate
@@ -19,7 +18,6 @@ from tumortrack.registration.model import RegistrationModel
 from tumortrack.report.rivals import best_rigid_pose, rigid_fit
 from tumortrack.simulate.scene_folder import Scene
 from tumortrack.tracking.tracker import Tracker
-from tumortrack_lab.study.tables import NOTHING
 from tumortrack_lab.study.tumor_sites import tumor_sites_of
 from tumortrack_lab.world.evidence import ALL_TRUE, EvidenceSource, Piece, hidden, mirrored
 
@@ -27,7 +25,7 @@ _COARSE = 16  # of the volume, which is not used
 _AT_A_TIME = 3  # touches, then it is located again
 _COUNTS = (3, 6, 12)
 _HIDDEN_SHARE = 0.4
-_WRONG = ("none", "3 touches, chosen", "6 touches, chosen", "3 landmarks")
+WRONG = ("none", "3 touches, chosen", "6 touches, chosen", "3 landmarks")
 Pieces = Sequence[Piece]
 Row = dict[str, Any]
 
@@ -76,19 +74,25 @@ def _advised(estimate: Estimate | None, source: EvidenceSource) -> list[Piece]:
 
 def own_rows(tracker: Tracker, scene: Scene, seed: tuple[int, ...]) -> Iterator[Row]:
     """A row for each kind of evidence and tumor: its centre's error, that of a rigid fit from the
-    best rigid pose to the same cloud, the verdict, and how many pieces were left out."""
+    best rigid pose to the same cloud, the verdict, and how many pieces were left out. Held is the
+    tumor that a rigid fit is most wrong about: the pulled one, where one is pulled."""
     whole = _Asker(tracker, scene, seed)
     shaded = replace(whole, scene=hidden(scene, _HIDDEN_SHARE, np.random.default_rng([*seed, 3])))
-    for asker, kinds in ((whole, _kinds(whole)), (shaded, _hidden_kinds(shaded))):
-        rigid_mm = _rigid_mm(asker)
+    rigid_mm, hidden_mm = _rigid_mm(whole), _rigid_mm(shaded)
+    held = max(rigid_mm, key=rigid_mm.__getitem__)
+    all_kinds = _kinds(whole, scene.reference.names.index(held) - 1)
+    for asker, kinds, rigid in (
+        (whole, all_kinds, rigid_mm), (shaded, _hidden_kinds(shaded), hidden_mm)
+    ):  # fmt: skip
         for kind, pieces, estimate, more in kinds:
-            yield from _rows(asker, kind, pieces, estimate, rigid_mm, more)
+            yield from _rows(asker, kind, pieces, estimate, rigid, {"held": held, **more})
 
 
 Answer = tuple[str, Pieces, Estimate | None, Row]
 
 
-def _kinds(asker: _Asker) -> Iterator[Answer]:
+def _kinds(asker: _Asker, held: int) -> Iterator[Answer]:
+    """``held``: the tumor that a tool holds."""
     none = asker.located(())
     yield "none", (), none, {}
     touched: Pieces = ()
@@ -107,9 +111,9 @@ def _kinds(asker: _Asker) -> Iterator[Answer]:
         "12 touches, chosen, and 1 outline": (*touched, *one),
         "3 landmarks": asker.source(3).landmarks(3),
         "6 landmarks": asker.source(3).landmarks(6),
-        "held tumor": (asker.source(4).held(),),
+        "held tumor": (asker.source(4).held(held),),
         "12 touches, random, 5 % false": asker.source(1, True).touches_at_random(12, None),
-        "held tumor, 5 % slipped": (asker.source(5, True).held(),),
+        "held tumor, 5 % slipped": (asker.source(5, True).held(held),),
     }
     for kind, pieces in fixed.items():
         yield kind, pieces, asker.located(pieces), {}
@@ -220,7 +224,7 @@ def wrong_rows(
         touched = asker.chosen(none, asker.source(0), 6)
         answers = [none, *(after for *_, after in touched)]
         answers.append(asker.located(asker.source(3).landmarks(3)))
-        for kind, estimate in zip(_WRONG, answers, strict=True):
+        for kind, estimate in zip(WRONG, answers, strict=True):
             yield {"organ": organ, "kind": kind, **_verdict(estimate)}
 
 
@@ -249,83 +253,3 @@ def all_rows(
             yield {**about, "organ": "own", "site": sites[row["tumor"]], **row}
         for row in wrong_rows(tracker, other, scene, (number, n)):
             yield {**about, **row}
-
-
-def errors(rows: pd.DataFrame, by: str = "kind") -> pd.DataFrame:
-    """A line for each kind of evidence; held tumors beside the same tumors, pulled, without."""
-    own = rows[rows.organ == "own"]
-    pulled = own[(own.family == "pull") & own.kind.isin(["none", "held tumor"])]
-    own = pd.concat([own, pulled.assign(kind="pulled: " + pulled.kind)])
-    return pd.DataFrame([_errors(name, some, by) for name, some in own.groupby(by, sort=False)])
-
-
-def _errors(name: str, some: pd.DataFrame, by: str) -> Row:
-    answers = some[some.quality != "none"]
-    scenes = answers.drop_duplicates(["kidney", "scene", "kind"])
-    good = answers[answers.quality == "good"]
-    miss, false = answers.miss_mm, scenes.false.sum()
-    true = scenes.pieces.sum() - false
-    return {
-        by: name,
-        "tumors": len(some),
-        "answers %": _percent(len(answers), len(some)),
-        "good %": _percent(len(good), len(some)),
-        "poor by evidence left out %": _percent((some.finding == "evidence").sum(), len(some)),
-        "median, mm": _rounded(miss.median()),
-        "95 %": _rounded(miss.quantile(0.95)),
-        "worst": _rounded(miss.max()),
-        "of good: median": _rounded(good.miss_mm.median()),
-        "its 95 %": _rounded(good.miss_mm.quantile(0.95)),
-        "rigid fit: median": _rounded(answers.rigid_mm.median()),
-        "its 95 %, mm": _rounded(answers.rigid_mm.quantile(0.95)),
-        "false left out %": _percent(scenes.false_out.sum(), false),
-        "true left out %": _percent(scenes.true_out.sum(), true),
-    }
-
-
-def foresight(rows: pd.DataFrame) -> pd.DataFrame:
-    """A line for each three touches that were advised: deviations foreseen, errors found (root mean
-    square), both along the axis that was least sure, and the found share of the foreseen gain."""
-    told = rows[rows.then_std_mm.notna()].drop_duplicates(["kidney", "scene", "kind"])
-    lines = []
-    for kind, some in told.groupby("kind", sort=False):
-        ratio = (some.off_before_mm - some.off_after_mm) / (some.std_mm - some.then_std_mm)
-        lines.append({
-            "with": kind,
-            "advised": len(some),
-            "foreseen before, mm": _rounded(_root_mean_square(some.std_mm), 2),
-            "and after": _rounded(_root_mean_square(some.then_std_mm), 2),
-            "found before, mm": _rounded(_root_mean_square(some.off_before_mm), 2),
-            "found after": _rounded(_root_mean_square(some.off_after_mm), 2),
-            "found before, median": _rounded(some.off_before_mm.median(), 2),
-            "after, median": _rounded(some.off_after_mm.median(), 2),
-            "found/foreseen gain: median": _rounded(ratio.median(), 2),
-            "10 %": _rounded(ratio.quantile(0.1)),
-            "90 %": _rounded(ratio.quantile(0.9)),
-        })  # fmt: skip
-    return pd.DataFrame(lines)
-
-
-def verdicts(rows: pd.DataFrame) -> pd.DataFrame:
-    """How often the own organ, its mirror image and another one are called good, by evidence."""
-    scenes = rows[rows.kind.isin(_WRONG)].drop_duplicates(["kidney", "scene", "organ", "kind"])
-    lines = []
-    for organ, some in scenes.groupby("organ", sort=False):
-        line = {"organ": organ, "scenes": int((some.kind == _WRONG[0]).sum())}
-        for kind in _WRONG:
-            mine = some[some.kind == kind].quality
-            line[f"good %: {kind}"] = _percent((mine == "good").sum(), len(mine))
-        lines.append(line)
-    return pd.DataFrame(lines)
-
-
-def _root_mean_square(values: pd.Series) -> float:
-    return float(np.sqrt((values**2).mean()))
-
-
-def _percent(count: float, of: float) -> str:
-    return f"{100 * count / of:.0f}" if of else NOTHING
-
-
-def _rounded(value: float, digits: int = 1) -> str:
-    return NOTHING if np.isnan(value) else f"{value:.{digits}f}"
