@@ -10,6 +10,7 @@ import pandas as pd
 import pytest
 
 import world_objects
+from tumortrack.core.errors import ArtifactError
 from tumortrack.core.geometry import triangles_of
 from tumortrack.core.mesh_query import contains
 from tumortrack.report.metrics import distance_to_surface
@@ -24,6 +25,7 @@ from tumortrack_lab.world.evidence import (
     met,
     mirrored,
 )
+from tumortrack_lab.world.made import scenes_of_kidney
 
 
 @cache
@@ -174,3 +176,13 @@ def test_tables_count_pieces_by_scene_and_misses_by_tumor():
     assert list(lines.index) == ["3 touches", "held tumor", "pulled, held tumor"]
     assert lines.loc["pulled, held tumor", "median, mm"] == "2.0"
     assert foresight(rows).iloc[0]["found/foreseen gain: median"] == "2.00"
+
+
+def test_scenes_that_were_made_or_tried_are_not_made_again(tmp_path):
+    for name in ("case", "scenes"):
+        (tmp_path / name).mkdir()
+    scene().write(tmp_path / "scenes" / "00002-rest-none")  # the two before had no equilibrium
+    assert [path.name for path in scenes_of_kidney(tmp_path, 1, 3)] == ["00002-rest-none"]
+    assert scenes_of_kidney(tmp_path, 1, 2) == []
+    with pytest.raises(ArtifactError):  # there is no case to make the fourth from
+        scenes_of_kidney(tmp_path, 1, 4)
