@@ -80,7 +80,7 @@ def test_the_stated_deviation_is_that_of_what_is_drawn(kind):
     for seed in range(400):
         piece = of(source(msgspec.structs.replace(ALL_TRUE, grip_mm=0.0), seed)).evidence
         true = known[piece.point_ct] if hasattr(piece, "point_ct") else plain
-        shares.append((np.array(piece.places) - true) / piece.std_mm)
+        shares.append((np.array(piece.places) - true) / np.hypot(piece.std_mm, piece.shared_std_mm))
     assert np.sqrt(np.mean(np.square(shares))) == pytest.approx(1.0, abs=0.06)
 
 

@@ -13,6 +13,7 @@ from scipy.spatial import cKDTree
 from tumortrack.core.errors import NoEstimate
 from tumortrack.core.estimate import Estimate
 from tumortrack.core.geometry import perpendicular, transform_points, triangles_of
+from tumortrack.core.report import NextEvidence
 from tumortrack.core.types import Anatomy
 from tumortrack.registration.model import RegistrationModel
 from tumortrack.report.rivals import best_rigid_pose, rigid_fit
@@ -65,11 +66,18 @@ class _Asker:
 
 
 def _advised(estimate: Estimate | None, source: EvidenceSource) -> list[Piece]:
-    if estimate is None or not estimate.report.next_touches:
+    advised = _advised_touches(estimate)
+    if not advised:
         return source.touches_at_random(_AT_A_TIME, None)
-    aims = np.array([touch.place_mm for touch in estimate.report.next_touches])
+    assert estimate is not None
+    aims = np.array([touch.place_mm for touch in advised])
     centres, outward = triangles_of(estimate.organ_mesh.vertices_mm, estimate.organ_mesh.faces)
     return source.touches(aims, outward[cKDTree(centres).query(aims)[1]])
+
+
+def _advised_touches(estimate: Estimate | None) -> list[NextEvidence]:
+    told = () if estimate is None else estimate.report.next_evidence
+    return [each for each in told if each.kind == "touch"]
 
 
 def own_rows(tracker: Tracker, scene: Scene, seed: tuple[int, ...]) -> Iterator[Row]:
@@ -190,9 +198,9 @@ def _rigid_mm(asker: _Asker) -> Row:
 def _foreseen(scene: Scene, before: Estimate | None, after: Estimate | None) -> Row:
     """Of the tumor that advice was for, along its least sure axis: foreseen deviations before and
     with all three touches, and errors."""
-    if before is None or after is None or not before.report.next_touches:
+    if before is None or after is None or not (advised := _advised_touches(before)):
         return {}
-    first, last = before.report.next_touches[0], before.report.next_touches[-1]
+    first, last = advised[0], advised[-1]
     axes, off = before.report.parts[first.part].center_axes, _off_mm(scene, before)
     if axes is None or first.part not in off:
         return {}

@@ -2,15 +2,15 @@
 
 All that the robot's tools tell of one scene (touches, held points, outlines of a probe that it
 holds) shares one hand-eye error: a shift, and a turn about the organ's middle. Landmarks are
-clicked in the camera's image and have none. ``std_mm`` states all errors of a piece but those that
-make it false, as if they were independent.
+clicked in the camera's image and have none. All errors of a piece but those that make it false are
+stated: by ``std_mm``, and by ``shared_std_mm`` what it shares with others of the robot.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -132,8 +132,9 @@ class EvidenceSource:
         told = self._by_robot(places) + self.rng.normal(0, half_mm, 3)
         told = told + self.rng.normal(0, half_mm, told.shape)
         name = self.scene.reference.names[1 + tumor]
-        std_mm = self._stated(middle, errors.probe_mm)
-        return Piece(Outline(places_mm=_tuples(told), part=name, std_mm=std_mm))
+        stated = self._stated(middle, half_mm)
+        stated |= {"shared_std_mm": float(np.hypot(stated["shared_std_mm"], half_mm)), "tool": ""}
+        return Piece(Outline(places_mm=_tuples(told), part=name, **stated))
 
     def normal(self) -> Float[np.ndarray, " 3"]:
         """Of a random plane."""
@@ -162,9 +163,9 @@ class EvidenceSource:
         told = self._by_robot(targets.points_mm[[point]])[0] + rng.normal(0, errors.tip_mm, 3)
         if slipped := rng.uniform() < errors.slips:
             told = told + unit(rng.normal(size=3)) * rng.uniform(*errors.slip_mm)
-        std_mm = self._stated(targets.points_mm[point], errors.tip_mm)
+        stated = self._stated(targets.points_mm[point], errors.tip_mm)
         place, which = _tuples(told), _tuples(point_ct)
-        held = Held(point_ct=which, place_mm=place, point_std_mm=errors.grip_mm, std_mm=std_mm)
+        held = Held(point_ct=which, place_mm=place, point_std_mm=errors.grip_mm, **stated)
         return Piece(held, bool(slipped))
 
     def _touch(self, aim_mm: np.ndarray, outward: np.ndarray) -> Piece:
@@ -173,22 +174,26 @@ class EvidenceSource:
         false, off_mm = rng.uniform() < errors.false_contacts, rng.uniform(*errors.false_mm)
         there = place + false * off_mm * normal
         told = self._by_robot(there[None])[0] + rng.normal(0, errors.tip_mm, 3)
-        std_mm = self._stated(place, errors.tip_mm)
-        return Piece(Touch(place_mm=_tuples(told), std_mm=std_mm), bool(false))
+        stated = self._stated(place, errors.tip_mm)
+        return Piece(Touch(place_mm=_tuples(told), **stated), bool(false))
 
     def _by_robot(self, places_mm: Points) -> Points:
         """As the robot has them in the camera's frame."""
         middle = self.scene.reference.organ.vertices_mm.mean(0)
         return (places_mm - middle) @ self.turn.T + middle + self.shift_mm
 
-    def _stated(self, place_mm: np.ndarray, own_mm: float) -> float:
-        """With the mean square, along an axis, of shifts of uniform length and of turns, both in
-        any direction."""
+    def _stated(self, place_mm: np.ndarray, own_mm: float) -> dict[str, Any]:
+        """Deviations of a piece of the robot: its own, and the shared one, by the mean square along
+        an axis of shifts of uniform length and of turns, both in any direction."""
         low, high = self.errors.hand_eye_mm
         lever_mm = np.linalg.norm(place_mm - self.scene.reference.organ.vertices_mm.mean(0))
         shift = (low**2 + low * high + high**2) / 9
         turn = (np.deg2rad(self.errors.hand_eye_degrees) * lever_mm) ** 2 * 2 / 9
-        return max(float(np.sqrt(own_mm**2 + shift + turn)), _LEAST_STD_MM)
+        return {
+            "std_mm": max(own_mm, _LEAST_STD_MM),
+            "shared_std_mm": float(np.sqrt(shift + turn)),
+            "tool": "robot",
+        }
 
 
 def met(
