@@ -6,6 +6,7 @@ from __future__ import annotations
 import csv
 import io
 import json
+from copy import copy
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -72,12 +73,15 @@ class _Evidence(Config, frozen=True, kw_only=True, tag_field="kind"):
         """Camera frame, mm."""
         return self.places_mm if hasattr(self, "places_mm") else (self.place_mm,)  # type: ignore[attr-defined]
 
-    def at(self, places_mm: Points) -> Any:
-        """The same at other places."""
-        field = "places_mm" if hasattr(self, "places_mm") else "place_mm"
-        places = _tuples(places_mm)
-        value = places if field == "places_mm" else places[0]
-        return msgspec.structs.replace(self, **{field: value})
+    def at(self, places_mm: Points, std_mm: float) -> Any:
+        """The same at other places, in another way sure; not checked again."""
+        moved, places = copy(self), _tuples(places_mm)
+        if hasattr(self, "places_mm"):
+            msgspec.structs.force_setattr(moved, "places_mm", places)
+        else:
+            msgspec.structs.force_setattr(moved, "place_mm", places[0])
+        msgspec.structs.force_setattr(moved, "std_mm", std_mm)
+        return moved
 
 
 class Touch(_Evidence, frozen=True, kw_only=True, tag="touch"):

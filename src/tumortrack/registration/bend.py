@@ -19,6 +19,7 @@ from jaxtyping import Float, Float32, Float64, Int64
 
 from tumortrack.core.mesh_kernels import farthest
 from tumortrack.registration.config import GaussNewtonConfig
+from tumortrack.registration.evidence import Terms
 from tumortrack.registration.gauss_newton import GaussNewton, RegistrationResult, prior_precision
 from tumortrack.registration.kernels import POSE
 from tumortrack.registration.looks import Looks
@@ -29,7 +30,6 @@ from tumortrack.registration.motion import ElasticMotion
 _STDS_MM = (0.5, 2.0, 6.0)
 _LINEAR_STEPS = 2
 _STEPS = 1  # true ones; two and six leave the same errors
-_STEPS_WITH_EVIDENCE = 4
 _EVERY = 3  # the choice takes one of so many points, and is as good as with all
 _GROUPS = 64  # of neighbouring points, some 8 mm apart
 _ALIKE_MM = 1.0  # points farther from their group's median count little in its mean
@@ -51,6 +51,7 @@ class BentFit:
     steps: int
     compliance_std_mm: float
     prior_slope: Float64[np.ndarray, " p"]
+    terms: Terms | None
 
 
 def bend(fit: RegistrationResult, config: GaussNewtonConfig) -> BentFit:
@@ -62,11 +63,13 @@ def bend(fit: RegistrationResult, config: GaussNewtonConfig) -> BentFit:
     precision = _blocks(prior_precision(fit.motion.shape, config), forces)
     near = msgspec.structs.replace(config, first_mm=config.last_mm)
     descent = GaussNewton(start.shape, fit.looks, start, near, fit.moved, precision)
-    descent.run(_STEPS if fit.looks.evidence is None else _STEPS_WITH_EVIDENCE)
+    descent.run(_STEPS)
     bent = descent.result()
     motion, steps = replace(bent.motion, rivals=fit.motion.rivals), fit.steps + bent.steps
     slope = precision @ np.append(bent.moved, motion.coefficients - start.shape.body.mean)
-    return BentFit(motion, fit.looks, bent.cost, bent.distances_mm, steps, std_mm, slope)
+    return BentFit(
+        motion, fit.looks, bent.cost, bent.distances_mm, steps, std_mm, slope, bent.terms
+    )
 
 
 def _with_compliance(motion: ElasticMotion) -> ElasticMotion:

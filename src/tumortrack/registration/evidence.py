@@ -14,7 +14,6 @@ from functools import cached_property
 from itertools import groupby
 from typing import Any
 
-import msgspec
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
@@ -202,27 +201,31 @@ class EvidenceTerms:
         """For a report: all ``evidence``, of which these terms are what was not left out; the first
         pieces came ``before`` this frame."""
         assert motion.covariance is not None
-        every = EvidenceTerms.of(evidence, motion.shape.anatomy_ct.names)
+        every = self if len(np.unique(self.piece)) == len(evidence) else None
+        every = every or EvidenceTerms.of(evidence, motion.shape.anatomy_ct.names)
         assert every is not None
-        terms = every.at(motion)
-        known = np.einsum("tp,pq,tq->t", terms.by_motion, motion.covariance, terms.by_motion)
+        terms, kept = every.at(motion), set(self.piece.tolist())
+        known = ((terms.by_motion @ motion.covariance) * terms.by_motion).sum(1)
+        starts = np.unique(terms.piece, return_index=True)[1]  # rows of a piece are neighbours,
+        order = np.argsort(starts)  # landmarks' after all others'
+        firsts = starts[order]
+        off_mm = np.maximum.reduceat(np.abs(terms.residuals_mm), firsts)[np.argsort(order)]
+        counts = np.diff(np.append(firsts, len(known)))[np.argsort(order)]
+        shares = np.add.reduceat(terms.weights * known, firsts)[np.argsort(order)] / counts
         told = []
         for number, each in enumerate(evidence):
-            mine, kept = terms.piece == number, number in self.piece
-            share = float((terms.weights[mine] * known[mine]).mean())
-            off_mm = float(np.abs(terms.residuals_mm[mine]).max())
-            if not kept and isinstance(each, Touch | Outline):  # perhaps beyond the field
+            off = float(off_mm[number])
+            if number not in kept and isinstance(each, Touch | Outline):  # perhaps beyond the field
                 part = motion.shape.anatomy_ct.parts[every.part[every.piece == number][0]]
-                off_mm = float(surface_distance(part, motion.back(np.array(each.places))).max())
-            news = min(share, 1.0) if kept else 0.0
+                off = float(surface_distance(part, motion.back(np.array(each.places))).max())
             told.append(
                 EvidenceReport(
                     name=each.name,
                     tool=each.tool,
                     std_mm=each.std_mm,
-                    off_mm=off_mm,
-                    news=news,
-                    left_out=not kept,
+                    off_mm=off,
+                    news=min(float(shares[number]), 1.0) if number in kept else 0.0,
+                    left_out=number not in kept,
                     before=number < before,
                 )
             )
@@ -239,7 +242,10 @@ class Known:
     def seen_from(self, camera_from_last: Affine) -> Known:
         """Before a camera that has moved."""
         places_mm = transform_points(camera_from_last, np.array(self.piece.places))
-        return Known(self.piece.at(places_mm), seen_from_first(self.motion, camera_from_last))
+        return Known(
+            self.piece.at(places_mm, self.piece.std_mm),
+            seen_from_first(self.motion, camera_from_last),
+        )
 
 
 def still_known(
@@ -261,7 +267,7 @@ def still_known(
             std_mm = math.hypot(each.piece.std_mm, _DRIFT * float(away.mean()))
             if std_mm <= _OLD_MM:
                 kept.append(each)
-                pieces.append(msgspec.structs.replace(each.piece.at(moved), std_mm=std_mm))
+                pieces.append(each.piece.at(moved, std_mm))
     return tuple(kept), tuple(pieces)
 
 
