@@ -17,7 +17,7 @@ define INSTALL
 endef
 
 .DEFAULT_GOAL := help
-.PHONY: help setup debian kernels demo test test-all quick pythons pytest test-hard check attack fuzz crash replay bench soak wheel lock licences audit results real world sequences pull pulls trust misses rehearsal population site pictures clean
+.PHONY: help setup debian kernels demo test test-all quick pythons pytest test-hard check attack fuzz crash replay bench soak wheel lock licences audit results real world sequences pull pulls trust misses evidence rehearsal population site pictures clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 10
@@ -128,6 +128,9 @@ trust: setup  ## what margins are worth for physics and organs left out (ARGS="M
 
 misses: setup  ## learns how far off tumors may be, from random kidneys (ARGS="OUT --write src/tumortrack/tracking/misses.json"; half an hour)
 	$(BIN)/python lab/scripts/misses.py $(ARGS)
+
+evidence: setup  ## what touches, outlines, landmarks and held tumors bring, on random kidneys (ARGS="OUT --kidneys 4"; 10 minutes)
+	$(BIN)/python lab/scripts/evidence.py $(ARGS)
 
 population: setup  ## KiTS19's kidneys with tumors: their list for a fleet, and what came of it (ARGS="DATA --list FILE", then --fleet OUT)
 	$(BIN)/python lab/scripts/population.py $(ARGS)

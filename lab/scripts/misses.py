@@ -15,7 +15,6 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from multiprocessing import get_context
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import pandas as pd
 import tyro
@@ -24,18 +23,15 @@ import tumortrack as tt
 from tumortrack.cli.console import model_folder, say
 from tumortrack.core import store
 from tumortrack.core.config import to_builtins
-from tumortrack.core.errors import TumortrackError
-from tumortrack.core.mesh_files import write_anatomy
 from tumortrack.core.process import available_cores
-from tumortrack.simulate.scene_folder import list_scenes, read_scene
+from tumortrack.simulate.scene_folder import read_scene
 from tumortrack.tracking.margins import METHOD
 from tumortrack.tracking.tracker import Tracker
 from tumortrack_lab.margins import misses
 from tumortrack_lab.study import scripts
 from tumortrack_lab.study.document import ReportWriter, table_of
 from tumortrack_lab.study.tables import NOTHING
-from tumortrack_lab.world.kidneys import random_anatomy
-from tumortrack_lab.world.scenes import TETS, World, WorldConfig
+from tumortrack_lab.world.made import scenes_of_kidney
 
 _BLOCK = "misses"
 
@@ -97,34 +93,19 @@ def _rows_path(out: Path, number: int, states: int) -> Path:
 
 def _kidney(out: Path, number: int, states: int) -> int:
     """A kidney's scenes and rows; how many scenes could be made."""
-    folder = out / str(number)
-    case, scenes = folder / "case", folder / "scenes"
-    if not case.exists():
-        anatomy_ct, up_lps = random_anatomy(number)
-        with TemporaryDirectory() as aside:
-            write_anatomy(Path(aside), anatomy_ct)
-            tt.prepare(aside, case, up=",".join(f"{value:.6f}" for value in up_lps))
-    rows_path = _rows_path(out, number, states)
+    folder, rows_path = out / str(number), _rows_path(out, number, states)
+    scenes = scenes_of_kidney(folder, number, states)
     if rows_path.exists():
-        return len(list_scenes(scenes))
-    scenes.mkdir(exist_ok=True)
-    world = World.opened(case, WorldConfig(seed=number), scenes / TETS)
-    for n in range(states):
-        name = "-".join((f"{n:05d}", *world.recipe(n)))
-        try:
-            if not (scenes / name).exists():
-                world.scene(n).write(scenes / name)
-        except TumortrackError:  # no equilibrium, or no organ in the image
-            continue
-    tracker = Tracker(tt.load_model(model_folder(case), "cpu"))
+        return len(scenes)
+    tracker = Tracker(tt.load_model(model_folder(folder / "case"), "cpu"))
     rows = [
         {"kidney": number, "scene": scene.name, **row}
-        for scene in list_scenes(scenes)
+        for scene in scenes
         for row in misses.rows_of(tracker, read_scene(scene))
     ]
     text = pd.DataFrame(rows).to_json(orient="records", lines=True)
     store.write_atomically(rows_path, text.encode())
-    return len(list_scenes(scenes))
+    return len(scenes)
 
 
 if __name__ == "__main__":

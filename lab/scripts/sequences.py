@@ -113,7 +113,7 @@ def _follow(options: Options, model: Path, films: list[Film]) -> None:
     sites, region = tumor_sites_of(films[0].rest), region_for(tracker.model)
     for done, film in enumerate(films, start=1):
         for method in options.methods:
-            locate = following.METHODS[method](tracker)
+            locate = following.METHODS[method](tracker, film)
             judge = partial(following.judge, locate, film, sites, region)
             rows = scripts.kept(film.folder / f"{method}.json", about, judge)
             errors = pd.DataFrame(rows).reindex(columns=["center_mm"])["center_mm"]
@@ -131,7 +131,7 @@ def _follow(options: Options, model: Path, films: list[Film]) -> None:
         pictures.draw(frame, plot)
         presses = (film for film in films if film.meta["kind"] == "press")
         press = max(presses, key=lambda film: film.bend_mm.max())
-        pictures.show(following.METHODS["track"](tracker), press, moving)
+        pictures.show(following.track(tracker), press, moving)
         each = made.items()
         links = [writer.data(f"sequences_{name}", its, tables.WORDS[name]) for name, its in each]
         links += writer.link(plot, "errors under a press"), writer.link(moving, "a press, followed")

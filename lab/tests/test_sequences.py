@@ -21,10 +21,11 @@ from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import Anatomy, Mesh
 from tumortrack.report.drawing import ESTIMATED, TRUE
-from tumortrack.report.metrics import surface_samples
+from tumortrack.report.metrics import distance_to_surface, surface_samples
 from tumortrack.sense.camera import deproject
 from tumortrack.sense.region import RegionConfig
 from tumortrack.simulate.scene_folder import draw_targets, read_scene
+from tumortrack.tracking.tracker import Tracker
 from tumortrack_devices.sources.recording import RecordingSourceConfig
 from tumortrack_lab.peers.base import OneWay
 from tumortrack_lab.study.tumor_sites import tumor_sites_of
@@ -339,3 +340,27 @@ def test_a_press_is_shown_as_a_small_film(film, tmp_path) -> None:
     for colour_of in (TRUE, ESTIMATED):
         off = np.abs(first - 255 * np.array(colour_of)).max(1)
         assert (off < 40).sum() > 50
+
+
+def test_touches_become_known_with_the_first_frame(film, monkeypatch) -> None:
+    given = []
+
+    class Recorder:
+        def __init__(self, *_): ...
+
+        def last_box_mm(self, _): ...
+
+        def locate(self, cloud, seen, evidence):
+            given.append(evidence)
+            raise NoEstimate("nothing is seen")
+
+    monkeypatch.setattr(following, "Follower", Recorder)
+    tracker = Tracker.__new__(Tracker)
+    tracker.model = None
+    locate = following.METHODS["track-touched"](tracker, film)
+    for number in range(2):
+        with pytest.raises(NoEstimate):
+            locate(following.Moment(film.looks(number), film.first_from_camera()))
+    assert [len(known) for known in given] == [6, 0]
+    places = np.array([touch.place_mm for touch in given[0]])
+    assert distance_to_surface(places, film.truth(0).organ).max() < 8.0

@@ -95,12 +95,10 @@ def _say_estimate(estimate: Estimate, located: Located) -> None:
         say(f"{each.name} {number}: {each.off_mm:.1f} mm off{', left out' * each.left_out}")
     # Of an answer that may be another organ, or in another place, no place is worth touching.
     placed = estimate.finding is None or estimate.finding.kind == "miss"
-    for touch in report.next_touches[:1] if placed else ():
-        x, y, z = touch.place_mm
-        say(
-            f"touch the organ at {x:.0f}, {y:.0f}, {z:.0f} mm (camera) next: the deviation of "
-            f"{touch.part} would fall from {touch.std_mm:.1f} to {touch.then_std_mm:.1f} mm"
-        )
+    # Only a touch of those after the first one counts on the others.
+    firsts = [*report.next_evidence[:1], *report.next_evidence[3:]] if placed else []
+    for advice in sorted(firsts, key=lambda each: each.then_std_mm):
+        say(f"next, {advice.words} (one deviation; camera frame)")
     for view in located.about["input"]:
         say(view["words"])
     say_notes(located.about["notes"])

@@ -6,6 +6,7 @@ from __future__ import annotations
 import csv
 import io
 import json
+from copy import copy
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -24,16 +25,18 @@ _LARGEST_FILE = 10_000_000  # bytes
 
 
 class _Evidence(Config, frozen=True, kw_only=True, tag_field="kind"):
-    """``std_mm``: of each place along any axis, the tracking of the tool included. ``stamp_ns``:
-    when; 0: at the time of the cloud. ``tool``: the name of what it is from."""
+    """``std_mm``: of each place along any axis, the tracking of the tool included;
+    ``shared_std_mm``: of a shift of all places of one ``tool``, as a hand-eye calibration errs, or
+    without its name of this piece. ``stamp_ns``: when; 0: at the time of the cloud."""
 
     std_mm: float
+    shared_std_mm: float = 0.0
     stamp_ns: int = 0
     tool: str = ""
 
     def __post_init__(self) -> None:
         self.check_between(self.name, std_mm=(0.05, 50.0))
-        for field in ("tip_mm", "point_std_mm"):
+        for field in ("tip_mm", "point_std_mm", "shared_std_mm"):
             if hasattr(self, field):
                 self.check_between(self.name, **{field: (0.0, 50.0)})
         for field in ("place_mm", "places_mm", "point_ct"):
@@ -70,12 +73,15 @@ class _Evidence(Config, frozen=True, kw_only=True, tag_field="kind"):
         """Camera frame, mm."""
         return self.places_mm if hasattr(self, "places_mm") else (self.place_mm,)  # type: ignore[attr-defined]
 
-    def at(self, places_mm: Points) -> Any:
-        """The same at other places."""
-        field = "places_mm" if hasattr(self, "places_mm") else "place_mm"
-        places = _tuples(places_mm)
-        value = places if field == "places_mm" else places[0]
-        return msgspec.structs.replace(self, **{field: value})
+    def at(self, places_mm: Points, std_mm: float) -> Any:
+        """The same at other places, in another way sure; not checked again."""
+        moved, places = copy(self), _tuples(places_mm)
+        if hasattr(self, "places_mm"):
+            msgspec.structs.force_setattr(moved, "places_mm", places)
+        else:
+            msgspec.structs.force_setattr(moved, "place_mm", places[0])
+        msgspec.structs.force_setattr(moved, "std_mm", std_mm)
+        return moved
 
 
 class Touch(_Evidence, frozen=True, kw_only=True, tag="touch"):
@@ -166,7 +172,7 @@ def read_evidence(path: Path) -> tuple[Evidence, ...]:
 
 
 _PLACE, _POINT = ("x_mm", "y_mm", "z_mm"), ("x_ct_mm", "y_ct_mm", "z_ct_mm")
-_NUMBERS = {*_PLACE, *_POINT, "std_mm", "tip_mm", "point_std_mm", "stamp_ns"}
+_NUMBERS = {*_PLACE, *_POINT, "std_mm", "shared_std_mm", "tip_mm", "point_std_mm", "stamp_ns"}
 _COLUMNS = {*_NUMBERS, "piece", "frame", "kind", "part", "tool"}
 
 

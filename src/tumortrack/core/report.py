@@ -328,14 +328,35 @@ class EvidenceReport(_Value, frozen=True, kw_only=True):
     before: bool = False
 
 
-class NextTouch(_Value, frozen=True, kw_only=True):
-    """A place of the organ's surface to touch next, and what one standard deviation of a part's
-    middle along its least sure axis is and would be ``then``."""
+class NextEvidence(_Value, frozen=True, kw_only=True):
+    """What to learn next of a part, and what one standard deviation of its middle along its least
+    sure axis is and would be ``then``. ``place_mm`` and ``direction`` (unit), by kind: of a touch
+    on the organ, with the surface's normal; an outline's middle, with its plane's normal; a
+    landmark (``name``: the structure); a look: the camera's place and line of sight."""
 
+    kind: Literal["touch", "outline", "landmark", "look"]
     part: str
     place_mm: Point
+    direction: Point
     std_mm: float
     then_std_mm: float
+    name: str = ""
+
+    @property
+    def words(self) -> str:
+        """In a sentence, camera frame."""
+        x, y, z = (f"{value:.0f}" for value in self.place_mm)
+        what = {
+            "touch": f"touch the organ at {x}, {y}, {z} mm",
+            "outline": f"outline {self.part} across {'xyz'[_largest(self.direction)]}",
+            "landmark": f"point at {self.name}",
+            "look": f"look from {x}, {y}, {z} mm as well",
+        }[self.kind]
+        return f"{what}: {self.part} {self.std_mm:.1f} -> {self.then_std_mm:.1f} mm"
+
+
+def _largest(direction: Point) -> int:
+    return max(range(3), key=lambda axis: abs(direction[axis]))
 
 
 class AllowedPoses(_Value, frozen=True, kw_only=True):
@@ -403,7 +424,7 @@ class FitReport(_Value, frozen=True, kw_only=True, omit_defaults=True):
     motion: MotionReport | None = None
     looks: LooksReport | None = None
     evidence: tuple[EvidenceReport, ...] = ()
-    next_touches: tuple[NextTouch, ...] = ()
+    next_evidence: tuple[NextEvidence, ...] = ()
     fit_mm: Residuals | None = None
     timings: dict[str, float] = {}
     unseen: float | None = None

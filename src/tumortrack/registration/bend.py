@@ -19,6 +19,7 @@ from jaxtyping import Float, Float32, Float64, Int64
 
 from tumortrack.core.mesh_kernels import farthest
 from tumortrack.registration.config import GaussNewtonConfig
+from tumortrack.registration.evidence import Terms
 from tumortrack.registration.gauss_newton import GaussNewton, RegistrationResult, prior_precision
 from tumortrack.registration.kernels import POSE
 from tumortrack.registration.looks import Looks
@@ -29,7 +30,6 @@ from tumortrack.registration.motion import ElasticMotion
 _STDS_MM = (0.5, 2.0, 6.0)
 _LINEAR_STEPS = 2
 _STEPS = 1  # true ones; two and six leave the same errors
-_STEPS_WITH_EVIDENCE = 4
 _EVERY = 3  # the choice takes one of so many points, and is as good as with all
 _GROUPS = 64  # of neighbouring points, some 8 mm apart
 _ALIKE_MM = 1.0  # points farther from their group's median count little in its mean
@@ -51,6 +51,7 @@ class BentFit:
     steps: int
     compliance_std_mm: float
     prior_slope: Float64[np.ndarray, " p"]
+    terms: Terms | None
 
 
 def bend(fit: RegistrationResult, config: GaussNewtonConfig) -> BentFit:
@@ -62,11 +63,13 @@ def bend(fit: RegistrationResult, config: GaussNewtonConfig) -> BentFit:
     precision = _blocks(prior_precision(fit.motion.shape, config), forces)
     near = msgspec.structs.replace(config, first_mm=config.last_mm)
     descent = GaussNewton(start.shape, fit.looks, start, near, fit.moved, precision)
-    descent.run(_STEPS if fit.looks.evidence is None else _STEPS_WITH_EVIDENCE)
+    descent.run(_STEPS)
     bent = descent.result()
     motion, steps = replace(bent.motion, rivals=fit.motion.rivals), fit.steps + bent.steps
     slope = precision @ np.append(bent.moved, motion.coefficients - start.shape.body.mean)
-    return BentFit(motion, fit.looks, bent.cost, bent.distances_mm, steps, std_mm, slope)
+    return BentFit(
+        motion, fit.looks, bent.cost, bent.distances_mm, steps, std_mm, slope, bent.terms
+    )
 
 
 def _with_compliance(motion: ElasticMotion) -> ElasticMotion:
@@ -110,6 +113,9 @@ class _Groups:
             means = np.concatenate([means, np.column_stack([terms.by_motion, terms.residuals_mm])])
             weights = np.append(weights, terms.std_mm**-2.0)
             width_mm = np.append(width_mm, terms.width_mm)
+        shared = np.zeros((len(means), len(means)))
+        if fit.looks.evidence is not None:
+            shared[len(counts) :, len(counts) :] = terms.by_shifts @ terms.by_shifts.T
         by_library, by_compliance, distances_mm = np.split(means, [POSE + len(body.mean), -1], 1)
         pose_std = np.repeat([config.shift_mm, config.turn_rad], 3)
         prior = _blocks(np.diag(pose_std**2), body.covariance)
@@ -117,7 +123,7 @@ class _Groups:
         return cls(
             distances_mm=distances_mm[:, 0],
             at_mean_mm=distances_mm[:, 0] - by_library @ off,
-            by_library_mm2=by_library @ prior @ by_library.T,
+            by_library_mm2=by_library @ prior @ by_library.T + shared,
             by_compliance_mm2=by_compliance @ by_compliance.T,
             weights=weights,
             width_mm=width_mm,

@@ -10,10 +10,10 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import groupby
 from typing import Any
 
-import msgspec
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
@@ -28,6 +28,7 @@ from tumortrack.registration.rest_shape import RestShape
 
 _WIDTHS = 4.0  # of the robust kernel, in standard deviations
 LEAST_WIDTH_MM = 4.0
+_SURFACE_MM = 1.0  # of the model's surfaces, segmentation included: ``sigma_mm`` of the points
 _RIGID_MM = 4.0  # error of the undeformed organ at best
 _DRIFT = 0.2  # error of unseen tissue's motion per way
 _OLD_MM = 5.0  # what is less sure tells nothing any more
@@ -35,26 +36,52 @@ _OLD_MM = 5.0  # what is less sure tells nothing any more
 
 @dataclass(frozen=True, eq=False)
 class Terms:
-    """Residuals at a motion, one a row, and how much each counts in the cost."""
+    """Residuals at a motion, one a row, and how much each counts. ``by_shifts``: what one standard
+    deviation of each tool's shift does; the likeliest ``shifts`` are left out of the equations
+    (Schur complement)."""
 
     residuals_mm: Float64[np.ndarray, " t"]
     by_motion: Float64[np.ndarray, "t p"]
-    weights: Float64[np.ndarray, " t"]
-    cost: float
+    by_shifts: Float64[np.ndarray, "t s"]
     std_mm: Float64[np.ndarray, " t"]
     width_mm: Float64[np.ndarray, " t"]  # of the robust kernel
     piece: Int64[np.ndarray, " t"]  # the number of the evidence that each belongs to
 
+    @cached_property
+    def weights(self) -> Float64[np.ndarray, " t"]:
+        """Of their squares in the cost."""
+        return 1 / (self.std_mm * (1 + (self.residuals_mm / self.width_mm) ** 2)) ** 2
+
+    @cached_property
+    def cost(self) -> float:
+        """As the points' cost: for small residuals their squares, in standard deviations."""
+        squares = (self.residuals_mm / self.width_mm) ** 2
+        alone = (self.width_mm / self.std_mm) ** 2 @ (squares / (1 + squares))
+        return float(alone - self.shifts @ self._own_precision @ self.shifts)
+
+    @cached_property
+    def _own_precision(self) -> Float64[np.ndarray, "s s"]:
+        return np.eye(self.by_shifts.shape[1]) + (self.by_shifts.T * self.weights) @ self.by_shifts
+
+    @cached_property
+    def shifts(self) -> Float64[np.ndarray, " s"]:
+        """The likeliest at this motion, in standard deviations."""
+        slope = (self.by_shifts.T * self.weights) @ self.residuals_mm
+        return -np.linalg.solve(self._own_precision, slope)
+
     @property
     def contradicting(self) -> Int64[np.ndarray, " k"]:
-        """Numbers of the evidence that lies beyond the robust kernel's width."""
-        return np.unique(self.piece[np.abs(self.residuals_mm) > self.width_mm])
+        """Numbers of the evidence that lies too far off, its tool's shift allowed for."""
+        off_mm = np.abs(self.residuals_mm + self.by_shifts @ self.shifts)
+        return np.unique(self.piece[off_mm > np.maximum(_WIDTHS * self.std_mm, LEAST_WIDTH_MM)])
 
     def add_to(self, curvature: Float64[np.ndarray, "p p"], gradient: np.ndarray) -> float:
         """Into a Gauss-Newton step's equations; the terms' cost."""
         weighted = self.by_motion.T * self.weights
+        across = weighted @ self.by_shifts
         curvature += weighted @ self.by_motion
-        gradient += weighted @ self.residuals_mm
+        curvature -= across @ np.linalg.solve(self._own_precision, across.T)
+        gradient += weighted @ (self.residuals_mm + self.by_shifts @ self.shifts)
         return self.cost
 
 
@@ -71,17 +98,23 @@ class EvidenceTerms:
     points_mm: Float64[np.ndarray, "m 3"]
     std_mm: Float64[np.ndarray, " k"]  # of places, then of points
     piece: Int64[np.ndarray, " k"]
+    tool: Int64[np.ndarray, " k"]  # which share a shift
+    shared_mm: Float64[np.ndarray, " tools"]  # its deviation
 
     @classmethod
     def of(cls, evidence: Sequence[Evidence], parts: Sequence[str]) -> EvidenceTerms | None:
         """``parts``: names of the organ's. None: there is none. Raises InputError: of a part that
         the organ lacks."""
         surfaces, points = list[tuple[Any, ...]](), list[tuple[Any, ...]]()
+        tools = dict[str, float]()
         for number, each in enumerate(evidence):
+            name = each.tool or f"piece {number}"
+            tools[name] = max(each.shared_std_mm, tools.get(name, 0.0))
+            about = number, list(tools).index(name)
             if isinstance(each, Landmark | Held):
                 which_mm = each.point_std_mm if isinstance(each, Held) else 0.0
                 whole_mm = math.hypot(each.std_mm, which_mm)
-                points.append((each.point_ct, each.place_mm, whole_mm, number))
+                points.append((each.point_ct, each.place_mm, whole_mm, *about))
                 continue
             name = each.part if isinstance(each, Touch | Outline) and each.part else parts[0]
             if name not in parts:
@@ -89,17 +122,20 @@ class EvidenceTerms:
                     f"{each.name} {number + 1} is of {name!r}; this organ has {', '.join(parts)}."
                 )
             away_mm = 0.0 if isinstance(each, Outline) else each.tip_mm
-            about = parts.index(name), away_mm, isinstance(each, Free), each.std_mm, number
-            surfaces += [(place, *about) for place in each.places]
+            std_mm = math.hypot(each.std_mm, _SURFACE_MM)
+            kind = parts.index(name), away_mm, isinstance(each, Free), std_mm
+            surfaces += [(place, *kind, *about) for place in each.places]
         if not surfaces and not points:
             return None
-        places, part, offset_mm, free, std_mm, piece = _columns(surfaces, 6)
-        points_ct, points_mm, point_std_mm, point_piece = _columns(points, 4)
+        places, part, offset_mm, free, *on_surfaces = _columns(surfaces, 7)
+        points_ct, points_mm, *of_points = _columns(points, 5)
+        stds_mm, piece, tool = (a + b for a, b in zip(on_surfaces, of_points, strict=True))
         return cls(
             np.array(places, float).reshape(-1, 3), np.array(part, int),
             np.array(offset_mm, float), np.array(free, bool),
             np.array(points_ct, float).reshape(-1, 3), np.array(points_mm, float).reshape(-1, 3),
-            np.array([*std_mm, *point_std_mm], float), np.array([*piece, *point_piece], int),
+            np.array(stds_mm, float), np.array(piece, int), np.array(tool, int),
+            np.array(list(tools.values())),
         )  # fmt: skip
 
     def at(self, motion: ElasticMotion, least_width_mm: float = LEAST_WIDTH_MM) -> Terms:
@@ -119,12 +155,13 @@ class EvidenceTerms:
             by_motion.append(motion.effects(self.points_ct).reshape(-1, unknowns))
         times = np.repeat([1, 3], [len(self.places_mm), len(self.points_ct)])
         std_mm, piece = np.repeat(self.std_mm, times), np.repeat(self.piece, times)
-        together = np.concatenate(residuals_mm)
-        width_mm = np.maximum(_WIDTHS * std_mm, least_width_mm)
-        squares = (together / width_mm) ** 2
-        cost = float(((width_mm / std_mm) ** 2 * squares / (1 + squares)).sum())
-        weights = 1 / (std_mm * (1 + squares)) ** 2
-        return Terms(together, np.concatenate(by_motion), weights, cost, std_mm, width_mm, piece)
+        tool = np.repeat(self.tool, times)
+        together, by_all = np.concatenate(residuals_mm), np.concatenate(by_motion)
+        shifted = [n for n in np.unique(tool) if self.shared_mm[n]]
+        by_shifts = [by_all[:, :3] * ((tool == n) * self.shared_mm[n])[:, None] for n in shifted]
+        width_mm = np.maximum(_WIDTHS * np.hypot(std_mm, self.shared_mm[tool]), least_width_mm)
+        shifts = np.concatenate([by_all[:, :0], *by_shifts], axis=1)
+        return Terms(together, by_all, shifts, std_mm, width_mm, piece)
 
     def rigid_costs(
         self,
@@ -155,6 +192,7 @@ class EvidenceTerms:
         return EvidenceTerms(
             self.places_mm[places], self.part[places], self.offset_mm[places], self.free[places],
             self.points_ct[points], self.points_mm[points], self.std_mm[kept], self.piece[kept],
+            self.tool[kept], self.shared_mm,
         )  # fmt: skip
 
     def described(
@@ -163,27 +201,31 @@ class EvidenceTerms:
         """For a report: all ``evidence``, of which these terms are what was not left out; the first
         pieces came ``before`` this frame."""
         assert motion.covariance is not None
-        every = EvidenceTerms.of(evidence, motion.shape.anatomy_ct.names)
+        every = self if len(np.unique(self.piece)) == len(evidence) else None
+        every = every or EvidenceTerms.of(evidence, motion.shape.anatomy_ct.names)
         assert every is not None
-        terms = every.at(motion)
-        known = np.einsum("tp,pq,tq->t", terms.by_motion, motion.covariance, terms.by_motion)
+        terms, kept = every.at(motion), set(self.piece.tolist())
+        known = ((terms.by_motion @ motion.covariance) * terms.by_motion).sum(1)
+        starts = np.unique(terms.piece, return_index=True)[1]  # rows of a piece are neighbours,
+        order = np.argsort(starts)  # landmarks' after all others'
+        firsts = starts[order]
+        off_mm = np.maximum.reduceat(np.abs(terms.residuals_mm), firsts)[np.argsort(order)]
+        counts = np.diff(np.append(firsts, len(known)))[np.argsort(order)]
+        shares = np.add.reduceat(terms.weights * known, firsts)[np.argsort(order)] / counts
         told = []
         for number, each in enumerate(evidence):
-            mine, kept = terms.piece == number, number in self.piece
-            share = float((terms.weights[mine] * known[mine]).mean())
-            off_mm = float(np.abs(terms.residuals_mm[mine]).max())
-            if not kept and isinstance(each, Touch | Outline):  # perhaps beyond the field
+            off = float(off_mm[number])
+            if number not in kept and isinstance(each, Touch | Outline):  # perhaps beyond the field
                 part = motion.shape.anatomy_ct.parts[every.part[every.piece == number][0]]
-                off_mm = float(surface_distance(part, motion.back(np.array(each.places))).max())
-            news = min(share, 1.0) if kept else 0.0
+                off = float(surface_distance(part, motion.back(np.array(each.places))).max())
             told.append(
                 EvidenceReport(
                     name=each.name,
                     tool=each.tool,
                     std_mm=each.std_mm,
-                    off_mm=off_mm,
-                    news=news,
-                    left_out=not kept,
+                    off_mm=off,
+                    news=min(float(shares[number]), 1.0) if number in kept else 0.0,
+                    left_out=number not in kept,
                     before=number < before,
                 )
             )
@@ -200,7 +242,10 @@ class Known:
     def seen_from(self, camera_from_last: Affine) -> Known:
         """Before a camera that has moved."""
         places_mm = transform_points(camera_from_last, np.array(self.piece.places))
-        return Known(self.piece.at(places_mm), seen_from_first(self.motion, camera_from_last))
+        return Known(
+            self.piece.at(places_mm, self.piece.std_mm),
+            seen_from_first(self.motion, camera_from_last),
+        )
 
 
 def still_known(
@@ -222,7 +267,7 @@ def still_known(
             std_mm = math.hypot(each.piece.std_mm, _DRIFT * float(away.mean()))
             if std_mm <= _OLD_MM:
                 kept.append(each)
-                pieces.append(msgspec.structs.replace(each.piece.at(moved), std_mm=std_mm))
+                pieces.append(each.piece.at(moved, std_mm))
     return tuple(kept), tuple(pieces)
 
 

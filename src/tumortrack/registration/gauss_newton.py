@@ -23,7 +23,7 @@ from jaxtyping import Float, Float64
 
 from tumortrack.registration import gauss_newton_kernels as kernels
 from tumortrack.registration.config import GaussNewtonConfig
-from tumortrack.registration.evidence import EvidenceTerms
+from tumortrack.registration.evidence import EvidenceTerms, Terms
 from tumortrack.registration.looks import Looks
 from tumortrack.registration.motion import ElasticMotion
 from tumortrack.registration.rest_shape import RestShape
@@ -43,6 +43,7 @@ class RegistrationResult:
             ``cost_without_strays``: if all lay as the others do.
         distances_mm: the residuals, signed.
         moved: shift (mm) and turn (rad) from where the prior has the pose.
+        terms: of the evidence, at the motion.
         rivals: other minima that explain the points nearly as well; ``beyond``: one that explains
             them better, in a pose that is excluded (see ``choose.likeliest``).
     """
@@ -55,22 +56,24 @@ class RegistrationResult:
     distances_mm: Float[np.ndarray, " n"]
     steps: int
     moved: Float64[np.ndarray, " 6"]
+    terms: Terms | None = None
     rivals: tuple[RegistrationResult, ...] = ()
     beyond: RegistrationResult | None = None
 
     @property
     def points_cost(self) -> float:
         """The cost without that of evidence."""
-        evidence = self.looks.evidence
-        return self.cost - (0.0 if evidence is None else evidence.at(self.motion).cost)
+        return self.cost - (0.0 if self.terms is None else self.terms.cost)
 
     def beside(self, evidence: EvidenceTerms | None) -> RegistrationResult:
         """A fit to points alone, judged by evidence as well."""
         if evidence is None:
             return self
-        more = evidence.at(self.motion).cost
+        terms = evidence.at(self.motion)
+        more = terms.cost
         return replace(
             self,
+            terms=terms,
             looks=replace(self.looks, evidence=evidence),
             cost=self.cost + more,
             cost_without_strays=self.cost_without_strays + more,
@@ -131,6 +134,7 @@ class GaussNewton:
         already = np.zeros(6) if moved is None else np.array(moved, float)
         self._state = kernels.State(rotation, centre_mm, coefficients, already, *left)
         self.cost, self.steps, self.converged = np.inf, 0, False
+        self._terms: Terms | None = None  # of the evidence, at the present state
 
     def run(self, steps: int) -> None:
         """Continue until ``steps`` are taken since the start, or it has converged."""
@@ -152,7 +156,8 @@ class GaussNewton:
         _, self.converged, cost = kernels.descend(self._problem, state, first, last)
         motion = ElasticMotion(self._rest, state.rotation, state.centre_mm, state.coefficients)
         assert evidence is not None
-        self.cost = cost + evidence.at(motion).add_to(state.curvature, state.gradient)
+        self._terms = evidence.at(motion)
+        self.cost = cost + self._terms.add_to(state.curvature, state.gradient)
 
     def result(self) -> RegistrationResult:
         """The present state."""
@@ -168,7 +173,7 @@ class GaussNewton:
         without = float(self.cost - of_strays) / max(1 - strays, 1 / len(far))
         costs = self.cost, strays, without
         left = state.distances_mm, self.steps, state.moved
-        return RegistrationResult(motion, self._looks, *costs, *left)
+        return RegistrationResult(motion, self._looks, *costs, *left, self._terms)
 
 
 def prior_precision(rest: RestShape, config: GaussNewtonConfig) -> Float64[np.ndarray, "p p"]:

@@ -20,6 +20,7 @@ from tumortrack.imaging.raster import label_grid
 from tumortrack.models.report import Frame, describe_parts, grid_over
 from tumortrack.registration import kernels
 from tumortrack.registration import report as entries
+from tumortrack.registration.advice import Advisor
 from tumortrack.registration.bend import BentFit
 from tumortrack.registration.choose import likeliest
 from tumortrack.registration.evidence import EvidenceTerms, Known, still_known
@@ -27,7 +28,6 @@ from tumortrack.registration.gauss_newton import RegistrationResult
 from tumortrack.registration.looks import Looks
 from tumortrack.registration.model import RegistrationModel
 from tumortrack.registration.motion import ElasticMotion, blend
-from tumortrack.registration.next_touch import next_touches
 from tumortrack.registration.search import PosePrior, apart_mm
 from tumortrack.registration.uncertainty import apparent_size, held_by_prior_mm
 
@@ -80,6 +80,11 @@ class _Placed:
     sample_mm2: Float[np.ndarray, "k 3 3"]
     middle_mm2: Float[np.ndarray, "parts 3 3"]
     structures: dict[str, Mesh]
+
+    @property
+    def least_sure(self) -> int:
+        """The number of the tumor whose place is least sure."""
+        return 1 + int(np.trace(self.middle_mm2[1:], axis1=1, axis2=2).argmax())
 
     def probability(self, mine: _OrganPoints) -> Float32[np.ndarray, " n"]:
         """The chance that each point lies on the side of the nearest surface where it was found,
@@ -142,8 +147,8 @@ class RegistrationLocator:
         found = self._found(fit, prior=self._registration.prior, pieces=tuple(evidence))
         told, known = self._told(placed, found)
         if len(self._model.parts) > 1:
-            least_sure = 1 + int(np.trace(placed.middle_mm2[1:], axis1=1, axis2=2).argmax())
-            more["next_touches"] = next_touches(placed.motion, least_sure)
+            advisor = Advisor(placed.motion, placed.least_sure, self._registration.config)
+            more["next_evidence"] = *advisor.touches(), *advisor.others()
         report = self._report(frame, looks, placed, inside, prior, evidence=told, **more)
         volume = CameraLabels(labels, camera_from_index)
         made = Estimate(inside, volume, placed.meshes, report, placed.motion, found.shown)
@@ -165,6 +170,10 @@ class RegistrationLocator:
         smoothing = SmoothingReport(time_s=how.smoothing_s, lag_ms=1000 * lag_s)
         told, known = self._told(placed, found)
         more = {"size": size, "smoothing": smoothing, "evidence": told}
+        if how.thorough and len(self._model.parts) > 1:
+            with frame.stage("advise"):
+                advisor = Advisor(placed.motion, placed.least_sure, self._registration.config)
+                more["next_evidence"] = advisor.touches()
         report = self._report(frame, looks, placed, inside, found.prior, **more)
         made = Estimate(inside, None, placed.meshes, report, placed.motion, found.shown)
         return replace(made, structures=placed.structures, evidence=known)

@@ -105,7 +105,7 @@ class Registration:
         rest."""
         bent = bend(fit, self.config)
         evidence = fit.looks.evidence
-        if evidence is None or not len(wrong := evidence.at(bent.motion).contradicting):
+        if evidence is None or bent.terms is None or not len(wrong := bent.terms.contradicting):
             return fit, bent
         looks = replace(fit.looks, evidence=evidence.without(wrong))
         near = msgspec.structs.replace(self.config, first_mm=self.config.last_mm)

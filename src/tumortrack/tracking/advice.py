@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float
 from tumortrack.core.estimate import Estimate
 from tumortrack.core.geometry import Points, transform_points, triangles_of
 from tumortrack.core.types import Look, Mesh
+from tumortrack.registration.advice import Advisor
 from tumortrack.registration.motion import ElasticMotion
 
 _MAX_SAMPLES = 2000  # faces or vertices of the organ that are looked at
@@ -22,10 +23,9 @@ _MIN_SINE = 0.3  # to the line of sight: below it, a direction is along the view
 def where_to_look(estimate: Estimate, looks: Sequence[Look]) -> str:
     """The side of the organ that the camera should look at, in words.
 
-    If no view has points on more than a tenth of the side that faces the camera: that part. If
-    another fit is nearly as likely: where its surface is farthest from this one's. Otherwise along
-    the axis in which a tumor's centre is least certain, as surfaces constrain motion along their
-    normals. Sides are those of the first look's image.
+    If no view has points on more than a tenth of the side that faces the camera: that part.
+    Otherwise from where a look would tell most of the least sure tumor. Sides are those of the
+    first look's image.
     """
     organ = estimate.organ_mesh
     facing, centre = near_side(organ), organ.vertices_mm.mean(0)
@@ -38,7 +38,7 @@ def where_to_look(estimate: Estimate, looks: Sequence[Look]) -> str:
         direction = facing[hidden].mean(0) - centre if hidden.mean() > _MAX_HIDDEN else np.zeros(3)
         if side := _side_in_words(direction, centre, camera):
             return f"free the view of the organ's side towards {side}, or look from there"
-    side = _side_in_words(_least_certain_direction(estimate, centre), centre, camera)
+    side = _side_in_words(_best_place(estimate) - centre, centre, camera)
     return f"look more from {side or 'another side'}, by about 30 degrees"
 
 
@@ -62,26 +62,14 @@ def _nearest_mm(from_mm: Points, points_mm: Float[np.ndarray, "_ 3"]) -> Float[n
     return np.asarray(cKDTree(points_mm).query(from_mm)[0])
 
 
-def _least_certain_direction(
-    estimate: Estimate, centre: Float[np.ndarray, " 3"]
-) -> Float[np.ndarray, " 3"]:
-    """From the organ's centre, camera frame; zero if nothing is known."""
-    motion = estimate.motion
-    if isinstance(motion, ElasticMotion) and motion.rivals:
-        vertices_mm = estimate.organ_mesh.vertices_mm
-        vertices_mm = vertices_mm[:: len(vertices_mm) // _MAX_SAMPLES + 1]
-        other_mm = motion.rivals[0][0].carry(motion.shape.anatomy_ct.organ.vertices_mm)
-        return vertices_mm[_nearest_mm(vertices_mm, other_mm).argmax()] - centre
-    axes = [
-        (part.center_axes_std_mm[0], name, part.center_axes[0])
-        for name, part in estimate.report.tumors.items()
-        if part.center_axes_std_mm and part.center_axes
-    ]
-    if not axes:
+def _best_place(estimate: Estimate) -> Float[np.ndarray, " 3"]:
+    """For one more camera; the camera's own if nothing is known."""
+    motion, tumors = estimate.motion, estimate.report.tumors
+    if not isinstance(motion, ElasticMotion) or motion.covariance is None or not tumors:
         return np.zeros(3)
-    _, name, least_certain = max(axes)
-    axis = np.array(least_certain)
-    return axis if (estimate.meshes[name].box_mm.mean(0) - centre) @ axis >= 0 else -axis
+    unsure = [part.center_std_mm or 0.0 for part in tumors.values()]
+    looks = Advisor(motion, 1 + int(np.argmax(unsure))).looks()
+    return np.array(min(looks, key=lambda look: look.then_std_mm).place_mm)
 
 
 def _side_in_words(

@@ -6,7 +6,7 @@ image of each camera, and the cameras' poses with a calibration's errors.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from typing import Any, NamedTuple
@@ -17,6 +17,7 @@ from jaxtyping import Float64
 
 from tumortrack.core.errors import NoEstimate
 from tumortrack.core.estimate import Estimate
+from tumortrack.core.evidence import Evidence
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.report import Finding
 from tumortrack.core.types import DepthFrame, Look, Mesh, SensorCloud
@@ -25,12 +26,15 @@ from tumortrack.registration.rest_shape import distance_of
 from tumortrack.report.metrics import surface_distances
 from tumortrack.report.rivals import rigid_fit
 from tumortrack.sense.region import Hints, RegionConfig, organ_points
+from tumortrack.simulate.scene_folder import Scene
 from tumortrack.tracking.tracker import Follower, FollowerConfig, Tracker, region_for
 from tumortrack_lab.study.tumor_sites import TumorSite
+from tumortrack_lab.world.evidence import ALL_TRUE, EvidenceSource, Piece
 from tumortrack_lab.world.films import Film
 
 _SURFACES_EVERY = 3  # frames: a Hausdorff distance takes as long as locating
 _COARSE = 16  # of the volume, which is not used
+_TOUCHES = 6  # in the first frame
 _NOTHING_KNOWN = Hints()
 
 
@@ -45,15 +49,15 @@ class Moment(NamedTuple):
 Locate = Callable[[Moment], Estimate]
 
 
-def track(tracker: Tracker) -> Locate:
+def track(tracker: Tracker, evidence: Sequence[Evidence] = ()) -> Locate:
     """The first camera's images as `tumortrack track` follows them, its wait for the third good
-    estimate in a row included."""
+    estimate in a row included. ``evidence``: what becomes known with the first frame."""
     region, follower = region_for(tracker.model), Follower(tracker, FollowerConfig())
-    in_a_row = 0
+    in_a_row, new = 0, tuple(evidence)
 
     def locate(look: Moment) -> Estimate:
-        nonlocal in_a_row
-        frame = look.frames[0]
+        nonlocal in_a_row, new
+        frame, known, new = look.frames[0], new, ()
         try:
             cloud = _organ(frame, region, Hints(last_box_mm=follower.last_box_mm(frame.stamp_ns)))
         except NoEstimate:
@@ -61,12 +65,22 @@ def track(tracker: Tracker) -> Locate:
             in_a_row = 0
             raise
         in_a_row, before = 0, in_a_row
-        estimate = follower.locate(cloud, frame)
+        estimate = follower.locate(cloud, frame, evidence=known)
         in_a_row = before + 1 if estimate.quality == "good" else 0
         wait = Finding("model", {"words": "wait"})
         return replace(estimate, finding=wait) if 0 < in_a_row < SURE_AFTER else estimate
 
     return locate
+
+
+def track_touched(tracker: Tracker, film: Film) -> Locate:
+    """``track`` with touches of the unseen side in the first frame, if the organ is found in it."""
+    frame, pieces = film.looks(0)[0], list[Piece]()
+    with suppress(NoEstimate):
+        seen = Scene(_organ(frame, region_for(tracker.model)), film.truth(0), frame)
+        source = EvidenceSource.of(seen, (film.meta["number"],), ALL_TRUE)
+        pieces = source.touches_at_random(_TOUCHES, source.unseen)
+    return track(tracker, [piece.evidence for piece in pieces])
 
 
 def first_look(tracker: Tracker) -> Locate:
@@ -93,9 +107,12 @@ def _organ(frame: DepthFrame, region: RegionConfig, hints: Hints = _NOTHING_KNOW
     return organ_points(frame, region, hints, rng).cloud
 
 
-METHODS: dict[str, Callable[[Tracker], Locate]] = {
-    "track": track, "first-look": first_look, "several-looks": several_looks,
-}  # fmt: skip
+METHODS: dict[str, Callable[[Tracker, Film], Locate]] = {
+    "track": lambda tracker, _: track(tracker),
+    "track-touched": track_touched,
+    "first-look": lambda tracker, _: first_look(tracker),
+    "several-looks": lambda tracker, _: several_looks(tracker),
+}
 
 
 def judge(

@@ -1,0 +1,190 @@
+"""What to learn next of a part's place: in closed form, from the fit's covariance.
+
+A touch measures the surface of the organ along its normal, a landmark a point's place, an outline
+the border of the part, a look from another side all of the surface that faces it. By Kalman's
+update each narrows the covariance of everything that moves with what it measures, before anybody
+takes it. Rivals count as one more unknown each, with their share of the probability.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float64
+
+from tumortrack.core.geometry import Points, triangles_of, turned_by, unit
+from tumortrack.core.report import NextEvidence
+from tumortrack.registration.config import GaussNewtonConfig
+from tumortrack.registration.motion import ElasticMotion
+from tumortrack.sense.noise import CAMERA_STD
+
+_DEFAULTS = GaussNewtonConfig()
+_PLACES = 300  # on the organ's surface
+_APART_MM = 10.0  # no two touches nearer to each other
+# Of each place, the model's surface included, and of what all touches of one tool share, as a
+# hand-eye calibration's error.
+_TOUCH_MM, _OUTLINE_MM, _LANDMARK_MM, _SHARED_MM = 1.4, 1.8, 2.0, 1.0
+_IN_OUTLINE = 12  # places
+_VIEW_DEGREES, _VIEWS = 30.0, 8  # all around the present line of sight
+_FACING = 0.3  # cosine to the line of sight: flatter surfaces return little
+_NEAR_MM = 2.0  # of an outline's plane
+
+
+Place = Float64[np.ndarray, " 3"]
+Kind = Literal["touch", "outline", "landmark", "look"]
+
+
+@dataclass(frozen=True, eq=False)
+class _Known:
+    """What is known of a part's middle (``middle``: how it moves with all unknowns) and of all
+    unknowns together; organ's axes."""
+
+    middle: Float64[np.ndarray, "3 p"]
+    covariance: Float64[np.ndarray, "p p"]
+
+    @property
+    def std_mm(self) -> float:
+        """Along the least sure axis."""
+        own = self.middle @ self.covariance @ self.middle.T
+        return float(np.sqrt(np.linalg.eigvalsh(own)[-1]))
+
+    def after(self, rows: Float64[np.ndarray, "k p"], noise: Float64[np.ndarray, "k k"]) -> _Known:
+        """Once this is measured."""
+        shared = rows @ self.covariance
+        gained = shared.T @ np.linalg.solve(shared @ rows.T + noise, shared)
+        return _Known(self.middle, self.covariance - gained)
+
+    def with_unknowns(self, variances: Float64[np.ndarray, " u"]) -> _Known:
+        """And with these, which do not move the middle."""
+        p, u = len(self.covariance), len(variances)
+        covariance = np.diag(np.append(np.zeros(p), variances))
+        covariance[:p, :p] = self.covariance
+        return _Known(np.concatenate([self.middle, np.zeros((3, u))], axis=1), covariance)
+
+    def best(self, rows: Float64[np.ndarray, "n p"], std_mm: float) -> int:
+        """Of single measurements."""
+        shared = rows @ self.covariance
+        with_middle = shared @ self.middle.T / np.sqrt((shared * rows).sum(1) + std_mm**2)[:, None]
+        own = self.middle @ self.covariance @ self.middle.T
+        left = own - with_middle[:, :, None] * with_middle[:, None, :]
+        return int(np.linalg.eigvalsh(left)[:, -1].argmin())
+
+
+@dataclass(frozen=True, eq=False)
+class Advisor:
+    """Of one part (its number) of an organ that was found."""
+
+    motion: ElasticMotion
+    part: int
+    config: GaussNewtonConfig = _DEFAULTS
+
+    def touches(self, count: int = 3) -> tuple[NextEvidence, ...]:
+        """The best places of the organ's surface, each after those before it."""
+        places_mm, normals = self._surface()
+        rows, known, told = self._rows(places_mm), self._known(), list[NextEvidence]()
+        known = known.with_unknowns(_SHARED_MM**2 * np.ones(3))
+        rows = np.concatenate([rows, rows[:, :3]], axis=1)
+        free = np.ones(len(rows), bool)
+        for _ in range(count):
+            best = int(np.flatnonzero(free)[known.best(rows[free], _TOUCH_MM)])
+            then = known.after(rows[[best]], np.diag([_TOUCH_MM**2]))
+            told.append(self._told("touch", places_mm[best], normals[best], known, then))
+            known = then
+            free &= np.linalg.norm(places_mm - places_mm[best], axis=1) > _APART_MM
+        return tuple(told)
+
+    def others(self) -> tuple[NextEvidence, ...]:
+        """The best outline of the part, landmark, and look from another side."""
+        kinds = self._outlines(), self._landmarks(), self.looks()
+        best = [min(kind, key=lambda each: each.then_std_mm, default=None) for kind in kinds]
+        return tuple(each for each in best if each is not None)
+
+    def _outlines(self) -> Iterator[NextEvidence]:
+        mesh = self.motion.shape.anatomy_ct.parts[self.part]
+        places_mm, known = self.motion.carry(mesh.vertices_mm), self._known()
+        middle_mm = places_mm.mean(0)
+        for normal in np.eye(3):
+            near = places_mm[np.abs((places_mm - middle_mm) @ normal) < _NEAR_MM]
+            some = near[:: max(1, len(near) // _IN_OUTLINE)]
+            noise = _OUTLINE_MM**2 * np.eye(len(some))
+            then = known.after(self._rows(some, self.part), noise)
+            yield self._told("outline", middle_mm, normal, known, then)
+
+    def _landmarks(self) -> Iterator[NextEvidence]:
+        known = self._known()
+        for name, mesh in self.motion.shape.anatomy_ct.structures.items():
+            middle_ct = mesh.vertices_mm.mean(0, keepdims=True)
+            then = known.after(self._moves(middle_ct)[0], _LANDMARK_MM**2 * np.eye(3))
+            place_mm = self.motion.carry(middle_ct)[0]
+            yield self._told("landmark", place_mm, np.zeros(3), known, then, name)
+
+    def looks(self) -> Iterator[NextEvidence]:
+        """From places about the camera's line of sight, at its distance."""
+        places_mm, normals = self._surface()
+        middle_mm, rows, known = places_mm.mean(0), self._rows(places_mm), self._known()
+        across = np.cross(middle_mm, [0.0, 1.0, 0.0])
+        for angle in np.linspace(0, 2 * np.pi, _VIEWS, endpoint=False):
+            axis = turned_by(angle * unit(middle_mm)) @ unit(across)
+            towards = turned_by(np.radians(_VIEW_DEGREES) * axis) @ -middle_mm
+            mine = rows[normals @ unit(towards) > _FACING]
+            by_camera = mine[:, : len(CAMERA_STD)] * CAMERA_STD
+            each = self.config.sigma_mm**2 * max(1, len(mine) / self.config.n_effective)
+            noise = each * np.eye(len(mine)) + by_camera @ by_camera.T
+            yield self._told(
+                "look", middle_mm + towards, -unit(towards), known, known.after(mine, noise)
+            )
+
+    def _surface(self) -> tuple[Points, Points]:
+        """Middles of some of the organ's triangles, and their normals."""
+        organ = self.motion.shape.anatomy_ct.organ
+        faces = organ.faces[:: max(1, len(organ.faces) // _PLACES)]
+        used, numbers = np.unique(faces, return_inverse=True)
+        vertices_mm = self.motion.carry(organ.vertices_mm[used])
+        places_mm, normals = triangles_of(vertices_mm, numbers.reshape(faces.shape))
+        return places_mm, normals / np.linalg.norm(normals, axis=1, keepdims=True)
+
+    def _known(self) -> _Known:
+        covariance, shares = self.motion.covariance, [share for _, share in self.motion.rivals]
+        assert covariance is not None
+        middle = self._moves(self.motion.shape.middles_ct[[self.part]])[0]
+        own = _Known(middle[:, : len(covariance)], self.motion.std_scale**2 * covariance)
+        return replace(own.with_unknowns(np.array(shares)), middle=middle)
+
+    def _moves(self, points_ct: Points) -> Float64[np.ndarray, "n 3 p"]:
+        here = self.motion.carry(points_ct)
+        away = [
+            (rival.carry(points_ct) - here) @ self.motion.rotation
+            for rival, _ in self.motion.rivals
+        ]
+        return np.concatenate([self.motion.effects(points_ct), *(a[:, :, None] for a in away)], 2)
+
+    def _rows(self, places_mm: Points, part: int = 0) -> Float64[np.ndarray, "n p"]:
+        rows = self.motion.residual_rows(places_mm, part).astype(float)
+        others = [
+            rival.residual_rows(places_mm, part)[:, [-1]] - rows[:, [-1]]
+            for rival, _ in self.motion.rivals
+        ]
+        return np.concatenate([rows[:, :-1], *others], axis=1)
+
+    def _told(
+        self,
+        kind: Kind,
+        place: Place,
+        direction: Place,
+        now: _Known,
+        then: _Known,
+        name: str = "",
+    ) -> NextEvidence:
+        x, y, z, i, j, k = map(float, [*place, *direction])
+        return NextEvidence(
+            kind=kind,
+            part=self.motion.shape.anatomy_ct.names[self.part],
+            place_mm=(x, y, z),
+            direction=(i, j, k),
+            std_mm=now.std_mm,
+            then_std_mm=then.std_mm,
+            name=name,
+        )
