@@ -323,6 +323,27 @@ def test_a_table_says_the_same(tmp_path):
             read_evidence(file)
 
 
+def test_touches_alone_are_an_answer(slim_model, tmp_path):
+    rng = np.random.default_rng(3)
+    chosen = rng.choice(len(VERTICES), 40, replace=False)
+    tips = MOVED[chosen] + 1.5 * NORMALS[chosen] @ TRUE.rotation.T
+    evidence = [Touch(place_mm=tuple(p), tip_mm=1.5) for p in tips]
+    file, out = tmp_path / "e.json", tmp_path / "out"
+    file.write_bytes(evidence_json((*evidence, *this_way_round())))
+    command = "locate", slim_model, "-", out, "--grid", 32, "--device", "cpu", "--evidence", file
+    said = answered(tumortrack(*command))
+    assert "no cloud: the organ was touched alone" in said
+    report = json.loads((out / "report.json").read_text())
+    assert report["points"] == 40
+    assert report["cloud_sha256"] is None
+    assert [each["name"] for each in report["evidence"]] == ["landmark"] * 2
+    found_mm = np.array(report["parts"]["tumor_1"]["center_mm"])
+    assert np.linalg.norm(found_mm - at_all(TUMOR).mean(0)) < 3
+    file.write_bytes(evidence_json(tuple(evidence[:11])))
+    assert "at least 12 touches" in refusal(tumortrack(*command, "--overwrite"))
+    assert "give --evidence" in refusal(tumortrack(*command[:-2], "--overwrite"))
+
+
 def test_what_is_older_than_the_organs_last_motion_is_refused(tmp_path):
     old = Touch(place_mm=(0.0, 0.0, 150.0), stamp_ns=5)
     content = {**json.loads(evidence_json((old,))), "still_since_ns": 6}
