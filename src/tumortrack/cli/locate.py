@@ -29,8 +29,9 @@ class Locate(LocateOptions):
     Attributes:
         model: a case, or a folder that `train` wrote.
         cloud: .ply, .pcd or .npz in the camera frame, or a depth image (with --intrinsics): 16-bit
-            PNG or TIFF, or a TIFF of floats. Several views of an organ that does not move in
-            between (CLOUD CLOUD ... OUT) need --poses; the answer is in the first one's frame.
+            PNG or TIFF, or a TIFF of floats; or -: none, but touches (--evidence). Several views
+            of an organ that does not move in between (CLOUD CLOUD ... OUT) need --poses; the answer
+            is in the first one's frame.
         out: folder to write.
         more: with several views: the paths that follow; the last one is OUT.
         json: print the report (OUT/report.json); sentences go to standard error.

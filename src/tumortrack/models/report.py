@@ -17,7 +17,7 @@ from tumortrack.core.report import FitReport, PartReport, Residuals
 from tumortrack.core.types import Anatomy, CameraLabels, Mesh, OccupancyCloud, SensorCloud
 from tumortrack.imaging.raster import label_grid
 from tumortrack.models.model import Model
-from tumortrack.sense.cloud import check_cloud, thin_cloud
+from tumortrack.sense.cloud import FEWEST_POINTS, check_cloud, thin_cloud
 
 Rng = np.random.Generator
 CLOUD_POINTS = 40_000  # of an estimate made of surfaces
@@ -27,8 +27,15 @@ class Frame:
     """One cloud (camera frame, mm; checked by ``check_cloud``) on its way to an estimate:
     ``points_mm`` are those that the network sees, ``seconds`` what each stage took."""
 
-    def __init__(self, model: Model, cloud: SensorCloud, seed: int, rng: Rng) -> None:
-        check_cloud(cloud)
+    def __init__(
+        self,
+        model: Model,
+        cloud: SensorCloud,
+        seed: int,
+        rng: Rng,
+        fewest: int = FEWEST_POINTS,
+    ) -> None:
+        check_cloud(cloud, fewest)
         self.model, self.cloud, self.seed, self.rng = model, cloud, seed, rng
         self.points_mm = thin_cloud(cloud, model.config.scene.cloud.n_points, rng).points_mm
         self.seconds: dict[str, float] = {}

@@ -30,7 +30,10 @@ _WIDTHS = 4.0  # of the robust kernel, in standard deviations
 LEAST_WIDTH_MM = 4.0
 _SURFACE_MM = 1.0  # of the model's surfaces, segmentation included: ``sigma_mm`` of the points
 _RIGID_MM = 4.0  # error of the undeformed organ at best
-_DRIFT = 0.2  # error of unseen tissue's motion per way
+# Error along an axis of where tissue is said to go, per way that it went: in 113 frames of two
+# sequences of the phantom under finite elements (pressed, pushed) the median is 0.05, and 90 % are
+# within 0.12.
+_DRIFT = 0.1
 _OLD_MM = 5.0  # what is less sure tells nothing any more
 
 

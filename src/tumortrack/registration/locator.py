@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Int32, Int64, UInt8
 
 from tumortrack.core.estimate import Estimate, FollowOptions
-from tumortrack.core.evidence import Evidence
+from tumortrack.core.evidence import FEWEST_TOUCHES, Evidence
 from tumortrack.core.report import EvidenceReport, FitReport, SizeFit, SmoothingReport
 from tumortrack.core.types import Anatomy, CameraLabels, Look, Mesh, OccupancyCloud, SensorCloud
 from tumortrack.imaging.raster import label_grid
@@ -30,6 +30,7 @@ from tumortrack.registration.model import RegistrationModel
 from tumortrack.registration.motion import ElasticMotion, blend
 from tumortrack.registration.search import PosePrior, apart_mm
 from tumortrack.registration.uncertainty import apparent_size, held_by_prior_mm
+from tumortrack.sense.cloud import FEWEST_POINTS
 
 QUERIES = 40_000  # as many as the paper asks
 CARRIED = 20_000  # points of the undeformed organ that live estimates carry along
@@ -131,7 +132,9 @@ class RegistrationLocator:
     ) -> Estimate:
         """See ``tracking.tracker.Tracker.locate``."""
         cloud = looks[0].cloud
-        frame = Frame(self._model, cloud, seed, np.random.default_rng(seed))
+        alone = isinstance(looks[0].seen, SensorCloud) and not len(looks[0].seen.points_mm)
+        fewest = FEWEST_TOUCHES if alone else FEWEST_POINTS
+        frame = Frame(self._model, cloud, seed, np.random.default_rng(seed), fewest)
         points = self._points(frame, looks, evidence=EvidenceTerms.of(evidence, self._model.parts))
         fit = self._registration.register(points, None, frame.stage)
         fit, bent = self._bent(fit, frame)

@@ -15,7 +15,7 @@ from tumortrack.core.evidence import read_evidence
 from tumortrack.report.seen import Seen
 from tumortrack.tracking.options import LocateOptions, check_grid, model_folder
 from tumortrack.tracking.points import PointTable, check_near_organ, read_points
-from tumortrack.tracking.views import View, further_looks, read_places, read_views
+from tumortrack.tracking.views import NO_CLOUD, View, further_looks, read_places, read_views
 
 if TYPE_CHECKING:
     from tumortrack.core.estimate import Estimate
@@ -91,7 +91,7 @@ def locate(given: Path, clouds: Sequence[Path], options: LocateOptions) -> Locat
         "input": [],
         "model": model.provenance,
         "model_sha256": store.sha256_of(folder / store.MANIFEST),
-        "cloud_sha256": store.sha256_of(clouds[0]),
+        "cloud_sha256": None if clouds[0] == NO_CLOUD else store.sha256_of(clouds[0]),
     }
     ct, organs = _ct(options.case, model, tracker.anatomy_ct), []
     seen = Seen(content=views[0].content, ct=ct)

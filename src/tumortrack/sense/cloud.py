@@ -93,22 +93,22 @@ def seen_points(
     )
 
 
-def check_cloud(cloud: SensorCloud) -> None:
+def check_cloud(cloud: SensorCloud, fewest: int = FEWEST_POINTS) -> None:
     """Refuse a cloud that cannot show an organ in front of the camera, in mm.
 
     Raises:
         InputError: the unit is evidently not mm (metres, or mm read as metres), or a point lies
             more than 20 m away.
-        NoEstimate: fewer than 200 distinct points, all on one line, or none before the camera.
+        NoEstimate: fewer than so many distinct points, all on one line, or none before the camera.
     """
     points_mm = cloud.points_mm
     ordered = np.sort(points_mm.T, axis=1)
     distinct = 1 + int(np.count_nonzero(np.diff(ordered[0])))  # cheap, and mostly enough
     for some in (points_mm[:2000], points_mm):  # sorting all of a large cloud takes a while
-        if distinct < FEWEST_POINTS:
+        if distinct < fewest:
             distinct = len(np.unique(some, axis=0))
-    if distinct < FEWEST_POINTS:
-        raise NoEstimate(Finding("sparse", {"points": distinct, "fewest": FEWEST_POINTS}))
+    if distinct < fewest:
+        raise NoEstimate(Finding("sparse", {"points": distinct, "fewest": fewest}))
     few = len(points_mm) // 100
     low, middle, high = ordered[:, [few, len(points_mm) // 2, -1 - few]].T
     extent_mm = float((high - low).max())

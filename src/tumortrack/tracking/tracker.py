@@ -14,7 +14,7 @@ from tumortrack.core.causes import Cause, Likely
 from tumortrack.core.config import Config, check_seed
 from tumortrack.core.errors import InputError, NoEstimate, NotThisOrgan
 from tumortrack.core.estimate import Estimate, FollowOptions
-from tumortrack.core.evidence import Evidence
+from tumortrack.core.evidence import Evidence, touched
 from tumortrack.core.geometry import HERE, Affine, transform_points
 from tumortrack.core.process import keep_small_blocks
 from tumortrack.core.report import Finding
@@ -82,8 +82,9 @@ class Tracker:
             grid: voxels along the longest side of the dense volume.
             seen: all that the camera saw, by which the estimate is judged; default: the cloud.
             others: further looks at the organ from other places, between which it did not move.
-            evidence: what else is known of where it lies then: ``Touch``, ``Landmark``,
-                ``Outline``, ``Free``, in the frame of ``cloud``.
+            evidence: what else is known of where it lies then: ``Touch``, ``Landmark``, ``Held``,
+                ``Outline``, ``Free``, in the frame of ``cloud``, which may be empty: then of twelve
+                touches or more.
 
         Raises:
             NoEstimate: too few points, no organ found in them, not the organ of this model, or the
@@ -98,6 +99,9 @@ class Tracker:
                 "SensorCloud(points_mm) of an n x 3 array in the camera frame."
             )
         looks = Look(cloud, seen or cloud, HERE), *others
+        if not len(cloud.points_mm) and evidence:
+            places_mm, evidence = touched(evidence, self.model.parts[0])
+            looks = (Look(replace(cloud, points_mm=places_mm), cloud, HERE),)
         with self._explaining_errors(looks, _DEFAULTS):
             estimate = self._locator.locate(looks, grid, seed, evidence)
             estimate = self._judged(estimate, looks, False)

@@ -21,6 +21,7 @@ from tumortrack.sense.files import DEPTH_SUFFIXES, read_cloud, read_depth, read_
 from tumortrack.sense.region import Hints, organ_points
 from tumortrack.tracking.options import LocateOptions
 
+NO_CLOUD = Path("-")
 _NEAR = range(-3, 4)  # pixels from the one of --at
 
 
@@ -86,6 +87,9 @@ class View:
         self, cloud: SensorCloud, range_mm: tuple[float, float] | None
     ) -> tuple[SensorCloud, dict[str, Any]]:
         count, hint = len(cloud.points_mm), "--range" if range_mm else ""
+        if self.path == NO_CLOUD:
+            words = "no cloud: the organ was touched alone."
+            return cloud, {"file": "", "hint": "touches", "organ": 0, "of": 0, "words": words}
         if range_mm:
             cloud = crop_cloud(cloud, *range_mm)
         kept = len(cloud.points_mm)
@@ -110,6 +114,12 @@ def read_views(paths: Sequence[Path], options: LocateOptions) -> list[View]:
 
 
 def _read_view(path: Path, intrinsics: Path | None, options: LocateOptions) -> View:
+    if path == NO_CLOUD:
+        if options.evidence is None:
+            raise InputError(
+                "without a cloud (-) give --evidence FILE with twelve touches or more."
+            )
+        return View(path, SensorCloud(np.zeros((0, 3), np.float32)))
     if path.suffix.lower() in DEPTH_SUFFIXES:
         if intrinsics is None:
             raise InputError(f"{path} is a depth image: give --intrinsics FILE.json with it.")
