@@ -11,7 +11,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from tyro.conf import Positional
+from tyro.conf import Positional, UseAppendAction
 
 from tumortrack.cli.console import console, keep_loaded, model_folder, options_of, say
 from tumortrack.tracking.options import TrackOptions
@@ -44,6 +44,7 @@ class Track(TrackOptions):
     model: Positional[Path]
     source: Positional[str]
     sinks: Positional[tuple[str, ...]] = ()
+    tool: UseAppendAction[tuple[str, ...]] = ()
 
     def run(self) -> None:
         from tumortrack import api
