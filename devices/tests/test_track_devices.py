@@ -12,7 +12,10 @@ from rosbags.highlevel import AnyReader
 
 from stories import refusal, succeeded, tumortrack
 from track_objects import PATIENT, World, start, told, virtual, wait_for
+from tumortrack.live.poses import COLUMNS, CONTACT
+from tumortrack.live.values import SourceEnded
 from tumortrack.sense.camera import d405
+from tumortrack_devices.sources.recording import RecordingSourceConfig
 
 pytestmark = pytest.mark.slow
 
@@ -59,6 +62,56 @@ def test_a_recording_is_played_back_to_the_same_estimates(world, tmp_path):
     assert {one["stamp_ns"] for one in reports(replay) if one["seen"]} == {
         one["stamp_ns"] for one in frames
     }
+
+
+def evidence(recording):
+    """What became known with each frame, by its stamp."""
+    seen = RecordingSourceConfig(path=recording, rate=0).open()
+    known = {}
+    while True:
+        try:
+            if (frame := seen.read(1.0)) is not None:
+                known[frame.stamp_ns] = frame.evidence
+        except SourceEnded:
+            seen.close()
+            return known
+
+
+def test_a_replay_with_the_evidence_of_tools_is_the_same_to_the_last_bit(world, tmp_path):
+    """A probe that touches the organ's middle as seen, and a shaft beside it."""
+    live, first, again = (tmp_path / name for name in ("live", "first", "again"))
+    source = virtual(world, fps=10, camera_motion="false")
+    given = (*("--seconds", 3, *PATIENT), "--report", tmp_path / "live.json")
+    succeeded(tumortrack("track", world.model, source, f"recording:{live}", *given))
+    found = [one for one in reports(live) if one["seen"]]
+    centre_mm = next(one for one in found if one["estimate"])["estimate"]["parts"]["kidney"]
+    x, y, z = centre_mm["center_mm"]
+    stamps = range(found[0]["stamp_ns"], found[-1]["stamp_ns"] + 10**8, 2 * 10**7)
+    rows = [
+        f"{stamp_ns},camera,{x},{y},{z - 30},1,0,0,0,{int(stamp_ns % 10**9 < 4 * 10**8)}"
+        for stamp_ns in stamps
+    ]
+    (tmp_path / "probe.csv").write_text("\n".join([COLUMNS + CONTACT, *rows]) + "\n")
+    table = f"file:{tmp_path}/probe.csv"
+    report = tmp_path / "first.json"
+    options = (f"probe={table}?tip_mm=2", f"shaft={table}?tip=0,0,-40&shaft_mm=20")
+    tools = [word for one in options for word in ("--tool", one)]
+    run = f"recording:{live}?rate=0", f"recording:{first}", *tools, "--report", report
+    succeeded(tumortrack("track", world.model, *run))
+    counts = told(report)["tools"]
+    assert counts["probe"]["touch"] >= 2
+    assert counts["shaft"]["free"] >= len(found) / 2
+    given = evidence(first)
+    assert {piece.name for known in given.values() for piece in known} == {"touch", "free"}
+    run = f"recording:{first}?rate=0", f"recording:{again}", "--report", tmp_path / "again.json"
+    succeeded(tumortrack("track", world.model, *run))
+    assert evidence(again) == given
+    for one, other in zip(reports(first), reports(again), strict=True):
+        for volatile in ("seconds", "latency_ms", "arrived_ns"):
+            one.pop(volatile), other.pop(volatile)
+        for each in (one, other):
+            (each["estimate"] or {}).pop("timings", None)
+        assert one == other
 
 
 def test_depths_that_were_corrected_are_not_corrected_again(world, tmp_path):

@@ -139,7 +139,8 @@ def unpack_transform(content: bytes) -> Float[np.ndarray, "4 4"]:
     if len(content) != 48:
         raise ProtocolError(f"a TRANSFORM has 48 bytes, not {len(content)}.")
     b_from_a = np.eye(4)
-    b_from_a[:3] = np.frombuffer(content, ">f4").reshape(4, 3).T
+    with np.errstate(invalid="ignore"):  # of what is no number
+        b_from_a[:3] = np.frombuffer(content, ">f4").reshape(4, 3).T
     turn = b_from_a[:3, :3]
     if not np.isfinite(b_from_a).all() or np.abs(turn @ turn.T - np.eye(3)).max() > _NOT_RIGID:
         raise ProtocolError("a TRANSFORM is not rigid.")
@@ -174,7 +175,8 @@ def unpack_polydata_points(content: bytes) -> Float[np.ndarray, "n 3"]:
     end = _POLYDATA.size + 12 * count
     if len(content) < end:
         raise ProtocolError("a POLYDATA is cut off.")
-    points = np.frombuffer(content[_POLYDATA.size : end], ">f4").reshape(-1, 3).astype(float)
+    with np.errstate(invalid="ignore"):
+        points = np.frombuffer(content[_POLYDATA.size : end], ">f4").reshape(-1, 3).astype(float)
     if not np.isfinite(points).all():
         raise ProtocolError("a POLYDATA is not finite.")
     return points
