@@ -179,6 +179,9 @@ class _Screen:
             if sink.dropped or sink.errors:
                 last = f"; the last: {sink.error}" if sink.error else ""
                 say(f"sink {sink.name}: {sink.dropped} missed, {sink.errors} errors{last}.")
+        for name, told in self._run.loop.views.tools.summary().items():
+            words = [f"{count} {what}" for what, count in told.items() if what != "trouble"]
+            say(f"tool {name}: {', '.join(words) or 'nothing'}.")
         for name, errors in statistics.errors.items():
             off = errors.summary()
             say(f"{name}: centre off by {off['p50']:.1f} mm (median; 95 %: {off['p95']:.1f} mm).")

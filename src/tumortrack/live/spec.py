@@ -183,8 +183,8 @@ def _filled(config: type[C], target: str, options: str, where: str) -> C:
     for key, text in given.items():
         kind = fields[key].type
         try:
-            value = text.split(",") if kind in (Point, Point | None) else text
-            values[key] = msgspec.convert(value, kind, strict=False, dec_hook=_path)
+            words = text.split(",") if kind in (Point, Point | None) else text
+            values[key] = msgspec.convert(words, kind, strict=False, dec_hook=_path)
         except msgspec.ValidationError as error:
             allowed = _allowed(msgspec.inspect.type_info(kind))
             raise InputError(

@@ -33,8 +33,8 @@ _MEANT = {"1": True, "true": True, "on": True, "0": False, "false": False, "off"
 
 
 class OpenIgtLinkToolConfig(TipConfig, frozen=True, kw_only=True, tag="openigtlink"):
-    """``address``: HOST:PORT of a server to connect to (PlusServer), or PORT alone to be the server
-    (3D Slicer connects); the protocol's default port is 18944.
+    """``address``: HOST[:PORT] of a server to connect to (PlusServer; 18944), or PORT alone to be
+    the server (3D Slicer connects), where 18944 may be the sink's.
 
     Attributes:
         name: device of the tool's TRANSFORM; empty: there is no tool, only what is drawn.
@@ -46,7 +46,7 @@ class OpenIgtLinkToolConfig(TipConfig, frozen=True, kw_only=True, tag="openigtli
 
     target: ClassVar[str] = "address"
 
-    address: str = "18944"
+    address: str = "18945"
     name: str = ""
     contact: str = "contact"
     space: Literal["", "ras", "lps"] = ""
