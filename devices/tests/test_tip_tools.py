@@ -176,7 +176,7 @@ def found(shift_mm, finding=None):
 
 
 def test_what_is_held_is_the_point_of_the_ct_that_was_taken_until_it_is_let_go(tmp_path):
-    poses = [facing((0.2 * n, 0, 120)) for n in range(80)]  # it pulls with 20 mm/s
+    poses = [facing((0.2 * n, 0, 106)) for n in range(80)]  # it pulls with 20 mm/s
     path = table(tmp_path / "t.csv", poses, [10 <= n < 50 for n in range(80)])
     tool = FileToolConfig(path=path, holds=True).open(setting(), "grasper")
     times = range(0, 700, 40)
@@ -185,15 +185,21 @@ def test_what_is_held_is_the_point_of_the_ct_that_was_taken_until_it_is_let_go(t
     assert [time for time, pieces in given.items() if pieces] == list(range(160, 500, 40))
     for time_ms, (held,) in ((t, p) for t, p in given.items() if p):
         assert isinstance(held, Held)
-        np.testing.assert_allclose(held.point_ct, (0.2 * 12, 0, 20), atol=1e-6)
-        np.testing.assert_allclose(held.place_mm, (0.02 * time_ms, 0, 120), atol=1e-6)
+        np.testing.assert_allclose(held.point_ct, (0.2 * 12, 0, 6), atol=1e-6)
+        np.testing.assert_allclose(held.place_mm, (0.02 * time_ms, 0, 106), atol=1e-6)
         assert (held.point_std_mm, held.std_mm, held.tool) == (2, 1, "grasper")
 
 
 def test_what_is_held_is_not_taken_from_a_doubtful_estimate(tmp_path):
-    tool = still((0, 0, 120), [True] * 60, tmp_path, holds=True)
+    tool = still((0, 0, 106), [True] * 60, tmp_path, holds=True)
     assert not any(frames(tool, range(0, 300, 40), found((0, 0, 0), NOT_JUDGED)))
     assert any(frames(tool, range(300, 500, 40), found((0, 0, 0))))
+
+
+def test_jaws_that_close_on_nothing_hold_nothing(tmp_path):
+    tool = still((0, 0, 90), [True] * 60, tmp_path, holds=True)
+    assert not any(frames(tool, range(0, 300, 40), found((0, 0, 0))))
+    assert tool.trouble == "it holds nothing of the organ, which is more than 1 cm away"
 
 
 def test_a_landmark_is_touched_and_a_click_is_a_touch(tmp_path):
@@ -206,7 +212,7 @@ def test_a_landmark_is_touched_and_a_click_is_a_touch(tmp_path):
     assert landmark.point_ct == point
     np.testing.assert_allclose(landmark.place_mm, (0, 0, 120), atol=1e-6)
     assert frames(tool, [120], small_estimate()) == [[]]
-    holder = still((0, 0, 120), [False] * 60, tmp_path, holds=True)
+    holder = still((0, 0, 106), [False] * 60, tmp_path, holds=True)
     holder.touched()
     given = frames(holder, [40, 80, 120], found((0, 0, 0)))
     assert [len(pieces) for pieces in given] == [0, 1, 1]

@@ -85,7 +85,7 @@ class OpenIgtLinkTool(TipTool):
         self._poses, self._lock = PoseBuffer(), threading.Lock()
         # By device and number of the fiducial; when each was changed last; None: it was given.
         self._drawn: dict[tuple[str, int], tuple[Piece, float | None]] = {}
-        self._fault, self._server, self._reached_s = "", config.server, time.monotonic()
+        self._heard_fault, self._server, self._reached_s = "", config.server, time.monotonic()
         self._readers = {
             "TRANSFORM": self._hear_pose,
             "STRING": self._hear_contact,
@@ -100,13 +100,13 @@ class OpenIgtLinkTool(TipTool):
         return self._poses.at(stamp_ns)
 
     def refresh(self, stamp_ns: int) -> None:
-        fault, self._fault = self._fault, ""
+        fault, self._heard_fault = self._heard_fault, ""
         now_s = time.monotonic()
         if not self._server or self.link.receivers:
             self._reached_s = now_s
         elif now_s - self._reached_s > _SILENT_S:
             fault = f"nothing answers at {self._server}:{self.link.port}; it is tried again"
-        self.trouble = fault
+        self.trouble = fault or self.trouble
 
     def drawn(self) -> list[Piece]:
         now_s, done = time.monotonic(), []
@@ -121,7 +121,7 @@ class OpenIgtLinkTool(TipTool):
         self.link.close()
 
     def _faulty(self, words: str) -> None:
-        self._fault = f"a message was ignored: {words}"
+        self._heard_fault = f"a message was ignored: {words}"
 
     def _heard(self, header: Header, body: bytes) -> None:
         """One message, in the link's thread. Raises ProtocolError."""

@@ -30,6 +30,7 @@ _LATE_NS = (0, 25_000_000, 50_000_000)  # a pose so long before a frame stands f
 _KEPT_NS = 1_000_000_000  # a touch waits so long for a frame in which the organ is found
 _SWEEP_MM = 3.0  # between two touches of a sweep
 _SHAFT_MM = 5.0  # between places along a shaft
+_GRASP_MM = 10.0  # from the tip to the next vertex of the organ: jaws are that long
 _REACH_MM = 2000.0  # of a point of the CT
 _LARGEST_STD_MM = 50.0  # of evidence
 _MOST_CHANGES = 1000  # of contact, between two frames
@@ -108,7 +109,7 @@ class TipTool(Tool):
         self._contact = False  # as told last
         self._on, self._began_ns, self._changed_ns = False, 0, -_BOUNCE_NS  # as followed
         self._told_ns, self._told_mm = 0, np.zeros(3)  # so far a contact is told; its last touch
-        self._clicks = 0
+        self._clicks, self._fault = 0, ""  # of which the next frame tells
         self._point: dict[str, Any] | None = None  # of the CT, that it holds
         self._waiting: list[tuple[int, Piece]] = []  # that no estimate knows yet; since when
 
@@ -151,14 +152,19 @@ class TipTool(Tool):
             return
         if (tip_mm := self._tip(view.seen.stamp_ns)) is None:
             return
-        point_ct = motion.back(transform_points(_camera_from_published(view), tip_mm[:1]))
+        tip_mm = transform_points(_camera_from_published(view), tip_mm[:1])
+        away_mm = np.linalg.norm(estimate.organ_mesh.vertices_mm - tip_mm, axis=1).min()
+        if away_mm > _GRASP_MM:
+            self._fault = "it holds nothing of the organ, which is more than 1 cm away"
+            return
+        point_ct = motion.back(tip_mm)
         std_mm = None if point_ct is None else motion.std_mm(point_ct)
         if point_ct is not None and std_mm is not None:
             std = min(float(std_mm[0]), _LARGEST_STD_MM)
             self._point = {"point_ct": point_ct[0], "point_std_mm": std}
 
     def _pieces(self, now_ns: int) -> list[Piece]:
-        self.trouble = ""
+        self.trouble, self._fault = self._fault, ""
         self.refresh(now_ns)
         for piece in self.drawn():
             self._add(piece, now_ns)
