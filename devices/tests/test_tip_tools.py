@@ -236,6 +236,9 @@ def test_a_tool_whose_poses_end_gives_nothing_and_says_so_once(tmp_path):
     for time_ms in (200, 300, 400):
         assert [p for p in tools.evidence(view(STAMP_NS + time_ms * MS)) if p.name == "free"] == []
     assert notes == ["tool probe: where it is at the time of a frame or touch is not known"]
+    assert tools.summary() == {
+        "probe": {"touch": 1, "free": 1, "trouble": [notes[0].removeprefix("tool probe: ")]}
+    }
 
 
 @pytest.mark.parametrize(

@@ -102,7 +102,7 @@ class Tools:
     def summary(self) -> dict[str, Any]:
         """Of each tool its counts and what was wrong (JSON types)."""
         told = self._told
-        return {n: {**t.counts, "trouble": told.get(n, [])} for n, t in self._tools.items()}
+        return {n: {**+t.counts, "trouble": told.get(n, [])} for n, t in self._tools.items()}
 
     def _check(self, part: str) -> None:
         if self._context.anatomy_ct is None:
