@@ -143,13 +143,14 @@ def test_the_tip_and_the_shaft_follow_the_tools_axes(tmp_path):
     np.testing.assert_allclose(free.places_mm, [(-5, 0, 120), (-10, 0, 120)], atol=1e-6)
 
 
-def test_the_calibrations_error_is_in_the_deviation(tmp_path):
+def test_a_tools_pieces_share_the_calibrations_error(tmp_path):
     path = table(tmp_path / "t.csv", [facing((0, 0, 150))] * 30, [True] * 30)
     published = replace(BASE, error_mm=2.0, error_deg=0.5)
     tool = FileToolConfig(path=path, std_mm=0.5).open(setting(published), "probe")
     ((touch,),) = frames(tool, [200])
-    expected = np.hypot(0.5, 2.0 + 150 * np.radians(0.5))
-    assert touch.std_mm == pytest.approx(expected, abs=1e-6)
+    expected = 2.0 + 150 * np.radians(0.5)
+    assert (touch.std_mm, touch.tool) == (0.5, "probe")
+    assert touch.shared_std_mm == pytest.approx(expected, abs=1e-6)
     assert expected > 3.3
 
 

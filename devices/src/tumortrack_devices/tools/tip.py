@@ -6,7 +6,6 @@ mean of its first poses.
 
 from __future__ import annotations
 
-import math
 from abc import abstractmethod
 from collections import deque
 from collections.abc import Mapping
@@ -187,15 +186,19 @@ class TipTool(Tool):
         return given
 
     def _seen_by(self, view: CameraView, piece: Piece) -> Evidence:
-        """In the frame of a view's camera. The calibration's error counts as if its bound were one
-        standard deviation: it is the same in all pieces, and their number does not lessen it."""
+        """In the frame of a view's camera. The calibration's error, its bound taken for one
+        standard deviation, is shared by all pieces: their number does not lessen it."""
         places_mm = transform_points(_camera_from_published(view), piece.places_mm)
         farthest_mm = float(np.linalg.norm(places_mm, axis=1).max())
         error_mm = self.context.published_frame.error_at(farthest_mm) or 0.0
         single = "place_mm" in piece.kind.__struct_fields__
         places = {"place_mm": places_mm[0]} if single else {"places_mm": places_mm}
-        std_mm = math.hypot(self.config.std_mm, error_mm)
-        about = {"std_mm": std_mm, "stamp_ns": piece.stamp_ns, "tool": self.name}
+        about = {
+            "std_mm": self.config.std_mm,
+            "shared_std_mm": error_mm,
+            "stamp_ns": piece.stamp_ns,
+            "tool": self.name,
+        }
         return piece.kind(**places, **piece.fields, **about)  # type: ignore[arg-type]
 
     def _click(self, now_ns: int) -> None:
