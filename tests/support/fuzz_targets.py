@@ -21,6 +21,14 @@ Target = tuple[list[bytes], Read]
 TURN = [[0, -1, 0, 0.4], [-1, 0, 0, 0.1], [0, 0, -1, 0.7], [0, 0, 0, 1]]
 
 
+EVIDENCE_TABLE = b"""piece,frame,kind,part,x_mm,y_mm,z_mm,std_mm,tip_mm,x_ct_mm,y_ct_mm,z_ct_mm
+1,camera,touch,,1.5,2,150,0.8,1.5,,,
+2,camera,outline,tumor_1,3,4,140,,,,,
+2,camera,outline,tumor_1,5,4,139,,,,,
+3,camera,landmark,,20,3,133,,,-41,12.5,88
+"""
+
+
 def scratch() -> Path:
     """A new folder, in memory where that can be."""
     return Path(tempfile.mkdtemp(dir="/dev/shm" if Path("/dev/shm").is_dir() else None))
@@ -288,6 +296,7 @@ def _configurations() -> dict[str, Target]:
     return {
         "poses": of_file(lambda path: read_poses(path, 2), "in.json", poses),
         "evidence": of_file(read_evidence, "in.json", evidence_json((touch, outline))),
+        "evidence table": of_file(read_evidence, "in.csv", EVIDENCE_TABLE),
         "calibration": of_file(read_frames, "in.json", hand_eye, marker),
         "cell": written(CellConfig()),
         "resection": written(ResectionConfig()),
