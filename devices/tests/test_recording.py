@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import resource
 import signal
 import subprocess
@@ -13,6 +14,7 @@ import time
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -31,10 +33,17 @@ from live_objects import (
 )
 from recording_objects import PERIOD_NS, frame_number, record, update_number, write_bag
 from tumortrack.core.errors import InputError, StorageError
+from tumortrack.core.evidence import Free, Held, Landmark, Outline, Touch
 from tumortrack.core.geometry import rigid
 from tumortrack.core.mesh_files import write_anatomy
 from tumortrack.core.types import DepthFrame, SensorCloud
-from tumortrack.live.values import Observation, PublishedFrame, SourceEnded, SourceLost
+from tumortrack.live.values import (
+    CameraView,
+    Observation,
+    PublishedFrame,
+    SourceEnded,
+    SourceLost,
+)
 from tumortrack.sense.ply import write_cloud_ply
 from tumortrack_devices.recording.mcap import CHUNK_S
 from tumortrack_devices.sinks.recording import RecordingSinkConfig as RecordTo
@@ -95,6 +104,54 @@ def test_clouds_come_back(tmp_path):
     assert seen.stamp_ns == STAMP_NS
     np.testing.assert_allclose(seen.content.points_mm, points_mm, rtol=2e-7)
     assert abs(seen.arrived_ns - time.time_ns()) < 600e9
+
+
+def test_evidence_comes_back_with_its_frame_and_its_camera_to_the_last_bit(tmp_path):
+    place, many = (1 / 3, np.pi, 1e3 / 7), ((0.1, 0.2, 130.3), (1e-9, -2 / 3, 99.0))
+    one = (
+        Touch(place_mm=place, part="tumor_1", tip_mm=1.5, stamp_ns=STAMP_NS - 7, tool="probe"),
+        Held(point_ct=place, place_mm=place, point_std_mm=2 / 3, tool="grasper"),
+        Outline(places_mm=many, part="tumor_2"),
+    )
+    other = (Free(places_mm=many, tip_mm=4.0), Landmark(point_ct=place, place_mm=place))
+    known = one, (), other
+    updates = [replace(update_number(n), evidence=each) for n, each in enumerate(known)]
+    got = play(record(tmp_path / "r", updates))
+    assert tuple(seen.evidence for seen in got) == known
+    # Of two cameras, that of the second, which leads, is its own.
+    first, second = (Observation(frame_number(n), STAMP_NS) for n in (0, 0))
+    views = tuple(CameraView(n, seen, np.eye(4)) for n, seen in ((2, second), (1, first)))
+    both = replace(update_number(0), observation=second, views=views, evidence=one)
+    path = record(tmp_path / "two", [both])
+    for camera, its in (("camera", ()), ("camera_2", one)):
+        (seen,) = play(path, topic=f"/{camera}/depth/image_rect")
+        assert seen.evidence == its
+    cloud = SensorCloud(small_estimate().cloud.points_mm, STAMP_NS)
+    (seen,) = play(record(tmp_path / "c", [replace(update_number(0, cloud), evidence=other)]))
+    assert seen.evidence == other
+
+
+@pytest.mark.parametrize(
+    ("text", "wrong"),
+    [
+        ("{", "truncated"),
+        ('{"stamp_ns": 1, "evidence": [{"kind": "smell"}]}', "smell"),
+        (
+            '{"stamp_ns": 1, "evidence": [{"kind": "touch", "place_mm": [0, 0, 1e9]}]}',
+            "reaches 1e\\+09; allowed: up to 2000",
+        ),
+    ],
+)
+def test_damaged_evidence_costs_its_frame_alone(text, wrong, tmp_path, monkeypatch):
+    updates = [update_number(n) for n in range(3)]
+    updates[1] = replace(updates[1], evidence=(Free(places_mm=((0.0, 0.0, 90.0),)),))
+    damaging = SimpleNamespace(json=SimpleNamespace(encode=lambda _: text.encode()))
+    monkeypatch.setattr("tumortrack_devices.recording.mcap.msgspec", damaging)
+    bad = record(tmp_path / "r", updates)
+    monkeypatch.undo()
+    before, error, after = play(bad)
+    assert (before.stamp_ns, after.stamp_ns) == (updates[0].stamp_ns, updates[2].stamp_ns)
+    assert re.search(rf"its /camera/evidence is damaged: .*{wrong}", str(error))
 
 
 def test_an_mcap_is_read_by_rosbags_with_its_estimates(tmp_path):

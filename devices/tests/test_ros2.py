@@ -27,7 +27,7 @@ from ros2_objects import Frames, own_graph, read_until, sending
 from ros2_peer import points_mm
 from tumortrack.core.errors import InputError, TumortrackError
 from tumortrack.core.types import SensorCloud
-from tumortrack.live.spec import POSES, SINKS, SOURCES, Registry
+from tumortrack.live.spec import POSES, SINKS, SOURCES, TOOLS, Registry
 from tumortrack.live.values import Observation, Source
 from tumortrack.live.workers import SourceWorker
 from tumortrack_devices.ros import sensors
@@ -299,7 +299,7 @@ def test_damaged_bytes_are_not_sent(bus: Bus, messages: Messages) -> None:
         publisher.publish(cdr[:60])
 
 
-@pytest.mark.parametrize("kinds", [SOURCES, SINKS, POSES])
+@pytest.mark.parametrize("kinds", [SOURCES, SINKS, POSES, TOOLS])
 def test_whoever_asks_for_ros_1_is_told_what_to_do(kinds: Registry) -> None:
     with pytest.raises(InputError, match=r"ROS 1 was removed.*ros1_bridge.*recording:PATH"):
         kinds.parse("ros1:/camera/points?unit_mm=1")

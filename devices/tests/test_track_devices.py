@@ -12,7 +12,10 @@ from rosbags.highlevel import AnyReader
 
 from stories import refusal, succeeded, tumortrack
 from track_objects import PATIENT, World, start, told, virtual, wait_for
-from tumortrack.sense.camera import d405
+from tumortrack.live.poses import COLUMNS, CONTACT
+from tumortrack.live.values import SourceEnded
+from tumortrack.sense.camera import d405, project
+from tumortrack_devices.sources.recording import RecordingSourceConfig
 
 pytestmark = pytest.mark.slow
 
@@ -59,6 +62,71 @@ def test_a_recording_is_played_back_to_the_same_estimates(world, tmp_path):
     assert {one["stamp_ns"] for one in reports(replay) if one["seen"]} == {
         one["stamp_ns"] for one in frames
     }
+
+
+def evidence(recording):
+    """What became known with each frame, by its stamp."""
+    seen = RecordingSourceConfig(path=recording, rate=0).open()
+    known = {}
+    while True:
+        try:
+            if (frame := seen.read(1.0)) is not None:
+                known[frame.stamp_ns] = frame.evidence
+        except SourceEnded:
+            seen.close()
+            return known
+
+
+def touched_place(recording):
+    """What the tip of a tool that touches the organ's front in the first frame is at, as in a
+    table, and the frames' stamps."""
+    found = [one for one in reports(recording) if one["seen"]]
+    first = next(one for one in found if one["estimate"])
+    seen = RecordingSourceConfig(path=recording, rate=0).open()
+    image = seen.read(30.0).content
+    seen.close()
+    centre_mm = np.array([first["estimate"]["parts"]["kidney"]["center_mm"]])
+    ((column, row),), _ = project(centre_mm, image.intrinsics)
+    row, column = round(row), round(column)
+    z = np.nanmedian(image.depth_mm[row - 3 : row + 4, column - 3 : column + 4])
+    x, y, z = (centre_mm[0] * z / centre_mm[0, 2] - [0, 0, 2.0]).tolist()  # a ball of 2 mm
+    return f"{x},{y},{z}", [one["stamp_ns"] for one in found]
+
+
+def test_a_replay_with_the_evidence_of_tools_is_the_same_to_the_last_bit(world, tmp_path):
+    """A probe that touches the organ's front, and a shaft towards the camera."""
+    live, first, again = (tmp_path / name for name in ("live", "first", "again"))
+    source = virtual(world, fps=10, camera_motion="false")
+    given = (*("--seconds", 3, *PATIENT), "--report", tmp_path / "live.json")
+    succeeded(tumortrack("track", world.model, source, f"recording:{live}", *given))
+    place_mm, stamps = touched_place(live)
+    # 50 Hz; it touches during 0.4 s of each second, from the first frame on.
+    rows = [
+        f"{stamps[0] + 20_000_000 * n},camera,{place_mm},1,0,0,0,{int(n % 50 < 20)}"
+        for n in range((stamps[-1] - stamps[0]) // 20_000_000 + 2)
+    ]
+    (tmp_path / "probe.csv").write_text("\n".join([COLUMNS + CONTACT, *rows]) + "\n")
+    rows = [row.rpartition(",")[0] for row in rows]
+    (tmp_path / "shaft.csv").write_text("\n".join([COLUMNS, *rows]) + "\n")
+    report = tmp_path / "first.json"
+    probe, shaft = (f"file:{tmp_path}/{name}.csv" for name in ("probe", "shaft"))
+    tools = "--tool", f"probe={probe}?tip_mm=2", "--tool", f"shaft={shaft}?tip=0,0,-40&shaft_mm=20"
+    run = f"recording:{live}?rate=0", f"recording:{first}", *tools, "--report", report
+    succeeded(tumortrack("track", world.model, *run))
+    counts = told(report)["tools"]
+    assert counts["probe"]["touch"] >= 2
+    assert counts["shaft"]["free"] >= len(stamps) / 2
+    given = evidence(first)
+    assert {piece.name for known in given.values() for piece in known} == {"touch", "free"}
+    run = f"recording:{first}?rate=0", f"recording:{again}", "--report", tmp_path / "again.json"
+    succeeded(tumortrack("track", world.model, *run))
+    assert evidence(again) == given
+    for one, other in zip(reports(first), reports(again), strict=True):
+        for volatile in ("seconds", "latency_ms", "arrived_ns"):
+            one.pop(volatile), other.pop(volatile)
+        for each in (one, other):
+            (each["estimate"] or {}).pop("timings", None)
+        assert one == other
 
 
 def test_depths_that_were_corrected_are_not_corrected_again(world, tmp_path):

@@ -6,6 +6,7 @@ import gc
 import socket
 import threading
 from dataclasses import dataclass, replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -21,6 +22,7 @@ from tumortrack.core.colours import TUMORS, part_colour
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import rigid, transform_points
 from tumortrack.core.patient import Patient
+from tumortrack.core.report import EvidenceReport
 from tumortrack.core.store import new_folder
 from tumortrack.core.types import Anatomy, LabelVolume, Mesh, Volume
 from tumortrack.imaging.case import Case, save_case
@@ -375,6 +377,25 @@ def test_a_camera_that_moves_is_shown_where_it_was_and_who_took_part_is_said(sin
         np.testing.assert_allclose(shown, tumor, atol=1e-3)
         clock.sleep(1 / 60)
     assert "cameras 1, 3; camera 2: gone" in sink._panel.stage.content
+
+
+def test_a_button_says_that_a_tool_touches_and_the_panel_how_much_is_known(sinks, clock):
+    assert not hasattr(sinks()._panel, "touches")
+    setting = replace(small_setting(), tools=("probe", "grasper"))
+    sink = sinks(setting, hz=60)
+    button = sink._panel.touches
+    assert button.options == ("probe", "grasper")
+    (clicked,) = button._impl.update_cb
+    for client, name in ((None, "probe"), (object(), "grasper")):  # no client: set by the program
+        clicked(SimpleNamespace(client=client, target=SimpleNamespace(value=name)))
+    assert [*setting.controls.touched] == ["grasper"]
+    said = [
+        EvidenceReport(name="touch", off_mm=0.1, news=0.2, left_out=out) for out in (False, True)
+    ]
+    update = small_update()
+    known = replace(update, estimate=reporting(update.estimate, evidence=tuple(said)))
+    sink.publish(known)
+    assert "evidence: 1 in use, 1 left out" in sink._panel.stage.content
 
 
 def test_part_that_was_not_found_is_not_shown(sinks, clock):

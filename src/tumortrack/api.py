@@ -564,9 +564,9 @@ def track(
         seconds: end so many s after the first frame; 0: not.
         range_mm: depths to keep (default: those that training showed).
         options: as on the command line: ``box``, ``whole``, ``intrinsics``,
-            ``frame``, ``views``, ``poses``, ``moving``, ``scan``, ``smoothing``, ``rescan``,
-            ``stale``, ``frozen``, ``give_up``, ``report``, ``seed``, ``patient``, ``side``,
-            ``device``.
+            ``frame``, ``views``, ``poses``, ``moving``, ``tool``, ``scan``, ``smoothing``,
+            ``rescan``, ``stale``, ``frozen``, ``give_up``, ``report``, ``seed``, ``patient``,
+            ``side``, ``device``.
 
     Returns:
         The run's figures: counts, latencies, stage times (docs/conventions.md).

@@ -16,7 +16,7 @@ from live_objects import small_frame, small_setting, small_update
 from stories import COMMAND, environment, succeeded
 from tumortrack.core.errors import InputError, StorageError
 from tumortrack.live.session import named_sinks, open_sinks
-from tumortrack.live.spec import POSES, SINKS, SOURCES, extensions
+from tumortrack.live.spec import POSES, SINKS, SOURCES, TOOLS, extensions
 from tumortrack.live.values import Sink, Source
 from tumortrack.report.inspection import describe
 
@@ -126,6 +126,8 @@ def test_a_kind_of_ours_that_is_not_installed_is_named_with_its_package(monkeypa
         (SINKS, "viewer", "tumortrack-devices"),
         (SINKS, "ur", "tumortrack-resection[ur]"),
         (POSES, "ur", "tumortrack-devices[ur]"),
+        (TOOLS, "ur", "tumortrack-devices[ur]"),
+        (TOOLS, "openigtlink", "tumortrack-devices"),
     ):
         with pytest.raises(InputError) as refused:
             registry.parse(f"{kind}:x")

@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from clock import PATIENCE_S, until
 from live_objects import empty_update, small_frame, small_update
 from tumortrack.core.errors import InputError, NoEstimate, StorageError
+from tumortrack.core.report import Point
 from tumortrack.live.calibration_file import read_frames
 from tumortrack.live.loop import check_age
 from tumortrack.live.meter import Histogram
@@ -34,6 +35,11 @@ class Camera(SinkConfig, frozen=True, kw_only=True, tag="camera"):
     every: Annotated[int, msgspec.Meta(ge=1, le=9)] | None = None
 
 
+class Needle(SinkConfig, frozen=True, kw_only=True, tag="needle"):
+    tip: Point = (0.0, 0.0, 80.5)
+    point: Point | None = None
+
+
 class Window(SinkConfig, frozen=True, kw_only=True, tag="window"):
     target: ClassVar[str] = "port"
     port: int = 8080
@@ -47,7 +53,12 @@ KINDS = Registry(
     "sink",
     "tumortrack.nothing",
     SinkConfig,
-    {"camera": f"{__name__}:Camera", "window": f"{__name__}:Window", "plain": f"{__name__}:Plain"},
+    {
+        "camera": f"{__name__}:Camera",
+        "window": f"{__name__}:Window",
+        "plain": f"{__name__}:Plain",
+        "needle": f"{__name__}:Needle",
+    },
 )
 
 
@@ -65,6 +76,8 @@ KINDS = Registry(
         ("camera:/a+b%20c", Camera(topic="/a+b%20c")),
         ("window?port=9000", Window(port=9000)),
         ("plain", Plain()),
+        ("needle?tip=1,-2.5,3", Needle(tip=(1.0, -2.5, 3.0))),
+        ("needle?point=1,2,3", Needle(point=(1.0, 2.0, 3.0))),
     ],
 )
 def test_text_becomes_configuration(text, expected):
@@ -74,7 +87,8 @@ def test_text_becomes_configuration(text, expected):
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("screen", "Allowed: camera, plain, window"),
+        ("screen", "Allowed: camera, needle, plain, window"),
+        ("needle?tip=1,2", "tip is '1,2'; allowed: X,Y,Z. Write needle[?tip=0,0,80.5&point=]."),
         ("camera", "lacks its topic. Write camera:TOPIC[?fps=30.0&noise=true&type=auto&every=]."),
         ("camera:/a?rate=3", "'rate' is no option. Write camera:TOPIC"),
         ("camera:/a?fps=fast", "': fps is 'fast'; allowed: a number. Write camera:TOPIC"),

@@ -57,6 +57,8 @@ def test_a_report_that_cannot_be_written_ends_nothing(world, tmp_path):
         (["virtual:CASE", "--range", "200", "100"], "depth range"),
         (["virtual:CASE", "--frame", "none.json"], "none.json"),
         (["virtual:no_case"], "no_case"),
+        (["virtual:CASE", "--tool", "pen:1"], "write NAME=KIND:..."),
+        (["virtual:CASE", "--tool", "a=pen:1"], "Allowed: file, openigtlink, ros2, ur"),
     ],
 )
 def test_bad_options_are_answered_in_one_line(world, tmp_path, arguments, said):

@@ -9,6 +9,7 @@ import shutil
 import tempfile
 import zlib
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,14 @@ import numpy as np
 Read = Callable[[bytes], object]
 Target = tuple[list[bytes], Read]
 TURN = [[0, -1, 0, 0.4], [-1, 0, 0, 0.1], [0, 0, -1, 0.7], [0, 0, 0, 1]]
+
+
+EVIDENCE_TABLE = b"""piece,frame,kind,part,x_mm,y_mm,z_mm,std_mm,tip_mm,x_ct_mm,y_ct_mm,z_ct_mm
+1,camera,touch,,1.5,2,150,0.8,1.5,,,
+2,camera,outline,tumor_1,3,4,140,,,,,
+2,camera,outline,tumor_1,5,4,139,,,,,
+3,camera,landmark,,20,3,133,,,-41,12.5,88
+"""
 
 
 def scratch() -> Path:
@@ -179,7 +188,7 @@ def _tables() -> dict[str, Target]:
 
 
 def _command_line() -> dict[str, Target]:
-    from tumortrack.live.spec import SINKS, SOURCES
+    from tumortrack.live.spec import SINKS, SOURCES, TOOLS
 
     def text(parse: Callable[[str], object], *seeds: bytes) -> Target:
         return [*seeds], lambda data: parse(data.decode("utf-8", "replace"))
@@ -188,22 +197,37 @@ def _command_line() -> dict[str, Target]:
     return {
         "source": text(SOURCES.parse, *sources),
         "sink": text(SINKS.parse, b"viewer:8080", b"ur:1.2.3.4?arm=cutter&gain=300"),
+        "tool": text(TOOLS.parse, b"file:a.csv?tip=0,0,80&holds=true", b"openigtlink:h:1?name=a"),
     }
 
 
 def _wire() -> dict[str, Target]:
-    from tumortrack_devices.igtl.message import (
-        HEADER_SIZE,
-        Message,
-        check_body,
-        pack,
-        unpack_header,
-    )
+    from tumortrack_devices.igtl import message as igtl_messages
+    from tumortrack_devices.igtl.message import HEADER_SIZE, Message, check_body, pack
     from tumortrack_devices.ros import sensors
     from tumortrack_devices.ros.messages import Messages
 
     def igtl(data: bytes) -> None:
-        check_body(unpack_header(data[:HEADER_SIZE]), data[HEADER_SIZE:])
+        check_body(igtl_messages.unpack_header(data[:HEADER_SIZE]), data[HEADER_SIZE:])
+
+    def igtl_body(data: bytes) -> None:
+        """The first byte says what it is of."""
+        kinds = "transform", "string", "points", "polydata_points"
+        header = igtl_messages.Header(2, "X", "x", 0, len(data) - 1, 0)
+        content, _ = igtl_messages.unpack_body(header, data[1:])
+        getattr(igtl_messages, f"unpack_{kinds[data[0] % 4]}")(content)
+
+    surface = igtl_messages.Polydata(np.ones((3, 3)), np.array([[0, 1, 2]]))
+    contents = (
+        igtl_messages.pack_transform(np.eye(4)),
+        b"\0\3\0\1" + b"1",
+        igtl_messages.pack_points(np.ones((2, 3)), ["a", "b"], [(1, 2, 3)] * 2),
+        igtl_messages.pack_polydata(surface),
+    )
+    bodies = [
+        bytes([n]) + pack(Message("X", "x", 1, content, {"k": "v"}))[HEADER_SIZE:]
+        for n, content in enumerate(contents)
+    ]
 
     def read_image(message: Any) -> object:
         return sensors._pixels(message, {"16UC1": "u2"}, "a depth image")  # type: ignore[attr-defined]
@@ -212,7 +236,8 @@ def _wire() -> dict[str, Target]:
         return sensors._intrinsics_of(message, False)  # type: ignore[attr-defined]
 
     targets: dict[str, Target] = {
-        "openigtlink": ([pack(Message("STATUS", "x", 10**18, b"abc", {"k": "v"}))], igtl)
+        "openigtlink": ([pack(Message("STATUS", "x", 10**18, b"abc", {"k": "v"}))], igtl),
+        "openigtlink tool": (bodies, igtl_body),
     }
     points = np.random.default_rng(0).random((20, 3)).astype("<f4").view(np.uint8).reshape(-1)
     camera = np.array([5.0, 0, 4, 0, 5, 3, 0, 0, 1])
@@ -271,6 +296,7 @@ def _configurations() -> dict[str, Target]:
     return {
         "poses": of_file(lambda path: read_poses(path, 2), "in.json", poses),
         "evidence": of_file(read_evidence, "in.json", evidence_json((touch, outline))),
+        "evidence table": of_file(read_evidence, "in.csv", EVIDENCE_TABLE),
         "calibration": of_file(read_frames, "in.json", hand_eye, marker),
         "cell": written(CellConfig()),
         "resection": written(ResectionConfig()),
@@ -282,6 +308,7 @@ def _configurations() -> dict[str, Target]:
 def _recordings() -> dict[str, Target]:
     from recording_objects import frame_number, record, update_number, write_bag
     from tumortrack.core.errors import InputError
+    from tumortrack.core.evidence import Free
     from tumortrack.live.values import SourceEnded
     from tumortrack_devices.sources.recording import RecordingSourceConfig
 
@@ -298,10 +325,11 @@ def _recordings() -> dict[str, Target]:
         finally:
             source.close()
 
-    folder = scratch()
+    folder, free = scratch(), Free(places_mm=((0.0, 0.0, 90.0),))
     frames = [frame_number(n) for n in range(2)]
     topics = {"/depth": ("depth/image_rect", frames), "/camera_info": ("depth/camera_info", frames)}
-    ours = record(folder / "ours", [update_number(n) for n in range(2)]) / "ours.mcap"
+    updates = [replace(update_number(n), evidence=(free,)) for n in range(2)]
+    ours = record(folder / "ours", updates) / "ours.mcap"
     packed = write_bag(folder / "packed", topics, "packed mcap")
     bag = write_bag(folder / "a.bag", topics, "bag")
     (file,) = write_bag(folder / "sqlite", topics, "sqlite3").glob("*.db3")

@@ -1,9 +1,10 @@
-"""Poses of a camera that an arm of Universal Robots holds."""
+"""Poses of a camera, or of another tool, that an arm of Universal Robots holds."""
 
 from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Callable
 from typing import ClassVar
 
 import numpy as np
@@ -31,10 +32,11 @@ class UrPosesConfig(PosesConfig, frozen=True, kw_only=True, tag="ur"):
 
 
 class UrPoses(CameraPoses):
-    """Through ur_rtde. Poses have the time of their arrival: milliseconds late. Raises InputError:
-    ur_rtde is missing, or the arm cannot be reached."""
+    """Through ur_rtde. Poses have the time of their arrival: milliseconds late. ``felt`` gets that
+    stamp and the force at the tool, N and Nm (6). Raises InputError: ur_rtde is missing, or the arm
+    cannot be reached."""
 
-    def __init__(self, host: str) -> None:
+    def __init__(self, host: str, felt: Callable[[int, np.ndarray], None] | None = None) -> None:
         try:
             import rtde_receive
 
@@ -44,11 +46,11 @@ class UrPoses(CameraPoses):
                 f"ur: the arm at {host} cannot be read ({error}). That needs ur_rtde (pip install "
                 "'tumortrack-devices[ur]') and an arm that is on, and reachable on port 30004."
             ) from error
-        self._poses, self._closed = PoseBuffer(), threading.Event()
+        self.poses, self._felt, self._closed = PoseBuffer(), felt, threading.Event()
         threading.Thread(target=self._read, name="ur poses", daemon=True).start()
 
     def pose(self, seen: Observation) -> Affine:
-        return self._poses.at(seen.stamp_ns, _WAIT_S)
+        return self.poses.at(seen.stamp_ns, _WAIT_S)
 
     def close(self) -> None:
         self._closed.set()
@@ -60,5 +62,7 @@ class UrPoses(CameraPoses):
             if (clock_s := self._receive.getTimestamp()) != last_s and self._receive.isConnected():
                 last_s, numbers = clock_s, np.array(self._receive.getActualTCPPose(), float)
                 turn = Rotation.from_rotvec(numbers[3:]).as_matrix()
-                self._poses.add(time.time_ns(), rigid(turn, 1000 * numbers[:3]))
+                self.poses.add(now_ns := time.time_ns(), rigid(turn, 1000 * numbers[:3]))
+                if self._felt is not None:
+                    self._felt(now_ns, np.array(self._receive.getActualTCPForce(), float))
         self._receive.disconnect()

@@ -11,7 +11,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from tyro.conf import Positional
+from tyro.conf import Positional, UseAppendAction
 
 from tumortrack.cli.console import console, keep_loaded, model_folder, options_of, say
 from tumortrack.tracking.options import TrackOptions
@@ -44,6 +44,7 @@ class Track(TrackOptions):
     model: Positional[Path]
     source: Positional[str]
     sinks: Positional[tuple[str, ...]] = ()
+    tool: UseAppendAction[tuple[str, ...]] = ()
 
     def run(self) -> None:
         from tumortrack import api
@@ -178,6 +179,9 @@ class _Screen:
             if sink.dropped or sink.errors:
                 last = f"; the last: {sink.error}" if sink.error else ""
                 say(f"sink {sink.name}: {sink.dropped} missed, {sink.errors} errors{last}.")
+        for name, told in self._run.loop.views.tools.summary().items():
+            words = [f"{count} {what}" for what, count in told.items() if what != "trouble"]
+            say(f"tool {name}: {', '.join(words) or 'nothing'}.")
         for name, errors in statistics.errors.items():
             off = errors.summary()
             say(f"{name}: centre off by {off['p50']:.1f} mm (median; 95 %: {off['p95']:.1f} mm).")

@@ -4,7 +4,6 @@ where there is no tissue. Camera frame, mm."""
 from __future__ import annotations
 
 import csv
-import io
 import json
 from collections.abc import Sequence
 from copy import copy
@@ -181,7 +180,10 @@ _COLUMNS = {*_NUMBERS, "piece", "frame", "kind", "part", "tool"}
 
 def _table(text: str, path: Path) -> dict[str, Any]:
     """The rows of a table as an ``EvidenceFile``; rows of one ``piece`` are places of one."""
-    rows = list(csv.DictReader(io.StringIO(text)))
+    try:
+        rows = list(csv.DictReader(text.splitlines()))
+    except csv.Error as error:
+        raise InputError(f"{path} is no table: {error}.") from error
     names = list(rows[0]) if rows else []
     if unknown := [name for name in names if name not in _COLUMNS]:
         raise InputError(

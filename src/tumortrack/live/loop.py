@@ -249,6 +249,7 @@ class Loop:
             views=tuple(views) if several else (),
             cameras=camera_words(numbers, absent) if several else self.views.scanned,
             finding=finding,
+            evidence=self.views.evidence,
         )
 
     def _confirmed(self, estimate: Estimate, doubt: str) -> tuple[Finding | None, str]:

@@ -26,6 +26,7 @@ _KEPT = 2000  # poses of a live source: 4 s at 500 Hz
 _NOT_UNIT = 1e-3  # tolerance of a quaternion's length: files have few digits
 _LARGEST_TABLE = 256 * 2**20  # bytes
 COLUMNS = "stamp_ns,frame_id,x_mm,y_mm,z_mm,qw,qx,qy,qz"
+CONTACT = ",contact"  # one more, of a tool: 1 while its tip touches, else 0
 
 
 class CameraPoses:
@@ -116,20 +117,23 @@ class PosesFileConfig(PosesConfig, frozen=True, kw_only=True, tag="file"):
 
 
 class FilePoses(CameraPoses):
-    """Raises InputError: there is no such table, or it is damaged."""
+    """``touches``: where the table says it, of each stamp (ns) whether the tip touches. Raises
+    InputError: there is no such table, or it is damaged."""
 
     def __init__(self, path: Path) -> None:
         head, *lines = read_file(path, _LARGEST_TABLE).decode(errors="replace").split("\n")
         rows = [line.strip().split(",") for line in lines if line.strip()]
+        columns = 7 + (head.strip() == COLUMNS + CONTACT)
         try:
             stamps_ns = np.array([int(row[0]) for row in rows])
-            numbers = np.array([row[2:] for row in rows], float).reshape(len(rows), 7)
+            numbers = np.array([row[2:] for row in rows], float).reshape(len(rows), columns)
         except (ValueError, OverflowError) as error:
             raise InputError(f"{path} is not a table of poses ({COLUMNS}): {error}.") from error
-        names = {row[1].strip() for row in rows}
+        names, (numbers, touches) = {row[1].strip() for row in rows}, np.hsplit(numbers, [7])
         lengths = np.linalg.norm(numbers[:, 3:], axis=1)
         faults = {
-            f"its first line must be {COLUMNS}": head.strip() == COLUMNS,
+            f"its first line must be {COLUMNS}": head.strip() in (COLUMNS, COLUMNS + CONTACT),
+            "contact must be 0 or 1": np.isin(touches, (0, 1)).all(),
             "it has no poses": len(rows) > 0,
             "stamps must rise": (np.diff(stamps_ns) > 0).all(),
             "frame_id must be one name, in every row": len(names) == 1 and "" not in names,
@@ -138,13 +142,15 @@ class FilePoses(CameraPoses):
         }
         if wrong := [what for what, met in faults.items() if not met]:
             raise InputError(f"{path} is not a table of poses: {wrong[0]}.")
-        (self.frame_id,), self._poses = names, PoseBuffer()
+        (self.frame_id,), self.poses = names, PoseBuffer()
         turns = Rotation.from_quat(numbers[:, 3:], scalar_first=True).as_matrix()
         for stamp_ns, turn, shift in zip(stamps_ns.tolist(), turns, numbers[:, :3], strict=True):
-            self._poses.add(stamp_ns, rigid(turn, shift), len(rows))
+            self.poses.add(stamp_ns, rigid(turn, shift), len(rows))
+        said = (touches.ravel() == 1).tolist()  # nothing without that column
+        self.touches = list(zip(stamps_ns.tolist(), said, strict=False))
 
     def pose(self, seen: Observation) -> Affine:
-        return self._poses.at(seen.stamp_ns)
+        return self.poses.at(seen.stamp_ns)
 
 
 def pose_row(stamp_ns: int, frame_id: str, pose: Affine) -> str:

@@ -17,7 +17,8 @@ from tumortrack.core.errors import InputError, StorageError
 from tumortrack.core.patient import Patient
 from tumortrack.live.cameras import Cameras, CameraSetup, camera_setup
 from tumortrack.live.loop import Loop, LoopConfig, summary
-from tumortrack.live.spec import SINKS
+from tumortrack.live.spec import SINKS, TOOLS
+from tumortrack.live.tools import ToolConfig, Tools
 from tumortrack.live.values import (
     ArmsController,
     SinkConfig,
@@ -69,7 +70,9 @@ class Session:
         named: Mapping[str, Any],
         config: LoopConfig,
         arms: Arms | None,
+        tools: Mapping[str, ToolConfig],
     ) -> None:
+        self._tools = tools
         self.tracker, self.setup, self._named, self._config = tracker, setup, named, config
         self.arms, model = arms, tracker.model
         self._context = SinkContext(
@@ -81,6 +84,7 @@ class Session:
             cameras=setup.still,
             tip_mm=None if arms is None else arms.tip_mm,
             corrected=config.correction != DepthCorrection(),
+            tools=tuple(tools),
         )
         self.loop = Loop(tracker, self._context, config, None if arms is None else arms.operation)
         self.report: Path | None = None
@@ -93,8 +97,10 @@ class Session:
         failed leaves nothing: the next one may use its names. Raises as ``open_sinks``."""
         self._began = self._stored = time.monotonic()
         self._memory_mb = {"start": round(resident_mb(), 1)}
+        views = self.loop.views
         with (
             ExitStack() as ending,
+            closing(Tools(self._tools, self._context, views.frames.notes)) as views.tools,
             open_sinks(self._named, self._context) as self.sinks,
             closing(self._open_cameras()) as self.cameras,
         ):
@@ -148,6 +154,7 @@ class Session:
             "memory_mb": self._memory_mb,
             "table_in_camera": frames.watch and frames.watch.table_in_camera,
             "frame_notes": frames.notes,
+            "tools": self.loop.views.tools.summary(),
             **self.summary(),
             **({} if self.arms is None else {"resection": self.arms.operation.summary()}),
         }
@@ -176,7 +183,7 @@ def session(
         InputError, ArtifactError: an option, a file or a combination of them cannot be used.
     """
     setup = _cameras(source, options) if arms is None else arms.setup  # what executes was checked
-    named = named_sinks(sinks)
+    named, tools = named_sinks(sinks), named_tools(options.tool)
     digest = {}
     if isinstance(model, Tracker):
         tracker = model
@@ -189,7 +196,7 @@ def session(
     if setup.still and tracker.anatomy_ct is None:
         raise InputError("--views needs a model that knows a motion: give the case itself.")
     config = _loop_config(options, tracker.model)
-    made = Session(tracker, setup, named, config, arms)
+    made = Session(tracker, setup, named, config, arms, tools)
     frames = setup.published
     placed = None if frames.moves else frames.published_from_camera.tolist()
     made.report, made.about = (
@@ -204,6 +211,7 @@ def session(
             "frame": {"frame_id": frames.frame_id, "published_from_camera": placed},
             "views": list(options.views),
             "moving": options.moving,
+            "tool": list(options.tool),
             "published_from_cameras": [place.tolist() for place in setup.still],
             **({} if arms is None else arms.about),
         },
@@ -276,6 +284,20 @@ def named_sinks(sinks: Sequence[Any]) -> dict[str, Any]:
         if name in named:
             raise InputError(f"sink {name!r} is given twice.")
         named[name] = SINKS.parse(sink) if isinstance(sink, str) else sink
+    return named
+
+
+def named_tools(tools: Sequence[str]) -> dict[str, ToolConfig]:
+    """Configurations of tools (``NAME=KIND:...``) by name. Raises as ``named_sinks``."""
+    named: dict[str, ToolConfig] = {}
+    for tool in tools:
+        name, _, text = tool.partition("=")
+        if not text or not name.isidentifier() or name in named:
+            raise InputError(
+                f"--tool {tool}: write NAME=KIND:..., as pointer=openigtlink:HOST?name=Stylus. A "
+                "name is of letters and digits, and given once."
+            )
+        named[name] = TOOLS.parse(text)
     return named
 
 

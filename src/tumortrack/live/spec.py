@@ -1,9 +1,9 @@
 """``kind:target?key=value&key=value`` -> the configuration of a source or sink.
 
 A kind is a configuration class: one listed here, or one that an installed package, such as
-tumortrack-devices, offers by an entry point in ``tumortrack.sources``, ``tumortrack.sinks`` or
-``tumortrack.poses``, named as the class's ``tag``. Only the requested kind is imported, so a broken
-package affects no other.
+tumortrack-devices, offers by an entry point in ``tumortrack.sources``, ``tumortrack.sinks``,
+``tumortrack.poses`` or ``tumortrack.tools``, named as the class's ``tag``. Only the requested kind
+is imported, so a broken package affects no other.
 """
 
 from __future__ import annotations
@@ -18,7 +18,9 @@ import msgspec
 
 from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError
+from tumortrack.core.report import Point
 from tumortrack.live.poses import PosesConfig
+from tumortrack.live.tools import ToolConfig
 from tumortrack.live.values import SinkConfig, SourceConfig
 
 C = TypeVar("C", bound=Config)
@@ -35,8 +37,8 @@ class Extension(NamedTuple):
 
 @dataclass(frozen=True)
 class Registry(Generic[C]):
-    """All kinds of source, sink, or poses: ``built_in`` (``module:class`` by kind), and those of
-    the entry points' ``group``. ``what`` names one in messages; ``base`` is the base class;
+    """All kinds of source, sink, poses or tool: ``built_in`` (``module:class`` by kind), and those
+    of the entry points' ``group``. ``what`` names one in messages; ``base`` is the base class;
     ``packages``: what to install for the kinds of our other distributions."""
 
     what: str
@@ -141,11 +143,18 @@ POSES = Registry[PosesConfig](
     {"file": "tumortrack.live.poses:PosesFileConfig"},
     {"ros2": _DEVICES, "ur": f"{_DEVICES}[ur]"},
 )
+TOOLS = Registry[ToolConfig](
+    "tool",
+    "tumortrack.tools",
+    ToolConfig,
+    {},
+    {**dict.fromkeys(("file", "ros2", "openigtlink"), _DEVICES), "ur": f"{_DEVICES}[ur]"},
+)
 
 
 def extensions() -> list[Extension]:
     """All kinds that installed packages add."""
-    return [*SOURCES.extensions(), *SINKS.extensions(), *POSES.extensions()]
+    return [each for kinds in (SOURCES, SINKS, POSES, TOOLS) for each in kinds.extensions()]
 
 
 def _package_of(entry: EntryPoint) -> str:
@@ -174,7 +183,8 @@ def _filled(config: type[C], target: str, options: str, where: str) -> C:
     for key, text in given.items():
         kind = fields[key].type
         try:
-            values[key] = msgspec.convert(text, kind, strict=False, dec_hook=_path)
+            words = text.split(",") if kind in (Point, Point | None) else text
+            values[key] = msgspec.convert(words, kind, strict=False, dec_hook=_path)
         except msgspec.ValidationError as error:
             allowed = _allowed(msgspec.inspect.type_info(kind))
             raise InputError(
@@ -197,6 +207,7 @@ _WORDS: dict[type, str] = {
     msgspec.inspect.IntType: "a whole number",
     msgspec.inspect.FloatType: "a number",
     msgspec.inspect.NoneType: "null",
+    msgspec.inspect.TupleType: "X,Y,Z",
 }
 _BOUNDS = {"ge": "from", "gt": "more than", "le": "to", "lt": "less than"}
 
@@ -227,4 +238,6 @@ def usage(config: type[Config]) -> str:
 def _text(value: object) -> str:
     if isinstance(value, bool):
         return str(value).lower()
+    if isinstance(value, tuple):
+        return ",".join(f"{number:g}" for number in value)
     return "" if value is None or value is msgspec.NODEFAULT else str(value)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 import threading
 from abc import abstractmethod
+from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -54,7 +55,7 @@ class Observation:
     by ``time.time_ns``. ``mask``: True in pixels of the depth image where the organ may be.
     ``truth``: the true surfaces, from a simulation. ``frame_id``: the source's name for the camera
     frame; None: this kind of source has no names. ``picture``: grey or RGB, aligned with the depth
-    image.
+    image. ``evidence``: what the source knows beside, new with this frame.
     """
 
     content: DepthFrame | SensorCloud
@@ -63,6 +64,7 @@ class Observation:
     truth: Anatomy | None = None
     frame_id: str | None = None
     picture: UInt8[np.ndarray, "h w *rgb"] | None = None
+    evidence: tuple[Evidence, ...] = ()
 
     @property
     def stamp_ns(self) -> int:
@@ -224,6 +226,7 @@ class TrackingResult:
             scan, what each look added; else empty.
         playback: a stored plan is shown: nothing is tracked, and there never is an estimate.
         finding: what ``reason`` or ``warning`` says, by its kind.
+        evidence: what became known with this frame, camera frame.
     """
 
     sequence: int
@@ -243,6 +246,7 @@ class TrackingResult:
     cameras: str = ""
     playback: bool = False
     finding: Finding | None = None
+    evidence: tuple[Evidence, ...] = ()
 
     @cached_property
     def transformed(self) -> TransformedEstimate | None:
@@ -287,11 +291,19 @@ class TrackingResult:
         turn = np.eye(3) if pose is None else pose[:3, :3]
         return None if center_mm is None else rigid(turn, center_mm)
 
+    @property
+    def beside(self) -> str:
+        """``cameras``, and how much evidence is in use or was left out, in words."""
+        told = () if self.estimate is None else self.estimate.report.evidence
+        out = sum(piece.left_out for piece in told)
+        words = f"evidence: {len(told) - out} in use, {out} left out" if told else ""
+        return "; ".join(filter(None, (self.cameras, words)))
+
     def describe(self) -> str:
         """How good the estimate is, in words, or why there is none."""
         if self.estimate is None:
             return f"none, no estimate: {self.reason}"
-        by = self.cameras and f"; {self.cameras}"
+        by = self.beside and f"; {self.beside}"
         if self.quality == "good":
             margins = margin_words(self.estimate.report.margin)
             return f"good: {NO_CHECK_FAILED}; {UNVERIFIED}; {margins}{by}"
@@ -325,13 +337,15 @@ class Controls:
     """What the user asks of the running loop; from any thread. ``picked_mm``: a point on the organ
     (published frame): track the piece that it is on. ``aborted``: the arms stop for good.
     ``clicks``: colours at clicks in pictures; ``taught``: the classifier learned from them, if they
-    can be separated; ``colour``: its state in words."""
+    can be separated; ``colour``: its state in words. ``touched``: names of tools of which the user
+    says that they touch now, or take, or let go."""
 
     picked_mm: Float64[np.ndarray, " 3"] | None = None
     aborted: threading.Event = field(default_factory=threading.Event)
     clicks: tuple[Click, ...] = ()
     taught: TissueClassifier | None = None
     colour: str = ""
+    touched: deque[str] = field(default_factory=deque)
 
     def click(self, seen: Observation, place_mm: Float[np.ndarray, " 3"], organ: bool) -> None:
         """The user clicked on this place (camera frame): on the ``organ``, or beside it. Raises
@@ -368,7 +382,7 @@ class SinkContext:
     motion, and their meshes its triangles. ``arms``: results may have a workcell. ``patient``: of
     the model. ``cameras``: poses of several fixed cameras, published frame. ``tip_mm``: from an
     arm's name (cutter, holder) and its six joints to the tip of its tool, published frame.
-    ``corrected``: depths are corrected before sinks see them."""
+    ``corrected``: depths are corrected before sinks see them. ``tools``: names of what touches."""
 
     parts: tuple[str, ...]
     published_frame: PublishedFrame
@@ -379,6 +393,7 @@ class SinkContext:
     cameras: tuple[Float64[np.ndarray, "4 4"], ...] = ()
     tip_mm: Callable[[str, Float64[np.ndarray, " 6"]], Float64[np.ndarray, " 3"]] | None = None
     corrected: bool = False
+    tools: tuple[str, ...] = ()
 
     @property
     def structures(self) -> tuple[str, ...]:

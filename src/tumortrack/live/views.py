@@ -17,6 +17,7 @@ from tumortrack.core.geometry import HERE, Affine, transform_points, unit
 from tumortrack.core.report import Finding, ScanReport
 from tumortrack.core.types import Look, SensorCloud
 from tumortrack.live.frames import FrameCheck
+from tumortrack.live.tools import Tools
 from tumortrack.live.values import CameraView, PublishedFrame, SinkContext
 from tumortrack.sense.region import Hints, RegionConfig, organ_points
 from tumortrack.sense.region.tissue import TissueClassifier
@@ -57,6 +58,8 @@ class ViewsLocator:
         # Of the first camera by its calibration, of others as they come.
         self.frames = FrameCheck(context.published_frame, region, frozen_s)
         self._frames = {1: self.frames}
+        self.tools = Tools({}, context, self.frames.notes)
+        self.evidence: tuple[Evidence, ...] = ()  # that the present frame brought
 
     def find(
         self, views: list[CameraView], absent: dict[int, str], seconds: dict[str, float]
@@ -64,6 +67,7 @@ class ViewsLocator:
         """The organ in each view, and a doubt about the frames. Where several cameras are, those
         that do not see it become ``absent``, with the reason. Raises NoEstimate: none sees it."""
         self._heed_pick()
+        self.evidence = ()
         found, doubts = [], []
         for view in views:
             try:
@@ -93,7 +97,9 @@ class ViewsLocator:
             return estimate
         way = self._camera_from_last(lead)
         others = _further_looks(lead, more)
-        estimate = self._follower.locate(organ, lead.seen.content, others, way, evidence)
+        self.evidence = (*evidence, *self.tools.evidence(lead))
+        estimate = self._follower.locate(organ, lead.seen.content, others, way, self.evidence)
+        self.tools.located(lead, estimate)
         self._published_from_last = lead.published_from_camera
         self._follow_pick(lead, organ)
         return estimate

@@ -22,7 +22,7 @@ from tumortrack.registration.motion import ElasticMotion
 from tumortrack.sense.noise import CAMERA_STD
 
 _DEFAULTS = GaussNewtonConfig()
-_PLACES = 300  # on the organ's surface
+_PLACES = 200  # on the organ's surface
 _APART_MM = 10.0  # no two touches nearer to each other
 # Of each place, the model's surface included, and of what all touches of one tool share, as a
 # hand-eye calibration's error.
@@ -51,11 +51,16 @@ class _Known:
         own = self.middle @ self.covariance @ self.middle.T
         return float(np.sqrt(np.linalg.eigvalsh(own)[-1]))
 
-    def after(self, rows: Float64[np.ndarray, "k p"], noise: Float64[np.ndarray, "k k"]) -> _Known:
-        """Once this is measured."""
-        shared = rows @ self.covariance
-        gained = shared.T @ np.linalg.solve(shared @ rows.T + noise, shared)
-        return _Known(self.middle, self.covariance - gained)
+    def after(self, rows: Float64[np.ndarray, "k p"], std_mm: float, shared: int = 0) -> _Known:
+        """Once this is measured, each row with this deviation; the camera errs by ``CAMERA_STD``
+        along the first ``shared`` unknowns (Woodbury)."""
+        precision = rows.T @ rows / std_mm**2
+        if shared:
+            across = precision[:, :shared]
+            own = np.diag(CAMERA_STD[:shared] ** -2) + precision[:shared, :shared]
+            precision = precision - across @ np.linalg.solve(own, across.T)
+        gained = np.eye(len(precision)) + self.covariance @ precision
+        return _Known(self.middle, np.linalg.solve(gained, self.covariance))
 
     def with_unknowns(self, variances: Float64[np.ndarray, " u"]) -> _Known:
         """And with these, which do not move the middle."""
@@ -90,7 +95,7 @@ class Advisor:
         free = np.ones(len(rows), bool)
         for _ in range(count):
             best = int(np.flatnonzero(free)[known.best(rows[free], _TOUCH_MM)])
-            then = known.after(rows[[best]], np.diag([_TOUCH_MM**2]))
+            then = known.after(rows[[best]], _TOUCH_MM)
             told.append(self._told("touch", places_mm[best], normals[best], known, then))
             known = then
             free &= np.linalg.norm(places_mm - places_mm[best], axis=1) > _APART_MM
@@ -109,15 +114,14 @@ class Advisor:
         for normal in np.eye(3):
             near = places_mm[np.abs((places_mm - middle_mm) @ normal) < _NEAR_MM]
             some = near[:: max(1, len(near) // _IN_OUTLINE)]
-            noise = _OUTLINE_MM**2 * np.eye(len(some))
-            then = known.after(self._rows(some, self.part), noise)
+            then = known.after(self._rows(some, self.part), _OUTLINE_MM)
             yield self._told("outline", middle_mm, normal, known, then)
 
     def _landmarks(self) -> Iterator[NextEvidence]:
         known = self._known()
         for name, mesh in self.motion.shape.anatomy_ct.structures.items():
             middle_ct = mesh.vertices_mm.mean(0, keepdims=True)
-            then = known.after(self._moves(middle_ct)[0], _LANDMARK_MM**2 * np.eye(3))
+            then = known.after(self._moves(middle_ct)[0], _LANDMARK_MM)
             place_mm = self.motion.carry(middle_ct)[0]
             yield self._told("landmark", place_mm, np.zeros(3), known, then, name)
 
@@ -130,12 +134,9 @@ class Advisor:
             axis = turned_by(angle * unit(middle_mm)) @ unit(across)
             towards = turned_by(np.radians(_VIEW_DEGREES) * axis) @ -middle_mm
             mine = rows[normals @ unit(towards) > _FACING]
-            by_camera = mine[:, : len(CAMERA_STD)] * CAMERA_STD
-            each = self.config.sigma_mm**2 * max(1, len(mine) / self.config.n_effective)
-            noise = each * np.eye(len(mine)) + by_camera @ by_camera.T
-            yield self._told(
-                "look", middle_mm + towards, -unit(towards), known, known.after(mine, noise)
-            )
+            std_mm = self.config.sigma_mm * np.sqrt(max(len(mine), 1) / self.config.n_effective)
+            then = known.after(mine, std_mm, len(CAMERA_STD))
+            yield self._told("look", middle_mm + towards, -unit(towards), known, then)
 
     def _surface(self) -> tuple[Points, Points]:
         """Middles of some of the organ's triangles, and their normals."""

@@ -58,11 +58,13 @@ def bend(fit: RegistrationResult, config: GaussNewtonConfig) -> BentFit:
     """A fit of the library, continued in the compliance that its points ask for; with its rivals,
     which stay as they are."""
     start = _with_compliance(fit.motion)
-    std_mm = _Groups.near(fit, start, config).likeliest_std_mm()
+    evidence = fit.looks.evidence
+    terms = None if evidence is None else evidence.at(start)
+    std_mm = _Groups.near(fit, start, config, terms).likeliest_std_mm()
     forces = np.eye(len(start.coefficients) - len(fit.motion.coefficients)) / std_mm**2
     precision = _blocks(prior_precision(fit.motion.shape, config), forces)
     near = msgspec.structs.replace(config, first_mm=config.last_mm)
-    descent = GaussNewton(start.shape, fit.looks, start, near, fit.moved, precision)
+    descent = GaussNewton(start.shape, fit.looks, start, near, fit.moved, precision, terms)
     descent.run(_STEPS)
     bent = descent.result()
     motion, steps = replace(bent.motion, rivals=fit.motion.rivals), fit.steps + bent.steps
@@ -101,20 +103,23 @@ class _Groups:
 
     @classmethod
     def near(
-        cls, fit: RegistrationResult, start: ElasticMotion, config: GaussNewtonConfig
+        cls,
+        fit: RegistrationResult,
+        start: ElasticMotion,
+        config: GaussNewtonConfig,
+        terms: Terms | None,
     ) -> _Groups:
-        """``start``: the fit's motion, with compliance."""
+        """``start``: the fit's motion, with compliance; ``terms``: of evidence, there."""
         points_mm, body = fit.looks.points_mm[::_EVERY], fit.motion.shape.body
         means, counts = _means_of_groups(start.residual_rows(points_mm), start.back(points_mm))
         weights = _EVERY * fit.looks.weight(config) * counts
         width_mm = np.full(len(counts), config.last_mm)
-        if fit.looks.evidence is not None:
-            terms = fit.looks.evidence.at(start)
+        if terms is not None:
             means = np.concatenate([means, np.column_stack([terms.by_motion, terms.residuals_mm])])
             weights = np.append(weights, terms.std_mm**-2.0)
             width_mm = np.append(width_mm, terms.width_mm)
         shared = np.zeros((len(means), len(means)))
-        if fit.looks.evidence is not None:
+        if terms is not None:
             shared[len(counts) :, len(counts) :] = terms.by_shifts @ terms.by_shifts.T
         by_library, by_compliance, distances_mm = np.split(means, [POSE + len(body.mean), -1], 1)
         pose_std = np.repeat([config.shift_mm, config.turn_rad], 3)

@@ -199,15 +199,16 @@ class EvidenceTerms:
         )  # fmt: skip
 
     def described(
-        self, evidence: Sequence[Evidence], motion: ElasticMotion, before: int
+        self, evidence: Sequence[Evidence], motion: ElasticMotion, before: int, terms: Terms
     ) -> tuple[EvidenceReport, ...]:
-        """For a report: all ``evidence``, of which these terms are what was not left out; the first
-        pieces came ``before`` this frame."""
+        """For a report: all ``evidence``, of which this is what was not left out, with its
+        ``terms``; the first pieces came ``before`` this frame."""
         assert motion.covariance is not None
-        every = self if len(np.unique(self.piece)) == len(evidence) else None
-        every = every or EvidenceTerms.of(evidence, motion.shape.anatomy_ct.names)
-        assert every is not None
-        terms, kept = every.at(motion), set(self.piece.tolist())
+        every, kept = self, set(self.piece.tolist())
+        if len(kept) < len(evidence):
+            whole = EvidenceTerms.of(evidence, motion.shape.anatomy_ct.names)
+            assert whole is not None
+            every, terms = whole, whole.at(motion)
         known = ((terms.by_motion @ motion.covariance) * terms.by_motion).sum(1)
         starts = np.unique(terms.piece, return_index=True)[1]  # rows of a piece are neighbours,
         order = np.argsort(starts)  # landmarks' after all others'

@@ -187,9 +187,11 @@ class RegistrationLocator:
         """What a report says of the evidence, and what the next frame needs of it."""
         if not found.pieces:
             return (), ()
-        terms, before = placed.bent.looks.evidence, found.before
+        evidence, terms = placed.bent.looks.evidence, placed.bent.terms
+        before = found.before
+        assert evidence is not None
         assert terms is not None
-        told = terms.described(found.pieces, placed.motion, len(before))
+        told = evidence.described(found.pieces, placed.motion, len(before), terms)
         new = [Known(piece, found.shown) for piece in found.pieces[len(before) :]]
         pairs = zip((*before, *new), told, strict=True)
         return told, tuple(known for known, said in pairs if not said.left_out)

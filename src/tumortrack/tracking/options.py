@@ -129,6 +129,8 @@ class TrackOptions(CameraOptions):
         moving: SOURCE's camera moves; its pose in each frame comes from file:POSES.csv, tf
             (ros2:FIXED_FRAME) or a robot (ur:HOST). If those are poses of a tool, --frame has
             tool_from_camera.
+        tool: NAME=KIND:..., a tool that touches or holds the organ, or outlines that are drawn
+            (file:TABLE.csv, ur:HOST, ros2:TF_FRAME, openigtlink:HOST:PORT); repeatable.
         scan: with --moving: begin with three looks at the organ at rest, 30 degrees apart, within
             5 s; tracking starts from all three together.
         smoothing: time constant in s of a mean over past estimates; the lag is in the report.
@@ -147,6 +149,7 @@ class TrackOptions(CameraOptions):
     views: tuple[str, ...] = ()
     poses: Path | None = None
     moving: str = ""
+    tool: tuple[str, ...] = ()
     scan: bool = False
     smoothing: float = 0.0
     rescan: float = 1.0

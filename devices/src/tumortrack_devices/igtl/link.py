@@ -19,8 +19,10 @@ from tumortrack_devices.igtl.message import Header, Message, ProtocolError, pack
 from tumortrack_devices.network import Pace
 
 _LARGEST_REQUEST = 2**16  # bytes
+_LARGEST_HEARD = 2**22  # bytes: a surface of 100,000 points
 MOST_RECEIVERS = 16  # further ones are refused: each may hold half a megabyte
 _REQUESTS_PER_S = 100.0
+_HEARD_PER_S = 5000.0  # some tens of tools of a tracker at some hundred Hz
 _MOST_ANSWERS = 100  # waiting for one receiver, which may only ask and never read
 _STALLED_S = 10.0  # a receiver that takes no piece for this long is dropped
 _RETRY_S = 1.0  # between attempts to connect
@@ -35,11 +37,21 @@ class Link:
     """Sends messages to all receivers; a new one gets the newest of each type and device.
 
     With ``connect`` it is a client of that host's server, and retries until that is there;
-    otherwise it is the server on ``host``. ``port``: the server's. Raises InputError: the port is
-    taken, the host's name is unknown, or fastcrc is missing."""
+    otherwise it is the server on ``host``. ``port``: the server's. ``heard``: gets each message
+    that comes, whole and undamaged, in this link's thread, and may raise ProtocolError;
+    ``faulty``: what was wrong with one, in words. Raises InputError: the port is taken, the host's
+    name is unknown, or fastcrc is missing."""
 
-    def __init__(self, host: str, port: int, connect: str = "") -> None:
+    def __init__(
+        self,
+        host: str,
+        port: int,
+        connect: str = "",
+        heard: Callable[[Header, bytes], None] | None = None,
+        faulty: Callable[[str], None] = lambda _: None,
+    ) -> None:
         igtl.crc64(b"")  # a missing package is reported before anything is opened
+        self._heard, self._faulty = heard, faulty
         self._listener: socket.socket | None = None
         self.port = port
         try:
@@ -122,19 +134,23 @@ class Link:
             async with asyncio.TaskGroup() as group:
                 group.create_task(self._receive(reader, receiver))
                 group.create_task(receiver.send())
-        except* (OSError, EOFError, ProtocolError):
-            pass  # it is gone, stalled, or uses another protocol
+        except* (OSError, EOFError):
+            pass  # it is gone, or stalled
+        except* ProtocolError as errors:
+            self._faulty(str(errors.exceptions[0]))  # it uses another protocol
         finally:
             self.receivers.remove(receiver)
             writer.transport.abort()
 
     async def _receive(self, reader: asyncio.StreamReader, receiver: _Receiver) -> None:
-        pace = Pace(_REQUESTS_PER_S)
+        hears = self._heard is not None
+        pace = Pace(_HEARD_PER_S if hears else _REQUESTS_PER_S)
+        largest = _LARGEST_HEARD if hears else _LARGEST_REQUEST
         while True:
             await asyncio.sleep(pace.wait_s())
             header = igtl.unpack_header(await reader.readexactly(igtl.HEADER_SIZE))
-            if header.body_size > _LARGEST_REQUEST:
-                raise ProtocolError(f"a request of {header.body_size} bytes is refused.")
+            if header.body_size > largest:
+                raise ProtocolError(f"a message of {header.body_size} bytes is refused.")
             body = await reader.readexactly(header.body_size)
             for key, answer in self._answers(header, body).items():
                 if key in receiver.waiting or len(receiver.waiting) < _MOST_ANSWERS:
@@ -143,12 +159,18 @@ class Link:
     def _answers(self, header: Header, body: bytes) -> dict[Key, bytes]:
         """To GET_...: the newest messages of that type (and device, if it names one), or an empty
         one. To STT_...: success, since everything is sent anyway; to STP_...: failure. Other
-        messages are ignored."""
+        messages are ignored here."""
         try:
             igtl.check_body(header, body)
         except ProtocolError as error:
+            self._faulty(str(error))
             content = igtl.pack_status(igtl.CHECKSUM_ERROR, "checksum", str(error))
             return {("STATUS", ""): pack(Message("STATUS", "", 0, content))}
+        if self._heard is not None:
+            try:
+                self._heard(header, body)
+            except ProtocolError as error:
+                self._faulty(str(error))
         verb, _, kind = header.type.partition("_")
         if not kind or verb not in ("GET", "STT", "STP"):
             return {}

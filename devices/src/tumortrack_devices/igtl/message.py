@@ -4,7 +4,7 @@ Header version 2 (protocol 3), which 3D Slicer (since 4.7), PLUS and pyigtl read
 metadata for frames and missing transforms. Headers of version 1 are read too, since clients use it
 for requests. All numbers are big-endian.
 Source: the protocol's Documents/Protocol: header.md, timestamp.md, transform.md, status.md,
-polydata.md, point.md.
+polydata.md, point.md, string.md.
 """
 
 from __future__ import annotations
@@ -33,6 +33,7 @@ _POLYDATA = struct.Struct("> 10I")
 _ATTRIBUTE = struct.Struct("> B B I")
 _POINT_SCALARS = 0x00
 _POINT = struct.Struct("> 64s 32s 4B 4f 20s")
+_NOT_RIGID = 1e-3  # deviation of a rotation from orthonormal: float32 of some trackers' matrices
 
 
 class ProtocolError(InputError):
@@ -111,6 +112,74 @@ def check_body(header: Header, body: bytes) -> None:
         )
     if crc64(body) != header.crc:
         raise ProtocolError(f"{header.type} of {header.device!r}: its checksum is wrong (damaged).")
+
+
+def unpack_body(header: Header, body: bytes) -> tuple[bytes, dict[str, str]]:
+    """A checked body's content and metadata. Raises ProtocolError: it is cut off."""
+    if header.version == 1:
+        return body, {}
+    try:
+        size, index_size, texts_size, _ = _EXTENDED.unpack_from(body)
+        end = len(body) - index_size - texts_size
+        if not _EXTENDED.size <= size <= end:
+            raise ProtocolError(f"{header.type} of {header.device!r}: its parts do not fit in it.")
+        index, texts, metadata = body[end : end + index_size], body[end + index_size :], {}
+        for number in range(int.from_bytes(index[:2], "big")):
+            key_size, _, value_size = _ENTRY.unpack_from(index, 2 + _ENTRY.size * number)
+            key, value = texts[:key_size], texts[key_size : key_size + value_size]
+            metadata[key.decode(errors="replace")] = value.decode(errors="replace")
+            texts = texts[key_size + value_size :]
+    except struct.error as error:
+        raise ProtocolError(f"{header.type} of {header.device!r} is cut off: {error}.") from error
+    return body[size:end], metadata
+
+
+def unpack_transform(content: bytes) -> Float[np.ndarray, "4 4"]:
+    """``b_from_a``. Raises ProtocolError: it is no rigid transform."""
+    if len(content) != 48:
+        raise ProtocolError(f"a TRANSFORM has 48 bytes, not {len(content)}.")
+    b_from_a = np.eye(4)
+    with np.errstate(invalid="ignore"):  # of what is no number
+        b_from_a[:3] = np.frombuffer(content, ">f4").reshape(4, 3).T
+    turn = b_from_a[:3, :3]
+    if not np.isfinite(b_from_a).all() or np.abs(turn @ turn.T - np.eye(3)).max() > _NOT_RIGID:
+        raise ProtocolError("a TRANSFORM is not rigid.")
+    return b_from_a
+
+
+def unpack_string(content: bytes) -> str:
+    """The text of a STRING, up to the first zero byte. Raises ProtocolError: it is cut off."""
+    length = int.from_bytes(content[2:4], "big")
+    if len(content) < 4 + length:
+        raise ProtocolError("a STRING is cut off.")
+    return content[4 : 4 + length].split(b"\0")[0].decode(errors="replace")
+
+
+def unpack_points(content: bytes) -> list[tuple[str, str, Float[np.ndarray, " 3"]]]:
+    """Name, group and place of the fiducials of a POINT. Raises ProtocolError: it is cut off, or
+    not finite."""
+    if len(content) % _POINT.size:
+        raise ProtocolError(f"a POINT is of pieces of {_POINT.size} bytes; {len(content)} came.")
+    points = []
+    for name, group, *_, x, y, z, _, _ in _POINT.iter_unpack(content):
+        if not np.isfinite((x, y, z)).all():
+            raise ProtocolError("a POINT is not finite.")
+        texts = (raw.split(b"\0")[0].decode(errors="replace") for raw in (name, group))
+        points.append((*texts, np.array([x, y, z])))
+    return points
+
+
+def unpack_polydata_points(content: bytes) -> Float[np.ndarray, "n 3"]:
+    """The points of a POLYDATA. Raises ProtocolError: it is cut off, or not finite."""
+    count = int.from_bytes(content[:4], "big")
+    end = _POLYDATA.size + 12 * count
+    if len(content) < end:
+        raise ProtocolError("a POLYDATA is cut off.")
+    with np.errstate(invalid="ignore"):
+        points = np.frombuffer(content[_POLYDATA.size : end], ">f4").reshape(-1, 3).astype(float)
+    if not np.isfinite(points).all():
+        raise ProtocolError("a POLYDATA is not finite.")
+    return points
 
 
 def crc64(data: bytes) -> int:

@@ -7,6 +7,7 @@ turn into code.
 from __future__ import annotations
 
 import io
+import re
 from collections.abc import Iterator
 from contextlib import ExitStack, closing, contextmanager, suppress
 from functools import partial
@@ -14,9 +15,13 @@ from itertools import chain
 from pathlib import Path
 from typing import Any
 
+import msgspec
+
 from tumortrack.core.errors import InputError
+from tumortrack.core.evidence import Evidence
 from tumortrack.live.values import Observation
 from tumortrack_devices.recording.folders import RecordedFrame
+from tumortrack_devices.recording.mcap import EVIDENCE, FrameEvidence
 from tumortrack_devices.ros import sensors
 from tumortrack_devices.ros.messages import Messages, stamp_of
 
@@ -70,7 +75,7 @@ class BagRecording:
         companions: dict[str, Any] = {self._info_topic: first}  # the latest of each topic
         stamp_ns = 0
         waiting: Any = None  # an image: its companions may follow it
-        topics = {self._topic, self._info_topic, MASK_TOPIC}
+        topics = {self._topic, self._info_topic, MASK_TOPIC, self._evidence_topic}
         if self._topic == OWN_DEPTH:  # another bag's picture may not be aligned
             topics.add(PICTURE_TOPIC)
         for topic, message in chain(self._all(topics), [("", None)]):
@@ -79,6 +84,7 @@ class BagRecording:
                 continue
             if waiting is not None:
                 yield RecordedFrame(stamp_ns, partial(self._observed, waiting, {**companions}))
+                companions.pop(self._evidence_topic, None)  # it is of one frame
             if message is not None and not isinstance(message, InputError):
                 stamp_ns = stamp_of(message.header)
             waiting = message
@@ -87,14 +93,34 @@ class BagRecording:
         if isinstance(message, InputError):
             raise message
         info, image = companions[self._info_topic], companions.get(MASK_TOPIC)
+        known = self._known(companions.get(self._evidence_topic), stamp_of(message.header))
         if info is None:
-            return Observation(sensors.cloud_of(message), 0, frame_id=sensors.frame_of(message))
+            cloud, frame_id = sensors.cloud_of(message), sensors.frame_of(message)
+            return Observation(cloud, 0, frame_id=frame_id, evidence=known)
         frame = sensors.depth_of(message, info, self._rectified, self._unit_mm)
         same_time = image is not None and stamp_of(image.header) == frame.stamp_ns
         mask = sensors.mask_of(image) if same_time else None
         picture = companions.get(PICTURE_TOPIC)
         picture = picture and sensors.picture_of(picture, frame)
-        return Observation(frame, 0, mask, None, sensors.frame_of(message), picture)
+        return Observation(frame, 0, mask, None, sensors.frame_of(message), picture, known)
+
+    @property
+    def _evidence_topic(self) -> str:
+        """Of the same camera, where our sink wrote both."""
+        own = re.match(r"/camera(_\d+)?/", self._topic)
+        return f"{own[0] if own else f'{self._topic}/'}{EVIDENCE}"
+
+    def _known(self, message: Any, stamp_ns: int) -> tuple[Evidence, ...]:
+        """What became known with the frame of this stamp."""
+        if message is None:
+            return ()
+        try:
+            known = msgspec.json.decode(message.data, type=FrameEvidence)
+        except (msgspec.MsgspecError, AttributeError, InputError) as error:
+            raise InputError(
+                f"{self._path}: its {self._evidence_topic} is damaged: {error}."
+            ) from error
+        return known.evidence if known.stamp_ns == stamp_ns else ()
 
     def _all(self, topics: set[str]) -> Iterator[tuple[str, Any]]:
         """Topic and message in recorded order; an InputError without a topic if a message, or the

@@ -10,17 +10,28 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 
+from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError, StorageError
+from tumortrack.core.evidence import Evidence
 from tumortrack.core.geometry import Affine
-from tumortrack.live.values import Observation
+from tumortrack.live.values import Observation, TrackingResult
 from tumortrack_devices.ros.messages import Messages, Outgoing
 from tumortrack_devices.ros.sensors import CAMERA_FRAME, messages_seen
 from tumortrack_devices.ros.tf import TRANSFORMS, transform_fields
 
 CHUNK_S = 0.25  # a crash loses messages that are not in a chunk yet
 STRING = "std_msgs/msg/String"
+EVIDENCE = "evidence"  # topic beside the depth image's: what became known with a frame
+
+
+class FrameEvidence(Config, frozen=True, kw_only=True):
+    """What became known with the frame of that stamp, in its camera's frame, mm."""
+
+    stamp_ns: int
+    evidence: tuple[Evidence, ...]
 
 
 class McapBag:
@@ -112,6 +123,15 @@ def camera_messages(
         pose = transform_fields(messages, seen.stamp_ns, frame_id, camera, fixed_from_camera)
         out.append(Outgoing("/tf", TRANSFORMS, messages.make(TRANSFORMS, transforms=[pose])))
     return out
+
+
+def evidence_message(result: TrackingResult, messages: Messages, number: int) -> Outgoing:
+    """What became known with a result's frame, as JSON, with the full name of its topic; of the
+    camera of that ``number``."""
+    known = FrameEvidence(stamp_ns=result.stamp_ns, evidence=result.evidence)
+    text = messages.make(STRING, data=msgspec.json.encode(known).decode())
+    suffix = f"_{number}" if number > 1 else ""
+    return Outgoing(f"/camera{suffix}/{EVIDENCE}", STRING, text)
 
 
 class _WholeWrites(io.FileIO):

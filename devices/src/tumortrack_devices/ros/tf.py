@@ -53,16 +53,20 @@ class TfPoses(CameraPoses):
         """Waits for transforms that may still arrive."""
         until_s = time.monotonic() + _WAIT_S
         while True:
-            for subscriber in (self._tf, self._tf_static):
-                for raw in subscriber.take():
-                    for transform in self._bus.messages.from_bytes(raw, TRANSFORMS).transforms:
-                        self._keep(transform, static=subscriber is self._tf_static)
+            self.take()
             try:
-                return self._fixed_from(self._camera or seen.frame_id or "", seen.stamp_ns)
+                return self.fixed_from(self._camera or seen.frame_id or "", seen.stamp_ns)
             except NoEstimate:
                 if time.monotonic() >= until_s:
                     raise
             self._bus.wait(max(until_s - time.monotonic(), 0.0))
+
+    def take(self) -> None:
+        """Keep the transforms that have come."""
+        for subscriber in (self._tf, self._tf_static):
+            for raw in subscriber.take():
+                for transform in self._bus.messages.from_bytes(raw, TRANSFORMS).transforms:
+                    self._keep(transform, static=subscriber is self._tf_static)
 
     def close(self) -> None:
         self._bus.close()
@@ -80,8 +84,9 @@ class TfPoses(CameraPoses):
             self._known[child] = parent, (poses := PoseBuffer())
         poses.add(stamp_of(message.header), pose)
 
-    def _fixed_from(self, camera: str, stamp_ns: int) -> Affine:
-        """The camera's pose in the fixed frame, by their lowest common ancestor."""
+    def fixed_from(self, camera: str, stamp_ns: int) -> Affine:
+        """The camera's (or another frame's) pose in the fixed frame, by their lowest common
+        ancestor. Raises NoEstimate: it is not known from what was taken."""
         of_fixed, of_camera = self._ancestors(self.frame_id), self._ancestors(camera)
         common = next((name for name in of_camera if name in of_fixed), None)
         if common is None:

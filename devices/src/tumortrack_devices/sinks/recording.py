@@ -17,7 +17,13 @@ from tumortrack.live.poses import COLUMNS, pose_row
 from tumortrack.live.values import SinkConfig, SinkContext, TrackingResult
 from tumortrack.tracking.files import report_entry
 from tumortrack_devices.recording.folders import ABOUT
-from tumortrack_devices.recording.mcap import CHUNK_S, STRING, McapBag, camera_messages
+from tumortrack_devices.recording.mcap import (
+    CHUNK_S,
+    STRING,
+    McapBag,
+    camera_messages,
+    evidence_message,
+)
 from tumortrack_devices.ros.messages import Messages, Outgoing
 from tumortrack_devices.ros.results import ResultMessages
 
@@ -68,8 +74,9 @@ class RecordingSinkConfig(SinkConfig, frozen=True, kw_only=True, tag="recording"
 
 class RecordingSink:
     """Topics: ``/camera/...`` observations in the camera's frame, of further cameras
-    ``/camera_2/...``; ``/tumortrack/...`` the results as in ROS, and ``report`` (JSON); ``/tf``
-    where the frames differ. For a moving camera also a table of its poses for `track --moving`."""
+    ``/camera_2/...``; of the one that leads also ``/camera/evidence`` (JSON), what became known
+    with the frame; ``/tumortrack/...`` the results as in ROS, and ``report`` (JSON); ``/tf`` where
+    the frames differ. For a moving camera also a table of its poses for `track --moving`."""
 
     def __init__(self, folder: Path, context: SinkContext, meshes_hz: float) -> None:
         self._messages = Messages()
@@ -105,7 +112,9 @@ class RecordingSink:
             return out
         for view in result.camera_views:
             pose = view.published_from_camera, frame.frame_id
-            out = [*camera_messages(view.seen, *pose, self._messages, view.number), *out]
+            known = view.seen is result.observation and result.evidence
+            more = [evidence_message(result, self._messages, view.number)] if known else []
+            out = [*camera_messages(view.seen, *pose, self._messages, view.number), *more, *out]
         return out
 
 

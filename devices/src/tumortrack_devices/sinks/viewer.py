@@ -102,7 +102,7 @@ class ViewerSink:
         self._server.scene.set_background_image(np.full((4, 4, 3), colours.BACKGROUND, np.uint8))
         self._scene = ViewerScene(self._server, context, config.margin_mm)
         slices = "" if self._ct is None else self._ct.name
-        options = slices, context.arms, str(context.patient)
+        options = slices, context.arms, str(context.patient), context.tools
         self._panel = Panel(self._server, context.parts, *options)
         self._connect()
         self._say("waiting")
@@ -124,6 +124,13 @@ class ViewerSink:
         panel.clicks[False].on_click(lambda _: self._ask(False))
         panel.forget.on_click(lambda _: self._forget())
         self._guard.on_refused = self._refused
+        if self._context.tools:
+
+            @panel.touches.on_click
+            def _(event: GuiEvent[Any]) -> None:
+                if event.client is not None:  # else set by the program
+                    self._context.controls.touched.append(event.target.value)
+
         if self._context.arms:
             panel.abort.on_click(lambda _: self._abort())
             self._guard.free[panel.abort._impl.uuid] = self._context.controls.aborted.set

@@ -163,7 +163,7 @@ class StatusPanel:
             f"<div class='tumortrack-numbers'>{parts}"
             f"<div class='tumortrack-row'><span>latency <b>{latency}</b></span>"
             f"<span>last frame <b>{self.age_s:.1f} s</b> ago</span></div>"
-            f"<div>{escape(result.cameras)}</div></div>"
+            f"<div>{escape(result.beside)}</div></div>"
         )
 
     def _parts(self, report: FitReport) -> str:
@@ -210,7 +210,7 @@ def _box(text: str, colour: Colour, why: str = "") -> str:
 class Panel:
     """The elements, shared by all clients; the sink sets their callbacks. The result comes first,
     then what shows it, then what changes it. ``slices``: of what; empty: there are none; ``arms``:
-    there may be some; ``patient``: in words."""
+    there may be some; ``patient``: in words; ``tools``: names of what touches."""
 
     def __init__(
         self,
@@ -219,6 +219,7 @@ class Panel:
         slices: str = "",
         arms: bool = False,
         patient: str = str(NOBODY),
+        tools: tuple[str, ...] = (),
     ) -> None:
         gui = server.gui
         gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
@@ -237,6 +238,10 @@ class Panel:
         gui.add_html('<div id="tumortrack-numbers"></div>')
         if arms:
             self.views = gui.add_button_group("Look at", get_args(View))
+        if tools:
+            self.touches = gui.add_button_group(
+                "It touches", tools, hint="This tool's tip touches now; or holds, or lets go"
+            )
         self.slice = None
         default = DisplayOptions()
         shown: dict[str, Any] = {}  # by the option's name

@@ -1,0 +1,189 @@
+"""A tracked tool (PLUS and others), and what is drawn in 3D Slicer, over OpenIGTLink.
+
+TRANSFORM is a tool's pose, STRING says when it touches. A fiducial (POINT) named as a part is a
+touch of that part, and places (POLYDATA) named as a part are an outline of it. They count as soon
+as they have not been changed for a moment: they are sent at every movement of the mouse.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Mapping
+from typing import ClassVar, Literal
+
+import numpy as np
+from jaxtyping import Float
+
+from tumortrack.core.errors import InputError
+from tumortrack.core.evidence import Outline, Touch
+from tumortrack.core.geometry import RAS_FROM_LPS, Affine, transform_points
+from tumortrack.live.poses import PoseBuffer
+from tumortrack.live.values import SinkContext
+from tumortrack_devices.igtl import message as igtl
+from tumortrack_devices.igtl.link import Link
+from tumortrack_devices.igtl.message import Header
+from tumortrack_devices.tools.tip import Piece, TipConfig, TipTool
+
+_SETTLED_S = 0.5  # a drawn piece that has not changed for so long is meant
+_SILENT_S = 5.0  # without a connection, before it is said
+_MOST_DRAWN = 200  # pieces under way
+_APART_MM, _MOST_PLACES = 3.0, 100  # of an outline: nearer places share their error
+_MEANT = {"1": True, "true": True, "on": True, "0": False, "false": False, "off": False}
+
+
+class OpenIgtLinkToolConfig(TipConfig, frozen=True, kw_only=True, tag="openigtlink"):
+    """``address``: HOST[:PORT] of a server to connect to (PlusServer; 18944), or PORT alone to be
+    the server (3D Slicer connects), where 18944 may be the sink's.
+
+    Attributes:
+        name: device of the tool's TRANSFORM; empty: there is no tool, only what is drawn.
+        contact: device of a STRING that is 1 while the tip touches, else 0.
+        space: ras negates x and y, as 3D Slicer has them; lps takes them as they are. Default: ras
+            of who connects to us, lps of a server.
+        host: as the server: which of this machine's addresses; 0.0.0.0: all.
+    """
+
+    target: ClassVar[str] = "address"
+
+    address: str = "18945"
+    name: str = ""
+    contact: str = "contact"
+    space: Literal["", "ras", "lps"] = ""
+    host: str = "127.0.0.1"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not self.port_text.isdecimal() or not 0 <= int(self.port_text) <= 65535:
+            raise InputError(
+                f"openigtlink: {self.address!r} is no address; write HOST, HOST:PORT or PORT."
+            )
+
+    @property
+    def server(self) -> str:
+        """To connect to; empty: this is the server."""
+        host, _, port = self.address.rpartition(":")
+        return host or ("" if port.isdecimal() else port)
+
+    @property
+    def port_text(self) -> str:
+        port = self.address.rpartition(":")[2]
+        return "18944" if port == self.server else port
+
+    def open(self, context: SinkContext, name: str) -> OpenIgtLinkTool:
+        return OpenIgtLinkTool(self, context, name)
+
+
+class OpenIgtLinkTool(TipTool):
+    """``link``: the connection. Poses and contacts have the time of their arrival."""
+
+    def __init__(self, config: OpenIgtLinkToolConfig, context: SinkContext, name: str) -> None:
+        super().__init__(config, context, name, "" if config.name else None)
+        self._device, self._contact_device = config.name, config.contact
+        ras = config.space == "ras" or not (config.space or config.server)
+        self._axes = RAS_FROM_LPS if ras else np.eye(4)
+        self._poses, self._lock = PoseBuffer(), threading.Lock()
+        # By device and number of the fiducial; when each was changed last; None: it was given.
+        self._drawn: dict[tuple[str, int], tuple[Piece, float | None]] = {}
+        self._heard_fault, self._server, self._reached_s = "", config.server, time.monotonic()
+        self._readers = {
+            "TRANSFORM": self._hear_pose,
+            "STRING": self._hear_contact,
+            "POINT": self._hear_points,
+            "POLYDATA": self._hear_outline,
+        }
+        self.link = Link(
+            config.host, int(config.port_text), config.server, self._heard, self._faulty
+        )
+
+    def pose(self, stamp_ns: int) -> Affine:
+        return self._poses.at(stamp_ns)
+
+    def refresh(self, stamp_ns: int) -> None:
+        fault, self._heard_fault = self._heard_fault, ""
+        now_s = time.monotonic()
+        if not self._server or self.link.receivers:
+            self._reached_s = now_s
+        elif now_s - self._reached_s > _SILENT_S:
+            fault = f"nothing answers at {self._server}:{self.link.port}; it is tried again"
+        self.trouble = fault or self.trouble
+
+    def drawn(self) -> list[Piece]:
+        now_s, done = time.monotonic(), []
+        with self._lock:
+            for key, (piece, changed_s) in self._drawn.items():
+                if changed_s is not None and now_s - changed_s >= _SETTLED_S:
+                    done.append(piece)
+                    self._drawn[key] = piece, None
+        return done
+
+    def close(self) -> None:
+        self.link.close()
+
+    def _faulty(self, words: str) -> None:
+        self._heard_fault = f"a message was ignored: {words}"
+
+    def _heard(self, header: Header, body: bytes) -> None:
+        """One message, in the link's thread. Raises ProtocolError."""
+        if (reader := self._readers.get(header.type)) is not None:
+            reader(header.device, *igtl.unpack_body(header, body))
+
+    def _hear_pose(self, device: str, content: bytes, metadata: Mapping[str, str]) -> None:
+        if device == self._device and metadata.get("TransformStatus", "OK") == "OK":
+            pose = self._axes @ igtl.unpack_transform(content) @ self._axes
+            self._poses.add(time.time_ns(), pose)
+
+    def _hear_contact(self, device: str, content: bytes, _: Mapping[str, str]) -> None:
+        if device == self._contact_device:
+            text = igtl.unpack_string(content).strip().lower()
+            if text not in _MEANT:
+                raise igtl.ProtocolError(f"the STRING {device} is {text!r}; allowed: 1 or 0.")
+            self.contact(time.time_ns(), _MEANT[text])
+
+    def _hear_points(self, device: str, content: bytes, _: Mapping[str, str]) -> None:
+        for number, (label, group, place_mm) in enumerate(igtl.unpack_points(content)):
+            part = self._part(label, group, device)
+            fields = {"part": part, "tip_mm": self.config.tip_mm}
+            self._draw((device, number), Touch, place_mm[None], fields)
+
+    def _hear_outline(self, device: str, content: bytes, _: Mapping[str, str]) -> None:
+        places_mm = _thinned(igtl.unpack_polydata_points(content))
+        if len(places_mm):
+            self._draw((device, -1), Outline, places_mm, {"part": self._part(device)})
+
+    def _part(self, *names: str) -> str:
+        parts = self.context.parts
+        if (part := next((one for one in names if one in parts), None)) is None:
+            raise igtl.ProtocolError(
+                f"{names[0]!r} is drawn, which is no part; name it as what it lies on: "
+                f"{', '.join(parts)}."
+            )
+        return part
+
+    def _draw(
+        self,
+        key: tuple[str, int],
+        kind: type[Touch | Outline],
+        places: Float[np.ndarray, "n 3"],
+        fields: Mapping[str, object],
+    ) -> None:
+        piece = Piece(kind, transform_points(self._axes, places), fields)
+        with self._lock:
+            known = (one.places_mm for (name, _), (one, _) in self._drawn.items() if name == key[0])
+            if any(np.array_equal(places_mm, piece.places_mm) for places_mm in known):
+                return
+            if key not in self._drawn and len(self._drawn) >= _MOST_DRAWN:
+                raise igtl.ProtocolError(f"more than {_MOST_DRAWN} pieces are drawn.")
+            self._drawn[key] = piece, time.monotonic()
+
+
+def _thinned(places_mm: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:
+    """One place of each cell of a grid; the wider, the more there are."""
+    width_mm, kept = _APART_MM, places_mm
+    while len(places_mm):
+        cells = np.floor(np.clip(places_mm / width_mm, -1e9, 1e9)).astype(np.int64)
+        kept = places_mm[np.sort(np.unique(cells, axis=0, return_index=True)[1])]
+        if len(kept) <= _MOST_PLACES:
+            break
+        width_mm *= 1.5
+    return kept

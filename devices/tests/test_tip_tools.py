@@ -1,0 +1,524 @@
+"""Tools with a tip: contacts, what is held, shafts, errors; from a table, an arm, a network."""
+
+from __future__ import annotations
+
+import socket
+import sys
+import time
+from dataclasses import replace
+from types import ModuleType
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import needs
+from clock import until
+from live_objects import STAMP_NS, small_anatomy, small_estimate, small_frame, small_setting
+from tumortrack.core.errors import InputError
+from tumortrack.core.estimate import NOT_JUDGED
+from tumortrack.core.evidence import Free, Held, Landmark, Outline, Touch
+from tumortrack.core.geometry import rigid, transform_points
+from tumortrack.live.poses import COLUMNS, CONTACT, pose_row
+from tumortrack.live.tools import Tools
+from tumortrack.live.values import CameraView, Observation, PublishedFrame
+from tumortrack_devices.igtl import message as igtl
+from tumortrack_devices.igtl.message import Message, Polydata, pack
+from tumortrack_devices.tools.file import FileToolConfig
+from tumortrack_devices.tools.openigtlink import OpenIgtLinkToolConfig
+from tumortrack_devices.tools.ur import UrToolConfig
+
+MS = 1_000_000
+BASE_FROM_CAMERA = rigid(np.diag([1.0, -1, -1]), np.array([400.0, 0, 500]))
+BASE = PublishedFrame("base", BASE_FROM_CAMERA, calibrated=True)
+
+
+def setting(published=BASE):
+    return replace(small_setting(), anatomy_ct=small_anatomy(), published_frame=published)
+
+
+def view(stamp_ns, published_from_camera=BASE_FROM_CAMERA):
+    seen = Observation(small_frame(stamp_ns), stamp_ns)
+    return CameraView(1, seen, published_from_camera)
+
+
+def facing(camera_mm, turn=None):
+    """Base from a tool whose origin is at this place before the camera."""
+    place = transform_points(BASE_FROM_CAMERA, np.array([camera_mm], float))[0]
+    return rigid(np.eye(3) if turn is None else turn, place)
+
+
+def table(path, poses, contacts, step_ms=10):
+    rows = [
+        f"{pose_row(STAMP_NS + n * step_ms * MS, 'base', pose).strip()},{int(contact)}"
+        for n, (pose, contact) in enumerate(zip(poses, contacts, strict=True))
+    ]
+    path.write_text("\n".join([COLUMNS + CONTACT, *rows]) + "\n")
+    return path
+
+
+def still(camera_mm, contacts, path, **options):
+    """A tool that stands there, with a state of contact every 10 ms."""
+    file = table(path / "tool.csv", [facing(camera_mm)] * len(contacts), contacts)
+    return FileToolConfig(path=file, **options).open(setting(), "probe")
+
+
+def frames(tool, times_ms, estimate=None):
+    """What it gives in frames at these times; where the organ is found, it is told so."""
+    given = []
+    for time_ms in times_ms:
+        now = view(STAMP_NS + time_ms * MS)
+        given.append(list(tool.evidence(now)))
+        if estimate is not None:
+            tool.located(now, estimate)
+    return given
+
+
+@pytest.mark.parametrize(
+    ("contacts", "touches"),
+    [
+        ("0" * 60, 0),
+        ("0" * 5 + "1" * 20 + "0" * 35, 1),
+        ("0" * 5 + "1" * 3 + "0" * 52, 1),  # shorter than what the mean is taken over
+        ("0" * 5 + "1" * 5 + "00" + "1" * 10 + "0" * 38, 1),  # it bounces
+        ("0" * 5 + "1" * 5 + "0" * 20 + "1" * 10 + "0" * 20, 2),
+        ("1" * 60, 1),
+    ],
+)
+def test_a_contact_is_one_touch(contacts, touches, tmp_path):
+    tool = still((3, 4, 120), [c == "1" for c in contacts], tmp_path, tip_mm=1.5, part="tumor_1")
+    given = [
+        piece for frame in frames(tool, range(0, 600, 33), small_estimate()) for piece in frame
+    ]
+    assert len(given) == tool.counts["touch"] == touches
+    for piece in given:
+        assert isinstance(piece, Touch)
+        assert (piece.part, piece.tip_mm, piece.tool, piece.std_mm) == ("tumor_1", 1.5, "probe", 1)
+        np.testing.assert_allclose(piece.place_mm, (3, 4, 120), atol=1e-6)
+        assert contacts[(piece.stamp_ns - STAMP_NS) // (10 * MS)] == "1"
+
+
+def test_a_touch_is_the_mean_of_its_first_tenth_of_a_second(tmp_path):
+    poses = [facing((0.1 * n, 0, 120)) for n in range(40)]  # 10 mm/s
+    path = table(tmp_path / "t.csv", poses, [10 <= n < 35 for n in range(40)])
+    tool = FileToolConfig(path=path).open(setting(), "probe")
+    assert frames(tool, [150]) == [[]]  # not yet known
+    ((touch,),) = frames(tool, [240])
+    np.testing.assert_allclose(touch.place_mm, (1.5, 0, 120), atol=1e-6)  # from 1 to 2 mm
+    assert touch.stamp_ns == STAMP_NS + 100 * MS
+
+
+def test_a_touch_waits_for_the_organ_but_not_for_long(tmp_path):
+    tool = still((0, 0, 120), [n < 20 for n in range(150)], tmp_path)
+    first, second = frames(tool, [300, 340])  # the organ is not found: it is given again
+    assert first == second != []
+    assert frames(tool, [1200]) == [[]]
+    assert tool.counts == {"touch": 1, "dropped": 1}
+
+
+def test_a_sweep_touches_every_three_millimetres(tmp_path):
+    poses = [facing((0.5 * n, 0, 120)) for n in range(60)]  # 50 mm/s
+    path = table(tmp_path / "t.csv", poses, [True] * 60)
+    tool = FileToolConfig(path=path, sweep=True).open(setting(), "probe")
+    given = [p for frame in frames(tool, range(0, 600, 33), small_estimate()) for p in frame]
+    xs = np.array([piece.place_mm[0] for piece in given])
+    assert xs[0] == pytest.approx(2.5)  # the mean over 5 mm
+    # A pose every 20 ms, 1 mm: the first ones at least 3 mm on.
+    np.testing.assert_allclose(np.diff(xs)[1:], 3.0, atol=1e-6)
+    assert xs[-1] > 24
+
+
+def test_the_tip_and_the_shaft_follow_the_tools_axes(tmp_path):
+    turn = Rotation.from_rotvec([0, np.pi / 2, 0]).as_matrix()  # z of the tool along x of the base
+    path = table(tmp_path / "t.csv", [facing((0, 0, 120), turn)] * 30, [True] * 30)
+    options = {"tip": (0.0, 0.0, 80.0), "shaft_mm": 20.0, "tip_mm": 4.0}
+    tool = FileToolConfig(path=path, **options).open(setting(), "probe")
+    free, touch = sorted(frames(tool, [200])[0], key=lambda piece: piece.name)
+    np.testing.assert_allclose(touch.place_mm, (80, 0, 120), atol=1e-6)
+    assert isinstance(free, Free)
+    assert free.tip_mm == 4
+    np.testing.assert_allclose(free.places_mm, [(x, 0, 120) for x in (75, 70, 65, 60)], atol=1e-6)
+    bare = FileToolConfig(path=path, shaft_mm=10.0).open(setting(), "probe")
+    free = frames(bare, [50])[0][0]  # from an origin that is the tip: along -z
+    np.testing.assert_allclose(free.places_mm, [(-5, 0, 120), (-10, 0, 120)], atol=1e-6)
+
+
+def test_a_tools_pieces_share_the_calibrations_error(tmp_path):
+    path = table(tmp_path / "t.csv", [facing((0, 0, 150))] * 30, [True] * 30)
+    published = replace(BASE, error_mm=2.0, error_deg=0.5)
+    tool = FileToolConfig(path=path, std_mm=0.5).open(setting(published), "probe")
+    ((touch,),) = frames(tool, [200])
+    expected = 2.0 + 150 * np.radians(0.5)
+    assert (touch.std_mm, touch.tool) == (0.5, "probe")
+    assert touch.shared_std_mm == pytest.approx(expected, abs=1e-6)
+    assert expected > 3.3
+
+
+class Shifted:
+    """A motion: the CT lies 100 mm nearer than the organ, and 2 mm are not known."""
+
+    def __init__(self, shift_mm):
+        self.shift_mm = np.array(shift_mm, float)
+
+    def carry(self, points):
+        return points + self.shift_mm
+
+    def back(self, points):
+        return points - self.shift_mm
+
+    def std_mm(self, points):
+        return np.full(len(points), 2.0)
+
+    largest_std_mm = covariance_mm2 = std_mm
+
+
+def found(shift_mm, finding=None):
+    return replace(small_estimate(), motion=Shifted(shift_mm), finding=finding)
+
+
+def test_what_is_held_is_the_point_of_the_ct_that_was_taken_until_it_is_let_go(tmp_path):
+    poses = [facing((0.2 * n, 0, 106)) for n in range(80)]  # it pulls with 20 mm/s
+    path = table(tmp_path / "t.csv", poses, [10 <= n < 50 for n in range(80)])
+    tool = FileToolConfig(path=path, holds=True).open(setting(), "grasper")
+    times = range(0, 700, 40)
+    given = dict(zip(times, frames(tool, times, found((0, 0, 100))), strict=True))
+    # In the frame at 120 ms it was told what it has; from the next one on it says so.
+    assert [time for time, pieces in given.items() if pieces] == list(range(160, 500, 40))
+    for time_ms, (held,) in ((t, p) for t, p in given.items() if p):
+        assert isinstance(held, Held)
+        np.testing.assert_allclose(held.point_ct, (0.2 * 12, 0, 6), atol=1e-6)
+        np.testing.assert_allclose(held.place_mm, (0.02 * time_ms, 0, 106), atol=1e-6)
+        assert (held.point_std_mm, held.std_mm, held.tool) == (2, 1, "grasper")
+
+
+def test_what_is_held_is_not_taken_from_a_doubtful_estimate(tmp_path):
+    tool = still((0, 0, 106), [True] * 60, tmp_path, holds=True)
+    assert not any(frames(tool, range(0, 300, 40), found((0, 0, 0), NOT_JUDGED)))
+    assert any(frames(tool, range(300, 500, 40), found((0, 0, 0))))
+
+
+def test_jaws_that_close_on_nothing_hold_nothing(tmp_path):
+    tool = still((0, 0, 90), [True] * 60, tmp_path, holds=True)
+    assert not any(frames(tool, range(0, 300, 40), found((0, 0, 0))))
+    assert tool.trouble == "it holds nothing of the organ, which is more than 1 cm away"
+
+
+def test_a_landmark_is_touched_and_a_click_is_a_touch(tmp_path):
+    point = (1.0, 2.0, 3.0)
+    tool = still((0, 0, 120), [False] * 60, tmp_path, point=point)
+    assert frames(tool, [40], small_estimate()) == [[]]
+    tool.touched()
+    ((landmark,),) = frames(tool, [80], small_estimate())
+    assert isinstance(landmark, Landmark)
+    assert landmark.point_ct == point
+    np.testing.assert_allclose(landmark.place_mm, (0, 0, 120), atol=1e-6)
+    assert frames(tool, [120], small_estimate()) == [[]]
+    holder = still((0, 0, 106), [False] * 60, tmp_path, holds=True)
+    holder.touched()
+    given = frames(holder, [40, 80, 120], found((0, 0, 0)))
+    assert [len(pieces) for pieces in given] == [0, 1, 1]
+    holder.touched()
+    assert frames(holder, [160], found((0, 0, 0))) == [[]]
+
+
+def test_of_a_moving_camera_the_pose_in_that_frame_counts(tmp_path):
+    tool = still((3, 4, 120), [True] * 30, tmp_path)
+    moved = BASE_FROM_CAMERA @ rigid(np.eye(3), np.array([10.0, 0, 0]))
+    (touch,) = tool.evidence(view(STAMP_NS + 200 * MS, moved))
+    np.testing.assert_allclose(touch.place_mm, (-7, 4, 120), atol=1e-6)
+
+
+def test_a_tool_whose_poses_end_gives_nothing_and_says_so_once(tmp_path):
+    path = table(tmp_path / "t.csv", [facing((0, 0, 120))] * 10, [True] * 10)
+    notes = []
+    configs = {"probe": FileToolConfig(path=path, shaft_mm=20.0)}
+    tools = Tools(configs, setting(), notes)
+    assert len(tools.evidence(view(STAMP_NS + 100 * MS))) == 2  # the pose 10 ms before
+    for time_ms in (200, 300, 400):
+        assert [p for p in tools.evidence(view(STAMP_NS + time_ms * MS)) if p.name == "free"] == []
+    assert notes == ["tool probe: where it is at the time of a frame or touch is not known"]
+    assert tools.summary() == {
+        "probe": {"touch": 1, "free": 1, "trouble": [notes[0].removeprefix("tool probe: ")]}
+    }
+
+
+@pytest.mark.parametrize(
+    ("options", "published", "wrong"),
+    [
+        ({"tip_mm": 99.0}, BASE, "tip_mm is 99; allowed: 0 to 50"),
+        ({"shaft_mm": 2.0}, BASE, "shaft_mm is 2; allowed: 5 to 500"),
+        ({"holds": True, "sweep": True}, BASE, "exclude each other"),
+        ({"part": "spleen"}, BASE, "no part 'spleen'; this organ has kidney, tumor_1"),
+        ({}, PublishedFrame(), "in frame 'base', and results in 'camera'. Give --frame FILE"),
+    ],
+)
+def test_what_cannot_be_is_one_clear_line(options, published, wrong, tmp_path):
+    path = table(tmp_path / "t.csv", [facing((0, 0, 120))] * 3, [False] * 3)
+    with pytest.raises(InputError, match=wrong):
+        FileToolConfig(path=path, **options).open(setting(published), "probe")
+
+
+def test_a_table_without_contacts_serves_for_a_shaft_alone(tmp_path):
+    path = tmp_path / "t.csv"
+    path.write_text(f"{COLUMNS}\n{pose_row(STAMP_NS, 'base', facing((0, 0, 120)))}")
+    with pytest.raises(InputError, match="does not say when the tip touches"):
+        FileToolConfig(path=path).open(setting(), "probe")
+    tool = FileToolConfig(path=path, shaft_mm=10.0).open(setting(), "probe")
+    assert [piece.name for piece in tool.evidence(view(STAMP_NS))] == ["free"]
+
+
+# OpenIGTLink
+
+
+def sent(sock, kind, device, content, **metadata):
+    sock.sendall(pack(Message(kind, device, time.time_ns(), content, metadata)))
+
+
+def string(text):
+    return b"\0\3" + len(text).to_bytes(2, "big") + text.encode()
+
+
+@pytest.fixture
+def tracker():
+    """A server as PlusServer is one, for one client; ``link()`` takes it in."""
+    server = socket.create_server(("127.0.0.1", 0))
+    server.settimeout(60)
+    opened = [server]
+
+    def link():
+        sock, _ = server.accept()
+        opened.append(sock)
+        return sock
+
+    yield server.getsockname()[1], link
+    for one in reversed(opened):
+        one.close()
+
+
+def heard(tool):
+    """What it gives in a frame of now, once there is something; and then located."""
+
+    def asked():
+        now = view(time.time_ns())
+        pieces = tool.evidence(now)
+        tool.located(now, small_estimate())
+        return [piece for piece in pieces if piece.name != "free"]
+
+    return until(asked, "evidence")
+
+
+def test_a_tracked_pointer_touches_over_openigtlink(tracker):
+    port, link = tracker
+    options = {"name": "Stylus", "tip": (0.0, 0.0, 10.0), "tip_mm": 1.0}
+    config = OpenIgtLinkToolConfig(address=f"127.0.0.1:{port}", **options)
+    tool = config.open(setting(), "pointer")
+    try:
+        sock = link()
+        pose = facing((5, 6, 130))
+        for n in range(40):  # each 10 ms, of two tools; that of ours touches from the tenth on
+            sent(sock, "TRANSFORM", "Other", igtl.pack_transform(facing((50, 6, 130))))
+            sent(sock, "TRANSFORM", "Stylus", igtl.pack_transform(pose))
+            sent(sock, "STRING", "contact", string("1" if n >= 10 else "0"))
+            time.sleep(0.01)
+        (touch,) = heard(tool)
+        assert isinstance(touch, Touch)
+        # The base's z points towards the camera.
+        np.testing.assert_allclose(touch.place_mm, (5, 6, 120), atol=1e-3)
+        assert abs(touch.stamp_ns - time.time_ns()) < 60e9
+        sent(sock, "STRING", "contact", string("0"))
+        missing = igtl.pack_transform(facing((99, 6, 130)))
+        sent(sock, "TRANSFORM", "Stylus", missing, TransformStatus="MISSING")
+        time.sleep(0.2)
+        assert tool.evidence(view(time.time_ns())) == []
+        assert tool.trouble == ""
+    finally:
+        tool.close()
+
+
+def test_damaged_messages_are_named_and_the_next_ones_are_heard(tracker):
+    port, link = tracker
+    config = OpenIgtLinkToolConfig(address=f"127.0.0.1:{port}", name="Stylus")
+    notes = []
+    tools = Tools({"pointer": config}, setting(), notes)
+
+    def named(words):
+        def told():
+            tools.evidence(view(time.time_ns()))
+            return any(words in note for note in notes)
+
+        until(told, f"{words!r}, not {notes}")
+
+    try:
+        sock = link()
+        whole = pack(Message("TRANSFORM", "Stylus", 1, igtl.pack_transform(np.eye(4))))
+        sock.sendall(whole[:-1] + bytes([whole[-1] ^ 1]))
+        named("checksum is wrong")
+        sent(sock, "TRANSFORM", "Stylus", igtl.pack_transform(2 * np.eye(4)))
+        named("not rigid")
+        sent(sock, "TRANSFORM", "Stylus", bytes(7))
+        named("has 48 bytes, not 7")
+        sent(sock, "STRING", "contact", string("perhaps"))
+        named("'perhaps'; allowed: 1 or 0")
+        sent(sock, "STRING", "contact", b"\0\3\0\5ab")
+        named("a STRING is cut off")
+        sent(sock, "POINT", "F", b"ab")
+        named("a POINT is of pieces of 136 bytes; 2 came")
+        sent(sock, "POLYDATA", "kidney", bytes([255] * 40))
+        named("a POLYDATA is cut off")
+        sock.sendall(whole[:42] + (2**40).to_bytes(8, "big") + whole[50:])
+        named("a message of 1099511627776 bytes is refused")
+        again = link()  # it comes back
+        for _ in range(3):
+            sent(again, "TRANSFORM", "Stylus", igtl.pack_transform(facing((0, 0, 120))))
+        sent(again, "STRING", "contact", string("1"))
+
+        def touched():
+            sent(again, "TRANSFORM", "Stylus", igtl.pack_transform(facing((0, 0, 120))))
+            return tools.evidence(view(time.time_ns()))
+
+        assert [piece.name for piece in until(touched, "a touch")] == ["touch"]
+    finally:
+        tools.close()
+
+
+def test_what_is_drawn_in_slicer_counts_once_it_rests():
+    """Slicer connects to us; its axes are RAS."""
+    tool = OpenIgtLinkToolConfig(address="0", std_mm=2.0).open(setting(PublishedFrame()), "slicer")
+    try:
+        sock = socket.create_connection(("127.0.0.1", tool.link.port))
+        places = np.array([(1.0, 2, 130), (3, 4, 131), (5, 6, 132)])
+        labels, ras = ["tumor_1", "spot", "tumor_2"], places * [-1, -1, 1]
+        here = np.eye(4)
+
+        def drawn():
+            now = view(time.time_ns(), here)
+            pieces = tool.evidence(now)
+            tool.located(now, small_estimate())
+            return pieces
+
+        for step in (9.0, 6.0, 3.0, 0.0):  # dragged by the mouse
+            colours = [(255, 0, 0)] * 3
+            content = igtl.pack_points(ras + [step, 0, 0], labels, colours)
+            sent(sock, "POINT", "kidney", content)
+        given = until(drawn, "touches")
+        assert [piece.part for piece in given] == ["tumor_1", "kidney", "tumor_2"]
+        np.testing.assert_allclose([p.place_mm for p in given], places, atol=1e-5)
+        assert {piece.std_mm for piece in given} == {2.0}
+        sent(sock, "POINT", "kidney", content)  # said again: nothing new
+        angles = np.linspace(0, 2 * np.pi, 2000)
+        ring = np.stack([20 * np.cos(angles), 20 * np.sin(angles), np.full(2000, 120.0)], axis=1)
+        surface = Polydata(ring * [-1, -1, 1], np.zeros((0, 3), int))
+        sent(sock, "POLYDATA", "tumor_2", igtl.pack_polydata(surface))
+        (outline,) = until(drawn, "an outline")
+        assert isinstance(outline, Outline)
+        assert outline.part == "tumor_2"
+        assert 30 <= len(outline.places_mm) <= 100
+        off_mm = np.linalg.norm(np.array(outline.places_mm)[:, :2], axis=1)
+        np.testing.assert_allclose(off_mm, 20, atol=1e-4)
+        sent(sock, "POINT", "F", igtl.pack_points(ras[:1] + 5, ["F-1"], [(255, 0, 0)]))
+
+        def said():
+            tool.evidence(view(time.time_ns(), here))
+            return "'F-1' is drawn, which is no part" in tool.trouble
+
+        until(said, "the unknown name")
+        sock.close()
+    finally:
+        tool.close()
+
+
+def test_a_pointer_needs_the_calibration_that_drawings_do_not():
+    config = OpenIgtLinkToolConfig(address="127.0.0.1:18944", name="Stylus")
+    with pytest.raises(InputError, match="give --frame FILE"):
+        config.open(setting(PublishedFrame()), "pointer")
+
+
+# An arm
+
+
+class Arm:
+    """ur_rtde's receiving half: 4 N of weight, and 3 N more while it touches."""
+
+    def __init__(self, host):
+        self.push_n = 0.0
+
+    def getTimestamp(self):  # noqa: N802
+        return time.time()
+
+    def isConnected(self):  # noqa: N802
+        return True
+
+    def getActualTCPPose(self):  # noqa: N802
+        return [0.4, 0.0, 0.5, 0.0, 0.0, 0.0]
+
+    def getActualTCPForce(self):  # noqa: N802
+        return [0.0, self.push_n, -4.0, 9.0, 9.0, 9.0]
+
+    def disconnect(self):
+        pass
+
+
+def test_an_arm_feels_that_it_touches(monkeypatch):
+    module = ModuleType("rtde_receive")
+    module.RTDEReceiveInterface = Arm
+    monkeypatch.setitem(sys.modules, "rtde_receive", module)
+    tool = UrToolConfig(host="10.0.0.9", tip=(0.0, 0.0, 20.0)).open(setting(), "arm")
+    try:
+        arm = tool._arm._receive
+        until(lambda: tool._rest_n is not None, "a force at rest")
+        arm.push_n = 1.9  # less than the threshold
+        time.sleep(0.1)
+        assert tool.evidence(view(time.time_ns())) == []
+        arm.push_n = 4.0
+        (touch,) = heard(tool)
+        np.testing.assert_allclose(touch.place_mm, (0, 0, -20), atol=1e-6)  # base z is -z
+        arm.push_n = 0.0
+        time.sleep(0.2)
+        assert tool.evidence(view(time.time_ns())) == []
+        arm.push_n = 4.0
+        assert len(heard(tool)) == 1
+    finally:
+        tool.close()
+
+
+def test_a_tool_of_tf_touches_as_its_topic_says():
+    needs.module("cyclonedds", "tumortrack-devices, x86-64, Python up to 3.13")
+    from ros2_objects import own_graph, peer
+    from ros2_peer import tool_pose
+    from tumortrack_devices.ros.ros2 import open_bus
+    from tumortrack_devices.tools.ros import Ros2ToolConfig
+
+    published = PublishedFrame("base_link", np.eye(4), calibrated=True)
+    with own_graph(), peer("tf", 100, 600) as sender:
+        sender.line()
+        options = {"tip": (0.0, 0.0, 100.0), "std_mm": 0.7, "shaft_mm": 20.0}
+        config = Ros2ToolConfig(frame="tool0", contact="/probe/contact", via="dds", **options)
+        tool = config.open(setting(published), "probe")
+        bus = open_bus("dds")
+        button = bus.publisher("/probe/contact", "std_msgs/msg/Bool")
+
+        def at(now_ns):
+            return tool.evidence(view(now_ns, np.eye(4)))
+
+        def pressing(state):
+            message = bus.messages.make("std_msgs/msg/Bool", data=state)
+            button.publish(bus.messages.to_bytes(message))
+
+        try:
+            frees = until(lambda: at(time.time_ns() - 30 * MS), "the shaft")
+            assert [piece.name for piece in frees] == ["free"]
+
+            def touched():
+                pressing(True)
+                return [p for p in at(time.time_ns() - 30 * MS) if isinstance(p, Touch)]
+
+            (touch,) = until(touched, "a touch")
+            pose = tool_pose(touch.stamp_ns + 50 * MS)
+            expected = 1000 * pose[:3, 3] + pose[:3, :3] @ [0, 0, 100]
+            np.testing.assert_allclose(
+                touch.place_mm, expected, atol=10
+            )  # 50 mm/s on a busy machine
+            assert touch.std_mm == 0.7
+        finally:
+            tool.close()
+            bus.close()
