@@ -89,17 +89,17 @@ class Advisor:
     def touches(self, count: int = 3) -> tuple[NextEvidence, ...]:
         """The best places of the organ's surface, each after those before it."""
         places_mm, normals = self._surface()
-        rows, known, told = self._rows(places_mm), self._known(), list[NextEvidence]()
+        rows, known, advised = self._rows(places_mm), self._known(), list[NextEvidence]()
         known = known.with_unknowns(_SHARED_MM**2 * np.ones(3))
         rows = np.concatenate([rows, rows[:, :3]], axis=1)
         free = np.ones(len(rows), bool)
         for _ in range(count):
             best = int(np.flatnonzero(free)[known.best(rows[free], _TOUCH_MM)])
             then = known.after(rows[[best]], _TOUCH_MM)
-            told.append(self._told("touch", places_mm[best], normals[best], known, then))
+            advised.append(self._entry("touch", places_mm[best], normals[best], known, then))
             known = then
             free &= np.linalg.norm(places_mm - places_mm[best], axis=1) > _APART_MM
-        return tuple(told)
+        return tuple(advised)
 
     def others(self) -> tuple[NextEvidence, ...]:
         """The best outline of the part, landmark, and look from another side."""
@@ -115,7 +115,7 @@ class Advisor:
             near = places_mm[np.abs((places_mm - middle_mm) @ normal) < _NEAR_MM]
             some = near[:: max(1, len(near) // _IN_OUTLINE)]
             then = known.after(self._rows(some, self.part), _OUTLINE_MM)
-            yield self._told("outline", middle_mm, normal, known, then)
+            yield self._entry("outline", middle_mm, normal, known, then)
 
     def _landmarks(self) -> Iterator[NextEvidence]:
         known = self._known()
@@ -123,7 +123,7 @@ class Advisor:
             middle_ct = mesh.vertices_mm.mean(0, keepdims=True)
             then = known.after(self._moves(middle_ct)[0], _LANDMARK_MM)
             place_mm = self.motion.carry(middle_ct)[0]
-            yield self._told("landmark", place_mm, np.zeros(3), known, then, name)
+            yield self._entry("landmark", place_mm, np.zeros(3), known, then, name)
 
     def looks(self) -> Iterator[NextEvidence]:
         """From places about the camera's line of sight, at its distance."""
@@ -136,7 +136,7 @@ class Advisor:
             mine = rows[normals @ unit(towards) > _FACING]
             std_mm = self.config.sigma_mm * np.sqrt(max(len(mine), 1) / self.config.n_effective)
             then = known.after(mine, std_mm, len(CAMERA_STD))
-            yield self._told("look", middle_mm + towards, -unit(towards), known, then)
+            yield self._entry("look", middle_mm + towards, -unit(towards), known, then)
 
     def _surface(self) -> tuple[Points, Points]:
         """Middles of some of the organ's triangles, and their normals."""
@@ -170,7 +170,7 @@ class Advisor:
         ]
         return np.concatenate([rows[:, :-1], *others], axis=1)
 
-    def _told(
+    def _entry(
         self,
         kind: Kind,
         place: Place,

@@ -148,11 +148,11 @@ class RegistrationLocator:
         voxel_mm = float(camera_from_index[0, 0])
         prior, more = self._registration.prior, {"size": size, "voxel_mm": voxel_mm}
         found = self._found(fit, prior=self._registration.prior, pieces=tuple(evidence))
-        told, known = self._told(placed, found)
+        said, known = self._evidence_report(placed, found)
         if len(self._model.parts) > 1:
             advisor = Advisor(placed.motion, placed.least_sure, self._registration.config)
             more["next_evidence"] = *advisor.touches(), *advisor.others()
-        report = self._report(frame, looks, placed, inside, prior, evidence=told, **more)
+        report = self._report(frame, looks, placed, inside, prior, evidence=said, **more)
         volume = CameraLabels(labels, camera_from_index)
         made = Estimate(inside, volume, placed.meshes, report, placed.motion, found.shown)
         return replace(made, structures=placed.structures, evidence=known)
@@ -171,8 +171,8 @@ class RegistrationLocator:
         with frame.stage("carry"):
             inside = self._carry(placed, cloud.stamp_ns)
         smoothing = SmoothingReport(time_s=how.smoothing_s, lag_ms=1000 * lag_s)
-        told, known = self._told(placed, found)
-        more = {"size": size, "smoothing": smoothing, "evidence": told}
+        said, known = self._evidence_report(placed, found)
+        more = {"size": size, "smoothing": smoothing, "evidence": said}
         if how.thorough and len(self._model.parts) > 1:
             with frame.stage("advise"):
                 advisor = Advisor(placed.motion, placed.least_sure, self._registration.config)
@@ -181,7 +181,7 @@ class RegistrationLocator:
         made = Estimate(inside, None, placed.meshes, report, placed.motion, found.shown)
         return replace(made, structures=placed.structures, evidence=known)
 
-    def _told(
+    def _evidence_report(
         self, placed: _Placed, found: _Found
     ) -> tuple[tuple[EvidenceReport, ...], tuple[Known, ...]]:
         """What a report says of the evidence, and what the next frame needs of it."""
@@ -191,10 +191,10 @@ class RegistrationLocator:
         before = found.before
         assert evidence is not None
         assert terms is not None
-        told = evidence.described(found.pieces, placed.motion, len(before), terms)
+        reports = evidence.described(found.pieces, placed.motion, len(before), terms)
         new = [Known(piece, found.shown) for piece in found.pieces[len(before) :]]
-        pairs = zip((*before, *new), told, strict=True)
-        return told, tuple(known for known, said in pairs if not said.left_out)
+        pairs = zip((*before, *new), reports, strict=True)
+        return reports, tuple(known for known, entry in pairs if not entry.left_out)
 
     def _found(
         self,
