@@ -36,6 +36,7 @@ from tumortrack_lab.study.methods import code_sha256
 from tumortrack_lab.world.made import scenes_of_kidney
 
 _BLOCK = "evidence"
+_SHOWN = ["kind", "good %", "median, mm", "95 %", "worst"]  # of errors, in the document
 _METHOD = "models", "registration", "tracking"  # packages whose code an answer depends on
 
 
@@ -94,25 +95,29 @@ def main(options: Options) -> None:
     sets = {"random kidneys": organs, "twin": twins}
     frames = {name: _read(some) for name, some in sets.items() if some}
     blocks = [block for name, rows in frames.items() for block in _tables(name, rows)]
-    for words, table in blocks:
+    for _, words, table in blocks:
         print(words, table_of(table), sep="\n\n", end="\n\n")
     if options.document is not None:
-        shown = [f"{words}\n\n{table_of(table)}" for words, table in blocks]
+        _, words, errors = blocks[0]
+        shown = f"{words}\n\n{table_of(errors[_SHOWN])}"
+        links = [writer.data(f"{_BLOCK}-{file}", table, words) for file, words, table in blocks]
         each = pd.concat([_by_family(name, rows) for name, rows in frames.items()])
-        link = writer.data(_BLOCK, each, "By family of physics")
-        writer.write({_BLOCK: "\n\n".join([f"`{writer.command}`", *shown, link])})
+        links.append(writer.data(_BLOCK, each, "By family of physics"))
+        writer.write({_BLOCK: "\n\n".join([f"`{writer.command}`", shown, *links])})
 
 
-def _tables(name: str, rows: pd.DataFrame) -> Iterable[tuple[str, pd.DataFrame]]:
+def _tables(name: str, rows: pd.DataFrame) -> Iterable[tuple[str, str, pd.DataFrame]]:
+    """Each with a name for a file and its title."""
+    file = name.split()[-1]
     scenes = len(rows[["kidney", "scene"]].drop_duplicates())
     of = f"{rows.kidney.nunique()} organs, {scenes} scenes"
-    yield f"{name}, {of}: errors of tumors' centres", evidence_tables.errors(rows)
+    yield f"{file}-errors", f"{name}, {of}: errors of centres", evidence_tables.errors(rows)
     if name == "twin":
         own = rows[rows.organ == "own"]
         for site, some in own.groupby("site"):
-            yield f"{name}, {site} tumors", evidence_tables.errors(some)
-    yield f"{name}: what advice foresees", evidence_tables.foresight(rows)
-    yield f"{name}: called good", evidence_tables.verdicts(rows)
+            yield f"{file}-{site}", f"{name}, {site} tumors", evidence_tables.errors(some)
+    yield f"{file}-advice", f"{name}: what advice foresees", evidence_tables.foresight(rows)
+    yield f"{file}-verdicts", f"{name}: called good", evidence_tables.verdicts(rows)
 
 
 def _by_family(name: str, rows: pd.DataFrame) -> pd.DataFrame:

@@ -26,7 +26,7 @@ def story(tmp_path_factory):
     """The folder that all examples wrote into, and what each of them said."""
     out = tmp_path_factory.mktemp("examples")
     said = {}
-    for file in EXAMPLES:  # as `python FILE FOLDER`, without loading the package seven times
+    for file in EXAMPLES:  # as `python FILE FOLDER`, without loading the package eight times
         with (
             pytest.MonkeyPatch.context() as patch,
             contextlib.chdir(out),
@@ -38,8 +38,8 @@ def story(tmp_path_factory):
     return out, said
 
 
-def test_there_are_seven_in_order():
-    assert [file.name[:2] for file in EXAMPLES] == [f"{n:02}" for n in range(1, 8)]
+def test_there_are_eight_in_order():
+    assert [file.name[:2] for file in EXAMPLES] == [f"{n:02}" for n in range(1, 9)]
 
 
 def test_a_resection_is_planned(story):
@@ -72,6 +72,17 @@ def test_a_moving_organ_is_followed(story):
     assert 0.01 < np.median(heard) < 3
     assert "that was all" in said["06"]
     assert "latency p50" in said["06"]
+
+
+def test_touches_bring_a_hidden_half_nearer(story):
+    _, said = story
+    off = [float(mm) for mm in re.findall(r"tumor_\d: centre off by ([\d.]+) mm", said["08"])]
+    assert len(off) == 6  # two tumors: without, with three, with six
+    assert 0 < sum(off[4:]) < sum(off[:2])
+    gains = re.findall(r"next, .+: tumor_\d ([\d.]+) -> ([\d.]+) mm", said["08"])
+    assert len(gains) >= 8  # twice three touches, an outline, a look
+    assert all(float(then) <= float(now) for now, then in gains)
+    assert said["08"].count("of it news") == 6
 
 
 def test_the_case_is_the_phantom(story):

@@ -15,7 +15,8 @@ import pytest
 
 from stories import cloud_by_rays, looking_down
 from tumortrack.cli.main import run
-from tumortrack.imaging.case import load_case
+from tumortrack.core.geometry import transform_points
+from tumortrack.imaging.case import Case, load_case
 from tumortrack.sense.ply import write_cloud_ply
 
 PAGES = sorted((Path(__file__).parents[2] / "docs" / "how-to").glob("*.md"))
@@ -23,6 +24,7 @@ LEFT = {  # what a page's commands leave behind, besides what they print
     "camera": ("RUN/metadata.yaml", "again.json"),
     "ct": ("CASE/qc.png", "RUN/tumor_2.ply", "RUN_WITH_POINTS/points.csv"),
     "evaluate": ("REPORT/index.html",),
+    "evidence": ("RUN/report.json", "TOUCHED/tumor_1.ply"),
     "organ": ("LIVER/liver.ply",),
     "plan": ("PLAN/plan.png",),
     "ros2": ("report.json",),
@@ -35,6 +37,18 @@ def commands(page: Path) -> list[list[str]]:
     return [shlex.split(line, comments=True) for block in blocks for line in block.splitlines()]
 
 
+def write_touches(path: Path, case: Case) -> None:
+    """On all sides of the organ, in the camera's frame."""
+    organ = case.anatomy.organ
+    faces = organ.faces[:: len(organ.faces) // 48]
+    places_mm = transform_points(looking_down(case), organ.vertices_mm[faces].mean(1))
+    rows = [
+        f"{n},camera,touch,{x:.2f},{y:.2f},{z:.2f},1.0,probe"
+        for n, (x, y, z) in enumerate(places_mm)
+    ]
+    path.write_text("\n".join(["piece,frame,kind,x_mm,y_mm,z_mm,std_mm,tool", *rows]))
+
+
 @pytest.fixture
 def desk(tmp_path, phantom_case, clinic_model):
     """A reader's folder: a label map, a case and its model, a cloud, points of the CT."""
@@ -43,6 +57,7 @@ def desk(tmp_path, phantom_case, clinic_model):
     case = load_case(phantom_case)
     cloud = cloud_by_rays(case, looking_down(case)).astype(np.float32)
     write_cloud_ply(tmp_path / "cloud.ply", cloud)
+    write_touches(tmp_path / "touches.csv", case)
     points = case.anatomy.tumors[0].vertices_mm[:3]
     np.savetxt(tmp_path / "points.csv", points, delimiter=",", header="x,y,z", comments="")
     return tmp_path

@@ -1,6 +1,7 @@
 """The notebooks run as a reader runs them, and are kept without outputs."""
 
 import os
+import re
 import shutil
 from pathlib import Path
 
@@ -21,7 +22,7 @@ def printed(cells: list[nbformat.NotebookNode]) -> str:
 
 
 def test_they_are_kept_without_outputs():
-    assert len(FILES) == 3
+    assert len(FILES) == 4
     for file in FILES:
         for cell in codes(nbformat.read(file, 4)):
             assert not cell.outputs
@@ -66,3 +67,15 @@ def test_a_moving_organ_is_followed_in_a_notebook(ran):
     moved = float(said.split("tumor 1 moved by ")[1].split()[0])
     assert moved > 0.05
     assert said.count("is CT") == 3
+
+
+def test_touches_make_a_hidden_half_surer_and_a_wrong_one_is_named(ran):
+    said = printed(ran[3])
+    lines = re.findall(r"tumor_\d: centre off by ([\d.]+) mm, one deviation ([\d.]+) mm", said)
+    off_mm, std_mm = np.array(lines, float).reshape(3, 2, 2).T  # without, with three, with six
+    assert (off_mm < 5).all()
+    assert (off_mm > 0).any()
+    assert (std_mm[:, 2] < std_mm[:, 0]).all()
+    assert "touch the organ at" in said
+    assert "poor: touch 7 lies" in said
+    assert said.count("left out\n") == 1

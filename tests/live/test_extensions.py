@@ -162,9 +162,12 @@ def test_doctor_names_what_other_packages_add(tmp_path):
 
 
 def test_the_documentation_shows_the_example_as_it_is():
+    root = EXAMPLE.parents[2]
     for page, file in (("live.md", "csv.py"), ("architecture.md", "twist.py")):
-        shown = (EXAMPLE.parents[2] / "docs" / page).read_text()
-        assert (EXAMPLE / "tumortrack_example" / file).read_text() in shown
+        included = EXAMPLE / "tumortrack_example" / file
+        assert included.is_file()
+        line = f'--8<-- "{included.relative_to(root)}"'
+        assert line in (root / "docs" / page).read_text()
 
 
 def test_the_examples_deformation_turns_one_end_against_the_other(example):

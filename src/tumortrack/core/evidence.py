@@ -22,7 +22,7 @@ from tumortrack.core.report import Point
 
 _REACH_MM = 2000.0  # of anything that a camera above a patient sees
 _LEAST_MM = 3.0  # no camera has an organ nearer
-FEWEST_TOUCHES = 12  # without a cloud; 12, 24, 48 leave tumors 4, 2, 1.7 mm off (docs/evidence.md)
+FEWEST_TOUCHES = 12  # without a cloud; how far off 12, 24 and 48 leave it: docs/evidence_gain.md
 _LARGEST_FILE = 10_000_000  # bytes
 
 
