@@ -7,19 +7,21 @@ import pytest
 from msgspec.structs import replace
 
 from live_objects import CAMERA, small_anatomy, small_estimate
-from reports import looked
+from reports import looked, reporting
 from tumortrack.core import store
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import SensorCloud
+from tumortrack.report.metrics import distance_to_surface
 from tumortrack.sense.cloud import CloudConfig, cloud_from_depth
 from tumortrack.sense.render import render_depth
 from tumortrack.simulate.scene_folder import Scene
-from tumortrack.tracking.margins import ModelMargins
+from tumortrack.tracking.margins import ModelMargins, evidence_words
 from tumortrack.tracking.quality import judged
 from tumortrack.tracking.tracker import Tracker
 from tumortrack_lab.margins.calibration import (
     Listed,
     answered,
+    evidence_of,
     list_states,
     margins_of,
     row_of,
@@ -139,7 +141,7 @@ class _Known(Tracker):
     def __init__(self):
         pass
 
-    def locate(self, cloud, grid, seed, seen=None):
+    def locate(self, cloud, grid, seed, seen=None, evidence=()):
         return judged(small_estimate(), looked(seen or cloud))
 
 
@@ -161,6 +163,56 @@ def test_a_partly_hidden_organ_is_judged_by_the_image_if_there_is_one(tmp_path):
     behind = frame.depth_mm + np.where(np.arange(64) < 28, 40, 0).astype(np.float32)
     through = row_of(_Known(), Scene(half, truth, frame.with_depth(behind)), listed, 0)
     assert "sees through" in through.doubt
+
+
+class _Using(_Known):
+    """Says that it used all evidence, or all but one piece."""
+
+    def __init__(self, left_out=0):
+        self.left_out = left_out
+
+    def locate(self, cloud, grid, seed, seen=None, evidence=()):
+        self.given = evidence
+        told = [
+            {"name": each.name, "part": getattr(each, "part", ""), "off_mm": 1.0, "news": 0.5,
+             "left_out": n < self.left_out}
+            for n, each in enumerate(evidence)
+        ]  # fmt: skip
+        estimate = judged(small_estimate(), looked(seen or cloud))
+        return reporting(estimate, evidence=told)
+
+
+def test_a_state_is_located_with_evidence_drawn_for_it(tmp_path):
+    truth, listed = small_anatomy(), Listed(tmp_path, ("plate", "far", "x"))
+    frame = render_depth(truth.organ.vertices_mm, truth.organ.faces, CAMERA)
+    crop = CloudConfig(near_mm=50, far_mm=200, n_points=800)
+    scene = Scene(cloud_from_depth(frame, crop, np.random.default_rng(0)), truth, frame)
+    asked, tracker = evidence_of("touch6+outline1"), _Using()
+    row = row_of(tracker, scene, listed, 0, asked)
+    assert (row.doubt, set(row.misses)) == ("", {"tumor", "organ"})
+    first = tracker.given
+    assert [each.name for each in first] == ["touch"] * 6 + ["outline"] * len(truth.tumors)
+    assert {each.part for each in first[6:]} == set(truth.names[1:])
+    places = np.array([each.place_mm for each in first[:6]])
+    off_mm = np.abs(distance_to_surface(places, truth.organ))
+    assert 0.01 < np.median(off_mm) < 5  # with the errors of tools
+    row_of(tracker, scene, listed, 0, asked)
+    assert tracker.given == first
+    row_of(tracker, scene, listed, 1, asked)
+    assert tracker.given != first
+    row_of(tracker, scene, listed, 0)
+    assert tracker.given == []
+    assert "left out" in row_of(_Using(left_out=1), scene, listed, 0, asked).doubt
+    with pytest.raises(InputError, match=r"need targets\.csv"):
+        row_of(tracker, scene, listed, 0, {"held": 1})
+
+
+def test_names_of_evidence():
+    assert evidence_of("touch12+outline1") == {"outline": 1, "touch": 12}
+    assert evidence_words(evidence_of("touch12+outline1")) == "outline1+touch12"
+    for wrong in ("touch", "touches12", "touch0", "touch12+touch6", "free1", "", "touch12+"):
+        with pytest.raises(InputError, match=r"is not allowed\. Allowed: touch1 to touch100"):
+            evidence_of(wrong)
 
 
 def test_too_few_states_are_refused_with_their_number_and_small_groups_join():

@@ -10,9 +10,12 @@ import pytest
 
 from stories import answered, refusal, succeeded, tumortrack
 from tumortrack.core import store
+from tumortrack.core.evidence import evidence_json
 from tumortrack.core.mesh_files import read_mesh
 from tumortrack.report.metrics import outward_miss
-from tumortrack.simulate.scene_folder import list_scenes
+from tumortrack.simulate.scene_folder import list_scenes, read_scene
+from tumortrack.tracking.margins import read_margins
+from tumortrack_lab.world.evidence import EXACT, EvidenceSource
 
 COUNT = 40  # 7 tested states without a gross miss show 50 %; two fifths of good ones are tested
 
@@ -47,11 +50,16 @@ def test_margins_are_found_stated_and_planned_with(ready_case, scenes, tmp_path)
     succeeded(tumortrack(*calibrate, 0.5))
     located = table.read_bytes()
     assert located.count(b"\n") == 1 + COUNT
-    said = succeeded(tumortrack(*calibrate, 0.5, 0.6))
+    assert "touches6 is not allowed" in refusal(
+        tumortrack(*calibrate, 0.5, "--evidence", "touches6")
+    )
+    said = succeeded(tumortrack(*calibrate, 0.5, 0.6, "--evidence", "touch6"))
     assert table.read_bytes() == located  # located once
     assert "60 % margin of a tumor's surface: " in said
     assert "50 % margin of mapped points: " in said
     assert "bed, over 2/3, " in said
+    assert "with touch6 or more beside the cloud:" in said
+    assert (model / "margins-touch6.jsonl").read_bytes().count(b"\n") == 1 + COUNT
 
     rows = [json.loads(line) for line in located.splitlines()[1:]]
     clouds = [Path(row["scene"]) / "cloud.ply" for row in rows if not row["doubt"]]
@@ -66,6 +74,22 @@ def test_margins_are_found_stated_and_planned_with(ready_case, scenes, tmp_path)
     assert f"60 % margin {radius:.1f} mm" in said
     shell, tumor = (read_mesh(run / f"{name}.ply") for name in ("tumor_1_margin", "tumor_1"))
     assert outward_miss(tumor, shell) == pytest.approx(radius, abs=0.2)
+
+    file = tmp_path / "evidence.json"
+    for good in clouds:  # the first that is as good with seven touches
+        source = EvidenceSource.of(read_scene(good.parent), [0], EXACT)
+        pieces = [piece.evidence for piece in source.touches_at_random(7, None)]
+        file.write_bytes(evidence_json(tuple(pieces)))
+        touched = ("--evidence", file, "--device", "cpu", "--overwrite")
+        answered(tumortrack("locate", case, good, tmp_path / "touched", *touched))
+        report = store.read_json(tmp_path / "touched" / "report.json")
+        if report["margin"]["stated"]:
+            break
+    group = read_margins(model).others[0]
+    deviation = report["parts"]["tumor_1"]["surface_std_mm"]
+    figures = {"rarity": report["motion"]["rarity"]}
+    at = group.shells[1].radii["tumor"].at(deviation, figures)
+    assert report["margin"]["stated"][1]["mm"]["tumor_1"] == pytest.approx(at)
 
     plan = ("plan", run, tmp_path / "plan", "--no-arms", "--confidence")
     assert "states no 95 % margin of tumor_2" in refusal(tumortrack(*plan, 0.95))

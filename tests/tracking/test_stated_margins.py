@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 
+import msgspec
 import numpy as np
 import pytest
 from msgspec.structs import replace
@@ -97,3 +98,84 @@ def test_an_estimate_beyond_a_limit_is_poor_and_says_which():
     without = with_margin(dataclasses.replace(small_estimate(), finding=None), whole, None)
     assert without.quality == "good"
     assert without.report.margin.reason.startswith("the model was not calibrated")
+
+
+def _with(evidence: dict[str, int], factor: float) -> ModelMargins:
+    return replace(MARGINS, evidence=evidence, shells=(_shells(0.9, factor),))
+
+
+def _using(left_out=0, **numbers):
+    """A report of an estimate that used so many pieces of each kind."""
+    parts = {"kidney": {"surface_std_mm": 2.0}, "tumor_1": {"surface_std_mm": 1.0}}
+    pieces = [
+        {"name": name, "part": "tumor_1", "off_mm": 0.0, "news": 0.5, "left_out": n < left_out}
+        for name, number in numbers.items()
+        for n in range(number)
+    ]
+    return report_of(parts=parts, evidence=pieces)
+
+
+SEVERAL = replace(MARGINS, others=(
+    _with({"touch": 12}, 5.0), _with({"touch": 6}, 7.0), _with({"outline": 1, "touch": 6}, 9.0),
+))  # fmt: skip
+
+
+def test_an_estimate_with_evidence_states_the_margin_of_its_own_group():
+    def factor(report):
+        said = stated_margin(report, SEVERAL, good=True)
+        return stated_radius(said, "kidney").mm  # constant: the factor
+
+    assert [factor(_using(touch=n)) for n in (0, 6, 11, 12, 40)] == [3.0, 7.0, 7.0, 5.0, 5.0]
+    assert factor(_using(touch=13, left_out=2)) == 7.0  # eleven were used
+    assert factor(_using(touch=12, outline=1)) == 9.0
+    told = stated_margin(_using(touch=12), SEVERAL, good=True)
+    assert stated_radius(told, "tumor_1").mm == 5.0 * (0.5 + 1.0)
+
+
+def test_an_estimate_with_other_evidence_states_no_margin_and_says_how_to_get_one():
+    def reason(report, margins=SEVERAL):
+        said = stated_margin(report, margins, good=True)
+        assert said.stated == ()
+        return said.reason
+
+    asked = "with held1+touch12 were not calibrated (tumortrack margins MODEL SCENES --evidence "
+    assert asked + "held1+touch12)" in reason(_using(touch=12, held=1))
+    assert "with touch5 were not" in reason(_using(touch=5))
+    assert "with outline1 were not" in reason(_using(outline=1))
+    assert "with touch12 were not" in reason(_using(touch=12), MARGINS)
+    parts = {name: {"surface_std_mm": 1.0} for name in ("kidney", "tumor_1", "tumor_2")}
+    some = replace(_using(outline=2, touch=6), parts=report_of(parts=parts).parts)
+    assert "of outlines of every tumor" in reason(some)  # none of tumor_2
+    early = _using(touch=12)
+    early = replace(early, evidence=tuple(replace(e, before=True) for e in early.evidence))
+    assert "not of earlier frames" in reason(early)
+    assert "not of touches alone" in reason(report_of(parts=parts, points=24))
+
+
+def test_margins_with_evidence_are_kept_beside_those_of_clouds_alone(tmp_path):
+    (tmp_path / store.MANIFEST).write_text("{}")
+    path = stored.keep_margins(tmp_path, SEVERAL)
+    assert stored.read_margins(tmp_path).others == SEVERAL.others
+    assert "with touch12 or more beside the cloud:" in stored.described(SEVERAL)
+    content = json.loads(path.read_text())["margins"]
+    before = {name: each for name, each in content.items() if name not in ("others", "evidence")}
+    store.write_json(path, {"sha256": stored._digest(before), "margins": before})
+    old = stored.read_margins(tmp_path)  # as an earlier version wrote it
+    assert (old.others, old.evidence, old.shells) == ((), {}, MARGINS.shells)
+
+
+def test_the_limits_of_an_estimate_are_those_of_its_group():
+    def judged(touches):
+        estimate = dataclasses.replace(small_estimate(), finding=None)
+        parts = {name: {"surface_std_mm": 1.0} for name in estimate.report.parts}
+        pieces = msgspec.to_builtins(_using(touch=touches).evidence)
+        estimate = reporting(
+            estimate, parts=parts, motion={**NOWHERE, "rarity": 1.2}, evidence=pieces
+        )
+        alone = replace(MARGINS, limits={"rarity": 1.0})
+        wider = replace(_with({"touch": 12}, 5.0), limits={"rarity": 2.0})
+        cloud = SensorCloud(estimate.meshes["kidney"].vertices_mm.astype(np.float32))
+        return with_margin(estimate, cloud, replace(alone, others=(wider,)))
+
+    assert judged(0).quality == judged(11).quality == "poor"
+    assert (judged(12).quality, len(judged(12).report.margin.stated)) == ("good", 1)

@@ -315,14 +315,15 @@ class LooksReport(_Value, frozen=True, kw_only=True):
 
 
 class EvidenceReport(_Value, frozen=True, kw_only=True):
-    """One piece of evidence: its kind, tool and deviation; how far it lies from the answer at most,
-    and which share of what it says is news beside all else (0 to 1). ``left_out``: it contradicts
-    the rest; ``before``: it is of an earlier frame."""
+    """One piece of evidence: its kind, part, tool and deviation; how far it lies from the answer at
+    most, and which share of what it says is news beside all else (0 to 1). ``left_out``: it
+    contradicts the rest; ``before``: it is of an earlier frame."""
 
     name: str
     off_mm: float
     news: float
     left_out: bool
+    part: str = ""
     tool: str = ""
     std_mm: float | None = None
     before: bool = False

@@ -225,6 +225,7 @@ class EvidenceTerms:
             told.append(
                 EvidenceReport(
                     name=each.name,
+                    part=getattr(each, "part", ""),
                     tool=each.tool,
                     std_mm=each.std_mm,
                     off_mm=off,

@@ -6,6 +6,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -17,6 +18,7 @@ from tumortrack.core.config import Config, from_builtins, to_builtins
 from tumortrack.core.errors import ArtifactError, InputError
 from tumortrack.core.organ import is_tumor
 from tumortrack.core.report import Finding, FitReport, MarginReport, StatedMargin
+from tumortrack.sense.cloud import FEWEST_POINTS
 
 # Raise it with every change that gives another estimate, or other figures (``measured``), for the
 # same cloud: margins calibrated before are then refused.
@@ -98,6 +100,8 @@ class ModelMargins(Config, frozen=True):
         risk_bound: upper bound, with 95 % confidence, of the share of accepted answers outside the
             widest margin of a tumor, in the worst group of the tested states.
         accepted, missed: shares of all tested states: accepted; accepted and outside the margin.
+        evidence: the kinds beside the cloud that they hold with, and least numbers of pieces.
+        others: with other evidence.
     """
 
     method: int
@@ -113,6 +117,8 @@ class ModelMargins(Config, frozen=True):
     risk_bound: float
     accepted: float
     missed: float
+    evidence: dict[str, int] = msgspec.field(default_factory=dict)
+    others: tuple[ModelMargins, ...] = ()
 
     def __post_init__(self) -> None:
         if not self.shells or not all(map(math.isfinite, self.limits.values())):
@@ -191,6 +197,29 @@ def sized(
     return {**figures, "size_mm": max(radius.size_mm(std_mm, figures) for std_mm in known)}
 
 
+def used_evidence(report: FitReport) -> dict[str, int]:
+    """How many pieces of each kind an estimate used; of outlines, how many each tumor has."""
+    kept = [each for each in report.evidence if not each.left_out]
+    used = dict(Counter(each.name for each in kept))
+    if "outline" in used:
+        outlined = Counter(each.part for each in kept if each.name == "outline")
+        used["outline"] = min((outlined[name] for name in report.tumors), default=0)
+    return used
+
+
+def evidence_words(evidence: dict[str, int]) -> str:
+    """As `tumortrack margins --evidence` takes it."""
+    return "+".join(f"{name}{number}" for name, number in sorted(evidence.items()))
+
+
+def margins_with(report: FitReport, margins: ModelMargins) -> ModelMargins | None:
+    """Those of an estimate's evidence: of the same kinds, and of the most pieces that it has."""
+    used = used_evidence(report)
+    every = [each for each in (margins, *margins.others) if each.evidence.keys() == used.keys()]
+    held = [each for each in every if all(n <= used[name] for name, n in each.evidence.items())]
+    return max(held, key=lambda each: sum(each.evidence.values()), default=None)
+
+
 def exceeded(limits: dict[str, float], figures: dict[str, float]) -> Finding | None:
     """The first limit that is exceeded."""
     for name, limit in limits.items():
@@ -204,10 +233,18 @@ def stated_margin(report: FitReport, margins: ModelMargins | None, good: bool) -
     no limit is exceeded."""
     if report.looks is not None:
         return MarginReport(reason="margins are of single views, not of several")
-    if report.evidence:
-        return MarginReport(reason="margins are of clouds alone, not of evidence beside them")
+    if 0 < report.points < FEWEST_POINTS:
+        return MarginReport(reason="margins are of clouds, not of touches alone")
     if margins is None:
         return MarginReport(reason=UNKNOWN)
+    if any(each.before and not each.left_out for each in report.evidence):
+        return MarginReport(reason="margins are of evidence of this moment, not of earlier frames")
+    if (margins := margins_with(report, margins)) is None:
+        evidence = used_evidence(report)
+        if not all(evidence.values()):
+            return MarginReport(reason="margins are of outlines of every tumor, not of some")
+        how = f"tumortrack margins MODEL SCENES --evidence {(name := evidence_words(evidence))}"
+        return MarginReport(reason=f"margins with {name} were not calibrated ({how})")
     if not good:
         return MarginReport(reason="a poor estimate has no margin")
     if report.smoothing is not None and report.smoothing.time_s > 0:
@@ -254,18 +291,14 @@ def margin_words(margin: MarginReport | None) -> str:
     if margin is None or not margin.stated:
         return f"no margin: {UNKNOWN if margin is None else margin.reason}"
     highest = margin.stated[-1]
-    radii = {name: mm for name, mm in highest.mm.items() if is_tumor(name)}
-    sizes = ", ".join(f"{name} {mm:.1f} mm" for name, mm in radii.items())
+    sizes = ", ".join(f"{name} {mm:.1f} mm" for name, mm in highest.mm.items() if is_tumor(name))
     return f"{100 * highest.confidence:g} % margin: {sizes}"
 
 
 def centre_label(report: FitReport, name: str, poor: bool) -> str:
     """A tumor's name, with its standard deviation and margin as far as they are known."""
     radius, deviation = stated_radius(report.margin, name), report.parts[name].deviation_words
-    words = [
-        f"{name} POOR" if poor else name,
-        *([] if deviation is None else [f"std {deviation}"]),
-    ]
+    words = [f"{name} POOR" if poor else name, *([f"std {deviation}"] if deviation else [])]
     return ", ".join([*words, radius.words if radius else "no margin stated"])
 
 
@@ -299,10 +332,13 @@ def described(margins: ModelMargins) -> list[str]:
         for small, large in margins.joined.items()
     ]
     limits = ", ".join(f"{name} {limit:.3g}" for name, limit in margins.limits.items())
-    return [
-        *lines,
+    lines += [
         f"no answer where one of these is exceeded: {limits}",
         f"of all states {100 * margins.accepted:.0f} % have an answer, "
         f"{100 * margins.missed:.1f} % one that is outside the widest margin; of the worst group's "
         f"answers these are no more than {100 * margins.risk_bound:.1f} %, with 95 % confidence",
     ]
+    for each in margins.others:
+        lines += [f"with {evidence_words(each.evidence)} or more beside the cloud:"]
+        lines += described(each)
+    return lines

@@ -17,7 +17,7 @@ from tumortrack.core.types import DepthFrame, Intrinsics, Look, Mesh, SensorClou
 from tumortrack.models.in_distribution import FIT_FACTOR, RIVAL_COST
 from tumortrack.sense.noise import CAMERA_STD
 from tumortrack.sense.render import render_depth
-from tumortrack.tracking.margins import ModelMargins, exceeded, figures, stated_margin
+from tumortrack.tracking.margins import ModelMargins, exceeded, figures, margins_with, stated_margin
 from tumortrack.tracking.misses import POOR_MM, with_misses
 
 # Where ``miss_mm`` is not known: largest standard deviation of a tumor's centre, and largest
@@ -134,7 +134,8 @@ def with_margin(estimate: Estimate, cloud: SensorCloud, margins: ModelMargins | 
     if margins is not None and estimate.finding is None:
         if estimate.report.unseen is None:
             estimate = estimate.reporting(unseen=cloud_shares(estimate.organ_mesh, cloud)[1])
-        finding = exceeded(margins.limits, figures(estimate.report, margins))
+        known = margins_with(estimate.report, margins) or margins  # others: limits of clouds alone
+        finding = exceeded(known.limits, figures(estimate.report, known))
         estimate = replace(estimate, finding=finding)
     margin = stated_margin(estimate.report, margins, estimate.finding is None)
     return estimate.reporting(margin=margin)

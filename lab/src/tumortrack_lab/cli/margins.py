@@ -15,6 +15,7 @@ from tumortrack.core.config import check_seed
 from tumortrack.core.errors import InputError
 
 if TYPE_CHECKING:
+    from tumortrack.tracking.margins import ModelMargins
     from tumortrack_lab.margins.calibration import Listed
     from tumortrack_lab.margins.table import Row
 
@@ -27,9 +28,13 @@ class Margins:
         model: a case, or a folder that `train` wrote; the margins are kept in it.
         scenes: folders of scene folders whose truth is known.
         confidence: the shares of cases in which the margins are to hold.
+        evidence: what margins are found with, besides those of clouds alone: kinds and least
+            numbers of pieces, as touch12, outline1 (of each tumor), held1, landmark2 or
+            touch6+outline1. It is drawn for the same scenes, with the errors of tools. Name all
+            that the model is to have.
         widest: answers that miss by more mm than this are to be kept out.
         out: file for what was found scene by scene; what is in it already is not located again
-            (default: MODEL/margins.jsonl).
+            (default: MODEL/margins.jsonl; with evidence its name is added).
         seed: of the scene that stands for each state, and of what it is used for.
         device: auto takes CUDA if there is a GPU.
     """
@@ -37,6 +42,7 @@ class Margins:
     model: Positional[Path]
     scenes: Positional[tuple[Path, ...]] = ()
     confidence: tuple[float, ...] = (0.9, 0.95)
+    evidence: tuple[str, ...] = ()
     widest: float = 8.0
     out: Path | None = None
     seed: int = 0
@@ -45,10 +51,11 @@ class Margins:
     def run(self) -> None:
         """Raises InputError: options or scenes that can't be used, too few of them, no limits that
         hold."""
+        import msgspec
+
         from tumortrack.models.folder import read_model_manifest
         from tumortrack.tracking.margins import described, keep_margins
-        from tumortrack_lab.margins.calibration import least_states, list_states, margins_of
-        from tumortrack_lab.margins.table import head_of, open_table
+        from tumortrack_lab.margins.calibration import evidence_of, least_states, list_states
 
         highest = max(self.confidence, default=0.0)
         if not self.confidence or not all(0.5 <= share <= 0.99 for share in self.confidence):
@@ -56,6 +63,7 @@ class Margins:
         if not 0.5 <= self.widest <= 20:
             raise InputError(f"--widest {self.widest:g} is not allowed; choose 0.5 to 20 mm.")
         check_seed(self.seed)
+        asked = [evidence_of(name) for name in self.evidence]
         if not self.scenes:
             raise InputError("give folders of scenes: tumortrack margins MODEL SCENES.")
         folder = model_folder(self.model)
@@ -66,19 +74,43 @@ class Margins:
                 f"{len(listed)} scenes given, a state each; about {needed} are needed for margins "
                 f"that hold in {100 * highest:g} % of cases. Give more, or a lower --confidence."
             )
-        table = self.out or folder / "margins.jsonl"
-        head = head_of(store.sha256_of(folder / store.MANIFEST), self.seed)
-        with open_table(table, head) as (known, add):
-            rows = self._located(folder, listed, known, add)
-        digest = store.sha256_of(table)
-        margins = margins_of(rows, digest, self.confidence, self.widest, self.seed)
+        margins, *others = [self._calibrated(folder, listed, each) for each in ({}, *asked)]
+        margins = msgspec.structs.replace(margins, others=tuple(others))
         path = keep_margins(folder, margins)
         for line in described(margins):
             say(line)
         say(f"written to {path}; `locate`, `track` and `plan` state them from now on.")
 
+    def _calibrated(
+        self, folder: Path, listed: list[Listed], evidence: dict[str, int]
+    ) -> ModelMargins:
+        """With this evidence beside the clouds, by a table of its own."""
+        import msgspec
+
+        from tumortrack.tracking.margins import evidence_words
+        from tumortrack_lab.margins.calibration import margins_of
+        from tumortrack_lab.margins.table import head_of, open_table
+
+        table, words = self.out or folder / "margins.jsonl", evidence_words(evidence)
+        head = head_of(store.sha256_of(folder / store.MANIFEST), self.seed)
+        if evidence:
+            table, head = table.with_stem(f"{table.stem}-{words}"), {**head, "evidence": words}
+        with open_table(table, head) as (known, add):
+            rows = self._located(folder, listed, evidence, known, add)
+        digest = store.sha256_of(table)
+        try:
+            margins = margins_of(rows, digest, self.confidence, self.widest, self.seed)
+        except InputError as error:
+            raise InputError(f"{f'with {words}: ' if words else ''}{error}") from error
+        return msgspec.structs.replace(margins, evidence=evidence)
+
     def _located(
-        self, folder: Path, listed: list[Listed], known: list[Row], add: Callable[[Row], None]
+        self,
+        folder: Path,
+        listed: list[Listed],
+        evidence: dict[str, int],
+        known: list[Row],
+        add: Callable[[Row], None],
     ) -> list[Row]:
         """A row for every state; known ones are not located again."""
         from tumortrack.report.protocol import check_case
@@ -102,7 +134,7 @@ class Margins:
                 check_case(model, [state.folder for state in left])
                 tracker = Tracker(model)
                 for state in left:
-                    row = row_of(tracker, read_scene(state.folder), state, self.seed)
+                    row = row_of(tracker, read_scene(state.folder), state, self.seed, evidence)
                     add(row)
                     done[row.scene] = row
                     advance()

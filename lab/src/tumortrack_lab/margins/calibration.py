@@ -6,11 +6,13 @@ The unit is the physical state: one scene of each counts. docs/trust.md says wha
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+import re
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 from operator import itemgetter
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Literal, get_args
 
 import numpy as np
@@ -32,10 +34,12 @@ from tumortrack.tracking.margins import (
     exceeded,
     measured,
     sized,
+    used_evidence,
 )
 from tumortrack.tracking.quality import cloud_shares
 from tumortrack_lab.margins import conformal
 from tumortrack_lab.margins.table import Miss, Row
+from tumortrack_lab.world.evidence import EvidenceSource
 
 if TYPE_CHECKING:
     from tumortrack.tracking.tracker import Tracker
@@ -58,6 +62,7 @@ _BENDS_MM = (0.0, 2.0, 4.0, 8.0, 16.0)
 # of each group take these turns, in an order drawn by the seed.
 _TURNS: tuple[_Turn, ...] = ("test", "calibrate", "choose", "test", "calibrate")
 _SIZE = "size_mm"
+_MOST = {"touch": 100, "outline": 10, "landmark": 20, "held": 4}  # pieces that are drawn
 _GRID = 8  # voxels: the labelled volume is not used
 _ALONE = 2  # times the scores that a quantile needs: the maximum of a few says little
 _WORTH = 0.95  # of the constant radius's mean: a varying one must be smaller than this
@@ -97,20 +102,45 @@ def list_states(folders: Sequence[Path], seed: int) -> list[Listed]:
 _WORDS = ("under 1/3", "1/3 to 2/3", "over 2/3")
 
 
-def row_of(tracker: Tracker, scene: Scene, listed: Listed, seed: int) -> Row:
+def evidence_of(name: str) -> dict[str, int]:
+    """Kinds and numbers by a name: ``touch12+outline1``. Raises InputError."""
+    found = [re.fullmatch(r"([a-z]+)(\d+)", each) for each in name.split("+")]
+    numbers = {each[1]: int(each[2]) for each in found if each}
+    right = len(numbers) == len(found) and numbers.keys() <= set(_MOST)
+    if not right or not all(1 <= count <= _MOST[kind] for kind, count in numbers.items()):
+        allowed = ", ".join(f"{kind}1 to {kind}{most}" for kind, most in _MOST.items())
+        raise InputError(
+            f"--evidence {name} is not allowed. Allowed: {allowed}, or several of these joined by "
+            "+, each kind once; outlines are counted for each tumor."
+        )
+    return dict(sorted(numbers.items()))
+
+
+def row_of(
+    tracker: Tracker,
+    scene: Scene,
+    listed: Listed,
+    seed: int,
+    evidence: Mapping[str, int] = MappingProxyType({}),
+) -> Row:
     """Locate one state, judged by its depth image, if any, as `locate` and `track` do. The
-    tracker's model must have no margins of its own."""
+    tracker's model must have no margins of its own. ``evidence``: how many pieces of each kind are
+    drawn beside the cloud, with all errors of ``EvidenceErrors``."""
     row = Row(
         scene=str(listed.folder.resolve()),
         sha256=store.sha256_of(listed.folder),
         label=listed.label,
     )
+    source = EvidenceSource.of(scene, (seed, int(row.sha256[:8], 16)))
+    drawn = [piece.evidence for piece in source.drawn(evidence)]
     try:
-        estimate = tracker.locate(scene.cloud, _GRID, seed, scene.depth)
+        estimate = tracker.locate(scene.cloud, _GRID, seed, scene.depth, evidence=drawn)
     except (NoEstimate, InputError) as error:
         return replace(row, doubt=str(error))
     if estimate.quality != "good":
         return replace(row, doubt=estimate.reason)
+    if used_evidence(estimate.report) != evidence:
+        return replace(row, doubt="evidence was left out, or could not be drawn")
     if scene.depth is not None:  # judging by an image leaves ``unseen`` open
         organ = estimate.meshes[scene.reference.names[0]]
         estimate = estimate.reporting(unseen=cloud_shares(organ, scene.cloud)[1])

@@ -8,7 +8,7 @@ stated: by ``std_mm``, and by ``shared_std_mm`` what it shares with others of th
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -17,6 +17,7 @@ from jaxtyping import Bool, Float
 from scipy.spatial import cKDTree
 
 from tumortrack.core.config import Config
+from tumortrack.core.errors import InputError
 from tumortrack.core.evidence import Evidence, Held, Landmark, Outline, Touch
 from tumortrack.core.geometry import perpendicular, plane_section, triangles_of, turned_by, unit
 from tumortrack.core.types import Mesh
@@ -113,6 +114,23 @@ class EvidenceSource:
         weights = weights if faces is None or not faces.any() else weights * faces
         chosen = self.rng.choice(len(centres), count, p=weights / weights.sum())
         return self.touches(centres[chosen], doubled[chosen])
+
+    def drawn(self, numbers: Mapping[str, int]) -> list[Piece]:
+        """So many pieces of each kind (``touch``, ``landmark``, ``held``), at random; of outlines,
+        so many of each tumor. Raises InputError: the scene has no points to recognise or hold."""
+        if self.scene.targets is None and numbers.keys() & {"landmark", "held"}:
+            raise InputError(
+                "landmarks and held points need targets.csv, which says where points of the CT "
+                "are; this scene has none."
+            )
+        tumors = len(self.scene.reference.tumors)
+        outlines = [self.outline(n % tumors) for n in range(tumors * numbers.get("outline", 0))]
+        return [
+            *self.touches_at_random(numbers.get("touch", 0), None),
+            *(outline for outline in outlines if outline is not None),
+            *(self.landmarks(n) if (n := numbers.get("landmark", 0)) else ()),
+            *(self.held(n % max(tumors, 1)) for n in range(numbers.get("held", 0))),
+        ]
 
     def outline(self, tumor: int, normal: Float[np.ndarray, " 3"] | None = None) -> Piece | None:
         """Places on the border of a tumor (0: the first) in the plane through its middle; of a
