@@ -23,6 +23,7 @@ from tumortrack.registration import looks as module
 from tumortrack.registration.config import GaussNewtonConfig
 from tumortrack.registration.gauss_newton import refine
 from tumortrack.registration.looks import CAMERA_STD, Looks
+from tumortrack.registration.motion import seen_from_first
 from tumortrack.registration.search import PosePrior, Search
 from tumortrack.registration.uncertainty import posterior
 from tumortrack.sense.camera import d405
