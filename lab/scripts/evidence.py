@@ -101,6 +101,8 @@ def main(options: Options) -> None:
         _, words, errors = blocks[0]
         shown = f"{words}\n\n{table_of(errors[_SHOWN])}"
         links = [writer.data(f"{_BLOCK}-{file}", table, words) for file, words, table in blocks]
+        evidence_tables.draw(next(iter(frames.values())), writer.image(_BLOCK))
+        shown += f"\n\n![Errors against the number of touches](images/{_BLOCK}.png)"
         each = pd.concat([_by_family(name, rows) for name, rows in frames.items()])
         links.append(writer.data(_BLOCK, each, "By family of physics"))
         writer.write({_BLOCK: "\n\n".join([f"`{writer.command}`", shown, *links])})

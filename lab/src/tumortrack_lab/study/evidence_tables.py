@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
+from matplotlib.lines import Line2D
 
+from tumortrack.report import drawing
 from tumortrack_lab.study.evidence import WRONG
 from tumortrack_lab.study.tables import NOTHING
 
@@ -46,6 +49,28 @@ def _errors(name: str, some: pd.DataFrame) -> dict[str, Any]:
         "false left out %": _percent(scenes.false_out.sum(), false),
         "true left out %": _percent(scenes.true_out.sum(), true),
     }
+
+
+def draw(rows: pd.DataFrame, path: Path) -> None:
+    """Errors of tumors' centres against the number of touches, as advised and at random: what half
+    and 95 % of all answers keep."""
+    own, figure = (
+        rows[(rows.organ == "own") & (rows.quality != "none")],
+        drawing.new_figure(6.4, 3.4),
+    )
+    axes, lines = figure.add_axes((0.09, 0.14, 0.89, 0.72)), list[Line2D]()
+    for way, color in (("chosen", "C1"), ("random", "C0")):
+        pattern = rf"^(\d+) touches, {way}$"
+        count = own.kind.str.extract(pattern)[0].where(own.kind != "none", "0").astype(float)
+        of = own.groupby(count).miss_mm
+        for share, style in ((0.95, "-"), (0.5, "--")):
+            axes.plot(of.quantile(share), style, marker="o", color=color, markersize=4)
+        lines.append(Line2D([], [], color=color, label=way))
+    named = (("-", "95 % within"), ("--", "median"))
+    lines += [Line2D([], [], color="0.4", linestyle=style, label=label) for style, label in named]
+    axes.set(xlabel="touches", ylabel="error of a tumor's centre, mm", ylim=(0, None))
+    drawing.show_legend(figure, lines, 4, (0.98, 1.0))
+    drawing.save(figure, path)
 
 
 def foresight(rows: pd.DataFrame) -> pd.DataFrame:
