@@ -1,6 +1,7 @@
 """`locate` on a raw depth image: table, drape and a hand in it; and the page that it writes."""
 
 import json
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -9,12 +10,15 @@ import pytest
 from PIL import Image, ImageFont
 
 import tumortrack as tt
-from live_objects import ball
+from live_objects import ball, small_estimate
 from region_objects import ORGAN, Props, make_scene
+from reports import reporting
 from stories import answered, refusal, tumortrack
 from tumortrack.cli.main import run
+from tumortrack.core import colours
 from tumortrack.core.errors import StorageError
 from tumortrack.core.geometry import plane_section
+from tumortrack.core.report import Finding
 from tumortrack.imaging.case import load_case
 from tumortrack.report.run_page import PICTURE, write_run_page
 from tumortrack.report.seen import PAGE, Seen
@@ -186,3 +190,46 @@ def test_no_word_of_a_warning_is_cut(tmp_path):
     page = (tmp_path / PAGE).read_text()
     assert "x" * 400 in page
     assert "&lt;b&gt; @TABLE@" in page
+
+
+@pytest.mark.parametrize("placed", [True, False])
+def test_the_page_shows_evidence_and_what_to_learn_next_where_the_organ_surely_lies(
+    tmp_path, placed
+):
+    place_mm, then_mm = [4.0, -3.0, 104.0], {"touch": 0.92, "look": 0.81}
+    known = [
+        {"name": "touch", "tool": "probe", "off_mm": 0.44, "news": 0.312, "left_out": False},
+        {"name": "outline", "off_mm": 24.0, "news": 0.0, "left_out": True},
+    ]
+    known = [{**each, "places_mm": [[30.0, 20.0, 110.0 + n]]} for n, each in enumerate(known)]
+    advice = [
+        {
+            "kind": kind, "part": "tumor_1", "place_mm": place_mm,
+            "direction": [0.0, 0.0, -1.0], "std_mm": 1.33, "then_std_mm": then_mm[kind],
+        }
+        for kind in ("touch", "touch", "touch", "look")
+    ]  # fmt: skip
+    estimate = reporting(small_estimate(), evidence=known, next_evidence=advice)
+    rival = Finding("rival", {"part": "tumor_1", "apart_mm": 9.0})
+    estimate = replace(estimate, finding=None if placed else rival)
+    write_run_page(tmp_path, {}, estimate, Seen())
+    page = (tmp_path / PAGE).read_text()
+    for cells in (
+        ">touch 1</th>", ">probe</td>", ">0.4 mm</td>", ">31 %</td>",
+        ">outline 2</th>", ">24.0 mm</td>", ">left out: it contradicts the rest</td>",
+    ):  # fmt: skip
+        assert cells in page
+    look, touch = (
+        f"Next, {words}: tumor_1 1.3 -&gt; {then} mm (one deviation; camera frame)"
+        for words, then in (
+            ("look from 4, -3, 104 mm as well", 0.8), ("touch the organ at 4, -3, 104 mm", 0.9),
+        )
+    )  # fmt: skip
+    assert (look in page, touch in page) == (placed, placed)
+    assert "Dots: white, evidence in use" in page
+    assert page.count("Next, touch") == placed  # of three touches the first alone
+    with Image.open(tmp_path / PICTURE) as image:
+        picture = np.asarray(image.convert("RGB"))
+    counts = [(picture == colour).all(2).sum() for colour in (colours.TO_CUT, colours.NONE)]
+    assert counts[1] > 30
+    assert (counts[0] > 30) == placed

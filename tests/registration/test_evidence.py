@@ -149,6 +149,7 @@ def test_what_contradicts_the_rest_is_left_out_and_named(slim_model):
     assert [each.left_out for each in told] == [False] * 4 + [True]
     assert told[4].off_mm == pytest.approx(25, abs=3)
     assert told[4].news == 0
+    assert told[4].places_mm == (away,)
     assert all(0 < each.news <= 1 for each in told[:4])
     assert found.finding.kind == "evidence"
     assert found.reason.startswith("touch 5 lies")
@@ -196,6 +197,9 @@ def test_what_was_touched_once_counts_while_the_organ_moves(slim_model):
         told = found.report.evidence
         assert all(each.before and not each.left_out for each in told)
         assert all(1.5 < each.std_mm < 3 for each in told)  # 0.1 of some 16 mm, and 1 or 2 mm
+        by_now = np.array([said.places_mm[0] for said in told])
+        went_mm = np.linalg.norm(by_now - [piece.places[0] for piece in evidence], axis=1)
+        assert went_mm == pytest.approx(16, abs=5)
     assert off_mm["touches"] < 0.9 * off_mm["nothing"] < 3
 
 

@@ -82,7 +82,7 @@ class Locate(LocateOptions):
 def _say_estimate(estimate: Estimate, located: Located) -> None:
     """The verdict, and where each part is."""
     from tumortrack.core.estimate import verdict_words
-    from tumortrack.report.seen import part_rows, row_words
+    from tumortrack.report.seen import next_lines, part_rows, row_words
     from tumortrack.tracking.margins import margin_words
 
     report, margin = estimate.report, estimate.report.margin
@@ -94,12 +94,8 @@ def _say_estimate(estimate: Estimate, located: Located) -> None:
         say(margin_words(margin))
     for number, each in enumerate(report.evidence, start=1):
         say(f"{each.name} {number}: {each.off_mm:.1f} mm off{', left out' * each.left_out}")
-    # Of an answer that may be another organ, or in another place, no place is worth touching.
-    placed = estimate.finding is None or estimate.finding.kind == "miss"
-    # Only a touch of those after the first one counts on the others.
-    firsts = [*report.next_evidence[:1], *report.next_evidence[3:]] if placed else []
-    for advice in sorted(firsts, key=lambda each: each.then_std_mm):
-        say(f"next, {advice.words} (one deviation; camera frame)")
+    for line in next_lines(estimate):
+        say(line)
     for view in located.about["input"]:
         say(view["words"])
     say_notes(located.about["notes"])

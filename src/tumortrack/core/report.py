@@ -317,7 +317,8 @@ class LooksReport(_Value, frozen=True, kw_only=True):
 class EvidenceReport(_Value, frozen=True, kw_only=True):
     """One piece of evidence: its kind, part, tool and deviation; how far it lies from the answer at
     most, and which share of what it says is news beside all else (0 to 1). ``left_out``: it
-    contradicts the rest; ``before``: it is of an earlier frame."""
+    contradicts the rest; ``before``: it is of an earlier frame; ``places_mm``: by now, camera
+    frame."""
 
     name: str
     off_mm: float
@@ -327,6 +328,7 @@ class EvidenceReport(_Value, frozen=True, kw_only=True):
     tool: str = ""
     std_mm: float | None = None
     before: bool = False
+    places_mm: tuple[Point, ...] = ()
 
 
 class NextEvidence(_Value, frozen=True, kw_only=True):

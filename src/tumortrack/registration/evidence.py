@@ -232,6 +232,7 @@ class EvidenceTerms:
                     news=min(float(shares[number]), 1.0) if number in kept else 0.0,
                     left_out=number not in kept,
                     before=number < before,
+                    places_mm=each.places,
                 )
             )
         return tuple(told)

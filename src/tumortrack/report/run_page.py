@@ -24,10 +24,11 @@ from tumortrack.core.geometry import transform_points
 from tumortrack.core.organ import is_tumor
 from tumortrack.core.patient import patient_in
 from tumortrack.core.process import parallel_map
+from tumortrack.core.report import Point
 from tumortrack.core.store import write_atomically
 from tumortrack.core.types import DepthFrame, SensorCloud
 from tumortrack.report.renderer import Body, ParallelView, corner_normals, render, rgb
-from tumortrack.report.seen import PAGE, Seen, part_rows, row_words
+from tumortrack.report.seen import PAGE, Seen, next_evidence, next_lines, part_rows, row_words
 from tumortrack.report.wrapping import wrapped
 from tumortrack.sense.camera import deproject
 from tumortrack.tracking.margins import margin_words
@@ -43,6 +44,7 @@ _MOST_TUMORS = 6  # with slices
 _NEAR_MM = 1.0  # points this near to a slice are shown in it
 _BAR_MM = 20.0
 _TITLES = {"good": "GOOD", "poor": "POOR", "none": "NONE: no estimate"}
+_TABLE_TITLES = {"part": "", "centre": "centre (x, y, z)", "std": "1 standard deviation"}
 Panel = tuple[str, Image.Image]  # with its caption
 
 
@@ -59,6 +61,7 @@ def write_run_page(
     reason = report["quality"]["reason"] if estimate is None else estimate.reason
     words = verdict_words(verdict, reason)
     rows = [] if estimate is None else part_rows(estimate.report, estimate.quality == "good")
+    known = [] if estimate is None else _evidence_rows(estimate)
     lines = list(_lines(report, estimate))
     picture = _picture(verdict, [words, *lines, *map(row_words, rows)], views + slices)
     png = _encoded(picture, "PNG", compress_level=1, compress_type=_RLE)
@@ -71,6 +74,7 @@ def write_run_page(
         "@WORDS@": html.escape(_sentence(words.partition(": ")[2])),
         "@LINES@": "".join(f"<p>{html.escape(line)}</p>" for line in lines),
         "@TABLE@": _table(rows) if rows else "",
+        "@EVIDENCE@": f"<section>{_table(known)}</section>" if known else "",
         "@PANELS@": _figures(views) + _figures(slices),
     }
     page = re.sub("@[A-Z]+@", lambda name: cells[name[0]], page)
@@ -96,25 +100,39 @@ def _lines(report: dict[str, Any], estimate: Estimate | None) -> Iterator[str]:
         yield f"{_sentence(margin_words(margin))}."
     yield from (view["words"] for view in report.get("input", ()))
     yield from (f"Note: {note}" for note in report.get("notes", ()))
+    yield from map(_sentence, next_lines(estimate))
+    if estimate is not None and any(_spots(estimate)):
+        yield "Dots: white, evidence in use; red, left out; blue, the best places to touch next."
 
 
 def _sentence(words: str) -> str:
     return words[:1].upper() + words[1:]
 
 
+def _evidence_rows(estimate: Estimate) -> list[dict[str, str]]:
+    return [
+        {
+            "evidence": f"{each.name} {number}",
+            "tool": each.tool,
+            "off": f"{each.off_mm:.1f} mm",
+            "news": f"{100 * each.news:.0f} %",
+            "": "left out: it contradicts the rest" if each.left_out else "",
+        }
+        for number, each in enumerate(estimate.report.evidence, start=1)
+    ]
+
+
 def _table(rows: list[dict[str, str]]) -> str:
-    titles = {"part": "", "centre": "centre (x, y, z)", "std": "1 standard deviation"}
-    titles |= {"volume": "volume", "margin": "margin"}
-    shown = {key: title for key, title in titles.items() if any(row[key] for row in rows)}
-    head = "".join(f"<th>{title}</th>" for title in shown.values())
+    """The first column names the rows; those of parts have their colours."""
+    titles = {key: _TABLE_TITLES.get(key, key) for key in rows[0] if any(row[key] for row in rows)}
+    head = "".join(f"<th>{title}</th>" for title in titles.values())
+    (first, _), *others = titles.items()
     body = ""
-    for number, row in enumerate(rows):
-        dot = f'<i style="background:{colours.css(colours.part_colour(number + 1))}"></i>'
-        name = f"<th>{dot}{html.escape(row['part'].replace('_', ' '))}</th>"
-        body += f"<tr>{name}" + "".join(
-            f'<td data-title="{title}">{html.escape(row[key])}</td>'
-            for key, title in shown.items()
-            if key != "part"
+    for number, row in enumerate(rows, start=1):
+        dot = f'<i style="background:{colours.css(colours.part_colour(number))}"></i>'
+        name = html.escape(row[first].replace("_", " "))
+        body += f"<tr><th>{dot if first == 'part' else ''}{name}</th>" + "".join(
+            f'<td data-title="{title}">{html.escape(row[key])}</td>' for key, title in others
         )
     return f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
 
@@ -188,10 +206,22 @@ def _view(
             at = (view.project(mesh.box_mm.mean(0)[None])[0, :2] - corner) / pixel_mm
             number = name.removeprefix("tumor_")
             draw.text(tuple(at.tolist()), number, "black", stroke_fill="white", **style)
+    for place_mm, colour in () if estimate is None else _spots(estimate):
+        x, y = (view.project(np.array([place_mm]))[0, :2] - corner) / pixel_mm
+        draw.ellipse((x - 5, y - 5, x + 5, y + 5), fill=colour, outline="black")
     foot, long = height - 20, _BAR_MM / pixel_mm
     draw.line((20, foot, 20 + long, foot), fill="black", width=4)
     draw.text((20, foot - 22), f"{_BAR_MM:g} mm", fill="black", font_size=15)
     return image
+
+
+def _spots(estimate: Estimate) -> Iterator[tuple[Point, colours.Colour]]:
+    """Where evidence lies, and where to touch next."""
+    for each in estimate.report.evidence:
+        colour = colours.NONE if each.left_out else colours.WHITE
+        yield from ((place_mm, colour) for place_mm in each.places_mm)
+    touches = (each for each in next_evidence(estimate) if each.kind == "touch")
+    yield from ((each.place_mm, colours.TO_CUT) for each in touches)
 
 
 def _slice(estimate: Estimate, seen: Seen, part: str, orientation: str) -> Image.Image:

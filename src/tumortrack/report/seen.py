@@ -9,11 +9,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import UInt8
 
-from tumortrack.core.report import FitReport
+from tumortrack.core.report import FitReport, NextEvidence
 from tumortrack.core.types import DepthFrame, SensorCloud
 from tumortrack.tracking.margins import stated_radius
 
 if TYPE_CHECKING:
+    from tumortrack.core.estimate import Estimate
     from tumortrack.tracking.slices import CarriedCt
 
 PAGE = "index.html"
@@ -43,15 +44,26 @@ def part_rows(report: FitReport, good: bool) -> list[dict[str, str]]:
     for name, part in report.parts.items():
         row = {"part": name, "centre": "not found", "std": "", "volume": "", "margin": ""}
         if part.center_mm is not None:
-            x, y, z = part.center_mm
+            (x, y, z), radius = part.center_mm, stated_radius(report.margin, name)
             row |= {"centre": f"({x:.1f}, {y:.1f}, {z:.1f}) mm"}
-            row |= {"volume": f"{part.volume_ml:.1f} ml"}
-            if (deviation := part.deviation_words) is not None and good:
-                row |= {"std": deviation}
-            if radius := stated_radius(report.margin, name):
-                row |= {"margin": radius.words}
+            row |= {"volume": f"{part.volume_ml:.1f} ml", "margin": radius.words if radius else ""}
+            row |= {"std": (part.deviation_words or "") if good else ""}
         rows.append(row)
     return rows
+
+
+def next_evidence(estimate: Estimate | None) -> tuple[NextEvidence, ...]:
+    """What to learn next; nothing of an answer that may be another organ, or in another place."""
+    if estimate is None or (estimate.finding is not None and estimate.finding.kind != "miss"):
+        return ()
+    return estimate.report.next_evidence
+
+
+def next_lines(estimate: Estimate | None) -> list[str]:
+    """The same in words, the best first, without touches that count on the first one."""
+    every = next_evidence(estimate)
+    firsts = sorted([*every[:1], *every[3:]], key=lambda each: each.then_std_mm)
+    return [f"next, {each.words} (one deviation; camera frame)" for each in firsts]
 
 
 def row_words(row: dict[str, str]) -> str:

@@ -22,6 +22,7 @@ from tumortrack.core.patient import Patient
 from tumortrack.core.types import Mesh, SensorCloud
 from tumortrack.live.meter import Rate
 from tumortrack.live.values import SinkContext, TrackingResult, TransformedEstimate, Workcell
+from tumortrack_devices.beside import Beside, NextTouch
 from tumortrack_devices.display import MOST_SEEN, seen_points, thinned, wxyz_of
 from tumortrack_devices.ros.messages import MM_PER_M, Messages, Outgoing, PointBlock, xyz
 from tumortrack_devices.ros.sensors import CLOUD, cloud_message, plain_cloud
@@ -34,7 +35,7 @@ JOINTS = "sensor_msgs/msg/JointState"
 
 _STATE = "state"  # the marker namespace of the arms' text
 _DELETE, _DELETE_ALL = 2, 3  # Marker's actions
-_LINE, _TEXT, _TRIANGLES = 4, 9, 11  # and types
+_LINE, _SPHERES, _TEXT, _TRIANGLES = 4, 7, 9, 11  # and types
 _LIFETIME_S = 2  # of markers, so that a stopped loop leaves nothing that looks current
 _STATUS_HZ = 1.0  # of /diagnostics, as rqt's monitor expects; and at once when a level changes
 _RATE_OVER = 30  # results
@@ -46,6 +47,13 @@ _TEXT_HEIGHT_M, _STATE_HEIGHT_M = 0.008, 0.025
 _TEXT_COLUMNS, _STATE_COLUMNS = 44, 70  # RViz does not wrap: long lines leave the screen
 _GAP_M = 0.012  # between lines, besides their height: measured in RViz of ROS 1; RViz 2 has 0.005
 _ORIGIN = np.zeros(3)
+# Namespaces, colours and radii (m) of what to touch next, and of evidence in use and left out.
+_NEXT, _NEXT_TEXT = "next_touch", "next_touch_text"
+_SPOTS = {
+    _NEXT: (colours.TO_CUT, 0.002),
+    "evidence": (colours.WHITE, 0.001),
+    "contradicting": (colours.NONE, 0.0015),
+}
 
 _POINT = np.dtype(
     [(name, "<f4") for name in "xyz"] + [("label", "u1"), ("probability", "<f4"), ("rgb", "<u4")],
@@ -74,6 +82,7 @@ class ResultMessages:
         self._status_rate, self._levels = Rate(_STATUS_HZ), list[int]()
         self._times_s = deque[float](maxlen=_RATE_OVER)  # of the latest results
         self._meshes_rate, self._markers_rate, self._points_rate = Rate(hz), Rate(hz), Rate(hz)
+        self._beside, self._spots_shown, self._texts_shown = Beside(), set[str](), 0
         self._shown: set[str] = set()
         self._shown_state: tuple[str, bool] | None = None
 
@@ -81,6 +90,7 @@ class ResultMessages:
         """The messages of one result; docs/ros.md describes each topic. Raises InputError for a
         stamp beyond ROS's range."""
         header = self._messages.header(result.stamp_ns, result.published_frame.frame_id)
+        self._beside.update(result)
         out: list[Outgoing] = []
 
         def send(suffix: str, message_type: str, **values: Any) -> None:
@@ -103,7 +113,8 @@ class ResultMessages:
         past_s = self._times_s[-1] - self._times_s[0]
         hz = (len(self._times_s) - 1) / past_s if past_s > 0 else 0.0
         arms = [_arms_status(result)] if self._context.arms else []
-        status = [_estimate_status(result, self._context.patient, hz), *arms]
+        touches = self._beside.touches
+        status = [_estimate_status(result, self._context.patient, hz, touches), *arms]
         send("diagnostics", DIAGNOSTICS, header=header, status=status)
         levels = [entry["level"] for entry in status]
         if self._status_rate.due() or levels != self._levels:
@@ -132,7 +143,8 @@ class ResultMessages:
         return self._messages.make(TRANSFORMS, transforms=transforms)
 
     def _organ(self, result: TrackingResult) -> list[dict[str, Any]]:
-        """Triangles per part and a text of the quality; without an estimate all are deleted."""
+        """Triangles per part, spots and a text of the quality; without an estimate all are
+        deleted."""
         estimate = result.transformed
         markers: list[dict[str, Any]] = []
         if estimate is None:
@@ -146,8 +158,31 @@ class ResultMessages:
                     markers.append(_triangles(name, mesh, colours.name_colour(name), opacity))
             for number, (name, mesh) in enumerate(estimate.structures.items()):
                 markers.append(_triangles(name, mesh, colours.structure_colour(number), 1.0))
+        if estimate is not None:
+            markers += self._spots()
         if estimate is not None or result.workcell is None:  # else it is in the workcell's text
             markers.append(_quality_text(result))
+        return markers
+
+    def _spots(self) -> list[dict[str, Any]]:
+        """Where to touch next, with texts, and evidence; of what there was, its deletion."""
+        beside, markers = self._beside, list[dict[str, Any]]()
+        next_mm = np.reshape([touch.place_mm for touch in beside.touches], (-1, 3))
+        every = next_mm, beside.known_mm, beside.contradicting_mm
+        for (ns, (colour, radius_m)), places_mm in zip(_SPOTS.items(), every, strict=True):
+            if len(places_mm):
+                scale, points = xyz((2 * radius_m,) * 3), PointBlock(places_mm / MM_PER_M)
+                markers.append(_marker(ns, _SPHERES, colour, scale=scale, points=points))
+                self._spots_shown.add(ns)
+            elif ns in self._spots_shown:
+                markers.append({"ns": ns, "action": _DELETE})
+        scale = {"z": _TEXT_HEIGHT_M}
+        for number, touch in enumerate(beside.touches):
+            about = {"id": number, "text": touch.label, "scale": scale}
+            markers.append(_marker(_NEXT_TEXT, _TEXT, colours.WHITE, touch.place_mm, **about))
+        for number in range(len(beside.touches), self._texts_shown):
+            markers.append({"ns": _NEXT_TEXT, "id": number, "action": _DELETE})
+        self._texts_shown = max(self._texts_shown, len(beside.touches))
         return markers
 
     def _workcell(self, result: TrackingResult) -> list[dict[str, Any]] | None:
@@ -188,7 +223,9 @@ class ResultMessages:
         return transform_points(result.published_frame.published_from_camera, points_mm)
 
 
-def _estimate_status(result: TrackingResult, patient: Patient, hz: float) -> dict[str, Any]:
+def _estimate_status(
+    result: TrackingResult, patient: Patient, hz: float, touches: tuple[NextTouch, ...]
+) -> dict[str, Any]:
     values: dict[str, Any] = {
         "patient": patient.id,
         "side": patient.side,
@@ -202,6 +239,7 @@ def _estimate_status(result: TrackingResult, patient: Patient, hz: float) -> dic
     if result.latency_ms is not None:
         values["latency_ms"] = f"{result.latency_ms:.3f}"
     values |= {f"{stage}_ms": f"{1000 * s:.3f}" for stage, s in result.seconds.items()}
+    values |= {f"{_NEXT}_{rank}": touch.words for rank, touch in enumerate(touches, start=1)}
     return _status(_LEVELS[result.quality], "estimate", result.describe(), result, values)
 
 

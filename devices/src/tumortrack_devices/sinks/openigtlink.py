@@ -12,7 +12,7 @@ from typing import ClassVar, Literal
 
 import numpy as np
 
-from tumortrack.core.colours import name_colour
+from tumortrack.core.colours import TO_CUT, name_colour
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import RAS_FROM_LPS, transform_points
 from tumortrack.core.report import FitReport
@@ -22,12 +22,14 @@ from tumortrack.live.values import SinkConfig, SinkContext, TrackingResult
 from tumortrack.tracking.files import CENTRES, CT, MARGIN
 from tumortrack.tracking.margins import centre_label, stated_radius
 from tumortrack.tracking.shells import rough_margin
+from tumortrack_devices.beside import Beside
 from tumortrack_devices.igtl import message as igtl
 from tumortrack_devices.igtl.link import Link
 from tumortrack_devices.igtl.message import Message, Polydata
 from tumortrack_devices.network import is_loopback
 
 STATUS_DEVICE, CLOUD_DEVICE, ARMS_DEVICE = "tumortrack", "occupancy", "arms"
+TOUCH_DEVICE = "next_touch"
 _TIP = "/tip"  # the end of the names of shapes at tool tips
 _NOTHING = Polydata(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32))
 _Content = tuple[str, str, bytes, dict[str, str]]  # type, device, content, own metadata
@@ -70,7 +72,8 @@ class OpenIgtLinkSinkConfig(SinkConfig, frozen=True, kw_only=True, tag="openigtl
 
 class OpenIgtLinkSink:
     """Per result: STATUS ``tumortrack``, TRANSFORM of each tumor, POINT ``tumors`` (their centres,
-    labelled with their uncertainty), and POLYDATA of each part and of each stated margin.
+    labelled with their uncertainty), POINT ``next_touch`` (the best places of the organ to touch
+    next, from the first advice on), and POLYDATA of each part and of each stated margin.
 
     With a motion TRANSFORM ``ct`` is the organ's pose, and vertices of tumors have the scalar
     ``std_mm``: one standard deviation along the least certain axis. Without an estimate STATUS says
@@ -88,6 +91,7 @@ class OpenIgtLinkSink:
         self._mesh_rate, self._cloud_rate = Rate(config.mesh_hz), Rate(config.cloud_hz)
         self._tips: set[str] = set()  # all so far
         self._margins: set[str] = set()  # all so far
+        self._beside, self._advised = Beside(), False
         self._next, self._closed = 0, False
 
     @property
@@ -119,6 +123,7 @@ class OpenIgtLinkSink:
             *self._statuses(result, code),
             *self._transforms(result),
             *self._centres(result),
+            *self._touches(result),
             *self._surfaces(result),
         ]
         self.link.send(
@@ -168,6 +173,16 @@ class OpenIgtLinkSink:
         if tumors:
             colours = [name_colour(name) for name in centres]
             yield "POINT", CENTRES, igtl.pack_points(points_mm, labels, colours), {}
+
+    def _touches(self, result: TrackingResult) -> Iterator[_Content]:
+        self._beside.update(result)
+        touches = self._beside.touches
+        self._advised |= bool(touches)
+        if self._advised:
+            places_mm = np.reshape([touch.place_mm for touch in touches], (-1, 3))
+            labels = [touch.label for touch in touches]
+            content = transform_points(self._axes, places_mm), labels, [TO_CUT] * len(touches)
+            yield "POINT", TOUCH_DEVICE, igtl.pack_points(*content), {}
 
     def _surfaces(self, result: TrackingResult) -> Iterator[_Content]:
         estimate = result.transformed

@@ -148,6 +148,7 @@ class ViewerSink:
         now = time.monotonic()
         with self._page():
             self._result, self._came_s = result, now
+            self._scene.beside.update(result)
             changed = self._drawn is None or _kind(self._drawn) != _kind(result)
             if changed or self._state == "stale" or now - self._drawn_s >= 1 / self._config.hz:
                 self._drawn_s = now

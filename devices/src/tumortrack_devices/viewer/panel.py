@@ -271,6 +271,13 @@ class Panel:
                     hint="95 % ellipsoid of each tumor's centre by the fit's own covariance, 2.80 "
                     "standard deviations: a diagnostic, not the margin",
                 ),
+                "evidence": gui.add_checkbox(
+                    "Evidence, next touches",
+                    default.evidence,
+                    hint="White: what is known beside the camera; red diamonds: what contradicts "
+                    "the rest; blue: what to touch next, and by how much the deviation of the "
+                    "tumor's middle along its least sure axis would fall",
+                ),
                 "observed": gui.add_checkbox("Observed points", default.observed),
                 "points": gui.add_dropdown("Labelled points", ("none", "tumors", "all")),
                 "helpers": gui.add_checkbox("Axes, region", default.helpers),

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, Int32, UInt8
@@ -23,6 +23,7 @@ from tumortrack.live.values import TrackingResult, TransformedEstimate
 from tumortrack.tracking.margins import stated_radius
 from tumortrack.tracking.shells import exact_margin, rough_margin
 from tumortrack.tracking.slices import SlicePlane
+from tumortrack_devices.beside import Beside
 from tumortrack_devices.display import MOST_SEEN, seen_colours, seen_points, thinned, wxyz_of
 from tumortrack_devices.viewer.look import Viewpoint
 
@@ -36,6 +37,9 @@ _ELLIPSOID = 2.7955
 _TUMOR_WITH_POINTS = 0.3  # opacity
 _SEEN_MM, _ORGAN_MM = 0.15, 0.15  # size of points: small, they lie over the tumors
 _CLICKABLE_MM = 1.0  # of observed points, while a click is expected
+_TOUCH_MM, _KNOWN_MM, _CONTRADICTING_MM = 2.0, 1.2, 1.8  # radii of their points
+# Where labels of what to touch next hang: those of two places near each other must not overlap.
+_ANCHORS: tuple[Any, ...] = ("bottom-left", "top-left", "top-right")
 _SAME_MM = 0.4  # between surfaces that coincide
 _NO_POINTS = np.zeros((0, 3), np.float32)
 _NOTHING = Mesh(np.zeros((3, 3)), np.array([[0, 1, 2]]))
@@ -52,6 +56,7 @@ class DisplayOptions:
     margin: bool = True
     structures: bool = True
     ellipsoids: bool = False
+    evidence: bool = True  # and what to touch next
     points: str = "none"  # none | tumors | all
     slice_plane: bool = False
     helpers: bool = True  # axes and the region of the organ's points
@@ -69,6 +74,7 @@ class ViewerScene:
             if margin_mm:
                 self._margins_ct = [exact_margin(part, margin_mm) for part in self._at_rest.tumors]
         self.options = DisplayOptions()
+        self.beside = Beside()  # the sink keeps it up to date
         self.margins: dict[str, Mesh] = {}  # of the shown estimate, published frame
         self._shown: tuple[TrackingResult, TransformedEstimate] | None = None
         self._has_organ = self._has_slice = self._clickable = False
@@ -111,18 +117,35 @@ class ViewerScene:
                 f"/estimate/{name}", _NOTHING, color=colour, side="double", visible=False
             )
         self._points = self._cloud("/estimate/points", 0.3, colours.ORGAN_PART)
+        self._spots = {
+            "next": self._cloud("/estimate/next", _TOUCH_MM, colours.TO_CUT),
+            "known": self._cloud("/estimate/known", _KNOWN_MM, colours.WHITE),
+            "contradicting": self._cloud(
+                "/estimate/contradicting", _CONTRADICTING_MM, colours.NONE, "diamond"
+            ),
+        }
+        self._labels = [
+            nodes.add_label(f"/estimate/next_{n}", "", visible=False, anchor=anchor)
+            for n, anchor in enumerate(_ANCHORS)
+        ]
         clear = np.zeros((2, 2, 4), np.uint8)
         self._slice = nodes.add_image("/estimate/slice", clear, 1, 1, format="png", **_FLAT)
         self._cell = nodes.add_frame("/workcell", show_axes=False, visible=False)
         self._drawn: dict[str, tuple[object, np.ndarray, Any]] = {}  # look, place and node by name
 
-    def _cloud(self, name: str, size_mm: float, colour: colours.Colour) -> PointCloudHandle:
+    def _cloud(
+        self,
+        name: str,
+        size_mm: float,
+        colour: colours.Colour,
+        shape: Literal["circle", "diamond"] = "circle",
+    ) -> PointCloudHandle:
         return self._nodes.add_point_cloud(
             name,
             _NO_POINTS,
             np.array(colour, np.uint8),
             point_size=size_mm,
-            point_shape="circle",
+            point_shape=shape,
             point_shading="flat",
             precision="float32",  # half precision is 0.125 mm at 150 mm
         )
@@ -169,6 +192,7 @@ class ViewerScene:
         for nodes, surfaces in (*groups, (self._structures, estimate.structures)):
             for name, node in nodes.items():
                 _put_mesh(node, surfaces.get(name, _NOTHING))
+        self._put_beside(self.beside)
         self._shown = result, estimate
         self.apply()
 
@@ -178,6 +202,7 @@ class ViewerScene:
         for group in (self._parts, self._shells, self._ellipsoids, self._structures):
             for node in group.values():
                 _put_mesh(node, _NOTHING)
+        self._put_beside(Beside())
         self._points.points, self._points.colors = _NO_POINTS, _NO_POINTS.astype(np.uint8)
         self._shown = None
         self._has_slice = self._slice.visible = False
@@ -203,6 +228,10 @@ class ViewerScene:
             node.visible = options.ellipsoids
         for node in self._structures.values():
             node.visible = options.structures
+        for spots in self._spots.values():
+            spots.visible = options.evidence
+        for label in self._labels:
+            label.visible = options.evidence and bool(label.text)
         self._parts[self._name].opacity = options.organ
         self._points.visible = options.points != "none"
         self._slice.visible = options.slice_plane and self._has_slice
@@ -296,6 +325,21 @@ class ViewerScene:
         some = thinned(np.flatnonzero(estimate.labels >= least), _MOST_LABELLED)
         self._points.points = estimate.points_mm[some].astype(np.float32)
         self._points.colors = colours.label_colours(estimate.labels[some])
+
+    def _put_beside(self, beside: Beside) -> None:
+        """What to touch next, and the evidence; their labels are made visible by ``apply``."""
+        touches = beside.touches[: len(self._labels)]
+        places = {
+            "next": np.reshape([touch.place_mm for touch in touches], (-1, 3)),
+            "known": beside.known_mm,
+            "contradicting": beside.contradicting_mm,
+        }
+        for name, places_mm in places.items():
+            self._spots[name].points = places_mm.astype(np.float32)
+        for label in self._labels[len(touches) :]:
+            label.text, label.visible = "", False
+        for label, touch in zip(self._labels, touches, strict=False):
+            label.text, label.position = touch.label, touch.place_mm
 
     def _margins_of(self, result: TrackingResult, estimate: TransformedEstimate) -> dict[str, Mesh]:
         assert result.estimate is not None

@@ -66,8 +66,8 @@ def draw(rows: pd.DataFrame, path: Path) -> None:
         for share, style in ((0.95, "-"), (0.5, "--")):
             axes.plot(of.quantile(share), style, marker="o", color=color, markersize=4)
         lines.append(Line2D([], [], color=color, label=way))
-    named = (("-", "95 % within"), ("--", "median"))
-    lines += [Line2D([], [], color="0.4", linestyle=style, label=label) for style, label in named]
+    lines.append(Line2D([], [], color="0.4", linestyle="-", label="95 % within"))
+    lines.append(Line2D([], [], color="0.4", linestyle="--", label="median"))
     axes.set(xlabel="touches", ylabel="error of a tumor's centre, mm", ylim=(0, None))
     drawing.show_legend(figure, lines, 4, (0.98, 1.0))
     drawing.save(figure, path)
