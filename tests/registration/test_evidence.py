@@ -139,6 +139,20 @@ def test_landmarks_tell_which_way_round_an_organ_lies():
     assert turned.looks.evidence is not None
 
 
+@pytest.mark.parametrize(
+    ("agree", "wrong", "decides"), [(4, 1, True), (8, 1, False), (9, 2, True), (10, 2, False)]
+)
+def test_many_that_agree_outvote_a_wrong_one(slim_model, agree, wrong, decides):
+    tracker = Tracker(load_model(slim_model, "cpu"))
+    away = np.array(at(BEHIND[0])) + [0, 0, 25.0]
+    false = [Touch(place_mm=tuple(away + [3.0 * n, 0, 0])) for n in range(wrong)]
+    cloud = SensorCloud(SEEN.astype(np.float32))
+    found = tracker.locate(cloud, 16, 0, evidence=[*touches(agree), *false])
+    left_out = [each.left_out for each in found.report.evidence]
+    assert left_out == [False] * agree + [True] * wrong
+    assert (found.finding is not None and found.finding.kind == "evidence") == decides
+
+
 def test_what_contradicts_the_rest_is_left_out_and_named(slim_model):
     tracker = Tracker(load_model(slim_model, "cpu"))
     away = tuple(np.array(at(BEHIND[0])) + [0, 0, 25.0])
