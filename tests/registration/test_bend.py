@@ -124,7 +124,7 @@ def test_the_evidence_is_that_of_all_unknowns(std_mm, monkeypatch):
     expected = weight @ (squares / (1 + squares / 4))
     expected += (off + change) @ precision @ (off + change)
     expected += 0.3 * (np.linalg.slogdet(curvature)[1] - np.linalg.slogdet(precision)[1])
-    cost = _Groups.near(fit, start, CONFIG).cost(std_mm)
+    cost = _Groups.near(fit, start, CONFIG, None).cost(std_mm)
     assert cost == pytest.approx(expected, rel=1e-4)
 
 
