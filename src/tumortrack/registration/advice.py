@@ -32,7 +32,6 @@ _VIEW_DEGREES, _VIEWS = 30.0, 8  # all around the present line of sight
 _FACING = 0.3  # cosine to the line of sight: flatter surfaces return little
 _NEAR_MM = 2.0  # of an outline's plane
 
-
 Place = Float64[np.ndarray, " 3"]
 Kind = Literal["touch", "outline", "landmark", "look"]
 
@@ -94,6 +93,8 @@ class Advisor:
         rows = np.concatenate([rows, rows[:, :3]], axis=1)
         free = np.ones(len(rows), bool)
         for _ in range(count):
+            if not free.any():  # a small organ
+                break
             best = int(np.flatnonzero(free)[known.best(rows[free], _TOUCH_MM)])
             then = known.after(rows[[best]], _TOUCH_MM)
             advised.append(self._entry("touch", places_mm[best], normals[best], known, then))

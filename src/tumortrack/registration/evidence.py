@@ -27,7 +27,7 @@ from tumortrack.registration.motion import ElasticMotion, seen_from_first
 from tumortrack.registration.rest_shape import RestShape
 
 _WIDTHS = 4.0  # of the robust kernel, in standard deviations
-LEAST_WIDTH_MM = 4.0
+_LEAST_WIDTH_MM = 4.0  # so that fits from starts some millimetres off are drawn
 _SURFACE_MM = 1.0  # of the model's surfaces, segmentation included: ``sigma_mm`` of the points
 _RIGID_MM = 4.0  # error of the undeformed organ at best
 # Error along an axis of where tissue is said to go, per way that it went: in 113 frames of two
@@ -76,7 +76,7 @@ class Terms:
     def contradicting(self) -> Int64[np.ndarray, " k"]:
         """Numbers of the evidence that lies too far off, its tool's shift allowed for."""
         off_mm = np.abs(self.residuals_mm + self.by_shifts @ self.shifts)
-        return np.unique(self.piece[off_mm > np.maximum(_WIDTHS * self.std_mm, LEAST_WIDTH_MM)])
+        return np.unique(self.piece[off_mm > np.maximum(_WIDTHS * self.std_mm, _LEAST_WIDTH_MM)])
 
     def add_to(self, curvature: Float64[np.ndarray, "p p"], gradient: np.ndarray) -> float:
         """Into a Gauss-Newton step's equations; the terms' cost."""
@@ -111,9 +111,9 @@ class EvidenceTerms:
         surfaces, points = list[tuple[Any, ...]](), list[tuple[Any, ...]]()
         tools = dict[str, float]()
         for number, each in enumerate(evidence):
-            name = each.tool or f"piece {number}"
-            tools[name] = max(each.shared_std_mm, tools.get(name, 0.0))
-            about = number, list(tools).index(name)
+            tool_name = each.tool or f"piece {number}"
+            tools[tool_name] = max(each.shared_std_mm, tools.get(tool_name, 0.0))
+            about = number, list(tools).index(tool_name)
             if isinstance(each, Landmark | Held):
                 which_mm = each.point_std_mm if isinstance(each, Held) else 0.0
                 whole_mm = math.hypot(each.std_mm, which_mm)
@@ -141,9 +141,8 @@ class EvidenceTerms:
             np.array(list(tools.values())),
         )  # fmt: skip
 
-    def at(self, motion: ElasticMotion, least_width_mm: float = LEAST_WIDTH_MM) -> Terms:
-        """The terms at a motion; landmarks' in the organ's axes. ``least_width_mm``: of the robust
-        kernel."""
+    def at(self, motion: ElasticMotion) -> Terms:
+        """The terms at a motion; landmarks' in the organ's axes."""
         unknowns = POSE + len(motion.coefficients)
         rows = np.zeros((len(self.places_mm), unknowns + 1))
         for part in np.unique(self.part):
@@ -162,7 +161,7 @@ class EvidenceTerms:
         together, by_all = np.concatenate(residuals_mm), np.concatenate(by_motion)
         shifted = [n for n in np.unique(tool) if self.shared_mm[n]]
         by_shifts = [by_all[:, :3] * ((tool == n) * self.shared_mm[n])[:, None] for n in shifted]
-        width_mm = np.maximum(_WIDTHS * np.hypot(std_mm, self.shared_mm[tool]), least_width_mm)
+        width_mm = np.maximum(_WIDTHS * np.hypot(std_mm, self.shared_mm[tool]), _LEAST_WIDTH_MM)
         shifts = np.concatenate([by_all[:, :0], *by_shifts], axis=1)
         return Terms(together, by_all, shifts, std_mm, width_mm, piece)
 

@@ -203,7 +203,7 @@ class RegistrationLocator:
         pieces: tuple[Evidence, ...],
         before: tuple[Known, ...] = (),
     ) -> _Found:
-        """Of a search, which heeds evidence."""
+        """Of a search, in which evidence counted."""
         if not pieces:
             return _Found(fit, prior, fit.motion)
         points = replace(fit.looks, evidence=None)
