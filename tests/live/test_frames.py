@@ -31,7 +31,7 @@ class Located(Tracker):
     def __init__(self, *verdicts):  # no model
         self._verdicts = list(verdicts)
 
-    def follow(self, cloud, last=None, how=None, seen=None, others=()):
+    def follow(self, cloud, last=None, how=None, seen=None, evidence=()):
         verdict = self._verdicts.pop(0) if self._verdicts else "good"
         if verdict == "none":
             raise NoEstimate("it does not look like this organ")
@@ -113,7 +113,7 @@ def test_a_frame_that_is_only_late_or_out_of_order_makes_nobody_forget():
     starts = []
 
     class Watched(Located):
-        def follow(self, cloud, last=None, how=None, seen=None, others=()):
+        def follow(self, cloud, last=None, how=None, seen=None, evidence=()):
             starts.append(last)
             return super().follow(cloud, last, how, seen)
 
@@ -171,7 +171,7 @@ def test_silence_is_said_before_what_is_shown_is_stale(monkeypatch):
     monkeypatch.setattr(sys.modules["tumortrack.live.loop"], "time", clock)
 
     class Slow(Located):
-        def follow(self, cloud, last=None, how=None, seen=None, others=()):
+        def follow(self, cloud, last=None, how=None, seen=None, evidence=()):
             clock.sleep(0.3)
             return super().follow(cloud, last, how, seen)
 

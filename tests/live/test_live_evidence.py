@@ -21,9 +21,9 @@ BASE_FROM_CAMERA = rigid(np.diag([1.0, -1.0, -1.0]), np.array([40.0, -30.0, 300.
 class Asked(Located):
     """Keeps the evidence of each frame."""
 
-    def follow(self, cloud, last=None, how=None, seen=None, others=()):
-        self.asked.append(how.evidence)
-        return super().follow(cloud, last, how, seen, others)
+    def follow(self, cloud, last=None, how=None, seen=None, evidence=()):
+        self.asked.append(tuple(evidence))
+        return super().follow(cloud, last, how, seen, evidence)
 
 
 class Holding:

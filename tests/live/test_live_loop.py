@@ -281,7 +281,7 @@ def test_garbage_and_defects_are_said_and_survived(tracker, stages, monkeypatch)
 
 def test_a_defect_is_kept_for_the_report(tracker, stages):
     class Broken(Tracker):
-        def follow(self, cloud, last=None, how=FollowOptions(), seen=None, others=()):  # noqa: B008
+        def follow(self, cloud, last=None, how=FollowOptions(), seen=None, evidence=()):  # noqa: B008
             if cloud.stamp_ns == clouds[1].stamp_ns:
                 raise ZeroDivisionError("a defect")
             return super().follow(cloud, last, how, seen)
@@ -324,7 +324,7 @@ def test_stale_frames_are_refused(tracker, stages, clock):
 
 def test_an_answer_that_comes_too_late_is_none_and_yet_a_start(tracker, stages, clock):
     class Slow(Tracker):
-        def follow(self, cloud, last=None, how=FollowOptions(), seen=None, others=()):  # noqa: B008
+        def follow(self, cloud, last=None, how=FollowOptions(), seen=None, evidence=()):  # noqa: B008
             helped.append(last is not None)
             clock.sleep(21 if len(helped) == 1 else 0)
             return super().follow(cloud, last, how, seen)
@@ -346,9 +346,9 @@ def test_an_answer_that_comes_too_late_is_none_and_yet_a_start(tracker, stages, 
 
 def test_only_an_organ_found_good_a_moment_ago_may_have_been_turned_over(tracker, stages):
     class Watched(Tracker):
-        def follow(self, cloud, last=None, how=FollowOptions(), seen=None, others=()):  # noqa: B008
+        def follow(self, cloud, last=None, how=FollowOptions(), seen=None, evidence=()):  # noqa: B008
             asked.append(how.either_side)
-            found = super().follow(cloud, last, how, seen, others)
+            found = super().follow(cloud, last, how, seen, evidence)
             return replace(found, finding=None if verdicts.pop(0) == "good" else poor("hidden"))
 
     asked, verdicts = [], ["poor", "good", "poor", "poor", "poor", "poor"]

@@ -137,7 +137,7 @@ class Following(Follower):
     def last_box_mm(self, *_):
         return None
 
-    def locate(self, cloud, seen, others, way, evidence):
+    def locate(self, cloud, seen, evidence, way):
         self.given.append(evidence)
         if self.fails:
             raise NoEstimate("hidden")

@@ -65,8 +65,8 @@ class Located(Tracker):
     def __init__(self):  # no model
         self.asked = []
 
-    def follow(self, cloud, last=None, how=None, seen=None, others=()):
-        self.asked.append((last, others))
+    def follow(self, cloud, last=None, how=None, seen=None, evidence=()):
+        self.asked.append((last, evidence))
         estimate = small_estimate(cloud.stamp_ns)
         return replace(estimate, finding=None)
 

@@ -223,7 +223,7 @@ def _number(text: str, name: str, path: Path) -> str | float:
 
 def touched(
     evidence: Sequence[Evidence], organ: str
-) -> tuple[Float64[np.ndarray, "n 3"], list[Evidence]]:
+) -> tuple[Float64[np.ndarray, "n 3"], tuple[Evidence, ...]]:
     """Where the organ's surface was touched (camera frame, mm), and the rest. A tip's radius is
     taken off towards the middle of all touches. Raises InputError: there are too few."""
     mine = [each for each in evidence if isinstance(each, Touch) and each.part in ("", organ)]
@@ -236,7 +236,7 @@ def touched(
     inwards = places_mm.mean(0) - places_mm
     tips_mm = np.array([[each.tip_mm] for each in mine])
     places_mm += tips_mm * inwards / np.linalg.norm(inwards, axis=1, keepdims=True)
-    return places_mm, [each for each in evidence if each not in mine]
+    return places_mm, tuple(each for each in evidence if each not in mine)
 
 
 def evidence_json(evidence: tuple[Evidence, ...]) -> bytes:

@@ -96,9 +96,9 @@ class ViewsLocator:
             self.scan, self._published_from_last = None, lead.published_from_camera
             return estimate
         way = self._camera_from_last(lead)
-        others = _further_looks(lead, more)
         self.evidence = (*evidence, *self.tools.evidence(lead))
-        estimate = self._follower.locate(organ, lead.seen.content, others, way, self.evidence)
+        known = *_further_looks(lead, more), *self.evidence
+        estimate = self._follower.locate(organ, lead.seen.content, known, way)
         self.tools.located(lead, estimate)
         self._published_from_last = lead.published_from_camera
         self._follow_pick(lead, organ)
@@ -186,7 +186,7 @@ class Scan:
         looks = _further_looks(last, others)
         try:
             estimates = [
-                self._tracker.follow(cloud, seen=last.seen.content, others=looks[:n])
+                self._tracker.follow(cloud, seen=last.seen.content, evidence=looks[:n])
                 for n in range(SCAN_LOOKS)
             ]
         except NoEstimate as error:

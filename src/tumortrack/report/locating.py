@@ -103,8 +103,8 @@ def locate(given: Path, clouds: Sequence[Path], options: LocateOptions) -> Locat
             if view is views[0]:
                 seen = replace(seen, cloud=organ, taken=taken)
         looks = further_looks(organs, views, fixed_from_camera)
-        seen_by_all = views[0].content, looks, evidence
-        estimate = tracker.locate(organs[0], options.grid, options.seed, *seen_by_all)
+        known = views[0].content, (*looks, *evidence)
+        estimate = tracker.locate(organs[0], options.grid, options.seed, *known)
     except NoEstimate as error:
         about = {**_no_estimate(error, views[0], model, options), **about}
         return Located(None, about, seen, points, error)

@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 
+import msgspec
 import numpy as np
 from jaxtyping import Float64
 
@@ -73,18 +74,16 @@ class Tracker:
         grid: int = 160,
         seed: int = 0,
         seen: DepthFrame | SensorCloud | None = None,
-        others: Sequence[Look] = (),
-        evidence: Sequence[Evidence] = (),
+        evidence: Sequence[Evidence | Look] = (),
     ) -> Estimate:
         """The full estimate from one cloud; the same cloud and seed give the same result.
 
         Args:
             grid: voxels along the longest side of the dense volume.
             seen: all that the camera saw, by which the estimate is judged; default: the cloud.
-            others: further looks at the organ from other places, between which it did not move.
-            evidence: what else is known of where it lies then: ``Touch``, ``Landmark``, ``Held``,
-                ``Outline``, ``Free``, in the frame of ``cloud``, which may be empty: then of twelve
-                touches or more.
+            evidence: what else is known of where it lies then: each ``Look`` from another place,
+                ``Touch``, ``Landmark``, ``Held``, ``Outline``, ``Free``, in the frame of ``cloud``,
+                which may be empty: then of twelve touches or more.
 
         Raises:
             NoEstimate: too few points, no organ found in them, not the organ of this model, or the
@@ -98,12 +97,12 @@ class Tracker:
                 f"locate takes a SensorCloud, not {type(cloud).__name__}: read_cloud(FILE), or "
                 "SensorCloud(points_mm) of an n x 3 array in the camera frame."
             )
-        looks = Look(cloud, seen or cloud, HERE), *others
-        if not len(cloud.points_mm) and evidence:
-            places_mm, evidence = touched(evidence, self.model.parts[0])
+        looks, pieces = _parted(cloud, seen, evidence)
+        if not len(cloud.points_mm) and pieces:
+            places_mm, pieces = touched(pieces, self.model.parts[0])
             looks = (Look(replace(cloud, points_mm=places_mm), cloud, HERE),)
         with self._explaining_errors(looks, _DEFAULTS):
-            estimate = self._locator.locate(looks, grid, seed, evidence)
+            estimate = self._locator.locate(looks, grid, seed, pieces)
             estimate = self._judged(estimate, looks, False)
         return self._explained(estimate, looks, _DEFAULTS)
 
@@ -113,14 +112,16 @@ class Tracker:
         last: Estimate | None = None,
         how: FollowOptions = _DEFAULTS,
         seen: DepthFrame | SensorCloud | None = None,
-        others: Sequence[Look] = (),
+        evidence: Sequence[Evidence | Look] = (),
     ) -> Estimate:
         """A fast estimate for one frame of many: without a volume, from a search that starts at the
-        ``last`` estimate, if there is a recent one. Models that know no motion cannot smooth.
-        Raises as ``locate``."""
+        ``last`` estimate, if there is a recent one. ``evidence``: what is new with this frame.
+        Models that know no motion cannot smooth. Raises as ``locate``."""
         # A fit that is suddenly worse may be to another object.
         strictly = how.either_side if last is None else last.quality != "good" or not _unusual(last)
-        looks = Look(cloud, seen or cloud, HERE), *others
+        looks, pieces = _parted(cloud, seen, evidence)
+        if pieces:
+            how = msgspec.structs.replace(how, evidence=(*how.evidence, *pieces))
         with self._explaining_errors(looks, how):
             estimate = self._locator.follow(looks, last, how)
             estimate = self._judged(estimate, looks, strictly, last)
@@ -174,6 +175,15 @@ class Tracker:
     def warm(self) -> None:
         """Load and compile what the first call of ``follow`` would otherwise wait for."""
         self._locator.warm()
+
+
+def _parted(
+    cloud: SensorCloud, seen: DepthFrame | SensorCloud | None, evidence: Sequence[Evidence | Look]
+) -> tuple[tuple[Look, ...], tuple[Evidence, ...]]:
+    """All looks, the cloud's first, and the other evidence."""
+    further = [each for each in evidence if isinstance(each, Look)]
+    pieces = tuple(each for each in evidence if not isinstance(each, Look))
+    return (Look(cloud, seen or cloud, HERE), *further), pieces
 
 
 def _locator(model: Model) -> Locator:
@@ -264,14 +274,12 @@ class Follower:
         self,
         cloud: SensorCloud,
         seen: DepthFrame | SensorCloud | None = None,
-        others: Sequence[Look] = (),
+        evidence: Sequence[Evidence | Look] = (),
         camera_from_last: Affine = HERE,
-        evidence: Sequence[Evidence] = (),
     ) -> Estimate:
-        """The estimate of this frame. ``others``: further looks at the same time;
-        ``camera_from_last``: as in ``last_box_mm``; ``evidence``: what became known with this frame
-        (its camera frame), beside what was known before. Raises NoEstimate, as ``Tracker.follow``;
-        the last estimate is then dropped."""
+        """The estimate of this frame. ``evidence``: what became known with it, beside what was
+        known before; ``camera_from_last``: as in ``last_box_mm``. Raises NoEstimate, as
+        ``Tracker.follow``; the last estimate is then dropped."""
         last, self._last, self._at_rest = self._recent(cloud.stamp_ns), None, False
         if last is not None and camera_from_last is not HERE:
             last = _seen_from(last, camera_from_last)
@@ -287,10 +295,9 @@ class Follower:
             smoothing_s=self._config.smoothing_s,
             seed=self._config.seed,
             known=self._causes,
-            evidence=tuple(evidence),
         )
         try:
-            self._last = self._tracker.follow(cloud, last, how, seen, others)
+            self._last = self._tracker.follow(cloud, last, how, seen, evidence)
         except NoEstimate as error:
             if error.causes:
                 self._causes = {**self._causes, "none": error.causes}
