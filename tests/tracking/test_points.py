@@ -353,7 +353,7 @@ class Knowing:
     def __init__(self, model):
         pass
 
-    def locate(self, cloud, grid, seed, seen, others, evidence):
+    def locate(self, cloud, grid, seed, seen, evidence):
         Knowing.asked += 1
         return located(Wave(sure=True))
 
