@@ -139,6 +139,19 @@ def test_landmarks_tell_which_way_round_an_organ_lies():
     assert turned.looks.evidence is not None
 
 
+def test_what_cameras_errors_cost_stays_when_a_touch_is_left_out():
+    shifted = SEEN + [2.0, 0, 0]  # by a camera that is 2 mm off
+    away = tuple(np.array(at(BEHIND[0])) + [0, 0, 25.0])
+    costs = []
+    for evidence in ([], [Touch(place_mm=away)]):
+        known = EvidenceTerms.of([*this_way_round(), *evidence], NAMES)
+        looks = Looks.of([SEEN, shifted], [np.eye(4)], known)
+        kept, _ = method().bend(method().register(looks))
+        assert kept.looks.cost > 0.5
+        costs.append(kept.points_cost)
+    assert costs[1] == pytest.approx(costs[0], abs=0.2)
+
+
 @pytest.mark.parametrize(
     ("agree", "wrong", "decides"), [(4, 1, True), (8, 1, False), (9, 2, True), (10, 2, False)]
 )
@@ -328,6 +341,9 @@ def test_a_table_says_the_same(tmp_path):
         Outline(places_mm=((3.0, 4.0, 140.0), (5.0, 4.0, 139.0)), part="tumor_1"),
         Landmark(point_ct=(-41.0, 12.5, 88.0), place_mm=(20.0, 3.0, 133.0), stamp_ns=7),
     )
+    told = read_evidence(file)
+    file.write_bytes(b"\xef\xbb\xbf" + TABLE.encode())  # as spreadsheets write it
+    assert read_evidence(file) == told
     wrong = {
         "frame 'camera, robot'": TABLE.replace("1,camera", "1,robot"),
         "x_mm is 'far'": TABLE.replace("1.5,2", "far,2"),

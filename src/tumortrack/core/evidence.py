@@ -76,7 +76,7 @@ class _Evidence(Config, frozen=True, kw_only=True, tag_field="kind"):
         return self.places_mm if hasattr(self, "places_mm") else (self.place_mm,)  # type: ignore[attr-defined]
 
     def at(self, places_mm: Points, std_mm: float) -> Any:
-        """The same at other places, in another way sure; not checked again."""
+        """The same at other places, with another deviation; not checked again."""
         moved, places = copy(self), _tuples(places_mm)
         if hasattr(self, "places_mm"):
             msgspec.structs.force_setattr(moved, "places_mm", places)
@@ -152,7 +152,7 @@ def read_evidence(path: Path) -> tuple[Evidence, ...]:
     InputError: missing, another frame or unit, a value that is not allowed."""
     content = store.read_file(path, _LARGEST_FILE)
     if path.suffix.lower() == ".csv":
-        given = _table(content.decode(errors="replace"), path)
+        given = _table(content.decode("utf-8-sig", errors="replace"), path)
     else:
         try:
             given = json.loads(content)
@@ -235,7 +235,8 @@ def touched(
     places_mm = np.array([each.place_mm for each in mine])
     inwards = places_mm.mean(0) - places_mm
     tips_mm = np.array([[each.tip_mm] for each in mine])
-    places_mm += tips_mm * inwards / np.linalg.norm(inwards, axis=1, keepdims=True)
+    lengths_mm = np.linalg.norm(inwards, axis=1, keepdims=True)
+    places_mm += tips_mm * inwards / np.where(lengths_mm > 0, lengths_mm, 1.0)
     return places_mm, tuple(each for each in evidence if each not in mine)
 
 

@@ -109,7 +109,7 @@ class Registration:
             return fit, bent
         looks = replace(fit.looks, evidence=evidence.without(wrong))
         near = msgspec.structs.replace(self.config, first_mm=self.config.last_mm)
-        fits = [refine(self.rest, looks, each.motion, near) for each in (fit, *fit.others)]
+        fits = [self.follow(looks, each.motion, near) for each in (fit, *fit.others)]
         fit = likeliest(fits, self.prior)
         return fit, bend(fit, self.config)
 
