@@ -7,16 +7,19 @@ from dataclasses import replace
 import msgspec
 import numpy as np
 import pytest
+import trimesh
 from scipy.spatial import cKDTree
 
 from arm_objects import CREEPING_MRAD, bare, flange_pose, nearest_mm, organ, plan
 from tumortrack.core.errors import InputError, NoPlan
 from tumortrack.core.geometry import transform_points
+from tumortrack.core.types import Mesh
 from tumortrack_resection.arms import body, kinematics, trajectory
 from tumortrack_resection.arms.cell import ArmCell, Blocked, PlanningGroup
 from tumortrack_resection.arms.config import Base, CellConfig
 from tumortrack_resection.arms.paths import connect
 from tumortrack_resection.arms.procedure import plan_motions, search_bases
+from tumortrack_resection.arms.reach import ArmsReach
 from tumortrack_resection.motions import CUTTER, HOLDER, JOINTS
 from tumortrack_resection.values import Cut
 
@@ -412,3 +415,35 @@ def test_no_motion_creeps(monkeypatch):
     assert (speed <= 1.001 * speeds_rad_s).all()
     monkeypatch.setattr(trajectory, "_FINER", (1.0,))
     assert trajectory.along(path_rad, speeds_rad_s)[0][-1] > 100  # else this path shows nothing
+
+
+# What the tips can touch --------------------------------------------------------------------------
+
+FAR = Base(position_mm=(3000.0, 0.0, 100.0), yaw_deg=0.0)
+
+
+@pytest.mark.parametrize(
+    ("changes", "top", "side"),
+    [({}, True, True), ({"holder_base": FAR}, False, True), ({"cutter_base": FAR}, True, False)],
+)
+def test_the_cup_reaches_the_top_and_the_electrode_the_sides(changes, top, side):
+    """Of a ball on the post; nothing comes from below."""
+    ball = trimesh.creation.icosphere(4, 30.0)
+    surface = Mesh(ball.vertices + [0.0, 0, 150], ball.faces)
+    config = CellConfig(**changes)
+    reach = ArmsReach(config, surface, ArmCell(config).home_rad)
+    ways = np.array([[0.0, 0, 1], [1.0, 0, 0], [0, 1.0, 0], [0, 0, -1.0]])
+    middle = np.array([0.0, 0, 150])
+    reached = [reach(middle + 30.0 * way, way) for way in ways]
+    assert reached == [top, side, side, False]
+    assert not reach(middle + [0, 0, 1500.0], ways[0])
+
+
+def test_what_stands_in_the_way_is_not_reached():
+    surface = organ()
+    place = surface.vertices_mm[surface.vertices_mm[:, 2].argmax()]
+    up = np.array([0.0, 0, 1])
+    free, cell = CellConfig(), ArmCell(CellConfig())
+    assert ArmsReach(free, surface, cell.home_rad)(place, up)
+    there = _at_tip(cell, CUTTER, place + [0, 0, 60.0], 0.0)[0]  # the instrument hangs over it
+    assert not ArmsReach(free, surface, there)(place, up)

@@ -22,6 +22,7 @@ from tumortrack_resection.budget import ErrorBudget
 from tumortrack_resection.live_budget import LiveBudget
 from tumortrack_resection.motions import ABORTED, DONE, JOINTS, Execution, Motions, MotionStage
 from tumortrack_resection.operation import (
+    Following,
     Operation,
     OperationConfig,
     Planned,
@@ -180,9 +181,7 @@ class World:
             self.planned,
             config or OperationConfig(settled_s=0.2),
             lambda joints: (),
-            self.locate,
-            self.begin,
-            budget,
+            Following(self.locate, self.begin, budget),
         )
         self.now_s = 100.0
         self.shift = np.zeros(3)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from concurrent.futures import Future
 from dataclasses import replace
+from functools import partial
 
 import msgspec
 import numpy as np
@@ -30,8 +31,9 @@ from tumortrack.tracking.model_files import load_model
 from tumortrack.tracking.tracker import Tracker, region_for
 from tumortrack_devices.pulled import PulledStates
 from tumortrack_resection.arms.cell import ArmCell
-from tumortrack_resection.arms.config import CellConfig
+from tumortrack_resection.arms.config import Base, CellConfig
 from tumortrack_resection.arms.procedure import plan_motions
+from tumortrack_resection.arms.reach import ArmsReach
 from tumortrack_resection.budget import ErrorBudget
 from tumortrack_resection.files import PlanFolder, read_plan, write_plan
 from tumortrack_resection.grip import Grip, held_std_mm
@@ -46,12 +48,13 @@ from tumortrack_resection.motions import (
     Motions,
     MotionStage,
 )
-from tumortrack_resection.operation import Operation, OperationConfig, Planned
+from tumortrack_resection.operation import Following, Operation, OperationConfig, Planned
 from tumortrack_resection.values import ResectionConfig
 
 STATES = ("approach", "grasp", "hold", PULL, TAUT, "sweep 1", LIFT, "release", "home")
 GRIPPING = (PULL, TAUT, "sweep 1")
 PULL_MM = 4.0
+FAR = Base(position_mm=(5000.0, 0.0, 100.0), yaw_deg=0.0)
 LOCATED = located(n=2_000)
 FRAMES = PublishedFrame(
     "table", np.array([[1.0, 0, 0, 5.0], [0, -1, 0, -8.0], [0, 0, -1, 300.0], [0, 0, 0, 1]])
@@ -88,7 +91,7 @@ class Procedure:
         config = OperationConfig(settled_s=0.1)
         planned, grip = Planned(plan(), LOCATED.meshes, motions()), Grip(tip_mm, 1.2)
         draw = lambda joints: ()  # noqa: E731
-        self.operation = Operation(planned, config, draw, self.locate, replan, grip=grip)
+        self.operation = Operation(planned, config, draw, Following(self.locate, replan, grip=grip))
 
     def locate(self, update):
         meshes = {n: m.moved(m.vertices_mm + self.shift_mm) for n, m in LOCATED.meshes.items()}
@@ -290,6 +293,41 @@ def test_a_held_point_that_slipped_is_left_out_and_halts_the_arms(pulled):
     procedure.until("sweep 1")
     update = replace(seen(), estimate=estimate, quality=estimate.quality)
     assert procedure.frame(update).halt.kind == "slipped"
+
+
+def test_arms_that_stand_advise_touches_that_they_reach(pulled):
+    tracker, cloud, *_ = pulled
+    estimate, config = tracker.locate(cloud), CellConfig()
+    table_from_camera = FRAMES.published_from_camera
+    meshes = {
+        name: mesh.moved(transform_points(table_from_camera, mesh.vertices_mm))
+        for name, mesh in estimate.meshes.items()
+    }
+    home_rad = ArmCell(config).home_rad
+    still = np.arange(2.0), np.tile(home_rad, (2, 1)), np.zeros(2, bool)
+    standing = Motions(tuple(MotionStage(name, *still) for name in ("approach", "hold", LIFT)))
+
+    def operation(config):
+        live = Following(
+            lambda update: replace(LOCATED, meshes=meshes), reach=partial(ArmsReach, config)
+        )
+        return Operation(
+            Planned(plan(), meshes, standing), OperationConfig(), lambda joints_rad: (), live
+        )
+
+    update = replace(seen(), estimate=estimate)
+    acting = operation(config)
+    assert acting.act(update, 0.0).estimate.report.next_evidence == ()  # at work
+    advice = acting.act(replace(update, quality="poor"), 0.02).estimate.report.next_evidence
+    touches = [each for each in advice if each.kind == "touch"]
+    assert len(touches) == 3
+    reaches = ArmsReach(config, meshes["kidney"], home_rad)
+    for touch in touches:
+        place_mm = transform_points(table_from_camera, np.array([touch.place_mm]))[0]
+        assert reaches(place_mm, table_from_camera[:3, :3] @ touch.direction)
+    nowhere = operation(CellConfig(cutter_base=FAR, holder_base=FAR))
+    advice = nowhere.act(replace(update, quality="poor"), 0.0).estimate.report.next_evidence
+    assert {each.kind for each in advice} == {"outline", "look"}
 
 
 @pytest.mark.slow

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from tumortrack.core.types import SensorCloud as SensorCloud
     from tumortrack.imaging.case import Case as Case
     from tumortrack.tracking import presets as presets
+    from tumortrack.tracking.advice import advise as advise
     from tumortrack.tracking.tracker import Tracker as Tracker
 
 _NAMES = {  # by the module that has them
@@ -38,6 +39,7 @@ _NAMES = {  # by the module that has them
     "core.evidence": "Free Held Landmark Outline Touch",
     "core.types": "DepthFrame Intrinsics Look SensorCloud",
     "imaging.case": "Case",
+    "tracking.advice": "advise",
     "tracking.tracker": "Tracker",
     "tracking": "presets",
 }

@@ -12,6 +12,7 @@ from live_objects import ball
 
 # A name or a parameter that goes or changes its meaning breaks users' scripts: think twice.
 SIGNATURES = {
+    "advise": "estimate part reach=None",
     "describe": "path",
     "estimate_from_surfaces": "surfaces grid=160",
     "evaluate": "locate scenes report=None overwrite=False grid=160 seed=0 device='auto' "

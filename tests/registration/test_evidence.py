@@ -412,6 +412,10 @@ def test_the_command_takes_a_file_and_says_what_is_wrong_with_it(slim_model, tmp
     report = json.loads((out / "report.json").read_text())
     assert [each["name"] for each in report["evidence"]] == ["touch"] * 6
     assert len(report["evidence_sha256"]) == 64
+    advise = "--overwrite", "--advise"
+    said = answered(tumortrack(*command, "--evidence", file, *advise, "kidney"))
+    assert re.search(r"next, touch the organ at .*: kidney ", said)
+    assert "allowed: kidney, tumor_1" in refusal(tumortrack(*command, *advise, "cyst"))
     away = [{**content["evidence"][0], "place_mm": [0.0, 0.0, 400.0]}]
     file.write_text(json.dumps({**content, "evidence": away}))
     said = answered(tumortrack(*command, "--evidence", file, "--overwrite"))

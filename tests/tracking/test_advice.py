@@ -1,4 +1,4 @@
-"""What a poor estimate advises: towards the side that is not seen, or in doubt."""
+"""What an estimate advises: what to learn next of a part; towards the side that is not seen."""
 
 from __future__ import annotations
 
@@ -10,12 +10,13 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from reports import looked, report_of
+from tumortrack.core.errors import InputError
 from tumortrack.core.estimate import Estimate
 from tumortrack.core.geometry import rigid, transform_points
 from tumortrack.core.types import Look, Mesh, OccupancyCloud, SensorCloud
 from tumortrack.registration.advice import Advisor
 from tumortrack.registration.motion import ElasticMotion
-from tumortrack.tracking.advice import where_to_look
+from tumortrack.tracking.advice import advise, where_to_look
 from warp_objects import ANATOMY, shape
 
 CENTRE = np.array([20.0, -10.0, 180.0])
@@ -113,3 +114,35 @@ def test_a_touch_where_another_fit_differs_tells_most():
     best = Advisor(fit, 1).touches(1)[0]
     assert best.place_mm[0] < CENTRE[0] - 20  # towards the left end
     assert best.then_std_mm < 0.6 * best.std_mm
+
+
+def test_advice_is_for_the_part_asked_for_and_for_touches_within_reach():
+    fit = ElasticMotion(shape(), LYING, CENTRE, shape().body.mean)
+    found = estimate([0, 0, 1], motion=unsure_along(np.array([1.0, 0, 0]), fit))
+    anywhere, of_organ = advise(found, "tumor_1"), advise(found, "kidney")
+    assert {each.part for each in anywhere} == {"tumor_1"}
+    assert {each.part for each in of_organ} == {"kidney"}
+    kinds = [each.kind for each in anywhere]
+    assert kinds == ["touch", "touch", "touch", "outline", "look"]
+    asked, first = [], anywhere[0]
+
+    def reach(place_mm, normal):
+        assert np.linalg.norm(normal) == pytest.approx(1)
+        asked.append(place_mm)
+        return (place_mm[0] - CENTRE[0]) * (first.place_mm[0] - CENTRE[0]) < 0
+
+    other_side = advise(found, "tumor_1", reach)
+    assert asked[0] == pytest.approx(first.place_mm)  # the best of all is asked for first
+    sides = [each.place_mm[0] < CENTRE[0] for each in (first, *other_side[:3])]
+    assert sides == [sides[0], *[not sides[0]] * 3]
+    assert other_side[0].then_std_mm >= first.then_std_mm
+    assert [each.kind for each in advise(found, "tumor_1", lambda *_: False)] == kinds[3:]
+
+
+def test_advice_for_no_part_or_without_a_motion_is_refused():
+    fit = ElasticMotion(shape(), LYING, CENTRE, shape().body.mean)
+    found = estimate([0, 0, 1], motion=unsure_along(np.array([1.0, 0, 0]), fit))
+    with pytest.raises(InputError, match=r"no part 'cyst'.*allowed: kidney, tumor_1"):
+        advise(found, "cyst")
+    with pytest.raises(InputError, match="needs a model that knows a motion"):
+        advise(estimate([0, 0, 1]), "tumor_1")

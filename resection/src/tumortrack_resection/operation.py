@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping
 from concurrent.futures import Future
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
@@ -21,11 +21,14 @@ from scipy.spatial import cKDTree
 from tumortrack.core.colours import CUT, NOW, TO_CUT
 from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError, TumortrackError
+from tumortrack.core.estimate import Estimate
 from tumortrack.core.evidence import Evidence
-from tumortrack.core.geometry import Affine
+from tumortrack.core.geometry import Affine, transform_points
 from tumortrack.core.halt import CUT_NOTE, Halt
 from tumortrack.core.types import Mesh
 from tumortrack.live.values import Polyline, RigidShape, TrackingResult, Workcell
+from tumortrack.registration.advice import Place, Reach
+from tumortrack.tracking.advice import advise
 from tumortrack_resection.budget import MOVED_MM, kept_mm
 from tumortrack_resection.grip import Grip
 from tumortrack_resection.live_budget import LiveBudget
@@ -113,6 +116,30 @@ class ResectionProgress:
 Replan = Callable[[TrackingResult, Joints, ResectionProgress], "Future[Planned]"]
 Locate = Callable[[TrackingResult], Located]
 Draw = Callable[[Joints], tuple[RigidShape, ...]]
+# From the organ's surface (table frame) and where the arms stand: what their tips reach
+ReachOf = Callable[[Mesh, Joints], Reach]
+
+
+class Following(NamedTuple):
+    """What an operation that follows the organ needs.
+
+    Attributes:
+        locate: an update's estimate in the table's frame; None: estimates are ignored.
+        replan: begins a new plan in another process, so that the loop continues meanwhile.
+        budget: adds up the errors of every update; None: they are ignored.
+        grip: what the holder holds, as evidence of where the organ is; None: it gives none.
+        reach: touches are advised for the plan's tumor, where the arms can take them; None: as they
+            come.
+    """
+
+    locate: Locate | None = None
+    replan: Replan | None = None
+    budget: LiveBudget | None = None
+    grip: Grip | None = None
+    reach: ReachOf | None = None
+
+
+_UNSEEING = Following()
 
 
 class Operation:
@@ -121,10 +148,6 @@ class Operation:
     Args:
         planned: the plan to begin with.
         draw: arms, table and tools as shapes, from twelve joint angles.
-        locate: an update's estimate in the table's frame; None: estimates are ignored.
-        replan: begins a new plan in another process, so that the loop continues meanwhile.
-        budget: adds up the errors of every update; None: they are ignored.
-        grip: what the holder holds, as evidence of where the organ is; None: it gives none.
 
     Attributes:
         planned: the current plan.
@@ -137,15 +160,12 @@ class Operation:
         planned: Planned,
         config: OperationConfig,
         draw: Draw,
-        locate: Locate | None = None,
-        replan: Replan | None = None,
-        budget: LiveBudget | None = None,
-        grip: Grip | None = None,
+        live: Following = _UNSEEING,
     ) -> None:
         self.planned, self._config = planned, config
         self._warnings = planned.plan.warnings  # also of later plans: the budget stays accepted
-        self._draw, self._locate, self._replan = draw, locate, replan
-        self._budget, self._grip = budget, grip
+        self._draw = draw
+        self._locate, self._replan, self._budget, self._grip, self._reach = live
         self._execution = Execution(planned.motions)
         self._last_s: float | None = None
         self._first_s = 0.0
@@ -185,7 +205,27 @@ class Operation:
         if halt is not None and reason != self._counted:
             self.halts[halt.words_without_numbers] += 1
         self._counted = reason
-        return replace(update, workcell=self.workcell())
+        return replace(update, workcell=self.workcell(), estimate=self._advised(update))
+
+    def _advised(self, update: TrackingResult) -> Estimate | None:
+        """The estimate with advice that the arms can follow; with none while they are at work."""
+        estimate, execution = update.estimate, self._execution
+        if estimate is None or self._locate is None or self._reach is None:
+            return estimate
+        if not estimate.report.next_evidence or self.planned.plan.tumor not in estimate.meshes:
+            return estimate
+        if execution.halted is None or execution.grips:
+            return estimate.reporting(next_evidence=())
+        table_from_camera = update.published_frame.published_from_camera
+        organ = next(iter(self._locate(update).meshes.values()))
+        reaches = self._reach(organ, execution.joints_rad)
+
+        def reach(place_mm: Place, normal: Place) -> bool:
+            there_mm = transform_points(table_from_camera, place_mm[None])[0]
+            return reaches(there_mm, table_from_camera[:3, :3] @ normal)
+
+        advice = advise(estimate, self.planned.plan.tumor, reach)
+        return estimate.reporting(next_evidence=advice)
 
     def evidence(self, camera_from_published: Affine, stamp_ns: int) -> tuple[Evidence, ...]:
         """Where the holder has the tissue that it grips, in a frame of the camera."""

@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import fields, replace
+from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -49,7 +50,13 @@ from tumortrack_resection.grip import Grip, held_std_mm
 from tumortrack_resection.live_budget import LiveBudget
 from tumortrack_resection.located import of_estimate
 from tumortrack_resection.motions import Joints, Motions
-from tumortrack_resection.operation import Operation, OperationConfig, Planned, ResectionProgress
+from tumortrack_resection.operation import (
+    Following,
+    Operation,
+    OperationConfig,
+    Planned,
+    ResectionProgress,
+)
 from tumortrack_resection.options import ResectOptions
 from tumortrack_resection.planning import check_arms_installed
 from tumortrack_resection.ur_sink import UrSinkConfig
@@ -151,6 +158,7 @@ class ResectionSession:
         has moved. InputError: no ``live`` source was given. ``reel``, if it is one, gets all."""
         from tumortrack_resection.arms import procedure
         from tumortrack_resection.arms.cell import tip_places
+        from tumortrack_resection.arms.reach import ArmsReach
 
         stored, live, cell, frames = self.stored, self._live, self._cell, self.stored.frames
         if live is None:
@@ -182,9 +190,10 @@ class ResectionSession:
             warming_up.result()
             late_s = max((arm.lookahead_s for arm in self.arms), default=0.0)
             budget = LiveBudget(stored.budget, late_s)
+            reach = partial(ArmsReach, cell.config)
             grip = Grip(tip_places(cell.config), held_std_mm(stored.budget))
             self.operation = self._operation(
-                stored.plan, self._config, locate, replan, budget, grip
+                stored.plan, self._config, Following(locate, replan, budget, grip, reach)
             )
             source = live.source
             if isinstance(source, VirtualSourceConfig) and source.pulled is not None:
@@ -294,7 +303,9 @@ class ResectionSession:
         )  # fmt: skip
         return len(cells) / FPS
 
-    def _operation(self, plan: ResectionPlan, config: OperationConfig, *live: Any) -> Operation:
+    def _operation(
+        self, plan: ResectionPlan, config: OperationConfig, *live: Following
+    ) -> Operation:
         return Operation(
             Planned(plan, self.stored.meshes, self.motions), config, self._cell.shapes, *live
         )

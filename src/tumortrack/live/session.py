@@ -186,13 +186,15 @@ def session(
     named, tools = named_sinks(sinks), named_tools(options.tool)
     digest = {}
     if isinstance(model, Tracker):
+        if options.advise:
+            raise InputError("--advise is of a case or model; a Tracker has its own (advise=...).")
         tracker = model
         _check(setup, model.model.patient, "the model", options)
     else:
         folder = model_folder(model)
         _check(setup, patient_of(read_model_manifest(folder), folder), str(model), options)
         digest = {"model_sha256": store.sha256_of(folder / store.MANIFEST)}
-        tracker = Tracker(load_model(folder, options.device))
+        tracker = Tracker(load_model(folder, options.device), options.advise)
     if setup.still and tracker.anatomy_ct is None:
         raise InputError("--views needs a model that knows a motion: give the case itself.")
     config = _loop_config(options, tracker.model)

@@ -8,13 +8,14 @@ takes it. Rivals count as one more unknown each, with their share of the probabi
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, TypeAlias
 
 import numpy as np
 from jaxtyping import Float64
 
+from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import Points, triangles_of, turned_by, unit
 from tumortrack.core.report import NextEvidence
 from tumortrack.registration.config import GaussNewtonConfig
@@ -34,6 +35,15 @@ _NEAR_MM = 2.0  # of an outline's plane
 
 Place = Float64[np.ndarray, " 3"]
 Kind = Literal["touch", "outline", "landmark", "look"]
+# Whether a tool can touch the organ at a place, where its outward normal is this; camera frame, mm.
+Reach: TypeAlias = Callable[[Place, Place], bool]
+
+
+def part_number(part: str, parts: Sequence[str]) -> int:
+    """Raises InputError: there is no such part."""
+    if part not in parts:
+        raise InputError(f"there is no part {part!r} to advise on; allowed: {', '.join(parts)}.")
+    return parts.index(part)
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,17 +95,19 @@ class Advisor:
     part: int
     config: GaussNewtonConfig = _DEFAULTS
 
-    def touches(self, count: int = 3) -> tuple[NextEvidence, ...]:
-        """The best places of the organ's surface, each after those before it."""
+    def touches(self, count: int = 3, reach: Reach | None = None) -> tuple[NextEvidence, ...]:
+        """The best places of the organ's surface that a tool reaches, each after those before
+        it."""
         places_mm, normals = self._surface()
         rows, known, advised = self._rows(places_mm), self._known(), list[NextEvidence]()
         known = known.with_unknowns(_SHARED_MM**2 * np.ones(3))
         rows = np.concatenate([rows, rows[:, :3]], axis=1)
         free = np.ones(len(rows), bool)
-        for _ in range(count):
-            if not free.any():  # a small organ
-                break
+        while len(advised) < count and free.any():
             best = int(np.flatnonzero(free)[known.best(rows[free], _TOUCH_MM)])
+            if reach is not None and not reach(places_mm[best], normals[best]):
+                free[best] = False
+                continue
             then = known.after(rows[[best]], _TOUCH_MM)
             advised.append(self._entry("touch", places_mm[best], normals[best], known, then))
             known = then

@@ -20,7 +20,7 @@ from tumortrack.imaging.raster import label_grid
 from tumortrack.models.report import Frame, describe_parts, grid_over
 from tumortrack.registration import kernels
 from tumortrack.registration import report as entries
-from tumortrack.registration.advice import Advisor
+from tumortrack.registration.advice import Advisor, part_number
 from tumortrack.registration.bend import BentFit
 from tumortrack.registration.choose import likeliest
 from tumortrack.registration.evidence import EvidenceTerms, Known, still_known
@@ -107,10 +107,12 @@ class _Found(NamedTuple):
 
 
 class RegistrationLocator:
-    """Locates by ``Registration``; its estimates have a motion."""
+    """Locates by ``Registration``; its estimates have a motion. ``advise``: the part that advice is
+    for; empty: the tumor that is least sure. Raises InputError: there is no such part."""
 
-    def __init__(self, model: RegistrationModel) -> None:
+    def __init__(self, model: RegistrationModel, advise: str = "") -> None:
         self._model, self._shape, self._calibration = model, model.shape, model.calibration
+        self._advised = part_number(advise, model.parts) if advise else None
         self._registration = known = model.registration
         self._turned_over = replace(known, prior=replace(known.prior, either_side=True))
         self._near = msgspec.structs.replace(model.config.refine, first_mm=_MOVED_MM)
@@ -150,7 +152,7 @@ class RegistrationLocator:
         found = self._found(fit, prior=self._registration.prior, pieces=tuple(evidence))
         said, known = self._evidence_report(placed, found)
         if len(self._model.parts) > 1:
-            advisor = Advisor(placed.motion, placed.least_sure, self._registration.config)
+            advisor = self._advisor(placed)
             more["next_evidence"] = *advisor.touches(), *advisor.others()
         report = self._report(frame, looks, placed, inside, prior, evidence=said, **more)
         volume = CameraLabels(labels, camera_from_index)
@@ -175,11 +177,14 @@ class RegistrationLocator:
         more = {"size": size, "smoothing": smoothing, "evidence": said}
         if how.thorough and len(self._model.parts) > 1:
             with frame.stage("advise"):
-                advisor = Advisor(placed.motion, placed.least_sure, self._registration.config)
-                more["next_evidence"] = advisor.touches()
+                more["next_evidence"] = self._advisor(placed).touches()
         report = self._report(frame, looks, placed, inside, found.prior, **more)
         made = Estimate(inside, None, placed.meshes, report, placed.motion, found.shown)
         return replace(made, structures=placed.structures, evidence=known)
+
+    def _advisor(self, placed: _Placed) -> Advisor:
+        part = placed.least_sure if self._advised is None else self._advised
+        return Advisor(placed.motion, part, self._registration.config)
 
     def _evidence_report(
         self, placed: _Placed, found: _Found

@@ -85,7 +85,7 @@ def locate(given: Path, clouds: Sequence[Path], options: LocateOptions) -> Locat
     from tumortrack.tracking.tracker import Tracker
 
     model = load_model(folder, options.device)
-    tracker = Tracker(model)
+    tracker = Tracker(model, options.advise)
     about: dict[str, Any] = {
         "notes": _notes(views, points, tracker.anatomy_ct, options),
         "input": [],

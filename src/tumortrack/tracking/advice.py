@@ -1,4 +1,4 @@
-"""Advice for a poor estimate: from where the camera should look."""
+"""Advice: what to learn next, and for a poor estimate from where the camera should look."""
 
 from __future__ import annotations
 
@@ -7,10 +7,12 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Bool, Float
 
+from tumortrack.core.errors import InputError
 from tumortrack.core.estimate import Estimate
 from tumortrack.core.geometry import Points, transform_points, triangles_of
+from tumortrack.core.report import NextEvidence
 from tumortrack.core.types import Look, Mesh
-from tumortrack.registration.advice import Advisor
+from tumortrack.registration.advice import Advisor, Reach, part_number
 from tumortrack.registration.motion import ElasticMotion
 
 _MAX_SAMPLES = 2000  # faces or vertices of the organ that are looked at
@@ -18,6 +20,24 @@ _MIN_COSINE = 0.3  # to the line of sight: surfaces at a flatter angle return li
 _SEEN_WITHIN_MM = 8.0  # of an observed point
 _MAX_HIDDEN = 0.1  # share of the side that faces the camera
 _MIN_SINE = 0.3  # to the line of sight: below it, a direction is along the view
+
+
+def advise(estimate: Estimate, part: str, reach: Reach | None = None) -> tuple[NextEvidence, ...]:
+    """What to learn next of a part's place: the best three touches, each after those before it, and
+    the best outline, landmark and look from another side.
+
+    Args:
+        reach: says whether a tool can touch a place with this outward normal (camera frame, mm);
+            None: any place will do.
+
+    Raises:
+        InputError: the organ has no such part, or the model knows no motion.
+    """
+    motion = estimate.motion
+    if not isinstance(motion, ElasticMotion) or motion.covariance is None:
+        raise InputError("advice needs a model that knows a motion: give the case itself.")
+    advisor = Advisor(motion, part_number(part, motion.shape.anatomy_ct.names))
+    return *advisor.touches(reach=reach), *advisor.others()
 
 
 def where_to_look(estimate: Estimate, looks: Sequence[Look]) -> str:

@@ -82,6 +82,7 @@ class LocateOptions(RegionOptions):
             for each, in their order.
         evidence: JSON with what else is known of where the organ lies: touched points, landmarks,
             outlines (docs/evidence.md). Needs a model of preset clinic.
+        advise: part for which it says what to learn next (default: the tumor that is least sure).
         map: points of the CT to map to the camera frame (OUT/points.csv): a .csv with columns
             x,y,z (LPS, mm), or 3D Slicer's .mrk.json or .fcsv. Needs a model of preset clinic.
         case: the model's case; the page's slices then show its CT moved to the organ (preset
@@ -98,6 +99,7 @@ class LocateOptions(RegionOptions):
     depth_unit: float | None = None
     intrinsics: tuple[Path, ...] = ()
     evidence: Path | None = None
+    advise: str = ""
     map: Path | None = None
     case: Path | None = None
     device: Device = "auto"
@@ -131,6 +133,7 @@ class TrackOptions(CameraOptions):
             tool_from_camera.
         tool: NAME=KIND:..., a tool that touches or holds the organ, or outlines that are drawn
             (file:TABLE.csv, ur:HOST, ros2:TF_FRAME, openigtlink:HOST:PORT); repeatable.
+        advise: as for `locate`.
         scan: with --moving: begin with three looks at the organ at rest, 30 degrees apart, within
             5 s; tracking starts from all three together.
         smoothing: time constant in s of a mean over past estimates; the lag is in the report.
@@ -150,6 +153,7 @@ class TrackOptions(CameraOptions):
     poses: Path | None = None
     moving: str = ""
     tool: tuple[str, ...] = ()
+    advise: str = ""
     scan: bool = False
     smoothing: float = 0.0
     rescan: float = 1.0

@@ -47,10 +47,14 @@ class Tracker:
     """Locates the organ and tumors of a case, or of a model, in sensor clouds (camera frame, mm).
     A case without a model gets one first, which takes some seconds.
 
-    Its process keeps the memory that a frame frees for the next one.
+    Its process keeps the memory that a frame frees for the next one. ``advise``: the part that its
+    reports' ``next_evidence`` is for; empty: the tumor that is least sure.
+
+    Raises:
+        InputError: no model; the organ has no such part, or the model knows no motion.
     """
 
-    def __init__(self, model: Model | Case) -> None:
+    def __init__(self, model: Model | Case, advise: str = "") -> None:
         if isinstance(model, Case):
             model = case_model(model)
         if not isinstance(model, Model):
@@ -61,7 +65,7 @@ class Tracker:
         keep_small_blocks()
         self.model, self._patient, self._organ = model, model.patient, model.organ
         self._weakness = weakness_of(model.provenance)
-        self._locator = _locator(model)
+        self._locator = _locator(model, advise)
 
     @property
     def anatomy_ct(self) -> Anatomy | None:
@@ -186,9 +190,11 @@ def _parted(
     return (Look(cloud, seen or cloud, HERE), *further), pieces
 
 
-def _locator(model: Model) -> Locator:
+def _locator(model: Model, advise: str) -> Locator:
     if isinstance(model, RegistrationModel):
-        return RegistrationLocator(model)
+        return RegistrationLocator(model, advise)
+    if advise:
+        raise InputError("advice needs a model that knows a motion: give the case itself.")
     return method_of_config(model.config).locator(model)
 
 
