@@ -10,6 +10,7 @@ from dataclasses import replace
 import msgspec
 import numpy as np
 import pytest
+import trimesh
 
 from elastic_objects import CENTER, RADII
 from stories import answered, refusal, tumortrack
@@ -23,7 +24,7 @@ from tumortrack.core.evidence import (
     evidence_json,
     read_evidence,
 )
-from tumortrack.core.types import SensorCloud
+from tumortrack.core.types import Mesh, SensorCloud
 from tumortrack.registration.advice import Advisor
 from tumortrack.registration.evidence import EvidenceTerms, Known, still_known
 from tumortrack.registration.looks import Looks
@@ -31,7 +32,7 @@ from tumortrack.sense.ply import write_cloud_ply
 from tumortrack.tracking.margins import UNKNOWN, used_evidence
 from tumortrack.tracking.model_files import load_model
 from tumortrack.tracking.tracker import Follower, FollowerConfig, Tracker
-from warp_objects import ANATOMY, method, nudged, placed
+from warp_objects import ANATOMY, method, nudged, placed, shape
 
 NAMES = ANATOMY.names
 TRUE = placed(share=0.3)
@@ -125,6 +126,27 @@ def test_evidence_where_nothing_is_seen_brings_the_answer_nearer_and_makes_it_su
             assert narrow < 0.95 * wide
     assert mean_mm["touches"] < 0.9 * mean_mm["nothing"]
     assert off_mm(fitted([every_kind()[3]]).motion) < max(off_mm(alone.motion), 0.3)
+
+
+def test_a_closed_structure_is_touched_and_outlined_as_a_part_is():
+    ball = trimesh.creation.icosphere(3, 6.0)
+    artery = Mesh(ball.vertices + BEHIND[len(BEHIND) // 2], ball.faces)
+    open_one = Mesh(artery.vertices_mm, artery.faces[1:])
+    anatomy = replace(ANATOMY, structures={"artery": artery, "sheet": open_one})
+    assert tuple(anatomy.closed) == (*NAMES, "artery")
+    rest = replace(shape(), anatomy_ct=anatomy)
+    true = replace(TRUE, shape=rest)
+    told = Outline(places_mm=tuple(map(at, artery.vertices_mm[::40])), part="artery", std_mm=0.5)
+    terms = EvidenceTerms.of([told], tuple(anatomy.closed))
+    assert np.abs(terms.at(true).residuals_mm).max() < 0.3
+    registration, off = replace(method(), rest=rest), {}
+    for name, evidence in {"nothing": None, "artery": terms}.items():
+        motion = registration.register(Looks.of([SEEN], (), evidence)).motion
+        off_mm = motion.carry(artery.vertices_mm) - true.carry(artery.vertices_mm)
+        off[name] = np.linalg.norm(off_mm, axis=1).mean()
+    assert off["artery"] < 0.7 * off["nothing"]
+    with pytest.raises(InputError, match="'sheet'; this organ has kidney, tumor_1, artery"):
+        EvidenceTerms.of([Touch(place_mm=at(CENTER), part="sheet")], tuple(anatomy.closed))
 
 
 def this_way_round():

@@ -129,6 +129,12 @@ class Mesh:
         away, so that a distance of 5 mm to the surface is at most 0.1 mm too long."""
         return spread_over(self.vertices_mm, self.faces, longest_mm)
 
+    @cached_property
+    def closed(self) -> bool:
+        """Whether it has an inside: an even number of triangles meet at each edge."""
+        edges = np.sort(np.concatenate([self.faces[:, [n, (n + 1) % 3]] for n in range(3)]), axis=1)
+        return not (np.unique(edges, axis=0, return_counts=True)[1] % 2).any()
+
     def moved(self, vertices_mm: Float[np.ndarray, "v 3"]) -> Mesh:
         """The same triangles with other vertices (a deformation or a change of frame)."""
         return Mesh(vertices_mm, self.faces)
@@ -152,6 +158,12 @@ class Anatomy:
     def names(self) -> tuple[str, ...]:
         """See ``part_names``; mesh files have these names, too."""
         return part_names(len(self.parts), self.kind.name)
+
+    @cached_property
+    def closed(self) -> Mapping[str, Mesh]:
+        """By name: the parts, then those structures that are closed. What can be touched."""
+        parts = dict(zip(self.names, self.parts, strict=True))
+        return parts | {name: mesh for name, mesh in self.structures.items() if mesh.closed}
 
     def of(self, parts: Iterable[Mesh]) -> Anatomy:
         """The same organ with other surfaces, and no structures."""

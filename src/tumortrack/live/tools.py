@@ -107,7 +107,7 @@ class Tools:
     def _check(self, part: str) -> None:
         if self._context.anatomy_ct is None:
             raise InputError("it needs a model that knows a motion: give the case itself.")
-        if part and part not in (parts := self._context.parts):
+        if part and part not in (parts := self._context.touchable):
             raise InputError(f"there is no part {part!r}; this organ has {', '.join(parts)}.")
 
     def _give(self, name: str, pieces: Sequence[Evidence]) -> None:

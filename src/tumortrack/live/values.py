@@ -396,6 +396,11 @@ class SinkContext:
     tools: tuple[str, ...] = ()
 
     @property
+    def touchable(self) -> tuple[str, ...]:
+        """Names of parts and structures that can be touched and outlined."""
+        return self.parts if self.anatomy_ct is None else tuple(self.anatomy_ct.closed)
+
+    @property
     def structures(self) -> tuple[str, ...]:
         """Names of the structures that move with the organ."""
         return () if self.anatomy_ct is None else tuple(self.anatomy_ct.structures)

@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 import msgspec
 import numpy as np
 from jaxtyping import Float, Float32, Float64, Int64
+from scipy.linalg import cho_factor, cho_solve
 
 from tumortrack.core.mesh_kernels import farthest
 from tumortrack.registration.config import GaussNewtonConfig
@@ -150,12 +151,13 @@ class _Groups:
         for _ in range(_LINEAR_STEPS):
             roots = np.sqrt(self.weights) / (1 + (residuals_mm / self.width_mm) ** 2)
             system = roots[:, None] * explained * roots + np.eye(len(roots))
-            pulls = roots * np.linalg.solve(system, roots * self.at_mean_mm)
+            factor = cho_factor(system, lower=True, check_finite=False)
+            pulls = roots * cho_solve(factor, roots * self.at_mean_mm, check_finite=False)
             residuals_mm = self.at_mean_mm - explained @ pulls
         width_mm = _JUDGED_WIDTH * self.width_mm
         squares = (residuals_mm / width_mm) ** 2
         misfit = (width_mm**2 * self.weights) @ (squares / (1 + squares))
-        determinant = _DETERMINANTS * np.linalg.slogdet(system)[1]
+        determinant = _DETERMINANTS * 2 * np.log(np.diag(factor[0])).sum()
         return float(misfit + pulls @ explained @ pulls + determinant)
 
 

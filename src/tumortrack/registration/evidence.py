@@ -106,8 +106,8 @@ class EvidenceTerms:
 
     @classmethod
     def of(cls, evidence: Sequence[Evidence], parts: Sequence[str]) -> EvidenceTerms | None:
-        """``parts``: names of the organ's. None: there is none. Raises InputError: of a part that
-        the organ lacks."""
+        """``parts``: names of what can be touched (``Anatomy.closed``). None: there is no evidence.
+        Raises InputError: of a part that the organ lacks, or that is open."""
         surfaces, points = list[tuple[Any, ...]](), list[tuple[Any, ...]]()
         tools = dict[str, float]()
         for number, each in enumerate(evidence):
@@ -203,11 +203,11 @@ class EvidenceTerms:
         """For a report: all ``evidence``, of which this is what was not left out, with its
         ``terms``; the first pieces came ``before`` this frame."""
         assert motion.covariance is not None
-        every, kept = self, set(self.piece.tolist())
+        anatomy_ct, kept = motion.shape.anatomy_ct, set(self.piece.tolist())
         if len(kept) < len(evidence):
-            whole = EvidenceTerms.of(evidence, motion.shape.anatomy_ct.names)
+            whole = EvidenceTerms.of(evidence, tuple(anatomy_ct.closed))
             assert whole is not None
-            every, terms = whole, whole.at(motion)
+            terms = whole.at(motion)
         known = ((terms.by_motion @ motion.covariance) * terms.by_motion).sum(1)
         starts = np.unique(terms.piece, return_index=True)[1]  # rows of a piece are neighbours,
         order = np.argsort(starts)  # landmarks' after all others'
@@ -219,8 +219,8 @@ class EvidenceTerms:
         for number, each in enumerate(evidence):
             off = float(off_mm[number])
             if number not in kept and isinstance(each, Touch | Outline):  # perhaps beyond the field
-                part = motion.shape.anatomy_ct.parts[every.part[every.piece == number][0]]
-                off = float(surface_distance(part, motion.back(np.array(each.places))).max())
+                surface = anatomy_ct.closed[each.part or anatomy_ct.names[0]]
+                off = float(surface_distance(surface, motion.back(np.array(each.places))).max())
             told.append(
                 EvidenceReport(
                     name=each.name,

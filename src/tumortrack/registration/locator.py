@@ -119,6 +119,7 @@ class RegistrationLocator:
         anatomy = model.shape.anatomy_ct
         self.anatomy_ct: Anatomy | None = anatomy
         vertices = [part.vertices_mm for part in anatomy.parts]
+        self._touchable = tuple(anatomy.closed)
         self._surfaces = (*anatomy.parts, *anatomy.structures.values())
         together = np.concatenate([mesh.vertices_mm for mesh in self._surfaces])
         self._vertices_ct = together.astype(np.float32)
@@ -137,7 +138,7 @@ class RegistrationLocator:
         alone = isinstance(looks[0].seen, SensorCloud) and not len(looks[0].seen.points_mm)
         fewest = FEWEST_TOUCHES if alone else FEWEST_POINTS
         frame = Frame(self._model, cloud, seed, np.random.default_rng(seed), fewest)
-        points = self._points(frame, looks, evidence=EvidenceTerms.of(evidence, self._model.parts))
+        points = self._points(frame, looks, evidence=EvidenceTerms.of(evidence, self._touchable))
         fit = self._registration.register(points, None, frame.stage)
         fit, bent = self._bent(fit, frame)
         size, placed = self._size(fit), self._checked(fit, bent, frame)
@@ -221,9 +222,9 @@ class RegistrationLocator:
         """The fit near the last motion and its rivals; of a search, where there is no last motion,
         or that fit is doubtful."""
         method = self._turned_over if how.either_side else self._registration
-        start, parts = None if last is None else last.unsmoothed, self._model.parts
+        start = None if last is None else last.unsmoothed
         if last is None or not isinstance(start, ElasticMotion):
-            looks = replace(looks, evidence=EvidenceTerms.of(how.evidence, parts))
+            looks = replace(looks, evidence=EvidenceTerms.of(how.evidence, self._touchable))
             fit = method.register(looks, None, frame.stage)
             return self._found(fit, method.prior, how.evidence)
         with frame.stage("follow"):
@@ -232,7 +233,7 @@ class RegistrationLocator:
             shown = fits[0].motion
             before, pieces = still_known(last.evidence, shown)
             pieces += how.evidence
-            looks = replace(looks, evidence=EvidenceTerms.of(pieces, parts))
+            looks = replace(looks, evidence=EvidenceTerms.of(pieces, self._touchable))
             fits = [fit.beside(looks.evidence) for fit in fits]
         fit, usual = likeliest(fits, method.prior), self._calibration.usual_cost * looks.count
         doubtful = fit.points_cost > usual or apart_mm(fit.motion, start) > _JUMP_MM
@@ -285,6 +286,8 @@ class RegistrationLocator:
         looks = Looks.of([points])
         fit = self._registration.best_fit(looks, [*self._registration.search.starts(looks), rest])
         self._carry(self._moved(*self._registration.bend(fit)), 0)
+        for surface in range(len(self._touchable)):
+            self._shape.field(surface)
 
     def _size(self, fit: RegistrationResult) -> SizeFit:
         times, gain = apparent_size(fit.motion, fit.looks, self._registration.config)

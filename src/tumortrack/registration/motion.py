@@ -117,13 +117,13 @@ class ElasticMotion:
         kernels.effects(self._flow, body.modes, body.center_ct, points, out)
         return out
 
-    def residual_rows(self, points_camera: Points, part: int = 0) -> Float32[np.ndarray, "n q"]:
+    def residual_rows(self, points_camera: Points, surface: int = 0) -> Float32[np.ndarray, "n q"]:
         """What shift, turn and coefficients each do to the signed distance (mm) of points, carried
-        back, to the surface of a part at rest (the organ's); that distance last."""
+        back, to a surface at rest (the organ's; see ``RestShape.field``); that distance last."""
         body, points = self.shape.body, np.array(points_camera, np.float32, order="C")
         pose = Pose(body.center_ct, self.rotation, self.centre_mm)
         out = np.empty((len(points), kernels.POSE + len(self.coefficients) + 1), np.float32)
-        distances = self.shape.distances[part]
+        distances = self.shape.field(surface)
         kernels.residual_rows(body.modes, distances, self._opposite, pose, points, out)
         return out
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 from jaxtyping import Float32, Float64, UInt8
@@ -38,6 +38,9 @@ def distance_of(mesh: Mesh) -> DistanceField:
     return DistanceField(values, origin.astype(np.float32), step)
 
 
+_kept_distance_of = lru_cache(maxsize=32)(distance_of)  # of structures, which few touch
+
+
 @dataclass(frozen=True, eq=False)
 class RestShape:
     """The organ at rest (CT frame, LPS mm): ``distances`` has one field per part."""
@@ -61,6 +64,12 @@ class RestShape:
         """Of each part's box."""
         return np.array([part.box_mm.mean(0) for part in self.anatomy_ct.parts])
 
+    def field(self, surface: int) -> DistanceField:
+        """Distances to a part, or to a structure: by its number in ``Anatomy.closed``."""
+        if surface < len(self.distances):
+            return self.distances[surface]
+        return _kept_distance_of(list(self.anatomy_ct.closed.values())[surface])
+
     def labels_at(
         self, points_ct: Float32[np.ndarray, "n 3"]
     ) -> tuple[UInt8[np.ndarray, " n"], Float32[np.ndarray, " n"]]:
@@ -76,11 +85,11 @@ class RestShape:
         parallel_for(mark_part, len(points_ct), _AT_ONCE)
         return labels, margin_mm
 
-    def distances_mm(self, points_ct: Float64[np.ndarray, "n 3"], part: int) -> np.ndarray:
-        """Of points to a part's surface, negative inside; right near it."""
+    def distances_mm(self, points_ct: Float64[np.ndarray, "n 3"], surface: int) -> np.ndarray:
+        """Of points to a surface (see ``field``), negative inside; right near it."""
         points, inside = points_ct.astype(np.float32), np.zeros(len(points_ct), np.uint8)
         away_mm = np.full(len(points), np.finfo(np.float32).max)
-        mark(self.distances[part], np.uint8(1), points, inside, away_mm)
+        mark(self.field(surface), np.uint8(1), points, inside, away_mm)
         return np.where(inside, -away_mm, away_mm)
 
     def to_arrays(self) -> dict[str, np.ndarray]:

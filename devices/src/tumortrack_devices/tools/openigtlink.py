@@ -152,7 +152,7 @@ class OpenIgtLinkTool(TipTool):
             self._draw((device, -1), Outline, places_mm, {"part": self._part(device)})
 
     def _part(self, *names: str) -> str:
-        parts = self.context.parts
+        parts = self.context.touchable
         if (part := next((one for one in names if one in parts), None)) is None:
             raise igtl.ProtocolError(
                 f"{names[0]!r} is drawn, which is no part; name it as what it lies on: "

@@ -93,8 +93,8 @@ class TipTool(Tool):
     ) -> None:
         super().__init__()
         self.config, self.context, self.name = config, context, name
-        if config.part and config.part not in context.parts:
-            parts = ", ".join(context.parts)
+        if config.part and config.part not in context.touchable:
+            parts = ", ".join(context.touchable)
             raise InputError(f"there is no part {config.part!r}; this organ has {parts}.")
         published = context.published_frame
         if frame_id == "" and not published.calibrated:
