@@ -73,7 +73,8 @@ def arm(browser: Browser) -> int:
 def test_page_in_a_browser(monkeypatch):
     # A feed that a loaded machine holds up for seconds isn't stale yet.
     monkeypatch.setattr("tumortrack_devices.sinks.viewer._STALE_S", 5.0)
-    setting = replace(small_setting(), published_frame=ROBOT, arms=True)
+    tools = "probe", "grasper"
+    setting = replace(small_setting(), published_frame=ROBOT, arms=True, tools=tools)
     sink = ViewerSinkConfig(port=0).open(setting)
     shown = small_update(frames=ROBOT)
     hidden = replace(empty_update(reason="only 12 points lie in range"), published_frame=ROBOT)
@@ -104,6 +105,7 @@ def test_page_in_a_browser(monkeypatch):
             until(lambda: tumor(browser) > 700, "the tumor again")
 
             check_click(browser, setting)
+            check_keys(browser, setting)
             check_arms(browser, feed, shown, setting)
 
             feed.update = None  # type: ignore[assignment]
@@ -162,6 +164,23 @@ def check_click(browser: Browser, setting: SinkContext) -> None:
     until(lambda: "Forget" in browser.text(), "the way back")
     browser.click_text("Forget")
     until(lambda: setting.controls.picked_mm is None, "forgetting")
+
+
+def check_keys(browser: Browser, setting: SinkContext) -> None:
+    """A key does what its button does: once however long it is held, and not while typing."""
+
+    def told(*tools: str) -> None:
+        touched = setting.controls.touched
+        until(lambda: [*touched] == [*tools], f"{tools}, not {touched}")
+
+    browser.press("2", times=3)
+    told("grasper")
+    browser.press("1")
+    told("grasper", "probe")
+    browser.call("Runtime.evaluate", expression="document.querySelector('[type=text]').focus()")
+    browser.press("2")
+    browser.click_text("probe (key 1)")
+    told("grasper", "probe", "probe")
 
 
 LONGEST = (
