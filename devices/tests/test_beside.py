@@ -152,6 +152,18 @@ def test_the_viewer_shows_them_where_they_are_unless_they_are_switched_off():
         assert not any(label.visible for label in labels)
 
 
+def test_a_place_behind_a_tumor_has_no_label():
+    sink = ViewerSinkConfig(port=0).open(replace(small_setting(), published_frame=ROBOT))
+    with closing(sink):
+        update, place_mm = told(), published(POINTS_CT, NOW)[0]
+        sink._scene.beside.update(update)
+        tumor_mm = update.transformed.meshes["tumor_1"].box_mm.mean(0)
+        for share, bare in ((2.0, False), (-1.0, True)):  # beyond the tumor; on this side
+            sink._scene.look._eye_mm = place_mm + share * (tumor_mm - place_mm)
+            sink._scene.show(update)
+            assert sink._server.scene.get_handle_by_name("/estimate/next_0").visible is bare
+
+
 def test_ros_has_them_as_spheres_with_texts_and_in_words():
     results = ResultMessages(Messages("humble"), small_setting())
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import gc
 import socket
 import threading
@@ -384,10 +385,11 @@ def test_a_button_says_that_a_tool_touches_and_the_panel_how_much_is_known(sinks
     setting = replace(small_setting(), tools=("probe", "grasper"))
     sink = sinks(setting, hz=60)
     button = sink._panel.touches
-    assert button.options == ("probe", "grasper")
+    probe, grasper = button.options
     (clicked,) = button._impl.update_cb
-    for client, name in ((None, "probe"), (object(), "grasper")):  # no client: set by the program
-        clicked(SimpleNamespace(client=client, target=SimpleNamespace(value=name)))
+    # No client: set by the program.
+    for client, label in ((None, probe), (object(), grasper), (object(), "scissors")):
+        asyncio.run(clicked(SimpleNamespace(client=client, target=SimpleNamespace(value=label))))
     assert [*setting.controls.touched] == ["grasper"]
     said = [
         EvidenceReport(name="touch", off_mm=0.1, news=0.2, left_out=out) for out in (False, True)

@@ -22,6 +22,7 @@ from scipy.spatial.transform import Rotation
 from browser import Browser, of_first_tumor
 from clock import until
 from live_objects import empty_update, small_setting, small_update
+from reports import reporting
 from stories import COMMAND, environment, live_resection
 from tumortrack.core.geometry import rigid, transform_points
 from tumortrack.live.values import PublishedFrame, SinkContext, TrackingResult
@@ -73,7 +74,8 @@ def arm(browser: Browser) -> int:
 def test_page_in_a_browser(monkeypatch):
     # A feed that a loaded machine holds up for seconds isn't stale yet.
     monkeypatch.setattr("tumortrack_devices.sinks.viewer._STALE_S", 5.0)
-    setting = replace(small_setting(), published_frame=ROBOT, arms=True)
+    tools = "probe", "grasper"
+    setting = replace(small_setting(), published_frame=ROBOT, arms=True, tools=tools)
     sink = ViewerSinkConfig(port=0).open(setting)
     shown = small_update(frames=ROBOT)
     hidden = replace(empty_update(reason="only 12 points lie in range"), published_frame=ROBOT)
@@ -104,6 +106,7 @@ def test_page_in_a_browser(monkeypatch):
             until(lambda: tumor(browser) > 700, "the tumor again")
 
             check_click(browser, setting)
+            check_keys(browser, setting)
             check_arms(browser, feed, shown, setting)
 
             feed.update = None  # type: ignore[assignment]
@@ -164,6 +167,23 @@ def check_click(browser: Browser, setting: SinkContext) -> None:
     until(lambda: setting.controls.picked_mm is None, "forgetting")
 
 
+def check_keys(browser: Browser, setting: SinkContext) -> None:
+    """A key does what its button does: once however long it is held, and not while typing."""
+
+    def told(*tools: str) -> None:
+        touched = setting.controls.touched
+        until(lambda: [*touched] == [*tools], f"{tools}, not {touched}")
+
+    browser.press("2", times=3)
+    told("grasper")
+    browser.press("1")
+    told("grasper", "probe")
+    browser.call("Runtime.evaluate", expression="document.querySelector('[type=text]').focus()")
+    browser.press("2")
+    browser.click_text("probe (key 1)")
+    told("grasper", "probe", "probe")
+
+
 LONGEST = (
     "tumor_1 may as well lie 14.3 mm away: the points fit there too; another patient's organ, or "
     "another frame: the camera's axes are x right, y down, z forward; look from another side, "
@@ -173,10 +193,13 @@ LONGEST = (
 
 @pytest.mark.slow
 def test_banner_and_panel_leave_room_for_each_other_at_every_size():
-    """On a phone, a laptop and a large screen, with a reason longer than any."""
+    """On a phone, a laptop and a large screen, with a reason longer than any. What lies below the
+    numbers does not jump."""
     shown = small_update()
+    sure = {name: {"center_std_mm": 1.1, "miss_mm": 1.9} for name in ("tumor_1", "tumor_2")}
+    touch = {"name": "touch", "off_mm": 0.1, "news": 0.2, "left_out": False}
     states = {
-        "GOOD": shown,
+        "GOOD": replace(shown, estimate=reporting(shown.estimate, parts=sure, evidence=[touch])),
         "POOR": replace(shown, quality="poor", warning=LONGEST),
         "NONE": replace(shown, estimate=None, quality="none", reason=LONGEST),
     }
@@ -187,9 +210,12 @@ def test_banner_and_panel_leave_room_for_each_other_at_every_size():
             browser.open(sink.url)
             for width, height in ((390, 844), (1440, 900), (3840, 2160)):
                 browser.resize(width, height)
+                heights = set()
                 for word, feed.update in states.items():
                     until(partial(says, browser, word, "tumor 1"), f"{word} at {width}")
                     check_room(browser, width, height)
+                    heights.add(round(browser.box("#tumortrack-numbers")[3]))
+                assert len(heights) == 1
                 assert LONGEST in browser.text()
                 assert "STALE" not in browser.text()
         finally:

@@ -147,6 +147,13 @@ class Browser:
                 clickCount=0 if kind == "mouseMoved" else 1,
             )
 
+    def press(self, key: str, times: int = 1) -> None:
+        """Press a key, which the keyboard repeats while it is held."""
+        for number in range(times):
+            about = {"key": key, "text": key, "autoRepeat": number > 0}
+            self.call("Input.dispatchKeyEvent", type="keyDown", **about)
+        self.call("Input.dispatchKeyEvent", type="keyUp", key=key)
+
     def click_text(self, text: str) -> None:
         """Click the middle of the button that says this, rather than of one that says more."""
         script = f"""(() => {{ const says = [...document.querySelectorAll('button')].filter(

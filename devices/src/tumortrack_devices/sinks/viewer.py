@@ -127,9 +127,10 @@ class ViewerSink:
         if self._context.tools:
 
             @panel.touches.on_click
-            def _(event: GuiEvent[Any]) -> None:
-                if event.client is not None:  # else set by the program
-                    self._context.controls.touched.append(event.target.value)
+            async def _(event: GuiEvent[Any]) -> None:  # at once: the next press changes the value
+                tool = panel.tools.get(event.target.value)
+                if tool and event.client is not None:  # else set by the program
+                    self._context.controls.touched.append(tool)
 
         if self._context.arms:
             panel.abort.on_click(lambda _: self._abort())

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from jaxtyping import Float
 
 from tumortrack.core.geometry import Affine, unit
+from tumortrack.core.mesh_query import contains
 from tumortrack.core.types import Mesh
 from tumortrack.live.values import Workcell
 
@@ -27,6 +29,7 @@ _NEAR_MM, _FAR_MM = 0.5, 20_000.0  # viser draws its background 1 before the eye
 # In the camera's frame: one above and left of the camera, a weaker one behind the organ.
 _LIGHTS = (("/light", 2.6, (-60.0, -120.0, -130.0)), ("/light_behind", 1.5, (60.0, -120.0, 130.0)))
 
+_STEP_MM = 1.0  # along a line of sight: a tumor is thicker
 _SAME_MM = 2.0  # of points this near the ray the foremost is meant
 _MISSED_MM = 10.0
 
@@ -110,6 +113,14 @@ class Viewpoint:
         half = np.abs(surface.vertices_mm - self._eye_mm).max(0)
         corners = [self._eye_mm - half, self._eye_mm + half]
         return Mesh(np.concatenate([surface.vertices_mm, corners]), surface.faces)
+
+    def hidden(self, place_mm: Float[np.ndarray, " 3"], behind: Iterable[Mesh]) -> bool:
+        """Whether a closed surface lies between a place and the eye of the visitor who moved
+        last."""
+        way_mm = self._eye_mm - place_mm
+        steps_mm = np.arange(_STEP_MM, np.linalg.norm(way_mm), _STEP_MM)
+        line_mm = place_mm + steps_mm[:, None] * unit(way_mm)
+        return any(contains(surface, line_mm).any() for surface in behind)
 
     def _follow(self, client: ClientHandle) -> None:
         def moved(camera: CameraHandle) -> None:

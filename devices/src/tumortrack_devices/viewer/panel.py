@@ -163,7 +163,7 @@ class StatusPanel:
             f"<div class='tumortrack-numbers'>{parts}"
             f"<div class='tumortrack-row'><span>latency <b>{latency}</b></span>"
             f"<span>last frame <b>{self.age_s:.1f} s</b> ago</span></div>"
-            f"<div>{escape(result.beside)}</div></div>"
+            f"<div class='tumortrack-beside'>{escape(result.beside)}</div></div>"
         )
 
     def _parts(self, report: FitReport) -> str:
@@ -238,9 +238,14 @@ class Panel:
         gui.add_html('<div id="tumortrack-numbers"></div>')
         if arms:
             self.views = gui.add_button_group("Look at", get_args(View))
+        # By its button's label, which status.html looks for when such a key is pressed.
+        keys = [f" (key {n})" if n < 10 else "" for n in range(1, len(tools) + 1)]
+        self.tools = {tool + key: tool for tool, key in zip(tools, keys, strict=True)}
         if tools:
             self.touches = gui.add_button_group(
-                "It touches", tools, hint="This tool's tip touches now; or holds, or lets go"
+                "It touches",
+                tuple(self.tools),
+                hint="This tool's tip touches now; or holds, or lets go",
             )
         self.slice = None
         default = DisplayOptions()

@@ -6,7 +6,7 @@ not overlap: the sink holds a lock.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, Literal
@@ -77,6 +77,7 @@ class ViewerScene:
         self.beside = Beside()  # the sink keeps it up to date
         self.margins: dict[str, Mesh] = {}  # of the shown estimate, published frame
         self._shown: tuple[TrackingResult, TransformedEstimate] | None = None
+        self._in_sight = list[bool]()  # of places to touch next: no tumor is in front
         self._has_organ = self._has_slice = self._clickable = False
         self.look = Viewpoint(server, self._pose)
         self._make_nodes(context)
@@ -192,7 +193,8 @@ class ViewerScene:
         for nodes, surfaces in (*groups, (self._structures, estimate.structures)):
             for name, node in nodes.items():
                 _put_mesh(node, surfaces.get(name, _NOTHING))
-        self._put_beside(self.beside)
+        tumors = [mesh for name, mesh in estimate.meshes.items() if name != self._name]
+        self._put_beside(self.beside, tumors)
         self._shown = result, estimate
         self.apply()
 
@@ -230,8 +232,8 @@ class ViewerScene:
             node.visible = options.structures
         for spots in self._spots.values():
             spots.visible = options.evidence
-        for label in self._labels:
-            label.visible = options.evidence and bool(label.text)
+        for label, in_sight in zip(self._labels, self._in_sight, strict=False):
+            label.visible = options.evidence and in_sight
         self._parts[self._name].opacity = options.organ
         self._points.visible = options.points != "none"
         self._slice.visible = options.slice_plane and self._has_slice
@@ -326,8 +328,9 @@ class ViewerScene:
         self._points.points = estimate.points_mm[some].astype(np.float32)
         self._points.colors = colours.label_colours(estimate.labels[some])
 
-    def _put_beside(self, beside: Beside) -> None:
-        """What to touch next, and the evidence; their labels are made visible by ``apply``."""
+    def _put_beside(self, beside: Beside, tumors: Sequence[Mesh] = ()) -> None:
+        """What to touch next, and the evidence; their labels are made visible by ``apply``. A label
+        is drawn over everything: that of a place behind a tumor is left out."""
         touches = beside.touches[: len(self._labels)]
         places = {
             "next": np.reshape([touch.place_mm for touch in touches], (-1, 3)),
@@ -336,8 +339,9 @@ class ViewerScene:
         }
         for name, places_mm in places.items():
             self._spots[name].points = places_mm.astype(np.float32)
+        self._in_sight = [not self.look.hidden(touch.place_mm, tumors) for touch in touches]
         for label in self._labels[len(touches) :]:
-            label.text, label.visible = "", False
+            label.visible = False
         for label, touch in zip(self._labels, touches, strict=False):
             label.text, label.position = touch.label, touch.place_mm
 
