@@ -356,7 +356,7 @@ def test_only_an_organ_found_good_a_moment_ago_may_have_been_turned_over(tracker
     for seconds in (0, 1, 2, 30, 32, -5):
         stamp_ns = 10**15 + seconds * 10**9
         follower.locate(SensorCloud(stages[0].cloud.points_mm, stamp_ns))
-        follower.forget()  # it was out of sight
+        follower.lose()  # it was out of sight
     assert asked == [False, False, True, True, False, False]
 
 

@@ -14,7 +14,7 @@ import trimesh
 
 from elastic_objects import CENTER, RADII
 from stories import answered, refusal, tumortrack
-from tumortrack.core.errors import InputError
+from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.evidence import (
     Free,
     Held,
@@ -250,6 +250,31 @@ def test_what_was_touched_once_counts_while_the_organ_moves(slim_model):
         went_mm = np.linalg.norm(by_now - [piece.places[0] for piece in evidence], axis=1)
         assert went_mm == pytest.approx(16, abs=5)
     assert off_mm["touches"] < 0.9 * off_mm["nothing"] < 3
+
+
+@pytest.mark.parametrize(("away_s", "known"), [(5.0, 14), (70.0, 0)])
+def test_what_was_touched_is_still_known_when_the_organ_is_seen_again(slim_model, away_s, known):
+    follower = Follower(Tracker(load_model(slim_model, "cpu")), FollowerConfig())
+    evidence = [*this_way_round(), *touches(12)]
+    before, *_, after = drifting()
+    follower.locate(stamped(sides(before), 0), evidence=evidence)
+    hand = SensorCloud(np.full((30, 3), 100.0), stamp_ns=int(1e9))
+    with pytest.raises(NoEstimate):
+        follower.locate(hand)
+    follower.lose()
+    cloud = replace(stamped(sides(after), 0), stamp_ns=int(away_s * 1e9))
+    found = follower.locate(cloud)
+    assert len(found.report.evidence) == known
+    assert all(each.before for each in found.report.evidence)
+    by_now = [np.array(each.places_mm[0]) for each in found.report.evidence]
+    went_mm = [
+        np.linalg.norm(b - piece.places[0])
+        for b, piece in zip(by_now, evidence[:known], strict=True)
+    ]
+    assert went_mm == pytest.approx([16] * known, abs=5)  # as the tissue did
+    follower.forget()
+    again = replace(cloud, stamp_ns=cloud.stamp_ns + int(1e8))
+    assert follower.locate(again).report.evidence == ()
 
 
 def test_touched_places_are_carried_as_the_tissue_goes():

@@ -64,7 +64,8 @@ class FollowOptions(Config, frozen=True, kw_only=True):
     ``either_side``: the organ may have been turned over. ``smoothing_s``: time constant of the mean
     over past estimates; 0: none. ``known``: recent causes by failed check (``none``: no estimate),
     which are not searched for again. ``evidence``: what became known with this frame, in its camera
-    frame; what was known before is in the last estimate."""
+    frame; what was known before is in the last estimate, or, where there is none, in ``earlier``
+    (as in ``Estimate.evidence``)."""
 
     thorough: bool = False
     either_side: bool = False
@@ -72,6 +73,7 @@ class FollowOptions(Config, frozen=True, kw_only=True):
     seed: int = 0
     known: dict[str, tuple[Likely, ...]] = msgspec.field(default_factory=dict)
     evidence: tuple[Evidence, ...] = ()
+    earlier: tuple[Any, ...] = ()
 
     def __post_init__(self) -> None:
         check_seed(self.seed)

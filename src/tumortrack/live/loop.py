@@ -223,7 +223,7 @@ class Loop:
             # If only the time was wrong, the last estimate is the best start of the next search.
             finding = _finding_of(_reason_of(error))
             if timely and not isinstance(error, _TooLate):
-                self._follower.forget()
+                self._follower.lose()
                 self._in_a_row = 0
             if not isinstance(error, TumortrackError):  # a defect of ours: the next frame is tried
                 self.statistics.add_defect(error)

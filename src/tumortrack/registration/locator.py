@@ -224,9 +224,15 @@ class RegistrationLocator:
         method = self._turned_over if how.either_side else self._registration
         start = None if last is None else last.unsmoothed
         if last is None or not isinstance(start, ElasticMotion):
-            looks = replace(looks, evidence=EvidenceTerms.of(how.evidence, self._touchable))
-            fit = method.register(looks, None, frame.stage)
-            return self._found(fit, method.prior, how.evidence)
+            new = () if how.earlier else how.evidence
+            looks = replace(looks, evidence=EvidenceTerms.of(new, self._touchable))
+            found = self._found(method.register(looks, None, frame.stage), method.prior, new)
+            if not how.earlier:
+                return found
+            before, pieces = still_known(how.earlier, found.shown)
+            pieces += how.evidence
+            fit = found.fit.beside(EvidenceTerms.of(pieces, self._touchable))
+            return found._replace(fit=fit, pieces=pieces, before=before)
         with frame.stage("follow"):
             starts = [start, *(rival for rival, _ in start.rivals)]
             fits = [self._registration.follow(looks, near, self._near) for near in starts]

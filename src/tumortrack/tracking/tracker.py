@@ -6,6 +6,7 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -40,6 +41,8 @@ _DEFAULTS = FollowOptions()
 _TURNED_OVER_S = 30.0
 # Causes are searched for at most this often for each failed check, as that takes several frames.
 _CAUSES_EVERY_S = 1.0
+# Evidence outlasts a hand before the camera: tissue carries what lies on it, as it is seen again.
+_REMEMBERED_S = 60.0
 _OF_POSES = "none", "poses", "fit", "strays", "seen_through"  # checks that wrong poses fail
 
 
@@ -248,6 +251,7 @@ class Follower:
         self._tracker, self._config = tracker, config
         self._last: Estimate | None = None
         self._scanned_ns, self._at_rest = 0, False
+        self._known, self._known_ns = tuple[Any, ...](), 0  # evidence of the last estimate
         self._good_ns: int | None = None
         self._causes_ns, self._causes = 0, dict[str, tuple[Likely, ...]]()
 
@@ -256,7 +260,11 @@ class Follower:
         self._tracker.warm()
 
     def forget(self) -> None:
-        """Drop the last estimate: after a new clock, or a new pick."""
+        """Drop the last estimate and all evidence: after a new clock, or a new pick."""
+        self._last, self._known = None, ()
+
+    def lose(self) -> None:
+        """Drop the last estimate: the organ was not found."""
         self._last = None
 
     def begin(self, estimate: Estimate) -> None:
@@ -285,10 +293,11 @@ class Follower:
     ) -> Estimate:
         """The estimate of this frame. ``evidence``: what became known with it, beside what was
         known before; ``camera_from_last``: as in ``last_box_mm``. Raises NoEstimate, as
-        ``Tracker.follow``; the last estimate is then dropped."""
+        ``Tracker.follow``; the last estimate is then dropped, but not the evidence."""
         last, self._last, self._at_rest = self._recent(cloud.stamp_ns), None, False
         if last is not None and camera_from_last is not HERE:
             last = _seen_from(last, camera_from_last)
+        earlier = () if last is not None else self._earlier(cloud.stamp_ns, camera_from_last)
         thorough = (cloud.stamp_ns - self._scanned_ns) * 1e-9 >= self._config.rescan_s
         if last is None or thorough:
             self._scanned_ns = cloud.stamp_ns
@@ -301,6 +310,7 @@ class Follower:
             smoothing_s=self._config.smoothing_s,
             seed=self._config.seed,
             known=self._causes,
+            earlier=earlier,
         )
         try:
             self._last = self._tracker.follow(cloud, last, how, seen, evidence)
@@ -308,11 +318,20 @@ class Follower:
             if error.causes:
                 self._causes = {**self._causes, "none": error.causes}
             raise
+        self._known, self._known_ns = self._last.evidence, cloud.stamp_ns
         if causes := self._last.causes:
             self._causes = {**self._causes, _check_of(self._last): causes}
         if self._last.quality == "good":
             self._good_ns = cloud.stamp_ns
         return self._last
+
+    def _earlier(self, stamp_ns: int, camera_from_last: Affine) -> tuple[Any, ...]:
+        """Evidence of before the organ was lost."""
+        if not 0 <= (stamp_ns - self._known_ns) * 1e-9 <= _REMEMBERED_S:
+            return ()
+        if camera_from_last is HERE:
+            return self._known
+        return tuple(each.seen_from(camera_from_last) for each in self._known)
 
     def _recent(self, stamp_ns: int) -> Estimate | None:
         if self._last is None:

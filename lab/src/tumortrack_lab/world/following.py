@@ -61,7 +61,7 @@ def track(tracker: Tracker, evidence: Sequence[Evidence] = ()) -> Locate:
         try:
             cloud = _organ(frame, region, Hints(last_box_mm=follower.last_box_mm(frame.stamp_ns)))
         except NoEstimate:
-            follower.forget()
+            follower.lose()
             in_a_row = 0
             raise
         in_a_row, before = 0, in_a_row
