@@ -179,7 +179,8 @@ def found(shift_mm, finding=None):
 def test_what_is_held_is_the_point_of_the_ct_that_was_taken_until_it_is_let_go(tmp_path):
     poses = [facing((0.2 * n, 0, 106)) for n in range(80)]  # it pulls with 20 mm/s
     path = table(tmp_path / "t.csv", poses, [10 <= n < 50 for n in range(80)])
-    tool = FileToolConfig(path=path, holds=True).open(setting(), "grasper")
+    published = replace(BASE, error_mm=2.0, error_deg=0.5)
+    tool = FileToolConfig(path=path, holds=True).open(setting(published), "grasper")
     times = range(0, 700, 40)
     given = dict(zip(times, frames(tool, times, found((0, 0, 100))), strict=True))
     # In the frame at 120 ms it was told what it has; from the next one on it says so.
@@ -189,6 +190,7 @@ def test_what_is_held_is_the_point_of_the_ct_that_was_taken_until_it_is_let_go(t
         np.testing.assert_allclose(held.point_ct, (0.2 * 12, 0, 6), atol=1e-6)
         np.testing.assert_allclose(held.place_mm, (0.02 * time_ms, 0, 106), atol=1e-6)
         assert (held.point_std_mm, held.std_mm, held.tool) == (2, 1, "grasper")
+        assert held.shared_std_mm == 0  # the point was taken through the same calibration
 
 
 def test_what_is_held_is_not_taken_from_a_doubtful_estimate(tmp_path):

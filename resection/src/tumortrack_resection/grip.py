@@ -31,7 +31,7 @@ class Grip:
 
     Args:
         tip_mm: from an arm's name and its six joints to its tip, published frame.
-        std_mm: one standard deviation of the tip's place in the camera's frame, along any axis.
+        std_mm: one standard deviation of the tip's way since then, along any axis.
 
     Attributes:
         pulled_mm: how far the holder has risen since it gripped; other threads may read it.
@@ -79,9 +79,9 @@ class Grip:
 
 
 def held_std_mm(budget: ErrorBudget) -> float:
-    """Of the holder's tip in the camera's frame: the bounds of hand-eye calibration and tool count
-    as three standard deviations, as that of tracking does."""
-    return math.hypot(budget.hand_eye_mm, budget.tool_mm) / DEVIATIONS
+    """Of the holder's way since it gripped: the tool's bound counts as three standard deviations, as
+    that of tracking does. The hand-eye calibration's error is in both ends of the way alike."""
+    return budget.tool_mm / DEVIATIONS
 
 
 def _point_at(tip_mm: Place, result: TrackingResult) -> _Taken | None:

@@ -29,7 +29,7 @@ _LARGEST_FILE = 10_000_000  # bytes
 class _Evidence(Config, frozen=True, kw_only=True, tag_field="kind"):
     """``std_mm``: of each place along any axis, the tracking of the tool included;
     ``shared_std_mm``: of a shift of all places of one ``tool``, as a hand-eye calibration errs, or
-    without its name of this piece. ``stamp_ns``: when; 0: at the time of the cloud."""
+    without its name of this piece; 0: it is not shifted. ``stamp_ns``: when; 0: at the time of the cloud."""
 
     std_mm: float
     shared_std_mm: float = 0.0
@@ -106,7 +106,8 @@ class Landmark(_Evidence, frozen=True, kw_only=True, tag="landmark"):
 
 class Held(_Evidence, frozen=True, kw_only=True, tag="held"):
     """A point of the CT (LPS, mm) that a tool holds, which is at a place by now. ``point_std_mm``:
-    of which point it is, as the estimate had it when the tool took it."""
+    of which point it is, as the estimate had it when the tool took it. If both are known through
+    one calibration, its error cancels: state no ``shared_std_mm``."""
 
     point_ct: Point
     place_mm: Point

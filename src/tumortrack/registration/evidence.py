@@ -111,7 +111,7 @@ class EvidenceTerms:
         surfaces, points = list[tuple[Any, ...]](), list[tuple[Any, ...]]()
         tools = dict[str, float]()
         for number, each in enumerate(evidence):
-            tool_name = each.tool or f"piece {number}"
+            tool_name = (each.shared_std_mm and each.tool) or f"piece {number}"
             tools[tool_name] = max(each.shared_std_mm, tools.get(tool_name, 0.0))
             about = number, list(tools).index(tool_name)
             if isinstance(each, Landmark | Held):

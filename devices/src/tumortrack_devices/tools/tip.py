@@ -187,10 +187,14 @@ class TipTool(Tool):
 
     def _seen_by(self, view: CameraView, piece: Piece) -> Evidence:
         """In the frame of a view's camera. The calibration's error, its bound taken for one
-        standard deviation, is shared by all pieces: their number does not lessen it."""
+        standard deviation, is shared by all pieces: their number does not lessen it. Of what is
+        held, a camera that stands still shows both through the same error: which point was taken,
+        and where it is by now; so only its way counts."""
         places_mm = transform_points(_camera_from_published(view), piece.places_mm)
         farthest_mm = float(np.linalg.norm(places_mm, axis=1).max())
-        error_mm = self.context.published_frame.error_at(farthest_mm) or 0.0
+        published = self.context.published_frame
+        cancels = piece.kind is Held and not published.moves
+        error_mm = 0.0 if cancels else published.error_at(farthest_mm) or 0.0
         single = "place_mm" in piece.kind.__struct_fields__
         places = {"place_mm": places_mm[0]} if single else {"places_mm": places_mm}
         about = {

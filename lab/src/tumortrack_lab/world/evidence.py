@@ -2,7 +2,8 @@
 
 All that the robot's tools tell of one scene (touches, held points, outlines of a probe that it
 holds) shares one hand-eye error: a shift, and a turn about the organ's middle. Landmarks are
-clicked in the camera's image and have none. All errors of a piece but those that make it false are
+clicked in the camera's image and have none; of a held point it cancels, since which point was taken
+is known through the same calibration. All errors of a piece but those that make it false are
 stated: by ``std_mm``, and by ``shared_std_mm`` what it shares with others of the robot.
 """
 
@@ -178,12 +179,13 @@ class EvidenceSource:
         surface = cKDTree(self.scene.reference.organ.vertices_mm)
         point = mine[surface.query(targets.points_mm[mine])[0].argmin()]
         point_ct = targets.points_ct[point] + rng.normal(0, errors.grip_mm, 3)
-        told = self._by_robot(targets.points_mm[[point]])[0] + rng.normal(0, errors.tip_mm, 3)
+        told = targets.points_mm[point] + rng.normal(0, errors.tip_mm, 3)
         if slipped := rng.uniform() < errors.slips:
             told = told + unit(rng.normal(size=3)) * rng.uniform(*errors.slip_mm)
-        stated = self._stated(targets.points_mm[point], errors.tip_mm)
-        place, which = _tuples(told), _tuples(point_ct)
-        held = Held(point_ct=which, place_mm=place, point_std_mm=errors.grip_mm, **stated)
+        held = Held(
+            point_ct=_tuples(point_ct), place_mm=_tuples(told), point_std_mm=errors.grip_mm,
+            std_mm=max(errors.tip_mm, _LEAST_STD_MM), tool="robot",
+        )  # fmt: skip
         return Piece(held, bool(slipped))
 
     def _touch(self, aim_mm: np.ndarray, outward: np.ndarray) -> Piece:
