@@ -48,9 +48,9 @@ def _cells(row: BenchRow) -> dict[str, str]:
     }
 
 
-def line(row: BenchRow, left: str) -> str:
-    """One row, as soon as it is measured; ``left``: how long all others will take."""
-    return "  {part} {of}, threads {threads}: {time}; ".format_map(_cells(row)) + left
+def line(row: BenchRow) -> str:
+    """One row, as soon as it is measured."""
+    return "  {part} {of}, threads {threads}: {time}".format_map(_cells(row))
 
 
 def rich_table(bench: BenchResult) -> Table:

@@ -35,8 +35,8 @@ class Bench:
         """Measure, show, write. Raises InputError: a document without its markers."""
         from tumortrack.cli.console import console, say
         from tumortrack.core.process import available_cores
-        from tumortrack_lab.bench.report import BLOCKS, line, rich_table, write_bench
-        from tumortrack_lab.bench.run import GROUPS, Task, measure, tasks_of
+        from tumortrack_lab.bench.report import BLOCKS, rich_table, write_bench
+        from tumortrack_lab.bench.run import GROUPS, measure, tasks_of
         from tumortrack_lab.study.document import ReportWriter
 
         if self.out.exists() and "machine" not in store.read_json(self.out):
@@ -45,12 +45,8 @@ class Bench:
         command = " ".join([*words, *(["--quick"] if self.quick else [])])
         if self.document is not None:
             ReportWriter(self.document, command).check(BLOCKS)
-        common = Task(threads=1, folder=str(MODELS), quick=self.quick)
-        tasks = tasks_of(common, self.only or tuple(GROUPS), available_cores())
-        with console.status("starting ...") as status:
-            report = status.update if console.is_terminal else say
-            report("starting ...")
-            result = measure(tasks, command, report, lambda row, left: say(line(row, left)))
+        groups = self.only or tuple(GROUPS)
+        result = measure(tasks_of(groups, MODELS, self.quick, available_cores()), command)
         shown = console if console.is_terminal else Console(width=_WIDE)
         shown.print(rich_table(result))
         for path in write_bench(result, self.out, self.document):
