@@ -45,7 +45,7 @@ class Bench:
         command = " ".join([*words, *(["--quick"] if self.quick else [])])
         if self.document is not None:
             ReportWriter(self.document, command).check(BLOCKS)
-        groups = self.only or tuple(GROUPS)
+        groups: tuple[str, ...] = self.only or tuple(GROUPS)
         result = measure(tasks_of(groups, MODELS, self.quick, available_cores()), command)
         shown = console if console.is_terminal else Console(width=_WIDE)
         shown.print(rich_table(result))

@@ -15,7 +15,6 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
-from pkgutil import resolve_name
 from typing import Any, Literal
 
 import tumortrack
@@ -32,7 +31,7 @@ class Job:
 
     key: str
     name: str
-    work: str
+    work: Work
     options: Mapping[str, Any]
     inputs: Mapping[str, str | File]  # keys of results in the store; users' files
     memory_mb: int
@@ -59,13 +58,9 @@ class Report:
 
 
 def job_of(task: Task, memory_mb: int, store: str, run: str, reasons: tuple[str, ...]) -> Job:
-    """Raises TypeError: the work cannot be imported by its name."""
-    name = f"{task.work.__module__}:{task.work.__qualname__}"  # type: ignore[attr-defined]
-    if resolve_name(name) is not task.work or name.startswith("__main__"):
-        raise TypeError(f"{name} is another object than the work of {task.step}")
     inputs = {key: of if isinstance(of, File) else of.key for key, of in task.inputs.items()}
     who = f"{task.patient} {task.step}"
-    return Job(task.key, who, name, dict(task.options), inputs, memory_mb, store, run, reasons)
+    return Job(task.key, who, task.work, task.options, inputs, memory_mb, store, run, reasons)
 
 
 def perform(job: Job) -> Report:
@@ -120,10 +115,9 @@ def _claimed(job: Job, store: Store) -> Iterator[None]:
 def _measured(job: Job, store: Store, inputs: Mapping[str, Path], out: Path) -> Report:
     """Do the work and store its result and cost."""
     meter = _Meter()
-    work: Work = resolve_name(job.work)
     _use_one_core()
     try:
-        work(inputs, job.options, out)
+        job.work(inputs, job.options, out)
     except StorageError as error:  # the disk's, not the patient's
         return _attempt_failed(error)
     except TumortrackError as error:
