@@ -84,8 +84,7 @@ def main(options: Options) -> None:
         write_atomically(options.list, "\n".join([head, *lines, ""]).encode())
         say(f"{len(lines)} kidneys listed in {options.list}.")
     if options.fleet is not None:
-        writer = ReportWriter(options.document, scripts.make_command("population"))
-        writer.check([BLOCK])
+        writer = scripts.begun("population", options.document, BLOCK)
         writer.write({BLOCK: block(options.fleet, writer)})
         say(f"block written to {options.document}.")
 

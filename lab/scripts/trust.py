@@ -18,7 +18,7 @@ import tyro
 from tumortrack.cli.console import say
 from tumortrack_lab.margins.calibration import WIDEST_MM
 from tumortrack_lab.study import scripts, trust
-from tumortrack_lab.study.document import ReportWriter, table_of
+from tumortrack_lab.study.document import table_of
 
 BLOCK = "trust"
 
@@ -41,8 +41,7 @@ class Options:
 
 def main(options: Options) -> None:
     """Calibrate on the others, test on what is left out, and write it down."""
-    writer = ReportWriter(options.document, scripts.make_command("trust"))
-    writer.check([BLOCK])
+    writer = scripts.begun("trust", options.document, BLOCK)
     tables = trust.read_tables(options.tables)
     states = trust.states_of([row for table in tables for row in table.rows])
     fifth = np.random.default_rng(options.seed).permutation(len(states)) % 5 + 1
@@ -63,14 +62,13 @@ def main(options: Options) -> None:
     trust.risk_picture(family, writer.image("trust_risk"))
     worst = trust.worst_picture(family, tables, options.worst, writer.image("trust_worst"))
     short = ["part", "answers %", "within 95 %", "95 % margin median mm"]
-    texts = [
-        f"`{writer.command}`",
+    writer.block(
+        BLOCK,
         table_of(coverage.loc[coverage["left out"] == "family", short]),
         writer.data("trust-coverage", coverage, "Coverage by what was left out"),
         writer.data("trust-ranks", trust.ranks(family), "Misses, and what goes with them"),
         writer.data("trust-worst", worst, "The worst accepted answers"),
-    ]
-    writer.write({BLOCK: "\n\n".join(texts)})
+    )
     say(f"written to {options.document}")
 
 

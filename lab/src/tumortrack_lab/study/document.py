@@ -72,42 +72,50 @@ def fill(document: str, blocks: dict[str, str]) -> str:
 
 @dataclass(frozen=True)
 class ReportWriter:
-    """A document with markers, and the command that its blocks name."""
+    """A document with markers (None: nothing is written), and the command that its blocks name."""
 
-    document: Path
+    document: Path | None
     command: str
+
+    def block(self, name: str, *texts: str) -> None:
+        """Replace a block by the command and these paragraphs."""
+        self.write({name: "\n\n".join([f"`{self.command}`", *texts])})
 
     def write(self, blocks: dict[str, str]) -> None:
         """Replace these blocks, in one step; errors as of ``check`` and ``store``."""
-        store.write_atomically(self.document, self._filled(blocks).encode())
+        if self.document is not None:
+            store.write_atomically(self.document, self._filled(self.document, blocks).encode())
 
     def check(self, names: Iterable[str]) -> None:
         """Check, before anything is measured, that these blocks can be filled. Raises InputError:
         no document, or a marker missing."""
-        self._filled(dict.fromkeys(names, ""))
+        if self.document is not None:
+            self._filled(self.document, dict.fromkeys(names, ""))
 
-    def _filled(self, blocks: dict[str, str]) -> str:
+    def _filled(self, document: Path, blocks: dict[str, str]) -> str:
         try:
-            return fill(self.document.read_text(encoding="utf-8"), blocks)
+            return fill(document.read_text(encoding="utf-8"), blocks)
         except OSError as error:
-            raise InputError(f"{self.document} cannot be read: {error.strerror}.") from error
+            raise InputError(f"{document} cannot be read: {error.strerror}.") from error
 
     def data(self, name: str, rows: pd.DataFrame, words: str) -> str:
         """Write data/NAME.csv beside the document; returns the paragraph that links to it, which
         the site shows as a table."""
-        path = self.document.parent / "data" / f"{name}.csv"
-        make_folder(path.parent)
-        store.write_atomically(path, rows.to_csv(index=False).encode())
-        return f"[{words}: {len(rows)} rows](data/{path.name})"
+        if self.document is not None:
+            path = self.document.parent / "data" / f"{name}.csv"
+            make_folder(path.parent)
+            store.write_atomically(path, rows.to_csv(index=False).encode())
+        return f"[{words}: {len(rows)} rows](data/{name}.csv)"
 
     def image(self, name: str) -> Path:
         """Where a picture goes; its folder is made."""
+        assert self.document is not None
         folder = self.document.parent / "images"
         make_folder(folder)
         return folder / f"{name}.png"
 
     def link(self, image: Path, words: str) -> str:
-        return f"![{words}]({image.relative_to(self.document.parent)})"
+        return f"![{words}](images/{image.name})"
 
 
 def make_folder(folder: Path) -> None:

@@ -30,10 +30,16 @@ class KeptOptions:
     def begin(self, target: str, *blocks: str) -> ReportWriter:
         """Make the folder; returns the writer of the document's blocks. Raises InputError: it
         lacks one."""
-        writer = ReportWriter(self.document, make_command(target))
-        writer.check(blocks)
+        writer = begun(target, self.document, *blocks)
         self.out.mkdir(parents=True, exist_ok=True)
         return writer
+
+
+def begun(target: str, document: Path | None, *blocks: str) -> ReportWriter:
+    """The writer of a document's blocks. Raises InputError: it lacks one."""
+    writer = ReportWriter(document, make_command(target))
+    writer.check(blocks)
+    return writer
 
 
 def kept(path: Path, about: dict, measure: Callable[[], list[dict]]) -> list[dict]:

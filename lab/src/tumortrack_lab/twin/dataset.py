@@ -77,7 +77,7 @@ def make_scenes(
     made from another case, seed or configuration; ArtifactError: a kept state is damaged;
     TumortrackError: a state has no equilibrium; StorageError: the disk refused.
     """
-    wanted = [(v, w) for v in _known(variants, VARIANTS) for w in _known(views, VIEWS)]
+    wanted = [(v, w) for v in known(variants, VARIANTS) for w in known(views, VIEWS)]
     case = load_case(run.case_folder)
     targets, rest_ct = draw_targets(case.anatomy, run.seed), case.anatomy.organ
     identity = {
@@ -139,7 +139,8 @@ def twin_picture(scene: Scene, path: Path) -> None:
     drawing.save(figure, path)
 
 
-def _known(names: Sequence[Any], allowed: Iterable[str]) -> list:
+def known(names: Sequence[Any], allowed: Iterable[str]) -> list:
+    """The names, each once. Raises InputError: one is not allowed, or there are none."""
     for name in names:
         if name not in allowed:
             raise InputError(f"{name!r} is not known; allowed: {', '.join(allowed)}.")
