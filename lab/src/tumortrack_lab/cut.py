@@ -12,6 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
+from scipy.ndimage import binary_dilation, binary_erosion, label
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import ORGAN, Anatomy
@@ -89,9 +92,7 @@ def _crossings(path: Flat, shape: tuple[int, int]) -> Int[np.ndarray, "i j"]:
 
 def pieces_of(tissue: Voxels, severed: Severed) -> Int[np.ndarray, "i j k"]:
     """Pieces connected over faces that are not severed: 1 is the largest; 0: no tissue."""
-    from scipy.ndimage import label
     from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
 
     # Pieces of voxels that touch no severed face, found fast; each other voxel is one by itself.
     beside = np.zeros(tissue.shape, bool)
@@ -248,8 +249,6 @@ class _Cutting:
     def severed(self, torn: bool) -> Severed:
         """A sheet reaches one voxel further than its outlines, for the strokes' chords leave those.
         ``torn``: what the strokes left of the outlines is severed too."""
-        from scipy.ndimage import binary_dilation, binary_erosion
-
         near, severed = np.ones((3, 3), bool), Severed(self.labels.shape)
         for stroke, layer in self.walls:
             severed.wall(self.flat(stroke.path_mm), *self.levels(layer))
@@ -277,8 +276,6 @@ class _Cutting:
     def bridge_mm2(self) -> float:
         """Area within tissue of what encloses the piece and was not cut: of outlines, that no
         stroke goes along; and where a layer is wider than the one above it, that rim."""
-        from scipy.spatial import cKDTree
-
         held = 0
         for layer in self.layers:
             strokes = [_even(s.path_mm[:, :2]) for s, wall in self.walls if wall is layer]

@@ -23,6 +23,7 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Float64
+from scipy.spatial import cKDTree
 
 from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError, TumortrackError
@@ -169,8 +170,6 @@ def contact_points(
 
 def _faces_down(organ: Mesh, points_mm: Float64[np.ndarray, "m 3"]) -> Bool[np.ndarray, " m"]:
     """Which points of the surface lie on its underside, where it is not too steep."""
-    from scipy.spatial import cKDTree
-
     middle, normal = triangles_of(organ.vertices_mm, organ.faces)
     down = -normal[:, 2] > np.linalg.norm(normal, axis=1) / np.hypot(1, _STEEPEST)
     return np.asarray(down[cKDTree(middle).query(points_mm)[1]])

@@ -17,6 +17,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save
 
 from tumortrack.core import store
 from tumortrack.core.config import to_builtins
@@ -191,8 +193,6 @@ class StateCache:
         )
 
     def _solve(self, name: str, say: Callable[[str], None]) -> None:
-        from safetensors.numpy import save
-
         if self._bench is None:
             say("bench: filling the organ with tetrahedra")
             self._bench = self._run.build(self._case.anatomy, self._case.up_lps, self._run.bench)
@@ -212,8 +212,6 @@ class StateCache:
 
     def _read(self, name: str) -> tuple[dict[str, np.ndarray], dict, str]:
         """A kept state: its arrays, its report, and the sha256 of its tetrahedra's nodes."""
-        from safetensors import SafetensorError, safe_open
-
         path = self._path(name)
         try:
             with safe_open(path, framework="np") as file:

@@ -10,16 +10,14 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float64
+from scipy.sparse import csr_matrix, eye
 
 from tumortrack.core.errors import TumortrackError
 from tumortrack_lab.tets import factorised
-
-if TYPE_CHECKING:
-    from scipy.sparse import csr_matrix
 
 TOLERANCE = 1e-3  # largest unbalanced force (2-norm over nodes), share of the load
 _LEAST_LOAD_MN = 1.0  # a tenth of a gram: less is no load
@@ -152,8 +150,6 @@ def _two_loop(gradient: np.ndarray, pairs: Pairs, precondition: Solve) -> np.nda
 
 def _factorised(problem: Equilibrium, nodes: Nodes) -> Solve:
     """Solves with the stiffness as it is now."""
-    from scipy.sparse import eye
-
     matrix = problem.stiffness(nodes)
     # A small diagonal stands for the hold, without which rigid motions are free of force.
     ground = 1e-3 * matrix.diagonal().mean()

@@ -7,10 +7,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float, Float64, Int
+from scipy.sparse import bsr_matrix, csr_matrix, eye, kron
 
 from tumortrack.core.compiled import njit
 from tumortrack.core.mesh_query import contains, surface_distance
@@ -18,9 +19,6 @@ from tumortrack.core.types import Mesh
 from tumortrack_lab.tets import Embedding, TetMesh
 from tumortrack_lab.twin.equilibrium import Nodes, Points
 from tumortrack_lab.twin.solid import NeoHookeanSolid
-
-if TYPE_CHECKING:
-    from scipy.sparse import csr_matrix
 
 _STEADY_MN_MM = 2e4
 _STICK_MM = 0.2  # a smaller slip meets less than full friction: keeps the energy smooth
@@ -45,16 +43,12 @@ class Obstacle(Protocol):
 
 def rows_of(held: Embedding, n_nodes: int) -> csr_matrix:
     """The matrix that carries nodes (n, 3) to points (m, 3)."""
-    from scipy.sparse import csr_matrix
-
     row = np.repeat(np.arange(len(held.nodes)), 4)
     return csr_matrix((held.weights.ravel(), (row, held.nodes.ravel())), (len(held.nodes), n_nodes))
 
 
 def _spread(rows: csr_matrix, blocks: Float64[np.ndarray, "m 3 3"]) -> csr_matrix:
     """The nodes' Hessian of those of single points."""
-    from scipy.sparse import bsr_matrix, csr_matrix, eye, kron
-
     m, n = rows.shape
     if m == 0:
         return csr_matrix((3 * n, 3 * n))
@@ -162,8 +156,6 @@ class Capsule:
         return self.springs_mn_mm * float(longer @ longer) / 2, gradient
 
     def stiffness(self, nodes_mm: Nodes) -> csr_matrix:
-        from scipy.sparse import csr_matrix
-
         way = nodes_mm[self.edges[:, 1]] - nodes_mm[self.edges[:, 0]]
         way /= np.linalg.norm(way, axis=1, keepdims=True)
         e, row = len(self.edges), np.arange(len(self.edges))
@@ -176,8 +168,6 @@ class _Soft:
     """Adds nothing to the approximate Hessian."""
 
     def stiffness(self, nodes_mm: Nodes) -> csr_matrix:
-        from scipy.sparse import csr_matrix
-
         return csr_matrix((nodes_mm.size, nodes_mm.size))
 
 
