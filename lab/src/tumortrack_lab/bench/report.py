@@ -12,12 +12,12 @@ import pandas as pd
 from tumortrack.core.store import write_atomically
 from tumortrack_lab.bench import rows
 from tumortrack_lab.bench.rows import BenchResult, BenchRow
-from tumortrack_lab.study.document import ReportWriter, table
+from tumortrack_lab.study.document import ReportWriter, table_of
 
 BLOCKS = ("speed",)
 _GIB = 2**30
 _SECONDS = {"s": 1.0, "ms": 1e-3, "µs": 1e-6}
-_SUMMARY = ("part", "of", "time")
+_SUMMARY = ["part", "of", "time"]
 
 
 def _digits(value: float) -> str:
@@ -138,8 +138,8 @@ def write_bench(bench: BenchResult, out: Path, document: Path | None) -> list[Pa
         ("speed_machine", pd.DataFrame(machine), "The machine"),
     )
     most = max(row.threads for row in bench.rows)
-    cells = [_cells(row) for row in bench.rows if row.threads == most]
-    summary = table(_SUMMARY, [[each[key] for key in _SUMMARY] for each in cells], left=2)
+    cells = pd.DataFrame([_cells(row) for row in bench.rows if row.threads == most])
+    summary = table_of(cells[_SUMMARY], left=2)
     caption = f"Medians on {most} threads; `{bench.command}`, {bench.machine.get('date', '')}."
     writer = ReportWriter(document, bench.command)
     links = (writer.data(*each) for each in tables)
