@@ -12,11 +12,13 @@ import secrets
 import time
 from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Sized
 from dataclasses import dataclass, field, replace
-from typing import Literal, Protocol, runtime_checkable
+from typing import Literal
 
+from tumortrack.cli.console import say
+from tumortrack_lab.fleet.executors import OnRay, Serial
 from tumortrack_lab.fleet.store import Store
 from tumortrack_lab.fleet.task import Task
-from tumortrack_lab.fleet.worker import Job, Report, job_of
+from tumortrack_lab.fleet.worker import job_of
 
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.5, 60.0  # between attempts
 _ELSEWHERE_S = 2.0  # between looks at a task that another run is doing
@@ -28,20 +30,6 @@ _FINAL: dict[str, Literal["done", "cannot", "failed"]] = {
 }  # fmt: skip
 
 Wanted = Task | Callable[[], Task]
-
-
-@runtime_checkable
-class Executor(Protocol):
-    """Runs tasks."""
-
-    def room(self) -> int:
-        """How many patients may be under way. Called often. Raises TumortrackError: no machine is
-        left."""
-
-    async def do(self, job: Job) -> Report: ...
-
-    def close(self) -> None:
-        """Stop what is under way."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +55,6 @@ class Status:
     done: int = 0
     running: int = 0  # handed over
     retried: int = 0
-    note: str = ""  # the last retry
     started_s: float = field(default_factory=time.monotonic)
 
     @property
@@ -85,7 +72,7 @@ class Status:
 def run(
     wanted: Iterable[Wanted],
     store: Store,
-    executor: Executor,
+    executor: Serial | OnRay,
     tries: int = 4,
     again: bool = False,
     show: Callable[[Status], None] = lambda status: None,
@@ -103,14 +90,11 @@ def run(
     fleet.status.total = len(wanted) if isinstance(wanted, Sized) else None
     outcomes = fleet.outcomes(iter(wanted), show)
 
-    async def following() -> Outcome | None:
-        return await anext(outcomes, None)
-
     with asyncio.Runner() as runner:
-        # An error is raised where the task is awaited.
-        runner.get_loop().set_exception_handler(lambda *_: None)
+        loop = runner.get_loop()
+        loop.set_exception_handler(lambda *_: None)  # the error is raised where it is awaited
         try:
-            while (outcome := runner.run(following())) is not None:
+            while (outcome := loop.run_until_complete(anext(outcomes, None))) is not None:
                 yield outcome
         finally:
             executor.close()
@@ -120,7 +104,7 @@ class _Fleet:
     """``under_way``: the coroutine of every task that is being made, by key, so that all tasks that
     need its result wait for the same one."""
 
-    def __init__(self, store: Store, executor: Executor, tries: int, again: bool) -> None:
+    def __init__(self, store: Store, executor: Serial | OnRay, tries: int, again: bool) -> None:
         self.store, self.executor, self.tries, self.again = store, executor, tries, again
         self.status = Status()
         self.under_way: dict[str, asyncio.Task[Outcome]] = {}
@@ -185,7 +169,7 @@ class _Fleet:
                 reason = f"{report.reason} (attempt {len(reasons)} of {self.tries})"
                 return Outcome(task, "failed", task.step, reason)
             self.status.retried += 1
-            self.status.note = f"{task.patient} {task.step} again: {report.reason}"
+            say(f"{task.patient} {task.step} again: {report.reason}")
             if report.state == "damaged":
                 if report.damaged not in self.under_way:
                     self.store.remove(report.damaged)

@@ -72,7 +72,7 @@ def chain(patient: Patient) -> dict[str, Task]:
     checked = add("check", check, series, {"case": case, "source": source}, 2000)
     after = {"case": case, "check": checked}
     groups: dict[str, dict[str, Task | File]] = {"margins": {}, "test": {}}
-    drawn = hashlib.sha256(f"{source.sha256} {patient.seed}".encode()).hexdigest()
+    drawn = hashlib.sha256(f"{source.key} {patient.seed}".encode()).hexdigest()
     counts = {"margins": (0, patient.margin_states, 1)}
     counts["test"] = _TEST, patient.test_states, patient.views
     for kind, (first, count, views) in counts.items():

@@ -171,7 +171,7 @@ class Store:
         path = Path(file.path)
         if not path.exists():
             raise FileNotFoundError(f"{file.path} is not there (on this machine)")
-        if sha256_of(path) != file.sha256:
+        if sha256_of(path) != file.key:
             raise InputError(f"{file.path} was changed after the list was read; start again.")
         return path
 

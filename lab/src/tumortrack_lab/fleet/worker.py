@@ -12,7 +12,7 @@ import time
 import traceback
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any, Literal
@@ -54,7 +54,6 @@ class Report:
     state: Literal["elsewhere", "there", "done", "cannot", "changed", "damaged", "memory", "failed"]
     reason: str = ""
     damaged: str = ""
-    cost: Mapping[str, Any] = field(default_factory=dict)
 
 
 def job_of(task: Task, memory_mb: int, store: str, run: str, reasons: tuple[str, ...]) -> Job:
@@ -125,11 +124,11 @@ def _measured(job: Job, store: Store, inputs: Mapping[str, Path], out: Path) -> 
         for name, path in (*inputs.items(), ("OUT", out)):
             reason = reason.replace(str(path), name)  # the same on every machine
         store.put_failure(job.key, reason)
-        report = Report("cannot", reason, cost=meter.cost(job, out))
+        report = Report("cannot", reason)
     else:
         store.put(job.key, out)
-        report = Report("done", cost=meter.cost(job, out))
-    store.put_cost(job.key, dict(report.cost))
+        report = Report("done")
+    store.put_cost(job.key, meter.cost(job, out))
     return report
 
 
