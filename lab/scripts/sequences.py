@@ -67,6 +67,7 @@ def main(options: Options) -> None:
     """Make what is missing, then follow what there is."""
     known(options.kinds, ALL_KINDS)
     known(options.methods, following.METHODS)
+    writer = scripts.begun("sequences", options.document, "sequences")
     if options.states is None and set(options.kinds) & set(STATE_KINDS):
         raise InputError("jump, hidden and random go through solved states; name some: --states.")
     if options.views not in (1, 3):
@@ -86,7 +87,7 @@ def main(options: Options) -> None:
     folders = [options.out / f"{kind}-{number:03d}" for kind, number in wanted]
     films = [read_film(folder) for folder in folders if folder.exists()]
     if options.model is not None:
-        _follow(options, model_folder(options.model), films)
+        _follow(options, model_folder(options.model), films, writer)
 
 
 def _opened(options: Options, config: FilmConfig) -> tuple[World, Callable[[], list[State]]]:
@@ -103,7 +104,7 @@ def _opened(options: Options, config: FilmConfig) -> tuple[World, Callable[[], l
     return world, cache(lambda: read_states(world, source))
 
 
-def _follow(options: Options, model: Path, films: list[Film]) -> None:
+def _follow(options: Options, model: Path, films: list[Film], writer: ReportWriter) -> None:
     tracker, sha256 = Tracker(api.load_model(model)), store.sha256_of(model / store.MANIFEST)
     about = {"model_sha256": sha256, "version": ""}
     sites, region = tumor_sites_of(films[0].rest), region_for(tracker.model)
@@ -121,7 +122,6 @@ def _follow(options: Options, model: Path, films: list[Film]) -> None:
         store.write_atomically(options.out / f"{name}.csv", table.to_csv(index=False).encode())
         print(f"{tables.WORDS[name]}\n{table.to_string(index=False)}\n")
     if options.document is not None:
-        writer = ReportWriter(options.document, scripts.make_command("sequences"))
         plot, moving = writer.image("sequences_press"), writer.image("sequences_film")
         moving = moving.with_suffix(".gif")
         pictures.draw(frame, plot)

@@ -97,15 +97,11 @@ def lattice(surface: Mesh, edge_mm: float) -> TetMesh:
     outer = np.unique(sides[times == 1])
     samples_mm = surface_samples(surface)[0]
     away = np.zeros_like(nodes_mm)
-    away[outer] = samples_mm[_nearest(samples_mm, nodes_mm[outer])] - nodes_mm[outer]
+    away[outer] = samples_mm[cKDTree(samples_mm).query(nodes_mm[outer])[1]] - nodes_mm[outer]
     share, least = np.ones((len(nodes_mm), 1)), tet_volumes(nodes_mm, tets).min() / 5
     while (flat := tet_volumes(nodes_mm + share * away, tets) < least).any():
         share[tets[flat].ravel()] *= 0.5
     return TetMesh(nodes_mm + share * away, tets)
-
-
-def _nearest(of: np.ndarray, points: np.ndarray) -> np.ndarray:
-    return cKDTree(of).query(points)[1]
 
 
 def _cubic(box_mm: np.ndarray, edge_mm: float) -> tuple[np.ndarray, np.ndarray]:

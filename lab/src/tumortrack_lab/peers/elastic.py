@@ -16,7 +16,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float, Float64, Int
 from scipy.linalg import cho_factor, cho_solve
-from scipy.sparse.linalg import LinearOperator, eigsh
 from scipy.spatial import cKDTree
 
 from tumortrack.core.config import Config
@@ -112,6 +111,7 @@ def elastic_body(tets: TetMesh, poisson: float, modes: int) -> PeerElasticBody:
     given surface displacement they have the least strain energy inside, so a few hundred stand for
     every way in which forces on the surface deform the organ. Raises InputError: more modes than
     the mesh's surface has, or the mesh is in pieces."""
+    from scipy.sparse.linalg import LinearOperator, eigsh
     from skfem import BilinearForm, FacetBasis
     from skfem.helpers import dot
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,20 +14,12 @@ from tumortrack.core.errors import InputError, StorageError
 _SPREAD = ("median", "90 %", "95 %", "worst")
 
 
-def table(head: Sequence[str], rows: Iterable[Sequence[str]], left: int = 1) -> str:
-    """A Markdown table; the first ``left`` columns are left-aligned, numbers right-aligned."""
-    lines = [head, ["---" if n < left else "---:" for n in range(len(head))]]
-    for row in rows:
-        if len(row) != len(head):
-            raise ValueError(f"a row of {len(row)} cells under a head of {len(head)}: {row}")
-        lines.append(row)
+def table_of(frame: pd.DataFrame, left: int = 1) -> str:
+    """A frame as Markdown; the first ``left`` columns are left-aligned, numbers right-aligned."""
+    rule = ["---" if n < left else "---:" for n in range(len(frame.columns))]
+    lines = [list(frame), rule, *frame.astype(str).to_numpy().tolist()]
     cells = ((cell.replace("|", "\\|") for cell in line) for line in lines)
     return "\n".join(f"| {' | '.join(line)} |" for line in cells)
-
-
-def table_of(frame: pd.DataFrame, left: int = 1) -> str:
-    """A frame as Markdown."""
-    return table(list(frame), frame.astype(str).to_numpy().tolist(), left)
 
 
 def spread_mm(of: str, values: pd.Series) -> dict[str, str]:
@@ -43,6 +35,14 @@ def spread_words(rows: pd.DataFrame, of: str) -> pd.Series:
     """Median / 95 % / worst of each row with the columns of ``spread_mm``."""
     shown = [f"{of} {name} mm" for name in _SPREAD if name != "90 %"]
     return rows[shown].agg(" / ".join, axis=1).replace(" /  / ", "–")
+
+
+def beside_rigid(rows: pd.DataFrame, of: str = "'s centre") -> dict[str, pd.Series]:
+    """Columns of a short table: errors of the centre, and of both rigid poses'."""
+    shown = {"centre, mm: median / 95 % / worst": spread_words(rows, "centre")}
+    return shown | {
+        name: spread_words(rows, name + of) for name in ("best rigid pose", "rigid fit")
+    }
 
 
 def opening(name: str) -> str:

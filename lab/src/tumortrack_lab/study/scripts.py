@@ -13,7 +13,7 @@ import tyro
 
 from tumortrack.core import store
 from tumortrack.core.errors import TumortrackError
-from tumortrack_lab.study.document import ReportWriter
+from tumortrack_lab.study.document import ReportWriter, make_folder
 
 Options = TypeVar("Options")
 
@@ -43,10 +43,12 @@ def begun(target: str, document: Path | None, *blocks: str) -> ReportWriter:
 
 
 def kept(path: Path, about: dict, measure: Callable[[], list[dict]]) -> list[dict]:
-    """The rows in a file if they were measured with the same ``about``; else measured now."""
+    """The rows in a file if they were measured with the same ``about``; else measured now, and its
+    folder made."""
     known = store.read_json(path) if path.is_file() else {}
     if known.get("about") == about and "rows" in known:
         return known["rows"]
+    make_folder(path.parent)
     rows = measure()
     store.write_json(path, {"about": about, "rows": rows})
     return rows

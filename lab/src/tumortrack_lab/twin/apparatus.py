@@ -67,13 +67,6 @@ class ApparatusConfig(Config, frozen=True, kw_only=True):
     poke_mm: float = 10.0
     poke_diameter_mm: float = 8.0
 
-    def __post_init__(self) -> None:
-        for name in self.__struct_fields__:
-            if not 0 < getattr(self, name) < np.inf:
-                raise InputError(f"bench {name} is {getattr(self, name)}; it must be positive.")
-        if not self.poisson <= 0.495:
-            raise InputError(f"bench poisson is {self.poisson}; it must be at most 0.495.")
-
 
 @dataclass(frozen=True, eq=False)
 class State:

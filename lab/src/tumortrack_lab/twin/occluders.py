@@ -152,14 +152,10 @@ def _beside(frame: DepthFrame, angle: float, depth_mm: float, gap_mm: float) -> 
     row, column = np.nonzero(np.isfinite(frame.depth_mm))
     middle = np.array([np.median(column), np.median(row)])
     offset = np.stack([column, row], axis=1) - middle
-    direction = _unit(angle)
+    direction = np.array([np.cos(angle), np.sin(angle)])
     along = offset @ direction
     across = np.abs(offset @ np.array([-direction[1], direction[0]]))
     edge_px = along[across < 10].max(initial=0.0)
     pixel = middle + edge_px * direction - np.array([camera.cx, camera.cy])
     focal = np.array([camera.fx, camera.fy])
     return pixel * depth_mm / focal + gap_mm * direction
-
-
-def _unit(angle: float) -> Flat:
-    return np.array([np.cos(angle), np.sin(angle)])
