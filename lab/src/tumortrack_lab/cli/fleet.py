@@ -74,6 +74,9 @@ class Fleet:
         with live_line("starting ...") as line:
 
             def show(status: Status) -> None:
+                if status.note:
+                    say(status.note)
+                    status.note = ""
                 line(progress_words(status))
 
             try:

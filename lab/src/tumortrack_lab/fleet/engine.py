@@ -14,7 +14,6 @@ from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Sized
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
-from tumortrack.cli.console import say
 from tumortrack_lab.fleet.executors import OnRay, Serial
 from tumortrack_lab.fleet.store import Store
 from tumortrack_lab.fleet.task import Task
@@ -55,6 +54,7 @@ class Status:
     done: int = 0
     running: int = 0  # handed over
     retried: int = 0
+    note: str = ""  # the last retry, until it is shown
     started_s: float = field(default_factory=time.monotonic)
 
     @property
@@ -169,7 +169,7 @@ class _Fleet:
                 reason = f"{report.reason} (attempt {len(reasons)} of {self.tries})"
                 return Outcome(task, "failed", task.step, reason)
             self.status.retried += 1
-            say(f"{task.patient} {task.step} again: {report.reason}")
+            self.status.note = f"{task.patient} {task.step} again: {report.reason}"
             if report.state == "damaged":
                 if report.damaged not in self.under_way:
                     self.store.remove(report.damaged)
