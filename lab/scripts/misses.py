@@ -10,7 +10,6 @@ were left out. The same command goes on where it was stopped. No patient's anato
 
 from __future__ import annotations
 
-import time
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from multiprocessing import get_context
@@ -20,7 +19,7 @@ import pandas as pd
 import tyro
 
 import tumortrack as tt
-from tumortrack.cli.console import model_folder, say
+from tumortrack.cli.console import model_folder, progress_bar
 from tumortrack.core import store
 from tumortrack.core.config import to_builtins
 from tumortrack.core.process import available_cores
@@ -29,7 +28,7 @@ from tumortrack.tracking.margins import METHOD
 from tumortrack.tracking.tracker import Tracker
 from tumortrack_lab.margins import misses
 from tumortrack_lab.study import scripts
-from tumortrack_lab.study.document import ReportWriter, table_of
+from tumortrack_lab.study.document import table_of
 from tumortrack_lab.study.tables import NOTHING
 from tumortrack_lab.world.made import scenes_of_kidney
 
@@ -56,18 +55,15 @@ class Options:
 
 def main(options: Options) -> None:
     """Make what is missing, then fit."""
-    writer = ReportWriter(options.document or Path(), scripts.make_command("misses"))
-    if options.document is not None:
-        writer.check([_BLOCK])
+    writer = scripts.begun("misses", options.document, _BLOCK)
     numbers = range(options.seed * 1000, options.seed * 1000 + options.kidneys)
     options.out.mkdir(parents=True, exist_ok=True)
     with ProcessPoolExecutor(available_cores(), get_context("spawn")) as pool:
-        jobs = {pool.submit(_kidney, options.out, n, options.states): n for n in numbers}
-        start = time.monotonic()
-        for done, job in enumerate(as_completed(jobs), start=1):
-            left_min = (time.monotonic() - start) / done * (len(jobs) - done) / 60
-            scenes = f"kidney {jobs[job]}, {job.result()} scenes"
-            say(f"{done}/{len(jobs)} {scenes}: {left_min:.0f} min left")
+        jobs = [pool.submit(_kidney, options.out, n, options.states) for n in numbers]
+        with progress_bar("kidneys", len(jobs)) as advance:
+            for job in as_completed(jobs):
+                job.result()
+                advance()
     rows = pd.concat(
         [pd.read_json(_rows_path(options.out, n, options.states), lines=True) for n in numbers],
         ignore_index=True,
@@ -76,10 +72,9 @@ def main(options: Options) -> None:
     all_three = [misses.left_out(rows, **each).astype(object).fillna(NOTHING) for each in asked]
     short, tables = table_of(all_three[0]), all_three[1:]
     print(short, *map(table_of, tables), sep="\n\n")
-    if options.document is not None:
-        named = [table.rename(columns={table.columns[0]: "left out"}) for table in tables]
-        link = writer.data(_BLOCK, pd.concat(named), "Each kidney and each family left out")
-        writer.write({_BLOCK: "\n\n".join([f"`{writer.command}`", short, link])})
+    named = [table.rename(columns={table.columns[0]: "left out"}) for table in tables]
+    link = writer.data(_BLOCK, pd.concat(named), "Each kidney and each family left out")
+    writer.block(_BLOCK, short, link)
     about = {"seed": options.seed, "kidneys": len(numbers), "states": options.states}
     learned = misses.learned(rows, about)
     if options.write is not None:
@@ -91,12 +86,12 @@ def _rows_path(out: Path, number: int, states: int) -> Path:
     return out / str(number) / f"misses-{METHOD}-{states}.jsonl"
 
 
-def _kidney(out: Path, number: int, states: int) -> int:
-    """A kidney's scenes and rows; how many scenes could be made."""
+def _kidney(out: Path, number: int, states: int) -> None:
+    """A kidney's scenes and rows."""
     folder, rows_path = out / str(number), _rows_path(out, number, states)
     scenes = scenes_of_kidney(folder, number, states)
     if rows_path.exists():
-        return len(scenes)
+        return
     tracker = Tracker(tt.load_model(model_folder(folder / "case"), "cpu"))
     rows = [
         {"kidney": number, "scene": scene.name, **row}
@@ -105,7 +100,6 @@ def _kidney(out: Path, number: int, states: int) -> int:
     ]
     text = pd.DataFrame(rows).to_json(orient="records", lines=True)
     store.write_atomically(rows_path, text.encode())
-    return len(scenes)
 
 
 if __name__ == "__main__":

@@ -30,7 +30,7 @@ from tumortrack.report import drawing
 from tumortrack_lab.fleet.results import LOOK, PATIENTS, PICTURES, SCENES
 from tumortrack_lab.real.kidneys import SET_ASIDE, WHERE
 from tumortrack_lab.study import scripts
-from tumortrack_lab.study.document import ReportWriter, spread_mm, spread_words, table_of
+from tumortrack_lab.study.document import ReportWriter, beside_rigid, spread_mm, table_of
 from tumortrack_lab.study.trust import BANDS, band_of
 
 DEVELOPMENT = (0, 2, 3)
@@ -84,8 +84,7 @@ def main(options: Options) -> None:
         write_atomically(options.list, "\n".join([head, *lines, ""]).encode())
         say(f"{len(lines)} kidneys listed in {options.list}.")
     if options.fleet is not None:
-        writer = ReportWriter(options.document, scripts.make_command("population"))
-        writer.check([BLOCK])
+        writer = scripts.begun("population", options.document, BLOCK)
         writer.write({BLOCK: block(options.fleet, writer)})
         say(f"block written to {options.document}.")
 
@@ -123,13 +122,10 @@ def block(fleet: Path, writer: ReportWriter) -> str:
         f"{done.holds_for.mean():.0%}.{' This run has no rigid fits.' if without else ''}"
     )
     short = rows[rows.by.isin(["all", "state"])]
-    short = short[["value", "scenes", "good %"]].assign(**{
-        "centre, mm: median / 95 % / worst": spread_words(short, "centre"),
-        "best rigid pose": spread_words(short, "best rigid pose's centre"),
-        "rigid fit": spread_words(short, "rigid fit's centre"),
-        "over 5 mm": short["over 5 mm"], "good within radius %": short["of good"],
-        "rank correlation": short["rank correlation"],
-    })  # fmt: skip
+    more = {"over 5 mm": "over 5 mm", "of good": "good within radius %"}
+    more["rank correlation"] = "rank correlation"
+    shown = short[["value", "scenes", "good %"]].assign(**beside_rigid(short))
+    short = shown.join(short[[*more]].rename(columns=more))
     short = short.drop(columns=["rigid fit"] if without else [])
     links = [
         writer.data(BLOCK, rows, "By state, hidden surface, tumor and slices"),

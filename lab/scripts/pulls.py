@@ -19,7 +19,7 @@ from tumortrack.core import store
 from tumortrack.tracking.model_files import load_model
 from tumortrack.tracking.tracker import Tracker
 from tumortrack_lab.study import pulls, scripts
-from tumortrack_lab.study.document import ReportWriter, table_of
+from tumortrack_lab.study.document import table_of
 from tumortrack_lab.world.scenes import TETS, World, WorldConfig
 
 
@@ -41,9 +41,7 @@ class Options:
 
 def main(options: Options) -> None:
     """Make missing rows, then the table."""
-    writer = ReportWriter(options.document or Path(), scripts.make_command("pulls"))
-    if options.document is not None:
-        writer.check(["pulls"])
+    writer = scripts.begun("pulls", options.document, "pulls")
     rows, lost = [], 0
     for number in range(options.count):
         for case in options.cases:
@@ -62,8 +60,7 @@ def main(options: Options) -> None:
     text = f"Scenes: {options.count * len(options.cases)}, without a plan: {lost}.\n\n"
     text += table_of(pulls.table(rows), 3)
     print(text)
-    if options.document is not None:
-        writer.write({"pulls": f"`{writer.command}`\n\n{text}"})
+    writer.block("pulls", text)
 
 
 @cache

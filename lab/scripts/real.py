@@ -31,7 +31,7 @@ from tumortrack.tracking.tracker import Tracker
 from tumortrack_lab.real import kidneys, lungs, silicone
 from tumortrack_lab.real.judging import DRAGGED, by_tumor, judge, scene_of
 from tumortrack_lab.study import scripts
-from tumortrack_lab.study.document import ReportWriter, spread_mm, spread_words, table_of
+from tumortrack_lab.study.document import ReportWriter, beside_rigid, spread_mm, table_of
 from tumortrack_lab.study.methods import named_folders
 
 Part = Literal["kidneys", "lungs", "silicone", "slab"]
@@ -148,9 +148,7 @@ def _dragged(organ: Organ) -> list[dict]:
         say(f"{organ.name}, dragged: {count} scenes")
         return [judge(tracker, case.anatomy, make(number)) for number in range(count)]
 
-    folder = organ.options.out / "dragged"
-    folder.mkdir(exist_ok=True)
-    return scripts.kept(folder / f"{organ.name}.json", about, measure)
+    return scripts.kept(organ.options.out / "dragged" / f"{organ.name}.json", about, measure)
 
 
 def lungs_block(organs: list[Organ], options: Options, writer: ReportWriter) -> str:
@@ -208,9 +206,8 @@ def _breathed(organ: Organ, patient: int, field, options: Options) -> list[dict]
     def measure() -> list[dict]:
         return list(_states(organ, patient, field(patient)))
 
-    folder = options.out / "lungs"
-    folder.mkdir(exist_ok=True)
-    return scripts.kept(folder / f"{organ.name}-{patient}.json", about, measure)
+    rows_path = options.out / "lungs" / f"{organ.name}-{patient}.json"
+    return scripts.kept(rows_path, about, measure)
 
 
 def _states(organ: Organ, patient: int, field: lungs.Field) -> Iterator[dict]:
@@ -260,18 +257,14 @@ def _block(writer: ReportWriter, name: str, rows: list[dict], short: list[dict],
     """The short table, and the link to all rows."""
     given = pd.DataFrame(short).rename(columns={"kind": "tumors", "of": "tumors"})
     head = given.columns.intersection(["tumors", "deformation", "scenes", "good"])
-    shown = given[head].assign(**{
-        "centre, mm: median / 95 % / worst": spread_words(given, "centre"),
-        "best rigid pose": spread_words(given, "best rigid pose's centre"),
-        "rigid fit": spread_words(given, "rigid fit's centre"),
-    })  # fmt: skip
+    shown = given[head].assign(**beside_rigid(given))
     return f"{table_of(shown, 2)}\n\n{writer.data(name, pd.DataFrame(rows), what)}"
 
 
 def silicone_block(options: Options, writer: ReportWriter) -> str:
     """The bent casts: distances of the scan to the estimated surface, seen and unseen."""
     data = options.data
-    top = silicone.read_surface(data, silicone.REST)
+    top = read_mesh(silicone.file(data, silicone.REST))
     files = {cast: silicone.file(data, name) for cast, name in silicone.BENT.items()}
     scans = {cast: partial(read_mesh, path) for cast, path in files.items()}
     rows = _bent("silicone", (top, silicone.UNDERSIDE_MM), files, scans, options)

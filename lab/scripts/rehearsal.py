@@ -47,11 +47,9 @@ class Options:
 
 def main(options: Options) -> None:
     """Rehearse, and say what was found."""
-    writer = None
-    if options.document is not None:
-        words = f"{options.case.name} MODEL OUT --document docs/bench.md"
-        writer = ReportWriter(options.document, f"make rehearsal ARGS='{words}'")
-        writer.check([BLOCK])
+    words = f"{options.case.name} MODEL OUT --document docs/bench.md"
+    writer = ReportWriter(options.document, f"make rehearsal ARGS='{words}'")
+    writer.check([BLOCK])
     rehearsal = Rehearsal(options.case, options.model, options.out)
     rows, reports = rehearsal.run()
     frames = {"errors": pd.DataFrame(rows), "states": tables.evaluation_rows(reports)}
@@ -60,12 +58,12 @@ def main(options: Options) -> None:
     for name, frame in frames.items():
         frames[name] = frame.round(2).replace("^tumortrack: ", "", regex=True)
         say(table_of(frames[name]))
-    if writer is not None:
+    if options.document is not None:
         image = writer.image("bench_rehearsal")
         tables.picture(rehearsal, image)
         links = [writer.data(f"rehearsal-{name}", frames[name], WORDS[name]) for name in frames]
         picture = writer.link(image, "a state before the camera, in the scanner, and compared")
-        writer.write({BLOCK: "\n\n".join([f"`{writer.command}`", *links, picture])})
+        writer.block(BLOCK, *links, picture)
 
 
 if __name__ == "__main__":

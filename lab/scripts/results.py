@@ -60,7 +60,7 @@ def main(options: Options) -> None:
     cases = list(cases_of(options))
     for case in cases:
         run = TwinRun(case.folder)
-        make_scenes(run, case.scenes, options.variants, (VIEW,), lambda now: say(now.text))
+        make_scenes(run, case.scenes, options.variants, (VIEW,), say)
         for method in methods_of(case, options):
             say(f"{case.name}: {method.name}, seed {method.seed}")
             about = case, method, options.variants, VIEW, options.grid, options.out / "rows"

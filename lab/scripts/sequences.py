@@ -9,7 +9,6 @@ every method locates the organ in every frame; the tables OUT/*.csv also count w
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache, partial
@@ -19,7 +18,7 @@ import pandas as pd
 import tyro
 
 from tumortrack import api
-from tumortrack.cli.console import model_folder, say
+from tumortrack.cli.console import model_folder, progress_bar, say
 from tumortrack.core import store
 from tumortrack.core.config import to_builtins
 from tumortrack.core.errors import InputError, TumortrackError
@@ -27,7 +26,7 @@ from tumortrack.tracking.tracker import Tracker, region_for
 from tumortrack_lab.study import scripts
 from tumortrack_lab.study.document import ReportWriter
 from tumortrack_lab.study.tumor_sites import tumor_sites_of
-from tumortrack_lab.twin.dataset import claim
+from tumortrack_lab.twin.dataset import claim, known
 from tumortrack_lab.world import following, pictures, tables
 from tumortrack_lab.world.films import ALL_KINDS, Film, FilmConfig, read_film, write_film
 from tumortrack_lab.world.paths import KINDS
@@ -66,10 +65,9 @@ class Options:
 
 def main(options: Options) -> None:
     """Make what is missing, then follow what there is."""
-    chosen = (options.kinds, ALL_KINDS), (options.methods, following.METHODS)
-    for names, known in chosen:
-        if unknown := sorted(set(names) - set(known)):
-            raise InputError(f"{unknown[0]!r} is not known; allowed: {', '.join(known)}.")
+    known(options.kinds, ALL_KINDS)
+    known(options.methods, following.METHODS)
+    writer = scripts.begun("sequences", options.document, "sequences")
     if options.states is None and set(options.kinds) & set(STATE_KINDS):
         raise InputError("jump, hidden and random go through solved states; name some: --states.")
     if options.views not in (1, 3):
@@ -78,19 +76,18 @@ def main(options: Options) -> None:
     world, states = _opened(options, config)
     wanted = [(kind, number) for number in range(options.count) for kind in options.kinds]
     todo = [(k, n) for k, n in wanted if not (options.out / f"{k}-{n:03d}").exists()]
-    start = time.monotonic()
-    for done, (kind, number) in enumerate(todo, start=1):
-        try:
-            write_film(world, config, kind, number, options.out / f"{kind}-{number:03d}", states)
-            what = "made"
-        except TumortrackError as error:
-            what = f"failed: {error}"
-        left_min = (time.monotonic() - start) / done * (len(todo) - done) / 60
-        say(f"{done}/{len(todo)} {kind}-{number:03d} {what}; {left_min:.0f} min left")
+    with progress_bar("sequences", len(todo)) as advance:
+        for kind, number in todo:
+            place = options.out / f"{kind}-{number:03d}"
+            try:
+                write_film(world, config, kind, number, place, states)
+            except TumortrackError as error:
+                say(f"{place.name} failed: {error}")
+            advance()
     folders = [options.out / f"{kind}-{number:03d}" for kind, number in wanted]
     films = [read_film(folder) for folder in folders if folder.exists()]
     if options.model is not None:
-        _follow(options, model_folder(options.model), films)
+        _follow(options, model_folder(options.model), films, writer)
 
 
 def _opened(options: Options, config: FilmConfig) -> tuple[World, Callable[[], list[State]]]:
@@ -107,7 +104,7 @@ def _opened(options: Options, config: FilmConfig) -> tuple[World, Callable[[], l
     return world, cache(lambda: read_states(world, source))
 
 
-def _follow(options: Options, model: Path, films: list[Film]) -> None:
+def _follow(options: Options, model: Path, films: list[Film], writer: ReportWriter) -> None:
     tracker, sha256 = Tracker(api.load_model(model)), store.sha256_of(model / store.MANIFEST)
     about = {"model_sha256": sha256, "version": ""}
     sites, region = tumor_sites_of(films[0].rest), region_for(tracker.model)
@@ -125,7 +122,6 @@ def _follow(options: Options, model: Path, films: list[Film]) -> None:
         store.write_atomically(options.out / f"{name}.csv", table.to_csv(index=False).encode())
         print(f"{tables.WORDS[name]}\n{table.to_string(index=False)}\n")
     if options.document is not None:
-        writer = ReportWriter(options.document, scripts.make_command("sequences"))
         plot, moving = writer.image("sequences_press"), writer.image("sequences_film")
         moving = moving.with_suffix(".gif")
         pictures.draw(frame, plot)

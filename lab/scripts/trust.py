@@ -18,9 +18,10 @@ import tyro
 from tumortrack.cli.console import say
 from tumortrack_lab.margins.calibration import WIDEST_MM
 from tumortrack_lab.study import scripts, trust
-from tumortrack_lab.study.document import ReportWriter, table_of
+from tumortrack_lab.study.document import table_of
 
 BLOCK = "trust"
+_WORST = 6  # so many of the worst accepted answers are drawn
 
 
 @dataclass(frozen=True)
@@ -31,25 +32,20 @@ class Options:
     """Files that `tumortrack margins` wrote beside the models."""
     document: Path = Path("docs/trust.md")
     """Its block is replaced; tables and pictures go beside it."""
-    worst: int = 6
-    """So many of the worst accepted answers are drawn."""
     widest: float = WIDEST_MM
     """As of `tumortrack margins`."""
-    seed: int = 0
-    """Of what each state is used for."""
 
 
 def main(options: Options) -> None:
     """Calibrate on the others, test on what is left out, and write it down."""
-    writer = ReportWriter(options.document, scripts.make_command("trust"))
-    writer.check([BLOCK])
+    writer = scripts.begun("trust", options.document, BLOCK)
     tables = trust.read_tables(options.tables)
     states = trust.states_of([row for table in tables for row in table.rows])
-    fifth = np.random.default_rng(options.seed).permutation(len(states)) % 5 + 1
+    fifth = np.random.default_rng(0).permutation(len(states)) % 5 + 1
     parts = {"family": states.family, "organ": states.organ, "fifth": pd.Series(fifth).astype(str)}
     left_out = {}
     for what, part in parts.items():
-        left_out[what] = trust.left_out(states, part, options.seed, widest_mm=options.widest)
+        left_out[what] = trust.left_out(states, part, 0, widest_mm=options.widest)
         say(f"calibrated without each {what}")
     family = left_out["family"]
     hidden = family[family.refused == ""]
@@ -61,16 +57,15 @@ def main(options: Options) -> None:
         writer.image("trust_reliability"),
     )
     trust.risk_picture(family, writer.image("trust_risk"))
-    worst = trust.worst_picture(family, tables, options.worst, writer.image("trust_worst"))
+    worst = trust.worst_picture(family, tables, _WORST, writer.image("trust_worst"))
     short = ["part", "answers %", "within 95 %", "95 % margin median mm"]
-    texts = [
-        f"`{writer.command}`",
+    writer.block(
+        BLOCK,
         table_of(coverage.loc[coverage["left out"] == "family", short]),
         writer.data("trust-coverage", coverage, "Coverage by what was left out"),
         writer.data("trust-ranks", trust.ranks(family), "Misses, and what goes with them"),
         writer.data("trust-worst", worst, "The worst accepted answers"),
-    ]
-    writer.write({BLOCK: "\n\n".join(texts)})
+    )
     say(f"written to {options.document}")
 
 

@@ -13,7 +13,6 @@ scene).
 
 from __future__ import annotations
 
-import time
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -25,16 +24,15 @@ from typing import Annotated
 import pandas as pd
 import tyro
 
-from tumortrack.cli.console import model_folder, say
+from tumortrack.cli.console import model_folder, progress_bar, say
 from tumortrack.core import store
 from tumortrack.core.config import to_builtins
 from tumortrack.core.errors import InputError, TumortrackError
 from tumortrack.simulate.scene_folder import Scene, list_scenes, read_scene
 from tumortrack_lab.study import resection, scripts
-from tumortrack_lab.study.document import ReportWriter
 from tumortrack_lab.study.measure import measured
 from tumortrack_lab.study.methods import study_case
-from tumortrack_lab.twin.dataset import claim
+from tumortrack_lab.twin.dataset import claim, known
 from tumortrack_lab.world import estimates
 from tumortrack_lab.world.families import FAMILIES
 from tumortrack_lab.world.scenes import DISTURBANCES, TETS, World, WorldConfig
@@ -78,14 +76,11 @@ class Options:
 
 def main(options: Options) -> None:
     """Make missing scenes, then measure."""
-    for names, known in ((options.families, FAMILIES), (options.disturb, DISTURBANCES)):
-        if unknown := sorted(set(names) - set(known)):
-            raise InputError(f"{unknown[0]!r} is not known; allowed: {', '.join(known)}.")
+    known(options.families, FAMILIES)
+    known(options.disturb, DISTURBANCES)
     block = "world" if set(options.disturb) == {"none"} else "world-disturbed"
     block = "world-plans" if options.plans else block
-    writer = ReportWriter(options.document or Path(), scripts.make_command("world"))
-    if options.document is not None:
-        writer.check([block])
+    writer = scripts.begun("world", options.document, block)
     config = WorldConfig(
         seed=options.seed,
         families=options.families,
@@ -97,28 +92,23 @@ def main(options: Options) -> None:
     failures_path = options.out / _FAILURES
     failures = store.read_json(failures_path) if failures_path.exists() else {}
     todo = [n for n in scenes if n not in failures and not (options.out / n).exists()]
-    start, used = time.monotonic(), time.process_time()
-    for done, name in enumerate(todo, start=1):
-        try:
-            scenes[name]().write(options.out / name)
-        except TumortrackError as error:
-            failures[name] = f"{type(error).__name__}: {error}"
-            store.write_json(failures_path, failures)
-        left_min = (time.monotonic() - start) / done * (len(todo) - done) / 60
-        each_s = (time.process_time() - used) / done
-        say(
-            f"{done}/{len(todo)} {name}: {left_min:.0f} min left, {each_s:.1f} s of one core a "
-            f"scene, {len(failures)} failed"
-        )
+    with progress_bar("scenes", len(todo)) as advance:
+        for name in todo:
+            try:
+                scenes[name]().write(options.out / name)
+            except TumortrackError as error:
+                failures[name] = f"{type(error).__name__}: {error}"
+                store.write_json(failures_path, failures)
+                say(f"{name}: {failures[name]}")
+            advance()
     if (given := options.plans or options.model) is not None:
         model = model_folder(given)
         made = [name for name in scenes if (options.out / name).exists()]
         text, data = (_plans if options.plans else _estimates)(options, world, model, made)
         print(text)
-        if options.document is not None:
-            named = [(f"{block}-{name}", *rows) for name, rows in data.items()]
-            links = [writer.data(name, rows, words) for name, words, rows in named]
-            writer.write({block: "\n\n".join([f"`{writer.command}`", text, *links])})
+        named = [(f"{block}-{name}", *rows) for name, rows in data.items()]
+        links = [writer.data(name, rows, words) for name, words, rows in named]
+        writer.block(block, text, *links)
 
 
 def _estimates(options: Options, world: World, model: Path, made: list[str]) -> Made:

@@ -30,7 +30,6 @@ from tumortrack_lab.study.resection import (
     tidy_plans,
     truth,
 )
-from tumortrack_lab.study.tables import groups
 from tumortrack_resection.located import of_estimate
 from tumortrack_resection.resection import plan_resection
 from tumortrack_resection.values import ResectionConfig
@@ -212,7 +211,9 @@ def test_tables_say_what_was_removed_and_why_not(case, tmp_path):
         for method in methods
         for row in measured(case, method, ("D0",), "noise", 64, tmp_path, cut_one, **cutting())
     ]
-    assert [group for group, _ in groups(tidy_plans(found), "method", "planner")] == [
+    assert [
+        group for group, _ in tidy_plans(found).groupby(["method", "planner"], observed=True)
+    ] == [
         (name, planner.name)
         for name in ("clinic", "M_lim", "truth")
         for planner in (PLANNERS if name == "M_lim" else (OURS,))

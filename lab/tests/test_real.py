@@ -171,7 +171,7 @@ def test_a_slab_is_closed_by_its_walls_and_its_underside():
     wanted = (columns[[0, 2, 3]].mean(0) + columns[[0, 1, 2]].mean(0)).sum() / 2
     assert solid.volume_mm3 == pytest.approx(wanted)
     with pytest.raises(InputError, match="vu-arma-dev/cpd-registration"):
-        silicone.read_surface(Path("nowhere"), silicone.REST)
+        silicone.file(Path("nowhere"), silicone.REST)
     pose = silicone.facing_pose(top, np.random.default_rng(0))
     assert pose[2, :3] @ [0, 0, -1] < -0.9  # the outer side looks back at the camera
 

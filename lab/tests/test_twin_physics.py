@@ -16,16 +16,9 @@ from tumortrack.core.errors import InputError, TumortrackError
 from tumortrack.core.types import Anatomy, Mesh
 from tumortrack_lab.tets import TetMesh, embed, tetrahedralise
 from tumortrack_lab.twin.apparatus import Apparatus, ApparatusConfig, solve
-from tumortrack_lab.twin.equilibrium import (
-    Contact,
-    ContactPlate,
-    EquilibriumProblem,
-    Hold,
-    Rod,
-    Support,
-    find_equilibrium,
-)
+from tumortrack_lab.twin.equilibrium import ContactPlate, Rod, Support, find_equilibrium
 from tumortrack_lab.twin.solid import NeoHookeanSolid
+from tumortrack_lab.world.forces import LoadedBody, Steady, Touch, Weight, rows_of
 
 pytestmark = pytest.mark.slow
 
@@ -99,12 +92,10 @@ def test_a_block_between_plates_follows_theory(poisson: float) -> None:
     skin = np.flatnonzero(np.isclose(mesh.nodes_mm[:, 2] % side, 0))
     rim = np.isclose(mesh.nodes_mm[skin, :2] % side, 0)
     area = (side / 5) ** 2 * np.where(rim, 0.5, 1.0).prod(1)  # each node's part of the face
-    contact = Contact(embed(mesh, mesh.nodes_mm[skin]), area, 3000.0)
-    nothing = np.zeros(len(mesh.nodes_mm))
-    share = solid.node_volumes_mm3 / mesh.volumes_mm3.sum()
+    rows = rows_of(embed(mesh, mesh.nodes_mm[skin]), len(mesh.nodes_mm))
     above = ContactPlate((10.0, 10.0, 16.0 + 10), (40.0, 40.0, 10.0), 1.0)
-    contacts = ((contact, (Support(), above)),)
-    problem = EquilibriumProblem(solid, contacts, nothing, Hold(mesh.nodes_mm, share))
+    below, pressed = (Touch(rows, area, obstacle, 3000.0) for obstacle in (Support(), above))
+    problem = LoadedBody(solid, (below, pressed, Steady.of(solid)))
     start = mesh.nodes_mm * [1.05, 1.05, 0.9]
     nodes, about = find_equilibrium(problem, start)
     assert about.residual < 1e-3
@@ -122,7 +113,7 @@ def test_a_block_between_plates_follows_theory(poisson: float) -> None:
     stress = shear * iso + bulk * (J - 1) * wide**2
     assert axial == pytest.approx(0.8, abs=0.005)
     assert stress < -3.0  # kPa: far from small strain
-    load = contact.load_mn(nodes, above)[2]
+    load = -pressed.energy(nodes)[1][:, 2].sum()
     assert load == pytest.approx(stress * side**2, rel=0.02)
     for layer in np.linspace(0, side, 6):
         widths = np.ptp(nodes[np.isclose(mesh.nodes_mm[:, 2], layer), :2], axis=0)
@@ -235,8 +226,8 @@ def test_the_rod_presses_a_dent_off_the_tumor(bench: Apparatus) -> None:
     state = solve(bench, "P1")
     poke = state.report["poke"]
     tip = np.array(poke["tip_mm"])
-    surface = bench.contact.surface.carry(state.nodes_mm)
-    at_rest = bench.contact.surface.carry(bench.mesh.nodes_mm)
+    surface = bench.surface.carry(state.nodes_mm)
+    at_rest = bench.surface.carry(bench.mesh.nodes_mm)
     under = np.linalg.norm(surface[:, :2] - tip[:2], axis=1) < 1.0
     assert (at_rest[under, 2] - surface[under, 2]).max() == pytest.approx(4.0, abs=0.8)
     tumor = bench.anatomy.tumors[0].vertices_mm
@@ -258,8 +249,9 @@ def test_a_stiffer_tumor_deforms_less() -> None:
 
 def test_a_load_that_finds_no_rest_is_an_error(bench: Apparatus) -> None:
     trap = ContactPlate((0.0, 0.0, 15.0), (100.0, 100.0, 14.9), 1.0)  # swallows the organ whole
-    weight_mn = 1e4 * bench.solid.node_volumes_mm3  # a million times its own
-    problem = EquilibriumProblem(bench.solid, ((bench.contact, (Support(), trap)),), weight_mn)
+    down_mn = 1e4 * bench.solid.node_volumes_mm3[:, None] * [0.0, 0.0, -1.0]  # a million times
+    forces = bench.touch(Support()), bench.touch(trap), Weight(down_mn)
+    problem = LoadedBody(bench.solid, forces)
     with pytest.raises(TumortrackError, match="no equilibrium: after 150 iterations"):
         find_equilibrium(problem, bench.mesh.nodes_mm, 150)
 

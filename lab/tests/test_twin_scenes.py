@@ -142,8 +142,6 @@ def test_the_camera_looks_down_on_the_bench():
     assert np.allclose(
         transform_points(to_camera, points), [[0, 0, 150], [10, 0, 150], [0, -10, 90]]
     )
-    with pytest.raises(InputError, match="multiples of 90"):
-        camera_from_bench(ViewConfig(), 45)
 
 
 @pytest.mark.parametrize("turn", [90, 180, 270])
@@ -390,10 +388,8 @@ def test_a_finished_folder_is_left_alone_and_can_be_extended(
     make_scenes(run, out, ("D0", "D1"), ("clean",), said.append)
     assert StandIn.solved == (("D1", None),)  # D0 was kept from Rot90
     assert len(store.read_manifest(out, "twin")["scenes"]) == 6
-    shares = [status.share for status in said]
-    assert shares == sorted(shares)
-    assert shares[-1] == 1.0
-    assert any("one step" in status.text for status in said)
+    assert said[-1] == "2 of 2 scenes: D1-clean"
+    assert any("one step" in text for text in said)
 
 
 def test_more_compression_goes_on_from_less(no_pictures, case_folder, tmp_path):

@@ -7,16 +7,18 @@ import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float, Float64, Int, Int32
+from scipy.sparse import coo_matrix, spmatrix
+from scipy.sparse.csgraph import connected_components
+from scipy.sparse.linalg import splu
+from scipy.spatial import cKDTree
 
 from tumortrack.core.errors import InputError
+from tumortrack.core.mesh_query import contains
 from tumortrack.core.types import Mesh
-
-if TYPE_CHECKING:
-    from scipy.sparse import spmatrix
+from tumortrack.report.metrics import surface_samples
 
 _FACES = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])  # of a tetrahedron, by corners
 _CANDIDATES = 24  # nearest tetrahedra of a point, among which its own is searched
@@ -81,9 +83,6 @@ def lattice(surface: Mesh, edge_mm: float) -> TetMesh:
     far as no tetrahedron loses more than four fifths of its volume. Coarser than ``tetrahedralise``
     where the organ is thin, and the same to the last bit whenever it is repeated. Raises
     InputError: nothing could be filled."""
-    from tumortrack.core.mesh_query import contains
-    from tumortrack.report.metrics import surface_samples
-
     nodes_mm, tets = _cubic(surface.box_mm, edge_mm)
     tets = tets[contains(surface, nodes_mm[tets].mean(1))]
     if len(tets) == 0:
@@ -98,17 +97,11 @@ def lattice(surface: Mesh, edge_mm: float) -> TetMesh:
     outer = np.unique(sides[times == 1])
     samples_mm = surface_samples(surface)[0]
     away = np.zeros_like(nodes_mm)
-    away[outer] = samples_mm[_nearest(samples_mm, nodes_mm[outer])] - nodes_mm[outer]
+    away[outer] = samples_mm[cKDTree(samples_mm).query(nodes_mm[outer])[1]] - nodes_mm[outer]
     share, least = np.ones((len(nodes_mm), 1)), tet_volumes(nodes_mm, tets).min() / 5
     while (flat := tet_volumes(nodes_mm + share * away, tets) < least).any():
         share[tets[flat].ravel()] *= 0.5
     return TetMesh(nodes_mm + share * away, tets)
-
-
-def _nearest(of: np.ndarray, points: np.ndarray) -> np.ndarray:
-    from scipy.spatial import cKDTree
-
-    return cKDTree(of).query(points)[1]
 
 
 def _cubic(box_mm: np.ndarray, edge_mm: float) -> tuple[np.ndarray, np.ndarray]:
@@ -131,9 +124,6 @@ def _cubic(box_mm: np.ndarray, edge_mm: float) -> tuple[np.ndarray, np.ndarray]:
 
 def _largest_piece(tets: np.ndarray) -> np.ndarray:
     """The tetrahedra that hang together by nodes, of the piece with most of them."""
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
-
     links = np.repeat(tets[:, 0], 3), tets[:, 1:].ravel()
     size = tets.max() + 1
     graph = coo_matrix((np.ones(len(links[0]), bool), links), (size, size))
@@ -143,8 +133,6 @@ def _largest_piece(tets: np.ndarray) -> np.ndarray:
 
 def factorised(matrix: spmatrix) -> Callable[[np.ndarray], np.ndarray]:
     """Solves with a symmetric stiffness matrix."""
-    from scipy.sparse.linalg import splu
-
     options = {"SymmetricMode": True}
     return splu(matrix.tocsc(), "MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options).solve
 
@@ -172,8 +160,6 @@ def find(
 ) -> tuple[Int[np.ndarray, " m"], Float64[np.ndarray, "m 4"]]:
     """The tetrahedron that holds each point (the nearest for points just outside), and the
     point's barycentric weights there."""
-    from scipy.spatial import cKDTree
-
     inverse = np.linalg.inv((corners_mm[:, 1:] - corners_mm[:, :1]).transpose(0, 2, 1))
     count = min(_CANDIDATES, len(corners_mm))
     near = cKDTree(corners_mm.mean(1)).query(points_mm, k=count)[1].reshape(-1, count)

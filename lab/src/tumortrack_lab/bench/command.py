@@ -8,16 +8,18 @@ import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from tumortrack.core.errors import TumortrackError
 from tumortrack.imaging.nifti import write_nifti
 from tumortrack.phantom.digital import PhantomParameters, phantom_labels
 from tumortrack.sense.ply import write_cloud_ply
-from tumortrack_lab.bench.rows import COMMAND, LARGE, METHOD, PATIENT, Workload, timing_of
+from tumortrack_lab.bench.rows import COMMAND, LARGE, METHOD, PATIENT, Workload
 from tumortrack_lab.bench.subject import BenchSubject
 
 _GRIDS = {COMMAND: 160, LARGE: 400}
-_FEWEST = 3
 # Runs the command line and writes down the process's peak memory (getrusage of an ended child
 # includes the memory of the parent that it was forked from).
 _PROBE = """
@@ -34,7 +36,7 @@ main()
 """
 
 
-def workloads(subject: BenchSubject, budget_s: float) -> Iterator[Workload]:
+def workloads(subject: BenchSubject, _: float) -> Iterator[Workload]:
     """`locate`, from the start of the process to its end, all files written."""
     with tempfile.TemporaryDirectory() as folder:
         cloud, out = Path(folder) / "cloud.ply", Path(folder) / "out"
@@ -43,10 +45,10 @@ def workloads(subject: BenchSubject, budget_s: float) -> Iterator[Workload]:
         arguments = [*map(str, words)]
         run_command(arguments)  # into the disk's cache
         for name, grid in _GRIDS.items():
-            yield _workload(name, [*arguments, "--grid", str(grid)], budget_s)
+            yield _workload(name, [*arguments, "--grid", str(grid)])
 
 
-def patient(subject: BenchSubject, budget_s: float) -> Iterator[Workload]:
+def patient(subject: BenchSubject, _: float) -> Iterator[Workload]:
     """A new patient's labels to the first estimate: `prepare` and `locate`, a process each."""
     with tempfile.TemporaryDirectory() as folder:
         labels, cloud = Path(folder) / "labels.nii.gz", Path(folder) / "cloud.ply"
@@ -54,27 +56,27 @@ def patient(subject: BenchSubject, budget_s: float) -> Iterator[Workload]:
         write_nifti(labels, phantom.labels, phantom.lps_from_index, lps=True)
         write_cloud_ply(cloud, subject.cloud.points_mm)
         runs: list[list[float]] = []
-        begun = time.perf_counter()
-        while len(runs) <= _FEWEST or time.perf_counter() - begun < budget_s:
+
+        def call() -> None:
             case, out = (Path(folder) / f"{name}-{len(runs)}" for name in ("case", "out"))
             steps = ("prepare", labels, case), ("locate", case, cloud, out)
             runs.append([run_command([*map(str, step)])[0] for step in steps])
-        medians_s = [timing_of([*seconds]).median_s for seconds in zip(*runs[1:], strict=True)]
-        note = " s, ".join(f"{step[0]} {s:.1f}" for step, s in zip(steps, medians_s, strict=True))
-        timing = timing_of([sum(run) for run in runs[1:]])  # the first one compiled
-        yield Workload(PATIENT, METHOD, "patient", timing, facts=lambda: {"note": f"{note} s"})
+
+        def facts() -> dict[str, str]:
+            prepare_s, locate_s = np.median(runs[1:], axis=0)
+            return {"note": f"prepare {prepare_s:.1f} s, locate {locate_s:.1f} s"}
+
+        call()  # compiles
+        yield Workload(PATIENT, METHOD, "patient", call, facts=facts)
 
 
-def _workload(name: str, arguments: list[str], budget_s: float) -> Workload:
-    runs: list[tuple[float, int]] = []
-    begun = time.perf_counter()
-    while len(runs) < _FEWEST or (
-        (time.perf_counter() - begun) * (len(runs) + 1) / len(runs) < budget_s
-    ):
-        runs.append(run_command(arguments))
-    seconds, peaks = zip(*runs, strict=True)
-    facts = {"peak_bytes": max(peaks), "note": f"{max(peaks) / 2**30:.2f} GiB at most"}
-    return Workload(name, METHOD, "run", timing_of([*seconds]), facts=lambda: facts)
+def _workload(name: str, arguments: list[str]) -> Workload:
+    peaks: list[int] = []
+
+    def facts() -> dict[str, Any]:
+        return {"peak_bytes": max(peaks), "note": f"{max(peaks) / 2**30:.2f} GiB at most"}
+
+    return Workload(name, METHOD, "run", lambda: peaks.append(run_command(arguments)[1]), facts)
 
 
 def run_command(arguments: list[str]) -> tuple[float, int]:

@@ -1,4 +1,4 @@
-"""A run's results: a table on a terminal, one in a document with CSV beside it, goals, JSON."""
+"""A run's results: a table, one in a document with CSV beside it, goals, JSON."""
 
 from __future__ import annotations
 
@@ -8,64 +8,51 @@ from typing import NamedTuple
 
 import msgspec
 import pandas as pd
-from rich.table import Table
 
 from tumortrack.core.store import write_atomically
 from tumortrack_lab.bench import rows
 from tumortrack_lab.bench.rows import BenchResult, BenchRow
-from tumortrack_lab.study.document import ReportWriter, table
+from tumortrack_lab.study.document import ReportWriter, table_of
 
 BLOCKS = ("speed",)
 _GIB = 2**30
 _SECONDS = {"s": 1.0, "ms": 1e-3, "µs": 1e-6}
-_COUNTS = {"M": 1e6, "k": 1e3, "": 1.0}
-# Columns of a terminal's table and of a document's, by what ``_cells`` calls them.
-_SHOWN = {"part": "part", "of": "", "threads": "threads", "took": "took", "a second": "per s"}
-_SUMMARY = ("part", "of", "time")
+_SUMMARY = ["part", "of", "time"]
 
 
 def _digits(value: float) -> str:
     return f"{value:,.0f}" if value >= 100 else f"{value:.1f}" if value >= 10 else f"{value:.2f}"
 
 
-def _text(value: float, units: dict[str, float] = _SECONDS) -> str:
-    """In the largest unit that it reaches, with three digits: 12.3 ms."""
-    unit = next((name for name, size in units.items() if value >= size), [*units][-1])
-    return f"{_digits(value / units[unit])} {unit}"
+def _text(seconds: float) -> str:
+    """In the largest unit that they reach, with three digits: 12.3 ms."""
+    unit = next((name for name, size in _SECONDS.items() if seconds >= size), "µs")
+    return f"{_digits(seconds / _SECONDS[unit])} {unit}"
 
 
 def _cells(row: BenchRow) -> dict[str, str]:
-    """What tables say of a row."""
+    """What a document and goals say of a row."""
     took = _text(row.timing.median_s)
     return {
         "part": row.name,
         "of": row.what,
-        "threads": f"{row.threads}",
         "took": took,
         "time": f"{took} a {row.item}",
-        "a second": _text(row.per_s, _COUNTS).strip(),
         "peak": f"{row.peak_bytes / _GIB:.2f} GiB",
     }
 
 
-def line(row: BenchRow, left: str) -> str:
-    """One row, as soon as it is measured; ``left``: how long all others will take."""
-    return "  {part} {of}, threads {threads}: {time}; ".format_map(_cells(row)) + left
+def line(row: BenchRow) -> str:
+    """One row, as soon as it is measured."""
+    return f"  {row.name} {row.what}, threads {row.threads}: {_cells(row)['time']}"
 
 
-def rich_table(bench: BenchResult) -> Table:
-    """For a terminal."""
-    title = f"{bench.machine.get('processor', '')}, {bench.machine.get('date', '')}"
-    out = Table(*_SHOWN.values(), title=title)
-    for row in bench.rows:
-        cells = _cells(row)
-        out.add_row(*(cells[key] for key in _SHOWN))
-    return out
+def figures(bench: BenchResult) -> pd.DataFrame:
+    """Every row, as in speed.csv; ms are of one call, quartiles half of their distance."""
+    return pd.DataFrame([_figures(row) for row in bench.rows])
 
 
 def _figures(row: BenchRow) -> dict[str, object]:
-    """A row of speed.csv; ms are of one call, quartiles half of their distance."""
-
     def digits(value: float) -> str:
         return _digits(value).replace(",", "") if value else ""
 
@@ -146,16 +133,16 @@ def write_bench(bench: BenchResult, out: Path, document: Path | None) -> list[Pa
         return [out]
     machine = [{"this machine": key, "value": value} for key, value in bench.machine.items()]
     tables = (
-        ("speed", [_figures(row) for row in bench.rows], "Every row"),
-        ("speed_goals", goals_of(bench), "Goals"),
-        ("speed_machine", machine, "The machine"),
+        ("speed", figures(bench), "Every row"),
+        ("speed_goals", pd.DataFrame(goals_of(bench)), "Goals"),
+        ("speed_machine", pd.DataFrame(machine), "The machine"),
     )
     most = max(row.threads for row in bench.rows)
-    cells = [_cells(row) for row in bench.rows if row.threads == most]
-    summary = table(_SUMMARY, [[each[key] for key in _SUMMARY] for each in cells], left=2)
+    cells = pd.DataFrame([_cells(row) for row in bench.rows if row.threads == most])
+    summary = table_of(cells[_SUMMARY], left=2)
     caption = f"Medians on {most} threads; `{bench.command}`, {bench.machine.get('date', '')}."
     writer = ReportWriter(document, bench.command)
-    links = (writer.data(name, pd.DataFrame(lines), words) for name, lines, words in tables)
+    links = (writer.data(*each) for each in tables)
     writer.write({"speed": "\n\n".join((summary, caption, *links))})
     folder = document.parent / "data"
     return [out, document, *(folder / f"{name}.csv" for name, *_ in tables)]

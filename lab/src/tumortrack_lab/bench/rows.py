@@ -98,22 +98,19 @@ class BenchRow(Config, frozen=True):
 
 @dataclass(frozen=True, eq=False)
 class Workload:
-    """What becomes a row: a call, or how long it took; ``facts``: the row's other fields, asked
-    for once it is timed."""
+    """What becomes a row; ``facts``: the row's other fields, asked for once it is timed."""
 
     name: str
     what: str
     item: str
-    call: Call | Timing
+    call: Call
     facts: Callable[[], dict[str, Any]] = dict
 
     def row(self, threads: int, budget_s: float) -> BenchRow:
         """Time it."""
-        timing = self.call if isinstance(self.call, Timing) else timed(self.call, budget_s)
-        return BenchRow(
-            name=self.name, what=self.what, threads=threads, item=self.item, timing=timing,
-            **self.facts(),
-        )  # fmt: skip
+        timing = timed(self.call, budget_s)
+        about = {"threads": threads, "item": self.item, "timing": timing, **self.facts()}
+        return BenchRow(self.name, self.what, **about)
 
 
 class BenchResult(Config, frozen=True):

@@ -6,12 +6,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from rich.console import Console
-
 from tumortrack.core import store
 
 MODELS = Path("runs/bench")  # where the model to measure is kept
-_WIDE = 150  # characters of a table that goes to a file
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,10 +30,10 @@ class Bench:
 
     def run(self) -> None:
         """Measure, show, write. Raises InputError: a document without its markers."""
-        from tumortrack.cli.console import console, say
+        from tumortrack.cli.console import say
         from tumortrack.core.process import available_cores
-        from tumortrack_lab.bench.report import BLOCKS, line, rich_table, write_bench
-        from tumortrack_lab.bench.run import GROUPS, Task, measure, tasks_of
+        from tumortrack_lab.bench.report import BLOCKS, figures, write_bench
+        from tumortrack_lab.bench.run import GROUPS, measure, tasks_of
         from tumortrack_lab.study.document import ReportWriter
 
         if self.out.exists() and "machine" not in store.read_json(self.out):
@@ -45,13 +42,8 @@ class Bench:
         command = " ".join([*words, *(["--quick"] if self.quick else [])])
         if self.document is not None:
             ReportWriter(self.document, command).check(BLOCKS)
-        common = Task(threads=1, folder=str(MODELS), quick=self.quick)
-        tasks = tasks_of(common, self.only or tuple(GROUPS), available_cores())
-        with console.status("starting ...") as status:
-            report = status.update if console.is_terminal else say
-            report("starting ...")
-            result = measure(tasks, command, report, lambda row, left: say(line(row, left)))
-        shown = console if console.is_terminal else Console(width=_WIDE)
-        shown.print(rich_table(result))
+        groups: tuple[str, ...] = self.only or tuple(GROUPS)
+        result = measure(tasks_of(groups, MODELS, self.quick, available_cores()), command)
+        print(figures(result).to_string(index=False))
         for path in write_bench(result, self.out, self.document):
             say(f"written to {path}")

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import os
 import signal
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from importlib.util import find_spec
@@ -19,7 +17,7 @@ from tumortrack.core.errors import InputError, TumortrackError
 from tumortrack.core.store import check_place
 
 if TYPE_CHECKING:
-    from tumortrack_lab.fleet.engine import Executor, Outcome, Status
+    from tumortrack_lab.fleet.engine import Outcome, Status
     from tumortrack_lab.fleet.list import Patient
     from tumortrack_lab.fleet.task import Task
 
@@ -56,6 +54,7 @@ class Fleet:
         self._check()
         say("starting ...")
         from tumortrack_lab.fleet.engine import run
+        from tumortrack_lab.fleet.executors import OnRay, Serial
         from tumortrack_lab.fleet.list import read_list
         from tumortrack_lab.fleet.results import PATIENTS, write_results
         from tumortrack_lab.fleet.store import Store
@@ -69,10 +68,17 @@ class Fleet:
         store.open()
         outcomes: dict[str, Outcome] = {}
         wanted = [partial(_wanted, patient) for patient in patients]
-        executor = self._executor()
+        executor = Serial() if self.serial else OnRay(self.address, self.cores)
         _say_dashboard(getattr(executor, "dashboard", ""))
         signal.signal(signal.SIGTERM, signal.default_int_handler)  # Ray's handler ends the process
-        with _screen() as show:
+        with live_line("starting ...") as line:
+
+            def show(status: Status) -> None:
+                if status.note:
+                    say(status.note)
+                    status.note = ""
+                line(progress_words(status))
+
             try:
                 for outcome in run(wanted, store, executor, self.tries, self.again, show):
                     outcomes[outcome.task.patient] = outcome
@@ -110,11 +116,6 @@ class Fleet:
                 f"fleet needs {' and '.join(lacking)}: pip install 'tumortrack-lab[fleet]'"
             )
 
-    def _executor(self) -> Executor:
-        from tumortrack_lab.fleet.executors import OnRay, Serial
-
-        return Serial() if self.serial else OnRay(self.address, self.cores)
-
 
 def _say_dashboard(address: str) -> None:
     """Say where Ray's dashboard is, if it has one. Its token lets others start programs here, so it
@@ -130,22 +131,6 @@ def _wanted(patient: Patient) -> Task:
     from tumortrack_lab.fleet.steps import chain
 
     return chain(patient)["summary"]
-
-
-@contextmanager
-def _screen() -> Iterator[Callable[[Status], None]]:
-    """Yields a function that shows progress."""
-    noted = ""
-
-    def show(status: Status) -> None:
-        nonlocal noted
-        if status.note != noted:
-            say(status.note)
-            noted = status.note
-        line(progress_words(status))
-
-    with live_line("starting ...") as line:
-        yield show
 
 
 def progress_words(status: Status) -> str:

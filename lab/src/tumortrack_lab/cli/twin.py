@@ -8,7 +8,7 @@ from typing import Literal
 
 from tyro.conf import Positional
 
-from tumortrack.cli.console import console, say
+from tumortrack.cli.console import live_line, say
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,17 +34,11 @@ class Twin:
     def run(self) -> None:
         """Make what is missing of these states and views; empty means all. Raises InputError: no
         case, unknown names, or scenes made from something else."""
-        with console.status("starting ...") as line:
-            report = line.update if console.is_terminal else say
-            report("starting ...")
-
+        with live_line("starting ...") as report:
             from tumortrack_lab.twin.dataset import TwinRun, make_scenes
             from tumortrack_lab.twin.views import VARIANTS, VIEWS
 
             run = TwinRun(self.case, seed=self.seed)
             states: tuple[str, ...] = self.states or tuple(VARIANTS)
-            made = make_scenes(
-                run, self.scenes, states, self.views or VIEWS,
-                lambda now: report(f"{now.share:.0%} {now.text}"),
-            )  # fmt: skip
+            made = make_scenes(run, self.scenes, states, self.views or VIEWS, report)
         say(f"{len(made)} scenes in {self.scenes}; look at the scene.png in each.")

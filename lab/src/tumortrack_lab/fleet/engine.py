@@ -10,17 +10,15 @@ from __future__ import annotations
 import asyncio
 import secrets
 import time
-from collections import deque
 from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Sized
-from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
-from typing import Literal, Protocol, runtime_checkable
+from typing import Literal
 
+from tumortrack_lab.fleet.executors import OnRay, Serial
 from tumortrack_lab.fleet.store import Store
 from tumortrack_lab.fleet.task import Task
-from tumortrack_lab.fleet.worker import Job, Report, job_of
+from tumortrack_lab.fleet.worker import job_of
 
-_LOOKED_AHEAD = 64  # wanted tasks that are looked up in the store before their turn
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.5, 60.0  # between attempts
 _ELSEWHERE_S = 2.0  # between looks at a task that another run is doing
 _SHOWN_S = 0.5
@@ -31,21 +29,6 @@ _FINAL: dict[str, Literal["done", "cannot", "failed"]] = {
 }  # fmt: skip
 
 Wanted = Task | Callable[[], Task]
-Stored = tuple[bool, str | None]  # what the store has of a task (``Store.found``)
-
-
-@runtime_checkable
-class Executor(Protocol):
-    """Runs tasks."""
-
-    def room(self) -> int:
-        """How many patients may be under way. Called often. Raises TumortrackError: no machine is
-        left."""
-
-    async def do(self, job: Job) -> Report: ...
-
-    def close(self) -> None:
-        """Stop what is under way."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +54,7 @@ class Status:
     done: int = 0
     running: int = 0  # handed over
     retried: int = 0
-    note: str = ""  # the last retry
+    note: str = ""  # the last retry, until it is shown
     started_s: float = field(default_factory=time.monotonic)
 
     @property
@@ -89,7 +72,7 @@ class Status:
 def run(
     wanted: Iterable[Wanted],
     store: Store,
-    executor: Executor,
+    executor: Serial | OnRay,
     tries: int = 4,
     again: bool = False,
     show: Callable[[Status], None] = lambda status: None,
@@ -97,54 +80,31 @@ def run(
     """Do the wanted tasks, and those that they depend on and the store lacks; yields an outcome of
     each wanted one when it has ended.
 
-    A wanted task may also be a function that makes it. It is called on another thread shortly
-    before its turn, since hashing a patient's files takes a while. ``tries``: how often a task may
-    fail for reasons that are not its own. ``again``: also try what the store says can't be done.
+    A wanted task may also be a function that makes it, on another thread: hashing a patient's files
+    takes a while. ``tries``: how often a task may fail for reasons that are not its own.
+    ``again``: also try what the store says can't be done.
     ``show`` is called about twice a second.
     """
     store.open()
     fleet = _Fleet(store, executor, tries, again)
     fleet.status.total = len(wanted) if isinstance(wanted, Sized) else None
-    loop = asyncio.new_event_loop()
-    loop.set_exception_handler(lambda *_: None)  # the error is raised where the task is awaited
-    try:
-        with ThreadPoolExecutor(8, "store") as pool:
-            outcomes = fleet.outcomes(_looked_up(wanted, store, pool), show)
+    outcomes = fleet.outcomes(iter(wanted), show)
+
+    with asyncio.Runner() as runner:
+        loop = runner.get_loop()
+        loop.set_exception_handler(lambda *_: None)  # the error is raised where it is awaited
+        try:
             while (outcome := loop.run_until_complete(anext(outcomes, None))) is not None:
                 yield outcome
-    finally:
-        executor.close()
-        if left := asyncio.all_tasks(loop):
-            for task in left:
-                task.cancel()
-            loop.run_until_complete(asyncio.wait(left))
-        loop.run_until_complete(loop.shutdown_asyncgens())
-        loop.close()
-
-
-def _looked_up(
-    wanted: Iterable[Wanted], store: Store, pool: ThreadPoolExecutor
-) -> Iterator[tuple[Task, Stored]]:
-    """Wanted tasks with what the store has of them, looked up ahead: object storage is slow."""
-
-    def look_up(item: Wanted) -> tuple[Task, Stored]:
-        task = item if isinstance(item, Task) else item()
-        return task, store.found(task.key)
-
-    asked: deque[Future[tuple[Task, Stored]]] = deque()
-    for item in wanted:
-        asked.append(pool.submit(look_up, item))
-        if len(asked) >= _LOOKED_AHEAD:
-            yield asked.popleft().result()
-    while asked:
-        yield asked.popleft().result()
+        finally:
+            executor.close()
 
 
 class _Fleet:
     """``under_way``: the coroutine of every task that is being made, by key, so that all tasks that
     need its result wait for the same one."""
 
-    def __init__(self, store: Store, executor: Executor, tries: int, again: bool) -> None:
+    def __init__(self, store: Store, executor: Serial | OnRay, tries: int, again: bool) -> None:
         self.store, self.executor, self.tries, self.again = store, executor, tries, again
         self.status = Status()
         self.under_way: dict[str, asyncio.Task[Outcome]] = {}
@@ -152,44 +112,42 @@ class _Fleet:
         self._run = secrets.token_hex(8)
 
     async def outcomes(
-        self, wanted: Iterator[tuple[Task, Stored]], show: Callable[[Status], None]
+        self, wanted: Iterator[Wanted], show: Callable[[Status], None]
     ) -> AsyncIterator[Outcome]:
         """Outcomes of the wanted tasks, as they end."""
         pending: set[asyncio.Task[Outcome]] = set()
-        is_last = False
-        while not is_last or pending or self.under_way:
+        while True:
             room = self.executor.room()
-            while not is_last and len(pending) < room:
-                if (item := next(wanted, None)) is None:
-                    is_last = True
-                else:
-                    pending.add(asyncio.create_task(self._wanted(*item)))
-            if waited_for := pending | {*self.under_way.values()}:
-                first = asyncio.FIRST_COMPLETED
-                await asyncio.wait(waited_for, timeout=_SHOWN_S, return_when=first)
+            while len(pending) < room and (item := next(wanted, None)) is not None:
+                pending.add(asyncio.create_task(self._wanted(item)))
+            if not (waited_for := pending | {*self.under_way.values()}):
+                return
+            first = asyncio.FIRST_COMPLETED
+            await asyncio.wait(waited_for, timeout=_SHOWN_S, return_when=first)
             show(self.status)
             for task in [task for task in pending if task.done()]:
                 pending.remove(task)
                 yield task.result()
 
-    async def _wanted(self, task: Task, stored: Stored) -> Outcome:
-        outcome = replace(await self._begin(task, stored), task=task)
+    async def _wanted(self, wanted: Wanted) -> Outcome:
+        task = wanted if isinstance(wanted, Task) else await asyncio.to_thread(wanted)
+        outcome = replace(await self._begin(task), task=task)
         self.status.wanted += 1
         self.status.there += outcome.state == "there"
         self.status.failed += outcome.state in ("cannot", "failed")
         return outcome
 
-    def _begin(self, task: Task, stored: Stored | None = None) -> asyncio.Task[Outcome]:
+    def _begin(self, task: Task) -> asyncio.Task[Outcome]:
         """Make a task's result, unless that is under way."""
         making = self.under_way.get(task.key)
         if making is None:
-            making = self.under_way[task.key] = asyncio.create_task(self._make(task, stored))
+            making = self.under_way[task.key] = asyncio.create_task(self._make(task))
             making.add_done_callback(lambda _: self.under_way.pop(task.key))
         return making
 
-    async def _make(self, task: Task, stored: Stored | None) -> Outcome:
+    async def _make(self, task: Task) -> Outcome:
         """A task's result, and before it those of its inputs, where the store lacks them."""
-        if (known := await self._known(task, stored)) is not None:
+        if (known := await self._known(task)) is not None:
             return known
         memory_mb, reasons = task.memory_mb, tuple[str, ...]()
         lacking = await self._lacking_input(task)
@@ -222,11 +180,9 @@ class _Fleet:
             await asyncio.sleep(min(_FIRST_PAUSE_S * 2 ** (len(reasons) - 1), _LONGEST_PAUSE_S))
         return replace(lacking, task=task)
 
-    async def _known(self, task: Task, stored: Stored | None) -> Outcome | None:
+    async def _known(self, task: Task) -> Outcome | None:
         """The outcome according to the store; None: the task is still to be done."""
-        if stored is None:
-            stored = await asyncio.to_thread(self.store.found, task.key)
-        there, failure = stored
+        there, failure = await asyncio.to_thread(self.store.found, task.key)
         if failure is None:
             return Outcome(task, "there") if there else None
         if not self.again or task.key in self._tried_again:

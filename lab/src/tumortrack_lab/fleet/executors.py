@@ -77,6 +77,7 @@ class OnRay:
         self._looked_s, self._machines = -_LOOK_S, [dict[str, float]()]
 
     def room(self) -> int:
+        """How many patients may be under way. Raises TumortrackError: no machine is left."""
         if time.monotonic() - self._heard_s > 1.0:
             self._look_for_head()
         return int(sum(machine.get("CPU", 0) for machine in self._largest())) + 4

@@ -6,14 +6,14 @@ from __future__ import annotations
 import csv
 import io
 import re
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import msgspec
+
 from tumortrack.core import store
 from tumortrack.core.errors import InputError
-from tumortrack.core.geometry import direction_lps
 from tumortrack.imaging.options import PrepareOptions
 from tumortrack_lab.fleet.task import File
 
@@ -22,38 +22,13 @@ _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 MISSING = "missing"  # instead of a sha256: no file has it
 
 
-def _at_least(least: int) -> Callable[[str], int]:
-    def parse(cell: str) -> int:
-        value = int(cell)
-        if value < least:
-            raise ValueError(f"must be at least {least}")
-        return value
-
-    return parse
-
-
-def _window(cell: str) -> tuple[float, float]:
-    low, high = map(float, cell.split())
-    return low, high
-
-
-def _up(cell: str) -> str:
-    direction_lps(cell)
-    return cell
-
-
-# Options of `prepare`; then those of the later steps.
-_OF_PREPARE: dict[str, Callable[[str], Any]] = {
-    "organ_name": str,
-    "side": str, "up": _up, "patient": str, "organ": int, "tumor": int, "series": str,
-    "unit": str, "min_tumor_ml": float, "organ_hu": _window, "tumor_hu": _window,
-    "rotations": str, "tilt": float, "sensor": str,
-}  # fmt: skip
-_OF_CHAIN: dict[str, Callable[[str], Any]] = {
-    "seed": _at_least(0), "margin_states": _at_least(1), "test_states": _at_least(1),
-    "views": _at_least(1),
-}  # fmt: skip
-COLUMNS = ("name", "input", *_OF_PREPARE, *_OF_CHAIN)
+# Options of `prepare`, ``name`` under another name: a list's is the row's.
+_OF_PREPARE = (
+    *("organ_name", "side", "up", "patient", "organ", "tumor", "series", "unit", "min_tumor_ml"),
+    *("organ_hu", "tumor_hu", "rotations", "tilt", "sensor"),
+)
+_LEAST = {"seed": 0, "margin_states": 1, "test_states": 1, "views": 1}  # of the later steps
+COLUMNS = ("name", "input", *_OF_PREPARE, *_LEAST)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -102,7 +77,7 @@ def read_list(path: Path) -> list[Patient]:
                 if patient.name in patients:
                     raise InputError(f"{patient.name} has a row already")
                 patients[patient.name] = patient
-            except InputError as error:
+            except (InputError, msgspec.ValidationError) as error:
                 wrong.append(f"line {reader.line_num}: {str(error).rstrip('.')}")
     except csv.Error as error:
         raise InputError(f"{path} is no CSV table: line {reader.line_num}: {error}.") from error
@@ -124,7 +99,7 @@ def _wrong_head(head: list[str]) -> list[str]:
 
 
 def _patient(head: list[str], cells: list[str], folder: Path) -> Patient:
-    """Raises InputError: a cell that is not allowed."""
+    """Raises InputError, msgspec.ValidationError: a cell that is not allowed."""
     if len(cells) != len(head):
         raise InputError(f"{len(cells)} cells under {len(head)} columns")
     given = {name: cell for name, cell in zip(head, cells, strict=True) if cell}
@@ -133,18 +108,18 @@ def _patient(head: list[str], cells: list[str], folder: Path) -> Patient:
         raise InputError(f"the name {name!r} is not allowed: letters, digits, . _ - (64 at most)")
     if not source:
         raise InputError(f"{name} has no input")
-    parsed: dict[str, Any] = {}
-    for column, cell in given.items():
-        parse = {**_OF_PREPARE, **_OF_CHAIN}[column]
-        try:
-            parsed[column] = parse(cell)
-        except ValueError as error:
-            raise InputError(f"{column} {cell!r} is not allowed: {error}") from error
-    prepare = {key: parsed.pop(key) for key in _OF_PREPARE if key in parsed}
-    if "organ_name" in prepare:  # `name` is the row's
-        prepare["name"] = prepare.pop("organ_name")
-    PrepareOptions(**prepare)
-    return Patient(name=name, source=folder / source, prepare=prepare, **parsed)
+    steps = {column: given.pop(column) for column in _LEAST if column in given}
+    for column, cell in steps.items():
+        if not cell.isdecimal() or int(cell) < _LEAST[column]:
+            raise InputError(
+                f"{column} {cell!r} is not a whole number of at least {_LEAST[column]}"
+            )
+    asked: dict[str, Any] = {"name" if key == "organ_name" else key: v for key, v in given.items()}
+    asked |= {key: asked[key].split() for key in ("organ_hu", "tumor_hu") if key in asked}
+    options = msgspec.convert(asked, PrepareOptions, strict=False)  # of words, numbers
+    prepare = {key: getattr(options, key) for key in asked}
+    counts = {column: int(cell) for column, cell in steps.items()}
+    return Patient(name=name, source=folder / source, prepare=prepare, **counts)
 
 
 def hashed(path: Path) -> File:

@@ -8,14 +8,19 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
+from PIL import Image
+
+from tumortrack.report.pictures import scene_picture
+from tumortrack.report.protocol import evaluate_scene
+from tumortrack.simulate.scene_folder import read_scene
+from tumortrack.tracking.model_files import load_model
+from tumortrack.tracking.tracker import Tracker
 
 _WIDTH = 720  # pixels
 
 
 def thumbnail(source: Path, out: Path) -> None:
     """A picture, no wider than ``_WIDTH``, as WebP."""
-    from PIL import Image
-
     with Image.open(source) as image:
         size = min(_WIDTH, image.width), round(image.height * min(1, _WIDTH / image.width))
         image.convert("RGB").resize(size).save(out, "WEBP", quality=80)
@@ -26,11 +31,6 @@ def worst_picture(
 ) -> None:
     """The estimate with the largest error, good ones first, over the truth; without estimates the
     first scene's truth; without scenes nothing."""
-    from tumortrack.report.pictures import scene_picture
-    from tumortrack.report.protocol import evaluate_scene
-    from tumortrack.simulate.scene_folder import read_scene
-    from tumortrack.tracking.model_files import load_model
-    from tumortrack.tracking.tracker import Tracker
 
     def far(row: dict[str, Any]) -> tuple[int, float]:
         errors = [tumor.get("middle_mm", -np.inf) for tumor in row["tumors"]]

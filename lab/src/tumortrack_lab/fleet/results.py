@@ -7,19 +7,16 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from importlib import resources
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pandas as pd
 
 from tumortrack.core import store
 from tumortrack.core.store import write_atomically, writing
+from tumortrack_lab.fleet.engine import Outcome
+from tumortrack_lab.fleet.list import Patient
 from tumortrack_lab.fleet.pictures import thumbnail
-from tumortrack_lab.fleet.store import DamagedError
-
-if TYPE_CHECKING:
-    from tumortrack_lab.fleet.engine import Outcome
-    from tumortrack_lab.fleet.list import Patient
-    from tumortrack_lab.fleet.store import Store
+from tumortrack_lab.fleet.store import DamagedError, Store
 
 SCENES, PATIENTS, LOOK, PAGE, PICTURES = (
     "scenes.parquet", "patients.parquet", "look.csv", "index.html", "pictures"

@@ -9,14 +9,34 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import msgspec
+import numpy as np
+
 from tumortrack.core import store
 from tumortrack.core.errors import InputError, TumortrackError
+from tumortrack.core.rigid_fit import matched_vertices
+from tumortrack.imaging import prepare as preparing
+from tumortrack.imaging.case import Case, load_case, save_case
+from tumortrack.imaging.options import PrepareOptions
+from tumortrack.report.pictures import qc_picture
+from tumortrack.simulate.scene_folder import read_scene
+from tumortrack.tracking.margins import NAME, write_sealed
+from tumortrack.tracking.model_files import case_model, load_model
+from tumortrack.tracking.tracker import Tracker
 from tumortrack_lab.fleet import checks
 from tumortrack_lab.fleet.list import Patient, hashed
+from tumortrack_lab.fleet.pictures import thumbnail, worst_picture
 from tumortrack_lab.fleet.task import File, Task
+from tumortrack_lab.margins.calibration import list_states, margins_of, row_of
+from tumortrack_lab.margins.table import head_of, open_table
+from tumortrack_lab.real.judging import judge
+from tumortrack_lab.tets import lattice
+from tumortrack_lab.twin.apparatus import bench_from_ct
+from tumortrack_lab.world.scenes import World, WorldConfig, simplified
 
 # Those of the wider world but for cut organs, which are not located any more.
 FAMILIES = ("rest", "plate", "clamp", "twist", "pull", "tether", "roll")
@@ -52,7 +72,7 @@ def chain(patient: Patient) -> dict[str, Task]:
     checked = add("check", check, series, {"case": case, "source": source}, 2000)
     after = {"case": case, "check": checked}
     groups: dict[str, dict[str, Task | File]] = {"margins": {}, "test": {}}
-    drawn = hashlib.sha256(f"{source.sha256} {patient.seed}".encode()).hexdigest()
+    drawn = hashlib.sha256(f"{source.key} {patient.seed}".encode()).hexdigest()
     counts = {"margins": (0, patient.margin_states, 1)}
     counts["test"] = _TEST, patient.test_states, patient.views
     for kind, (first, count, views) in counts.items():
@@ -73,14 +93,6 @@ def chain(patient: Patient) -> dict[str, Task]:
 
 def prepare(inputs: Inputs, options: Given, out: Path) -> None:
     """A case with its model, as from `tumortrack prepare`, but without its source's name."""
-    from dataclasses import replace
-
-    from tumortrack.imaging import prepare as preparing
-    from tumortrack.imaging.case import load_case, save_case
-    from tumortrack.imaging.options import PrepareOptions
-    from tumortrack.report.pictures import qc_picture
-    from tumortrack.tracking.model_files import case_model
-
     given: dict[str, Any] = {
         key: tuple(value) if isinstance(value, list) else value for key, value in options.items()
     }
@@ -95,8 +107,6 @@ def prepare(inputs: Inputs, options: Given, out: Path) -> None:
 def check(inputs: Inputs, options: Given, out: Path) -> None:
     """check.json: the anatomy in numbers, and ``doubts``: what a person should look at. Raises
     InputError: the case fails the quality check."""
-    from tumortrack.imaging.case import load_case
-
     case = load_case(inputs["case"])
     cut = checks.is_cut_off(case, inputs["source"], options["series"])
     numbers = checks.described(case)
@@ -108,11 +118,6 @@ def check(inputs: Inputs, options: Given, out: Path) -> None:
 def states(inputs: Inputs, options: Given, out: Path) -> None:
     """Scene folders of ``count`` states of the wider world from number ``first`` on, in ``views``
     views each, and failures.json: states without an equilibrium, views without an organ."""
-    from tumortrack.imaging.case import load_case
-    from tumortrack_lab.tets import lattice
-    from tumortrack_lab.twin.apparatus import bench_from_ct
-    from tumortrack_lab.world.scenes import World, WorldConfig
-
     case, sha256 = load_case(inputs["case"]), store.sha256_of(inputs["case"] / store.MANIFEST)
     config = WorldConfig(seed=options["seed"], families=FAMILIES)
     organ = case.anatomy.organ
@@ -147,17 +152,6 @@ def margins(inputs: Inputs, options: Given, out: Path) -> None:
     the answers; ``holds_for``, the chance that one more exchangeable answer misses by no more than
     that: n / (n + 1).
     """
-    import msgspec
-    import numpy as np
-
-    from tumortrack.imaging.case import Case
-    from tumortrack.simulate.scene_folder import read_scene
-    from tumortrack.tracking.margins import NAME, write_sealed
-    from tumortrack.tracking.model_files import load_model
-    from tumortrack.tracking.tracker import Tracker
-    from tumortrack_lab.margins.calibration import list_states, margins_of, row_of
-    from tumortrack_lab.margins.table import head_of, open_table
-
     model = inputs["case"] / Case.MODEL
     seed, digest = options["seed"], store.sha256_of(model / store.MANIFEST)
     tracker, rows = Tracker(load_model(model)), []
@@ -194,16 +188,6 @@ def margins(inputs: Inputs, options: Given, out: Path) -> None:
 
 def evaluate(inputs: Inputs, options: Given, out: Path) -> None:
     """rows.json: verdict and errors of every scene, beside those of rigid poses."""
-    from dataclasses import replace
-
-    from tumortrack.core.rigid_fit import matched_vertices
-    from tumortrack.imaging.case import load_case
-    from tumortrack.simulate.scene_folder import read_scene
-    from tumortrack.tracking.model_files import load_model
-    from tumortrack.tracking.tracker import Tracker
-    from tumortrack_lab.real.judging import judge
-    from tumortrack_lab.world.scenes import simplified
-
     anatomy = simplified(load_case(inputs["case"]).anatomy)
     tracker, rows = Tracker(load_model(inputs["case"])), []
     failures: dict[str, str] = {}
@@ -227,9 +211,6 @@ def evaluate(inputs: Inputs, options: Given, out: Path) -> None:
 def summary(inputs: Inputs, options: Given, out: Path) -> None:
     """summary.json: what the fleet's tables say of the patient; case.webp and, of the worst
     estimate, worst.webp."""
-    from tumortrack.imaging.case import Case
-    from tumortrack_lab.fleet.pictures import thumbnail, worst_picture
-
     checked = store.read_json(inputs["check"] / "check.json")
     result = store.read_json(inputs["margins"] / "result.json")
     judged = store.read_json(inputs["evaluate"] / "rows.json")

@@ -167,18 +167,11 @@ class Store:
         self._files.pipe_file(self._cost(key), json.dumps(cost, indent=1).encode())
 
     def user_file(self, file: File) -> Path:
-        """A user's file on this machine; of a URL, a copy. InputError: it is another by now."""
+        """A user's file on this machine. Raises InputError: it is another by now."""
         path = Path(file.path)
-        if "://" in file.path:
-            import fsspec
-
-            path = self._kept / file.sha256
-            if not path.exists():
-                files, source = fsspec.core.url_to_fs(file.path)
-                _fetch(files, source, path)
         if not path.exists():
             raise FileNotFoundError(f"{file.path} is not there (on this machine)")
-        if sha256_of(path) != file.sha256:
+        if sha256_of(path) != file.key:
             raise InputError(f"{file.path} was changed after the list was read; start again.")
         return path
 

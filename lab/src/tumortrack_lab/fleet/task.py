@@ -38,11 +38,7 @@ class File:
     """A user's file or folder: where it is, and the sha256 of its content."""
 
     path: str
-    sha256: str
-
-    @property
-    def key(self) -> str:
-        return self.sha256
+    key: str
 
 
 @dataclass(frozen=True, eq=False)

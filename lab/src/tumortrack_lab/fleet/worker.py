@@ -12,10 +12,9 @@ import time
 import traceback
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from pkgutil import resolve_name
 from typing import Any, Literal
 
 import tumortrack
@@ -32,7 +31,7 @@ class Job:
 
     key: str
     name: str
-    work: str
+    work: Work
     options: Mapping[str, Any]
     inputs: Mapping[str, str | File]  # keys of results in the store; users' files
     memory_mb: int
@@ -55,17 +54,12 @@ class Report:
     state: Literal["elsewhere", "there", "done", "cannot", "changed", "damaged", "memory", "failed"]
     reason: str = ""
     damaged: str = ""
-    cost: Mapping[str, Any] = field(default_factory=dict)
 
 
 def job_of(task: Task, memory_mb: int, store: str, run: str, reasons: tuple[str, ...]) -> Job:
-    """Raises TypeError: the work cannot be imported by its name."""
-    name = f"{task.work.__module__}:{task.work.__qualname__}"  # type: ignore[attr-defined]
-    if resolve_name(name) is not task.work or name.startswith("__main__"):
-        raise TypeError(f"{name} is another object than the work of {task.step}")
     inputs = {key: of if isinstance(of, File) else of.key for key, of in task.inputs.items()}
     who = f"{task.patient} {task.step}"
-    return Job(task.key, who, name, dict(task.options), inputs, memory_mb, store, run, reasons)
+    return Job(task.key, who, task.work, task.options, inputs, memory_mb, store, run, reasons)
 
 
 def perform(job: Job) -> Report:
@@ -120,10 +114,9 @@ def _claimed(job: Job, store: Store) -> Iterator[None]:
 def _measured(job: Job, store: Store, inputs: Mapping[str, Path], out: Path) -> Report:
     """Do the work and store its result and cost."""
     meter = _Meter()
-    work: Work = resolve_name(job.work)
     _use_one_core()
     try:
-        work(inputs, job.options, out)
+        job.work(inputs, job.options, out)
     except StorageError as error:  # the disk's, not the patient's
         return _attempt_failed(error)
     except TumortrackError as error:
@@ -131,11 +124,11 @@ def _measured(job: Job, store: Store, inputs: Mapping[str, Path], out: Path) -> 
         for name, path in (*inputs.items(), ("OUT", out)):
             reason = reason.replace(str(path), name)  # the same on every machine
         store.put_failure(job.key, reason)
-        report = Report("cannot", reason, cost=meter.cost(job, out))
+        report = Report("cannot", reason)
     else:
         store.put(job.key, out)
-        report = Report("done", cost=meter.cost(job, out))
-    store.put_cost(job.key, dict(report.cost))
+        report = Report("done")
+    store.put_cost(job.key, meter.cost(job, out))
     return report
 
 

@@ -17,15 +17,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from tumortrack import api
 from tumortrack.core import store
 from tumortrack.core.errors import InputError
-from tumortrack.core.patient import UNKNOWN
 from tumortrack.core.types import Anatomy, Mesh
 from tumortrack.imaging.case import Case
-from tumortrack.imaging.volume import read_labels
 from tumortrack.report.metrics import distance_to_surface, surface_samples
 
 SET_ASIDE = (91, 93, 96, 146, 155)
@@ -58,18 +54,9 @@ def outer_share(tumor: Mesh, organ: Mesh) -> float:
 
 
 def described(case: Case, path: Path) -> dict[str, Any]:
-    """A case in numbers, and the checks that it fails (``fails``)."""
-    labels = read_labels(path).labels
-    cut = labels.any() and np.count_nonzero(labels) > np.count_nonzero(labels[1:-1, 1:-1, 1:-1])
+    """A case in numbers, as the list has it."""
     organ_ml, *tumors_ml = case.report["volumes_ml"].values()
     share = outer_share(case.anatomy.tumors[0], case.anatomy.organ) if tumors_ml else 1.0
-    largest = tumors_ml[0] if tumors_ml else 0.0
-    fails = {
-        "side unknown": case.patient.side == UNKNOWN,
-        "cut off by the map's border": bool(cut),
-        "organ's volume": not ORGAN_ML[0] <= organ_ml <= ORGAN_ML[1],
-        "tumor's volume": not TUMOR_ML[0] <= largest <= TUMOR_ML[1],
-    }
     return {
         "sha256": store.sha256_of(path),
         "side": case.patient.side,
@@ -78,7 +65,6 @@ def described(case: Case, path: Path) -> dict[str, Any]:
         "organ_ml": round(organ_ml, 1),
         "tumors_ml": [round(ml, 2) for ml in tumors_ml],
         "spacing_mm": [round(mm, 3) for mm in case.report["spacing_mm"]],
-        "fails": [words for words, failed in fails.items() if failed],
     }
 
 
@@ -134,7 +120,7 @@ def check(data: Path, cases: Path, rows: Sequence[dict[str, Any]]) -> dict[str, 
         if store.sha256_of(path) != row["sha256"]:
             raise InputError(f"{path} is not the file in the list; fetch {WHERE} again.")
         now = {"case": number, **described(prepared(data, number, folder), path)}
-        if now.pop("fails") or now != row:
+        if now != row:
             raise InputError(f"{folder}: {now} is prepared now, where the list has {row}.")
         folders[name_of(number)] = folder
     return folders

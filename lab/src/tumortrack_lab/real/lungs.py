@@ -91,14 +91,11 @@ class Field:
     smoothing: float = SMOOTHING
 
     @cached_property
-    def _spline(self) -> RBFInterpolator:
+    def at(self) -> RBFInterpolator:
+        """Called with points: their displacements, mm."""
         rest_mm, there_mm = self.landmarks
         kernel = "thin_plate_spline"
         return RBFInterpolator(rest_mm, there_mm - rest_mm, smoothing=self.smoothing, kernel=kernel)
-
-    def at(self, points_mm: Points) -> Points:
-        """Displacements, mm."""
-        return self._spline(np.asarray(points_mm, float))
 
 
 def held_out_mm(

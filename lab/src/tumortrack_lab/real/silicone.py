@@ -23,7 +23,6 @@ from scipy.spatial import Delaunay, cKDTree
 
 from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.geometry import Points, transform_points, triangles_of
-from tumortrack.core.mesh_files import read_mesh
 from tumortrack.core.types import Anatomy, Mesh, SensorCloud
 from tumortrack.models.report import Frame
 from tumortrack.registration.looks import Looks
@@ -67,10 +66,6 @@ def file(data: Path, name: str) -> Path:
     if not path.is_file():
         raise InputError(f"{path} is missing: put a copy of {WHERE} at {data / 'silicone'}.")
     return path
-
-
-def read_surface(data: Path, name: str) -> Mesh:
-    return read_mesh(file(data, name))
 
 
 def read_slab(data: Path, what: str) -> Points:

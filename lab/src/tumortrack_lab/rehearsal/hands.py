@@ -3,7 +3,7 @@ the phantom to the scanner."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -50,15 +50,9 @@ class Hands:
     @property
     def true(self) -> Intrinsics:
         """The true intrinsics."""
-        camera, (right, down) = self.believed, self.errors.centre_px
-        return Intrinsics(
-            camera.width,
-            camera.height,
-            camera.fx * self.errors.focal,
-            camera.fy * self.errors.focal,
-            camera.cx + right,
-            camera.cy + down,
-        )
+        camera, focal, (right, down) = self.believed, self.errors.focal, self.errors.centre_px
+        fx, fy = camera.fx * focal, camera.fy * focal
+        return replace(camera, fx=fx, fy=fy, cx=camera.cx + right, cy=camera.cy + down)
 
     def plug_in(self) -> None:
         """Connect the camera; it shows nothing yet."""

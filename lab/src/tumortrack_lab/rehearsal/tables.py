@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from matplotlib.image import imread
 
 from tumortrack.imaging.volume import read_volume
 from tumortrack.report.drawing import new_figure, save
@@ -34,8 +35,6 @@ def evaluation_rows(reports: dict[str, dict[str, Any]]) -> pd.DataFrame:
 def picture(rehearsal: Rehearsal, path: Path) -> None:
     """One state: the depth image, the second CT across base and organ, and the estimate
     over the second CT's surfaces."""
-    from matplotlib.image import imread
-
     out = rehearsal.out
     figure = new_figure(15, 4.2, wspace=0.04)
     depth, ct, estimate = figure.subplots(1, 3, width_ratios=(1.5, 1.1, 1.3))

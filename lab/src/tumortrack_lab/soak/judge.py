@@ -6,12 +6,12 @@ import re
 import time
 from collections import Counter
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import numpy as np
 
 from tumortrack.cli.console import say
 from tumortrack.live.meter import Histogram
+from tumortrack.live.session import resident_mb
 from tumortrack.live.values import TrackingResult
 from tumortrack.live.workers import SinkWorker
 from tumortrack_lab.soak.faults import FAULTS, SINK_FAULTS, Fault, Schedule, Staged
@@ -122,9 +122,3 @@ class Judge:
         if not self.counts["good"]:
             problems.append("there was no good estimate")
         return problems
-
-
-def resident_mb() -> float:
-    """Memory of this process now."""
-    pages = int(Path("/proc/self/statm").read_text().split()[1])
-    return pages * 4096 / 2**20

@@ -5,10 +5,11 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from tumortrack_lab.soak.faults import FAULTS
 from tumortrack_lab.soak.judge import Answer, Judge
-from tumortrack_lab.study.document import table
+from tumortrack_lab.study.document import table_of
 
 
 def document(judge: Judge, summary: dict[str, Any], about: str) -> str:
@@ -48,16 +49,15 @@ def _figures(judge: Judge, summary: dict[str, Any]) -> str:
             f"{sink['delivered']:,} delivered, {sink['dropped']:,} missed, {sink['errors']:,} "
             "errors (of the faults)"
         )
-    return table(("", ""), [*rows.items()], left=2)
+    return table_of(pd.DataFrame(rows.items(), columns=["", ""]), left=2)
 
 
 def _faults(judge: Judge) -> str:
-    head = (
-        "fault", "times", "named after (median; longest), s", "in these words",
-        "good again after (longest), s",
-    )  # fmt: skip
+    head = ["fault", "times", "named after (median; longest), s", "in these words"]
+    head.append("good again after (longest), s")
     each = {kind: [a for a in judge.answers.values() if a.fault.kind == kind] for kind in FAULTS}
-    return table(head, [_row(kind, answers) for kind, answers in each.items()], left=4)
+    rows = [_row(kind, answers) for kind, answers in each.items()]
+    return table_of(pd.DataFrame(rows, columns=head), left=4)
 
 
 def _row(kind: str, answers: list[Answer]) -> list[str]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,20 +14,12 @@ from tumortrack.core.errors import InputError, StorageError
 _SPREAD = ("median", "90 %", "95 %", "worst")
 
 
-def table(head: Sequence[str], rows: Iterable[Sequence[str]], left: int = 1) -> str:
-    """A Markdown table; the first ``left`` columns are left-aligned, numbers right-aligned."""
-    lines = [head, ["---" if n < left else "---:" for n in range(len(head))]]
-    for row in rows:
-        if len(row) != len(head):
-            raise ValueError(f"a row of {len(row)} cells under a head of {len(head)}: {row}")
-        lines.append(row)
+def table_of(frame: pd.DataFrame, left: int = 1) -> str:
+    """A frame as Markdown; the first ``left`` columns are left-aligned, numbers right-aligned."""
+    rule = ["---" if n < left else "---:" for n in range(len(frame.columns))]
+    lines = [list(frame), rule, *frame.astype(str).to_numpy().tolist()]
     cells = ((cell.replace("|", "\\|") for cell in line) for line in lines)
     return "\n".join(f"| {' | '.join(line)} |" for line in cells)
-
-
-def table_of(frame: pd.DataFrame, left: int = 1) -> str:
-    """A frame as Markdown."""
-    return table(list(frame), frame.astype(str).to_numpy().tolist(), left)
 
 
 def spread_mm(of: str, values: pd.Series) -> dict[str, str]:
@@ -43,6 +35,14 @@ def spread_words(rows: pd.DataFrame, of: str) -> pd.Series:
     """Median / 95 % / worst of each row with the columns of ``spread_mm``."""
     shown = [f"{of} {name} mm" for name in _SPREAD if name != "90 %"]
     return rows[shown].agg(" / ".join, axis=1).replace(" /  / ", "–")
+
+
+def beside_rigid(rows: pd.DataFrame, of: str = "'s centre") -> dict[str, pd.Series]:
+    """Columns of a short table: errors of the centre, and of both rigid poses'."""
+    shown = {"centre, mm: median / 95 % / worst": spread_words(rows, "centre")}
+    return shown | {
+        name: spread_words(rows, name + of) for name in ("best rigid pose", "rigid fit")
+    }
 
 
 def opening(name: str) -> str:
@@ -72,42 +72,50 @@ def fill(document: str, blocks: dict[str, str]) -> str:
 
 @dataclass(frozen=True)
 class ReportWriter:
-    """A document with markers, and the command that its blocks name."""
+    """A document with markers (None: nothing is written), and the command that its blocks name."""
 
-    document: Path
+    document: Path | None
     command: str
+
+    def block(self, name: str, *texts: str) -> None:
+        """Replace a block by the command and these paragraphs."""
+        self.write({name: "\n\n".join([f"`{self.command}`", *texts])})
 
     def write(self, blocks: dict[str, str]) -> None:
         """Replace these blocks, in one step; errors as of ``check`` and ``store``."""
-        store.write_atomically(self.document, self._filled(blocks).encode())
+        if self.document is not None:
+            store.write_atomically(self.document, self._filled(self.document, blocks).encode())
 
     def check(self, names: Iterable[str]) -> None:
         """Check, before anything is measured, that these blocks can be filled. Raises InputError:
         no document, or a marker missing."""
-        self._filled(dict.fromkeys(names, ""))
+        if self.document is not None:
+            self._filled(self.document, dict.fromkeys(names, ""))
 
-    def _filled(self, blocks: dict[str, str]) -> str:
+    def _filled(self, document: Path, blocks: dict[str, str]) -> str:
         try:
-            return fill(self.document.read_text(encoding="utf-8"), blocks)
+            return fill(document.read_text(encoding="utf-8"), blocks)
         except OSError as error:
-            raise InputError(f"{self.document} cannot be read: {error.strerror}.") from error
+            raise InputError(f"{document} cannot be read: {error.strerror}.") from error
 
     def data(self, name: str, rows: pd.DataFrame, words: str) -> str:
         """Write data/NAME.csv beside the document; returns the paragraph that links to it, which
         the site shows as a table."""
-        path = self.document.parent / "data" / f"{name}.csv"
-        make_folder(path.parent)
-        store.write_atomically(path, rows.to_csv(index=False).encode())
-        return f"[{words}: {len(rows)} rows](data/{path.name})"
+        if self.document is not None:
+            path = self.document.parent / "data" / f"{name}.csv"
+            make_folder(path.parent)
+            store.write_atomically(path, rows.to_csv(index=False).encode())
+        return f"[{words}: {len(rows)} rows](data/{name}.csv)"
 
     def image(self, name: str) -> Path:
         """Where a picture goes; its folder is made."""
+        assert self.document is not None
         folder = self.document.parent / "images"
         make_folder(folder)
         return folder / f"{name}.png"
 
     def link(self, image: Path, words: str) -> str:
-        return f"![{words}]({image.relative_to(self.document.parent)})"
+        return f"![{words}](images/{image.name})"
 
 
 def make_folder(folder: Path) -> None:

@@ -15,7 +15,6 @@ from tumortrack.report.protocol import evaluate_scene
 from tumortrack.simulate.scene_folder import read_scene
 from tumortrack_lab.bench.machine import cpu_name
 from tumortrack_lab.study import scripts
-from tumortrack_lab.study.document import make_folder
 from tumortrack_lab.study.methods import Method, StudyCase
 
 One = Callable[[StudyCase, Method, str, str, int], list[dict[str, Any]]]
@@ -46,7 +45,6 @@ def measured(
             rows += [{**known, "variant": variant, **_machine(), **row} for row in made]
         return rows
 
-    make_folder(folder)
     name = f"{case.name}-{method.name}-{method.seed}-{view}-{measure_scene.__name__}.json"
     return scripts.kept(folder / name, about, measure)
 

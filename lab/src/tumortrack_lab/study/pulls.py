@@ -4,7 +4,7 @@ of what the holder holds as evidence."""
 
 from __future__ import annotations
 
-from dataclasses import asdict, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -17,9 +17,9 @@ from tumortrack.core.evidence import Evidence, Held
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import Anatomy, SensorCloud
 from tumortrack.tracking.tracker import Tracker
-from tumortrack_lab.cut import VOXEL_MM, cut
-from tumortrack_lab.study.resection import PLANNERS, WHOLE
-from tumortrack_lab.study.tables import groups, ordered
+from tumortrack_lab.cut import VOXEL_MM
+from tumortrack_lab.study.resection import PLANNERS, WHOLE, effects
+from tumortrack_lab.study.tables import ordered
 from tumortrack_lab.study.tumor_sites import tumor_sites_of
 from tumortrack_lab.world import pulled, segmentation
 from tumortrack_lab.world.families import Deformed
@@ -69,7 +69,7 @@ def pull_one(tracker: Tracker, world: World, number: int, grid: int = 160) -> li
     (rest,) = organ.pulled(world.organ.points_mm[0], up, [0.0])
     truth, view, cloud = seen(rest, None)
     estimate, before = located(view, cloud)
-    plans = {planner.name: _plan(planner, before, tumor) for planner in _PLANNERS}
+    plans = {planner.name: planner.tried(before, tumor) for planner in _PLANNERS}
     grasps = [plan.grasp_mm for plan in plans.values() if isinstance(plan, ResectionPlan)]
     if not grasps or estimate.motion is None:
         raise NoPlan(f"nothing to grip: {next(iter(plans.values()))}")
@@ -107,7 +107,7 @@ def pull_one(tracker: Tracker, world: World, number: int, grid: int = 160) -> li
                 refused = {"refused": f"no estimate: {failure}"}
                 rows += [{**pull, "how": how, "planner": p.name, **refused} for p in _PLANNERS]
                 continue
-            anew = {planner.name: _plan(planner, there, tumor) for planner in _PLANNERS}
+            anew = {planner.name: planner.tried(there, tumor) for planner in _PLANNERS}
             found = _found(now, there, truth, tumor)
             rows += [{**pull, "how": how, **found, **row} for row in _cuts(truth, anew)]
     return rows
@@ -127,21 +127,8 @@ def _beside(cup_mm: np.ndarray, view: View, cloud: SensorCloud) -> SensorCloud:
     return replace(cloud, points_mm=cloud.points_mm[~hidden])
 
 
-def _plan(planner: Any, located: Located, tumor: str) -> ResectionPlan | str:
-    try:
-        return planner.plan(located, tumor)
-    except (NoPlan, InputError) as error:
-        return str(error)
-
-
 def _cuts(truth: Anatomy, plans: dict[str, ResectionPlan | str]) -> list[dict[str, Any]]:
-    rows = []
-    for name, plan in plans.items():
-        if isinstance(plan, str):
-            rows.append({"planner": name, "refused": plan})
-        else:
-            rows.append({"planner": name, **asdict(cut(truth, plan))})
-    return rows
+    return [{"planner": name, **effects(truth, plan)} for name, plan in plans.items()]
 
 
 def _found(estimate: Estimate, there: Located, truth: Anatomy, tumor: str) -> dict[str, Any]:
@@ -160,7 +147,8 @@ def table(rows: list[dict[str, Any]]) -> pd.DataFrame:
     frame = ordered(pd.DataFrame(rows).reindex(columns=_COLUMNS), ["planner"])
     frame = frame.assign(how=pd.Categorical(frame.how, _HOW))
     lines = []
-    for (pull_mm, how, planner), plans in groups(frame, "pull_mm", "how", "planner"):
+    by = frame.groupby(["pull_mm", "how", "planner"], observed=True)
+    for (pull_mm, how, planner), plans in by:
         made = plans[plans.removed_share.notna()]
         margins = made.margin_mm.astype(float)
         asked_mm = {p.name: p.margin_mm for p in _PLANNERS}[planner] - VOXEL_MM

@@ -34,7 +34,7 @@ from tumortrack_lab.cut import VOXEL_MM, cut
 from tumortrack_lab.peers.base import Fit, estimate_of
 from tumortrack_lab.study.document import table_of
 from tumortrack_lab.study.methods import Method, StudyCase, code_sha256
-from tumortrack_lab.study.tables import NOTHING, groups, ordered
+from tumortrack_lab.study.tables import NOTHING, ordered
 from tumortrack_lab.study.trust import share_words
 from tumortrack_lab.study.tumor_sites import tumor_sites_of
 from tumortrack_lab.twin.apparatus import moved
@@ -79,6 +79,13 @@ class Planner(Config, frozen=True):
 
         config = ResectionConfig(tumor=tumor, margin_mm=self.margin_mm, sigmas=self.sigmas)
         return plan_within(located, config, budget_of, self.confidence > 0)[0]
+
+    def tried(self, located: Located, tumor: str) -> ResectionPlan | str:
+        """A plan, or why there is none."""
+        try:
+            return self.plan(located, tumor)
+        except (NoPlan, InputError) as error:
+            return str(error)
 
 
 # All but the last keep the same healthy tissue.
@@ -160,20 +167,17 @@ def cut_one(
     located = of_estimate(estimate).moved(table_from_camera)
     about = {"good": estimate.quality == "good"}
     return [
-        {"tumor": name, "planner": p.name, **about, **_planned_and_cut(true, located, p, name)}
+        {"tumor": name, "planner": p.name, **about, **effects(true, p.tried(located, name))}
         for name in tumors
         for p in PLANNERS
         if not (p.sigmas or p.confidence) or located.std_mm  # others know no uncertainty
     ]
 
 
-def _planned_and_cut(
-    true: Anatomy, located: Located, planner: Planner, tumor: str
-) -> dict[str, Any]:
-    try:
-        plan = planner.plan(located, tumor)
-    except (NoPlan, InputError) as error:
-        return {"refused": str(error)}
+def effects(true: Anatomy, plan: ResectionPlan | str) -> dict[str, Any]:
+    """Columns of a row: what a plan cuts, or why there is none."""
+    if isinstance(plan, str):
+        return {"refused": plan}
     result = cut(true, plan)
     more = {"hurt": list(result.hurt), "left_ml": result.left_ml, "promised_ml": plan.volumes_ml}
     return {**asdict(result), **more}
@@ -204,11 +208,11 @@ def tables_of(rows: list[dict[str, Any]]) -> tuple[pd.DataFrame, pd.DataFrame]:
             **_cut(plans, name[-1]),
         }
         for every, *keys in parts
-        for name, plans in groups(frame, *keys)
+        for name, plans in frame.groupby(keys, observed=True)
     ]
     refused = Counter(
         (method, planner, _NUMBER.sub("N", reason.partition(": ")[0]))
-        for (method, planner), plans in groups(frame, "method", "planner")
+        for (method, planner), plans in frame.groupby(["method", "planner"], observed=True)
         for reason in plans.refused.dropna()
     )
     whys = [(*why, count) for why, count in refused.items()]

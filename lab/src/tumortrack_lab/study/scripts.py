@@ -13,7 +13,7 @@ import tyro
 
 from tumortrack.core import store
 from tumortrack.core.errors import TumortrackError
-from tumortrack_lab.study.document import ReportWriter
+from tumortrack_lab.study.document import ReportWriter, make_folder
 
 Options = TypeVar("Options")
 
@@ -30,17 +30,25 @@ class KeptOptions:
     def begin(self, target: str, *blocks: str) -> ReportWriter:
         """Make the folder; returns the writer of the document's blocks. Raises InputError: it
         lacks one."""
-        writer = ReportWriter(self.document, make_command(target))
-        writer.check(blocks)
+        writer = begun(target, self.document, *blocks)
         self.out.mkdir(parents=True, exist_ok=True)
         return writer
 
 
+def begun(target: str, document: Path | None, *blocks: str) -> ReportWriter:
+    """The writer of a document's blocks. Raises InputError: it lacks one."""
+    writer = ReportWriter(document, make_command(target))
+    writer.check(blocks)
+    return writer
+
+
 def kept(path: Path, about: dict, measure: Callable[[], list[dict]]) -> list[dict]:
-    """The rows in a file if they were measured with the same ``about``; else measured now."""
+    """The rows in a file if they were measured with the same ``about``; else measured now, and its
+    folder made."""
     known = store.read_json(path) if path.is_file() else {}
     if known.get("about") == about and "rows" in known:
         return known["rows"]
+    make_folder(path.parent)
     rows = measure()
     store.write_json(path, {"about": about, "rows": rows})
     return rows

@@ -6,7 +6,7 @@ means not found.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -42,25 +42,6 @@ def ordered(frame: pd.DataFrame, columns: list[str]) -> pd.DataFrame:
     return frame.assign(**{key: pd.Categorical(frame[key], frame[key].unique()) for key in columns})
 
 
-def groups(frame: pd.DataFrame, *keys: str) -> Iterator[tuple[tuple, pd.DataFrame]]:
-    """The rows of each combination of values that there is."""
-    return iter(frame.groupby(list(keys), observed=True))
-
-
-def tumors(frame: pd.DataFrame) -> pd.DataFrame:
-    return frame[frame.part != ORGAN]
-
-
-def scenes(frame: pd.DataFrame) -> pd.DataFrame:
-    """One row for each scene and seed."""
-    return frame[frame.part == ORGAN]
-
-
-def is_deformed(frame: pd.DataFrame) -> pd.Series:
-    """Neither at rest nor turned only."""
-    return ~frame.variant.astype(str).str.fullmatch("D0|Rot.*")
-
-
 def spread(values: pd.Series, digits: int = 1, high: bool = False) -> dict[str, str]:
     """Median, and so many are no worse than this (nearest rank); ``high``: the lowest is the
     worst."""
@@ -77,15 +58,16 @@ def spread(values: pd.Series, digits: int = 1, high: bool = False) -> dict[str, 
 def accuracy(frame: pd.DataFrame, sites: dict[str, Sites]) -> pd.DataFrame:
     """A row for each organ, method, state (all deformed ones, each of them, and the others), part
     and figure; each scene of each seed counts."""
-    bent, rows = is_deformed(frame), []
+    # Neither at rest nor turned only.
+    bent, rows = ~frame.variant.astype(str).str.fullmatch("D0|Rot.*"), []
     each = frame[bent].assign(state=frame.variant.astype(str))
     every = pd.concat([frame.assign(state=np.where(bent, "deformed", "undeformed")), each])
-    for (case, method, state), mine in groups(every, "case", "method", "state"):
-        whole = scenes(mine)
+    for (case, method, state), mine in every.groupby(["case", "method", "state"], observed=True):
+        whole, tumors = mine[mine.part == ORGAN], mine[mine.part != ORGAN]
         about = {"organ": case, "state": state, "method": METHODS.get(method, method)}
         about |= {"scenes": mine.variant.nunique(), "seeds": mine.seed.nunique()}
         about |= {"scenes with a part not found": whole.failed.sum()}
-        for (part,), part_rows in groups(tumors(mine), "part"):
+        for part, part_rows in tumors.groupby("part", observed=True):
             site = sites[case][part]
             lies = {"part": part, "kind": site.kind, "cover mm": f"{site.cover_mm:.1f}"}
             lies["on the surface %"] = f"{100 * site.exposed_share:.0f}"

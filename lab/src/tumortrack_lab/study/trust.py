@@ -21,6 +21,7 @@ from tumortrack.report.drawing import new_figure, save
 from tumortrack.report.pictures import FROM_CAMERA, FROM_SIDE, draw_solid_view, scene_legend
 from tumortrack.simulate.scene_folder import Scene, read_scene
 from tumortrack.tracking.margins import METHOD, ModelMargins
+from tumortrack.tracking.model_files import load_model
 from tumortrack.tracking.tracker import Tracker
 from tumortrack_lab.margins.calibration import WIDEST_MM, answered, margins_of
 from tumortrack_lab.margins.table import Row, read_table
@@ -200,8 +201,6 @@ def worst_picture(
 ) -> pd.DataFrame:
     """Draw the accepted answers with the largest errors over the truth, a row each; returns their
     table."""
-    from tumortrack.tracking.model_files import load_model
-
     taken = judged[judged.accepted.astype(bool)].nlargest(count, "miss")
     models, trackers = {table.organ: table.model for table in tables}, {}
     height = 2.75 * len(taken) + 0.5

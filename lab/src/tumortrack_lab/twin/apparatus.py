@@ -23,6 +23,7 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Float64
+from scipy.spatial import cKDTree
 
 from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError, TumortrackError
@@ -34,8 +35,9 @@ from tumortrack_experiment.kit.base import laid_down as bench_from_ct
 from tumortrack_experiment.kit.stands import COMPRESSION_MM, poke_point
 from tumortrack_lab.tets import TetMesh, embed, tetrahedralise
 from tumortrack_lab.twin import equilibrium
-from tumortrack_lab.twin.equilibrium import Contact, ContactPlate, Nodes, Obstacles, Rod, Support
+from tumortrack_lab.twin.equilibrium import ContactPlate, Nodes, Rod, Support
 from tumortrack_lab.twin.solid import NeoHookeanSolid
+from tumortrack_lab.world.forces import LoadedBody, Obstacle, Steady, Touch, Weight, rows_of
 
 GRAVITY_KPA_PER_MM = 9.81e-6  # of 1 kg/m^3
 STATES = ("D0", "D1", "D2", "D3", "G1", "P1")
@@ -44,6 +46,7 @@ _STEEPEST = 1.5  # slope of the underside, which packing bears
 _SINK_STEPS = 15
 _SINK_TOLERANCE_MM = 0.4
 
+Obstacles = tuple[Obstacle, ...]
 Step = Callable[..., Nodes]  # of the load: nodes, obstacles, text, added weight -> nodes at rest
 
 
@@ -64,13 +67,6 @@ class ApparatusConfig(Config, frozen=True, kw_only=True):
     poke_mm: float = 10.0
     poke_diameter_mm: float = 8.0
 
-    def __post_init__(self) -> None:
-        for name in self.__struct_fields__:
-            if not 0 < getattr(self, name) < np.inf:
-                raise InputError(f"bench {name} is {getattr(self, name)}; it must be positive.")
-        if not self.poisson <= 0.495:
-            raise InputError(f"bench poisson is {self.poisson}; it must be at most 0.495.")
-
 
 @dataclass(frozen=True, eq=False)
 class State:
@@ -79,6 +75,14 @@ class State:
     name: str
     nodes_mm: Float64[np.ndarray, "n 3"]
     report: dict
+
+
+class _Body(LoadedBody):
+    """Unbalanced forces are measured against weight and contact forces, each one's sum."""
+
+    def load_mn(self, nodes_mm: Nodes) -> float:
+        forces = (force for force in self.forces if not isinstance(force, Steady))
+        return float(sum(np.linalg.norm(f.energy(nodes_mm)[1].sum(0)) for f in forces))
 
 
 class Apparatus:
@@ -92,15 +96,15 @@ class Apparatus:
         ratio = 1 + (config.tumor_ratio - 1) * tumor_share(self.mesh, self.anatomy)
         shear_kpa = config.youngs_kpa * ratio / (2 * (1 + config.poisson))
         self.solid = NeoHookeanSolid(self.mesh, shear_kpa, config.poisson)
-        points_mm, areas_mm2 = contact_points(self.anatomy.organ, 1.0, 1.0)
-        self.contact = Contact(embed(self.mesh, points_mm), areas_mm2, config.contact_kpa_mm)
+        points_mm, self._areas_mm2 = contact_points(self.anatomy.organ, 1.0, 1.0)
+        self.surface = embed(self.mesh, points_mm)
+        self._rows = rows_of(self.surface, len(self.mesh.nodes_mm))
         volumes = self.solid.node_volumes_mm3
         self._weight_mn = config.density_kg_m3 * GRAVITY_KPA_PER_MM * volumes
         under = _faces_down(self.anatomy.organ, points_mm)
-        surface = embed(self.mesh, points_mm[under])
-        packing = Contact(surface, areas_mm2[under], config.packing_kpa_mm)
-        self._packing = packing, (Support(points_mm[under, 2]),)
-        self._hold = equilibrium.Hold(self.mesh.nodes_mm, volumes / volumes.sum())
+        areas_mm2, bed = self._areas_mm2[under], Support(points_mm[under, 2])
+        packing = Touch(self._rows[under], areas_mm2, bed, config.packing_kpa_mm)
+        self._always = self.touch(Support()), packing, Steady.of(self.solid)
 
     def carry(
         self, state: State, points_ct: Float[np.ndarray, "m 3"]
@@ -115,16 +119,28 @@ class Apparatus:
     ) -> tuple[np.ndarray, equilibrium.Convergence]:
         """One load step: the nodes at rest in their bed among obstacles, under so many weights more
         than in the CT. Raises TumortrackError: no equilibrium was found."""
-        contacts = ((self.contact, (Support(), *obstacles)), self._packing)
-        load_mn = weight * self._weight_mn
-        problem = equilibrium.EquilibriumProblem(self.solid, contacts, load_mn, self._hold)
-        return equilibrium.find_equilibrium(problem, nodes_mm)
+        down_mn = weight * self._weight_mn[:, None] * [0.0, 0.0, -1.0]
+        body = _Body(self.solid, (*self._always, *map(self.touch, obstacles), Weight(down_mn)))
+        return equilibrium.find_equilibrium(body, nodes_mm)
+
+    def touch(self, obstacle: Obstacle) -> Touch:
+        """What an obstacle does to the surface."""
+        return Touch(self._rows, self._areas_mm2, obstacle, self.config.contact_kpa_mm)
+
+    def load_n(self, nodes_mm: Nodes, obstacle: Obstacle) -> float:
+        """How much of an obstacle's weight the organ bears."""
+        return float(self.touch(obstacle).energy(nodes_mm)[1][:, 2].sum()) / 1000
+
+    def sunk_in_mm(self, nodes_mm: Nodes, *obstacles: Obstacle) -> float:
+        """The deepest penetration of the surface into the support or an obstacle."""
+        points = self.surface.carry(nodes_mm)
+        return max(0.0, *(-float(o.distance(points)[0].min()) for o in (Support(), *obstacles)))
 
     def midsection(self, nodes_mm: np.ndarray, axis: int = 2) -> tuple[float, float]:
         """Lowest and highest z (or y) of the surface under the middle half of the plate, mm."""
-        at_rest = self.contact.surface.carry(self.mesh.nodes_mm)
+        at_rest = self.surface.carry(self.mesh.nodes_mm)
         in_middle = np.abs(at_rest[:, 0]) < self.config.plate_mm / 4
-        there = self.contact.surface.carry(nodes_mm)[in_middle, axis]
+        there = self.surface.carry(nodes_mm)[in_middle, axis]
         return float(there.min()), float(there.max())
 
 
@@ -147,8 +163,6 @@ def contact_points(
 
 def _faces_down(organ: Mesh, points_mm: Float64[np.ndarray, "m 3"]) -> Bool[np.ndarray, " m"]:
     """Which points of the surface lie on its underside, where it is not too steep."""
-    from scipy.spatial import cKDTree
-
     middle, normal = triangles_of(organ.vertices_mm, organ.faces)
     down = -normal[:, 2] > np.linalg.norm(normal, axis=1) / np.hypot(1, _STEEPEST)
     return np.asarray(down[cKDTree(middle).query(points_mm)[1]])
@@ -234,8 +248,8 @@ def _compress(bench: Apparatus, step: Step, by_mm: float, warm: State | None) ->
     return nodes, {
         "plate_z_mm": high - by_mm,
         "midsection_mm": [high - low, now_high - now_low],
-        "plate_load_n": -float(bench.contact.load_mn(nodes, above)[2]) / 1000,
-        "sunk_in_mm": bench.contact.depth_mm(nodes, (Support(), above)),
+        "plate_load_n": bench.load_n(nodes, above),
+        "sunk_in_mm": bench.sunk_in_mm(nodes, above),
     }
 
 
@@ -253,7 +267,7 @@ def _sink(bench: Apparatus, step: Step) -> tuple[Nodes, dict]:
             return nodes, {
                 "youngs_kpa": bench.config.youngs_kpa / (1 + added),
                 "sunk_mm": sunk,
-                "sunk_in_mm": bench.contact.depth_mm(nodes, (Support(),)),
+                "sunk_in_mm": bench.sunk_in_mm(nodes),
             }
         less, more = ((added, sunk), more) if sunk < wanted else (less, (added, sunk))
         if np.isfinite(more[0]):
@@ -274,11 +288,11 @@ def _poke(bench: Apparatus, step: Step) -> tuple[Nodes, dict]:
     for depth in _increments(0.0, config.poke_mm, config.load_step_mm / 2):
         rod = Rod(point - depth * up, up, radius)
         nodes = step(nodes, (rod,), f"rod pressed in by {depth:.1f} mm")
-    load_n = -float(bench.contact.load_mn(nodes, rod)[2]) / 1000
+    load_n = bench.load_n(nodes, rod)
     if load_n <= 0:
         raise TumortrackError("P1: the surface slipped past the rod; take a finer mesh (edge_mm).")
     return nodes, {
         "poke": {"tip_mm": rod.tip_mm.tolist(), "axis": up.tolist(), "radius_mm": radius},
         "poke_load_n": load_n,
-        "sunk_in_mm": bench.contact.depth_mm(nodes, (Support(), rod)),
+        "sunk_in_mm": bench.sunk_in_mm(nodes, rod),
     }

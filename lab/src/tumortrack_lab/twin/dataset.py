@@ -14,9 +14,11 @@ import json
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save
 
 from tumortrack.core import store
 from tumortrack.core.config import to_builtins
@@ -39,7 +41,6 @@ from tumortrack_lab.twin.views import VARIANTS, VIEWS, EquilibriumState
 
 KIND = "twin"
 _STATES = "states"
-_STATE_SHARE = 15.0  # a state takes about as long as so many scenes
 # More compression starts from less: the same answer in fewer load steps.
 _GOES_ON_FROM = {"D2": "D1", "D3": "D2"}
 
@@ -56,28 +57,22 @@ class TwinRun:
     solve: Callable[..., State] = solve  # these two have stand-ins in tests
 
 
-class TwinStatus(NamedTuple):
-    """Progress: the share done (a guess), and the last step."""
-
-    share: float
-    text: str
-
-
 def make_scenes(
     run: TwinRun,
     out: Path,
     variants: Sequence[str] = tuple(VARIANTS),
     views: Sequence[viewing.View] = VIEWS,
-    report: Callable[[TwinStatus], None] = lambda status: None,
+    report: Callable[[str], None] = lambda text: None,
 ) -> list[Path]:
     """Make the scenes of these variants in these views, unless they are there; returns their
     folders. A state is solved once and kept; a killed run loses only the present state or scene.
+    ``report`` gets a line of progress.
 
     Raises InputError: no case, an unknown variant or view, ``out`` holds something else, or scenes
     made from another case, seed or configuration; ArtifactError: a kept state is damaged;
     TumortrackError: a state has no equilibrium; StorageError: the disk refused.
     """
-    wanted = [(v, w) for v in _known(variants, VARIANTS) for w in _known(views, VIEWS)]
+    wanted = [(v, w) for v in known(variants, VARIANTS) for w in known(views, VIEWS)]
     case = load_case(run.case_folder)
     targets, rest_ct = draw_targets(case.anatomy, run.seed), case.anatomy.organ
     identity = {
@@ -92,17 +87,9 @@ def make_scenes(
     todo = [(v, w) for v, w in wanted if not (out / f"{v}-{w}").exists()]
     states = list(dict.fromkeys(VARIANTS[v].state for v, _ in todo))
     cache = StateCache(out / _STATES, run, case, targets)
-    unsolved = [state for state in states if not cache.has(state)]
-    total, done = max(len(todo) + _STATE_SHARE * len(unsolved), 1.0), 0.0
-
-    def say(text: str) -> None:
-        report(TwinStatus(done / total, text))
-
+    done = 0
     for name in states:
-        state = cache.get(name, say)
-        if name in unsolved:
-            done += _STATE_SHARE
-            say(f"{name}: solved")
+        state = cache.get(name, report)
         for variant, view in todo:
             if VARIANTS[variant].state == name:
                 height_mm = float(np.ptp(rest_ct.vertices_mm @ state.bench_from_ct[2, :3]))
@@ -113,8 +100,8 @@ def make_scenes(
                 with store.new_folder(out / f"{variant}-{view}") as aside:
                     write_scene_files(aside, scene)
                     twin_picture(scene, aside / "scene.png")
-                done += 1.0
-                say(f"{variant}-{view}")
+                done += 1
+                report(f"{done} of {len(todo)} scenes: {variant}-{view}")
     names = [f"{variant}-{view}" for variant in VARIANTS for view in VIEWS]
     scenes = {name: store.sha256_of(out / name) for name in names if (out / name).is_dir()}
     store.seal(out, KIND, {**identity, "scenes": scenes}, frame="camera")
@@ -139,7 +126,8 @@ def twin_picture(scene: Scene, path: Path) -> None:
     drawing.save(figure, path)
 
 
-def _known(names: Sequence[Any], allowed: Iterable[str]) -> list:
+def known(names: Sequence[Any], allowed: Iterable[str]) -> list:
+    """The names, each once. Raises InputError: one is not allowed, or there are none."""
     for name in names:
         if name not in allowed:
             raise InputError(f"{name!r} is not known; allowed: {', '.join(allowed)}.")
@@ -190,8 +178,6 @@ class StateCache:
         )
 
     def _solve(self, name: str, say: Callable[[str], None]) -> None:
-        from safetensors.numpy import save
-
         if self._bench is None:
             say("bench: filling the organ with tetrahedra")
             self._bench = self._run.build(self._case.anatomy, self._case.up_lps, self._run.bench)
@@ -211,8 +197,6 @@ class StateCache:
 
     def _read(self, name: str) -> tuple[dict[str, np.ndarray], dict, str]:
         """A kept state: its arrays, its report, and the sha256 of its tetrahedra's nodes."""
-        from safetensors import SafetensorError, safe_open
-
         path = self._path(name)
         try:
             with safe_open(path, framework="np") as file:

@@ -1,9 +1,8 @@
 """The equilibrium of a loaded solid: the minimum of its energy among rigid obstacles.
 
-Contact is frictionless, evaluated at points of the anatomy's own fine surface, which are embedded
-in the tetrahedra: a penalty of stiffness x depth^2 / 2 per area (kPa/mm). Quasi-Newton (L-BFGS) on
-top of the factorised rest stiffness (Liu, Bouaziz and Kavan 2017, doi 10.1145/2990496), with the
-contact stiffness of the start: a few dozen iterations a load step.
+Quasi-Newton (L-BFGS) on top of the factorised rest stiffness (Liu, Bouaziz and Kavan 2017, doi
+10.1145/2990496), with the contact stiffness of the start: a few dozen iterations a load step. The
+forces are those of ``world.forces``.
 """
 
 from __future__ import annotations
@@ -11,20 +10,15 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
-from typing import TYPE_CHECKING, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float64
+from scipy.sparse import csr_matrix, eye
 
 from tumortrack.core.errors import TumortrackError
-from tumortrack_lab.tets import Embedding, factorised
-from tumortrack_lab.twin.solid import NeoHookeanSolid
+from tumortrack_lab.tets import factorised
 
-if TYPE_CHECKING:
-    from scipy.sparse import csr_matrix
-
-_TOUCHING_MM = 1e-6  # what only touches counts in the stiffness
 TOLERANCE = 1e-3  # largest unbalanced force (2-norm over nodes), share of the load
 _LEAST_LOAD_MN = 1.0  # a tenth of a gram: less is no load
 _ITERATIONS = 1500
@@ -87,86 +81,6 @@ class Rod:
         return length - self.radius_mm, offset / np.maximum(length, 1e-12)[:, None]
 
 
-Obstacle = Support | ContactPlate | Rod
-Obstacles = tuple[Obstacle, ...]
-
-
-@dataclass(frozen=True, eq=False)
-class Contact:
-    """A surface (embedded points, an area each) that obstacles push back."""
-
-    surface: Embedding
-    areas_mm2: Float64[np.ndarray, " m"]
-    stiffness_kpa_mm: float
-
-    def energy(self, nodes_mm: Points, obstacles: Obstacles) -> tuple[float, Points]:
-        """Penalty energy (uJ) and its gradient at the nodes (mN)."""
-        points = self.surface.carry(nodes_mm)
-        gradient = np.zeros_like(nodes_mm)
-        energy = 0.0
-        for obstacle in obstacles:
-            distance, normal = obstacle.distance(points)
-            hit = np.flatnonzero(distance < 0)
-            push = self.stiffness_kpa_mm * self.areas_mm2[hit] * distance[hit]
-            energy += float(push @ distance[hit]) / 2
-            force = (push[:, None] * normal[hit])[:, None] * self.surface.weights[hit][..., None]
-            np.add.at(gradient, self.surface.nodes[hit], force)
-        return energy, gradient
-
-    def load_mn(self, nodes_mm: Points, obstacle: Obstacle) -> Float64[np.ndarray, " 3"]:
-        """Total force on the body by one obstacle, mN."""
-        distance, normal = obstacle.distance(self.surface.carry(nodes_mm))
-        push = self.stiffness_kpa_mm * self.areas_mm2 * np.minimum(distance, 0)
-        return -(push @ normal)
-
-    def depth_mm(self, nodes_mm: Points, obstacles: Obstacles) -> float:
-        """The deepest penetration of the surface into an obstacle."""
-        points = self.surface.carry(nodes_mm)
-        return max(0.0, *(-float(o.distance(points)[0].min()) for o in obstacles))
-
-    def stiffness(self, nodes_mm: Points, obstacles: Obstacles) -> csr_matrix:
-        """Hessian of the penalty, the obstacles' curvature left out: (3 n, 3 n), mN/mm."""
-        from scipy.sparse import coo_matrix
-
-        size = 3 * len(nodes_mm)
-        total = coo_matrix((size, size)).tocsr()
-        points = self.surface.carry(nodes_mm)
-        for obstacle in obstacles:
-            distance, normal = obstacle.distance(points)
-            hit = np.flatnonzero(distance < _TOUCHING_MM)
-            pull = (self.surface.weights[hit][..., None] * normal[hit][:, None]).reshape(-1, 12)
-            unknowns = (3 * self.surface.nodes[hit][..., None] + np.arange(3)).reshape(-1, 12)
-            rows = np.repeat(np.arange(len(hit)), 12)
-            jacobian = coo_matrix((pull.ravel(), (rows, unknowns.ravel())), (len(hit), size))
-            weight = self.stiffness_kpa_mm * self.areas_mm2[hit]
-            total += (jacobian.T @ jacobian.multiply(weight[:, None])).tocsr()
-        return total
-
-
-@dataclass(frozen=True, eq=False)
-class Hold:
-    """Prevents sliding sideways and rolling to the next stable side without deforming the body:
-    stiff springs hold the mean sideways displacement and the mean rotation, with forces spread over
-    the whole mass as in a rigid motion (inertia relief)."""
-
-    rest_mm: Nodes
-    share: Float64[np.ndarray, " n"]  # of the volume at each node
-    stiffness_mn_mm: float = 2e4
-
-    @cached_property
-    def _modes(self) -> Float64[np.ndarray, "5 n 3"]:
-        arm = self.rest_mm - self.share @ self.rest_mm
-        arm /= np.sqrt(self.share @ (arm**2).sum(1))  # rotations in mm at the radius of gyration
-        slides = np.tile(np.eye(3)[:2, None], (1, len(arm), 1))
-        turns = np.stack([np.cross(axis, arm) for axis in np.eye(3)])
-        return np.concatenate([slides, turns]) * self.share[:, None]
-
-    def energy(self, nodes_mm: Nodes) -> tuple[float, Nodes]:
-        amounts = np.einsum("mni,ni->m", self._modes, nodes_mm - self.rest_mm)
-        gradient = self.stiffness_mn_mm * np.einsum("m,mni->ni", amounts, self._modes)
-        return self.stiffness_mn_mm * float(amounts @ amounts) / 2, gradient
-
-
 @runtime_checkable
 class Equilibrium(Protocol):
     """The problem of ``find_equilibrium``: an energy (uJ) with its gradient (mN), an approximate
@@ -175,42 +89,6 @@ class Equilibrium(Protocol):
     def energy(self, nodes_mm: Nodes) -> tuple[float, Nodes]: ...
     def stiffness(self, nodes_mm: Nodes) -> csr_matrix: ...
     def load_mn(self, nodes_mm: Nodes) -> float: ...
-
-
-@dataclass(frozen=True, eq=False)
-class EquilibriumProblem:
-    """A solid among obstacles under its weight. Units: mm, kPa, mN, uJ."""
-
-    solid: NeoHookeanSolid
-    contacts: tuple[tuple[Contact, Obstacles], ...]  # surfaces, and what pushes them back
-    weight_mn: Float64[np.ndarray, " n"]  # along -z
-    hold: Hold | None = None
-
-    def energy(self, nodes_mm: Nodes) -> tuple[float, Nodes]:
-        energy, gradient = self.solid.energy(nodes_mm)
-        if not np.isfinite(energy):
-            return energy, gradient
-        energy += float(self.weight_mn @ (nodes_mm - self.solid.mesh.nodes_mm)[:, 2])
-        gradient[:, 2] += self.weight_mn
-        terms = [contact.energy(nodes_mm, obstacles) for contact, obstacles in self.contacts]
-        if self.hold is not None:
-            terms.append(self.hold.energy(nodes_mm))
-        for more, slope in terms:
-            energy += more
-            gradient += slope
-        return energy, gradient
-
-    def stiffness(self, nodes_mm: Nodes) -> csr_matrix:
-        """Of the solid at rest, and of the contacts as they are now."""
-        matrix = self.solid.rest_stiffness
-        for contact, obstacles in self.contacts:
-            matrix = matrix + contact.stiffness(nodes_mm, obstacles)
-        return matrix
-
-    def load_mn(self, nodes_mm: Nodes) -> float:
-        """What unbalanced forces are measured against: weight and contact forces, summed."""
-        pushes = [c.load_mn(nodes_mm, obstacle) for c, some in self.contacts for obstacle in some]
-        return float(self.weight_mn.sum() + sum(np.linalg.norm(push) for push in pushes))
 
 
 @dataclass(frozen=True)
@@ -272,8 +150,6 @@ def _two_loop(gradient: np.ndarray, pairs: Pairs, precondition: Solve) -> np.nda
 
 def _factorised(problem: Equilibrium, nodes: Nodes) -> Solve:
     """Solves with the stiffness as it is now."""
-    from scipy.sparse import eye
-
     matrix = problem.stiffness(nodes)
     # A small diagonal stands for the hold, without which rigid motions are free of force.
     ground = 1e-3 * matrix.diagonal().mean()

@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
+import trimesh
 from jaxtyping import Float64
 
 from tumortrack.core.errors import InputError
@@ -33,8 +34,6 @@ Generator = np.random.Generator
 
 def rod_mesh(rod: Rod) -> Mesh:
     """The rod's closed surface."""
-    import trimesh
-
     tip, axis, length = rod.tip_mm, rod.axis, rod.length_mm
     if axis[2] < 0:  # towards the camera's plane
         length = min(length, max((_LAST_DEPTH_MM - tip[2]) / axis[2], 3 * rod.radius_mm))
@@ -101,8 +100,6 @@ def add_background(
 
 
 def ellipsoid(middle_mm: np.ndarray, half_mm: np.ndarray) -> Mesh:
-    import trimesh
-
     ball = trimesh.creation.icosphere(3)
     return Mesh(ball.vertices * half_mm + middle_mm, ball.faces)
 
@@ -155,14 +152,10 @@ def _beside(frame: DepthFrame, angle: float, depth_mm: float, gap_mm: float) -> 
     row, column = np.nonzero(np.isfinite(frame.depth_mm))
     middle = np.array([np.median(column), np.median(row)])
     offset = np.stack([column, row], axis=1) - middle
-    direction = _unit(angle)
+    direction = np.array([np.cos(angle), np.sin(angle)])
     along = offset @ direction
     across = np.abs(offset @ np.array([-direction[1], direction[0]]))
     edge_px = along[across < 10].max(initial=0.0)
     pixel = middle + edge_px * direction - np.array([camera.cx, camera.cy])
     focal = np.array([camera.fx, camera.fy])
     return pixel * depth_mm / focal + gap_mm * direction
-
-
-def _unit(angle: float) -> Flat:
-    return np.array([np.cos(angle), np.sin(angle)])

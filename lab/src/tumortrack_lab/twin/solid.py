@@ -13,16 +13,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Float64, Int32
+from scipy.sparse import csr_matrix, diags
 
 from tumortrack.core.compiled import njit
 from tumortrack_lab.tets import TetMesh
-
-if TYPE_CHECKING:
-    from scipy.sparse import csr_matrix
 
 PER_TET = 0.05  # share of the bulk modulus that is kept per tetrahedron
 
@@ -78,8 +76,6 @@ class NeoHookeanSolid:
     @cached_property
     def rest_stiffness(self) -> csr_matrix:
         """The energy's Hessian at rest, (3 n, 3 n), mN/mm, unknowns node by node."""
-        from scipy.sparse import csr_matrix, diags
-
         tets, volumes = self.mesh.tets, self.mesh.volumes_mm3
         inner = self._rest.inner
         shape = np.concatenate([-inner.sum(1, keepdims=True), inner], axis=1)  # (t, 4, 3)

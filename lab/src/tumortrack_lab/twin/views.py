@@ -10,7 +10,6 @@ from jaxtyping import Float64
 from msgspec import structs
 
 from tumortrack.core.config import Config, to_builtins
-from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import rigid, transform_points
 from tumortrack.core.types import Anatomy
 from tumortrack.sense.camera import d405, project
@@ -84,8 +83,6 @@ class EquilibriumState:
 def camera_from_bench(config: ViewConfig, turn_degrees: int = 0) -> Float64[np.ndarray, "4 4"]:
     """Straight down from above the bench's middle, turned about the camera's axis by a multiple of
     90 degrees. Unturned, the picture's right is the bench's x and its down the bench's -y."""
-    if turn_degrees % 90:
-        raise InputError(f"turns are multiples of 90 degrees, not {turn_degrees}.")
     cosine, sine = {0: (1, 0), 90: (0, 1), 180: (-1, 0), 270: (0, -1)}[turn_degrees % 360]
     turn = np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1.0]])
     return rigid(turn @ np.diag([1.0, -1.0, -1.0]), np.array([0, 0, config.camera_above_mm]))

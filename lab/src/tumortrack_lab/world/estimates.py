@@ -19,7 +19,7 @@ from tumortrack.tracking.margins import METHOD
 from tumortrack.tracking.model_files import load_model
 from tumortrack.tracking.tracker import Tracker
 from tumortrack_lab.real.judging import by_tumor, judge
-from tumortrack_lab.study.document import spread_mm, spread_words, table_of
+from tumortrack_lab.study.document import beside_rigid, spread_mm, table_of
 from tumortrack_lab.study.trust import BANDS, band_of
 
 _ERRORS = {"middle_mm": "off", "rigid_middle_mm": "rigid", "rigid_fit_middle_mm": "fit"}
@@ -94,10 +94,7 @@ def summary(lines: pd.DataFrame) -> str:
     """The first part of these in Markdown."""
     short, by = lines[lines.by == lines.by[0]], lines.by[0]
     shown = short[["value", "scenes", "good", "wrong"]].rename(columns={"value": by})
-    shown["centre, mm: median / 95 % / worst"] = spread_words(short, "centre")
-    for of in ("best rigid pose", "rigid fit"):
-        shown[of] = spread_words(short, of)
-    return table_of(shown)
+    return table_of(shown.assign(**beside_rigid(short, "")))
 
 
 def wrong_ones(rows: pd.DataFrame) -> pd.DataFrame:

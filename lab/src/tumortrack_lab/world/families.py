@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float64, Int
+from scipy.spatial.transform import Rotation
 
 from tumortrack.core.errors import TumortrackError
 from tumortrack.core.geometry import perpendicular, unit
@@ -93,8 +94,6 @@ def clamp(stage: Stage, rng: Generator) -> Load:
 
 def _twist(stage: Stage, rng: Generator) -> Load:
     """Both ends are held and turned about the long axis, oppositely."""
-    from scipy.spatial.transform import Rotation
-
     x, angle = stage.organ.points_mm[:, 0], rng.uniform(10.0, 50.0) * rng.choice([-1, 1])
     ends = np.flatnonzero(x < np.quantile(x, 0.12)), np.flatnonzero(x > np.quantile(x, 0.88))
     middles = [stage.organ.points_mm[end].mean(0) for end in ends]

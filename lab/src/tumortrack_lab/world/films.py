@@ -20,6 +20,8 @@ from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float, Float32, Float64, Int64
+from safetensors.numpy import load_file, save
+from scipy.spatial.transform import Rotation
 
 from tumortrack.core import store
 from tumortrack.core.config import Config
@@ -125,8 +127,6 @@ def write_film(
     """Solve, render and write one sequence, all or nothing; ``states``: solved states, for the
     kinds that use them. Raises TumortrackError: none of several loads has equilibria all along its
     path; StorageError."""
-    from scipy.spatial.transform import Rotation
-
     seed = [config.seed, ALL_KINDS.index(kind), number]
     path, failed = _some_path(world, kind, seed, states)
     rng, rest = np.random.default_rng([*seed, 1]), world.organ.anatomy
@@ -240,8 +240,6 @@ def _filmed(
 def _write_truth(
     folder: Path, world: World, stamps_ns: np.ndarray, seen_mm: np.ndarray, hidden: np.ndarray
 ) -> None:
-    from safetensors.numpy import save
-
     rest = world.anatomy_ct
     count = sum(len(part.vertices_mm) for part in rest.parts)
     poses, bends = [], []
@@ -269,8 +267,6 @@ def _write_truth(
 
 def read_film(folder: Path) -> Film:
     """Read a sequence that ``write_film`` wrote."""
-    from safetensors.numpy import load_file
-
     kept = load_file(folder / "truth.safetensors")
     sizes, vertices, faces = (kept.pop(name) for name in ("sizes", "vertices_ct", "faces"))
     ends = np.cumsum(sizes, axis=0)[:-1].T
@@ -280,7 +276,5 @@ def read_film(folder: Path) -> Film:
 
 
 def _small_error(rng: np.random.Generator) -> Float64[np.ndarray, "4 4"]:
-    from scipy.spatial.transform import Rotation
-
     turn = Rotation.from_rotvec(rng.normal(0, _POSE_DEGREES, 3), degrees=True)
     return rigid(turn.as_matrix(), rng.normal(0, _POSE_MM, 3))

@@ -1,27 +1,26 @@
-"""Forces on an organ of the wider world, each an energy (uJ) with its gradient (mN) and an
-approximate Hessian (mN/mm); and the organ under them, whose equilibrium is found by
+"""Forces on an organ of the twin or the wider world, each an energy (uJ) with its gradient (mN) and
+an approximate Hessian (mN/mm); and the organ under them, whose equilibrium is found by
 ``twin.equilibrium``. Units: mm, kPa, mN.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Protocol, runtime_checkable
+from functools import cached_property
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float, Float64, Int
+from scipy.sparse import bsr_matrix, csr_matrix, eye, kron
 
 from tumortrack.core.compiled import njit
 from tumortrack.core.mesh_query import contains, surface_distance
 from tumortrack.core.types import Mesh
 from tumortrack_lab.tets import Embedding, TetMesh
-from tumortrack_lab.twin import equilibrium
 from tumortrack_lab.twin.equilibrium import Nodes, Points
 from tumortrack_lab.twin.solid import NeoHookeanSolid
 
-if TYPE_CHECKING:
-    from scipy.sparse import csr_matrix
-
+_STEADY_MN_MM = 2e4
 _STICK_MM = 0.2  # a smaller slip meets less than full friction: keeps the energy smooth
 FACES = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]])  # of a tetrahedron, outward
 _GRID_MM, _GRID_ROOM_MM = 2.5, 25.0
@@ -44,16 +43,12 @@ class Obstacle(Protocol):
 
 def rows_of(held: Embedding, n_nodes: int) -> csr_matrix:
     """The matrix that carries nodes (n, 3) to points (m, 3)."""
-    from scipy.sparse import csr_matrix
-
     row = np.repeat(np.arange(len(held.nodes)), 4)
     return csr_matrix((held.weights.ravel(), (row, held.nodes.ravel())), (len(held.nodes), n_nodes))
 
 
 def _spread(rows: csr_matrix, blocks: Float64[np.ndarray, "m 3 3"]) -> csr_matrix:
     """The nodes' Hessian of those of single points."""
-    from scipy.sparse import bsr_matrix, csr_matrix, eye, kron
-
     m, n = rows.shape
     if m == 0:
         return csr_matrix((3 * n, 3 * n))
@@ -161,8 +156,6 @@ class Capsule:
         return self.springs_mn_mm * float(longer @ longer) / 2, gradient
 
     def stiffness(self, nodes_mm: Nodes) -> csr_matrix:
-        from scipy.sparse import csr_matrix
-
         way = nodes_mm[self.edges[:, 1]] - nodes_mm[self.edges[:, 0]]
         way /= np.linalg.norm(way, axis=1, keepdims=True)
         e, row = len(self.edges), np.arange(len(self.edges))
@@ -175,8 +168,6 @@ class _Soft:
     """Adds nothing to the approximate Hessian."""
 
     def stiffness(self, nodes_mm: Nodes) -> csr_matrix:
-        from scipy.sparse import csr_matrix
-
         return csr_matrix((nodes_mm.size, nodes_mm.size))
 
 
@@ -190,17 +181,36 @@ class Weight(_Soft):
         return -float((self.force_mn * nodes_mm).sum()), -self.force_mn
 
 
-class Steady(_Soft, equilibrium.Hold):
-    """Holds the mean sideways displacement and the mean rotation; see the twin's ``Hold``."""
+@dataclass(frozen=True, eq=False)
+class Steady(_Soft):
+    """Prevents sliding sideways and rolling to the next stable side without deforming the body:
+    stiff springs hold the mean sideways displacement and the mean rotation, with forces spread over
+    the whole mass as in a rigid motion (inertia relief)."""
+
+    rest_mm: Nodes
+    share: Float64[np.ndarray, " n"]  # of the volume at each node
 
     @classmethod
     def of(cls, solid: NeoHookeanSolid) -> Steady:
         return cls(solid.mesh.nodes_mm, solid.node_volumes_mm3 / solid.node_volumes_mm3.sum())
 
+    @cached_property
+    def _modes(self) -> Float64[np.ndarray, "5 n 3"]:
+        arm = self.rest_mm - self.share @ self.rest_mm
+        arm /= np.sqrt(self.share @ (arm**2).sum(1))  # rotations in mm at the radius of gyration
+        slides = np.tile(np.eye(3)[:2, None], (1, len(arm), 1))
+        turns = np.stack([np.cross(axis, arm) for axis in np.eye(3)])
+        return np.concatenate([slides, turns]) * self.share[:, None]
+
+    def energy(self, nodes_mm: Nodes) -> tuple[float, Nodes]:
+        amounts = np.einsum("mni,ni->m", self._modes, nodes_mm - self.rest_mm)
+        gradient = _STEADY_MN_MM * np.einsum("m,mni->ni", amounts, self._modes)
+        return _STEADY_MN_MM * float(amounts @ amounts) / 2, gradient
+
 
 @dataclass(frozen=True, eq=False)
 class LoadedBody:
-    """A solid under forces; see ``equilibrium.Equilibrium``."""
+    """A solid under forces; see ``twin.equilibrium.Equilibrium``."""
 
     solid: NeoHookeanSolid
     forces: tuple[Force, ...]

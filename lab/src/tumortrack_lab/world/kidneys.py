@@ -7,7 +7,9 @@ CT and seen from a random side. Nothing in them comes from a patient.
 from __future__ import annotations
 
 import numpy as np
+import trimesh
 from scipy.spatial.transform import Rotation
+from skimage.measure import marching_cubes
 
 from tumortrack.core.errors import TumortrackError
 from tumortrack.core.types import Anatomy, Mesh
@@ -92,9 +94,6 @@ def _fields(parameters: digital.PhantomParameters) -> tuple[list[np.ndarray], di
 
 def _surface(field_mm: np.ndarray, axes: digital.Axes) -> Mesh:
     """The closed zero surface of a field, its largest piece, organ frame."""
-    import trimesh
-    from skimage.measure import marching_cubes
-
     capped = np.clip(field_mm, -_FIELD_LIMIT_MM, _FIELD_LIMIT_MM)
     vertices, faces, _, _ = marching_cubes(capped, 0.0, spacing=(_STEP_MM,) * 3)
     pieces = trimesh.Trimesh(vertices, faces[:, ::-1]).split(only_watertight=True)

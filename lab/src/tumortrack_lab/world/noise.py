@@ -27,6 +27,7 @@ from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Float32, Float64
+from scipy.ndimage import gaussian_filter, map_coordinates, minimum_filter
 
 from tumortrack.core.config import Config
 from tumortrack.core.types import DepthFrame, Intrinsics
@@ -114,8 +115,6 @@ class StereoCamera:
 
     def _bent(self, true: Image) -> Image:
         """The image with the residual distortion of the lenses."""
-        from scipy.ndimage import map_coordinates
-
         if self._config.lens_px == 0:
             return true
         height, width = true.shape
@@ -150,8 +149,6 @@ class StereoCamera:
 
 def _field(shape: tuple[int, int], reach_px: float, rng: np.random.Generator) -> Image:
     """Gaussian noise of variance 1 whose correlation falls as exp(-(d / 2 reach)^2)."""
-    from scipy.ndimage import gaussian_filter
-
     if reach_px < 0.3:
         return rng.normal(size=shape)
     field = gaussian_filter(rng.normal(size=shape), reach_px, mode="wrap")
@@ -162,8 +159,6 @@ def _field(shape: tuple[int, int], reach_px: float, rng: np.random.Generator) ->
 
 def _fattened(true: Image) -> Image:
     """Near objects grow by a pixel: a matching window that contains their edge matches there."""
-    from scipy.ndimage import minimum_filter
-
     near = minimum_filter(np.nan_to_num(true, nan=np.inf), 3)
     with np.errstate(invalid="ignore"):
         wins = ~(true - near < _FATTEN_MM) & np.isfinite(near)

@@ -7,6 +7,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import Anatomy
@@ -44,9 +46,6 @@ class Wound(NamedTuple):
 def cut_open(mesh: TetMesh, slit: Slit) -> Wound:
     """Part the mesh: nodes that lie inside the slit are doubled. Raises InputError: the slit meets
     no face between tetrahedra."""
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
-
     middles = mesh.nodes_mm[mesh.tets].mean(1)
     side = (middles - slit.middle_mm) @ slit.normal > 0
     faces = mesh.tets[:, FACES].reshape(-1, 3)

@@ -16,6 +16,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float64
+from scipy.interpolate import PchipInterpolator
+from scipy.spatial.transform import Rotation, Slerp
 
 from tumortrack.core.geometry import rigid, transform_points, unit
 from tumortrack.core.rigid_fit import kabsch
@@ -99,9 +101,6 @@ class LoadPath:
 
     def of(self, points_mm: Points) -> Moving:
         """Points in or on the organ at rest on their way."""
-        from scipy.interpolate import PchipInterpolator
-        from scipy.spatial.transform import Rotation, Slerp
-
         mesh, (poses, left) = self.organ.mesh, self.parted(points_mm)
         middle = np.average(mesh.nodes_mm, axis=0, weights=mesh.lump(mesh.volumes_mm3))
         places = poses[:, :3, :3] @ middle + poses[:, :3, 3]
@@ -287,8 +286,6 @@ def _breathe(organ: Organ, rng: Generator) -> LoadPath:
 
 def turned(middle_mm: np.ndarray, degrees: Sequence[float], shift_mm: np.ndarray) -> Transform:
     """A motion that turns about a point (a rotation vector), and moves it."""
-    from scipy.spatial.transform import Rotation
-
     rotation = Rotation.from_rotvec(degrees, degrees=True).as_matrix()
     return rigid(rotation, middle_mm - rotation @ middle_mm + shift_mm)
 

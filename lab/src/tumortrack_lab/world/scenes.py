@@ -9,6 +9,7 @@ from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 from jaxtyping import Float64
+from safetensors.numpy import load_file, save
 
 from tumortrack.core import store
 from tumortrack.core.config import Config
@@ -100,8 +101,6 @@ class World:
     def opened(cls, case: Path, config: WorldConfig, tets: Path) -> World:
         """The world of a case's folder, with the tetrahedra in a file, which is written if there is
         none."""
-        from safetensors.numpy import load_file, save
-
         of = partial(cls.of, load_case(case), store.sha256_of(case / store.MANIFEST), config)
         if tets.exists():
             kept = load_file(tets)

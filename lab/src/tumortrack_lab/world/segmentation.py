@@ -11,6 +11,7 @@ from __future__ import annotations
 from typing import Literal, get_args
 
 import numpy as np
+from scipy.ndimage import gaussian_filter1d, map_coordinates
 
 from tumortrack.core.geometry import rotation_onto
 from tumortrack.core.mesh_query import contains
@@ -64,8 +65,6 @@ def _disagreement(mesh: Mesh, reach_mm: float, rng: np.random.Generator) -> np.n
 def _sliced(mesh: Mesh, thick_mm: float, phase: float, axis: np.ndarray) -> np.ndarray:
     """Each vertex's shift if the shape is known only in slices: each shows the mean over its
     thickness, and the steps between them are smoothed along the slices' normal."""
-    from scipy.ndimage import gaussian_filter1d, map_coordinates
-
     turn = rotation_onto(axis, np.array([0.0, 0.0, 1.0]))
     there = mesh.vertices_mm @ turn.T
     low = there.min(0) - 2 * _REACH_MM - [0, 0, phase * thick_mm]

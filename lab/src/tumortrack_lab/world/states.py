@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from tumortrack.core import store
 from tumortrack.core.errors import InputError
@@ -81,8 +82,6 @@ class StatePath(LoadPath):
     shares: tuple[tuple[State, float], ...] = ()
 
     def parted(self, points_mm: Points) -> tuple[np.ndarray, np.ndarray]:
-        from scipy.spatial.transform import Rotation
-
         middle, poses = self.organ.middle_mm, []
         for state, share in self.shares:
             turn = Rotation.from_matrix(state.pose[:3, :3]).as_rotvec(degrees=True)

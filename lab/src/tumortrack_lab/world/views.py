@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float64
+from scipy.spatial import cKDTree
 
 from tumortrack.core.geometry import rigid, rotation_onto, transform_points, unit
 from tumortrack.core.types import DepthFrame, Intrinsics, Mesh, SensorCloud
@@ -79,8 +80,6 @@ def look(
 def organ_cloud(view: View, organ: Mesh, rng: Generator) -> tuple[SensorCloud, float]:
     """The organ's points as tracking finds them, and the share of them that lie on it. Raises
     NoEstimate: too few are found."""
-    from scipy.spatial import cKDTree
-
     rest = organ.vertices_mm - organ.vertices_mm.mean(0)
     extents = np.ptp(rest @ np.linalg.svd(rest, full_matrices=False)[2].T, axis=0)
     crop = CloudConfig(near_mm=75.0, far_mm=330.0, n_points=2000)
