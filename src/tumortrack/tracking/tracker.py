@@ -54,7 +54,8 @@ class Tracker:
             model = case_model(model)
         if not isinstance(model, Model):
             raise InputError(
-                f"Tracker takes a case or model, not {type(model).__name__}: load_case(FOLDER)."
+                f"Tracker takes a case or a model, not {type(model).__name__}: "
+                "Tracker(load_case(FOLDER))."
             )
         keep_small_blocks()
         self.model, self._patient, self._organ = model, model.patient, model.organ
