@@ -84,7 +84,8 @@ def labels_of(raw: grid.RawVolume, path: Path) -> LabelVolume:
     low, high = float(raw.array.min()), float(raw.array.max())
     if not (low >= 0 and high <= 255):
         raise InputError(
-            f"{path} is no label map: values from {low:g} to {high:g}; 0 to 255 are allowed."
+            f"{path} is no label map: values from {low:g} to {high:g}; whole numbers from 0 to "
+            "255 are allowed."
         )
     labels = raw.array.astype(np.uint8)
     if raw.array.dtype.kind == "f" and not np.array_equal(labels, raw.array):
