@@ -26,8 +26,8 @@ from live_objects import (
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import rigid
 from tumortrack.core.types import SensorCloud
-from tumortrack.live.meter import Rate
 from tumortrack.live.values import Observation, PublishedFrame, Workcell
+from tumortrack_devices.rate import Rate
 from tumortrack_devices.ros.messages import Messages, stamp_of
 from tumortrack_devices.ros.results import MARKERS, ResultMessages
 from tumortrack_devices.ros.sensors import (

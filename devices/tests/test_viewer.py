@@ -22,17 +22,17 @@ from reports import reporting
 from tumortrack.core.colours import TUMORS, part_colour
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import rigid, transform_points
+from tumortrack.core.mesh_query import exact_margin, rough_margin
 from tumortrack.core.patient import Patient
 from tumortrack.core.report import EvidenceReport
 from tumortrack.core.store import new_folder
 from tumortrack.core.types import Anatomy, LabelVolume, Mesh, Volume
 from tumortrack.imaging.case import Case, save_case
 from tumortrack.live.values import PublishedFrame, SinkContext, TrackingResult
-from tumortrack.tracking.shells import exact_margin, rough_margin
-from tumortrack.tracking.slices import CarriedCt, SlicePlane, plane_through, slice_picture
+from tumortrack.tracking.slices import CarriedCt, SlicePlane, plane_through
 from tumortrack_devices.display import seen_points
 from tumortrack_devices.sinks import viewer
-from tumortrack_devices.sinks.viewer import ViewerSink, ViewerSinkConfig
+from tumortrack_devices.sinks.viewer import ViewerSink, ViewerSinkConfig, slice_picture
 from tumortrack_devices.viewer.look import point_under
 from tumortrack_devices.viewer.panel import StatusPanel
 from tumortrack_devices.viewer.scene import bare_faces

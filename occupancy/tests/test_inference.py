@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from tumortrack.cli.models import Compile
+from tumortrack.cli.doctor import Compile
 from tumortrack.tracking.model_files import load_model
 from tumortrack_occupancy.config import MlpDecoderConfig, NetworkConfig
 from tumortrack_occupancy.inference import Inference, can_pack, fastest

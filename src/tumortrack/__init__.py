@@ -26,19 +26,22 @@ if TYPE_CHECKING:
     from tumortrack.core.types import Look as Look
     from tumortrack.core.types import SensorCloud as SensorCloud
     from tumortrack.imaging.case import Case as Case
+    from tumortrack.imaging.case import load_case as load_case
+    from tumortrack.report.inspection import describe as describe
     from tumortrack.tracking import presets as presets
     from tumortrack.tracking.advice import advise as advise
     from tumortrack.tracking.tracker import Tracker as Tracker
 
 _NAMES = {  # by the module that has them
-    "api": "describe estimate_from_surfaces evaluate export find_organ load_case "
-    "load_estimate load_model locate prepare read_cloud read_depth save_estimate scan_phantom "
-    "simulate_scenes teach track train write_scenes",
+    "api": "estimate_from_surfaces evaluate export find_organ load_estimate load_model locate "
+    "prepare read_cloud read_depth save_estimate scan_phantom simulate_scenes teach track train "
+    "write_scenes",
     "core": "errors",
     "core.estimate": "Estimate",
     "core.evidence": "Free Held Landmark Outline Touch",
     "core.types": "DepthFrame Intrinsics Look SensorCloud",
-    "imaging.case": "Case",
+    "imaging.case": "Case load_case",
+    "report.inspection": "describe",
     "tracking.advice": "advise",
     "tracking.tracker": "Tracker",
     "tracking": "presets",

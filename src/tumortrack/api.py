@@ -23,7 +23,7 @@ from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.estimate import Estimate
 from tumortrack.core.types import DepthFrame, Mesh, SensorCloud
 from tumortrack.imaging.case import Case
-from tumortrack.imaging.case import load_case as read_case
+from tumortrack.imaging.case import load_case as load_case
 from tumortrack.tracking.options import (
     Device,
     ExportOptions,
@@ -125,27 +125,6 @@ def prepare(
         case = load_case(folder)
         case_model(case, progress=progress)
     return case
-
-
-def load_case(folder: StrPath) -> Case:
-    """Read a folder that ``prepare`` wrote.
-
-    Raises:
-        ArtifactError: missing, of another schema, or changed since.
-    """
-    return read_case(Path(folder))
-
-
-def describe(path: StrPath) -> list[str]:
-    """What a folder or file is and what is in it, as lines of text: of all that commands write, and
-    of clouds, depth images, meshes, CTs and label maps.
-
-    Raises:
-        InputError, ArtifactError: it is missing, of no kind that is known here, or damaged.
-    """
-    from tumortrack.report import inspection
-
-    return inspection.describe(Path(path))
 
 
 def simulate_scenes(

@@ -1,5 +1,8 @@
-"""Halts of arms: compared by kind, whatever their numbers."""
+"""Halts of arms: compared by kind, whatever their numbers. Every kind has a sentence."""
 
+from typing import get_args
+
+from tumortrack.core import halt, report
 from tumortrack.core.halt import CUT_NOTE, Halt
 from tumortrack.core.report import Finding
 
@@ -24,3 +27,8 @@ def test_halts_that_differ_in_numbers_alone_are_the_same():
     assert CUT_NOTE in moved("tumor_1", 2.04, cut=True).words
     assert without_frame(0.6).same_as == without_frame(1.9).same_as
     assert without_frame(0.6).words == "no estimate: no frame for 0.6 s"
+
+
+def test_every_kind_has_one_sentence():
+    assert {*halt._SENTENCES} == {*get_args(halt.HaltKind)}
+    assert sorted([*report._SAID.poor, *report._SAID.none]) == sorted(get_args(report.Kind))

@@ -16,7 +16,7 @@ from tumortrack.core.errors import ArtifactError, InputError
 from tumortrack.core.types import SensorCloud
 from tumortrack.imaging.case import Case, load_case, save_case
 from tumortrack.registration.build import build_model
-from tumortrack.registration.presets import clinic
+from tumortrack.registration.config import clinic
 from tumortrack.simulate.deform import DragConfig, ElasticConfig
 from tumortrack.tracking import model_files
 from tumortrack.tracking.model_files import case_model, load_model, make_model

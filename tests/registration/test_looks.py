@@ -13,9 +13,9 @@ from scipy.spatial.transform import Rotation
 from live_objects import small_setting
 from stories import answered, refusal, tumortrack
 from tumortrack.core import store
-from tumortrack.core.causes import Cause
 from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.geometry import rigid, transform_points
+from tumortrack.core.report import Cause
 from tumortrack.core.types import DepthFrame, Look, SensorCloud
 from tumortrack.live.values import CameraView, Observation
 from tumortrack.live.views import Scan, ViewsLocator

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from tumortrack.core.causes import Cause, Likely
 from tumortrack.core.errors import InputError, NoEstimate
+from tumortrack.core.report import Cause, Likely
 from tumortrack.core.types import Anatomy, SensorCloud
 from tumortrack.imaging.surface import surfaces
 from tumortrack.phantom.digital import PhantomParameters, phantom_labels

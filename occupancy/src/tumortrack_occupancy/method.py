@@ -15,7 +15,7 @@ from tumortrack.core.types import Anatomy
 from tumortrack.imaging.case import Case
 from tumortrack.models.method import Locator, Preset, TrainingStatus, TrainOptions
 from tumortrack.models.model import Model
-from tumortrack.registration.presets import Rotations
+from tumortrack.registration.config import Rotations
 
 if TYPE_CHECKING:
     from tumortrack_occupancy.config import TrainConfig

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from tumortrack.core.types import Anatomy
-from tumortrack.registration.presets import Rotations
+from tumortrack.registration.config import Rotations
 from tumortrack.sense.clutter import ClutterConfig
 from tumortrack.sense.noise import D405_NOISE
 from tumortrack.simulate.deform import ChainConfig, DragConfig, StretchConfig

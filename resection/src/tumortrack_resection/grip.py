@@ -79,8 +79,8 @@ class Grip:
 
 
 def held_std_mm(budget: ErrorBudget) -> float:
-    """Of the holder's way since it gripped: the tool's bound counts as three standard deviations, as
-    that of tracking does. The hand-eye calibration's error is in both ends of the way alike."""
+    """Of the holder's way since it gripped: the tool's bound counts as three standard deviations,
+    as that of tracking does. The hand-eye calibration's error is in both ends of the way alike."""
     return budget.tool_mm / DEVIATIONS
 
 

@@ -10,9 +10,8 @@ from pathlib import Path
 from typing import Any, Literal
 
 import tumortrack
-from tumortrack.cli.cases import Prepare, Simulate
+from tumortrack.cli.cases import Evaluate, Prepare, Simulate
 from tumortrack.cli.console import say
-from tumortrack.cli.evaluate import Evaluate
 from tumortrack.cli.main import command
 from tumortrack.cli.training import Train
 from tumortrack.core import store

@@ -1,4 +1,5 @@
-"""What this machine can do, and how to install what is missing: `doctor`."""
+"""What this machine can do, how to install what is missing, and what it compiles once: `doctor`,
+`compile`."""
 
 from __future__ import annotations
 
@@ -14,53 +15,38 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Literal
 
+import msgspec
 from packaging.requirements import Requirement
+from tyro.conf import Positional
 
-from tumortrack.cli.console import say
-from tumortrack.core.errors import TumortrackError
+from tumortrack.cli.console import Device, say
+from tumortrack.core.errors import NoEstimate, TumortrackError
 from tumortrack.core.process import available_cores
+from tumortrack.core.tables import read_table
 from tumortrack.models.method import GROUP
+from tumortrack.models.model import Model
 
-# By distribution and extra ("": what it always needs).
+_GRID = 32  # of `compile`
+_VOXEL_MM, _UP_LPS = 1.5, (0.0, -1.0, 0.0)  # of the built-in phantom
+
+
+class _Table(msgspec.Struct, forbid_unknown_fields=True):
+    """See doctor.toml."""
+
+    purposes: dict[str, dict[str, str]]
+    modules: dict[str, str]
+    parts: dict[str, str]
+    system: dict[str, tuple[str, str]]
+
+
+_TABLE = read_table("tumortrack.cli", "doctor.toml", _Table)
 PURPOSES = {
-    ("tumortrack", ""): "cases, locating, tracking",
-    ("tumortrack", "dicom"): "DICOM segmentations",
-    ("tumortrack", "pcd"): ".pcd clouds",
-    ("tumortrack-occupancy", ""): "the paper's method: networks and their training",
-    ("tumortrack-occupancy", "onnx"): "networks as ONNX files",
-    ("tumortrack-occupancy", "tensorboard"): "training curves",
-    ("tumortrack-devices", ""): "recordings, ROS 2, the web viewer, 3D Slicer",
-    ("tumortrack-devices", "realsense"): "RealSense cameras",
-    ("tumortrack-devices", "stereo"): "depth from two pictures",
-    ("tumortrack-devices", "ur"): "a camera that an arm of Universal Robots holds",
-    ("tumortrack-resection", ""): "plans of a resection",
-    ("tumortrack-resection", "arms"): "motions of two arms",
-    ("tumortrack-resection", "ur"): "a real arm of Universal Robots",
-    ("tumortrack-experiment", ""): "phantoms, calibrations, recordings",
-    ("tumortrack-lab", ""): "digital twin, studies, benchmarks",
-    ("tumortrack-lab", "fleet"): "many patients on many machines",
-}
-_MODULES = {  # import names that differ from the package's
-    "opencv-python-headless": "cv2",
-    "pillow": "PIL",
-    "pin": "pinocchio",
-    "python-gdcm": "gdcm",
-    "scikit-fem": "skfem",
-    "scikit-image": "skimage",
-    "ur_rtde": "rtde_control",
-}
-# Packages that only a part of their extra needs: the rest works without them.
-_PARTS = {
-    "rosbags": "recordings, and messages of ROS",
-    "cyclonedds": "ROS 2",
-    "viser": "the web viewer",
-    "fastcrc": "OpenIGTLink to 3D Slicer",
-    "pyrealsense2": "RealSense cameras",
+    (name, extra): words
+    for name, extras in _TABLE.purposes.items()
+    for extra, words in extras.items()
 }
 _ABSENT = " is not installed"
 Status = tuple[Literal["ok", "absent", "BROKEN"], str]  # with its text
-# System libraries, which pip cannot install.
-_SYSTEM = {"pyrealsense2": ("libusb", "apt-get install libusb-1.0-0")}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,8 +75,7 @@ class Doctor:
                     say(line)
         if broken:
             raise TumortrackError(
-                f"{broken} of what is installed here does not work: see BROKEN above. All else can "
-                "be used."
+                f"{broken} of what is installed does not work: see BROKEN above. The rest does."
             )
 
 
@@ -143,7 +128,7 @@ def part(name: str, extra: str, purpose: str) -> Iterator[Status]:
         return
     faults = {package.name: fault for package in needed if (fault := _fault(package))}
     works = [package.name for package in needed if package.name not in faults]
-    parts = _PARTS if works else _SYSTEM
+    parts = _TABLE.parts if works else _TABLE.system
     alone = {name: fault for name, fault in faults.items() if name in parts}
     if rest := [fault for name, fault in faults.items() if name not in alone]:
         absent = extra and all(fault.endswith(_ABSENT) for fault in rest)
@@ -152,11 +137,11 @@ def part(name: str, extra: str, purpose: str) -> Iterator[Status]:
         there = ", ".join(f"{name} {version(name)}" for name in works)
         yield "ok", f"{what}: {purpose}{', but for what follows' if alone else ''}; {there}"
     for package, fault in alone.items():
-        library, cure = _SYSTEM.get(package, ("", ""))
+        library, cure = _TABLE.system.get(package, ("", ""))
         if not (library and library in fault):
             library, cure = "", install
         absent = bool(library) or fault.endswith(_ABSENT)
-        yield "absent" if absent else "BROKEN", f"{_PARTS[package]}: {fault}; {cure}"
+        yield "absent" if absent else "BROKEN", f"{_TABLE.parts[package]}: {fault}; {cure}"
 
 
 def _needed(name: str, extra: str) -> Iterator[Requirement]:
@@ -188,7 +173,51 @@ def _fault(needed: Requirement) -> str:
     if not needed.specifier.contains(present, prereleases=True):
         return f"{needed.name} {present} is installed, but {needed.specifier} is supported"
     try:
-        import_module(_MODULES.get(needed.name, needed.name.replace("-", "_")))
+        import_module(_TABLE.modules.get(needed.name, needed.name.replace("-", "_")))
     except Exception as error:  # a broken installation raises anything
         return f"{needed.name} {present}: {error}"
     return ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Compile:
+    """Compile what this machine needs, before the first patient or frame would wait for it.
+
+    Attributes:
+        model: a case, or a folder that `train` wrote. Without one, what a new patient's model needs
+            is compiled as well, on the built-in phantom.
+        device: auto takes CUDA if there is a GPU.
+    """
+
+    model: Positional[Path | None] = None
+    device: Device = "auto"
+
+    def run(self) -> None:
+        """Fill numba's cache: one frame and one answer in full; models that place an organ are
+        shown their own."""
+        say("compiling ...")
+
+        from tumortrack.core.types import SensorCloud
+        from tumortrack.tracking.model_files import load_model
+        from tumortrack.tracking.tracker import Tracker
+
+        given = None if self.model is None else load_model(self.model, self.device)
+        tracker = Tracker(given or _phantom_model())
+        tracker.warm()
+        if tracker.anatomy_ct is not None:
+            organ = tracker.anatomy_ct.organ.vertices_mm
+            cloud = SensorCloud(organ - organ.mean(0) + [0, 0, 150])
+            with suppress(NoEstimate):  # seen from all sides at once it may fit nothing
+                tracker.locate(cloud, _GRID)
+        say("kernels: compiled and kept for every model of this machine.")
+
+
+def _phantom_model() -> Model:
+    """Of the built-in phantom; none of it stays."""
+    from tumortrack.imaging.surface import surfaces
+    from tumortrack.phantom.digital import PhantomParameters, phantom_labels
+    from tumortrack.registration.build import build_model
+    from tumortrack.tracking.presets import clinic
+
+    anatomy = surfaces(phantom_labels(PhantomParameters(), _VOXEL_MM))[0]
+    return build_model(anatomy, _UP_LPS, clinic(anatomy))

@@ -29,8 +29,8 @@ class Command(Protocol):
 _MODULES = {  # in the order of --help; only the chosen command's is imported
     "demo": "demo", "prepare": "cases", "export": "cases", "train": "training",
     "locate": "locate", "track": "track", "simulate": "cases",
-    "evaluate": "evaluate", "compile": "models",
-    "inspect": "inspect", "doctor": "doctor",
+    "evaluate": "cases", "compile": "doctor",
+    "inspect": "cases", "doctor": "doctor",
 }  # fmt: skip
 # Commands of other distributions: if one is missing, the message names its distribution.
 _DISTRIBUTIONS = {
@@ -44,7 +44,6 @@ _EXITS_AT_ONCE = ["locate"]  # leaves nothing open, and users wait for its end
 
 
 def main() -> None:
-    """Entry point."""
     # Let waiting OpenMP threads yield early. Spinning is several times slower where other programs
     # want the cores, and no faster where they don't.
     os.environ.setdefault("GOMP_SPINCOUNT", "1000")

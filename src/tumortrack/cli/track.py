@@ -132,7 +132,6 @@ class _Screen:
         self._notes = 0  # how many notes on the camera's frame were printed
 
     def show(self, result: TrackingResult) -> None:
-        """Called with every result."""
         state = result.describe()
         finding, used = result.finding, result.estimate and result.estimate.report.cameras
         kind: list[object] = [result.quality, finding.same_as if finding else result.reason, used]

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -105,14 +104,14 @@ class Train:
             say_notes([f"{self.preset} knows no motion: structures are left out; clinic has them"])
         last: TrainingStatus | None = None
 
-        with training_screen() as show:
+        with live_line("making labelled points, starting workers ...") as show:
 
             def report(status: TrainingStatus) -> None:
                 nonlocal last
                 if last is None:  # all is loaded
                     keep_loaded()
                 last = status
-                show(status)
+                show(_progress(status), status.step == status.end)
 
             about = train(report=report).provenance
         say(f"model written to {self.model}: {folder.training_words(about)}.")
@@ -121,20 +120,12 @@ class Train:
         say_notes(filter(None, [hint if few else "", folder.weakness_of(about)]))
 
 
-@contextmanager
-def training_screen() -> Iterator[Callable[[TrainingStatus], None]]:
-    """Yields a function that shows a status."""
-
-    def show(status: TrainingStatus) -> None:
-        end = f"/{status.end}" if status.end is not None else ""
-        validated = "" if status.miou is None else f"validation mIoU {status.miou:.3f} | "
-        minutes, seconds = divmod(int(status.seconds_left), 60)
-        line(
-            f"step {status.step}{end} | {status.samples_per_s:.0f} samples/s | loss "
-            f"{status.loss:.4f} | {validated}{minutes}:{seconds:02d} left | "
-            f"{status.waiting:.0%} waiting for scenes",
-            last=status.step == status.end,
-        )
-
-    with live_line("making labelled points, starting workers ...") as line:
-        yield show
+def _progress(status: TrainingStatus) -> str:
+    end = f"/{status.end}" if status.end is not None else ""
+    validated = "" if status.miou is None else f"validation mIoU {status.miou:.3f} | "
+    minutes, seconds = divmod(int(status.seconds_left), 60)
+    return (
+        f"step {status.step}{end} | {status.samples_per_s:.0f} samples/s | loss "
+        f"{status.loss:.4f} | {validated}{minutes}:{seconds:02d} left | "
+        f"{status.waiting:.0%} waiting for scenes"
+    )

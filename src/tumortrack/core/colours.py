@@ -66,8 +66,7 @@ def css(colour: Colour) -> str:
 
 
 def sweep_colour(sweep: int, sweeps: int) -> Colour:
-    """Of the cuts in sweep 1, 2, ...: from blue for the first to magenta for the last; no part has
-    these colours."""
+    """Of the cuts in sweep 1, 2, ...: from blue to magenta, colours that no part has."""
     share = (sweep - 1) / max(sweeps - 1, 1)
     mixed = [np.interp(share, (0.0, 0.5, 1.0), shades) for shades in zip(*_SWEEPS, strict=True)]
     red, green, blue = (round(float(value)) for value in mixed)

@@ -10,8 +10,7 @@ from tumortrack.core.errors import InputError
 
 
 class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Base of every configuration. Members of a typed union (one kind, one file) add
-    ``tag=...``."""
+    """Base of every configuration. Members of a union (one kind, one file) add ``tag=...``."""
 
     def check_ranges(self, what: str, least: str = "0 (off)", **most: float) -> None:
         """InputError for a named field outside 0..most. The message calls the configuration

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from tumortrack.core.causes import Likely
-
 if TYPE_CHECKING:
-    from tumortrack.core.report import Finding
+    from tumortrack.core.report import Finding, Likely
 
 # Of `locate`, by its verdict; each of them with a folder written.
 EXIT_STATUSES = {"good": 0, "poor": 4, "none": 3}

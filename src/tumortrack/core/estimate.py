@@ -10,14 +10,13 @@ import msgspec
 import numpy as np
 from jaxtyping import Float
 
-from tumortrack.core.causes import Likely
 from tumortrack.core.config import Config, check_seed
 from tumortrack.core.errors import InputError
 from tumortrack.core.evidence import Evidence
 from tumortrack.core.geometry import Points
 from tumortrack.core.organ import KIDNEY, Organ
 from tumortrack.core.patient import NOBODY, Patient
-from tumortrack.core.report import Finding, FitReport
+from tumortrack.core.report import Finding, FitReport, Likely
 from tumortrack.core.types import CameraLabels, Mesh, OccupancyCloud
 
 LARGEST_GRID = 400

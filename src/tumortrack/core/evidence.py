@@ -29,7 +29,8 @@ _LARGEST_FILE = 10_000_000  # bytes
 class _Evidence(Config, frozen=True, kw_only=True, tag_field="kind"):
     """``std_mm``: of each place along any axis, the tracking of the tool included;
     ``shared_std_mm``: of a shift of all places of one ``tool``, as a hand-eye calibration errs, or
-    without its name of this piece; 0: it is not shifted. ``stamp_ns``: when; 0: at the time of the cloud."""
+    without its name of this piece; 0: it is not shifted. ``stamp_ns``: when; 0: at the time of the
+    cloud."""
 
     std_mm: float
     shared_std_mm: float = 0.0

@@ -49,8 +49,7 @@ def rigid(rotation: Matrix, translation_mm: Vector) -> Affine:
 
 
 def read_rigid(rows: Sequence[Sequence[float]], unit: Literal["mm", "m"], where: str) -> Affine:
-    """A transform in mm from the 4 x 4 rows in a file. Raises InputError, which names ``where``:
-    not a rigid transform."""
+    """A transform in mm from a file's 4 x 4 rows. InputError names ``where``: it is not rigid."""
     b_from_a = np.array(rows, float) if {len(row) for row in rows} == {4} else np.zeros((0, 4))
     if len(b_from_a) != 4:
         raise InputError(f"{where} has {len(rows)} rows; it must have 4 of 4 numbers.")

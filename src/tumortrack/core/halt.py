@@ -8,31 +8,13 @@ from typing import Literal
 import msgspec
 
 from tumortrack.core.report import Finding
+from tumortrack.core.tables import read_table
 
 HaltKind = Literal[
     "no_estimate", "poor", "missing", "moved", "over_budget", "no_margin", "planning", "silent",
     "no_plan", "defect", "interrupted", "aborted", "ended", "stopped", "slipped",
 ]  # fmt: skip
-_SENTENCES: dict[HaltKind, str] = {
-    "no_estimate": "no estimate: {words}",
-    "poor": "poor estimate: {words}",
-    "missing": "{part} was not found",
-    "moved": "{part} has moved by {off_mm:.1f} mm",
-    "over_budget": (
-        "{sum_mm:.1f} mm of error, most of it {term} ({term_mm:.1f}), against a margin of "
-        "{margin_mm:.1f} mm"
-    ),
-    "no_margin": "the estimate states no {percent:g} % margin, with which it was planned",
-    "planning": "planning anew",
-    "silent": "no word from the loop",
-    "no_plan": "no new plan: {words}",
-    "defect": "internal error, {words}",
-    "interrupted": "stopped by the user",
-    "aborted": "stopped by the viewer, or a real arm gave up",
-    "ended": "tracking has ended",
-    "stopped": "{words}",
-    "slipped": "the grip slipped, or the estimate is wrong: they differ by {off_mm:.1f} mm",
-}
+_SENTENCES = read_table("tumortrack.core", "halts.toml", dict[HaltKind, str])
 CUT_NOTE = "cut: estimates are of the intact organ"
 _WITHOUT_NUMBERS = str.maketrans("", "", "0123456789.")
 
@@ -48,13 +30,11 @@ class Halt(msgspec.Struct, frozen=True):
 
     @property
     def words(self) -> str:
-        """For people."""
         words = _SENTENCES[self.kind].format(**self.values)
         return f"{words} ({CUT_NOTE}; --replan-cut plans on them anyway)" if self.cut else words
 
     @property
     def words_without_numbers(self) -> str:
-        """For counts in reports."""
         return self.words.translate(_WITHOUT_NUMBERS)
 
     @property

@@ -86,8 +86,7 @@ def write_anatomy(folder: Path, anatomy: Anatomy) -> None:
 
 
 def read_anatomy(folder: Path, kind: Organ = KIDNEY) -> Anatomy:
-    """Read what ``write_anatomy`` wrote. Raises InputError: no such organ, or an unreadable
-    mesh."""
+    """Read what ``write_anatomy`` wrote. Raises InputError: no such organ, an unreadable mesh."""
     parts = [read_mesh(folder / f"{kind.name}.ply")]
     while (path := folder / f"tumor_{len(parts)}.ply").exists():
         parts.append(read_mesh(path))

@@ -20,8 +20,7 @@ def signed_volume(vertices, faces):  # type: ignore[no-untyped-def]
 
 
 def contained(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Whether points (n, 3) lie inside a closed surface, that is below an odd number of its
-    faces (f, 3)."""
+    """Whether points (n, 3) lie inside a closed surface: below an odd number of faces (f, 3)."""
     side = int(np.sqrt(len(points) / 2)) + 1  # of a grid over x and y
     lower = points[:, :2].min(0, initial=np.inf)
     per_mm = side / np.maximum(points[:, :2].max(0, initial=-np.inf) - lower, 1e-9)

@@ -1,14 +1,17 @@
-"""Points against closed surfaces: inside or not, labels of an anatomy, distances."""
+"""Points against closed surfaces: inside or not, labels of an anatomy, distances; and surfaces at a
+distance."""
 
 from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
+from tumortrack.core.geometry import Points, triangles_of
 from tumortrack.core.types import Anatomy, Mesh
 
-Points = Float[np.ndarray, "n 3"]
 _WITHIN_MM = 0.1  # of ``surface_distance``
+_CELLS = 32  # of a margin's lattice along the longest side
+_FINEST_MM, _COARSEST_MM = 0.6, 1.5
 
 
 def contains(mesh: Mesh, points_mm: Points) -> Bool[np.ndarray, " n"]:
@@ -24,8 +27,7 @@ def contains(mesh: Mesh, points_mm: Points) -> Bool[np.ndarray, " n"]:
 
 
 def labels_of(anatomy: Anatomy, points_mm: Points) -> UInt8[np.ndarray, " n"]:
-    """Labels of points in the anatomy's frame: a tumor wins over the organ, a later tumor over
-    an earlier one."""
+    """Labels of points in the anatomy's frame: a tumor wins over the organ and earlier tumors."""
     labels = np.zeros(len(points_mm), np.uint8)
     for label, part in enumerate(anatomy.parts, start=1):
         labels[contains(part, points_mm)] = label
@@ -33,8 +35,7 @@ def labels_of(anatomy: Anatomy, points_mm: Points) -> UInt8[np.ndarray, " n"]:
 
 
 def surface_distance(mesh: Mesh, points_mm: Points) -> Float32[np.ndarray, " n"]:
-    """Distance to the surface in mm by the nearest of dense surface points: about 0.1 mm too long
-    at most, so no metric."""
+    """Distance to the surface in mm, by dense points of it: up to 0.1 mm too long, so no metric."""
     corners = mesh.vertices_mm[mesh.faces]
     edge = float(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(initial=0))
     distance = _nearest_of(mesh.vertices_mm, points_mm)
@@ -53,3 +54,39 @@ def _nearest_of(samples_mm: np.ndarray, points_mm: Points) -> Float32[np.ndarray
     # faster here than scipy's usual tree, with the same distances.
     tree = cKDTree(samples_mm, leafsize=100, balanced_tree=False, compact_nodes=False)
     return np.asarray(tree.query(points_mm, workers=-1)[0], np.float32)
+
+
+def signed_distances(
+    mesh: Mesh, origin_mm: Float[np.ndarray, " 3"], step_mm: float, shape: tuple[int, ...]
+) -> Float32[np.ndarray, "i j k"]:
+    """``surface_distance`` at the nodes of a lattice, negative inside a closed mesh."""
+    nodes = origin_mm + step_mm * np.indices(shape).reshape(3, -1).T
+    distance = surface_distance(mesh, nodes)
+    near = np.flatnonzero(((nodes > mesh.box_mm[0]) & (nodes < mesh.box_mm[1])).all(1))
+    distance[near[contains(mesh, nodes[near])]] *= -1
+    return distance.reshape(shape)
+
+
+def exact_margin(part: Mesh, margin_mm: float) -> Mesh:
+    """The closed surface ``margin_mm`` outside a closed one: an isosurface of its distance field on
+    a lattice, right to 0.2 mm; about a second."""
+    from skimage.measure import marching_cubes
+
+    lower, upper = part.box_mm
+    size = float((upper - lower).max()) + 2 * margin_mm
+    step = float(np.clip(size / _CELLS, _FINEST_MM, _COARSEST_MM))
+    origin = lower - margin_mm - 2 * step
+    shape = np.ceil((upper - lower + 2 * margin_mm) / step).astype(int) + 5
+    distance = signed_distances(part, origin, step, tuple(shape.tolist()))
+    vertices, faces, _, _ = marching_cubes(distance, margin_mm, gradient_direction="descent")
+    return Mesh(origin + step * vertices, faces)
+
+
+def rough_margin(part: Mesh, margin_mm: float) -> Mesh:
+    """The surface moved outwards along its normals: quick, and right unless concavities are
+    narrower than the margin."""
+    weighted = triangles_of(part.vertices_mm, part.faces)[1]
+    normals = np.zeros_like(part.vertices_mm)
+    np.add.at(normals, part.faces.ravel(), np.repeat(weighted, 3, axis=0))
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    return part.moved(part.vertices_mm + margin_mm * normals)

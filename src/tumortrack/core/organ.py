@@ -11,6 +11,7 @@ from typing import Any
 from tumortrack.core.config import Config, from_builtins, to_builtins
 from tumortrack.core.errors import InputError
 from tumortrack.core.patient import UNKNOWN, Patient
+from tumortrack.core.tables import read_table
 
 _NAME = re.compile(r"[a-z][a-z0-9_]{0,31}")
 _CODE = re.compile(r"[1-9][0-9]{5,17}")
@@ -18,28 +19,7 @@ _TAKEN = (  # names of files, topics and report entries that are not parts
     *("camera", "case", "cloud", "depth", "estimate", "labels", "map", "observed", "occupancy"),
     *("points", "quality", "state", "status", "strokes", "targets", "workcell"),
 )
-# SNOMED CT codes and meanings, as DICOM and 3D Slicer list them.
-_TERMS = {
-    "adrenal_gland": ("23451007", "Adrenal gland"),
-    "bladder": ("89837001", "Bladder"),
-    "brain": ("12738006", "Brain"),
-    "breast": ("76752008", "Breast"),
-    "colon": ("71854001", "Colon"),
-    "gallbladder": ("28231008", "Gallbladder"),
-    "heart": ("80891009", "Heart"),
-    "kidney": ("64033007", "Kidney"),
-    "liver": ("10200004", "Liver"),
-    "lung": ("39607008", "Lung"),
-    "ovary": ("15497006", "Ovary"),
-    "pancreas": ("15776009", "Pancreas"),
-    "prostate": ("41216001", "Prostate"),
-    "spleen": ("78961009", "Spleen"),
-    "stomach": ("69695003", "Stomach"),
-    "testis": ("40689003", "Testis"),
-    "thyroid": ("69748006", "Thyroid"),
-    "tongue": ("21974007", "Tongue"),
-    "uterus": ("35039007", "Uterus"),
-}
+_TERMS = read_table("tumortrack.core", "organs.toml", dict[str, tuple[str, str]])
 _UNNAMED = ("113343008", "Organ")
 _IN_PAIRS = ("adrenal_gland", "breast", "kidney", "lung", "ovary", "testis")
 
@@ -80,7 +60,6 @@ class Organ(Config, frozen=True):
 
     @property
     def words(self) -> str:
-        """The name for people."""
         return self.name.replace("_", " ")
 
     @property

@@ -37,7 +37,6 @@ class Patient(Config, frozen=True):
 
     @property
     def known(self) -> bool:
-        """Whether both are known."""
         return UNKNOWN not in (self.id, self.side)
 
     def differs(self, other: Patient) -> bool:

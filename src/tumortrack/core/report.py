@@ -5,9 +5,13 @@ from __future__ import annotations
 
 import string
 from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import Enum
 from typing import Any, Literal
 
 import msgspec
+
+from tumortrack.core.tables import read_table
 
 Point = tuple[float, float, float]
 
@@ -29,158 +33,16 @@ Kind = Literal[
     "no_organ_colour", "spread", "misfit", "implausible", "organ_seen_through", "few_inside",
     "left", "far_off",
 ]  # fmt: skip
-# The check that each kind of finding belongs to, and its sentence.
-_FINDINGS: dict[Kind, tuple[Check, str]] = {
-    "not_judged": ("other", "it was not judged"),
-    "poses": (
-        "poses",
-        "view {view} shows the organ {shift_mm:.1f} mm and {degrees:.1f} degrees from where its "
-        "pose has it",
-    ),
-    "strays": ("strays", "{percent:.0f} % of the points do not lie on the organ's surface"),
-    "fit": (
-        "fit",
-        "the organ's surface fits the points worse than in most validation scenes ({times:.1f} "
-        "times the usual cost)",
-    ),
-    "size": ("size", "an organ {times:.2f} times as large fits better"),
-    "upside_down": (
-        "place",
-        "the organ may lie upside down: it fits the points as well tilted by {degrees:.0f} degrees",
-    ),
-    "tilted": (
-        "place",
-        "the organ may be tilted farther than stated: it fits the points as well tilted by "
-        "{degrees:.0f} degrees",
-    ),
-    "not_turned": (
-        "place",
-        "the organ may not have been turned over: it fits the points as well tilted by "
-        "{degrees:.0f} degrees",
-    ),
-    "rival": ("place", "{part} may as well lie {apart_mm:.1f} mm away, which fits too"),
-    "missing": ("place", "{part} was not found"),
-    "unsure": ("place", "the place of {part} is unsure by {std_mm:.1f} mm"),
-    "miss": ("place", "{part} may lie up to {miss_mm:.1f} mm off"),
-    "improbable": ("place", "the points of {part} have a probability of {probability:.2f}"),
-    "seen_through": (
-        "seen_through",
-        "the camera sees through {percent:.0f} % of where the organ lies",
-    ),
-    "unseen": ("unseen", "over {percent:.0f} % of where the organ lies the cloud has no points"),
-    "hidden_now": (
-        "other",
-        "a moment ago the camera saw through where the organ lies; what showed that is hidden",
-    ),
-    "evidence": (
-        "place",
-        "{name} {number} lies {off_mm:.1f} mm from where the rest has it, and was left out",
-    ),
-    "beyond_margins": ("other", "{figure} is {value:.3g}; margins are known up to {limit:.3g}"),
-    "model": ("other", "{words}"),
-    "frame_in_doubt": ("other", "{words}"),
-    "good_again": ("other", "good again for {frames} of {of} frames; wait"),
-}
-# Why there is no estimate: of the frame and its source, then of the organ in it.
-_NO_ESTIMATE: dict[Kind, str] = {
-    "no_frame": "no frame for {seconds:.1f} s",
-    "source": "{words}",
-    "defect": "internal error, {words}: {error}",
-    "stamp_negative": "the frame's stamp is {stamp_ns} ns; it must be 0 or more",
-    "stamp_back": "the frame's stamp went back by {seconds:.3f} s",
-    "stale": "the frame is stale: {seconds:.2f} s old{doubt}",
-    "future": "the frame's stamp lies {seconds:.2f} s in the future: {clocks} disagree",
-    "too_late": "the answer came too late: {seconds:.2f} s after the frame",
-    "frozen": (
-        "the source is frozen: the same image for up to {seconds:.2f} s. Look at the camera; a "
-        "simulated one without noise needs --frozen 0."
-    ),
-    "other_frame_id": (
-        "the frame is in {name!r}, and the calibration is for {wanted!r}. Give this camera's "
-        "calibration, or the topic of the calibrated camera"
-    ),
-    "frame_id_changed": (
-        "the source's frame changed from {first!r} to {name!r}: another camera, or another setting "
-        "of it. Restart to accept it"
-    ),
-    "intrinsics_changed": (
-        "the camera's intrinsics changed from {before} to {now}. If that is meant, start again."
-    ),
-    "moved": (
-        "the camera or the table has moved since {since}: the table lies {shift_mm:.1f} mm off and "
-        "{degrees:.1f} degrees tilted. Calibrate again, and restart"
-    ),
-    "cameras": "{troubles}",
-    "no_pose": "where the camera was is unknown: no pose has come",
-    "old_pose": (
-        "where the camera was is unknown: its last pose is older than the frame by {seconds:.2f} s"
-    ),
-    "new_pose": (
-        "where the camera was is unknown: its first pose is newer than the frame by {seconds:.2f} s"
-    ),
-    "pose_gap": (
-        "where the camera was is unknown: its poses before and after the frame are {seconds:.2f} s "
-        "apart; allowed: {allowed_s:g} s"
-    ),
-    "unconnected": "tf does not connect the camera, {camera!r}, with {frame_id!r}",
-    "scan_waits": (
-        "scan: {looks} of {of} looks; lead the camera on round the organ, {degrees:g} degrees from "
-        "each look, all within {seconds:g} s"
-    ),
-    "scan_failed": "scan, begun anew: {reason}",
-    "scan_poor": "scan, begun anew: laid together, the looks are poor: {reason}",
-    "few_points": (
-        "only {points} points are left for the organ; at least {fewest} are needed. Of {pixels} "
-        "pixels went to: {steps} (range {near_mm:g}..{far_mm:g} mm): {advice}.{doubt}"
-    ),
-    "few_in_range": (
-        "only {points} points lie between {near_mm:g} and {far_mm:g} mm ({seen}); at least "
-        "{fewest} are needed: {advice}."
-    ),
-    "sparse": (
-        "the cloud has {points} different points with a return; at least {fewest} are needed. Give "
-        "a denser cloud."
-    ),
-    "line": (
-        "the points of the cloud lie on one line; an organ has extent along two axes at least. "
-        "Give the whole surface that the camera sees."
-    ),
-    "behind_camera": (
-        "no point of the cloud lies before the camera (z > 0). The camera frame has x right, y "
-        "down, z forward; turn the cloud into that frame."
-    ),
-    "pick_missed": (
-        "no piece of the scene lies within {reach_mm:g} mm of the picked point ({place}) mm: it is "
-        "on the background, on something thin, or outside the range. Pick again, or clear the "
-        "pick."
-    ),
-    "no_picture": "this frame has no picture",
-    "no_organ_colour": (
-        "hardly anything that is seen looks like the organ where it was clicked on: another light, "
-        "or it is hidden. Wait, or forget the clicks and click again"
-    ),
-    "spread": (
-        "the cloud does not show this model's organ: four fifths of its points lie within "
-        "{spread_mm:.0f} mm of their middle, in this model's scenes within {low_mm:.0f} to "
-        "{high_mm:.0f} mm"
-    ),
-    "misfit": (
-        "the cloud does not show this model's organ: {share} of its points lie more than "
-        "{fit_mm:.1f} mm from the estimated surface, where {limit_mm:.1f} mm are the most to "
-        "expect"
-    ),
-    "implausible": (
-        "the cloud does not show this model's organ: only a deformation {times:.1f} times as rare "
-        "as usual would fit it, where {limit:g} times is the most to expect"
-    ),
-    "organ_seen_through": "the camera sees through {percent:.0f} % of where the organ would lie",
-    "few_inside": (
-        "no organ was found: {inside} of {queries} queries round the cloud lie inside. Does the "
-        "cloud show this model's organ, freed of its background?"
-    ),
-    "left": "no organ was found: it has left the place where it was.",
-    "far_off": "no organ was found: its surface is nowhere near the cloud.",
-}
+
+
+class _Said(msgspec.Struct, forbid_unknown_fields=True):
+    """Of a ``poor`` estimate the check that failed, and the sentence; of ``none`` the sentence."""
+
+    poor: dict[Kind, tuple[Check, str]]
+    none: dict[Kind, str]
+
+
+_SAID = read_table("tumortrack.core", "findings.toml", _Said)
 
 
 class _WithoutNumbers(string.Formatter):
@@ -199,16 +61,14 @@ class Finding(msgspec.Struct, frozen=True):
 
     @property
     def check(self) -> Check:
-        """The check that failed."""
-        return "none" if self.kind in _NO_ESTIMATE else _FINDINGS[self.kind][0]
+        return "none" if self.kind in _SAID.none else _SAID.poor[self.kind][0]
 
     @property
     def _sentence(self) -> str:
-        return _NO_ESTIMATE.get(self.kind) or _FINDINGS[self.kind][1]
+        return _SAID.none.get(self.kind) or _SAID.poor[self.kind][1]
 
     @property
     def words(self) -> str:
-        """For people."""
         return self._sentence.format(**self.values)
 
     @property
@@ -218,8 +78,7 @@ class Finding(msgspec.Struct, frozen=True):
 
     @property
     def same_as(self) -> tuple[Kind, object]:
-        """Equal for what is the same but for its numbers: the kind, and what was said that has
-        none."""
+        """Equal for what is the same but for its numbers: the kind, and what was said in words."""
         return self.kind, self.values.get("words")
 
 
@@ -347,19 +206,15 @@ class NextEvidence(_Value, frozen=True, kw_only=True):
 
     @property
     def words(self) -> str:
-        """In a sentence, camera frame."""
         x, y, z = (f"{value:.0f}" for value in self.place_mm)
+        axis = "xyz"[max(range(3), key=lambda axis: abs(self.direction[axis]))]
         what = {
             "touch": f"touch the organ at {x}, {y}, {z} mm",
-            "outline": f"outline {self.part} across {'xyz'[_largest(self.direction)]}",
+            "outline": f"outline {self.part} across {axis}",
             "landmark": f"point at {self.name}",
             "look": f"look from {x}, {y}, {z} mm as well",
         }[self.kind]
         return f"{what}: {self.part} {self.std_mm:.1f} -> {self.then_std_mm:.1f} mm"
-
-
-def _largest(direction: Point) -> int:
-    return max(range(3), key=lambda axis: abs(direction[axis]))
 
 
 class AllowedPoses(_Value, frozen=True, kw_only=True):
@@ -372,8 +227,7 @@ class AllowedPoses(_Value, frozen=True, kw_only=True):
 
 class MotionReport(_Value, frozen=True, kw_only=True):
     """The fitted motion: pose, elastic ``coefficients``, Gauss-Newton ``steps``. ``rarity``: of the
-    library's state; ``compliance_std_mm``: of the compliance beside it, whose coefficients are the
-    last."""
+    library's state; ``compliance_std_mm``: of the compliance, whose coefficients are the last."""
 
     camera_from_ct: tuple[tuple[float, float, float, float], ...]
     coefficients: tuple[float, ...]
@@ -443,3 +297,23 @@ class FitReport(_Value, frozen=True, kw_only=True, omit_defaults=True):
     def tumors(self) -> dict[str, PartReport]:
         """All parts but the organ, which is the first."""
         return dict(list(self.parts.items())[1:])
+
+
+# Of a poor estimate, or of none.
+Cause = Enum(
+    "Cause",
+    "UNIT FRAME MIRRORED SCALE OBJECT BACKGROUND HIDDEN ANOTHER_PATIENT DEFORMED POSES VIEW",
+)
+
+
+@dataclass(frozen=True)
+class Likely:
+    """A likely cause. ``number``: the factor of UNIT and SCALE, the share of BACKGROUND and HIDDEN.
+    ``fit``: cost of the fit without it over the model's usual cost; None: not tried."""
+
+    cause: Cause
+    number: float | None = None
+    fit: float | None = None
+
+    def entry(self) -> dict[str, Any]:
+        return {"cause": self.cause.name.lower(), "number": self.number, "fit": self.fit}

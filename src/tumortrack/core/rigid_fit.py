@@ -27,8 +27,7 @@ def kabsch(source_mm: Points, target_mm: Points, weights: Float[np.ndarray, " n"
 
 def matched_vertices(rest: Mesh, moved: Mesh) -> Float64[np.ndarray, "_ 3"]:
     """The place in ``moved`` of each vertex of ``rest``, by triangles: reading a mesh merges and
-    reorders vertices but keeps the order of triangles. Raises InputError: ``moved`` has other
-    triangles."""
+    reorders vertices but keeps the order of triangles. Raises InputError: it has others."""
     vertex = np.full(len(rest.vertices_mm), -1)
     same = rest.faces.shape == moved.faces.shape
     if same:

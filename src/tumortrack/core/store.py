@@ -213,8 +213,7 @@ def _lock(folder: Path) -> int | None:
 
 
 def _clean_up(path: Path) -> None:
-    """Remove what killed processes left beside ``path``; move back what they had moved aside and
-    not replaced."""
+    """Remove what killed processes left beside ``path``; move back what they did not replace."""
     name = glob.escape(path.name)
     for stale in path.parent.glob(f".{name}.????????.part"):
         if (descriptor := _lock(stale)) is not None:
@@ -226,7 +225,6 @@ def _clean_up(path: Path) -> None:
 
 
 def remove(path: Path) -> None:
-    """Remove a file or folder if it exists."""
     if path.is_dir() and not path.is_symlink():
         shutil.rmtree(path, ignore_errors=True)
     else:

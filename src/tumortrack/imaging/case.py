@@ -67,8 +67,7 @@ class _Manifest(msgspec.Struct):
 
 
 def save_case(case: Case, folder: Path) -> None:
-    """Write the case's files and manifest into an existing folder. Raises StorageError: the disk
-    refused."""
+    """Write the case's files and manifest into an existing folder. Raises StorageError."""
     write_anatomy(folder, case.anatomy)
     for name, mesh in case.anatomy.structures.items():
         write_mesh(folder / f"{name}.ply", mesh)
@@ -96,9 +95,13 @@ def holds_case(folder: Path) -> bool:
     return path.is_file() and store.read_json(path).get("kind") == KIND
 
 
-def load_case(folder: Path) -> Case:
-    """Read a case folder, every file checked against its sha256. Raises ArtifactError: not a case,
-    of another schema, damaged or changed."""
+def load_case(folder: str | Path) -> Case:
+    """Read a folder that ``prepare`` wrote, every file checked against its sha256.
+
+    Raises:
+        ArtifactError: not a case, of another schema, damaged or changed since.
+    """
+    folder = Path(folder)
     try:
         manifest = msgspec.convert(store.read_manifest(folder, KIND), _Manifest)
         for name in manifest.structures:

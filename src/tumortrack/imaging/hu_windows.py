@@ -7,6 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float
+from scipy import ndimage
+from scipy.spatial import ConvexHull, QhullError
 
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import spacing_mm
@@ -77,8 +79,6 @@ def _find_tumors(
     organ: np.ndarray, solid: np.ndarray, dense: np.ndarray, affine: np.ndarray, min_tumor_ml: float
 ) -> tuple[np.ndarray, list[np.ndarray], list[str]]:
     """The organ with tumors and without blocks, the tumors' masks, notes on what was dropped."""
-    from scipy import ndimage
-
     steps = spacing_mm(affine)
     rim_mm = max(_RIM_MM, 1.5 * float(steps.max()))
     parenchyma = _opened(organ & ~dense, steps, rim_mm)
@@ -122,8 +122,6 @@ def _find_tumors(
 
 def _opened(mask: np.ndarray, steps_mm: np.ndarray, radius_mm: float) -> np.ndarray:
     """Morphological opening by a ball: removes what is thinner than twice the radius."""
-    from scipy import ndimage
-
     inner = depth_mm(mask, steps_mm) > radius_mm
     if not inner.any():
         return np.zeros_like(mask)
@@ -177,8 +175,6 @@ def _find_organ(
 
 
 def _search(grid: _Grid) -> np.ndarray | None:
-    from scipy import ndimage
-
     depth = depth_mm(grid.solid, grid.steps_mm)
     # Eroding by r leaves at least a few percent even of the smallest organ.
     least = 0.02 * grid.organ_ml[0] / voxel_ml(grid.lps_from_index)
@@ -210,7 +206,6 @@ def _sheds_sheet(before: np.ndarray, after: np.ndarray, grid: _Grid) -> bool:
 
 def _grown_back(core: np.ndarray, depth: np.ndarray, radius: float, grid: _Grid) -> np.ndarray:
     """Grow a core back to the surface, cut from its neighbours, without attached sheets."""
-    from scipy import ndimage
     from skimage.segmentation import watershed
 
     steps = grid.steps_mm
@@ -268,9 +263,6 @@ def _flatness(region: np.ndarray, steps_mm: np.ndarray) -> float:
 
 def _solidity(region: np.ndarray, steps_mm: np.ndarray) -> float:
     """Volume over the volume of the convex hull (of the voxels' centres, grown by half a voxel)."""
-    from scipy import ndimage
-    from scipy.spatial import ConvexHull, QhullError
-
     shell = np.argwhere(region & ~ndimage.binary_erosion(region))
     corners = np.concatenate([shell - 0.5, shell + 0.5]) * steps_mm
     try:
@@ -284,8 +276,6 @@ def _refine(
     region: np.ndarray, other: np.ndarray, solid: np.ndarray, factors: np.ndarray
 ) -> np.ndarray:
     """The coarse region on the voxels; cells that are not solid follow their nearest solid cell."""
-    from scipy import ndimage
-
     label = np.where(region, 1, np.where(other, 2, 0)).astype(np.uint8)
     reach = ndimage.binary_dilation(region, np.ones((3, 3, 3)))
     nearest = ndimage.distance_transform_edt(

@@ -49,17 +49,15 @@ _SILENT = logging.Logger("nibabel", logging.CRITICAL)  # nibabel logs each repai
 
 
 def read_nifti(path: Path) -> grid.RawVolume:
-    """Read .nii or .nii.gz. The sform is used, or the qform where there is no sform. Raises
-    InputError: damaged, not 3-D, too large, without or with contradictory orientation, not in
-    millimetres."""
+    """Read .nii or .nii.gz. The sform is used, or the qform without one. Raises InputError:
+    damaged, not 3-D, too large, without or with contradictory orientation, not in millimetres."""
     compressed = path.suffix.lower() == ".gz"
     with grid.volume_stream(path, compressed) as stream:
         return _read(path, stream, compressed)
 
 
 def _read(path: Path, stream: BufferedIOBase, compressed: bool) -> grid.RawVolume:
-    """``nibabel.load`` would trust the stated length of extensions, and not read up to the
-    checksum."""
+    """``nibabel.load`` would trust the stated length of extensions and skip the checksum."""
     load_pydicom()
     import nibabel
     from nibabel.volumeutils import apply_read_scaling

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy import ndimage
 
 from tumortrack.core import store
 from tumortrack.core.errors import InputError
@@ -88,8 +89,6 @@ def _with_structures(case: Case, options: PrepareOptions) -> Case:
 
 def _check_organ_outside(labels: LabelVolume) -> None:
     """Refuse tumors that enclose the organ, which in reality keeps some surface of its own."""
-    from scipy import ndimage
-
     inside = labels.labels > 0
     outermost = labels.labels[inside & ~ndimage.binary_erosion(inside)]
     share = np.count_nonzero(outermost == ORGAN) / max(len(outermost), 1)

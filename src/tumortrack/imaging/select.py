@@ -7,6 +7,7 @@ from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float, Int32, UInt8
+from scipy import ndimage
 
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import spacing_mm
@@ -215,8 +216,6 @@ def _with_tumor(pieces: _Pieces, min_tumor_ml: float) -> list[int]:
 def _joined(pieces: _Pieces, organs: list[int], number: int) -> tuple[_Pieces, float, float] | None:
     """The pieces with piece ``number`` joined to its nearest organ, and the gap's width and filled
     volume; None: it is too far away."""
-    from scipy.ndimage import distance_transform_edt
-
     affine = pieces.lps_from_index
     spacing = spacing_mm(affine)
     reach_mm = max(_GAP_MM, float(spacing.max()))
@@ -225,14 +224,16 @@ def _joined(pieces: _Pieces, organs: list[int], number: int) -> tuple[_Pieces, f
     tumor, organ = numbers == number, np.isin(numbers, organs)
     if not organ.any():
         return None
-    to_organ, nearest = distance_transform_edt(~organ, sampling=spacing, return_indices=True)
+    to_organ, nearest = ndimage.distance_transform_edt(
+        ~organ, sampling=spacing, return_indices=True
+    )
     tumor_voxel = np.unravel_index(np.where(tumor, to_organ, np.inf).argmin(), tumor.shape)
     organ_voxel = tuple(int(axis[tumor_voxel]) for axis in nearest)
     steps = np.abs(np.subtract(tumor_voxel, organ_voxel))
     gap_mm = float(np.linalg.norm(np.maximum(steps - 1, 0) * spacing))  # between voxels' faces
     if gap_mm > reach_mm:
         return None
-    to_tumor = distance_transform_edt(~tumor, sampling=spacing)
+    to_tumor = ndimage.distance_transform_edt(~tumor, sampling=spacing)
     between = to_organ + to_tumor <= float(to_organ[tumor_voxel]) + float(np.median(spacing))
     bridge = between & (numbers == 0)
     joined, labels = pieces.numbers.copy(), pieces.labels.copy()
@@ -245,8 +246,8 @@ def _joined(pieces: _Pieces, organs: list[int], number: int) -> tuple[_Pieces, f
 def _left_out(
     pieces: _Pieces, organs: list[int], apart: list[int], min_tumor_ml: float
 ) -> list[str]:
-    """Notes on specks and on tumors apart from every organ. Raises InputError: there is no other
-    tumor."""
+    """Notes on specks and on tumors apart from every organ. Raises InputError: there is no
+    other."""
     notes: list[str] = []
     specks_ml = np.delete(pieces.whole_ml, [0, *apart, *organs])
     if count := int((specks_ml > 0).sum()):
@@ -310,8 +311,6 @@ def _number_tumors(
     labels: np.ndarray, tumors: list[int], voxel_volume_ml: float, min_tumor_ml: float
 ) -> tuple[np.ndarray, list[str]]:
     """Labels 1, 2, 3, ... without gaps, and notes on what was dropped or renumbered."""
-    from scipy import ndimage
-
     notes: list[str] = []
     solid = labels > 0
     out = np.where(ndimage.binary_fill_holes(solid), ORGAN, 0).astype(np.uint8)

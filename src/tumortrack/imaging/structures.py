@@ -59,8 +59,7 @@ def split_structures(
 def read_structures(
     sources: StructureSources, unit: str | None
 ) -> tuple[dict[str, Mesh], list[str]]:
-    """The structures in mesh files, LPS mm, and notes. Raises InputError: not a mesh, or too many
-    triangles."""
+    """The structures in mesh files, LPS mm, and notes. Raises InputError: no mesh, or too large."""
     meshes, notes = {}, list[str]()
     for name, path in sources.items():
         if isinstance(path, Path):

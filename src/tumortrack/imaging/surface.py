@@ -7,6 +7,10 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from scipy import ndimage
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import spacing_mm, transform_points
@@ -70,8 +74,6 @@ def surface_of(
 ) -> Mesh:
     """The closed surface of a mask, LPS mm, faces outward, with the mask's volume. ``keep`` selects
     pieces; None: the largest. Raises InputError: the mask is too small or thin for a surface."""
-    from scipy import ndimage
-
     spacing = spacing_mm(affine)
     box = tight_box(mask)
     step_mm = min(step_mm, float(extent_mm(box, spacing).min()) / _STEPS_ACROSS)
@@ -137,8 +139,6 @@ def _boundary_distance(mesh: Mesh, mask: np.ndarray, affine: np.ndarray) -> np.n
     """Distance of each vertex (4,000 of them at most) to the nearest face between mask and
     background, in units of a voxel's longest edge. Faces are sampled at 5 x 5 points, so that it is
     at most a tenth of a voxel too long."""
-    from scipy.spatial import cKDTree
-
     box = tight_box(mask)
     padded = np.pad(mask[box], 1)
     raster = np.stack(np.meshgrid(*[np.linspace(-0.4, 0.4, 5)] * 2), -1).reshape(-1, 2)
@@ -157,9 +157,6 @@ def _boundary_distance(mesh: Mesh, mask: np.ndarray, affine: np.ndarray) -> np.n
 
 def largest_shell(mesh: Mesh) -> Mesh:
     """The connected piece with the largest absolute volume, without shells inside it and specks."""
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
     if len(mesh.faces) == 0:
         return mesh
     i, j, k = mesh.faces.T

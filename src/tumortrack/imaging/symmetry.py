@@ -28,8 +28,7 @@ class HalfTurn:
     """The organ turned by 180 degrees about a principal axis and fitted to itself by ``ct_from_ct``
     (LPS, mm). ``mean_mm``, ``p90_mm``: mean and 90th percentile of the distances between the
     surfaces. ``tumors_mm``: how far the tumors' centres move. ``any_turn``: a quarter turn fits as
-    well, so that any angle does, as for a body of revolution.
-    """
+    well, so that any angle does, as for a body of revolution."""
 
     ct_from_ct: Float64[np.ndarray, "4 4"]
     mean_mm: float
@@ -39,8 +38,7 @@ class HalfTurn:
 
 
 def half_turns(anatomy: Anatomy) -> list[HalfTurn]:
-    """Half turns about the principal axes of the organ's surface, best match first; takes at most a
-    second."""
+    """Half turns about the principal axes of the organ's surface, best match first; within 1 s."""
     points, normals = triangles_of(anatomy.organ.vertices_mm, anatomy.organ.faces)
     area = np.linalg.norm(normals, axis=1) / 2
     count = max(_FITTED, round(area.sum() / _SPACING_MM**2))

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from tumortrack.core.errors import InputError
+from tumortrack.core.tables import read_table
 from tumortrack.core.types import LabelVolume, Volume
 from tumortrack.imaging import grid
 from tumortrack.imaging.dicom import read_dicom
@@ -21,19 +22,8 @@ _DETACHED = (".nhdr", ".mhd", ".hdr", ".img")
 _MOST_LABELS = 32  # distinct values that still look like a label map
 _MAX_HEADER = 2**20
 _IS_GZIP = {"raw": False, "gzip": True, "gz": True}
-_NAMES = {  # of number types in NRRD headers
-    "i1": "signed char, int8, int8_t",
-    "u1": "uchar, unsigned char, uint8, uint8_t",
-    "i2": "short, short int, signed short, signed short int, int16, int16_t",
-    "u2": "ushort, unsigned short, unsigned short int, uint16, uint16_t",
-    "i4": "int, signed int, int32, int32_t",
-    "u4": "uint, unsigned int, uint32, uint32_t",
-    "i8": "longlong, long long, int64, int64_t",
-    "u8": "ulonglong, unsigned long long, uint64, uint64_t",
-    "f4": "float",
-    "f8": "double",
-}
-_TYPES = {name: dtype for dtype, names in _NAMES.items() for name in names.split(", ")}
+_NAMES = read_table("tumortrack.imaging", "nrrd_types.toml", dict[str, list[str]])
+_TYPES = {name: dtype for dtype, names in _NAMES.items() for name in names}
 _LPS_FROM_SPACE = {
     **dict.fromkeys(("lps", "left-posterior-superior"), (1.0, 1.0, 1.0)),
     **dict.fromkeys(("ras", "right-anterior-superior"), (-1.0, -1.0, 1.0)),
@@ -62,8 +52,7 @@ def read_raw(path: Path, series: str | None = None) -> grid.RawVolume:
             "Export one .nrrd, .nii or .nii.gz file."
         )
     raise InputError(
-        f"{path} is no volume that can be read. Allowed: a folder of DICOM slices, .nii, .nii.gz, "
-        ".nrrd."
+        f"{path} is no volume. Allowed: a folder of DICOM slices, .nii, .nii.gz, .nrrd."
     )
 
 
@@ -155,10 +144,7 @@ def _header(path: Path) -> tuple[dict[str, str], int]:
             name, _, value = line.partition(":")
             fields[name.strip().lower()] = value.strip()
     if gap is None or "data file" in fields or "datafile" in fields:
-        raise InputError(
-            f"{path}: its voxels lie in another file; detached data are refused. Export one "
-            "attached .nrrd file."
-        )
+        raise InputError(f"{path}: its voxels lie in another file. Export one attached .nrrd file.")
     if any(fields.get(name, "0") != "0" for name in ("line skip", "byte skip", "lineskip")):
         raise InputError(f"{path}: skipped lines or bytes are not read. Export it again.")
     return fields, gap.end()

@@ -115,7 +115,6 @@ class Cameras:
 
     @property
     def opening(self) -> bool:
-        """Whether one of them is being opened for the first time."""
         return any(worker.opening for worker in self.workers)
 
     @property
@@ -153,16 +152,14 @@ class Cameras:
         return got
 
     def close(self) -> None:
-        """Stop reading."""
         for worker in self.workers:
             worker.close()
         if isinstance(self._places, CameraPoses):
             self._places.close()
 
     def views(self, seen: Observation) -> tuple[list[CameraView], dict[int, str]]:
-        """What all cameras saw together with a frame just taken, that one first; and by the
-        others' numbers, why there is nothing. Raises NoEstimate: where the camera was is not
-        known."""
+        """What all cameras saw together with a frame just taken, that one first; and by the others'
+        numbers, why there is nothing. Raises NoEstimate: where the camera was is not known."""
         if isinstance(self._places, CameraPoses):
             return [CameraView(1, seen, self._places.at(seen))], {}
         views, absent = [CameraView(self._lead + 1, seen, self._places[self._lead])], {}

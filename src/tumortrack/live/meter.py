@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 import traceback
 from collections import Counter
 from typing import Any
@@ -52,22 +51,6 @@ class Histogram:
         return {"count": len(self), **marks, "max": round(self._largest, 3)}
 
 
-class Rate:
-    """Lets things happen at most ``hz`` times a second on average; 0: each time."""
-
-    def __init__(self, hz: float) -> None:
-        self._period_s = 1 / hz if hz > 0 else 0.0
-        self._next_s = 0.0
-
-    def due(self) -> bool:
-        now = time.monotonic()
-        if now < self._next_s:
-            return False
-        in_step = now < self._next_s + self._period_s
-        self._next_s = (self._next_s if in_step else now) + self._period_s
-        return True
-
-
 class RunStatistics:
     """What a run was like: how often, why not, how fast, how exact."""
 
@@ -107,7 +90,6 @@ class RunStatistics:
                 self.errors.setdefault(name, Histogram()).add(float(np.linalg.norm(off)))
 
     def add_defect(self, error: Exception) -> None:
-        """Keep the traceback of an internal error."""
         if len(self.defects) < _DEFECTS:
             self.defects.append("".join(traceback.format_exception(error)))
 

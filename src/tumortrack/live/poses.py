@@ -37,8 +37,7 @@ class CameraPoses:
     tool_from_camera = HERE
 
     def at(self, seen: Observation) -> Affine:
-        """Fixed frame from camera at the observation's stamp. Raises NoEstimate: the pose at that
-        time is unknown."""
+        """Fixed frame from camera at the observation's stamp. Raises NoEstimate: it is unknown."""
         return self.pose(seen) @ self.tool_from_camera
 
     @abstractmethod

@@ -42,8 +42,7 @@ _STORE_S = 10.0  # between two writings of the report: kill -9 loses no more
 @dataclass(frozen=True, eq=False)
 class Arms:
     """Arms that act on what is tracked. ``setup``: what they were checked with; ``about`` them, for
-    the report; ``tip_mm``: as of ``SinkContext``; ``ur``: there are sinks of real arms, connected
-    or not."""
+    the report; ``tip_mm``: as of ``SinkContext``; ``ur``: sinks are real arms, connected or not."""
 
     operation: ArmsController
     setup: CameraSetup
@@ -137,7 +136,6 @@ class Session:
         self.loop.run(self.cameras, self.sinks, show)
 
     def summary(self) -> dict[str, Any]:
-        """The run's figures, JSON types."""
         return summary(self.loop, self.cameras, self.sinks)
 
     def _store(self) -> None:
@@ -333,6 +331,5 @@ def check_closed(sinks: list[SinkWorker]) -> None:
 
 
 def resident_mb() -> float:
-    """Memory of this process now."""
     pages = int(Path("/proc/self/statm").read_text().split()[1])
     return pages * os.sysconf("SC_PAGE_SIZE") / 2**20

@@ -19,6 +19,7 @@ import msgspec
 from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError
 from tumortrack.core.report import Point
+from tumortrack.core.tables import read_table
 from tumortrack.live.poses import PosesConfig
 from tumortrack.live.tools import ToolConfig
 from tumortrack.live.values import SinkConfig, SourceConfig
@@ -111,45 +112,16 @@ class Registry(Generic[C]):
         return sorted(entry_points(group=self.group), key=lambda entry: entry.name)
 
 
-_DEVICES = "tumortrack-devices"
+_PACKAGES = read_table("tumortrack.live", "packages.toml", dict[str, dict[str, str]])
 SOURCES = Registry[SourceConfig](
-    "source",
-    "tumortrack.sources",
-    SourceConfig,
-    {},
-    {
-        "virtual": _DEVICES,
-        "realsense": f"{_DEVICES}[realsense]",
-        "stereo": f"{_DEVICES}[stereo]",
-        "recording": _DEVICES,
-        "ros2": _DEVICES,
-        "rehearsal": "tumortrack-lab",
-    },
+    "source", "tumortrack.sources", SourceConfig, {}, _PACKAGES["sources"]
 )
-SINKS = Registry[SinkConfig](
-    "sink",
-    "tumortrack.sinks",
-    SinkConfig,
-    {},
-    {
-        **dict.fromkeys(("viewer", "recording", "ros2", "moveit", "openigtlink"), _DEVICES),
-        "ur": "tumortrack-resection[ur]",
-    },
-)
+SINKS = Registry[SinkConfig]("sink", "tumortrack.sinks", SinkConfig, {}, _PACKAGES["sinks"])
+_FILE = {"file": "tumortrack.live.poses:PosesFileConfig"}
 POSES = Registry[PosesConfig](
-    "camera's pose",
-    "tumortrack.poses",
-    PosesConfig,
-    {"file": "tumortrack.live.poses:PosesFileConfig"},
-    {"ros2": _DEVICES, "ur": f"{_DEVICES}[ur]"},
+    "camera's pose", "tumortrack.poses", PosesConfig, _FILE, _PACKAGES["poses"]
 )
-TOOLS = Registry[ToolConfig](
-    "tool",
-    "tumortrack.tools",
-    ToolConfig,
-    {},
-    {**dict.fromkeys(("file", "ros2", "openigtlink"), _DEVICES), "ur": f"{_DEVICES}[ur]"},
-)
+TOOLS = Registry[ToolConfig]("tool", "tumortrack.tools", ToolConfig, {}, _PACKAGES["tools"])
 
 
 def extensions() -> list[Extension]:
@@ -158,7 +130,6 @@ def extensions() -> list[Extension]:
 
 
 def _package_of(entry: EntryPoint) -> str:
-    """The distribution that declares an entry point."""
     return entry.dist.name if entry.dist is not None else entry.value
 
 
@@ -213,7 +184,6 @@ _BOUNDS = {"ge": "from", "gt": "more than", "le": "to", "lt": "less than"}
 
 
 def _allowed(info: msgspec.inspect.Type) -> str:
-    """The allowed text of an option, in words."""
     if isinstance(info, msgspec.inspect.Metadata):
         return _allowed(info.type)
     if isinstance(info, msgspec.inspect.UnionType):

@@ -371,7 +371,6 @@ class Controls:
         self.colour = f"clicks: {count} on the organ, {beside} beside it; {state}"
 
     def forget(self) -> None:
-        """Forget all clicks."""
         self.picked_mm, self.clicks, self.taught, self.colour = None, (), None, ""
 
 
@@ -408,10 +407,9 @@ class SinkContext:
 
 @runtime_checkable
 class Sink(Protocol):
-    """An open sink. Both methods are called from one thread of its own, so they may take their
-    time. Errors are counted and reported, and the loop goes on. An optional ``counts: dict[str,
-    int]`` goes into the run's report; optional ``notes``, lines of text, are printed when it is
-    open."""
+    """An open sink. Both methods are called from one thread of its own and may take their time.
+    Errors are counted and reported, and the loop goes on. An optional ``counts: dict[str, int]``
+    goes into the run's report; optional ``notes``, lines of text, are printed when it is open."""
 
     def publish(self, result: TrackingResult) -> None: ...
 

@@ -35,8 +35,7 @@ OrganInView = tuple[CameraView, SensorCloud]  # the organ's points in it
 
 class ViewsLocator:
     """Locates in the views of one run; ``seed``: of the random points. An estimate is in the frame
-    of its first view's camera, which may be another one, or stand differently, in the next frame.
-    """
+    of its first view's camera, which may be another, or stand differently, in the next frame."""
 
     def __init__(
         self,
@@ -168,9 +167,8 @@ class Scan:
         self._views: list[OrganInView] = []
 
     def look(self, view: CameraView, organ: SensorCloud) -> Estimate:
-        """The estimate from all looks, in the frame of the last one. Raises NoEstimate: there are
-        too few yet, they are too much alike, or they do not show one organ at rest; then it starts
-        over."""
+        """The estimate from all looks, in the frame of the last. Raises NoEstimate: they are too
+        few yet, too much alike, or do not show one organ at rest; then it starts over."""
         oldest_ns = view.seen.stamp_ns - SCAN_WITHIN_S * 1e9
         self._views = [known for known in self._views if known[0].seen.stamp_ns >= oldest_ns]
         cosines = [_towards(view, organ) @ _towards(*known) for known in self._views]

@@ -231,7 +231,6 @@ class SinkWorker:
             self.unclosed = True
 
     def summary(self) -> dict[str, Any]:
-        """Counts and latencies of the results (JSON types)."""
         counts = getattr(self._sink, "counts", None)
         return {
             "delivered": self.delivered,

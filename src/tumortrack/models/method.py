@@ -99,8 +99,8 @@ class Method(Protocol):
 
     def load(self, folder: Path, manifest: dict[str, Any], device: str, **known: Any) -> Model:
         """The model of a folder. ``known``: the fields of ``Model`` but for ``config``, read
-        already. InputError, KeyError, ValueError, RuntimeError or OSError: the folder is not
-        complete."""
+        already. InputError, KeyError, ValueError, RuntimeError or OSError: the folder is
+        incomplete."""
 
     def locator(self, model: Model) -> Locator:
         """For one of this method's models."""

@@ -43,7 +43,6 @@ class Model(ABC):
 
     @property
     def organ(self) -> Organ:
-        """Which organ it is made for."""
         return organ_in(self.provenance.get("organ"), "provenance")
 
     @abstractmethod

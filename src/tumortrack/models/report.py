@@ -42,7 +42,6 @@ class Frame:
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
-        """Time a ``with`` block."""
         start = time.perf_counter()
         yield
         self.model.synchronise()

@@ -13,6 +13,7 @@ from tumortrack.core.geometry import spacing_mm
 from tumortrack.core.patient import UNKNOWN, Side
 from tumortrack.core.pydicom_library import load_pydicom
 from tumortrack.core.store import new_folder
+from tumortrack.core.tables import read_table
 from tumortrack.core.types import Volume
 
 if TYPE_CHECKING:
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
 
 _INTERCEPT = -1024  # stored values are unsigned, as scanners write them
 _HIGHEST_HU = 65535 + _INTERCEPT
-_DATE, _TIME = "20250101", "120000"  # fixed, so that the same volume gives the same files
+_TAGS = read_table("tumortrack.phantom", "ct_tags.toml", dict[str, Any])
 
 
 def write_dicom_series(
@@ -44,8 +45,7 @@ def write_dicom_series(
     directions = volume.lps_from_index[:3, :3] / spacing_mm(volume.lps_from_index)
     if not np.allclose(directions.T @ directions, np.eye(3), atol=1e-4):
         raise InputError(
-            "the volume's axes are not perpendicular; a DICOM series cannot hold that. Resample "
-            "it first."
+            "the volume's axes are not perpendicular, as DICOM needs. Resample it first."
         )
     digest = hashlib.sha256(volume.hu.tobytes() + volume.lps_from_index.tobytes()).hexdigest()
     entropy = [digest, str(seed), description]
@@ -78,31 +78,13 @@ def _slice(volume: Volume, k: int, entropy: list[str], description: str) -> Data
     dataset.file_meta = FileMetaDataset()
     dataset.file_meta.TransferSyntaxUID = ExplicitVRLittleEndian
     tags: dict[str, Any] = {
-        **dict.fromkeys(("StudyDate", "SeriesDate", "AcquisitionDate", "ContentDate"), _DATE),
-        **dict.fromkeys(("StudyTime", "SeriesTime", "AcquisitionTime", "ContentTime"), _TIME),
-        **dict.fromkeys(("AccessionNumber", "ReferringPhysicianName", "PatientBirthDate"), ""),
-        "PositionReferenceIndicator": "",
+        **_TAGS,
         "SOPClassUID": CTImageStorage,
         "SOPInstanceUID": uid(f"slice {k}"),
         "StudyInstanceUID": uid("study"),
         "SeriesInstanceUID": uid("series"),
         "FrameOfReferenceUID": uid("frame"),
-        "ImageType": ["ORIGINAL", "PRIMARY", "AXIAL"],
-        "Modality": "CT",
-        "Manufacturer": "tumortrack",
-        "ManufacturerModelName": "Virtual CT scanner",
-        "StudyDescription": "Phantom, not a patient",
         "SeriesDescription": description,
-        "PatientName": "PHANTOM^TUMORTRACK",
-        "PatientID": "PHANTOM",
-        "PatientSex": "O",
-        "BodyPartExamined": "KIDNEY",
-        "KVP": 90,
-        "XRayTubeCurrent": 14,  # a whole number by the standard; the next tag is exact
-        "XRayTubeCurrentInuA": 13600,
-        "PatientPosition": "HFS",
-        "StudyID": "1",
-        **dict.fromkeys(("SeriesNumber", "AcquisitionNumber"), 1),
         "InstanceNumber": k + 1,
         "ImagePositionPatient": decimal(position[:3]),
         # Direction of increasing column number (axis 0), then of increasing row number (axis 1)
@@ -110,12 +92,8 @@ def _slice(volume: Volume, k: int, entropy: list[str], description: str) -> Data
         "PixelSpacing": decimal(spacing[[1, 0]]),  # between rows, then between columns
         "SliceThickness": decimal(spacing[2:])[0],
         "SliceLocation": decimal(directions[:, 2:].T @ position[:3])[0],
-        "SamplesPerPixel": 1,
-        "PhotometricInterpretation": "MONOCHROME2",
         **dict(zip(("Rows", "Columns"), stored.shape, strict=True)),
-        **{"BitsAllocated": 16, "BitsStored": 16, "HighBit": 15, "PixelRepresentation": 0},
-        **{"RescaleIntercept": _INTERCEPT, "RescaleSlope": 1, "RescaleType": "HU"},
-        **{"WindowCenter": 100, "WindowWidth": 1600},
+        "RescaleIntercept": _INTERCEPT,
         "PixelData": np.ascontiguousarray(stored).tobytes(),
     }
     for name, value in tags.items():

@@ -8,6 +8,9 @@ from collections.abc import Mapping
 
 import numpy as np
 from jaxtyping import Float, Float32
+from scipy import ndimage
+from scipy.spatial.transform import Rotation
+from scipy.special import ndtr
 
 from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError
@@ -87,8 +90,6 @@ def scan(
 
 def _crop(labels: LabelVolume) -> LabelVolume:
     """The map's box around all labels, with an empty voxel on every side."""
-    from scipy import ndimage
-
     if not labels.labels.any():
         raise InputError("the label map is empty (0 everywhere); there is nothing to scan.")
     box = ndimage.find_objects((labels.labels > 0).astype(np.uint8))[0]
@@ -120,8 +121,6 @@ def _field_of_view(
     box_mm: np.ndarray, objects: list[_Object], parameters: ScannerParameters
 ) -> tuple[np.ndarray, tuple[int, int, int]]:
     """``lps_from_index`` and shape of a grid that holds everything, tilted as requested."""
-    from scipy.spatial.transform import Rotation
-
     lower = np.min([box_mm[0] - parameters.margin_mm, *(o[0] - 4 for o in objects)], axis=0)
     upper = np.max([box_mm[1] + parameters.margin_mm, *(o[1] + 4 for o in objects)], axis=0)
     rotation = Rotation.from_euler("xyz", parameters.tilt_deg, degrees=True).as_matrix()
@@ -155,8 +154,6 @@ def _scan_labels(
     material_hu: Mapping[int, float],
 ) -> Float32[np.ndarray, "i j k"]:
     """The label map's HU, blurred on its own grid and resampled to the scanner's."""
-    from scipy import ndimage
-
     hu_of_label = np.full(256, AIR_HU, np.float32)
     hu_of_label[ORGAN] = parameters.organ_hu
     hu_of_label[FIRST_TUMOR:] = parameters.tumor_hu
@@ -188,8 +185,6 @@ def _add_box(
     sigma_mm: np.ndarray,
 ) -> None:
     """Add a box along the LPS axes, blurred exactly: a product of three error functions."""
-    from scipy.special import ndtr
-
     lower, upper = (np.asarray(c, np.float32) for c in corners_mm)
     sigma = np.maximum(sigma_mm, 1e-6).astype(np.float32)
     i, j = (np.arange(n, dtype=np.float32) for n in hu.shape[:2])
@@ -204,8 +199,6 @@ def _add_box(
 
 def _noise(shape: tuple[int, ...], parameters: ScannerParameters, seed: int) -> np.ndarray:
     """Gaussian noise of the stated standard deviation, correlated between neighbouring voxels."""
-    from scipy import ndimage
-
     noise = np.random.default_rng(seed).standard_normal(shape, dtype=np.float32)
     width = parameters.noise_correlation_voxels
     impulse = np.zeros(1 + 2 * int(np.ceil(5 * width)))

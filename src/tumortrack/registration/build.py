@@ -84,8 +84,7 @@ def build_model(
         body = body_for(anatomy_ct, up_lps, config.scene, seed)
         if body is None:
             raise InputError(
-                "an elastic body is registered with elastic deformations; the scene configuration "
-                "has none."
+                "the scene configuration has no elastic deformation, which this method needs."
             )
         progress(1, steps)
         rest = RestShape(anatomy_ct, body, distances.result())

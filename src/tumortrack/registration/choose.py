@@ -66,8 +66,7 @@ def _better_on_other_side(
 
 
 def _is_distinct(other: ElasticMotion, motion: ElasticMotion) -> bool:
-    """Whether it puts the middle of a part outside the ellipsoid that holds 95 % of the other's
-    covariance."""
+    """Whether a part's middle lies outside the ellipsoid of 95 % of the other's covariance."""
     bent = np.abs(other.coefficients - motion.coefficients).max()
     if max(bent, apart_mm(other, motion)) < _SAME_MM:
         return False  # most are the same minimum, which is quickly found

@@ -81,7 +81,6 @@ class RegistrationResult:
 
     @property
     def others(self) -> tuple[RegistrationResult, ...]:
-        """Rivals, and what lies beyond."""
         return self.rivals if self.beyond is None else (*self.rivals, self.beyond)
 
 
@@ -161,7 +160,6 @@ class GaussNewton:
         self.cost = cost + self._terms.add_to(state.curvature, state.gradient)
 
     def result(self) -> RegistrationResult:
-        """The present state."""
         state = kernels.State._make(part.copy() for part in self._state)
         covariance = np.linalg.inv(state.curvature)
         placed = state.rotation, state.centre_mm, state.coefficients

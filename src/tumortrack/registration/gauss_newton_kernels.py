@@ -22,8 +22,7 @@ _APART = 16  # numbers between rows of sums: rows a power of two apart share a c
 
 @njit(fastmath=True, nogil=True, inline="always")
 def rho(r):  # type: ignore[no-untyped-def]
-    """The robust kernel, r^2 / (1 + r^2), of a distance in widths. Source: Geman and McClure, Bull.
-    ISI 52, 1987."""
+    """The robust kernel, r^2 / (1 + r^2), of a distance in widths (Geman and McClure 1987)."""
     square = r**2
     return square / (1.0 + square)
 
@@ -74,8 +73,7 @@ def descend(problem, state, first, last):  # type: ignore[no-untyped-def]
     rows = np.empty((BLOCK, unknowns + 1), np.float32)
     columns = np.zeros((-(-(unknowns + 1) // 4) * 4, _AT_ONCE + _APART), np.float32)
     change = np.zeros(unknowns)
-    # Before step 0 there are equations, and no step. (One place of theirs compiles in half the time
-    # of two.)
+    # Before step 0 there are equations, no step. (One place of theirs compiles in half the time.)
     for step in range(first if first > 0 else -1, last):
         if step >= 0:
             change[:] = np.linalg.solve(state.curvature, state.gradient)

@@ -84,7 +84,6 @@ class Looks:
 
     @property
     def count(self) -> int:
-        """Of looks."""
         return len(self.camera_from_look)
 
     @property
@@ -108,8 +107,7 @@ class Looks:
         )
 
     def weight(self, config: GaussNewtonConfig) -> float:
-        """Of a point's squared distance in the cost. As much is known of the organ by each look as
-        by one."""
+        """Of a point's squared distance in the cost. Each look tells as much as a single one."""
         n_effective = self.count * config.n_effective
         return min(n_effective / len(self.points_mm), 1.0) / config.sigma_mm**2
 

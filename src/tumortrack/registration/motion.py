@@ -169,8 +169,8 @@ def seen_from_first(motion: ElasticMotion, camera_from_look: Affine) -> ElasticM
 
 
 def blend(a: ElasticMotion, b: ElasticMotion, share: float) -> ElasticMotion:
-    """Between two motions of one shape: ``share`` 0 is at ``a``, 1 at ``b``, whose covariance it
-    keeps."""
+    """Between two motions of one shape: ``share`` 0 is ``a``, 1 is ``b``, whose covariance it
+    has."""
     from scipy.spatial.transform import Rotation
 
     turn = Rotation.from_matrix(a.rotation.T @ b.rotation).as_rotvec()

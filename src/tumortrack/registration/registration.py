@@ -101,8 +101,7 @@ class Registration:
         return self._correct_cameras(looks, refine(self.rest, looks, start, config))
 
     def bend(self, fit: RegistrationResult) -> tuple[RegistrationResult, BentFit]:
-        """A fit, continued in the body's compliance; both without the evidence that contradicts the
-        rest."""
+        """A fit, and it in the body's compliance; both without what contradicts the rest."""
         bent = bend(fit, self.config)
         evidence = fit.looks.evidence
         if evidence is None or bent.terms is None or not len(wrong := bent.terms.contradicting):

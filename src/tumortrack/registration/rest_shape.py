@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float32, Float64, UInt8
 
 from tumortrack.core.errors import InputError
-from tumortrack.core.mesh_query import contains, surface_distance
+from tumortrack.core.mesh_query import signed_distances
 from tumortrack.core.organ import KIDNEY, Organ, check_name
 from tumortrack.core.process import parallel_for
 from tumortrack.core.types import Anatomy, Mesh
@@ -29,12 +29,7 @@ def distance_of(mesh: Mesh) -> DistanceField:
     step = float(np.clip((upper - lower).max() / _STEPS, _FINEST_MM, _COARSEST_MM))
     origin = lower - _REACH * step
     shape = np.ceil((upper - lower) / step).astype(int) + 2 * _REACH + 1
-    nodes = origin + step * np.indices(tuple(shape)).reshape(3, -1).T
-    distance = surface_distance(mesh, nodes).astype(np.float32)
-    near = ((nodes > lower) & (nodes < upper)).all(1)
-    inside = np.zeros(len(nodes), bool)
-    inside[near] = contains(mesh, nodes[near])
-    values = np.where(inside, -distance, distance).reshape(tuple(shape))
+    values = signed_distances(mesh, origin, step, tuple(shape.tolist()))
     return DistanceField(values, origin.astype(np.float32), step)
 
 
@@ -93,7 +88,6 @@ class RestShape:
         return np.where(inside, -away_mm, away_mm)
 
     def to_arrays(self) -> dict[str, np.ndarray]:
-        """Everything as named arrays, for a file."""
         arrays = {f"{_BODY}{name}": value for name, value in self.body.to_arrays().items()}
         for n, (part, field) in enumerate(zip(self.anatomy_ct.parts, self.distances, strict=True)):
             named = {"vertices_mm": part.vertices_mm, "faces": part.faces, **field._asdict()}

@@ -28,8 +28,7 @@ def posterior(
 
 def held_by_prior_mm(motion: ElasticMotion, prior_slope: Float64[np.ndarray, " p"]) -> list[float]:
     """How far the prior, against the points, holds the middle of each part: to first order, how far
-    each moves per share of the prior's weight that is taken away. ``prior_slope``: see
-    ``BentFit``."""
+    each moves per share of the prior's weight taken away. ``prior_slope``: see ``BentFit``."""
     assert motion.covariance is not None
     middles_ct = motion.shape.middles_ct
     freer = motion.changed(_LESS * motion.covariance @ prior_slope)

@@ -149,7 +149,6 @@ def section_mask(
 
 
 def show_bodies(axes: Axes, view: ParallelView, bodies: list[Body], frame: Frame) -> None:
-    """Draw shaded bodies on white."""
     picture = view.draw(bodies, frame)
     axes.imshow(picture, extent=frame.extent, zorder=2, interpolation="bilinear")
 
@@ -165,12 +164,10 @@ def outline(
 
 
 def draw_lines(axes: Axes, segments: Float[np.ndarray, "n 2 2"], **style: Any) -> None:
-    """Draw a section's segments as one collection."""
     axes.add_collection(LineCollection(list(segments), capstyle="round", **style))
 
 
 def tint(axes: Axes, mask: Bool[np.ndarray, "h w"], frame: Frame, color: RGB) -> None:
-    """Tint the mask with a translucent colour."""
     picture = np.where(mask[..., None], (*color, 0.25), (*color, 0.0))
     axes.imshow(picture, extent=frame.extent, zorder=1)
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import string
-import tomllib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -11,36 +10,28 @@ from typing import Any
 
 from tumortrack.core import store
 from tumortrack.core.errors import InputError
+from tumortrack.core.tables import read_table
 
 Content = Mapping[str, Any]  # of a JSON file
-_DESCRIBED_BY = {  # kinds of folders that another file than the manifest describes
-    "run": "report.json",
-    "plan": "plan.json",
-    "kit": "kit.json",
-    "camera": "intrinsics.json",
-    "hand-eye calibration": "calibration.json",
-}
-
-_METHODS = {  # by whether the model has a network
-    False: "lays the organ of the CT on the points; `locate --map` says where points of the CT are",
-    True: "labels points; it does not know which point of the CT lies where (no `--map`)",
-}
 _BAGS = (".mcap", ".db3", ".bag")
-_KINDS = (
-    "folders that commands write (cases, models, runs, plans, scenes, evaluations, fleets, kits, "
-    "calibrations), their reports, calibration and intrinsics files, clouds, depth images beside "
-    "intrinsics.json, meshes, CTs, label maps, and with tumortrack-devices recordings"
-)
+_TABLE = read_table("tumortrack.report", "inspect.toml", dict[str, dict[str, Any]])
 
 
-def describe(path: Path) -> list[str]:
-    """Lines about a folder or file. Raises InputError: nothing that is known here; ArtifactError:
-    it is damaged."""
+def describe(path: str | Path) -> list[str]:
+    """What a folder or file is and what is in it, as lines of text: of all that commands write, and
+    of clouds, depth images, meshes, CTs and label maps.
+
+    Raises:
+        InputError, ArtifactError: it is missing, of no kind that is known here, or damaged.
+    """
+    path = Path(path)
     if not path.exists():
         raise InputError(f"{path} does not exist.")
     lines = [line.removesuffix(".") for line in (_folder if path.is_dir() else _file)(path)]
     if not lines:
-        raise InputError(f"{path} is nothing that inspect knows. It knows {_KINDS}.")
+        raise InputError(
+            f"{path} is nothing that inspect knows. It knows {_TABLE['texts']['known']}."
+        )
     return [f"{path}: {lines[0]}.", *(f"  {line}." for line in lines[1:])]
 
 
@@ -88,15 +79,11 @@ def _json(path: Path) -> list[str]:
     content = store.read_json(path)
     if content.keys() >= {"rule", "summary", "scenes"}:
         return _evaluation(content)
-    for kind in _kinds():
+    for kind in _TABLE.values():
         if "keys" in kind and content.keys() >= {*kind["keys"]}:
             filled = _words(_with_figures(content, path.parent), kind.get("sentences", ()))
             return [kind["name"], *filled]
     return []
-
-
-def _kinds() -> Iterable[dict[str, Any]]:
-    return tomllib.loads(Path(__file__).with_name("inspect.toml").read_text("utf-8")).values()
 
 
 def _with_figures(content: Content, folder: Path) -> Content:
@@ -108,7 +95,8 @@ def _with_figures(content: Content, folder: Path) -> Content:
     elif "familiar" in content:  # a model
         pose = content["config"]["scene"]["pose"]
         figures = {"lies": _poses(pose["rotations"], pose["tilt_deg"])}
-        figures |= {"does": _METHODS["network" in content["config"]], **_of_model(content, folder)}
+        method = "labels" if "network" in content["config"] else "registers"
+        figures |= {"does": _TABLE["texts"][method], **_of_model(content, folder)}
         figures["part_names"] = ", ".join(content["parts"])
     elif content.keys() >= {"quality", "parts"}:
         import msgspec
@@ -128,7 +116,6 @@ def _with_figures(content: Content, folder: Path) -> Content:
 
 
 def _poses(rotations: str, tilt_degrees: float) -> str:
-    """How the organ may lie."""
     if rotations == "full":
         return "in any way"
     return f"turned about the line of sight, and tilted by up to {tilt_degrees:g} degrees"
@@ -146,7 +133,6 @@ def _of_the_cases_model(case: Path) -> Content:
 
 
 def _of_model(manifest: Content, folder: Path) -> Content:
-    """How good a model is."""
     from tumortrack.models.folder import training_words, weakness_of
     from tumortrack.tracking.margins import UNKNOWN, described, read_margins
 
@@ -169,7 +155,7 @@ def _artifact(folder: Path) -> Iterable[str]:
     )
     if isinstance(manifest.get("scenes"), dict):
         yield from _sealed_scenes(folder, manifest["scenes"])
-    lines = _json(folder / _DESCRIBED_BY.get(kind, store.MANIFEST))[1:]
+    lines = _json(folder / _TABLE["described_by"].get(kind, store.MANIFEST))[1:]
     plain = ((k, v) for k, v in [*manifest.items()][5:] if isinstance(v, str | int | float))
     yield from lines or (f"{key.replace('_', ' ')}: {value}" for key, value in plain)
     yield f"files: {', '.join(manifest['files'])}"
@@ -194,7 +180,7 @@ def _folder(path: Path) -> Iterable[str]:
     scenes = sum((path / name / "cloud.ply").is_file() for name in inside)
     if "twin.json" in inside:
         return [f"twin scenes, not finished ({scenes} so far); the same `twin` command goes on"]
-    if named := [kind["name"] for kind in _kinds() if kind.get("file") in inside]:
+    if named := [kind["name"] for kind in _TABLE.values() if kind.get("file") in inside]:
         return named
     if "cloud.ply" in inside:
         return _scene(path)

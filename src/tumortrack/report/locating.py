@@ -46,12 +46,10 @@ class Located:
 
     @property
     def reason(self) -> str:
-        """Why there is no estimate, or a poor one."""
         return self.about["quality"]["reason"] if self.estimate is None else self.estimate.reason
 
     @cached_property
     def report(self) -> dict[str, Any]:
-        """report.json."""
         from tumortrack.tracking.files import report_entry
 
         head = {} if self.estimate is None else report_entry(self.estimate)

@@ -25,6 +25,7 @@ from tumortrack.report.summary import (
     MEASURES,
     METHODS,
     RIVALS,
+    SAID,
     VERDICTS,
     error_rows,
     failures,
@@ -39,14 +40,6 @@ from tumortrack.report.summary import (
 from tumortrack.simulate.scene_folder import Scene
 
 _ORGAN_CELL_MM, _TUMOR_CELL_MM = 2.5, 2.0
-_COLUMNS = {
-    "center_mm": "centre off, mm",
-    "hausdorff_mm": "surface off at most (Hausdorff), mm",
-    "hausdorff_95_mm": "95 % of the surface within, mm",
-    "hausdorff_one_sided_mm": "one-sided Hausdorff, mm",
-    "surface_mm": "surface off in the mean, mm",
-    "iou": "overlap (IoU, 0 to 1)",
-}
 _MAX_POINTS, _AROUND_MM = 2000, 12.0  # of the cloud, in a box so much larger than the organ's
 
 
@@ -98,7 +91,10 @@ def write_page(report: dict[str, Any], scenes: list[dict[str, Any]], path: Path)
         "TABLE": _scene_table(entries),
         "SUMMARY": _part_table(part_rows(summary)),
         "RULE": html.escape(report["rule"]),
-        "VERDICT_COLOURS": _verdict_colours(),
+        "VERDICT_COLOURS": " ".join(
+            f".{verdict} {{ --verdict: {colours.css(c)}; }}"
+            for verdict, c in colours.VERDICTS.items()
+        ),
     }
     for name, text in texts.items():
         page = page.replace(f"@{name}@", text)
@@ -165,11 +161,6 @@ def _typical_and_worst(entries: list[dict[str, Any]]) -> dict[str, int]:
     return {"typical": answers[(len(answers) - 1) // 2][1], "worst": answers[-1][1]}
 
 
-def _verdict_colours() -> str:
-    pairs = colours.VERDICTS.items()
-    return " ".join(f".{verdict} {{ --verdict: {colours.css(c)}; }}" for verdict, c in pairs)
-
-
 def _verdicts(summary: dict[str, Any]) -> str:
     """A card for each verdict: the number of scenes, and their errors."""
     cards = []
@@ -212,7 +203,6 @@ def _error_table(summary: dict[str, Any]) -> str:
 
 
 def _scene_table(entries: list[dict[str, Any]]) -> str:
-    """One row per scene."""
     head = ["scene", "verdict", "reason", "tumor or organ farthest off", "centre off, mm"]
     head += [f"{name}: centre off, mm" for name in RIVALS.values()]
     head += ["targets: mean, mm", "largest, mm"]
@@ -232,7 +222,7 @@ def _scene_table(entries: list[dict[str, Any]]) -> str:
 
 def _part_table(parts: dict[str, dict[str, Any]]) -> str:
     """Metrics of a scene's parts, or the summary's medians with the worst Hausdorff distance."""
-    columns = dict(_COLUMNS)
+    columns = dict(SAID.columns)
     if any("registration_mm" in part for part in parts.values()):
         columns["registration_mm"] = "expected error of the truth itself, mm"
     over_scenes = any("worst" in part for part in parts.values())

@@ -273,5 +273,4 @@ def _write_letters(axes: Axes, view: ParallelView, color: str) -> None:
 
 
 def _part_colors(anatomy: Anatomy) -> list[RGB]:
-    """Of the organ and of each tumor."""
     return [rgb(name_colour(name)) for name in anatomy.names]

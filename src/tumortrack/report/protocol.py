@@ -21,27 +21,15 @@ from tumortrack.report.page import page_scene, write_page
 from tumortrack.report.pictures import scene_picture
 from tumortrack.report.place import clear
 from tumortrack.report.rivals import rivals_of
-from tumortrack.report.summary import MEANING, summarise, worst_center
+from tumortrack.report.summary import SAID, summarise, worst_center
 from tumortrack.simulate.scene_folder import Scene, list_scenes, read_scene
 from tumortrack.tracking.model_files import load_model
 from tumortrack.tracking.options import model_folder
 from tumortrack.tracking.tracker import Tracker
 
-MEDIANS = (
-    "Medians over all scenes that have the part. A part that was not found counts as infinitely "
-    "far and with IoU 0; a median that is infinite is written as null."
-)
-RULE = (
-    f"{MEDIANS} A scene counts as failed where a part was not found, or where the centre of a "
-    f"tumor (without one: of the organ) is over {FAR_MM:g} mm off, whether the answer is called "
-    "good or poor; where nothing was found its mIoU is 0 and its target errors are infinite."
-)
+RULE = f"{SAID.medians} {SAID.rule.format(far_mm=FAR_MM)}"
 Locate = Callable[[SensorCloud], Estimate]
 Compare = Callable[[Scene], dict[str, Any]]
-NO_RIVALS = (
-    "Rigid registration is left out: it needs the organ at rest, which models of the preset clinic "
-    "alone keep; a function that estimates states none."
-)
 
 
 def evaluate_model(
@@ -131,7 +119,7 @@ def evaluate_scenes(
             "frame": "camera",
             **(about or {}),
             "rule": RULE,
-            "rivals": MEANING if rivals is not None else {"not_available": NO_RIVALS},
+            "rivals": SAID.rivals if rivals is not None else {"not_available": SAID.no_rivals},
             "summary": summarise(entries),
             "scenes": entries,
         }

@@ -153,7 +153,6 @@ class ParallelView:
         return points_mm @ self.axes.T
 
     def frame_around(self, points_mm: Float[np.ndarray, "n 3"], margin_mm: float = 5.0) -> Frame:
-        """The frame that shows all these points."""
         flat = self.project(points_mm)
         low, high = flat.min(0) - margin_mm, flat.max(0) + margin_mm
         return Frame(float(low[0]), float(high[0]), float(low[1]), float(high[1]))
@@ -234,8 +233,7 @@ _NORMALS: WeakKeyDictionary[Mesh, np.ndarray] = WeakKeyDictionary()
 
 
 def corner_normals(mesh: Mesh) -> Float32[np.ndarray, "f 3 3"]:
-    """Unit normal at each face's corners: the mean over the faces that meet there, except those
-    beyond a crease."""
+    """Unit normal at each face's corners: the mean over the faces there, but beyond a crease."""
     if (known := _NORMALS.get(mesh)) is not None:
         return known
     place = np.unique(mesh.vertices_mm, axis=0, return_inverse=True)[1].reshape(-1)[mesh.faces]

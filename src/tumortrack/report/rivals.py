@@ -27,7 +27,7 @@ from tumortrack.registration.rest_shape import RestShape
 from tumortrack.report import metrics
 from tumortrack.report.summary import RIVALS, judged_parts
 from tumortrack.sense.cloud import thin_cloud
-from tumortrack.simulate.scene_folder import Scene, Targets
+from tumortrack.simulate.scene_folder import Scene
 
 _POINTS = 1000  # of the cloud, as many as the estimate uses
 _WIDTH_MM = 5.0  # of the robust kernel, the initial one of the elastic fit
@@ -89,14 +89,10 @@ def best_rigid_pose(rest: Anatomy, scene: Scene) -> tuple[Affine, str]:
     try:
         matched = rest.organ.moved(matched_vertices(rest.organ, true.organ))
     except InputError:  # another program's surface, or a second CT's
-        if scene.targets is not None and len(scene.targets.labels) >= _FEWEST_TARGETS:
-            return _on_targets(scene.targets), "targets"
+        if (at := scene.targets) is not None and len(at.labels) >= _FEWEST_TARGETS:
+            return kabsch(at.points_ct, at.points_mm, np.ones(len(at.labels))), "targets"
         return _on_surfaces(rest.parts, true.parts), "surfaces"
     return fit_over_volume(rest.organ, matched)[0], "triangles"
-
-
-def _on_targets(targets: Targets) -> Affine:
-    return kabsch(targets.points_ct, targets.points_mm, np.ones(len(targets.labels)))
 
 
 def _on_surfaces(rest: tuple[Mesh, ...], true: tuple[Mesh, ...]) -> Affine:

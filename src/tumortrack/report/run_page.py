@@ -92,7 +92,6 @@ def _figures(panels: list[Panel]) -> str:
 
 
 def _lines(report: dict[str, Any], estimate: Estimate | None) -> Iterator[str]:
-    """The lines below the verdict."""
     patient = _sentence(str(patient_in(report.get("patient"), "report")))
     yield f"{patient}. Camera frame: x right, y down, z away."
     margin = None if estimate is None else estimate.report.margin
@@ -138,7 +137,6 @@ def _table(rows: list[dict[str, str]]) -> str:
 
 
 def _views(estimate: Estimate | None, seen: Seen) -> Iterator[Panel]:
-    """The depth image, and three views."""
     if isinstance(seen.content, DepthFrame):
         taken = "; tinted: taken for the organ" if seen.taken is not None else ""
         size = f"{seen.content.intrinsics.width} x {seen.content.intrinsics.height} pixels"

@@ -67,7 +67,6 @@ def next_lines(estimate: Estimate | None) -> list[str]:
 
 
 def row_words(row: dict[str, str]) -> str:
-    """A part's row as one line."""
     std = row["std"] and f"standard deviation {row['std']}"
     words = (f"centre {row['centre']}", std, row["volume"], row["margin"])
     return f"{row['part']}: {', '.join(filter(None, words)).replace('centre not', 'not')}"

@@ -95,8 +95,7 @@ def _export_case(
 
 
 def _report_with_motion(run: Path, case: Case, folder: Path) -> dict[str, Any]:
-    """report.json of a run. Raises InputError: it was located with another case's model, or without
-    a motion."""
+    """report.json of a run. Raises InputError: of another case's model, or without a motion."""
     report = read_report(run)
     if report.get("model", {}).get("case_sha256") != case.sha256:
         raise InputError(f"{run} was not located with a model of {folder}: give its case.")

@@ -5,23 +5,32 @@ from __future__ import annotations
 from dataclasses import fields
 from typing import Any
 
+import msgspec
 import numpy as np
 from rich.table import Table
 
 from tumortrack.core.estimate import FAR_MM
 from tumortrack.core.organ import is_tumor
+from tumortrack.core.tables import read_table
 from tumortrack.report.metrics import SurfaceDistances
 
 DISTANCES = (*(field.name for field in fields(SurfaceDistances)), "center_mm")
 TARGET_ERRORS = ("mean", "rms", "median", "p95")
 VERDICTS = ("good", "poor", "none")
+
+
+class _Said(msgspec.Struct, forbid_unknown_fields=True):
+    """See evaluation.toml."""
+
+    medians: str
+    rule: str
+    no_rivals: str
+    rivals: dict[str, str]
+    columns: dict[str, str]
+
+
+SAID = read_table("tumortrack.report", "evaluation.toml", _Said)
 RIVALS = {"best_rigid_pose": "best rigid pose", "rigid_fit": "rigid fit"}
-MEANING = {
-    "best_rigid_pose": "an oracle: the undeformed organ, moved onto the true one as well as rigid "
-    "motion allows",
-    "rigid_fit": "the undeformed organ, fitted to the same points by point-to-plane least squares, "
-    "started at the best rigid pose",
-}
 METHODS = {"estimate": "estimate", **RIVALS}
 # Of the two that a surgeon asks for; the third is of targets, where a scene has some.
 MEASURES = {"center_mm": "centre", "hausdorff_mm": "surface", "target_mm": "targets"}
@@ -220,7 +229,7 @@ def summary_tables(report: dict[str, Any]) -> list[Table]:
         cells = [triple(group.get(key)) for key in MEASURES]
         errors.add_row(verdict, METHODS[method], *cells)
     if "best_rigid_pose" in summary.get("errors", {}).get("all", {}):
-        errors.caption = "; ".join(f"{RIVALS[name]}: {text}" for name, text in MEANING.items())
+        errors.caption = "; ".join(f"{RIVALS[name]}: {text}" for name, text in SAID.rivals.items())
     overlap = f"mIoU {summary['miou']:.3f} (overlap, 1: perfect)"
     table = Table(title=f"medians over scenes, distances in mm; {overlap}")
     table.add_column("part")
@@ -271,7 +280,6 @@ def scene_lines(entries: list[Entry]) -> list[str]:
 
 
 def scene_note(entry: dict[str, Any]) -> str:
-    """A scene's errors in one line."""
     if entry["quality"] == "none":
         return "no estimate, so there is nothing to measure"
     far_mm, part = worst_center(entry)

@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float32
 
-from tumortrack.core.causes import Cause, Likely
 from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError, NoEstimate
-from tumortrack.core.report import Finding
+from tumortrack.core.report import Cause, Finding, Likely
 from tumortrack.core.types import DepthFrame, SensorCloud
 from tumortrack.sense.camera import deproject_pixels
 from tumortrack.sense.units import Unit, unit_advice
@@ -47,14 +46,15 @@ def cloud_from_depth(
     index = np.flatnonzero((depth_mm > config.near_mm) & (depth_mm < config.far_mm))
     if len(index) < FEWEST_POINTS:
         raise _too_few(len(index), frame, config.near_mm, config.far_mm)
-    chosen = index[draw_some(len(index), config.n_points, rng)]
+    chosen = rng.choice(index, min(len(index), config.n_points), replace=False)
     points_mm = deproject_pixels(chosen, depth_mm[chosen].astype(np.float64), frame.intrinsics)
     return SensorCloud(points_mm, frame.stamp_ns)
 
 
 def thin_cloud(cloud: SensorCloud, n_points: int, rng: np.random.Generator) -> SensorCloud:
     """``n_points`` distinct random points of the cloud (all of them if it has no more)."""
-    chosen = draw_some(len(cloud.points_mm), n_points, rng)
+    count = len(cloud.points_mm)
+    chosen = rng.choice(count, min(count, n_points), replace=False)
     return SensorCloud(cloud.points_mm[chosen], cloud.stamp_ns)
 
 
@@ -127,8 +127,7 @@ def check_cloud(cloud: SensorCloud, fewest: int = FEWEST_POINTS) -> None:
     farthest_mm = float(np.abs(ordered[:, [0, -1]]).max())
     if farthest_mm > _FARTHEST_MM:
         raise InputError(
-            f"a point of the cloud is {farthest_mm:.4g} mm away, beyond any depth camera. Remove "
-            "such points."
+            f"a point is {farthest_mm:.4g} mm away, beyond any depth camera. Remove such points."
         )
     some = points_mm[:: max(1, len(points_mm) // 2000)]
     inner = some[((some >= low) & (some <= high)).all(axis=1)].astype(float)
@@ -170,16 +169,10 @@ def check_depth_unit(frame: DepthFrame, unit_mm: float, near_mm: float, far_mm: 
     )
 
 
-def draw_some(available: int, wanted: int, rng: np.random.Generator) -> np.ndarray:
-    """Indices of ``wanted`` random ones of ``available`` points; of all if there are no more."""
-    return rng.choice(available, min(available, wanted), replace=False)
-
-
 def _check_range(near_mm: float, far_mm: float) -> None:
     if not 0 <= near_mm < far_mm < np.inf:
         raise InputError(
-            f"the depth range {near_mm:g}..{far_mm:g} mm is empty; near must be at least 0 and "
-            "less than far."
+            f"the depth range {near_mm:g}..{far_mm:g} mm is empty; allowed: 0 <= near < far."
         )
 
 

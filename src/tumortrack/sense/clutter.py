@@ -47,8 +47,7 @@ _Patch = tuple[Float[np.ndarray, " 2"], float, Float[np.ndarray, " n"]]
 
 def add_clutter(frame: DepthFrame, config: ClutterConfig, rng: np.random.Generator) -> DepthFrame:
     """The frame with background in some of its pixels without return: a piece of a tilted plane
-    behind the organ, a ball beside it, or points anywhere, with equal chance. ``rng`` does not
-    advance."""
+    behind the organ, a ball beside it, or points anywhere, equally likely. ``rng`` stays."""
     rng = rng.spawn(1)[0]
     if rng.uniform() >= config.scenes:
         return frame

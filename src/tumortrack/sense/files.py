@@ -66,8 +66,7 @@ class DepthCorrection(Config, frozen=True, kw_only=True):
 
 def read_poses(path: Path, count: int) -> tuple[str, tuple[Affine, ...]]:
     """``frame_id`` and ``fixed_from_camera`` (mm) of ``count`` views from JSON (``PosesFile``).
-    Raises InputError: missing file, unknown key, wrong number of views, a matrix that is no rigid
-    transform."""
+    Raises InputError: missing file, unknown key, wrong number of views, no rigid transform."""
     file = from_builtins(read_json(path), PosesFile, str(path))
     if len(file.fixed_from_camera) != count:
         raise InputError(
@@ -220,7 +219,6 @@ def _correction(data: dict[str, Any], path: Path) -> DepthCorrection:
 
 
 def _camera(path: Path) -> tuple[Intrinsics, dict[str, Any]]:
-    """The camera, and everything in its file."""
     data = read_json(path)
     for key in _DISTORTION_KEYS:
         if any(_numbers(data.get(key, 0), key, path)):
@@ -279,8 +277,7 @@ def read_depth(
     steps, mode = _image(path, (intrinsics.width, intrinsics.height))
     if not mode.startswith(("I", "F")):
         raise InputError(
-            f"{path} has pixels of the kind {mode}; a depth image must be 16-bit grey, or floats "
-            "in a TIFF."
+            f"{path} has pixels of the kind {mode}; allowed: 16-bit grey, or floats in a TIFF."
         )
     default = DEPTH_UNIT_MM if mode.startswith("I") else 1000.0
     stated = data.get("depth_unit_mm", default) if unit_mm is None else unit_mm

@@ -118,8 +118,7 @@ def _across(points: np.ndarray) -> np.ndarray:
 def _hidden(rays, rays_uv, vertices, vertices_uv, faces, columns, tolerance_mm):  # type: ignore[no-untyped-def]
     """Whether a triangle crosses each ray (n, 3) nearer to the eye than the ray's end by more than
     the tolerance (Moeller and Trumbore 1997, doi 10.1080/10867651.1997.10487468). Rays are sorted
-    by their first image coordinate; columns: index of each one's first ray, lowest coordinate,
-    width."""
+    by their first image coordinate; columns: their first rays, lowest coordinate, width."""
     starts, lowest, width = columns
     hidden = np.zeros(len(rays), np.bool_)
     slack = 1e-9  # rounding: a ray along an edge belongs to both triangles

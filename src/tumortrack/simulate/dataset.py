@@ -53,8 +53,7 @@ def write_scenes(
             meta = store.read_json(folder / "meta.json")
             if {key: meta.get(key) for key in made_from} != made_from:
                 raise InputError(
-                    f"{folder} is a scene of another case, seed or option. Choose another "
-                    "DATASET folder."
+                    f"{folder} is of another case, seed or option. Choose another DATASET."
                 )
         else:
             scene = make(index)

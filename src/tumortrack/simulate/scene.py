@@ -106,8 +106,7 @@ class SceneConfig(Config, frozen=True):
         fewest, most = self.cloud_points or (FEWEST_POINTS, FEWEST_POINTS)
         if not FEWEST_POINTS <= fewest <= most:
             raise InputError(
-                f"cloud_points is {fewest}..{most}; it must be a rising range from "
-                f"{FEWEST_POINTS} points up."
+                f"cloud_points is {fewest}..{most}; allowed: rising, from {FEWEST_POINTS} up."
             )
 
 
@@ -162,7 +161,6 @@ class Simulator:
         self._hull_ct = Mesh(corners, np.empty((0, 3)))
 
     def render(self, recipe: SceneRecipe) -> RenderedScene:
-        """Pose, deformation, depth image and cloud of a recipe."""
         return self.draw(recipe)[0]
 
     def reference(self, scene: RenderedScene) -> Anatomy:

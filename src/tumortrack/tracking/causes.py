@@ -13,10 +13,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from tumortrack.core.causes import Cause, Likely
 from tumortrack.core.estimate import Estimate
 from tumortrack.core.geometry import Points, rotation_onto
-from tumortrack.core.report import Check
+from tumortrack.core.report import Cause, Check, Likely
+from tumortrack.core.tables import read_table
 from tumortrack.core.types import Mesh, SensorCloud
 from tumortrack.models.in_distribution import spread_mm
 from tumortrack.models.model import Model
@@ -27,36 +27,10 @@ from tumortrack.sense.cloud import thin_cloud
 from tumortrack.sense.units import Unit, likely_unit
 from tumortrack.tracking.advice import near_side, unseen
 
-_AXES = "x points right, y down and z away from the camera"
-# Cause, and what to do about it.
-_WORDS = {
-    Cause.UNIT: ("another unit than mm", "{unit}"),
-    Cause.FRAME: ("another frame than the camera's (a robot's, swapped axes)", f"see that {_AXES}"),
-    Cause.MIRRORED: (
-        "the other side's organ, or a mirrored frame (y up, two axes swapped)",
-        f"check the side, and that {_AXES}",
-    ),
-    Cause.SCALE: (
-        "a camera out of scale (the organ fits {number:.2g} times as wide)",
-        "check the focal length, and calibrate it",
-    ),
-    Cause.OBJECT: (
-        "something else than the organ (a table, a ball, a hand)",
-        "make sure that this is the organ (a click, --box)",
-    ),
-    Cause.BACKGROUND: (
-        "things round the organ left in ({percent:.0f} % of the points)",
-        "remove the background (--range NEAR FAR), free the organ of what lies on it",
-    ),
-    Cause.HIDDEN: ("about {percent:.0f} % of the organ's near side hidden", ""),
-    Cause.ANOTHER_PATIENT: ("another patient's organ, or the other side's", "check both"),
-    Cause.DEFORMED: ("an organ deformed as hardly any in training", ""),
-    Cause.POSES: ("wrong poses, or the organ moved between the views", "check the poses"),
-    Cause.VIEW: ("", ""),
-}
+# By cause: what it is called, and what to do about it.
+_WORDS = read_table("tumortrack.tracking", "causes.toml", dict[str, tuple[str, str]])
 _POINTS = 400  # of a trial fit
-# A trial must cost less than so many times the usual cost, and the present one; right ones have
-# 0.1 to 0.5 times it.
+# A trial must cost less than so many times the usual and the present cost; right: 0.1 to 0.5.
 _FITS, _BETTER = 1.0, 0.6
 _XY_SCALES = 0.5, 0.75, 1.33, 2.0  # of a wrong focal length
 _STARTS = 2  # of the search that are refined
@@ -105,7 +79,7 @@ def words(causes: tuple[Likely, ...], view: str) -> str:
     for cause, number in ((likely.cause, likely.number or 0.0) for likely in causes[:2]):
         unit = Unit(number).of_cloud if cause is Cause.UNIT else ""
         values = {"number": number, "percent": 100 * number, "unit": unit}
-        parts.append([text.format(**values) for text in _WORDS[cause]])
+        parts.append([text.format(**values) for text in _WORDS[cause.name]])
     # The only evidence for another patient is a bad fit, which the right organ has if bent far.
     sure, link = ("perhaps", ", or ") if causes[0].cause in _GUESSED else ("most likely", ", else ")
     what = link.join(what for what, _ in parts if what)

@@ -18,6 +18,7 @@ from tumortrack.core.errors import ArtifactError, InputError
 from tumortrack.core.estimate import Estimate, Quality
 from tumortrack.core.geometry import RAS_FROM_LPS, largest_std_of, std_of
 from tumortrack.core.mesh_files import read_mesh, write_mesh
+from tumortrack.core.mesh_query import exact_margin
 from tumortrack.core.organ import is_tumor, organ_entry, organ_in
 from tumortrack.core.patient import patient_in
 from tumortrack.core.report import Finding, FitReport
@@ -27,7 +28,6 @@ from tumortrack.imaging.segmentation_files import segments, write_seg_nrrd
 from tumortrack.sense.ply import parse_ply_properties, write_cloud_ply
 from tumortrack.tracking.margins import stated_radius
 from tumortrack.tracking.points import PointTable, camera_table
-from tumortrack.tracking.shells import exact_margin
 
 MARGIN = "_margin"  # suffix of the names of shells
 CENTRES, CT = "tumors", "ct"  # names of the tumor centres and of the organ's pose in 3D Slicer
@@ -135,8 +135,7 @@ def has_no_estimate(folder: Path) -> bool:
 
 
 def read_report(folder: Path) -> dict[str, Any]:
-    """report.json of a run's folder. Raises ArtifactError: no such folder, damaged, or without an
-    estimate."""
+    """report.json of a run's folder. Raises ArtifactError: damaged, or without an estimate."""
     store.read_manifest(folder, "run")
     report = store.read_json(folder / "report.json")
     if has_no_estimate(folder):

@@ -10,7 +10,7 @@ from tumortrack.core.errors import InputError
 from tumortrack.core.types import Anatomy
 from tumortrack.models.method import Preset, method_of_preset
 from tumortrack.models.model import ModelConfig
-from tumortrack.registration.presets import Rotations, clinic
+from tumortrack.registration.config import Rotations, clinic
 from tumortrack.sense.noise import CLEAN, SENSORS, Sensor
 
 C = TypeVar("C", bound=ModelConfig)
@@ -32,8 +32,7 @@ PRESETS: dict[str, Preset] = {"clinic": clinic, "quick": quick, "paper": paper}
 
 
 def seen_by(config: C, sensor: Sensor) -> C:
-    """The configuration with the noise of another sensor. Raises InputError: its scenes have no
-    sensor noise."""
+    """The configuration with another sensor's noise. Raises InputError: its scenes have none."""
     noise = config.scene.noise
     if noise == SENSORS[sensor] or (noise == CLEAN and sensor == "d405"):
         return config

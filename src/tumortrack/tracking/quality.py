@@ -25,8 +25,7 @@ from tumortrack.tracking.misses import POOR_MM, with_misses
 _MAX_UNCERTAINTY_MM = 3.0
 # Shares of the organ's image that are seen through. Right estimates have up to 0.03 (moving and
 # pushed, on tables, in beds and cavities, among instruments and hands), an organ upside down 0.12
-# to 0.16, one fitted to a hand 0.2 to 0.4, a model fitted to another patient's kidney mostly 0.1 to
-# 0.24.
+# to 0.16, one fitted to a hand 0.2 to 0.4, one of another patient's kidney mostly 0.1 to 0.24.
 _LIMITS = 0.05, 0.09  # doubtful, impossible
 # Without a motion surfaces are rougher: with centres 2 to 8 mm off, 0.09 to 0.15 are usual.
 _ROUGH_LIMITS = 0.1, 0.2
@@ -156,8 +155,7 @@ def _misplaced_camera(looks: LooksReport | None) -> Finding | None:
 
 
 def _misfit(report: FitReport, surroundings_seen: bool) -> Finding | None:
-    """Too many strays, or too high a cost. ``surroundings_seen``: a wrong place would be seen
-    through."""
+    """Too many strays, or too high a cost. ``surroundings_seen``: a wrong place is seen through."""
     cost = report.fit_cost
     if cost is None:
         return None
@@ -170,8 +168,7 @@ def _misfit(report: FitReport, surroundings_seen: bool) -> Finding | None:
 
 
 def _doubt(report: FitReport) -> Finding | None:
-    """Another size or pose that is as likely; a part that is missing, or a tumor that may be far
-    off."""
+    """Another size or pose as likely; a part that is missing, or a tumor that may be far off."""
     size, cost = report.size, report.fit_cost
     if size is not None and size.gain > RIVAL_COST:
         return Finding("size", {"times": size.times})

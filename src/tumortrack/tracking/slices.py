@@ -9,7 +9,6 @@ import numpy as np
 from jaxtyping import Float, Float32, Float64, UInt8
 
 from tumortrack.core.colours import Colour, label_colours
-from tumortrack.core.estimate import Motion
 from tumortrack.core.geometry import plane_section, spacing_mm, transform_points
 from tumortrack.core.organ import organ_name
 from tumortrack.core.types import Mesh
@@ -27,7 +26,6 @@ _FILL = 0.6  # brightness of a label: estimated outlines stand out from it
 _SLICE_ROOM = 1.15  # side of a slice, relative to the organ's largest extent
 _BAR_MM = 10
 _FINER = 2
-_COARSER = 2  # the CT is sampled coarser: a pixel in the panel is less than a voxel
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,25 +89,6 @@ class CarriedCt:
         return np.repeat(grey[:, None], 3, axis=1)
 
 
-def slice_picture(
-    ct: CarriedCt,
-    motion: Motion,
-    plane: SlicePlane,
-    outlines: Iterable[tuple[Mesh, Colour, int]],
-    pixels: int,
-    note: str = "",
-) -> UInt8[np.ndarray, "h w 3"] | None:
-    """The CT in a plane before the camera, over it the outlines of surfaces (camera frame) in
-    their colour and width (pixels), a bar of 10 mm, and ``note`` in the corner. None if ``motion``
-    has no inverse."""
-    sampled = pixels // _COARSER
-    points_ct = motion.back(plane.points(sampled))
-    if points_ct is None:
-        return None
-    picture = ct.picture(points_ct).reshape(sampled, sampled, 3)
-    return outlined(picture, plane, outlines, pixels, note)
-
-
 def outlined(
     picture: UInt8[np.ndarray, "s s *rgb"],
     plane: SlicePlane,
@@ -117,7 +96,8 @@ def outlined(
     pixels: int,
     note: str = "",
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """A picture of the plane, with outlines, bar and note as in ``slice_picture``."""
+    """A picture of the plane, over it outlines of surfaces (camera frame) in their colour and width
+    (pixels), a bar of 10 mm, and ``note`` in the corner."""
     from PIL import Image, ImageDraw
 
     fine = _FINER * pixels  # lines are drawn finer and then shrunk: smooth

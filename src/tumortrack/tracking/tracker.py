@@ -12,14 +12,13 @@ import msgspec
 import numpy as np
 from jaxtyping import Float64
 
-from tumortrack.core.causes import Cause, Likely
 from tumortrack.core.config import Config, check_seed
 from tumortrack.core.errors import InputError, NoEstimate, NotThisOrgan
 from tumortrack.core.estimate import Estimate, FollowOptions
 from tumortrack.core.evidence import Evidence, touched
 from tumortrack.core.geometry import HERE, Affine, transform_points
 from tumortrack.core.process import keep_small_blocks
-from tumortrack.core.report import Finding
+from tumortrack.core.report import Cause, Finding, Likely
 from tumortrack.core.types import Anatomy, DepthFrame, Look, SensorCloud
 from tumortrack.imaging.case import Case
 from tumortrack.models.folder import weakness_of
@@ -202,7 +201,6 @@ def _locator(model: Model, advise: str) -> Locator:
 
 
 def _unusual(estimate: Estimate) -> bool:
-    """Whether it fits worse than usual."""
     cost = estimate.report.fit_cost
     return cost is not None and cost.now > cost.usual
 
@@ -256,7 +254,6 @@ class Follower:
         self._causes_ns, self._causes = 0, dict[str, tuple[Likely, ...]]()
 
     def warm(self) -> None:
-        """See ``Tracker.warm``."""
         self._tracker.warm()
 
     def forget(self) -> None:

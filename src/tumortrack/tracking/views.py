@@ -185,7 +185,6 @@ def _picked_mm(frame: DepthFrame, column: int, row: int) -> Float[np.ndarray, " 
     index, depth_mm = index[np.isfinite(depth_mm)], depth_mm[np.isfinite(depth_mm)]
     if not len(index):
         raise InputError(
-            f"--at {column} {row}: the depth image has no return there. Give a pixel on the organ "
-            "that has one."
+            f"--at {column} {row}: the depth image has no return there. Give another pixel."
         )
     return deproject_pixels(index[:1], depth_mm[:1], camera)[0].astype(float)

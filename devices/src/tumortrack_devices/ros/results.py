@@ -20,10 +20,10 @@ from tumortrack.core.geometry import transform_points
 from tumortrack.core.organ import is_tumor, organ_name
 from tumortrack.core.patient import Patient
 from tumortrack.core.types import Mesh, SensorCloud
-from tumortrack.live.meter import Rate
 from tumortrack.live.values import SinkContext, TrackingResult, TransformedEstimate, Workcell
 from tumortrack_devices.beside import Beside, NextTouch
 from tumortrack_devices.display import MOST_SEEN, seen_points, thinned, wxyz_of
+from tumortrack_devices.rate import Rate
 from tumortrack_devices.ros.messages import MM_PER_M, Messages, Outgoing, PointBlock, xyz
 from tumortrack_devices.ros.sensors import CLOUD, cloud_message, plain_cloud
 from tumortrack_devices.ros.tf import TRANSFORMS, transform_fields

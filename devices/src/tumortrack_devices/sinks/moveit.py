@@ -9,8 +9,8 @@ import numpy as np
 
 from tumortrack.core.colours import PICKED, Colour, name_colour
 from tumortrack.core.types import Mesh
-from tumortrack.live.meter import Rate
 from tumortrack.live.values import SinkConfig, SinkContext, TrackingResult
+from tumortrack_devices.rate import Rate
 from tumortrack_devices.ros.bus import check_topic
 from tumortrack_devices.ros.messages import MM_PER_M, Messages, PointBlock
 from tumortrack_devices.ros.results import ORGAN_OPACITY

@@ -15,18 +15,18 @@ import numpy as np
 from tumortrack.core.colours import TO_CUT, name_colour
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import RAS_FROM_LPS, transform_points
+from tumortrack.core.mesh_query import rough_margin
 from tumortrack.core.report import FitReport
 from tumortrack.core.types import Mesh
-from tumortrack.live.meter import Rate
 from tumortrack.live.values import SinkConfig, SinkContext, TrackingResult
 from tumortrack.tracking.files import CENTRES, CT, MARGIN
 from tumortrack.tracking.margins import centre_label, stated_radius
-from tumortrack.tracking.shells import rough_margin
 from tumortrack_devices.beside import Beside
 from tumortrack_devices.igtl import message as igtl
 from tumortrack_devices.igtl.link import Link
 from tumortrack_devices.igtl.message import Message, Polydata
 from tumortrack_devices.network import is_loopback
+from tumortrack_devices.rate import Rate
 
 STATUS_DEVICE, CLOUD_DEVICE, ARMS_DEVICE = "tumortrack", "occupancy", "arms"
 TOUCH_DEVICE = "next_touch"

@@ -9,21 +9,23 @@ from __future__ import annotations
 import socket
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
+from jaxtyping import UInt8
 
 from tumortrack.core import colours
 from tumortrack.core.errors import InputError
+from tumortrack.core.estimate import Motion
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import Mesh
 from tumortrack.imaging.case import load_case
 from tumortrack.live.values import SinkConfig, SinkContext, TrackingResult
-from tumortrack.tracking.slices import CarriedCt, plane_through, slice_picture
+from tumortrack.tracking.slices import CarriedCt, SlicePlane, outlined, plane_through
 from tumortrack_devices.display import seen_points
 from tumortrack_devices.network import is_loopback
 from tumortrack_devices.viewer.look import point_under
@@ -38,6 +40,7 @@ if TYPE_CHECKING:
 _STALE_S = 1.0
 _TICK_S = 0.2  # how often the age is updated and the slice renewed
 _SLICE_PIXELS = 320
+_COARSER = 2  # the CT is sampled coarser: a pixel in the panel is less than a voxel
 # For viser's thread to pause, else changes may arrive in pieces: on a busy machine, or in a full
 # garbage collection, it may not run for a second.
 _PARKED_S = 5.0
@@ -437,3 +440,21 @@ def _silence() -> Iterator[None]:
         yield
     finally:
         console.quiet = before
+
+
+def slice_picture(
+    ct: CarriedCt,
+    motion: Motion,
+    plane: SlicePlane,
+    outlines: Iterable[tuple[Mesh, colours.Colour, int]],
+    pixels: int,
+    note: str = "",
+) -> UInt8[np.ndarray, "h w 3"] | None:
+    """The CT in a plane before the camera, with the rest as in ``outlined``. None if ``motion`` has
+    no inverse."""
+    sampled = pixels // _COARSER
+    points_ct = motion.back(plane.points(sampled))
+    if points_ct is None:
+        return None
+    picture = ct.picture(points_ct).reshape(sampled, sampled, 3)
+    return outlined(picture, plane, outlines, pixels, note)

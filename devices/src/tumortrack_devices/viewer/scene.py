@@ -16,12 +16,11 @@ from jaxtyping import Bool, Float, Int32, UInt8
 
 from tumortrack.core import colours
 from tumortrack.core.geometry import transform_points
-from tumortrack.core.mesh_query import surface_distance
+from tumortrack.core.mesh_query import exact_margin, rough_margin, surface_distance
 from tumortrack.core.types import Anatomy, Mesh
 from tumortrack.live import values as live
 from tumortrack.live.values import TrackingResult, TransformedEstimate
 from tumortrack.tracking.margins import stated_radius
-from tumortrack.tracking.shells import exact_margin, rough_margin
 from tumortrack.tracking.slices import SlicePlane
 from tumortrack_devices.beside import Beside
 from tumortrack_devices.display import MOST_SEEN, seen_colours, seen_points, thinned, wxyz_of

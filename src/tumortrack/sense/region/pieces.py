@@ -86,7 +86,7 @@ def _isolated(depth_mm, taken, jump):  # type: ignore[no-untyped-def]
 
 @jit
 def _without_holes(depth_mm, taken, jump):  # type: ignore[no-untyped-def]
-    """The remaining depths (NaN otherwise), with short holes along a row bridged where both ends
+    """The remaining depths (NaN otherwise), short holes along a row bridged where its ends
     agree."""
     height, width = depth_mm.shape
     out = np.full((height, width), np.nan, np.float32)

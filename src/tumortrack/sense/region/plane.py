@@ -26,8 +26,7 @@ _NARROWEST_MM = 120.0  # extent of a background across its long side
 
 class Plane(NamedTuple):
     """``normal @ point = offset``, mm; the unit normal points to the camera. ``half_mm``: points up
-    to this far from it belong to it. ``middle``, ``wide_mm``: centre and width of its visible
-    part."""
+    to this far from it belong to it. ``middle``, ``wide_mm``: of its visible part."""
 
     normal: np.ndarray
     offset: float

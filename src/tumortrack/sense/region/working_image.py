@@ -139,21 +139,19 @@ class WorkingImage:
         return (rows, columns), part
 
     def counts(self) -> dict[str, int]:
-        """Number of pixels by state."""
         counts = np.bincount(self.taken.ravel(), minlength=len(STEPS))
         return dict(zip(STEPS, counts.tolist(), strict=True))
 
 
 def sampled_pixels(frame: DepthFrame) -> tuple[slice, slice]:
-    """Rows and columns of the working image: all of a small frame, every second, third ... of a
-    large one."""
+    """Rows and columns of the working image: all of a small frame, each second ... of a large
+    one."""
     step = int(np.ceil(np.sqrt(frame.depth_mm.size / MOST_PIXELS)))
     return slice(step // 2, None, step), slice(step // 2, None, step)
 
 
 def image_of_frame(frame: DepthFrame, mask: np.ndarray | None) -> WorkingImage:
-    """A frame's ``sampled_pixels``, without those outside a mask. Raises InputError: a mask of
-    another size."""
+    """A frame's ``sampled_pixels``, without those outside a mask. InputError: of another size."""
     camera, sampled = frame.intrinsics, sampled_pixels(frame)
     step = sampled[0].step
     depth_mm = frame.depth_mm[sampled].copy()

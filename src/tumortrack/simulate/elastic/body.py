@@ -62,8 +62,7 @@ class ElasticBody:
     # motion; the last one swells, the others keep volume.
     modes: Float32[np.ndarray, "i j k 3 m"]
     states: Float32[np.ndarray, "s m"]  # the library
-    # Displacements by forces anywhere on the surface (``modes.compliance_modes``); a scene's body
-    # has none.
+    # Displacements by forces on the surface (``modes.compliance_modes``); none of a scene's body.
     compliance: Float32[np.ndarray, "i j k 3 c"] | None = None
 
     def __post_init__(self) -> None:
@@ -85,7 +84,6 @@ class ElasticBody:
 
     @cached_property
     def mean(self) -> Float64[np.ndarray, " m"]:
-        """Mean of the library."""
         return self.states.mean(0, dtype=float)
 
     @cached_property
@@ -95,8 +93,7 @@ class ElasticBody:
 
     @cached_property
     def compliant(self) -> ElasticBody:
-        """The body with its compliance among the modes, as the last of them. Raises InputError: it
-        has none."""
+        """The body with its compliance as the last of its modes. Raises InputError: it has none."""
         if self.compliance is None:
             raise InputError("the body has no compliance; build it again.")
         modes = np.concatenate([self.modes, self.compliance], axis=-1)
@@ -105,7 +102,6 @@ class ElasticBody:
 
     @cached_property
     def precision(self) -> Float64[np.ndarray, "m m"]:
-        """Inverse of ``covariance``."""
         return np.linalg.inv(self.covariance)
 
     def velocity(self, coefficients: Float[np.ndarray, " m"]) -> Field:
@@ -113,8 +109,7 @@ class ElasticBody:
         return combine(self.modes, np.asarray(coefficients, np.float32))
 
     def carry(self, coefficients: Float[np.ndarray, " m"], points_ct: Points) -> Moved:
-        """Points in or near the undeformed organ, moved to a state; negative coefficients move them
-        back."""
+        """Points in or near the undeformed organ in a state; of negative coefficients, back."""
         return self.follow(self.velocity(coefficients), points_ct)
 
     def follow(self, velocity_mm: Field, points: Points, steps: int | None = None) -> Moved:
@@ -135,14 +130,12 @@ class ElasticBody:
         return LatticeField(values, self.origin_mm, np.float32(self.spacing_mm))
 
     def to_arrays(self) -> dict[str, np.ndarray]:
-        """The body as named arrays, for a file."""
         arrays = {name: getattr(self, name) for name in _ARRAYS}
         return {name: np.asarray(value) for name, value in arrays.items() if value is not None}
 
     @classmethod
     def from_arrays(cls, arrays: dict[str, np.ndarray]) -> ElasticBody:
-        """The inverse of ``to_arrays``. Raises InputError: an array is missing or has a wrong
-        shape."""
+        """The inverse of ``to_arrays``. Raises InputError: an array is missing or misshapen."""
         missing = [name for name in _ARRAYS if name not in arrays]
         if missing:
             raise InputError(f"a body lacks {', '.join(missing)}; build it again.")
@@ -182,8 +175,7 @@ def build_body(
 
 
 def length_over_kidney(anatomy_ct: Anatomy) -> float:
-    """An organ's length over a typical kidney's, to scale what is meant for kidneys; 1 for every
-    kidney."""
+    """An organ's length over a typical kidney's, to scale what is meant for kidneys (there 1)."""
     kidney = anatomy_ct.kind.name == KIDNEY.name
     return 1.0 if kidney else anatomy_ct.organ.longest_mm / _KIDNEY_MM
 
@@ -191,8 +183,7 @@ def length_over_kidney(anatomy_ct: Anatomy) -> float:
 def reduced_organ(
     anatomy_ct: Anatomy, up: Float64[np.ndarray, " 3"], config: BodyConfig, rng: np.random.Generator
 ) -> ReducedModel:
-    """An organ in the space of its modes, ready for loads; ``up`` is a unit vector. Raises the same
-    as ``build_body``."""
+    """An organ in the space of its modes; ``up`` is a unit vector. Raises as ``build_body``."""
     from tumortrack.simulate.elastic.finite import ElementLattice, LatticeSolid
     from tumortrack.simulate.elastic.modes import ReducedModel, modes_of, patches_of, random_loads
 

@@ -76,8 +76,7 @@ class ElementLattice:
 def cube_stiffness(poisson: float) -> tuple[np.ndarray, np.ndarray]:
     """Stiffness (24, 24), and mean dilatation per displacement (24,), of a unit cube with Young's
     modulus 1. Unknowns: x, y, z of the corners in the order of ``CORNERS``. A cube of edge h has h
-    times this stiffness, and 1 / h times this dilatation.
-    """
+    times this stiffness, and 1 / h times this dilatation."""
     shear = 1 / (2 * (1 + poisson))
     bulk = 1 / (3 * (1 - 2 * poisson))
     gauss = 0.5 + _CORNER_SIGNS / (2 * np.sqrt(3))

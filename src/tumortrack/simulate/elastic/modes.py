@@ -193,8 +193,8 @@ class _Tractions:
         return force - _total(patches.facing(-along), along) if rng.uniform() < 0.6 else force
 
     def hang(self) -> np.ndarray:
-        """Supported in one place; the weight, which is what inertia relief amounts to, pulls on
-        the rest."""
+        """Supported in one place; the weight, to which inertia relief amounts, pulls on the
+        rest."""
         along, points = self._direction(), self.patches.points_mm
         radius = self.rng.uniform(0.4, 2) * self._size_mm
         support = self.patches.spot(points[self.rng.integers(len(points))], radius)
@@ -252,8 +252,7 @@ class ReducedModel:
         arms = (patches.points_mm - solid.center_mm) / LEVER_MM
         turned = np.stack([np.cross(axis, arms) for axis in np.eye(3)], -1)
         shifted = np.broadcast_to(np.eye(3), turned.shape)
-        # Displacement per unknown: of each patch (p, 3, k + 6); integrated over the volume
-        # (3, k + 6), mm3.
+        # Displacement per unknown: of each patch (p, 3, k + 6); over the volume (3, k + 6), mm3.
         self.moves = np.concatenate([deformed, shifted, turned], -1)
         volume = solid.volume_mm3
         mean = np.tensordot(volume, modes.reshape(n, 3, k), 1)
