@@ -123,7 +123,7 @@ pull: setup  ## an organ under the pull of a plan's holder, for the virtual sour
 pulls: setup  ## whether tumors that the holder pulls are cut out (ARGS="OUT CASE ... --count 40": 15 s a scene)
 	$(BIN)/python lab/scripts/pulls.py $(ARGS)
 
-trust: setup  ## what margins are worth for physics and organs left out (ARGS="MODEL/margins.jsonl ...": an organ each)
+trust: setup  ## what margins are worth for kidneys and physics left out (ARGS="OUT"; an hour)
 	$(BIN)/python lab/scripts/trust.py $(ARGS)
 
 misses: setup  ## learns how far off tumors may be, from random kidneys (ARGS="OUT --write src/tumortrack/tracking/misses.json"; half an hour)

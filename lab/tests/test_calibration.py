@@ -202,7 +202,7 @@ def test_a_state_is_located_with_evidence_drawn_for_it(tmp_path):
     assert tracker.given != first
     row_of(tracker, scene, listed, 0)
     assert tracker.given == []
-    assert "left out" in row_of(_Using(left_out=1), scene, listed, 0, asked).doubt
+    assert not row_of(_Using(left_out=1), scene, listed, 0, asked).doubt  # as a user's may be
     with pytest.raises(InputError, match=r"need targets\.csv"):
         row_of(tracker, scene, listed, 0, {"held": 1})
 

@@ -1,29 +1,24 @@
-"""What tables of margins say of physics and organs that are left out."""
+"""What margins are worth of physics and organs that are left out."""
 
 from __future__ import annotations
-
-import json
 
 import numpy as np
 import pytest
 
 from tumortrack.core import store
-from tumortrack.core.config import to_builtins
 from tumortrack.core.errors import InputError
-from tumortrack_lab.margins.table import Row, head_of
+from tumortrack_lab.margins.table import Row
 from tumortrack_lab.study import trust
 
 FAMILIES = {"rest": 1.0, "plate": 1.0, "pull": 1.0, "cut": 4.0}  # how far it misses, times the size
 
 
 @pytest.fixture(scope="module")
-def tables(tmp_path_factory):
-    """Two organs' tables; every tenth estimate is poor, a third of the scenes is partly hidden."""
-    rng, paths = np.random.default_rng(0), []
+def states(tmp_path_factory):
+    """Two organs' states; every tenth estimate is poor, a third of the scenes is partly hidden."""
+    rng, rows = np.random.default_rng(0), []
     for organ in ("a", "b"):
-        folder = tmp_path_factory.mktemp("models") / organ
-        folder.mkdir()
-        lines = [head_of("", 0)]
+        folder = tmp_path_factory.mktemp(organ)
         for n in range(480):
             scene = folder / f"scene{n}"
             scene.mkdir()
@@ -36,16 +31,12 @@ def tables(tmp_path_factory):
                     scene=str(scene), sha256="", label=label, measured={"fit_cost": rng.random()},
                     misses={"tumor": ((float(size * rng.uniform()), s),)},
                 )  # fmt: skip
-            lines.append(to_builtins(row))
-        paths.append(folder / "margins.jsonl")
-        paths[-1].write_text("".join(f"{json.dumps(line)}\n" for line in lines))
-    return paths
+            rows.append(row)
+    found = trust.states_of(rows)
+    return found.assign(rigid=2 * found.miss)
 
 
-def test_a_family_unlike_the_others_is_found_out_by_leaving_it_out(tables, tmp_path):
-    read = trust.read_tables(tables)
-    assert [table.organ for table in read] == ["a", "b"]
-    states = trust.states_of([row for table in read for row in table.rows])
+def test_a_family_unlike_the_others_is_found_out_by_leaving_it_out(states, tmp_path):
     assert dict(states.hidden.value_counts()) == {"nothing hidden": 640, "over 40 %": 320}
     found = trust.left_out(states, states.family, 0, widest_mm=20.0)
     taken = found[found.accepted.astype(bool)]
@@ -60,20 +51,20 @@ def test_a_family_unlike_the_others_is_found_out_by_leaving_it_out(tables, tmp_p
     within = organs[organs.accepted.astype(bool)]["within 0.95"]
     assert within.mean() > 0.93  # the other organ has the same physics
     assert float(trust.ranks(organs)["95 % radius and miss"].iloc[-1]) > 0.3
+    each = trust.coverage({"organ, by family": organs.assign(part=organs.family)})
+    short = trust.by_family(each.assign(evidence="clouds alone"))
+    answers = organs[organs.family == "cut"].accepted.sum()
+    assert short["clouds alone"][0].endswith(f"({answers})")
+    assert list(short.family) == [*sorted(FAMILIES), "all of these"]
+    assert (short["rigid fit's 95 % mm"].astype(float) > each["miss 95 % mm"].astype(float)).all()
     trust.risk_picture(found, tmp_path / "risk.png")
     trust.reliability_picture({"each family left out": found}, tmp_path / "reliability.png")
     assert all((tmp_path / f"{name}.png").stat().st_size > 9000 for name in ("risk", "reliability"))
 
 
-def test_too_few_states_and_other_methods_are_refused(tables, tmp_path):
-    states = trust.states_of(trust.read_tables(tables)[0].rows[:60])
+def test_too_few_states_are_refused(states):
     with pytest.raises(InputError, match="no limits hold 5 %"):
-        trust.left_out(states, states.family, 0)
-    head, *rest = tables[0].read_text().splitlines()
-    old = {**json.loads(head), "method": 1}
-    (tmp_path / "margins.jsonl").write_text("\n".join([json.dumps(old), *rest]))
-    with pytest.raises(InputError, match="another version of the method"):
-        trust.read_tables([tmp_path / "margins.jsonl"])
+        trust.left_out(states[:60], states.family[:60], 0)
 
 
 def test_a_share_is_stated_with_clopper_and_pearsons_interval():

@@ -344,7 +344,7 @@ def _recordings() -> dict[str, Target]:
 
 def _margins() -> dict[str, Target]:
     from tumortrack.tracking import margins
-    from tumortrack_lab.margins.table import head_of, read_table
+    from tumortrack_lab.margins.table import head_of, open_table
 
     shells = margins.Shells(
         confidence=0.9, radii={"tumor": margins.Radius(used="constant", constant_mm=3.0)}
@@ -357,9 +357,14 @@ def _margins() -> dict[str, Target]:
     margins.write_sealed(path := scratch() / "margins.json", valid)
     row = {"scene": "s", "sha256": "", "label": ["a", "b", "c"], "misses": {"tumor": [[1.0, None]]}}
     table = "\n".join(map(json.dumps, (head_of("", 0), row)))
+
+    def rows(path: Path) -> object:
+        with open_table(path, head_of("", 0)) as (known, _):
+            return known
+
     return {
         "margins": of_file(margins.read_sealed, "in.json", path.read_bytes()),
-        "margins table": of_file(read_table, "in.jsonl", table),
+        "margins table": of_file(rows, "in.jsonl", table),
     }
 
 

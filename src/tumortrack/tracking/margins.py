@@ -197,14 +197,15 @@ def sized(
     return {**figures, "size_mm": max(radius.size_mm(std_mm, figures) for std_mm in known)}
 
 
-def used_evidence(report: FitReport) -> dict[str, int]:
-    """How many pieces of each kind an estimate used; of outlines, how many each tumor has."""
-    kept = [each for each in report.evidence if not each.left_out]
-    used = dict(Counter(each.name for each in kept))
-    if "outline" in used:
-        outlined = Counter(each.part for each in kept if each.name == "outline")
-        used["outline"] = min((outlined[name] for name in report.tumors), default=0)
-    return used
+def given_evidence(report: FitReport) -> dict[str, int]:
+    """How many pieces of each kind of this moment an estimate was given; of outlines, how many each
+    tumor has. Those left out count: calibrations have false ones, too, and many make it poor."""
+    pieces = [each for each in report.evidence if not each.before]
+    given = dict(Counter(each.name for each in pieces))
+    if "outline" in given:
+        outlined = Counter(each.part for each in pieces if each.name == "outline")
+        given["outline"] = min((outlined[name] for name in report.tumors), default=0)
+    return given
 
 
 def evidence_words(evidence: dict[str, int]) -> str:
@@ -214,9 +215,9 @@ def evidence_words(evidence: dict[str, int]) -> str:
 
 def margins_with(report: FitReport, margins: ModelMargins) -> ModelMargins | None:
     """Those of an estimate's evidence: of the same kinds, and of the most pieces that it has."""
-    used = used_evidence(report)
-    every = [each for each in (margins, *margins.others) if each.evidence.keys() == used.keys()]
-    held = [each for each in every if all(n <= used[name] for name, n in each.evidence.items())]
+    given = given_evidence(report)
+    every = [each for each in (margins, *margins.others) if each.evidence.keys() == given.keys()]
+    held = [each for each in every if all(n <= given[name] for name, n in each.evidence.items())]
     return max(held, key=lambda each: sum(each.evidence.values()), default=None)
 
 
@@ -240,7 +241,7 @@ def stated_margin(report: FitReport, margins: ModelMargins | None, good: bool) -
     if any(each.before and not each.left_out for each in report.evidence):
         return MarginReport(reason="margins are of evidence of this moment, not of earlier frames")
     if (margins := margins_with(report, margins)) is None:
-        evidence = used_evidence(report)
+        evidence = given_evidence(report)
         if not all(evidence.values()):
             return MarginReport(reason="margins are of outlines of every tumor, not of some")
         how = f"tumortrack margins MODEL SCENES --evidence {(name := evidence_words(evidence))}"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -89,37 +88,43 @@ class Margins:
 
         from tumortrack.tracking.margins import evidence_words
         from tumortrack_lab.margins.calibration import margins_of
-        from tumortrack_lab.margins.table import head_of, open_table
 
-        table, words = self.out or folder / "margins.jsonl", evidence_words(evidence)
-        head = head_of(store.sha256_of(folder / store.MANIFEST), self.seed)
-        if evidence:
-            table, head = table.with_stem(f"{table.stem}-{words}"), {**head, "evidence": words}
-        with open_table(table, head) as (known, add):
-            rows = self._located(folder, listed, evidence, known, add)
+        first = self.out or folder / "margins.jsonl"
+        table, rows = located(folder, listed, evidence, first, self.seed, self.device)
         digest = store.sha256_of(table)
         try:
             margins = margins_of(rows, digest, self.confidence, self.widest, self.seed)
         except InputError as error:
-            raise InputError(f"{f'with {words}: ' if words else ''}{error}") from error
+            words = f"with {evidence_words(evidence)}: " if evidence else ""
+            raise InputError(f"{words}{error}") from error
         return msgspec.structs.replace(margins, evidence=evidence)
 
-    def _located(
-        self,
-        folder: Path,
-        listed: list[Listed],
-        evidence: dict[str, int],
-        known: list[Row],
-        add: Callable[[Row], None],
-    ) -> list[Row]:
-        """A row for every state; known ones are not located again."""
-        from tumortrack.report.protocol import check_case
-        from tumortrack.simulate.scene_folder import read_scene
-        from tumortrack.tracking.model_files import load_model
-        from tumortrack.tracking.tracker import Tracker
-        from tumortrack_lab.margins.calibration import row_of
 
-        states = {str(state.folder.resolve()): state for state in listed}
+def located(
+    folder: Path,
+    listed: list[Listed],
+    evidence: dict[str, int],
+    first: Path,
+    seed: int,
+    device: Device = "auto",
+) -> tuple[Path, list[Row]]:
+    """Every state located with the model of this folder and evidence that is drawn: the table, the
+    ``first`` one or with evidence another beside it, and its rows. Known ones are not located
+    again. Raises InputError: a scene was changed since then."""
+    from tumortrack.report.protocol import check_case
+    from tumortrack.simulate.scene_folder import read_scene
+    from tumortrack.tracking.margins import evidence_words
+    from tumortrack.tracking.model_files import load_model
+    from tumortrack.tracking.tracker import Tracker
+    from tumortrack_lab.margins.calibration import row_of
+    from tumortrack_lab.margins.table import head_of, open_table
+
+    table, head = first, head_of(store.sha256_of(folder / store.MANIFEST), seed)
+    if evidence:
+        words = evidence_words(evidence)
+        table, head = first.with_stem(f"{first.stem}-{words}"), {**head, "evidence": words}
+    states = {str(state.folder.resolve()): state for state in listed}
+    with open_table(table, head) as (known, add):
         done = {row.scene: row for row in known}
         for scene, state in states.items():
             if scene in done and done[scene].sha256 != store.sha256_of(state.folder):
@@ -130,12 +135,12 @@ class Margins:
         if left := [state for scene, state in states.items() if scene not in done]:
             with progress_bar("locating", len(left)) as advance:
                 keep_loaded()
-                model = load_model(folder, self.device, with_margins=False)
+                model = load_model(folder, device, with_margins=False)
                 check_case(model, [state.folder for state in left])
                 tracker = Tracker(model)
                 for state in left:
-                    row = row_of(tracker, read_scene(state.folder), state, self.seed, evidence)
+                    row = row_of(tracker, read_scene(state.folder), state, seed, evidence)
                     add(row)
                     done[row.scene] = row
                     advance()
-        return [done[scene] for scene in states]
+    return table, [done[scene] for scene in states]

@@ -32,9 +32,9 @@ from tumortrack.tracking.margins import (
     Radius,
     Shells,
     exceeded,
+    given_evidence,
     measured,
     sized,
-    used_evidence,
 )
 from tumortrack.tracking.quality import cloud_shares
 from tumortrack_lab.margins import conformal
@@ -139,8 +139,8 @@ def row_of(
         return replace(row, doubt=str(error))
     if estimate.quality != "good":
         return replace(row, doubt=estimate.reason)
-    if used_evidence(estimate.report) != evidence:
-        return replace(row, doubt="evidence was left out, or could not be drawn")
+    if given_evidence(estimate.report) != evidence:
+        return replace(row, doubt="evidence could not be drawn")
     if scene.depth is not None:  # judging by an image leaves ``unseen`` open
         organ = estimate.meshes[scene.reference.names[0]]
         estimate = estimate.reporting(unseen=cloud_shares(organ, scene.cloud)[1])

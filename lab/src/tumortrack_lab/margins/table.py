@@ -81,11 +81,6 @@ def open_table(
         yield rows, lambda row: add(to_builtins(row))
 
 
-def read_table(path: Path) -> tuple[dict[str, Any], list[Row]]:
-    """Head and rows. Raises InputError: it is no such table."""
-    return _parsed(store.read_file(path, 2**30), path)
-
-
 def _parsed(content: bytes, path: Path) -> tuple[dict[str, Any], list[Row]]:
     try:
         head, *lines = [json.loads(line) for line in content.splitlines()]

@@ -1,30 +1,31 @@
-"""How far margins can be trusted: tables of `tumortrack margins`, tested on states, physics and
-organs that were left out of the calibration. The results are in docs/trust.md."""
+"""How far margins can be trusted: rows of `tumortrack margins`, tested on physics and organs that
+were left out of the calibration. The results are in docs/trust.md."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
-from msgspec.structs import replace
 from scipy.stats import binomtest, spearmanr
 
 from tumortrack.core import store
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.rigid_fit import kabsch
+from tumortrack.registration.rest_shape import RestShape
 from tumortrack.report.drawing import new_figure, save
+from tumortrack.report.metrics import outward_miss
 from tumortrack.report.pictures import FROM_CAMERA, FROM_SIDE, draw_solid_view, scene_legend
+from tumortrack.report.rivals import best_rigid_pose, rigid_fit
 from tumortrack.simulate.scene_folder import Scene, read_scene
-from tumortrack.tracking.margins import METHOD, ModelMargins
+from tumortrack.tracking.margins import ModelMargins
 from tumortrack.tracking.model_files import load_model
 from tumortrack.tracking.tracker import Tracker
 from tumortrack_lab.margins.calibration import WIDEST_MM, answered, margins_of
-from tumortrack_lab.margins.table import Row, read_table
+from tumortrack_lab.margins.table import Row
 from tumortrack_lab.study.document import spread_mm
 
 STATED = (0.9, 0.95)
@@ -34,38 +35,16 @@ BANDS = ("nothing hidden", "up to 40 %", "over 40 %")
 _BEYOND_MM = {3.0: "#0072B2", 5.0: "#E69F00", 8.0: "#D55E00"}  # Okabe and Ito
 
 
-@dataclass(frozen=True)
-class Table:
-    """An organ's rows and the folder of the model that located them."""
-
-    organ: str
-    model: Path
-    rows: list[Row]
-
-
-def read_tables(paths: Sequence[Path]) -> list[Table]:
-    """Organs have the names of their models' folders, where `margins` writes by default. Raises
-    InputError: a table of another version of the method."""
-    tables = []
-    for path in paths:
-        head, rows = read_table(path)
-        if head.get("method") != METHOD:
-            raise InputError(f"{path} was made with another version of the method.")
-        organ = path.parent.name
-        rows = [replace(row, label=(*row.label[:2], organ)) for row in rows]
-        tables.append(Table(organ, path.parent, rows))
-    return tables
-
-
 def states_of(rows: Sequence[Row]) -> pd.DataFrame:
-    """A line a state: family, band of hidden surface, organ, whether its estimate is good, and of
-    the tumors the largest miss (mm), the largest standard deviation (mm) and whether all lie within
-    ``two`` of their own."""
+    """A line a state: family, organ, band of hidden surface, how the CT's segmentation errs,
+    whether its estimate is good, and of the tumors the largest miss (mm), the largest standard
+    deviation (mm) and whether all lie within ``two`` of their own."""
     lines = []
     for row in rows:
         meta = store.read_json(Path(row.scene) / "meta.json")
         line: dict[str, Any] = {"family": row.label[0], "organ": row.label[2]}
         line["hidden"] = band_of(meta.get("hidden_share", 0.0))
+        line["segmentation"] = meta.get("segmentation", {}).get("kind", "none")
         line |= {"good": not row.doubt, "row": row}
         if not row.doubt:
             line["miss"] = row.score("tumor", None)
@@ -112,6 +91,15 @@ def _judged(row: Row, margins: ModelMargins) -> dict[str, Any]:
     return result
 
 
+def rigid_miss(shape: RestShape, scene: Scene) -> float:
+    """Largest outward miss of a tumor by a rigid fit to the cloud, from the best rigid pose, mm."""
+    start, _ = best_rigid_pose(shape.anatomy_ct, scene)
+    pose = rigid_fit(shape.distances[0], scene.cloud, start)
+    pairs = zip(shape.anatomy_ct.tumors, scene.reference.tumors, strict=True)
+    placed = ((ct.moved(transform_points(pose, ct.vertices_mm)), truth) for ct, truth in pairs)
+    return max(outward_miss(tumor, truth) for tumor, truth in placed)
+
+
 def share_words(hits: int, cases: int) -> str:
     """A share with Clopper and Pearson's interval of 95 %."""
     if not cases:
@@ -131,13 +119,30 @@ def coverage(kinds: dict[str, pd.DataFrame]) -> pd.DataFrame:
             row = {"left out": what, "part": name, "states": len(mine), "good": mine.good.sum()}
             taken = mine[mine.accepted.astype(bool)]
             row["answers %"] = f"{100 * len(taken) / len(mine):.0f}" if len(taken) else ""
+            row["answers"] = len(taken)
             for stated in STATED if len(taken) else ():
                 of, margin = f"{100 * stated:g} %", taken[f"mm {stated}"].astype(float)
                 row[f"within {of}"] = share_words(int(taken[f"within {stated}"].sum()), len(taken))
                 for words, share in (("median", 0.5), ("90 %", 0.9)):
                     row[f"{of} margin {words} mm"] = f"{margin.quantile(share):.1f}"
+            for words, key in (("miss", "miss"), ("rigid fit's", "rigid")):
+                row[f"{words} 95 % mm"] = f"{taken[key].quantile(0.95):.1f}" if len(taken) else ""
             rows.append(row)
     return pd.DataFrame(rows).fillna("")
+
+
+def by_family(coverage: pd.DataFrame) -> pd.DataFrame:
+    """A row for each family, a column for each kind of evidence: share within the 95 % margin and
+    its median, of so many answers."""
+    mine = coverage[coverage["left out"] == "organ, by family"]
+    within = mine["within 95 %"].str.split(" ").str[0]
+    mine = mine.assign(
+        cell=within + " / " + mine["95 % margin median mm"] + " (" + mine.answers.astype(str) + ")"
+    )
+    table = mine.pivot(index="part", columns="evidence", values="cell")
+    table = table.loc[mine.part.unique(), mine.evidence.unique()]
+    rigid = mine.drop_duplicates("part").set_index("part")["rigid fit's 95 % mm"]
+    return table.assign(**{rigid.name: rigid}).reset_index(names="family")
 
 
 def ranks(judged: pd.DataFrame) -> pd.DataFrame:
@@ -197,12 +202,12 @@ def reliability_picture(kinds: dict[str, pd.DataFrame], path: Path) -> None:
 
 
 def worst_picture(
-    judged: pd.DataFrame, tables: Sequence[Table], count: int, path: Path
+    judged: pd.DataFrame, models: Mapping[str, Path], count: int, path: Path
 ) -> pd.DataFrame:
     """Draw the accepted answers with the largest errors over the truth, a row each; returns their
-    table."""
+    table. ``models``: folders, by organ."""
     taken = judged[judged.accepted.astype(bool)].nlargest(count, "miss")
-    models, trackers = {table.organ: table.model for table in tables}, {}
+    trackers: dict[str, Tracker] = {}
     height = 2.75 * len(taken) + 0.5
     drawing = new_figure(8.4, height)
     panels, rows = drawing.subplots(len(taken), 2, squeeze=False), []
