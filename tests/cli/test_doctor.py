@@ -98,4 +98,4 @@ def test_what_is_installed_and_does_not_work_is_told_by_the_exit_status(monkeypa
     assert run(["doctor"]) == 1
     said = capsys.readouterr()
     assert re.search(r"^BROKEN   the web viewer: viser \S+: undefined symbol", said.out, re.M)
-    assert "1 of what is installed here does not work" in said.err
+    assert "1 of what is installed does not work" in said.err

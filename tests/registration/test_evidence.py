@@ -14,7 +14,7 @@ import trimesh
 
 from elastic_objects import CENTER, RADII
 from stories import answered, refusal, tumortrack
-from tumortrack.core.errors import InputError, NoEstimate
+from tumortrack.core.errors import InputError, NoEstimate, NotThisOrgan
 from tumortrack.core.evidence import (
     Free,
     Held,
@@ -249,6 +249,24 @@ def test_what_was_touched_once_counts_while_the_organ_moves(slim_model):
         went_mm = np.linalg.norm(by_now - [piece.places[0] for piece in evidence], axis=1)
         assert went_mm == pytest.approx(16, abs=5)
     assert off_mm["touches"] < 0.9 * off_mm["nothing"] < 3
+
+
+def test_many_touches_of_another_place_are_named_where_the_organ_is_not_found(slim_model):
+    tracker = Tracker(load_model(slim_model, "cpu"))
+    cloud = stamped(sides(TRUE), 0)
+    away = [Touch(place_mm=tuple(TRUE.centre_mm + [0, 0, -35.0]), std_mm=0.05)] * 60
+    with pytest.raises(NotThisOrgan, match="evidence is of another place: try without it"):
+        tracker.locate(cloud, 16, evidence=away)
+    tracker.locate(cloud, 16)
+    with pytest.raises(InputError, match="1002 places; allowed: up to 1000"):
+        tracker.locate(cloud, 16, evidence=[Outline(places_mm=(TRUE.centre_mm,) * 1002, part="")])
+
+
+def test_only_the_newest_of_many_touches_are_kept():
+    many = [Known(Touch(place_mm=at(BEHIND[0]), stamp_ns=n + 1), TRUE) for n in range(900)]
+    kept, pieces = still_known(many, TRUE)
+    assert [each.stamp_ns for each in pieces] == list(range(501, 901))
+    assert [each.piece.stamp_ns for each in kept] == list(range(501, 901))
 
 
 @pytest.mark.parametrize(("away_s", "known"), [(5.0, 14), (70.0, 0)])

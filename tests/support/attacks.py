@@ -15,6 +15,7 @@ from pathlib import Path
 
 import attack_artifacts
 import attack_clouds
+import attack_evidence
 import attack_series
 import attack_volumes
 import warm
@@ -23,7 +24,7 @@ from harness import Child, Ending, Work, base_in, command
 
 SECONDS, MEGABYTES = 20.0, 1024
 WITHOUT_BASE = attack_volumes.ATTACKS | attack_series.ATTACKS
-ATTACKS = WITHOUT_BASE | attack_clouds.ATTACKS | attack_artifacts.ATTACKS
+ATTACKS = WITHOUT_BASE | attack_clouds.ATTACKS | attack_artifacts.ATTACKS | attack_evidence.ATTACKS
 
 
 def run(attack: Attack, room: Room, models: bool) -> tuple[Ending, str]:

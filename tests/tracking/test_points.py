@@ -350,7 +350,7 @@ class Knowing:
     anatomy_ct = Anatomy((Mesh(*_block(BOX)),))
     asked = 0
 
-    def __init__(self, model):
+    def __init__(self, model, advise):
         pass
 
     def locate(self, cloud, grid, seed, seen, evidence):

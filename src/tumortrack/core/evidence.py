@@ -24,6 +24,7 @@ _REACH_MM = 2000.0  # of anything that a camera above a patient sees
 _LEAST_MM = 3.0  # no camera has an organ nearer
 FEWEST_TOUCHES = 12  # without a cloud; how far off 12, 24 and 48 leave it: docs/evidence_gain.md
 _LARGEST_FILE = 10_000_000  # bytes
+_LAST_NS = 2**63 - 1
 
 
 class _Evidence(Config, frozen=True, kw_only=True, tag_field="kind"):
@@ -38,7 +39,7 @@ class _Evidence(Config, frozen=True, kw_only=True, tag_field="kind"):
     tool: str = ""
 
     def __post_init__(self) -> None:
-        self.check_between(self.name, std_mm=(0.05, 50.0))
+        self.check_between(self.name, std_mm=(0.05, 50.0), stamp_ns=(0, _LAST_NS))
         for field in ("tip_mm", "point_std_mm", "shared_std_mm"):
             if hasattr(self, field):
                 self.check_between(self.name, **{field: (0.0, 50.0)})
@@ -158,7 +159,7 @@ def read_evidence(path: Path) -> tuple[Evidence, ...]:
     else:
         try:
             given = json.loads(content)
-        except ValueError as error:
+        except (ValueError, RecursionError) as error:
             raise InputError(f"{path} is no JSON: {error}.") from error
     known = from_builtins(given, EvidenceFile, str(path))
     if (known.frame, known.unit) != ("camera", "mm"):

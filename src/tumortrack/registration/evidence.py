@@ -35,6 +35,8 @@ _RIGID_MM = 4.0  # error of the undeformed organ at best
 # within 0.12.
 _DRIFT = 0.1
 _OLD_MM = 5.0  # what is less sure tells nothing any more
+_MOST = 1000  # places: a second more each time; the time grows with the cube of their number
+_MOST_KEPT = 400  # from frame to frame, the newest ones
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,7 +109,9 @@ class EvidenceTerms:
     @classmethod
     def of(cls, evidence: Sequence[Evidence], parts: Sequence[str]) -> EvidenceTerms | None:
         """``parts``: names of what can be touched (``Anatomy.closed``). None: there is no evidence.
-        Raises InputError: of a part that the organ lacks, or that is open."""
+        Raises InputError: of a part that the organ lacks, or that is open; too many places."""
+        if (count := sum(len(each.places) for each in evidence)) > _MOST:
+            raise InputError(f"evidence has {count} places; allowed: up to {_MOST}. Thin it out.")
         surfaces, points = list[tuple[Any, ...]](), list[tuple[Any, ...]]()
         tools = dict[str, float]()
         for number, each in enumerate(evidence):
@@ -258,8 +262,11 @@ def still_known(
 ) -> tuple[tuple[Known, ...], tuple[Evidence, ...]]:
     """What tells something yet at a later motion, as the points alone show that; and how it is by
     now. What lies on tissue moves with it, and is less sure the farther from where it came. What a
-    tool holds, and where no tissue was, tell nothing but in their own frame."""
+    tool holds, and where no tissue was, tell nothing but in their own frame; nor do the oldest of
+    many."""
     lasting = [each for each in known if not isinstance(each.piece, Held | Free)]
+    counts = np.cumsum([len(each.piece.places) for each in reversed(lasting)])
+    lasting = lasting[len(lasting) - int((counts <= _MOST_KEPT).sum()) :]
     kept, pieces = list[Known](), list[Evidence]()
     for before, some in groupby(lasting, key=lambda each: each.motion):
         mine = list(some)

@@ -107,7 +107,7 @@ class Tracker:
         if not len(cloud.points_mm) and pieces:
             places_mm, pieces = touched(pieces, self.model.parts[0])
             looks = (Look(replace(cloud, points_mm=places_mm), cloud, HERE),)
-        with self._explaining_errors(looks, _DEFAULTS):
+        with self._explaining_errors(looks, _DEFAULTS, bool(pieces)):
             estimate = self._locator.locate(looks, grid, seed, pieces)
             estimate = self._judged(estimate, looks, False)
         return self._explained(estimate, looks, _DEFAULTS)
@@ -128,7 +128,7 @@ class Tracker:
         looks, pieces = _parted(cloud, seen, evidence)
         if pieces:
             how = msgspec.structs.replace(how, evidence=(*how.evidence, *pieces))
-        with self._explaining_errors(looks, how):
+        with self._explaining_errors(looks, how, bool(pieces or (last and last.evidence))):
             estimate = self._locator.follow(looks, last, how)
             estimate = self._judged(estimate, looks, strictly, last)
         return self._explained(estimate, looks, how)
@@ -169,13 +169,17 @@ class Tracker:
         return how.known.get(check) or likely_causes(self.model, looks[0].cloud, estimate)
 
     @contextmanager
-    def _explaining_errors(self, looks: Sequence[Look], how: FollowOptions) -> Iterator[None]:
-        """Adds the likely causes to NotThisOrgan."""
+    def _explaining_errors(
+        self, looks: Sequence[Look], how: FollowOptions, touched: bool
+    ) -> Iterator[None]:
+        """Adds the likely causes to NotThisOrgan. ``touched``: evidence may be one of them."""
         try:
             yield
         except NotThisOrgan as error:
             causes = self._causes(looks, how, None)
             advice = f"{words(causes, '')}."
+            if touched:
+                advice += " Or its evidence is of another place: try without it."
             raise NotThisOrgan(error.finding or str(error), causes, advice) from error
 
     def warm(self) -> None:
