@@ -30,7 +30,8 @@ for version in $(printf '%s\n' "${!pythons[@]}" | sort -V); do
   who=$(id -un)
   if [ "$(id -u)" -eq 0 ]; then
     nobody=(setpriv --reuid 65534 --regid 65534 --clear-groups)
-    if "${nobody[@]}" "$python" -c '' 2>/dev/null; then
+    # By env: what setpriv itself starts, root's rights may still find in a home closed to others.
+    if "${nobody[@]}" env "$python" -c '' 2>/dev/null; then
       as=("${nobody[@]}") who=nobody
       chown -R 65534:65534 "$home"
     fi
