@@ -35,8 +35,8 @@ _RIGID_MM = 4.0  # error of the undeformed organ at best
 # within 0.12.
 _DRIFT = 0.1
 _OLD_MM = 5.0  # what is less sure tells nothing any more
-_MOST = 1000  # places: a second more each time; the time grows with the cube of their number
-_MOST_KEPT = 400  # from frame to frame, the newest ones
+_MOST = 1000  # places: with so many an answer takes a second, or several where they contradict it
+_MOST_KEPT = 200  # from frame to frame, the newest: a frame then takes three times as long
 
 
 @dataclass(frozen=True, eq=False)

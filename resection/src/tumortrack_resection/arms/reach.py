@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from jaxtyping import Float64
 
 from tumortrack.core.types import Mesh
+from tumortrack.registration.advice import Place
 from tumortrack_resection.arms.cell import ArmCell, PlanningGroup
 from tumortrack_resection.arms.config import CellConfig
 from tumortrack_resection.arms.kinematics import Pose, level_pose
@@ -15,8 +15,6 @@ from tumortrack_resection.motions import CUTTER, HOLDER, Joints
 
 _FACING = 0.5  # cosine from a tool's way back to the surface's normal: a flatter tip slides off
 _YAWS = 8  # directions from which the electrode comes; the cup always comes from above
-
-Place = Float64[np.ndarray, " 3"]
 
 
 class ArmsReach:
