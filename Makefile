@@ -17,7 +17,7 @@ define INSTALL
 endef
 
 .DEFAULT_GOAL := help
-.PHONY: help setup debian kernels demo test test-all quick pythons pytest test-hard check attack fuzz crash replay bench soak wheel lock licences audit results real world sequences pull pulls trust misses evidence rehearsal population site pictures clean
+.PHONY: help setup debian kernels demo test test-all quick pythons pytest test-hard check attack fuzz crash replay bench soak wheel lock licences audit results real world sequences plans pull pulls trust misses evidence rehearsal population site pictures clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 10
@@ -119,6 +119,9 @@ sequences: setup  ## an organ pressed, pushed, rolled, breathing, turned over, a
 
 pull: setup  ## an organ under the pull of a plan's holder, for the virtual source (ARGS="PLAN virtual:CASE?... OUT")
 	$(BIN)/python lab/scripts/pull.py $(ARGS)
+
+plans: setup  ## the instrument's distances in plans of scenes and random kidneys, and what they cost (ARGS="OUT CASE=SCENES ...")
+	$(BIN)/python lab/scripts/plans.py $(ARGS)
 
 pulls: setup  ## whether tumors that the holder pulls are cut out (ARGS="OUT CASE ... --count 40": 15 s a scene)
 	$(BIN)/python lab/scripts/pulls.py $(ARGS)

@@ -19,7 +19,7 @@ from scipy.stats import chi2
 from clock import Clock, until
 from live_objects import PARTS, ball, empty_update, small_anatomy, small_setting, small_update
 from reports import reporting
-from tumortrack.core.colours import TUMORS, part_colour
+from tumortrack.core.colours import ENERGISED, TUMORS, part_colour
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import rigid, transform_points
 from tumortrack.core.mesh_query import exact_margin, rough_margin
@@ -526,6 +526,28 @@ def test_arms_move_without_being_sent_again_and_what_is_gone_is_removed(sinks, c
     assert nodes("/workcell/shape/table") is table
 
 
+def test_a_shape_changes_its_colour_in_place(sinks, clock):
+    sink = sinks(with_arms(), hz=60)
+    nodes = sink._server.scene.get_handle_by_name
+    sink.publish(working(0))
+    tip, forearm = (nodes(f"/workcell/shape/cutter:{name}") for name in ("tip", "forearm"))
+    before = tuple(forearm.color)
+    for n, colour in enumerate((ENERGISED, (250, 230, 60)), start=1):
+        cell = workcell()
+        shapes = tuple(replace(s, colour=colour) if s.name == "cutter/tip" else s
+                       for s in cell.shapes)  # fmt: skip
+        clock.sleep(0.1)
+        sink.publish(replace(working(n), workcell=replace(cell, shapes=shapes)))
+        assert nodes("/workcell/shape/cutter:tip") is tip  # its surface is not sent again
+        assert tuple(tip.color) == colour
+    assert tuple(forearm.color) == before
+    thinner = tuple(replace(s, opacity=0.5) for s in workcell().shapes)
+    clock.sleep(0.1)
+    sink.publish(replace(working(3), workcell=replace(workcell(), shapes=thinner)))
+    assert nodes("/workcell/shape/cutter:tip") is not tip
+    assert nodes("/workcell/shape/cutter:tip").opacity == 0.5
+
+
 def test_arms_are_shown_without_an_estimate_and_never_after_silence(sinks, clock):
     sink = sinks(with_arms())
     nodes = sink._server.scene.get_handle_by_name
@@ -574,7 +596,10 @@ def test_status_says_why_and_no_old_numbers():
     assert "tumor 1</td><td>0.9 ml</td><td>–</td>" in doubtful
     cell = replace(workcell(), left_mm=1.23)
     arms = StatusPanel("good", replace(small_update(), workcell=cell), 0.1, 9, arms=True)
-    assert "1.2 mm of the margin are left" in arms.flag()
+    assert f">{cell.left}<" in arms.flag()
+    assert "1.2 mm" in cell.left
+    assert "2.3 mm" in replace(cell, left_mm=-2.34).left
+    assert replace(cell, left_mm=None).left == ""
     assert " ml" not in replace(stale, parts=PARTS).numbers()
 
 

@@ -115,6 +115,11 @@ def test_markers_keep_their_rate_and_changes_come_at_once():
     markers = sent(less(working(2, 0.3), "holder/tip", "cut/2"), cell)["workcell"].markers
     assert [(m.ns, m.action) for m in markers[:2]] == [("cut/2", 2), ("holder/tip", 2)]
     assert [m.ns for m in markers[2:]] == [*NAMES[:-1], "cut/1", "state"]
+    cut = less(working(2, 0.3), "holder/tip", "cut/2")  # begins: the electrode's colour changes
+    assert cut.workcell is not None
+    cut = replace(cut, workcell=replace(cut.workcell, cutting=True))
+    assert "workcell" in sent(cut, cell)
+    assert "workcell" not in sent(cut, cell)
     halted = less(working(3, 0.3, "hidden"), "holder/tip", "cut/2")
     assert sent(halted, cell)["workcell"].markers[-1].text == "sweep 1, halted: hidden"
     assert "workcell" not in sent(halted, cell)

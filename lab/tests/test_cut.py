@@ -1,11 +1,8 @@
-"""A plan cuts the true anatomy: volumes, margins and bridges of bodies that can be reckoned.
-
-Walls on quarters of a millimetre lie midway between voxels here, where volumes are exact.
-"""
+"""A plan cuts the true anatomy: volumes, margins and wounds of bodies that can be reckoned."""
 
 from __future__ import annotations
 
-from collections import deque
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,320 +10,280 @@ import trimesh
 
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import Anatomy, Mesh
-from tumortrack.imaging.meshes import mesh_of, solid_of
-from tumortrack_lab.cut import Severed, cut, pieces_of, within
-from tumortrack_resection.values import Cut, CutLayer, ResectionPlan
+from tumortrack_lab.cut import CutResult, Swept, cut, electrode_margin_mm, swept_by
+from tumortrack_resection.values import Cut, ResectionPlan
 
 ML = 1e-3
+RADIUS_MM, KERF_MM = 1.2, 2.4
+BALL_ML = 4 / 3 * np.pi * ML
+HALF_MM = np.array([30.0, 20.0, 15.0])  # of the box, whose middle is the origin
+X, Y, Z = np.eye(3)
 
 
-def ball(radius_mm, center_mm, semi_axes=(1, 1, 1)):
-    solid = trimesh.creation.icosphere(5, radius_mm)
-    return Mesh(solid.vertices * np.array(semi_axes) + np.array(center_mm), solid.faces)
+def ball(radius_mm, center_mm) -> Mesh:
+    solid = trimesh.creation.icosphere(4, radius_mm)
+    return Mesh(solid.vertices + np.array(center_mm, float), solid.faces)
 
 
-def block(low, high):
+def block(low, high) -> Mesh:
     solid = trimesh.creation.box(bounds=[low, high])
     return Mesh(solid.vertices, solid.faces)
 
 
-def united(organ, *tumors):
-    whole = solid_of(organ, "organ")
-    for tumor in tumors:
-        whole = whole + solid_of(tumor, "tumor")
-    return Anatomy((mesh_of(whole), *tumors))
+def boxed(*tumors: Mesh) -> Anatomy:
+    return Anatomy((block(-HALF_MM, HALF_MM), *tumors))
 
 
-def circle(radius_mm, n=180):
-    angle = np.linspace(0, 2 * np.pi, n, endpoint=False)
-    return radius_mm * np.stack([np.cos(angle), np.sin(angle)], 1)
+def moved(truth: Anatomy, turn: np.ndarray) -> Anatomy:
+    return Anatomy(tuple(part.moved(part.vertices_mm @ turn.T) for part in truth.parts))
 
 
-def square(low, high):
-    (x0, y0), (x1, y1) = low, high
-    return np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]], float)
-
-
-def stroke(points, height_mm, closed=True):
-    """Along these points, every half millimetre."""
-    path = np.concatenate([points, points[:1]]) if closed else np.asarray(points, float)
-    steps = np.linalg.norm(np.diff(path, axis=0), axis=1)
-    way = np.concatenate([[0], np.cumsum(steps)])
-    at = np.unique(np.concatenate([way, np.arange(0, way[-1], 0.5)]))
-    flat = [np.interp(at, way, axis) for axis in path.T]
-    return Cut(1, np.column_stack([*flat, np.full(len(at), float(height_mm))]))
-
-
-def plan(layers, cuts=None, tumor="tumor_1"):
-    if cuts is None:
-        cuts = [stroke(ring, layer.bottom_mm) for layer in layers for ring in layer.rings_mm]
+def plan(*cuts: Cut, grasp_mm=(0.0, 0.0, 15.0), tumor="tumor_1") -> ResectionPlan:
+    """What a plan promises is not used."""
+    grasp = np.array(grasp_mm, float)
     return ResectionPlan(
-        "margin", tumor, 2, np.zeros(3), tuple(cuts), tuple(layers), 5.0, {}, exophytic=0.5
-    )
+        method="margin", tumor=tumor, label=2, grasp_mm=grasp, cuts=cuts, piece=ball(1, grasp),
+        taken=(tumor,), keep_mm={}, facets=np.zeros((0, 4)), lift=Z, margin_mm=5.0, volumes_ml={},
+        exophytic=0.5,
+    )  # fmt: skip
 
 
-def prism(ring, bottom_mm=0.0):
-    return CutLayer(bottom_mm, np.inf, (ring,))
+def straight(start, end, axis=-Z, sweep=1) -> Cut:
+    """Of the tip; from the pencil to the tip the electrode points along ``axis``."""
+    axis = np.asarray(axis, float)
+    return Cut(sweep, np.array([start, end], float), axis / np.linalg.norm(axis))
 
 
-@pytest.fixture(scope="module")
-def half_sunk():
-    """A kidney-sized ellipsoid with a ball of 12 mm, half sunk, on its top."""
-    return united(ball(1, (0, 0, 0), (50, 30, 25)), ball(12, (0, 0, 25)))
+def across(x_mm, tip_mm=-25.0) -> Cut:
+    """A plane across the box at x, the electrode upright, its tip below the box or in it."""
+    return straight((x_mm, -30, tip_mm), (x_mm, 30, tip_mm))
 
 
-def test_a_half_sunk_ball_comes_away_with_the_healthy_tissue_below_it(half_sunk):
-    result = cut(half_sunk, plan([prism(circle(17), 8.0)]))
-    assert result.tumor_ml == pytest.approx(4 / 3 * np.pi * 12**3 * ML, rel=0.005)
-    assert (result.removed_share, result.enclosed_share) == (1.0, 1.0)
-    assert result.left_ml == 0.0
+def turned(one: Cut, turn: np.ndarray) -> Cut:
+    assert one.axis is not None
+    return replace(one, path_mm=one.path_mm @ turn.T, axis=turn @ one.axis)
+
+
+def parts_ml(result: CutResult) -> float:
+    """Of the tumor."""
+    return result.tumor_ml * (result.removed_share + result.cut_share + result.left_share)
+
+
+@pytest.mark.parametrize("angle_rad", [0.0, 0.3, 0.8])
+def test_one_plane_cuts_off_an_end_with_a_kerf_of_twice_the_radius(angle_rad):
+    """At x = 10 of a box of 60 x 40 x 30, whose section is 1200 mm2; about any angle."""
+    c, s = np.cos(angle_rad), np.sin(angle_rad)
+    turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+    truth = moved(boxed(ball(6, (20, 0, 3))), turn)
+    result = cut(truth, plan(turned(across(10), turn), grasp_mm=turn @ [20, 0, 15]))
     assert result.detached
-    assert result.bridge_mm2 == 0.0
-    assert result.margin_mm == pytest.approx(5.0, abs=0.05)  # of the sheet; the walls have more
-    assert result.healthy_ml == pytest.approx(_healthy_ml(17, 8), rel=0.02)
-    assert result.piece_ml == pytest.approx(result.tumor_ml + result.healthy_ml)
+    assert result.tumor_ml == pytest.approx(BALL_ML * 6**3, rel=0.01)
+    assert (result.removed_share, result.cut_share, result.left_ml) == (1.0, 0.0, 0.0)
+    assert result.piece_ml == pytest.approx((20 - 1.2) * 1200 * ML, rel=0.01)
+    assert result.kerf_ml == pytest.approx(1200 * KERF_MM * ML, rel=0.02)
+    assert result.healthy_ml == pytest.approx(result.piece_ml - result.tumor_ml + result.kerf_ml)
+    assert result.kerf_area_mm2 == pytest.approx(1200, rel=0.03)
+    assert result.margin_mm == pytest.approx(20 - 10 - 6 - RADIUS_MM, abs=0.03)
     assert result.hurt == ()
 
 
-def _healthy_ml(radius_mm, bottom_mm):
-    """Of that ellipsoid, within a cylinder and above a height, without that ball: by quadrature."""
-    r, a = np.meshgrid(np.arange(0.05, radius_mm, 0.1), np.arange(0, 2 * np.pi, 0.01))
-    x, y = r * np.cos(a), r * np.sin(a)
-    top = 25 * np.sqrt(1 - (x / 50) ** 2 - (y / 30) ** 2)
-    half = np.sqrt(np.maximum(144 - r**2, 0))
-    ball_in = np.where(half > 0, np.clip(top - (25 - half), 0, None), 0)
-    return float(((top - bottom_mm - ball_in) * r).sum() * 0.1 * 0.01) * ML
+def test_a_thicker_electrode_takes_a_wider_kerf_and_leaves_less_margin():
+    truth, planned = boxed(ball(6, (20, 0, 3))), plan(across(10), grasp_mm=(20, 0, 15))
+    result = cut(truth, planned, swept_by(planned, radius_mm=2.0))
+    assert result.kerf_ml == pytest.approx(1200 * 4 * ML, rel=0.02)
+    assert result.margin_mm == pytest.approx(2.0, abs=0.03)
 
 
-@pytest.mark.parametrize("voxel_mm", [0.5, 0.7])
-def test_a_prism_cut_has_the_volumes_of_blocks(voxel_mm):
-    """A tumor of 10 x 10 x 10 in a corner of an organ of 40 x 30 x 20, cut by a prism of 16 x 14
-    x 13, of which 15 x 13 x 13 lie in the organ."""
-    truth = Anatomy((block([0, 0, 0], [40, 30, 20]), block([0.2, 0.2, 9.8], [10, 10, 19.8])))
-    result = cut(truth, plan([prism(square((-1, -1), (15, 13)), 7.0)]), voxel_mm)
-    edge_ml = voxel_mm * 500 * ML  # of half a voxel all round
-    assert result.piece_ml == pytest.approx(15 * 13 * 13 * ML, abs=edge_ml)
-    assert result.healthy_ml == pytest.approx((15 * 13 * 13 - 9.8 * 9.8 * 10) * ML, abs=edge_ml)
-    assert result.removed_share == 1.0
-    assert result.margin_mm == pytest.approx(2.8, abs=0.01)
-
-
-def test_layers_that_grow_narrower_come_away_as_a_staircase():
-    truth = Anatomy((block([-20, -20, 0], [20, 20, 20]), ball(4, (0, 0, 13))))
-    stairs = [
-        prism(square((-12, -12), (12, 12)), 14.0),
-        CutLayer(9.0, 14.0, (square((-9, -9), (9, 9)),)),
-        CutLayer(6.0, 9.0, (square((-6, -6), (6, 6)),)),
-    ]
-    result = cut(truth, plan(stairs))
-    assert result.detached
-    assert result.bridge_mm2 == 0.0
-    assert result.piece_ml == pytest.approx((24**2 * 6 + 18**2 * 5 + 12**2 * 3) * ML, rel=0.05)
-    assert result.margin_mm == pytest.approx(3.0, abs=0.05)  # below; beside it is 5
-
-
-def test_a_layer_wider_than_the_one_above_it_still_hangs_by_its_rim():
-    truth = Anatomy((block([-20, -20, 0], [20, 20, 20]), ball(4, (0, 0, 10))))
-    layers = [
-        prism(square((-6, -6), (6, 6)), 14.0),
-        CutLayer(4.0, 14.0, (square((-9, -9), (9, 9)),)),
-    ]
-    result = cut(truth, plan(layers))
-    assert not result.detached
-    assert (result.removed_share, result.enclosed_share, result.healthy_ml) == (0.0, 1.0, 0.0)
-    assert result.bridge_mm2 == pytest.approx(18**2 - 12**2, rel=0.05)
-    assert result.margin_mm == pytest.approx(2.0, abs=0.05)
-
-
-def test_a_stroke_with_a_gap_in_tissue_leaves_a_bridge():
-    """Four walls of 20 mm, 15 mm high; the last 4 mm of the way are not cut."""
-    truth = Anatomy((block([-20, -20, 0], [20, 20, 20]), ball(5, (0, 0, 14))))
-    ring = square((-10, -10), (10, 10))
-    open_way = np.concatenate([ring, [[-10, -6]]])
-    result = cut(truth, plan([prism(ring, 5.0)], [stroke(open_way, 5.0, closed=False)]))
-    assert not result.detached
-    assert (result.removed_share, result.left_ml) == (0.0, result.tumor_ml)
-    assert (result.enclosed_share, result.piece_ml) == (1.0, 0.0)
-    assert result.bridge_mm2 == pytest.approx((4 - 2 * 0.5) * 15, rel=0.1)  # 0.5 mm beside its ends
-    through = cut(truth, plan([prism(ring, 5.0)]))
-    assert through.detached
-    assert through.removed_share == 1.0
-
-
-def test_a_stroke_may_be_open_where_there_is_no_tissue(half_sunk):
-    """An organ's end is cut off from the front to the back, by an arc that both ends leave."""
-    truth = Anatomy((half_sunk.organ, ball(5, (42, 0, 0))))
-    at = 30.25
-    arc = stroke([[at, 40.0], [at, -40.0]], -30.0, closed=False)
-    result = cut(truth, plan([prism(square((at, -40), (70, 40)), -30.0)], [arc]))
-    assert result.detached
-    assert result.bridge_mm2 == 0.0
-    cap = np.pi * 30 * 25 * 50 * (2 / 3 - at / 50 + (at / 50) ** 3 / 3)
-    assert result.piece_ml == pytest.approx(cap * ML, rel=0.005)
-    assert result.margin_mm == pytest.approx(42 - 5 - at, abs=0.05)
-
-
-@pytest.mark.parametrize("beyond_mm", [1.0, 3.0, 6.0])
-def test_a_tumor_that_lies_elsewhere_is_cut_as_deep_and_left_as_much_as_it_is_off(beyond_mm):
-    """A wall 4.25 mm beside where a ball of 8 mm was thought, which lies further that way."""
-    truth = Anatomy((block([-30, -20, 0], [30, 20, 30]), ball(8, (4.25 + beyond_mm, 0, 15))))
-    result = cut(truth, plan([prism(square((-12, -14), (12.25, 14)), 3.0)]))
-    cap = np.pi * beyond_mm**2 * (24 - beyond_mm) / 3
-    assert result.left_ml == pytest.approx(cap * ML, rel=0.03)
-    assert result.removed_share == pytest.approx(1 - result.left_ml / result.tumor_ml)
-    assert result.margin_mm == pytest.approx(-beyond_mm, abs=0.1)
-
-
-def test_a_strand_that_tears_holds_nothing():
-    """The gap is 1.5 mm wide at the top of the wall alone, where 1 mm of tissue is."""
-    truth = Anatomy((block([-20, -20, 0], [20, 20, 20]), ball(5, (0, 0, 14))))
-    ring = square((-10, -10), (10, 10))
-    layers = [prism(ring, 19.0), CutLayer(5.0, 19.0, (ring,))]
-    gap = np.concatenate([ring, [[-10.0, -7.5]]])
-    whole = stroke(ring, 5.0)
-    result = cut(truth, plan(layers, [stroke(gap, 19.0, closed=False), whole]))
-    assert result.bridge_mm2 == pytest.approx(1.5, rel=0.3)
-    assert result.detached
-    assert result.removed_share == 1.0
-    longer = np.concatenate([ring, [[-10.0, -4.5]]])
-    held = cut(truth, plan(layers, [stroke(longer, 19.0, closed=False), whole]))
-    assert held.bridge_mm2 == pytest.approx(4.5, rel=0.25)
-    assert not held.detached
-
-
-def test_what_comes_off_beside_the_piece_is_not_removed():
-    """A wall goes through a tumor that lies in an organ's end: its rest is off, but loose."""
-    truth = Anatomy((block([-40, -10, 0], [14.25, 10, 20]), ball(8, (6.25, 0, 10))))
-    ring = square((-15, -12), (10.25, 12))
-    result = cut(truth, plan([prism(ring, 0.0)]))
-    cap = np.pi * 16 * (24 - 4) / 3 * ML
-    assert result.detached
-    assert result.loose_share * result.tumor_ml == pytest.approx(cap, rel=0.03)
-    assert result.removed_share == pytest.approx(1 - result.loose_share)
-    assert result.enclosed_share == pytest.approx(result.removed_share)
-    assert result.left_ml == pytest.approx(cap, rel=0.03)
-    assert result.piece_ml == pytest.approx((25.25 * 20 * 20) * ML, rel=0.03)
-
-
-@pytest.mark.parametrize("wall_mm", [12.0, 12.1, 12.4])
-def test_volumes_err_by_half_a_voxel_at_each_of_their_ends_at_most(wall_mm):
-    truth = Anatomy((block([-30, -20, 0], [30, 20, 30]), ball(4, (0, 0, 20))))
-    result = cut(truth, plan([prism(square((-30, -30), (wall_mm, 30)), 10.0)]))
-    assert result.piece_ml == pytest.approx((wall_mm + 30) * 40 * 20 * ML, abs=0.5 * 40 * 20 * ML)
-
-
-@pytest.mark.parametrize("margin_mm", [0.7, 5.0])
-def test_the_margin_of_a_ball_is_exact(margin_mm):
-    truth = Anatomy((block([-30, -30, 0], [30, 30, 40]), ball(10, (0, 0, 20))))
-    result = cut(truth, plan([prism(circle(10 + margin_mm), 1.0)]))
+@pytest.mark.parametrize(
+    ("axis_mm", "margin_mm"),
+    [(5.0, 3.8), (1.3, 0.1), (1.0, 0.0), (0.2, 0.0), (-0.2, -0.2), (-5, -5)],
+)
+def test_the_margin_is_that_of_the_electrodes_surface_and_in_the_tumor_that_of_its_axis(
+    axis_mm, margin_mm
+):
+    """A ball of 8 mm, so far from a plane in which the electrode's axis lies."""
+    result = cut(boxed(ball(8, (8 + axis_mm, 0, 2))), plan(across(0)))
     assert result.margin_mm == pytest.approx(margin_mm, abs=0.03)
+    assert (result.cut_share > 0) == (axis_mm < RADIUS_MM)
 
 
-def test_turned_about_the_vertical_the_same_comes_away(half_sunk):
-    ring = np.array([[-15.0, -17], [16, -15], [22, 8], [-4, 19], [-21, 3]])
-    straight = cut(half_sunk, plan([prism(ring, 10.0)]))
-    c, s = np.cos(0.7), np.sin(0.7)
-    turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
-    parts = tuple(part.moved(part.vertices_mm @ turn.T) for part in half_sunk.parts)
-    turned = cut(Anatomy(parts), plan([prism(ring @ turn[:2, :2].T, 10.0)]))
-    assert turned.piece_ml == pytest.approx(straight.piece_ml, rel=0.01)
-    assert turned.margin_mm == pytest.approx(straight.margin_mm, abs=0.05)
-    assert turned.detached
-    assert straight.detached
-
-
-def test_another_tumor_in_the_way_is_hurt_and_one_beside_is_not():
-    organ = block([-30, -20, 0], [30, 20, 30])
-    truth = Anatomy((organ, ball(6, (0, 0, 20)), ball(5, (12, 0, 20)), ball(4, (-22, 0, 20))))
-    result = cut(truth, plan([prism(circle(11), 8.0)]))
-    assert result.hurt == ("tumor_2",)
-    assert result.margin_mm == pytest.approx(5.0, abs=0.05)
-
-
-def test_a_cut_in_the_air_does_nothing():
-    truth = Anatomy((block([-20, -20, 0], [20, 20, 20]), ball(5, (0, 0, 10))))
-    result = cut(truth, plan([prism(square((40, -5), (50, 5)), 2.0)]))
-    assert (result.removed_share, result.piece_ml, result.detached) == (0.0, 0.0, False)
-    assert result.margin_mm is None
-    above = cut(truth, plan([prism(circle(15), 21.0)]))
-    assert above.margin_mm is None
-    assert above.enclosed_share == 0.0
-
-
-def test_a_plan_for_another_anatomy_is_refused(half_sunk):
-    with pytest.raises(InputError, match=r"tumor_2.*kidney, tumor_1"):
-        cut(half_sunk, plan([prism(circle(17), 8.0)], tumor="tumor_2"))
-    with pytest.raises(InputError, match="none of the plan's layers"):
-        cut(half_sunk, plan([prism(circle(17), 8.0)], [stroke(circle(17), 4.0)]))
-
-
-@pytest.mark.parametrize("seed", range(4))
-def test_what_is_severed_agrees_with_walking_from_voxel_to_voxel(seed):
+@pytest.mark.parametrize("seed", range(6))
+def test_the_margin_of_electrodes_anywhere_is_that_reckoned_for_a_ball(seed):
+    """Near, far and through it; the last three seeds have one in the tumor."""
     rng = np.random.default_rng(seed)
-    tissue = rng.random((7, 6, 5)) < 0.9
-    severed = Severed(tissue.shape)
-    for faces in severed.faces:
-        faces |= rng.random(faces.shape) < 0.5
-    found = pieces_of(tissue, severed)
-    expected = _walked(tissue, severed.faces)
-    assert len(expected) > 3
-    assert np.array_equal(found > 0, tissue)
-    assert found.max() == len(expected)
-    sizes = []
-    for number in range(1, found.max() + 1):
-        piece = {tuple(v) for v in np.argwhere(found == number).tolist()}
-        assert piece in expected
-        sizes.append(len(piece))
-    assert sizes == sorted(sizes, reverse=True)
+    tips, away = rng.normal(0, 60, (40, 3)), rng.normal(0, 1, (40, 3))
+    ends = np.stack([tips, tips + 70 * away / np.linalg.norm(away, axis=1)[:, None]], axis=1)
+    if seed > 2:
+        ends[7] = [rng.normal(0, 2, 3), [0, 0, 70]]
+    way = ends[:, 1] - ends[:, 0]
+    share = np.clip(-(ends[:, 0] * way).sum(1) / (way**2).sum(1), 0, 1)
+    off_mm = np.linalg.norm(ends[:, 0] + share[:, None] * way, axis=1).min() - 8
+    expected_mm = off_mm if off_mm < 0 else max(0.0, off_mm - RADIUS_MM)
+    assert electrode_margin_mm(ball(8, (0, 0, 0)), Swept(ends)) == pytest.approx(
+        expected_mm, abs=0.05
+    )
 
 
-def _walked(tissue, faces):
-    """The pieces, by breadth-first search."""
-    left, pieces = {tuple(v) for v in np.argwhere(tissue).tolist()}, []
-    while left:
-        piece, todo = set(), deque([left.pop()])
-        while todo:
-            here = todo.popleft()
-            piece.add(here)
-            for axis in range(3):
-                for step in (-1, 1):
-                    there = tuple(n + step * (a == axis) for a, n in enumerate(here))
-                    face = min(here, there)
-                    if there in left and not faces[axis][face]:
-                        left.remove(there)
-                        todo.append(there)
-        pieces.append(piece)
-    return pieces
+def test_an_electrode_whose_length_goes_through_the_tumor_cuts_it_though_its_tip_keeps_clear():
+    """The tip goes along a line 6 mm below the ball, the electrode upright through its middle."""
+    truth = boxed(ball(8, (0, 0, 3)))
+    below = straight((0, -30, -11), (0, 30, -11))
+    tips = Swept(np.repeat(below.path_mm[:, None], 2, axis=1))
+    assert electrode_margin_mm(truth.tumors[0], tips) > 6
+    result = cut(truth, plan(below))
+    assert result.margin_mm == pytest.approx(-8, abs=0.05)
+    slab = np.pi * (8**2 * KERF_MM - 2 * RADIUS_MM**3 / 3)  # of a ball's middle
+    assert result.cut_share == pytest.approx(slab * ML / result.tumor_ml, rel=0.04)
+    assert not result.detached
+    assert result.left_share == pytest.approx(1 - result.cut_share)
+    assert parts_ml(result) == pytest.approx(result.tumor_ml)
+    level = straight((0, -30, -11), (0, 30, -11), axis=X)  # the same tips, the electrode beside it
+    beside = cut(truth, plan(level))
+    assert beside.cut_share == 0
+    assert beside.margin_mm == pytest.approx(3 + 11 - 8 - RADIUS_MM, abs=0.05)
 
 
-@pytest.mark.parametrize("whole", [True, False])
-def test_closed_strokes_sever_just_what_they_enclose(whole):
-    """Also where they run exactly through voxels' centres (``whole``)."""
-    rng = np.random.default_rng(5)
-    tissue = np.ones((30, 28, 3), bool)
-    for _ in range(20):
-        angles = np.sort(rng.uniform(0, 2 * np.pi, 9))
-        ring = 14 + rng.uniform(4, 12, (9, 1)) * np.stack([np.cos(angles), np.sin(angles)], 1)
-        ring = np.rint(ring) if whole else ring
-        severed = Severed(tissue.shape)
-        severed.wall(np.concatenate([ring, ring[:1]]), 1, 3)
-        columns = within((ring,), tissue.shape[:2])
-        severed.sheet(columns, 1)
-        expected = columns[:, :, None] & np.array([False, True, True])
-        away = pieces_of(tissue, severed) > 1
-        # A corner less wide than a voxel may leave single voxels by themselves.
-        assert np.array_equal(away & expected, expected)
-        assert (away & ~expected).sum() <= 4
-        assert 20 < columns.sum() < 600
+def test_a_tumor_cut_in_two_comes_away_in_part():
+    """A plane 2 mm beside the middle of a ball of 8 mm in the end that comes away."""
+    truth = boxed(ball(8, (12, 0, 0)))
+    result = cut(truth, plan(across(10), grasp_mm=(25, 0, 15)))
+    left = np.pi * (8 - 3.2) ** 2 * (3 * 8 - 4.8) / 3 * ML
+    cap = np.pi * (8 - 0.8) ** 2 * (3 * 8 - 7.2) / 3 * ML
+    removed = result.tumor_ml - cap
+    assert result.detached
+    assert result.left_ml == pytest.approx(left, rel=0.03)
+    assert result.removed_share == pytest.approx(removed / result.tumor_ml, rel=0.02)
+    assert result.cut_share * result.tumor_ml == pytest.approx(cap - left, rel=0.04)
+    assert parts_ml(result) == pytest.approx(result.tumor_ml)
+    assert result.margin_mm == pytest.approx(-6, abs=0.05)
 
 
-def test_within_agrees_with_shapely():
-    import shapely
+@pytest.mark.parametrize(("tip_mm", "detached"), [(-12.0, False), (-13.7, True), (-25.0, True)])
+def test_a_cut_that_stops_short_leaves_a_bridge(tip_mm, detached):
+    """The tip's end reaches 1.2 mm deeper; 0.1 mm of tissue below it tears, 1.8 mm holds."""
+    result = cut(boxed(ball(6, (20, 0, 3))), plan(across(10, tip_mm), grasp_mm=(20, 0, 15)))
+    assert result.detached == detached
+    assert result.removed_share == float(detached)
+    assert (result.piece_ml > 0) == detached
+    lost = result.piece_ml - result.tumor_ml * detached + result.kerf_ml
+    assert result.healthy_ml == pytest.approx(lost, abs=0.05)
+    if not detached:
+        assert result.left_ml == result.tumor_ml
+        # Both walls and the bottom of the trench, whose end is round.
+        wall, section = 15 + 12, 40 * (np.pi * RADIUS_MM)
+        assert result.kerf_area_mm2 == pytest.approx(2 * 40 * wall + section, rel=0.03)
+        trench = 40 * (wall * KERF_MM + np.pi * RADIUS_MM**2 / 2) * ML
+        assert result.kerf_ml == pytest.approx(trench, rel=0.02)
 
-    rng = np.random.default_rng(1)
-    angles = np.sort(rng.uniform(0, 2 * np.pi, 40))
-    ring = 20 + rng.uniform(6, 18, (40, 1)) * np.stack([np.cos(angles), np.sin(angles)], 1)
-    i, j = np.mgrid[0:40, 0:40]
-    expected = shapely.contains_xy(shapely.Polygon(ring), i, j)
-    assert np.array_equal(within((ring,), (40, 40)), expected)
-    assert within((ring, ring), (40, 40)).sum() == 0
+
+def wedge(z_mm=-6.0, beyond_mm=1.5) -> tuple[Cut, Cut]:
+    """Two planes along y, which open upwards by 45 degrees each and meet at this height; the tips
+    reach so far beyond their edge."""
+    cuts = []
+    for sweep, side in ((1, 1.0), (2, -1.0)):
+        back = np.array([side, 0, 1]) / np.sqrt(2)
+        tip = np.array([0, 0, z_mm]) - beyond_mm * back
+        cuts.append(straight(tip - 30 * Y, tip + 30 * Y, -back, sweep))
+    return cuts[0], cuts[1]
+
+
+def test_two_planes_cut_out_a_wedge():
+    """21 mm deep and 42 mm wide on top, in which the kerfs' inner walls lie sqrt(2) of the radius
+    higher; the tumor sticks out above."""
+    truth = boxed(ball(6, (0, 0, 10)))
+    result = cut(truth, plan(*wedge()))
+    assert result.detached
+    assert result.removed_share == 1.0
+    inner = 21 - np.sqrt(2) * RADIUS_MM
+    above = np.pi * 1**2 * (18 - 1) / 3  # of the ball, above the box
+    assert result.piece_ml == pytest.approx((40 * inner**2 + above) * ML, rel=0.01)
+    side = 21 * np.sqrt(2) + 1.5  # of each plane, from the tip to the top
+    assert result.kerf_ml == pytest.approx(2 * side * 40 * KERF_MM * ML, rel=0.04)
+    # Beyond the edge both walls of each kerf are what stays.
+    assert result.kerf_area_mm2 == pytest.approx(40 * (2 * side + 2 * 1.5 + 1.2 * np.pi), rel=0.05)
+    assert result.margin_mm == pytest.approx(16 / np.sqrt(2) - 6 - RADIUS_MM, abs=0.05)
+
+
+def test_a_kerf_that_goes_on_beyond_the_piece_adds_to_the_wound_and_to_healthy_tissue():
+    truth = boxed(ball(6, (0, 0, 10)))
+    short, long = cut(truth, plan(*wedge())), cut(truth, plan(*wedge(beyond_mm=5.0)))
+    more = 2 * 3.5 * 40  # mm2 of planes
+    assert long.piece_ml == pytest.approx(short.piece_ml)
+    assert long.kerf_ml - short.kerf_ml == pytest.approx(more * KERF_MM * ML, rel=0.1)
+    assert long.healthy_ml - short.healthy_ml == pytest.approx(long.kerf_ml - short.kerf_ml)
+    assert long.kerf_area_mm2 - short.kerf_area_mm2 == pytest.approx(2 * more, rel=0.1)
+
+
+def test_the_piece_is_what_the_cup_holds_and_what_is_loose_beside_it_is_lost():
+    """The box in three: the middle, the largest, stays; both ends come off."""
+    truth, cuts = boxed(ball(6, (20, 0, 3))), (across(10), across(-15))
+    end = cut(truth, plan(*cuts, grasp_mm=(20, 0, 16)))
+    other = cut(truth, plan(*cuts, grasp_mm=(-25, 0, 14)))
+    middle = cut(truth, plan(*cuts, grasp_mm=(0, 0, 15)))
+    nothing = cut(truth, plan(*cuts, grasp_mm=(20, 0, 27)))
+    assert [end.detached, other.detached, middle.detached] == [True, True, False]
+    assert not nothing.detached
+    assert end.piece_ml == pytest.approx(18.8 * 1200 * ML, rel=0.01)
+    assert other.piece_ml == pytest.approx(13.8 * 1200 * ML, rel=0.01)
+    assert (end.removed_share, other.removed_share, middle.removed_share) == (1.0, 0.0, 0.0)
+    assert other.left_share == 1.0
+    lost = (18.8 + 13.8 + 2 * KERF_MM) * 1200 * ML - end.tumor_ml
+    assert end.healthy_ml == pytest.approx(lost, rel=0.01)
+    assert other.healthy_ml == middle.healthy_ml == end.healthy_ml
+
+
+def test_another_tumor_that_the_electrode_touches_is_hurt():
+    """A plane 10 mm beside the middles of both, of 9.5 and 4 mm; the axis passes both."""
+    near, far = ball(9.5, (0, 0, 0)), ball(4, (0, 14, 0))
+    truth = boxed(ball(6, (20, 0, 3)), near, far)
+    result = cut(truth, plan(across(10), grasp_mm=(20, 0, 15)))
+    assert result.hurt == ("tumor_2",)
+    swept = swept_by(plan(across(10)))
+    margins_mm = [electrode_margin_mm(part, swept) for part in (near, far)]
+    assert margins_mm == pytest.approx([0, 10 - 4 - RADIUS_MM], abs=0.03)
+    assert result.removed_share == 1.0
+
+
+def test_a_finer_grid_gives_the_same():
+    truth, planned = boxed(ball(6, (0, 0, 10))), plan(*wedge())
+    coarse, fine = cut(truth, planned, voxel_mm=0.7), cut(truth, planned, voxel_mm=0.4)
+    for name in ("piece_ml", "kerf_ml", "healthy_ml", "kerf_area_mm2"):
+        assert getattr(coarse, name) == pytest.approx(getattr(fine, name), rel=0.03)
+    assert coarse.margin_mm == fine.margin_mm
+
+
+def test_poses_of_motions_go_before_the_plan():
+    """The electrode was 2 mm nearer to the tumor than planned, and was off in the first half."""
+    truth, planned = boxed(ball(6, (20, 0, 3))), plan(across(10), grasp_mm=(20, 0, 15))
+    ends = swept_by(planned).ends_mm + [2.0, 0.0, 0.0]
+    result = cut(truth, planned, Swept(ends))
+    assert result.margin_mm == pytest.approx(4 - 2 - RADIUS_MM, abs=0.05)
+    assert result.detached
+    half = cut(truth, planned, Swept(ends[ends[:, 0, 1] > 0]))
+    assert not half.detached
+    assert half.kerf_ml == pytest.approx(result.kerf_ml / 2, rel=0.05)
+
+
+def test_a_plan_is_followed_in_small_steps_over_its_whole_length():
+    path = np.array([[0, 0, 0], [10, 0, 0], [10, 5.5, 0]], float)
+    swept = swept_by(plan(Cut(1, path, -Z), across(4)), electrode_mm=50.0)
+    tips, rears = swept.ends_mm[:, 0], swept.ends_mm[:, 1]
+    assert np.allclose(rears - tips, 50 * Z)
+    first = tips[: np.flatnonzero((tips == path[-1]).all(1))[0] + 1]
+    steps = np.linalg.norm(np.diff(first, axis=0), axis=1)
+    assert steps.max() <= 0.3 + 1e-9
+    assert steps.sum() == pytest.approx(15.5)
+    assert (tips[len(first)] == [4, -30, -25]).all()
+
+
+def test_what_cannot_be_cut_is_refused():
+    truth = boxed(ball(6, (20, 0, 3)))
+    with pytest.raises(InputError, match=r"tumor_2.*kidney, tumor_1"):
+        cut(truth, plan(across(10), tumor="tumor_2"))
+    published = plan(replace(across(10), axis=None))
+    with pytest.raises(InputError, match="how the electrode lies"):
+        cut(truth, published)
+    with pytest.raises(InputError, match="never energised"):
+        Swept(np.zeros((0, 2, 3)))
+    given = swept_by(plan(across(10)))
+    assert cut(truth, published, given) == cut(truth, plan(across(10)))

@@ -62,9 +62,10 @@ def test_no_point_that_the_cup_hides_is_the_organs() -> None:
 
 def test_the_table_counts_what_the_cuts_did_by_pull_and_way() -> None:
     asked = {"number": 0, "tumor": "tumor_1", "planner": "5 mm", "off_mm": 1.0, "good": True}
-    cut = {"removed_share": 1.0, "healthy_ml": 9.0, "left_out": False}
+    cut = {"removed_share": 1.0, "cut_share": 0.0, "healthy_ml": 9.0, "kerf_area_mm2": 3210.0}
+    cut |= {"left_out": False}
     rows = [
-        {**asked, **cut, "pull_mm": 4.0, "how": "pull", "margin_mm": -2.0},
+        {**asked, **cut, "pull_mm": 4.0, "how": "pull", "margin_mm": -2.0, "cut_share": 0.125},
         {**asked, **cut, "pull_mm": 4.0, "how": "pull", "margin_mm": 5.0, "off_mm": 3.0},
         {**asked, "pull_mm": 4.0, "how": "pull", "refused": "no estimate"},
         {**asked, **cut, "pull_mm": 4.0, "how": "pull, held", "margin_mm": 4.6, "left_out": True},
@@ -73,4 +74,6 @@ def test_the_table_counts_what_the_cuts_did_by_pull_and_way() -> None:
     assert (seen["followed by"], held["followed by"]) == ("pull", "pull, held")
     assert (seen["asked"], seen["plans"], seen["cut into it"], seen["as asked"]) == (3, 2, 1, 1)
     assert (seen["worst mm"], seen["margin kept median mm"]) == ("-2.0", "1.5")
+    assert (seen["healthy tissue mean ml"], seen["kerf area mean cm2"]) == ("9.0", "32.1")
+    assert (seen["cut worst %"], held["cut worst %"]) == ("12.5", "0.0")
     assert (held["asked"], held["left out"], held["as asked"]) == (1, 1, 1)

@@ -2,7 +2,6 @@
 
 import itertools
 import xml.etree.ElementTree as ET
-from dataclasses import replace
 
 import msgspec
 import numpy as np
@@ -10,23 +9,34 @@ import pytest
 import trimesh
 from scipy.spatial import cKDTree
 
-from arm_objects import CREEPING_MRAD, bare, flange_pose, nearest_mm, organ, plan
+from arm_objects import CREEPING_MRAD, bare, flange_pose, nearest_mm, organ, plan, seen
+from cut_objects import beyond
+from plan_objects import sphere
 from tumortrack.core.errors import InputError, NoPlan
 from tumortrack.core.geometry import transform_points
+from tumortrack.core.mesh_query import contains
 from tumortrack.core.types import Mesh
 from tumortrack_resection.arms import body, kinematics, trajectory
 from tumortrack_resection.arms.cell import ArmCell, Blocked, PlanningGroup
 from tumortrack_resection.arms.config import Base, CellConfig
+from tumortrack_resection.arms.cutting import Leg, Outside, cut_level, turns_about
 from tumortrack_resection.arms.paths import connect
-from tumortrack_resection.arms.procedure import plan_motions, search_bases
+from tumortrack_resection.arms.procedure import Start, plan_motions, search_bases
 from tumortrack_resection.arms.reach import ArmsReach
-from tumortrack_resection.motions import CUTTER, HOLDER, JOINTS
-from tumortrack_resection.values import Cut
+from tumortrack_resection.arms.trajectory import TrajectoryBuilder
+from tumortrack_resection.check import clearances
+from tumortrack_resection.checking import checked
+from tumortrack_resection.motions import CUTTER, HOLDER, JOINTS, WITHDRAW, Motions
+from tumortrack_resection.values import CUTS_TUMOR, Cut, ResectionConfig, ResectionPlan
 
 MODELS = pytest.mark.parametrize("model", kinematics.MODELS.values(), ids=lambda model: model.name)
-HOLDING = ("grasp", "hold", "lift", "release")
+HOLDING = ("grasp", "hold")
 HOLDS = {"approach": (), "home": ()} | dict.fromkeys(HOLDING, (HOLDER,))
-LAST = ["lift", "release", "home"]
+FIRST, LAST = ["approach", "grasp", "hold"], ["lift", "release", "home"]
+CONFIG = CellConfig()
+FAR = Base(position_mm=(3000.0, 0.0, 100.0), yaw_deg=0.0)
+OURS, PUBLISHED = ResectionConfig(), ResectionConfig(method="published")
+HOME = np.array(CONFIG.home_rad)
 
 
 @pytest.fixture(scope="module")
@@ -34,9 +44,19 @@ def cell():
     return ArmCell(organ=organ())
 
 
+@pytest.fixture(scope="module", params=[OURS, PUBLISHED], ids=["margin", "published"])
+def made(request):
+    """A plan and its motions."""
+    return plan_motions(seen(), request.param, CONFIG)
+
+
 @pytest.fixture(scope="module")
-def motions(cell):
-    return plan_motions(plan(), cell, cell.organ)
+def ours():
+    return plan_motions(seen(), OURS, CONFIG)
+
+
+def sweeps(plan: ResectionPlan) -> list[str]:
+    return [f"sweep {n}" for n in range(1, plan.sweeps + 1)]
 
 
 def _at_tip(cell, arm, tip_mm, yaw_rad, joints_rad=None):
@@ -158,6 +178,26 @@ def test_only_the_electrode_and_the_cup_may_touch_the_organ(cell):
     assert ("cutter/pencil", "organ") in pairs
 
 
+def test_the_electrode_alone_keeps_a_distance_and_more_in_free_motions(cell):
+    """Beside a ball of 4 mm radius, along the electrode's axis and across it."""
+    config, tip = cell.config, np.array([250.0, 0.0, 300.0])
+    joints = next(j for j in _at_tip(cell, CUTTER, tip, np.pi) if cell.collisions(j) is None)
+    names = ("cutter/electrode", "the margin of tumor_1")
+
+    def found(off_mm, touching, along_mm=-30.0, keep_mm=5.0):
+        # The instrument points towards -x.
+        middle = tip - [along_mm, 0.0, off_mm + 4.0 + 1.2]
+        keeping = ArmCell(config, keep={"tumor_1": (sphere(middle, 4.0), keep_mm)})
+        assert keeping.keep_mm == {names[1]: keep_mm}
+        return keeping.collisions(joints, touching)
+
+    for touching, more_mm in (((CUTTER,), 0.0), ((), config.organ_clearance_mm)):
+        assert found(5.0 + more_mm - 0.1, touching) == names
+        assert found(5.0 + more_mm + 0.1, touching) is None
+    assert found(7.9, (CUTTER,), keep_mm=8.0) == names
+    assert found(-6.0, (CUTTER,), along_mm=-100.0) is None  # the pencil may
+
+
 def test_clearances_agree_with_distances(cell):
     rng, seen, touch = np.random.default_rng(5), set(), bare(cell)
     for joints in cell.home_rad + rng.normal(0, 0.25, (80, 12)):
@@ -215,23 +255,49 @@ def test_cells_that_can_t_be_are_refused(wrong):
         CellConfig(**wrong)
 
 
+def test_the_planner_knows_the_tools_of_the_cell():
+    tools = CellConfig(electrode_mm=55.0, cup_radius_mm=6.0).tools
+    assert (tools.electrode_mm, tools.cup_radius_mm) == (55.0, 6.0)
+    electrode = [part for part in body.cell_parts(CONFIG) if part.name == "electrode"]
+    assert {tools.radius_mm} == {part.size_mm[0] for part in electrode if part.use != "picture"}
+
+
 # Motions ------------------------------------------------------------------------------------------
 
 
-def test_the_procedure_has_its_stages_without_gaps(cell, motions):
-    names = [stage.name for stage in motions.stages]
-    assert names == ["approach", "grasp", "hold", "sweep 1", "sweep 2", "lift", "release", "home"]
+def test_the_procedure_has_its_stages_without_gaps(cell, made):
+    plan, motions = made
+    assert [stage.name for stage in motions.stages] == [*FIRST, *sweeps(plan), *LAST]
     assert np.array_equal(motions.stages[0].joints_rad[0], cell.home_rad)
     assert np.allclose(motions.stages[-1].joints_rad[-1], cell.home_rad, atol=1e-9)
     for one, other in itertools.pairwise(motions.stages):
         assert np.array_equal(one.joints_rad[-1], other.joints_rad[0])
     held = cell.tips(motions.stages[2].joints_rad[0])[HOLDER]
-    assert np.abs(held[:3, 3] - plan().grasp_mm).max() < 0.01
-    assert held[2, 2] == pytest.approx(1.0)
+    assert np.abs(held[:3, 3] - plan.grasp_mm).max() < 0.01
+    assert held[:3, 2] == pytest.approx(plan.lift, abs=1e-6)
 
 
-def test_joints_keep_their_limits(cell, motions):
-    for stage in motions.stages:
+def test_the_cup_comes_and_goes_along_the_lift_and_the_cutter_is_home_before(cell, made):
+    plan, motions = made
+    grasp, lift = motions.stages[1], motions.stages[-3]
+    ways = [np.array([cell.tips(joints)[HOLDER] for joints in s.joints_rad]) for s in (grasp, lift)]
+    for poses in ways:
+        off = poses[:, :3, 3] - plan.grasp_mm
+        along = off @ plan.lift
+        assert np.abs(off - np.outer(along, plan.lift)).max() < 0.1
+        assert np.abs(poses[:, :3, 2] - plan.lift).max() < 1e-3
+        assert along.max() > 30.0
+    assert (np.diff(ways[0][:, :3, 3] @ plan.lift) < 1e-6).all()
+    assert (np.diff(ways[1][:, :3, 3] @ plan.lift) > -1e-6).all()
+    rising = np.abs(np.diff(lift.joints_rad[:, 6:], axis=0)).max(1) > 1e-9
+    assert np.abs(lift.joints_rad[1:][rising][:, :6] - cell.home_rad[:6]).max() < 1e-9
+    for stage in motions.stages[3:-3]:  # it holds
+        assert np.ptp(stage.joints_rad[:, 6:], axis=0).max() == 0
+    assert np.ptp(motions.stages[-1].joints_rad[:, :6], axis=0).max() < 1e-9
+
+
+def test_joints_keep_their_limits(cell, made):
+    for stage in made[1].stages:
         assert (np.abs(stage.joints_rad) <= cell.limits_rad).all()
         steps_s = np.diff(stage.times_s)[:, None]
         speeds = np.diff(stage.joints_rad, axis=0) / steps_s
@@ -243,108 +309,286 @@ def test_joints_keep_their_limits(cell, motions):
             assert np.abs(end).max() <= kinematics.ACCELERATION_RAD_S2 * steps_s.max() + 1e-9
 
 
-def test_nothing_collides_between_the_tested_places(cell, motions):
+def test_nothing_collides_between_the_tested_places(cell, made):
     touch = bare(cell)
-    for stage in motions.stages:
+    for stage in made[1].stages:
         touching = HOLDS.get(stage.name, (CUTTER, HOLDER))
         for time_s in np.arange(0, stage.seconds, 0.013):
             assert touch.collisions(stage.at(time_s), touching) is None
 
 
-def test_the_instrument_is_level_and_on_its_path(cell, motions):
-    paths = {f"sweep {cut.sweep}": cut.path_mm for cut in plan().cuts}
-    fine = {
-        name: np.concatenate([np.linspace(a, b, 20) for a, b in itertools.pairwise(path)])
-        for name, path in paths.items()
+def test_the_check_finds_what_was_planned(made):
+    plan, motions = made
+    found = checked(plan, motions, body.cell_urdf(CONFIG), seen())
+    harm = [note for note in found.warnings if note.startswith(CUTS_TUMOR)]
+    if plan.method == "margin":
+        assert plan.margin_mm <= found.least_mm["tumor_1"] < plan.margin_mm + 0.3
+        assert harm == []
+    else:  # its level electrode lies in the tumor, on the way to the far side
+        assert found.least_mm["tumor_1"] < -5
+        assert len(harm) == 1
+        assert "tumor_1" in harm[0]
+    assert {(each.solid, each.part) for each in found.clearances} == {
+        (solid, "tumor_1") for solid in ("bracket", "pencil", "electrode", "rod", "cup")
     }
-    trees = {name: cKDTree(points) for name, points in fine.items()}
-    tips = {name: [] for name in paths}
+    assert plan.clearances == ()  # what was planned is as it was
+
+
+def test_tools_that_must_not_touch_the_organ_do_not(made):
+    """Only electrode and cup may."""
+    found = clearances(body.cell_urdf(CONFIG), made[1], {"kidney": organ()}, ())
+    least = {each.solid: each.least_mm for each in found}
+    assert least["electrode"] < 0
+    assert abs(least["cup"]) < 1.0
+    for solid in ("bracket", "pencil"):
+        assert least[solid] > CONFIG.organ_clearance_mm / 2
+    assert least["rod"] > CONFIG.cup_mm / 2
+
+
+def test_the_tip_follows_its_path_and_leaves_nothing_out(cell, made):
+    plan, motions = made
+    tips = {name: [] for name in sweeps(plan)}
     for name, tip in _cutting_tips(cell, motions):
-        assert abs(tip[2, 0]) < np.sin(np.radians(0.1))
-        assert tip[2, 2] > np.cos(np.radians(0.1))
-        assert trees[name].query(tip[:3, 3])[0] < 0.2
-        tips[name].append(tip[:3, 3])
-    for name, path in paths.items():
-        assert cKDTree(np.array(tips[name])).query(path)[0].max() < 0.2  # nothing is left out
+        tips[name].append(tip)
+    for name, cut in zip(sweeps(plan), plan.cuts, strict=True):
+        fine = [np.linspace(a, b, 20) for a, b in itertools.pairwise(cut.path_mm)]
+        places = np.array([tip[:3, 3] for tip in tips[name]])
+        assert cKDTree(np.concatenate(fine)).query(places)[0].max() < 0.2
+        assert cKDTree(places).query(cut.path_mm)[0].max() < 0.2
+        ahead = np.array([tip[:3, 0] for tip in tips[name]])
+        if cut.axis is None:  # level
+            assert np.abs(ahead[:, 2]).max() < np.sin(np.radians(0.1))
+        else:
+            assert np.abs(ahead - cut.axis).max() < np.sin(np.radians(0.1))
+            # In the order of motion
+            assert np.linalg.norm(places[0] - cut.path_mm[0]) < 0.5
+            assert np.linalg.norm(places[-1] - cut.path_mm[-1]) < 0.5
 
 
-def test_the_tip_is_no_faster_than_asked_on_a_cut(cell, motions):
-    for stage in motions.stages:
+def test_the_electrode_stays_in_its_plane_while_it_cuts(cell, ours):
+    """To less than the slack by which the plane is farther off than the margin."""
+    plan, motions = ours
+    for name, tip in _cutting_tips(cell, motions):
+        plane = plan.facets[sweeps(plan).index(name)]
+        ends = tip[:3, 3] - np.outer([0.0, CONFIG.electrode_mm], tip[:3, 0])
+        assert np.abs(beyond(plane[None], ends)).max() < 0.1
+
+
+def test_the_tip_is_no_faster_than_asked_on_a_cut(cell, made):
+    for stage in made[1].stages:
         tips = np.array([cell.tips(joints)[CUTTER][:3, 3] for joints in stage.joints_rad])
         speeds = np.linalg.norm(np.diff(tips, axis=0), axis=1) / np.diff(stage.times_s)
         cutting = stage.cutting[1:] & stage.cutting[:-1]
-        assert speeds[cutting].max(initial=0) <= 1.01 * cell.config.cutting_mm_s
+        assert (
+            speeds[cutting].max(initial=0) <= 1.05 * cell.config.cutting_mm_s
+        )  # at grid points alone it is kept
         if cutting.any():
             assert np.median(speeds[cutting]) > 0.9 * cell.config.cutting_mm_s
+        # The electrode is as slow wherever it is in the organ.
+        joints = stage.joints_rad[1:][speeds > 1.05 * cell.config.cutting_mm_s]
+        for each in joints[::5]:
+            tip = cell.tips(each)[CUTTER]
+            along = tip[:3, 3] - np.outer(np.arange(0.0, 70.0, 2.0), tip[:3, 0])
+            assert not contains(cell.organ, along).any()
 
 
-def test_both_arms_go_home_together(cell, motions):
-    joints = motions.stages[-1].joints_rad
-    turns = joints[-1] - joints[0]
-    moving = np.abs(turns) > 1e-3
-    assert moving[:6].any()
-    assert moving[6:].any()
-    share = (joints - joints[0])[:, moving] / turns[moving]
-    assert np.ptp(share, axis=1).max() < 1e-6
-    assert (np.diff(share[:, 0]) > 0).all()
-
-
-def test_the_same_every_time(motions):
-    again = plan_motions(plan(), ArmCell(), organ())
-    for one, other in zip(motions.stages, again.stages, strict=True):
+def test_the_same_every_time(ours):
+    plan, motions = ours
+    again, same = plan_motions(seen(), OURS, CONFIG)
+    assert np.array_equal(again.facets, plan.facets)
+    assert np.array_equal(again.grasp_mm, plan.grasp_mm)
+    for one, other in zip(motions.stages, same.stages, strict=True):
         assert np.array_equal(one.joints_rad, other.joints_rad)
         assert np.array_equal(one.times_s, other.times_s)
 
 
 @pytest.mark.slow
-def test_a_cut_round_the_cup_is_made_from_several_sides(cell):
-    ring = plan()
-    above = ring.cuts[0].path_mm + [0.0, 0.0, 8.0 + ring.grasp_mm[2] - ring.cuts[0].height_mm]
-    motions = plan_motions(replace(ring, cuts=(Cut(1, above),)), cell, cell.organ)
-    sweep = motions.stages[3]
+def test_a_cut_round_the_cup_is_made_from_several_sides(cell, ours):
+    held = ours[1].stages[2].joints_rad[0].copy()
+    held[:6] = cell.home_rad[:6]
+    grasp_mm = cell.tips(held)[HOLDER][:3, 3]
+    turns = np.linspace(0, 2 * np.pi, 60)
+    ring = 17.0 * np.column_stack([np.cos(turns), np.sin(turns), np.zeros(60)])
+    cut = Cut(1, ring + grasp_mm + [0.0, 0.0, 8.0])
+    builder = TrajectoryBuilder(cell, held, np.random.default_rng(0))
+    cut_level(builder, cut, Outside(cell, cell.organ, grasp_mm, ours[0].lift))
+    builder.close("sweep 1")
+    (sweep,) = builder.stages
     begins = np.flatnonzero(np.diff(sweep.cutting.astype(int)) == 1)
     assert len(begins) >= 2
-    tips = np.array([tip[:3, 3] for _, tip in _cutting_tips(cell, motions)])
-    assert cKDTree(tips).query(above)[0].max() < 0.2
+    tips = np.array([tip[:3, 3] for _, tip in _cutting_tips(cell, Motions(builder.stages))])
+    assert cKDTree(tips).query(cut.path_mm)[0].max() < 0.2
     touch = bare(cell)
     for time_s in np.arange(0, sweep.seconds, 0.03):
         assert touch.collisions(sweep.at(time_s), (CUTTER, HOLDER)) is None
 
 
 @pytest.mark.parametrize(
-    ("altered", "message"),
+    "config", [pytest.param(OURS, marks=pytest.mark.slow), PUBLISHED], ids=["margin", "published"]
+)
+@pytest.mark.parametrize(
+    ("shift_mm", "cell_changes", "names"),
     [
-        (lambda p: replace(p, grasp_mm=p.grasp_mm + [0, 2000, 0]), "holder does not reach"),
-        (lambda p: replace(p, grasp_mm=p.grasp_mm - [12, 8, 25]), "below the organ's surface"),
+        ((0.0, 2000.0, 0.0), {}, "holder"),
+        ((0.0, 0.0, -140.0), {}, "(table|stand|organ)"),
         (
-            lambda p: replace(p, cuts=(Cut(1, p.cuts[0].path_mm - [0, 0, 138]),)),
-            "cutter/.* would meet (table|stand)",
+            (0.0, 0.0, 0.0),
+            {"cutter_base": FAR},
+            CUTTER,
         ),
     ],
 )
-def test_no_plan_says_why(cell, altered, message):
-    with pytest.raises(NoPlan, match=message):
-        plan_motions(altered(plan()), cell, cell.organ)
+def test_no_plan_says_what_is_in_the_way(config, shift_mm, cell_changes, names):
+    with pytest.raises(NoPlan, match=names):
+        plan_motions(seen(shift_mm), config, CellConfig(**cell_changes))
 
 
-def test_arms_begin_anew_in_the_middle_of_a_cut(cell, motions):
-    sweep = motions.stages[3]
-    middle = sweep.joints_rad[np.flatnonzero(sweep.cutting)[200]]
-    anew = plan_motions(plan((0, 3, 0)), cell, organ((0, 3, 0)), middle, from_sweep=1)
-    assert [stage.name for stage in anew.stages] == ["sweep 1", "sweep 2", *LAST]
+# Where the arms begin -----------------------------------------------------------------------------
+
+
+def middle_of(motions: Motions, number: int, share: float = 0.5) -> np.ndarray:
+    """Joints on a cut, so far along it."""
+    sweep = next(stage for stage in motions.stages if stage.sweep == number)
+    on = np.flatnonzero(sweep.cutting)
+    return sweep.joints_rad[on[int(share * len(on))]]
+
+
+def is_straight_back(cell: ArmCell, joints_rad: np.ndarray, off_mm: float = 0.1) -> bool:
+    tips = np.array([cell.tips(each)[CUTTER] for each in joints_rad])
+    back, ahead = tips[:, :3, 3] - tips[0, :3, 3], tips[0, :3, 0]
+    aside = np.linalg.norm(back - np.outer(back @ ahead, ahead), axis=1).max()
+    return bool((back @ ahead < 1e-6).all() and aside < off_mm)
+
+
+@pytest.mark.parametrize("share", [0.1, 0.5, 0.9])
+def test_arms_begin_anew_in_the_middle_of_a_cut(cell, made, share):
+    plan, motions = made
+    middle = middle_of(motions, 1, share)
+    config = OURS if plan.method == "margin" else PUBLISHED
+    like = plan.facets[:, :3] if len(plan.facets) else None
+    there = seen((0.0, 3.0, 0.0))
+    again, anew = plan_motions(there, config, CONFIG, Start(middle, 1), like)
+    assert [stage.name for stage in anew.stages] == [WITHDRAW, *sweeps(again), *LAST]
     joints = anew.stages[0].joints_rad
     assert np.array_equal(joints[0], middle)
-    assert np.array_equal(joints[:, 6:], np.repeat(middle[None, 6:], len(joints), 0))  # it holds
-    tips = [cell.tips(each)[CUTTER] for each in joints[:100]]
-    back = np.array([tip[:3, 3] for tip in tips]) - tips[0][:3, 3]
-    ahead = tips[0][:3, 0]
-    assert (back @ ahead < 1e-6).all()
-    assert np.abs(back - np.outer(back @ ahead, ahead)).max() < 0.1  # straight back
-    whole = plan_motions(plan((0, 3, 0)), cell, organ((0, 3, 0)), middle)
-    assert [stage.name for stage in whole.stages] == [stage.name for stage in motions.stages]
-    assert np.array_equal(whole.stages[0].joints_rad[0], middle)  # both withdraw first
-    only = plan_motions(plan(), cell, cell.organ, motions.stages[5].joints_rad[0], from_sweep=3)
-    assert [stage.name for stage in only.stages] == LAST
+    for stage in anew.stages[: 1 + again.sweeps]:  # it holds
+        assert np.ptp(stage.joints_rad[:, 6:], axis=0).max() == 0
+    assert is_straight_back(cell, joints)
+    assert not anew.stages[0].cutting.any()
+    tip = cell.tips(joints[-1])[CUTTER]
+    along = tip[:3, 3] - np.outer(np.arange(0.0, 70.0, 1.0), tip[:3, 0])
+    assert cKDTree(there.organ.spread_mm(1.0)).query(along)[0].min() > CONFIG.organ_clearance_mm
+    assert np.array_equal(again.facets[:, :3], plan.facets[:, :3])
+    checked(again, anew, body.cell_urdf(CONFIG), there)
+
+
+@pytest.mark.slow
+def test_arms_that_do_not_hold_yet_begin_from_wherever_they_are(cell, made):
+    plan, motions = made
+    config = OURS if plan.method == "margin" else PUBLISHED
+    there = seen((0.0, 3.0, 0.0))
+    for start, first in (
+        (middle_of(motions, 1), [WITHDRAW, *FIRST]),
+        (motions.stages[2].joints_rad[0], FIRST),
+        (motions.stages[0].joints_rad[len(motions.stages[0].times_s) // 2], FIRST),
+    ):
+        again, anew = plan_motions(there, config, CONFIG, Start(start))
+        assert [stage.name for stage in anew.stages] == [*first, *sweeps(again), *LAST]
+        assert np.array_equal(anew.stages[0].joints_rad[0], start)
+        held = cell.tips(anew.stages[first.index("hold")].joints_rad[0])[HOLDER]
+        assert np.abs(held[:3, 3] - again.grasp_mm).max() < 0.01
+        for one, other in itertools.pairwise(anew.stages):
+            assert np.array_equal(one.joints_rad[-1], other.joints_rad[0])
+        checked(again, anew, body.cell_urdf(CONFIG), there)
+
+
+@pytest.mark.slow
+def test_sweeps_that_are_done_are_not_made_again(cell, made):
+    plan, motions = made
+    config = OURS if plan.method == "margin" else PUBLISHED
+    like = plan.facets[:, :3] if len(plan.facets) else None
+    for done in range(plan.sweeps + 1):
+        at = motions.stages[3 + done].joints_rad[0]
+        again, rest = plan_motions(seen(), config, CONFIG, Start(at, done + 1), like)
+        names = [stage.name for stage in rest.stages if stage.name != WITHDRAW]
+        assert names == [*sweeps(plan)[done:], *LAST]
+        assert again.sweeps == plan.sweeps
+        assert np.array_equal(rest.stages[0].joints_rad[0], at)
+
+
+def test_a_plan_like_another_has_its_facets_where_the_organ_is_now(ours):
+    plan, _ = ours
+    there = seen((2.0, -3.0, 4.0))
+    again, motions = plan_motions(there, OURS, CONFIG, like=plan.facets[:, :3])
+    assert np.array_equal(again.facets[:, :3], plan.facets[:, :3])
+    shift = plan.facets[:, :3] @ [2.0, -3.0, 4.0]
+    assert again.facets[:, 3] == pytest.approx(plan.facets[:, 3] + shift)
+    found = checked(again, motions, body.cell_urdf(CONFIG), there)
+    assert found.least_mm["tumor_1"] >= OURS.margin_mm
+
+
+@pytest.mark.parametrize(
+    "start",
+    [
+        Start(np.full(12, 7.0)),
+        Start(np.full(12, np.nan)),
+        Start(HOME, 0),
+        Start(HOME, -1),
+        Start(HOME, 99),
+    ],
+)
+def test_starts_that_are_none_are_refused(start):
+    with pytest.raises(InputError):
+        plan_motions(seen(), PUBLISHED, CONFIG, start)
+
+
+# The instrument's way -----------------------------------------------------------------------------
+
+
+def test_an_instrument_goes_back_until_it_is_clear_of_the_organ_and_of_the_cup():
+    ball = sphere([0.0, 0.0, 200.0], 20.0, 5)
+    cell = ArmCell(CONFIG, ball, {"tumor_1": (ball, 6.0)})
+    up, ahead = np.array([0.0, 0.0, 1.0]), np.array([1.0, 0.0, 0.0])
+    outside = Outside(cell, ball, np.array([0.0, 0.0, 220.0]), up)
+    room_mm = 6.0 + CONFIG.organ_clearance_mm
+    for tip, least_mm in (
+        ([0.0, 0.0, 200.0], 20.0 + room_mm),
+        ([30.0, 0.0, 200.0], 50.0 + room_mm),  # right through
+        ([0.0, 19.0, 200.0], np.sqrt(max((20 + room_mm) ** 2 - 19**2, 0))),
+        ([0.0, 0.0, 300.0], CONFIG.cup_radius_mm + CONFIG.clearance_mm),
+        ([-60.0, 0.0, 200.0], 0.0),
+        ([0.0, 90.0, 200.0], 0.0),
+    ):
+        far = outside.back_mm(np.array(tip), ahead)
+        assert (far == 0) == (least_mm == 0)
+        if least_mm:
+            assert least_mm < far < least_mm + 8.0
+            along = tip - np.outer(np.arange(far, far + CONFIG.electrode_mm, 0.5), ahead)
+            assert np.linalg.norm(along - [0, 0, 200], axis=1).min() > 20 + room_mm
+
+
+def test_a_leg_leads_in_and_out_along_the_instrument_and_stops_at_corners():
+    path = np.array([[0.0, 0, 0], [2, 0, 0], [4, 0, 0], [4, 2, 0], [4, 4, 0]])
+    turn = turns_about(np.array([0.0, 0.0, -1.0]))[3]
+    leg = Leg.along(path, turn, (20.0, 0.0))
+    assert turn[:, 0] == pytest.approx([0, 0, -1])
+    assert leg.poses[0, :3, 3] == pytest.approx([0, 0, 20])
+    assert leg.poses[-1, :3, 3] == pytest.approx([4, 4, 0])
+    places = [leg.poses[run][:, :3, 3] for run, _ in leg.runs]
+    assert [cutting for _, cutting in leg.runs] == [False, True, True]
+    assert places[1][-1] == pytest.approx([4, 0, 0])
+    for one, other in itertools.pairwise(places):
+        assert one[-1] == pytest.approx(other[0])
+
+
+def test_an_instrument_is_turned_evenly_about_its_axis():
+    axis = np.array([2.0, -1.0, 2.0]) / 3
+    turns = turns_about(axis, 8)
+    for one, other in zip(turns, turns[1:] + turns[:1], strict=True):
+        assert np.linalg.det(one) == pytest.approx(1.0)
+        assert one @ one.T == pytest.approx(np.eye(3), abs=1e-12)
+        assert one[:, 0] == pytest.approx(axis)
+        assert one[:, 2] @ other[:, 2] == pytest.approx(np.cos(np.pi / 4))
 
 
 @pytest.mark.parametrize("turn_rad", [2e-6, 1e-4, 0.1, 3.0])
@@ -356,13 +600,6 @@ def test_ways_of_any_length_are_timed(turn_rad):
     ):
         assert (np.diff(times) > 0).all()
         assert np.allclose(joints[[0, -1]], path[[0, -1]], atol=1e-9)
-
-
-def test_starts_that_are_none_are_refused(cell):
-    with pytest.raises(InputError, match="start_rad"):
-        plan_motions(plan(), cell, cell.organ, from_sweep=1)
-    with pytest.raises(InputError, match="within their limits"):
-        plan_motions(plan(), cell, cell.organ, np.full(12, 7.0))
 
 
 def test_a_way_round_is_found_and_the_same_for_the_same_seed(cell):
@@ -391,20 +628,26 @@ def test_a_way_round_is_found_and_the_same_for_the_same_seed(cell):
 
 
 @pytest.mark.slow
-def test_places_for_the_bases_are_searched():
-    shift = (0.0, 150.0, 0.0)
+@pytest.mark.parametrize("config", [OURS, PUBLISHED], ids=["margin", "published"])
+def test_places_for_the_bases_are_searched(config):
+    there = seen((0.0, 150.0, 0.0))
     far = Base(position_mm=(-900.0, -380.0, 150.0), yaw_deg=180.0)
-    config = msgspec.structs.replace(CellConfig(), holder_base=far)
-    with pytest.raises(NoPlan, match="does not reach"):
-        plan_motions(plan(shift), ArmCell(config), organ(shift))
-    cell, motions, message = search_bases(plan(shift), config, organ(shift))
-    assert cell.config.holder_base != far
-    assert f"{cell.config.holder_base.position_mm[0]:g}" in message
-    assert motions.stages[-1].name == "home"
-    tip = cell.tips(motions.stages[2].joints_rad[0])[HOLDER]
-    assert np.abs(tip[:3, 3] - plan(shift).grasp_mm).max() < 0.01
-    same, _, nothing = search_bases(plan(), CellConfig(), organ())
-    assert (same.config, nothing) == (CellConfig(), "")
+    asked = msgspec.structs.replace(CellConfig(), holder_base=far)
+    with pytest.raises(NoPlan, match="holder"):
+        plan_motions(there, config, asked)
+    found, plan, motions, note = search_bases(there, config, asked)
+    assert found.holder_base != far
+    assert f"{found.holder_base.position_mm[0]:g}" in note
+    assert [stage.name for stage in motions.stages] == [*FIRST, *sweeps(plan), *LAST]
+    tip = ArmCell(found).tips(motions.stages[2].joints_rad[0])[HOLDER]
+    assert np.abs(tip[:3, 3] - plan.grasp_mm).max() < 0.01
+    checked(plan, motions, body.cell_urdf(found), there)
+
+
+def test_bases_stay_where_they_are_if_the_arms_manage_from_there(ours):
+    found, plan, _, nothing = search_bases(seen(), OURS, CONFIG)
+    assert (found, nothing) == (CONFIG, "")
+    assert np.array_equal(plan.facets, ours[0].facets)
 
 
 def test_no_motion_creeps(monkeypatch):
@@ -418,8 +661,6 @@ def test_no_motion_creeps(monkeypatch):
 
 
 # What the tips can touch --------------------------------------------------------------------------
-
-FAR = Base(position_mm=(3000.0, 0.0, 100.0), yaw_deg=0.0)
 
 
 @pytest.mark.parametrize(

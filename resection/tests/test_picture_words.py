@@ -1,5 +1,7 @@
 """No word of a plan's picture, nor of a film, is lost; warnings first."""
 
+# ruff: noqa: F811 (fixtures)
+
 from __future__ import annotations
 
 import itertools
@@ -9,8 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from test_plan_pictures import located, plan, workcells  # noqa: F401 (fixtures)
 
+from picture_objects import located, plan, published, workcells  # noqa: F401 (fixtures)
 from picture_words import LONG, PATIENT, check
 from tumortrack.core.colours import NONE, WHITE
 from tumortrack.live.values import Workcell
@@ -37,7 +39,7 @@ SETS = [(), WARNINGS[1:2], WARNINGS, (*WARNINGS, f"{OVER_BUDGET} {LONG}")]
 
 
 @pytest.mark.parametrize("warnings", SETS)
-def test_a_plan(warnings: tuple[str, ...], plan: ResectionPlan, located: Located) -> None:  # noqa: F811
+def test_a_plan(warnings: tuple[str, ...], plan: ResectionPlan, located: Located) -> None:
     notes = (*warnings, "tumor_2 comes away with tumor_1.", "a note that goes on " * 30)
     figure = plan_figure(replace(plan, notes=notes), replace(located, patient=PATIENT))
     check(figure, warnings)
@@ -48,11 +50,12 @@ def test_a_plan(warnings: tuple[str, ...], plan: ResectionPlan, located: Located
     assert not any(word in title for word in ("kept", "safe", "good"))
 
 
-def test_a_plans_views_have_one_scale(plan: ResectionPlan, located: Located) -> None:  # noqa: F811
+def test_a_plans_views_have_one_scale(plan: ResectionPlan, located: Located) -> None:
     figure = plan_figure(plan, located)
     figure.canvas.draw()  # type: ignore[attr-defined]
     scales = [np.ptp(axes.transData.transform([[0, 0], [10, 0]])[:, 0]) for axes in figure.axes]
     assert scales[0] == pytest.approx(scales[1], rel=1e-6)
+    assert scales[2:] == pytest.approx([scales[2]] * len(plan.cuts), rel=1e-6)  # sections
     assert all(any("mm" in text.get_text() for text in axes.texts) for axes in figure.axes)
 
 
@@ -72,9 +75,9 @@ def test_the_strip_of_a_films_frame(size: tuple[int, int]) -> None:
 
 
 def test_every_frame_of_a_film_has_its_words(
-    workcells: list[Workcell],  # noqa: F811
-    located: Located,  # noqa: F811
-    plan: ResectionPlan,  # noqa: F811
+    workcells: list[Workcell],
+    located: Located,
+    plan: ResectionPlan,
     tmp_path: Path,
 ) -> None:
     cells = [*workcells[:2], replace(workcells[2], halt=stopped(WARNINGS[0]))]

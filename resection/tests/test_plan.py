@@ -1,25 +1,26 @@
-"""The planner: outlines, margins, what comes away, and when there is no plan."""
+"""The planner: outlines, the paper's method, which tumor, and when there is no plan. What facets
+keep and cut: ``test_facets``."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import shapely
-import shapely.affinity
 import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from plan_objects import HALF_MM, MIDDLE_MM, RADIUS_MM, TUMOR_MM, located, sphere
 from tumortrack.core.errors import InputError, NoPlan
+from tumortrack.core.mesh_query import contains
 from tumortrack.core.types import Anatomy, Mesh
 from tumortrack.imaging.meshes import mesh_of, solid_of
 from tumortrack_lab.cut import cut as cut_out
-from tumortrack_resection.budget import planned_budget
+from tumortrack_resection.budget import planned_budgets
 from tumortrack_resection.files import as_builtins, from_plain
-from tumortrack_resection.outline import arcs, concave_hull, evenly, grown, polygon_of
-from tumortrack_resection.resection import exophytic_shares, inside, plan_resection
-from tumortrack_resection.values import CutLayer, Located, ResectionConfig
+from tumortrack_resection.outline import concave_hull, evenly, grown, rings_of
+from tumortrack_resection.resection import exophytic_shares, plan_resection
+from tumortrack_resection.values import Located, ResectionConfig
 
 PUBLISHED, OURS = ResectionConfig(method="published"), ResectionConfig()
 
@@ -96,22 +97,19 @@ def test_points_lie_evenly_on_the_line_they_were_asked_for(n, spacing):
     assert np.ptp(steps) < 1e-6 if len(steps) else True
 
 
-@given(st.lists(st.booleans(), min_size=6, max_size=40), st.integers(0, 3))
-@settings(max_examples=100, deadline=None)
-def test_runs_of_a_ring_hold_what_is_wanted_and_its_leads_and_no_more(wanted, lead):
-    wanted = np.array(wanted)
-    n = len(wanted)
-    ring = np.stack([np.arange(n), np.arange(n) * 2.0], axis=1)
-    expected = {(k + s) % n for k in np.flatnonzero(wanted) for s in range(-lead, lead + 1)}
-    found = arcs(ring, wanted, lead)
-    if len(expected) == n:
-        assert len(found) == 1
-        assert np.array_equal(found[0][0], found[0][-1])
-        found = [found[0][:-1]]
-    numbers = [int(x) for line in found for x in line[:, 0]]
-    assert sorted(numbers) == sorted(expected)  # each once
-    for line in found:
-        assert all((b - a) % n == 1 for a, b in zip(line[:-1, 0], line[1:, 0], strict=True))
+def test_rings_are_the_outer_ones_anticlockwise_and_the_largest_first():
+    small, large = shapely.Point(40, 0).buffer(3), shapely.Point(0, 0).buffer(9)
+    speck = shapely.Point(60, 0).buffer(0.1)
+    holed = large.difference(shapely.Point(0, 0).buffer(4))
+    rings = rings_of(shapely.union_all([small, holed, speck]).reverse())
+    areas = [
+        0.5 * (x * np.roll(y, -1) - np.roll(x, -1) * y).sum() for x, y in map(np.transpose, rings)
+    ]
+    assert areas == pytest.approx([large.area, small.area])
+    assert all((ring[0] != ring[-1]).any() for ring in rings)
+
+
+# The paper's method -------------------------------------------------------------------------------
 
 
 def test_the_published_plan_is_the_papers():
@@ -122,9 +120,10 @@ def test_the_published_plan_is_the_papers():
     assert plan.grasp_mm == pytest.approx([*tumor[:, :2].mean(0), tumor[:, 2].max()])
     assert [cut.sweep for cut in plan.cuts] == [1, 2]
     low, high = tumor[:, 2].min(), tumor[:, 2].max()
-    assert [cut.height_mm for cut in plan.cuts] == pytest.approx([(low + high) / 2, low])
+    assert [cut.path_mm[0, 2] for cut in plan.cuts] == pytest.approx([(low + high) / 2, low])
     for cut in plan.cuts:
         assert cut.closed
+        assert cut.axis is None  # level, from wherever the arms manage
         assert np.ptp(cut.path_mm[:, 2]) == 0
         steps = np.linalg.norm(np.diff(cut.path_mm, axis=0), axis=1)
         assert steps.max() <= PUBLISHED.spacing_mm + 1e-9
@@ -134,122 +133,30 @@ def test_the_published_plan_is_the_papers():
     deep = plan.cuts[0].path_mm[:, 1] > TUMOR_MM[1]
     assert off[deep].max() == pytest.approx(RADIUS_MM + 5, abs=0.8)
     assert off[~deep].min() < RADIUS_MM + 1
+    assert plan.facets.shape == (0, 4)
+    assert plan.lift == pytest.approx([0, 0, 1])
+    assert (plan.taken, plan.keep_mm) == (("tumor_1",), {})
 
 
-@pytest.mark.parametrize("margin_mm", [1.0, 3.0, 5.0, 10.0])
-def test_our_margin_round_a_sphere_is_exact(margin_mm):
+def test_the_published_piece_is_the_organ_over_the_lower_sweep_within_its_contour():
     seen = located()
-    config = ResectionConfig(margin_mm=margin_mm, layer_mm=2.0, most_healthy=1.0)
-    plan = plan_resection(seen, config)
-    whole = RADIUS_MM + margin_mm
-    for cut in plan.cuts:
-        flat = np.linalg.norm(cut.path_mm[:, :2] - TUMOR_MM[:2], axis=1)
-        if cut.kind == "wall":  # no nearer, and no farther than the next layer's outline
-            top = min(TUMOR_MM[2], cut.height_mm + 2.0)
-            outer = np.sqrt(max(whole**2 - (TUMOR_MM[2] - top) ** 2, 0))
-            assert flat.max() < outer + 0.15
-            assert flat.min() > outer - 0.6  # corners of a polygon, near the flat pole
-        distance = np.linalg.norm(cut.path_mm - TUMOR_MM, axis=1)
-        assert distance.min() > whole - 0.3
-    floor = min(layer.bottom_mm for layer in plan.layers)
-    assert floor == pytest.approx(TUMOR_MM[2] - whole, abs=0.05)
-    # The whole grown sphere below its equator comes away, and its column above.
-    rng = np.random.default_rng(1)
-    points = rng.uniform(-1, 1, (4000, 3)) * (whole + 2) + TUMOR_MM
-    off = np.linalg.norm(points - TUMOR_MM, axis=1)
-    assert inside(plan.layers, points[off < whole - 0.3]).all()
-    aside = np.linalg.norm(points[:, :2] - TUMOR_MM[:2], axis=1)
-    assert not inside(plan.layers, points[aside > whole + 0.15]).any()
-
-
-def test_uncertainty_widens_the_margin_and_too_much_of_it_is_no_plan():
-    seen = located(std_mm=1.5)
-    plain = plan_resection(seen, OURS)
-    wider = plan_resection(seen, ResectionConfig(sigmas=2.0))
-    low = [min(layer.bottom_mm for layer in plan.layers) for plan in (plain, wider)]
-    assert low[0] - low[1] == pytest.approx(3.0, abs=0.05)
-    assert wider.volumes_ml["healthy"] > plain.volumes_ml["healthy"]
-    with pytest.raises(NoPlan, match=r"20\.\d mm|unsure"):
-        plan_resection(located(std_mm=8.0), ResectionConfig(sigmas=2.0))
-    with pytest.raises(NoPlan, match="does not say how unsure"):
-        plan_resection(located(), ResectionConfig(sigmas=2.0))
-
-
-def test_only_kidney_is_cut_and_the_strokes_reach_beyond_it():
-    plan = plan_resection(located(), OURS)
-    walls = [cut for cut in plan.cuts if cut.kind == "wall"]
-    assert walls
-    assert not any(cut.closed for cut in walls)  # the tumor bulges out: one side is air
-    for cut in walls:
-        at_rest = (((cut.path_mm - MIDDLE_MM) / HALF_MM) ** 2).sum(1)
-        assert at_rest.min() < 1  # goes through the organ
-        ends = at_rest[[0, -1]]
-        assert (ends > 1).all()  # and out of it at both ends
-    heights = [cut.height_mm for cut in plan.cuts]
-    assert heights == sorted(heights, reverse=True)  # from the top down
-    gaps = [
-        np.linalg.norm(a.path_mm[-1] - b.path_mm[0])
-        for a, b in zip(plan.cuts, plan.cuts[1:], strict=False)
-    ]
-    assert max(gaps) < 25  # each begins on the side where the last one ended
-
-
-def turn_of(stroke):
-    """1: anticlockwise about the tumor, seen from above."""
-    x, y = (stroke.path_mm[:, :2] - TUMOR_MM[:2]).T
-    return np.sign((x[:-1] * np.diff(y) - y[:-1] * np.diff(x)).sum())
-
-
-def test_order_and_direction_of_strokes_can_be_chosen():
-    down = plan_resection(located(), OURS)
-    up = plan_resection(located(), ResectionConfig(order="up"))
-    heights = [stroke.height_mm for stroke in up.cuts]
-    assert heights == sorted(heights)
-    assert [stroke.sweep for stroke in up.cuts] == sorted(stroke.sweep for stroke in up.cuts)
-    assert {round(s.length_mm, 6) for s in up.cuts} == {round(s.length_mm, 6) for s in down.cuts}
-    for direction, sign in (("anticlockwise", 1), ("clockwise", -1)):
-        plan = plan_resection(located(), ResectionConfig(direction=direction))
-        for stroke in plan.cuts:
-            assert turn_of(stroke) == sign
-    walls = [stroke for stroke in down.cuts if stroke.kind == "wall"]
-    turns = [turn_of(wall) for wall in walls]
-    assert turns == [turns[0] * (-1) ** n for n in range(len(turns))]  # to and fro
-
-
-def test_the_floor_is_cut_where_the_next_layer_is_smaller():
-    plan = plan_resection(located(), ResectionConfig(stroke_mm=3.0))
-    lowest = polygon_of(plan.layers[-1].rings_mm)
-    strokes = [cut for cut in plan.cuts if cut.height_mm == plan.layers[-1].bottom_mm]
-    swept = shapely.union_all(
-        [shapely.LineString(cut.path_mm[:, :2]).buffer(3.0) for cut in strokes]
+    plan = plan_resection(seen, PUBLISHED)
+    outline = shapely.Polygon(plan.cuts[1].path_mm[:, :2])
+    points = np.random.default_rng(0).uniform(*seen.organ.box_mm, (20_000, 3))
+    within = shapely.contains_xy(outline, *points[:, :2].T) & (
+        points[:, 2] > seen.of(2)[:, 2].min()
     )
-    assert any(cut.kind == "floor" for cut in strokes)
-    across = np.sqrt(1 - ((strokes[0].height_mm - MIDDLE_MM[2]) / HALF_MM[2]) ** 2) * HALF_MM
-    organ = shapely.affinity.scale(shapely.Point(0, 0).buffer(1, 64), across[0], across[1])
-    there = lowest.intersection(organ)
-    assert there.area > 30
-    assert there.difference(swept).area < 0.05 * there.area
+    organ = contains(seen.organ, points)
+    assert (contains(plan.piece, points) == (within & organ)).mean() > 0.998
+    ml, piece_ml = plan.volumes_ml, (within & organ).sum() / organ.sum() * seen.organ.volume_ml
+    assert plan.piece.closed
+    assert plan.piece.volume_ml == pytest.approx(piece_ml, rel=0.04)
+    assert ml["piece"] == pytest.approx(piece_ml, rel=0.06)
+    assert ml["piece"] == pytest.approx(ml["tumor"] + ml["healthy"])
+    assert "kerf" not in ml  # level directions are the arms' choice
 
 
-def test_volumes_are_those_of_the_bodies():
-    seen = located()
-    plan = plan_resection(seen, OURS)
-    assert plan.volumes_ml["tumor"] == pytest.approx(4 / 3 * np.pi * 1.2**3, rel=0.05)
-    assert plan.volumes_ml["piece"] > plan.volumes_ml["tumor"]
-    surface_ml = {name: mesh.volume_mm3 / 1000 for name, mesh in seen.meshes.items()}
-    assert plan.volumes_ml["tumor"] == pytest.approx(surface_ml["tumor_1"])  # as `locate` states it
-    whole = plan.volumes_ml["parenchyma"] + plan.volumes_ml["tumor"]
-    assert whole == pytest.approx(surface_ml["kidney"]) == pytest.approx(plan.volumes_ml["organ"])
-    assert plan.volumes_ml["piece"] == pytest.approx(
-        plan.volumes_ml["tumor"] + plan.volumes_ml["healthy"], rel=1e-6
-    )
-
-
-def test_the_grasp_point_lies_on_the_piece():
-    plan = plan_resection(located(), OURS)
-    assert inside(plan.layers, plan.grasp_mm[None] - [0, 0, 1.0]).all()
-    on_tumor = np.linalg.norm(plan.grasp_mm - TUMOR_MM) - RADIUS_MM
-    assert abs(on_tumor) < 2.5  # the highest point in a column of 2 mm
+# Which tumor, and whether -------------------------------------------------------------------------
 
 
 def test_how_much_of_a_tumor_is_outside_is_told_apart():
@@ -261,8 +168,10 @@ def test_how_much_of_a_tumor_is_outside_is_told_apart():
     middle_out = (((TUMOR_MM - MIDDLE_MM) / HALF_MM) ** 2).sum() ** 0.5
     assert 0.2 < shares[3] < 0.8
     assert middle_out > 0.85
-    assert plan_resection(seen, OURS).tumor == "tumor_2"
     for config in (OURS, PUBLISHED):
+        plan = plan_resection(seen, config)
+        assert (plan.tumor, plan.label) == ("tumor_2", 3)
+        assert plan.exophytic == shares[3]
         with pytest.raises(NoPlan, match=r"tumor_1 lies wholly inside .* no contour"):
             plan_resection(seen, ResectionConfig(method=config.method, tumor="tumor_1"))
         with pytest.raises(NoPlan, match="wholly inside"):
@@ -271,20 +180,10 @@ def test_how_much_of_a_tumor_is_outside_is_told_apart():
         plan_resection(seen, ResectionConfig(tumor="tumor_7"))
 
 
-def test_a_cut_through_another_tumor_is_no_plan_and_a_swallowed_one_is_said():
-    bulging = sphere(TUMOR_MM, RADIUS_MM)
-    for far_mm in (19.0, 21.0):  # in the second the surface alone is grazed, no point of the cloud
-        beside = sphere(TUMOR_MM + [far_mm, 8, -4], 6)
-        with pytest.raises(NoPlan, match="would go through tumor_2"):
-            plan_resection(located(bulging, beside), OURS)
-    tiny = sphere(TUMOR_MM + [0.0, 14, 0], 1.8)
-    plan = plan_resection(located(bulging, tiny), ResectionConfig(tumor="tumor_1", margin_mm=8))
-    assert any("tumor_2 comes away" in note for note in plan.notes)
-
-
-def test_too_much_healthy_tissue_is_no_plan():
+@pytest.mark.parametrize("config", [PUBLISHED, OURS], ids=["published", "margin"])
+def test_too_much_healthy_tissue_is_no_plan(config):
     with pytest.raises(NoPlan, match="healthy tissue would come away"):
-        plan_resection(located(), ResectionConfig(most_healthy=0.05))
+        plan_resection(located(), ResectionConfig(method=config.method, most_healthy=0.02))
 
 
 @pytest.mark.parametrize("kept", [0, 12])
@@ -293,42 +192,86 @@ def test_a_tumor_of_few_points_is_no_plan(kept):
     keep = np.concatenate(
         [np.flatnonzero(seen.labels == 1), np.flatnonzero(seen.labels == 2)[:kept]]
     )
-    few = type(seen)(seen.points_mm[keep], seen.labels[keep])
+    few = Located(seen.points_mm[keep], seen.labels[keep])
     with pytest.raises(NoPlan, match="no tumor was located" if kept == 0 else "only 12 points"):
         plan_resection(few, PUBLISHED)
-    for gone in seen.meshes:
-        others = {name: mesh for name, mesh in seen.meshes.items() if name != gone}
-        part = gone if gone.startswith("tumor") else "the organ"
-        with pytest.raises(NoPlan, match=f"{part} has no surface"):
-            plan_resection(replace(seen, meshes=others), OURS)
-    bare = type(seen)(seen.points_mm[:0], seen.labels[:0])
+    bare = Located(seen.points_mm[:0], seen.labels[:0])
     with pytest.raises(NoPlan, match="no organ"):
         plan_resection(bare, PUBLISHED)
 
 
 @pytest.mark.parametrize("config", [PUBLISHED, OURS], ids=["published", "margin"])
+def test_what_has_no_surface_is_no_plan(config):
+    seen = located()
+    for gone in seen.meshes:
+        others = {name: mesh for name, mesh in seen.meshes.items() if name != gone}
+        part = gone if gone.startswith("tumor") else "the organ"
+        with pytest.raises(NoPlan, match=f"{part} has no surface"):
+            plan_resection(replace(seen, meshes=others), config)
+    open_organ = Mesh(seen.organ.vertices_mm, seen.organ.faces[:-40])
+    with pytest.raises(InputError, match="organ"):
+        plan_resection(replace(seen, meshes={**seen.meshes, "kidney": open_organ}), config)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"margin_mm": -1},
+        {"margin_mm": 20.1},
+        {"margin_mm": float("nan")},
+        {"sigmas": -0.1},
+        {"spacing_mm": 0.1},
+        {"lead_mm": 31.0},
+        {"most_facets": 0},
+        {"most_facets": 13},
+        {"least_exophytic": 1.1},
+        {"most_healthy": -0.1},
+        {"most_margin_mm": 19.0},
+    ],
+)
+def test_nonsense_is_refused(wrong):
+    (name,) = wrong
+    with pytest.raises(InputError, match=name):
+        ResectionConfig(**wrong)
+
+
+# A plan as a value --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("config", [PUBLISHED, OURS], ids=["published", "margin"])
 def test_a_plan_comes_back_from_json(config):
     plan = plan_resection(located(), config)
-    again = from_plain(as_builtins(plan))
-    assert as_builtins(again) == as_builtins(plan)
-    assert again.layers[0].top_mm == np.inf
+    data = as_builtins(plan)
+    again = from_plain(data, plan.piece)
+    assert as_builtins(again) == data
+    assert again.facets.shape == plan.facets.shape
+    assert [cut.axis is None for cut in again.cuts] == [cut.axis is None for cut in plan.cuts]
+    # What is stored to fewer digits is still in its plane, and keeps what it kept.
+    for cut, plane in zip(again.cuts, again.facets, strict=False):
+        assert np.abs(cut.path_mm @ plane[:3] - plane[3]).max() < 0.02
+    with pytest.raises(KeyError):
+        from_plain(data, None)
 
 
 @pytest.mark.parametrize("config", [PUBLISHED, OURS], ids=["published", "margin"])
 def test_a_turned_and_shifted_world_has_a_turned_and_shifted_plan(config):
+    """Ours up to the directions that are tried, which stay."""
     seen = located(n=20_000)
     turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
     shift = np.array([40.0, -13.0, 6.0])
-    moved = type(seen)(
-        seen.points_mm @ turn.T + shift,
-        seen.labels,
-        {name: mesh.moved(mesh.vertices_mm @ turn.T + shift) for name, mesh in seen.meshes.items()},
-    )
-    a, b = plan_resection(seen, config), plan_resection(moved, config)
-    assert b.grasp_mm == pytest.approx(turn @ a.grasp_mm + shift, abs=1.6)
-    assert b.volumes_ml["healthy"] == pytest.approx(a.volumes_ml["healthy"], rel=0.05)
-    length = [sum(cut.length_mm for cut in plan.cuts) for plan in (a, b)]
-    assert length[1] == pytest.approx(length[0], rel=0.06)
+    b_from_a = np.eye(4)
+    b_from_a[:3, :3], b_from_a[:3, 3] = turn, shift
+    a, b = plan_resection(seen, config), plan_resection(seen.moved(b_from_a), config)
+    published = config is PUBLISHED
+    assert b.grasp_mm == pytest.approx(turn @ a.grasp_mm + shift, abs=1.6 if published else 6.0)
+    lost = [plan.volumes_ml["healthy"] + plan.volumes_ml.get("kerf", 0.0) for plan in (a, b)]
+    assert lost[1] == pytest.approx(lost[0], rel=0.05 if published else 0.25)
+    if published:
+        length = [sum(cut.length_mm for cut in plan.cuts) for plan in (a, b)]
+        assert length[1] == pytest.approx(length[0], rel=0.06)
+
+
+# Against the truth --------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("finer", "margin_mm"), [(0, 2.0), (1, 2.0), (1, 5.0)])
@@ -342,15 +285,8 @@ def test_coarse_surfaces_are_cut_through_and_keep_the_margin(finer, margin_mm):
     done = cut_out(Anatomy((organ, tumor)), plan)
     assert done.detached
     assert done.removed_share == 1.0
-    assert done.margin_mm > margin_mm - 0.3
-    assert planned_budget(plan, seen).margin_mm == pytest.approx(done.margin_mm, abs=0.4)
-
-
-def test_nonsense_is_refused():
-    with pytest.raises(InputError, match="margin_mm is -1; allowed: 1 to 20"):
-        ResectionConfig(margin_mm=-1)
-    with pytest.raises(InputError, match="layer from 5 up to 5"):
-        CutLayer(5.0, 5.0, ())
+    assert margin_mm <= done.margin_mm < margin_mm + 0.3
+    assert planned_budgets(plan, seen)[0].margin_mm == pytest.approx(done.margin_mm, abs=0.3)
 
 
 @pytest.mark.parametrize("off_mm", [-1.5, 0.0, 1.5])
@@ -361,12 +297,12 @@ def test_the_piece_comes_free_of_an_organ_that_is_a_little_larger_than_was_estim
     done = cut_out(Anatomy((mesh_of(solid_of(ball, "o") + solid_of(tumor, "t")), tumor)), plan)
     assert done.detached
     assert done.removed_share == 1.0
-    assert done.margin_mm > 4.5
+    assert done.margin_mm > 4.9
 
 
-def test_an_organ_that_reaches_into_the_next_layer_is_not_left_hanging_on_it():
-    """Estimated to end 1 mm above the lowest layer, it ends 0.7 mm within."""
-    tumor = sphere([10.0, -30.0, 135.0], RADIUS_MM)
+def test_an_organ_that_reaches_deeper_than_was_estimated_is_cut_through():
+    """A slab whose lower side was estimated 1.7 mm too high."""
+    tumor = sphere([10.0, -30.0, 140.0], RADIUS_MM)
 
     def slab(bottom_mm):
         box = trimesh.creation.box(bounds=[[-55, -30, bottom_mm], [55, 30, 150]])
@@ -375,12 +311,12 @@ def test_an_organ_that_reaches_into_the_next_layer_is_not_left_hanging_on_it():
     estimated, true = slab(123.0), slab(121.3)
     rng = np.random.default_rng(0)
     points = rng.uniform(*estimated.box_mm, (20_000, 3))
-    in_tumor = np.linalg.norm(points - [10.0, -30.0, 135.0], axis=1) < RADIUS_MM
+    in_tumor = np.linalg.norm(points - [10.0, -30.0, 140.0], axis=1) < RADIUS_MM
     in_slab = (np.abs(points[:, 1]) < 30) & (points[:, 2] > 123)
     labels = np.where(in_tumor, 2, in_slab).astype(np.uint8)
     seen = Located(points[labels > 0], labels[labels > 0], {"kidney": estimated, "tumor_1": tumor})
     plan = plan_resection(seen, OURS)
-    assert min(layer.bottom_mm for layer in plan.layers) == pytest.approx(118, abs=0.05)
     done = cut_out(Anatomy((true, tumor)), plan)
     assert done.detached
     assert done.removed_share == 1.0
+    assert done.margin_mm > 5.0

@@ -13,12 +13,12 @@ import pytest
 import trimesh
 from PIL import Image
 
-from arm_objects import organ, plan
 from live_objects import small_estimate, small_update
-from plan_objects import Deviating, located
+from plan_objects import Deviating, located, sphere
 from reports import reporting
 from stories import answered, looking_down, succeeded, tumortrack
 from tumortrack.core import store
+from tumortrack.core.errors import NoPlan
 from tumortrack.core.evidence import Held
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import SensorCloud
@@ -30,6 +30,8 @@ from tumortrack.sense.region import Hints, organ_points
 from tumortrack.tracking.model_files import load_model
 from tumortrack.tracking.tracker import Tracker, region_for
 from tumortrack_devices.pulled import PulledStates
+from tumortrack_resection.arms import procedure as arms_procedure
+from tumortrack_resection.arms.body import cell_urdf
 from tumortrack_resection.arms.cell import ArmCell
 from tumortrack_resection.arms.config import Base, CellConfig
 from tumortrack_resection.arms.procedure import plan_motions
@@ -39,6 +41,7 @@ from tumortrack_resection.files import PlanFolder, read_plan, write_plan
 from tumortrack_resection.grip import Grip, held_std_mm
 from tumortrack_resection.motions import (
     ABORTED,
+    HOLD,
     HOLDER,
     LIFT,
     PULL,
@@ -48,14 +51,22 @@ from tumortrack_resection.motions import (
     Motions,
     MotionStage,
 )
-from tumortrack_resection.operation import Following, Operation, OperationConfig, Planned
+from tumortrack_resection.operation import (
+    Following,
+    Operation,
+    OperationConfig,
+    Planned,
+    ResectionProgress,
+)
+from tumortrack_resection.resection import plan_resection
 from tumortrack_resection.values import ResectionConfig
 
 STATES = ("approach", "grasp", "hold", PULL, TAUT, "sweep 1", LIFT, "release", "home")
 GRIPPING = (PULL, TAUT, "sweep 1")
 PULL_MM = 4.0
 FAR = Base(position_mm=(5000.0, 0.0, 100.0), yaw_deg=0.0)
-LOCATED = located(n=2_000)
+LOCATED = located(sphere((12.0, -14.0, 165.0), 10.0), n=6_000)
+PLAN = plan_resection(LOCATED, ResectionConfig(method="published"))
 FRAMES = PublishedFrame(
     "table", np.array([[1.0, 0, 0, 5.0], [0, -1, 0, -8.0], [0, 0, -1, 300.0], [0, 0, 0, 1]])
 )
@@ -89,7 +100,7 @@ class Procedure:
     def __init__(self, replan=None):
         self.shift_mm, self.now_s = np.zeros(3), 0.0
         config = OperationConfig(settled_s=0.1)
-        planned, grip = Planned(plan(), LOCATED.meshes, motions()), Grip(tip_mm, 1.2)
+        planned, grip = Planned(PLAN, LOCATED.meshes, motions()), Grip(tip_mm, 1.2)
         draw = lambda joints: ()  # noqa: E731
         self.operation = Operation(planned, config, draw, Following(self.locate, replan, grip=grip))
 
@@ -166,38 +177,36 @@ def test_a_tip_that_moves_is_less_sure_of_where_it_is():
     assert grip.evidence(CAMERA_FROM_TABLE, 0)[0].std_mm == pytest.approx(1.2)
 
 
-@pytest.mark.parametrize(
-    ("far_mm", "words"), [(PULL_MM, "has moved by 4.0 mm"), (0.5, "planning anew")]
-)
-def test_the_pull_itself_halts_nothing_and_then_it_is_planned_on_the_pulled_tumor(far_mm, words):
+@pytest.mark.parametrize(("far_mm", "kind"), [(PULL_MM, "moved"), (0.5, "planning")])
+def test_the_pull_itself_halts_nothing_and_then_it_is_planned_on_the_pulled_tumor(far_mm, kind):
     plans = []
 
-    def replan(update, joints_rad, progress):
+    def replan(update, joints_rad, progress, facets):
+        assert facets is PLAN.facets
         plans.append((joints_rad[6], progress))
         meshes = procedure.locate(update).meshes
         later = Motions(motions(STATES[5:]).stages)
         for stage in later.stages:
             stage.joints_rad[:, 6] = np.maximum(stage.joints_rad[:, 6], PULL_MM)
         work = Future()
-        work.set_result(Planned(plan(), meshes, later))
+        work.set_result(Planned(PLAN, meshes, later))
         return work
 
     procedure = Procedure(replan)
     procedure.until(PULL)
     for _ in range(20):
         procedure.shift_mm = np.array([0.0, 0.0, procedure.operation._grip.pulled_mm])
-        assert not procedure.frame().halted
+        assert procedure.frame().halt is None
     while procedure.frame().state == PULL:
         pass
     procedure.shift_mm = np.array([0.0, 0.0, far_mm])
-    assert words in procedure.frame().halted
+    assert procedure.frame().halt.kind == kind
     procedure.until("sweep 1")
     ((height_mm, progress),) = plans
     assert height_mm == pytest.approx(PULL_MM)
-    assert progress.holds
-    assert progress.done_mm is None  # so the new plan begins with its first sweep
+    assert progress == ResectionProgress(holds=True, done=0)  # it begins with its first sweep
     assert len(procedure.held) == 1  # with the same point, though no stage of the new plan took it
-    assert not procedure.frame().halted
+    assert procedure.frame().halt is None
 
 
 def test_a_grip_that_slips_halts_the_arms():
@@ -206,9 +215,8 @@ def test_a_grip_that_slips_halts_the_arms():
     slipped = [{"name": "held", "std_mm": 1.2, "off_mm": 11.6, "news": 0.0, "left_out": True}]
     for quality in ("good", "poor"):  # whatever else is thought of it
         cell = procedure.frame(seen(quality, evidence=slipped))
-        assert cell.halt.kind == "slipped"
-        assert "11.6 mm" in cell.halted
-    assert not procedure.frame(seen(evidence=[{**slipped[0], "left_out": False}])).halted
+        assert (cell.halt.kind, cell.halt.values["off_mm"]) == ("slipped", 11.6)
+    assert procedure.frame(seen(evidence=[{**slipped[0], "left_out": False}])).halt is None
 
 
 def test_bounds_count_as_three_deviations():
@@ -216,27 +224,50 @@ def test_bounds_count_as_three_deviations():
     assert held_std_mm(budget) == 1.0  # what the calibration errs is in both ends of the way
 
 
-def test_arms_are_planned_to_pull_and_a_plan_without_its_pull_is_refused(tmp_path):
+@pytest.fixture(scope="module")
+def taut():
+    """A workcell that pulls, and what was planned in it."""
     config = CellConfig(pull_mm=PULL_MM)
-    cell = ArmCell(config, organ())
-    made = plan_motions(plan(), cell, cell.organ)
-    assert [stage.name for stage in made.stages][:6] == [
-        "approach", "grasp", "hold", PULL, TAUT, "sweep 1",
-    ]  # fmt: skip
+    return config, *plan_motions(LOCATED, ResectionConfig(most_facets=3), config)
+
+
+def test_arms_are_planned_to_pull_and_a_plan_without_its_pull_is_refused(taut, tmp_path):
+    config, plan, made = taut
+    sweeps = [f"sweep {n}" for n in range(1, plan.sweeps + 1)]
     named = {stage.name: stage for stage in made.stages}
+    assert list(named) == ["approach", "grasp", HOLD, PULL, TAUT, *sweeps, LIFT, "release", "home"]
+    cell = ArmCell(config, LOCATED.organ)
     begin, end = (cell.tips(named[PULL].joints_rad[n])[HOLDER][:3, 3] for n in (0, -1))
-    assert end - begin == pytest.approx([0.0, 0.0, PULL_MM], abs=0.02)
+    assert end - begin == pytest.approx(PULL_MM * plan.lift, abs=0.02)
     assert np.ptp(named[TAUT].joints_rad, axis=0).max() == 0
-    meshes = {"kidney": cell.organ, "tumor_1": cell.organ}
     content = PlanFolder(
-        plan(), ResectionConfig(), PublishedFrame("table"), meshes, ErrorBudget(margin_mm=5.0),
-        config, made,
+        plan, ResectionConfig(), PublishedFrame("table"), LOCATED.meshes,
+        (ErrorBudget(part="tumor_1", margin_mm=5.0),), config, made,
     )  # fmt: skip
     write_plan(tmp_path / "plan", content, {}, lambda folder: None)
     assert [s.name for s in read_plan(tmp_path / "plan").motions.stages] == list(named)
     still = replace(content, cell=msgspec.structs.replace(config, pull_mm=0.0))
-    with pytest.raises(Exception, match="its stages are approach, grasp, hold, pull"):
+    with pytest.raises(NoPlan, match="its stages are approach, grasp, hold, pull"):
         write_plan(tmp_path / "still", still, {}, lambda folder: None)
+
+
+def test_what_is_taut_is_cut_along_the_same_facets_where_it_lies_now(taut, monkeypatch):
+    config, plan, made = taut
+    urdf = cell_urdf(config)
+    monkeypatch.setattr(
+        arms_procedure, "_setting", [(ResectionConfig(most_facets=3), config, urdf)]
+    )
+    here = next(stage.joints_rad[-1] for stage in made.stages if stage.name == TAUT)
+    up_mm = PULL_MM * plan.lift
+    meshes = {n: mesh.moved(mesh.vertices_mm + up_mm) for n, mesh in LOCATED.meshes.items()}
+    pulled = replace(LOCATED, points_mm=LOCATED.points_mm + up_mm, meshes=meshes)
+    anew = arms_procedure.replan(pulled, here, ResectionProgress(holds=True), plan.facets)
+    assert [stage.name for stage in anew.motions.stages] == [s.name for s in made.stages[5:]]
+    assert anew.plan.facets[:, :3] == pytest.approx(plan.facets[:, :3])
+    assert anew.plan.facets[:, 3] == pytest.approx(plan.facets[:, 3] + plan.facets[:, :3] @ up_mm)
+    assert anew.plan.least_mm["tumor_1"] > 4.7
+    holder_rad = np.concatenate([s.joints_rad[:, 6:] for s in anew.motions.stages[: plan.sweeps]])
+    assert np.ptp(holder_rad, axis=0).max() == 0  # it pulls on, and does not pull again
 
 
 @pytest.fixture(scope="module")
@@ -312,7 +343,7 @@ def test_arms_that_stand_advise_touches_that_they_reach(pulled):
             lambda update: replace(LOCATED, meshes=meshes), reach=partial(ArmsReach, config)
         )
         return Operation(
-            Planned(plan(), meshes, standing), OperationConfig(), lambda joints_rad: (), live
+            Planned(PLAN, meshes, standing), OperationConfig(), lambda joints_rad: (), live
         )
 
     update = replace(seen(), estimate=estimate)

@@ -58,7 +58,8 @@ def test_parts_differ_for_every_colour_vision(vision: str) -> None:
 def test_truth_and_cuts_are_no_parts(vision: str) -> None:
     strokes = [colours.sweep_colour(n, 5) for n in range(1, 6)]
     for part in (part_colour(1), part_colour(2), part_colour(3)):
-        for other in (colours.TRUTH, colours.NOW, colours.TO_CUT, colours.PIECE, *strokes):
+        drawn = colours.TRUTH, colours.NOW, colours.TO_CUT, colours.PIECE, colours.ENERGISED
+        for other in (*drawn, *strokes):
             assert apart(part, other, vision) >= 15
 
 

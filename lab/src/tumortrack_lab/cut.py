@@ -1,310 +1,247 @@
 """A plan made on the estimate cuts the true anatomy: what is removed, and the margins.
 
-The planner's own volumes are not used. The true organ is voxelised, faces between voxels are
-severed where a stroke or a level sheet passes between their centres, and the largest connected
-piece is what stays. Tissue does not move while it is cut. No voxel is removed, so that a cut has
-no volume and leaves no diagonal way through.
+The planner's own volumes are not used. The instrument is a line with a thickness: the true organ is
+voxelised, and all that comes within the electrode's radius of its axis, over its whole bare length,
+while it is energised, is gone. Tissue does not move while it is cut.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, UInt8
-from scipy.ndimage import binary_dilation, binary_erosion, label
-from scipy.spatial import cKDTree
+from jaxtyping import Bool, Float, Int
+from scipy.ndimage import label, maximum_filter
+from scipy.spatial.transform import Rotation
 
+from tumortrack.core.compiled import njit
 from tumortrack.core.errors import InputError
-from tumortrack.core.types import ORGAN, Anatomy
-from tumortrack.imaging.raster import expand, label_grid
+from tumortrack.core.geometry import rigid, transform_points
+from tumortrack.core.mesh_query import contains, surface_distance
+from tumortrack.core.types import ORGAN, Anatomy, Mesh
+from tumortrack.imaging.raster import label_grid
 from tumortrack.report.metrics import distance_to_surface
-from tumortrack_resection.values import Cut, CutLayer, ResectionPlan
+from tumortrack_resection.values import ResectionPlan
 
-Flat = Float[np.ndarray, "_ 2"]
-Points = Float[np.ndarray, "_ 3"]
-Mask = Bool[np.ndarray, "i j"]
+Points = Float[np.ndarray, "n 3"]
 Voxels = Bool[np.ndarray, "i j k"]
 
-# In voxels: with this offset no line runs exactly through a voxel's centre, where rounding would
-# decide on which side it passes. So closed lines separate inside from outside.
-_ASIDE = 1e-7 * np.sqrt([2.0, 3.0])
 VOXEL_MM = 0.5
-SAMPLES_MM = 0.4  # between points of the cut's surface
-_SAME_MM = 1e-6  # of heights
-_BESIDE_MM = 0.5  # an outline this close to a stroke is cut: its chords leave it by less
-_TEARS_MM2 = 2.0  # a thinner bridge tears when the piece is lifted
+ELECTRODE_MM, RADIUS_MM = 70.0, 1.2  # of the bare electrode
+STEP_MM = 0.3  # between poses: the kerf's walls are rough by 0.01 mm
+# The grid is askew, so that a plane along the axes passes its voxels' centres at all distances.
+_ASKEW = Rotation.from_rotvec([0.11, 0.17, 0.23]).as_matrix()
+_ALONG_MM = 3.0, 0.5  # samples of the electrode: to find the poses that are nearest, and of these
+_SOME = 29  # every so many samples give a bound of the least distance
+_ROUGH_MM = 0.2  # by which ``surface_distance`` errs at most, twice
+_TEARS = 0.5  # voxels: so thin a layer of tissue beside the kerf tears when the piece is lifted
+_REACH_MM = 10.0  # the cup holds nothing farther from where it was to touch
+_CUP_MM = 3.0  # it holds what lies so near to the first tissue that it meets
+_STAYS = 0.35  # of all tissue: a smaller part beside the held one is not what stays
+_PART = 4.0  # voxels: a box of voxels is looked through for so much of an axis
 _ML = 1e-3  # of a mm3
 
 
-class Severed:
-    """Which faces between neighbouring voxels of a grid are cut; axis by axis, face n between
-    voxels n and n + 1."""
+@dataclass(frozen=True, eq=False)
+class Swept:
+    """Where the electrode was energised: the tip and the rear end of its bare axis at each pose, in
+    steps of at most ``STEP_MM``, table frame, mm; and its radius."""
 
-    def __init__(self, shape: tuple[int, int, int]) -> None:
-        self.shape = shape
-        self.faces = [
-            np.zeros(tuple(n - (axis == a) for a, n in enumerate(shape)), bool) for axis in range(3)
-        ]
+    ends_mm: Float[np.ndarray, "n 2 3"]
+    radius_mm: float = RADIUS_MM
 
-    def wall(self, path: Flat, first: int, stop: int) -> None:
-        """Cut along a line (x and y in voxels), in the levels first .. stop - 1."""
-        i, j, _ = self.shape
-        path = path + _ASIDE
-        self.faces[0][:, :, first:stop] |= (_crossings(path, (i, j))[1:-1] > 0)[:, :, None]
-        across = _crossings(path[:, ::-1], (j, i))[1:-1].T
-        self.faces[1][:, :, first:stop] |= (across > 0)[:, :, None]
-
-    def sheet(self, columns: Mask, level: int) -> None:
-        """Cut these columns level, between the levels level - 1 and level."""
-        if 0 < level < self.shape[2]:
-            self.faces[2][:, :, level - 1] |= columns
+    def __post_init__(self) -> None:
+        if not len(self.ends_mm):
+            raise InputError("the electrode is never energised, so that nothing is cut.")
 
 
-def within(rings: tuple[Flat, ...], shape: tuple[int, int]) -> Mask:
-    """Which of the points (i, j), i < shape[0], j < shape[1], lie within rings (the first point not
-    repeated) by the even-odd rule."""
-    counts = np.zeros((shape[0] + 1, shape[1]), int)
-    for ring in rings:
-        counts += _crossings(_closed(ring) + _ASIDE, shape)
-    return np.cumsum(counts, axis=0)[:-1] % 2 == 1
-
-
-def _closed(ring: Flat) -> Flat:
-    return np.concatenate([ring, ring[:1]])
-
-
-def _crossings(path: Flat, shape: tuple[int, int]) -> Int[np.ndarray, "i j"]:
-    """How often a line crosses each row j just before point i; (shape[0] + 1, shape[1])."""
-    start, end = path[:-1], path[1:]
-    low, high = np.minimum(start[:, 1], end[:, 1]), np.maximum(start[:, 1], end[:, 1])
-    first = np.clip(np.ceil(low), 0, shape[1]).astype(int)
-    stop = np.clip(np.ceil(high), 0, shape[1]).astype(int)
-    part, step = expand(np.maximum(stop - first, 0))
-    row = first[part] + step
-    share = (row - start[part, 1]) / (end[part, 1] - start[part, 1])
-    at = start[part, 0] + share * (end[part, 0] - start[part, 0])
-    counts = np.zeros((shape[0] + 1, shape[1]), int)
-    np.add.at(counts, (np.clip(np.ceil(at), 0, shape[0]).astype(int), row), 1)
-    return counts
-
-
-def pieces_of(tissue: Voxels, severed: Severed) -> Int[np.ndarray, "i j k"]:
-    """Pieces connected over faces that are not severed: 1 is the largest; 0: no tissue."""
-    # On a grid of half the spacing, with a cell for each voxel and for each face that holds.
-    cells = np.zeros([2 * n - 1 for n in tissue.shape], bool)
-    cells[::2, ::2, ::2] = tissue
-    for axis, cut in enumerate(severed.faces):
-        before = (slice(None),) * axis
-        low, high = (*before, slice(None, -1)), (*before, slice(1, None))
-        between = tuple(slice(int(a == axis), None, 2) for a in range(3))
-        cells[between] = tissue[low] & tissue[high] & ~cut
-    pieces = label(cells, output=np.int32)[0][::2, ::2, ::2]
-    sizes = np.bincount(pieces[tissue])
-    rank = np.argsort(np.argsort(-sizes, kind="stable")) + 1
-    return np.where(tissue, rank[pieces], 0)
+def swept_by(
+    plan: ResectionPlan, electrode_mm: float = ELECTRODE_MM, radius_mm: float = RADIUS_MM
+) -> Swept:
+    """The poses of a plan that is followed exactly. Raises InputError: a cut has no direction of
+    the electrode, as in the method ``published``."""
+    ends = []
+    for stroke in plan.cuts:
+        if stroke.axis is None:
+            raise InputError(
+                f"sweep {stroke.sweep} does not say how the electrode lies; give poses of motions."
+            )
+        path = stroke.path_mm
+        way = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1)))
+        at = np.unique(np.append(way, np.arange(0, way[-1], STEP_MM)))
+        tips = np.column_stack([np.interp(at, way, axis) for axis in path.T])
+        ends.append(np.stack([tips, tips - electrode_mm * stroke.axis], axis=1))
+    return Swept(np.concatenate(ends), radius_mm)
 
 
 @dataclass(frozen=True)
 class CutResult:
-    """Effects of a cut on the true anatomy. The piece is what the layers enclose."""
+    """Effects of a cut on the true anatomy. The piece is what the cup holds; what stays is the
+    largest part of the rest, if that is a third of all or more; else nothing has come free."""
 
     tumor_ml: float  # true volume of the tumor that was to come away
-    removed_share: float  # of it, what came away within the piece
-    loose_share: float  # of it, what came off beside the piece, for a cut went through the tumor
-    enclosed_share: float  # of it, what lies within the layers, whether or not they came free
-    healthy_ml: float  # organ without tumors that has come away, within the piece or beside it
+    removed_share: float  # of it, what came away whole, in the piece
+    cut_share: float  # of it, what the electrode destroyed
+    left_share: float  # of it, all else: in what stays, or loose beside the piece
+    healthy_ml: float  # parenchyma that is lost: in the piece, in kerfs, and loose beside it
+    kerf_ml: float  # of that, in kerfs
+    kerf_area_mm2: float  # of what stays, the surface that kerfs laid open: the wound
     piece_ml: float  # 0 where it did not come free
     detached: bool  # whether the piece came free
-    # Area of the piece's outline that lies in tissue and that no stroke went along. Less than 2 mm2
-    # tears, and counts as cut.
-    bridge_mm2: float
-    # Least distance between a cut within tissue and the tumor's surface; negative: this deep the
-    # cut went into the tumor. None where nothing was cut at all.
-    margin_mm: float | None
-    hurt: tuple[str, ...]  # other tumors that were cut into
+    # Least distance between the surfaces of the energised electrode and of the tumor. 0: it
+    # touched; negative: its axis went so deep into the tumor.
+    margin_mm: float
+    hurt: tuple[str, ...]  # other tumors that the energised electrode touched
 
     @property
     def left_ml(self) -> float:
-        """Tumor that does not come away with the piece."""
-        return self.tumor_ml * (1 - self.removed_share)
+        return self.tumor_ml * self.left_share
 
 
-def cut(truth: Anatomy, plan: ResectionPlan, voxel_mm: float = VOXEL_MM) -> CutResult:
-    """Cut the true anatomy (table frame, mm) by a plan.
+def cut(
+    truth: Anatomy, plan: ResectionPlan, swept: Swept | None = None, voxel_mm: float = VOXEL_MM
+) -> CutResult:
+    """Cut the true anatomy (table frame, mm) by a plan that is followed exactly, or by the poses of
+    its motions.
 
-    Cut are walls, along the strokes alone, each from the bottom to the top of the layer in which
-    its stroke lies; and level sheets, at the bottom of each layer where none goes on below. Raises
-    InputError: the truth lacks the plan's tumor, or a stroke lies in none of its layers.
+    Pieces hang together over faces between voxels, but not through a layer beside a kerf that is
+    thinner than half a voxel. Raises InputError: the truth lacks the plan's tumor; without poses, a
+    cut of the plan does not say how the electrode lies.
     """
     if plan.tumor not in truth.names[1:]:
         raise InputError(
             f"the plan is for {plan.tumor}, which is not among the anatomy's parts: "
             f"{', '.join(truth.names)}."
         )
-    cutting, number = _Cutting(truth, plan, voxel_mm), truth.names.index(plan.tumor)
-    bridge_mm2 = cutting.bridge_mm2()
-    labels = cutting.labels
+    swept, number = swept or swept_by(plan), truth.names.index(plan.tumor)
+    margins_mm = {
+        name: electrode_margin_mm(part, swept)
+        for name, part in zip(truth.names[1:], truth.tumors, strict=True)
+    }
+    table_from_index, shape = _grid(truth, voxel_mm)
+    labels = label_grid(truth, table_from_index, shape)
     tissue, tumor = labels > 0, labels == ORGAN + number
-    pieces = pieces_of(tissue, cutting.severed(torn=bridge_mm2 < _TEARS_MM2))
-    enclosed = cutting.enclosed() & tissue
-    largest = int(np.bincount(pieces[enclosed], minlength=1).argmax())  # 0: nothing enclosed
-    piece = pieces == largest if largest > 1 else np.zeros_like(tissue)
-    surface = cutting.surface()
-    labels_there = cutting.at(surface)
-    surface, labels_there = surface[labels_there > 0], labels_there[labels_there > 0]
-    deep, margin_mm = surface[labels_there == ORGAN + number], None
-    if len(deep):
-        margin_mm = -float(distance_to_surface(deep, truth.parts[number]).max())
-    elif len(surface):
-        margin_mm = float(distance_to_surface(surface, truth.parts[number]).min())
-    voxel_ml = voxel_mm**3 * _ML
+    index_from_table = np.linalg.inv(table_from_index)
+    radius = swept.radius_mm / voxel_mm
+    near = np.full(shape, (radius + 1) ** 2, np.float32)
+    ends = transform_points(index_from_table, swept.ends_mm.reshape(-1, 3)).reshape(-1, 2, 3)
+    _approach(ends, radius + 1, near)
+    kerf = tissue & (near <= radius**2)
+    pieces = _pieces(tissue & ~kerf, near > (radius + _TEARS) ** 2)
+    held = _held(pieces, transform_points(index_from_table, plan.grasp_mm[None])[0], voxel_mm)
+    sizes = np.bincount(pieces[pieces > 0], minlength=2)
+    sizes[held] *= sizes[np.arange(len(sizes)) != held].max() < _STAYS * sizes.sum()
+    stays = int(sizes.argmax())
+    detached = held not in (0, stays)
+    rest, piece = pieces == stays, (pieces == held) & detached
+    voxel_ml, tumors = voxel_mm**3 * _ML, max(1, int(tumor.sum()))
+    removed, destroyed = (float((of & tumor).sum()) / tumors for of in (piece, kerf))
     return CutResult(
         tumor_ml=float(tumor.sum()) * voxel_ml,
-        removed_share=_share(piece, tumor),
-        loose_share=_share((pieces > 1) & ~piece, tumor),
-        enclosed_share=_share(enclosed, tumor),
-        healthy_ml=float(((pieces > 1) & (labels == ORGAN)).sum()) * voxel_ml,
+        removed_share=removed,
+        cut_share=destroyed,
+        left_share=max(0.0, 1 - removed - destroyed),
+        healthy_ml=float(((labels == ORGAN) & ~rest).sum()) * voxel_ml,
+        kerf_ml=float(((labels == ORGAN) & kerf).sum()) * voxel_ml,
+        kerf_area_mm2=_wound(rest, kerf, near) * voxel_mm**2,
         piece_ml=float(piece.sum()) * voxel_ml,
-        detached=largest > 1,
-        bridge_mm2=bridge_mm2,
-        margin_mm=margin_mm,
-        hurt=tuple(
-            truth.names[n]
-            for n in range(1, len(truth.names))
-            if n != number and (labels_there == ORGAN + n).any()
-        ),
+        detached=detached,
+        margin_mm=margins_mm.pop(plan.tumor),
+        hurt=tuple(name for name, margin_mm in margins_mm.items() if margin_mm <= 0),
     )
 
 
-class _Cutting:
-    """A plan in the true anatomy, whose voxel (i, j, k) lies at low_mm + voxel_mm (i, j, k).
-    ``walls``: strokes along outlines, with the layer whose wall each cuts; ``box_mm``: of the
-    organ, beyond which nothing is looked at."""
-
-    def __init__(self, truth: Anatomy, plan: ResectionPlan, voxel_mm: float) -> None:
-        self.layers, self.box_mm, self.voxel_mm = plan.layers, truth.organ.box_mm, voxel_mm
-        corners = np.concatenate([part.box_mm for part in truth.parts])
-        self.low_mm = low_mm = corners.min(0) - voxel_mm
-        # The lowest layer's bottom lies midway between two levels, so that half a voxel all over
-        # the largest sheet is no bias of the volumes.
-        bottom_mm = min(layer.bottom_mm for layer in plan.layers) + voxel_mm / 2
-        low_mm[2] = bottom_mm - voxel_mm * np.ceil((bottom_mm - low_mm[2]) / voxel_mm)
-        i, j, k = (np.ceil((corners.max(0) - low_mm) / voxel_mm) + 2).astype(int).tolist()
-        table_from_index = np.diag([voxel_mm, voxel_mm, voxel_mm, 1.0])
-        table_from_index[:3, 3] = low_mm
-        self.labels = label_grid(truth, table_from_index, (i, j, k))
-        self.walls: list[tuple[Cut, CutLayer]] = []
-        for stroke in (stroke for stroke in plan.cuts if stroke.kind == "wall"):
-            at = stroke.height_mm + _SAME_MM
-            here = [layer for layer in plan.layers if layer.bottom_mm <= at < layer.top_mm]
-            if not here:
-                raise InputError(
-                    f"a stroke at {stroke.height_mm:g} mm lies in none of the plan's layers."
-                )
-            self.walls.append((stroke, here[0]))
-
-    def flat(self, path_mm: np.ndarray) -> Flat:
-        """A line in voxels."""
-        return (path_mm[:, :2] - self.low_mm[:2]) / self.voxel_mm
-
-    def columns(self, layer: CutLayer) -> Mask:
-        """Which columns of voxels lie within a layer."""
-        return within(tuple(map(self.flat, layer.rings_mm)), self.labels.shape[:2])
-
-    def levels(self, layer: CutLayer) -> tuple[int, int]:
-        """First level of a layer and first beyond it, by the voxels' centres."""
-        heights = np.array([layer.bottom_mm, layer.top_mm])
-        levels = np.ceil((heights - self.low_mm[2]) / self.voxel_mm)
-        first, stop = np.clip(levels, 0, self.labels.shape[2]).astype(int).tolist()
-        return first, stop
-
-    def at(self, points_mm: Points) -> UInt8[np.ndarray, " n"]:
-        """Labels of the nearest voxels; 0 beyond the grid."""
-        index = np.rint((points_mm - self.low_mm) / self.voxel_mm).astype(int)
-        known = ((index >= 0) & (index < self.labels.shape)).all(1)
-        out = np.zeros(len(points_mm), np.uint8)
-        out[known] = self.labels[tuple(index[known].T)]
-        return out
-
-    def severed(self, torn: bool) -> Severed:
-        """A sheet reaches one voxel further than its outlines, for the strokes' chords leave those.
-        ``torn``: what the strokes left of the outlines is severed too."""
-        near, severed = np.ones((3, 3), bool), Severed(self.labels.shape)
-        for stroke, layer in self.walls:
-            severed.wall(self.flat(stroke.path_mm), *self.levels(layer))
-        for layer in self.layers:
-            for ring in layer.rings_mm if torn else ():
-                severed.wall(self.flat(_closed(ring)), *self.levels(layer))
-            sheet = binary_dilation(self.columns(layer), near)
-            for lower in self._below(layer):
-                sheet &= ~binary_erosion(self.columns(lower), near)
-            severed.sheet(sheet, self.levels(layer)[0])
-        return severed
-
-    def enclosed(self) -> Voxels:
-        inside = np.zeros(self.labels.shape, bool)
-        for layer in self.layers:
-            inside[:, :, slice(*self.levels(layer))] |= self.columns(layer)[:, :, None]
-        return inside
-
-    def surface(self) -> Points:
-        """Points all over walls and sheets, SAMPLES_MM apart."""
-        points = [self._curtain(stroke.path_mm[:, :2], layer) for stroke, layer in self.walls]
-        points += [self._flat(layer, self._below(layer), layer.bottom_mm) for layer in self.layers]
-        return np.concatenate(points)
-
-    def bridge_mm2(self) -> float:
-        """Area within tissue of what encloses the piece and was not cut: of outlines, that no
-        stroke goes along; and where a layer is wider than the one above it, that rim."""
-        held = 0
-        for layer in self.layers:
-            strokes = [_even(s.path_mm[:, :2]) for s, wall in self.walls if wall is layer]
-            for ring in layer.rings_mm:
-                points = self._curtain(_closed(ring), layer)
-                points = points[self.at(points) > 0]
-                if strokes and len(points):
-                    beside = cKDTree(np.concatenate(strokes)).query(points[:, :2])[0]
-                    points = points[beside > _BESIDE_MM]
-                held += len(points)
-            above = [other for other in self.layers if layer in self._below(other)]
-            if np.isfinite(layer.top_mm):
-                rim = self._flat(layer, above, layer.top_mm)
-                held += int((self.at(rim) > 0).sum())
-        return held * SAMPLES_MM**2
-
-    def _below(self, layer: CutLayer) -> list[CutLayer]:
-        """The layers whose top is this one's bottom."""
-        return [other for other in self.layers if abs(other.top_mm - layer.bottom_mm) < _SAME_MM]
-
-    def _curtain(self, path: Flat, layer: CutLayer) -> Points:
-        """Points on the wall over a line, from the layer's bottom to its top, within the box."""
-        low = max(layer.bottom_mm, self.box_mm[0, 2]) + SAMPLES_MM / 2
-        heights = np.arange(low, min(layer.top_mm, self.box_mm[1, 2]), SAMPLES_MM)
-        flat = _even(path)
-        return np.column_stack([np.tile(flat, (len(heights), 1)), np.repeat(heights, len(flat))])
-
-    def _flat(self, layer: CutLayer, without: list[CutLayer], height_mm: float) -> Points:
-        """Points level within a layer and outside others, within the box."""
-        low, high = self.box_mm[:, :2]
-        shape = tuple((np.ceil((high - low) / SAMPLES_MM).astype(int) + 1).tolist())
-
-        def inside(layer: CutLayer) -> Mask:
-            return within(tuple((ring - low) / SAMPLES_MM for ring in layer.rings_mm), shape)
-
-        kept = inside(layer)
-        for other in without:
-            kept &= ~inside(other)
-        heights = np.full(kept.sum(), height_mm)
-        return np.column_stack([low + SAMPLES_MM * np.argwhere(kept), heights])
+def electrode_margin_mm(part: Mesh, swept: Swept) -> float:
+    """Least distance between a closed surface and that of the electrode, right to 0.03 mm. 0: it
+    touches; negative: its axis goes so deep into the part."""
+    ends = swept.ends_mm
+    for step_mm in _ALONG_MM:
+        length_mm = float(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1).max())
+        along = np.linspace(0, 1, 1 + int(np.ceil(length_mm / step_mm)))[:, None]
+        points = ends[:, None, 0] + along * (ends[:, None, 1] - ends[:, None, 0])
+        off = _signed(part, points.reshape(-1, 3), step_mm).reshape(points.shape[:2])
+        near = off < off.min() + step_mm / 2 + _ROUGH_MM
+        ends = ends[near.any(1)]
+    least_mm = float(np.copysign(distance_to_surface(points[near], part), off[near]).min())
+    return min(least_mm, max(0.0, least_mm - swept.radius_mm))
 
 
-def _even(path: Flat) -> Flat:
-    """Points along a line, SAMPLES_MM apart, its end included."""
-    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
-    at = np.append(np.arange(0, way[-1], SAMPLES_MM), way[-1])
-    return np.column_stack([np.interp(at, way, axis) for axis in path.T])
+def _signed(part: Mesh, points: Points, more_mm: float) -> Float[np.ndarray, " n"]:
+    """``surface_distance``, negative inside; infinite where it is larger by ``more_mm`` than the
+    least of some points, as the part's box shows."""
+    low, high = part.box_mm
+    beyond = np.linalg.norm(np.maximum(np.maximum(low - points, points - high), 0), axis=1)
+    least_mm = surface_distance(part, points[::_SOME]).min()
+    near, off = beyond < least_mm + more_mm, np.full(len(points), np.inf)
+    off[near] = surface_distance(part, points[near])
+    boxed = np.flatnonzero(beyond == 0)
+    off[boxed[contains(part, points[boxed])]] *= -1
+    return off
 
 
-def _share(of: Voxels, whole: Voxels) -> float:
-    return float((of & whole).sum() / max(1, whole.sum()))
+def _grid(truth: Anatomy, voxel_mm: float) -> tuple[np.ndarray, tuple[int, int, int]]:
+    """``table_from_index`` (4, 4) and shape of a grid round all parts, with an empty border."""
+    corners = np.concatenate([part.vertices_mm for part in truth.parts]) @ _ASKEW / voxel_mm
+    low = np.floor(corners.min(0)) - 1
+    i, j, k = (np.ceil(corners.max(0) - low) + 2).astype(int).tolist()
+    scaled = _ASKEW * voxel_mm
+    return rigid(scaled, scaled @ low), (i, j, k)
+
+
+@njit(nogil=True)
+def _approach(ends, reach, near):  # type: ignore[no-untyped-def]
+    """Lower ``near`` (i, j, k), squared distances of voxels, to those from the lines between
+    ``ends`` (n, 2, 3), at least where that is less than ``reach``; all in voxels."""
+    for n in range(len(ends)):
+        start, way = ends[n, 0], ends[n, 1] - ends[n, 0]
+        squared = max((way**2).sum(), 1e-12)
+        parts = int(np.sqrt(squared) / _PART) + 1
+        low, stop = np.empty(3, np.int64), np.empty(3, np.int64)
+        for part in range(parts):
+            for a in range(3):
+                one, two = start[a] + way[a] * part / parts, start[a] + way[a] * (part + 1) / parts
+                low[a] = max(int(np.ceil(min(one, two) - reach)), 0)
+                stop[a] = min(int(np.floor(max(one, two) + reach)) + 1, near.shape[a])
+            for i in range(low[0], stop[0]):
+                for j in range(low[1], stop[1]):
+                    for k in range(low[2], stop[2]):
+                        x, y, z = i - start[0], j - start[1], k - start[2]
+                        t = min(max((x * way[0] + y * way[1] + z * way[2]) / squared, 0.0), 1.0)
+                        x, y, z = x - t * way[0], y - t * way[1], z - t * way[2]
+                        near[i, j, k] = min(near[i, j, k], x * x + y * y + z * z)
+
+
+def _pieces(tissue: Voxels, holds: Voxels) -> Int[np.ndarray, "i j k"]:
+    """Pieces that hang together where tissue ``holds``, from 1; other tissue joins a neighbour. 0:
+    no tissue, or a crumb."""
+    pieces = label(tissue & holds, output=np.int32)[0]
+    thin = tissue & ~holds
+    pieces[thin] = maximum_filter(pieces, 3)[thin]
+    return pieces
+
+
+def _held(pieces: Int[np.ndarray, "i j k"], grasp: np.ndarray, voxel_mm: float) -> int:
+    """The piece with most tissue where the cup meets it; 0: there is none within its reach."""
+    reach = (_REACH_MM + _CUP_MM) / voxel_mm
+    low = np.clip(np.floor(grasp - reach), 0, pieces.shape).astype(int)
+    stop = np.clip(np.ceil(grasp + reach), low, pieces.shape).astype(int)
+    i, j, k = (slice(a, b) for a, b in zip(low, stop, strict=True))
+    near = pieces[i, j, k]
+    at = np.argwhere(near > 0)
+    off_mm = np.linalg.norm(at + low - grasp, axis=1) * voxel_mm
+    first_mm = off_mm.min(initial=np.inf)
+    if first_mm > _REACH_MM:
+        return 0
+    return int(np.bincount(near[tuple(at[off_mm < first_mm + _CUP_MM].T)]).argmax())
+
+
+def _wound(rest: Voxels, kerf: Voxels, near: Float[np.ndarray, "i j k"]) -> float:
+    """Area of the faces between the two, in voxels: each face counts by how squarely it lies to the
+    kerf's wall, so that a slanting wall has its true area."""
+    slope, area = np.gradient(near), 0.0
+    for axis, step in product(range(3), (-1, 1)):
+        faces = kerf & np.roll(rest, step, axis)  # the border is empty: nothing comes round
+        normal = np.stack([along[faces] for along in slope])
+        area += float(np.abs(normal[axis] / np.linalg.norm(normal, axis=0)).sum())
+    return area

@@ -54,10 +54,10 @@ def plan_resection(
         run = places.read_run(Path(located))
     stand_mm = places.STAND_MM if stand_mm is None else stand_mm
     frames = PublishedFrame("table", places.table_under(run.meshes, stand_mm))
-    plan, _, errors, run = plan_cuts(run, config, frames, accept_poor, confidence)
-    plan = checked_against(plan, errors, accept_budget)
+    cuts = plan_cuts(run, config, frames, accept_poor, confidence)
+    plan = checked_against(cuts.plan, cuts.budgets_of(cuts.plan), accept_budget)
     if picture is not None:
         from tumortrack_resection.pictures import draw_plan
 
-        draw_plan(plan, run, Path(picture))
+        draw_plan(plan, cuts.located, Path(picture))
     return plan

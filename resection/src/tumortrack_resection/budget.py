@@ -1,4 +1,4 @@
-"""The error budget: how much nearer to the tumor than planned a cut may come.
+"""The error budget: how much nearer to a tumor than planned the electrode may come.
 
 Motion and lag displace the tumor against the plan in the same direction, so they add up. Tracking,
 hand-eye calibration and tool are bounds of independent errors: they add in quadrature.
@@ -7,29 +7,28 @@ hand-eye calibration and tool are bounds of independent errors: they add in quad
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import msgspec
 import numpy as np
-import shapely
-from jaxtyping import Float, Float64
 from scipy.spatial import cKDTree
 
 from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError, NoPlan
 from tumortrack.core.halt import Halt
+from tumortrack.core.mesh_query import contains
+from tumortrack.core.organ import is_tumor, organ_name
 from tumortrack.tracking.margins import StatedRadius, margin_words, stated_radius
-from tumortrack_resection.outline import evenly_round, polygon_of
-from tumortrack_resection.resection import inside, plan_resection
+from tumortrack_resection.facets import TOOLS, Tools
 from tumortrack_resection.ur_sink import OFF_MM
 from tumortrack_resection.values import (
     MARGIN_MM,
     OVER_BUDGET,
-    CutLayer,
     Located,
     ResectionConfig,
     ResectionPlan,
+    name_of,
 )
 
 # So many standard deviations, but no less than the largest Hausdorff distance of a tumor of any
@@ -45,15 +44,16 @@ HAND_EYE_MM = 2.0
 TOOL_MM = 1.0
 MOVED_MM = 2.0  # allowed for in a plan: the arms halt once the tumor has moved farther
 TERMS = ("tracking", "hand-eye", "tool", "motion", "lag")
-_SPACING_MM = 0.25  # between points on the planned cut
+_SPACING_MM = 0.5  # between points on the planned cuts
 
 
 class ErrorBudget(Config, frozen=True, kw_only=True):
-    """Bounds of errors, mm, and the margin that they are taken from.
+    """Bounds of errors, mm, and the distance that they are taken from, for one tumor.
 
     Attributes:
-        margin_mm: the least distance between the planned cut and the tumor's located surface;
-            negative where the cut goes through the tumor.
+        part: the tumor's name.
+        margin_mm: the least distance between the electrode, cutting or not, and the tumor's located
+            surface; negative where it goes into the tumor.
         tracking_mm: of the tumor's located surface.
         hand_eye_mm: of the camera's place in the arms' frame, at the tumor.
         tool_mm: of the tool's tip: the arm's accuracy, compliance, and its tolerated distance from
@@ -65,6 +65,7 @@ class ErrorBudget(Config, frozen=True, kw_only=True):
     """
 
     margin_mm: float
+    part: str = ""
     tracking_mm: float = 0.0
     hand_eye_mm: float = 0.0
     tool_mm: float = 0.0
@@ -100,6 +101,7 @@ class ErrorBudget(Config, frozen=True, kw_only=True):
         """Why arms halt when no margin is left."""
         term, term_mm = max(self.terms.items(), key=lambda item: item[1])
         values: dict[str, float | str] = {"sum_mm": self.sum_mm, "margin_mm": self.margin_mm}
+        values["part"] = self.part
         return Halt("over_budget", {**values, "term": term, "term_mm": term_mm})
 
     @property
@@ -108,14 +110,14 @@ class ErrorBudget(Config, frozen=True, kw_only=True):
 
     def table(self) -> list[str]:
         """Lines for the screen."""
-        lines = ["errors that the margin has to cover, mm:"]
+        lines = [f"errors that the electrode's distance to {self.part} has to cover, mm:"]
         for name, value in self.terms.items():
             how = "  assumed" if name in self.assumed else ""
             if name == "tracking" and not how:
                 sure = f"{100 * self.confidence:g} % margin"
                 how = f"  {sure if self.confidence else 'not calibrated'}"
             lines.append(f"  {name:<9}{value:5.1f}{how}")
-        lines.append(f"  {'together':<9}{self.sum_mm:5.1f}  of a margin of {self.margin_mm:.1f}")
+        lines.append(f"  {'together':<9}{self.sum_mm:5.1f}  of {self.margin_mm:.1f}")
         return lines
 
     def updated(
@@ -134,17 +136,19 @@ class ErrorBudget(Config, frozen=True, kw_only=True):
         return msgspec.structs.replace(self, assumed=others, **terms)
 
 
-def planned_budget(
+def planned_budgets(
     plan: ResectionPlan,
     located: Located,
     hand_eye_mm: float | None = None,
     tool_error_mm: float | None = None,
     moved_mm: float = MOVED_MM,
     confidence: float | None = None,
-) -> ErrorBudget:
-    """The budget of a plan; ``hand_eye_mm`` and ``tool_error_mm`` are assumed if not stated. Apart
-    from ``moved_mm`` the organ lies still: there is no lag yet. The tumor's margin is the one with
-    this or else the highest ``confidence``. InputError: none has it."""
+    tools: Tools = TOOLS,
+) -> tuple[ErrorBudget, ...]:
+    """Of each tumor, the planned one's first. ``hand_eye_mm`` and ``tool_error_mm`` are assumed if
+    not stated. Apart from ``moved_mm`` the organ lies still: there is no lag yet. A tumor's margin
+    is the one with this or else the highest ``confidence``. InputError: the planned one has none.
+    """
     stated_mm = stated_radius(located.margin, plan.tumor, confidence)
     if confidence is not None and stated_mm is None:
         raise InputError(
@@ -152,14 +156,21 @@ def planned_budget(
             f"{margin_words(located.margin)}."
         )
     stated = {"hand-eye": hand_eye_mm, "tool": tool_error_mm}
-    budget = ErrorBudget(
-        margin_mm=kept_mm(plan.layers, tumor_points(plan, located)),
-        hand_eye_mm=HAND_EYE_MM if hand_eye_mm is None else hand_eye_mm,
-        tool_mm=OFF_MM + (TOOL_MM if tool_error_mm is None else tool_error_mm),
-        motion_mm=moved_mm,
-        assumed=tuple(name for name, value in stated.items() if value is None),
-    )
-    return budget.updated(located.std_mm.get(plan.tumor), stated_mm)
+    least_mm = plan.least_mm or foreseen_mm(plan, located, tools)
+    others = [name for name in map(name_of, located.tumors) if name != plan.tumor]
+    budgets = []
+    for part in (plan.tumor, *others):
+        budget = ErrorBudget(
+            margin_mm=least_mm[part],
+            part=part,
+            hand_eye_mm=HAND_EYE_MM if hand_eye_mm is None else hand_eye_mm,
+            tool_mm=OFF_MM + (TOOL_MM if tool_error_mm is None else tool_error_mm),
+            motion_mm=moved_mm,
+            assumed=tuple(name for name, value in stated.items() if value is None),
+        )
+        sure = stated_radius(located.margin, part, confidence)
+        budgets.append(budget.updated(located.std_mm.get(part), sure))
+    return tuple(budgets)
 
 
 def widened(config: ResectionConfig, budget: ErrorBudget) -> ResectionConfig:
@@ -176,85 +187,105 @@ def widened(config: ResectionConfig, budget: ErrorBudget) -> ResectionConfig:
     return msgspec.structs.replace(config, margin_mm=wide_mm)
 
 
-def checked_against(plan: ResectionPlan, budget: ErrorBudget, accept: bool) -> ResectionPlan:
-    """The plan with a note on its budget. NoPlan: the margin doesn't cover the errors, and that was
-    not accepted."""
-    words = f"{budget.left_mm:.1f} mm of the margin are left after {budget.sum_mm:.1f} mm of error"
-    if budget.left_mm < 0:
-        words = f"{OVER_BUDGET}: {budget.words}"
+def tightest(budgets: Sequence[ErrorBudget]) -> ErrorBudget:
+    """Of the tumor that is the least safe."""
+    return min(budgets, key=lambda budget: budget.left_mm)
+
+
+def checked_against(
+    plan: ResectionPlan, budgets: Sequence[ErrorBudget], accept: bool
+) -> ResectionPlan:
+    """The plan with a note on its budgets. NoPlan: a distance doesn't cover the errors, and that
+    was not accepted."""
+    over = [budget for budget in budgets if budget.left_mm < 0]
+    budget = tightest(budgets)
+    notes = [f"{budget.left_mm:.1f} mm are left of the distance to {budget.part} after "
+             f"{budget.sum_mm:.1f} mm of error."]  # fmt: skip
+    if over:
+        notes = [f"{OVER_BUDGET}: {budget.words}." for budget in over]
         if not accept:
             raise NoPlan(
-                f"the margin does not cover the errors: {budget.words}. {_remedy(plan, budget)} "
-                "Only for a plan that nobody carries out, accept it (--accept-budget, "
-                "accept_budget=True)."
+                f"the distance does not cover the errors: {over[0].words}. "
+                f"{_remedy(plan, over[0])} Only for a plan that nobody carries out, accept it "
+                "(--accept-budget, accept_budget=True)."
             )
-    return replace(plan, notes=(*plan.notes, f"{words}."))
+    return replace(plan, notes=(*plan.notes, *notes))
 
 
 def plan_within(
-    located: Located,
+    plan_of: Callable[[ResectionConfig], ResectionPlan],
     config: ResectionConfig,
-    budget_of: Callable[[ResectionPlan], ErrorBudget],
+    budgets_of: Callable[[ResectionPlan], tuple[ErrorBudget, ...]],
     beyond_errors: bool = False,
-) -> tuple[ResectionPlan, ResectionConfig, ErrorBudget]:
-    """A plan, its configuration in the end, and its budget. ``beyond_errors``: all errors are added
-    to the margin, and a note says so. Raises as ``widened``."""
-    plan = plan_resection(located, config)
-    budget = budget_of(plan)
+) -> tuple[ResectionPlan, ResectionConfig, tuple[str, ...]]:
+    """A plan, its configuration in the end, and notes on that. ``beyond_errors``: all errors are
+    added to the margin. Raises as ``widened``."""
+    plan = plan_of(config)
     if not beyond_errors:
-        return plan, config, budget
-    healthy_mm, config = config.margin_mm, widened(config, budget)
-    plan = plan_resection(located, config)
-    budget = budget_of(plan)
+        return plan, config, ()
+    healthy_mm, config = config.margin_mm, widened(config, budgets_of(plan)[0])
+    plan = plan_of(config)
+    budgets = budgets_of(plan)
     note = (
-        f"the margin is {healthy_mm:g} mm of healthy tissue and {budget.sum_mm:.1f} mm of error, "
-        f"with the tumor within {budget.tracking_mm:.1f} mm of its estimate in "
-        f"{100 * budget.confidence:g} of 100 such cases."
+        f"the margin is {healthy_mm:g} mm of healthy tissue and {budgets[0].sum_mm:.1f} mm of "
+        f"error, with the tumor within {budgets[0].tracking_mm:.1f} mm of its estimate in "
+        f"{100 * budgets[0].confidence:g} of 100 such cases."
     )
-    return replace(plan, notes=(note, *plan.notes)), config, budget
+    return plan, config, (note,)
 
 
-def kept_mm(layers: tuple[CutLayer, ...], points_mm: Float[np.ndarray, "n 3"]) -> float:
-    """The least distance between the planned cut and points of a tumor's surface; if the cut goes
-    into the tumor, how deep, negative. The open top is no cut."""
-    nearest_mm = np.full(len(points_mm), np.inf)
-    below = shapely.Polygon()
-    x, y, z = np.asarray(points_mm, float).T
-    for layer in reversed(layers):  # from the floor up
-        lines = [evenly_round(ring, _SPACING_MM) for ring in layer.rings_mm]
-        beside_mm = cKDTree(np.concatenate(lines)).query(np.column_stack([x, y]))[0]
-        beyond_mm = np.clip(z, layer.bottom_mm, layer.top_mm) - z
-        nearest_mm = np.minimum(nearest_mm, np.hypot(beside_mm, beyond_mm))
-        area = polygon_of(layer.rings_mm)
-        ledge = area.difference(below)
-        over = shapely.contains_xy(ledge, x, y)
-        nearest_mm[over] = np.minimum(nearest_mm, np.abs(z - layer.bottom_mm))[over]
-        below = area
-    outside = ~inside(layers, points_mm)
-    return float(-nearest_mm[outside].max() if outside.any() else nearest_mm.min())
+def foreseen_mm(plan: ResectionPlan, located: Located, tools: Tools) -> dict[str, float]:
+    """The least distance of the electrode on its cuts to each tumor and structure, to 0.2 mm, mm;
+    negative: so deep inside. Of cuts without a direction, of the tip. What the arms do besides is
+    known only once their motions are checked."""
+    surfaces = {**located.meshes, **located.structures}
+    organ = organ_name(located.meshes)
+    lines = []
+    for cut in plan.cuts:
+        far = np.arange(0.0, tools.electrode_mm, 2 * _SPACING_MM) if cut.axis is not None else [0.0]
+        axis = np.zeros(3) if cut.axis is None else cut.axis
+        lines.append((cut.path_mm[:, None] - np.outer(far, axis)).reshape(-1, 3))
+    points = np.concatenate(lines)
+    least = {}
+    for name, mesh in surfaces.items():
+        if name == organ:
+            continue
+        away = cKDTree(mesh.spread_mm(2 * _SPACING_MM)).query(points)[0]
+        inside = contains(mesh, points) if is_tumor(name) else np.zeros(len(points), bool)
+        deep, near = float(away[inside].max(initial=0)), float(away.min()) - tools.radius_mm
+        least[name] = -deep if inside.any() else near
+    return least
 
 
-def kept_words(plan: ResectionPlan, located: Located) -> str:
-    """The margin kept and, if it differs, the one asked for."""
-    kept = kept_mm(plan.layers, tumor_points(plan, located))
+def kept_words(plan: ResectionPlan, least_mm: Mapping[str, float]) -> str:
+    """The electrode's least distances: to the tumor, what was asked for, and to all others."""
+    kept = least_mm[plan.tumor]
     asked = f"{plan.margin_mm:g} mm asked for"
     if kept < 0:
-        return f"the cut goes {-kept:.1f} mm into the tumor ({asked})"
-    return f"margin {kept:.1f} mm" + (
-        "" if f"{kept:.1f}" == f"{plan.margin_mm:.1f}" else f" ({asked})"
-    )
+        words = f"the electrode goes {-kept:.1f} mm into {plan.tumor} ({asked})"
+    else:
+        words = f"the electrode keeps {kept:.1f} mm from {plan.tumor} ({asked})"
+    others = [f"{mm:.1f} mm from {name}" for name, mm in least_mm.items() if name != plan.tumor]
+    return ", ".join([words, *others])
 
 
-def tumor_points(plan: ResectionPlan, located: Located) -> Float64[np.ndarray, "n 3"]:
-    """On the tumor's surface; table frame, mm."""
-    return located.meshes[plan.tumor].spread_mm()
+def lost_words(plan: ResectionPlan) -> str:
+    """The healthy tissue that a plan costs."""
+    ml = plan.volumes_ml
+    lost_ml = ml["healthy"] + ml.get("kerf", 0.0)
+    words = f"{lost_ml:.1f} ml of healthy tissue ({lost_ml / ml['parenchyma']:.0%} of the organ's)"
+    if "kerf" in ml:
+        return f"{words} are lost, {ml['kerf']:.1f} of it in the cuts"
+    return f"{words} come away; what the electrode cuts besides is not counted"
 
 
 def _remedy(plan: ResectionPlan, budget: ErrorBudget) -> str:
     """A margin that suffices, if there is one."""
     enough_mm = math.ceil(2 * (plan.margin_mm - budget.left_mm) + 0.2) / 2
     if plan.method != "margin":
-        return "The method keeps no margin below the tumor; take the method margin."
+        return "The method knows the instrument's tip alone; take the method margin."
+    if budget.part != plan.tumor:
+        return f"Plan {budget.part} as well, or look from nearer."
     if enough_mm > MARGIN_MM[1]:
         return "Look from nearer, or uncover more of the organ."
     return f"{enough_mm:g} mm would cover them (--margin, margin_mm)."

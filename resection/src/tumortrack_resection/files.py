@@ -6,9 +6,9 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, get_type_hints
 
 import msgspec
 import numpy as np
@@ -37,6 +37,7 @@ from tumortrack_resection.values import Located, ResectionConfig, ResectionPlan
 
 KIND = "plan"
 _NAME, _STROKES, _MOTIONS = "plan.json", "strokes.ply", "motions.safetensors"
+_PIECE = "piece"
 INVENTED = "invented"  # a frame or cell that no file of the user's gave
 _OVER = 1.01  # of speeds: their limits are kept at grid points only
 _GAP_RAD = 1e-6
@@ -54,19 +55,29 @@ class PlanFolder:
     config: ResectionConfig
     frames: PublishedFrame
     meshes: dict[str, Mesh]
-    budget: ErrorBudget
+    budgets: tuple[ErrorBudget, ...]
     cell: CellConfig | None = None
     motions: Motions | None = None
     case_sha256: str = ""
     frame_source: str = INVENTED
     cell_source: str = INVENTED
     patient: Patient = NOBODY
+    structures: dict[str, Mesh] = field(default_factory=dict)
+
+    @property
+    def located(self) -> Located:
+        """What the plan was made on, without its cloud, for pictures and checks."""
+        points, labels = np.zeros((0, 3)), np.zeros(0, np.uint8)
+        return Located(
+            points, labels, self.meshes, stamp_ns=self.plan.stamp_ns, patient=self.patient,
+            structures=self.structures,
+        )  # fmt: skip
 
 
 # Fields that plan.json holds under their own names.
 _STORED: dict[str, Any] = {
     "config": ResectionConfig,
-    "budget": ErrorBudget,
+    "budgets": tuple[ErrorBudget, ...],
     "cell": CellConfig | None,
     "case_sha256": str,
     "frame_source": str,
@@ -101,14 +112,16 @@ def write_plan(
         "camera_frame_id": frames.camera_frame_id,
         "table_in_camera": frames.table_in_camera,
         "plan": as_builtins(plan),
-        "budget": content.budget,
+        "budgets": content.budgets,
+        "structures": list(content.structures),
         "cell": content.cell,
         "seconds": motions and motions.seconds,
     }
     with store.new_folder(folder, overwrite) as aside:
         store.write_json(aside / _NAME, msgspec.to_builtins(data))
         store.write_atomically(aside / _STROKES, _strokes(plan))
-        for name, mesh in content.meshes.items():
+        surfaces = {**content.meshes, **content.structures, _PIECE: plan.piece}
+        for name, mesh in surfaces.items():
             write_mesh(aside / f"{name}.ply", mesh)
         if motions is not None:
             _write_motions(aside / _MOTIONS, motions)
@@ -116,13 +129,6 @@ def write_plan(
             store.write_atomically(aside / "trajectories.json", trajectories)
         more(aside)
         store.seal(aside, KIND, {"inputs": inputs}, frame=frames.frame_id)
-
-
-def as_located(content: PlanFolder) -> Located:
-    """What the plan was made on, without its cloud, for pictures."""
-    points, labels = np.zeros((0, 3)), np.zeros(0, np.uint8)
-    stamp_ns, patient = content.plan.stamp_ns, content.patient
-    return Located(points, labels, content.meshes, stamp_ns=stamp_ns, patient=patient)
 
 
 def read_plan(folder: Path) -> PlanFolder:
@@ -134,9 +140,11 @@ def read_plan(folder: Path) -> PlanFolder:
     meshes = {
         name: read_mesh(folder / f"{name}.ply") for name in organ_first(surfaces - {"strokes"})
     }
+    piece = meshes.pop(_PIECE, None)
     motions = _read_motions(path) if path.is_file() else None
     try:
-        plan = from_plain(data["plan"])
+        structures = {name: meshes.pop(name) for name in data["structures"]}
+        plan = from_plain(data["plan"], piece)
         read = {name: msgspec.convert(data[name], kind) for name, kind in _STORED.items()}
         frames = PublishedFrame(
             str(data["frame_id"]),
@@ -152,42 +160,47 @@ def read_plan(folder: Path) -> PlanFolder:
             raise ArtifactError(f"{folder} has motions and no cell that they are for. Plan again.")
         for fault in _faults(motions, read["cell"], plan.sweeps):
             raise ArtifactError(f"{path} can't be carried out: {fault}. Plan again.")
-    return PlanFolder(plan=plan, frames=frames, meshes=meshes, motions=motions, **read)
+    return PlanFolder(
+        plan=plan, frames=frames, meshes=meshes, motions=motions, structures=structures, **read
+    )
 
 
 def as_builtins(plan: ResectionPlan) -> dict[str, Any]:
-    """The plan as JSON holds it; an infinite height is null."""
+    """The plan as JSON holds it: without the piece, which is a surface of its own."""
 
     def plain(array: np.ndarray | np.floating[Any]) -> Any:
         return (array.round(4) if array.ndim == 2 else array).tolist()  # of lines: 0.1 micrometres
 
-    data: dict[str, Any] = msgspec.to_builtins(plan, enc_hook=plain)
+    values = {each.name: getattr(plan, each.name) for each in fields(plan) if each.name != _PIECE}
+    data: dict[str, Any] = msgspec.to_builtins(values, enc_hook=plain)
     for cut, stored in zip(plan.cuts, data["cuts"], strict=True):
         stored |= {"closed": cut.closed, "length_mm": round(cut.length_mm, 1)}
-    for layer in data["layers"]:
-        layer["top_mm"] = layer["top_mm"] if np.isfinite(layer["top_mm"]) else None
     return {**data, "approach": [0.0, 0.0, -1.0]}
 
 
-def from_plain(data: dict[str, Any]) -> ResectionPlan:
+def from_plain(data: dict[str, Any], piece: Mesh | None) -> ResectionPlan:
     """The inverse of ``as_builtins``; raises KeyError, TypeError, ValueError, ValidationError."""
-    layers = [dict(layer) for layer in data["layers"]]
-    for layer in layers:
-        layer["top_mm"] = np.inf if layer["top_mm"] is None else layer["top_mm"]
-    read = {**data, "layers": layers}
-    return msgspec.convert(read, ResectionPlan, dec_hook=lambda _, value: np.array(value, float))
+    if piece is None:
+        raise KeyError(f"{_PIECE}.ply")
+    kinds = get_type_hints(ResectionPlan)
+    read = {
+        name: msgspec.convert(data[name], kind, dec_hook=lambda _, value: np.array(value, float))
+        for name, kind in kinds.items()
+        if name not in (_PIECE, "facets")
+    }
+    read["facets"] = np.array(data["facets"], float).reshape(-1, 4)
+    return ResectionPlan(piece=piece, **read)
 
 
 def _strokes(plan: ResectionPlan) -> bytes:
-    """The strokes' points in order, each with its sweep, its stroke and whether that is of the
-    floor; the grasp point last, with sweep 0."""
+    """The strokes' points in order, each with its sweep and its stroke; the grasp point last, with
+    sweep 0."""
     points = [*(cut.path_mm for cut in plan.cuts), plan.grasp_mm[None]]
-    rows = [(cut.sweep, n, cut.kind == "floor") for n, cut in enumerate(plan.cuts, start=1)]
-    columns = np.repeat([*rows, (0, 0, 0)], [len(each) for each in points], axis=0).T
-    kinds = {"sweep": np.int32, "stroke": np.int32, "floor": np.uint8}
+    rows = [(cut.sweep, n) for n, cut in enumerate(plan.cuts, start=1)]
+    columns = np.repeat([*rows, (0, 0)], [len(each) for each in points], axis=0).T
     properties = {
-        name: column.astype(kind)
-        for (name, kind), column in zip(kinds.items(), columns, strict=True)
+        name: column.astype(np.int32)
+        for name, column in zip(("sweep", "stroke"), columns, strict=True)
     }
     return cloud_ply(np.concatenate(points), properties, "table (z up)")
 

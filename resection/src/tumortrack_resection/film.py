@@ -19,19 +19,21 @@ from jaxtyping import Float, Float64, UInt8
 from PIL import Image, ImageDraw, ImageFont
 from trimesh.creation import sweep_polygon
 
-from tumortrack.core.colours import ARMS, BACKGROUND, NONE, WHITE, Colour, part_colour
+from tumortrack.core.colours import ARMS, BACKGROUND, ENERGISED, NONE, WHITE, Colour, part_colour
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.store import write_atomically
 from tumortrack.core.types import ORGAN, Mesh
+from tumortrack.imaging.meshes import mesh_of, solid_of
 from tumortrack.live.values import Polyline, TrackingResult, Workcell
 from tumortrack.report.drawing import SIGN
 from tumortrack.report.renderer import Body, Viewpoint, render, rgb
 from tumortrack.report.wrapping import wrapped
+from tumortrack_resection.facets import Tools
 from tumortrack_resection.motions import LIFT, PULL, RELEASE, Motions
-from tumortrack_resection.pictures import organ_surfaces, parted
-from tumortrack_resection.resection import inside
-from tumortrack_resection.values import Located, ResectionPlan
+from tumortrack_resection.pictures import organ_surfaces
+from tumortrack_resection.strokes import trimmed
+from tumortrack_resection.values import Located, ResectionPlan, name_of
 
 FPS = 10  # a GIF counts hundredths of a second
 _FROM = np.array([-0.36, -0.8, 0.48])  # where the viewer is: to the left, in front, above
@@ -46,12 +48,14 @@ _BACKDROP = rgb((238, 241, 244))
 _LEAST_PIXELS = 2.0  # width of a line
 _COLOURS = 255  # and one for what did not change
 _SAMPLES = 8  # frames from which the colours are chosen
+_SHADES = 24  # rows
 _SAMPLED, _EVERY = 40, 3  # the viewpoint is chosen by so many frames, and every third vertex
 _LEAST_FRAMES = 2  # of a stage
 _KEPT_EVERY_NS = 200_000_000  # of a live run, at first
 _MOST_KEPT = 60  # moments of a stage: some 15 MB of surfaces
 _LAST_S = 1.5  # the last picture stays
 _PLAYBACK = "PLAYBACK of a stored plan, SIMULATED: nothing is tracked"
+_CUTS = ": the electrode is energised"
 _MEANING = {
     PULL: ": the holder pulls at the tumor",
     LIFT: ": the holder lifts the piece out",
@@ -101,6 +105,7 @@ def film(
     painter = _FramePainter(cells, located, size, plan, tracked)
     chosen = np.linspace(0, len(cells) - 1, min(_SAMPLES, len(cells))).astype(int).tolist()
     some = [np.asarray(painter.picture(n))[::2, ::2] for n in chosen]
+    some.append(_shades(ENERGISED, some[0].shape[1]))  # too few pixels to be chosen otherwise
     sheet, plain = Image.fromarray(np.concatenate(some)), Image.Dither.NONE
     palette = sheet.quantize(_COLOURS, Image.Quantize.MEDIANCUT, kmeans=2, dither=plain)
 
@@ -125,6 +130,12 @@ def film(
         optimize=True,
     )
     write_atomically(path, buffer.getvalue())
+
+
+def _shades(colour: Colour, width: int) -> UInt8[np.ndarray, "h w 3"]:
+    """From half as bright to as it is; rows of a picture."""
+    row = np.outer(np.linspace(0.5, 1.0, width), colour).round().astype(np.uint8)
+    return np.repeat(row[None], _SHADES, axis=0)
 
 
 def moments_s(motions: Motions, frames: int) -> Float64[np.ndarray, " n"]:
@@ -218,23 +229,24 @@ class _FramePainter:
         self._tubes: dict[tuple[int, float], tuple[Polyline, Mesh]] = {}
         self._warnings = () if plan is None else plan.warnings
         self._patient_words = str(located.patient)
-        shown = {(cell.state, cell.halted): cell for cell in frames}
+        shown = {(cell.state, cell.halted, cell.cutting): cell for cell in frames}
         self._room = max(words_strip(self._words(cell), size)[0].height for cell in shown.values())
         lifted = (n for n, cell in enumerate(frames) if _stage(cell) == LIFT)
         self._lifted_from = next(lifted, len(frames))
         self._stays, self._goes = self._organ, list[Body]()
         if plan is not None and self._lifted_from < len(frames):
-            self._stays, self._goes = _divided(located, plan)
+            self._stays, self._goes = divided(located, plan)
 
     def _words(self, cell: Workcell) -> list[Paragraph]:
         """The text above a frame, most important first."""
         return [
             Paragraph(self._title, WHITE, ARMS),
             *(Paragraph(f"{SIGN} WARNING: {text}", WHITE, NONE) for text in self._warnings),
-            Paragraph(cell.state + _MEANING.get(_stage(cell), ""), BACKGROUND, large=True),
+            Paragraph(cell.state + (_CUTS if cell.cutting else _MEANING.get(_stage(cell), "")),
+                      BACKGROUND, large=True),
             *([Paragraph(f"halted: {cell.halted}", NONE)] if cell.halted else []),
             Paragraph(self._patient_words, BACKGROUND),
-        ]
+        ]  # fmt: skip
 
     def _bodies(self, n: int) -> list[Body]:
         """Organ, tumors and the piece, which moves with the holder."""
@@ -333,15 +345,18 @@ def words_strip(
     return strip, boxes
 
 
-def _divided(located: Located, plan: ResectionPlan) -> tuple[list[Body], list[Body]]:
-    """What stays, and what comes away."""
+def divided(located: Located, plan: ResectionPlan) -> tuple[list[Body], list[Body]]:
+    """What stays, and what comes away; between them is a gap as wide as the electrode."""
     surfaces = organ_surfaces(located)
-    piece, rest = parted(surfaces.pop(ORGAN), plan.layers)
+    whole = solid_of(surfaces.pop(ORGAN), "the located organ")
+    if len(plan.facets):
+        rest = whole - trimmed(whole, plan.facets, -Tools().radius_mm)
+    else:
+        rest = whole - solid_of(plan.piece, "the piece")
     shade = rgb(part_colour(ORGAN))
-    halves = [Body(rest, shade, _ORGAN_OPACITY)], [Body(piece, shade, _ORGAN_OPACITY)]
+    halves = [Body(mesh_of(rest), shade, _ORGAN_OPACITY)], [Body(plan.piece, shade, _ORGAN_OPACITY)]
     for label, mesh in surfaces.items():
-        goes = label == plan.label or bool(inside(plan.layers, mesh.box_mm.mean(0)[None])[0])
-        halves[goes].append(Body(mesh, rgb(part_colour(label))))
+        halves[name_of(label) in plan.taken].append(Body(mesh, rgb(part_colour(label))))
     return halves
 
 

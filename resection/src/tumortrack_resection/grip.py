@@ -34,7 +34,7 @@ class Grip:
         std_mm: one standard deviation of the tip's way since then, along any axis.
 
     Attributes:
-        pulled_mm: how far the holder has risen since it gripped; other threads may read it.
+        pulled_mm: how far the holder has moved since it gripped; other threads may read it.
     """
 
     def __init__(
@@ -58,7 +58,7 @@ class Grip:
         tip_mm, gripped_mm = map(self._place, (execution.joints_rad, execution.gripped_rad))
         last_mm = gripped_mm if self._tip_mm is None else self._tip_mm
         self._tip_mm, self._step_mm = tip_mm, float(np.linalg.norm(tip_mm - last_mm))
-        self.pulled_mm = float(tip_mm[2] - gripped_mm[2])
+        self.pulled_mm = float(np.linalg.norm(tip_mm - gripped_mm))
         if self._taken is None and self._before is not None:
             self._taken = _point_at(gripped_mm, self._before)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import msgspec
@@ -10,11 +11,12 @@ import numpy as np
 from jaxtyping import Float64
 
 from tumortrack.core.config import to_builtins
+from tumortrack.core.estimate import Estimate
 from tumortrack.core.halt import Halt
 from tumortrack.core.types import Mesh
 from tumortrack.live.values import TrackingResult
 from tumortrack.tracking.margins import stated_radius
-from tumortrack_resection.budget import ErrorBudget
+from tumortrack_resection.budget import ErrorBudget, tightest
 
 _SPEED_S = 0.3  # time over which a speed is averaged: estimates jitter from frame to frame
 _GAP_S = 0.5  # an older position does not count for the speed
@@ -25,57 +27,74 @@ class LiveBudget:
     """Adds up the errors of every update.
 
     Args:
-        planned: the plan's. If a person accepted a margin that does not cover it, the errors are
-            reported only: they never halt the arms.
+        planned: the plan's, one a tumor. If a person accepted a distance that does not cover one,
+            that tumor's errors are reported only: they never halt the arms.
         servo_s: how far the arms lag behind their targets.
 
     Attributes:
-        now: of the last estimate. ``worst``: the one with the least margin left while the arms
-            were allowed to move.
+        now: of the last estimate and the tumor that is the least safe. ``worst``: the one with the
+            least margin left while the arms were allowed to move.
     """
 
-    def __init__(self, planned: ErrorBudget, servo_s: float = 0.0) -> None:
-        self._planned, self._servo_s = planned, servo_s
+    def __init__(self, planned: Sequence[ErrorBudget], servo_s: float = 0.0) -> None:
+        self._planned = {budget.part: budget for budget in planned}
+        self._servo_s = servo_s
         self.now: ErrorBudget | None = None
         self.worst: ErrorBudget | None = None
         # Of the tumor's centroid, by stamp
         self._places: deque[tuple[int, Float64[np.ndarray, " 3"]]] = deque()
 
     def add_up(
-        self, update: TrackingResult, part: str, tumor: Mesh, motion_mm: float, margin_mm: float
+        self,
+        update: TrackingResult,
+        part: str,
+        tumors: Mapping[str, tuple[Mesh, float]],
+        least_mm: Mapping[str, float],
     ) -> tuple[Halt | None, bool]:
         """Why the arms must halt (None: they need not), and whether a new plan would help.
 
         Args:
             update: with an estimate.
-            part: the tumor's name; ``tumor``: its surface, table frame.
-            motion_mm: its largest distance from where it was planned.
-            margin_mm: the least distance between the planned cut and the tumor.
+            part: the planned tumor's name.
+            tumors: all tumors' surfaces, table frame, each with its largest distance from where it
+                was planned, mm.
+            least_mm: the electrode's least distances from them, as planned.
         """
         estimate = update.estimate
         assert estimate is not None
         late_ms = max(update.latency_ms or 0.0, 0.0)  # a camera's clock may be ahead
         smoothing = estimate.report.smoothing
         late_ms += 0.0 if smoothing is None else smoothing.lag_ms
-        stated = stated_radius(estimate.report.margin, part, self._planned.confidence or None)
+        speed_mm_s = self._speed_mm_s(update.stamp_ns, tumors[part][0])
+        lag_mm = speed_mm_s * (late_ms / 1000 + self._servo_s)
+        budgets = {
+            name: self._of(name, estimate, least_mm[name], motion_mm, lag_mm)
+            for name, (_, motion_mm) in tumors.items()
+            if name in self._planned
+        }
+        self.now = tightest(list(budgets.values()))
+        heeded = {n: each for n, each in budgets.items() if self._planned[n].left_mm >= 0}
+        for name, now in heeded.items():
+            if self._planned[name].confidence > now.confidence:
+                percent = 100 * self._planned[name].confidence
+                return Halt("no_margin", {"percent": percent}), False
+        if not heeded or (worst := tightest(list(heeded.values()))).left_mm >= 0:
+            return None, False
+        return worst.as_halt, msgspec.structs.replace(worst, motion_mm=0.0).left_mm >= 0
+
+    def _of(
+        self, part: str, estimate: Estimate, least_mm: float, motion_mm: float, lag_mm: float
+    ) -> ErrorBudget:
+        """A tumor's, now."""
+        planned = self._planned[part]
+        stated = stated_radius(estimate.report.margin, part, planned.confidence or None)
         std_mm, motion = None, estimate.motion
         if stated is None and motion is not None:
             places = motion.back(estimate.meshes[part].vertices_mm[::_EVERY])
             std_mm = None if places is None else motion.largest_std_mm(places)
-        self.now = now = self._planned.updated(
-            std_mm,
-            stated,
-            margin_mm=margin_mm,
-            motion_mm=motion_mm,
-            lag_mm=self._speed_mm_s(update.stamp_ns, tumor) * (late_ms / 1000 + self._servo_s),
+        return planned.updated(
+            std_mm, stated, margin_mm=least_mm, motion_mm=float(motion_mm), lag_mm=lag_mm
         )
-        if self._planned.left_mm < 0:
-            return None, False
-        if self._planned.confidence > now.confidence:
-            return Halt("no_margin", {"percent": 100 * self._planned.confidence}), False
-        if now.left_mm >= 0:
-            return None, False
-        return now.as_halt, msgspec.structs.replace(now, motion_mm=0.0).left_mm >= 0
 
     def went_on(self) -> None:
         """The arms may move on the last estimate."""
@@ -88,7 +107,8 @@ class LiveBudget:
 
     def summary(self) -> dict[str, Any]:
         """For the report: as planned, and at its worst."""
-        budgets = {"planned": self._planned, "worst": self.worst}
+        planned = tightest(list(self._planned.values()))
+        budgets = {"planned": planned, "worst": self.worst}
         return {
             name: {**to_builtins(budget), "sum_mm": budget.sum_mm, "left_mm": budget.left_mm}
             for name, budget in budgets.items()

@@ -18,6 +18,7 @@ Joints = Float64[np.ndarray, " 12"]  # radians, in the order of ``JOINTS``
 JOINTS = tuple(f"{arm}_{joint}" for arm in ARMS for joint in UR_JOINTS)
 DONE, ABORTED = "done", "aborted"
 HOLD, LIFT, RELEASE = "hold", "lift", "release"
+WITHDRAW = "withdraw"  # only of motions that were planned anew, with an instrument in the tissue
 PULL, TAUT = "pull", "taut"  # with a pull, between hold and the first sweep
 _BRAKE_RAD_S2 = 4.0  # deceleration of the fastest joint when arms halt during a motion
 _SHORTEST_BRAKE_S = 0.1
@@ -108,7 +109,10 @@ class Execution:
     def sweep(self) -> int:
         """Number of the current sweep; 0 before the first; after the last, the number of sweeps
         plus 1."""
-        past = max(stage.sweep for stage in self._motions.stages[: self._number + 1])
+        stages = self._motions.stages
+        past = max(stage.sweep for stage in stages[: self._number + 1])
+        if not past and self.holds and self._first(HOLD, -1) < 0:  # withdraws before it goes on
+            return next((stage.sweep for stage in stages if stage.sweep), 0)
         after = self._over or not self._stage.sweep
         return past + 1 if past and after else past
 

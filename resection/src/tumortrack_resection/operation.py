@@ -10,7 +10,6 @@ from collections import Counter
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Any, NamedTuple
 
 import msgspec
@@ -18,7 +17,7 @@ import numpy as np
 from jaxtyping import Float64
 from scipy.spatial import cKDTree
 
-from tumortrack.core.colours import CUT, NOW, TO_CUT
+from tumortrack.core.colours import CUT, ENERGISED, NOW, TO_CUT
 from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError, TumortrackError
 from tumortrack.core.estimate import Estimate
@@ -29,11 +28,12 @@ from tumortrack.core.types import Mesh
 from tumortrack.live.values import Polyline, RigidShape, TrackingResult, Workcell
 from tumortrack.registration.advice import Place, Reach
 from tumortrack.tracking.advice import advise
-from tumortrack_resection.budget import MOVED_MM, kept_mm
+from tumortrack_resection.budget import MOVED_MM
 from tumortrack_resection.grip import Grip
 from tumortrack_resection.live_budget import LiveBudget
 from tumortrack_resection.motions import (
     ABORTED,
+    CUTTER,
     JOINTS,
     PULL,
     TAUT,
@@ -41,11 +41,11 @@ from tumortrack_resection.motions import (
     Joints,
     Motions,
 )
-from tumortrack_resection.values import Located, ResectionPlan
+from tumortrack_resection.values import ELECTRODE, Located, ResectionPlan
 
-_SAME_MM = 0.2  # tolerance of heights
 _OTHER_PARTS = 2.0  # they may move so many times as far as the tumor
 _COMPARED = 500  # points of surfaces with different triangles
+_ELECTRODE = f"{CUTTER}/{ELECTRODE}"  # drawn in a colour of its own while it is energised
 _SILENT_S = 0.2  # without an update for longer, the arms halt
 
 
@@ -84,36 +84,28 @@ class Planned:
     meshes: Mapping[str, Mesh]
     motions: Motions
 
-    @cached_property
-    def kept_mm(self) -> float:
-        """The least distance between the cut and the tumor's surface: the margin as planned."""
-        return kept_mm(self.plan.layers, self.meshes[self.plan.tumor].spread_mm())
+    @property
+    def kept_mm(self) -> dict[str, float]:
+        """The electrode's least distance to each tumor that it must not come near to, as checked;
+        of structures it is no matter of errors in tumors' places."""
+        return {name: mm for name, mm in self.plan.least_mm.items() if name in self.meshes}
 
 
-@dataclass(frozen=True)
-class ResectionProgress:
-    """How far a plan was carried out: whether the grasper holds, and how high above the tumor's
-    lowest point the last finished sweep was (None: none is finished)."""
+class ResectionProgress(NamedTuple):
+    """How far a plan was carried out: whether the grasper holds, and how many sweeps are done."""
 
     holds: bool = False
-    done_mm: float | None = None
+    done: int = 0
 
-    def first_sweep(self, planned: ResectionPlan, tumor: Mesh) -> int | None:
-        """The sweep at which another plan continues: the first past what is finished, in cutting
-        order, at most its last; None: it begins with the approach. Sweeps differ from plan to plan,
-        so they are matched by height."""
-        if not self.holds:
-            return None
-        if self.done_mm is None:
-            return 1
-        done_mm = float(tumor.box_mm[0, 2]) + self.done_mm
-        onward = 1 if planned.cuts[-1].height_mm > planned.cuts[0].height_mm else -1
-        ahead = [c.sweep for c in planned.cuts if onward * (c.height_mm - done_mm) > _SAME_MM]
-        return min(ahead, default=planned.sweeps)
+    @property
+    def first_sweep(self) -> int | None:
+        """The sweep at which another plan continues; None: it begins with the approach."""
+        return self.done + 1 if self.holds else None
 
 
-# The estimate to plan on, the arms' joints, and their progress
-Replan = Callable[[TrackingResult, Joints, ResectionProgress], "Future[Planned]"]
+Facets = Float64[np.ndarray, "k 4"]
+# The estimate to plan on, the arms' joints, their progress, and the plan's facets so far
+Replan = Callable[[TrackingResult, Joints, ResectionProgress, Facets], "Future[Planned]"]
 Locate = Callable[[TrackingResult], Located]
 Draw = Callable[[Joints], tuple[RigidShape, ...]]
 # From the organ's surface (table frame) and where the arms stand: what their tips reach
@@ -183,13 +175,8 @@ class Operation:
 
     @property
     def progress(self) -> ResectionProgress:
-        plan, sweep = self.planned.plan, self._execution.sweep
-        done = [cut.height_mm for cut in plan.cuts if cut.sweep < sweep]
-        if not (self._execution.holds and done):
-            return ResectionProgress(self._execution.holds)
-        return ResectionProgress(
-            True, done[-1] - float(self.planned.meshes[plan.tumor].box_mm[0, 2])
-        )
+        execution = self._execution
+        return ResectionProgress(execution.holds, max(0, execution.sweep - 1))
 
     def act(self, update: TrackingResult, now_s: float | None = None) -> TrackingResult:
         """The update with the arms' present state. ``now_s``: time of a monotonic clock."""
@@ -248,10 +235,16 @@ class Operation:
         for number, cut in enumerate(plan.cuts, start=1):
             colour = CUT if cut.sweep < sweep else NOW if cut.sweep == sweep else TO_CUT
             lines.append(Polyline(f"cut/{number}", cut.path_mm, colour, 0.8))
-        above = plan.grasp_mm + np.array([[0.0, 0.0, 40.0], [0.0, 0.0, 0.0]])
+        above = plan.grasp_mm + np.outer([40.0, 0.0], plan.lift)
         lines.append(Polyline("grasp", above, (90, 200, 255), 0.8))
         named = dict(zip(JOINTS, joints.tolist(), strict=True))
-        shapes = (*self.static_shapes, *self._draw(joints))
+        drawn = self._draw(joints)
+        if execution.cutting:
+            drawn = tuple(
+                replace(each, colour=ENERGISED) if each.name == _ELECTRODE else each
+                for each in drawn
+            )
+        shapes = (*self.static_shapes, *drawn)
         state = f"{execution.state} ({self._note})" if self._note else execution.state
         now = None if self._budget is None else self._budget.now
         left_mm = None if now is None else now.left_mm
@@ -261,7 +254,7 @@ class Operation:
     @property
     def _note(self) -> str:
         """Warnings on the plan, and on estimates of an organ that is being cut."""
-        heads = [warning.split(":")[0].rstrip(".") for warning in self._warnings]
+        heads = dict.fromkeys(warning.split(":")[0].rstrip(".") for warning in self._warnings)
         return "; ".join([*heads, *([CUT_NOTE] if self._cut and self._locate is not None else [])])
 
     def summary(self) -> dict[str, Any]:
@@ -343,7 +336,8 @@ class Operation:
         elif now_s - self._settled[1] >= config.settled_s and execution.still:
             self._settled = None
             if self._replan is not None:
-                self._work = self._replan(update, execution.joints_rad, self.progress)
+                facets = self.planned.plan.facets
+                self._work = self._replan(update, execution.joints_rad, self.progress, facets)
 
     def _reason_to_halt(self, update: TrackingResult, located: Located) -> tuple[Halt | None, bool]:
         """Why the arms must halt (None: they need not), and whether a new plan would help."""
@@ -354,9 +348,12 @@ class Operation:
             if off_mm > self._config.moved_mm * (1.0 if part == name else _OTHER_PARTS):
                 moved.append((part == name, off_mm, part))
         if self._budget is not None:
-            tumor, kept = located.meshes[name], self.planned.kept_mm
-            motion_mm = float(_distances_mm(tumor, self.planned.meshes[name]).max())
-            over_budget = self._budget.add_up(update, name, tumor, motion_mm, kept)
+            tumors = {
+                part: (located.meshes[part], _distances_mm(located.meshes[part], mesh).max())
+                for part, mesh in self.planned.meshes.items()
+                if part in self.planned.kept_mm
+            }
+            over_budget = self._budget.add_up(update, name, tumors, self.planned.kept_mm)
         if moved:
             _, off_mm, part = max(moved)  # the tumor, or else what moved farthest
             return Halt("moved", {"part": part, "off_mm": off_mm}), True

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
 import shapely
-from jaxtyping import Bool, Float, Float64, Int
+from jaxtyping import Float, Float64, Int
 from scipy.ndimage import binary_erosion, label
 from scipy.spatial import ConvexHull, Delaunay, QhullError
 from shapely import Polygon
@@ -66,46 +65,12 @@ def evenly(ring_mm: Float[np.ndarray, "n 2"], spacing_mm: float) -> Float64[np.n
     return shapely.get_coordinates(shapely.line_interpolate_point(line, shares, normalized=True))
 
 
-def evenly_round(ring: Float[np.ndarray, "n 2"], spacing: float) -> Float64[np.ndarray, "m 2"]:
-    """The same on a closed ring, whose first point is not repeated."""
-    return evenly(np.concatenate([ring, ring[:1]]), spacing)[:-1]
-
-
-def arcs(
-    ring_mm: Float[np.ndarray, "n 2"], wanted: Bool[np.ndarray, " n"], lead: int
-) -> list[Float64[np.ndarray, "m 2"]]:
-    """The runs of a closed ring's wanted points, each extended by ``lead`` points at both ends; the
-    whole ring, closed, if that leaves no gap. ``ring_mm``: evenly spaced, the first point not
-    repeated."""
-    n = len(ring_mm)
-    if not wanted.any():
-        return []
-    reach = np.arange(-lead, lead + 1)
-    grown_to = np.zeros(n, bool)
-    grown_to[(np.flatnonzero(wanted)[:, None] + reach).ravel() % n] = True
-    if grown_to.all():
-        return [np.concatenate([ring_mm, ring_mm[:1]])]
-    first = int(np.flatnonzero(~grown_to)[0])
-    turned = np.roll(grown_to, -first)  # begins with a gap, so that no run wraps round
-    edges = np.flatnonzero(np.diff(np.concatenate([turned, [False]]).astype(int)))
-    runs = zip(edges[::2] + 1, edges[1::2] + 1, strict=True)
-    return [ring_mm[(np.arange(start, stop) + first) % n] for start, stop in runs]
-
-
 def rings_of(area: Any) -> tuple[Float64[np.ndarray, "n 2"], ...]:
     """The outer rings of a polygon or several, anticlockwise, first points not repeated, largest
     first."""
     pieces = [piece for piece in _polygons(area) if piece.area >= _LEAST_MM2]
     pieces.sort(key=lambda piece: -piece.area)
     return tuple(np.array(orient(piece).exterior.coords)[:-1, :2] for piece in pieces)
-
-
-def polygon_of(rings_mm: Iterable[Float[np.ndarray, "n 2"]]) -> Any:
-    """The inverse of ``rings_of``."""
-    pieces = [shapely.Polygon(ring) for ring in rings_mm]
-    if len(pieces) == 1 and pieces[0].is_valid:
-        return pieces[0]
-    return shapely.union_all([shapely.make_valid(piece) for piece in pieces])
 
 
 def _polygons(area: Any) -> list[Polygon]:

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
@@ -24,68 +24,96 @@ from tumortrack_resection.budget import (
     ErrorBudget,
     checked_against,
     plan_within,
-    planned_budget,
-    tumor_points,
+    planned_budgets,
 )
 from tumortrack_resection.files import INVENTED, PlanFolder, write_plan
 from tumortrack_resection.located import poor_estimate_notes, read_run, table_under
 from tumortrack_resection.operation import OperationConfig
 from tumortrack_resection.options import PlanOptions
-from tumortrack_resection.values import Located, ResectionConfig, ResectionPlan
+from tumortrack_resection.resection import plan_resection
+from tumortrack_resection.values import (
+    UNCHECKED,
+    Located,
+    ResectionConfig,
+    ResectionPlan,
+)
 
 
 @dataclass(frozen=True, eq=False)
 class Planning:
-    """A plan, step by step: the cuts are there; ``checked``, ``with_motions`` and ``save`` follow.
+    """A plan, step by step: the cuts are there; ``checked`` or ``with_motions``, and ``save``
+    follow.
 
     Attributes:
         content: of the plan's folder, so far.
-        located: organ and tumors, in the plan's frame.
         cell: the requested workcell.
         bases_source: of the arms' bases in it, as ``PlanFolder.cell_source``.
-        note: what was changed in it for the motions; empty: nothing.
+        cuts: as planned without the arms.
+        note: what was changed in the cell for the motions; empty: nothing.
     """
 
     content: PlanFolder
-    located: Located
     run_folder: Path
     options: PlanOptions
     cell: CellConfig
     bases_source: str
+    cuts: Cuts
     note: str = ""
 
+    @property
+    def located(self) -> Located:
+        """Organ and tumors, in the plan's frame."""
+        return self.cuts.located
+
     def checked(self) -> Planning:
-        """With a note on the error budget. NoPlan: the margin doesn't cover the errors, and that
-        was not accepted."""
-        content, accept = self.content, self.options.accept_budget
-        plan = checked_against(content.plan, content.budget, accept)
-        return replace(self, content=replace(content, plan=plan))
+        """Unchecked, without motions, with a note on the error budget. NoPlan: the distances don't
+        cover the errors, and that was not accepted."""
+        plan = checked_against(self.content.plan, self.content.budgets, self.options.accept_budget)
+        if not plan.clearances:
+            note = f"{UNCHECKED}: without the arms' motions nobody knows where the electrode goes."
+            plan = replace(plan, notes=(*plan.notes, note))
+        return replace(self, content=replace(self.content, plan=plan))
 
     def with_motions(self) -> Planning:
-        """With the motions of both arms. NoPlan: they can't carry it out."""
+        """With the motions of both arms, checked, and the plan that these carry out. NoPlan: they
+        can't carry one out, or the check refuses it, or as ``checked``."""
+        from tumortrack_resection.arms.body import cell_urdf
         from tumortrack_resection.arms.procedure import search_bases
         from tumortrack_resection.arms.trajectory import first_hit
+        from tumortrack_resection.checking import checked
 
-        plan, organ = self.content.plan, self.located.organ
-        placed, motions, note = search_bases(plan, _below(organ, self.cell), organ)
-        if hit := first_hit(motions, placed.config, organ):
+        organ, config = self.located.organ, self.content.config
+        placed, plan, motions, note = search_bases(self.located, config, below(organ, self.cell))
+        if hit := first_hit(motions, placed, organ):
             raise NoPlan(f"the arms can't carry this out: {hit}. Place the organ otherwise.")
+        plan = checked(plan, motions, cell_urdf(placed), self.located)
+        budgets = self.cuts.budgets_of(plan)
+        plan = replace(plan, notes=(*self.cuts.heading, *plan.notes))
         source = INVENTED if note else self.bases_source
-        content = replace(self.content, motions=motions, cell=placed.config, cell_source=source)
-        return replace(self, content=content, note=note)
+        content = replace(
+            self.content, plan=plan, budgets=budgets, motions=motions, cell=placed,
+            cell_source=source,
+        )  # fmt: skip
+        return replace(self, content=content, note=note).checked()
 
     def save(self, folder: Path, overwrite: bool = False) -> None:
         """Write the folder that `tumortrack plan` writes. Raises as ``files.write_plan``."""
         from tumortrack_resection.pictures import draw_plan
 
-        cell = self.content.cell
+        cell, motions = self.content.cell, self.content.motions
 
         def pictures(aside: Path) -> None:
-            draw_plan(self.content.plan, self.located, aside / "plan.png")
-            if cell is not None:
+            poses_mm = None
+            if cell is not None and motions is not None:
                 from tumortrack_resection.arms.body import cell_urdf
+                from tumortrack_resection.check import electrode_poses
 
-                store.write_atomically(aside / "cell.urdf", cell_urdf(cell).encode())
+                urdf = cell_urdf(cell)
+                store.write_atomically(aside / "cell.urdf", urdf.encode())
+                ends_mm, energised = electrode_poses(urdf, motions)
+                poses_mm = ends_mm[energised]
+            path = aside / "plan.png"
+            draw_plan(self.content.plan, self.located, path, self.cell.tools, poses_mm)
 
         digest = store.sha256_of(self.run_folder / store.MANIFEST)
         write_plan(folder, self.content, {"run": digest}, pictures, overwrite)
@@ -116,19 +144,32 @@ def begin_plan(run_folder: str | Path, **given: Any) -> Planning:
     run = read_run(run_folder)
     run.patient.check_is(options.stated, str(run_folder))
     frames = _frames(run.meshes, options, cell.stand_mm)
-    plan, config, budget, located = plan_cuts(
+    cuts = plan_cuts(
         run, config, frames, options.accept_poor, options.confidence,
-        tool_error_mm=cell.tool_error_mm, moved_mm=options.moved,
+        cell=cell, moved_mm=options.moved,
     )  # fmt: skip
     model = store.read_json(run_folder / "report.json").get("model")
     has_bases = written.keys() >= {"cutter_base", "holder_base"}
     bases_source = store.sha256_of(options.cell) if options.cell and has_bases else INVENTED
     content = PlanFolder(
-        plan, config, frames, located.meshes, budget, patient=run.patient,
+        cuts.plan, cuts.config, frames, cuts.located.meshes, cuts.budgets_of(cuts.plan),
+        structures=dict(cuts.located.structures), patient=run.patient,
         case_sha256=str(model.get("case_sha256") or "") if isinstance(model, dict) else "",
         frame_source=store.sha256_of(options.frame) if options.frame else INVENTED,
     )  # fmt: skip
-    return Planning(content, located, run_folder, options, cell, bases_source)
+    return Planning(content, run_folder, options, cell, bases_source, cuts)
+
+
+class Cuts(NamedTuple):
+    """A plan without the arms; ``config``: in the end (see ``budget.plan_within``); ``located``:
+    the run in the plan's frame; ``budgets_of``: of this or another plan of it; ``heading``: notes
+    that come before any such plan's own."""
+
+    plan: ResectionPlan
+    config: ResectionConfig
+    located: Located
+    budgets_of: Callable[[ResectionPlan], tuple[ErrorBudget, ...]]
+    heading: tuple[str, ...]
 
 
 def plan_cuts(
@@ -138,22 +179,30 @@ def plan_cuts(
     accept_poor: bool,
     confidence: float | None,
     *,
-    tool_error_mm: float | None = None,
+    cell: CellConfig | None = None,
     moved_mm: float = MOVED_MM,
-) -> tuple[ResectionPlan, ResectionConfig, ErrorBudget, Located]:
-    """The cuts, the configuration in the end (see ``budget.plan_within``), the budget, and the run
-    in the plan's frame."""
+) -> Cuts:
+    """Where to cut a run, without the arms."""
     doubts = poor_estimate_notes(run.doubt, accept_poor)
     located = run.moved(frames.published_from_camera)
+    cell = below(located.organ, cell or CellConfig())
 
-    def budget_of(plan: ResectionPlan) -> ErrorBudget:
+    def budgets_of(plan: ResectionPlan) -> tuple[ErrorBudget, ...]:
         """With the camera's error at the tumor's far side."""
-        off_mm = tumor_points(plan, located) - frames.published_from_camera[:3, 3]
+        tumor = located.meshes[plan.tumor].vertices_mm
+        off_mm = tumor - frames.published_from_camera[:3, 3]
         error_mm = frames.error_at(float(np.linalg.norm(off_mm, axis=1).max()))
-        return planned_budget(plan, located, error_mm, tool_error_mm, moved_mm, confidence)
+        return planned_budgets(
+            plan, located, error_mm, cell.tool_error_mm, moved_mm, confidence, cell.tools
+        )  # fmt: skip
 
-    plan, config, budget = plan_within(located, config, budget_of, confidence is not None)
-    return replace(plan, notes=(*doubts, *plan.notes)), config, budget, located
+    def plan_of(config: ResectionConfig) -> ResectionPlan:
+        return plan_resection(located, config, cell.tools)
+
+    plan, config, notes = plan_within(plan_of, config, budgets_of, confidence is not None)
+    heading = (*doubts, *notes)
+    plan = replace(plan, notes=(*heading, *plan.notes))
+    return Cuts(plan, config, located, budgets_of, heading)
 
 
 def check_arms_installed() -> None:
@@ -185,7 +234,7 @@ def _frames(meshes: Mapping[str, Mesh], options: PlanOptions, stand_mm: float) -
     return frames
 
 
-def _below(organ: Mesh, config: CellConfig) -> CellConfig:
+def below(organ: Mesh, config: CellConfig) -> CellConfig:
     """With the table below the organ, if the cell's file does not place it."""
     if any(config.middle_mm):
         return config

@@ -22,7 +22,7 @@ from tumortrack import api
 from tumortrack.core import store
 from tumortrack.core.colours import part_colour
 from tumortrack.core.config import to_builtins
-from tumortrack.core.errors import ArtifactError, InputError
+from tumortrack.core.errors import ArtifactError, InputError, NoPlan
 from tumortrack.core.halt import Halt
 from tumortrack.core.organ import KIDNEY, Organ, organ_first, organ_name
 from tumortrack.core.patient import Patient
@@ -45,12 +45,15 @@ from tumortrack.models.folder import patient_of
 from tumortrack.tracking.options import CameraOptions, model_folder, options_from
 from tumortrack_devices.sources.virtual import VirtualSourceConfig
 from tumortrack_devices.viewer.scene import bare_faces
-from tumortrack_resection.files import INVENTED, PlanFolder, as_located, read_plan
+from tumortrack_resection.budget import tightest
+from tumortrack_resection.checking import checked
+from tumortrack_resection.files import INVENTED, PlanFolder, read_plan
 from tumortrack_resection.grip import Grip, held_std_mm
 from tumortrack_resection.live_budget import LiveBudget
 from tumortrack_resection.located import of_estimate
 from tumortrack_resection.motions import Joints, Motions
 from tumortrack_resection.operation import (
+    Facets,
     Following,
     Operation,
     OperationConfig,
@@ -157,6 +160,7 @@ class ResectionSession:
         """A live session that compares every estimate with the plan, and replans where the tumor
         has moved. InputError: no ``live`` source was given. ``reel``, if it is one, gets all."""
         from tumortrack_resection.arms import procedure
+        from tumortrack_resection.arms.body import cell_urdf
         from tumortrack_resection.arms.cell import tip_places
         from tumortrack_resection.arms.reach import ArmsReach
 
@@ -174,14 +178,18 @@ class ResectionSession:
         config = msgspec.structs.replace(stored.config, tumor=stored.plan.tumor)
         # In a process of its own: planning takes a second, and must not delay a frame.
         with ProcessPoolExecutor(
-            1, get_context("spawn"), procedure.begin_worker, (config, cell.config)
+            1,
+            get_context("spawn"),
+            procedure.begin_worker,
+            (config, cell.config, cell_urdf(cell.config)),
         ) as planner:
 
             def replan(
-                result: TrackingResult, joints_rad: Joints, progress: ResectionProgress
-            ) -> Future[Planned]:
+                result: TrackingResult, joints_rad: Joints, progress: ResectionProgress,
+                facets: Facets,
+            ) -> Future[Planned]:  # fmt: skip
                 located = locate(result, with_std=stored.config.sigmas > 0)
-                return planner.submit(procedure.replan, located, joints_rad, progress)
+                return planner.submit(procedure.replan, located, joints_rad, progress, facets)
 
             # The worker ignores Ctrl-C, which the live loop handles.
             before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
@@ -189,9 +197,9 @@ class ResectionSession:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
             warming_up.result()
             late_s = max((arm.lookahead_s for arm in self.arms), default=0.0)
-            budget = LiveBudget(stored.budget, late_s)
+            budget = LiveBudget(stored.budgets, late_s)
             reach = partial(ArmsReach, cell.config)
-            grip = Grip(tip_places(cell.config), held_std_mm(stored.budget))
+            grip = Grip(tip_places(cell.config), held_std_mm(stored.budgets[0]))
             self.operation = self._operation(
                 stored.plan, self._config, Following(locate, replan, budget, grip, reach)
             )
@@ -280,7 +288,7 @@ class ResectionSession:
         def advance() -> None:
             progress(next(count), len(times_s))
 
-        film(frames(), as_located(self.stored), path, progress=advance, plan=plan)
+        film(frames(), self.stored.located, path, progress=advance, plan=plan)
         return len(times_s) / FPS
 
     def film_of_run(
@@ -295,7 +303,7 @@ class ResectionSession:
         arms = "arms moved" if self.moving else "arms SIMULATED"
         title = f"A RUN of resect, organ tracked ({self._live.source_kind}), {arms}"
         plan = replace(self.operation.planned.plan, notes=self.stored.plan.notes)
-        located = replace(as_located(self.stored), meshes=dict(self.operation.planned.meshes))
+        located = replace(self.stored.located, meshes=dict(self.operation.planned.meshes))
         count = itertools.count(1)
         film(
             cells, located, path, progress=lambda: progress(next(count), len(cells)),
@@ -341,12 +349,12 @@ def begin_resection(
         lacking = stored.plan.tumor if organ else "the organ"
         raise ArtifactError(f"{plan} lacks {lacking}'s surface. Plan again.")
     moving = [arm for arm in _real_arms(sinks) if arm.execute]  # reports wrong sinks early
-    moved_mm = stored.budget.motion_mm if options.moved is None else options.moved
+    moved_mm = stored.budgets[0].motion_mm if options.moved is None else options.moved
     config = OperationConfig(speed=options.speed, moved_mm=moved_mm, replan_cut=options.replan_cut)
     live = None if options.live is None else _live_of(*options.live, stored)
     if moving:
         _check_real(stored, moving, live, config, options.stated)
-    cell = _checked_cell(plan, stored.motions, stored.cell, stored.meshes[organ])
+    cell = _checked_cell(plan, stored.motions, stored.cell, stored)
     return ResectionSession(stored, stored.motions, cell, live, sinks, config, options)
 
 
@@ -366,7 +374,7 @@ def _check_real(
     stated: Patient,
 ) -> None:
     """Raises InputError that lists what is missing for real arms to move."""
-    budget, kind = stored.budget, Organ(name=organ_name(stored.meshes) or KIDNEY.name)
+    budget, kind = tightest(stored.budgets), Organ(name=organ_name(stored.meshes) or KIDNEY.name)
     needs = {
         "--live MODEL SOURCE, so that they stop where the tumor moves": live,
         "a plan that says which case it was made on (locate and plan again)": stored.case_sha256,
@@ -384,7 +392,12 @@ def _check_real(
             stored.cell_source != INVENTED
         ),
         f"--speed up to 1, not {config.speed:g}": config.speed <= 1,
-        "a plan whose margin covers its errors (plan again with a wider one)": budget.left_mm >= 0,
+        "a plan of the method margin (the published one cuts the tumor)": (
+            stored.plan.method == "margin"
+        ),
+        "a plan whose distances cover its errors (plan again with a wider margin)": (
+            budget.left_mm >= 0
+        ),
         "a plan by a model that says how unsure it is (preset clinic)": (
             "tracking" not in budget.assumed
         ),
@@ -419,14 +432,23 @@ def _check_real(
         raise InputError(f"the arm at {names} may not move. It needs: {'; '.join(lacking)}.")
 
 
-def _checked_cell(path: Path, motions: Motions, cell: CellConfig, organ: Mesh) -> ArmCell:
-    """Raises ArtifactError: the motions hit something in it, so they are not those planned."""
+def _checked_cell(path: Path, motions: Motions, cell: CellConfig, stored: PlanFolder) -> ArmCell:
+    """Raises ArtifactError: the motions hit something in it, or a
+    tool comes nearer to a tumor than it may, so they are not those planned."""
+    from tumortrack_resection.arms.body import cell_urdf
     from tumortrack_resection.arms.cell import ArmCell
     from tumortrack_resection.arms.trajectory import first_hit
 
-    if hit := first_hit(motions, cell, organ):
+    located, urdf = stored.located, cell_urdf(cell)
+    if (path / "cell.urdf").read_text() != urdf:
+        raise ArtifactError(f"{path}: cell.urdf is not of the plan's cell. Plan again.")
+    if hit := first_hit(motions, cell, located.organ):
         raise ArtifactError(f"{path}: its motions are not as planned: {hit}. Plan again.")
-    return ArmCell(cell, organ)
+    try:
+        checked(stored.plan, motions, urdf, located)
+    except NoPlan as fault:
+        raise ArtifactError(f"{path}: its motions are not as planned: {fault}") from fault
+    return ArmCell(cell, located.organ)
 
 
 def _live_of(model: Path, source: str, stored: PlanFolder) -> _Live:

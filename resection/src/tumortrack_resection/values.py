@@ -23,36 +23,35 @@ from tumortrack.core.report import MarginReport
 from tumortrack.core.types import FIRST_TUMOR, Mesh
 
 Method = Literal["published", "margin"]
-Direction = Literal["shortest", "clockwise", "anticlockwise"]
-StrokeKind = Literal["wall", "floor"]
-Rings = tuple[Float64[np.ndarray, "_ 2"], ...]
 MARGIN_MM = (1.0, 20.0)  # allowed
+ELECTRODE = "electrode"
 # Beginnings of the notes that pictures and screens must always show, first.
 POOR_ESTIMATE = "PLANNED ON A POOR ESTIMATE"
 OVER_BUDGET = "PLANNED OVER ITS ERROR BUDGET"
+UNCHECKED = "UNCHECKED"
+CUTS_TUMOR = "THE INSTRUMENT CUTS INTO"
+NO_ROOM = "NO ROOM TO KEEP"
 UNGUARDED = "Nothing keeps the cuts away from"
+WARNINGS = (POOR_ESTIMATE, CUTS_TUMOR, OVER_BUDGET, NO_ROOM, UNCHECKED, UNGUARDED)
 
 
 class ResectionConfig(Config, frozen=True, kw_only=True):
     """How to cut a tumor out.
 
     Attributes:
-        method: published: the paper's two sweeps round the tumor's projection; margin: layers that
-            keep the margin in all directions.
+        method: published: the paper's two sweeps round the tumor's projection; margin: plane facets
+            in which the electrode lies, so that its whole length keeps the margin.
         tumor: its part's name (tumor_1, ...); empty: the one that lies farthest out.
-        margin_mm: least distance between tumor and cut (the paper's 5), to which ``sigmas``
+        margin_mm: least distance between tumor and electrode (the paper's 5), to which ``sigmas``
             standard deviations of the estimate's own uncertainty are added; with them it is
             nowhere wider than ``most_margin_mm``.
         spacing_mm: between points of a stroke.
-        layer_mm: height of a layer, where the method is ``margin``.
-        stroke_mm: width that one stroke of the horizontal instrument cuts.
-        order: of layers, from the top down or from the floor up.
-        direction: of strokes, seen from above; shortest: each from the end that is nearer to where
-            the one before ended.
         lead_mm: strokes begin and end so far outside the organ.
+        most_facets: of the piece; more follow the tumor more closely, and take longer.
         least_exophytic: a tumor with a smaller share outside the organ's hull lies wholly inside.
         most_healthy: the largest share of the organ's healthy tissue that a plan may take.
-        keep_away: structures that no cut may come near to, with the least distance in mm.
+        keep_away: structures and other tumors, with the least distance of the electrode in mm;
+            other tumors that are not named keep ``margin_mm``.
     """
 
     method: Method = "margin"
@@ -60,11 +59,8 @@ class ResectionConfig(Config, frozen=True, kw_only=True):
     margin_mm: float = 5.0
     sigmas: float = 0.0
     spacing_mm: float = 1.0
-    layer_mm: float = 4.0
-    stroke_mm: float = 6.0
-    order: Literal["down", "up"] = "down"
-    direction: Direction = "shortest"
     lead_mm: float = 5.0
+    most_facets: int = 6
     least_exophytic: float = 0.05
     most_healthy: float = 0.5
     most_margin_mm: float = 20.0
@@ -72,10 +68,10 @@ class ResectionConfig(Config, frozen=True, kw_only=True):
 
     def __post_init__(self) -> None:
         self.check_between("plan:", margin_mm=MARGIN_MM, most_margin_mm=(20, 60), sigmas=(0, 10))
-        self.check_between("plan:", spacing_mm=(0.2, 10), layer_mm=(1, 20), stroke_mm=(1, 30))
+        self.check_between("plan:", spacing_mm=(0.2, 10), lead_mm=(0, 30), most_facets=(1, 12))
         if not all(0 < mm <= 50 for mm in self.keep_away.values()):
             raise InputError(f"plan: keep_away is {self.keep_away}; allowed: above 0 to 50 mm.")
-        self.check_between("plan:", lead_mm=(0, 30), least_exophytic=(0, 1), most_healthy=(0, 1))
+        self.check_between("plan:", least_exophytic=(0, 1), most_healthy=(0, 1))
 
 
 def name_of(label: int) -> str:
@@ -139,43 +135,17 @@ class Located:
 
 
 @dataclass(frozen=True, eq=False)
-class CutLayer:
-    """A slab of the piece to be removed: this outline between two heights.
-
-    ``rings_mm``: closed polygons (n, 2), x and y, the first point not repeated; several where the
-    slab is in pieces. ``top_mm`` is infinite in the uppermost.
-    """
-
-    bottom_mm: float
-    top_mm: float
-    rings_mm: Rings
-
-    def __post_init__(self) -> None:
-        if not self.bottom_mm < self.top_mm:
-            raise InputError(f"a layer from {self.bottom_mm:g} up to {self.top_mm:g} mm is none.")
-
-
-@dataclass(frozen=True, eq=False)
 class Cut:
-    """One stroke of the instrument's tip, which is held horizontally.
+    """One pass of the instrument.
 
-    ``sweep``: the one it belongs to, from 1. ``path_mm``: of the tip, evenly spaced, all at one
-    height, in the order of motion; of a closed stroke the first point is repeated at the end.
-    ``kind``: wall: along the outline of a layer; floor: the sheet below the piece.
+    ``sweep``: the one it belongs to, from 1. ``path_mm``: of the electrode's tip, in the order of
+    motion; of a closed stroke the first point is repeated at the end. ``axis``: unit vector from
+    the pencil to the tip, the same all along; None: level, in directions that the arms choose.
     """
 
     sweep: int
     path_mm: Float64[np.ndarray, "_ 3"]
-    kind: StrokeKind = "wall"
-
-    @classmethod
-    def level(cls, sweep: int, flat: np.ndarray, height: float, kind: StrokeKind = "wall") -> Cut:
-        """From its x and y (n, 2), and its height, mm."""
-        return cls(sweep, np.column_stack([flat, np.full(len(flat), height)]), kind)
-
-    @property
-    def height_mm(self) -> float:
-        return float(self.path_mm[0, 2])
+    axis: Float64[np.ndarray, " 3"] | None = None
 
     @property
     def closed(self) -> bool:
@@ -186,21 +156,51 @@ class Cut:
         return float(np.linalg.norm(np.diff(self.path_mm, axis=0), axis=1).sum())
 
 
+@dataclass(frozen=True)
+class Clearance:
+    """The least distance, over all motions, of one solid of a tool to one surface.
+
+    Attributes:
+        solid: electrode (its bare length, energised or not), pencil, rod or cup.
+        part: tumor_1, ..., or a structure.
+        least_mm: between the surfaces; negative: the solid's axis goes so deep into the part.
+        energised_mm: the same while the electrode cuts; None: never, or another solid.
+        stage, at_s: of the motions, and seconds after it began, where ``least_mm`` is reached.
+        place_mm: the place on the part's surface that is nearest then; table frame.
+    """
+
+    solid: str
+    part: str
+    least_mm: float
+    energised_mm: float | None
+    stage: str
+    at_s: float
+    place_mm: tuple[float, float, float]
+
+
 @dataclass(frozen=True, eq=False)
 class ResectionPlan:
     """Where to grasp and to cut, and what comes away if the estimate is right.
 
     Attributes:
         tumor: its part's name (tumor_1, ...) and ``label``.
-        grasp_mm: where the grasper's cup touches, coming from straight above.
-        cuts: strokes in their order.
-        layers: what the cuts enclose, top first: the wall is each layer's outline, and where a
-            layer is wider than the one below it, or has none below, the tissue is cut level.
-        margin_mm: the requested least distance between tumor and cut.
+        grasp_mm: where the grasper's cup touches.
+        cuts: passes in their order.
+        piece: what comes away, closed; without what the electrode's width takes.
+        taken: names of the tumors that come away, the planned one among them.
+        keep_mm: what the electrode keeps away from beside them, with distances.
+        facets: of the method ``margin`` (k, 4), one a sweep: outward unit normals n and offsets h,
+            mm. The electrode's axis stays in the planes n x = h; the piece lies on their inner
+            sides. Empty: another method.
+        lift: unit vector along which the piece is lifted out, and from where the cup comes.
+        margin_mm: the requested least distance between tumor and electrode.
         volumes_ml: organ, parenchyma (of that, no tumor), tumor, piece (all that comes away),
-            healthy (of that, parenchyma).
+            healthy (of that, parenchyma); with facets kerf (parenchyma within the electrode's
+            width).
         exophytic: share of the tumor outside the organ's hull.
         notes: what the user should know.
+        clearances: what the check of the finished motions found (``check``); empty: there are no
+            motions, and the plan is unchecked.
     """
 
     method: Method
@@ -208,23 +208,28 @@ class ResectionPlan:
     label: int
     grasp_mm: Float64[np.ndarray, " 3"]
     cuts: tuple[Cut, ...]
-    layers: tuple[CutLayer, ...]
+    piece: Mesh
+    taken: tuple[str, ...]
+    keep_mm: dict[str, float]
+    facets: Float64[np.ndarray, "k 4"]
+    lift: Float64[np.ndarray, " 3"]
     margin_mm: float
     volumes_ml: dict[str, float]
     exophytic: float
     stamp_ns: int = 0
     notes: tuple[str, ...] = ()
+    clearances: tuple[Clearance, ...] = ()
 
     @property
     def warnings(self) -> tuple[str, ...]:
         """Notes that say not to rely on the plan."""
-        beginnings = (POOR_ESTIMATE, OVER_BUDGET, UNGUARDED)
-        return tuple(note for note in self.notes if note.startswith(beginnings))
+        return tuple(note for note in self.notes if note.startswith(WARNINGS))
 
     @property
     def sweeps(self) -> int:
         return max(cut.sweep for cut in self.cuts)
 
-
-# Of a planning method: layers, cuts, and the grasp point (table frame, mm)
-MethodResult = tuple[tuple[CutLayer, ...], tuple[Cut, ...], Float64[np.ndarray, " 3"]]
+    @property
+    def least_mm(self) -> dict[str, float]:
+        """The electrode's least distance to each tumor and structure; empty: unchecked."""
+        return {each.part: each.least_mm for each in self.clearances if each.solid == ELECTRODE}

@@ -1,14 +1,17 @@
-"""A kidney-like ellipsoid with a tumor at its side, and a plan to cut it out in two sweeps."""
+"""A kidney-like ellipsoid with a tumor at its side, and the arms that cut it out."""
 
 from __future__ import annotations
+
+from functools import cache
 
 import msgspec
 import numpy as np
 
+from plan_objects import located_of, sphere
 from tumortrack.core.types import Mesh
 from tumortrack_resection.arms.cell import ArmCell
 from tumortrack_resection.arms.kinematics import ArmModel
-from tumortrack_resection.values import Cut, CutLayer, ResectionPlan
+from tumortrack_resection.values import Cut, Located, ResectionPlan
 
 Vector = tuple[float, float, float]
 HALF_MM = np.array([55.0, 30.0, 25.0])
@@ -16,14 +19,16 @@ STAND_MM = 120.0
 TUMOR_MM = 12.0  # radius
 
 
-def organ(shift_mm: Vector = (0.0, 0.0, 0.0), angle_rad: float = 0.6) -> Mesh:
-    """The ellipsoid united with the tumor, lowest point on the stand."""
-    import manifold3d
+@cache
+def seen(shift_mm: Vector = (0.0, 0.0, 0.0), angle_rad: float = 0.6, n: int = 6_000) -> Located:
+    """The ellipsoid united with the tumor, lowest point on the stand, as an estimate."""
+    middle_mm = np.array([0.0, 0.0, STAND_MM + HALF_MM[2]]) + shift_mm
+    body = sphere(middle_mm, HALF_MM, 3)
+    return located_of(body, sphere(_tumor(angle_rad) + middle_mm, TUMOR_MM, 3), n=n)
 
-    body = manifold3d.Manifold.sphere(1.0, 48).scale(HALF_MM.tolist())
-    tumor = manifold3d.Manifold.sphere(TUMOR_MM, 32).translate(_tumor(angle_rad).tolist())
-    both = (body + tumor).translate([0.0, 0.0, STAND_MM + HALF_MM[2]]).to_mesh64()
-    return Mesh(both.vert_properties[:, :3] + np.array(shift_mm), both.tri_verts)
+
+def organ(shift_mm: Vector = (0.0, 0.0, 0.0), angle_rad: float = 0.6) -> Mesh:
+    return seen(shift_mm, angle_rad).organ
 
 
 def _tumor(angle_rad: float) -> np.ndarray:
@@ -45,9 +50,12 @@ def plan(
         Cut(n, np.column_stack([ring, np.full(len(ring), height)]))
         for n, height in ((1, centre[2]), (2, low))
     )
-    layers = (CutLayer(centre[2], np.inf, (ring[:-1],)), CutLayer(low, centre[2], (ring[:-1],)))
-    grasp = np.append(centre[:2], top)
-    return ResectionPlan("published", "tumor_1", 2, grasp, cuts, layers, 5.0, {}, 0.5)
+    return ResectionPlan(
+        method="published", tumor="tumor_1", label=2, grasp_mm=np.append(centre[:2], top),
+        cuts=cuts, piece=seen(shift_mm, angle_rad).meshes["tumor_1"], taken=("tumor_1",),
+        keep_mm={}, facets=np.zeros((0, 4)), lift=np.array([0.0, 0.0, 1.0]), margin_mm=5.0,
+        volumes_ml={}, exophytic=0.5,
+    )  # fmt: skip
 
 
 def bare(cell: ArmCell) -> ArmCell:

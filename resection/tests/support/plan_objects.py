@@ -1,11 +1,14 @@
-"""Organs and tumors whose plans are known: an ellipsoid with a half-sunk sphere."""
+"""Organs and tumors whose plans are known: an ellipsoid with a half-sunk sphere, and others."""
 
 from __future__ import annotations
+
+from collections.abc import Mapping
 
 import numpy as np
 import trimesh
 from numpy.typing import ArrayLike
 
+from tumortrack.core.mesh_query import contains
 from tumortrack.core.types import Mesh
 from tumortrack.imaging.meshes import mesh_of, solid_of
 from tumortrack_resection.values import Located
@@ -16,16 +19,21 @@ TUMOR_MM, RADIUS_MM = np.array([10.0, -27.0, 148.0]), 12.0  # bulges out of the 
 
 
 def sphere(middle_mm: ArrayLike, radius_mm: ArrayLike, finer: int = 4) -> Mesh:
+    """Or an ellipsoid, if each axis has a radius of its own."""
     ball = trimesh.creation.icosphere(finer, 1.0)
     return Mesh(ball.vertices * radius_mm + middle_mm, ball.faces)
 
 
+def united(*parts: Mesh) -> Mesh:
+    whole = solid_of(parts[0], "the first part")
+    for part in parts[1:]:
+        whole += solid_of(part, "another part")
+    return mesh_of(whole)
+
+
 def organ_with(*tumors: Mesh) -> Mesh:
     """The union of the ellipsoid and its tumors."""
-    whole = solid_of(sphere(MIDDLE_MM, HALF_MM), "organ")
-    for tumor in tumors:
-        whole += solid_of(tumor, "tumor")
-    return mesh_of(whole)
+    return united(sphere(MIDDLE_MM, HALF_MM), *tumors)
 
 
 def located(*tumors: Mesh, n: int = 40_000, seed: int = 0, std_mm: float | None = None) -> Located:
@@ -47,6 +55,22 @@ def located(*tumors: Mesh, n: int = 40_000, seed: int = 0, std_mm: float | None 
         name: np.full(len(mesh.vertices_mm), std_mm) for name, mesh in named.items()
     }  # fmt: skip
     return Located(points[inside], labels[inside], {"kidney": organ, **named}, deviations)
+
+
+def located_of(
+    body: Mesh, *tumors: Mesh, n: int = 12_000, structures: Mapping[str, Mesh] | None = None
+) -> Located:
+    """The same of any organ: of a body that is united with tumors of any shape."""
+    organ = united(body, *tumors)
+    points = np.random.default_rng(0).uniform(*organ.box_mm, (n, 3))
+    labels = contains(organ, points).astype(np.uint8)
+    for label, tumor in enumerate(tumors, start=2):
+        labels[contains(tumor, points)] = label
+    named = {f"tumor_{k}": tumor for k, tumor in enumerate(tumors, start=1)}
+    inside = labels > 0
+    return Located(
+        points[inside], labels[inside], {"kidney": organ, **named}, structures=structures or {}
+    )
 
 
 class Deviating:

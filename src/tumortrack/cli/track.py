@@ -139,7 +139,7 @@ class _Screen:
             arms = self._run.arms
             stage = stage_words(cell.state, arms is not None and arms.ur)
             state += f"; arms: {stage}" + (f" ({cell.halted})" if cell.halted else "")
-            state += "" if cell.left_mm is None else f"; {cell.left_mm:.1f} mm of the margin left"
+            state += f"; {cell.left}" if cell.left else ""
             kind += [cell.state, cell.halt and cell.halt.same_as]
         now = time.monotonic()
         if kind != self._state and now - self._changed >= _SAY_S:

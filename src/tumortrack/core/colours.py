@@ -37,6 +37,7 @@ ARMS: Colour = (45, 95, 165)
 TO_CUT: Colour = (0, 120, 240)
 NOW: Colour = (205, 0, 130)  # being cut
 CUT: Colour = (120, 40, 40)
+ENERGISED: Colour = (70, 0, 255)  # an electrode that cuts
 WHITE: Colour = (255, 255, 255)
 BACKGROUND: Colour = (22, 24, 29)
 

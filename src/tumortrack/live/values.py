@@ -169,8 +169,8 @@ class Workcell:
 
     ``state``: of the procedure: approach, grasp, hold, sweep 1, ... ``halt``: why the arms have
     stopped early; None: they have not. ``joints_rad``: angle by name of the joint. ``left_mm``:
-    what the present errors leave of the planned margin; None: unknown. ``cutting``: the instrument
-    is on a cut.
+    what the present errors leave of the instrument's distance to the tumor that is the least safe;
+    None: unknown. ``cutting``: the instrument is on a cut.
     """
 
     state: str
@@ -185,6 +185,15 @@ class Workcell:
     def halted(self) -> str:
         """Why the arms have stopped early, in words; empty: they have not."""
         return "" if self.halt is None else self.halt.words
+
+    @property
+    def left(self) -> str:
+        """``left_mm`` in words; empty: unknown."""
+        if self.left_mm is None:
+            return ""
+        if self.left_mm < 0:
+            return f"errors exceed the distance to a tumor by {-self.left_mm:.1f} mm"
+        return f"{self.left_mm:.1f} mm or more are left of the distance to each tumor"
 
     @property
     def drawn_lines(self) -> list[Polyline]:

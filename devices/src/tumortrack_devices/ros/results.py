@@ -84,7 +84,7 @@ class ResultMessages:
         self._meshes_rate, self._markers_rate, self._points_rate = Rate(hz), Rate(hz), Rate(hz)
         self._beside, self._spots_shown, self._texts_shown = Beside(), set[str](), 0
         self._shown: set[str] = set()
-        self._shown_state: tuple[str, bool] | None = None
+        self._shown_state: tuple[str, bool, bool] | None = None
 
     def of(self, result: TrackingResult) -> list[Outgoing]:
         """The messages of one result; docs/ros.md describes each topic. Raises InputError for a
@@ -194,7 +194,7 @@ class ResultMessages:
             return [{"action": _DELETE_ALL}]
         names = {_STATE, *(s.name for s in cell.shapes), *(line.name for line in cell.drawn_lines)}
         gone, self._shown = self._shown - names, names
-        state = cell.state, bool(cell.halted)  # the reason may change with each frame
+        state = cell.state, bool(cell.halted), cell.cutting  # the reason changes with each frame
         changed, self._shown_state = gone or state != self._shown_state, state
         if not self._markers_rate.due() and not changed:
             return None

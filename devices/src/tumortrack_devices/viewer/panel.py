@@ -131,8 +131,7 @@ class StatusPanel:
             return _box("ARMS: nothing is known of them", colours.STALE), ""
         colour = colours.NONE if cell.halted else colours.ARMS
         text = f"{cell.state}: HALTED" if cell.halted else cell.state
-        left = "" if cell.left_mm is None else f"{cell.left_mm:.1f} mm of the margin are left"
-        box = _box(f"ARMS: {text}", colour, cell.halted or left)
+        box = _box(f"ARMS: {text}", colour, cell.halted or cell.left)
         return box, _over("bottom", "plain", colour, text, cell.halted)
 
     def _reason(self) -> str:

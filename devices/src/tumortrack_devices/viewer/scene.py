@@ -131,7 +131,8 @@ class ViewerScene:
         clear = np.zeros((2, 2, 4), np.uint8)
         self._slice = nodes.add_image("/estimate/slice", clear, 1, 1, format="png", **_FLAT)
         self._cell = nodes.add_frame("/workcell", show_axes=False, visible=False)
-        self._drawn: dict[str, tuple[object, np.ndarray, Any]] = {}  # look, place and node by name
+        # Look, place and node by name
+        self._drawn: dict[str, tuple[dict[str, Any], np.ndarray, Any]] = {}
 
     def _cloud(
         self,
@@ -276,7 +277,7 @@ class ViewerScene:
 
     def show_cell(self, cell: live.Workcell | None) -> None:
         """Show the present workcell; None: nothing. A shape's surface is sent once, then only its
-        pose."""
+        pose and its colour."""
         self._cell.visible = cell is not None
         if cell is None:
             return
@@ -306,9 +307,13 @@ class ViewerScene:
     def _placed_node(
         self, name: str, place: np.ndarray, add: Callable[..., Any], look: dict[str, Any]
     ) -> Any | None:
-        """The node to be moved, replaced if it looks different; None: it is in place."""
-        before, present, node = self._drawn.get(name, (None, None, None))
-        if before != look:
+        """The node to be moved, coloured or replaced if it looks different; None: it is in
+        place."""
+        unseen: tuple[dict[str, Any], np.ndarray | None, Any] = {}, None, None
+        before, present, node = self._drawn.get(name, unseen)
+        if before and before != look and {**before, "color": look.get("color")} == look:
+            node.color = look["color"]
+        elif before != look:
             kind, _, own = name.partition("/")
             # Further slashes would make a node move with another in viser.
             node, present = add(f"/workcell/{kind}/{own.replace('/', ':')}", **look), None

@@ -19,6 +19,7 @@ from tumortrack_resection.resection import plan_resection
 from tumortrack_resection.values import Located, ResectionConfig
 
 _POINTS = 40_000
+_FRONT_UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # of LPS
 
 
 def workloads(subject: BenchSubject, _: float) -> Iterator[Workload]:
@@ -30,19 +31,22 @@ def workloads(subject: BenchSubject, _: float) -> Iterator[Workload]:
         yield Workload(PLAN, f"{name}, {_POINTS:,} points", "plan", plan)
     if find_spec("pinocchio") is None:  # the extra `arms`
         return
-    from tumortrack_resection.arms.cell import ArmCell
+    from tumortrack_resection.arms.body import cell_urdf
     from tumortrack_resection.arms.config import CellConfig
     from tumortrack_resection.arms.procedure import plan_motions
+    from tumortrack_resection.checking import checked
+    from tumortrack_resection.planning import below
 
-    organ = located.organ
-    cell, made = ArmCell(CellConfig(), organ), plan_resection(located, ours)
-    motions = partial(plan_motions, made, cell, organ)
-    yield Workload(MOTIONS, f"margin, {made.sweeps} sweeps", "plan", motions)
+    cell = below(located.organ, CellConfig())
+    plan_both = partial(plan_motions, located, ours, cell)
+    made, motions = plan_both()
+    yield Workload(MOTIONS, f"margin, {made.sweeps} sweeps, the plan included", "plan", plan_both)
+    check = partial(checked, made, motions, cell_urdf(cell), located)
+    yield Workload(MOTIONS, "their check", "plan", check)
 
 
-def on_its_stand(anatomy_ct: Anatomy) -> Located:
-    """An organ with its front up: 40,000 points inside, and its surfaces."""
-    turn = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # LPS, its front up
+def on_its_stand(anatomy_ct: Anatomy, turn: np.ndarray = _FRONT_UP) -> Located:
+    """An organ, turned so (3, 3): 40,000 points inside, and its surfaces."""
     organ = anatomy_ct.organ.vertices_mm @ turn.T
     x, y, _ = -(organ.min(0) + organ.max(0)) / 2
     placed = moved(anatomy_ct, rigid(turn, np.array([x, y, STAND_MM - organ[:, 2].min()])))

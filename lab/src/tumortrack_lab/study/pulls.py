@@ -160,16 +160,18 @@ def table(rows: list[dict[str, Any]]) -> pd.DataFrame:
             "left out": int(plans.left_out.eq(True).sum()),
             "asked": len(plans), "plans": len(made),
             "whole": int((made.removed_share >= WHOLE).sum()),
+            "cut worst %": f"{100 * made.cut_share.max():.1f}",
             "margin kept median mm": f"{margins.median():.1f}", "worst mm": f"{margins.min():.1f}",
-            "as asked": int((margins >= asked_mm).sum()), "cut into it": int((margins < 0).sum()),
+            "as asked": int((margins >= asked_mm).sum()), "cut into it": int((margins <= 0).sum()),
             "healthy tissue mean ml": f"{made.healthy_ml.mean():.1f}",
+            "kerf area mean cm2": f"{made.kerf_area_mm2.mean() / 100:.1f}",
         })  # fmt: skip
     return pd.DataFrame(lines)
 
 
 _COLUMNS = [
     "case", "number", "tumor", "pull_mm", "how", "planner", "refused", "off_mm", "good",
-    "left_out", "removed_share", "margin_mm", "healthy_ml", "left_ml",
+    "left_out", "removed_share", "cut_share", "left_ml", "margin_mm", "healthy_ml", "kerf_area_mm2",
 ]  # fmt: skip
 
 

@@ -38,8 +38,9 @@ from tumortrack_lab.study.tables import NOTHING, ordered
 from tumortrack_lab.study.trust import share_words
 from tumortrack_lab.study.tumor_sites import tumor_sites_of
 from tumortrack_lab.twin.apparatus import moved
-from tumortrack_resection.budget import ErrorBudget, plan_within, planned_budget
+from tumortrack_resection.budget import ErrorBudget, plan_within, planned_budgets
 from tumortrack_resection.located import of_estimate
+from tumortrack_resection.resection import plan_resection
 from tumortrack_resection.values import Located, ResectionConfig, ResectionPlan
 
 TRUTH = "truth"
@@ -47,7 +48,9 @@ _FINE = 256  # voxels along the true organ: its points' labels err by 0.2 mm
 MARGIN_MM = 5.0  # the paper's
 SIGMAS = 2.0
 WHOLE = 0.999  # of a tumor: what is missing is a voxel's rounding
-_RESULTS = ["detached", "removed_share", "left_ml", "margin_mm", "healthy_ml", "hurt"]
+_NUMBERS = ["removed_share", "cut_share", "left_ml", "margin_mm"]
+_NUMBERS += ["healthy_ml", "kerf_ml", "kerf_area_mm2"]
+_RESULTS = ["detached", *_NUMBERS, "hurt"]
 _NUMBER = re.compile(r"\d+(\.\d+)?")
 
 
@@ -72,13 +75,17 @@ class Planner(Config, frozen=True):
     def plan(self, located: Located, tumor: str) -> ResectionPlan:
         """Raises InputError and NoPlan as ``plan_within``."""
 
-        def budget_of(plan: ResectionPlan) -> ErrorBudget:
-            budget = planned_budget(plan, located, confidence=self.confidence or None)
+        def plan_of(config: ResectionConfig) -> ResectionPlan:
+            return plan_resection(located, config)
+
+        def budgets_of(plan: ResectionPlan) -> tuple[ErrorBudget, ...]:
+            budgets = planned_budgets(plan, located, confidence=self.confidence or None)
             others = {"hand_eye_mm": 0.0, "tool_mm": 0.0, "motion_mm": 0.0, "assumed": ()}
-            return msgspec.structs.replace(budget, **(others if self.still else {}))
+            changed = others if self.still else {}
+            return tuple(msgspec.structs.replace(budget, **changed) for budget in budgets)
 
         config = ResectionConfig(tumor=tumor, margin_mm=self.margin_mm, sigmas=self.sigmas)
-        return plan_within(located, config, budget_of, self.confidence > 0)[0]
+        return plan_within(plan_of, config, budgets_of, self.confidence > 0)[0]
 
     def tried(self, located: Located, tumor: str) -> ResectionPlan | str:
         """A plan, or why there is none."""
@@ -187,7 +194,7 @@ def tidy_plans(rows: list[dict[str, Any]]) -> pd.DataFrame:
     """One row for each plan, made or ``refused``: the truth's last, planners in their order."""
     columns = ["case", "method", "planner", "refused", "promised_ml", *_RESULTS]
     frame = pd.DataFrame(rows).reindex(columns=columns)
-    frame = frame.astype(dict.fromkeys(_RESULTS[1:5], float))
+    frame = frame.astype(dict.fromkeys(_NUMBERS, float))
     planners = pd.Categorical(frame.planner, [planner.name for planner in PLANNERS])
     methods = sorted(frame.method.unique(), key=lambda name: name == TRUTH)
     frame = frame.assign(planner=planners, method=pd.Categorical(frame.method, methods))
@@ -223,12 +230,13 @@ def summary(cuts: pd.DataFrame) -> str:
     """All cases, in Markdown."""
     shown = ["located by", "planner", "plans", "whole", "margin kept median mm", "worst mm"]
     shown += ["as asked %", "cut into it", "into another tumor", "healthy tissue mean ml"]
+    shown += ["kerf area mean cm2"]
     return table_of(cuts.loc[cuts.case == "all", shown], 2)
 
 
 def _cut(plans: pd.DataFrame, planner: str) -> dict[str, Any]:
-    """Numbers are of the plans that were made, shares of tumors rounded down; margins are those of
-    the least distance from the cut to the true tumor."""
+    """Numbers are of the plans that were made, shares removed rounded down, shares cut up; margins
+    are those of the energised electrode, over its whole length, to the true tumor."""
     made = plans[plans.refused.isna()]
     free, removed = made[made.detached.astype(bool)], 100 * made.removed_share
     least_mm = {p.name: p.margin_mm for p in PLANNERS}[planner] - VOXEL_MM
@@ -238,19 +246,23 @@ def _cut(plans: pd.DataFrame, planner: str) -> dict[str, Any]:
         "whole": (made.removed_share >= WHOLE).sum(),
         "removed median %": _text(removed.median(), down=True),
         "removed worst %": _text(removed.min(), down=True),
+        "cut worst %": _text(100 * made.cut_share.max(), up=True),
         "left worst ml": _text(made.left_ml.max(), digits=2),
         "margin kept median mm": _text(made.margin_mm.median()),
         "worst mm": _text(made.margin_mm.min()),
         "as asked %": share_words((made.margin_mm >= least_mm).sum(), len(made)),
-        "cut into it": (made.margin_mm < 0).sum(), "into another tumor": made.hurt.map(bool).sum(),
+        "cut into it": (made.margin_mm <= 0).sum(), "into another tumor": made.hurt.map(bool).sum(),
         "healthy tissue mean ml": _text(free.healthy_ml.mean()),
         "healthy tissue mean %": _text(100 * (free.healthy_ml / parenchyma_ml).mean(), 0),
+        "of that in kerfs mean ml": _text(free.kerf_ml.mean()),
+        "kerf area mean cm2": _text(free.kerf_area_mm2.mean() / 100),
     }  # fmt: skip
 
 
-def _text(value: float, digits: int = 1, down: bool = False) -> str:
+def _text(value: float, digits: int = 1, down: bool = False, up: bool = False) -> str:
     if math.isnan(value):
         return NOTHING
-    if down:
-        value = math.floor(round(value * 10**digits, 6)) / 10**digits
+    if down or up:
+        whole = round(value * 10**digits, 6)
+        value = (math.floor(whole) if down else math.ceil(whole)) / 10**digits
     return f"{value + 0.0:.{digits}f}"

@@ -19,7 +19,12 @@ import numpy as np
 from tumortrack.core.colours import Colour
 from tumortrack.core.geometry import rigid, rotation_onto, transform_points
 from tumortrack.core.types import Mesh
-from tumortrack_resection.arms.config import CellConfig
+from tumortrack_resection.arms.config import (
+    ELECTRODE_RADIUS_MM,
+    PENCIL_RADIUS_MM,
+    STAND_GAP_MM,
+    CellConfig,
+)
 from tumortrack_resection.arms.kinematics import ArmModel, Pose
 from tumortrack_resection.motions import ARMS, CUTTER, HOLDER
 from tumortrack_resection.ur_sink import UR_JOINTS
@@ -31,7 +36,6 @@ GREY, DARK, BLUE = (206, 210, 214), (92, 98, 106), (104, 160, 196)
 STEEL, YELLOW, CUP = (176, 182, 190), (222, 190, 80), (70, 76, 92)
 WOOD, POST = (226, 229, 232), (150, 158, 166)
 
-PENCIL_RADIUS_MM, ELECTRODE_RADIUS_MM = 6.5, 1.2
 _BEAD_MM, _SIDES = 1.5, 28  # of display surfaces
 
 LINKS = ("base", "shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
@@ -151,8 +155,7 @@ def _surroundings(config: CellConfig) -> list[Part]:
     in the table frame."""
     middle, (x, y, top) = np.array(config.middle_mm), config.middle_mm
     slab = rigid(np.eye(3), middle - [0.0, 0.0, 20.0])
-    # The post ends a little below the organ, which must not count as touched by its own support.
-    post = ((x, y, top), (x, y, top + config.stand_mm - 3))
+    post = ((x, y, top), (x, y, top + config.stand_mm - STAND_GAP_MM))
     parts = [
         Part(TABLE, TABLE, "box", (*config.table_mm, 40.0), slab, WOOD),
         _rod(STAND, TABLE, post, config.stand_radius_mm, POST),

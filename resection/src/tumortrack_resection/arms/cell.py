@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import product
@@ -34,12 +34,20 @@ class ArmCell:
     """Both arms with their tools over the table, and the organ once it is known.
 
     Values do not change after construction, but the buffers of pinocchio do: one thread at a time.
-    ``model`` and ``solids`` are pinocchio's, in metres.
+    ``model`` and ``solids`` are pinocchio's, in metres. ``keep``: surfaces from which the electrode
+    keeps a distance, mm, whatever it does.
     """
 
-    def __init__(self, config: CellConfig | None = None, organ: Mesh | None = None) -> None:
+    def __init__(
+        self,
+        config: CellConfig | None = None,
+        organ: Mesh | None = None,
+        keep: Mapping[str, tuple[Mesh, float]] | None = None,
+    ) -> None:
         self.config = config or CellConfig()
         self.organ = organ
+        keep = {f"the margin of {name}": kept for name, kept in (keep or {}).items()}
+        self.keep_mm = {name: mm for name, (_, mm) in keep.items()}
         self.home_rad: Joints = np.array(self.config.home_rad)
         self.limits_rad, self.speeds_rad_s = self.config.limits_rad, self.config.speeds_rad_s
         text = body.cell_urdf(self.config)
@@ -47,12 +55,14 @@ class ArmCell:
         self.solids = pin.buildGeomFromUrdfString(self.model, text, pin.GeometryType.COLLISION)
         self._data = self.model.createData()
         names = _solid_names(self.solids, body.cell_parts(self.config))
-        if organ is not None:
-            surface = _bounding_volumes(organ)
-            self.solids.addGeometryObject(pin.GeometryObject(ORGAN, 0, pin.SE3.Identity(), surface))
-            names.append(ORGAN)
+        kept = {name: mesh for name, (mesh, _) in keep.items()}
+        for name, mesh in {**({} if organ is None else {ORGAN: organ}), **kept}.items():
+            surface = _bounding_volumes(mesh)
+            self.solids.addGeometryObject(pin.GeometryObject(name, 0, pin.SE3.Identity(), surface))
+            names.append(name)
         index = {name: n for n, name in enumerate(names)}
         self._pairs = [pair for pair in _pairs() if index.keys() >= set(pair)]
+        self._pairs += [(TOUCHES[CUTTER], name) for name in kept]
         for first, second in self._pairs:
             self.solids.addCollisionPair(pin.CollisionPair(index[first], index[second]))
         self._states: dict[tuple[Any, ...], Any] = {}
@@ -136,6 +146,10 @@ class ArmCell:
 
     def _margin_mm(self, pair: CollidingPair, touching: tuple[str, ...]) -> float:
         """The least distance of a pair."""
+        if pair[1] in self.keep_mm:
+            # In free motions it may come nearer between two tested poses.
+            room_mm = 0.0 if CUTTER in touching else self.config.least_clearance_mm(touching)
+            return self.keep_mm[pair[1]] + room_mm
         if ORGAN in pair or (body.STAND in pair and TOUCHES[CUTTER] in pair):
             return self.config.organ_clearance_mm
         tools = pair[0] == TOUCHES[CUTTER] and pair[1].removeprefix("holder/") in TOOLS[HOLDER]

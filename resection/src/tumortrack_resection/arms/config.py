@@ -11,8 +11,11 @@ from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import rigid
 from tumortrack_resection.arms.kinematics import MODELS, ArmModel, Pose, level_pose
+from tumortrack_resection.facets import Tools
 from tumortrack_resection.motions import ARMS, CUTTER, JOINTS, Joints
 
+PENCIL_RADIUS_MM, ELECTRODE_RADIUS_MM = 6.5, 1.2
+STAND_GAP_MM = 3.0  # between the organ's lowest point and what carries it
 _DOWN = np.diag([1.0, -1.0, -1.0])  # a flange that points down, over a tip whose z is up
 _LENGTHS = (
     *("bracket_mm", "pencil_mm", "electrode_mm", "rod_mm", "cup_mm", "cup_radius_mm"),
@@ -112,6 +115,17 @@ class CellConfig(Config, frozen=True, kw_only=True):
             raise InputError("cell: places must be finite and within 10000 mm, angles finite.")
         if self.cup_mm >= self.rod_mm:
             raise InputError("cell: the cup must be shorter than the rod that ends in it.")
+
+    @property
+    def tools(self) -> Tools:
+        """What the planner has to know of them."""
+        x, y, z = self.middle_mm
+        # The post ends a little below the organ, which must not count as touched by its support.
+        stand = (x, y, z + self.stand_mm - STAND_GAP_MM, self.stand_radius_mm)
+        return Tools(
+            self.electrode_mm, ELECTRODE_RADIUS_MM, self.cup_radius_mm, stand,
+            self.organ_clearance_mm,
+        )  # fmt: skip
 
     def model(self, arm: str) -> ArmModel:
         """The type of arm that is ``cutter`` or ``holder``."""

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float64
 
-from tumortrack.core.geometry import rigid
+from tumortrack.core.geometry import rigid, rotation_onto
 
 Pose = Float64[np.ndarray, "4 4"]  # of frame b in frame a: ``a_from_b``, mm
 TURN = 2 * np.pi
@@ -81,6 +81,11 @@ def level_pose(position_mm: Float64[np.ndarray, " 3"], yaw_rad: float) -> Pose:
     """``table_from_frame`` of a frame whose z is up and whose x points towards the yaw."""
     c, s = np.cos(yaw_rad), np.sin(yaw_rad)
     return rigid(np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]), position_mm)
+
+
+def upright(up: Float64[np.ndarray, " 3"], yaw_rad: float = 0.0) -> Float64[np.ndarray, "3 3"]:
+    """The shortest turn of ``level_pose``'s frame that brings its z to ``up``, a unit vector."""
+    return rotation_onto(np.array([0.0, 0.0, 1.0]), up) @ level_pose(np.zeros(3), yaw_rad)[:3, :3]
 
 
 def yaw_of(table_from_frame: Pose) -> float:

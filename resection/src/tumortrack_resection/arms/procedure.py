@@ -10,35 +10,38 @@ import itertools
 import signal
 from collections.abc import Iterator
 from copy import copy
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
+from jaxtyping import Float64
 
-from tumortrack.core.errors import InputError, NoPlan
-from tumortrack.core.types import Mesh
+from tumortrack.core.errors import NoPlan
+from tumortrack.core.geometry import rigid
 from tumortrack_resection.arms import cutting
 from tumortrack_resection.arms.cell import TOUCHES, ArmCell, Blocked, PlanningGroup
 from tumortrack_resection.arms.config import Base, CellConfig
-from tumortrack_resection.arms.cutting import Surroundings, level_poses
-from tumortrack_resection.arms.kinematics import level_pose, yaw_of
+from tumortrack_resection.arms.cutting import Outside, Way, turns_about
+from tumortrack_resection.arms.kinematics import Pose, level_pose, upright, yaw_of
 from tumortrack_resection.arms.paths import connect, follow, out_of_reach
-from tumortrack_resection.arms.trajectory import TrajectoryBuilder, along, first_hit, together
+from tumortrack_resection.arms.trajectory import TrajectoryBuilder, first_hit
+from tumortrack_resection.checking import checked
 from tumortrack_resection.motions import (
     ARMS,
     CUTTER,
     HOLD,
     HOLDER,
-    JOINTS,
     LIFT,
     PULL,
     RELEASE,
     TAUT,
+    WITHDRAW,
     Joints,
     Motions,
 )
 from tumortrack_resection.operation import Planned, ResectionProgress
-from tumortrack_resection.resection import plan_resection
-from tumortrack_resection.values import Located, ResectionConfig, ResectionPlan
+from tumortrack_resection.resection import Draft, Drafts, plan_resection
+from tumortrack_resection.values import Cut, Located, ResectionConfig, ResectionPlan
 
 _VACUUM_S = 0.5  # until the cup holds
 _LET_GO_S = 0.3
@@ -50,84 +53,119 @@ _GRIPS = 4  # ways of holding that are tried
 # from the present one), in the order of trying.
 _DISTANCES = (0.65, 0.5, 0.8)
 _SIDES_DEG = (0.0, 30.0, -30.0, 60.0, -60.0)
-_YAWS = 8  # in which the instrument is asked to reach
-_MOST_TRIED = 8  # pairs of places for which motions are planned
+_YAWS = 8  # in which a level instrument is asked to reach
+_MOST_PIECES, _ELSEWHERE = 8, 3  # for which motions are planned, and with other bases
+_HAND = tuple(f"{HOLDER}/{name}" for name in ("cup", "rod", "wrist_3"))
+_UP = np.array([0.0, 0.0, 1.0])
+_MOST_TRIED = 4  # pairs of places for which motions are planned
 _EDGE_MM = 120.0  # a base's middle is no nearer to the table's edge
 
 
+class Start(NamedTuple):
+    """Where the arms are (twelve joints) when they are planned for anew. An instrument in tissue
+    first leaves straight back. ``from_sweep``: the grasper holds already and stays where it is;
+    begin with this sweep, counted from 1; one more than there are: lift, release and go home."""
+
+    joints_rad: Joints
+    from_sweep: int | None = None
+
+
+class FacetsBlocked(Blocked):
+    """Facets that the arms can't cut, the reason being that of the first; ``numbers``: of their
+    sweeps, from 1."""
+
+    def __init__(self, blocked: dict[int, Blocked]) -> None:
+        first = next(iter(blocked.values()))
+        super().__init__(str(first), first.pair)
+        self.numbers = tuple(blocked)
+
+
 def plan_motions(
-    plan: ResectionPlan,
-    cell: ArmCell,
-    organ: Mesh,
-    start_rad: Joints | None = None,
-    from_sweep: int | None = None,
+    located: Located,
+    config: ResectionConfig,
+    cell: CellConfig,
+    start: Start | None = None,
+    like: Float64[np.ndarray, "k 3"] | None = None,
     seed: int = 0,
-) -> Motions:
-    """Both arms through the whole procedure; the same every time. Raises NoPlan: a place out of
-    reach, or a collision that could not be avoided, and what to do; InputError: an invalid start.
+    pieces: int = _MOST_PIECES,
+) -> tuple[ResectionPlan, Motions]:
+    """A plan that both arms can carry out, and their motions through the whole procedure; the same
+    every time. Pieces are tried in the order of the healthy tissue that they take; a facet that the
+    arms don't manage is left out of those that follow.
 
     Args:
-        organ: the whole organ as it lies now, closed, table frame, mm.
-        start_rad: where the arms are (twelve joints), if not at home. An instrument in tissue first
-            leaves straight back.
-        from_sweep: the grasper holds already and stays where it is; begin with this sweep, counted
-            from 1; one more than there are: lift, release and go home.
+        located: the organ as it lies now, table frame, mm.
+        start: where the arms are, if not at home.
+        like: outward normals (k, 3) of the facets of an earlier plan, which are kept.
+        pieces: for so many motions are planned at most.
+
+    Raises NoPlan: nothing to cut, or the arms manage no piece, and why; InputError: an option that
+        can't be used.
     """
-    cell = cell if cell.organ is organ else ArmCell(cell.config, organ)
-    start = cell.home_rad if start_rad is None else np.array(start_rad, float)
-    if start.shape != (len(JOINTS),) or not (np.abs(start) <= cell.limits_rad).all():
-        raise InputError("the arms' start must be twelve joint angles within their limits.")
-    if from_sweep is not None and start_rad is None:
-        raise InputError("from_sweep needs start_rad: where the arms are while one holds.")
-    builder = TrajectoryBuilder(cell, start, np.random.default_rng(seed))
-    around = Surroundings(organ, cell.config, plan)
-    try:
-        _withdraw(builder, around, holding=from_sweep is not None)
-        if from_sweep is not None:
-            return _cut_and_finish(builder, plan, around, from_sweep)
-        return _grasp_and_cut(builder, plan, around)
-    except Blocked as blocked:
-        raise NoPlan(
-            f"the arms can't carry this out: {blocked}. Place the arms or the organ otherwise, or "
-            "plan with other margins."
-        ) from blocked
-
-
-def _grasp_and_cut(
-    builder: TrajectoryBuilder, plan: ResectionPlan, around: Surroundings
-) -> Motions:
-    """By the first grip that leaves the instrument a path; Blocked: the first grip's reason."""
-    deep_mm = around.depth_mm(plan.grasp_mm)
-    if deep_mm > builder.cell.config.cup_mm:
-        raise Blocked(f"the grasp point lies {deep_mm:.0f} mm below the organ's surface")
+    drafts = Drafts(located, config, cell.tools, like)
     reason: Blocked | None = None
-    for grip in _grips(builder, plan.grasp_mm):
+    for _ in range(pieces):
         try:
-            attempt = copy(builder)
-            _grasp(attempt, grip)
-            return _cut_and_finish(attempt, plan, around, 1)
+            draft = drafts.best()
+        except NoPlan:
+            if reason is None:
+                raise
+            break
+        try:
+            return _attempt(draft, cell, start, np.random.default_rng(seed))
+        except FacetsBlocked as blocked:
+            reason = reason or blocked
+            drafts.leave_out(blocked.numbers)
         except Blocked as blocked:
             reason = reason or blocked
-            if blocked.pair and not any(name.startswith(HOLDER) for name in blocked.pair):
-                break  # the holder is not in the way
+            break
+        if like is not None or config.method == "published":
+            break
+    raise NoPlan(
+        f"the arms can't carry this out: {reason}. Place the arms or the organ otherwise, or plan "
+        "with other margins."
+    ) from reason
+
+
+def _attempt(
+    draft: Draft, config: CellConfig, start: Start | None, rng: np.random.Generator
+) -> tuple[ResectionPlan, Motions]:
+    """The procedure with this piece. Raises Blocked."""
+    located = draft.located
+    cell = ArmCell(config, located.organ, draft.keep)
+    joints_rad = cell.home_rad if start is None else start.joints_rad
+    builder = TrajectoryBuilder(cell, joints_rad, rng)
+    outside = Outside(cell, located.organ, draft.grasp_mm, draft.lift)
+    from_sweep = None if start is None else start.from_sweep
+    if start is not None:
+        _withdraw(builder, outside, from_sweep is not None)
+    if from_sweep is not None:
+        return _cut_and_finish(builder, draft, outside, from_sweep)
+    reason: Blocked | None = None
+    for grip in _grips(builder, draft):
+        try:
+            attempt = copy(builder)
+            _grasp(attempt, grip, draft.lift)
+            return _cut_and_finish(attempt, draft, outside, 1)
+        except Blocked as blocked:
+            reason = reason or blocked
+            pair = blocked.pair or ()
+            if not any(name.startswith(HOLDER) and name not in _HAND for name in pair):
+                break  # held otherwise, the holder's hand would be where it is
     assert reason is not None
     raise reason
 
 
-def _lowering(grasp_mm: np.ndarray, yaw_rad: float, above_mm: float = _ABOVE_MM) -> np.ndarray:
-    """Poses of the cup from above down to where it holds."""
-    heights = np.linspace(above_mm, 0, max(2, int(above_mm / _STEP_MM)) + 1)
-    return level_poses(grasp_mm + heights[:, None] * [0.0, 0.0, 1.0], yaw_rad)
-
-
-def _grips(builder: TrajectoryBuilder, grasp_mm: np.ndarray) -> Iterator[np.ndarray]:
-    """Joint paths (n, 6) straight down onto the grasp, those near the arm's present place first;
-    Blocked where there is none.
+def _grips(builder: TrajectoryBuilder, draft: Draft) -> Iterator[np.ndarray]:
+    """Joint paths (n, 6) straight onto the grasp, those near the arm's present place first; Blocked
+    where there is none.
 
     How the cup is turned does not matter: it is round, and turns about the last joint alone.
     """
     group = builder.group(HOLDER, touching=(HOLDER,))
-    poses = _lowering(grasp_mm, yaw_of(builder.tip(HOLDER)))
+    turn = upright(draft.lift, yaw_of(builder.tip(HOLDER)))
+    heights = np.linspace(_ABOVE_MM, 0, int(_ABOVE_MM / _STEP_MM) + 1)
+    poses = cutting.poses(draft.grasp_mm + heights[:, None] * draft.lift, turn)
     starts = group.inverse_kinematics(poses[0])
     if not len(starts):
         raise out_of_reach(group, poses[0])
@@ -146,7 +184,7 @@ def _grips(builder: TrajectoryBuilder, grasp_mm: np.ndarray) -> Iterator[np.ndar
         raise reason
 
 
-def _grasp(builder: TrajectoryBuilder, grip_rad: np.ndarray) -> None:
+def _grasp(builder: TrajectoryBuilder, grip_rad: np.ndarray, lift: np.ndarray) -> None:
     """Approach, grasp, hold and pull."""
     builder.go(HOLDER, connect(builder.group(HOLDER), grip_rad[0], builder.rng))
     builder.close("approach")
@@ -155,85 +193,111 @@ def _grasp(builder: TrajectoryBuilder, grip_rad: np.ndarray) -> None:
     builder.wait(_VACUUM_S)
     builder.close(HOLD)
     if pull_mm := builder.cell.config.pull_mm:
-        _rise(builder, pull_mm, builder.cell.config.cutting_mm_s)
+        _rise(builder, lift, pull_mm, builder.cell.config.cutting_mm_s)
         builder.close(PULL)
         builder.wait(_TAUT_S)
         builder.close(TAUT)
 
 
 def _cut_and_finish(
-    builder: TrajectoryBuilder, plan: ResectionPlan, around: Surroundings, first: int
-) -> Motions:
-    for sweep in range(first, plan.sweeps + 1):
-        for path_mm in cutting.passes(cut for cut in plan.cuts if cut.sweep == sweep):
-            cutting.cut_pass(builder, path_mm, around)
+    builder: TrajectoryBuilder, draft: Draft, outside: Outside, first: int
+) -> tuple[ResectionPlan, Motions]:
+    """From this sweep on; the instrument has gone home before the piece is lifted."""
+    group, blocks = builder.group(CUTTER, (CUTTER, HOLDER)), dict[int, Blocked]()
+    ways: dict[int, list[Way]] = {}
+    for sweep, choices in enumerate(draft.sweeps, start=1):
+        if sweep >= first and not draft.level:
+            try:
+                ways[sweep] = cutting.ways(group, choices, outside)
+            except Blocked as blocked:
+                blocks[sweep] = blocked
+    if blocks:
+        raise FacetsBlocked(blocks)
+    cuts: list[Cut] = []
+    for sweep, choices in enumerate(draft.sweeps, start=1):
+        if sweep < first:
+            cuts.append(choices[0])
+            continue
+        try:
+            if draft.level:
+                cuts += choices
+                cutting.cut_level(builder, choices[0], outside)
+            else:
+                cuts.append(cutting.go_one_of(builder, ways[sweep]))
+        except Blocked as blocked:
+            raise FacetsBlocked({sweep: blocked}) from blocked
         builder.close(f"sweep {sweep}")
-    _rise(builder)
+    _go_home(builder, CUTTER, (HOLDER,))
+    _rise(builder, draft.lift)
     builder.close(LIFT)
     builder.wait(_LET_GO_S)
     builder.close(RELEASE)
-    _go_home(builder)
+    _go_home(builder, HOLDER, ())
     builder.close("home")
-    return Motions(builder.stages)
+    return draft.plan(tuple(cuts)), Motions(builder.stages)
 
 
-def _withdraw(builder: TrajectoryBuilder, around: Surroundings, holding: bool) -> None:
+def _withdraw(builder: TrajectoryBuilder, outside: Outside, holding: bool) -> None:
     """Straight back with an instrument that is in tissue or at it, and up with a cup on it."""
     pair = builder.cell.collisions(builder.joints_rad, (HOLDER,))
     if pair is not None and TOUCHES[CUTTER] in pair:
         tip = builder.tip(CUTTER)
-        yaw = yaw_of(tip)
-        leave = cutting.leg(tip[None, :3, 3], yaw, around).leave_mm
-        builder.follow(CUTTER, level_poses(leave, yaw), builder.cell.config.cutting_mm_s)
+        leave = cutting.straight_back(tip, outside.back_mm(tip[:3, 3], tip[:3, 0]))
+        # Whatever has moved towards it meanwhile: going straight back it comes no nearer.
+        bare = ArmCell(builder.cell.config, builder.cell.organ)
+        group = PlanningGroup(bare, CUTTER, builder.joints_rad, (CUTTER, HOLDER))
+        builder.go(CUTTER, follow(group, leave), bare.config.cutting_mm_s)
+        builder.close(WITHDRAW)
     pair = builder.cell.collisions(builder.joints_rad, (CUTTER,))
     if not holding and pair is not None and TOUCHES[HOLDER] in pair:
         builder.wait(_LET_GO_S)
-        _rise(builder)
+        _rise(builder, _UP)
 
 
-def _rise(builder: TrajectoryBuilder, by_mm: float = _ABOVE_MM, mm_s: float | None = None) -> None:
-    """The holder goes straight up, after the last cut with the piece."""
+def _rise(
+    builder: TrajectoryBuilder,
+    direction: np.ndarray,
+    by_mm: float = _ABOVE_MM,
+    mm_s: float | None = None,
+) -> None:
+    """The holder goes straight up, or after the last cut with the piece where that comes free."""
     tip = builder.tip(HOLDER)
-    rising = _lowering(tip[:3, 3], yaw_of(tip), by_mm)[::-1]
+    far = np.linspace(0, by_mm, max(2, int(by_mm / _STEP_MM)) + 1)
+    rising = cutting.poses(tip[:3, 3] + far[:, None] * direction, tip[:3, :3])
     builder.follow(HOLDER, rising, mm_s or builder.cell.config.grasping_mm_s)
 
 
-def _go_home(builder: TrajectoryBuilder) -> None:
-    """Both arms at once: straight in joint space if that is free."""
-    both, home, speeds = builder.group(None), builder.cell.home_rad, builder.cell.speeds_rad_s
-    for place in (both.joints_rad, home):
-        if pair := both.collides(place):
-            raise Blocked.by(pair, " on the way home")
-    if both.segment_collides(both.joints_rad, home) is None:
-        builder.add(together(both.joints_rad, home, speeds))
-    else:
-        cutter, tip = builder.group(CUTTER), builder.tip(CUTTER)
-        corners = [cutting.aside(cutter, tip, *by) for by in cutting.DETOURS_MM]
-        detours = [cutter.all_joints(corner)[None] for corner in corners if len(corner)]
-        builder.add(along(connect(both, home, builder.rng, detours), speeds))
+def _go_home(builder: TrajectoryBuilder, arm: str, touching: tuple[str, ...]) -> None:
+    """One arm, straight in joint space if that is free; what is ``touching`` stands still."""
+    group = builder.group(arm, touching)
+    tip = builder.tip(arm)
+    corners = [cutting.aside(group, tip, *by) for by in cutting.DETOURS_MM]
+    detours = [corner[None] for corner in corners if len(corner)]
+    builder.go(arm, connect(group, builder.cell.home_rad[group.own], builder.rng, detours))
 
 
 def search_bases(
-    plan: ResectionPlan, config: CellConfig, organ: Mesh, seed: int = 0
-) -> tuple[ArmCell, Motions, str]:
-    """The motions from where the arms stand, or else from elsewhere round the table; the workcell
-    that they are for, with the organ; and a note for the user on what was changed, empty: nothing.
+    located: Located, config: ResectionConfig, cell: CellConfig, seed: int = 0
+) -> tuple[CellConfig, ResectionPlan, Motions, str]:
+    """A plan with its motions from where the arms stand, or else from elsewhere round the table;
+    the workcell that they are for; and a note for the user on what was changed, empty: nothing.
 
     A small fixed grid of places for both bases, on their pedestals and facing as they do: first
     those within reach of every stroke, near to where the arms stand now; then the first for which
-    the whole procedure can be planned. Raises NoPlan: no place will do; the reason is the one for
-    the places where the arms stand now."""
-    cell = ArmCell(config, organ)
+    the whole procedure can be planned. Raises as ``plan_motions``: no place will do; the reason is
+    the one for the places where the arms stand now."""
     try:
-        return cell, plan_motions(plan, cell, organ, seed=seed), ""
+        return cell, *plan_motions(located, config, cell, seed=seed), ""
     except NoPlan as failure:
         reason = failure
-    for moved in itertools.islice(_reachable_cells(plan, config), _MOST_TRIED):
-        cell = ArmCell(moved, organ)
-        if cell.collisions(cell.home_rad) is not None:
+    plan = plan_resection(located, config, cell.tools)
+    for moved in itertools.islice(_reachable_cells(plan, cell), _MOST_TRIED):
+        placed = ArmCell(moved, located.organ)
+        if placed.collisions(placed.home_rad) is not None:
             continue
         try:
-            return cell, plan_motions(plan, cell, organ, seed=seed), _note(moved)
+            made = plan_motions(located, config, moved, seed=seed, pieces=_ELSEWHERE)
+            return moved, *made, _note(moved)
         except NoPlan:
             continue
     raise NoPlan(f"{reason} Other places for the arms round the table were tried in vain.")
@@ -242,8 +306,15 @@ def search_bases(
 def _reachable_cells(plan: ResectionPlan, config: CellConfig) -> Iterator[CellConfig]:
     """Configurations in which both arms reach all they have to, the least change first."""
     # Ends and middles of all strokes
-    strokes = np.concatenate([cut.path_mm[[0, len(cut.path_mm) // 2, -1]] for cut in plan.cuts])
-    targets = {CUTTER: strokes, HOLDER: plan.grasp_mm[None] + [[0, 0, 0], [0, 0, 60.0]]}
+    tips = [(cut, tip) for cut in plan.cuts for tip in cut.path_mm[[0, len(cut.path_mm) // 2, -1]]]
+    level = [level_pose(np.zeros(3), yaw)[:3, :3] for yaw in 2 * np.pi * np.arange(_YAWS) / _YAWS]
+    turns = {id(cut): level if cut.axis is None else turns_about(cut.axis) for cut in plan.cuts}
+    targets = {
+        CUTTER: [[rigid(turn, tip) for turn in turns[id(cut)]] for cut, tip in tips],
+        HOLDER: [
+            [rigid(upright(plan.lift), plan.grasp_mm + far * plan.lift)] for far in (0.0, _ABOVE_MM)
+        ],
+    }
     good = []
     for arm in ARMS:
         places = [
@@ -273,15 +344,11 @@ def _places(config: CellConfig, arm: str, middle_mm: np.ndarray) -> list[Base]:
     return bases
 
 
-def _reaches(config: CellConfig, arm: str, targets_mm: np.ndarray) -> bool:
-    """Whether the arm's tip comes to all its targets, each time pointing in any direction."""
+def _reaches(config: CellConfig, arm: str, targets: list[list[Pose]]) -> bool:
+    """Whether the arm's tip comes to each of these places, in any of its poses there."""
     cell = ArmCell(config)
     group = PlanningGroup(cell, arm, cell.home_rad)
-    yaws = np.linspace(0, 2 * np.pi, _YAWS if arm == CUTTER else 1, endpoint=False)
-    return all(
-        any(len(group.inverse_kinematics(level_pose(target, yaw))) for yaw in yaws)
-        for target in targets_mm
-    )
+    return all(any(len(group.inverse_kinematics(pose)) for pose in poses) for poses in targets)
 
 
 def _note(config: CellConfig) -> str:
@@ -292,13 +359,14 @@ def _note(config: CellConfig) -> str:
     return f"the arms do not manage from where they stand; planned with the {', the '.join(places)}"
 
 
-_setting: list[tuple[ResectionConfig, ArmCell]] = []  # of the worker
+_setting: list[tuple[ResectionConfig, CellConfig, str]] = []  # of the worker
 
 
-def begin_worker(config: ResectionConfig, cell: CellConfig) -> None:
-    """Called once in the new process, which ignores Ctrl-C: the live loop handles it."""
+def begin_worker(config: ResectionConfig, cell: CellConfig, urdf: str) -> None:
+    """Called once in the new process, which ignores Ctrl-C: the live loop handles it. ``urdf``: of
+    the plan's folder, by which motions are checked."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    _setting.append((config, ArmCell(cell)))
+    _setting.append((config, cell, urdf))
 
 
 def warm_up() -> None:
@@ -307,16 +375,24 @@ def warm_up() -> None:
     import toppra  # noqa: F401
 
 
-def replan(located: Located, joints_rad: Joints, progress: ResectionProgress) -> Planned:
-    """The plan for the organ as it lies now, from where the arms are; see ``plan_motions``. Raises
-    NoPlan: there is none."""
-    config, cell = _setting[0]
-    plan = plan_resection(located, config)
-    organ = located.organ
-    from_sweep = progress.first_sweep(plan, located.meshes[plan.tumor])
-    motions = plan_motions(plan, cell, organ, start_rad=joints_rad, from_sweep=from_sweep)
-    if hit := first_hit(motions, cell.config, organ, begun=True):
+def replan(
+    located: Located,
+    joints_rad: Joints,
+    progress: ResectionProgress,
+    facets: Float64[np.ndarray, "k 4"],
+) -> Planned:
+    """The plan for the organ as it lies now, from where the arms are; see ``plan_motions``.
+    ``facets``: of the plan so far, which are kept if that is possible, and in any case once one is
+    cut. Raises NoPlan: there is none, or it fails the check."""
+    config, cell, urdf = _setting[0]
+    start = Start(joints_rad, progress.first_sweep)
+    like = facets[:, :3] if len(facets) else None
+    try:
+        plan, motions = plan_motions(located, config, cell, start, like)
+    except NoPlan:
+        if like is None or progress.done:
+            raise
+        plan, motions = plan_motions(located, config, cell, start)
+    if hit := first_hit(motions, cell, located.organ, begun=True):
         raise NoPlan(f"the arms can't carry this out: {hit}")
-    planned = Planned(plan, located.meshes, motions)
-    _ = planned.kept_mm  # computed here, as it takes time
-    return planned
+    return Planned(checked(plan, motions, urdf, located), located.meshes, motions)

@@ -63,6 +63,10 @@ class TrajectoryBuilder:
         self.stages: tuple[MotionStage, ...] = ()
         self._pieces: tuple[tuple[np.ndarray, np.ndarray, bool], ...] = ()
 
+    def take(self, other: TrajectoryBuilder) -> None:
+        """Go on with what was added to a copy."""
+        self.joints_rad, self.stages, self._pieces = other.joints_rad, other.stages, other._pieces
+
     def group(self, arm: str | None, touching: Collection[str] = ()) -> PlanningGroup:
         """This arm (None: both) moves from here."""
         return PlanningGroup(self.cell, arm, self.joints_rad, touching)
@@ -211,10 +215,11 @@ def first_hit(motions: Motions, config: CellConfig, organ: Mesh, begun: bool = F
     }
     cell = ArmCell(msgspec.structs.replace(config, **halves), organ)
     slow_mm_s = _OVER * np.array([config.cutting_mm_s, config.grasping_mm_s])
-    levers_mm = cell.levers_mm(np.zeros(len(cell.home_rad)), np.zeros(len(cell.home_rad)))
     for number, stage in enumerate(motions.stages):
         touching = ARMS if begun and not number else _TOUCHING.get(stage.name, ARMS)
-        turns = np.abs(np.diff(stage.joints_rad, axis=0)) @ levers_mm
+        # An arm is longest where its elbow, somewhere between the ends, is straightest.
+        ends = stage.joints_rad.min(0), stage.joints_rad.max(0)
+        turns = np.abs(np.diff(stage.joints_rad, axis=0)) @ cell.levers_mm(*ends)
         moved_mm = np.concatenate([[0.0], np.cumsum(turns)])  # at most, of any point
         steps = int(np.ceil(moved_mm[-1] / (2 * cell.config.least_clearance_mm(touching))))
         at_mm = np.linspace(0, moved_mm[-1], steps + 1)
@@ -222,7 +227,7 @@ def first_hit(motions: Motions, config: CellConfig, organ: Mesh, begun: bool = F
             [np.interp(at_mm, moved_mm, joint) for joint in stage.joints_rad.T], axis=1
         )
         times_s = np.interp(at_mm, moved_mm, stage.times_s)
-        tips = np.array([[cell.tips(each)[arm][:3, 3] for arm in ARMS] for each in joints])
+        tips = np.array([[pose[:3, 3] for pose in cell.tips(each).values()] for each in joints])
         speeds = np.linalg.norm(np.diff(tips, axis=0), axis=2) / np.diff(times_s)[:, None]
         edge = np.full((1, len(ARMS)), np.inf)
         slow = np.minimum(np.r_[edge, speeds], np.r_[speeds, edge]) <= slow_mm_s

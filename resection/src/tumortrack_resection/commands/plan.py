@@ -39,13 +39,10 @@ class Plan(PlanOptions):
         store.check_place(self.plan, KIND, self.overwrite)
         planning = api.begin_plan(self.run_folder, **options_of(self, PlanOptions))
         say(str(planning.content.patient))
-        for line in planning.content.budget.table():
-            say(line)
-        planning = planning.checked()
+        start = time.perf_counter()
+        planning = planning.with_motions() if self.arms else planning.checked()
         _say_plan(planning)
         if self.arms:
-            start = time.perf_counter()
-            planning = planning.with_motions()
             motions = planning.content.motions
             assert motions is not None
             say(
@@ -60,9 +57,12 @@ class Plan(PlanOptions):
 
 
 def _say_plan(planning: Planning) -> None:
-    from tumortrack_resection.budget import kept_words
+    from tumortrack_resection.budget import foreseen_mm, kept_words, lost_words
 
-    plan = planning.content.plan
+    content, plan = planning.content, planning.content.plan
+    for budget in content.budgets:
+        for line in budget.table():
+            say(line)
     warn(plan.warnings)
     ml = plan.volumes_ml
     say(
@@ -70,9 +70,7 @@ def _say_plan(planning: Planning) -> None:
         f"hull): {len(plan.cuts)} strokes in {plan.sweeps} sweeps, "
         f"{sum(cut.length_mm for cut in plan.cuts):.0f} mm."
     )
-    say(
-        f"{kept_words(plan, planning.located)}; {ml['piece']:.1f} ml come away, of that "
-        f"{ml['healthy']:.1f} ml healthy tissue ({ml['healthy'] / ml['parenchyma']:.0%} of the "
-        "organ's)."
-    )
+    least_mm = plan.least_mm or foreseen_mm(plan, planning.located, planning.cell.tools)
+    say(f"{kept_words(plan, least_mm)}.")
+    say(f"{ml['piece']:.1f} ml come away; {lost_words(plan)}.")
     say_notes(note for note in plan.notes if note not in plan.warnings)
