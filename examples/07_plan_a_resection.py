@@ -36,10 +36,11 @@ def main(out: Path) -> None:
         picture = out / f"plan_{method}.png"
         plan = plan_resection(seen, method=method, picture=picture, accept_budget=True)
         length = sum(stroke.length_mm for stroke in plan.cuts)
+        ml = plan.volumes_ml  # the published method does not know what its cuts burn
+        lost_ml = ml["healthy"] + ml.get("kerf", 0.0)
         print(
             f"{method}: {plan.tumor}, {len(plan.cuts)} strokes in {plan.sweeps} sweeps, "
-            f"{length:.0f} mm; {plan.volumes_ml['healthy']:.1f} ml of healthy tissue; look at "
-            f"{picture}"
+            f"{length:.0f} mm; {lost_ml:.1f} ml of healthy tissue are lost; look at {picture}"
         )
 
 

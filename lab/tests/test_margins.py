@@ -93,11 +93,15 @@ def test_margins_are_found_stated_and_planned_with(ready_case, scenes, tmp_path)
 
     plan = ("plan", run, tmp_path / "plan", "--no-arms", "--confidence")
     assert "states no 95 % margin of tumor_2" in refusal(tumortrack(*plan, 0.95))
-    said = succeeded(tumortrack(*plan, 0.6, "--margin", 2))
-    budget = store.read_json(tmp_path / "plan" / "plan.json")["budget"]
+    beside = ("--margin", 1, "--keep-away", "tumor_1=0.5", "--accept-budget")  # there is no room
+    said = succeeded(tumortrack(*plan, 0.6, *beside))
+    budgets = store.read_json(tmp_path / "plan" / "plan.json")["budgets"]
+    stated = {budget["part"]: budget for budget in budgets}
     radius = radii[1]["mm"]["tumor_2"]
-    assert budget["tracking_mm"] == radius
-    assert budget["confidence"] == 0.6
+    assert list(stated) == ["tumor_2", "tumor_1"]
+    for part, budget in stated.items():
+        assert budget["tracking_mm"] == radii[1]["mm"][part]
+        assert budget["confidence"] == 0.6
     assert f"tracking {radius:5.1f}  60 % margin" in said
     assert f"within {radius:.1f} mm of its estimate in 60 of 100 such cases" in said
 

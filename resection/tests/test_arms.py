@@ -549,7 +549,8 @@ def test_an_instrument_goes_back_until_it_is_clear_of_the_organ_and_of_the_cup()
     ball = sphere([0.0, 0.0, 200.0], 20.0, 5)
     cell = ArmCell(CONFIG, ball, {"tumor_1": (ball, 6.0)})
     up, ahead = np.array([0.0, 0.0, 1.0]), np.array([1.0, 0.0, 0.0])
-    outside = Outside(cell, ball, np.array([0.0, 0.0, 220.0]), up)
+    things = [(ball, 0.0), (ball, 6.0)]
+    outside = Outside(cell, things, np.array([0.0, 0.0, 220.0]), up)
     room_mm = 6.0 + CONFIG.organ_clearance_mm
     for tip, least_mm in (
         ([0.0, 0.0, 200.0], 20.0 + room_mm),
@@ -657,6 +658,7 @@ def test_no_motion_creeps(monkeypatch):
     speed = np.abs(np.diff(joints_rad, axis=0)) / np.diff(times_s)[:, None]
     assert (speed <= 1.001 * speeds_rad_s).all()
     monkeypatch.setattr(trajectory, "_FINER", (1.0,))
+    monkeypatch.setattr(trajectory, "_DENSE", 1)
     assert trajectory.along(path_rad, speeds_rad_s)[0][-1] > 100  # else this path shows nothing
 
 

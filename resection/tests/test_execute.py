@@ -38,6 +38,7 @@ from tumortrack_resection.operation import (
 from tumortrack_resection.resection import plan_resection
 from tumortrack_resection.values import (
     ELECTRODE,
+    NO_ROOM,
     OVER_BUDGET,
     POOR_ESTIMATE,
     Clearance,
@@ -663,3 +664,20 @@ def test_the_plans_warnings_go_with_every_state():
         assert f"({POOR_ESTIMATE}; {OVER_BUDGET}" in cell.state
     assert "a note" not in world.frame().state
     assert OVER_BUDGET in world.operation.summary()["note"]
+
+
+def test_what_a_new_plan_warns_of_is_said_with_every_state_from_then_on():
+    def replan(organ, joints_rad, progress):
+        made = world.replan(organ, joints_rad, progress)
+        notes = (f"{NO_ROOM} 5 mm from other tumors; kept are 1 mm from tumor_2.",)
+        return replace(made, plan=replace(made.plan, notes=notes))
+
+    world = World(replan, plan=replace(PLAN, notes=(f"{OVER_BUDGET}: 9 mm of error.",)))
+    assert NO_ROOM not in world.until("approach").state
+    world.shift = np.array([6.0, 2.0, 0.0])
+    while not world.calls:
+        world.frame()
+    cell = world.until("sweep 1")
+    assert NO_ROOM in cell.state
+    assert OVER_BUDGET in cell.state  # which a person accepted, for all plans
+    assert NO_ROOM in world.operation.summary()["note"]

@@ -228,6 +228,18 @@ def test_voxels_of_the_organ_fall_apart_into_the_piece_and_what_stays(name):
     assert done.piece_ml == pytest.approx(plan.piece.volume_ml, rel=0.03)
 
 
+@pytest.mark.parametrize("spacing_mm", [0.5, 1.0, 2.0])
+def test_however_far_apart_points_of_strokes_are_the_piece_comes_free(spacing_mm):
+    seen = scene("side")
+    plan = plan_resection(seen, ResectionConfig(spacing_mm=spacing_mm))
+    for number, (cut, plane) in enumerate(zip(plan.cuts, plan.facets, strict=True)):
+        others = np.delete(plan.facets, number, axis=0)
+        wall = in_plane(plane, seen.organ)
+        wall = wall[in_box(seen.organ, wall) & (beyond(others, wall) <= 0).all(1)]
+        wall = wall[contains(seen.organ, wall)]
+        assert to_axes(wall, swept(cut)).max(initial=0) < RADIUS
+
+
 @IN_ALL
 def test_the_piece_comes_free_the_way_it_is_lifted_and_the_cup_comes(name):
     plan = planned(name)

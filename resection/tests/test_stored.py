@@ -33,6 +33,8 @@ from tumortrack_resection.motions import CUTTER, JOINTS, WITHDRAW, Motions, Moti
 from tumortrack_resection.operation import ResectionProgress
 from tumortrack_resection.values import ELECTRODE, ResectionConfig
 
+pytestmark = pytest.mark.slow
+
 CONFIG = CellConfig()
 URDF = cell_urdf(CONFIG)
 MARGIN_MM = 5.0
@@ -120,6 +122,12 @@ def test_a_plan_that_lacks_what_arms_are_judged_by_is_refused(stored, tmp_path, 
     folder = changed(stored, tmp_path / "plan", plan_json=lambda data: data.pop(lacking))
     with pytest.raises(ArtifactError, match=lacking):
         read_plan(folder)
+
+
+def test_a_plan_of_which_no_tumor_has_a_budget_is_refused(stored, tmp_path):
+    folder = changed(stored, tmp_path / "plan", plan_json=lambda data: data.update(budgets=[]))
+    with pytest.raises(ArtifactError):
+        begin_resection(folder)
 
 
 @pytest.mark.parametrize("lacking", ["facets", "taken", "keep_mm", "lift", "clearances", "cuts"])

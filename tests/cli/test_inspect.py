@@ -43,8 +43,8 @@ TRACK = {
 PLAN = {
     "table_from_camera": np.eye(4).tolist(), "patient": PATIENT, "seconds": 93.2,
     "plan": {"tumor": "tumor_1", "margin_mm": 9.0, "cuts": [], "notes": ["PLANNED OVER BUDGET"],
-             "volumes_ml": {"tumor": 11.6, "piece": 30.0, "healthy": 18.4}},
-    "budget": {"margin_mm": 8.9, "tracking_mm": 4.2},
+             "volumes_ml": {"tumor": 11.6, "piece": 30.0, "healthy": 18.4, "kerf": 2.5}},
+    "budgets": [{"part": "tumor_1", "margin_mm": 8.9, "tracking_mm": 4.2}],
 }  # fmt: skip
 CALIBRATION = {"frame_id": "base", "unit": "mm", "robot_from_camera": [], "error_mm": 0.8}
 CAMERA = {"width": 848, "height": 480, "fx": 433.0, "fy": 433.0, "cx": 424, "cy": 240,
@@ -75,7 +75,7 @@ def say(path: Path) -> str:
                  "tumor_1: centre off by 1.2 mm", "to viewer: 199 delivered, 1 missed")),
         ({"patient": PATIENT, "resection": {"state": "done", "halts": {"no estimate": 2}}},
          ("a report of `resect`", "arms: done", "arms halted (2 x): no estimate")),
-        (PLAN, ("tumor_1, 11.6 ml", "keep 8.9 mm", "18.4 ml healthy", "carry it out in 93 s",
+        (PLAN, ("tumor_1", "11.6 ml", "30.0 ml", "8.9 mm", "4.2 mm", "18.4 ml", "93 s",
                 "note: PLANNED OVER BUDGET")),
         (CALIBRATION, ("a calibration (--frame)", "frame base", "off by up to 0.8 mm")),
         (CAMERA, ("848 x 480 pixels", "1.01 times what is measured, -0.5 mm")),

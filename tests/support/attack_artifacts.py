@@ -138,6 +138,44 @@ def motions(change: Callable[[dict[str, np.ndarray]], object]) -> Make:
     return make
 
 
+def plan(change: Change) -> Make:
+    """`resect` of a plan whose other files were changed."""
+    return lambda room: [
+        *("resect", resealed(room, "plan", change), "--speed", 20),
+        *("--report", room.folder / "report.json"),
+    ]
+
+
+def _plan_json(change: Callable[[dict[str, Any]], object]) -> Make:
+    def edit(folder: Path) -> None:
+        path = folder / "plan.json"
+        data = json.loads(path.read_text())
+        change(data)
+        path.write_text(json.dumps(data))
+
+    return plan(edit)
+
+
+def _without(name: str) -> Make:
+    """A file that the manifest does not know of either."""
+
+    def remove(folder: Path) -> None:
+        (folder / name).unlink()
+        edited(lambda whole: whole | {"files": {n: 0 for n in whole["files"] if n != name}})(folder)
+
+    return plan(remove)
+
+
+def _nearer_tumor(folder: Path) -> None:
+    """The tumor that is cut out lies 2 mm nearer to the first facet."""
+    from tumortrack.core.mesh_files import read_mesh, write_mesh
+
+    planned = json.loads((folder / "plan.json").read_text())["plan"]
+    path = folder / f"{planned['tumor']}.ply"
+    mesh = read_mesh(path)
+    write_mesh(path, mesh.moved(mesh.vertices_mm + 2 * np.array(planned["facets"][0][:3])))
+
+
 def _joint(value: float) -> Make:
     def change(arrays: dict[str, np.ndarray]) -> None:
         arrays["1.joints_rad"] = arrays["1.joints_rad"].copy()
@@ -217,6 +255,14 @@ ATTACKS = attacks(
         "motions_of_no_length": motions(
             lambda arrays: arrays.update({name: array[:0] for name, array in arrays.items()})
         ),
+        "plan_of_a_nearer_tumor": plan(_nearer_tumor),
+        "plan_in_another_cell": plan(
+            file("cell.urdf", lambda text: text.replace(b'radius="0.0012"', b'radius="0.0002"'))
+        ),
+        "plan_without_its_cell": _without("cell.urdf"),
+        "plan_without_its_piece": _without("piece.ply"),
+        "plan_without_budgets": _plan_json(lambda data: data.update(budgets=[])),
+        "plan_that_keeps_nan": _plan_json(lambda data: data["plan"].update(margin_mm=NAN)),
         # A stored plan that nothing looks at must move no real arm.
         "real_arm_without_live": lambda room: [
             *("resect", room.base / "plan", "ur:127.0.0.1?execute=true"),

@@ -413,7 +413,7 @@ def _artifacts(base: Path) -> dict[str, Target]:
         ("case", load_case, ("manifest.json", "tumor_1.ply")),
         ("scenes/0000", read_scene, ("meta.json", "targets.csv", "tumor_1.ply")),
         ("run", read_run, ("manifest.json", "report.json", "occupancy.ply")),
-        ("plan", read_plan, ("plan.json", "motions.safetensors")),
+        ("plan", read_plan, ("plan.json", "motions.safetensors", "piece.ply")),
         ("model", read_model, model),
         ("network", read_model, model),
     ]

@@ -25,6 +25,7 @@ Vector = Float64[np.ndarray, " 3"]
 Planes = Float64[np.ndarray, "k 4"]  # unit normals n, which point out of the piece; offsets, mm
 Chosen = tuple[int, ...]  # numbers of normals, anticlockwise as seen from where the piece opens
 
+EDGE_MM = 1.0  # the tip goes so far beyond the edge to the next facet
 SLACK_MM = 0.1  # by which the planes are farther off than the margin: arms follow them to 0.05 mm
 _NORMALS = 1000  # all over the sphere, 6 degrees apart
 _OPENINGS = 64  # directions in which a piece may open, over the upper hemisphere
@@ -142,7 +143,7 @@ class FacetSearch:
         for points, mm, weight in things:
             room = mm + tools.radius_mm + SLACK_MM
             off = self._normals @ points.T - offsets[:, None]
-            rows.append(_Near(_packed(np.abs(off) < room), _packed(off < room), weight))
+            rows.append(_Near(_packed(np.abs(off) < room), _packed(off < room + EDGE_MM), weight))
         return rows
 
     def _grown(self) -> tuple[np.ndarray, np.ndarray]:

@@ -16,7 +16,7 @@ import numpy as np
 from tumortrack.core import store
 from tumortrack.core.errors import ArtifactError, InputError, NoPlan
 from tumortrack.core.mesh_files import read_mesh, write_mesh
-from tumortrack.core.organ import organ_first
+from tumortrack.core.organ import is_tumor, organ_first
 from tumortrack.core.patient import NOBODY, Patient
 from tumortrack.core.types import Mesh
 from tumortrack.live.values import PublishedFrame
@@ -155,6 +155,9 @@ def read_plan(folder: Path) -> PlanFolder:
         )
     except (KeyError, TypeError, ValueError, InputError, msgspec.ValidationError) as error:
         raise ArtifactError(f"{folder / _NAME} lacks or spoils {error}; plan again.") from error
+    parts = [budget.part for budget in read["budgets"]]
+    if parts[:1] != [plan.tumor] or {*parts} != {name for name in meshes if is_tumor(name)}:
+        raise ArtifactError(f"{folder / _NAME} lacks a tumor's error budget; plan again.")
     if motions is not None:
         if read["cell"] is None:
             raise ArtifactError(f"{folder} has motions and no cell that they are for. Plan again.")

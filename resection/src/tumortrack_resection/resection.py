@@ -6,7 +6,6 @@ Two methods: the paper's (its section "Integration with Robotic Resection") and 
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -52,6 +51,7 @@ from tumortrack_resection.values import (
 
 _DIRECTIONS, _MOST = 192, 12_000  # of the hull, points it is made of: off by 0.5 mm
 _FEWEST = 30  # points that define a tumor's shape
+_LOOSE_MM3 = 500.0  # what may come off beside the piece
 _CLEAR_MM = 5.0  # of the electrode stay outside the organ: its grip must not touch it
 _IN_THE_WAY_MM = 40.0  # of depth that a direction out of the arms' way is worth
 _LESS_ROOM = (0.5, 0.2)  # shares of the margin that other tumors keep where there is no room
@@ -176,7 +176,11 @@ class Drafts:
         if self._config.method == "published":
             return self._published()
         reasons: list[str] = []
-        alone, near = (self._label,), [n for n in self._located.tumors if n != self._label]
+        alone = (self._label,)
+        near = [
+            n for n in self._located.tumors
+            if n != self._label and name_of(n) not in self._config.keep_away
+        ]  # fmt: skip
         found = self._first([(alone, 1.0)], reasons)
         if found is None and near:
             found = self._first([(alone, room) for room in _LESS_ROOM], reasons)
@@ -243,6 +247,8 @@ class Drafts:
                 f"{piece.healthy:.0%} of the organ's healthy tissue would come away; allowed are "
                 f"{config.most_healthy:.0%}. Ask for a smaller margin, or allow more."
             )
+        if swallowed := sorted({*piece.with_it} - {*targets}):
+            return _Unfit(f"{name_of(swallowed[0])} would come away, too.")
         if len(full) < len(facets):
             if self._like is not None:
                 return _Unfit("the organ no longer reaches all facets of the earlier plan.")
@@ -253,11 +259,38 @@ class Drafts:
         lift = cup_direction(piece.planes)
         if lift is None:
             return _Unfit("the cup can't be held so that it lifts the piece out.")
+        sweeps = self._sweeps(facets, piece, lift)
+        if isinstance(sweeps, _Unfit):
+            return sweeps
+        grasp_mm = grasp_point(located, self._label, piece, tools, lift)
+        if grasp_mm is None:
+            return _Unfit("there is no place on the piece on which the cup can come down.")
+        rest = search.solid - trimmed(search.solid, piece.planes, -tools.radius_mm)
+        loose_mm3 = sum(sorted(part.volume() for part in rest.decompose())[:-1])
+        if loose_mm3 > _LOOSE_MM3:
+            return _Unfit(f"{loose_mm3 / 1000:.0f} ml beside the piece would come off, too.")
+        solid = mesh_of(trimmed(search.solid, piece.planes, tools.radius_mm))
+        healthy = located.of(ORGAN)
+        inner = float(inside(piece.planes, healthy, tools.radius_mm).mean())
+        outer = float(inside(piece.planes, healthy, -tools.radius_mm).mean())
+        return Draft(
+            located=located, config=config, label=self._label, taken=targets, share=self._share,
+            piece=piece, sweeps=sweeps, level=False, grasp_mm=grasp_mm,
+            lift=lift, keep_mm=search.keep_mm,
+            solid=solid, healthy=inner, kerf=outer - inner,
+            notes=(*self._notes(targets, room, search), *_unguarded(located, config)),
+        )  # fmt: skip
+
+    def _sweeps(
+        self, facets: Sequence[Facet], piece: Piece, lift: Vector
+    ) -> tuple[tuple[Cut, ...], ...] | _Unfit:
+        """For each facet the ways to cut it, the best first."""
         sweeps: list[tuple[Cut, ...]] = []
-        room_mm = tools.electrode_mm - _CLEAR_MM
+        room_mm = self._tools.electrode_mm - _CLEAR_MM
         for facet, normal in zip(facets, piece.chosen, strict=True):
             strokes = [
-                facet.stroke(back, config) for back in facet.directions(self._lowest)[:_MOST_WAYS]
+                facet.stroke(back, self._config)
+                for back in facet.directions(self._lowest)[:_MOST_WAYS]
             ]
             strokes.sort(key=lambda stroke: _effort(stroke, lift))
             fit = tuple(stroke.cut for stroke in strokes if stroke.depth_mm <= room_mm)
@@ -266,27 +299,12 @@ class Drafts:
             if not fit:
                 return _Unfit(
                     f"the cut would be {min(stroke.depth_mm for stroke in strokes):.0f} mm deep; "
-                    f"the bare electrode of {tools.electrode_mm:g} mm allows {room_mm:g} mm "
+                    f"the bare electrode of {self._tools.electrode_mm:g} mm allows {room_mm:g} mm "
                     "(electrode_mm in the cell).",
                     (normal,),
                 )
             sweeps.append(fit)
-        grasp_mm = grasp_point(located, self._label, piece, tools, lift)
-        if grasp_mm is None:
-            return _Unfit("there is no place on the piece on which the cup can come down.")
-        solid = mesh_of(trimmed(search.solid, piece.planes, tools.radius_mm))
-        healthy = located.of(ORGAN)
-        inner = float(inside(piece.planes, healthy, tools.radius_mm).mean())
-        outer = float(inside(piece.planes, healthy, -tools.radius_mm).mean())
-        taken = (self._label, *piece.with_it)
-        keep = {name: mm for name, mm in search.keep_mm.items() if name not in map(name_of, taken)}
-        return Draft(
-            located=located, config=config, label=self._label, taken=taken, share=self._share,
-            piece=piece, sweeps=tuple(sweeps), level=False, grasp_mm=grasp_mm,
-            lift=lift, keep_mm=keep,
-            solid=solid, healthy=inner, kerf=outer - inner,
-            notes=(*self._notes(targets, room, search), *_unguarded(located, config)),
-        )  # fmt: skip
+        return tuple(sweeps)
 
     def _notes(self, targets: tuple[int, ...], room: float, search: FacetSearch) -> tuple[str, ...]:
         located, name, margin_mm = self._located, name_of(self._label), self._config.margin_mm
@@ -309,7 +327,7 @@ class Drafts:
         return tuple(notes)
 
     def _why_not(self, reasons: list[str]) -> str:
-        """That something lies too near to the tumor, or else the most frequent reason."""
+        """That something lies too near to the tumor, or else the best piece's reason."""
         located, name, tools = self._located, name_of(self._label), self._tools
         tumor = cKDTree(located.meshes[name].spread_mm(1.0))
         surfaces, tight = {**located.meshes, **located.structures}, []
@@ -328,7 +346,7 @@ class Drafts:
                 f"for less distance (--keep-away {other}=1), or plan the other one."
             )
         if reasons:
-            return Counter(reasons).most_common(1)[0][0]
+            return reasons[0]
         return (
             f"no piece with up to {self._config.most_facets} plane facets round {name} can be cut "
             "and lifted out. Place the organ otherwise, or ask for a smaller margin."

@@ -342,7 +342,8 @@ def begin_resection(
     check_arms_installed()
     stored = read_plan(plan)
     stored.patient.check_is(options.stated, str(plan))
-    if stored.motions is None or stored.cell is None:
+    motions = stored.motions
+    if motions is None or stored.cell is None:
         raise InputError(f"{plan} was planned with --no-arms; plan again without it.")
     organ = organ_name(stored.meshes)
     if organ is None or stored.plan.tumor not in stored.meshes:
@@ -352,10 +353,10 @@ def begin_resection(
     moved_mm = stored.budgets[0].motion_mm if options.moved is None else options.moved
     config = OperationConfig(speed=options.speed, moved_mm=moved_mm, replan_cut=options.replan_cut)
     live = None if options.live is None else _live_of(*options.live, stored)
+    cell, stored = _checked(plan, motions, stored.cell, stored)
     if moving:
         _check_real(stored, moving, live, config, options.stated)
-    cell = _checked_cell(plan, stored.motions, stored.cell, stored)
-    return ResectionSession(stored, stored.motions, cell, live, sinks, config, options)
+    return ResectionSession(stored, motions, cell, live, sinks, config, options)
 
 
 def _real_arms(sinks: Sequence[str | SinkConfig]) -> list[UrSinkConfig]:
@@ -432,23 +433,31 @@ def _check_real(
         raise InputError(f"the arm at {names} may not move. It needs: {'; '.join(lacking)}.")
 
 
-def _checked_cell(path: Path, motions: Motions, cell: CellConfig, stored: PlanFolder) -> ArmCell:
-    """Raises ArtifactError: the motions hit something in it, or a
-    tool comes nearer to a tumor than it may, so they are not those planned."""
+def _checked(
+    path: Path, motions: Motions, cell: CellConfig, stored: PlanFolder
+) -> tuple[ArmCell, PlanFolder]:
+    """The workcell, and the plan with the distances that were found now. Raises ArtifactError: the
+    motions hit something in it, or a tool comes nearer to a tumor than it may, so they are not
+    those planned."""
     from tumortrack_resection.arms.body import cell_urdf
     from tumortrack_resection.arms.cell import ArmCell
     from tumortrack_resection.arms.trajectory import first_hit
 
-    located, urdf = stored.located, cell_urdf(cell)
-    if (path / "cell.urdf").read_text() != urdf:
-        raise ArtifactError(f"{path}: cell.urdf is not of the plan's cell. Plan again.")
+    located, urdf, file = stored.located, cell_urdf(cell), path / "cell.urdf"
+    if not file.is_file() or file.read_text() != urdf:
+        raise ArtifactError(f"{file} is not of the plan's cell. Plan again.")
     if hit := first_hit(motions, cell, located.organ):
         raise ArtifactError(f"{path}: its motions are not as planned: {hit}. Plan again.")
     try:
-        checked(stored.plan, motions, urdf, located)
+        found = checked(stored.plan, motions, urdf, located)
     except NoPlan as fault:
         raise ArtifactError(f"{path}: its motions are not as planned: {fault}") from fault
-    return ArmCell(cell, located.organ)
+    plan = replace(stored.plan, clearances=found.clearances)
+    budgets = tuple(
+        msgspec.structs.replace(budget, margin_mm=plan.least_mm[budget.part])
+        for budget in stored.budgets
+    )
+    return ArmCell(cell, located.organ), replace(stored, plan=plan, budgets=budgets)
 
 
 def _live_of(model: Path, source: str, stored: PlanFolder) -> _Live:

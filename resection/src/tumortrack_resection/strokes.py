@@ -10,6 +10,7 @@ from jaxtyping import Float64
 from scipy.spatial import cKDTree
 
 from tumortrack_resection.facets import (
+    EDGE_MM,
     Piece,
     Planes,
     Tools,
@@ -21,7 +22,6 @@ from tumortrack_resection.facets import (
 from tumortrack_resection.outline import evenly
 from tumortrack_resection.values import Cut, Located, ResectionConfig, name_of
 
-_EDGE_MM = 1.0  # the tip goes so far beyond the edge to the next facet
 _THROUGH_MM = 3.0  # and beyond the organ's surface: it may lie deeper than estimated
 _COLUMN_MM = 2.0  # of the organ's highest points
 _FINE_DEG, _TURN_DEG = 2.0, 13.0  # between directions of the electrode in its facet
@@ -126,8 +126,7 @@ class Facet:
         lead = config.lead_mm
         s = np.linspace(at[0] - lead, at[-1] + lead, 4 * len(at) + 8)
         path = np.column_stack([s, tip_at(s)])
-        out = path[:, 1] - np.interp(s, at, exits) <= lead  # beside the organ it is out long before
-        path = path[slice(*np.flatnonzero(out)[[0, -1]] + [0, 1])]
+        path = _within(path, path[:, 1] - np.interp(s, at, exits) - lead)
         place = self._offset * self.normal
         path_mm = evenly(path, config.spacing_mm) @ np.stack([aside, back]) + place
         return Stroke(Cut(self.number, path_mm, -back), depth_mm)
@@ -138,7 +137,21 @@ class Facet:
             return np.full(len(s), -np.inf)
         normals = self._rest[:, :3]
         edges = (self._room[:, None] - np.outer(normals @ aside, s)) / (normals @ back)[:, None]
-        return edges.max(0) - _EDGE_MM
+        return edges.max(0) - EDGE_MM
+
+
+def _within(path: np.ndarray, beyond: np.ndarray) -> np.ndarray:
+    """From the first to the last place where ``beyond`` is 0: beside the organ the tip is out of it
+    long before."""
+    first, last = np.flatnonzero(beyond <= 0)[[0, -1]]
+    ends = []
+    for inner, outer in ((first, first - 1), (last, last + 1)):
+        if 0 <= outer < len(path):
+            share = beyond[inner] / (beyond[inner] - beyond[outer])
+            ends.append((path[inner] + share * (path[outer] - path[inner]))[None])
+        else:
+            ends.append(path[:0])
+    return np.concatenate([ends[0], path[first : last + 1], ends[1]])
 
 
 def _lower_hull(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -68,7 +68,7 @@ class ResectionConfig(Config, frozen=True, kw_only=True):
 
     def __post_init__(self) -> None:
         self.check_between("plan:", margin_mm=MARGIN_MM, most_margin_mm=(20, 60), sigmas=(0, 10))
-        self.check_between("plan:", spacing_mm=(0.2, 10), lead_mm=(0, 30), most_facets=(1, 12))
+        self.check_between("plan:", spacing_mm=(0.2, 2), lead_mm=(0, 30), most_facets=(1, 12))
         if not all(0 < mm <= 50 for mm in self.keep_away.values()):
             raise InputError(f"plan: keep_away is {self.keep_away}; allowed: above 0 to 50 mm.")
         self.check_between("plan:", least_exophytic=(0, 1), most_healthy=(0, 1))

@@ -41,16 +41,25 @@ DETOURS_MM = ((60.0, 0.0), (0.0, 70.0), (60.0, 70.0), (0.0, 140.0))
 
 class Outside:
     """How far the instrument has to go straight back until its electrode is clear of the organ, and
-    of a cup that holds it (at ``grasp_mm``, coming from ``lift``)."""
+    all that it keeps away from (``things``, with distances in mm), and of the cup that holds it
+    (at ``grasp_mm``, coming from ``lift``)."""
 
-    def __init__(self, cell: ArmCell, organ: Mesh, grasp_mm: np.ndarray, lift: np.ndarray) -> None:
+    def __init__(
+        self,
+        cell: ArmCell,
+        things: Sequence[tuple[Mesh, float]],
+        grasp_mm: np.ndarray,
+        lift: np.ndarray,
+    ) -> None:
         config = cell.config
         slack_mm = ELECTRODE_RADIUS_MM + _SPREAD_MM
-        room_mm = max([0.0, *cell.keep_mm.values()]) + config.organ_clearance_mm
         rod_mm = grasp_mm + np.outer(np.arange(0.0, config.rod_mm, _SPREAD_MM), lift)
-        self._obstacles = (
-            (cKDTree(organ.spread_mm(_SPREAD_MM)), room_mm + slack_mm),
-            (cKDTree(rod_mm), config.cup_radius_mm + config.clearance_mm + slack_mm),
+        self._obstacles = [
+            (cKDTree(mesh.spread_mm(_SPREAD_MM)), mm + config.organ_clearance_mm + slack_mm)
+            for mesh, mm in things
+        ]
+        self._obstacles.append(
+            (cKDTree(rod_mm), config.cup_radius_mm + config.clearance_mm + slack_mm)
         )
         self._longest_mm = config.electrode_mm
 

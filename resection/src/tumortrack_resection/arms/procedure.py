@@ -16,7 +16,7 @@ import msgspec
 import numpy as np
 from jaxtyping import Float64
 
-from tumortrack.core.errors import NoPlan
+from tumortrack.core.errors import InputError, NoPlan
 from tumortrack.core.geometry import rigid
 from tumortrack_resection.arms import cutting
 from tumortrack_resection.arms.cell import TOUCHES, ArmCell, Blocked, PlanningGroup
@@ -31,6 +31,7 @@ from tumortrack_resection.motions import (
     CUTTER,
     HOLD,
     HOLDER,
+    JOINTS,
     LIFT,
     PULL,
     RELEASE,
@@ -102,6 +103,8 @@ def plan_motions(
     Raises NoPlan: nothing to cut, or the arms manage no piece, and why; InputError: an option that
         can't be used.
     """
+    if start is not None:
+        _check_start(start, cell)
     drafts = Drafts(located, config, cell.tools, like)
     reason: Blocked | None = None
     for _ in range(pieces):
@@ -115,16 +118,25 @@ def plan_motions(
             return _attempt(draft, cell, start, np.random.default_rng(seed))
         except FacetsBlocked as blocked:
             reason = reason or blocked
+            if like is not None or config.method == "published":
+                break
             drafts.leave_out(blocked.numbers)
         except Blocked as blocked:
             reason = reason or blocked
-            break
-        if like is not None or config.method == "published":
             break
     raise NoPlan(
         f"the arms can't carry this out: {reason}. Place the arms or the organ otherwise, or plan "
         "with other margins."
     ) from reason
+
+
+def _check_start(start: Start, cell: CellConfig) -> None:
+    """Raises InputError: arms can't be there, or no sweep has that number."""
+    joints = np.asarray(start.joints_rad)
+    if joints.shape != (len(JOINTS),) or not (np.abs(joints) <= cell.limits_rad).all():
+        raise InputError("the arms' start must be twelve joint angles within their limits.")
+    if start.from_sweep is not None and start.from_sweep < 1:
+        raise InputError(f"from_sweep is {start.from_sweep}; sweeps are counted from 1.")
 
 
 def _attempt(
@@ -135,7 +147,8 @@ def _attempt(
     cell = ArmCell(config, located.organ, draft.keep)
     joints_rad = cell.home_rad if start is None else start.joints_rad
     builder = TrajectoryBuilder(cell, joints_rad, rng)
-    outside = Outside(cell, located.organ, draft.grasp_mm, draft.lift)
+    things = [(located.organ, 0.0), *draft.keep.values()]
+    outside = Outside(cell, things, draft.grasp_mm, draft.lift)
     from_sweep = None if start is None else start.from_sweep
     if start is not None:
         _withdraw(builder, outside, from_sweep is not None)
@@ -203,6 +216,8 @@ def _cut_and_finish(
     builder: TrajectoryBuilder, draft: Draft, outside: Outside, first: int
 ) -> tuple[ResectionPlan, Motions]:
     """From this sweep on; the instrument has gone home before the piece is lifted."""
+    if first > len(draft.sweeps) + 1:
+        raise InputError(f"from_sweep is {first}; there are {len(draft.sweeps)} sweeps.")
     group, blocks = builder.group(CUTTER, (CUTTER, HOLDER)), dict[int, Blocked]()
     ways: dict[int, list[Way]] = {}
     for sweep, choices in enumerate(draft.sweeps, start=1):

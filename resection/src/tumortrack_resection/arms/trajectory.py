@@ -34,9 +34,10 @@ from tumortrack_resection.motions import (
 
 _STEP_S = 0.02  # between two samples; straight segments between them stay within 0.05 mm
 _TIP_SPEED_UP_S = 0.2  # until a tip has its speed
-_GRID = 80
+_GRID, _DENSE = 80, 6  # least number of grid points, and how many to a point of the path
 _FINER = (1.0, 1.7, 2.9, 4.3)  # numbers of grid points tried, relative to the first
 _CRAWL, _CRAWL_S = 2.0, 3.0  # a motion crawls if longer than this factor times the least + this
+_TIP_SLACK = 0.92  # of a tip's speed: between its points a path's spline is faster
 _SLACK = 0.97  # of the acceleration: toppra keeps its limits at grid points only
 _THERE_RAD = 1e-6  # a thousandth of a millimetre at the tip: no motion to be timed
 
@@ -148,6 +149,7 @@ def along(
     if tip_mm is not None:
         # The tip's arc length is one more joint, with limits of its own.
         path_rad = np.column_stack([path_rad, knots])
+        tip_mm_s *= _TIP_SLACK
         speeds_rad_s = np.append(speeds_rad_s, tip_mm_s)
         acceleration = np.append(acceleration, tip_mm_s / _TIP_SPEED_UP_S)
     keep = np.r_[True, np.diff(knots) > 1e-9 * knots[-1]]
@@ -161,7 +163,7 @@ def along(
     least_s = float((np.abs(np.diff(path_rad, axis=0)) / speeds_rad_s).max(axis=1).sum())
     best: Any = None
     for finer in _FINER:
-        grid = np.linspace(0, knots[-1], round(finer * max(_GRID, keep.sum())))
+        grid = np.linspace(0, knots[-1], round(finer * max(_GRID, _DENSE * keep.sum())))
         solver = toppra.algorithm.TOPPRA(limits, curve, grid, parametrizer="ParametrizeConstAccel")
         trajectory = solver.compute_trajectory(0, 0)
         if trajectory is not None and (best is None or trajectory.duration < best.duration):
