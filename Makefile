@@ -144,7 +144,7 @@ rehearsal: setup  ## the experiment on a bench that does not exist, by all its c
 pictures: demo debian  ## the pictures in docs/images that the demo shows (docs/pictures.md has the others; 10 minutes)
 	cp runs/demo/scenes/dragged-0002.png docs/images/demo.png
 	$(BIN)/tumortrack locate runs/demo/case runs/demo/dataset/dragged-0002/cloud.ply runs/pictures/run --overwrite
-	$(BIN)/tumortrack plan runs/pictures/run runs/pictures/plan --margin 9 --overwrite
+	$(BIN)/tumortrack plan runs/pictures/run runs/pictures/plan --accept-budget --overwrite
 	cp runs/pictures/plan/plan.png docs/images/plan.png
 	$(BIN)/tumortrack resect runs/pictures/plan --film docs/images/resection.gif
 	TUMORTRACK_PICTURES=docs/images TUMORTRACK_DEMO=runs/demo TUMORTRACK_PLAN=runs/pictures/plan $(BIN)/pytest -n0 devices/tests/test_viewer_page.py

@@ -2,7 +2,7 @@
 
 Run after 01: python examples/07_plan_a_resection.py [FOLDER]
 Needs `pip install tumortrack-resection` (`make setup` has it).
-From the command line, with the motions of two arms: tumortrack plan RUN PLAN --margin 9
+From the command line, with the motions of two arms: tumortrack plan RUN PLAN
 """
 
 import sys

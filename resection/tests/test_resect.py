@@ -430,6 +430,12 @@ def test_a_plan_over_its_budget_or_with_assumed_errors_moves_no_real_arm(story, 
         command = ("plan", folder / "run", tmp_path / name, "--frame", given / f"{frame}.json")
         succeeded(tumortrack(*command, *cell, "--margin", margin, "--accept-budget"))
     assert missing(tumortrack("resect", tmp_path / "narrow", *live)) == {"budget", "person"}
+    path = tmp_path / "narrow" / "plan.json"
+    data = json.loads(path.read_text())
+    data["budgets"][0]["margin_mm"] = 20.0  # which the motions do not keep
+    path.write_text(json.dumps(data))
+    store.seal(path.parent, "plan", {}, "base_link")
+    assert missing(tumortrack("resect", tmp_path / "narrow", *live)) == {"budget", "person"}
     assert missing(tumortrack("resect", tmp_path / "unstated", *live)) == {"calibration", "person"}
     # The error of the direction counts at the tumor's distance, about 180 mm.
     (stated,) = read_plan(given / "plan").budgets
@@ -446,6 +452,20 @@ def test_a_run_of_an_unknown_case_moves_no_real_arm(story, given, tmp_path):
     store.seal(plan, "plan", {}, "base_link")
     done = tumortrack("resect", plan, REAL, *STATED, "--live", given / "model", "realsense")
     assert missing(done) == {"plan", "person"}
+
+
+def test_a_tumor_whose_place_is_a_guess_moves_no_real_arm_however_far_it_is(given, tmp_path):
+    data = json.loads((given / "plan" / "plan.json").read_text())
+    plan = tmp_path / "plan"
+    shutil.copytree(given / "plan", plan)
+    (stated,) = data["budgets"]
+    unsure = {**stated, "part": "tumor_2", "margin_mm": 40.0, "assumed": ["tracking"]}
+    data["budgets"].append(unsure)
+    write_mesh(plan / "tumor_2.ply", sphere((-40.0, 10.0, 140.0), 3.0))
+    (plan / "plan.json").write_text(json.dumps(data))
+    store.seal(plan, "plan", {}, "base_link")
+    done = tumortrack("resect", plan, REAL, *STATED, "--live", given / "model", "realsense")
+    assert missing(done) == {"unsure", "person"}
 
 
 def test_a_ros_camera_moves_a_real_arm_only_if_the_calibration_names_its_frame(given, tmp_path):
