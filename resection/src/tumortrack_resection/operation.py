@@ -254,7 +254,10 @@ class Operation:
     @property
     def _note(self) -> str:
         """Warnings on the plan, and on estimates of an organ that is being cut."""
-        heads = dict.fromkeys(warning.split(":")[0].rstrip(".") for warning in self._warnings)
+        heads = dict.fromkeys(
+            warning.split(":")[0].rstrip(".")
+            for warning in (*self._warnings, *self.planned.plan.warnings)
+        )
         return "; ".join([*heads, *([CUT_NOTE] if self._cut and self._locate is not None else [])])
 
     def summary(self) -> dict[str, Any]:

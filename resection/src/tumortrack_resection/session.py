@@ -376,6 +376,7 @@ def _check_real(
 ) -> None:
     """Raises InputError that lists what is missing for real arms to move."""
     budget, kind = tightest(stored.budgets), Organ(name=organ_name(stored.meshes) or KIDNEY.name)
+    assumed = {name for each in stored.budgets for name in each.assumed}
     needs = {
         "--live MODEL SOURCE, so that they stop where the tumor moves": live,
         "a plan that says which case it was made on (locate and plan again)": stored.case_sha256,
@@ -399,15 +400,11 @@ def _check_real(
         "a plan whose distances cover its errors (plan again with a wider margin)": (
             budget.left_mm >= 0
         ),
-        "a plan by a model that says how unsure it is (preset clinic)": (
-            "tracking" not in budget.assumed
-        ),
+        "a plan by a model that says how unsure it is (preset clinic)": ("tracking" not in assumed),
         "a plan with the calibration's error (error_mm in the --frame file)": (
-            "hand-eye" not in budget.assumed
+            "hand-eye" not in assumed
         ),
-        "a plan with the tools' error (tool_error_mm in the --cell file)": (
-            "tool" not in budget.assumed
-        ),
+        "a plan with the tools' error (tool_error_mm in the --cell file)": ("tool" not in assumed),
         f"--moved as planned with, not {config.moved_mm:g}": config.moved_mm <= budget.motion_mm,
         "each arm once, at an address of its own": (
             len(arms) == len({arm.arm for arm in arms}) == len({arm.host for arm in arms})
