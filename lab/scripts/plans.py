@@ -43,7 +43,7 @@ from tumortrack_resection.check import electrode_poses
 from tumortrack_resection.checking import checked
 from tumortrack_resection.located import STAND_MM, of_estimate, table_under
 from tumortrack_resection.planning import below
-from tumortrack_resection.resection import exophytic_shares
+from tumortrack_resection.tumors import exophytic_shares
 from tumortrack_resection.values import Located, ResectionConfig, name_of
 
 _LEAST_SHARE = 0.3  # of a tumor, outside the organ

@@ -409,18 +409,18 @@ FREE = [seen(part=part) for part in NEEDED]
     ],
 )
 def test_faults(one, wrong):
-    assert faults(FREE, NEEDED, "tumor_1") == []
-    found = faults([*FREE, one], NEEDED, "tumor_1")
+    assert faults(FREE, NEEDED, ["tumor_1"]) == []
+    found = faults([*FREE, one], NEEDED, ["tumor_1"])
     assert len(found) == wrong
     assert all(one.part in text and one.solid in text for text in found)
 
 
 def test_what_was_not_looked_at_is_a_fault():
-    assert len(faults([], NEEDED, "tumor_1")) == len(NEEDED)
+    assert len(faults([], NEEDED, ["tumor_1"])) == len(NEEDED)
     others = [seen("pencil", part) for part in NEEDED]
-    assert len(faults(others, NEEDED, "tumor_1")) == len(NEEDED)
-    assert len(faults(FREE[1:], NEEDED, "tumor_1")) == 1
-    assert len(faults(FREE, {**NEEDED, "tumor_1": math.nan}, "tumor_1")) == 1
+    assert len(faults(others, NEEDED, ["tumor_1"])) == len(NEEDED)
+    assert len(faults(FREE[1:], NEEDED, ["tumor_1"])) == 1
+    assert len(faults(FREE, {**NEEDED, "tumor_1": math.nan}, ["tumor_1"])) == 1
 
 
 def test_distances_that_contradict_each_other_are_a_fault(monkeypatch):
@@ -431,7 +431,7 @@ def test_distances_that_contradict_each_other_are_a_fault(monkeypatch):
     tumor = ellipsoid([0.0, 0.0, 100.0], [5.0] * 3)
     found = clearances(URDF, motions, {"tumor_1": tumor}, ())
     assert math.isnan(of(found).least_mm)
-    assert faults(found, {"tumor_1": 5.0}, "tumor_1")
+    assert faults(found, {"tumor_1": 5.0}, ["tumor_1"])
 
 
 # Bad input ----------------------------------------------------------------------------------------

@@ -19,7 +19,8 @@ from tumortrack_lab.cut import cut as cut_out
 from tumortrack_resection.budget import planned_budgets
 from tumortrack_resection.files import as_builtins, from_plain
 from tumortrack_resection.outline import concave_hull, evenly, grown, rings_of
-from tumortrack_resection.resection import exophytic_shares, plan_resection
+from tumortrack_resection.resection import plan_resection
+from tumortrack_resection.tumors import exophytic_shares
 from tumortrack_resection.values import Located, ResectionConfig
 
 PUBLISHED, OURS = ResectionConfig(method="published"), ResectionConfig()

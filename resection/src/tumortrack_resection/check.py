@@ -250,19 +250,21 @@ def clearances(
     return tuple(found)
 
 
-def faults(found: Sequence[Clearance], least_mm: Mapping[str, float], planned: str) -> list[str]:
+def faults(
+    found: Sequence[Clearance], least_mm: Mapping[str, float], taken: Collection[str]
+) -> list[str]:
     """What forbids the motions, a sentence each; empty: nothing does.
 
     Args:
         least_mm: by part, what electrode and shaft must keep, less ``TOLERANCE_MM``. The other
-            solids may touch ``planned``, the tumor that is cut out, and no other part named here.
+            solids may touch ``taken``, the tumors that come away, and no other part named here.
     """
     known = {one.part for one in found if one.solid == ELECTRODE}
     lacking = [f"How near the electrode comes to {n} is unknown." for n in {*least_mm} - known]
-    return sorted(lacking) + [text for one in found if (text := _fault(one, least_mm, planned))]
+    return sorted(lacking) + [text for one in found if (text := _fault(one, least_mm, taken))]
 
 
-def _fault(one: Clearance, least_mm: Mapping[str, float], planned: str) -> str:
+def _fault(one: Clearance, least_mm: Mapping[str, float], taken: Collection[str]) -> str:
     """What is wrong with it, or an empty text."""
     if not np.isfinite([one.least_mm, one.energised_mm or 0.0]).all():
         return f"How near the {one.solid} comes to {one.part} cannot be computed."
@@ -273,7 +275,7 @@ def _fault(one: Clearance, least_mm: Mapping[str, float], planned: str) -> str:
     if one.solid in IN_TISSUE:
         kept, needs = one.least_mm >= needs_mm - TOLERANCE_MM, f", which needs {needs_mm:.1f} mm"
     else:
-        kept = one.least_mm > 0 or one.part == planned
+        kept = one.least_mm > 0 or one.part in taken
     if kept:
         return ""
     how = f"comes within {one.least_mm:.1f} mm of" if one.least_mm > 0 else "touches"

@@ -26,10 +26,7 @@ def checked(plan: ResectionPlan, motions: Motions, urdf: str, located: Located) 
     found = check.clearances(urdf, motions, parts, plan.taken)
     published = plan.method == "published"
     needed = {name: plan.margin_mm for name in plan.taken if not published} | plan.keep_mm
-    # What comes away may be touched by all but the electrode.
-    held = [each for each in found if each.solid not in check.IN_TISSUE and each.part in plan.taken]
-    judged = [each for each in found if each not in held]
-    if faults := check.faults(judged, needed, plan.tumor):
+    if faults := check.faults(found, needed, plan.taken):
         raise NoPlan(f"{faults[0]} Ask for another margin, or place the organ otherwise.")
     plan = replace(plan, clearances=found)
     harm = [
@@ -37,6 +34,9 @@ def checked(plan: ResectionPlan, motions: Motions, urdf: str, located: Located) 
         for name, mm in plan.least_mm.items()
         if mm < 0 and is_tumor(name)
     ]
-    touched = [f"the {each.solid} touches {each.part}" for each in held if each.least_mm <= 0]
+    touched = [
+        f"the {each.solid} touches {each.part}" for each in found
+        if each.least_mm <= 0 and each.solid not in check.IN_TISSUE and each.part in plan.taken
+    ]  # fmt: skip
     notes = [*(f"{words}." for words in harm), *plan.notes, *(f"{words}." for words in touched)]
     return replace(plan, notes=tuple(notes))

@@ -18,13 +18,13 @@ from jaxtyping import Bool, Float64
 
 from tumortrack.core.errors import NoPlan
 from tumortrack.core.types import ORGAN
-from tumortrack.imaging.meshes import solid_of
 from tumortrack_resection.values import Located, ResectionConfig, name_of
 
 Vector = Float64[np.ndarray, " 3"]
 Planes = Float64[np.ndarray, "k 4"]  # unit normals n, which point out of the piece; offsets, mm
 Chosen = tuple[int, ...]  # numbers of normals, anticlockwise as seen from where the piece opens
 
+UP = np.array([0.0, 0.0, 1.0])
 EDGE_MM = 1.0  # the tip goes so far beyond the edge to the next facet
 SLACK_MM = 0.1  # by which the planes are farther off than the margin: arms follow them to 0.05 mm
 _NORMALS = 1000  # all over the sphere, 6 degrees apart
@@ -34,7 +34,7 @@ _FIRST, _BEST = 3, 8  # facets by which openings are compared, and how many open
 _POINTS = 2048  # of healthy tissue, by which normals are chosen
 _OPEN = np.sin(np.radians(8.0))  # least sine between facet and opening: the piece comes free
 _CONVEX = np.sin(np.radians(25.0))  # least turn at a corner of the normals' outline
-_ROUNDS = 2  # of choosing each normal anew
+_ROUNDS = 2  # of choosing each normal again
 # Points of healthy tissue that one too near to the electrode outweighs: of another tumor, and of
 # what carries the organ, which is not always in the way.
 _TOO_NEAR, _AT_STAND = 50.0, 0.5
@@ -92,7 +92,6 @@ class FacetSearch:
     ) -> None:  # fmt: skip
         self._located, self._targets, self.keep_mm = located, targets, keep_mm
         self._config, self._tools = config, tools
-        self.solid = solid_of(located.organ, "the organ's surface")
         self._like = None if like is None else np.asarray(like, float)
         self._normals = sphere(_NORMALS) if self._like is None else self._like
         points, margins = self._grown()
@@ -238,7 +237,7 @@ class _Choice:
         return self._best([chosen[:n] + (-1,) + chosen[n:] for n in range(max(len(chosen), 1))])
 
     def _refined(self, chosen: Chosen, worth: float) -> tuple[Chosen, float]:
-        """Each normal chosen anew, the others as they are."""
+        """Each normal chosen again, the others as they are."""
         for _ in range(_ROUNDS):
             before = chosen
             for n in range(len(chosen)):

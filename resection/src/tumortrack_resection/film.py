@@ -29,7 +29,7 @@ from tumortrack.live.values import Polyline, TrackingResult, Workcell
 from tumortrack.report.drawing import SIGN
 from tumortrack.report.renderer import Body, Viewpoint, render, rgb
 from tumortrack.report.wrapping import wrapped
-from tumortrack_resection.facets import Tools
+from tumortrack_resection.facets import TOOLS
 from tumortrack_resection.motions import LIFT, PULL, RELEASE, Motions
 from tumortrack_resection.pictures import organ_surfaces
 from tumortrack_resection.strokes import trimmed
@@ -350,7 +350,7 @@ def divided(located: Located, plan: ResectionPlan) -> tuple[list[Body], list[Bod
     surfaces = organ_surfaces(located)
     whole = solid_of(surfaces.pop(ORGAN), "the located organ")
     if len(plan.facets):
-        rest = whole - trimmed(whole, plan.facets, -Tools().radius_mm)
+        rest = whole - trimmed(whole, plan.facets, -TOOLS.radius_mm)
     else:
         rest = whole - solid_of(plan.piece, "the piece")
     shade = rgb(part_colour(ORGAN))

@@ -73,12 +73,12 @@ class LiveBudget:
             if name in self._planned
         }
         self.now = tightest(list(budgets.values()))
-        heeded = {n: each for n, each in budgets.items() if self._planned[n].left_mm >= 0}
-        for name, now in heeded.items():
+        covered = {n: each for n, each in budgets.items() if self._planned[n].left_mm >= 0}
+        for name, now in covered.items():
             if self._planned[name].confidence > now.confidence:
                 percent = 100 * self._planned[name].confidence
                 return Halt("no_margin", {"percent": percent}), False
-        if not heeded or (worst := tightest(list(heeded.values()))).left_mm >= 0:
+        if not covered or (worst := tightest(list(covered.values()))).left_mm >= 0:
             return None, False
         return worst.as_halt, msgspec.structs.replace(worst, motion_mm=0.0).left_mm >= 0
 

@@ -22,7 +22,7 @@ from tumortrack.report import drawing
 from tumortrack.report.drawing import CENTRED
 from tumortrack.report.renderer import RGB, Body, Frame, ParallelView, rgb
 from tumortrack_resection.budget import foreseen_mm, kept_words, lost_words
-from tumortrack_resection.facets import Tools, across
+from tumortrack_resection.facets import TOOLS, Tools, across
 from tumortrack_resection.sections import (
     INK,
     ORGAN_OPACITY,
@@ -41,7 +41,6 @@ from tumortrack_resection.sweeps import Lines, Sweep, sweeps_of
 from tumortrack_resection.values import CUTS_TUMOR, Located, ResectionPlan
 
 FROM_ABOVE = ParallelView("from above", (1.0, 0.0, 0.0), (0.0, -1.0, 0.0))
-_TOOLS = Tools()
 _METHODS = {"published": "published method", "margin": "margin method"}
 
 _WIDE_IN, _VIEWS_IN, _SECTIONS_IN, _LINE_IN = 12.0, 4.5, 3.0, 0.17  # the last: of a title
@@ -58,7 +57,7 @@ _HEAD = "simple,head_width=0.7,head_length=0.75,tail_width=0.01"
 
 
 def draw_plan(
-    plan: ResectionPlan, located: Located, path: Path, tools: Tools = _TOOLS,
+    plan: ResectionPlan, located: Located, path: Path, tools: Tools = TOOLS,
     poses_mm: Lines | None = None,
 ) -> None:  # fmt: skip
     """Write ``plan_figure`` as a PNG, atomically; raises as it does."""
@@ -66,7 +65,7 @@ def draw_plan(
 
 
 def plan_figure(
-    plan: ResectionPlan, located: Located, tools: Tools = _TOOLS, poses_mm: Lines | None = None
+    plan: ResectionPlan, located: Located, tools: Tools = TOOLS, poses_mm: Lines | None = None
 ) -> Figure:
     """Warnings; the electrode's least distances; organ, tumors, the piece, the tip's paths and what
     the electrode covers, from where instrument and cup come; a section for each sweep.

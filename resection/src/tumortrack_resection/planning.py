@@ -207,11 +207,11 @@ def plan_cuts(
 
 def check_arms_installed() -> None:
     """Raises InputError: a library that motions need is missing."""
-    needed = ("pinocchio", "coal", "toppra", "ruckig")
+    needed = ("pinocchio", "coal", "toppra")
     if missing := [name for name in needed if find_spec(name) is None]:
         raise InputError(
-            f"arms need {', '.join(missing)}: pip install 'tumortrack-resection[arms]'. toppra and "
-            "ruckig have packages for x86-64 alone; elsewhere plan the cuts with --no-arms."
+            f"arms need {', '.join(missing)}: pip install 'tumortrack-resection[arms]'. toppra "
+            "has packages for x86-64 alone; elsewhere plan the cuts with --no-arms."
         )
 
 

@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 
 from tumortrack_resection.facets import (
     EDGE_MM,
+    UP,
     Piece,
     Planes,
     Tools,
@@ -30,7 +31,6 @@ _CUP_SLOPE = 0.05  # the same of the cup's way
 _CUP_ROOM_MM, _STEEP_MM = 2.0, 6.0  # beside the cup; a slope of 1 counts as so far off
 _LEAST_MM2 = 1.0  # a smaller section needs no cut
 _DIRECTIONS = 500  # from which the cup may come
-_UP = np.array([0.0, 0.0, 1.0])
 
 
 class Stroke(NamedTuple):
@@ -188,7 +188,7 @@ def trimmed(solid: Any, planes: Planes, inward_mm: float) -> Any:
 def cup_direction(planes: Planes) -> Vector | None:
     """From where the cup comes, and the piece is lifted to: as steeply from above as the piece
     comes free. None: from nowhere above."""
-    directions = np.concatenate([[_UP], sphere(_DIRECTIONS, 0.0)])
+    directions = np.concatenate([[UP], sphere(_DIRECTIONS, 0.0)])
     free = (directions @ planes[:, :3].T).max(1) <= -_CUP_SLOPE
     if not free.any():
         return None

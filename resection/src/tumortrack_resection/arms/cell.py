@@ -189,21 +189,21 @@ class PlanningGroup:
     """The joints that move while the others stand still.
 
     Attributes:
-        arm: cutter or holder; None: both move.
+        arm: cutter or holder.
         joints_rad: where both are (12,).
         touching: arms that may touch the organ with their electrode or cup.
     """
 
     cell: ArmCell
-    arm: str | None
+    arm: str
     joints_rad: Joints
     touching: Collection[str] = ()
 
     @cached_property
     def own(self) -> slice:
         """The moving joints among the twelve."""
-        first = 6 * ARMS.index(self.arm or CUTTER)
-        return slice(first, first + 6 if self.arm else 6 * len(ARMS))
+        first = 6 * ARMS.index(self.arm)
+        return slice(first, first + 6)
 
     @property
     def current_rad(self) -> Float64[np.ndarray, " d"]:
@@ -217,7 +217,7 @@ class PlanningGroup:
     @property
     def model(self) -> ArmModel:
         """The type of the moving arm."""
-        return self.cell.config.model(str(self.arm))
+        return self.cell.config.model(self.arm)
 
     def all_joints(self, own_rad: Float64[np.ndarray, " d"]) -> Joints:
         """All twelve joints, the moving ones being these."""
@@ -235,7 +235,7 @@ class PlanningGroup:
     @cached_property
     def _frames(self) -> tuple[Pose, Pose]:
         """``base_from_table`` and ``tip_from_flange``, mm."""
-        config, arm = self.cell.config, str(self.arm)
+        config, arm = self.cell.config, self.arm
         poses = config.base(arm).table_from_base, config.flange_from_tip(arm)
         return np.linalg.inv(poses[0]), np.linalg.inv(poses[1])
 

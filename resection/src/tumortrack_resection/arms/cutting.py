@@ -17,7 +17,7 @@ from tumortrack.core.geometry import rigid
 from tumortrack.core.types import Mesh
 from tumortrack_resection.arms.cell import ArmCell, Blocked, CollidingPair, PlanningGroup
 from tumortrack_resection.arms.config import ELECTRODE_RADIUS_MM
-from tumortrack_resection.arms.kinematics import Pose, nearest_turn
+from tumortrack_resection.arms.kinematics import Pose, level_pose, nearest_turn
 from tumortrack_resection.arms.paths import connect, follow, resampled
 from tumortrack_resection.arms.trajectory import TrajectoryBuilder
 from tumortrack_resection.motions import CUTTER, HOLDER
@@ -253,7 +253,7 @@ def _cut_leg(builder: TrajectoryBuilder, cut: Cut, path_mm: np.ndarray, outside:
     group, reasons = builder.group(CUTTER, (CUTTER, HOLDER)), list[Blocked]()
     probes = np.unique(np.r_[np.arange(0, len(path_mm), _PROBE_STEP), len(path_mm) - 1])
     legs: list[tuple[int, float, int, np.ndarray, int]] = []
-    for turn in _level_turns():
+    for turn in level_turns():
         first = _free(group, rigid(turn, path_mm[0]), reasons)
         if first is None:
             continue
@@ -278,11 +278,10 @@ def _cut_leg(builder: TrajectoryBuilder, cut: Cut, path_mm: np.ndarray, outside:
     raise _most_frequent(reasons, path_mm[0])
 
 
-def _level_turns() -> list[np.ndarray]:
-    yaws = 2 * np.pi * np.arange(_YAWS) / _YAWS
-    ahead = np.stack([np.cos(yaws), np.sin(yaws), np.zeros(_YAWS)], 1)
-    up = np.array([0.0, 0.0, 1.0])
-    return [np.stack([axis, np.cross(up, axis), up], axis=1) for axis in ahead]
+def level_turns(count: int = _YAWS) -> list[np.ndarray]:
+    """Table from tip (3, 3) of a level instrument, in directions all round."""
+    yaws = 2 * np.pi * np.arange(count) / count
+    return [level_pose(np.zeros(3), yaw)[:3, :3] for yaw in yaws]
 
 
 def _detours(group: PlanningGroup, there: Pose) -> list[np.ndarray]:

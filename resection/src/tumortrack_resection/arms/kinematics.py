@@ -59,7 +59,6 @@ MODELS = {model.name: model for model in (UR5, UR10E)}
 # The maker states no limit of acceleration. 1.4 rad/s^2 is its controller's default for a joint
 # move (URScript manual, movej): a pace for work beside people, far below what either arm can do.
 ACCELERATION_RAD_S2 = 1.4
-JERK_RAD_S3 = 10.0
 
 
 def wrapped(angles_rad: np.ndarray) -> np.ndarray:

@@ -21,11 +21,13 @@ from tumortrack.core.geometry import rigid
 from tumortrack_resection.arms import cutting
 from tumortrack_resection.arms.cell import TOUCHES, ArmCell, Blocked, PlanningGroup
 from tumortrack_resection.arms.config import Base, CellConfig
-from tumortrack_resection.arms.cutting import Outside, Way, turns_about
-from tumortrack_resection.arms.kinematics import Pose, level_pose, upright, yaw_of
+from tumortrack_resection.arms.cutting import Outside, Way, level_turns, turns_about
+from tumortrack_resection.arms.kinematics import Pose, upright, yaw_of
 from tumortrack_resection.arms.paths import connect, follow, out_of_reach
 from tumortrack_resection.arms.trajectory import TrajectoryBuilder, first_hit
 from tumortrack_resection.checking import checked
+from tumortrack_resection.drafts import Draft, Drafts
+from tumortrack_resection.facets import UP
 from tumortrack_resection.motions import (
     ARMS,
     CUTTER,
@@ -41,7 +43,7 @@ from tumortrack_resection.motions import (
     Motions,
 )
 from tumortrack_resection.operation import Planned, ResectionProgress
-from tumortrack_resection.resection import Draft, Drafts, plan_resection
+from tumortrack_resection.resection import plan_resection
 from tumortrack_resection.values import Cut, Located, ResectionConfig, ResectionPlan
 
 _VACUUM_S = 0.5  # until the cup holds
@@ -57,13 +59,12 @@ _SIDES_DEG = (0.0, 30.0, -30.0, 60.0, -60.0)
 _YAWS = 8  # in which a level instrument is asked to reach
 _MOST_PIECES, _ELSEWHERE = 8, 3  # for which motions are planned, and with other bases
 _HAND = tuple(f"{HOLDER}/{name}" for name in ("cup", "rod", "wrist_3"))
-_UP = np.array([0.0, 0.0, 1.0])
 _MOST_TRIED = 4  # pairs of places for which motions are planned
 _EDGE_MM = 120.0  # a base's middle is no nearer to the table's edge
 
 
 class Start(NamedTuple):
-    """Where the arms are (twelve joints) when they are planned for anew. An instrument in tissue
+    """Where the arms are (twelve joints) when they are planned for again. An instrument in tissue
     first leaves straight back. ``from_sweep``: the grasper holds already and stays where it is;
     begin with this sweep, counted from 1; one more than there are: lift, release and go home."""
 
@@ -266,7 +267,7 @@ def _withdraw(builder: TrajectoryBuilder, outside: Outside, holding: bool) -> No
     pair = builder.cell.collisions(builder.joints_rad, (CUTTER,))
     if not holding and pair is not None and TOUCHES[HOLDER] in pair:
         builder.wait(_LET_GO_S)
-        _rise(builder, _UP)
+        _rise(builder, UP)
 
 
 def _rise(
@@ -322,7 +323,7 @@ def _reachable_cells(plan: ResectionPlan, config: CellConfig) -> Iterator[CellCo
     """Configurations in which both arms reach all they have to, the least change first."""
     # Ends and middles of all strokes
     tips = [(cut, tip) for cut in plan.cuts for tip in cut.path_mm[[0, len(cut.path_mm) // 2, -1]]]
-    level = [level_pose(np.zeros(3), yaw)[:3, :3] for yaw in 2 * np.pi * np.arange(_YAWS) / _YAWS]
+    level = level_turns(_YAWS)
     turns = {id(cut): level if cut.axis is None else turns_about(cut.axis) for cut in plan.cuts}
     targets = {
         CUTTER: [[rigid(turn, tip) for turn in turns[id(cut)]] for cut, tip in tips],
@@ -386,7 +387,6 @@ def begin_worker(config: ResectionConfig, cell: CellConfig, urdf: str) -> None:
 
 def warm_up() -> None:
     """Loads in the worker what is slow to load."""
-    import ruckig  # noqa: F401
     import toppra  # noqa: F401
 
 

@@ -1,8 +1,7 @@
 """From paths to trajectories: as fast as the joints' and tips' limits allow.
 
 Pham and Pham 2018, 'A new approach to time-optimal path parameterization based on reachability
-analysis' (toppra), DOI 10.1109/TRO.2018.2819195; Berscheid and Kroeger 2021, 'Jerk-limited
-real-time trajectory generation with arbitrary target states' (ruckig), arXiv:2105.04830.
+analysis' (toppra), DOI 10.1109/TRO.2018.2819195.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ from jaxtyping import Float64
 from tumortrack.core.types import Mesh
 from tumortrack_resection.arms.cell import ArmCell, Blocked, PlanningGroup
 from tumortrack_resection.arms.config import CellConfig
-from tumortrack_resection.arms.kinematics import ACCELERATION_RAD_S2, JERK_RAD_S3, Pose
+from tumortrack_resection.arms.kinematics import ACCELERATION_RAD_S2, Pose
 from tumortrack_resection.arms.paths import arc_lengths, follow
 from tumortrack_resection.motions import (
     ARMS,
@@ -68,8 +67,8 @@ class TrajectoryBuilder:
         """Go on with what was added to a copy."""
         self.joints_rad, self.stages, self._pieces = other.joints_rad, other.stages, other._pieces
 
-    def group(self, arm: str | None, touching: Collection[str] = ()) -> PlanningGroup:
-        """This arm (None: both) moves from here."""
+    def group(self, arm: str, touching: Collection[str] = ()) -> PlanningGroup:
+        """This arm moves from here."""
         return PlanningGroup(self.cell, arm, self.joints_rad, touching)
 
     def tip(self, arm: str) -> Pose:
@@ -174,33 +173,6 @@ def along(
         raise Blocked("a path can't be gone within the joints' limits")
     times = _samples(best.duration)
     return times, best(times)[:, :width]
-
-
-def together(
-    start_rad: Float64[np.ndarray, " d"],
-    goal_rad: Float64[np.ndarray, " d"],
-    speeds_rad_s: Float64[np.ndarray, " d"],
-) -> Timed:
-    """Every joint leaves at the same time and arrives at the same time, on the straight segment.
-    Raises Blocked: no such motion."""
-    import ruckig
-
-    # One joint that goes from 0 to 1, as slowly as the slowest of them needs: so all are on the
-    # straight segment that was tested, which synchronised ends alone would not mean.
-    turns = np.maximum(np.abs(goal_rad - start_rad), 1e-9)
-    longest = float(turns.max())
-    wish = ruckig.InputParameter(1)
-    wish.current_position, wish.target_position = [0.0], [1.0]
-    wish.max_velocity = [float((speeds_rad_s / turns).min())]
-    wish.max_acceleration = [ACCELERATION_RAD_S2 / longest]
-    wish.max_jerk = [JERK_RAD_S3 / longest]
-    motion = ruckig.Trajectory(1)
-    outcome = ruckig.Ruckig(1).calculate(wish, motion)
-    if outcome not in (ruckig.Result.Working, ruckig.Result.Finished):
-        raise Blocked(f"no synchronous motion ({outcome})")
-    times = _samples(motion.duration)
-    share = np.array([motion.at_time(time)[0] for time in times]).reshape(-1, 1)
-    return times, start_rad + share * (goal_rad - start_rad)
 
 
 def first_hit(motions: Motions, config: CellConfig, organ: Mesh, begun: bool = False) -> str:

@@ -1,0 +1,380 @@
+"""The pieces that can be planned, and for each the ways to cut it: what the arms choose from."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import manifold3d
+import numpy as np
+from jaxtyping import Float64
+from scipy.spatial import cKDTree
+
+from tumortrack.core.errors import InputError, NoPlan
+from tumortrack.core.mesh_query import contains
+from tumortrack.core.types import ORGAN, Mesh
+from tumortrack.imaging.meshes import mesh_of, solid_of
+from tumortrack_resection.facets import UP, FacetSearch, Piece, Tools, Vector, inside, keep_mm
+from tumortrack_resection.published import published_cuts
+from tumortrack_resection.strokes import (
+    Facet,
+    Sections,
+    Stroke,
+    cup_direction,
+    grasp_point,
+    trimmed,
+)
+from tumortrack_resection.tumors import chosen_tumor
+from tumortrack_resection.values import (
+    NO_ROOM,
+    UNGUARDED,
+    Cut,
+    Located,
+    ResectionConfig,
+    ResectionPlan,
+    name_of,
+)
+
+_LOOSE_MM3 = 500.0  # what may come off beside the piece
+_CLEAR_MM = 5.0  # of the electrode stay outside the organ: its grip must not touch it
+_IN_THE_WAY_MM = 40.0  # of depth that a direction out of the arms' way is worth
+_LESS_ROOM = (0.5, 0.2)  # shares of the margin that other tumors keep where there is no room
+_TOGETHER = 2.0  # tumors come away together if that takes less than so many times the tissue
+# z of where an electrode comes from: below, stand and table are in its arm's way. The more drafts
+# the arms did not manage, the less is tried.
+_LOWEST = (-0.5, -0.5, -0.2, -0.2, -0.2, 0.0)
+_MOST_WAYS = 8  # to cut a facet
+_MOST_PIECES, _MOST_SEARCHES = 8, 6  # that are looked at, each without what was to blame before
+_EVERY, _SHELL_MM = 8, 1.5  # points of healthy tissue, and of the tumor's surface, for its shell
+
+
+class _Unfit(NamedTuple):
+    """Why a piece can't be planned; ``normals``: numbers of those that are to blame."""
+
+    words: str
+    normals: tuple[int, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Draft:
+    """A piece, and for each sweep the ways to cut it, the best first. Table frame, mm.
+
+    Attributes:
+        taken: labels of the tumors that come away.
+        share: of the tumor outside the organ's hull.
+        piece: its facets; None: the paper's method has none.
+        keep_mm: what the electrode keeps away from beside the tumors that come away.
+        solid: what comes away, closed. ``healthy``, ``kerf``: shares of the parenchyma that come
+            away with it, and that the electrode's width takes.
+    """
+
+    located: Located
+    config: ResectionConfig
+    label: int
+    taken: tuple[int, ...]
+    share: float
+    piece: Piece | None
+    sweeps: tuple[tuple[Cut, ...], ...]
+    grasp_mm: Vector
+    lift: Vector
+    keep_mm: Mapping[str, float]
+    solid: Mesh
+    healthy: float
+    kerf: float
+    notes: tuple[str, ...] = ()
+
+    @property
+    def level(self) -> bool:
+        """A way needs several directions of a level instrument, which the arms choose."""
+        return self.piece is None
+
+    @property
+    def facets(self) -> Float64[np.ndarray, "k 4"]:
+        """As in ``ResectionPlan``."""
+        return np.zeros((0, 4)) if self.piece is None else self.piece.planes
+
+    @property
+    def lost(self) -> float:
+        """Share of the parenchyma."""
+        return self.healthy + self.kerf
+
+    @property
+    def keep(self) -> dict[str, tuple[Mesh, float]]:
+        """Surfaces, with the distances that the electrode keeps from them whatever it does. The
+        paper's method knows none."""
+        kept = {} if self.level else {name_of(n): self.config.margin_mm for n in self.taken}
+        surfaces = {**self.located.meshes, **self.located.structures}
+        return {name: (surfaces[name], mm) for name, mm in {**kept, **self.keep_mm}.items()}
+
+    def plan(self, cuts: tuple[Cut, ...]) -> ResectionPlan:
+        """With these ways."""
+        located, config = self.located, self.config
+        organ_ml = located.organ.volume_ml
+        tumors_ml = {n: located.meshes[name_of(n)].volume_ml for n in located.tumors}
+        parenchyma_ml = organ_ml - sum(tumors_ml.values())
+        with_it_ml = sum(tumors_ml[n] for n in self.taken)
+        healthy_ml = parenchyma_ml * self.healthy
+        volumes_ml = {
+            "organ": organ_ml, "parenchyma": parenchyma_ml, "tumor": tumors_ml[self.label],
+            "piece": healthy_ml + with_it_ml, "healthy": healthy_ml,
+        }  # fmt: skip
+        if not self.level:
+            volumes_ml["kerf"] = parenchyma_ml * self.kerf
+        return ResectionPlan(
+            method=config.method, tumor=name_of(self.label), label=self.label,
+            grasp_mm=self.grasp_mm, cuts=cuts, piece=self.solid, facets=self.facets,
+            taken=tuple(map(name_of, self.taken)), keep_mm=dict(self.keep_mm), lift=self.lift,
+            margin_mm=config.margin_mm, volumes_ml=volumes_ml, exophytic=self.share,
+            stamp_ns=located.stamp_ns, notes=self.notes,
+        )  # fmt: skip
+
+
+class Drafts:
+    """The pieces that can be planned for one tumor, the best first; others once one or the other
+    facet is left out. Raises as ``plan_resection``."""
+
+    def __init__(
+        self, located: Located, config: ResectionConfig, tools: Tools,
+        like: Float64[np.ndarray, "k 3"] | None = None,
+    ) -> None:  # fmt: skip
+        self._label, self._share = chosen_tumor(located, config)
+        _check_kept(located, config, name_of(self._label))
+        self._located, self._config, self._tools, self._like = located, config, tools, like
+        self._solid = solid_of(located.organ, "the organ's surface")
+        self._sections = Sections(self._solid)
+        self._searches: dict[tuple[tuple[int, ...], float], FacetSearch] = {}
+        self._left_out: list[int] = []
+        self._failures = 0
+        self._last: Piece | None = None
+
+    def best(self) -> Draft:
+        """Raises NoPlan: there is none any more."""
+        if self._config.method == "published":
+            return self._published()
+        reasons: list[str] = []
+        alone = (self._label,)
+        near = [
+            n for n in self._located.tumors
+            if n != self._label and name_of(n) not in self._config.keep_away
+        ]  # fmt: skip
+        found = self._first([(alone, 1.0)], reasons)
+        if found is None and near:
+            found = self._first([(alone, room) for room in _LESS_ROOM], reasons)
+            together = [*((self._label, n) for n in near), (self._label, *near)]
+            both = self._first([(targets, 1.0) for targets in together], reasons)
+            if both and (found is None or both[1].lost <= _TOGETHER * found[1].lost):
+                found = both
+        if found is None:
+            raise NoPlan(self._why_not(reasons))
+        self._last = found[0]
+        return found[1]
+
+    @property
+    def _lowest(self) -> float:
+        return _LOWEST[min(self._failures, len(_LOWEST) - 1)]
+
+    def leave_out(self, sweeps: Sequence[int]) -> None:
+        """The facets of these sweeps of the last draft can't be cut; nor can those like them."""
+        assert self._last is not None
+        before, self._failures = self._lowest, self._failures + 1
+        if self._lowest != before:  # from there another facet may be possible
+            self._left_out = []
+            return
+        self._left_out += [self._last.chosen[sweep - 1] for sweep in sweeps]
+
+    def _first(
+        self, ways: Sequence[tuple[tuple[int, ...], float]], reasons: list[str]
+    ) -> tuple[Piece, Draft] | None:
+        """The best piece round these tumors, where others keep this share of the margin; of the
+        first way for which there is one."""
+        for targets, room in ways:
+            search = self._searches.get((targets, room))
+            if search is None:
+                keep = keep_mm(self._located, targets, self._config, room)
+                search = FacetSearch(
+                    self._located, targets, keep, self._config, self._tools, self._like
+                )
+                self._searches[targets, room] = search
+            left_out = list(self._left_out)
+            for _ in range(_MOST_SEARCHES):
+                bad: set[int] = set()
+                for piece in search.pieces(left_out, self._lowest)[:_MOST_PIECES]:
+                    draft = self._draft(search, piece, targets, room)
+                    if isinstance(draft, Draft):
+                        return draft.piece or piece, draft
+                    reasons.append(draft.words)
+                    bad |= set(draft.normals)
+                if not bad or self._like is not None:
+                    break
+                left_out += bad
+        return None
+
+    def _draft(
+        self, search: FacetSearch, piece: Piece, targets: tuple[int, ...], room: float
+    ) -> Draft | _Unfit:
+        """What this piece makes, or why it makes none."""
+        located, config, tools = self._located, self._config, self._tools
+        facets = [Facet(self._sections, piece.planes, n) for n in range(1, len(piece.planes) + 1)]
+        full = [facet for facet in facets if not facet.empty]
+        if not full:
+            return _Unfit("the organ does not reach the tumor's margin; there is nothing to cut.")
+        if piece.healthy > config.most_healthy:
+            return _Unfit(
+                f"{piece.healthy:.0%} of the organ's healthy tissue would come away; allowed are "
+                f"{config.most_healthy:.0%}. Ask for a smaller margin, or allow more."
+            )
+        if swallowed := sorted({*piece.with_it} - {*targets}):
+            return _Unfit(f"{name_of(swallowed[0])} would come away, too.")
+        if len(full) < len(facets):
+            if self._like is not None:
+                return _Unfit("the organ no longer reaches all facets of the earlier plan.")
+            kept = [facet.number - 1 for facet in full]
+            piece = replace(piece, planes=piece.planes[kept],
+                            chosen=tuple(piece.chosen[n] for n in kept))  # fmt: skip
+            return self._draft(search, piece, targets, room)
+        lift = cup_direction(piece.planes)
+        if lift is None:
+            return _Unfit("the cup can't be held so that it lifts the piece out.")
+        sweeps = self._sweeps(facets, piece, lift)
+        if isinstance(sweeps, _Unfit):
+            return sweeps
+        grasp_mm = grasp_point(located, self._label, piece, tools, lift)
+        if grasp_mm is None:
+            return _Unfit("there is no place on the piece on which the cup can come down.")
+        rest = self._solid - trimmed(self._solid, piece.planes, -tools.radius_mm)
+        loose_mm3 = sum(sorted(part.volume() for part in rest.decompose())[:-1])
+        if loose_mm3 > _LOOSE_MM3:
+            return _Unfit(f"{loose_mm3 / 1000:.0f} ml beside the piece would come off, too.")
+        solid = mesh_of(trimmed(self._solid, piece.planes, tools.radius_mm))
+        healthy = located.of(ORGAN)
+        inner = float(inside(piece.planes, healthy, tools.radius_mm).mean())
+        outer = float(inside(piece.planes, healthy, -tools.radius_mm).mean())
+        return Draft(
+            located=located, config=config, label=self._label, taken=targets, share=self._share,
+            piece=piece, sweeps=sweeps, grasp_mm=grasp_mm,
+            lift=lift, keep_mm=search.keep_mm,
+            solid=solid, healthy=inner, kerf=outer - inner,
+            notes=(*self._notes(targets, room, search), *_unguarded(located, config)),
+        )  # fmt: skip
+
+    def _sweeps(
+        self, facets: Sequence[Facet], piece: Piece, lift: Vector
+    ) -> tuple[tuple[Cut, ...], ...] | _Unfit:
+        """For each facet the ways to cut it, the best first."""
+        sweeps: list[tuple[Cut, ...]] = []
+        room_mm = self._tools.electrode_mm - _CLEAR_MM
+        for facet, normal in zip(facets, piece.chosen, strict=True):
+            strokes = [
+                facet.stroke(back, self._config)
+                for back in facet.directions(self._lowest)[:_MOST_WAYS]
+            ]
+            strokes.sort(key=lambda stroke: _effort(stroke, lift))
+            fit = tuple(stroke.cut for stroke in strokes if stroke.depth_mm <= room_mm)
+            if not strokes:
+                return _Unfit("the instrument would have to come from below.", (normal,))
+            if not fit:
+                return _Unfit(
+                    f"the cut would be {min(stroke.depth_mm for stroke in strokes):.0f} mm deep; "
+                    f"the bare electrode of {self._tools.electrode_mm:g} mm allows {room_mm:g} mm "
+                    "(electrode_mm in the cell).",
+                    (normal,),
+                )
+            sweeps.append(fit)
+        return tuple(sweeps)
+
+    def _notes(self, targets: tuple[int, ...], room: float, search: FacetSearch) -> tuple[str, ...]:
+        located, name, margin_mm = self._located, name_of(self._label), self._config.margin_mm
+        notes = [f"{name_of(n)} comes away with {name}." for n in targets[1:]]
+        if room < 1:
+            least = ", ".join(
+                f"{mm:g} mm from {other}" for other, mm in search.keep_mm.items()
+                if other not in self._config.keep_away
+            )  # fmt: skip
+            notes.append(f"{NO_ROOM} {margin_mm:g} mm from other tumors; kept are {least}.")
+        healthy = located.of(ORGAN)[::_EVERY]
+        surface = cKDTree(located.meshes[name].spread_mm(_SHELL_MM))
+        shell = float((surface.query(healthy)[0] < margin_mm).mean())
+        ml = located.organ.volume_ml - sum(located.meshes[name_of(n)].volume_ml
+                                           for n in located.tumors)  # fmt: skip
+        notes.append(
+            f"a shell of {margin_mm:g} mm alone, which no straight electrode can cut, would be "
+            f"{shell * ml:.1f} ml of healthy tissue."
+        )
+        return tuple(notes)
+
+    def _why_not(self, reasons: list[str]) -> str:
+        """That something lies too near to the tumor, or else the best piece's reason."""
+        located, name, tools = self._located, name_of(self._label), self._tools
+        tumor = cKDTree(located.meshes[name].spread_mm(1.0))
+        surfaces, tight = {**located.meshes, **located.structures}, []
+        for other, mm in keep_mm(located, (self._label,), self._config, 1.0).items():
+            points = surfaces[other].spread_mm(1.0)
+            gaps = tumor.query(points)[0]
+            needed_mm = self._config.margin_mm + 2 * tools.radius_mm + mm
+            if gaps.min() < needed_mm:
+                tight.append((float(gaps.min()), other, points[gaps.argmin()]))
+        if tight:
+            gap_mm, other, (x, y, z) = min(tight, key=lambda near: near[:2])
+            return (
+                f"{other} lies {gap_mm:.1f} mm from {name}, at x {x:.0f}, y {y:.0f}, z {z:.0f} mm "
+                f"(table): an electrode {2 * tools.radius_mm:g} mm thick has no way between them "
+                f"that keeps {self._config.margin_mm:g} mm from {name}. Ask for a smaller margin, "
+                f"for less distance (--keep-away {other}=1), or plan the other one."
+            )
+        if reasons:
+            return reasons[0]
+        return (
+            f"no piece with up to {self._config.most_facets} plane facets round {name} can be cut "
+            "and lifted out. Place the organ otherwise, or ask for a smaller margin."
+        )
+
+    def _published(self) -> Draft:
+        """The paper's: the piece, two sweeps, and where to hold (its section II-D)."""
+        located, label = self._located, self._label
+        cuts, ring, low_mm, grasp_mm = published_cuts(located, label, self._config)
+        area = manifold3d.CrossSection([ring], manifold3d.FillRule.NonZero)
+        high_mm = float(located.organ.box_mm[1, 2]) + 1.0
+        prism = area.extrude(high_mm - low_mm).translate((0.0, 0.0, low_mm))
+        piece = mesh_of(self._solid ^ prism)
+        healthy = contains(piece, located.of(ORGAN)).mean()
+        if healthy > self._config.most_healthy:
+            raise NoPlan(
+                f"{healthy:.0%} of the organ's healthy tissue would come away; allowed are "
+                f"{self._config.most_healthy:.0%}. Ask for a smaller margin, or allow more."
+            )
+        return Draft(
+            located=located, config=self._config, label=label, taken=(label,), share=self._share,
+            piece=None, sweeps=tuple((cut,) for cut in cuts),
+            grasp_mm=grasp_mm, lift=UP, keep_mm=self._config.keep_away, solid=piece,
+            healthy=float(healthy), kerf=0.0,
+            notes=_unguarded(located, self._config),
+        )  # fmt: skip
+
+
+def _effort(stroke: Stroke, lift: Vector) -> float:
+    """By which strokes of a facet are ordered: depth, mm; an instrument beside the grasper, or that
+    comes from below, is in the arms' way."""
+    assert stroke.cut.axis is not None
+    back = -stroke.cut.axis
+    return stroke.depth_mm + _IN_THE_WAY_MM * float(max(back @ lift, 0) + max(-back[2], 0))
+
+
+def _check_kept(located: Located, config: ResectionConfig, tumor: str) -> None:
+    """InputError: something to keep away from was not located, or is the tumor itself."""
+    if tumor in config.keep_away:
+        raise InputError(
+            f"--keep-away {tumor}: that is the tumor to be cut out; its distance is --margin."
+        )
+    known = [*located.structures, *map(name_of, located.tumors)]
+    if lacking := sorted(config.keep_away.keys() - set(known)):
+        raise InputError(
+            f"--keep-away {lacking[0]}: there is no such structure or tumor in this estimate. It "
+            f"has: {', '.join(known) or 'none'}."
+        )
+
+
+def _unguarded(located: Located, config: ResectionConfig) -> tuple[str, ...]:
+    """A note on structures without a distance to keep."""
+    others = [name for name in located.structures if name not in config.keep_away]
+    return (f"{UNGUARDED} {', '.join(others)}.",) if others else ()
