@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, Phase, given, settings
+from hypothesis import HealthCheck, Phase, assume, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
@@ -92,10 +92,13 @@ def cases(draw: st.DrawFn, most_tumors: int = 2, most_facets: int = 6) -> Case:
         cutter_base=Base(position_mm=(850.0 + off[0], off[1], 100.0), yaw_deg=0.0),
         holder_base=Base(position_mm=(-520.0 + off[2], off[3], 150.0), yaw_deg=180.0),
         electrode_mm=draw(between(50, 90)),
+        bend_deg=draw(st.sampled_from([0.0, 0.0, 20.0, 45.0])),
         clearance_mm=draw(between(5, 10)),
         organ_clearance_mm=draw(between(2, 5)),
     )
-    return Case(located_of(*parts, n=8_000), config, cell)
+    located = located_of(*parts, n=8_000)
+    assume(all(len(located.of(n)) for n in located.tumors))  # none is hidden in the other
+    return Case(located, config, cell)
 
 
 def many(count: int, of: st.SearchStrategy[Case]) -> Callable[[Callable[[Case], bool]], None]:
@@ -187,7 +190,7 @@ def test_plans_of_random_organs():
 
 @pytest.mark.slow
 def test_plans_of_many_random_organs():
-    many(60, cases())(plan_keeps_what_it_says)
+    many(24, cases())(plan_keeps_what_it_says)
 
 
 def test_motions_for_random_organs_and_cells_pass_the_check():
@@ -196,7 +199,7 @@ def test_motions_for_random_organs_and_cells_pass_the_check():
 
 @pytest.mark.slow
 def test_motions_for_many_random_organs_and_cells_pass_the_check():
-    many(8, cases())(arms_keep_what_was_planned)
+    many(4, cases())(arms_keep_what_was_planned)
 
 
 # Tampered motions ---------------------------------------------------------------------------------

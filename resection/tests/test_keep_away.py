@@ -92,3 +92,20 @@ def test_what_cannot_be_kept_away_from_is_refused():
     for mm in (0.0, -1.0, 51.0, float("nan")):
         with pytest.raises(InputError, match="keep_away"):
             ResectionConfig(keep_away={"artery": mm})
+
+
+def test_a_tumor_with_a_surface_and_no_points_is_kept_away_from():
+    """As of a tumor that is smaller than the spacing of the cloud's points."""
+    seen = located(sphere(TUMOR_MM, RADIUS_MM), n=12_000)
+    ball = sphere(TUMOR_MM + [0.0, RADIUS_MM + MARGIN_MM + 6.0, 0.0], 1.0)
+    seen = replace(seen, meshes={**seen.meshes, "tumor_2": ball})
+    assert seen.tumors == (2, 3)
+    plan = plan_resection(seen, ResectionConfig(tumor="tumor_1", keep_away={"tumor_2": 2.0}))
+    assert gap_mm(plan, ball) > 2.0 - 0.05
+    with pytest.raises(NoPlan):
+        plan_resection(seen, ResectionConfig(tumor="tumor_2"))
+
+
+def test_a_short_electrode_is_named_as_the_reason():
+    with pytest.raises(NoPlan, match="electrode"):
+        plan_resection(beside(12.0), ResectionConfig(), Tools(electrode_mm=15.0))

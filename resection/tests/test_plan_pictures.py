@@ -226,7 +226,7 @@ def test_least_distances_stand_in_the_title(plan: ResectionPlan, located: Locate
     assert "7%" in words(figure)
     foreseen = plan_figure(plan, located).texts[0].get_text()
     assert "5.0 mm from tumor_1" in foreseen
-    assert "not checked" in foreseen
+    assert "unchecked" in foreseen
 
 
 def test_a_tumor_that_is_cut_is_a_warning(

@@ -181,8 +181,8 @@ def test_a_tip_that_moves_is_less_sure_of_where_it_is():
 def test_the_pull_itself_halts_nothing_and_then_it_is_planned_on_the_pulled_tumor(far_mm, kind):
     plans = []
 
-    def replan(update, joints_rad, progress, facets):
-        assert facets is PLAN.facets
+    def replan(update, joints_rad, progress, before):
+        assert before is PLAN
         plans.append((joints_rad[6], progress))
         meshes = procedure.locate(update).meshes
         later = Motions(motions(STATES[5:]).stages)
@@ -261,7 +261,7 @@ def test_what_is_taut_is_cut_along_the_same_facets_where_it_lies_now(taut, monke
     up_mm = PULL_MM * plan.lift
     meshes = {n: mesh.moved(mesh.vertices_mm + up_mm) for n, mesh in LOCATED.meshes.items()}
     pulled = replace(LOCATED, points_mm=LOCATED.points_mm + up_mm, meshes=meshes)
-    anew = arms_procedure.replan(pulled, here, ResectionProgress(holds=True), plan.facets)
+    anew = arms_procedure.replan(pulled, here, ResectionProgress(holds=True), plan)
     assert [stage.name for stage in anew.motions.stages] == [s.name for s in made.stages[5:]]
     assert anew.plan.facets[:, :3] == pytest.approx(plan.facets[:, :3])
     assert anew.plan.facets[:, 3] == pytest.approx(plan.facets[:, 3] + plan.facets[:, :3] @ up_mm)

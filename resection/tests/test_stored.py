@@ -14,7 +14,7 @@ from safetensors.numpy import load_file, save_file
 
 from plan_objects import located, sphere
 from tumortrack.core import store
-from tumortrack.core.errors import ArtifactError, NoPlan
+from tumortrack.core.errors import ArtifactError, InputError, NoPlan
 from tumortrack.core.mesh_files import write_mesh
 from tumortrack.live.values import PublishedFrame
 from tumortrack_resection import begin_resection
@@ -28,7 +28,8 @@ from tumortrack_resection.arms.trajectory import first_hit
 from tumortrack_resection.budget import ErrorBudget
 from tumortrack_resection.check import TOLERANCE_MM, clearances
 from tumortrack_resection.checking import checked
-from tumortrack_resection.files import PlanFolder, read_plan, write_plan
+from tumortrack_resection.facets import sphere as directions
+from tumortrack_resection.files import PlanFolder, check_structures, read_plan, write_plan
 from tumortrack_resection.motions import CUTTER, JOINTS, WITHDRAW, Motions, MotionStage
 from tumortrack_resection.operation import ResectionProgress
 from tumortrack_resection.values import ELECTRODE, ResectionConfig
@@ -128,6 +129,13 @@ def test_a_plan_of_which_no_tumor_has_a_budget_is_refused(stored, tmp_path):
     folder = changed(stored, tmp_path / "plan", plan_json=lambda data: data.update(budgets=[]))
     with pytest.raises(ArtifactError):
         begin_resection(folder)
+
+
+def test_a_structure_with_the_name_of_a_plans_file_is_refused():
+    check_structures(["artery", "vein"])
+    for name in ("piece", "strokes"):
+        with pytest.raises(InputError, match=name):
+            check_structures(["artery", name])
 
 
 @pytest.mark.parametrize("lacking", ["facets", "taken", "keep_mm", "lift", "clearances", "cuts"])
@@ -417,7 +425,7 @@ def in_the_middle_of(motions, sweep):
 def test_an_organ_that_moved_is_cut_on_along_the_same_facets(content, worker, sweep):
     before, shift_mm = content.plan, np.array([2.0, -1.5, 2.0])
     organ, joints_rad = lying(shift_mm), in_the_middle_of(content.motions, sweep)
-    made = worker(organ, joints_rad, ResectionProgress(True, sweep - 1), before.facets)
+    made = worker(organ, joints_rad, ResectionProgress(True, sweep - 1), before)
     names = [stage.name for stage in made.motions.stages]
     assert names == [WITHDRAW, *(f"sweep {n}" for n in range(sweep, before.sweeps + 1)), *LAST]
     assert made.motions.stages[0].joints_rad[0] == pytest.approx(joints_rad)
@@ -435,11 +443,20 @@ def test_an_organ_that_moved_is_cut_on_along_the_same_facets(content, worker, sw
 
 
 def test_before_the_grasp_it_is_planned_from_the_approach_on(content, worker):
-    made = worker(
-        lying([3.0, 0, 0]), np.array(CONFIG.home_rad), ResectionProgress(), content.plan.facets
-    )
+    made = worker(lying([3.0, 0, 0]), np.array(CONFIG.home_rad), ResectionProgress(), content.plan)
     assert [stage.name for stage in made.motions.stages][:4] == [*FIRST, "sweep 1"]
     assert made.plan.facets[:, :3] == pytest.approx(content.plan.facets[:, :3])
+
+
+@pytest.mark.parametrize("sweep", [1, 2])
+def test_an_organ_that_moves_by_two_millimetres_leaves_every_facet_possible(content, worker, sweep):
+    """Or the arms would stand with the electrode in tissue."""
+    joints_rad = in_the_middle_of(content.motions, sweep)
+    for shift_mm in 2.0 * directions(3):
+        progress = ResectionProgress(True, sweep - 1)
+        made = worker(lying(shift_mm), joints_rad, progress, content.plan)
+        assert made.plan.facets[:, :3] == pytest.approx(content.plan.facets[:, :3])
+        assert made.motions.stages[0].name == WITHDRAW
 
 
 @pytest.mark.parametrize("others", [0, 1])
@@ -447,16 +464,17 @@ def test_facets_that_can_be_cut_no_more_are_given_up_only_if_none_is_cut(content
     lid = np.array([0.0, 0.0, 1.0, 190.0])  # over the piece: the organ does not reach it
     facets = np.stack([lid, *content.plan.facets[:others]])
     hold = content.motions.stages[2].joints_rad[-1]
-    made = worker(LOCATED, hold, ResectionProgress(True, 0), facets)
+    before = replace(content.plan, facets=facets)
+    made = worker(LOCATED, hold, ResectionProgress(True, 0), before)
     assert made.plan.facets[:, 2].max() < 0.5
     assert made.motions.stages[0].name == "sweep 1"
     with pytest.raises(NoPlan):
-        worker(LOCATED, hold, ResectionProgress(True, 1), facets)
+        worker(LOCATED, hold, ResectionProgress(True, 1), before)
 
 
 def test_new_motions_are_checked_before_anything_moves(content, worker, monkeypatch):
     """A planner that is wrong about where the tumor is, or where the arms are."""
-    start = np.array(CONFIG.home_rad), ResectionProgress(), content.plan.facets
+    start = np.array(CONFIG.home_rad), ResectionProgress(), content.plan
     monkeypatch.setattr(procedure, "plan_motions", lambda *_: (content.plan, content.motions))
     made = worker(LOCATED, *start)
     assert made.motions is content.motions
@@ -489,7 +507,7 @@ def test_an_instrument_leaves_a_tumor_that_came_to_it_without_coming_nearer(
     towards = off_mm / np.linalg.norm(off_mm)
     by_mm = found.least_mm - left_mm + (ELECTRODE_RADIUS_MM if left_mm < 0 else 0.0)
     organ = lying(by_mm * towards, parts=("tumor_1",))
-    made = worker(organ, joints_rad, ResectionProgress(True, 1), content.plan.facets)
+    made = worker(organ, joints_rad, ResectionProgress(True, 1), content.plan)
     withdraw = made.motions.stages[0]
     assert withdraw.name == WITHDRAW
     assert not withdraw.cutting.any()

@@ -25,6 +25,7 @@ from tumortrack_resection.ur_sink import OFF_MM
 from tumortrack_resection.values import (
     MARGIN_MM,
     OVER_BUDGET,
+    UNCHECKED,
     Located,
     ResectionConfig,
     ResectionPlan,
@@ -117,7 +118,8 @@ class ErrorBudget(Config, frozen=True, kw_only=True):
                 sure = f"{100 * self.confidence:g} % margin"
                 how = f"  {sure if self.confidence else 'not calibrated'}"
             lines.append(f"  {name:<9}{value:5.1f}{how}")
-        lines.append(f"  {'together':<9}{self.sum_mm:5.1f}  of {self.margin_mm:.1f}")
+        of = f"of {self.margin_mm:.1f}" if self.margin_mm > 0 else "of none: it is cut"
+        lines.append(f"  {'together':<9}{self.sum_mm:5.1f}  {of}")
         return lines
 
     def updated(
@@ -195,8 +197,8 @@ def tightest(budgets: Sequence[ErrorBudget]) -> ErrorBudget:
 def checked_against(
     plan: ResectionPlan, budgets: Sequence[ErrorBudget], accept: bool
 ) -> ResectionPlan:
-    """The plan with a note on its budgets. NoPlan: a distance doesn't cover the errors, and that
-    was not accepted."""
+    """The plan with a note on its budgets, and one if it is unchecked. NoPlan: a distance doesn't
+    cover the errors, and that was not accepted."""
     over = [budget for budget in budgets if budget.left_mm < 0]
     budget = tightest(budgets)
     notes = [f"{budget.left_mm:.1f} mm are left of the distance to {budget.part} after "
@@ -209,6 +211,9 @@ def checked_against(
                 f"{_remedy(plan, over[0])} Only for a plan that nobody carries out, accept it "
                 "(--accept-budget, accept_budget=True)."
             )
+    if not plan.clearances:
+        unknown = "without the arms' motions nobody knows where the electrode goes"
+        notes = [f"{UNCHECKED}: {unknown}.", *notes]
     return replace(plan, notes=(*plan.notes, *notes))
 
 
@@ -258,13 +263,16 @@ def foreseen_mm(plan: ResectionPlan, located: Located, tools: Tools) -> dict[str
 
 
 def kept_words(plan: ResectionPlan, least_mm: Mapping[str, float]) -> str:
-    """The electrode's least distances: to the tumor, what was asked for, and to all others."""
-    kept = least_mm[plan.tumor]
+    """The electrode's least distances: to the tumor, what was asked for, and to all others. Of an
+    unchecked plan they are those of its cuts alone."""
+    kept, how = least_mm[plan.tumor], "the electrode"
+    if not plan.clearances:
+        how = "on its cuts, unchecked, the electrode"
     asked = f"{plan.margin_mm:g} mm asked for"
     if kept < 0:
-        words = f"the electrode goes {-kept:.1f} mm into {plan.tumor} ({asked})"
+        words = f"{how} goes {-kept:.1f} mm into {plan.tumor} ({asked})"
     else:
-        words = f"the electrode keeps {kept:.1f} mm from {plan.tumor} ({asked})"
+        words = f"{how} keeps {kept:.1f} mm from {plan.tumor} ({asked})"
     others = [f"{mm:.1f} mm from {name}" for name, mm in least_mm.items() if name != plan.tumor]
     return ", ".join([words, *others])
 
@@ -276,7 +284,7 @@ def lost_words(plan: ResectionPlan) -> str:
     words = f"{lost_ml:.1f} ml of healthy tissue ({lost_ml / ml['parenchyma']:.0%} of the organ's)"
     if "kerf" in ml:
         return f"{words} are lost, {ml['kerf']:.1f} of it in the cuts"
-    return f"{words} come away; what the electrode cuts besides is not counted"
+    return f"{words} are in it; what the electrode cuts besides is not counted"
 
 
 def _remedy(plan: ResectionPlan, budget: ErrorBudget) -> str:

@@ -33,6 +33,7 @@ from tumortrack_resection.values import (
     Located,
     ResectionConfig,
     ResectionPlan,
+    label_of,
     name_of,
 )
 
@@ -50,10 +51,12 @@ _EVERY, _SHELL_MM = 8, 1.5  # points of healthy tissue, and of the tumor's surfa
 
 
 class _Unfit(NamedTuple):
-    """Why a piece can't be planned; ``normals``: numbers of those that are to blame."""
+    """Why a piece can't be planned; ``normals``: numbers of those that are to blame; ``tool``: a
+    longer electrode would do."""
 
     words: str
     normals: tuple[int, ...] = ()
+    tool: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,8 +110,9 @@ class Draft:
         surfaces = {**self.located.meshes, **self.located.structures}
         return {name: (surfaces[name], mm) for name, mm in {**kept, **self.keep_mm}.items()}
 
-    def plan(self, cuts: tuple[Cut, ...]) -> ResectionPlan:
-        """With these ways."""
+    def plan(self, cuts: tuple[Cut, ...] = ()) -> ResectionPlan:
+        """With these ways; by default each sweep's best, as far as geometry goes."""
+        cuts = cuts or tuple(choices[0] for choices in self.sweeps)
         located, config = self.located, self.config
         organ_ml = located.organ.volume_ml
         tumors_ml = {n: located.meshes[name_of(n)].volume_ml for n in located.tumors}
@@ -132,11 +136,12 @@ class Draft:
 
 class Drafts:
     """The pieces that can be planned for one tumor, the best first; others once one or the other
-    facet is left out. Raises as ``plan_resection``."""
+    facet is left out. ``like``: an earlier plan, whose facets are kept, and with them what comes
+    away and what they keep away from. Raises as ``plan_resection``."""
 
     def __init__(
         self, located: Located, config: ResectionConfig, tools: Tools,
-        like: Float64[np.ndarray, "k 3"] | None = None,
+        like: ResectionPlan | None = None,
     ) -> None:  # fmt: skip
         self._label, self._share = chosen_tumor(located, config)
         _check_kept(located, config, name_of(self._label))
@@ -147,19 +152,24 @@ class Drafts:
         self._left_out: list[int] = []
         self._failures = 0
         self._last: Piece | None = None
+        self._best: Draft | None = None
 
     def best(self) -> Draft:
         """Raises NoPlan: there is none any more."""
-        if self._config.method == "published":
-            return self._published()
-        reasons: list[str] = []
-        alone = (self._label,)
+        if self._best is None:
+            self._best = self._published() if self._config.method == "published" else self._found()
+        return self._best
+
+    def _found(self) -> Draft:
+        reasons: list[_Unfit] = []
+        taken = () if self._like is None else tuple(map(label_of, self._like.taken))
+        alone = taken or (self._label,)
         near = [
             n for n in self._located.tumors
-            if n != self._label and name_of(n) not in self._config.keep_away
+            if n not in alone and name_of(n) not in self._config.keep_away
         ]  # fmt: skip
         found = self._first([(alone, 1.0)], reasons)
-        if found is None and near:
+        if found is None and near and self._like is None:
             found = self._first([(alone, room) for room in _LESS_ROOM], reasons)
             together = [*((self._label, n) for n in near), (self._label, *near)]
             both = self._first([(targets, 1.0) for targets in together], reasons)
@@ -177,14 +187,18 @@ class Drafts:
     def leave_out(self, sweeps: Sequence[int]) -> None:
         """The facets of these sweeps of the last draft can't be cut; nor can those like them."""
         assert self._last is not None
+        self._best = None
         before, self._failures = self._lowest, self._failures + 1
+        if self._like is not None:  # these facets are wanted: only from where they are cut changes
+            while self._lowest == before and self._failures < len(_LOWEST):
+                self._failures += 1
         if self._lowest != before:  # from there another facet may be possible
             self._left_out = []
             return
         self._left_out += [self._last.chosen[sweep - 1] for sweep in sweeps]
 
     def _first(
-        self, ways: Sequence[tuple[tuple[int, ...], float]], reasons: list[str]
+        self, ways: Sequence[tuple[tuple[int, ...], float]], reasons: list[_Unfit]
     ) -> tuple[Piece, Draft] | None:
         """The best piece round these tumors, where others keep this share of the margin; of the
         first way for which there is one."""
@@ -192,8 +206,11 @@ class Drafts:
             search = self._searches.get((targets, room))
             if search is None:
                 keep = keep_mm(self._located, targets, self._config, room)
+                normals = None
+                if self._like is not None:
+                    keep, normals = self._like.keep_mm, self._like.facets[:, :3]
                 search = FacetSearch(
-                    self._located, targets, keep, self._config, self._tools, self._like
+                    self._located, targets, keep, self._config, self._tools, normals
                 )
                 self._searches[targets, room] = search
             left_out = list(self._left_out)
@@ -203,7 +220,7 @@ class Drafts:
                     draft = self._draft(search, piece, targets, room)
                     if isinstance(draft, Draft):
                         return draft.piece or piece, draft
-                    reasons.append(draft.words)
+                    reasons.append(draft)
                     bad |= set(draft.normals)
                 if not bad or self._like is not None:
                     break
@@ -219,13 +236,13 @@ class Drafts:
         full = [facet for facet in facets if not facet.empty]
         if not full:
             return _Unfit("the organ does not reach the tumor's margin; there is nothing to cut.")
+        if swallowed := sorted({*piece.with_it} - {*targets}):
+            return _Unfit(f"{name_of(swallowed[0])} would come away, too.")
         if piece.healthy > config.most_healthy:
             return _Unfit(
                 f"{piece.healthy:.0%} of the organ's healthy tissue would come away; allowed are "
                 f"{config.most_healthy:.0%}. Ask for a smaller margin, or allow more."
             )
-        if swallowed := sorted({*piece.with_it} - {*targets}):
-            return _Unfit(f"{name_of(swallowed[0])} would come away, too.")
         if len(full) < len(facets):
             if self._like is not None:
                 return _Unfit("the organ no longer reaches all facets of the earlier plan.")
@@ -279,6 +296,7 @@ class Drafts:
                     f"the bare electrode of {self._tools.electrode_mm:g} mm allows {room_mm:g} mm "
                     "(electrode_mm in the cell).",
                     (normal,),
+                    tool=True,
                 )
             sweeps.append(fit)
         return tuple(sweeps)
@@ -303,8 +321,12 @@ class Drafts:
         )
         return tuple(notes)
 
-    def _why_not(self, reasons: list[str]) -> str:
-        """That something lies too near to the tumor, or else the best piece's reason."""
+    def _why_not(self, reasons: list[_Unfit]) -> str:
+        """That the electrode is too short, or something lies too near to the tumor, or else the
+        best piece's reason."""
+        for reason in reasons:
+            if reason.tool:
+                return reason.words
         located, name, tools = self._located, name_of(self._label), self._tools
         tumor = cKDTree(located.meshes[name].spread_mm(1.0))
         surfaces, tight = {**located.meshes, **located.structures}, []
@@ -320,10 +342,10 @@ class Drafts:
                 f"{other} lies {gap_mm:.1f} mm from {name}, at x {x:.0f}, y {y:.0f}, z {z:.0f} mm "
                 f"(table): an electrode {2 * tools.radius_mm:g} mm thick has no way between them "
                 f"that keeps {self._config.margin_mm:g} mm from {name}. Ask for a smaller margin, "
-                f"for less distance (--keep-away {other}=1), or plan the other one."
+                f"for less distance (--keep-away {other}=0.5), or plan the other one."
             )
         if reasons:
-            return reasons[0]
+            return reasons[0].words
         return (
             f"no piece with up to {self._config.most_facets} plane facets round {name} can be cut "
             "and lifted out. Place the organ otherwise, or ask for a smaller margin."

@@ -124,7 +124,7 @@ class FacetSearch:
             planes = np.column_stack([self._normals[at], self._offsets[at]])
             with_it = tuple(
                 n for n in self._located.tumors if n != self._targets[0]
-                and inside(planes, self._located.of(n)).mean() > 0.5
+                and inside(planes, self._located.meshes[name_of(n)].vertices_mm).mean() > 0.5
             )  # fmt: skip
             share = 1 - choice.cut_off(chosen) / choice.points
             pieces.append(Piece(chosen, planes, opening, share, with_it))

@@ -5,7 +5,7 @@ moveit_msgs/RobotTrajectory. All in the table's frame, mm; ``plan.json`` has ``t
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, get_type_hints
@@ -55,7 +55,7 @@ class PlanFolder:
     config: ResectionConfig
     frames: PublishedFrame
     meshes: dict[str, Mesh]
-    budgets: tuple[ErrorBudget, ...]
+    budgets: tuple[ErrorBudget, ...] = ()
     cell: CellConfig | None = None
     motions: Motions | None = None
     case_sha256: str = ""
@@ -84,6 +84,15 @@ _STORED: dict[str, Any] = {
     "cell_source": str,
     "patient": Patient,
 }
+
+
+def check_structures(names: Collection[str]) -> None:
+    """InputError: one has the name of a file of the plan's own."""
+    if taken := sorted({_PIECE, Path(_STROKES).stem} & set(names)):
+        raise InputError(
+            f"a structure is called {taken[0]}, as a file of the plan is. Prepare the case with "
+            "another name for it."
+        )
 
 
 def write_plan(

@@ -103,9 +103,8 @@ class ResectionProgress(NamedTuple):
         return self.done + 1 if self.holds else None
 
 
-Facets = Float64[np.ndarray, "k 4"]
-# The estimate to plan on, the arms' joints, their progress, and the plan's facets so far
-Replan = Callable[[TrackingResult, Joints, ResectionProgress, Facets], "Future[Planned]"]
+# The estimate to plan on, the arms' joints, their progress, and the plan so far
+Replan = Callable[[TrackingResult, Joints, ResectionProgress, ResectionPlan], "Future[Planned]"]
 Locate = Callable[[TrackingResult], Located]
 Draw = Callable[[Joints], tuple[RigidShape, ...]]
 # From the organ's surface (table frame) and where the arms stand: what their tips reach
@@ -339,8 +338,8 @@ class Operation:
         elif now_s - self._settled[1] >= config.settled_s and execution.still:
             self._settled = None
             if self._replan is not None:
-                facets = self.planned.plan.facets
-                self._work = self._replan(update, execution.joints_rad, self.progress, facets)
+                plan = self.planned.plan
+                self._work = self._replan(update, execution.joints_rad, self.progress, plan)
 
     def _reason_to_halt(self, update: TrackingResult, located: Located) -> tuple[Halt | None, bool]:
         """Why the arms must halt (None: they need not), and whether a new plan would help."""

@@ -212,7 +212,6 @@ def _words(
         warnings = (*harm, *warnings)
     count = f"{plan.sweeps} sweep" + ("s" if plan.sweeps > 1 else "")
     title = f"Plan to resect {tumor}, {located.patient}: {_METHODS[plan.method]}, {count}"
-    how = "" if plan.clearances else " (foreseen, not checked)"
     lines = [
         f"{ml['piece']:.1f} ml come away with {ml['tumor']:.1f} ml of {tumor}; {lost_words(plan)}",
         f"{plan.exophytic:.0%} of the tumor outside the organ's hull; "
@@ -229,7 +228,7 @@ def _words(
           for each in sweeps),
         Line2D([], [], color=INK, marker="o", mfc="none", mew=1.8, ls="", label="cup"),
     ]  # fmt: skip
-    title = f"{title}\n{kept_words(plan, least_mm)}{how}"
+    title = f"{title}\n{kept_words(plan, least_mm)}"
     drawing.add_words(figure, title, warnings, lines, handles)
 
 

@@ -26,17 +26,12 @@ from tumortrack_resection.budget import (
     plan_within,
     planned_budgets,
 )
-from tumortrack_resection.files import INVENTED, PlanFolder, write_plan
+from tumortrack_resection.drafts import Drafts
+from tumortrack_resection.files import INVENTED, PlanFolder, check_structures, write_plan
 from tumortrack_resection.located import poor_estimate_notes, read_run, table_under
 from tumortrack_resection.operation import OperationConfig
 from tumortrack_resection.options import PlanOptions
-from tumortrack_resection.resection import plan_resection
-from tumortrack_resection.values import (
-    UNCHECKED,
-    Located,
-    ResectionConfig,
-    ResectionPlan,
-)
+from tumortrack_resection.values import Located, ResectionConfig, ResectionPlan
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,11 +63,9 @@ class Planning:
     def checked(self) -> Planning:
         """Unchecked, without motions, with a note on the error budget. NoPlan: the distances don't
         cover the errors, and that was not accepted."""
-        plan = checked_against(self.content.plan, self.content.budgets, self.options.accept_budget)
-        if not plan.clearances:
-            note = f"{UNCHECKED}: without the arms' motions nobody knows where the electrode goes."
-            plan = replace(plan, notes=(*plan.notes, note))
-        return replace(self, content=replace(self.content, plan=plan))
+        budgets = self.cuts.budgets_of(self.content.plan)
+        plan = checked_against(self.content.plan, budgets, self.options.accept_budget)
+        return replace(self, content=replace(self.content, plan=plan, budgets=budgets))
 
     def with_motions(self) -> Planning:
         """With the motions of both arms, checked, and the plan that these carry out. NoPlan: they
@@ -83,17 +76,14 @@ class Planning:
         from tumortrack_resection.checking import checked
 
         organ, config = self.located.organ, self.content.config
-        placed, plan, motions, note = search_bases(self.located, config, below(organ, self.cell))
+        cell, drafts = below(organ, self.cell), self.cuts.drafts
+        placed, plan, motions, note = search_bases(self.located, config, cell, drafts=drafts)
         if hit := first_hit(motions, placed, organ):
             raise NoPlan(f"the arms can't carry this out: {hit}. Place the organ otherwise.")
         plan = checked(plan, motions, cell_urdf(placed), self.located)
-        budgets = self.cuts.budgets_of(plan)
         plan = replace(plan, notes=(*self.cuts.heading, *plan.notes))
         source = INVENTED if note else self.bases_source
-        content = replace(
-            self.content, plan=plan, budgets=budgets, motions=motions, cell=placed,
-            cell_source=source,
-        )  # fmt: skip
+        content = replace(self.content, plan=plan, motions=motions, cell=placed, cell_source=source)
         return replace(self, content=content, note=note).checked()
 
     def save(self, folder: Path, overwrite: bool = False) -> None:
@@ -143,6 +133,7 @@ def begin_plan(run_folder: str | Path, **given: Any) -> Planning:
         check_arms_installed()
     run = read_run(run_folder)
     run.patient.check_is(options.stated, str(run_folder))
+    check_structures(run.structures)
     frames = _frames(run.meshes, options, cell.stand_mm)
     cuts = plan_cuts(
         run, config, frames, options.accept_poor, options.confidence,
@@ -152,7 +143,7 @@ def begin_plan(run_folder: str | Path, **given: Any) -> Planning:
     has_bases = written.keys() >= {"cutter_base", "holder_base"}
     bases_source = store.sha256_of(options.cell) if options.cell and has_bases else INVENTED
     content = PlanFolder(
-        cuts.plan, cuts.config, frames, cuts.located.meshes, cuts.budgets_of(cuts.plan),
+        cuts.plan, cuts.config, frames, cuts.located.meshes,
         structures=dict(cuts.located.structures), patient=run.patient,
         case_sha256=str(model.get("case_sha256") or "") if isinstance(model, dict) else "",
         frame_source=store.sha256_of(options.frame) if options.frame else INVENTED,
@@ -161,12 +152,13 @@ def begin_plan(run_folder: str | Path, **given: Any) -> Planning:
 
 
 class Cuts(NamedTuple):
-    """A plan without the arms; ``config``: in the end (see ``budget.plan_within``); ``located``:
-    the run in the plan's frame; ``budgets_of``: of this or another plan of it; ``heading``: notes
-    that come before any such plan's own."""
+    """A plan without the arms; ``config``: in the end (see ``budget.plan_within``); ``drafts``: of
+    what it was taken; ``located``: the run in the plan's frame; ``budgets_of``: of this or another
+    plan of it; ``heading``: notes that come before any such plan's own."""
 
     plan: ResectionPlan
     config: ResectionConfig
+    drafts: Drafts
     located: Located
     budgets_of: Callable[[ResectionPlan], tuple[ErrorBudget, ...]]
     heading: tuple[str, ...]
@@ -196,13 +188,16 @@ def plan_cuts(
             plan, located, error_mm, cell.tool_error_mm, moved_mm, confidence, cell.tools
         )  # fmt: skip
 
+    made: list[Drafts] = []
+
     def plan_of(config: ResectionConfig) -> ResectionPlan:
-        return plan_resection(located, config, cell.tools)
+        made.append(Drafts(located, config, cell.tools))
+        return made[-1].best().plan()
 
     plan, config, notes = plan_within(plan_of, config, budgets_of, confidence is not None)
     heading = (*doubts, *notes)
     plan = replace(plan, notes=(*heading, *plan.notes))
-    return Cuts(plan, config, located, budgets_of, heading)
+    return Cuts(plan, config, made[-1], located, budgets_of, heading)
 
 
 def check_arms_installed() -> None:

@@ -16,5 +16,4 @@ def plan_resection(
     """A plan by itself, table frame, mm, as far as geometry goes; the arms may want another
     (``arms.procedure.plan_motions``). Raises InputError: no such tumor; NoPlan: nothing to cut, or
     not as asked."""
-    draft = Drafts(located, config, tools).best()
-    return draft.plan(tuple(choices[0] for choices in draft.sweeps))
+    return Drafts(located, config, tools).best().plan()

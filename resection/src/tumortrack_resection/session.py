@@ -53,7 +53,6 @@ from tumortrack_resection.live_budget import LiveBudget
 from tumortrack_resection.located import of_estimate
 from tumortrack_resection.motions import Joints, Motions
 from tumortrack_resection.operation import (
-    Facets,
     Following,
     Operation,
     OperationConfig,
@@ -186,10 +185,10 @@ class ResectionSession:
 
             def replan(
                 result: TrackingResult, joints_rad: Joints, progress: ResectionProgress,
-                facets: Facets,
+                plan: ResectionPlan,
             ) -> Future[Planned]:  # fmt: skip
                 located = locate(result, with_std=stored.config.sigmas > 0)
-                return planner.submit(procedure.replan, located, joints_rad, progress, facets)
+                return planner.submit(procedure.replan, located, joints_rad, progress, plan)
 
             # The worker ignores Ctrl-C, which the live loop handles.
             before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})

@@ -34,7 +34,7 @@ def chosen_tumor(located: Located, config: ResectionConfig) -> tuple[int, float]
         inside = f"{name} lies" if len(candidates) == 1 else "all tumors lie"
         raise NoPlan(
             f"{inside} wholly inside the organ ({shares[label]:.0%} outside its hull, "
-            f"{config.least_exophytic:.0%} are needed): there is no contour to cut along."
+            f"{config.least_exophytic:.0%} are needed; least_exophytic in --config allows less)."
         )
     needed = (organ_name(located.meshes), *names)
     if lacking := [part for part in needed if part not in located.meshes]:
@@ -60,5 +60,6 @@ def exophytic_shares(located: Located, labels: list[int]) -> dict[int, float]:
     shares = {}
     for label in labels:
         points = located.of(label).astype(np.float32)
-        shares[label] = float(((normals @ points.T + offsets).max(axis=0) > 0).mean())
+        outside = (normals @ points.T + offsets).max(axis=0) > 0
+        shares[label] = float(outside.mean()) if len(points) else 0.0
     return shares

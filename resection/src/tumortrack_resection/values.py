@@ -79,6 +79,11 @@ def name_of(label: int) -> str:
     return f"tumor_{label - 1}"
 
 
+def label_of(tumor: str) -> int:
+    """tumor_1 has label 2."""
+    return int(tumor.removeprefix("tumor_")) + 1
+
+
 def organ_surface(meshes: Mapping[str, Mesh]) -> Mesh:
     """The organ's surface; NoPlan: there is none."""
     if (name := organ_name(meshes)) is None:
@@ -129,9 +134,10 @@ class Located:
 
     @property
     def tumors(self) -> tuple[int, ...]:
-        """Labels of the located tumors."""
-        labels = np.flatnonzero(np.bincount(self.labels)).tolist()
-        return tuple(label for label in labels if label >= FIRST_TUMOR)
+        """Labels of the located tumors: those with points or a surface."""
+        labels = {*np.unique(self.labels).tolist()}
+        named = range(FIRST_TUMOR, np.iinfo(np.uint8).max + 1)
+        return tuple(n for n in named if n in labels or name_of(n) in self.meshes)
 
 
 @dataclass(frozen=True, eq=False)

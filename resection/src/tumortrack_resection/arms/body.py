@@ -138,13 +138,13 @@ def _arm_parts(arm: str, model: ArmModel) -> list[Part]:
 def _tool_parts(config: CellConfig) -> list[Part]:
     """Instrument and grasper, on their arms' flanges (z out of the flange)."""
     hand, ahead, down = f"{CUTTER}_tool", config.pencil_mm, config.bracket_mm
-    end = ahead + config.electrode_mm
+    end = config.flange_from_tip(CUTTER)[:3, 3].tolist()
     grasper, shaft, cup = f"{HOLDER}_tool", config.rod_mm - config.cup_mm, config.cup_radius_mm
     wire = ELECTRODE_RADIUS_MM
     return [
         _rod("bracket", hand, ((0, 0, 0), (0, 0, down)), 10.0, STEEL),
         _rod("pencil", hand, ((-10, 0, down), (ahead, 0, down)), PENCIL_RADIUS_MM, BLUE),
-        _rod("electrode", hand, ((ahead, 0, down), (end, 0, down)), wire, YELLOW),
+        _rod("electrode", hand, ((ahead, 0, down), tuple(end)), wire, YELLOW),
         _rod("rod", grasper, ((0, 0, 0), (0, 0, shaft)), 6.0, STEEL),
         _rod("cup", grasper, ((0, 0, shaft), (0, 0, config.rod_mm)), cup, CUP),
     ]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
+from collections import defaultdict, deque
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -28,6 +28,9 @@ TOOLS = {CUTTER: ("bracket", "pencil", "electrode"), HOLDER: ("rod", "cup")}
 TOUCHES = {CUTTER: "cutter/electrode", HOLDER: "holder/cup"}  # what of a tool may touch the organ
 CollidingPair = tuple[str, str]
 _THICK_MM = 10.0  # of what a tool is made of, about its own axis
+_MOST_ROOM_MM = (
+    64.0  # that is asked for beyond all clearances: parts of an arm are no farther apart
+)
 
 
 class ArmCell:
@@ -115,15 +118,22 @@ class ArmCell:
         return places
 
     def collisions(
-        self, joints_rad: Joints, touching: Collection[str] = (), moving: str | None = None
+        self,
+        joints_rad: Joints,
+        touching: Collection[str] = (),
+        moving: str | None = None,
+        room_mm: float = 0.0,
     ) -> CollidingPair | None:
         """Names of the first pair that comes nearer than its clearance, or None.
 
         Args:
             touching: arms whose electrode or cup may touch the organ.
             moving: the moving arm, if the rest is known to be free; None: test everything.
+            room_mm: beyond all clearances, rounded up.
         """
-        state = self._state(tuple(sorted(touching)), moving)
+        if room_mm > 0:
+            room_mm = 2.0 ** np.ceil(np.log2(room_mm))  # few, as each has buffers of its own
+        state = self._state(tuple(sorted(touching)), moving, room_mm)
         pin.updateGeometryPlacements(self.model, self._data, self.solids, state, joints_rad)
         if not pin.computeCollisions(self.solids, state, True):
             return None
@@ -131,18 +141,18 @@ class ArmCell:
         results = zip(self._pairs, state.activeCollisionPairs, state.collisionResults, strict=True)
         return next(pair for pair, active, result in results if active and result.isCollision())
 
-    def _state(self, touching: tuple[str, ...], moving: str | None) -> Any:
+    def _state(self, touching: tuple[str, ...], moving: str | None, room_mm: float) -> Any:
         """Collision buffers with only the relevant pairs active."""
-        if (touching, moving) not in self._states:
+        if (touching, moving, room_mm) not in self._states:
             state, ends = pin.GeometryData(self.solids), {TOUCHES[arm] for arm in touching}
             for n, pair in enumerate(self._pairs):
                 still = moving is not None and not any(moving in name for name in pair)
                 if still or (ORGAN in pair and ends & set(pair)):
                     state.deactivateCollisionPair(n)
-                margin_mm = self._margin_mm(pair, touching)
+                margin_mm = self._margin_mm(pair, touching) + room_mm
                 state.collisionRequests[n].security_margin = margin_mm / 1000
-            self._states[touching, moving] = state
-        return self._states[touching, moving]
+            self._states[touching, moving, room_mm] = state
+        return self._states[touching, moving, room_mm]
 
     def _margin_mm(self, pair: CollidingPair, touching: tuple[str, ...]) -> float:
         """The least distance of a pair."""
@@ -239,9 +249,11 @@ class PlanningGroup:
         poses = config.base(arm).table_from_base, config.flange_from_tip(arm)
         return np.linalg.inv(poses[0]), np.linalg.inv(poses[1])
 
-    def collides(self, own_rad: Float64[np.ndarray, " d"]) -> CollidingPair | None:
-        """A pair that comes nearer than allowed."""
-        return self.cell.collisions(self.all_joints(own_rad), self.touching, self.arm)
+    def collides(
+        self, own_rad: Float64[np.ndarray, " d"], room_mm: float = 0.0
+    ) -> CollidingPair | None:
+        """A pair that comes nearer than allowed, or than that and ``room_mm``."""
+        return self.cell.collisions(self.all_joints(own_rad), self.touching, self.arm, room_mm)
 
     def segment_collides(
         self, start_rad: np.ndarray, goal_rad: np.ndarray, spacing: float = 1.0
@@ -255,11 +267,50 @@ class PlanningGroup:
         levers_mm = self.cell.levers_mm(self.all_joints(start_rad), self.all_joints(goal_rad))
         moved_mm = float(np.abs(goal_rad - start_rad) @ levers_mm[self.own])
         n = int(np.ceil(moved_mm / (2 * least_mm * spacing)))
-        # From the middle outward: collisions are rarely near the ends.
-        for k in sorted(range(1, n), key=lambda k: abs(2 * k - n)):
-            if pair := self.collides(start_rad + (goal_rad - start_rad) * (k / n)):
-                return pair
-        return None
+        if n < 2:
+            return None
+        step_rad = (goal_rad - start_rad) / n
+        found = blocked_between(
+            0,
+            n,
+            np.full(n, moved_mm / n),
+            lambda k, mm: self.collides(start_rad + k * step_rad, mm),
+        )
+        return None if found is None else found[1]
+
+
+def blocked_between(
+    first: int,
+    last: int,
+    moved_mm: Float64[np.ndarray, " n"],
+    test: Callable[[int, float], CollidingPair | None],
+) -> tuple[int, CollidingPair] | None:
+    """The number of a pose between two others at which something comes too near, and what.
+
+    Not every pose is tested: where all keep more than their clearances by as much as anything moves
+    until another pose, that one is free, too. From the middle outward, as collisions are rarely
+    near the ends.
+
+    Args:
+        moved_mm: at most, of any point, from pose ``first`` + n to the next.
+        test: the pair that comes nearer at a pose than its clearance and some room, mm.
+    """
+    way_mm = np.append(0.0, np.cumsum(moved_mm))
+    open_ends = deque([(first, last)])
+    while open_ends:
+        a, b = open_ends.popleft()
+        if b - a < 2:
+            continue
+        k = (a + b) // 2
+        here_mm, *ends_mm = way_mm[[k - first, a + 1 - first, b - 1 - first]]
+        room_mm = float(max(here_mm - ends_mm[0], ends_mm[1] - here_mm))
+        tried = 0 < room_mm <= _MOST_ROOM_MM
+        if tried and test(k, room_mm) is None:
+            continue
+        if (pair := test(k, 0.0)) is not None:
+            return k, pair
+        open_ends += [(a, k), (k, b)]
+    return None
 
 
 def _solid_names(solids: Any, parts: tuple[body.Part, ...]) -> list[str]:

@@ -6,6 +6,7 @@ from collections.abc import Collection
 from typing import Literal
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError
@@ -47,7 +48,8 @@ class CellConfig(Config, frozen=True, kw_only=True):
         cutter_model, holder_model: which arm carries the instrument, which the vacuum grasper.
         cutter_base, holder_base: where they stand, on pedestals if above the table.
         bracket_mm, pencil_mm, electrode_mm: the instrument hangs this far below the flange; its
-            grip and its bare electrode (the usual long one) reach this far forward, level.
+            grip reaches this far forward, level, and so does its bare electrode (the usual long
+            one), or by ``bend_deg`` downward: a bent tip.
         rod_mm, cup_mm, cup_radius_mm: the grasper hangs straight down from its flange; the last
             ``cup_mm`` are a soft cup.
         home_rad: all twelve joints in the order of ``JOINTS``.
@@ -77,6 +79,7 @@ class CellConfig(Config, frozen=True, kw_only=True):
     bracket_mm: float = 110.0
     pencil_mm: float = 110.0
     electrode_mm: float = 70.0
+    bend_deg: float = 0.0
     rod_mm: float = 200.0
     cup_mm: float = 20.0
     cup_radius_mm: float = 8.0
@@ -107,7 +110,7 @@ class CellConfig(Config, frozen=True, kw_only=True):
             if value is not None and not (0 < value < 1000 and low <= value <= high):
                 allowed = f"{low or 'over 0'} to {high}"
                 raise InputError(f"cell: {name} is {value:g}; allowed: {allowed}.")
-        self.check_between("cell:", table_mm=(100, 10_000), pull_mm=(0, 20))
+        self.check_between("cell:", table_mm=(100, 10_000), pull_mm=(0, 20), bend_deg=(0, 90))
         places = (*self.middle_mm, *self.camera_mm, *self.home_rad)
         for base in (self.cutter_base, self.holder_base):
             places += (*base.position_mm, base.yaw_deg)
@@ -151,8 +154,10 @@ class CellConfig(Config, frozen=True, kw_only=True):
         return min(self.clearance_mm, self.organ_clearance_mm, contact_mm)
 
     def flange_from_tip(self, arm: str) -> Pose:
-        """The tip's frame: z up where the flange points down; the instrument points along x."""
+        """The tip's frame: the instrument points along x, and is level where z is up; that is where
+        the flange points down, or by ``bend_deg`` off it."""
         if arm == CUTTER:
-            ahead_mm = self.pencil_mm + self.electrode_mm
-            return rigid(_DOWN, np.array([ahead_mm, 0.0, self.bracket_mm]))
+            turn = _DOWN @ Rotation.from_euler("y", self.bend_deg, degrees=True).as_matrix()
+            grip_mm = np.array([self.pencil_mm, 0.0, self.bracket_mm])
+            return rigid(turn, grip_mm + self.electrode_mm * turn[:, 0])
         return rigid(_DOWN, np.array([0.0, 0.0, self.rod_mm]))

@@ -27,11 +27,11 @@ _STEP_MM = 2.0  # between poses on a cut
 _AIR_STEP_MM = 5.0  # on the straight lead-in and lead-out
 _CORNER = np.cos(np.radians(40.0))  # at sharper corners the tip stops
 _YAWS = 24  # of a level instrument
-_ROLLS = 12  # about the electrode's own axis
+_ROLLS, _LEAP = 12, 5  # about the electrode's own axis, and between two that are tried
 _PROBE_STEP = 3  # points of a level stroke between comparisons of directions
 _MOST_LEGS = 8  # of a level stroke
 _FAR_RAD = 2.0  # a joint turns farther only if nothing else is possible
-_TRIED, _ENOUGH = 9, 3  # legs of a pass that are tried whole, and that are enough
+_TRIED, _ENOUGH = 4, 3  # legs of a pass that are tried whole, and that are enough of a facet
 _SEARCHED = 4  # legs of a level stroke whose approach is searched by trees
 _FARTHEST_MM = 200.0  # the instrument goes back so far, to be clear of organ and tumors
 _SPREAD_MM = 2.0  # between points of the organ's surface
@@ -148,35 +148,38 @@ def ways(group: PlanningGroup, cuts: Sequence[Cut], outside: Outside) -> list[Wa
     can't; with the most frequent reason."""
     reasons: list[Blocked] = []
     found: list[Way] = []
-    legs = itertools.islice(_legs(group, cuts, outside, reasons), _TRIED)
-    for cut, leg in legs:
-        try:
-            found.append(Way(cut, leg, follow(group, leg.poses)))
-        except Blocked as blocked:
-            reasons.append(blocked)
-        if len(found) == _ENOUGH:
-            break
+    for cut in cuts:
+        for oriented, leg in itertools.islice(_legs(group, cut, outside, reasons), _TRIED):
+            try:
+                found.append(Way(oriented, leg, follow(group, leg.poses)))
+            except Blocked as blocked:
+                reasons.append(blocked)
+            if len(found) == _ENOUGH:
+                return found
     if not found:
         raise _most_frequent(reasons, cuts[0].path_mm[0])
     return found
 
 
 def _legs(
-    group: PlanningGroup, cuts: Sequence[Cut], outside: Outside, reasons: list[Blocked]
+    group: PlanningGroup, cut: Cut, outside: Outside, reasons: list[Blocked]
 ) -> Iterator[tuple[Cut, Leg]]:
-    """Those whose first, middle and last pose are possible, each by itself."""
-    for cut in cuts:
-        assert cut.axis is not None
-        path_mm = resampled(cut.path_mm, _STEP_MM)
-        back_mm = [outside.back_mm(path_mm[n], cut.axis) for n in (0, -1)]
-        for turn in turns_about(cut.axis):
-            places = path_mm[[len(path_mm) // 2, 0, -1]]
-            if any(_free(group, rigid(turn, place), reasons) is None for place in places):
-                continue
-            for way in (1, -1):
-                leg = Leg.along(path_mm[::way], turn, back_mm[::way])
-                if _free(group, leg.enter[0], reasons) is not None:
-                    yield replace(cut, path_mm=cut.path_mm[::way]), leg
+    """Those whose first, middle and last pose are possible, each by itself, and from which the
+    instrument can be taken straight back; turned by much before by little."""
+    assert cut.axis is not None
+    path_mm = resampled(cut.path_mm, _STEP_MM)
+    places = path_mm[[len(path_mm) // 2, 0, -1]]
+    middle_mm, *back_mm = (outside.back_mm(place, cut.axis) for place in places)
+    back = places[0] - middle_mm * cut.axis
+    turns = turns_about(cut.axis)
+    for n in range(len(turns)):
+        turn = turns[_LEAP * n % len(turns)]
+        if any(free(group, rigid(turn, place), reasons) is None for place in (*places, back)):
+            continue
+        for way in (1, -1):
+            leg = Leg.along(path_mm[::way], turn, back_mm[::way])
+            if free(group, leg.enter[0], reasons) is not None:
+                yield replace(cut, path_mm=cut.path_mm[::way]), leg
 
 
 def go_one_of(builder: TrajectoryBuilder, ways: Sequence[Way]) -> Cut:
@@ -203,16 +206,17 @@ def go_one_of(builder: TrajectoryBuilder, ways: Sequence[Way]) -> Cut:
     raise _most_frequent(reasons, ways[0].cut.path_mm[0])
 
 
-def _free(
-    group: PlanningGroup, table_from_tip: Pose, reasons: list[Blocked]
+def free(
+    group: PlanningGroup, table_from_tip: Pose, reasons: list[Blocked] | None = None
 ) -> Float64[np.ndarray, " 6"] | None:
-    """The nearest joints that bring the tip there without a collision."""
+    """The nearest joints that bring the tip there without a collision. None: there are none, and
+    ``reasons`` has one more."""
     solutions = group.inverse_kinematics(table_from_tip)
     pair: CollidingPair | None = None
     for n in np.argsort(np.abs(solutions - group.current_rad).max(1, initial=0.0)):
         if (pair := group.collides(solutions[n])) is None:
             return solutions[n]
-    if pair is not None:
+    if pair is not None and reasons is not None:
         reasons.append(Blocked.by(pair))
     return None
 
@@ -254,11 +258,11 @@ def _cut_leg(builder: TrajectoryBuilder, cut: Cut, path_mm: np.ndarray, outside:
     probes = np.unique(np.r_[np.arange(0, len(path_mm), _PROBE_STEP), len(path_mm) - 1])
     legs: list[tuple[int, float, int, np.ndarray, int]] = []
     for turn in level_turns():
-        first = _free(group, rigid(turn, path_mm[0]), reasons)
+        first = free(group, rigid(turn, path_mm[0]), reasons)
         if first is None:
             continue
-        free = (_free(group, rigid(turn, path_mm[n]), reasons) is None for n in probes[1:])
-        run = next((n for n, blocked in enumerate(free) if blocked), len(probes) - 1)
+        clear = (free(group, rigid(turn, path_mm[n]), reasons) is None for n in probes[1:])
+        run = next((n for n, blocked in enumerate(clear) if blocked), len(probes) - 1)
         if run > 0:
             turn_rad = float(np.abs(first - group.current_rad).max())
             legs.append((-run, turn_rad, len(legs), turn, int(probes[run])))

@@ -14,7 +14,6 @@ from typing import NamedTuple
 
 import msgspec
 import numpy as np
-from jaxtyping import Float64
 
 from tumortrack.core.errors import InputError, NoPlan
 from tumortrack.core.geometry import rigid
@@ -43,7 +42,6 @@ from tumortrack_resection.motions import (
     Motions,
 )
 from tumortrack_resection.operation import Planned, ResectionProgress
-from tumortrack_resection.resection import plan_resection
 from tumortrack_resection.values import Cut, Located, ResectionConfig, ResectionPlan
 
 _VACUUM_S = 0.5  # until the cup holds
@@ -59,6 +57,7 @@ _SIDES_DEG = (0.0, 30.0, -30.0, 60.0, -60.0)
 _YAWS = 8  # in which a level instrument is asked to reach
 _MOST_PIECES, _ELSEWHERE = 8, 3  # for which motions are planned, and with other bases
 _HAND = tuple(f"{HOLDER}/{name}" for name in ("cup", "rod", "wrist_3"))
+_ROOM_MM = 4.0  # between the arms beyond their clearance, so that they still manage later on
 _MOST_TRIED = 4  # pairs of places for which motions are planned
 _EDGE_MM = 120.0  # a base's middle is no nearer to the table's edge
 
@@ -87,9 +86,9 @@ def plan_motions(
     config: ResectionConfig,
     cell: CellConfig,
     start: Start | None = None,
-    like: Float64[np.ndarray, "k 3"] | None = None,
-    seed: int = 0,
+    like: ResectionPlan | None = None,
     pieces: int = _MOST_PIECES,
+    drafts: Drafts | None = None,
 ) -> tuple[ResectionPlan, Motions]:
     """A plan that both arms can carry out, and their motions through the whole procedure; the same
     every time. Pieces are tried in the order of the healthy tissue that they take; a facet that the
@@ -98,16 +97,19 @@ def plan_motions(
     Args:
         located: the organ as it lies now, table frame, mm.
         start: where the arms are, if not at home.
-        like: outward normals (k, 3) of the facets of an earlier plan, which are kept.
+        like: an earlier plan with facets, which are kept.
         pieces: for so many motions are planned at most.
+        drafts: of the same, if there are some already.
 
     Raises NoPlan: nothing to cut, or the arms manage no piece, and why; InputError: an option that
         can't be used.
     """
     if start is not None:
         _check_start(start, cell)
-    drafts = Drafts(located, config, cell.tools, like)
+    drafts = drafts or Drafts(located, config, cell.tools, like)
     reason: Blocked | None = None
+    roomy = start is None and config.method == "margin"
+    rooms_mm: tuple[float, ...] = (_ROOM_MM, 0.0) if roomy else (0.0,)
     for _ in range(pieces):
         try:
             draft = drafts.best()
@@ -115,16 +117,16 @@ def plan_motions(
             if reason is None:
                 raise
             break
-        try:
-            return _attempt(draft, cell, start, np.random.default_rng(seed))
-        except FacetsBlocked as blocked:
-            reason = reason or blocked
-            if like is not None or config.method == "published":
-                break
-            drafts.leave_out(blocked.numbers)
-        except Blocked as blocked:
-            reason = reason or blocked
+        for room_mm in rooms_mm:
+            tried = msgspec.structs.replace(cell, clearance_mm=cell.clearance_mm + room_mm)
+            try:
+                return _attempt(draft, tried, start, np.random.default_rng(0))
+            except Blocked as blocked:
+                last = blocked
+        reason, rooms_mm = reason or last, (0.0,)  # for the best piece alone: it takes as long
+        if not isinstance(last, FacetsBlocked) or config.method == "published":
             break
+        drafts.leave_out(last.numbers)
     raise NoPlan(
         f"the arms can't carry this out: {reason}. Place the arms or the organ otherwise, or plan "
         "with other margins."
@@ -149,8 +151,11 @@ def _attempt(
     joints_rad = cell.home_rad if start is None else start.joints_rad
     builder = TrajectoryBuilder(cell, joints_rad, rng)
     things = [(located.organ, 0.0), *draft.keep.values()]
-    outside = Outside(cell, things, draft.grasp_mm, draft.lift)
     from_sweep = None if start is None else start.from_sweep
+    cup_mm, lift = draft.grasp_mm, draft.lift
+    if from_sweep is not None:  # it is where it is
+        cup_mm, lift = builder.tip(HOLDER)[:3, 3], builder.tip(HOLDER)[:3, 2]
+    outside = Outside(cell, things, cup_mm, lift)
     if start is not None:
         _withdraw(builder, outside, from_sweep is not None)
     if from_sweep is not None:
@@ -254,15 +259,17 @@ def _cut_and_finish(
 
 
 def _withdraw(builder: TrajectoryBuilder, outside: Outside, holding: bool) -> None:
-    """Straight back with an instrument that is in tissue or at it, and up with a cup on it."""
-    pair = builder.cell.collisions(builder.joints_rad, (HOLDER,))
-    if pair is not None and TOUCHES[CUTTER] in pair:
+    """Straight back with an instrument that is in tissue or too near to anything, only until it is
+    free, and up with a cup on it."""
+    here = builder.group(CUTTER, (HOLDER,))
+    if here.collides(here.current_rad) is not None:
         tip = builder.tip(CUTTER)
         leave = cutting.straight_back(tip, outside.back_mm(tip[:3, 3], tip[:3, 0]))
+        free = (n for n, pose in enumerate(leave) if cutting.free(here, pose) is not None)
+        leave = leave[: next(free, len(leave)) + 1]
         # Whatever has moved towards it meanwhile: going straight back it comes no nearer.
-        bare = ArmCell(builder.cell.config, builder.cell.organ)
-        group = PlanningGroup(bare, CUTTER, builder.joints_rad, (CUTTER, HOLDER))
-        builder.go(CUTTER, follow(group, leave), bare.config.cutting_mm_s)
+        group = PlanningGroup(ArmCell(here.cell.config), CUTTER, builder.joints_rad)
+        builder.go(CUTTER, follow(group, leave), here.cell.config.cutting_mm_s)
         builder.close(WITHDRAW)
     pair = builder.cell.collisions(builder.joints_rad, (CUTTER,))
     if not holding and pair is not None and TOUCHES[HOLDER] in pair:
@@ -293,7 +300,10 @@ def _go_home(builder: TrajectoryBuilder, arm: str, touching: tuple[str, ...]) ->
 
 
 def search_bases(
-    located: Located, config: ResectionConfig, cell: CellConfig, seed: int = 0
+    located: Located,
+    config: ResectionConfig,
+    cell: CellConfig,
+    drafts: Drafts | None = None,
 ) -> tuple[CellConfig, ResectionPlan, Motions, str]:
     """A plan with its motions from where the arms stand, or else from elsewhere round the table;
     the workcell that they are for; and a note for the user on what was changed, empty: nothing.
@@ -301,18 +311,19 @@ def search_bases(
     A small fixed grid of places for both bases, on their pedestals and facing as they do: first
     those within reach of every stroke, near to where the arms stand now; then the first for which
     the whole procedure can be planned. Raises as ``plan_motions``: no place will do; the reason is
-    the one for the places where the arms stand now."""
+    the one for the places where the arms stand now. ``drafts``: as of ``plan_motions``."""
+    drafts = drafts or Drafts(located, config, cell.tools)
+    plan = drafts.best().plan()
     try:
-        return cell, *plan_motions(located, config, cell, seed=seed), ""
+        return cell, *plan_motions(located, config, cell, drafts=drafts), ""
     except NoPlan as failure:
         reason = failure
-    plan = plan_resection(located, config, cell.tools)
     for moved in itertools.islice(_reachable_cells(plan, cell), _MOST_TRIED):
         placed = ArmCell(moved, located.organ)
         if placed.collisions(placed.home_rad) is not None:
             continue
         try:
-            made = plan_motions(located, config, moved, seed=seed, pieces=_ELSEWHERE)
+            made = plan_motions(located, config, moved, pieces=_ELSEWHERE)
             return moved, *made, _note(moved)
         except NoPlan:
             continue
@@ -394,14 +405,14 @@ def replan(
     located: Located,
     joints_rad: Joints,
     progress: ResectionProgress,
-    facets: Float64[np.ndarray, "k 4"],
+    before: ResectionPlan,
 ) -> Planned:
-    """The plan for the organ as it lies now, from where the arms are; see ``plan_motions``.
-    ``facets``: of the plan so far, which are kept if that is possible, and in any case once one is
-    cut. Raises NoPlan: there is none, or it fails the check."""
+    """The plan for the organ as it lies now, from where the arms are; see ``plan_motions``. The
+    facets of the plan ``before`` are kept if that is possible, and in any case once one is cut.
+    Raises NoPlan: there is none, or it fails the check."""
     config, cell, urdf = _setting[0]
     start = Start(joints_rad, progress.first_sweep)
-    like = facets[:, :3] if len(facets) else None
+    like = before if len(before.facets) else None
     try:
         plan, motions = plan_motions(located, config, cell, start, like)
     except NoPlan:

@@ -6,16 +6,24 @@ analysis' (toppra), DOI 10.1109/TRO.2018.2819195.
 
 from __future__ import annotations
 
+import itertools
 import logging
 from collections.abc import Collection
+from functools import partial
 from typing import Any
 
 import msgspec
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Bool, Float64
 
 from tumortrack.core.types import Mesh
-from tumortrack_resection.arms.cell import ArmCell, Blocked, PlanningGroup
+from tumortrack_resection.arms.cell import (
+    ArmCell,
+    Blocked,
+    CollidingPair,
+    PlanningGroup,
+    blocked_between,
+)
 from tumortrack_resection.arms.config import CellConfig
 from tumortrack_resection.arms.kinematics import ACCELERATION_RAD_S2, Pose
 from tumortrack_resection.arms.paths import arc_lengths, follow
@@ -172,11 +180,20 @@ def along(
     if best is None:
         raise Blocked("a path can't be gone within the joints' limits")
     times = _samples(best.duration)
-    return times, best(times)[:, :width]
+    joints = best(times)[:, :width]
+    return times * _stretched(times, joints), joints
+
+
+def _stretched(times: np.ndarray, joints: np.ndarray) -> float:
+    """Between toppra's grid points, in tight curves, a motion may be too sudden: how many times as
+    long it has to take."""
+    accelerations = np.diff(joints, 2, axis=0) / np.diff(times)[1:, None] ** 2
+    most = float(np.abs(accelerations).max(initial=0.0))
+    return max(1.0, np.sqrt(most / ACCELERATION_RAD_S2))
 
 
 def first_hit(motions: Motions, config: CellConfig, organ: Mesh, begun: bool = False) -> str:
-    """The first collision of these motions, and when; empty: none.
+    """A collision of these motions, and when; empty: none.
 
     Tested as densely as by the planner, with half of its clearances: between the tested places its
     motions come nearer than the whole ones. An electrode or cup may touch the organ only where its
@@ -194,23 +211,59 @@ def first_hit(motions: Motions, config: CellConfig, organ: Mesh, begun: bool = F
         # An arm is longest where its elbow, somewhere between the ends, is straightest.
         ends = stage.joints_rad.min(0), stage.joints_rad.max(0)
         turns = np.abs(np.diff(stage.joints_rad, axis=0)) @ cell.levers_mm(*ends)
-        moved_mm = np.concatenate([[0.0], np.cumsum(turns)])  # at most, of any point
+        moved_mm = np.append(0.0, np.cumsum(turns))  # at most, of any point
         steps = int(np.ceil(moved_mm[-1] / (2 * cell.config.least_clearance_mm(touching))))
         at_mm = np.linspace(0, moved_mm[-1], steps + 1)
         joints = np.stack(
             [np.interp(at_mm, moved_mm, joint) for joint in stage.joints_rad.T], axis=1
         )
         times_s = np.interp(at_mm, moved_mm, stage.times_s)
-        tips = np.array([[pose[:3, 3] for pose in cell.tips(each).values()] for each in joints])
-        speeds = np.linalg.norm(np.diff(tips, axis=0), axis=2) / np.diff(times_s)[:, None]
-        edge = np.full((1, len(ARMS)), np.inf)
-        slow = np.minimum(np.r_[edge, speeds], np.r_[speeds, edge]) <= slow_mm_s
-        slow |= steps == 0
-        for joints_rad, time_s, both in zip(joints, times_s, slow, strict=True):
-            now = [arm for arm, is_slow in zip(ARMS, both, strict=True) if is_slow]
-            if pair := cell.collisions(joints_rad, [arm for arm in touching if arm in now]):
-                return f"{pair[0]} would meet {pair[1]} {time_s:.1f} s after {stage.name} begins"
+        allowed = _slow(cell, stage, moved_mm, at_mm, slow_mm_s) & np.isin(ARMS, touching)
+        moving = [arm for arm in ARMS if _turns(stage, arm).any()]
+        test = partial(_test, cell, joints, allowed, moving[0] if len(moving) == 1 else None)
+
+        # Poses at which the same may touch the organ
+        edges = np.flatnonzero((allowed[1:] != allowed[:-1]).any(1))
+        for first, last in itertools.pairwise([-1, *edges.tolist(), steps]):
+            step_mm = np.full(last - first + 1, moved_mm[-1] / max(steps, 1))
+            if found := blocked_between(first, last + 1, step_mm, test):
+                k, pair = found
+                return (
+                    f"{pair[0]} would meet {pair[1]} {times_s[k]:.1f} s after {stage.name} begins"
+                )
     return ""
+
+
+def _turns(stage: MotionStage, arm: str) -> Float64[np.ndarray, " 6"]:
+    """How far each of an arm's joints turns in a stage, between its extremes."""
+    return np.ptp(stage.joints_rad[:, 6 * ARMS.index(arm) :][:, :6], axis=0)
+
+
+def _test(
+    cell: ArmCell, joints: np.ndarray, allowed: np.ndarray, moving: str | None, k: int,
+    room_mm: float,
+) -> CollidingPair | None:  # fmt: skip
+    """At one of a stage's poses; what stands still is tested at the first alone."""
+    now = [arm for arm, may in zip(ARMS, allowed[k], strict=True) if may]
+    return cell.collisions(joints[k], now, moving if k else None, room_mm)
+
+
+def _slow(
+    cell: ArmCell,
+    stage: MotionStage,
+    moved_mm: Float64[np.ndarray, " n"],
+    at_mm: Float64[np.ndarray, " k"],
+    slow_mm_s: Float64[np.ndarray, " 2"],
+) -> Bool[np.ndarray, "k 2"]:
+    """Whether each arm's tip is so slow just before or after each of these places."""
+    if len(stage.times_s) < 2:
+        return np.ones((len(at_mm), len(ARMS)), bool)
+    poses = [cell.tips(joints_rad) for joints_rad in stage.joints_rad]
+    tips = np.array([[pose[:3, 3] for pose in each.values()] for each in poses])
+    speeds = np.linalg.norm(np.diff(tips, axis=0), axis=2) / np.diff(stage.times_s)[:, None]
+    before = np.clip(np.searchsorted(moved_mm, at_mm, "left") - 1, 0, len(speeds) - 1)
+    after = np.clip(np.searchsorted(moved_mm, at_mm, "right") - 1, 0, len(speeds) - 1)
+    return np.minimum(speeds[before], speeds[after]) <= slow_mm_s
 
 
 def _samples(seconds: float) -> Float64[np.ndarray, " n"]:
