@@ -146,6 +146,7 @@ pictures: demo debian  ## the pictures in docs/images that the demo shows (docs/
 	$(BIN)/tumortrack locate runs/demo/case runs/demo/dataset/dragged-0002/cloud.ply runs/pictures/run --overwrite
 	$(BIN)/tumortrack plan runs/pictures/run runs/pictures/plan --accept-budget --overwrite
 	cp runs/pictures/plan/plan.png docs/images/plan.png
+	rm -f docs/images/resection.gif  # a film replaces none
 	$(BIN)/tumortrack resect runs/pictures/plan --film docs/images/resection.gif
 	TUMORTRACK_PICTURES=docs/images TUMORTRACK_DEMO=runs/demo TUMORTRACK_PLAN=runs/pictures/plan $(BIN)/pytest -n0 devices/tests/test_viewer_page.py
 

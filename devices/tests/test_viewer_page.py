@@ -254,7 +254,7 @@ def test_pictures_for_the_documentation(tmp_path):
     assert PICTURES
     assert DEMO
     demo, port = Path(DEMO).resolve(), free_port()
-    command = [*COMMAND, "track", demo / "model", f"virtual:{demo / 'case'}"]
+    command = [*COMMAND, "track", demo / "case", f"virtual:{demo / 'case'}"]
     process = subprocess.Popen(
         [*map(str, command), f"viewer:{port}?case={demo / 'case'}"],
         env=environment(),

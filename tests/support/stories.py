@@ -154,5 +154,5 @@ def cloud_by_rays(case: Case, camera_from_ct: np.ndarray, step: float = 0.006) -
 def live_resection(demo: Path, plan: Path, sink: str) -> list[str]:
     """A command for pictures: the plan, live, on the demo's phantom, which lies still."""
     source = f"virtual:{demo / 'case'}?seed=1&instrument=false&breathing=false&camera_motion=false"
-    command = [*COMMAND, "resect", plan, sink, "--live", demo / "model", source, "--speed", "2"]
+    command = [*COMMAND, "resect", plan, sink, "--live", demo / "case", source, "--speed", "2"]
     return [str(word) for word in command]
