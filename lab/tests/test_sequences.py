@@ -19,9 +19,10 @@ from scipy.spatial.transform import Rotation
 from reports import report_of
 from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.geometry import transform_points
+from tumortrack.core.mesh_query import surface_samples
 from tumortrack.core.types import Anatomy, Mesh
 from tumortrack.report.drawing import ESTIMATED, TRUE
-from tumortrack.report.metrics import distance_to_surface, surface_samples
+from tumortrack.report.metrics import distance_to_surface
 from tumortrack.sense.camera import deproject
 from tumortrack.sense.region import RegionConfig
 from tumortrack.simulate.scene_folder import draw_targets, read_scene

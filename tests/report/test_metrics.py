@@ -6,9 +6,11 @@ import trimesh
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.distance import directed_hausdorff
+from trimesh.triangles import closest_point
 
 from covering import cover
 from tumortrack.core.errors import InputError
+from tumortrack.core.mesh_query import nearest_places, surface_samples
 from tumortrack.core.types import Anatomy, CameraLabels, Mesh
 from tumortrack.imaging.raster import voxelise
 from tumortrack.report.metrics import (
@@ -19,8 +21,6 @@ from tumortrack.report.metrics import (
     mean_iou,
     outward_miss,
     surface_distances,
-    surface_samples,
-    triangle_distance,
 )
 
 
@@ -133,22 +133,40 @@ def test_distances_obey_their_laws(seed):
     assert surface_distances(*turned, 2.0).hausdorff_mm == pytest.approx(there.hausdorff_mm)
 
 
-@pytest.mark.parametrize("target", [lumpy(7), box((22, 25, 28), (2, 1, 0))], ids=["fine", "coarse"])
-def test_nearest_triangle_is_found_among_the_few(target):
-    """The distance to the few faces that are tried is the distance to all faces."""
-    points = surface_samples(lumpy(6), 4.0)[0][::5]
+def uneven(seed):
+    """Triangles from needles to plates, some of them points or lines."""
+    rng = np.random.default_rng(seed)
+    vertices = rng.normal(0, [30.0, 20.0, 3.0], (150, 3))
+    vertices[1], vertices[3] = vertices[0], (vertices[2] + vertices[4]) / 2
+    faces = [[0, 1, 5], [2, 3, 4], *rng.integers(0, 150, (200, 3))]
+    return Mesh(vertices, np.array(faces))
+
+
+@pytest.mark.parametrize(
+    "target",
+    [lumpy(7), box((22, 25, 28), (2, 1, 0)), uneven(3), sphere(12.0)],
+    ids=["fine", "coarse", "uneven", "round"],
+)
+def test_nearest_places_are_those_of_all_triangles(target):
+    """Points near to it, far from it, on it, and where all of it is equally far."""
+    rng = np.random.default_rng(1)
+    points = np.concatenate([
+        surface_samples(lumpy(6), 4.0)[0][::5], rng.normal(0, 80.0, (30, 3)),
+        target.vertices_mm[:20], np.zeros((1, 3)),
+    ])  # fmt: skip
     triangles = target.vertices_mm[target.faces]
+    each = (closest_point(triangles, np.tile(p, (len(triangles), 1))) for p in points)
     exact = np.array(
-        [triangle_distance(np.tile(p, (len(triangles), 1)), triangles).min() for p in points]
+        [np.linalg.norm(q - p, axis=1).min() for p, q in zip(points, each, strict=True)]
     )
-    found = distance_to_surface(points, target)
-    assert exact.max() > 1.0
-    assert (found >= exact - 1e-9).all()
-    np.testing.assert_allclose(found, exact, atol=0.01)
+    places = nearest_places(target, points)
+    np.testing.assert_allclose(np.linalg.norm(places - points, axis=1), exact, atol=1e-6)
+    assert np.linalg.norm(nearest_places(target, places) - places, axis=1).max() < 1e-6
+    assert (distance_to_surface(points, target) == np.linalg.norm(points - places, axis=1)).all()
 
 
 def test_triangle_distance_in_every_region():
-    triangle = np.array([[0.0, 0, 0], [4, 0, 0], [0, 3, 0]])
+    triangle = Mesh(np.array([[0.0, 0, 0], [4, 0, 0], [0, 3, 0]]), np.array([[0, 1, 2]]))
     cases = {
         (1, 1, 2): 2.0,  # above the inside
         (-3, -4, 0): 5.0,  # off a corner
@@ -157,16 +175,14 @@ def test_triangle_distance_in_every_region():
         (7, 0, 4): 5.0,
     }
     points = np.array(list(cases), float)
-    triangles = np.broadcast_to(triangle, (len(points), 3, 3))
-    np.testing.assert_allclose(triangle_distance(points, triangles), list(cases.values()))
+    np.testing.assert_allclose(distance_to_surface(points, triangle), list(cases.values()))
 
 
 def test_samples_carry_the_whole_area_evenly():
     mesh = lumpy(3)
-    points, area, face = surface_samples(mesh, 0.5)
+    points, area = surface_samples(mesh, 0.5)
     assert area.sum() == pytest.approx(trimesh.Trimesh(mesh.vertices_mm, mesh.faces).area)
-    on = triangle_distance(points, mesh.vertices_mm[mesh.faces][face])
-    assert on.max() < 1e-9
+    assert distance_to_surface(points, mesh).max() < 1e-9
     # First moments: sums over samples equal the exact integrals over the triangles.
     corners = mesh.vertices_mm[mesh.faces]
     size = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]),

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 from jaxtyping import Float, Int
 
-from tumortrack.imaging.raster import expand
+from tumortrack.core.geometry import expand
 
 _CHUNK = 2_000_000  # candidate pixels held at once
 

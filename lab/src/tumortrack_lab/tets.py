@@ -16,9 +16,8 @@ from scipy.sparse.linalg import splu
 from scipy.spatial import cKDTree
 
 from tumortrack.core.errors import InputError
-from tumortrack.core.mesh_query import contains
+from tumortrack.core.mesh_query import contains, surface_samples
 from tumortrack.core.types import Mesh
-from tumortrack.report.metrics import surface_samples
 
 _FACES = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])  # of a tetrahedron, by corners
 _CANDIDATES = 24  # nearest tetrahedra of a point, among which its own is searched

@@ -1,4 +1,4 @@
-"""Kernels on meshes and points: volumes, points inside, farthest points."""
+"""Kernels on meshes and points: volumes, points inside, nearest places, farthest points."""
 
 from __future__ import annotations
 
@@ -75,6 +75,72 @@ def _left_of(a, b, x, y):  # type: ignore[no-untyped-def]
     if a[1] > b[1]:
         a, b = b, a
     return (b[0] - a[0]) * (y - a[1]) - (x - a[0]) * (b[1] - a[1]) > 0
+
+
+@njit(nogil=True)
+def nearest_on_faces(points, vertices, faces, candidates):  # type: ignore[no-untyped-def]
+    """Of each point (n, 3), the nearest place (n, 3) on its ``candidates`` (n, k) of the faces."""
+    places = np.empty((len(points), 3))
+    for n in range(len(points)):
+        least = np.inf
+        for k in range(candidates.shape[1]):
+            face = faces[candidates[n, k]]
+            place = _on_triangle(points[n], vertices[face[0]], vertices[face[1]], vertices[face[2]])
+            off = (
+                (points[n, 0] - place[0]) ** 2
+                + (points[n, 1] - place[1]) ** 2
+                + (points[n, 2] - place[2]) ** 2
+            )
+            if off < least:
+                least = off
+                places[n] = place
+    return places
+
+
+_FLAT = 1e-14  # square of the sine of a corner, below which a triangle is a line
+
+
+@njit(inline="always")
+def _on_triangle(p, a, b, c):  # type: ignore[no-untyped-def]
+    """The nearest place on a triangle, by the region (corner, edge, inside) that the point is over:
+    Ericson 2005, Real-Time Collision Detection, 5.1.5."""
+    ab0, ab1, ab2 = b[0] - a[0], b[1] - a[1], b[2] - a[2]
+    ac0, ac1, ac2 = c[0] - a[0], c[1] - a[1], c[2] - a[2]
+    x, y, z = p[0] - a[0], p[1] - a[1], p[2] - a[2]
+    d1, d2 = ab0 * x + ab1 * y + ab2 * z, ac0 * x + ac1 * y + ac2 * z
+    bb, bc, cc = (
+        ab0 * ab0 + ab1 * ab1 + ab2 * ab2,
+        ab0 * ac0 + ab1 * ac1 + ab2 * ac2,
+        ac0 * ac0 + ac1 * ac1 + ac2 * ac2,
+    )
+    d3, d4 = d1 - bb, d2 - bc  # of p - b
+    d5, d6 = d1 - bc, d2 - cc  # of p - c
+    va, vb, vc = d3 * d6 - d5 * d4, d5 * d2 - d1 * d6, d1 * d4 - d3 * d2
+    ee = bb + cc - 2 * bc  # squares of the edges' lengths
+    if bb * cc - bc * bc <= _FLAT * bb * cc or ee <= 0:  # a line: its longest edge
+        if bb >= cc and bb >= ee:
+            s, t = min(max(d1 / bb, 0.0), 1.0) if bb > 0 else 0.0, 0.0
+        elif cc >= ee:
+            s, t = 0.0, min(max(d2 / cc, 0.0), 1.0)
+        else:
+            t = min(max((d4 - d3) / ee, 0.0), 1.0)
+            s = 1.0 - t
+    elif d1 <= 0 and d2 <= 0:
+        s, t = 0.0, 0.0
+    elif d3 >= 0 and d4 <= d3:
+        s, t = 1.0, 0.0
+    elif d6 >= 0 and d5 <= d6:
+        s, t = 0.0, 1.0
+    elif vc <= 0 and d1 >= 0 and d3 <= 0:
+        s, t = d1 / (d1 - d3), 0.0
+    elif vb <= 0 and d2 >= 0 and d6 <= 0:
+        s, t = 0.0, d2 / (d2 - d6)
+    elif va <= 0 and d4 >= d3 and d5 >= d6:
+        t = (d4 - d3) / ((d4 - d3) + (d5 - d6))
+        s = 1.0 - t
+    else:
+        s, t = vb / (va + vb + vc), vc / (va + vb + vc)
+    return (a[0] + s * ab0 + t * ac0, a[1] + s * ab1 + t * ac1, a[2] + s * ab2 + t * ac2)
 
 
 _MAXIMUM = {"nnan", "nsz"}  # lets a maximum be taken in lanes; sums stay as they are written

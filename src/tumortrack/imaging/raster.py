@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, Int16, UInt8
+from jaxtyping import Bool, Float, Int16, UInt8
 
 from tumortrack.core.compiled import njit
 from tumortrack.core.errors import InputError
@@ -13,12 +13,6 @@ from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import Anatomy, Mesh
 
 _MOST_CELLS = 2**28
-
-
-def expand(counts: Int[np.ndarray, " n"]) -> tuple[Int[np.ndarray, " m"], Int[np.ndarray, " m"]]:
-    """``counts[item]`` entries for each item: the item, and the entry's number within it."""
-    item = np.repeat(np.arange(len(counts)), counts)
-    return item, np.arange(len(item)) - np.repeat(np.cumsum(counts) - counts, counts)
 
 
 def winding_numbers(

@@ -20,9 +20,10 @@ from typing import Any
 from tumortrack import api
 from tumortrack.core import store
 from tumortrack.core.errors import InputError
+from tumortrack.core.mesh_query import surface_samples
 from tumortrack.core.types import Anatomy, Mesh
 from tumortrack.imaging.case import Case
-from tumortrack.report.metrics import distance_to_surface, surface_samples
+from tumortrack.report.metrics import distance_to_surface
 
 SET_ASIDE = (91, 93, 96, 146, 155)
 NEAR_MM = 2.0
@@ -48,7 +49,7 @@ def label_map(data: Path, number: int) -> Path:
 
 def outer_share(tumor: Mesh, organ: Mesh) -> float:
     """The share of a tumor's surface within ``NEAR_MM`` of the organ's outer surface."""
-    points_mm, area_mm2, _ = surface_samples(tumor)
+    points_mm, area_mm2 = surface_samples(tumor)
     near = distance_to_surface(points_mm, organ) <= NEAR_MM
     return float(area_mm2[near].sum() / area_mm2.sum())
 

@@ -23,11 +23,12 @@ from scipy.spatial import Delaunay, cKDTree
 
 from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.geometry import Points, transform_points, triangles_of
+from tumortrack.core.mesh_query import surface_samples
 from tumortrack.core.types import Anatomy, Mesh, SensorCloud
 from tumortrack.models.report import Frame
 from tumortrack.registration.looks import Looks
 from tumortrack.registration.model import RegistrationModel
-from tumortrack.report.metrics import distance_to_surface, surface_samples
+from tumortrack.report.metrics import distance_to_surface
 from tumortrack.sense.cloud import CloudConfig, cloud_from_depth
 from tumortrack.sense.noise import D405_NOISE, add_noise
 from tumortrack.sense.render import render_depth

@@ -6,8 +6,9 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
+from tumortrack.core.mesh_query import surface_samples
 from tumortrack.core.types import Anatomy
-from tumortrack.report.metrics import distance_to_surface, surface_samples
+from tumortrack.report.metrics import distance_to_surface
 
 Kind = Literal["exophytic", "endophytic"]
 
@@ -31,7 +32,7 @@ def tumor_sites_of(anatomy: Anatomy) -> dict[str, TumorSite]:
     """By part name; any frame."""
     sites = {}
     for name, tumor in zip(anatomy.names[1:], anatomy.tumors, strict=True):
-        points, area, _ = surface_samples(tumor)
+        points, area = surface_samples(tumor)
         distance = distance_to_surface(points, anatomy.organ)
         share = float(area[distance < EXPOSED_MM].sum() / area.sum())
         sites[name] = TumorSite(share, float(np.min(distance)))

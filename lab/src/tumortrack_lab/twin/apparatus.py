@@ -28,9 +28,9 @@ from scipy.spatial import cKDTree
 from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError, TumortrackError
 from tumortrack.core.geometry import rigid, transform_points, triangles_of
+from tumortrack.core.mesh_query import surface_samples
 from tumortrack.core.types import Anatomy, Mesh
 from tumortrack.imaging.raster import label_grid
-from tumortrack.report.metrics import surface_samples
 from tumortrack_experiment.kit.base import laid_down as bench_from_ct
 from tumortrack_experiment.kit.stands import COMPRESSION_MM, poke_point
 from tumortrack_lab.tets import TetMesh, embed, tetrahedralise
@@ -155,7 +155,7 @@ def contact_points(
     organ: Mesh, spacing_mm: float, cube_mm: float
 ) -> tuple[Float64[np.ndarray, "m 3"], Float64[np.ndarray, " m"]]:
     """One point of the surface per cube that it passes, and the area there."""
-    points_mm, areas_mm2, _ = surface_samples(organ, spacing_mm)
+    points_mm, areas_mm2 = surface_samples(organ, spacing_mm)
     cubes = np.floor(points_mm / cube_mm)
     _, first, cube = np.unique(cubes, axis=0, return_index=True, return_inverse=True)
     return points_mm[first], np.bincount(cube.ravel(), areas_mm2)
