@@ -12,12 +12,11 @@ from dataclasses import replace
 
 import msgspec
 import numpy as np
-from scipy.spatial import cKDTree
 
 from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError, NoPlan
 from tumortrack.core.halt import Halt
-from tumortrack.core.mesh_query import contains
+from tumortrack.core.mesh_query import contains, nearest_places
 from tumortrack.core.organ import is_tumor, organ_name
 from tumortrack.tracking.margins import StatedRadius, margin_words, stated_radius
 from tumortrack_resection.facets import TOOLS, Tools
@@ -240,9 +239,9 @@ def plan_within(
 
 
 def foreseen_mm(plan: ResectionPlan, located: Located, tools: Tools) -> dict[str, float]:
-    """The least distance of the electrode on its cuts to each tumor and structure, to 0.2 mm, mm;
-    negative: so deep inside. Of cuts without a direction, of the tip. What the arms do besides is
-    known only once their motions are checked."""
+    """The least distance of the electrode on its cuts to each tumor and structure, mm; negative: so
+    deep inside. Of cuts without a direction, of the tip. What the arms do besides is known only
+    once their motions are checked."""
     surfaces = {**located.meshes, **located.structures}
     organ = organ_name(located.meshes)
     lines = []
@@ -255,7 +254,7 @@ def foreseen_mm(plan: ResectionPlan, located: Located, tools: Tools) -> dict[str
     for name, mesh in surfaces.items():
         if name == organ:
             continue
-        away = cKDTree(mesh.spread_mm(2 * _SPACING_MM)).query(points)[0]
+        away = np.linalg.norm(nearest_places(mesh, points) - points, axis=1)
         inside = contains(mesh, points) if is_tumor(name) else np.zeros(len(points), bool)
         deep, near = float(away[inside].max(initial=0)), float(away.min()) - tools.radius_mm
         least[name] = -deep if inside.any() else near

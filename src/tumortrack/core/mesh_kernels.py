@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 
 from tumortrack.core.compiled import njit
@@ -77,24 +80,80 @@ def _left_of(a, b, x, y):  # type: ignore[no-untyped-def]
     return (b[0] - a[0]) * (y - a[1]) - (x - a[0]) * (b[1] - a[1]) > 0
 
 
-@njit(nogil=True)
-def nearest_on_faces(points, vertices, faces, candidates):  # type: ignore[no-untyped-def]
-    """Of each point (n, 3), the nearest place (n, 3) on its ``candidates`` (n, k) of the faces."""
-    places = np.empty((len(points), 3))
+_LEAF = 4  # triangles in a box of the lowest level
+_A_THREAD = 20_000  # points that are worth a thread
+
+
+def nearest_on_faces(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """The nearest place on triangles (f, 3, 3) of each point (n, 3), by a tree of boxes: triangles
+    in the order of a curve through space (Morton's), halved again and again."""
+    middles = triangles.mean(1)
+    span = np.maximum(np.ptp(middles, axis=0), 1e-9)
+    cells = (1023 * (middles - middles.min(0)) / span).astype(np.int64)
+    bits = cells[:, :, None] >> np.arange(10) & 1
+    keys = (bits << np.arange(3)[:, None] + 3 * np.arange(10)).sum((1, 2))
+    levels = max(0, int(np.ceil(np.log2(len(triangles) / _LEAF))))
+    # Filled up with the last one, so that all leaves are full
+    order = np.argsort(keys, kind="stable")[
+        np.minimum(np.arange(_LEAF << levels), len(triangles) - 1)
+    ]
+    leaves = np.ascontiguousarray(triangles[order]).reshape(-1, _LEAF, 3, 3)
+    level, boxes = np.stack([leaves.min((1, 2)), leaves.max((1, 2))], axis=1), []
+    for _ in range(levels + 1):
+        boxes.append(level)
+        pairs = level.reshape(-1, 2, 2, 3) if len(level) > 1 else level[None]
+        level = np.stack([pairs[:, :, 0].min(1), pairs[:, :, 1].max(1)], axis=1)
+    tree = leaves, np.concatenate(boxes[::-1]), levels
+    parts = np.array_split(points, 1 + len(points) // _A_THREAD)
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        return np.concatenate(list(pool.map(lambda part: _nearest(part, *tree), parts)))
+
+
+@njit(nogil=True, error_model="numpy")
+def _nearest(points, leaves, boxes, levels):  # type: ignore[no-untyped-def]
+    """Box 0 is around all; in box n are the boxes 2 n + 1 and 2 n + 2, or leaf n - 2^levels + 1."""
+    places, first, last = np.empty((len(points), 3)), 2**levels - 1, 0
+    open_boxes, away = np.empty(levels + 3, np.int64), np.empty(levels + 3)
     for n in range(len(points)):
-        least = np.inf
-        for k in range(candidates.shape[1]):
-            face = faces[candidates[n, k]]
-            place = _on_triangle(points[n], vertices[face[0]], vertices[face[1]], vertices[face[2]])
-            off = (
-                (points[n, 0] - place[0]) ** 2
-                + (points[n, 1] - place[1]) ** 2
-                + (points[n, 2] - place[2]) ** 2
-            )
-            if off < least:
-                least = off
-                places[n] = place
+        # Neighbouring points are often nearest to neighbouring triangles: first where the last was
+        p, least, count = points[n], np.inf, 2
+        open_boxes[0], open_boxes[1] = 0, first + last
+        away[0] = away[1] = 0.0
+        while count:
+            count -= 1
+            box = open_boxes[count]
+            if away[count] >= least:
+                continue
+            if box >= first:
+                leaf = leaves[box - first]
+                for k in range(_LEAF):
+                    x, y, z = _on_triangle(p, leaf[k, 0], leaf[k, 1], leaf[k, 2])
+                    off = (p[0] - x) ** 2 + (p[1] - y) ** 2 + (p[2] - z) ** 2
+                    if off < least:
+                        least, last = off, box - first
+                        places[n, 0], places[n, 1], places[n, 2] = x, y, z
+                continue
+            one, other = 2 * box + 1, 2 * box + 2
+            near, far = _to_box(p, boxes[one]), _to_box(p, boxes[other])
+            if near > far:
+                one, other, near, far = other, one, far, near
+            if far < least:
+                open_boxes[count], away[count] = other, far
+                count += 1
+            if near < least:
+                open_boxes[count], away[count] = one, near
+                count += 1
     return places
+
+
+@njit(inline="always")
+def _to_box(p, box):  # type: ignore[no-untyped-def]
+    """The square of a point's distance to a box (2, 3)."""
+    total = 0.0
+    for axis in range(3):
+        off = max(box[0, axis] - p[axis], p[axis] - box[1, axis], 0.0)
+        total += off * off
+    return total
 
 
 _FLAT = 1e-14  # square of the sine of a corner, below which a triangle is a line

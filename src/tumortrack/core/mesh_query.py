@@ -3,10 +3,8 @@ on them; and surfaces at a distance."""
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Float64, Int, UInt8
+from jaxtyping import Bool, Float, Float32, Float64, UInt8
 
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import Points, expand, triangles_of
@@ -18,8 +16,6 @@ _FINEST_MM, _COARSEST_MM = 0.6, 1.5
 # Vertices are sampled too, so the maximum misses at most s^2 / (8 R) where a flat piece of size s
 # lies over a surface of radius R: 0.025 mm at R = 5 mm.
 SPACING_MM = 1.0
-_SEED_MM = 2.0  # spacing of the points by which nearest triangles are looked up
-_FIRST, _MORE = 6, 4  # of them for each point, and how many times as many where they do not suffice
 
 
 def contains(mesh: Mesh, points_mm: Points) -> Bool[np.ndarray, " n"]:
@@ -42,18 +38,14 @@ def labels_of(anatomy: Anatomy, points_mm: Points) -> UInt8[np.ndarray, " n"]:
     return labels
 
 
-class _Cells(NamedTuple):
-    """A surface in small triangles: their middles, mm, areas, mm^2, and faces; ``wide_mm``: no
-    place in one is farther from its middle."""
+def surface_samples(
+    mesh: Mesh, spacing_mm: float = SPACING_MM
+) -> tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, " n"]]:
+    """Points on a surface and the area each stands for, mm^2.
 
-    middles_mm: Float64[np.ndarray, "n 3"]
-    areas: Float64[np.ndarray, " n"]
-    faces: Int[np.ndarray, " n"]
-    wide_mm: float
-
-
-def _cells_of(mesh: Mesh, spacing_mm: float) -> _Cells:
-    """Every triangle is cut into n^2 equal ones with edges <= spacing."""
+    Deterministic: every triangle is cut into n^2 equal ones with edges <= spacing, whose centroids
+    carry the area. The vertices follow with area 0, so that extremes are included.
+    """
     triangles = mesh.vertices_mm[mesh.faces]
     edges = triangles - np.roll(triangles, 1, axis=1)
     cuts = np.maximum(np.ceil(np.linalg.norm(edges, axis=2).max(1) / spacing_mm), 1).astype(int)
@@ -68,47 +60,20 @@ def _cells_of(mesh: Mesh, spacing_mm: float) -> _Cells:
     v = (place // 2 + np.where(down, 2 / 3, 1 / 3)) / n
     a, b, c = (triangles[face, corner] for corner in range(3))
     points = a + u[:, None] * (b - a) + v[:, None] * (c - a)
-    off = np.linalg.norm(triangles - triangles.mean(1, keepdims=True), axis=2).max(1)
-    return _Cells(points, area[face] / n**2, face, float((off / cuts).max(initial=0)))
-
-
-def surface_samples(
-    mesh: Mesh, spacing_mm: float = SPACING_MM
-) -> tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, " n"]]:
-    """Points on a surface and the area each stands for, mm^2.
-
-    Deterministic: the middles of small triangles with edges <= spacing. The vertices follow with
-    area 0, so that extremes are included.
-    """
-    cells, used = _cells_of(mesh, spacing_mm), np.unique(mesh.faces)
-    points = np.concatenate([cells.middles_mm, mesh.vertices_mm[used]])
-    return points, np.append(cells.areas, np.zeros(len(used)))
+    used = np.unique(mesh.faces)
+    points = np.concatenate([points, mesh.vertices_mm[used]])
+    return points, np.append(area[face] / n**2, np.zeros(len(used)))
 
 
 def nearest_places(mesh: Mesh, points_mm: Float[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3"]:
-    """The place of a surface that is nearest to each point, mm; exact. InputError: it has no faces.
-
-    The surface is cut into small cells. The nearest place lies in one whose middle is no farther
-    than the best place found so far and a cell's width.
-    """
-    from scipy.spatial import cKDTree
-
+    """The place of a surface that is nearest to each point, mm; exact. InputError: it has no
+    faces."""
     from tumortrack.core.mesh_kernels import nearest_on_faces
 
     if not len(mesh.faces):
         raise InputError("distances to a surface need triangles; it has none.")
-    cells, faces = _cells_of(mesh, _SEED_MM), np.ascontiguousarray(mesh.faces, np.int64)
-    tree, points = cKDTree(cells.middles_mm), np.ascontiguousarray(points_mm, np.float64)
-    places, left, count = np.empty_like(points), np.arange(len(points)), _FIRST
-    while len(left):
-        count = min(count, len(cells.faces))
-        far_mm, near = tree.query(points[left], k=[*range(1, count + 1)], workers=-1)
-        here = nearest_on_faces(points[left], mesh.vertices_mm, faces, cells.faces[near])
-        places[left] = here
-        off_mm = np.linalg.norm(points[left] - here, axis=1)
-        enough = (far_mm[:, -1] >= off_mm + cells.wide_mm) | (count == len(cells.faces))
-        left, count = left[~enough], count * _MORE
-    return places
+    points = np.ascontiguousarray(points_mm, np.float64)
+    return nearest_on_faces(points, mesh.vertices_mm[mesh.faces])
 
 
 def surface_distance(mesh: Mesh, points_mm: Points) -> Float32[np.ndarray, " n"]:
