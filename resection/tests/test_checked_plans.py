@@ -199,7 +199,7 @@ def test_motions_for_random_organs_and_cells_pass_the_check():
 
 @pytest.mark.slow
 def test_motions_for_many_random_organs_and_cells_pass_the_check():
-    many(4, cases())(arms_keep_what_was_planned)
+    many(3, cases())(arms_keep_what_was_planned)
 
 
 # Tampered motions ---------------------------------------------------------------------------------

@@ -506,7 +506,9 @@ def evaluate(
         folder, out, progress = Path(scenes), Path(report), progress or (lambda: None)
         check_place(out, overwrite)
         if isinstance(locate, Path | Tracker):
-            return protocol.evaluate_model(locate, folder, out, grid, seed, device, progress)
+            return protocol.evaluate_model(
+                locate, folder, out, protocol.Asked(grid, seed, device), progress
+            )
         call: Any = getattr(locate, "locate", locate)
         rivals = rivals_of(getattr(locate, "model", None))
         return protocol.evaluate_scenes(call, folder, out, progress, rivals=rivals)

@@ -5,6 +5,7 @@ import json
 import re
 import shutil
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -12,8 +13,9 @@ import trimesh
 
 from browser import Browser, of_first_tumor
 from clock import until
+from tumortrack.api import write_scenes
 from tumortrack.core.colours import TUMORS, css, part_colour
-from tumortrack.core.errors import InputError, NoEstimate
+from tumortrack.core.errors import ArtifactError, InputError, NoEstimate
 from tumortrack.core.estimate import Estimate
 from tumortrack.core.report import FitReport
 from tumortrack.core.types import (
@@ -25,6 +27,7 @@ from tumortrack.core.types import (
     SensorCloud,
     Volume,
 )
+from tumortrack.report import protocol
 from tumortrack.report.drawing import section, section_mask
 from tumortrack.report.metrics import label_grid
 from tumortrack.report.page import thinned
@@ -38,7 +41,7 @@ from tumortrack.report.pictures import (
     slice_volume,
 )
 from tumortrack.report.place import check_place
-from tumortrack.report.protocol import evaluate_scenes, failure
+from tumortrack.report.protocol import Asked, evaluate_model, evaluate_scenes, failure
 from tumortrack.report.renderer import Body, Frame, ParallelView, rgb
 from tumortrack.report.summary import headlines, scene_lines, summarise, summary_tables
 from tumortrack.simulate.scene_folder import Scene
@@ -532,3 +535,41 @@ def test_slice_and_outline_of_coarse_voxels_belong_together():
     turned = trimesh.transformations.rotation_matrix(0.4, (1, 2, 3)) @ lps_from_index
     index = np.linalg.inv(turned) @ [*in_voxels(np.array([20.0, 31.0, 7.0]), turned), 1.0]
     np.testing.assert_allclose(index, np.rint(index), atol=1e-9)
+
+
+@pytest.mark.slow
+def test_two_processes_say_what_one_says(ready_case, tmp_path, monkeypatch):
+    """But how long it took."""
+    monkeypatch.setattr(protocol, "_SCENES", 1)
+    write_scenes(ready_case, tmp_path / "scenes", scenes=3, seed=4)
+    reports = []
+    for processes in (1, 2):
+        out, seen = tmp_path / f"report_{processes}", []
+        asked = Asked(processes=processes)
+        report = evaluate_model(
+            ready_case, tmp_path / "scenes", out, asked, partial(seen.append, 1)
+        )
+        assert len(seen) == 3
+        assert {path.stem for path in (out / "scenes").iterdir()} == {"0000", "0001", "0002"}
+        assert json.loads((out / "report.json").read_text()) == report
+        for scene in report["scenes"]:
+            assert scene.pop("seconds") > 0
+            assert scene.pop("timings")
+            scene["rivals"].pop("seconds", None)
+        report["summary"].pop("seconds", None)
+        reports.append(report)
+    assert reports[0]["scenes"] == reports[1]["scenes"]
+    assert reports[0]["summary"].keys() == reports[1]["summary"].keys()
+
+
+@pytest.mark.slow
+def test_a_scene_that_cannot_be_read_leaves_no_report_of_two_processes(
+    ready_case, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(protocol, "_SCENES", 1)
+    write_scenes(ready_case, tmp_path / "scenes", scenes=2, seed=4)
+    (cloud,) = (tmp_path / "scenes" / "0001").glob("cloud*")
+    cloud.write_text("nothing")
+    with pytest.raises((InputError, ArtifactError), match="0001"):
+        evaluate_model(ready_case, tmp_path / "scenes", tmp_path / "out", Asked(processes=2))
+    assert not (tmp_path / "out").exists()

@@ -23,6 +23,8 @@ from tumortrack.cli.console import (
 from tumortrack.imaging.options import ORGAN_HU, PrepareOptions
 from tumortrack.tracking.options import ExportOptions, SimulateOptions, check_grid
 
+_PROCESSES = 2  # that `evaluate` begins at most: each takes 0.6 GB
+
 
 @dataclass(frozen=True, kw_only=True)
 class Prepare(PrepareOptions):
@@ -149,15 +151,14 @@ class Evaluate:
         say(f"comparing {self.model} with the truth of {count} scenes; loading it ...")
         say(str(patient))
 
-        from tumortrack.report.protocol import evaluate_model
+        from tumortrack.report.protocol import Asked, evaluate_model
         from tumortrack.report.summary import headlines, scene_lines, summary_tables
 
         keep_loaded()
         out = self.report
         with progress_bar("evaluate", count) as advance:
-            result = evaluate_model(
-                folder, self.variants, out, self.grid, self.seed, self.device, advance
-            )
+            asked = Asked(self.grid, self.seed, self.device, _PROCESSES)
+            result = evaluate_model(folder, self.variants, out, asked, advance)
         for table in summary_tables(result):
             console.print(table)
         for line in (*scene_lines(result["scenes"]), *headlines(result["summary"])):

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import os
+import signal
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from functools import partial
+from multiprocessing import get_context
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import tumortrack
 from tumortrack.core import store
@@ -30,35 +34,86 @@ from tumortrack.tracking.tracker import Tracker
 RULE = f"{SAID.medians} {SAID.rule.format(far_mm=FAR_MM)}"
 Locate = Callable[[SensorCloud], Estimate]
 Compare = Callable[[Scene], dict[str, Any]]
+_SCENES = 4  # are worth a process
+
+
+class Asked(NamedTuple):
+    """How a model is asked: see ``api.evaluate``. ``processes``: at most, for the model of a
+    folder. Each begins with the program's main module, so a script without
+    ``if __name__ == "__main__"`` can have but one."""
+
+    grid: int = 160
+    seed: int = 0
+    device: str = "auto"
+    processes: int = 1
+
+
+_AS_USUAL = Asked()
+
+
+class _Judged(NamedTuple):
+    entry: dict[str, Any]
+    shown: dict[str, Any]
 
 
 def evaluate_model(
     model: Path | Tracker,
     scenes_dir: Path,
     out: Path,
-    grid: int = 160,
-    seed: int = 0,
-    device: str = "auto",
+    asked: Asked = _AS_USUAL,
     progress: Callable[[], None] = lambda: None,
 ) -> dict[str, Any]:
     """``evaluate_scenes`` with a tracker, or the model of a folder, which the report then names.
     Also raises InputError for scenes of another case."""
     folders, digest = list_scenes(scenes_dir), {}
-    if isinstance(model, Path):
+    folder = None
+    if isinstance(model, Tracker):
+        tracker = model
+    else:
         folder = model_folder(model)
         digest = {"model_sha256": store.sha256_of(folder / store.MANIFEST)}
-        model = Tracker(load_model(folder, device))
-    check_case(model.model, folders)
+        tracker = Tracker(load_model(folder, asked.device))
+    check_case(tracker.model, folders)
+    rivals = rivals_of(tracker.model)
     about = {
-        "patient": to_builtins(model.model.patient),
-        "model": model.model.provenance,
+        "patient": to_builtins(tracker.model.patient),
+        "model": tracker.model.provenance,
         **digest,
         "scenes_folder": str(scenes_dir),
-        "grid": grid,
-        "seed": seed,
+        "grid": asked.grid,
+        "seed": asked.seed,
+        **_said(rivals),
     }
-    locate = partial(model.locate, grid=grid, seed=seed)
-    return evaluate_scenes(locate, scenes_dir, out, progress, about, rivals_of(model.model))
+    processes = min(asked.processes, os.cpu_count() or 1, len(folders) // _SCENES)
+    if folder is None or processes < 2:
+        locate = partial(tracker.locate, grid=asked.grid, seed=asked.seed)
+        return _report(map(partial(_judged, locate, rivals, out), folders), out, progress, about)
+    with ProcessPoolExecutor(processes, get_context("spawn"), _begin, (folder, asked, out)) as pool:
+        try:
+            return _report(_each(pool, folders), out, progress, about)
+        except BaseException:  # Ctrl-C, too
+            pool.shutdown(cancel_futures=True)
+            raise
+
+
+_judge: list[Callable[[Path], _Judged]] = []  # of a process
+
+
+def _begin(folder: Path, asked: Asked, out: Path) -> None:
+    """Called once in a new process, which leaves Ctrl-C to the one that began it."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    tracker = Tracker(load_model(folder, asked.device))
+    locate = partial(tracker.locate, grid=asked.grid, seed=asked.seed)
+    _judge.append(partial(_judged, locate, rivals_of(tracker.model), out))
+
+
+def _in_process(folder: Path) -> _Judged:
+    return _judge[0](folder)
+
+
+def _each(pool: ProcessPoolExecutor, folders: Sequence[Path]) -> Iterator[_Judged]:
+    """Begun when the first is asked for: then the report's folder is there."""
+    yield from pool.map(_in_process, folders)
 
 
 def check_case(model: Model, folders: list[Path]) -> None:
@@ -97,33 +152,49 @@ def evaluate_scenes(
         about: plain JSON for the report: the model and options behind ``locate``.
         rivals: rigid registration of a scene, see ``report.rivals.Rivals``.
     """
-    folders = list_scenes(scenes_dir)
+    judge = partial(_judged, locate, rivals, out)
+    about = {**(about or {}), **_said(rivals)}
+    return _report(map(judge, list_scenes(scenes_dir)), out, progress, about)
+
+
+def _said(rivals: Compare | None) -> dict[str, Any]:
+    return {"rivals": SAID.rivals if rivals is not None else {"not_available": SAID.no_rivals}}
+
+
+def _judged(locate: Locate, rivals: Compare | None, out: Path, folder: Path) -> _Judged:
+    """A scene's entry, and what the page shows of it; its picture is written."""
+    scene = read_scene(folder)
+    entry, estimate = evaluate_scene(locate, scene, folder.name, rivals)
+    if isinstance(stated := scene.meta.get("registration"), dict):  # of a second CT
+        entry["registration_mm"] = stated.get("tre_mm", {})
+    picture = out / "scenes" / f"{folder.name}.png"
+    scene_picture(scene, estimate, entry, picture)
+    return _Judged(entry, page_scene(scene, estimate, picture))
+
+
+def _report(
+    judged: Iterable[_Judged], out: Path, progress: Callable[[], None], about: dict[str, Any]
+) -> dict[str, Any]:
+    """The report of scenes as they come."""
     clear(out)
     try:
         with writing(out):
             (out / "scenes").mkdir(parents=True, exist_ok=True)
-        entries, shown = [], []
-        for folder in folders:
-            scene = read_scene(folder)
-            entry, estimate = evaluate_scene(locate, scene, folder.name, rivals)
-            if isinstance(stated := scene.meta.get("registration"), dict):  # of a second CT
-                entry["registration_mm"] = stated.get("tre_mm", {})
-            picture = out / "scenes" / f"{folder.name}.png"
-            scene_picture(scene, estimate, entry, picture)
-            entries.append(entry)
-            shown.append(page_scene(scene, estimate, picture))
+        scenes = []
+        for each in judged:
+            scenes.append(each)
             progress()
+        entries = [each.entry for each in scenes]
         report = {
             "tumortrack": tumortrack.__version__,
             "units": "mm",
             "frame": "camera",
-            **(about or {}),
+            **about,
             "rule": RULE,
-            "rivals": SAID.rivals if rivals is not None else {"not_available": SAID.no_rivals},
             "summary": summarise(entries),
             "scenes": entries,
         }
-        write_page(report, shown, out / "index.html")
+        write_page(report, [each.shown for each in scenes], out / "index.html")
         write_json(out / "report.json", report)
     except BaseException:  # Ctrl-C, too: an unfinished report would block the next command
         clear(out)
