@@ -54,7 +54,7 @@ class SoakConfig:
         table: file for the Markdown tables, which are also printed.
     """
 
-    model: Positional[Path] = Path("runs/demo/model")
+    model: Positional[Path] = Path("runs/demo/case")
     case: Positional[Path] = Path("runs/demo/case")
     minutes: float = 60.0
     fps: float = 30.0
