@@ -17,7 +17,7 @@ from tumortrack.core.errors import InputError, NoPlan
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.mesh_query import contains
 from tumortrack.core.types import Mesh
-from tumortrack_resection.arms import body, kinematics, trajectory
+from tumortrack_resection.arms import body, kinematics, procedure, trajectory
 from tumortrack_resection.arms.cell import ArmCell, Blocked, PlanningGroup, blocked_between
 from tumortrack_resection.arms.config import Base, CellConfig
 from tumortrack_resection.arms.cutting import Leg, Outside, cut_level, turns_about
@@ -28,6 +28,7 @@ from tumortrack_resection.arms.trajectory import TrajectoryBuilder
 from tumortrack_resection.check import clearances
 from tumortrack_resection.checking import checked
 from tumortrack_resection.motions import CUTTER, HOLDER, JOINTS, WITHDRAW, Motions
+from tumortrack_resection.operation import ResectionProgress
 from tumortrack_resection.urdf import UrdfCell
 from tumortrack_resection.values import CUTS_TUMOR, Cut, ResectionConfig, ResectionPlan
 
@@ -534,18 +535,39 @@ def test_arms_begin_anew_in_the_middle_of_a_cut(cell, made, share):
 
 
 @pytest.mark.slow
-def test_a_short_instrument_leaves_an_organ_that_its_grip_touches():
+def test_a_short_instrument_leaves_an_organ_that_its_grip_touches(monkeypatch):
     config = msgspec.structs.replace(CONFIG, electrode_mm=35.0)
+    setting = [(OURS, config, body.cell_urdf(config))]
+    monkeypatch.setattr(procedure, "_setting", setting)
     plan, motions = plan_motions(seen(), OURS, config)
     for sweep in range(1, plan.sweeps + 1):
         middle, cell = middle_of(motions, sweep), ArmCell(config)
         there = seen(tuple(-8.0 * cell.tips(middle)[CUTTER][:3, 0]))
         met = ArmCell(config, there.organ).collisions(middle, (CUTTER, HOLDER))
         assert met == ("cutter/pencil", "organ")
-        again, anew = plan_motions(there, OURS, config, Start(middle, sweep), plan)
-        assert anew.stages[0].name == WITHDRAW
-        assert is_straight_back(cell, anew.stages[0].joints_rad)
-        assert np.array_equal(again.facets[:, :3], plan.facets[:, :3])
+        made = procedure.replan(there, middle, ResectionProgress(True, sweep - 1), plan)
+        assert made.motions.stages[0].name == WITHDRAW
+        assert is_straight_back(cell, made.motions.stages[0].joints_rad)
+        assert np.array_equal(made.plan.facets[:, :3], plan.facets[:, :3])
+
+
+@pytest.mark.slow
+def test_an_instrument_beside_the_cup_is_withdrawn():
+    """At work it may come nearer to that than the arms' clearance, so on its way back, too."""
+    config = ResectionConfig(tumor="tumor_1", margin_mm=2.0, most_facets=3)
+    plan, motions = plan_motions(seen(), config, CONFIG)
+    cell = ArmCell(CONFIG)
+    beside = [
+        (joints, stage.sweep)
+        for stage in motions.stages
+        for joints in stage.joints_rad[stage.cutting]
+        if cell.collisions(joints) == ("cutter/electrode", "holder/cup")
+    ]
+    joints, number = beside[len(beside) // 2]
+    assert cell.collisions(joints, (CUTTER, HOLDER)) is None
+    _, again = plan_motions(seen(), config, CONFIG, Start(joints, number), plan)
+    assert again.stages[0].name == WITHDRAW
+    assert is_straight_back(cell, again.stages[0].joints_rad)
 
 
 @pytest.mark.slow

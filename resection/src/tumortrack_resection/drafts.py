@@ -153,9 +153,12 @@ class Drafts:
         self._failures = 0
         self._last: Piece | None = None
         self._best: Draft | None = None
+        self._over = False
 
     def best(self) -> Draft:
         """Raises NoPlan: there is none any more."""
+        if self._over:
+            raise NoPlan("the facets of the earlier plan can be cut from no direction.")
         if self._best is None:
             self._best = self._published() if self._config.method == "published" else self._found()
         return self._best
@@ -187,11 +190,12 @@ class Drafts:
     def leave_out(self, sweeps: Sequence[int]) -> None:
         """The facets of these sweeps of the last draft can't be cut; nor can those like them."""
         assert self._last is not None
-        self._best = None
-        before, self._failures = self._lowest, self._failures + 1
+        self._best, before = None, self._lowest
         if self._like is not None:  # these facets are wanted: only from where they are cut changes
-            while self._lowest == before and self._failures < len(_LOWEST):
-                self._failures += 1
+            higher = [n for n, lowest in enumerate(_LOWEST) if lowest > before]
+            self._over, self._failures = not higher, min(higher, default=0)
+            return
+        self._failures += 1
         if self._lowest != before:  # from there another facet may be possible
             self._left_out = []
             return

@@ -135,9 +135,9 @@ class Located:
     @property
     def tumors(self) -> tuple[int, ...]:
         """Labels of the located tumors: those with points or a surface."""
-        labels = {*np.unique(self.labels).tolist()}
-        named = range(FIRST_TUMOR, np.iinfo(np.uint8).max + 1)
-        return tuple(n for n in named if n in labels or name_of(n) in self.meshes)
+        counts = np.bincount(self.labels, minlength=np.iinfo(np.uint8).max + 1)
+        named = range(FIRST_TUMOR, len(counts))
+        return tuple(n for n in named if counts[n] or name_of(n) in self.meshes)
 
 
 @dataclass(frozen=True, eq=False)

@@ -28,9 +28,7 @@ TOOLS = {CUTTER: ("bracket", "pencil", "electrode"), HOLDER: ("rod", "cup")}
 TOUCHES = {CUTTER: "cutter/electrode", HOLDER: "holder/cup"}  # what of a tool may touch the organ
 CollidingPair = tuple[str, str]
 _THICK_MM = 10.0  # of what a tool is made of, about its own axis
-_MOST_ROOM_MM = (
-    64.0  # that is asked for beyond all clearances: parts of an arm are no farther apart
-)
+_MOST_ROOM_MM = 64.0  # asked for beyond all clearances: parts of an arm are no farther apart
 
 
 class ArmCell:

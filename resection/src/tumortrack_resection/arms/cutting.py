@@ -164,8 +164,8 @@ def ways(group: PlanningGroup, cuts: Sequence[Cut], outside: Outside) -> list[Wa
 def _legs(
     group: PlanningGroup, cut: Cut, outside: Outside, reasons: list[Blocked]
 ) -> Iterator[tuple[Cut, Leg]]:
-    """Those whose first, middle and last pose are possible, each by itself, and from which the
-    instrument can be taken straight back; turned by much before by little."""
+    """Those whose first, middle and last pose are possible, each by itself, and from whose middle
+    the instrument can be taken straight back. Turns that are alike do not follow one another."""
     assert cut.axis is not None
     path_mm = resampled(cut.path_mm, _STEP_MM)
     places = path_mm[[len(path_mm) // 2, 0, -1]]

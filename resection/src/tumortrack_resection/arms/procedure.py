@@ -267,9 +267,12 @@ def _withdraw(builder: TrajectoryBuilder, outside: Outside, holding: bool) -> No
         leave = cutting.straight_back(tip, outside.back_mm(tip[:3, 3], tip[:3, 0]))
         free = (n for n, pose in enumerate(leave) if cutting.free(here, pose) is not None)
         leave = leave[: next(free, len(leave)) + 1]
-        # Whatever has moved towards it meanwhile: going straight back it comes no nearer.
-        group = PlanningGroup(ArmCell(here.cell.config), CUTTER, builder.joints_rad)
-        builder.go(CUTTER, follow(group, leave), here.cell.config.cutting_mm_s)
+        config, both = here.cell.config, (CUTTER, HOLDER)
+        group = PlanningGroup(ArmCell(config, here.cell.organ), CUTTER, builder.joints_rad, both)
+        if group.collides(group.current_rad) is not None:
+            # The organ has come too near to more than the electrode: going back makes it no nearer.
+            group = PlanningGroup(ArmCell(config), CUTTER, builder.joints_rad, both)
+        builder.go(CUTTER, follow(group, leave), config.cutting_mm_s)
         builder.close(WITHDRAW)
     pair = builder.cell.collisions(builder.joints_rad, (CUTTER,))
     if not holding and pair is not None and TOUCHES[HOLDER] in pair:

@@ -34,6 +34,7 @@ from tumortrack_resection.motions import (
     HOLDER,
     PULL,
     TAUT,
+    WITHDRAW,
     Joints,
     Motions,
     MotionStage,
@@ -197,16 +198,21 @@ def first_hit(motions: Motions, config: CellConfig, organ: Mesh, begun: bool = F
 
     Tested as densely as by the planner, with half of its clearances: between the tested places its
     motions come nearer than the whole ones. An electrode or cup may touch the organ only where its
-    tip is as slow as planned there. ``begun``: the arms do not come from home, so both tools may be
-    at the organ in the first stage too.
+    tip is as slow as planned there. An instrument that withdraws from an organ that has come too
+    near to more than its electrode is not tested against that. ``begun``: the arms do not come from
+    home, so both tools may be at the organ in the first stage too.
     """
     halves = {
         name: max(getattr(config, name) / 2, 0.5)
         for name in ("clearance_mm", "organ_clearance_mm", "contact_mm")
     }
-    cell = ArmCell(msgspec.structs.replace(config, **halves), organ)
+    config = msgspec.structs.replace(config, **halves)
+    with_organ = ArmCell(config, organ)
     slow_mm_s = _OVER * np.array([config.cutting_mm_s, config.grasping_mm_s])
     for number, stage in enumerate(motions.stages):
+        cell = with_organ
+        if stage.name == WITHDRAW and cell.collisions(stage.joints_rad[0], ARMS) is not None:
+            cell = ArmCell(config)
         touching = ARMS if begun and not number else _TOUCHING.get(stage.name, ARMS)
         # An arm is longest where its elbow, somewhere between the ends, is straightest.
         ends = stage.joints_rad.min(0), stage.joints_rad.max(0)
