@@ -112,7 +112,7 @@ def nearest_on_faces(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
 @njit(nogil=True, error_model="numpy")
 def _nearest(points, leaves, boxes, levels):  # type: ignore[no-untyped-def]
     """Box 0 is around all; in box n are the boxes 2 n + 1 and 2 n + 2, or leaf n - 2^levels + 1."""
-    places, first, last = np.empty((len(points), 3)), 2**levels - 1, 0
+    places, first, last = np.full((len(points), 3), np.nan), 2**levels - 1, 0
     open_boxes, away = np.empty(levels + 3, np.int64), np.empty(levels + 3)
     for n in range(len(points)):
         # Neighbouring points are often nearest to neighbouring triangles: first where the last was

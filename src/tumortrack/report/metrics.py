@@ -15,14 +15,10 @@ from jaxtyping import Float
 
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import Points, transform_points
-from tumortrack.core.mesh_query import contains, nearest_places, surface_samples
+from tumortrack.core.mesh_query import SPACING_MM, contains, nearest_places, surface_samples
 from tumortrack.core.types import Anatomy, CameraLabels, Mesh
 from tumortrack.imaging.raster import label_grid
 from tumortrack.simulate.scene_folder import Targets
-
-# Vertices are sampled too, so the maximum misses at most s^2 / (8 R) where a flat piece of size s
-# lies over a surface of radius R: 0.025 mm at R = 5 mm.
-SPACING_MM = 1.0
 
 
 @dataclass(frozen=True)

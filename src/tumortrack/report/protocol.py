@@ -82,15 +82,14 @@ def evaluate_model(
         "scenes_folder": str(scenes_dir),
         "grid": asked.grid,
         "seed": asked.seed,
-        **_said(rivals),
     }
     processes = min(asked.processes, os.cpu_count() or 1, len(folders) // _SCENES)
     if folder is None or processes < 2:
         locate = partial(tracker.locate, grid=asked.grid, seed=asked.seed)
-        return _report(map(partial(_judged, locate, rivals, out), folders), out, progress, about)
+        return evaluate_scenes(locate, scenes_dir, out, progress, about, rivals)
     with ProcessPoolExecutor(processes, get_context("spawn"), _begin, (folder, asked, out)) as pool:
         try:
-            return _report(_each(pool, folders), out, progress, about)
+            return _report(_each(pool, folders), out, progress, {**about, **_said(rivals)})
         except BaseException:  # Ctrl-C, too
             pool.shutdown(cancel_futures=True)
             raise
