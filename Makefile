@@ -17,7 +17,7 @@ define INSTALL
 endef
 
 .DEFAULT_GOAL := help
-.PHONY: help setup debian kernels demo test test-all quick pythons pytest test-hard check attack fuzz crash replay bench soak wheel lock licences audit results real world sequences plans pull pulls trust misses evidence rehearsal population site pictures clean
+.PHONY: help setup debian kernels demo test test-all quick pythons pytest test-hard check attack fuzz crash replay fingerprint figures bench soak wheel lock licences audit results real world sequences plans pull pulls trust misses evidence rehearsal population site pictures clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 10
@@ -52,12 +52,13 @@ $(TOOLS): requirements/tools.txt
 demo: $(TRACKER)  ## install the tracker (without PyTorch), then CT -> tumors located in unseen deformed scenes (ARGS="--scenes 2": two of them)
 	$(BIN)/tumortrack demo $(ARGS)
 
-check: setup  ## lint, types, import order, licences
+check: setup  ## lint, types, import order, licences, figures in the pages
 	$(BIN)/ruff check src devices occupancy resection lab experiment tests examples tools notebooks conftest.py
 	$(BIN)/ruff format --check src devices occupancy resection lab experiment tests examples tools notebooks conftest.py
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 	$(BIN)/python tools/dependencies.py licences
+	$(BIN)/python tools/figures.py --check
 
 debian:  ## install what tests need from Debian (Chromium, Fast DDS)
 	tools/debian.sh
@@ -91,8 +92,14 @@ fuzz: setup  ## a million damaged inputs over all readers (20 minutes; ARGS="--i
 crash: setup  ## kill -9 at random moments, shortages, two at once (ARGS="--times 20 --only NAME ...")
 	$(BIN)/python tests/support/crashes.py runs/crashes $(ARGS)
 
-replay: setup  ## has any number changed since runs/replay.json? Without that file: record it (4 minutes; ARGS=--quick)
-	$(BIN)/python tools/replay.py either runs/replay.json $(ARGS)
+replay: setup  ## has any of 500 answers changed since runs/replay.json, by how many mm? Without that file: record them
+	$(BIN)/python tools/replay.py either runs/replay.json
+
+fingerprint: setup  ## the method's version, by 30 answers: recorded again where it has changed (a minute)
+	$(BIN)/python tools/replay.py fingerprint
+
+figures: setup  ## write the measured figures of the pages from docs/data; fails on tables of another method
+	$(BIN)/python tools/figures.py
 
 test-hard: setup  ## tests on narrow vector units beside two busy processes (ARGS=tests/...)
 	@$(BIN)/python -c 'while True: pass' & one=$$!; $(BIN)/python -c 'while True: pass' & two=$$!; \

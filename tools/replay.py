@@ -1,113 +1,157 @@
-# ruff: noqa: E402
-"""Has any number changed? Digests of scenes, weights, estimates, plans and help texts.
+"""Has any answer changed, by how many mm?
 
-python tools/replay.py record FILE.json     before a change of the code
-python tools/replay.py compare FILE.json    after it, on the same machine; exit status 1 where any
-                                            digest differs
-
-Timings are left out, as are versions and the hashes of files that hold timings. The tetrahedra that
-the twin's solver needs are never twice alike: one solved state is kept in replay-state/ beside
-FILE.json, and its scenes are made from that. Remove it where the phantom's surfaces have changed.
+python tools/replay.py either FILE.json     record some 500 answers, or compare with those in FILE:
+                                            the largest difference of a place, of a bound, of other
+                                            figures, and verdicts that changed; exit status 1 where
+                                            anything differs
+python tools/replay.py fingerprint          the 30 answers that come with the package, whose hash is
+                                            the method's version: kept while each place lies within
+                                            0.05 mm of what is recorded, else recorded again
+python tools/replay.py check                the same, but exit status 1 instead of a new record
 """
 
 from __future__ import annotations
 
 import os
 
-# Sums depend on the number of threads, help texts on the terminal.
-THREADS = ("OMP", "OPENBLAS", "MKL", "NUMBA")
-os.environ.update({f"{name}_NUM_THREADS": "1" for name in THREADS})
+# Sums depend on the number of threads.
+os.environ.update({f"{name}_NUM_THREADS": "1" for name in ("OMP", "OPENBLAS", "MKL", "NUMBA")})
 os.environ.update(COLUMNS="100", NO_COLOR="1", TERM="dumb", CUDA_VISIBLE_DEVICES="")
 
 import argparse
-import hashlib
 import json
+import math
 import platform
 import sys
 import tempfile
 import time
+from collections import Counter
 from collections.abc import Iterable
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
-from replay_entries import SECTIONS, twin, under  # imports the package: after the settings
+from answers import Answer, Numbers, answers, network, plan
 
-TRAINED = {"quick", "paper"}
-# Of JSON: timings, and hashes of files that hold timings.
-VOLATILE = {"timings", "training_s", "seconds", "tumortrack", "model_sha256", "inputs"}
-
-
-def digest(value: object) -> str:
-    """Of an array with its type and shape, of bytes, or of what JSON can say."""
-    if isinstance(value, torch.Tensor):
-        value = value.numpy(force=True)
-    if isinstance(value, np.ndarray):
-        value = f"{value.dtype} {value.shape} ".encode() + np.ascontiguousarray(value).tobytes()
-    if not isinstance(value, bytes):
-        value = json.dumps(steady(value), sort_keys=True).encode()
-    return hashlib.sha256(value).hexdigest()
+ROOT = Path(__file__).parents[1]
+KEPT = ROOT / "src/tumortrack/tracking/answers.json"
+SAME_MM = 0.05  # far above what processors differ by, far below what anybody measures
+SAME_SHARE = 0.02  # of a figure that margins have a limit for
+SAME_INPUT_MM = 0.01
+SHORT = (3, 4, 2, 1)  # 15 clouds, 4 images, 8 with evidence, 3 frames
 
 
-def steady(value: Any) -> Any:
-    """JSON without what changes from run to run; a manifest's table of files without hashes."""
-    if isinstance(value, dict):
-        kept = {key: steady(inner) for key, inner in value.items() if key not in VOLATILE}
-        return {**kept, "files": sorted(kept["files"])} if "files" in kept else kept
-    return [steady(inner) for inner in value] if isinstance(value, list | tuple) else value
+def asked(some: Iterable[Answer]) -> dict[str, Numbers]:
+    """Their numbers, with progress."""
+    made, start = dict[str, Numbers](), time.perf_counter()
+    for name, ask in some:
+        made[name] = ask()
+        rate = len(made) / (time.perf_counter() - start)
+        if sys.stderr.isatty():
+            print(f"\r{len(made)} answers, {rate:.1f} a second: {name}   ", end="", file=sys.stderr)
+    print(f"{len(made)} answers in {time.perf_counter() - start:.0f} s", flush=True)
+    return made
 
 
-def digests(sections: Iterable[str], states: Path, recording: bool) -> dict[str, str]:
-    entries: dict[str, str] = {}
-    made_by = {**SECTIONS, "twin": partial(twin, states, recording)}
-    with tempfile.TemporaryDirectory() as work:
-        os.chdir(work)  # what is written names folders: the same ones every time
-        for name in sections:
-            start = time.perf_counter()
-            made = {key: digest(value) for key, value in under(name, made_by[name]())}
-            entries |= made
-            print(f"{name}: {len(made)} in {time.perf_counter() - start:.0f} s", flush=True)
-        os.chdir("/")
-    return entries
+def everything() -> Iterable[Answer]:
+    yield from answers(40, 100, 30, 4)
+    yield "plan", plan
+    yield "network", network
 
 
-def compare(entries: dict[str, str], recorded: dict[str, str]) -> int:
-    """Exit status; only sections that ran are compared."""
-    ran = {key.split("/")[0] for key in entries}
-    known = {key: value for key, value in recorded.items() if key.split("/")[0] in ran}
-    differing = sorted(key for key in entries | known if entries.get(key) != known.get(key))
-    for key in differing:
-        print(f"{'new' if key not in known else 'differs' if key in entries else 'missing'}: {key}")
-    equal = len(entries | known) - len(differing)
-    print(f"{equal} entries equal, {len(differing)} differ")
-    return 1 if differing else 0
+def farthest_mm(made: Numbers, known: Numbers) -> float:
+    """Between corresponding places; infinite where one has another number of them."""
+    places, before = (np.reshape(each.get("places_mm", ()), (-1, 3)) for each in (made, known))
+    if places.shape != before.shape:
+        return math.inf
+    return float(np.linalg.norm(places - before, axis=1).max(initial=0.0))
+
+
+def largest(made: Numbers, known: Numbers, key: str, share: bool) -> float:
+    """Difference of values by name; ``share``: of the larger one."""
+    here, there = made.get(key, {}), known.get(key, {})
+    if here.keys() != there.keys():
+        return math.inf
+    pairs = ((here[name], there[name]) for name in here)
+    off = (abs(a - b) / (max(abs(a), abs(b), 1e-6) if share else 1.0) for a, b in pairs)
+    return max(off, default=0.0)
+
+
+def compare(made: dict[str, Numbers], known: dict[str, Numbers]) -> bool:
+    """Say what differs; whether nothing does."""
+    both = [name for name in made if name in known]
+    print(f"{len(both)} answers compared, {len(made.keys() ^ known.keys())} without a counterpart")
+    moved = [n for n in both if largest(made[n], known[n], "input_mm", False) > SAME_INPUT_MM]
+    if moved:
+        print(f"the question of {len(moved)} differs, so their answers may: {moved[0]}, ...")
+    worst = dict[str, float]()
+    for what, measure in (
+        ("places, mm", farthest_mm),
+        ("bounds, mm", lambda a, b: largest(a, b, "bounds_mm", False)),
+        ("other figures, share", lambda a, b: largest(a, b, "figures", True)),
+    ):
+        off = {name: measure(made[name], known[name]) for name in both}
+        off = {name: value for name, value in off.items() if math.isfinite(value)}
+        where = max(off, key=lambda name: off[name], default="")
+        worst[what] = off.get(where, 0.0)
+        over = sum(value > SAME_MM for value in off.values())
+        print(f"{what}: at most {worst[what]:.3g} ({where}); over {SAME_MM:g} in {over}")
+    pairs = Counter((known[n].get("verdict"), made[n].get("verdict")) for n in both)
+    verdicts = {pair: count for pair, count in pairs.items() if pair[0] != pair[1]}
+    for (before, now), count in sorted(verdicts.items(), key=lambda pair: -pair[1]):
+        print(f"verdicts: {count} times {before} -> {now}")
+    return not verdicts and not any(worst.values()) and made.keys() == known.keys()
+
+
+def stands(made: dict[str, Numbers], known: dict[str, Numbers]) -> bool:
+    """Whether the recorded answers are still the method's."""
+    return made.keys() == known.keys() and all(
+        farthest_mm(made[name], known[name]) <= SAME_MM
+        and largest(made[name], known[name], "figures", True) <= SAME_SHARE
+        for name in made
+    )
+
+
+def written(path: Path, answers: dict[str, Numbers], **about: Any) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    lines = ",\n".join(f" {json.dumps(name)}: {json.dumps(each)}" for name, each in answers.items())
+    head = "".join(f"{json.dumps(name)}: {json.dumps(value)},\n" for name, value in about.items())
+    path.write_text(f'{{{head}"answers": {{\n{lines}\n}}}}\n')
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description="Has any number changed?")
-    parser.add_argument("action", choices=("record", "compare", "either"))
-    parser.add_argument("file", type=Path)
-    parser.add_argument("--quick", action="store_true", help="without the presets quick and paper")
-    names = [*SECTIONS, "twin"]
-    parser.add_argument("--only", nargs="+", choices=names, default=names)
+    parser = argparse.ArgumentParser(description="Has any answer changed, by how many mm?")
+    parser.add_argument("action", choices=("record", "compare", "either", "fingerprint", "check"))
+    parser.add_argument("file", type=Path, nargs="?", default=KEPT)
     given = parser.parse_args()
     file, action = given.file.absolute(), given.action
-    recording = action == "record" or (action == "either" and not file.exists())
-    print(f"{'recording' if recording else 'comparing with'} {file}", flush=True)
-    recorded = {} if recording else json.loads(file.read_bytes())
-    versions = f"{platform.python_version()}, torch {torch.__version__}, numpy {np.__version__}"
-    machine = f"{platform.node()}, {platform.machine()}, python {versions}"
-    if not recording and recorded["machine"] != machine:
-        print(f"ANOTHER MACHINE OR LIBRARY: {recorded['machine']}; this is {machine}", flush=True)
-    chosen = [name for name in given.only if not (given.quick and name in TRAINED)]
-    entries = digests(chosen, file.parent / "replay-state", recording)
-    if not recording:
-        return compare(entries, recorded["entries"])
-    file.parent.mkdir(parents=True, exist_ok=True)
-    file.write_text(json.dumps({"machine": machine, "entries": entries}, indent=1))
-    print(f"{len(entries)} entries recorded")
+    short = action in ("fingerprint", "check")
+    recording = action == "record" or not file.exists()
+    with tempfile.TemporaryDirectory() as work:
+        os.chdir(work)  # what is written names folders: the same ones every time
+        made = asked(answers(*SHORT) if short else everything())
+        os.chdir("/")
+    machine = f"{platform.machine()}, python {platform.python_version()}, numpy {np.__version__}"
+    if recording:
+        written(file, made, **({} if short else {"machine": machine}))
+        print(f"recorded in {file}")
+        return 0
+    stored = json.loads(file.read_bytes())
+    same = compare(made, stored["answers"])
+    if not short:
+        if stored["machine"] != machine:
+            print(f"ANOTHER MACHINE OR LIBRARY: {stored['machine']}; this is {machine}")
+        return 0 if same else 1
+    if stands(made, stored["answers"]):
+        print("the fingerprint stands")
+        return 0
+    if action == "check":
+        print(
+            "another method: make fingerprint records it; tables of the former one go, or are made again"
+        )
+        return 1
+    written(file, made)
+    print(f"recorded again in {file}: tables of the former method go, or are made again")
     return 0
 
 

@@ -8,7 +8,6 @@ and shows a table that is a CSV file in docs/data/ where a link to it is a parag
 from __future__ import annotations
 
 import argparse
-import csv
 import posixpath
 import re
 import warnings
@@ -21,6 +20,7 @@ import tyro
 from mkdocs.structure.files import File, Files
 
 from tumortrack.cli.main import _commands as all_commands
+from tumortrack_lab.study.document import MeasuredTable
 
 ROOT = Path(__file__).parents[1]
 TAKEN_IN = {"CONTRIBUTING.md": "contributing.md", "CHANGELOG.md": "changes.md"}
@@ -64,8 +64,8 @@ _DATA_LINK = re.compile(r"\[([^\]]+)\]\(((?:\.\./)*data/[\w.-]+\.csv)\)")
 
 def data_table(path: Path, text: str, link: str) -> str:
     """A CSV file as a table that opens, and that site.js sorts by the column clicked."""
-    with path.open(encoding="utf-8", newline="") as file:
-        header, *rows = csv.reader(file)
+    table = MeasuredTable.read(path)
+    header, rows = table.header, table.rows
     head = "".join(f'<th scope="col"><button>{escape(name)}</button></th>' for name in header)
     body = "\n".join(
         "<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in row) + "</tr>" for row in rows
@@ -74,6 +74,7 @@ def data_table(path: Path, text: str, link: str) -> str:
         f"<code>{escape(part)}</code>" if odd % 2 else escape(part)
         for odd, part in enumerate(text.split("`"))
     )
+    made = escape(table.caption) if table.about else ""
     figures = any(cell[:1].isdigit() for row in rows for cell in row)  # words can be searched for
     return f"""<details class="data"{" data-search-exclude" * figures}><summary>{summary}</summary>
 <div class="data" tabindex="0"><table class="data">
@@ -81,7 +82,7 @@ def data_table(path: Path, text: str, link: str) -> str:
 <tbody>
 {body}
 </tbody></table></div>
-<p><a href="{escape(link)}" download>{escape(path.name)}</a></p>
+<p>{made} <a href="{escape(link)}" download>{escape(path.name)}</a></p>
 </details>"""
 
 

@@ -23,16 +23,15 @@ import pandas as pd
 import tyro
 
 import tumortrack as tt
-import tumortrack_lab
 from tumortrack.cli.console import model_folder, say
 from tumortrack.core import store
 from tumortrack.core.errors import InputError
 from tumortrack.core.process import available_cores
 from tumortrack.simulate.scene_folder import read_scene
+from tumortrack.tracking.fingerprint import fingerprint
 from tumortrack.tracking.tracker import Tracker
 from tumortrack_lab.study import evidence, evidence_tables, scripts
-from tumortrack_lab.study.document import ReportWriter, table_of
-from tumortrack_lab.study.methods import code_sha256
+from tumortrack_lab.study.document import table_of
 from tumortrack_lab.world.made import scenes_of_kidney
 
 _BLOCK = "evidence"
@@ -43,7 +42,6 @@ _KINDS = (
     "1 outline", "12 touches, chosen, and 1 outline", "held tumor", "40 % hidden: none",
     "40 % hidden: 6 touches, chosen",
 )  # fmt: skip
-_METHOD = "models", "registration", "tracking"  # packages whose code an answer depends on
 
 
 @dataclass(frozen=True)
@@ -78,9 +76,7 @@ class Organ(NamedTuple):
 
 def main(options: Options) -> None:
     """Make what is missing, then measure."""
-    writer = ReportWriter(options.document or Path(), scripts.make_command("evidence"))
-    if options.document is not None:
-        writer.check([_BLOCK])
+    writer = scripts.begun("evidence", options.document)
     first = 1000 * options.seed if options.first is None else options.first
     numbers = range(first, first + options.kidneys)
     options.out.mkdir(parents=True, exist_ok=True)
@@ -104,15 +100,14 @@ def main(options: Options) -> None:
     for _, words, table in blocks:
         print(words, table_of(table), sep="\n\n", end="\n\n")
     if options.document is not None:
-        _, words, errors = blocks[0]
+        _, _, errors = blocks[0]
         some = errors.loc[errors.kind.isin(_KINDS), _SHOWN]
-        shown = f"{words}\n\n{table_of(some)}"
-        links = [writer.data(f"{_BLOCK}-{file}", table, words) for file, words, table in blocks]
         evidence_tables.draw(next(iter(frames.values())), writer.image(_BLOCK))
-        shown += f"\n\n![Errors against the number of touches](images/{_BLOCK}.png)"
         each = pd.concat([_by_family(name, rows) for name, rows in frames.items()])
-        links.append(writer.data(_BLOCK, each, "By family of physics"))
-        writer.write({_BLOCK: "\n\n".join([f"`{writer.command}`", shown, *links])})
+        tables = {f"{_BLOCK}-{file}": table for file, _, table in blocks}
+        scenes = sum(len(organ.scenes) for organ in (*organs, *twins))
+        sample = f"{len(organs) + len(twins)} organs, {scenes} scenes"
+        writer.tables({_BLOCK: some, f"{_BLOCK}-families": each, **tables}, sample=sample)
 
 
 def _tables(name: str, rows: pd.DataFrame) -> Iterable[tuple[str, str, pd.DataFrame]]:
@@ -154,11 +149,8 @@ def _next(cases: list[Path]) -> list[Path]:
 
 
 def _rows(folder: Path, states: int) -> Path:
-    """Rows are of one state of the code, and of so many states."""
-    tracker, lab = (Path(package.__path__[0]) for package in (tt, tumortrack_lab))
-    code = [path for name in _METHOD for path in (tracker / name).glob("*.py")]
-    code += [tracker / "core" / "evidence.py", *lab.glob("*/evidence.py")]
-    return folder / f"evidence-{code_sha256(code)[:8]}-{states}.jsonl"
+    """Rows are of one version of the method, and of so many states."""
+    return folder / f"evidence-{fingerprint()}-{states}.jsonl"
 
 
 def _measure(organ: Organ) -> int:

@@ -24,7 +24,7 @@ from tumortrack.core import store
 from tumortrack.core.config import to_builtins
 from tumortrack.core.process import available_cores
 from tumortrack.simulate.scene_folder import read_scene
-from tumortrack.tracking.margins import METHOD
+from tumortrack.tracking.fingerprint import fingerprint
 from tumortrack.tracking.tracker import Tracker
 from tumortrack_lab.margins import misses
 from tumortrack_lab.study import scripts
@@ -55,7 +55,7 @@ class Options:
 
 def main(options: Options) -> None:
     """Make what is missing, then fit."""
-    writer = scripts.begun("misses", options.document, _BLOCK)
+    writer = scripts.begun("misses", options.document)
     numbers = range(options.seed * 1000, options.seed * 1000 + options.kidneys)
     options.out.mkdir(parents=True, exist_ok=True)
     with ProcessPoolExecutor(available_cores(), get_context("spawn")) as pool:
@@ -70,20 +70,28 @@ def main(options: Options) -> None:
     )
     asked = ({"part": "kidney", "by": "family"}, {"part": "kidney"}, {"part": "family"})
     all_three = [misses.left_out(rows, **each).astype(object).fillna(NOTHING) for each in asked]
-    short, tables = table_of(all_three[0]), all_three[1:]
-    print(short, *map(table_of, tables), sep="\n\n")
+    short, tables = all_three[0], all_three[1:]
+    print(*map(table_of, all_three), sep="\n\n")
     named = [table.rename(columns={table.columns[0]: "left out"}) for table in tables]
-    link = writer.data(_BLOCK, pd.concat(named), "Each kidney and each family left out")
-    writer.block(_BLOCK, short, link)
+    sample = f"{len(rows)} answers of {len(numbers)} random kidneys"
+    written = {_BLOCK: short, f"{_BLOCK}-left-out": pd.concat(named)}
+    writer.tables(written, sample=sample, interval=f"over 5 mm {_over(short)} of good")
     about = {"seed": options.seed, "kidneys": len(numbers), "states": options.states}
     learned = misses.learned(rows, about)
     if options.write is not None:
         store.write_json(options.write, to_builtins(learned))
 
 
+def _over(short: pd.DataFrame) -> str:
+    """Of all good answers."""
+    of_all = short.iloc[-1]
+    good = round(int(of_all["answers"]) * int(of_all["good %"]) / 100)
+    return share_words(int(of_all["over 5 mm"]), good)
+
+
 def _rows_path(out: Path, number: int, states: int) -> Path:
     """Rows are of one version of the method, and of so many states."""
-    return out / str(number) / f"misses-{METHOD}-{states}.jsonl"
+    return out / str(number) / f"misses-{fingerprint()}-{states}.jsonl"
 
 
 def _kidney(out: Path, number: int, states: int) -> None:

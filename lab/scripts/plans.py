@@ -77,7 +77,7 @@ class Subject(NamedTuple):
 
 def main(options: Options) -> None:
     """Make missing rows, then the table."""
-    writer = scripts.begun("plans", options.document, "plans")
+    writer = scripts.begun("plans", options.document)
     options.out.mkdir(parents=True, exist_ok=True)
     rows = []
     for subject in _subjects(options):
@@ -97,9 +97,11 @@ def main(options: Options) -> None:
         (row["group"], row["refused"][:70]) for row in rows if row.get("refused")
     ).items():
         say(f"{count} x {group}: {why}")
-    text = table_of(table(frame), 2)
-    print(text)
-    writer.block("plans", text)
+    shown = table(frame)
+    print(table_of(shown))
+    planned = frame.refused.isna().sum() if "refused" in frame else len(frame)
+    share = share_words(int(planned), len(frame))
+    writer.tables({"plans": shown}, sample=f"{len(frame)} plans", interval=f"possible {share}")
 
 
 def _subjects(options: Options) -> Iterator[Subject]:

@@ -30,7 +30,7 @@ from tumortrack.report import drawing
 from tumortrack_lab.fleet.results import LOOK, PATIENTS, PICTURES, SCENES
 from tumortrack_lab.real.kidneys import SET_ASIDE, WHERE
 from tumortrack_lab.study import scripts
-from tumortrack_lab.study.document import ReportWriter, beside_rigid, spread_mm, table_of
+from tumortrack_lab.study.document import ReportWriter, beside_rigid, share_words, spread_mm
 from tumortrack_lab.study.trust import BANDS, band_of
 
 DEVELOPMENT = (0, 2, 3)
@@ -84,9 +84,9 @@ def main(options: Options) -> None:
         write_atomically(options.list, "\n".join([head, *lines, ""]).encode())
         say(f"{len(lines)} kidneys listed in {options.list}.")
     if options.fleet is not None:
-        writer = scripts.begun("population", options.document, BLOCK)
-        writer.write({BLOCK: block(options.fleet, writer)})
-        say(f"block written to {options.document}.")
+        writer = scripts.begun("population", options.document)
+        fill(options.fleet, writer)
+        say(f"written to {options.document}.")
 
 
 def label_maps(data: Path) -> list[Path]:
@@ -101,8 +101,8 @@ def label_maps(data: Path) -> list[Path]:
     return paths
 
 
-def block(fleet: Path, writer: ReportWriter) -> str:
-    """The document's block; tables and plot go beside it."""
+def fill(fleet: Path, writer: ReportWriter) -> None:
+    """The document's tables and pictures."""
     people, scenes = (pd.read_parquet(fleet / name) for name in (PATIENTS, SCENES))
     looks = pd.read_csv(fleet / LOOK)
     done = people[people.state == "done"]
@@ -114,12 +114,10 @@ def block(fleet: Path, writer: ReportWriter) -> str:
     draw(scenes, writer.image(BLOCK))
     draw_worst(scenes, fleet / PICTURES, writer.image(f"{BLOCK}_worst"))
     rows, alone = grouped(scenes), len(done[~done.patient.isin(looks.patient)])
-    summary = (
-        f"{len(people)} patients, {len(done)} done, {alone} with nothing for a person to look at. "
-        f"{int(done.scenes.sum())} scenes; {int(done.lost.sum())} more could not be made. Within "
-        f"the largest miss of a patient's margin states: {done.within_largest.mean():.0%} of good "
-        "answers; expected of one more among n alike, n / (n + 1): "
-        f"{done.holds_for.mean():.0%}.{' This run has no rigid fits.' if without else ''}"
+    sample = (
+        f"{len(people)} patients, {len(done)} done, {alone} with nothing for a person to look at, "
+        f"{int(done.scenes.sum())} scenes, {int(done.lost.sum())} more could not be made"
+        f"{', without rigid fits' if without else ''}"
     )
     short = rows[rows.by.isin(["all", "state"])]
     more = {"over 5 mm": "over 5 mm", "of good": "good within radius %"}
@@ -127,12 +125,11 @@ def block(fleet: Path, writer: ReportWriter) -> str:
     shown = short[["value", "scenes", "good %"]].assign(**beside_rigid(short))
     short = shown.join(short[[*more]].rename(columns=more))
     short = short.drop(columns=["rigid fit"] if without else [])
-    links = [
-        writer.data(BLOCK, rows, "By state, hidden surface, tumor and slices"),
-        writer.data(f"{BLOCK}-wrong", wrong(scenes), "Good answers that are over 5 mm off"),
-        writer.data(f"{BLOCK}-look", looks, "What a person should look at"),
-    ]
-    return "\n\n".join([f"`{writer.command}`: {summary}", table_of(short), *links])
+    good = scenes[scenes.verdict == "good"]
+    share = share_words(int(good.over_5_mm.sum()), len(good)) if len(good) else "none"
+    tables = {"": short, "-groups": rows, "-wrong": wrong(scenes), "-look": looks}
+    tables = {f"{BLOCK}{name}": table for name, table in tables.items()}
+    writer.tables(tables, sample=sample, interval=f"over 5 mm {share} of good")
 
 
 def grouped(scenes: pd.DataFrame) -> pd.DataFrame:

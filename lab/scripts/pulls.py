@@ -41,7 +41,7 @@ class Options:
 
 def main(options: Options) -> None:
     """Make missing rows, then the table."""
-    writer = scripts.begun("pulls", options.document, "pulls")
+    writer = scripts.begun("pulls", options.document)
     rows, lost = [], 0
     for number in range(options.count):
         for case in options.cases:
@@ -57,10 +57,10 @@ def main(options: Options) -> None:
             known = store.read_json(path)
             rows += [{"case": sha256[:8], **row} for row in known["rows"]]
             lost += not known["rows"]
-    text = f"Scenes: {options.count * len(options.cases)}, without a plan: {lost}.\n\n"
-    text += table_of(pulls.table(rows), 3)
-    print(text)
-    writer.block("pulls", text)
+    shown = pulls.table(rows)
+    sample = f"{options.count * len(options.cases)} scenes, {lost} without a plan"
+    print(sample, table_of(shown), sep="\n\n")
+    writer.tables({"pulls": shown}, sample=sample)
 
 
 @cache

@@ -31,7 +31,7 @@ from tumortrack.tracking.tracker import Tracker
 from tumortrack_lab.real import kidneys, lungs, silicone
 from tumortrack_lab.real.judging import DRAGGED, by_tumor, judge, scene_of
 from tumortrack_lab.study import scripts
-from tumortrack_lab.study.document import ReportWriter, beside_rigid, spread_mm, table_of
+from tumortrack_lab.study.document import ReportWriter, beside_rigid, spread_mm
 from tumortrack_lab.study.methods import named_folders
 
 Part = Literal["kidneys", "lungs", "silicone", "slab"]
@@ -87,8 +87,8 @@ class Organ:
 
 
 def main(options: Options) -> None:
-    """The parts, and after each its block."""
-    writer = options.begin("real", *(f"real-{part}" for part in options.parts))
+    """The parts, and after each its tables."""
+    writer = options.begin("real")
     rows = kidneys.frozen()
     if unknown := set(options.kidneys) - {row["case"] for row in rows}:
         raise InputError(f"--kidneys {min(unknown)} is not in the list; see docs/real.md.")
@@ -106,12 +106,11 @@ def main(options: Options) -> None:
         "slab": lambda: slab_block(options, writer),
     }
     for part in options.parts:
-        text = made[part]()
-        writer.write({f"real-{part}": f"{text}\n\n`{writer.command}`"})
-        say(f"{part}: block written to {options.document}")
+        made[part]()
+        say(f"{part}: written to {options.document}")
 
 
-def kidneys_block(listed: list[dict], organs: list[Organ], writer: ReportWriter) -> str:
+def kidneys_block(listed: list[dict], organs: list[Organ], writer: ReportWriter) -> None:
     """Errors in dragged, squeezed and bent kidneys: by kind, and by kidney."""
     about = {
         kidneys.name_of(row["case"]): {
@@ -129,7 +128,7 @@ def kidneys_block(listed: list[dict], organs: list[Organ], writer: ReportWriter)
         for kind in KINDS
         if (mine := _of(kind, every))
     ]
-    return _block(writer, "real-kidneys", by_kidney + by_kind, by_kind, "By kidney and by kind")
+    _tables(writer, "real-kidneys", by_kidney + by_kind, by_kind)
 
 
 def _of(kind: str, rows: list[dict]) -> list[dict]:
@@ -151,7 +150,7 @@ def _dragged(organ: Organ) -> list[dict]:
     return scripts.kept(organ.options.out / "dragged" / f"{organ.name}.json", about, measure)
 
 
-def lungs_block(organs: list[Organ], options: Options, writer: ReportWriter) -> str:
+def lungs_block(organs: list[Organ], options: Options, writer: ReportWriter) -> None:
     """Every organ at a place of every patient's lung."""
     pairs = {
         patient: lungs.read_landmarks(lungs.landmark_file(options.data, patient), patient)
@@ -191,9 +190,9 @@ def lungs_block(organs: list[Organ], options: Options, writer: ReportWriter) -> 
         if (mine := [row for row in some if row["variant"] == name])
     ]
     short = [line for line in lines if line["by"] == "tumors"]
-    text = _block(writer, "real-lungs", lines, short, "By kind of tumor, organ and patient")
-    fields = pd.DataFrame(fields).round(2)
-    return f"{text}\n\n{writer.data('real-lungs-fields', fields, 'The displacement fields')}"
+    _tables(writer, "real-lungs", lines, short)
+    sample = f"{len(pairs)} patients"
+    writer.tables({"real-lungs-fields": pd.DataFrame(fields).round(2)}, sample=sample)
 
 
 def _breathed(organ: Organ, patient: int, field, options: Options) -> list[dict]:
@@ -253,27 +252,27 @@ def summary(rows: list[dict]) -> dict[str, Any]:
     }
 
 
-def _block(writer: ReportWriter, name: str, rows: list[dict], short: list[dict], what: str) -> str:
-    """The short table, and the link to all rows."""
+def _tables(writer: ReportWriter, name: str, rows: list[dict], short: list[dict]) -> None:
+    """The short table, and all rows."""
     given = pd.DataFrame(short).rename(columns={"kind": "tumors", "of": "tumors"})
     head = given.columns.intersection(["tumors", "deformation", "scenes", "good"])
     shown = given[head].assign(**beside_rigid(given))
-    return f"{table_of(shown, 2)}\n\n{writer.data(name, pd.DataFrame(rows), what)}"
+    tables = {name: shown, f"{name}-groups": pd.DataFrame(rows)}
+    writer.tables(tables, sample=f"{int(given.scenes.sum())} scenes")
 
 
-def silicone_block(options: Options, writer: ReportWriter) -> str:
+def silicone_block(options: Options, writer: ReportWriter) -> None:
     """The bent casts: distances of the scan to the estimated surface, seen and unseen."""
     data = options.data
     top = read_mesh(silicone.file(data, silicone.REST))
     files = {cast: silicone.file(data, name) for cast, name in silicone.BENT.items()}
     scans = {cast: partial(read_mesh, path) for cast, path in files.items()}
     rows = _bent("silicone", (top, silicone.UNDERSIDE_MM), files, scans, options)
-    return writer.data(
-        "real-silicone", pd.DataFrame(_bent_rows("cast", rows)).round(1), "By cast and view"
-    )
+    table = pd.DataFrame(_bent_rows("cast", rows)).round(1)
+    writer.tables({"real-silicone": table}, sample=f"{len(silicone.BENT)} casts")
 
 
-def slab_block(options: Options, writer: ReportWriter) -> str:
+def slab_block(options: Options, writer: ReportWriter) -> None:
     """The bent slab: the same, and distances of the curve on it to its trace."""
     data = options.data
     files = {what: silicone.file(data, name) for what, name in silicone.SLAB.items()}
@@ -289,7 +288,7 @@ def slab_block(options: Options, writer: ReportWriter) -> str:
         for what, of in {"surface": "", "curve": "curve_"}.items()
         for line in _bent_rows("view", rows, of)
     ]
-    return writer.data("real-slab", pd.DataFrame(lines).round(1), "Surface and curve by view")
+    writer.tables({"real-slab": pd.DataFrame(lines).round(1)}, sample="1 slab")
 
 
 def _bent(

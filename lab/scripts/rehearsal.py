@@ -49,7 +49,6 @@ def main(options: Options) -> None:
     """Rehearse, and say what was found."""
     words = f"{options.case.name} MODEL OUT --document docs/bench.md"
     writer = ReportWriter(options.document, f"make rehearsal ARGS='{words}'")
-    writer.check([BLOCK])
     rehearsal = Rehearsal(options.case, options.model, options.out)
     rows, reports = rehearsal.run()
     frames = {"errors": pd.DataFrame(rows), "states": tables.evaluation_rows(reports)}
@@ -61,9 +60,7 @@ def main(options: Options) -> None:
     if options.document is not None:
         image = writer.image("bench_rehearsal")
         tables.picture(rehearsal, image)
-        links = [writer.data(f"rehearsal-{name}", frames[name], WORDS[name]) for name in frames]
-        picture = writer.link(image, "a state before the camera, in the scanner, and compared")
-        writer.block(BLOCK, *links, picture)
+        writer.tables({f"rehearsal-{name}": frame for name, frame in frames.items()})
 
 
 if __name__ == "__main__":

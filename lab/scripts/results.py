@@ -15,7 +15,7 @@ from typing import Any
 from tumortrack.cli.console import say
 from tumortrack.phantom.digital import PhantomParameters
 from tumortrack_lab.study import scripts, tables
-from tumortrack_lab.study.document import ReportWriter, table_of
+from tumortrack_lab.study.document import ReportWriter
 from tumortrack_lab.study.measure import measured
 from tumortrack_lab.study.methods import (
     Method,
@@ -56,7 +56,7 @@ class Options(scripts.KeptOptions):
 
 def main(options: Options) -> None:
     """Scenes, measurements, the block and its tables, in this order."""
-    writer, rows = options.begin("results", BLOCK), []
+    writer, rows = options.begin("results"), []
     cases = list(cases_of(options))
     for case in cases:
         run = TwinRun(case.folder)
@@ -65,8 +65,8 @@ def main(options: Options) -> None:
             say(f"{case.name}: {method.name}, seed {method.seed}")
             about = case, method, options.variants, VIEW, options.grid, options.out / "rows"
             rows += measured(*about)
-    writer.write({BLOCK: text_of(rows, cases, writer)})
-    say(f"block written to {options.document}")
+    fill(rows, cases, writer)
+    say(f"written to {options.document}")
 
 
 def cases_of(options: Options) -> Iterator[StudyCase]:
@@ -83,13 +83,12 @@ def methods_of(case: StudyCase, options: Options) -> Iterator[Method]:
     yield from (peer(name, case) for name in options.peers)
 
 
-def text_of(rows: list[dict[str, Any]], cases: list[StudyCase], writer: ReportWriter) -> str:
-    """The block; the full table goes beside the document."""
+def fill(rows: list[dict[str, Any]], cases: list[StudyCase], writer: ReportWriter) -> None:
+    """The document's tables, in full and in short."""
     sites = {case.name: tumor_sites_of(case.anatomy_ct) for case in cases}
     accuracy = tables.accuracy(tables.tidy(rows), sites)
-    link = writer.data("results-accuracy", accuracy, "Every organ, state, figure and method")
-    short = table_of(tables.accuracy_summary(accuracy), 3)
-    return "\n\n".join([short, tables.caption(rows, writer.command), link])
+    made = {BLOCK: tables.accuracy_summary(accuracy), "results-accuracy": accuracy}
+    writer.tables(made, sample=tables.sample(rows))
 
 
 if __name__ == "__main__":

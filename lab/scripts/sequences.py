@@ -67,7 +67,7 @@ def main(options: Options) -> None:
     """Make what is missing, then follow what there is."""
     known(options.kinds, ALL_KINDS)
     known(options.methods, following.METHODS)
-    writer = scripts.begun("sequences", options.document, "sequences")
+    writer = scripts.begun("sequences", options.document)
     if options.states is None and set(options.kinds) & set(STATE_KINDS):
         raise InputError("jump, hidden and random go through solved states; name some: --states.")
     if options.views not in (1, 3):
@@ -128,11 +128,7 @@ def _follow(options: Options, model: Path, films: list[Film], writer: ReportWrit
         presses = (film for film in films if film.meta["kind"] == "press")
         press = max(presses, key=lambda film: film.bend_mm.max())
         pictures.show(following.track(tracker), press, moving)
-        each = made.items()
-        links = [writer.data(f"sequences_{name}", its, tables.WORDS[name]) for name, its in each]
-        links += writer.link(plot, "errors under a press"), writer.link(moving, "a press, followed")
-        block = [tables.overview(made["errors"]), *links, f"Made by `{writer.command}`."]
-        writer.write({"sequences": "\n\n".join(block)})
+        writer.tables({f"sequences_{name}": table for name, table in made.items()})
 
 
 if __name__ == "__main__":

@@ -56,7 +56,7 @@ class Options:
 
 def main(options: Options) -> None:
     """Calibrate on the others, test on what is left out, and write it down."""
-    writer = scripts.begun("trust", options.document, BLOCK)
+    writer = scripts.begun("trust", options.document)
     asked = {_ALONE: {}, **{name: evidence_of(name) for name in options.evidence}}
     options.out.mkdir(parents=True, exist_ok=True)
     with ProcessPoolExecutor(available_cores(), get_context("spawn")) as pool:
@@ -93,13 +93,9 @@ def main(options: Options) -> None:
     models = {str(number): _model(options.out, number) for number in options.kidneys}
     image = writer.image("trust_worst")
     worst = trust.worst_picture(alone["organ"], models, options.worst, image)
-    writer.block(
-        BLOCK,
-        table_of(short),
-        writer.data("trust-coverage", coverage, "Coverage by what was left out"),
-        writer.data("trust-ranks", ranks, "Misses, and what goes with them"),
-        writer.data("trust-worst", worst, "The worst accepted answers"),
-    )
+    sample = f"{len(options.kidneys)} random kidneys"
+    tables = {"": short, "-coverage": coverage, "-ranks": ranks, "-worst": worst}
+    writer.tables({f"{BLOCK}{name}": table for name, table in tables.items()}, sample=sample)
     say(f"written to {options.document}")
 
 

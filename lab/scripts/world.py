@@ -80,7 +80,7 @@ def main(options: Options) -> None:
     known(options.disturb, DISTURBANCES)
     block = "world" if set(options.disturb) == {"none"} else "world-disturbed"
     block = "world-plans" if options.plans else block
-    writer = scripts.begun("world", options.document, block)
+    writer = scripts.begun("world", options.document)
     config = WorldConfig(
         seed=options.seed,
         families=options.families,
@@ -106,9 +106,8 @@ def main(options: Options) -> None:
         made = [name for name in scenes if (options.out / name).exists()]
         text, data = (_plans if options.plans else _estimates)(options, world, model, made)
         print(text)
-        named = [(f"{block}-{name}", *rows) for name, rows in data.items()]
-        links = [writer.data(name, rows, words) for name, words, rows in named]
-        writer.block(block, text, *links)
+        tables = {f"{block}-{name}": rows for name, (_, rows) in data.items()}
+        writer.tables(tables, sample=f"{len(made)} scenes")
 
 
 def _estimates(options: Options, world: World, model: Path, made: list[str]) -> Made:

@@ -1,6 +1,5 @@
 """The bench: figures that follow from their definitions, processes, documents."""
 
-import csv
 import json
 import shutil
 import sys
@@ -13,7 +12,7 @@ from stories import tumortrack
 from tumortrack.core.errors import InputError, TumortrackError
 from tumortrack_lab.bench import registration, rows
 from tumortrack_lab.bench import run as running
-from tumortrack_lab.bench.report import BLOCKS, GOALS, goals_of, write_bench
+from tumortrack_lab.bench.report import GOALS, goals_of, write_bench
 from tumortrack_lab.bench.rows import (
     FIRST_LOOK,
     FRAME,
@@ -31,7 +30,7 @@ from tumortrack_lab.bench.rows import (
 from tumortrack_lab.bench.run import GROUPS, Task, carry_out, tasks_of
 from tumortrack_lab.bench.subject import BenchSubject
 from tumortrack_lab.cli.bench import Bench
-from tumortrack_lab.study.document import closing, opening
+from tumortrack_lab.study.document import MeasuredTable
 
 
 def timing(median_s: float) -> Timing:
@@ -85,7 +84,7 @@ def test_goals_are_judged_by_what_was_measured() -> None:
 def test_a_document_is_filled_and_the_rest_of_it_stays(tmp_path) -> None:
     document = tmp_path / "docs" / "performance.md"
     document.parent.mkdir()
-    blocks = "\n".join(f"{opening(name)}\nold\n{closing(name)}" for name in BLOCKS)
+    blocks = "<!-- results:speed -->\nold\n<!-- /results:speed -->"
     document.write_text(f"before\n{blocks}\nafter")
     data = document.parent / "data"
     written = write_bench(some_bench(), tmp_path / "bench.json", document)
@@ -94,11 +93,10 @@ def test_a_document_is_filled_and_the_rest_of_it_stays(tmp_path) -> None:
     assert text.endswith("after")
     assert "old" not in text
     assert "| frame | clinic | 12.0 ms a frame |" in text
-    assert "\n\n[Every row: 2 rows](data/speed.csv)\n\n" in text
-    head, frame, _ = csv.reader((data / "speed.csv").read_text().splitlines())
-    values = dict(zip(head, frame, strict=True))
+    rows = MeasuredTable.read(data / "speed-rows.csv")
+    values = dict(zip(rows.header, rows.rows[0], strict=True))
     assert (values["ms"], values["items a second"]) == ("12.0", "83.3")
-    tables = [data / f"speed{name}.csv" for name in ("", "_goals", "_machine")]
+    tables = [data / f"speed{name}.csv" for name in ("", "-rows", "-goals", "-machine")]
     assert written == [tmp_path / "bench.json", document, *tables]
 
 
@@ -174,7 +172,7 @@ def test_each_process_has_its_own_threads(tmp_path) -> None:
 
 def test_what_cannot_be_measured_is_refused(tmp_path) -> None:
     assert "nonsense" in tumortrack("bench", "--only", "nonsense").stderr
-    with pytest.raises(InputError, match="cannot be read"):
+    with pytest.raises(InputError, match="does not exist"):
         Bench(document=tmp_path / "none.md").run()
     (tmp_path / "bare.md").write_text("no markers")
     with pytest.raises(InputError, match="results:speed"):

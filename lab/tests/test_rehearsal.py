@@ -6,7 +6,6 @@ from contextlib import closing
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 import pytest
 import trimesh
 
@@ -126,5 +125,5 @@ def test_estimates_are_judged_by_the_second_ct_and_by_the_truth():
     rows = evaluation_rows({"scenes": report(0.5), "true-scenes": report(0.3)})
     assert list(rows.state) == list(STATES)
     assert rows.iloc[0].to_list()[1:] == ["good", "tumor_1", 0.5, 0.3, pytest.approx(0.2)]
-    kept = pd.read_csv(ROOT / "docs" / "data" / "rehearsal-states.csv")
-    assert list(kept) == list(rows)
+    columns = ["state", "verdict", "tumor", "by second CT mm", "by truth mm", "apart mm"]
+    assert list(rows) == columns

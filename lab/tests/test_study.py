@@ -21,17 +21,17 @@ from tumortrack.core.types import Anatomy, Mesh, SensorCloud
 from tumortrack.simulate.deform import DragConfig
 from tumortrack.simulate.scene import SceneConfig, SceneRecipe, Simulator
 from tumortrack.simulate.scene_folder import Scene
+from tumortrack.tracking.fingerprint import fingerprint
 from tumortrack.tracking.model_files import load_model
 from tumortrack_lab.peers.base import Fit, OneWay, estimate_of, rigid_carry
 from tumortrack_lab.study import tables, tumor_sites
 from tumortrack_lab.study.document import (
+    MeasuredTable,
     ReportWriter,
-    closing,
-    fill,
-    opening,
+    rendered,
     spread_mm,
     spread_words,
-    table_of,
+    write_table,
 )
 from tumortrack_lab.study.measure import measured
 from tumortrack_lab.study.methods import Method, StudyCase, peer, study_case
@@ -161,8 +161,7 @@ def test_known_errors_reach_the_table(case, tmp_path):
     ]
     targets = rows[rows.figure == "target error, mm"]
     assert set(targets["median"]) == {""}  # no targets.csv
-    said = tables.caption(found, "make results")
-    assert said.startswith("`make results`: 7 measurements (view: clean), volumes of 24³")
+    assert tables.sample(found).startswith("7 measurements (view: clean), volumes of 24³")
 
 
 def test_rigid_poses_stand_beside_clinic_where_they_were_measured(case, tmp_path):
@@ -224,30 +223,57 @@ def test_how_a_tumor_lies():
     assert (outer.kind, outer.exposed_share) == ("exophytic", pytest.approx(1.0))
 
 
-def test_blocks_are_replaced_and_the_rest_stays():
-    written = (
-        f"# Mine\n{opening('a')}\nold\n{closing('a')}\ntext \\1\n{opening('b')}\n{closing('b')}\n"
+ABOUT = {"command": "make it", "fingerprint": "abc", "sample": "2 rows"}
+
+
+def test_pages_show_tables_and_cells_and_the_rest_stays(tmp_path):
+    rows = pd.DataFrame({"who": ["a", "b, c"], "off, mm: 95 %": [1.5, 2.0], "x": ["–", "p|q"]})
+    write_table(tmp_path / "errors.csv", rows, ABOUT)
+    table = MeasuredTable.read(tmp_path / "errors.csv")
+    assert (table.about, table.header) == (ABOUT, list(rows))
+    page = (
+        "# Mine\n<!-- results:errors -->\nold\n<!-- /results:errors -->\ntext \\1 "
+        "<!--=errors:a:off, mm: 95 %-->9<!--/--> and <!--=errors:b, c:x-->9<!--/-->\n"
     )
-    second = f"{opening('b')}\n{closing('b')}\n"
-    shown = table_of(pd.DataFrame({"x": [1], "y": [r"\g<0> | 2"]}))
-    once = fill(written, {"a": shown})
-    assert once.startswith("# Mine\n")
-    assert once.endswith(second)
+    once = rendered(page, tmp_path)
+    assert once.startswith("# Mine\n<!-- results:errors -->\n")
+    assert once.endswith(
+        "text \\1 <!--=errors:a:off, mm: 95 %-->1.5<!--/--> and <!--=errors:b, c:x-->p|q<!--/-->\n"
+    )
     assert "old" not in once
-    assert "text \\1" in once
-    assert r"\g<0> \| 2" in once
-    assert fill(once, {"a": shown}) == once
-    with pytest.raises(InputError, match="exactly once"):
-        fill(written, {"c": "new"})
-    with pytest.raises(InputError, match="put it after"):
-        fill(f"{closing('a')}\n{opening('a')}\n", {"a": "new"})
+    assert "| who | off, mm: 95 % | x |\n| --- | ---: | --- |\n| a | 1.5 | – |" in once
+    assert "p\\|q" in once
+    assert "`make it`; fingerprint abc; sample 2 rows." in once
+    assert rendered(once, tmp_path) == once
+    for wrong in ("errors:a:y", "errors:c:x", "others:a:x"):
+        with pytest.raises(InputError):
+            rendered(f"<!--={wrong}-->1<!--/-->", tmp_path)
+    write_table(tmp_path / "errors.csv", pd.concat([rows, rows]), ABOUT)
+    with pytest.raises(InputError):  # which of two rows?
+        rendered(page, tmp_path)
 
 
-@pytest.mark.parametrize("name", ["results", "trust", "population"])
-def test_documents_have_a_place_for_what_scripts_write(name):
-    document = (ROOT / "docs" / f"{name}.md").read_text(encoding="utf-8")
-    block = runpy.run_path(str(ROOT / "lab" / "scripts" / f"{name}.py"))["BLOCK"]
-    assert f"\n\nx\n\n{closing(block)}" in fill(document, {block: "x"})
+def test_a_table_of_another_method_or_a_page_that_differs_is_found(tmp_path, monkeypatch):
+    figures = runpy.run_path(str(ROOT / "tools" / "figures.py"))
+    monkeypatch.setitem(figures["faults"].__globals__, "ROOT", tmp_path)
+    monkeypatch.setitem(figures["faults"].__globals__, "DATA", tmp_path / "docs" / "data")
+    page, rows = tmp_path / "docs" / "page.md", pd.DataFrame({"who": ["a"], "off": [1.5]})
+    data = tmp_path / "docs" / "data" / "errors.csv"
+    about = {"command": "make it", "fingerprint": fingerprint()}
+    write_table(data, rows, about)
+    (tmp_path / "README.md").write_text("nothing measured\n")
+    page.write_text("It is <!--=errors:a:off-->1.4<!--/--> mm off.\n")
+    assert len(figures["faults"](True)) == 1
+    assert "1.4" in page.read_text()
+    assert figures["faults"](False) == []
+    assert "-->1.5<" in page.read_text()
+    assert figures["faults"](True) == []
+    write_table(data, rows, {**about, "fingerprint": "of another"})
+    assert len(figures["faults"](True)) == 1
+    write_table(data, rows, {"command": "make it"})  # of what?
+    assert len(figures["faults"](True)) == 1
+    write_table(data, rows, {"command": "make it", "weights": "abc", "version": "0.2"})
+    assert figures["faults"](True) == []
 
 
 def test_a_population_shows_rigid_fits_or_says_that_a_run_lacks_them(tmp_path):
@@ -262,26 +288,31 @@ def test_a_population_shows_rigid_fits_or_says_that_a_run_lacks_them(tmp_path):
     row |= {"depth_mm": 8.0, "outer_share": 0.3, "verdict": "good"}
     row |= {"over_3_mm": False, "over_5_mm": False}
     row |= dict.fromkeys(script["_ERRORS"].values(), 1.5) | {"rigid_fit_middle_mm": 2.5}
-    writer = ReportWriter(tmp_path / "page.md", "make population")
+    page = tmp_path / "page.md"
+    page.write_text("<!-- results:population -->\n<!-- /results:population -->\n")
+    writer = ReportWriter(page, "make population")
     for fit_mm, shown in ((2.5, " 2.5 / 2.5 / 2.5 |"), (None, "")):
         kept = {**row, "rigid_fit_middle_mm": fit_mm}
         pd.DataFrame([kept]).to_parquet(tmp_path / "scenes.parquet")
-        text, ours = script["block"](tmp_path, writer), "1.5 / 1.5 / 1.5"
+        script["fill"](tmp_path, writer)
+        text, ours = page.read_text(), "1.5 / 1.5 / 1.5"
         assert f"| pull | 1 | 100 | {ours} | {ours} |{shown} 0 |" in text
-        assert ("This run has no rigid fits." in text) == (fit_mm is None)
+        assert ("without rigid fits" in text) == (fit_mm is None)
     older = {name: value for name, value in row.items() if not name.startswith("rigid_fit")}
     pd.DataFrame([older]).to_parquet(tmp_path / "scenes.parquet")
-    assert script["block"](tmp_path, writer) == text
+    script["fill"](tmp_path, writer)
+    assert page.read_text() == text
 
 
 def test_a_table_goes_beside_the_document(tmp_path):
     errors = {"a": pd.Series([1.0, 2, 3, np.nan]), "b": pd.Series([], dtype=float)}
     rows = pd.DataFrame([{"who": k, **spread_mm("off", v)} for k, v in errors.items()])
-    link = ReportWriter(tmp_path / "page.md", "make it").data("errors", rows, "All, by who")
-    assert link == "[All, by who: 2 rows](data/errors.csv)"
-    assert (tmp_path / "data" / "errors.csv").read_text().splitlines() == [
-        "who,off median mm,off 90 % mm,off 95 % mm,off worst mm", "a,2.0,2.8,2.9,3.0", "b,,,,",
-    ]  # fmt: skip
+    (tmp_path / "page.md").write_text("")
+    ReportWriter(tmp_path / "page.md", "make it").tables({"errors": rows}, sample="3")
+    table = MeasuredTable.read(tmp_path / "data" / "errors.csv")
+    assert table.rows == [["a", "2.0", "2.8", "2.9", "3.0"], ["b", "", "", "", ""]]
+    assert table.about.keys() == {"command", "fingerprint", "commit", "date", "machine", "sample"}
+    assert (table.about["command"], table.about["fingerprint"]) == ("make it", fingerprint())
     assert list(spread_words(rows, "off")) == ["2.0 / 2.9 / 3.0", "–"]
 
 
@@ -311,7 +342,7 @@ def phantom(tmp_path_factory):
 @pytest.mark.slow
 def test_end_to_end_twice_gives_the_same_document(phantom, clinic_model, tmp_path, monkeypatch):
     document = tmp_path / "results.md"
-    document.write_text(f"mine\n{opening('accuracy')}\n{closing('accuracy')}\nyours\n")
+    document.write_text("mine\n<!-- results:accuracy -->\n<!-- /results:accuracy -->\nyours\n")
     script, made = runpy.run_path(str(RESULTS)), []
 
     def make(case, seed):
@@ -331,7 +362,7 @@ def test_end_to_end_twice_gives_the_same_document(phantom, clinic_model, tmp_pat
         for method in script["methods_of"](phantom, options):
             about = method, options.variants, "noise", options.grid, tmp_path / "rows"
             rows += measured(phantom, *about)
-        writer.write({"accuracy": script["text_of"](rows, [phantom], writer)})
+        script["fill"](rows, [phantom], writer)
         return document.read_text()
 
     first = run()
@@ -342,7 +373,6 @@ def test_end_to_end_twice_gives_the_same_document(phantom, clinic_model, tmp_pat
         "models by seed 0, 7",
         "worst: best rigid pose",
         "worst: rigid fit",
-        "(data/results-accuracy.csv)",
     ):
         assert words in first
     assert run() == first

@@ -306,7 +306,7 @@ def test_estimates_are_held_against_truth_and_rigid_pose_once_and_wrong_ones_nam
     assert list(wrong.wrong) == ["wrong pose", "not this organ"]
     assert list(wrong.scene) == names
     assert estimates.wrong_ones(rows.assign(wrong=False)).empty
-    monkeypatch.setattr(estimates, "METHOD", -1)
+    monkeypatch.setattr(estimates, "fingerprint", lambda: "another")
     with pytest.raises(InputError, match="another version"):
         estimates.read_rows([out])
 

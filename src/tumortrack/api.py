@@ -543,7 +543,7 @@ def track(
         sinks: likewise, or objects with ``publish(result)`` and ``close()``.
         until: called with every result; True ends the loop.
         seconds: end so many s after the first frame; 0: not.
-        range_mm: depths to keep (default: those that training showed).
+        range_mm: depths to keep (default: those of the model's scenes).
         options: as on the command line: ``box``, ``whole``, ``intrinsics``,
             ``frame``, ``views``, ``poses``, ``moving``, ``tool``, ``scan``, ``smoothing``,
             ``rescan``, ``stale``, ``frozen``, ``give_up``, ``report``, ``seed``, ``patient``,

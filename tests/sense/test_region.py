@@ -310,7 +310,7 @@ def test_wrong_input_is_refused():
 
 
 # Precision and recall, mean over scenes; and in how many scenes 85 % of what is found are the
-# organ's, which the trained networks tolerate. docs/live_region.md has 50 scenes each.
+# organ's, which the trained networks tolerate.
 LEAST = {
     "table": (0.97, 0.9, 1.0),
     "uneven drape, 100-300 mm": (0.97, 0.9, 1.0),

@@ -216,7 +216,7 @@ def with_and_without(kind, kidneys):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_what_clicks_gain_in_scenes(kind, kidneys):
-    """``TAUGHT_SCENES=40 pytest -s``: the table of docs/live_region.md."""
+    """``TAUGHT_SCENES=40 pytest -s`` prints the gain of each kind."""
     rows, refused = with_and_without(kind, kidneys)
     good = (rows[:, ::2] > 0.85) & (rows[:, 1::2] > 0.6)
     means, tenth = 100 * rows.mean(0), 100 * np.quantile(rows, 0.1, axis=0)

@@ -344,13 +344,14 @@ def _recordings() -> dict[str, Target]:
 
 def _margins() -> dict[str, Target]:
     from tumortrack.tracking import margins
+    from tumortrack.tracking.fingerprint import fingerprint
     from tumortrack_lab.margins.table import head_of, open_table
 
     shells = margins.Shells(
         confidence=0.9, radii={"tumor": margins.Radius(used="constant", constant_mm=3.0)}
     )
     valid = margins.ModelMargins(
-        method=margins.METHOD, tumortrack="0", model_sha256="", table_sha256="", seed=0,
+        fingerprint=fingerprint(), tumortrack="0", model_sha256="", table_sha256="", seed=0,
         widest_mm=8.0, limits={"rarity": 1.0}, shells=(shells,), groups=(), joined={},
         risk_bound=0.1, accepted=1.0, missed=0.0,
     )  # fmt: skip

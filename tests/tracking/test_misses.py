@@ -11,7 +11,7 @@ from reports import reporting
 from tumortrack.core.types import SensorCloud
 from tumortrack.models.report import estimate_of
 from tumortrack.tracking import misses, quality
-from tumortrack.tracking.margins import METHOD
+from tumortrack.tracking.fingerprint import fingerprint
 from tumortrack.tracking.misses import POOR_MM, MissModel, figures, shipped, with_misses
 from tumortrack.tracking.model_files import load_model
 from tumortrack.tracking.tracker import Tracker
@@ -32,7 +32,7 @@ def visible():
 
 def test_what_is_shipped_is_of_this_method_and_cannot_reward_what_gets_worse(estimate):
     model = shipped()
-    assert model.method == METHOD
+    assert model.fingerprint == fingerprint()
     known = figures(estimate.report, "tumor_1")
     assert set(model.weights) <= set(known)
     assert min(model.weights.values()) >= 0
@@ -55,7 +55,7 @@ def test_an_answer_says_how_far_off_its_tumors_may_be(estimate):
 def test_a_miss_that_may_be_large_makes_an_answer_poor(slim_model, monkeypatch):
     tracker, cloud = Tracker(load_model(slim_model, "cpu")), visible()
     for radius_mm, kind in ((POOR_MM - 0.1, None), (POOR_MM + 0.1, "miss")):
-        model = MissModel(METHOD, math.log(radius_mm), {}, {})
+        model = MissModel(fingerprint(), math.log(radius_mm), {}, {})
         monkeypatch.setattr(misses, "shipped", lambda model=model: model)
         found = tracker.locate(cloud, 16, 0).finding
         assert (None if found is None else found.kind) == kind

@@ -17,6 +17,7 @@ from tumortrack.core.errors import ArtifactError
 from tumortrack.core.report import MarginReport
 from tumortrack.core.types import SensorCloud
 from tumortrack.tracking import margins as stored
+from tumortrack.tracking.fingerprint import fingerprint
 from tumortrack.tracking.margins import ModelMargins, Radius, Shells, stated_margin, stated_radius
 from tumortrack.tracking.quality import with_margin
 
@@ -28,13 +29,13 @@ def _shells(confidence: float, factor: float) -> Shells:
 
 
 MARGINS = ModelMargins(
-    method=stored.METHOD, tumortrack="0", model_sha256="", table_sha256="abc", seed=0,
+    fingerprint=fingerprint(), tumortrack="0", model_sha256="", table_sha256="abc", seed=0,
     widest_mm=20.0, limits={"fit_cost": 1.0}, shells=(_shells(0.8, 2.0), _shells(0.9, 3.0)),
     groups=(), joined={}, risk_bound=0.1, accepted=1.0, missed=0.0,
 )  # fmt: skip
 
 
-def test_stored_margins_are_refused_where_anything_differs(tmp_path, monkeypatch):
+def test_stored_margins_are_refused_where_anything_differs(tmp_path):
     (tmp_path / store.MANIFEST).write_text("{}")
     assert stored.read_margins(tmp_path) is None
     path = stored.keep_margins(tmp_path, MARGINS)
@@ -50,10 +51,8 @@ def test_stored_margins_are_refused_where_anything_differs(tmp_path, monkeypatch
     with pytest.raises(ArtifactError, match="is of another model"):
         stored.read_margins(tmp_path)
     stored.keep_margins(tmp_path, MARGINS)
-    now = stored.METHOD
-    monkeypatch.setattr(stored, "METHOD", now + 1)
-    said = f"version {now} of the method; this is version {now + 1}"
-    with pytest.raises(ArtifactError, match=said):
+    stored.keep_margins(tmp_path, replace(MARGINS, fingerprint="of another method"))
+    with pytest.raises(ArtifactError, match="of another method"):
         stored.read_margins(tmp_path)
 
 

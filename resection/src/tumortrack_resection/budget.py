@@ -31,10 +31,10 @@ from tumortrack_resection.values import (
     name_of,
 )
 
-# So many standard deviations, but no less than the largest Hausdorff distance of a tumor of any
-# organ in docs/results.md (clinic, case_00000). Not calibrated: see docs/resection.md.
+# So many standard deviations, but no less than the largest Hausdorff distance that version 0.1 had
+# for a tumor of five organs under finite-element loads. Not calibrated: see docs/resection.md.
 DEVIATIONS, LEAST_TRACKING_MM = 3.0, 4.2
-# Without standard deviations: the largest of M_lim (preset quick) there, P1 of case_00000.
+# Without standard deviations: the largest that the preset quick had there.
 UNKNOWN_TRACKING_MM = 8.0
 # Calibrations with 3D cameras err by about 0.9 mm and 0.27 degrees (arXiv 2311.01335): 1.9 mm at
 # 200 mm.

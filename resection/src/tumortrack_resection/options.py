@@ -24,7 +24,7 @@ class PlanOptions(PatientOptions):
             planner.
         tumor: which one (tumor_1, ...; default: the one that lies farthest out of the organ).
         margin: least distance between tumor and cut in mm (default 5, the paper's; ordinary
-            estimates need about 10, docs/resection.md).
+            estimates need more, docs/resection.md).
         sigmas: add this many standard deviations of the estimate's own uncertainty to the margin
             (default 0).
         confidence: the margin is of healthy tissue, beyond all errors, with the tumor's place as

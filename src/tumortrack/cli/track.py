@@ -32,8 +32,8 @@ class Track(TrackOptions):
     Sources and sinks are written kind:target?option=value&option=value. Sources: virtual:CASE,
     recording:PATH, realsense[:SERIAL|FILE], ros2:TOPIC. Sinks: viewer[:PORT],
     recording:FOLDER, ros2[:TOPIC], moveit, openigtlink[:PORT], and for `resect` ur:HOST. All but
-    virtual and ur come with tumortrack-devices; other installed packages can add more. A wrong
-    one is answered with what is allowed. docs/live.md has examples.
+    ur come with tumortrack-devices; other installed packages can add more. A wrong one is answered
+    with what is allowed. docs/live.md has examples.
 
     Attributes:
         model: a case, or a folder that `train` wrote.

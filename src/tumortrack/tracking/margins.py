@@ -19,10 +19,8 @@ from tumortrack.core.errors import ArtifactError, InputError
 from tumortrack.core.organ import is_tumor
 from tumortrack.core.report import Finding, FitReport, MarginReport, StatedMargin
 from tumortrack.sense.cloud import FEWEST_POINTS
+from tumortrack.tracking.fingerprint import fingerprint
 
-# Raise it with every change that gives another estimate, or other figures (``measured``), for the
-# same cloud: margins calibrated before are then refused.
-METHOD = 6
 NAME = "margins.json"
 Kind = Literal["tumor", "organ", "map"]
 _WHAT = {"tumor": "a tumor's surface", "organ": "the organ's surface", "map": "mapped points"}
@@ -104,7 +102,7 @@ class ModelMargins(Config, frozen=True):
         others: with other evidence.
     """
 
-    method: int
+    fingerprint: str
     tumortrack: str
     model_sha256: str
     table_sha256: str
@@ -149,10 +147,10 @@ def read_sealed(path: Path) -> ModelMargins:
     content = stored.get("margins")
     if not isinstance(content, dict) or stored.get("sha256") != _digest(content):
         raise ArtifactError(f"{path} was changed after it was written. {_AGAIN}")
-    if content.get("method") != METHOD:
+    if content.get("fingerprint") != fingerprint():
         raise ArtifactError(
-            f"{path} was found with version {content.get('method')} of the method; this is version "
-            f"{METHOD}, whose estimates differ. {_AGAIN}"
+            f"{path} was calibrated with a version of the method whose estimates differ "
+            f"({content.get('fingerprint', 'an older one')}; this is {fingerprint()}). {_AGAIN}"
         )
     try:
         return from_builtins(content, ModelMargins, str(path))

@@ -28,10 +28,10 @@ _LEAST_HELD_MM = 0.05  # nor does less
 
 
 class MissModel(Config, frozen=True):
-    """``constant``: logarithm of the radius, mm, if all figures are 0; ``method``: the version that
-    it was learned with, see ``margins.METHOD``; ``about``: on what."""
+    """``constant``: logarithm of the radius, mm, if all figures are 0; ``fingerprint``: of the
+    method that it was learned with; ``about``: on what."""
 
-    method: int
+    fingerprint: str
     constant: float
     weights: dict[str, float]
     about: dict[str, Any]

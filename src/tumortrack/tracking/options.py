@@ -47,7 +47,7 @@ class RegionOptions(PatientOptions):
     """Options of commands that look for an organ in depth images.
 
     Attributes:
-        range: keep depths between NEAR and FAR mm (default: the range the model was trained on).
+        range: keep depths between NEAR and FAR mm (default: the range of the model's scenes).
         box: keep what is in a box: two opposite corners X Y Z X Y Z, camera frame, mm.
         whole: take everything in range and box for the organ, without searching for it.
     """

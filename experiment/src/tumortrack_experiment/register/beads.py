@@ -35,7 +35,7 @@ _CERTAIN = 0.95
 @dataclass(frozen=True)
 class Device:
     """What found beads. ``error_mm``: the usual distance of a bead from where it is found, three
-    axes together (docs/bench.md: measured); ``tolerance_mm``: the farthest from the kit's
+    axes together; ``tolerance_mm``: the farthest from the kit's
     drawing, which a print misses by some tenths, at which a bead is still in its place."""
 
     name: str

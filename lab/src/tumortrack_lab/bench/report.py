@@ -12,9 +12,8 @@ import pandas as pd
 from tumortrack.core.store import write_atomically
 from tumortrack_lab.bench import rows
 from tumortrack_lab.bench.rows import BenchResult, BenchRow
-from tumortrack_lab.study.document import ReportWriter, table_of
+from tumortrack_lab.study.document import ReportWriter
 
-BLOCKS = ("speed",)
 _GIB = 2**30
 _SECONDS = {"s": 1.0, "ms": 1e-3, "µs": 1e-6}
 _SUMMARY = ["part", "of", "time"]
@@ -132,17 +131,15 @@ def write_bench(bench: BenchResult, out: Path, document: Path | None) -> list[Pa
     if document is None:
         return [out]
     machine = [{"this machine": key, "value": value} for key, value in bench.machine.items()]
-    tables = (
-        ("speed", figures(bench), "Every row"),
-        ("speed_goals", pd.DataFrame(goals_of(bench)), "Goals"),
-        ("speed_machine", pd.DataFrame(machine), "The machine"),
-    )
     most = max(row.threads for row in bench.rows)
     cells = pd.DataFrame([_cells(row) for row in bench.rows if row.threads == most])
-    summary = table_of(cells[_SUMMARY], left=2)
-    caption = f"Medians on {most} threads; `{bench.command}`, {bench.machine.get('date', '')}."
-    writer = ReportWriter(document, bench.command)
-    links = (writer.data(*each) for each in tables)
-    writer.write({"speed": "\n\n".join((summary, caption, *links))})
+    tables = {
+        "speed": cells[_SUMMARY],
+        "speed-rows": figures(bench),
+        "speed-goals": pd.DataFrame(goals_of(bench)),
+        "speed-machine": pd.DataFrame(machine),
+    }
+    sample = f"medians of calls on {most} threads"
+    ReportWriter(document, bench.command).tables(tables, sample=sample)
     folder = document.parent / "data"
-    return [out, document, *(folder / f"{name}.csv" for name, *_ in tables)]
+    return [out, document, *(folder / f"{name}.csv" for name in tables)]

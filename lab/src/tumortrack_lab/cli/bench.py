@@ -32,16 +32,15 @@ class Bench:
         """Measure, show, write. Raises InputError: a document without its markers."""
         from tumortrack.cli.console import say
         from tumortrack.core.process import available_cores
-        from tumortrack_lab.bench.report import BLOCKS, figures, write_bench
+        from tumortrack_lab.bench.report import figures, write_bench
         from tumortrack_lab.bench.run import GROUPS, measure, tasks_of
-        from tumortrack_lab.study.document import ReportWriter
+        from tumortrack_lab.study.scripts import check_page
 
         if self.out.exists() and "machine" not in store.read_json(self.out):
             store.check_place(self.out, "", None)  # no bench wrote it
         words = ["tumortrack bench", *(["--only", *self.only] if self.only else [])]
         command = " ".join([*words, *(["--quick"] if self.quick else [])])
-        if self.document is not None:
-            ReportWriter(self.document, command).check(BLOCKS)
+        check_page(self.document)
         groups: tuple[str, ...] = self.only or tuple(GROUPS)
         result = measure(tasks_of(groups, MODELS, self.quick, available_cores()), command)
         print(figures(result).to_string(index=False))

@@ -24,8 +24,8 @@ from tumortrack.core import store
 from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.report.metrics import outward_miss
 from tumortrack.simulate.scene_folder import Scene, list_scenes
+from tumortrack.tracking.fingerprint import fingerprint
 from tumortrack.tracking.margins import (
-    METHOD,
     Group,
     Kind,
     ModelMargins,
@@ -202,7 +202,7 @@ def margins_of(
     parts = _grouped(tested, least)[0].values()
     bounds = [conformal.risk_bound(_misses(of, kinds[0], last), len(of)) for of in parts]
     return ModelMargins(
-        method=METHOD,
+        fingerprint=fingerprint(),
         tumortrack=tumortrack.__version__,
         model_sha256="",
         table_sha256=table_sha256,

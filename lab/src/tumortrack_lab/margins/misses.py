@@ -17,7 +17,7 @@ from tumortrack.core.types import DepthFrame
 from tumortrack.registration.model import RegistrationModel
 from tumortrack.report.rivals import best_rigid_pose, rigid_fit
 from tumortrack.simulate.scene_folder import Scene
-from tumortrack.tracking.margins import METHOD
+from tumortrack.tracking.fingerprint import fingerprint
 from tumortrack.tracking.misses import POOR_MM, MissModel, figures
 from tumortrack.tracking.tracker import Tracker
 
@@ -75,7 +75,7 @@ def learned(rows: pd.DataFrame, about: dict[str, Any]) -> MissModel:
     rank = min(int(np.ceil((len(left) + 1) * _CONFIDENCE)), len(left))
     constant = float(np.sort(left)[rank - 1])
     kept = {name: round(float(w), 4) for name, w in zip(names, weights, strict=True) if w > 0}
-    return MissModel(METHOD, round(constant, 4), kept, {**about, "answers": len(rows)})
+    return MissModel(fingerprint(), round(constant, 4), kept, {**about, "answers": len(rows)})
 
 
 def left_out(rows: pd.DataFrame, part: str, by: str | None = None) -> pd.DataFrame:

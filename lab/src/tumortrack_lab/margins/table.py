@@ -15,7 +15,8 @@ from msgspec import field
 from tumortrack.core import store
 from tumortrack.core.config import Config, from_builtins, to_builtins
 from tumortrack.core.errors import InputError
-from tumortrack.tracking.margins import METHOD, Kind, Radius
+from tumortrack.tracking.fingerprint import fingerprint
+from tumortrack.tracking.margins import Kind, Radius
 
 Miss = tuple[float, float | None]  # outward miss or distance (mm), and s (mm)
 
@@ -91,4 +92,4 @@ def _parsed(content: bytes, path: Path) -> tuple[dict[str, Any], list[Row]]:
 
 def head_of(model_sha256: str, seed: int) -> dict[str, Any]:
     """What every row depends on besides its scene."""
-    return {"model_sha256": model_sha256, "method": METHOD, "seed": seed}
+    return {"model_sha256": model_sha256, "fingerprint": fingerprint(), "seed": seed}

@@ -49,7 +49,7 @@ def _figures(judge: Judge, summary: dict[str, Any]) -> str:
             f"{sink['delivered']:,} delivered, {sink['dropped']:,} missed, {sink['errors']:,} "
             "errors (of the faults)"
         )
-    return table_of(pd.DataFrame(rows.items(), columns=["", ""]), left=2)
+    return table_of(pd.DataFrame(rows.items(), columns=["", ""]))
 
 
 def _faults(judge: Judge) -> str:
@@ -57,7 +57,7 @@ def _faults(judge: Judge) -> str:
     head.append("good again after (longest), s")
     each = {kind: [a for a in judge.answers.values() if a.fault.kind == kind] for kind in FAULTS}
     rows = [_row(kind, answers) for kind, answers in each.items()]
-    return table_of(pd.DataFrame(rows, columns=head), left=4)
+    return table_of(pd.DataFrame(rows, columns=head))
 
 
 def _row(kind: str, answers: list[Answer]) -> list[str]:

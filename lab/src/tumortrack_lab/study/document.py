@@ -1,25 +1,55 @@
-"""Tables in Markdown and as CSV, and documents with marked blocks that are replaced."""
+"""Measured tables (docs/data/*.csv) and the pages that show them.
+
+A table says above its header what made it, one ``# key: value`` a line: ``command``, ``commit``,
+``date``, ``machine``, ``sample``, ``interval`` and ``fingerprint``, the method's version. Tables of
+other things than the method (trained weights, an older version, the user's data) have ``version``,
+``weights`` or ``data`` instead. A page shows a whole table between ``<!-- results:NAME -->`` and
+``<!-- /results:NAME -->``, and one cell between ``<!--=NAME:ROW:COLUMN-->`` and ``<!--/-->``, where
+ROW is the text of the first columns, as many as are needed, joined by commas.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import csv
+import re
+import subprocess
+from collections.abc import Mapping
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from pathlib import Path
+from typing import NamedTuple
 
 import pandas as pd
+from scipy.stats import binomtest
 
 from tumortrack.core import store
 from tumortrack.core.errors import InputError, StorageError
+from tumortrack.core.process import available_cores
+from tumortrack.tracking.fingerprint import fingerprint
+from tumortrack_lab.bench.machine import cpu_name
 
 _SPREAD = ("median", "90 %", "95 %", "worst")
 
 
-def table_of(frame: pd.DataFrame, left: int = 1) -> str:
-    """A frame as Markdown; the first ``left`` columns are left-aligned, numbers right-aligned."""
-    rule = ["---" if n < left else "---:" for n in range(len(frame.columns))]
-    lines = [list(frame), rule, *frame.astype(str).to_numpy().tolist()]
-    cells = ((cell.replace("|", "\\|") for cell in line) for line in lines)
-    return "\n".join(f"| {' | '.join(line)} |" for line in cells)
+def table_of(frame: pd.DataFrame) -> str:
+    """A frame as Markdown; columns of numbers are right-aligned."""
+    cells = [[str(cell) for cell in row] for row in frame.to_numpy().tolist()]
+    rule = [
+        "---:" if all(_NUMBER.match(row[n]) for row in cells) else "---"
+        for n in range(len(frame.columns))
+    ]
+    lines = [list(map(str, frame)), rule, *cells]
+    escaped = ((cell.replace("|", "\\|") for cell in line) for line in lines)
+    return "\n".join(f"| {' | '.join(line)} |" for line in escaped)
+
+
+_NUMBER = re.compile(r"-?[\d.]|–|$|nan")
+
+
+def share_words(count: int, of: int) -> str:
+    """A share with its 95 % interval (Wilson's), %."""
+    low, high = binomtest(count, of).proportion_ci(method="wilson")
+    return f"{100 * count / of:.1f} % ({100 * low:.1f} to {100 * high:.1f})"
 
 
 def spread_mm(of: str, values: pd.Series) -> dict[str, str]:
@@ -45,67 +75,106 @@ def beside_rigid(rows: pd.DataFrame, of: str = "'s centre") -> dict[str, pd.Seri
     }
 
 
-def opening(name: str) -> str:
-    return f"<!-- results:{name} -->"
+class MeasuredTable(NamedTuple):
+    """``about``: what made it."""
+
+    about: dict[str, str]
+    header: list[str]
+    rows: list[list[str]]
+
+    @classmethod
+    def read(cls, path: Path) -> MeasuredTable:
+        """Raises InputError: it is not there."""
+        try:
+            lines = path.read_text(encoding="utf-8").splitlines()
+        except OSError as error:
+            raise InputError(f"{path} cannot be read: {error.strerror}.") from error
+        above = [line[1:].partition(":") for line in lines if line.startswith("#")]
+        header, *rows = csv.reader(line for line in lines if not line.startswith("#"))
+        return cls({key.strip(): value.strip() for key, _, value in above}, header, rows)
+
+    def cell(self, row: str, column: str) -> str:
+        """Raises InputError: there is no such cell, or more than one."""
+        depth = row.count(",") + 1
+        found = [each for each in self.rows if row in (each[0], ",".join(each[:depth]))]
+        if len(found) != 1 or self.header.count(column) != 1:
+            raise InputError(f"{len(found)} rows {row!r}, {self.header.count(column)} {column!r}")
+        return found[0][self.header.index(column)]
+
+    @property
+    def caption(self) -> str:
+        """What made it, in a line."""
+        about = dict(self.about)
+        command = f"`{made}`; " if (made := about.pop("command", "")) else ""
+        return command + "; ".join(f"{key} {value}" for key, value in about.items()) + "."
 
 
-def closing(name: str) -> str:
-    return f"<!-- /results:{name} -->"
+def provenance(command: str, **more: str) -> dict[str, str]:
+    """What a table says that is measured now by this version of the method."""
+    here = Path(__file__).parent
+    asked = ["git", "describe", "--always", "--dirty", "--exclude=*"]
+    commit = subprocess.run(asked, cwd=here, capture_output=True, text=True, check=False).stdout
+    return {
+        "command": command,
+        "fingerprint": fingerprint(),
+        "commit": commit.strip() or "none",
+        "date": datetime.now(UTC).strftime("%Y-%m-%d"),
+        "machine": f"{cpu_name()}, {available_cores()} cores",
+        **more,
+    }
 
 
-def fill(document: str, blocks: dict[str, str]) -> str:
-    """The document with the text between each block's markers replaced. Raises InputError: a marker
-    is missing, double or out of order."""
-    for name, text in blocks.items():
-        if document.count(opening(name)) != 1 or document.count(closing(name)) != 1:
-            raise InputError(
-                f"the document needs the markers {opening(name)} and {closing(name)} exactly once "
-                f"each; put them where the {name} results belong."
-            )
-        before, _, rest = document.partition(opening(name))
-        if closing(name) not in rest:
-            raise InputError(f"{closing(name)} stands before {opening(name)}; put it after.")
-        after = rest.partition(closing(name))[2]
-        document = f"{before}{opening(name)}\n\n{text.strip()}\n\n{closing(name)}{after}"
-    return document
+def write_table(path: Path, rows: pd.DataFrame, about: Mapping[str, str]) -> None:
+    """Atomically. Raises StorageError."""
+    make_folder(path.parent)
+    above = "".join(f"# {key}: {value}\n" for key, value in about.items())
+    store.write_atomically(path, (above + rows.to_csv(index=False)).encode())
+
+
+_BLOCK = re.compile(r"(<!-- results:([\w-]+) -->\n).*?(<!-- /results:\2 -->)", re.DOTALL)
+_CELL = re.compile(r"(<!--=([^:>]+):([^:>]*):([^>]*?)-->).*?(<!--/-->)", re.DOTALL)
+
+
+def rendered(page: str, data: Path) -> str:
+    """A page with its blocks and cells as the tables in ``data`` have them. Raises InputError: a
+    table or cell is not there."""
+
+    def block(found: re.Match[str]) -> str:
+        table = MeasuredTable.read(data / f"{found[2]}.csv")
+        shown = table_of(pd.DataFrame(table.rows, columns=table.header))
+        return f"{found[1]}\n{shown}\n\n{table.caption}\n\n{found[3]}"
+
+    def cell(found: re.Match[str]) -> str:
+        table = MeasuredTable.read(data / f"{found[2]}.csv")
+        try:
+            return found[1] + table.cell(found[3], found[4]) + found[5]
+        except InputError as error:
+            raise InputError(f"{data / found[2]}.csv has {error}.") from error
+
+    return _CELL.sub(cell, _BLOCK.sub(block, page))
 
 
 @dataclass(frozen=True)
 class ReportWriter:
-    """A document with markers (None: nothing is written), and the command that its blocks name."""
+    """Writes tables into data/ beside a document (None: nothing is written), with the command that
+    made them, and the document's blocks and cells."""
 
     document: Path | None
     command: str
 
-    def block(self, name: str, *texts: str) -> None:
-        """Replace a block by the command and these paragraphs."""
-        self.write({name: "\n\n".join([f"`{self.command}`", *texts])})
-
-    def write(self, blocks: dict[str, str]) -> None:
-        """Replace these blocks, in one step; errors as of ``check`` and ``store``."""
-        if self.document is not None:
-            store.write_atomically(self.document, self._filled(self.document, blocks).encode())
-
-    def check(self, names: Iterable[str]) -> None:
-        """Check, before anything is measured, that these blocks can be filled. Raises InputError:
-        no document, or a marker missing."""
-        if self.document is not None:
-            self._filled(self.document, dict.fromkeys(names, ""))
-
-    def _filled(self, document: Path, blocks: dict[str, str]) -> str:
+    def tables(self, tables: Mapping[str, pd.DataFrame], **more: str) -> None:
+        """Write data/NAME.csv each; ``more``: sample, interval. Raises InputError: no such
+        document, or it shows a table that is not there; StorageError."""
+        if self.document is None:
+            return
+        data = self.document.parent / "data"
+        for name, rows in tables.items():
+            write_table(data / f"{name}.csv", rows, provenance(self.command, **more))
         try:
-            return fill(document.read_text(encoding="utf-8"), blocks)
+            page = self.document.read_text(encoding="utf-8")
         except OSError as error:
-            raise InputError(f"{document} cannot be read: {error.strerror}.") from error
-
-    def data(self, name: str, rows: pd.DataFrame, words: str) -> str:
-        """Write data/NAME.csv beside the document; returns the paragraph that links to it, which
-        the site shows as a table."""
-        if self.document is not None:
-            path = self.document.parent / "data" / f"{name}.csv"
-            make_folder(path.parent)
-            store.write_atomically(path, rows.to_csv(index=False).encode())
-        return f"[{words}: {len(rows)} rows](data/{name}.csv)"
+            raise InputError(f"{self.document} cannot be read: {error.strerror}.") from error
+        store.write_atomically(self.document, rendered(page, data).encode())
 
     def image(self, name: str) -> Path:
         """Where a picture goes; its folder is made."""
@@ -113,9 +182,6 @@ class ReportWriter:
         folder = self.document.parent / "images"
         make_folder(folder)
         return folder / f"{name}.png"
-
-    def link(self, image: Path, words: str) -> str:
-        return f"![{words}](images/{image.name})"
 
 
 def make_folder(folder: Path) -> None:

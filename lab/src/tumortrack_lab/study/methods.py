@@ -24,7 +24,7 @@ from tumortrack.imaging.case import Case, load_case, save_case
 from tumortrack.imaging.surface import surfaces
 from tumortrack.phantom.digital import PhantomParameters, TumorParameters, phantom_labels
 from tumortrack.simulate.scene_folder import Scene
-from tumortrack.tracking.margins import METHOD
+from tumortrack.tracking.fingerprint import fingerprint
 from tumortrack.tracking.model_files import make_model
 from tumortrack.tracking.tracker import Tracker
 from tumortrack_lab.peers.base import OneWay, estimate_of
@@ -118,7 +118,7 @@ class Method:
 def clinic(case: StudyCase, seed: int) -> Method:
     """The default method with a model by this seed, made when it is first asked."""
     tracker = cache(lambda: Tracker(make_model(load_case(case.folder), seed=seed)))
-    identity = {"tumortrack": tumortrack.__version__, "method": METHOD}
+    identity = {"tumortrack": tumortrack.__version__, "fingerprint": fingerprint()}
     return Method(CLINIC, identity, lambda s, grid: tracker().locate(s.cloud, grid), seed)
 
 

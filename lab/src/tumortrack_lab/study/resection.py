@@ -231,7 +231,7 @@ def summary(cuts: pd.DataFrame) -> str:
     shown = ["located by", "planner", "plans", "whole", "margin kept median mm", "worst mm"]
     shown += ["as asked %", "cut into it", "into another tumor", "healthy tissue mean ml"]
     shown += ["kerf area mean cm2"]
-    return table_of(cuts.loc[cuts.case == "all", shown], 2)
+    return table_of(cuts.loc[cuts.case == "all", shown])
 
 
 def _cut(plans: pd.DataFrame, planner: str) -> dict[str, Any]:

@@ -12,7 +12,7 @@ from typing import NoReturn, TypeVar
 import tyro
 
 from tumortrack.core import store
-from tumortrack.core.errors import TumortrackError
+from tumortrack.core.errors import InputError, TumortrackError
 from tumortrack_lab.study.document import ReportWriter, make_folder
 
 Options = TypeVar("Options")
@@ -25,21 +25,26 @@ class KeptOptions:
     out: Path
     """Where cases, models and rows are kept."""
     document: Path
-    """Whose marked blocks are replaced."""
+    """The page beside which the tables go, and which shows them."""
 
-    def begin(self, target: str, *blocks: str) -> ReportWriter:
-        """Make the folder; returns the writer of the document's blocks. Raises InputError: it
-        lacks one."""
-        writer = begun(target, self.document, *blocks)
+    def begin(self, target: str) -> ReportWriter:
+        """Make the folder; returns the writer of the document's tables. Raises InputError: there
+        is no such document."""
+        writer = begun(target, self.document)
         self.out.mkdir(parents=True, exist_ok=True)
         return writer
 
 
-def begun(target: str, document: Path | None, *blocks: str) -> ReportWriter:
-    """The writer of a document's blocks. Raises InputError: it lacks one."""
-    writer = ReportWriter(document, make_command(target))
-    writer.check(blocks)
-    return writer
+def begun(target: str, document: Path | None) -> ReportWriter:
+    """The writer of a document's tables. Raises InputError: there is no such document."""
+    check_page(document)
+    return ReportWriter(document, make_command(target))
+
+
+def check_page(document: Path | None) -> None:
+    """Called before anything is measured. Raises InputError: there is no such document."""
+    if document is not None and not document.is_file():
+        raise InputError(f"{document} does not exist; --document names a page that shows tables.")
 
 
 def kept(path: Path, about: dict, measure: Callable[[], list[dict]]) -> list[dict]:
@@ -55,7 +60,7 @@ def kept(path: Path, about: dict, measure: Callable[[], list[dict]]) -> list[dic
 
 
 def make_command(target: str) -> str:
-    """The present call of make, which blocks name."""
+    """The present call of make, which tables name."""
     given = f" ARGS='{shlex.join(sys.argv[1:])}'" if sys.argv[1:] else ""
     return f"make {target}{given}"
 

@@ -92,16 +92,13 @@ def accuracy_summary(rows: pd.DataFrame) -> pd.DataFrame:
     return wide.reset_index()
 
 
-def caption(rows: list[dict[str, Any]], command: str) -> str:
-    """The line below a block: what was measured, where and when."""
+def sample(rows: list[dict[str, Any]]) -> str:
+    """What was measured."""
     frame = pd.DataFrame(rows)
     count = len(frame.drop_duplicates(["case", "method", "seed", "variant"]))
-    loads, seeds = frame.load.dropna(), _listed(frame.seed)
     return (
-        f"`{command}`: {count} measurements (view: {_listed(frame.view)}), volumes of "
-        f"{_listed(frame.grid, '{}³')} voxels at most, models by seed {seeds}. Measured on "
-        f"{_listed(frame.on)}, {_listed(frame.when)}, load average {loads.min():.1f} to "
-        f"{loads.max():.1f}."
+        f"{count} measurements (view: {_listed(frame.view)}), volumes of "
+        f"{_listed(frame.grid, '{}³')} voxels at most, models by seed {_listed(frame.seed)}"
     )
 
 

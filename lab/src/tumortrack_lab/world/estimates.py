@@ -15,7 +15,7 @@ from tumortrack.core.errors import InputError
 from tumortrack.core.estimate import FAR_MM
 from tumortrack.core.types import Anatomy
 from tumortrack.simulate.scene_folder import Scene, read_scene
-from tumortrack.tracking.margins import METHOD
+from tumortrack.tracking.fingerprint import fingerprint
 from tumortrack.tracking.model_files import load_model
 from tumortrack.tracking.tracker import Tracker
 from tumortrack_lab.real.judging import by_tumor, judge
@@ -31,7 +31,7 @@ def measure(model: Path, anatomy_ct: Anatomy, out: Path, names: Sequence[str]) -
     """A row for each scene, located as by `track` in a first look; kept in the scenes' folder by
     model and method, so that no scene is located again."""
     path = out / _ROWS
-    about = {"model_sha256": store.sha256_of(model / store.MANIFEST), "method": METHOD}
+    about = {"model_sha256": store.sha256_of(model / store.MANIFEST), "fingerprint": fingerprint()}
     kept = store.read_json(path) if path.exists() else {}
     rows = kept["rows"] if all(kept.get(name) == value for name, value in about.items()) else {}
     tracker = Tracker(load_model(model, "cpu", with_margins=False))
@@ -49,7 +49,7 @@ def read_rows(folders: Sequence[Path]) -> pd.DataFrame:
     rows = []
     for folder in folders:
         kept = store.read_json(folder / _ROWS)
-        if kept.get("method") != METHOD:
+        if kept.get("fingerprint") != fingerprint():
             raise InputError(f"{folder} was measured with another version of the method.")
         some = kept["rows"].items()
         rows += [{"organ": folder.name, "scene": name, **row} for name, row in some]

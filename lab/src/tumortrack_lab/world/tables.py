@@ -9,7 +9,6 @@ import numpy as np
 import pandas as pd
 
 from tumortrack.core import store
-from tumortrack_lab.study.document import table_of
 from tumortrack_lab.world.paths import KINDS
 from tumortrack_lab.world.states import JUMPS
 
@@ -61,19 +60,6 @@ def tables(rows: pd.DataFrame) -> dict[str, pd.DataFrame]:
     lists = [errors, *_verdicts(frames), _jumps(jumps), _hiding(hidden)]
     made = zip(WORDS, lists, strict=True)
     return {name: pd.DataFrame(its).round(1).convert_dtypes() for name, its in made if its}
-
-
-def overview(errors: pd.DataFrame) -> str:
-    """Markdown: of ``errors`` in all sequences, centre / Hausdorff distance of each method."""
-
-    def off(row: pd.Series) -> str:
-        known = (of for of in _OFF if pd.notna(row[of]))
-        return " / ".join(f"{row[of]:.1f} [{row[f'{of}, worst organ']:.1f}]" for of in known)
-
-    rows = errors[errors["sequences"] == "all"]
-    keys, rows = ["state", "tumor", "organs", "frames"], rows.assign(off=rows.apply(off, axis=1))
-    wide = rows.pivot_table("off", keys, "method", "first", sort=False).reset_index()
-    return table_of(wide, 2)
 
 
 def _errors(rows: pd.DataFrame, sequences: str) -> list[dict[str, Any]]:

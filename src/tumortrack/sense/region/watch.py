@@ -23,7 +23,7 @@ _PER_CELL = 6  # points of a cloud sampled for each cell
 _EVERY, _SELDOM = 2, 30  # frames from one check to the next; while no table has been found
 _MEDIAN_OF = 7  # checks, against noise and passing hands
 _LEARNT_FROM = 15  # checks, whose median is the table at the start: a second at 30 Hz
-# Without motion the median varies by up to 0.3 mm (docs/live.md); the least shift that counts is
+# Without motion the median varies by up to 0.3 mm; the least shift that counts is
 # well above that, and grows with the table's unevenness.
 _SHIFT_MM, _SHIFT_SHARE = 1.0, 0.3
 _CAPTURE_MM, _LEAST_MM = 6.0, 1.5  # tolerance of a shift's inliers, at first and at least
