@@ -1,7 +1,7 @@
 """Do the pages say what the tables say, and are the tables of today's method?
 
-python tools/figures.py           write each page again from docs/data (tumortrack_lab.study.document
-                                  has the format); exit status 1 where a table is of another method
+python tools/figures.py           fill the pages from docs/data (tumortrack_lab.study.document has
+                                  the format); exit status 1 where a table is of another method
 python tools/figures.py --check   write nothing; exit status 1 also where a page differs
 """
 

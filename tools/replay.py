@@ -26,7 +26,7 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -77,6 +77,13 @@ def largest(made: Numbers, known: Numbers, key: str, share: bool) -> float:
     return max(off, default=0.0)
 
 
+MEASURES: dict[str, Callable[[Numbers, Numbers], float]] = {
+    "places, mm": farthest_mm,
+    "bounds, mm": lambda made, known: largest(made, known, "bounds_mm", False),
+    "other figures, share": lambda made, known: largest(made, known, "figures", True),
+}
+
+
 def compare(made: dict[str, Numbers], known: dict[str, Numbers]) -> bool:
     """Say what differs; whether nothing does."""
     both = [name for name in made if name in known]
@@ -84,18 +91,16 @@ def compare(made: dict[str, Numbers], known: dict[str, Numbers]) -> bool:
     moved = [n for n in both if largest(made[n], known[n], "input_mm", False) > SAME_INPUT_MM]
     if moved:
         print(f"the question of {len(moved)} differs, so their answers may: {moved[0]}, ...")
-    worst = dict[str, float]()
-    for what, measure in (
-        ("places, mm", farthest_mm),
-        ("bounds, mm", lambda a, b: largest(a, b, "bounds_mm", False)),
-        ("other figures, share", lambda a, b: largest(a, b, "figures", True)),
-    ):
-        off = {name: measure(made[name], known[name]) for name in both}
-        off = {name: value for name, value in off.items() if math.isfinite(value)}
-        where = max(off, key=lambda name: off[name], default="")
-        worst[what] = off.get(where, 0.0)
-        over = sum(value > SAME_MM for value in off.values())
-        print(f"{what}: at most {worst[what]:.3g} ({where}); over {SAME_MM:g} in {over}")
+    worst = dict[tuple[str, str], float]()
+    for kind in dict.fromkeys(name.partition("/")[0] for name in both):
+        for what, measure in MEASURES.items():
+            mine = (name for name in both if name.partition("/")[0] == kind)
+            off = {name: measure(made[name], known[name]) for name in mine}
+            off = {name: value for name, value in off.items() if math.isfinite(value)}
+            where = max(off, key=lambda name: off[name], default="")
+            worst[kind, what] = off.get(where, 0.0)
+            over = sum(value > SAME_MM for value in off.values())
+            print(f"{kind}: {what} {worst[kind, what]:.3g} ({where}), over {SAME_MM:g} in {over}")
     pairs = Counter((known[n].get("verdict"), made[n].get("verdict")) for n in both)
     verdicts = {pair: count for pair, count in pairs.items() if pair[0] != pair[1]}
     for (before, now), count in sorted(verdicts.items(), key=lambda pair: -pair[1]):
@@ -146,9 +151,7 @@ def main() -> int:
         print("the fingerprint stands")
         return 0
     if action == "check":
-        print(
-            "another method: make fingerprint records it; tables of the former one go, or are made again"
-        )
+        print("another method: `make fingerprint` records it; tables of the former one must go")
         return 1
     written(file, made)
     print(f"recorded again in {file}: tables of the former method go, or are made again")

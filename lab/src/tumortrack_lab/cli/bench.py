@@ -29,7 +29,7 @@ class Bench:
     document: Path | None = None
 
     def run(self) -> None:
-        """Measure, show, write. Raises InputError: a document without its markers."""
+        """Measure, show, write. Raises InputError: no such document."""
         from tumortrack.cli.console import say
         from tumortrack.core.process import available_cores
         from tumortrack_lab.bench.report import figures, write_bench
