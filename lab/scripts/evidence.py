@@ -61,7 +61,7 @@ class Options:
     twin: Path | None = None
     """A folder with cases/NAME and scenes/NAME."""
     document: Path | None = None
-    """Its block is replaced; tables go beside it."""
+    """A page that shows the tables, which go beside it."""
 
 
 class Organ(NamedTuple):

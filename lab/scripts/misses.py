@@ -50,7 +50,7 @@ class Options:
     write: Path | None = None
     """File for what was learned: src/tumortrack/tracking/misses.json."""
     document: Path | None = None
-    """Its block is replaced; a table goes beside it."""
+    """A page that shows the tables, which go beside it."""
 
 
 def main(options: Options) -> None:

@@ -62,7 +62,7 @@ class Options:
     margins: tuple[float, ...] = (5.0, 9.0)
     """Of scenes, mm; random kidneys get the first alone."""
     document: Path | None = None
-    """Its block is replaced."""
+    """A page that shows the table, which goes beside it."""
 
 
 class Subject(NamedTuple):

@@ -70,7 +70,7 @@ class Options:
     fleet: Path | None = None
     """Folder that `tumortrack fleet` wrote."""
     document: Path = Path("docs/population.md")
-    """Its block is replaced; tables and plot go beside it."""
+    """A page that shows the tables, which go beside it with the plots."""
 
 
 def main(options: Options) -> None:

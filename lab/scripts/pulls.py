@@ -36,7 +36,7 @@ class Options:
     seed: int = 0
     """Of everything."""
     document: Path | None = None
-    """Its block is replaced."""
+    """A page that shows the table, which goes beside it."""
 
 
 def main(options: Options) -> None:

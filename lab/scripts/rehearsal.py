@@ -2,7 +2,7 @@
 
     make rehearsal ARGS='CASE MODEL OUT'      (five minutes; goes on where it was stopped)
 
-The commands are those of a laboratory; OUT keeps every file. --document fills its block and writes
+The commands are those of a laboratory; OUT keeps every file. --document writes
 tables beside it.
 """
 
@@ -42,7 +42,7 @@ class Options:
     mishaps: bool = True
     """Also act out mishaps."""
     document: Path | None = None
-    """Its block `rehearsal` is replaced."""
+    """A page beside which the tables go."""
 
 
 def main(options: Options) -> None:

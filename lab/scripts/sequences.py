@@ -59,7 +59,7 @@ class Options:
     others: tuple[Path, ...] = ()
     """Folders of other organs, followed before, that the table counts in."""
     document: Path | None = None
-    """Its block is replaced by a table, a plot and a film of this organ's strongest press; the
+    """A page beside which go tables, a plot and a film of this organ's strongest press; the
     other tables go to data/ beside it."""
 
 

@@ -45,7 +45,7 @@ class Options:
     evidence: tuple[str, ...] = ("touch12", "outline1")
     """As of `tumortrack margins`."""
     document: Path | None = None
-    """Its block is replaced; tables and pictures go beside it."""
+    """A page that shows the tables, which go beside it with the pictures."""
     worst: int = 6
     """So many of the worst accepted answers are drawn."""
     widest: float = WIDEST_MM

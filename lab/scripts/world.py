@@ -71,7 +71,7 @@ class Options:
     beside: tuple[Path, ...] = ()
     """Other organs' scenes that are measured already: they join the tables."""
     document: Path | None = None
-    """Its block of undisturbed or of disturbed scenes is replaced; tables go beside it."""
+    """A page that shows the tables, which go beside it."""
 
 
 def main(options: Options) -> None:
