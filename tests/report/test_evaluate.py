@@ -2,6 +2,7 @@
 
 import itertools
 import json
+import multiprocessing
 import re
 import shutil
 from dataclasses import replace
@@ -15,7 +16,7 @@ from browser import Browser, of_first_tumor
 from clock import until
 from tumortrack.api import write_scenes
 from tumortrack.core.colours import TUMORS, css, part_colour
-from tumortrack.core.errors import ArtifactError, InputError, NoEstimate
+from tumortrack.core.errors import ArtifactError, InputError, NoEstimate, TumortrackError
 from tumortrack.core.estimate import Estimate
 from tumortrack.core.report import FitReport
 from tumortrack.core.types import (
@@ -102,9 +103,17 @@ def evaluated(tmp_path_factory):
         estimate_of(anatomy(), without=("tumor_1",)),
         NoEstimate("no <organ> in view"),
     )
-    seen = []
-    report = evaluate_scenes(locate, folder / "scenes", folder / "report", lambda: seen.append(1))
-    return folder / "report", report, seen
+    out, seen = folder / "report", []
+
+    def judged():
+        seen.append("judged")
+        assert not (out / "report.json").exists()
+
+    def drawn():
+        seen.append("drawn")
+        assert (out / "report.json").is_file()  # before the pictures
+
+    return out, evaluate_scenes(locate, folder / "scenes", out, judged, drawn), seen
 
 
 def test_report_has_the_promised_layout(evaluated):
@@ -112,7 +121,7 @@ def test_report_has_the_promised_layout(evaluated):
     text = (out / "report.json").read_text()
     assert json.loads(text, parse_constant=pytest.fail) == report
     assert [s["name"] for s in report["scenes"]] == [f"scene_{n}" for n in range(4)]
-    assert len(seen) == 4
+    assert seen == ["judged"] * 4 + ["drawn"] * 4
     keys = {"hausdorff_mm", "hausdorff_one_sided_mm", "hausdorff_95_mm", "surface_mm",
             "center_mm", "iou"}  # fmt: skip
     assert keys <= report["summary"]["tumor_1"].keys()
@@ -573,3 +582,21 @@ def test_a_scene_that_cannot_be_read_leaves_no_report_of_two_processes(
     with pytest.raises((InputError, ArtifactError), match="0001"):
         evaluate_model(ready_case, tmp_path / "scenes", tmp_path / "out", Asked(processes=2))
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.slow
+def test_a_process_that_dies_is_said_in_one_line(ready_case, tmp_path, monkeypatch):
+    """As the system ends one when memory runs out."""
+    monkeypatch.setattr(protocol, "_SCENES", 1)
+    write_scenes(ready_case, tmp_path / "scenes", scenes=3, seed=4)
+
+    def kill_one():
+        multiprocessing.active_children()[0].kill()
+
+    asked = Asked(processes=2)
+    for calls in ((kill_one, lambda: None), (lambda: None, kill_one)):  # judging, drawing
+        with pytest.raises(TumortrackError, match=r"ended from outside.*memory") as caught:
+            evaluate_model(ready_case, tmp_path / "scenes", tmp_path / "out", asked, *calls)
+        assert "\n" not in str(caught.value)
+        assert not (tmp_path / "out").exists()
+        assert not multiprocessing.active_children()

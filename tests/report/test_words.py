@@ -41,7 +41,7 @@ def test_a_scene(failed: str, drawn: list[Figure], tmp_path: Path) -> None:
         "name": "a-scene-of-the-laboratory-" * 8, "miou": 0.5, "parts": {"tumor_1": part},
         "failed": failed, "quality": "poor", "reason": WARNINGS[0],
     }  # fmt: skip
-    scene_picture(scene(), estimate_of(anatomy()), entry, tmp_path / "scene.png")
+    scene_picture(scene(), estimate_of(anatomy()).meshes, entry, tmp_path / "scene.png")
     check(drawn[0], (f"FAILED: {failed}", f"POOR: {WARNINGS[0]}"))
 
 

@@ -5,8 +5,6 @@ from collections.abc import Iterator
 import numpy as np
 from jaxtyping import Float, Int
 
-from tumortrack.core.geometry import expand
-
 _CHUNK = 2_000_000  # candidate pixels held at once
 
 
@@ -65,3 +63,9 @@ def _cover_chunk(
     depth -= slope[tri, 1] * (j - corner[tri, 1])
     depth = np.clip(depth, triangles[:, :, 2].min(1)[tri], triangles[:, :, 2].max(1)[tri])
     return tri, i, j, depth
+
+
+def expand(counts: Int[np.ndarray, " n"]) -> tuple[Int[np.ndarray, " m"], Int[np.ndarray, " m"]]:
+    """``counts[item]`` entries for each item: the item, and the entry's number within it."""
+    item = np.repeat(np.arange(len(counts)), counts)
+    return item, np.arange(len(item)) - np.repeat(np.cumsum(counts) - counts, counts)

@@ -156,9 +156,9 @@ class Evaluate:
 
         keep_loaded()
         out = self.report
-        with progress_bar("evaluate", count) as advance:
+        with progress_bar("evaluate", count, then="draw") as advance:
             asked = Asked(self.grid, self.seed, self.device, _PROCESSES)
-            result = evaluate_model(folder, self.variants, out, asked, advance)
+            result = evaluate_model(folder, self.variants, out, asked, advance, advance)
         for table in summary_tables(result):
             console.print(table)
         for line in (*scene_lines(result["scenes"]), *headlines(result["summary"])):

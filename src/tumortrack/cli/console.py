@@ -54,29 +54,30 @@ def say_notes(notes: Iterable[str]) -> None:
 
 
 @contextmanager
-def progress_bar(what: str, total: int) -> Iterator[Callable[[], None]]:
+def progress_bar(what: str, total: int, then: str = "") -> Iterator[Callable[[], None]]:
     """Shows progress, speed and the time left; yields a function to call after each of ``total``
-    steps. Begin it before slow imports."""
+    steps, and of as many of what comes ``then``. Begin it before slow imports."""
     done = 0
 
     with progress_of(what, f"{what}: 0 of {total} ...") as show:
 
         def advance() -> None:
             nonlocal done
-            done += 1
-            show(done, total)
+            before, done = done, done + 1
+            show(before % total + 1, total, then if before >= total else what)
 
         yield advance
 
 
 @contextmanager
-def progress_of(what: str, first: str = "") -> Iterator[Callable[[int, int], None]]:
-    """The same, but the yielded function takes the number of steps done, and of how many."""
+def progress_of(what: str, first: str = "") -> Iterator[Callable[..., None]]:
+    """The same, but the yielded function takes the number of steps done, of how many, and what if
+    it is something else."""
     first_s = 0.0
 
     with live_line(first or f"{what} ...") as line:
 
-        def show(done: int, total: int) -> None:
+        def show(done: int, total: int, what: str = what) -> None:
             nonlocal first_s
             if done == 1:  # may have included imports and compilation: says nothing of the rate
                 first_s = time.monotonic()

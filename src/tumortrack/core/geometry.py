@@ -133,12 +133,6 @@ def triangles_of(
     return corners.mean(1), doubled
 
 
-def expand(counts: Int[np.ndarray, " n"]) -> tuple[Int[np.ndarray, " m"], Int[np.ndarray, " m"]]:
-    """``counts[item]`` entries for each item: the item, and the entry's number within it."""
-    item = np.repeat(np.arange(len(counts)), counts)
-    return item, np.arange(len(item)) - np.repeat(np.cumsum(counts) - counts, counts)
-
-
 def spread_over(
     vertices: Float64[np.ndarray, "v k"], faces: Faces, longest_mm: float
 ) -> Float64[np.ndarray, "n k"]:

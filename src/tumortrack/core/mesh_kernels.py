@@ -80,80 +80,139 @@ def _left_of(a, b, x, y):  # type: ignore[no-untyped-def]
     return (b[0] - a[0]) * (y - a[1]) - (x - a[0]) * (b[1] - a[1]) > 0
 
 
-_LEAF = 4  # triangles in a box of the lowest level
+_WIDE = 8  # boxes in a box, triangles in a leaf: tested together, in lanes
 _A_THREAD = 20_000  # points that are worth a thread
 
 
 def nearest_on_faces(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     """The nearest place on triangles (f, 3, 3) of each point (n, 3), by a tree of boxes: triangles
-    in the order of a curve through space (Morton's), halved again and again."""
+    in the order of a curve through space (Morton's), by eights, again and again."""
     middles = triangles.mean(1)
     span = np.maximum(np.ptp(middles, axis=0), 1e-9)
-    cells = (1023 * (middles - middles.min(0)) / span).astype(np.int64)
-    bits = cells[:, :, None] >> np.arange(10) & 1
-    keys = (bits << np.arange(3)[:, None] + 3 * np.arange(10)).sum((1, 2))
-    levels = max(0, int(np.ceil(np.log2(len(triangles) / _LEAF))))
-    # Filled up with the last one, so that all leaves are full
-    order = np.argsort(keys, kind="stable")[
-        np.minimum(np.arange(_LEAF << levels), len(triangles) - 1)
-    ]
-    leaves = np.ascontiguousarray(triangles[order]).reshape(-1, _LEAF, 3, 3)
-    level, boxes = np.stack([leaves.min((1, 2)), leaves.max((1, 2))], axis=1), []
-    for _ in range(levels + 1):
-        boxes.append(level)
-        pairs = level.reshape(-1, 2, 2, 3) if len(level) > 1 else level[None]
-        level = np.stack([pairs[:, :, 0].min(1), pairs[:, :, 1].max(1)], axis=1)
-    tree = leaves, np.concatenate(boxes[::-1]), levels
+    order = np.argsort(_morton((1023 * (middles - middles.min(0)) / span).astype(np.int64)))
+    sizes = [-(-len(triangles) // _WIDE)]  # of the levels: leaves first, one box last
+    while sizes[-1] > 1:
+        sizes.append(-(-sizes[-1] // _WIDE))
+    firsts = np.cumsum([0, 0, *sizes[1:]])[: len(sizes)]
+    tree = _tree(triangles[order], np.array(sizes), firsts)
     parts = np.array_split(points, 1 + len(points) // _A_THREAD)
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         return np.concatenate(list(pool.map(lambda part: _nearest(part, *tree), parts)))
 
 
+@njit(nogil=True)
+def _morton(cells):  # type: ignore[no-untyped-def]
+    """How far along the curve cells (n, 3) below 1024 are."""
+    keys = np.zeros(len(cells), np.int64)
+    for n in range(len(cells)):
+        for bit in range(10):
+            for axis in range(3):
+                keys[n] |= (cells[n, axis] >> bit & 1) << (3 * bit + axis)
+    return keys
+
+
 @njit(nogil=True, error_model="numpy")
-def _nearest(points, leaves, boxes, levels):  # type: ignore[no-untyped-def]
-    """Box 0 is around all; in box n are the boxes 2 n + 1 and 2 n + 2, or leaf n - 2^levels + 1."""
-    places, first, last = np.full((len(points), 3), np.nan), 2**levels - 1, 0
-    open_boxes, away = np.empty(levels + 3, np.int64), np.empty(levels + 3)
+def _tree(triangles, sizes, firsts):  # type: ignore[no-untyped-def]
+    """The triangles; leaves (n, 7, 8) of each one's middle, unit normal (0 if it is a line) and
+    radius; boxes (m, 6, 8), the lower and upper corners of those in them, of which each level's
+    begin at ``firsts``. What fills the last of a level is infinitely far away."""
+    leaves = np.zeros((sizes[0], 7, _WIDE))
+    leaves[-1, :3] = np.inf
+    low, high = np.full((sizes[0], 3), np.inf), np.full((sizes[0], 3), -np.inf)
+    for f in range(len(triangles)):
+        (a, b, c), leaf, k = triangles[f], leaves[f // _WIDE], f % _WIDE
+        u0, u1, u2 = b[0] - a[0], b[1] - a[1], b[2] - a[2]
+        v0, v1, v2 = c[0] - a[0], c[1] - a[1], c[2] - a[2]
+        x, y, z = u1 * v2 - u2 * v1, u2 * v0 - u0 * v2, u0 * v1 - u1 * v0
+        square, edges = x * x + y * y + z * z, (u0 * u0 + u1 * u1 + u2 * u2)
+        edges *= v0 * v0 + v1 * v1 + v2 * v2
+        scale = 1 / np.sqrt(square) if square > 1e-10 * edges else 0.0
+        leaf[3, k], leaf[4, k], leaf[5, k] = scale * x, scale * y, scale * z
+        for axis in range(3):
+            leaf[axis, k] = (a[axis] + b[axis] + c[axis]) / 3
+        for corner in (a, b, c):
+            off = 0.0
+            for axis in range(3):
+                off += (corner[axis] - leaf[axis, k]) ** 2
+                low[f // _WIDE, axis] = min(low[f // _WIDE, axis], corner[axis])
+                high[f // _WIDE, axis] = max(high[f // _WIDE, axis], corner[axis])
+            leaf[6, k] = max(leaf[6, k], np.sqrt(off))
+    boxes = np.full((max(firsts[-1] + 1, 1), 6, _WIDE), np.inf)
+    for level in range(1, len(sizes)):
+        lower, higher = low, high
+        low, high = np.full((sizes[level], 3), np.inf), np.full((sizes[level], 3), -np.inf)
+        for n in range(sizes[level - 1]):
+            box, k = n // _WIDE, n % _WIDE
+            for axis in range(3):
+                boxes[firsts[level] + box, axis, k] = lower[n, axis]
+                boxes[firsts[level] + box, 3 + axis, k] = higher[n, axis]
+                low[box, axis] = min(low[box, axis], lower[n, axis])
+                high[box, axis] = max(high[box, axis], higher[n, axis])
+    return triangles, leaves, boxes, firsts
+
+
+@njit(nogil=True, error_model="numpy")
+def _nearest(points, triangles, leaves, boxes, firsts):  # type: ignore[no-untyped-def]
+    """See ``nearest_on_faces`` and ``_tree``. Open boxes are kept as level, number and distance."""
+    places, bounds, last = np.full((len(points), 3), np.nan), np.empty(_WIDE), 0
+    levels = np.empty(_WIDE * len(firsts) + 1, np.int64)
+    numbers, away = np.empty(len(levels), np.int64), np.empty(len(levels))
     for n in range(len(points)):
         # Neighbouring points are often nearest to neighbouring triangles: first where the last was
-        p, least, count = points[n], np.inf, 2
-        open_boxes[0], open_boxes[1] = 0, first + last
-        away[0] = away[1] = 0.0
+        p, least, count = (points[n, 0], points[n, 1], points[n, 2]), np.inf, 2
+        levels[0], numbers[0], away[0] = len(firsts) - 1, 0, 0.0
+        levels[1], numbers[1], away[1] = 0, last // _WIDE, 0.0
         while count:
             count -= 1
-            box = open_boxes[count]
             if away[count] >= least:
                 continue
-            if box >= first:
-                leaf = leaves[box - first]
-                for k in range(_LEAF):
-                    x, y, z = _on_triangle(p, leaf[k, 0], leaf[k, 1], leaf[k, 2])
-                    off = (p[0] - x) ** 2 + (p[1] - y) ** 2 + (p[2] - z) ** 2
-                    if off < least:
-                        least, last = off, box - first
-                        places[n, 0], places[n, 1], places[n, 2] = x, y, z
+            level, number = levels[count], numbers[count]
+            if level == 0:
+                _to_triangles(p, leaves[number], bounds)
+                for k in range(min(_WIDE, len(triangles) - _WIDE * number)):
+                    if bounds[k] < least:
+                        t = _WIDE * number + k
+                        x, y, z = _on_triangle(p, triangles[t, 0], triangles[t, 1], triangles[t, 2])
+                        off = (p[0] - x) ** 2 + (p[1] - y) ** 2 + (p[2] - z) ** 2
+                        if off < least:
+                            least, last = off, t
+                            places[n, 0], places[n, 1], places[n, 2] = x, y, z
                 continue
-            one, other = 2 * box + 1, 2 * box + 2
-            near, far = _to_box(p, boxes[one]), _to_box(p, boxes[other])
-            if near > far:
-                one, other, near, far = other, one, far, near
-            if far < least:
-                open_boxes[count], away[count] = other, far
-                count += 1
-            if near < least:
-                open_boxes[count], away[count] = one, near
-                count += 1
+            _to_boxes(p, boxes[firsts[level] + number], bounds)
+            first = count
+            for k in range(_WIDE):
+                if bounds[k] < least:  # sorted in, the nearest last
+                    at = count
+                    while at > first and away[at - 1] < bounds[k]:
+                        numbers[at], away[at] = numbers[at - 1], away[at - 1]
+                        at -= 1
+                    numbers[at], away[at] = _WIDE * number + k, bounds[k]
+                    levels[count] = level - 1
+                    count += 1
     return places
 
 
 @njit(inline="always")
-def _to_box(p, box):  # type: ignore[no-untyped-def]
-    """The square of a point's distance to a box (2, 3)."""
-    total = 0.0
-    for axis in range(3):
-        off = max(box[0, axis] - p[axis], p[axis] - box[1, axis], 0.0)
-        total += off * off
-    return total
+def _to_boxes(p, boxes, out):  # type: ignore[no-untyped-def]
+    """The squares of a point's distances to boxes (6, 8)."""
+    px, py, pz = p  # not read again for each lane, as ``out`` might be the same
+    for k in range(_WIDE):
+        x = max(max(boxes[0, k] - px, px - boxes[3, k]), 0.0)
+        y = max(max(boxes[1, k] - py, py - boxes[4, k]), 0.0)
+        z = max(max(boxes[2, k] - pz, pz - boxes[5, k]), 0.0)
+        out[k] = x * x + y * y + z * z
+
+
+@njit(inline="always")
+def _to_triangles(p, leaf, out):  # type: ignore[no-untyped-def]
+    """Not above the squares of a point's distances to a leaf's triangles: those to discs about
+    them (balls, if they are lines)."""
+    px, py, pz = p
+    for k in range(_WIDE):
+        x, y, z = px - leaf[0, k], py - leaf[1, k], pz - leaf[2, k]
+        height = x * leaf[3, k] + y * leaf[4, k] + z * leaf[5, k]
+        aside = np.sqrt(max(x * x + y * y + z * z - height * height, 0.0)) - leaf[6, k]
+        out[k] = height * height + max(aside, 0.0) ** 2
 
 
 _FLAT = 1e-14  # square of the sine of a corner, below which a triangle is a line
@@ -200,6 +259,35 @@ def _on_triangle(p, a, b, c):  # type: ignore[no-untyped-def]
     else:
         s, t = vb / (va + vb + vc), vc / (va + vb + vc)
     return (a[0] + s * ab0 + t * ac0, a[1] + s * ab1 + t * ac1, a[2] + s * ab2 + t * ac2)
+
+
+@njit(nogil=True)
+def spread(triangles, spacing):  # type: ignore[no-untyped-def]
+    """Points on triangles (f, 3, 3), and each one's area: see ``mesh_query.surface_samples``."""
+    cuts = np.empty(len(triangles), np.int64)
+    for f in range(len(triangles)):
+        longest = 0.0
+        for corner in range(3):
+            edge = triangles[f, corner] - triangles[f, corner - 1]
+            longest = max(longest, np.sqrt(edge[0] ** 2 + edge[1] ** 2 + edge[2] ** 2))
+        cuts[f] = max(np.ceil(longest / spacing), 1)
+    points, areas, at = np.empty((np.sum(cuts**2), 3)), np.empty(np.sum(cuts**2)), 0
+    for f in range(len(triangles)):
+        (a, b, c), n = triangles[f], cuts[f]
+        x = (b[1] - a[1]) * (c[2] - a[2]) - (b[2] - a[2]) * (c[1] - a[1])
+        y = (b[2] - a[2]) * (c[0] - a[0]) - (b[0] - a[0]) * (c[2] - a[2])
+        z = (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
+        for row in range(n):
+            for place in range(2 * row + 1):  # pointing up (even) and down (odd) in turn
+                down = place % 2
+                third = 2 / 3 if down else 1 / 3
+                u, v = (row - place // 2 - down + third) / n, (place // 2 + third) / n
+                for axis in range(3):
+                    own = a[axis]
+                    points[at, axis] = own + u * (b[axis] - own) + v * (c[axis] - own)
+                areas[at] = np.sqrt(x * x + y * y + z * z) / 2 / n**2
+                at += 1
+    return points, areas
 
 
 _MAXIMUM = {"nnan", "nsz"}  # lets a maximum be taken in lanes; sums stay as they are written

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, UInt8
 
 from tumortrack.core.errors import InputError
-from tumortrack.core.geometry import Points, expand, triangles_of
+from tumortrack.core.geometry import Points, triangles_of
 from tumortrack.core.types import Anatomy, Mesh
 
 _WITHIN_MM = 0.1  # of ``surface_distance``
@@ -46,23 +46,12 @@ def surface_samples(
     Deterministic: every triangle is cut into n^2 equal ones with edges <= spacing, whose centroids
     carry the area. The vertices follow with area 0, so that extremes are included.
     """
-    triangles = mesh.vertices_mm[mesh.faces]
-    edges = triangles - np.roll(triangles, 1, axis=1)
-    cuts = np.maximum(np.ceil(np.linalg.norm(edges, axis=2).max(1) / spacing_mm), 1).astype(int)
-    area = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1) / 2
-    face, cell = expand(cuts**2)
-    n = cuts[face]
-    # Row r of the cut triangle holds 2 r + 1 cells, pointing up (even) and down (odd) in turn.
-    row = np.floor(np.sqrt(cell)).astype(int)
-    place = cell - row**2
-    down = place % 2
-    u = (row - place // 2 - down + np.where(down, 2 / 3, 1 / 3)) / n
-    v = (place // 2 + np.where(down, 2 / 3, 1 / 3)) / n
-    a, b, c = (triangles[face, corner] for corner in range(3))
-    points = a + u[:, None] * (b - a) + v[:, None] * (c - a)
+    from tumortrack.core.mesh_kernels import spread
+
+    points, areas = spread(mesh.vertices_mm[mesh.faces], spacing_mm)
     used = np.unique(mesh.faces)
     points = np.concatenate([points, mesh.vertices_mm[used]])
-    return points, np.append(area[face] / n**2, np.zeros(len(used)))
+    return points, np.append(areas, np.zeros(len(used)))
 
 
 def nearest_places(mesh: Mesh, points_mm: Float[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3"]:

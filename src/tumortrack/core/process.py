@@ -1,13 +1,16 @@
-"""Resources of this process: cores, a second thread, freed memory."""
+"""Resources of this process: cores, a second thread, freed memory; its Ctrl-C."""
 
 from __future__ import annotations
 
 import ctypes
 import os
+import signal
 import sys
+import threading
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 from typing import TypeVar
@@ -78,6 +81,24 @@ def _helper(process: int) -> ThreadPoolExecutor | None:
     """A second thread of this process (threads do not survive a fork), if there is a core."""
     cores = min(available_cores(), int(os.environ.get("NUMBA_NUM_THREADS", "2")))
     return ThreadPoolExecutor(1, "parallel") if cores > 1 else None
+
+
+@contextmanager
+def undisturbed() -> Iterator[None]:
+    """Ctrl-C waits until the end. Processes that begin in here never get it."""
+    if threading.current_thread() is not threading.main_thread():  # which alone gets it
+        yield
+        return
+    came: list[int] = []
+    handler = signal.signal(signal.SIGINT, lambda number, _: came.append(number))
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # is inherited
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+        signal.signal(signal.SIGINT, handler)
+        if came:
+            signal.raise_signal(signal.SIGINT)
 
 
 def keep_freed_memory() -> None:

@@ -6,16 +6,17 @@ import base64
 import html
 import io
 import json
+from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from PIL import Image
 
 from tumortrack.core import colours
-from tumortrack.core.estimate import NO_CHECK_FAILED, UNVERIFIED, Estimate
+from tumortrack.core.estimate import NO_CHECK_FAILED, UNVERIFIED
 from tumortrack.core.geometry import plane_section
 from tumortrack.core.organ import is_tumor
 from tumortrack.core.patient import patient_in
@@ -43,10 +44,9 @@ _ORGAN_CELL_MM, _TUMOR_CELL_MM = 2.5, 2.0
 _MAX_POINTS, _AROUND_MM = 2000, 12.0  # of the cloud, in a box so much larger than the organ's
 
 
-def page_scene(scene: Scene, estimate: Estimate | None, picture: Path) -> dict[str, Any]:
+def page_scene(scene: Scene, shown: Mapping[str, Mesh], picture: Path) -> dict[str, Any]:
     """The page's data of a scene (JSON types): ``layers``, simplified meshes, ``box`` around organ
     and tumors, and ``picture``, the PNG of ``scene_picture``, compressed."""
-    shown = estimate.meshes if estimate else {}
     meshes = [*scene.reference.parts, *shown.values()]
     lower = np.min([mesh.box_mm[0] for mesh in meshes], axis=0) - _AROUND_MM
     upper = np.max([mesh.box_mm[1] for mesh in meshes], axis=0) + _AROUND_MM
@@ -59,7 +59,7 @@ def page_scene(scene: Scene, estimate: Estimate | None, picture: Path) -> dict[s
     layers += map(_outline, scene.reference.names, scene.reference.parts)
     webp = io.BytesIO()
     with Image.open(picture) as image:
-        image.convert("RGB").save(webp, "WEBP", quality=82)
+        image.convert("RGB").save(webp, "WEBP", quality=82, method=2)  # in half of 4's time
     box = [lower.round(1).tolist(), upper.round(1).tolist()]
     return {"layers": layers, "box": box, "picture": _base64(webp.getvalue())}
 
@@ -106,18 +106,24 @@ def write_page(report: dict[str, Any], scenes: list[dict[str, Any]], path: Path)
 
 def thinned(mesh: Mesh, cell_mm: float) -> Mesh:
     """A coarser mesh for display: the vertices in a cubic cell are replaced by their mean."""
-    cells = np.floor(mesh.vertices_mm / cell_mm).astype(np.int64)
-    _, group = np.unique(cells, axis=0, return_inverse=True)
-    group = group.reshape(-1)
+    group = _numbered(np.floor(mesh.vertices_mm / cell_mm).astype(np.int64))[0]
     count = np.bincount(group)
     means = [np.bincount(group, mesh.vertices_mm[:, axis]) / count for axis in range(3)]
     a, b, c = group[mesh.faces].T
     faces = group[mesh.faces][(a != b) & (b != c) & (c != a)]
     # A thin fold collapses to two sheets with the same corners: drop faces that occur in pairs.
-    _, kind, times = np.unique(
-        np.sort(faces, axis=1), axis=0, return_inverse=True, return_counts=True
-    )
-    return Mesh(np.stack(means, axis=1), faces[times[kind.reshape(-1)] % 2 == 1])
+    kind, times = _numbered(np.sort(faces, axis=1))
+    return Mesh(np.stack(means, axis=1), faces[times[kind] % 2 == 1])
+
+
+def _numbered(rows: Int[np.ndarray, "n 3"]) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, " m"]]:
+    """Each row's number among the different ones in order, and how often each of those occurs: as
+    by ``np.unique``, in a fifth of the time."""
+    offset = rows - rows.min(0, initial=0)
+    _, sizes_j, sizes_k = (offset.max(0, initial=0) + 1).tolist()
+    keys = (offset[:, 0] * sizes_j + offset[:, 1]) * sizes_k + offset[:, 2]
+    _, kind, times = np.unique(keys, return_inverse=True, return_counts=True)
+    return kind, times
 
 
 def _surface(part: str, mesh: Mesh) -> dict[str, Any]:

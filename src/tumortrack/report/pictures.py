@@ -6,7 +6,7 @@ needed.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from tumortrack.core.colours import name_colour
-from tumortrack.core.estimate import NO_CHECK_FAILED, UNVERIFIED, Estimate
+from tumortrack.core.estimate import NO_CHECK_FAILED, UNVERIFIED
 from tumortrack.core.geometry import DIRECTIONS_LPS, transform_points
 from tumortrack.core.organ import is_tumor, organ_name
 from tumortrack.core.types import Anatomy, LabelVolume, Mesh, Volume
@@ -51,12 +51,10 @@ _NEAR_BORDER = {
 
 
 def scene_picture(
-    scene: Scene, estimate: Estimate | None, entry: dict[str, Any], path: Path
+    scene: Scene, shown: Mapping[str, Mesh], entry: dict[str, Any], path: Path
 ) -> None:
-    """Write a PNG, atomically: the estimate over the truth in two 3-D views, and in two slices
-    through each true tumor's centre. Without an estimate, the truth alone. ``entry``: of the scene
-    in the report."""
-    shown = estimate.meshes if estimate else {}
+    """Write a PNG, atomically: the estimate's meshes over the truth in two 3-D views, and in two
+    slices through each true tumor's centre. ``entry``: of the scene in the report."""
     slices = [(name, view) for name in scene.reference.names[1:] for view in _SLICES]
     rows = -(-len(slices) // 4)
     height_in = 4.6 + 4.05 * rows
@@ -64,7 +62,7 @@ def scene_picture(
     outer = figure.add_gridspec(2, 1, height_ratios=[4.1, 3.95 * max(rows, 0.01)], hspace=0.13)
     above = outer[0].subgridspec(1, 2, wspace=0.04)
     for column, view in enumerate(_SLICES):
-        draw_solid_view(figure.add_subplot(above[column]), scene, estimate, view)
+        draw_solid_view(figure.add_subplot(above[column]), scene, shown, view)
     below = outer[1].subgridspec(max(rows, 1), 4, wspace=0.06, hspace=0.2)
     for n, (name, view) in enumerate(slices):
         axes = figure.add_subplot(below[n // 4, n % 4])
@@ -87,10 +85,10 @@ def scene_picture(
 
 
 def draw_solid_view(
-    axes: Axes, scene: Scene, estimate: Estimate | None, view: ParallelView
+    axes: Axes, scene: Scene, meshes: Mapping[str, Mesh], view: ParallelView
 ) -> None:
     """The estimate's surfaces, the truth's outlines and the observed points."""
-    shown = dict(estimate.meshes) if estimate else {}
+    shown = dict(meshes)
     everything = [mesh.vertices_mm for mesh in (*scene.reference.parts, *shown.values())]
     frame = view.frame_around(np.concatenate(everything), 6.0).widened(1.7)
     name = organ_name(shown)
@@ -109,17 +107,20 @@ def draw_solid_view(
 
 
 def _draw_slice(
-    axes: Axes, scene: Scene, shown: dict[str, Mesh], name: str, view: ParallelView
+    axes: Axes, scene: Scene, shown: Mapping[str, Mesh], name: str, view: ParallelView
 ) -> None:
     truth = dict(zip(scene.reference.names, scene.reference.parts, strict=True))
     through_mm = truth[name].box_mm.mean(0)
     around = [meshes[name].vertices_mm for meshes in (truth, shown) if name in meshes]
     frame = view.frame_around(np.concatenate(around), 12.0).widened(1.0)
+    tints = []
     for part, mesh in shown.items():
         color, width = rgb(name_colour(part)), 2.4 if is_tumor(part) else 1.4
-        drawing.tint(axes, drawing.section_mask(mesh, view, frame, through_mm), frame, color)
+        tints.append((drawing.section_mask(mesh, view, frame, through_mm), color))
         lines = drawing.section(mesh, view, through_mm)
         drawing.draw_lines(axes, lines, color=color, linewidth=width, zorder=3)
+    if tints:
+        drawing.tint(axes, tints, frame)
     for part, mesh in truth.items():
         width = 2.0 if is_tumor(part) else 1.1
         lines = drawing.section(mesh, view, through_mm)

@@ -41,10 +41,12 @@ def check_place(out: Path, overwrite: bool) -> None:
 def clear(out: Path) -> None:
     """Remove a report's files, and the folders if nothing else is in them."""
     with writing(out):
-        for name in ("report.json", "index.html"):
-            (out / name).unlink(missing_ok=True)  # never an old table beside new pictures
-        for picture in (out / "scenes").glob("*.png"):
-            picture.unlink()
+        for name in ("report.json", "index.html"):  # never an old table beside new pictures
+            for file in (out / name, *out.glob(f".{name}.*.part")):  # of an interrupted write
+                file.unlink(missing_ok=True)
+        for pattern in ("*.png", ".*.png.*.part"):
+            for picture in (out / "scenes").glob(pattern):
+                picture.unlink()
     for folder in (out / "scenes", out):
         with suppress(OSError):
             folder.rmdir()

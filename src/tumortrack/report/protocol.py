@@ -3,26 +3,28 @@
 from __future__ import annotations
 
 import os
-import signal
+import pickle
+import threading
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable
 from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from functools import partial
-from multiprocessing import get_context
+from multiprocessing import active_children, get_context, parent_process
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 import tumortrack
 from tumortrack.core import store
 from tumortrack.core.config import to_builtins
-from tumortrack.core.errors import InputError, NoEstimate
+from tumortrack.core.errors import InputError, NoEstimate, TumortrackError
 from tumortrack.core.estimate import FAR_MM, Estimate
+from tumortrack.core.process import undisturbed
 from tumortrack.core.store import write_json, writing
 from tumortrack.core.types import SensorCloud
 from tumortrack.models.model import Model
 from tumortrack.report import metrics
-from tumortrack.report.page import page_scene, write_page
-from tumortrack.report.pictures import scene_picture
 from tumortrack.report.place import clear
 from tumortrack.report.rivals import rivals_of
 from tumortrack.report.summary import SAID, summarise, worst_center
@@ -34,7 +36,13 @@ from tumortrack.tracking.tracker import Tracker
 RULE = f"{SAID.medians} {SAID.rule.format(far_mm=FAR_MM)}"
 Locate = Callable[[SensorCloud], Estimate]
 Compare = Callable[[Scene], dict[str, Any]]
+Judge = Callable[[Path, Path], dict[str, Any]]
+Step = Callable[[], None]
 _SCENES = 4  # are worth a process
+_KILLED = (
+    "a process that evaluated scenes was ended from outside, as the system does when memory runs "
+    "out; no report was written. End other programs or choose a smaller --grid, and try again."
+)
 
 
 class Asked(NamedTuple):
@@ -51,9 +59,12 @@ class Asked(NamedTuple):
 _AS_USUAL = Asked()
 
 
-class _Judged(NamedTuple):
-    entry: dict[str, Any]
-    shown: dict[str, Any]
+class _Work(NamedTuple):
+    """``map``: over scenes, here or in other processes; ``stop`` ends those."""
+
+    map: Callable[..., Iterable[dict[str, Any]]]
+    judge: Judge
+    stop: Step = lambda: None
 
 
 def evaluate_model(
@@ -61,23 +72,24 @@ def evaluate_model(
     scenes_dir: Path,
     out: Path,
     asked: Asked = _AS_USUAL,
-    progress: Callable[[], None] = lambda: None,
+    progress: Step = lambda: None,
+    drawn: Step = lambda: None,
 ) -> dict[str, Any]:
     """``evaluate_scenes`` with a tracker, or the model of a folder, which the report then names.
-    Also raises InputError for scenes of another case."""
+    Also raises InputError for scenes of another case; TumortrackError: a process was killed."""
     folders, digest = list_scenes(scenes_dir), {}
     folder = None
     if isinstance(model, Tracker):
-        tracker = model
+        loaded = model.model
     else:
         folder = model_folder(model)
         digest = {"model_sha256": store.sha256_of(folder / store.MANIFEST)}
-        tracker = Tracker(load_model(folder, asked.device))
-    check_case(tracker.model, folders)
-    rivals = rivals_of(tracker.model)
+        loaded = load_model(folder, asked.device)
+    check_case(loaded, folders)
+    rivals = rivals_of(loaded)
     about = {
-        "patient": to_builtins(tracker.model.patient),
-        "model": tracker.model.provenance,
+        "patient": to_builtins(loaded.patient),
+        "model": loaded.provenance,
         **digest,
         "scenes_folder": str(scenes_dir),
         "grid": asked.grid,
@@ -85,34 +97,52 @@ def evaluate_model(
     }
     processes = min(asked.processes, os.cpu_count() or 1, len(folders) // _SCENES)
     if folder is None or processes < 2:
+        tracker = model if isinstance(model, Tracker) else Tracker(loaded)
         locate = partial(tracker.locate, grid=asked.grid, seed=asked.seed)
-        return evaluate_scenes(locate, scenes_dir, out, progress, about, rivals)
-    with ProcessPoolExecutor(processes, get_context("spawn"), _begin, (folder, asked, out)) as pool:
+        return evaluate_scenes(locate, scenes_dir, out, progress, drawn, about, rivals)
+    about |= _said(rivals)
+    others = {*active_children()}
+    with ProcessPoolExecutor(processes, get_context("spawn"), _begin, (folder, asked)) as pool:
+
+        def stop() -> None:  # what they do is not waited for
+            for process in {*active_children()} - others:
+                process.kill()
+            pool.shutdown()
+
+        work = _Work(partial(_mapped, pool), _in_process, stop)
         try:
-            return _report(_each(pool, folders), out, progress, {**about, **_said(rivals)})
-        except BaseException:  # Ctrl-C, too
-            pool.shutdown(cancel_futures=True)
-            raise
+            return _report(work, folders, out, (progress, drawn), about)
+        except BrokenProcessPool as error:
+            raise TumortrackError(_KILLED) from error
 
 
-_judge: list[Callable[[Path], _Judged]] = []  # of a process
+_judge: list[Judge] = []  # of a process
 
 
-def _begin(folder: Path, asked: Asked, out: Path) -> None:
-    """Called once in a new process, which leaves Ctrl-C to the one that began it."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+def _begin(folder: Path, asked: Asked) -> None:
+    """Called once in a new process, which ends with the one that began it."""
+    threading.Thread(target=_watch, daemon=True).start()
     tracker = Tracker(load_model(folder, asked.device))
     locate = partial(tracker.locate, grid=asked.grid, seed=asked.seed)
-    _judge.append(partial(_judged, locate, rivals_of(tracker.model), out))
+    _judge.append(partial(_judged, locate, rivals_of(tracker.model)))
 
 
-def _in_process(folder: Path) -> _Judged:
-    return _judge[0](folder)
+def _watch() -> None:
+    parent = parent_process()
+    assert parent is not None
+    parent.join()
+    os._exit(1)
 
 
-def _each(pool: ProcessPoolExecutor, folders: Sequence[Path]) -> Iterator[_Judged]:
-    """Begun when the first is asked for: then the report's folder is there."""
-    yield from pool.map(_in_process, folders)
+def _in_process(aside: Path, folder: Path) -> dict[str, Any]:
+    return _judge[0](aside, folder)
+
+
+def _mapped(
+    pool: ProcessPoolExecutor, call: Callable[[Path], Any], folders: Iterable[Path]
+) -> Iterable[Any]:
+    with undisturbed():  # processes begin here, and leave Ctrl-C to this one
+        return pool.map(call, folders)
 
 
 def check_case(model: Model, folders: list[Path]) -> None:
@@ -134,71 +164,96 @@ def evaluate_scenes(
     locate: Locate,
     scenes_dir: Path,
     out: Path,
-    progress: Callable[[], None] = lambda: None,
+    progress: Step = lambda: None,
+    drawn: Step = lambda: None,
     about: dict[str, Any] | None = None,
     rivals: Compare | None = None,
 ) -> dict[str, Any]:
     """Evaluate ``locate`` on every scene of a folder.
 
-    Writes OUT/scenes/NAME.png, OUT/index.html and, last, OUT/report.json. Replaces a report that is
-    there (``place.check_place`` says whether that is allowed), and removes an unfinished one.
+    Judges all scenes and writes OUT/report.json, then OUT/scenes/NAME.png and, last,
+    OUT/index.html. Replaces a report that is there (``place.check_place`` says whether that is
+    allowed), and removes one without all its pictures, even if its figures are complete.
     Raises InputError: no scenes, or a scene that cannot be read; StorageError: the disk refused.
 
     Args:
         locate: observed cloud (camera frame, mm) -> estimate; raises NoEstimate or InputError if it
             has none, which counts as a failed scene.
-        progress: called after each scene.
+        progress: called after each scene that was judged; drawn: after each picture.
         about: plain JSON for the report: the model and options behind ``locate``.
         rivals: rigid registration of a scene, see ``report.rivals.Rivals``.
     """
-    judge = partial(_judged, locate, rivals, out)
+    work = _Work(map, partial(_judged, locate, rivals))
     about = {**(about or {}), **_said(rivals)}
-    return _report(map(judge, list_scenes(scenes_dir)), out, progress, about)
+    return _report(work, list_scenes(scenes_dir), out, (progress, drawn), about)
 
 
 def _said(rivals: Compare | None) -> dict[str, Any]:
     return {"rivals": SAID.rivals if rivals is not None else {"not_available": SAID.no_rivals}}
 
 
-def _judged(locate: Locate, rivals: Compare | None, out: Path, folder: Path) -> _Judged:
-    """A scene's entry, and what the page shows of it; its picture is written."""
+def _judged(locate: Locate, rivals: Compare | None, aside: Path, folder: Path) -> dict[str, Any]:
+    """A scene's entry; what its picture shows is put aside."""
     scene = read_scene(folder)
     entry, estimate = evaluate_scene(locate, scene, folder.name, rivals)
     if isinstance(stated := scene.meta.get("registration"), dict):  # of a second CT
         entry["registration_mm"] = stated.get("tre_mm", {})
+    shown = Scene(scene.cloud, scene.reference), estimate.meshes if estimate else {}, entry
+    with writing(aside):
+        (aside / folder.name).write_bytes(pickle.dumps(shown))
+    return entry
+
+
+def _drawn(out: Path, aside: Path, folder: Path) -> dict[str, Any]:
+    """What the page shows of a scene; its picture is written."""
+    from tumortrack.report.page import page_scene
+    from tumortrack.report.pictures import scene_picture  # slow to import, like the page
+
+    scene, meshes, entry = pickle.loads((aside / folder.name).read_bytes())
     picture = out / "scenes" / f"{folder.name}.png"
-    scene_picture(scene, estimate, entry, picture)
-    return _Judged(entry, page_scene(scene, estimate, picture))
+    scene_picture(scene, meshes, entry, picture)
+    return page_scene(scene, meshes, picture)
 
 
 def _report(
-    judged: Iterable[_Judged], out: Path, progress: Callable[[], None], about: dict[str, Any]
+    work: _Work, folders: list[Path], out: Path, steps: tuple[Step, Step], about: dict[str, Any]
 ) -> dict[str, Any]:
-    """The report of scenes as they come."""
     clear(out)
-    try:
-        with writing(out):
-            (out / "scenes").mkdir(parents=True, exist_ok=True)
-        scenes = []
-        for each in judged:
-            scenes.append(each)
-            progress()
-        entries = [each.entry for each in scenes]
-        report = {
-            "tumortrack": tumortrack.__version__,
-            "units": "mm",
-            "frame": "camera",
-            **about,
-            "rule": RULE,
-            "summary": summarise(entries),
-            "scenes": entries,
-        }
-        write_page(report, [each.shown for each in scenes], out / "index.html")
-        write_json(out / "report.json", report)
-    except BaseException:  # Ctrl-C, too: an unfinished report would block the next command
-        clear(out)
-        raise
+    with TemporaryDirectory(prefix="tumortrack-") as name:
+        aside = Path(name)
+        try:
+            with writing(out):
+                (out / "scenes").mkdir(parents=True, exist_ok=True)
+            entries = _counted(work.map(partial(work.judge, aside), folders), steps[0])
+            report = {
+                "tumortrack": tumortrack.__version__,
+                "units": "mm",
+                "frame": "camera",
+                **about,
+                "rule": RULE,
+                "summary": summarise(entries),
+                "scenes": entries,
+            }
+            write_json(out / "report.json", report)
+            shown = _counted(work.map(partial(_drawn, out, aside), folders), steps[1])
+
+            from tumortrack.report.page import write_page
+
+            write_page(report, shown, out / "index.html")
+        except BaseException:  # Ctrl-C, too: an unfinished report would block the next command
+            with undisturbed():
+                work.stop()
+                clear(out)
+            raise
     return report
+
+
+def _counted(results: Iterable[dict[str, Any]], step: Step) -> list[dict[str, Any]]:
+    done = []
+    for result in results:
+        done.append(result)
+        step()
+    return done
 
 
 def evaluate_scene(

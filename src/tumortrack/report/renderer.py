@@ -236,14 +236,13 @@ def corner_normals(mesh: Mesh) -> Float32[np.ndarray, "f 3 3"]:
     """Unit normal at each face's corners: the mean over the faces there, but beyond a crease."""
     if (known := _NORMALS.get(mesh)) is not None:
         return known
-    place = np.unique(mesh.vertices_mm, axis=0, return_inverse=True)[1].reshape(-1)[mesh.faces]
-    corner = place.ravel()
+    order = np.lexsort(mesh.vertices_mm.T)
+    new = (np.diff(mesh.vertices_mm[order], axis=0) != 0).any(1)
+    place = np.empty(len(order), np.int64)
+    place[order] = np.append(0, np.cumsum(new))[: len(order)]
     weighted = triangles_of(mesh.vertices_mm, mesh.faces)[1]
     facing = weighted / np.maximum(np.linalg.norm(weighted, axis=1, keepdims=True), 1e-12)
-    # The faces about place p are sharers[first[p] : first[p + 1]].
-    sharers = np.argsort(corner, kind="stable") // 3
-    first = np.append(0, np.cumsum(np.bincount(corner)))
-    normals = mean_normals(corner, sharers, first, weighted, facing, np.cos(_CREASE_RAD))
+    normals = mean_normals(place[mesh.faces].ravel(), weighted, facing, np.cos(_CREASE_RAD))
     _NORMALS[mesh] = normals
     return normals
 

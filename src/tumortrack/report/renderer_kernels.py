@@ -24,10 +24,20 @@ def _dot(one, two):  # type: ignore[no-untyped-def]
 
 
 @njit(nogil=True)
-def mean_normals(corner, sharers, first, weighted, facing, cosine):  # type: ignore[no-untyped-def]
+def mean_normals(corner, weighted, facing, cosine):  # type: ignore[no-untyped-def]
     """Unit normals (f, 3, 3), float32, of faces' corners (3 f,), numbers of places: the mean of the
-    ``weighted`` normals (f, 3) of the faces about the same place, ``sharers[first[p] :
-    first[p + 1]]``, whose unit normals (``facing``) have at least this cosine to its own."""
+    ``weighted`` normals (f, 3) of the faces about the same place whose unit normals (``facing``)
+    have at least this cosine to its own."""
+    # The faces about place p are sharers[first[p] : first[p + 1]].
+    places = corner.max() + 1 if len(corner) else 0
+    first, sharers = np.zeros(places + 1, np.int64), np.empty(len(corner), np.int64)
+    for place in corner:
+        first[place + 1] += 1
+    first = np.cumsum(first)
+    filled = first.copy()
+    for c in range(len(corner)):
+        sharers[filled[corner[c]]] = c // 3
+        filled[corner[c]] += 1
     out = np.empty((len(facing), 3, 3), np.float32)
     for c in range(len(corner)):
         own, x, y, z = facing[c // 3], 0.0, 0.0, 0.0

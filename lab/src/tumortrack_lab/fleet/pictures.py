@@ -45,5 +45,6 @@ def worst_picture(
         lambda cloud: tracker.locate(cloud, seen=scene.depth), scene, name
     )
     with TemporaryDirectory() as aside:
-        scene_picture(scene, estimate, entry, Path(aside) / "scene.png")
+        shown = estimate.meshes if estimate else {}
+        scene_picture(scene, shown, entry, Path(aside) / "scene.png")
         thumbnail(Path(aside) / "scene.png", out)

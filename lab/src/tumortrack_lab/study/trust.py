@@ -221,7 +221,7 @@ def worst_picture(
         scene = read_scene(Path(state["row"].scene))
         estimate = trackers[state.organ].locate(scene.cloud, 8, 0, scene.depth)
         for axes, view in zip(row, (FROM_CAMERA, FROM_SIDE), strict=True):
-            draw_solid_view(axes, scene, estimate, view)
+            draw_solid_view(axes, scene, estimate.meshes, view)
         row[0].set_ylabel(f"{number}", fontsize=14, fontweight="bold", rotation=0, labelpad=10)
         rows.append({
             "row": number, "organ": state.organ, "scene": Path(state["row"].scene).name,

@@ -120,7 +120,7 @@ def twin_picture(scene: Scene, path: Path) -> None:
     bar.ax.invert_yaxis()
     axes.set(xticks=[], yticks=[], title=f"depth image, cropped to {near:g} .. {far:g} mm")
     for number, view in enumerate((FROM_CAMERA, FROM_SIDE), start=2):
-        draw_solid_view(figure.add_subplot(1, 3, number), scene, None, view)
+        draw_solid_view(figure.add_subplot(1, 3, number), scene, {}, view)
     words = f"{scene.meta['variant']}, {scene.meta['view']}"
     drawing.add_words(figure, words, handles=scene_legend()[-2:])
     drawing.save(figure, path)

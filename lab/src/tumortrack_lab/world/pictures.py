@@ -119,7 +119,7 @@ def _section(
     for parts, color in shown:
         for n, part in enumerate(parts):
             lines = drawing.section(part, view, middle_mm)
-            drawing.draw_lines(axes, lines, colors=[color], linewidths=2.0 if n else 1.2)
+            drawing.draw_lines(axes, lines, color=color, linewidth=2.0 if n else 1.2)
 
 
 def _curve(axes: Axes, film: Film, errors: list[float]) -> None:
