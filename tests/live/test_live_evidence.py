@@ -48,7 +48,7 @@ class Holding:
 class Tape:
     """Frames that wait for their reader."""
 
-    host_clock, lossless, dropped = True, True, 0
+    host_clock, lossless, on_demand, dropped = True, True, False, 0
 
     def __init__(self, count):
         self._left = count

@@ -74,7 +74,7 @@ def moving(stage, n, start_ns=10**15, step_mm=(0.4, -0.2, 0.1)):
 class Script:
     """A source that gives items in order: clouds, errors to raise, things to do first."""
 
-    dropped = 0
+    dropped, on_demand = 0, False
 
     def __init__(self, items, waits=True, host_clock=False):
         self._items, self.lossless, self.host_clock = list(items), waits, host_clock

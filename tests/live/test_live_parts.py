@@ -174,7 +174,7 @@ def test_ages_count_from_where_the_source_allows(waits, host_clock, counts_from)
 class Script:
     """A source that does what it is told: gives items, raises errors, waits at the end."""
 
-    host_clock = False
+    host_clock = on_demand = False
     dropped = 0
 
     def __init__(self, items, waits=False):
@@ -220,6 +220,15 @@ def test_a_source_that_waits_loses_nothing():
     assert reader.take(PATIENCE_S) is None
     assert reader.ended
     assert reader.dropped == 0
+    reader.close()
+
+
+def test_a_source_has_not_ended_while_its_last_frame_waits():
+    reader = SourceWorker(lambda: Script([_seen(1), SourceEnded("end")], waits=True))
+    reader._thread.join()
+    assert not reader.ended
+    assert reader.take(PATIENCE_S).stamp_ns == 1
+    assert reader.ended
     reader.close()
 
 

@@ -32,7 +32,7 @@ BASE = rigid(Rotation.from_euler("x", 170, degrees=True).as_matrix(), np.array([
 class Tape:
     """A source that waits for its reader: frames at these milliseconds, errors, things to do."""
 
-    host_clock, lossless, dropped = False, True, 0
+    host_clock, lossless, on_demand, dropped = False, True, False, 0
 
     def __init__(self, *items, of=0.0):
         self._left, self._of = list(items), of
