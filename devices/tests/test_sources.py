@@ -189,6 +189,11 @@ def test_a_read_is_back_in_time(source: Source):
         assert min(took_s) < timeout_s + SLACK_S  # what a loaded machine adds, it adds to some
 
 
+def test_cameras_and_topics_can_be_silent_and_all_else_is_on_demand(source: Source, request):
+    kind = request.node.callspec.params["source"]
+    assert source.on_demand == (kind not in ("realsense", "ros2_images", "ros2_clouds"))
+
+
 def test_a_source_that_waits_loses_nothing(source: Source):
     if not source.lossless:
         pytest.skip("the newest frame counts here")

@@ -181,18 +181,8 @@ class Loop:
                 yield self._without_frame(trouble or silence)
             if now_s >= ends_s:
                 return
-            self._give_up(
-                now_s - fresh_s, self._config.give_up_s if ready_s else OPENING_S, trouble
-            )
-
-    @staticmethod
-    def _give_up(silent_s: float, most_s: float, trouble: str) -> None:
-        if silent_s > most_s:
-            why = f": {trouble.rstrip('.')}" if trouble else ""
-            raise SourceLost(
-                f"no frame for {silent_s:.0f} s{why}. Look at the camera or the topic, then start "
-                "again."
-            )
+            most_s = self._config.give_up_s if ready_s else OPENING_S
+            _check_heard(now_s - fresh_s, most_s, trouble)
 
     def _shown(self, seen: Observation, source: Cameras) -> tuple[TrackingResult, float]:
         """The result of a frame, and of what time it is, by ``time.monotonic``."""
@@ -339,6 +329,14 @@ class Loop:
             self.statistics.add_defect(error)
             arms.abort(Halt("defect", {"words": f"{type(error).__name__}: {error}"}))
             return result
+
+
+def _check_heard(silent_s: float, most_s: float, trouble: str) -> None:
+    if silent_s > most_s:
+        why = trouble and f": {trouble.rstrip('.')}"
+        raise SourceLost(
+            f"no frame for {silent_s:.0f} s{why}. Look at the camera or the topic, then start again."
+        )
 
 
 def _reason_of(error: Exception) -> str | Finding:
