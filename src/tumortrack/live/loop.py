@@ -335,7 +335,8 @@ def _check_heard(silent_s: float, most_s: float, trouble: str) -> None:
     if silent_s > most_s:
         why = trouble and f": {trouble.rstrip('.')}"
         raise SourceLost(
-            f"no frame for {silent_s:.0f} s{why}. Look at the camera or the topic, then start again."
+            f"no frame for {silent_s:.0f} s{why}. Look at the camera or the topic, then start "
+            "again."
         )
 
 
