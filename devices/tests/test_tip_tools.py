@@ -480,18 +480,25 @@ def test_an_arm_feels_that_it_touches(monkeypatch):
     tool = UrToolConfig(host="10.0.0.9", tip=(0.0, 0.0, 20.0)).open(setting(), "arm")
     try:
         arm = tool._arm._receive
+
+        def touched():  # again, where a busy machine lost poses for over a tenth of a second
+            for arm.push_n in (0.0, 4.0):
+                arm.felt()
+            now = view(time.time_ns())
+            pieces = tool.evidence(now)
+            tool.located(now, small_estimate())
+            return pieces
+
         until(lambda: tool._rest_n is not None, "a force at rest")
         arm.push_n = 1.9  # less than the threshold
         arm.felt()
         assert tool.evidence(view(time.time_ns())) == []
-        arm.push_n = 4.0
-        (touch,) = heard(tool)
+        (touch,) = until(touched, "a touch")
         np.testing.assert_allclose(touch.place_mm, (0, 0, -20), atol=1e-6)  # base z is -z
         arm.push_n = 0.0
         arm.felt()
         assert tool.evidence(view(time.time_ns())) == []
-        arm.push_n = 4.0
-        assert len(heard(tool)) == 1
+        assert len(until(touched, "another touch")) == 1
     finally:
         tool.close()
 
