@@ -41,7 +41,7 @@ BESIDE_FAT = Props(distance_mm=(120.0, 130.0), tilt_degrees=5.0, waves_mm=2.0, f
 class Script:
     """A source that gives frames in order, and does what stands between them."""
 
-    dropped, lossless, host_clock = 0, True, False
+    dropped, lossless, host_clock, on_demand = 0, True, False, False
 
     def __init__(self, items):
         self.items = list(items)

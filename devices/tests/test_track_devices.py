@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import signal
 import socket
@@ -11,7 +12,8 @@ import pytest
 from rosbags.highlevel import AnyReader
 
 from stories import refusal, succeeded, tumortrack
-from track_objects import PATIENT, World, start, told, virtual, wait_for
+from track_objects import PATIENT, World, ended_when, start, told, virtual, wait_for
+from tumortrack.core.errors import InputError
 from tumortrack.live.poses import COLUMNS, CONTACT
 from tumortrack.live.values import SourceEnded
 from tumortrack.sense.camera import d405, project
@@ -35,16 +37,7 @@ def reports(recording):
 
 def test_a_recording_is_played_back_to_the_same_estimates(world, tmp_path):
     live, replay = tmp_path / "live", tmp_path / "replay"
-    first = tumortrack(
-        "track",
-        world.model,
-        virtual(world, fps=10),
-        f"recording:{live}",
-        *("--seconds", 4, *PATIENT),
-        "--report",
-        tmp_path / "live.json",
-    )
-    succeeded(first)
+    recorded(world, live, 8, virtual(world, fps=10))
     frames = [one for one in reports(live) if one["seen"]]
     assert len(frames) >= 3
     again = tumortrack(
@@ -62,6 +55,17 @@ def test_a_recording_is_played_back_to_the_same_estimates(world, tmp_path):
     assert {one["stamp_ns"] for one in reports(replay) if one["seen"]} == {
         one["stamp_ns"] for one in frames
     }
+
+
+def recorded(world, folder, count, *arguments):
+    """Record at least so many frames, however long they take."""
+
+    def enough():
+        with contextlib.suppress(InputError):  # nothing is in it yet
+            return len(evidence(folder)) >= count
+
+    report = ("--report", folder.with_suffix(".json"))
+    return ended_when(start(world, *arguments, f"recording:{folder}", *report), enough)
 
 
 def evidence(recording):
@@ -97,13 +101,14 @@ def test_a_replay_with_the_evidence_of_tools_is_the_same_to_the_last_bit(world, 
     """A probe that touches the organ's front, and a shaft towards the camera."""
     live, first, again = (tmp_path / name for name in ("live", "first", "again"))
     source = virtual(world, fps=10, camera_motion="false")
-    given = (*("--seconds", 3, *PATIENT), "--report", tmp_path / "live.json")
-    succeeded(tumortrack("track", world.model, source, f"recording:{live}", *given))
+    recorded(world, live, 22, source)
     place_mm, stamps = touched_place(live)
-    # 50 Hz; it touches during 0.4 s of each second, from the first frame on.
+    # 50 Hz; it touches during four of ten frames, from the first one on.
+    times = range(stamps[0], stamps[-1] + 40_000_000, 20_000_000)
+    frames = np.searchsorted(stamps, times, side="right") - 1
     rows = [
-        f"{stamps[0] + 20_000_000 * n},camera,{place_mm},1,0,0,0,{int(n % 50 < 20)}"
-        for n in range((stamps[-1] - stamps[0]) // 20_000_000 + 2)
+        f"{at},camera,{place_mm},1,0,0,0,{int(frame % 10 < 4)}"
+        for at, frame in zip(times, frames, strict=True)
     ]
     (tmp_path / "probe.csv").write_text("\n".join([COLUMNS + CONTACT, *rows]) + "\n")
     rows = [row.rpartition(",")[0] for row in rows]
@@ -166,20 +171,9 @@ def test_a_robot_gets_its_own_frame(world, tmp_path):
     calibration.write_text(
         json.dumps({"frame_id": "base_link", "unit": "m", "robot_from_camera": turn.tolist()})
     )
-    out = tmp_path / "out"
-    report = tmp_path / "report.json"
-    done = tumortrack(
-        "track",
-        world.model,
-        virtual(world, fps=5),
-        f"recording:{out}",
-        "--frame",
-        calibration,
-        *("--seconds", 2, *PATIENT),
-        "--report",
-        report,
-    )
-    assert "in frame 'base_link'" in succeeded(done)
+    out, report = tmp_path / "out", tmp_path / "out.json"
+    said = recorded(world, out, 3, virtual(world, fps=5), "--frame", calibration)
+    assert "in frame 'base_link'" in said
     found = told(report)
     assert found["frame"]["frame_id"] == "base_link"
     assert found["frame"]["published_from_camera"][2][3] == pytest.approx(700)
@@ -237,12 +231,7 @@ def test_a_port_that_is_taken_is_refused(world, tmp_path):
 def test_several_cameras_and_one_that_moves_are_tracked_from_recordings(world, tmp_path):
     tape, poses = tmp_path / "tape", tmp_path / "poses.json"
     source = f"recording:{tape}?rate=0"
-    first = tumortrack(
-        *("track", world.model, virtual(world, fps=10, camera_motion="false")),
-        *(f"recording:{tape}", "--seconds", 3, *PATIENT),
-        *("--report", tmp_path / "live.json"),
-    )
-    succeeded(first)
+    recorded(world, tape, 6, virtual(world, fps=10, camera_motion="false"))
     rows = np.eye(4).tolist()
     poses.write_text(
         json.dumps({"unit": "mm", "frame_id": "base", "fixed_from_camera": [rows, rows]})

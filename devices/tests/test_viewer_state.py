@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from browser import Browser, of_first_tumor
-from clock import until
+from clock import PATIENCE_S, until
 from live_objects import small_setting, small_update
 from tumortrack.core import colours
 from tumortrack.core.estimate import Quality
@@ -118,7 +118,7 @@ def test_a_change_waits_for_a_sender_that_is_held_up():
             assert before.is_set(), "what it still had to send would go out within the change"
             sending.call_soon_threadsafe(after.set)
             assert not after.wait(0.3), "something can be sent while the change is made"
-        assert after.wait(5)
+        assert after.wait(PATIENCE_S)
     finally:
         sink.close()
 

@@ -116,7 +116,7 @@ def test_ctrl_c_while_processes_start_ends_the_training(case, tmp_path):
             until(lambda: "spawn_main" in _commands_below(process.pid), "a process for scenes")
             time.sleep(0.3)  # it imports
             os.killpg(process.pid, signal.SIGINT)
-            _, errors = process.communicate(timeout=60)
+            _, errors = process.communicate(timeout=300)
         finally:
             if process.poll() is None:
                 os.killpg(process.pid, signal.SIGKILL)

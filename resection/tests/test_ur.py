@@ -11,7 +11,7 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from clock import Clock, until
+from clock import PATIENCE_S, Clock, until
 from live_objects import small_setting, small_update
 from tumortrack.core.errors import InputError, TumortrackError
 from tumortrack.live.spec import SINKS
@@ -374,10 +374,11 @@ def test_a_broken_link_is_left_to_the_controllers_watchdog(arm, moving):
     for n in (1, 2):
         with pytest.raises(TumortrackError, match=r"10\.0\.0\.9 is lost \(connection lost\)"):
             sink.publish(working(n, 0.01))
-    time.sleep(0.06)
+    sink._watch.join(PATIENCE_S)
     kicks = arm.kicks
     time.sleep(0.1)
     assert arm.kicks == kicks
+    assert not sink._watch.is_alive()
     assert arm.what() == ["servo"]
 
 

@@ -13,7 +13,8 @@ import pytest
 from depth_files import write_depth_png, write_intrinsics
 from extension_objects import EXAMPLE, distribution, installed_example
 from live_objects import small_frame, small_setting, small_update
-from stories import COMMAND, environment, succeeded
+from stories import COMMAND, environment
+from track_objects import World, ended_when, estimates, start
 from tumortrack.core.errors import InputError, StorageError
 from tumortrack.live.session import named_sinks, open_sinks
 from tumortrack.live.spec import POSES, SINKS, SOURCES, TOOLS, extensions
@@ -33,14 +34,18 @@ def example(tmp_path, monkeypatch):
 
 def with_packages(folders: list[Path], *arguments: object) -> subprocess.CompletedProcess[str]:
     """A command of a new process that finds these packages."""
-    paths = [*map(str, folders), os.environ.get("PYTHONPATH", "")]
     return subprocess.run(
         [*COMMAND, *map(str, arguments)],
         capture_output=True,
         text=True,
         timeout=600,
-        env={**environment(), "PYTHONPATH": os.pathsep.join(filter(None, paths))},
+        env=finding(folders),
     )
+
+
+def finding(folders: list[Path]) -> dict[str, str]:
+    paths = [*map(str, folders), os.environ.get("PYTHONPATH", "")]
+    return {**environment(), "PYTHONPATH": os.pathsep.join(filter(None, paths))}
 
 
 def test_an_installed_package_adds_a_source(example, tmp_path):
@@ -82,9 +87,10 @@ def test_a_sink_that_cannot_open_its_file_is_a_clear_line(example, tmp_path):
 def test_track_uses_it_by_its_text(phantom_case, clinic_model, tmp_path):
     folders = installed_example(tmp_path / "site")
     table = tmp_path / "centres.csv"
-    arguments = (f"virtual:{phantom_case}?fps=10", f"csv:{table}", "--seconds", 2)
-    report = ("--report", tmp_path / "report.json")
-    succeeded(with_packages(folders, "track", clinic_model, *arguments, *report))
+    report = tmp_path / "report.json"
+    arguments = (f"virtual:{phantom_case}?fps=10", f"csv:{table}", "--report", report)
+    world = World(phantom_case, clinic_model)
+    ended_when(start(world, *arguments, env=finding(folders)), lambda: estimates(report) > 1)
     rows = [line.split(",") for line in table.read_text().splitlines()[1:]]
     assert {row[2] for row in rows} >= {"kidney", "tumor_1"}
     assert len({row[0] for row in rows}) > 1  # several frames, however slow the machine

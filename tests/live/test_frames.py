@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 import sys
+import threading
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from clock import Clock, until
+from clock import PATIENCE_S, Clock, until
 from live_objects import CAMERA, STAMP_NS, small_estimate, small_frame, small_setting, small_update
 from reports import poor
-from tumortrack.core.errors import NoEstimate
+from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.live.frames import FrameCheck
 from tumortrack.live.loop import Loop, LoopConfig
-from tumortrack.live.values import Observation, PublishedFrame, SourceEnded
-from tumortrack.live.workers import SinkWorker, SourceWorker
+from tumortrack.live.values import Observation, PublishedFrame, SourceEnded, SourceLost
+from tumortrack.live.workers import OPENING_S, SinkWorker, SourceWorker
 from tumortrack.sense.region import RegionConfig
 from tumortrack.tracking.tracker import Tracker
 
@@ -42,10 +43,12 @@ class Located(Tracker):
 class Frames(SourceWorker):
     """Hands over what it is given, without a thread."""
 
+    ended = False
+
     def __init__(self, frames=(), latency_from="taking"):
         self._left = list(frames)
-        self.latency_from, self.trouble, self.ended, self.failure = latency_from, "", False, None
-        self.opening = False
+        self.latency_from, self.trouble, self.failure = latency_from, "", None
+        self.ready_s, self.on_demand = 0.001, False
         self._passed, self._source = 0, None
 
     def take(self, timeout_s):
@@ -56,7 +59,7 @@ class Frames(SourceWorker):
 class Tape:
     """A source that waits for its reader."""
 
-    host_clock, lossless, dropped = False, True, 0
+    host_clock, lossless, on_demand, dropped = False, True, False, 0
 
     def __init__(self, frames):
         self._left = list(frames)
@@ -191,6 +194,155 @@ def test_silence_is_said_before_what_is_shown_is_stale(monkeypatch):
     assert waits == pytest.approx([0.4, 0.1, 0.4, 0.4])
     assert told[0].estimate is not None
     assert told[1].reason.startswith("no frame for 0.4 s")
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    """The loop's and its reader's, which ``Turned`` turns."""
+    one = Clock()
+    for module in ("loop", "workers", "cameras"):
+        monkeypatch.setattr(f"tumortrack.live.{module}.time", one)
+    return one
+
+
+class Turned(SourceWorker):
+    """A reader for which time passes only while the loop waits for it, and ``slow_s`` in all before
+    ``gate`` opens; from then on as long in real time as it takes."""
+
+    def __init__(self, open_source, clock, gate, slow_s):
+        self._clock, self._gate, self._until_s = clock, gate, clock.monotonic() + slow_s
+        super().__init__(open_source)
+
+    def take(self, timeout_s):
+        if self._gate.is_set():
+            return super().take(PATIENCE_S)
+        self._clock.sleep(timeout_s)
+        if self._clock.monotonic() > self._until_s:
+            self._gate.set()
+            until(lambda: self.ready_s)
+        return None
+
+
+class Late(Tape):
+    """A source whose first frame waits for ``gate``."""
+
+    def __init__(self, frames, gate, on_demand=False):
+        super().__init__(frames)
+        self._gate, self.on_demand = gate, on_demand
+
+    def read(self, timeout_s):
+        assert self._gate.wait(PATIENCE_S)
+        return super().read(timeout_s)
+
+
+def followed(clock, open_source, gate, slow_s, config=None):
+    """The loop's results of a source that takes its time."""
+    reader, told = Turned(open_source, clock, gate, slow_s), []
+    try:
+        Loop(Located(), small_setting(), config or LoopConfig(region=ALL)).run(
+            reader, [], told.append
+        )
+    finally:
+        gate.set()
+        reader.close()
+    return told
+
+
+def test_a_slow_opening_is_no_silence(clock):
+    """On a busy machine libraries load for longer than a camera may be silent."""
+    gate = threading.Event()
+
+    def slow():
+        assert gate.wait(PATIENCE_S)
+        return Tape([frame_at(0.1)])
+
+    told = followed(clock, slow, gate, 90.0, LoopConfig(region=ALL, give_up_s=1.0))
+    assert {one.reason for one in told[:-1]} == {"the source is still opening; 300 s are allowed"}
+    assert len(told) > 90 / 0.5
+    assert told[-1].estimate is not None
+
+
+def test_an_opening_that_never_ends_ends_the_loop(clock):
+    gate, begin_s = threading.Event(), clock.monotonic()
+    with pytest.raises(SourceLost, match="no frame for 300 s: the source is still opening"):
+        followed(clock, gate.wait, gate, 1000.0)
+    assert clock.monotonic() - begin_s == pytest.approx(OPENING_S, abs=0.5)
+
+
+@pytest.mark.parametrize("opens_s", [0.0, 70.0])
+def test_a_camera_that_is_ready_and_silent_is_told_in_time_and_given_up(clock, opens_s):
+    gate, begin_s = threading.Event(), clock.monotonic()
+    told, said_s = [], []
+
+    def slow():
+        until(lambda: clock.monotonic() - begin_s >= opens_s)
+        return Late([], gate)
+
+    def note(result):
+        told.append(result.reason)
+        said_s.append(clock.monotonic() - begin_s)
+        if said_s[-1] >= opens_s:
+            until(lambda: reader.ready_s)
+
+    reader = Turned(slow, clock, gate, 1000.0)
+    if not opens_s:
+        until(lambda: reader.ready_s)
+    with pytest.raises(SourceLost, match=r"no frame for 60 s\. Look at"):
+        Loop(Located(), small_setting(), LoopConfig(region=ALL)).run(reader, [], note)
+    ready_s = reader.ready_s - begin_s
+    gate.set()
+    reader.close()
+    first = told.index("no frame for 0.4 s")
+    assert said_s[first] - ready_s == pytest.approx(0.4)
+    assert all("still opening" in one for one in told[:first])
+    assert all("no frame for" in one for one in told[first:])
+    assert said_s[-1] - ready_s == pytest.approx(60, abs=0.5)
+
+
+def test_a_source_that_makes_frames_on_demand_is_never_silent(clock):
+    gate, begin_s = threading.Event(), clock.monotonic()
+    told = followed(clock, lambda: Late([frame_at(0.1)], gate, on_demand=True), gate, 90.0)
+    assert clock.monotonic() - begin_s > 90  # more than is allowed to a camera
+    assert [one.reason for one in told if "still opening" not in one.reason] == [""]
+
+
+def test_a_source_on_demand_that_cannot_open_is_given_up(clock):
+    def away():
+        raise SourceLost("the disk is gone")
+
+    with pytest.raises(SourceLost, match="no frame for 60 s: the disk is gone"):
+        followed(clock, away, threading.Event(), 1000.0)
+
+
+def test_a_source_on_demand_whose_frames_are_all_refused_is_given_up(clock):
+    class Refused(Tape):
+        on_demand = True
+
+        def read(self, timeout_s):
+            clock.sleep(0.1)
+            raise InputError("no image")
+
+    gate = threading.Event()
+    gate.set()
+    with pytest.raises(SourceLost, match="no frame for 60 s"):
+        followed(clock, lambda: Refused([]), gate, 0.0)
+
+
+@pytest.mark.parametrize("on_demand", [False, True])
+def test_only_a_camera_is_opened_again_because_it_is_silent(clock, monkeypatch, on_demand):
+    monkeypatch.setattr("tumortrack.live.workers._AGAIN_S", 0.0)
+    silent = [None, None, frame_at(0.1)]
+
+    class Slow(Tape):
+        def read(self, timeout_s):
+            clock.sleep(3.0)
+            return silent.pop(0) if silent else super().read(timeout_s)
+
+    Slow.on_demand = on_demand
+    reader = SourceWorker(lambda: Slow([]))
+    assert isinstance(reader.take(PATIENCE_S), Observation)
+    assert reader.opened == (1 if on_demand else 2)
+    reader.close()
 
 
 def test_a_sink_that_hangs_at_a_result_is_in_trouble():

@@ -7,6 +7,7 @@ import time
 import numpy as np
 
 from camera_objects import ALL, Located
+from clock import PATIENCE_S
 from live_objects import PARTS, small_frame
 from tumortrack.core.evidence import Held
 from tumortrack.core.geometry import rigid
@@ -48,7 +49,7 @@ class Holding:
 class Tape:
     """Frames that wait for their reader."""
 
-    host_clock, lossless, dropped = True, True, 0
+    host_clock, lossless, on_demand, dropped = True, True, False, 0
 
     def __init__(self, count):
         self._left = count
@@ -68,7 +69,9 @@ def test_what_arms_hold_goes_into_each_frames_estimate_in_its_cameras_frame():
     tracker, told = Asked(), []
     published = PublishedFrame("base", BASE_FROM_CAMERA, calibrated=True)
     context = SinkContext(PARTS, published, arms=True)
-    loop = Loop(tracker, context, LoopConfig(region=ALL, frozen_s=0.0), Holding())
+    loop = Loop(
+        tracker, context, LoopConfig(region=ALL, frozen_s=0.0, stale_s=PATIENCE_S / 2), Holding()
+    )
     worker = SourceWorker(lambda: Tape(3))
     cameras = Cameras([worker], [BASE_FROM_CAMERA])
     try:

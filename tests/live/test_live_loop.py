@@ -74,7 +74,7 @@ def moving(stage, n, start_ns=10**15, step_mm=(0.4, -0.2, 0.1)):
 class Script:
     """A source that gives items in order: clouds, errors to raise, things to do first."""
 
-    dropped = 0
+    dropped, on_demand = 0, False
 
     def __init__(self, items, waits=True, host_clock=False):
         self._items, self.lossless, self.host_clock = list(items), waits, host_clock
@@ -416,7 +416,7 @@ def test_other_intrinsics_replace_the_sources(tracker):
             assert said in sink.updates[-1].reason
 
 
-def test_a_frozen_source_is_said_again_and_again_and_its_return_is_seen(tracker, stages):
+def test_a_frozen_source_is_said_again_and_again_and_its_return_is_seen(tracker, stages, clock):
     clouds = moving(stages[0], 3)
     config, sink = LoopConfig(region=WHOLE, stale_s=0.1), Notes()
 
@@ -438,7 +438,7 @@ def test_a_source_that_stays_away_ends_the_loop(tracker):
         play(tracker, [threading.Event().wait], config)
 
 
-def test_a_lost_source_comes_back(tracker, stages, monkeypatch):
+def test_a_lost_source_comes_back(tracker, stages, clock, monkeypatch):
     monkeypatch.setattr("tumortrack.live.workers._AGAIN_S", 0.0)
     clouds = moving(stages[0], 4)
     scripts = [Script([*clouds[:2], SourceLost("the camera was unplugged")]), Script(clouds[2:])]
@@ -483,7 +483,7 @@ def test_a_click_makes_the_loop_look_anew(tracker, stages):
     clouds = moving(stages[0], 3)
     controls = Controls()
     setting = SinkContext(tracker.model.parts, PublishedFrame(), tracker.anatomy_ct, controls)
-    loop = Loop(tracker, setting, LoopConfig(region=WHOLE))
+    loop = Loop(tracker, setting, LoopConfig(region=WHOLE, stale_s=PATIENCE_S / 2))
     sink = Notes()
     outlets = [SinkWorker("notes", sink, 100)]
     reader = SourceWorker(lambda: Script(clouds))

@@ -174,14 +174,16 @@ def test_ages_count_from_where_the_source_allows(waits, host_clock, counts_from)
 class Script:
     """A source that does what it is told: gives items, raises errors, waits at the end."""
 
-    host_clock = False
+    host_clock = on_demand = False
     dropped = 0
 
     def __init__(self, items, waits=False):
         self._items, self.lossless, self.closed = list(items), waits, 0
+        self.over = threading.Event()  # all was read, and handed on
 
     def read(self, timeout_s):
         if not self._items:
+            self.over.set()
             time.sleep(timeout_s)
             return None
         item = self._items.pop(0)
@@ -203,9 +205,10 @@ def test_the_newest_frame_wins_and_the_others_are_counted():
 
 
 def test_exchanged_frames_are_noticed_by_a_loop_that_is_too_busy_to_see_both():
-    reader = SourceWorker(lambda: Script([_seen(n) for n in (2, 1, 4, 3)]))
-    until(lambda: reader.dropped == 1)  # 2, for 4
-    time.sleep(0.05)  # for the last one to be read
+    script = Script([_seen(n) for n in (2, 1, 4, 3)])
+    reader = SourceWorker(lambda: script)
+    assert script.over.wait(PATIENCE_S)
+    assert reader.dropped == 1  # 2, for 4
     assert "went back" in str(reader.take(PATIENCE_S))
     assert reader.take(PATIENCE_S).stamp_ns == 4  # not 3, which came last
     assert reader.take(0.05) is None
@@ -220,6 +223,15 @@ def test_a_source_that_waits_loses_nothing():
     assert reader.take(PATIENCE_S) is None
     assert reader.ended
     assert reader.dropped == 0
+    reader.close()
+
+
+def test_a_source_has_not_ended_while_its_last_frame_waits():
+    reader = SourceWorker(lambda: Script([_seen(1), SourceEnded("end")], waits=True))
+    reader._thread.join()
+    assert not reader.ended
+    assert reader.take(PATIENCE_S).stamp_ns == 1
+    assert reader.ended
     reader.close()
 
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from clock import PATIENCE_S
 from live_objects import PARTS, STAMP_NS, small_estimate, small_frame
 from tumortrack.core.errors import NoEstimate
 from tumortrack.core.geometry import rigid
@@ -32,7 +33,7 @@ BASE = rigid(Rotation.from_euler("x", 170, degrees=True).as_matrix(), np.array([
 class Tape:
     """A source that waits for its reader: frames at these milliseconds, errors, things to do."""
 
-    host_clock, lossless, dropped = False, True, 0
+    host_clock, lossless, on_demand, dropped = False, True, True, 0
 
     def __init__(self, *items, of=0.0):
         self._left, self._of = list(items), of
@@ -87,7 +88,7 @@ def played(sources, places, published=None, tracker=None):
     published = published or PublishedFrame("base", places[0], calibrated=True)
     still = () if hasattr(places, "at") else tuple(places)
     context = SinkContext(PARTS, published, cameras=still)
-    loop = Loop(tracker or Located(), context, LoopConfig(region=ALL))
+    loop = Loop(tracker or Located(), context, LoopConfig(region=ALL, stale_s=PATIENCE_S / 2))
     cameras, told = Cameras(workers, places), []
     try:
         loop.run(cameras, [], told.append)

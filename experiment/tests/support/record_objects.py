@@ -43,7 +43,7 @@ class SmallBenchConfig(SourceConfig, frozen=True, kw_only=True, tag="small"):
 class SmallBench:
     """Its stamps go on from one opening to the next."""
 
-    host_clock, lossless, dropped = False, True, 0
+    host_clock, lossless, on_demand, dropped = False, True, True, 0
 
     def __init__(self, config: SmallBenchConfig) -> None:
         self._config, self._read = config, 0

@@ -24,7 +24,8 @@ from tumortrack.sense.files import read_poses
 # that is pushed at 50 mm/s moves by 1 mm, one standard deviation of where a camera stands
 # (``sense.noise.CAMERA_STD``).
 TOGETHER_NS = 20_000_000
-_FIRST_S = 2.0  # for a camera's first frame, and one that is read from a disk
+_FIRST_S = 2.0  # for a camera's first frame
+_READ_S = 60.0  # for one that is made or read on demand: it comes, or the source ends
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,8 +115,12 @@ class Cameras:
         return sum(worker.dropped for worker in self.workers)
 
     @property
-    def opening(self) -> bool:
-        return any(worker.opening for worker in self.workers)
+    def ready_s(self) -> float:
+        return min((ready_s for worker in self.workers if (ready_s := worker.ready_s)), default=0.0)
+
+    @property
+    def on_demand(self) -> bool:
+        return all(worker.on_demand for worker in self.workers)
 
     @property
     def opened(self) -> int:
@@ -184,8 +189,10 @@ class Cameras:
         """A camera's frame of about that stamp, or why there is none. It may still be on its way,
         for as long as it may be apart."""
         worker = self.workers[n]
-        patient = n not in self._troubles or worker.latency_from == "taking"
-        until_s = time.monotonic() + (_FIRST_S if patient else TOGETHER_NS * 1e-9)
+        first, waits_s = n not in self._troubles, TOGETHER_NS * 1e-9
+        if first or worker.latency_from == "taking":
+            waits_s = _READ_S if worker.on_demand else _FIRST_S
+        until_s = time.monotonic() + waits_s
         self._troubles.setdefault(n, "")
         while (got := self._next(n, max(until_s - time.monotonic(), 0.0))) is not None:
             if isinstance(got, Observation):

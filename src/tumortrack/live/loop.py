@@ -29,13 +29,12 @@ from tumortrack.live.cameras import Cameras
 from tumortrack.live.meter import RunStatistics
 from tumortrack.live.values import CameraView, Observation, SourceLost, TrackingResult
 from tumortrack.live.views import OrganInView, Scan, ViewsLocator, camera_words, timed
-from tumortrack.live.workers import SinkWorker, SourceWorker
+from tumortrack.live.workers import OPENING_S, SinkWorker, SourceWorker
 from tumortrack.sense.camera import d405
 from tumortrack.sense.files import DepthCorrection
 from tumortrack.sense.region import Hints, RegionConfig, organ_points
 from tumortrack.tracking.tracker import Follower, FollowerConfig, Tracker
 
-_OPENING_S = 60.0  # allowed for opening a source
 _QUIET = 0.8  # of stale_s: silence is reported while the last result is still valid
 _AHEAD_S = 0.1  # allowed difference of two clocks
 SURE_AFTER = 3  # good estimates in a row after doubt: single frames of something else may pass
@@ -43,7 +42,8 @@ SURE_AFTER = 3  # good estimates in a row after doubt: single frames of somethin
 
 class LoopConfig(Config, frozen=True, kw_only=True):
     """``stale_s``: after this time without a frame, or with one that old, there is 'no estimate'.
-    ``give_up_s``: after this time without a frame the loop ends. ``intrinsics``: replace the
+    ``give_up_s``: after this time without a frame the loop ends. Neither counts a source's opening,
+    nor the slowness of one whose frames are made ``on_demand``. ``intrinsics``: replace the
     source's, ``correction`` of depths included. ``frozen_s``: an image that repeats bit for bit for
     this time is old; 0: it may repeat. ``seconds``: the loop ends this time after the first frame;
     0: never. ``scan``: the first estimate is from several looks."""
@@ -132,7 +132,8 @@ class Loop:
         on_result: Callable[[TrackingResult], None],
     ) -> None:
         """``on_result`` is called with every result, after the sinks have got it. Raises
-        SourceLost: no frame came for ``give_up_s``; and whatever keeps a source from working."""
+        SourceLost: no frame came for ``give_up_s``, or it did not open; and whatever keeps a source
+        from working."""
         if not isinstance(source, Cameras):
             source = Cameras([source], [self._context.published_frame.published_from_camera])
         self._cameras = source
@@ -150,40 +151,45 @@ class Loop:
                 )
 
     def _results(self, source_worker: Cameras) -> Iterator[TrackingResult]:
-        began_s = fresh_s = time.monotonic()
+        fresh_s = time.monotonic()
         quiet_s = _QUIET * self._config.stale_s
         ends_s, shown_s = math.inf, fresh_s  # the time of what is shown
         while not self._stop.is_set():
+            opening = not source_worker.ready_s
             got = source_worker.take(max(shown_s + quiet_s - time.monotonic(), 0.0))
             now_s = shown_s = time.monotonic()
+            # In this order: the reader writes them in the other one.
+            on_demand, trouble = source_worker.on_demand, source_worker.trouble
+            ready_s = source_worker.ready_s
+            fresh_s = now_s if on_demand and got is None else max(fresh_s, ready_s)
             if isinstance(got, Observation):
                 got = self._calibrated(got)
             if isinstance(got, Observation):
                 fresh_s = now_s
                 if self._config.seconds and ends_s == math.inf:
                     ends_s = now_s + self._config.seconds
-                live_clock = source_worker.latency_from != "taking"
-                result = self._answer(got, source_worker.born_ns(got), live_clock)
-                shown_s = time.monotonic()
-                if live_clock and result.estimate is not None and result.latency_ms is not None:
-                    shown_s -= result.latency_ms / 1000
+                result, shown_s = self._shown(got, source_worker)
                 yield result
-            elif got is None and source_worker.ended:
+            elif got is not None:
+                yield self._without_frame(_reason_of(got))
+            elif source_worker.ended:
                 return
-            else:
+            elif opening and ready_s:
+                shown_s = fresh_s  # it has just opened, so it may be silent from now on
+            elif not on_demand:
                 silence = Finding("no_frame", {"seconds": now_s - fresh_s})
-                trouble = source_worker.trouble if got is None else _reason_of(got)
                 yield self._without_frame(trouble or silence)
             if now_s >= ends_s:
                 return
-            if source_worker.opening and now_s - began_s < _OPENING_S:
-                fresh_s = now_s  # it may first load libraries, on a busy machine
-            if now_s - fresh_s > self._config.give_up_s:
-                trouble = source_worker.trouble.rstrip(".")
-                raise SourceLost(
-                    f"no frame for {now_s - fresh_s:.0f} s{trouble and f': {trouble}'}. Look at "
-                    "the camera or the topic, then start again."
-                )
+            most_s = self._config.give_up_s if ready_s else OPENING_S
+            _check_heard(now_s - fresh_s, most_s, trouble)
+
+    def _shown(self, seen: Observation, source: Cameras) -> tuple[TrackingResult, float]:
+        """The result of a frame, and of what time it is, by ``time.monotonic``."""
+        live_clock = source.latency_from != "taking"
+        result = self._answer(seen, source.born_ns(seen), live_clock)
+        late_ms = result.latency_ms if live_clock and result.estimate is not None else None
+        return result, time.monotonic() - (late_ms or 0.0) / 1000
 
     def _answer(self, seen: Observation, born_ns: int, live_clock: bool) -> TrackingResult:
         """The result of one frame of the time ``born_ns``. ``live_clock``: time goes on while we
@@ -323,6 +329,15 @@ class Loop:
             self.statistics.add_defect(error)
             arms.abort(Halt("defect", {"words": f"{type(error).__name__}: {error}"}))
             return result
+
+
+def _check_heard(silent_s: float, most_s: float, trouble: str) -> None:
+    if silent_s > most_s:
+        why = trouble and f": {trouble.rstrip('.')}"
+        raise SourceLost(
+            f"no frame for {silent_s:.0f} s{why}. Look at the camera or the topic, then start "
+            "again."
+        )
 
 
 def _reason_of(error: Exception) -> str | Finding:

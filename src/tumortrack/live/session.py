@@ -35,7 +35,7 @@ from tumortrack.tracking.options import TrackOptions, model_folder
 from tumortrack.tracking.tracker import FollowerConfig, Tracker
 
 _SETTLED_S = 60.0  # by then all buffers have their size: memory that grows on is a leak
-_OPENING_S = 5.0  # the first frame may take so long, however short a run is wanted
+_FIRST_S = 5.0  # an open camera's first frame may take so long, however short a run is wanted
 _STORE_S = 10.0  # between two writings of the report: kill -9 loses no more
 
 
@@ -250,7 +250,7 @@ def _check(setup: CameraSetup, patient: Patient, what: str, options: TrackOption
 
 def _loop_config(options: TrackOptions, model: Model) -> LoopConfig:
     intrinsics, correction = read_camera(options.intrinsics)
-    first_s = max(options.seconds, _OPENING_S, 2 * options.stale)
+    first_s = max(options.seconds, _FIRST_S, 2 * options.stale)
     return LoopConfig(
         region=options.region(model),
         follower=FollowerConfig(

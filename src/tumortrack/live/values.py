@@ -78,6 +78,8 @@ class Source(Protocol):
     # The stamp of the frame read last is this machine's time.time_ns, so its age is known.
     host_clock: bool
     lossless: bool  # every frame is processed, not only the newest: the source waits for the loop
+    # Simulated or played: where no frame comes, this computer is slow, and no camera is silent.
+    on_demand: bool
 
     @property
     def dropped(self) -> int:

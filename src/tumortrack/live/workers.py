@@ -24,6 +24,7 @@ from tumortrack.live.values import (
 )
 
 _READ_S = 0.2  # timeout of one read: how soon the thread notices that it must stop
+OPENING_S = 300.0  # allowed for the first opening: libraries load, on a busy machine
 _AGAIN_S = 1.0  # between two attempts to open
 _FROZEN_S = 5.0  # without a frame: reopened
 _DEFECTS = 5  # tracebacks that are kept
@@ -70,12 +71,14 @@ class SourceWorker:
         self._passed = 0  # replaced before they were taken, or dropped by sources now closed
         self._source: Source | None = None
         self.latency_from = "arrival"  # where the age of the frame taken last counts from
-        self.trouble = "the source is not open yet"
-        self.ended = False
+        self.trouble = f"the source is still opening; {OPENING_S:g} s are allowed"
+        self._ended = False
         self.failure: Exception | None = None
         self.defects: list[str] = []
         self.opened = 0
-        self.opening = True  # until the first attempt has succeeded or failed
+        # Silence counts from here: when the first opening ended, by time.monotonic; 0: it goes on.
+        self.ready_s = 0.0
+        self.on_demand = False  # open and without trouble, a source that is never silent
         self._thread = threading.Thread(target=self._run, name="source", daemon=True)
         self._thread.start()
 
@@ -83,6 +86,11 @@ class SourceWorker:
     def dropped(self) -> int:
         """Frames that newer ones replaced, here or in the source."""
         return self._passed + (source.dropped if (source := self._source) else 0)
+
+    @property
+    def ended(self) -> bool:
+        """No frame will come, and none waits."""
+        return self._ended and not self._waits
 
     def born_ns(self, seen: Observation) -> int:
         """The time of the frame taken last, by ``time.time_ns``: its stamp, or, if the source has
@@ -122,17 +130,17 @@ class SourceWorker:
 
     @property
     def _over(self) -> bool:
-        return self.ended or self.failure is not None
+        return self._ended or self.failure is not None
 
     def _run(self) -> None:
         while not self._stop.is_set() and not self._over:
             try:
                 self._read_all()
             except SourceEnded:
-                self.ended = True
+                self._ended = True
             except Exception as error:
                 self._note(error)
-            self.opening = False
+            self.ready_s = self.ready_s or time.monotonic()
             if not self._over:
                 self._stop.wait(_AGAIN_S)
         with self._lock:
@@ -148,13 +156,15 @@ class SourceWorker:
             self.trouble = f"internal error, {_text_of(error)}"
             self.defects.append("".join(traceback.format_exception(error)))
             del self.defects[_DEFECTS:]
+        self.on_demand = False
 
     def _read_all(self) -> None:
         source = self._open()
         self._source = source
         self.opened += 1
-        self.opening = False
-        self.trouble = ""
+        self.on_demand = source.on_demand
+        self.ready_s = self.ready_s or time.monotonic()
+        self.trouble = ""  # last: without trouble, the other two are known
         try:
             last_s = time.monotonic()
             while not self._stop.is_set():
@@ -169,7 +179,7 @@ class SourceWorker:
                     # Read each time: some sources know their clock only from the first frame on.
                     clock = "stamp" if source.host_clock else "arrival"
                     self._put(got, "taking" if source.lossless else clock)
-                elif time.monotonic() - last_s > _FROZEN_S:
+                elif not self.on_demand and time.monotonic() - last_s > _FROZEN_S:
                     raise SourceLost(f"no frame for {_FROZEN_S:g} s; the source is opened again")
         finally:
             self._passed, self._source = self.dropped, None

@@ -141,9 +141,9 @@ class TrackOptions(CameraOptions):
         stale: refuse frames older than so many s; a pause is reported after four fifths of it.
         frozen: refuse an image that repeats bit for bit for so many s; 0: it may repeat, as from a
             simulated camera without noise.
-        give_up: end after so many s without a frame.
-        seconds: end so many s after the first frame, or after as long without one (at least 5 s:
-            cameras take time to open); 0: never.
+        give_up: end after so many s without a frame from an open camera.
+        seconds: end so many s after the first frame, or after as long without one (at least 5 s);
+            0: never.
         report: file for latencies, counts and reasons (default: runs/track-TIME.json).
         seed: of the random points.
     """

@@ -92,7 +92,8 @@ class RealSenseSource:
         self.dropped = 0
         self._device = device
         self._playback = device.as_playback() if device.is_playback() else None
-        self.lossless = self._playback is not None and not config.realtime
+        self.on_demand = self._playback is not None
+        self.lossless = self.on_demand and not config.realtime
         self._room = threading.Condition()
         # The SDK's depth image (True) and picture (False) of one moment, and their arrival.
         self._newest: tuple[dict[bool, Any], int] | None = None

@@ -110,6 +110,7 @@ class RecordingSource:
     continues after it."""
 
     host_clock = False  # the stamps are those of the recording
+    on_demand = True
 
     def __init__(
         self, config: RecordingSourceConfig, frames: Frames, close: Callable[[], None]

@@ -64,7 +64,7 @@ class RosSource:
     """An open subscription, to reliable and best effort publishers alike. The newest frame wins.
     Without a publisher for 2 s, ``read`` raises InputError."""
 
-    lossless = False
+    lossless = on_demand = False
 
     def __init__(self, config: Ros2SourceConfig, bus: Bus) -> None:
         self._clock: str = config.clock  # or "known"

@@ -67,7 +67,7 @@ class StereoSource:
     def __init__(self, rig: StereoRig, pair: tuple[str, str], fps: float) -> None:
         self._rig, self._fps, self._cv2 = rig, fps, opencv()
         self.host_clock = pair[0].isdecimal()
-        self.lossless = not self.host_clock
+        self.lossless = self.on_demand = not self.host_clock
         self._room, self._closed = threading.Condition(), False
         self._newest: tuple[list[np.ndarray], int] | None = None
         self._end: TumortrackError | None = None

@@ -91,8 +91,7 @@ class VirtualSource:
     """Renders the scene ``fps`` times a second, with its true surfaces. ``pull_mm``: how far a tool
     pulls at the moment; whoever moves one replaces it."""
 
-    host_clock = True
-    lossless = False
+    host_clock, lossless, on_demand = True, False, True
 
     def __init__(self, player: ScenePlayer, fps: float) -> None:
         self.player = player

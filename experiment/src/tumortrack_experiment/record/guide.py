@@ -17,7 +17,7 @@ from tumortrack.core.types import DepthFrame, Intrinsics
 from tumortrack.live.cameras import CameraSetup
 from tumortrack.live.frames import FrameCheck
 from tumortrack.live.values import Observation, SourceLost
-from tumortrack.live.workers import SourceWorker
+from tumortrack.live.workers import OPENING_S, SourceWorker
 from tumortrack.sense.cloud import CloudConfig
 from tumortrack.sense.files import DepthCorrection
 from tumortrack.sense.region import RegionConfig
@@ -181,8 +181,11 @@ class Guide:
                 self._trouble, self._unusable = str(got), self._unusable + 1
             elif self.worker.ended:
                 raise InputError("the source is at its end, and states are missing.")
-            if not patient and time.monotonic() - self._heard_s > _GIVE_UP_S:
-                raise SourceLost(f"no frame for {_GIVE_UP_S:g} s. {self._why()}")
+            elif self.worker.on_demand:
+                self._heard_s = time.monotonic()
+            limit_s = _GIVE_UP_S if (ready_s := self.worker.ready_s) else OPENING_S
+            if not patient and time.monotonic() - max(self._heard_s, ready_s) > limit_s:
+                raise SourceLost(f"no frame for {limit_s:g} s. {self._why()}")
             yield None, None
 
     def _why(self) -> str:

@@ -43,9 +43,7 @@ class BenchSourceConfig(SourceConfig, frozen=True, kw_only=True, tag="rehearsal"
 class BenchSource:
     """The present depth image, with a D405's noise."""
 
-    host_clock = True
-    lossless = False
-    dropped = 0
+    host_clock, lossless, on_demand, dropped = True, False, True, 0
 
     def __init__(self, config: BenchSourceConfig, camera: Intrinsics) -> None:
         self._config, self._camera = config, camera

@@ -108,7 +108,8 @@ class FaultyCamera:
     """A virtual source with scheduled faults in its frames and its connection. ``truth`` stays that
     of the true organ at the stamp's time."""
 
-    host_clock, lossless, dropped = True, False, 0
+    host_clock, lossless, on_demand = True, False, False  # it stalls as a camera does
+    dropped = 0
 
     def __init__(
         self, player: ScenePlayer, others: list[ScenePlayer], fps: float, schedule: Schedule

@@ -29,6 +29,7 @@ class ImageSourceConfig(SourceConfig, frozen=True, kw_only=True, tag="image"):
 class ImageSource:
     host_clock = True  # stamps are time.time_ns
     lossless = False  # the newest frame wins
+    on_demand = True  # no camera: where no frame comes, this computer is slow
     dropped = 0
 
     def __init__(self, frame: DepthFrame, period_s: float) -> None:
