@@ -248,6 +248,9 @@ def test_pages_show_tables_and_cells_and_the_rest_stays(tmp_path):
     for wrong in ("errors:a:y", "errors:c:x", "others:a:x"):
         with pytest.raises(InputError):
             rendered(f"<!--={wrong}-->1<!--/-->", tmp_path)
+    write_table(tmp_path / "errors.csv", rows, {})
+    with pytest.raises(InputError):  # of what?
+        rendered(page, tmp_path)
     write_table(tmp_path / "errors.csv", pd.concat([rows, rows]), ABOUT)
     with pytest.raises(InputError):  # which of two rows?
         rendered(page, tmp_path)

@@ -137,15 +137,21 @@ _CELL = re.compile(r"(<!--=([^:>]+):([^:>]*):([^>]*?)-->).*?(<!--/-->)", re.DOTA
 
 def rendered(page: str, data: Path) -> str:
     """A page with its blocks and cells as the tables in ``data`` have them. Raises InputError: a
-    table or cell is not there."""
+    table or cell is not there, or nothing says what made it."""
+
+    def known(name: str) -> MeasuredTable:
+        table = MeasuredTable.read(data / f"{name}.csv")
+        if not table.about:
+            raise InputError(f"{data / name}.csv does not say what made it.")
+        return table
 
     def block(found: re.Match[str]) -> str:
-        table = MeasuredTable.read(data / f"{found[2]}.csv")
+        table = known(found[2])
         shown = table_of(pd.DataFrame(table.rows, columns=table.header))
         return f"{found[1]}\n{shown}\n\n{table.caption}\n\n{found[3]}"
 
     def cell(found: re.Match[str]) -> str:
-        table = MeasuredTable.read(data / f"{found[2]}.csv")
+        table = known(found[2])
         try:
             return found[1] + table.cell(found[3], found[4]) + found[5]
         except InputError as error:
