@@ -117,7 +117,7 @@ def _draw_views(
     for axes, view, frame in zip(every, views, frames, strict=True):
         frame = frame.widened(_ASPECT, widest_mm)
         drawing.show_bodies(axes, view, bodies, frame)
-        drawing.outline(axes, plan.piece, view, frame, rgb(PIECE), 0.9)
+        drawing.outline(axes, plan.piece, view, rgb(PIECE), 0.9)
         depth = np.min([view.depth_of(mesh, frame) for mesh in parts.values()], axis=0)
         for sweep in sweeps[::-1]:
             low = 0.0 if sweep.near else (sweep.number - 1) / max(len(sweeps) - 1, 1)

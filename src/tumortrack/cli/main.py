@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import gc
 import os
+import signal
 import sys
 from collections.abc import Callable
 from importlib import import_module
@@ -40,6 +41,7 @@ _DISTRIBUTIONS = {
     **dict.fromkeys(("phantom-kit", "calibrate", "record", "reference"), "tumortrack-experiment"),
 }
 _OBJECTS_PER_COLLECTION = 20_000
+_STOPPED = 130  # by Ctrl-C
 _EXITS_AT_ONCE = ["locate"]  # leaves nothing open, and users wait for its end
 
 
@@ -53,6 +55,8 @@ def main() -> None:
     # them for garbage takes a tenth of their import's time.
     gc.set_threshold(_OBJECTS_PER_COLLECTION)
     code = run(sys.argv[1:])
+    if code == _STOPPED:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # a second Ctrl-C changes nothing
     if sys.argv[1:2] == _EXITS_AT_ONCE and code in EXIT_STATUSES.values():
         leave(code)
     if code:
@@ -73,7 +77,7 @@ def run(arguments: list[str]) -> int:
         return error.exit_code
     except KeyboardInterrupt:
         print("tumortrack: stopped.", file=sys.stderr)
-        return 130
+        return _STOPPED
     except BrokenPipeError:  # `tumortrack inspect X | head`
         sys.stderr.close()
     except OSError as error:  # of the file system: a name too long, no permission

@@ -86,10 +86,10 @@ _A_THREAD = 20_000  # points that are worth a thread
 
 def nearest_on_faces(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     """The nearest place on triangles (f, 3, 3) of each point (n, 3), by a tree of boxes: triangles
-    in the order of a curve through space (Morton's), by eights, again and again."""
+    in the order of a curve through space (Hilbert's), by eights, again and again."""
     middles = triangles.mean(1)
     span = np.maximum(np.ptp(middles, axis=0), 1e-9)
-    order = np.argsort(_morton((1023 * (middles - middles.min(0)) / span).astype(np.int64)))
+    order = np.argsort(_along_curve((1023 * (middles - middles.min(0)) / span).astype(np.int64)))
     sizes = [-(-len(triangles) // _WIDE)]  # of the levels: leaves first, one box last
     while sizes[-1] > 1:
         sizes.append(-(-sizes[-1] // _WIDE))
@@ -101,13 +101,29 @@ def nearest_on_faces(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
 
 
 @njit(nogil=True)
-def _morton(cells):  # type: ignore[no-untyped-def]
-    """How far along the curve cells (n, 3) below 1024 are."""
+def _along_curve(cells):  # type: ignore[no-untyped-def]
+    """How far along Hilbert's curve cells (n, 3) below 1024 are: Skilling 2004, Programming the
+    Hilbert curve, doi 10.1063/1.1751381."""
     keys = np.zeros(len(cells), np.int64)
     for n in range(len(cells)):
+        x = cells[n].copy()
+        for bit in range(9, 0, -1):
+            low = (1 << bit) - 1
+            for axis in range(3):
+                if x[axis] >> bit & 1:
+                    x[0] ^= low
+                else:
+                    swapped = (x[0] ^ x[axis]) & low
+                    x[0] ^= swapped
+                    x[axis] ^= swapped
+        x[1] ^= x[0]
+        x[2] ^= x[1]
+        turn = 0
+        for bit in range(9, 0, -1):
+            turn ^= (1 << bit) - 1 if x[2] >> bit & 1 else 0
         for bit in range(10):
             for axis in range(3):
-                keys[n] |= (cells[n, axis] >> bit & 1) << (3 * bit + axis)
+                keys[n] |= ((x[axis] ^ turn) >> bit & 1) << (3 * bit + 2 - axis)
     return keys
 
 

@@ -156,13 +156,13 @@ def show_bodies(axes: Axes, view: ParallelView, bodies: list[Body], frame: Frame
 
 
 def outline(
-    axes: Axes, mesh: Mesh, view: ParallelView, frame: Frame, color: RGB | str, width: float,
-    **style: Any,
-) -> None:  # fmt: skip
+    axes: Axes, mesh: Mesh, view: ParallelView, color: RGB | str, width: float, **style: Any
+) -> None:
     """Draw the mesh's silhouette as a contour."""
-    x, y = np.meshgrid(*frame.pixel_centres())
-    mask = view.silhouette(mesh, frame)
-    axes.contour(x, y, mask, levels=[0.5], colors=[color], linewidths=width, **style)
+    around = view.frame_around(mesh.vertices_mm, 1.0)
+    mask = view.silhouette(mesh, around)
+    style |= {"levels": [0.5], "colors": [color], "linewidths": width}
+    axes.contour(*around.pixel_centres(), mask, **style)
 
 
 def draw_lines(axes: Axes, segments: Float[np.ndarray, "n 2 2"], **style: Any) -> None:

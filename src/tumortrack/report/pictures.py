@@ -98,7 +98,7 @@ def draw_solid_view(
     flat = view.project(scene.cloud.points_mm.astype(float))
     axes.scatter(flat[:, 0], flat[:, 1], s=2.5, color=OBSERVED, alpha=0.55, linewidths=0, zorder=3)
     for n, part in enumerate(scene.reference.parts):
-        drawing.outline(axes, part, view, frame, TRUE, 1.2 if n == 0 else 2.2)
+        drawing.outline(axes, part, view, TRUE, 1.2 if n == 0 else 2.2)
     for name, mesh in shown.items():
         u, v = view.project(mesh.box_mm.mean(0)[None])[0, :2]
         axes.text(u, v, name.split("_")[-1], fontweight="bold", **CENTRED)

@@ -142,7 +142,10 @@ def _mapped(
     pool: ProcessPoolExecutor, call: Callable[[Path], Any], folders: Iterable[Path]
 ) -> Iterable[Any]:
     with undisturbed():  # processes begin here, and leave Ctrl-C to this one
-        return pool.map(call, folders)
+        tasks = [pool.submit(call, folder) for folder in folders]
+    # Not by ``pool.map``: an exception would cancel the others, over which Python's pool stumbles
+    # when its processes are killed.
+    return (task.result() for task in tasks)
 
 
 def check_case(model: Model, folders: list[Path]) -> None:
