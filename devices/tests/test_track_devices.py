@@ -126,8 +126,10 @@ def test_a_replay_with_the_evidence_of_tools_is_the_same_to_the_last_bit(world, 
     run = f"recording:{first}?rate=0", f"recording:{again}", "--report", tmp_path / "again.json"
     succeeded(tumortrack("track", world.model, *run))
     assert evidence(again) == given
-    for one, other in zip(reports(first), reports(again), strict=True):
-        for volatile in ("seconds", "latency_ms", "arrived_ns"):
+    # On a busy machine the source is said to be opening first, in results that are counted.
+    frames = ([one for one in reports(folder) if one["seen"]] for folder in (first, again))
+    for one, other in zip(*frames, strict=True):
+        for volatile in ("sequence", "seconds", "latency_ms", "arrived_ns"):
             one.pop(volatile), other.pop(volatile)
         for each in (one, other):
             (each["estimate"] or {}).pop("timings", None)
