@@ -56,7 +56,7 @@ def test_the_first_command_makes_it_and_all_others_take_it(case, cloud, tmp_path
     tracked = tmp_path / "track.json"
     for command in (
         ("evaluate", case, scenes, tmp_path / "report", "--grid", 32),
-        ("track", case, source, "--seconds", 5, "--stale", 60, "--report", tracked),
+        ("track", case, source, "--seconds", 5, "--stale", 30, "--report", tracked),
         ("compile", case),
     ):
         assert MAKING not in succeeded(tumortrack(*command))
