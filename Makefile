@@ -54,6 +54,7 @@ demo: $(TRACKER)  ## install the tracker (without PyTorch), then CT -> tumors lo
 
 check: setup  ## lint, types, import order, licences, figures in the pages
 	$(BIN)/ruff check src devices occupancy resection lab experiment tests examples tools notebooks conftest.py
+	$(BIN)/ruff check --select F821 lab/scripts tools tests/support  # mypy does not see these
 	$(BIN)/ruff format --check src devices occupancy resection lab experiment tests examples tools notebooks conftest.py
 	$(BIN)/mypy
 	$(BIN)/lint-imports
@@ -93,7 +94,7 @@ crash: setup  ## kill -9 at random moments, shortages, two at once (ARGS="--time
 	$(BIN)/python tests/support/crashes.py runs/crashes $(ARGS)
 
 replay: setup  ## has any of 500 answers changed since runs/replay.json, by how many mm? Without that file: record them
-	$(BIN)/python tools/replay.py either runs/replay.json
+	$(BIN)/python tools/replay.py compare
 
 fingerprint: setup  ## the method's version, by 30 answers: recorded again where it has changed (a minute)
 	$(BIN)/python tools/replay.py fingerprint

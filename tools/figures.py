@@ -14,47 +14,36 @@ from tumortrack.core.errors import InputError
 from tumortrack.tracking.fingerprint import fingerprint
 from tumortrack_lab.study.document import MeasuredTable, rendered
 
-ROOT = Path(__file__).parents[1]
-DATA = ROOT / "docs/data"
-# Of what a table was measured, where it is not today's method: as the table says it.
-OTHER = "version", "weights", "data"
 
-
-def pages() -> list[Path]:
-    return [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
-
-
-def faults(check: bool) -> list[str]:
-    found = []
-    for page in pages():
-        text = page.read_text(encoding="utf-8")
+def faults(root: Path, check: bool) -> list[str]:
+    """Of the pages and tables of a checkout; ``check``: the pages are left as they are."""
+    found, data = [], root / "docs/data"
+    for page in [root / "README.md", *sorted((root / "docs").rglob("*.md"))]:
+        text, name = page.read_text(encoding="utf-8"), page.relative_to(root)
         try:
-            new = rendered(text, DATA)
+            new = rendered(text, data)
         except InputError as error:
-            found.append(f"{page.relative_to(ROOT)}: {error}")
+            found.append(f"{name}: {error}")
             continue
-        if new == text:
-            continue
-        if check:
-            found.append(f"{page.relative_to(ROOT)} differs from its tables: make figures")
-        else:
+        if new != text and check:
+            found.append(f"{name} differs from its tables: make figures")
+        elif new != text:
             page.write_text(new, encoding="utf-8")
-            print(f"{page.relative_to(ROOT)} written")
-    for path in sorted(DATA.glob("*.csv")):
-        about = MeasuredTable.read(path).about
+            print(f"{name} written")
+    for path in sorted(data.glob("*.csv")):
+        about, name = MeasuredTable.read(path).about, path.relative_to(root)
         of = about.get("fingerprint")
         if of not in (None, fingerprint()):
             found.append(
-                f"{path.relative_to(ROOT)} was measured with method {of}, and this is "
-                f"{fingerprint()}: make it again ({about['command']}), or delete it with the "
-                "sentences that rest on it"
+                f"{name} was measured with method {of}, and this is {fingerprint()}: make it again "
+                f"({about.get('command')}), or delete it with the sentences that rest on it"
             )
-        elif about and of is None and not any(about.get(key) for key in OTHER):
-            found.append(f"{path.relative_to(ROOT)} does not say of what it is: {', '.join(OTHER)}")
+        elif about and of is None and "version" not in about:
+            found.append(f"{name} says neither a fingerprint nor a version")
     return found
 
 
 if __name__ == "__main__":
-    wrong = faults("--check" in sys.argv[1:])
+    wrong = faults(Path(__file__).parents[1], "--check" in sys.argv[1:])
     print(*wrong, sep="\n", file=sys.stderr)
     sys.exit(bool(wrong))

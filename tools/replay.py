@@ -1,13 +1,13 @@
 """Has any answer changed, by how many mm?
 
-python tools/replay.py either FILE.json     record some 500 answers, or compare with those in FILE:
-                                            the largest difference of a place, of a bound, of other
-                                            figures, and verdicts that changed; exit status 1 where
-                                            anything differs
-python tools/replay.py fingerprint          the 30 answers that come with the package, whose hash is
-                                            the method's version: kept while each place lies within
-                                            0.05 mm of what is recorded, else recorded again
-python tools/replay.py check                the same, but exit status 1 instead of a new record
+python tools/replay.py compare       with the 500 answers in runs/replay.json, which are recorded
+                                     where that file is missing: the largest difference of a place,
+                                     of a bound, of other figures, and verdicts that changed; exit
+                                     status 1 where anything differs
+python tools/replay.py fingerprint   the 30 answers that come with the package, whose hash is the
+                                     method's version: kept while each place lies within 0.05 mm of
+                                     what is recorded, else recorded again
+python tools/replay.py check         the same, but exit status 1 instead of a new record
 """
 
 from __future__ import annotations
@@ -33,7 +33,10 @@ from typing import Any
 import numpy as np
 from answers import Answer, Numbers, answers, network, plan
 
+from tumortrack.cli.console import progress_bar
+
 ROOT = Path(__file__).parents[1]
+LATEST = ROOT / "runs/replay.json"
 KEPT = ROOT / "src/tumortrack/tracking/answers.json"
 SAME_MM = 0.05  # far above what processors differ by, far below what anybody measures
 SAME_SHARE = 0.02  # of a figure that margins have a limit for
@@ -42,13 +45,12 @@ SHORT = (3, 4, 2, 1)  # 15 clouds, 4 images, 8 with evidence, 3 frames
 
 
 def asked(some: Iterable[Answer]) -> dict[str, Numbers]:
-    """Their numbers, with progress."""
-    made, start = dict[str, Numbers](), time.perf_counter()
-    for name, ask in some:
-        made[name] = ask()
-        rate = len(made) / (time.perf_counter() - start)
-        if sys.stderr.isatty():
-            print(f"\r{len(made)} answers, {rate:.1f} a second: {name}   ", end="", file=sys.stderr)
+    """Their numbers."""
+    some, made, start = list(some), dict[str, Numbers](), time.perf_counter()
+    with progress_bar("answers", len(some)) as advance:
+        for name, ask in some:
+            made[name] = ask()
+            advance()
     print(f"{len(made)} answers in {time.perf_counter() - start:.0f} s", flush=True)
     return made
 
@@ -96,9 +98,8 @@ def compare(made: dict[str, Numbers], known: dict[str, Numbers]) -> bool:
         for what, measure in MEASURES.items():
             mine = (name for name in both if name.partition("/")[0] == kind)
             off = {name: measure(made[name], known[name]) for name in mine}
-            off = {name: value for name, value in off.items() if math.isfinite(value)}
-            where = max(off, key=lambda name: off[name], default="")
-            worst[kind, what] = off.get(where, 0.0)
+            where = max(off, key=lambda name: off[name])  # infinite: other places or figures
+            worst[kind, what] = off[where]
             over = sum(value > SAME_MM for value in off.values())
             print(f"{kind}: {what} {worst[kind, what]:.3g} ({where}), over {SAME_MM:g} in {over}")
     pairs = Counter((known[n].get("verdict"), made[n].get("verdict")) for n in both)
@@ -126,19 +127,17 @@ def written(path: Path, answers: dict[str, Numbers], **about: Any) -> None:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description="Has any answer changed, by how many mm?")
-    parser.add_argument("action", choices=("record", "compare", "either", "fingerprint", "check"))
-    parser.add_argument("file", type=Path, nargs="?", default=KEPT)
-    given = parser.parse_args()
-    file, action = given.file.absolute(), given.action
-    short = action in ("fingerprint", "check")
-    recording = action == "record" or not file.exists()
+    parser.add_argument("action", choices=("compare", "fingerprint", "check"))
+    action = parser.parse_args().action
+    short = action != "compare"
+    file = KEPT if short else LATEST
     with tempfile.TemporaryDirectory() as work:
         os.chdir(work)  # what is written names folders: the same ones every time
         made = asked(answers(*SHORT) if short else everything())
         os.chdir("/")
     machine = f"{platform.machine()}, python {platform.python_version()}, numpy {np.__version__}"
-    if recording:
-        written(file, made, **({} if short else {"machine": machine}))
+    if not (short or file.exists()):
+        written(file, made, machine=machine)
         print(f"recorded in {file}")
         return 0
     stored = json.loads(file.read_bytes())

@@ -74,7 +74,7 @@ def data_table(path: Path, text: str, link: str) -> str:
         f"<code>{escape(part)}</code>" if odd % 2 else escape(part)
         for odd, part in enumerate(text.split("`"))
     )
-    made = escape(table.caption) if table.about else ""
+    made = escape(table.caption.replace("`", "")) if table.about else ""
     figures = any(cell[:1].isdigit() for row in rows for cell in row)  # words can be searched for
     return f"""<details class="data"{" data-search-exclude" * figures}><summary>{summary}</summary>
 <div class="data" tabindex="0"><table class="data">

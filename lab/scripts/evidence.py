@@ -23,6 +23,7 @@ import pandas as pd
 import tyro
 
 import tumortrack as tt
+import tumortrack_lab
 from tumortrack.cli.console import model_folder, say
 from tumortrack.core import store
 from tumortrack.core.errors import InputError
@@ -32,6 +33,7 @@ from tumortrack.tracking.fingerprint import fingerprint
 from tumortrack.tracking.tracker import Tracker
 from tumortrack_lab.study import evidence, evidence_tables, scripts
 from tumortrack_lab.study.document import table_of
+from tumortrack_lab.study.methods import code_sha256
 from tumortrack_lab.world.made import scenes_of_kidney
 
 _BLOCK = "evidence"
@@ -149,8 +151,9 @@ def _next(cases: list[Path]) -> list[Path]:
 
 
 def _rows(folder: Path, states: int) -> Path:
-    """Rows are of one version of the method, and of so many states."""
-    return folder / f"evidence-{fingerprint()}-{states}.jsonl"
+    """Rows are of one version of the method and of how evidence is drawn, and of so many states."""
+    drawn = code_sha256(Path(tumortrack_lab.__path__[0]).glob("*/evidence.py"))
+    return folder / f"evidence-{fingerprint()}-{drawn[:8]}-{states}.jsonl"
 
 
 def _measure(organ: Organ) -> int:

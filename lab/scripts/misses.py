@@ -28,7 +28,7 @@ from tumortrack.tracking.fingerprint import fingerprint
 from tumortrack.tracking.tracker import Tracker
 from tumortrack_lab.margins import misses
 from tumortrack_lab.study import scripts
-from tumortrack_lab.study.document import table_of
+from tumortrack_lab.study.document import share_words, table_of
 from tumortrack_lab.study.tables import NOTHING
 from tumortrack_lab.world.made import scenes_of_kidney
 

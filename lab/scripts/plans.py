@@ -32,7 +32,7 @@ from tumortrack.tracking.tracker import Tracker
 from tumortrack_lab.bench.planning import on_its_stand
 from tumortrack_lab.cut import Swept, cut
 from tumortrack_lab.study import scripts
-from tumortrack_lab.study.document import table_of
+from tumortrack_lab.study.document import share_words, table_of
 from tumortrack_lab.study.tables import NOTHING
 from tumortrack_lab.twin.apparatus import moved
 from tumortrack_lab.world.kidneys import random_anatomy

@@ -2,8 +2,8 @@
 
     make rehearsal ARGS='CASE MODEL OUT'      (five minutes; goes on where it was stopped)
 
-The commands are those of a laboratory; OUT keeps every file. --document writes
-tables beside it.
+The commands are those of a laboratory; OUT keeps every file. --document writes tables
+beside it.
 """
 
 from __future__ import annotations
@@ -20,13 +20,6 @@ from tumortrack_lab.rehearsal.mishaps import Mishaps
 from tumortrack_lab.rehearsal.run import Rehearsal
 from tumortrack_lab.study import scripts
 from tumortrack_lab.study.document import ReportWriter, table_of
-
-BLOCK = "rehearsal"
-WORDS = {
-    "errors": "What each step states of its error, and what is true",
-    "states": "Errors of estimates by the second CT and by the truth",
-    "mishaps": "What goes wrong on a bench, and what is said",
-}
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,7 @@ import os
 import runpy
 import signal
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -29,6 +30,7 @@ from tumortrack_lab.study.document import (
     MeasuredTable,
     ReportWriter,
     rendered,
+    share_words,
     spread_mm,
     spread_words,
     write_table,
@@ -256,27 +258,30 @@ def test_pages_show_tables_and_cells_and_the_rest_stays(tmp_path):
         rendered(page, tmp_path)
 
 
-def test_a_table_of_another_method_or_a_page_that_differs_is_found(tmp_path, monkeypatch):
-    figures = runpy.run_path(str(ROOT / "tools" / "figures.py"))
-    monkeypatch.setitem(figures["faults"].__globals__, "ROOT", tmp_path)
-    monkeypatch.setitem(figures["faults"].__globals__, "DATA", tmp_path / "docs" / "data")
+def test_a_share_has_wilsons_interval():
+    assert share_words(19, 1482) == "1.3 % (0.8 to 2.0)"  # R's binom::binom.wilson
+    assert share_words(0, 10) == "0.0 % (0.0 to 27.8)"
+
+
+def test_a_table_of_another_method_or_a_page_that_differs_is_found(tmp_path):
+    faults = partial(runpy.run_path(str(ROOT / "tools" / "figures.py"))["faults"], tmp_path)
     page, rows = tmp_path / "docs" / "page.md", pd.DataFrame({"who": ["a"], "off": [1.5]})
     data = tmp_path / "docs" / "data" / "errors.csv"
     about = {"command": "make it", "fingerprint": fingerprint()}
     write_table(data, rows, about)
     (tmp_path / "README.md").write_text("nothing measured\n")
     page.write_text("It is <!--=errors:a:off-->1.4<!--/--> mm off.\n")
-    assert len(figures["faults"](True)) == 1
+    assert len(faults(True)) == 1
     assert "1.4" in page.read_text()
-    assert figures["faults"](False) == []
+    assert faults(False) == []
     assert "-->1.5<" in page.read_text()
-    assert figures["faults"](True) == []
+    assert faults(True) == []
     write_table(data, rows, {**about, "fingerprint": "of another"})
-    assert len(figures["faults"](True)) == 1
-    write_table(data, rows, {"command": "make it"})  # of what?
-    assert len(figures["faults"](True)) == 1
+    assert len(faults(True)) == 1
+    write_table(data, rows, {"command": "make it", "weights": "abc"})  # of which version?
+    assert len(faults(True)) == 1
     write_table(data, rows, {"command": "make it", "weights": "abc", "version": "0.2"})
-    assert figures["faults"](True) == []
+    assert faults(True) == []
 
 
 def test_a_population_shows_rigid_fits_or_says_that_a_run_lacks_them(tmp_path):

@@ -44,7 +44,7 @@ def test_a_slow_first_step_tells_no_rate(monkeypatch, capsys):
     assert "9 of 10 | 2.0 s each | 0:02 left" in capsys.readouterr().out
 
 
-def test_what_comes_after_counts_anew(monkeypatch, capsys):
+def test_what_comes_after_is_counted_from_one(monkeypatch, capsys):
     clock = Clock()
     monkeypatch.setattr(console, "time", clock)
     with console.progress_bar("evaluate", 20, then="draw") as advance:

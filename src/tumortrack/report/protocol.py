@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import os
-import pickle
 import threading
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from functools import partial
@@ -15,6 +14,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
+import numpy as np
+
 import tumortrack
 from tumortrack.core import store
 from tumortrack.core.config import to_builtins
@@ -22,7 +23,7 @@ from tumortrack.core.errors import InputError, NoEstimate, TumortrackError
 from tumortrack.core.estimate import FAR_MM, Estimate
 from tumortrack.core.process import undisturbed
 from tumortrack.core.store import write_json, writing
-from tumortrack.core.types import SensorCloud
+from tumortrack.core.types import Mesh, SensorCloud
 from tumortrack.models.model import Model
 from tumortrack.report import metrics
 from tumortrack.report.place import clear
@@ -139,10 +140,10 @@ def _in_process(aside: Path, folder: Path) -> dict[str, Any]:
 
 
 def _mapped(
-    pool: ProcessPoolExecutor, call: Callable[[Path], Any], folders: Iterable[Path]
+    pool: ProcessPoolExecutor, call: Callable[..., Any], items: Iterable[Any]
 ) -> Iterable[Any]:
     with undisturbed():  # processes begin here, and leave Ctrl-C to this one
-        tasks = [pool.submit(call, folder) for folder in folders]
+        tasks = [pool.submit(call, item) for item in items]
     # Not by ``pool.map``: an exception would cancel the others, over which Python's pool stumbles
     # when its processes are killed.
     return (task.result() for task in tasks)
@@ -201,18 +202,31 @@ def _judged(locate: Locate, rivals: Compare | None, aside: Path, folder: Path) -
     entry, estimate = evaluate_scene(locate, scene, folder.name, rivals)
     if isinstance(stated := scene.meta.get("registration"), dict):  # of a second CT
         entry["registration_mm"] = stated.get("tre_mm", {})
-    shown = Scene(scene.cloud, scene.reference), estimate.meshes if estimate else {}, entry
     with writing(aside):
-        (aside / folder.name).write_bytes(pickle.dumps(shown))
+        _put_aside(aside / f"{folder.name}.npz", estimate.meshes if estimate else {})
     return entry
 
 
-def _drawn(out: Path, aside: Path, folder: Path) -> dict[str, Any]:
-    """What the page shows of a scene; its picture is written."""
+def _put_aside(path: Path, meshes: Mapping[str, Mesh]) -> None:
+    """For ``_put_there``, in another process."""
+    arrays = {f"{part}/vertices": mesh.vertices_mm for part, mesh in meshes.items()}
+    arrays |= {f"{part}/faces": mesh.faces for part, mesh in meshes.items()}
+    np.savez(path, **arrays)  # type: ignore[arg-type]  # numpy's names of options are no parts
+
+
+def _put_there(path: Path) -> dict[str, Mesh]:
+    with np.load(path) as arrays:
+        parts = [name.removesuffix("/faces") for name in arrays if name.endswith("/faces")]
+        return {part: Mesh(arrays[f"{part}/vertices"], arrays[f"{part}/faces"]) for part in parts}
+
+
+def _drawn(out: Path, aside: Path, judged: tuple[Path, dict[str, Any]]) -> dict[str, Any]:
+    """What the page shows of a scene (its folder and entry); its picture is written."""
     from tumortrack.report.page import page_scene
     from tumortrack.report.pictures import scene_picture  # slow to import, like the page
 
-    scene, meshes, entry = pickle.loads((aside / folder.name).read_bytes())
+    folder, entry = judged
+    scene, meshes = read_scene(folder), _put_there(aside / f"{folder.name}.npz")
     picture = out / "scenes" / f"{folder.name}.png"
     scene_picture(scene, meshes, entry, picture)
     return page_scene(scene, meshes, picture)
@@ -238,7 +252,9 @@ def _report(
                 "scenes": entries,
             }
             write_json(out / "report.json", report)
-            shown = _counted(work.map(partial(_drawn, out, aside), folders), steps[1])
+            shown = _counted(
+                work.map(partial(_drawn, out, aside), zip(folders, entries, strict=True)), steps[1]
+            )
 
             from tumortrack.report.page import write_page
 

@@ -35,8 +35,8 @@ _CERTAIN = 0.95
 @dataclass(frozen=True)
 class Device:
     """What found beads. ``error_mm``: the usual distance of a bead from where it is found, three
-    axes together; ``tolerance_mm``: the farthest from the kit's
-    drawing, which a print misses by some tenths, at which a bead is still in its place."""
+    axes together; ``tolerance_mm``: the farthest from the kit's drawing, which a print misses by
+    some tenths, at which a bead is still in its place."""
 
     name: str
     error_mm: float

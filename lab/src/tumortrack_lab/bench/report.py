@@ -123,9 +123,8 @@ GOALS = [
 
 
 def write_bench(bench: BenchResult, out: Path, document: Path | None) -> list[Path]:
-    """Write OUT, and where there is a document its tables in data/ beside it; returns
-    what was written. Raises InputError: no such document;
-    StorageError: the disk refused."""
+    """Write OUT, and where there is a document its tables in data/ beside it; returns what was
+    written. Raises InputError: no such document; StorageError: the disk refused."""
     out.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(out, msgspec.json.format(msgspec.json.encode(bench), indent=1))
     if document is None:

@@ -2,15 +2,18 @@
 
 A table says above its header what made it, one ``# key: value`` a line: ``command``, ``commit``,
 ``date``, ``machine``, ``sample``, ``interval`` and ``fingerprint``, the method's version. Tables of
-other things than the method (trained weights, an older version, the user's data) have ``version``,
-``weights`` or ``data`` instead. A page shows a whole table between ``<!-- results:NAME -->`` and
-``<!-- /results:NAME -->``, and one cell between ``<!--=NAME:ROW:COLUMN-->`` and ``<!--/-->``, where
-ROW is the text of the first columns, as many as are needed, joined by commas.
+other things than the method (trained weights, another machine, an older version) say with which
+``version`` they were measured instead, and of which ``weights`` or ``data``.
+
+A page shows a whole table between ``<!-- results:NAME -->`` and ``<!-- /results:NAME -->``, and one
+cell between ``<!--=NAME:ROW:COLUMN-->`` and ``<!--/-->``, where ROW is the text of the first
+columns, as many as are needed, joined by commas.
 """
 
 from __future__ import annotations
 
 import csv
+import io
 import re
 import subprocess
 from collections.abc import Mapping
@@ -22,6 +25,7 @@ from typing import NamedTuple
 import pandas as pd
 from scipy.stats import binomtest
 
+import tumortrack
 from tumortrack.core import store
 from tumortrack.core.errors import InputError, StorageError
 from tumortrack.core.process import available_cores
@@ -33,7 +37,7 @@ _SPREAD = ("median", "90 %", "95 %", "worst")
 
 def table_of(frame: pd.DataFrame) -> str:
     """A frame as Markdown; columns of numbers are right-aligned."""
-    cells = [[str(cell) for cell in row] for row in frame.to_numpy().tolist()]
+    cells = frame.astype(str).to_numpy().tolist()
     rule = [
         "---:" if all(_NUMBER.match(row[n]) for row in cells) else "---"
         for n in range(len(frame.columns))
@@ -86,12 +90,16 @@ class MeasuredTable(NamedTuple):
     def read(cls, path: Path) -> MeasuredTable:
         """Raises InputError: it is not there."""
         try:
-            lines = path.read_text(encoding="utf-8").splitlines()
+            text = path.read_text(encoding="utf-8")
         except OSError as error:
             raise InputError(f"{path} cannot be read: {error.strerror}.") from error
-        above = [line[1:].partition(":") for line in lines if line.startswith("#")]
-        header, *rows = csv.reader(line for line in lines if not line.startswith("#"))
-        return cls({key.strip(): value.strip() for key, _, value in above}, header, rows)
+        about = {}
+        while text.startswith("#"):
+            line, _, text = text.partition("\n")
+            key, _, value = line[1:].partition(":")
+            about[key.strip()] = value.strip()
+        header, *rows = csv.reader(io.StringIO(text, newline=""))
+        return cls(about, header, rows)
 
     def cell(self, row: str, column: str) -> str:
         """Raises InputError: there is no such cell, or more than one."""
@@ -111,13 +119,23 @@ class MeasuredTable(NamedTuple):
 
 def provenance(command: str, **more: str) -> dict[str, str]:
     """What a table says that is measured now by this version of the method."""
-    here = Path(__file__).parent
-    asked = ["git", "describe", "--always", "--dirty", "--exclude=*"]
-    commit = subprocess.run(asked, cwd=here, capture_output=True, text=True, check=False).stdout
+    asked = [
+        "git",
+        "-C",
+        str(Path(__file__).parent),
+        "describe",
+        "--always",
+        "--dirty",
+        "--exclude=*",
+    ]
+    try:
+        commit = subprocess.run(asked, capture_output=True, text=True, check=True).stdout.strip()
+    except (OSError, subprocess.CalledProcessError):  # no git, or no checkout
+        commit = f"none, version {tumortrack.__version__}"
     return {
         "command": command,
         "fingerprint": fingerprint(),
-        "commit": commit.strip() or "none",
+        "commit": commit,
         "date": datetime.now(UTC).strftime("%Y-%m-%d"),
         "machine": f"{cpu_name()}, {available_cores()} cores",
         **more,
