@@ -14,6 +14,7 @@ import time
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,8 +22,8 @@ import numpy as np
 import pandas as pd
 import tyro
 
+import tumortrack_resection
 from tumortrack.cli.console import model_folder, say
-from tumortrack.core import store
 from tumortrack.core.errors import InputError, NoEstimate, NoPlan
 from tumortrack.core.geometry import rotation_onto
 from tumortrack.core.types import Anatomy
@@ -33,6 +34,7 @@ from tumortrack_lab.bench.planning import on_its_stand
 from tumortrack_lab.cut import Swept, cut
 from tumortrack_lab.study import scripts
 from tumortrack_lab.study.document import share_words, table_of
+from tumortrack_lab.study.methods import code_sha256
 from tumortrack_lab.study.tables import NOTHING
 from tumortrack_lab.twin.apparatus import moved
 from tumortrack_lab.world.kidneys import random_anatomy
@@ -79,17 +81,15 @@ def main(options: Options) -> None:
     """Make missing rows, then the table."""
     writer = scripts.begun("plans", options.document)
     options.out.mkdir(parents=True, exist_ok=True)
-    rows = []
+    rows, planner = [], code_sha256(Path(tumortrack_resection.__path__[0]).rglob("*.py"))
     for subject in _subjects(options):
         for label, share in exophytic_shares(subject.located, list(subject.located.tumors)).items():
             if share < _LEAST_SHARE:
                 continue
             for margin_mm in subject.margins:
                 name = f"{subject.group}-{subject.name}-{name_of(label)}-{margin_mm:g}.json"
-                path = options.out / name
-                if not path.exists():
-                    store.write_json(path, plan_one(subject, label, margin_mm))
-                rows.append(store.read_json(path))
+                measure = partial(_plans, subject, label, margin_mm)
+                rows += scripts.kept(options.out / name, {"planner": planner}, measure)
                 say(f"{name}: {rows[-1].get('refused') or rows[-1]['least_mm']}")
     frame = pd.DataFrame(rows)
     frame.to_csv(options.out / "plans.csv", index=False)
@@ -102,6 +102,10 @@ def main(options: Options) -> None:
     planned = frame.refused.isna().sum() if "refused" in frame else len(frame)
     share = share_words(int(planned), len(frame))
     writer.tables({"plans": shown}, sample=f"{len(frame)} plans", interval=f"possible {share}")
+
+
+def _plans(subject: Subject, label: int, margin_mm: float) -> list[dict]:
+    return [plan_one(subject, label, margin_mm)]
 
 
 def _subjects(options: Options) -> Iterator[Subject]:

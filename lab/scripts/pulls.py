@@ -9,17 +9,19 @@ stopped.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 
 import tyro
 
+import tumortrack_resection
 from tumortrack.cli.console import model_folder, say
 from tumortrack.core import store
 from tumortrack.tracking.model_files import load_model
 from tumortrack.tracking.tracker import Tracker
 from tumortrack_lab.study import pulls, scripts
 from tumortrack_lab.study.document import table_of
+from tumortrack_lab.study.methods import code_sha256
 from tumortrack_lab.world.scenes import TETS, World, WorldConfig
 
 
@@ -43,24 +45,25 @@ def main(options: Options) -> None:
     """Make missing rows, then the table."""
     writer = scripts.begun("pulls", options.document)
     rows, lost = [], 0
+    planner = code_sha256(Path(tumortrack_resection.__path__[0]).rglob("*.py"))
     for number in range(options.count):
         for case in options.cases:
             sha256 = store.sha256_of(case / store.MANIFEST)
             folder = options.out / sha256[:8]
-            path = folder / f"{number:05d}.json"
-            if not path.exists():
-                folder.mkdir(parents=True, exist_ok=True)
-                world = _world(case, folder, options.seed)
-                made, why = pulls.tried(_tracker(case), world, number)
-                store.write_json(path, {"rows": made, "why": why})
-                say(f"{case.name} {number}: {why or f'{len(made)} cuts'}")
-            known = store.read_json(path)
-            rows += [{"case": sha256[:8], **row} for row in known["rows"]]
-            lost += not known["rows"]
+            measure = partial(_tried, case, folder, options.seed, number)
+            known = scripts.kept(folder / f"{number:05d}.json", {"planner": planner}, measure)
+            rows += [{"case": sha256[:8], **row} for row in known]
+            lost += not known
     shown = pulls.table(rows)
     sample = f"{options.count * len(options.cases)} scenes, {lost} without a plan"
     print(sample, table_of(shown), sep="\n\n")
     writer.tables({"pulls": shown}, sample=sample)
+
+
+def _tried(case: Path, folder: Path, seed: int, number: int) -> list[dict]:
+    made, why = pulls.tried(_tracker(case), _world(case, folder, seed), number)
+    say(f"{case.name} {number}: {why or f'{len(made)} cuts'}")
+    return made
 
 
 @cache

@@ -24,6 +24,7 @@ from tumortrack.imaging.case import Case, load_case, save_case
 from tumortrack.imaging.options import PrepareOptions
 from tumortrack.report.pictures import qc_picture
 from tumortrack.simulate.scene_folder import read_scene
+from tumortrack.tracking.fingerprint import fingerprint
 from tumortrack.tracking.margins import NAME, write_sealed
 from tumortrack.tracking.model_files import case_model, load_model
 from tumortrack.tracking.tracker import Tracker
@@ -83,9 +84,9 @@ def chain(patient: Patient) -> dict[str, Task]:
             }  # fmt: skip
             name = f"states-{kind}-{len(groups[kind])}"
             groups[kind][f"states_{len(groups[kind]):04d}"] = add(name, states, here, after, 1500)
-    known = {"case": case, **groups["margins"]}
-    margin = add("margins", margins, {"seed": patient.seed}, known, 1500)
-    judged = add("evaluate", evaluate, {}, {"case": case, **groups["test"]}, 1500)
+    known, method = {"case": case, **groups["margins"]}, {"fingerprint": fingerprint()}
+    margin = add("margins", margins, {"seed": patient.seed, **method}, known, 1500)
+    judged = add("evaluate", evaluate, method, {"case": case, **groups["test"]}, 1500)
     results = {**after, "margins": margin, "evaluate": judged}
     add("summary", summary, {}, {**results, **groups["test"]}, 1500)
     return steps

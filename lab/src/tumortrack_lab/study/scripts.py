@@ -13,6 +13,7 @@ import tyro
 
 from tumortrack.core import store
 from tumortrack.core.errors import InputError, TumortrackError
+from tumortrack.tracking.fingerprint import fingerprint
 from tumortrack_lab.study.document import ReportWriter, make_folder
 
 Options = TypeVar("Options")
@@ -48,8 +49,9 @@ def check_page(document: Path | None) -> None:
 
 
 def kept(path: Path, about: dict, measure: Callable[[], list[dict]]) -> list[dict]:
-    """The rows in a file if they were measured with the same ``about``; else measured now, and its
-    folder made."""
+    """The rows in a file if they were measured with the same ``about`` by this version of the
+    method, as tables say of them; else measured now, and its folder made."""
+    about = {**about, "fingerprint": fingerprint()}
     known = store.read_json(path) if path.is_file() else {}
     if known.get("about") == about and "rows" in known:
         return known["rows"]
