@@ -19,7 +19,7 @@ from tumortrack.core.errors import InputError
 from tumortrack.core.patient import NOBODY, UNKNOWN, Patient, Side
 from tumortrack.core.pydicom_library import load_pydicom
 from tumortrack.imaging.dicom_pixels import read_pixels
-from tumortrack.imaging.grid import GZIP_BEST, RawVolume, check_affine, check_size
+from tumortrack.imaging.grid import GZIP_BEST, RawVolume, check_affine, check_size, check_suffix
 
 MIN_SLICES = 10
 _MAX_FILES = 20_000
@@ -161,6 +161,8 @@ def _groups(folder: Path) -> tuple[list[list[_Slice]], tuple[str, ...]]:
             "each, or NIfTI."
         )
     if not by_key:
+        for file in left_out[_NO_SLICE]:
+            check_suffix(file)
         raise NoSeries(
             f"{folder} holds no DICOM image with a position. Give the folder that holds the CT's "
             "slices themselves."
