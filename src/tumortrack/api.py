@@ -110,7 +110,7 @@ def prepare(
     if segment is None:
         case = preparing.prepare(sources, asked)
     elif folder is None or len(sources) != 1:
-        raise InputError("segment needs a folder, beside which the label map of the one CT is kept.")
+        raise InputError("segment needs a folder, beside which the one CT's label map is kept.")
     else:
         from tumortrack.imaging.segmentation_tool import segmented_case
 

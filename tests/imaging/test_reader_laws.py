@@ -3,6 +3,7 @@ organ at the image's border is told, tolerances are stated, segments may overlap
 
 import gzip
 import json
+import os
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from imaging_objects import kidney_labels, write_dicom, write_nifti
 from tumortrack.core import store
 from tumortrack.core.case_warning import warnings_in
 from tumortrack.core.errors import InputError
+from tumortrack.core.types import LabelVolume, Volume
 from tumortrack.imaging.case import load_case, save_case
 from tumortrack.imaging.options import PrepareOptions
 from tumortrack.imaging.prepare import prepare
@@ -165,13 +167,13 @@ def test_an_organ_at_the_border_is_told_and_stays_told(phantom, tmp_path, write)
     assert [(w.kind, w.values) for w in again] == [(w.kind, w.values) for w in case.warnings]
 
 
-def test_a_ct_that_ends_in_the_organ_is_told(tmp_path):
+def test_a_ct_that_ends_in_the_organ_is_refused(tmp_path):
     truth = kidney_labels((1.5, 1.5, 1.5))
-    first = int(np.flatnonzero(truth.labels.any((0, 1)))[0]) + 4
+    first = int(np.flatnonzero(truth.labels.any((0, 1)))[0]) + 1
     hu = np.choose(truth.labels[..., first:], [-1000, 40, 570, 570])
     write_dicom(tmp_path / "ct", hu, truth.lps_from_index)
-    expected = (truth.labels[..., first] > 0).sum()
-    assert kinds(prepare(tmp_path / "ct"))["cut"]["voxels"] == pytest.approx(expected, rel=0.1)
+    with pytest.raises(InputError, match="the image's end"):
+        prepare(tmp_path / "ct")
 
 
 def test_a_case_of_before_has_no_warnings(phantom, tmp_path):
@@ -345,3 +347,112 @@ def _moved(affine: np.ndarray, voxels: float) -> np.ndarray:
     out = affine.copy()
     out[:3, 3] += affine[:3, :3] @ ([voxels] * 3)
     return out
+
+
+def slices(phantom: Scene, folder: Path) -> tuple[list[Path], np.ndarray]:
+    hu = np.choose(phantom.map(), [-1000, 40, 570, 570]).astype(np.int16)
+    return write_dicom(folder, hu, phantom.affine), hu
+
+
+def retagged(paths: list[Path], **change) -> None:
+    import pydicom
+
+    for n, path in enumerate(paths):
+        data = pydicom.dcmread(path)
+        for tag, of in change.items():
+            setattr(data, tag, of(n, getattr(data, tag)))
+        data.save_as(path)
+
+
+def late_decimals(by: float):
+    return lambda n, values: [f"{float(v) + by * (n % 3):.9g}" for v in values]
+
+
+@pytest.mark.parametrize(
+    ("change", "read"),
+    [
+        ({"ImageOrientationPatient": late_decimals(5e-4)}, True),
+        ({"ImageOrientationPatient": late_decimals(5e-3)}, False),
+        ({"PixelSpacing": late_decimals(2e-4)}, True),
+        ({"PixelSpacing": late_decimals(2e-2)}, False),
+        ({"RescaleIntercept": lambda n, _: f"{-1024 + 0.02 * (n % 3)}"}, True),
+        ({"RescaleIntercept": lambda n, _: f"{-1024 + 2 * (n % 3)}"}, False),
+    ],
+)
+def test_slices_may_differ_by_what_rounding_leaves(phantom, tmp_path, change, read):
+    paths, hu = slices(phantom, tmp_path / "ct")
+    retagged(paths, **change)
+    if read:
+        raw = read_raw(tmp_path / "ct")
+        assert raw.notes == ()
+        assert np.abs(raw.array - hu).max() < 0.1
+    else:
+        with pytest.raises(InputError):
+            read_raw(tmp_path / "ct")
+
+
+def test_slices_without_a_preamble_and_with_names_of_no_encoding_are_read(phantom, tmp_path):
+    paths, hu = slices(phantom, tmp_path / "ct")
+    for n, path in enumerate(paths):
+        content = path.read_bytes()[132:]
+        path.unlink()
+        (tmp_path / "ct" / os.fsdecode(b"sch\xf6n%d" % n)).write_bytes(content)
+    raw = read_raw(tmp_path / "ct")
+    assert raw.notes == ()
+    assert np.array_equal(raw.array, hu)
+
+
+def test_a_multi_frame_ct_is_read_from_its_folder_or_itself(phantom, tmp_path):
+    import pydicom
+    from pydicom.dataset import Dataset
+
+    paths, hu = slices(phantom, tmp_path / "classic")
+    data = [pydicom.dcmread(path) for path in paths]
+    whole = pydicom.dcmread(paths[0])
+    whole.SOPClassUID = whole.file_meta.MediaStorageSOPClassUID = "1.2.840.10008.5.1.4.1.1.2.1"
+    whole.NumberOfFrames = len(data)
+    shared, own = Dataset(), []
+    groups = {
+        "PixelMeasuresSequence": ("PixelSpacing",),
+        "PlaneOrientationSequence": ("ImageOrientationPatient",),
+        "PixelValueTransformationSequence": ("RescaleSlope", "RescaleIntercept"),
+    }
+    for name, tags in groups.items():
+        item = Dataset()
+        for tag in tags:
+            setattr(item, tag, getattr(whole, tag))
+            delattr(whole, tag)
+        setattr(shared, name, [item])
+    for slice_ in data[::-1]:
+        item, place = Dataset(), Dataset()
+        place.ImagePositionPatient = slice_.ImagePositionPatient
+        item.PlanePositionSequence = [place]
+        own.append(item)
+    del whole.ImagePositionPatient
+    whole.SharedFunctionalGroupsSequence, whole.PerFrameFunctionalGroupsSequence = [shared], own
+    whole.PixelData = b"".join(slice_.PixelData for slice_ in data[::-1])
+    (tmp_path / "enhanced").mkdir()
+    whole.save_as(tmp_path / "enhanced" / "ct.dcm")
+    for given in (tmp_path / "enhanced", tmp_path / "enhanced" / "ct.dcm"):
+        raw = read_raw(given)
+        assert np.array_equal(raw.array, hu)
+        assert np.allclose(raw.lps_from_index, phantom.affine, atol=1e-4)
+
+
+def test_our_own_dicom_segmentation_is_read_as_it_was_written(phantom, tmp_path):
+    pytest.importorskip("highdicom")
+    from tumortrack.imaging.segmentation_files import segments, write_dicom_seg
+    from tumortrack.phantom.dicom import write_dicom_series
+
+    hu = np.choose(phantom.map(), [-1000, 40, 570, 570]).astype(np.float32)
+    write_dicom_series(Volume(hu, phantom.affine), tmp_path / "ct")
+    labels = LabelVolume(phantom.map(), phantom.affine)
+    path = tmp_path / "segmentation.dcm"
+    write_dicom_seg(path, labels, segments(("kidney", "tumor_1", "tumor_2")), tmp_path / "ct")
+    case = prepare(path)
+    assert volumes(case) == pytest.approx([KIDNEY_ML, *TUMORS_ML], rel=0.015)
+    raw = read_raw(path)
+    first = int(np.flatnonzero(labels.labels.any((0, 1)))[0])
+    stop = first + raw.array.shape[2]
+    assert np.array_equal(raw.array, labels.labels[..., first:stop])
+    assert not labels.labels[..., stop:].any()

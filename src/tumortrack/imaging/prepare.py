@@ -58,7 +58,7 @@ def prepare(input: Path | Sequence[Path], options: PrepareOptions | None = None)
         if missing := [path for path in paths if not path.exists()]:
             raise InputError(f"{missing[0]} does not exist.")
         files = _files_in(paths)
-        if len(files) == 1 and is_volume(files[0]):
+        if len(files) == 1:
             paths = files
         is_meshes = any(path.suffix.lower() in SUFFIXES for path in files)
         for path in files if is_meshes or len(paths) > 1 else []:

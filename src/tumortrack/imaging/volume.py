@@ -19,6 +19,7 @@ from tumortrack.core.tables import read_table
 from tumortrack.core.types import LabelVolume, Volume
 from tumortrack.imaging import grid
 from tumortrack.imaging.dicom import read_dicom
+from tumortrack.imaging.dicom_segmentation import read_segmentation
 from tumortrack.imaging.nifti import read_nifti
 from tumortrack.imaging.segments import Parts, painted
 
@@ -51,6 +52,8 @@ def read_raw(path: Path, series: str | None = None) -> grid.RawVolume:
         raise InputError(f"{path} does not exist or is no file (but a pipe or a device).")
     if path.stat().st_size == 0:
         raise InputError(f"{path} is empty (0 bytes).")
+    if name.endswith((".dcm", ".ima")) or _is_dicom(path):
+        return read_segmentation(path) or read_dicom(path, series)
     if name.endswith((".nii", ".nii.gz")):
         return read_nifti(path)
     if name.endswith(".nrrd"):
@@ -64,6 +67,11 @@ def read_raw(path: Path, series: str | None = None) -> grid.RawVolume:
     raise InputError(
         f"{path} is no volume. Allowed: a folder of DICOM slices, .dcm, .nii, .nii.gz, .nrrd."
     )
+
+
+def _is_dicom(path: Path) -> bool:
+    with path.open("rb") as stream:
+        return stream.read(132)[128:] == b"DICM"
 
 
 def is_volume(path: Path) -> bool:
