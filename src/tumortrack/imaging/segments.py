@@ -52,7 +52,7 @@ def parts_of(raw: RawVolume, options: PrepareOptions, where: str) -> Parts:
     organ = options.organs or tuple(n for n in names if is_organ(names[n], options.name))
     tumors = options.tumors
     if not names:
-        stated = tumors if tumors is not None or not options.organs else ()
+        stated = tumors if tumors is not None or options.organs in ((), (ORGAN,)) else ()
         note = "tumors by their numbers alone: every label from 2 up" if stated is None else ""
         return Parts(organ or (ORGAN,), stated, structures, {}, note)
     listing = ", ".join(f"{n} {name}" for n, name in names.items())
