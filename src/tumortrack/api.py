@@ -67,7 +67,7 @@ def scan_phantom(
 
 
 def prepare(
-    source: StrPath,
+    source: StrPath | Sequence[StrPath],
     folder: StrPath | None = None,
     *,
     overwrite: bool = False,
@@ -75,9 +75,11 @@ def prepare(
     progress: Callable[[int, int], None] | None = None,
     **options: Any,
 ) -> Case:
-    """A case from a DICOM folder, a CT volume, a label map or a folder of meshes.
+    """A case from a DICOM folder, a CT volume, a label map or segmentation, a folder of meshes or
+    of label files with one structure each.
 
     Args:
+        source: one, or several mesh or label files.
         folder: where to write the case with a picture to check it by (qc.png); None: nowhere.
         overwrite: replace a case that lies there.
         segment: of a CT: what segments it, as ``prepare --segment``; its label map is kept beside
@@ -86,7 +88,7 @@ def prepare(
         options: as on the command line: ``name``, ``term``,
             ``structure``, ``organ_hu``, ``tumor_hu``, ``labels``, ``side``, ``organ``,
             ``tumor``, ``up``, ``rotations``, ``tilt``, ``sensor``, ``series``,
-            ``unit``, ``min_tumor_ml``, ``patient``.
+            ``unit``, ``min_tumor_ml``, ``patient``, ``ct``.
 
     Returns:
         The case: anatomy as closed surfaces, labels and CT; CT frame, mm.
@@ -101,25 +103,27 @@ def prepare(
     from tumortrack.tracking.model_files import case_model
 
     asked = options_from(PrepareOptions, options, "prepare")
+    given = [source] if isinstance(source, str | Path) else source
+    sources = [Path(each) for each in given]
     if folder is not None:
         store.check_place(Path(folder), KIND, overwrite)
     if segment is None:
-        case = preparing.prepare(Path(source), asked)
-    elif folder is None:
-        raise InputError("segment needs a folder, beside which the label map is kept.")
+        case = preparing.prepare(sources, asked)
+    elif folder is None or len(sources) != 1:
+        raise InputError("segment needs a folder, beside which the one CT's label map is kept.")
     else:
         from tumortrack.imaging.segmentation_tool import segmented_case
 
         keep = Path(folder).with_name(f"{Path(folder).name}.labels.nii.gz")
-        case = segmented_case(Path(source), segment, asked, keep)
+        case = segmented_case(sources[0], segment, asked, keep)
     if folder is not None:
         from tumortrack.report.pictures import qc_picture
 
         with store.new_folder(Path(folder), overwrite) as aside:
-            warnings = [note for note in case.report["notes"] if note.startswith("LEFT OUT")]
+            doubts: list[str] = [*case.warnings]
             if doubtful := case.report["half_turn"]["warning"]:
-                warnings.append(doubtful)
-            about = str(case.patient), warnings
+                doubts.append(doubtful)
+            about = str(case.patient), doubts
             qc_picture(case.labels, case.ct, case.anatomy, aside / "qc.png", *about)
             save_case(case, aside)
         case = load_case(folder)
