@@ -145,7 +145,7 @@ def check_place(path: Path, kind: str, overwrite: bool | None) -> None:
     except OSError as error:  # a name that is too long
         raise InputError(f"{path} cannot be written: {error.strerror}.") from error
     if not overwrite:
-        advice = "." if overwrite is None else ", or give --overwrite."
+        advice = "." if overwrite is None else ", or give --overwrite (overwrite=True)."
         raise InputError(f"{path} exists already. Choose another path{advice}")
     if not path.is_dir():
         raise InputError(f"{path} is a file; only a {kind} folder is replaced.")
