@@ -132,7 +132,7 @@ def prepare(
 
 
 def simulate_scenes(
-    case: Case, count: int = 1, *, seed: int = 0, elastic: bool = True, noise: bool = True
+    case: Case | StrPath, count: int = 1, *, seed: int = 0, elastic: bool = True, noise: bool = True
 ) -> list[Scene]:
     """Deformed scenes with their truth, as a D405 sees them; never those that training sees. The
     same seed gives the same scenes.
@@ -149,6 +149,7 @@ def simulate_scenes(
 
     from tumortrack.simulate.dataset import scene_maker
 
+    case = case if isinstance(case, Case) else load_case(case)
     config = SimulateOptions(elastic=elastic, noise=noise).scene_config()
     config = replace(config, width=424, height=240).seen_whole(case.anatomy)
     return list(map(scene_maker(case, config, seed), range(count)))
@@ -180,6 +181,12 @@ def write_scenes(
 
     asked = options_from(SimulateOptions, options, "write_scenes")
     made_of = load_case(case)
+    inside = Path(folder).iterdir() if Path(folder).is_dir() else ()
+    if strays := [p.name for p in inside if p.name[0] != "." and not (p / "meta.json").is_file()]:
+        raise InputError(
+            f"{folder} also holds {', '.join(sorted(strays)[:3])}, which are no scenes. Choose "
+            "another folder, or an empty one."
+        )
     config = asked.scene_config().seen_whole(made_of.anatomy)
     folders = [Path(folder) / f"{prefix}{index:04d}" for index in range(asked.scenes)]
     for _ in dataset.write_scenes(made_of, config, asked.seed, folders):
@@ -330,7 +337,7 @@ def read_depth(path: StrPath, intrinsics: StrPath, unit_mm: float | None = None)
 def find_organ(
     content: DepthFrame | SensorCloud,
     *,
-    model: Model | None = None,
+    model: Model | Case | None = None,
     range_mm: tuple[float, float] | None = None,
     box_mm: tuple[tuple[float, float, float], tuple[float, float, float]] | None = None,
     mask: Bool[np.ndarray, "h w"] | None = None,
@@ -355,9 +362,18 @@ def find_organ(
             was taught cannot be used on this picture.
         InputError: an option that is not allowed.
     """
+    from tumortrack.models.model import Model
     from tumortrack.sense.region import Hints, organ_points
+    from tumortrack.tracking.model_files import case_model
     from tumortrack.tracking.tracker import region_for
 
+    if isinstance(model, Case):
+        model = case_model(model)
+    elif model is not None and not isinstance(model, Model):
+        raise InputError(
+            f"find_organ takes a model or a case, not {type(model).__name__}: "
+            "find_organ(frame, model=load_case(FOLDER))."
+        )
     region = region_for(model, range_mm=range_mm, box_mm=box_mm)
     hints = Hints(mask, picked_mm, None, picture, taught)
     found = organ_points(content, region, hints, np.random.default_rng(seed))
@@ -404,6 +420,11 @@ def locate(model: StrPath, clouds: StrPath | Sequence[StrPath], **options: Any) 
     """
     from tumortrack.report.locating import locate as locate_files
 
+    if not isinstance(model, str | Path):
+        raise InputError(
+            f"locate takes the folder of a case or model, not {type(model).__name__}: "
+            "locate(FOLDER, FILE), or Tracker(load_case(FOLDER)).locate(cloud)."
+        )
     files = [clouds] if isinstance(clouds, str | Path) else clouds
     asked = options_from(LocateOptions, options, "locate")
     return locate_files(Path(model), [Path(file) for file in files], asked)
