@@ -200,7 +200,7 @@ def _parted(
 ) -> tuple[tuple[Look, ...], tuple[Evidence, ...]]:
     """All looks, the cloud's first, and the other evidence."""
     several = isinstance(evidence, Iterable) and not isinstance(evidence, Mapping | str)
-    given = tuple(evidence) if several else (evidence,)  # type: ignore[arg-type]
+    given: tuple[Any, ...] = tuple(evidence) if several else (evidence,)  # type: ignore[arg-type]
     if wrong := [each for each in given if not isinstance(each, Evidence | Look)]:
         raise InputError(
             "evidence is of Look, Touch, Landmark, Held, Outline and Free, not "
