@@ -141,6 +141,15 @@ def test_bound_knows_triangles_whose_vertices_were_reordered(anatomy):
         matched_vertices(anatomy.organ, Mesh(organ.vertices_mm, organ.faces[::-1]))
 
 
+def test_bound_knows_vertices_that_rounding_made_one():
+    """Two vertices 2e-5 mm apart, which a file in single precision does not tell apart."""
+    square = np.array([[0.0, 0, 0], [100, 0, 0], [100, 100, 0], [0, 100, 0], [100, 100, 2e-5]])
+    rest = Mesh(square, np.array([[0, 1, 2], [2, 1, 4], [0, 4, 3]]))
+    read = Mesh(square[:4] + 7, np.array([[0, 1, 2], [0, 2, 3]]))
+    found = matched_vertices(rest, read)
+    np.testing.assert_allclose(found, square + 7, atol=1e-4)
+
+
 def test_bound_minimises_over_the_volume():
     """A ball stretched along x by a: the mean square over its volume is a^2 R^2 / 5."""
     ball = ellipsoid((30, 30, 30), (5, 6, 7), 4)

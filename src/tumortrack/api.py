@@ -67,7 +67,7 @@ def scan_phantom(
 
 
 def prepare(
-    source: StrPath,
+    source: StrPath | Sequence[StrPath],
     folder: StrPath | None = None,
     *,
     overwrite: bool = False,
@@ -75,9 +75,11 @@ def prepare(
     progress: Callable[[int, int], None] | None = None,
     **options: Any,
 ) -> Case:
-    """A case from a DICOM folder, a CT volume, a label map or a folder of meshes.
+    """A case from a DICOM folder, a CT volume, a label map or segmentation, a folder of meshes or
+    of label files with one structure each.
 
     Args:
+        source: one, or several mesh or label files.
         folder: where to write the case with a picture to check it by (qc.png); None: nowhere.
         overwrite: replace a case that lies there.
         segment: of a CT: what segments it, as ``prepare --segment``; its label map is kept beside
@@ -86,7 +88,7 @@ def prepare(
         options: as on the command line: ``name``, ``term``,
             ``structure``, ``organ_hu``, ``tumor_hu``, ``labels``, ``side``, ``organ``,
             ``tumor``, ``up``, ``rotations``, ``tilt``, ``sensor``, ``series``,
-            ``unit``, ``min_tumor_ml``, ``patient``.
+            ``unit``, ``min_tumor_ml``, ``patient``, ``ct``.
 
     Returns:
         The case: anatomy as closed surfaces, labels and CT; CT frame, mm.
@@ -101,25 +103,27 @@ def prepare(
     from tumortrack.tracking.model_files import case_model
 
     asked = options_from(PrepareOptions, options, "prepare")
+    given = [source] if isinstance(source, str | Path) else source
+    sources = [Path(each) for each in given]
     if folder is not None:
         store.check_place(Path(folder), KIND, overwrite)
     if segment is None:
-        case = preparing.prepare(Path(source), asked)
-    elif folder is None:
-        raise InputError("segment needs a folder, beside which the label map is kept.")
+        case = preparing.prepare(sources, asked)
+    elif folder is None or len(sources) != 1:
+        raise InputError("segment needs a folder, beside which the one CT's label map is kept.")
     else:
         from tumortrack.imaging.segmentation_tool import segmented_case
 
         keep = Path(folder).with_name(f"{Path(folder).name}.labels.nii.gz")
-        case = segmented_case(Path(source), segment, asked, keep)
+        case = segmented_case(sources[0], segment, asked, keep)
     if folder is not None:
         from tumortrack.report.pictures import qc_picture
 
         with store.new_folder(Path(folder), overwrite) as aside:
-            warnings = [note for note in case.report["notes"] if note.startswith("LEFT OUT")]
+            doubts: list[str] = [*case.warnings]
             if doubtful := case.report["half_turn"]["warning"]:
-                warnings.append(doubtful)
-            about = str(case.patient), warnings
+                doubts.append(doubtful)
+            about = str(case.patient), doubts
             qc_picture(case.labels, case.ct, case.anatomy, aside / "qc.png", *about)
             save_case(case, aside)
         case = load_case(folder)
@@ -128,7 +132,7 @@ def prepare(
 
 
 def simulate_scenes(
-    case: Case, count: int = 1, *, seed: int = 0, elastic: bool = True, noise: bool = True
+    case: Case | StrPath, count: int = 1, *, seed: int = 0, elastic: bool = True, noise: bool = True
 ) -> list[Scene]:
     """Deformed scenes with their truth, as a D405 sees them; never those that training sees. The
     same seed gives the same scenes.
@@ -145,6 +149,7 @@ def simulate_scenes(
 
     from tumortrack.simulate.dataset import scene_maker
 
+    case = case if isinstance(case, Case) else load_case(case)
     config = SimulateOptions(elastic=elastic, noise=noise).scene_config()
     config = replace(config, width=424, height=240).seen_whole(case.anatomy)
     return list(map(scene_maker(case, config, seed), range(count)))
@@ -176,6 +181,12 @@ def write_scenes(
 
     asked = options_from(SimulateOptions, options, "write_scenes")
     made_of = load_case(case)
+    inside = Path(folder).iterdir() if Path(folder).is_dir() else ()
+    if strays := [p.name for p in inside if p.name[0] != "." and not (p / "meta.json").is_file()]:
+        raise InputError(
+            f"{folder} also holds {', '.join(sorted(strays)[:3])}, which are no scenes. Choose "
+            "another folder, or an empty one."
+        )
     config = asked.scene_config().seen_whole(made_of.anatomy)
     folders = [Path(folder) / f"{prefix}{index:04d}" for index in range(asked.scenes)]
     for _ in dataset.write_scenes(made_of, config, asked.seed, folders):
@@ -326,7 +337,7 @@ def read_depth(path: StrPath, intrinsics: StrPath, unit_mm: float | None = None)
 def find_organ(
     content: DepthFrame | SensorCloud,
     *,
-    model: Model | None = None,
+    model: Model | Case | None = None,
     range_mm: tuple[float, float] | None = None,
     box_mm: tuple[tuple[float, float, float], tuple[float, float, float]] | None = None,
     mask: Bool[np.ndarray, "h w"] | None = None,
@@ -351,9 +362,18 @@ def find_organ(
             was taught cannot be used on this picture.
         InputError: an option that is not allowed.
     """
+    from tumortrack.models.model import Model
     from tumortrack.sense.region import Hints, organ_points
+    from tumortrack.tracking.model_files import case_model
     from tumortrack.tracking.tracker import region_for
 
+    if isinstance(model, Case):
+        model = case_model(model)
+    elif model is not None and not isinstance(model, Model):
+        raise InputError(
+            f"find_organ takes a model or a case, not {type(model).__name__}: "
+            "find_organ(frame, model=load_case(FOLDER))."
+        )
     region = region_for(model, range_mm=range_mm, box_mm=box_mm)
     hints = Hints(mask, picked_mm, None, picture, taught)
     found = organ_points(content, region, hints, np.random.default_rng(seed))
@@ -400,6 +420,11 @@ def locate(model: StrPath, clouds: StrPath | Sequence[StrPath], **options: Any) 
     """
     from tumortrack.report.locating import locate as locate_files
 
+    if not isinstance(model, str | Path):
+        raise InputError(
+            f"locate takes the folder of a case or model, not {type(model).__name__}: "
+            "locate(FOLDER, FILE), or Tracker(load_case(FOLDER)).locate(cloud)."
+        )
     files = [clouds] if isinstance(clouds, str | Path) else clouds
     asked = options_from(LocateOptions, options, "locate")
     return locate_files(Path(model), [Path(file) for file in files], asked)

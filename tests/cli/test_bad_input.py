@@ -178,7 +178,6 @@ def test_options_of_other_inputs_are_refused(tmp_path):
         (meshes, {"organ_hu": (0.0, 200.0)}),
         (meshes, {"labels": True}),
         (meshes, {"series": "1"}),
-        (meshes, {"min_tumor_ml": 1.0}),
     ):
         with pytest.raises(InputError, match="--" + next(iter(wrong)).replace("_", "-")):
             prepare(source, PrepareOptions(**wrong))

@@ -3,12 +3,14 @@
 import inspect
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 import tumortrack as tt
 from live_objects import ball
+from tumortrack.tracking.tracker import _parted
 
 # A name or a parameter that goes or changes its meaning breaks users' scripts: think twice.
 SIGNATURES = {
@@ -94,16 +96,23 @@ def test_surfaces_become_an_estimate_that_compares_as_equal():
 
 
 WRONG = """
+from functools import partial
 import numpy as np
 import tumortrack as tt
 from tumortrack.core.errors import InputError
 
+EVIDENCE = ({"kind": "touch"}, {}, "touches.csv", 5, [{"kind": "touch"}], [None])
+cloud = tt.SensorCloud(np.ones((300, 3), np.float32))
 unmade = object.__new__(tt.Tracker)  # it looks at the cloud before the model
 for call in (
     lambda: tt.Tracker("MODEL"),
     lambda: unmade.locate(np.zeros((2000, 3), np.float32)),
     lambda: tt.evaluate(print, []),
     lambda: tt.evaluate(7, [1]),
+    lambda: tt.find_organ(cloud, model="CASE"),
+    lambda: tt.simulate_scenes("CASE"),
+    lambda: tt.locate(unmade, "cloud.ply"),
+    *(partial(unmade.locate, cloud, evidence=given) for given in EVIDENCE),
 ):
     try:
         call()
@@ -117,8 +126,33 @@ def test_other_types_are_refused_with_the_call_that_makes_the_right_ones():
     done = subprocess.run(
         [sys.executable, "-c", WRONG], capture_output=True, text=True, check=False
     )
-    tracker, locate, none, function = done.stdout.splitlines()
+    tracker, locate, none, function, *others = done.stdout.splitlines()
+    assert len(others) == 3 + 6, done.stderr
     assert tracker.endswith("not str: Tracker(load_case(FOLDER)).")
     assert "not ndarray: read_cloud(FILE)" in locate
     assert none.startswith("there are no scenes to evaluate")
     assert "a tracker or a function, not int" in function
+
+
+def test_an_echoed_estimate_is_a_few_lines():
+    from live_objects import small_estimate
+
+    said = repr(small_estimate()).splitlines()
+    assert len(said) < 12
+    assert max(map(len, said)) < 300
+    assert sum("center_mm=" in line for line in said) == len(small_estimate().report.parts)
+
+
+def test_a_single_piece_of_evidence_stands_for_a_sequence():
+    touch = tt.Touch(place_mm=(0.0, 0.0, 150.0))
+    cloud = tt.SensorCloud(np.ones((3, 3), np.float32))
+    for given in (touch, [touch], (touch,)):
+        assert _parted(cloud, None, given)[1] == (touch,)
+
+
+def test_scenes_are_not_written_among_other_files(tmp_path, monkeypatch):
+    monkeypatch.setattr("tumortrack.api.load_case", lambda case: SimpleNamespace(anatomy=None))
+    (tmp_path / "thesis.txt").touch()
+    with pytest.raises(tt.errors.InputError, match=r"thesis\.txt"):
+        tt.write_scenes("case", tmp_path, scenes=1)
+    assert [path.name for path in tmp_path.iterdir()] == ["thesis.txt"]

@@ -162,13 +162,13 @@ def test_tumor_numbers_are_kept_split_and_closed_up():
 def test_chosen_numbers_and_missing_labels():
     truth = kidney_labels()
     other = LabelVolume(np.array([0, 9, 5, 6])[truth.labels], truth.lps_from_index)
-    chosen, _, _ = select_labels(other, organ=9, tumor=6)
+    chosen, _, _ = select_labels(other, organ=9, tumors=(6,))
     assert volumes(chosen)[2] == pytest.approx(volumes(truth)[3])
-    assert select_labels(other, organ=9, tumor=0)[0].labels.max() == 1
+    assert select_labels(other, organ=9, tumors=())[0].labels.max() == 1
     with pytest.raises(InputError, match=r"no organ label 1; it has \[5, 6, 9\]"):
         select_labels(other)
     with pytest.raises(InputError, match="no tumor label 4"):
-        select_labels(other, organ=9, tumor=4)
+        select_labels(other, organ=9, tumors=(4,))
     with pytest.raises(InputError, match="empty"):
         select_labels(LabelVolume(np.zeros((5, 5, 5)), np.eye(4)))
     with pytest.raises(InputError, match=r"fill 0\.\d ml"):
@@ -216,7 +216,7 @@ def test_a_tumor_far_off_is_refused_or_loudly_left_out():
     far = beside(8, 16.0)
     with pytest.raises(InputError, match=r"the only tumor \(1\d\.\d ml\) lies more than 3 mm"):
         select_labels(far)
-    alone, _, _ = select_labels(far, tumor=0)
+    alone, _, _ = select_labels(far, tumors=())
     assert alone.labels.max() == 1
     labels = far.labels.copy()
     middle = np.argwhere(labels == 1).mean(0)

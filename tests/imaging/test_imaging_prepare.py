@@ -181,7 +181,7 @@ fuzzed = settings(
 @pytest.fixture(scope="module")
 def samples(tmp_path_factory):
     """One tiny valid file of each type, and what reads it."""
-    from tumortrack.imaging.meshes import read_mesh_folder
+    from tumortrack.imaging.meshes import read_meshes
 
     folder = tmp_path_factory.mktemp("samples")
     array = np.arange(60, dtype=np.int16).reshape(3, 4, 5)
@@ -195,7 +195,7 @@ def samples(tmp_path_factory):
     readers = {}
     for path in sorted(folder.iterdir()):
         is_mesh = path.stem == "kidney"
-        read = (lambda p: read_mesh_folder(p.parent)) if is_mesh else read_either
+        read = (lambda p: read_meshes([*p.parent.iterdir()])) if is_mesh else read_either
         readers[path.name] = (path.read_bytes(), read)
     return readers
 

@@ -149,17 +149,17 @@ HEAD = "stamp_ns,frame_id,x_mm,y_mm,z_mm,qw,qx,qy,qz\n"
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("", "its first line must be stamp_ns"),
+        ("", "has no rows"),
         ("stamp,x\n1,2\n", "is not a table of poses"),
-        (HEAD, "has no poses"),
+        (HEAD, "has no rows"),
         (HEAD + "5,base,0,0,0,1,0,0,0\n5,base,0,0,0,1,0,0,0\n", "stamps must rise"),
         (HEAD + "5,base,0,0,0,1,1,0,0\n", "qw, qx, qy, qz must have length 1"),
         (HEAD + "5,base,0,0,0,nan,0,0,0\n", "must be finite"),
         (HEAD + "5,base,0,inf,0,1,0,0,0\n", "must be finite"),
         (HEAD + "5,base,0,0,0,1,0,0,0\n6,tool,0,0,0,1,0,0,0\n", "frame_id must be one"),
         (HEAD + "5,,0,0,0,1,0,0,0\n", "frame_id must be one"),
-        (HEAD + "x,base,0,0,0,1,0,0,0\n", "is not a table of poses"),
-        (HEAD + "5,base,0,0\n", "is not a table of poses"),
+        (HEAD + "x,base,0,0,0,1,0,0,0\n", "line 2, column stamp_ns"),
+        (HEAD + "5,base,0,0\n", "line 2"),
     ],
 )
 def test_tables_of_poses_are_refused_with_the_line(tmp_path, text, said):

@@ -183,8 +183,8 @@ def test_a_table_says_when_the_tip_touches(tmp_path):
     assert FilePoses(table).touches == []
     for content, wrong in (
         (f"{COLUMNS}{CONTACT}\n5,{row},2\n", "contact must be 0 or 1"),
-        (f"{COLUMNS}{CONTACT}\n5,{row}\n", "not a table of poses"),
-        (f"{COLUMNS}\n5,{row},1\n", "not a table of poses"),
+        (f"{COLUMNS}{CONTACT}\n5,{row}\n", "line 2"),
+        (f"{COLUMNS}\n5,{row},1\n", "line 2"),
     ):
         table.write_text(content)
         with pytest.raises(InputError, match=wrong):

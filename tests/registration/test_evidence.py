@@ -410,9 +410,9 @@ def test_a_table_says_the_same(tmp_path):
     assert read_evidence(file) == told
     wrong = {
         "frame 'camera, robot'": TABLE.replace("1,camera", "1,robot"),
-        "x_mm is 'far'": TABLE.replace("1.5,2", "far,2"),
+        "line 2, column x_mm": TABLE.replace("1.5,2", "far,2"),
         "no column 'smell'": TABLE.replace("part,", "smell,"),
-        "piece 2 has several rows that differ": TABLE.replace("tumor_1,5", ",5"),
+        "line 4: piece 2 differs": TABLE.replace("tumor_1,5", ",5"),
         "no column for z_mm": TABLE.replace("y_mm,z_mm,std", "y_mm,point_std_mm,std"),
         "has no rows": TABLE.splitlines()[0],
         "not a valid": TABLE.replace("touch", "smell"),

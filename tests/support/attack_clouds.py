@@ -31,6 +31,12 @@ def pcd(viewpoint: str = "0 0 0 1 0 0 0", count: int = 3) -> bytes:
     ).encode()
 
 
+def npy(array: np.ndarray) -> bytes:
+    stream = io.BytesIO()
+    np.save(stream, array)
+    return stream.getvalue()
+
+
 def npz(**arrays: np.ndarray) -> bytes:
     out = io.BytesIO()
     np.savez_compressed(out, **arrays)
@@ -206,6 +212,11 @@ ATTACKS = attacks(
         "pcd_viewpoint_of_words": _pcd_from("a b c"),
         "pcd_from_another_viewpoint": _pcd_from("100 0 0 0 1 0 0"),
         "npz_pickle": file(lambda: npz(points_mm=np.array([{}], object)), "in.npz"),
+        "npy_pickle": file(lambda: npy(np.array([{}], object)), "in.npy"),
+        "npy_of_words": file(lambda: npy(np.array([["a", "b", "c"]])), "in.npy"),
+        "npy_cut_off": file(lambda: npy(np.ones((500, 3)))[:200], "in.npy"),
+        "npy_of_numbers_beyond_float": file(lambda: npy(np.full((500, 3), 1e300)), "in.npy"),
+        "exr": file(lambda: b"\x76\x2f\x31\x01" + bytes(100), "in.exr"),
         "npz_bomb": file(_npz_bomb, "in.npz"),
         "npz_without_points": file(lambda: npz(other=np.zeros(3)), "in.npz"),
         "cloud_is_a_fifo": lambda room: [

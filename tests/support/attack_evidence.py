@@ -90,6 +90,10 @@ ATTACKS = attacks(
         ),
         "evidence_table_with_nul": table(HEADER + "1,camera,touch,\0,0,150\n"),
         "evidence_table_of_no_rows": table(HEADER),
+        "evidence_table_with_a_column_twice": table(
+            HEADER.strip() + ",x_mm\n1,camera,touch,0,0,150,9\n"
+        ),
+        "evidence_with_a_key_twice": _evidence(b'{"frame": "camera", "unit": "mm", "unit": "m"}'),
         "evidence_of_5000_touches": told(*[TOUCH] * 5000),
         "evidence_outline_of_50000_places": told(
             {"kind": "outline", "part": "tumor_1", "places_mm": [[0, 0, 150.0]] * 50_000}

@@ -21,6 +21,12 @@ Target = tuple[list[bytes], Read]
 TURN = [[0, -1, 0, 0.4], [-1, 0, 0, 0.1], [0, 0, -1, 0.7], [0, 0, 0, 1]]
 
 
+EASY_HANDEYE = b"""parameters:
+  eye_on_hand: false
+  robot_base_frame: base_link
+  tracking_base_frame: camera_optical
+transformation: {qw: 0.0, qx: 1.0, qy: 0.0, qz: 0.0, x: 0.4, y: 0.1, z: 0.7}
+"""
 EVIDENCE_TABLE = b"""piece,frame,kind,part,x_mm,y_mm,z_mm,std_mm,tip_mm,x_ct_mm,y_ct_mm,z_ct_mm
 1,camera,touch,,1.5,2,150,0.8,1.5,,,
 2,camera,outline,tumor_1,3,4,140,,,,,
@@ -72,7 +78,7 @@ def of_member(read: Callable[[Path], object], folder: Path, name: str) -> Target
 
 
 def _clouds() -> dict[str, Target]:
-    from attack_clouds import npz, pcd, ply
+    from attack_clouds import npy, npz, pcd, ply
     from tumortrack.sense.files import read_cloud
 
     points = np.random.default_rng(0).uniform(50, 150, (40, 3)).astype("<f4")
@@ -82,6 +88,7 @@ def _clouds() -> dict[str, Target]:
         "ply": of_file(read_cloud, "in.ply", ply(points), text + b"end_header\n" + rows.encode()),
         "pcd": of_file(read_cloud, "in.pcd", pcd(count=40) + points.tobytes()),
         "npz": of_file(read_cloud, "in.npz", npz(points_mm=points)),
+        "npy": of_file(read_cloud, "in.npy", npy(points)),
     }
 
 
@@ -298,6 +305,7 @@ def _configurations() -> dict[str, Target]:
         "evidence": of_file(read_evidence, "in.json", evidence_json((touch, outline))),
         "evidence table": of_file(read_evidence, "in.csv", EVIDENCE_TABLE),
         "calibration": of_file(read_frames, "in.json", hand_eye, marker),
+        "easy_handeye": of_file(read_frames, "in.yaml", EASY_HANDEYE),
         "cell": written(CellConfig()),
         "resection": written(ResectionConfig()),
         "registration": written(PRESETS["clinic"](ANATOMY)),

@@ -160,8 +160,8 @@ def test_an_answer_can_be_asked_again(tmp_path):
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("", "is empty"),
-        ("x,y,z\n", "holds no points"),
+        ("", "has no rows"),
+        ("x,y,z\n", "has no rows"),
         ("1,2,3\n4,5,6\n", "must name the columns x,y,z"),
         ("x,y\n1,2\n", "must name the columns x,y,z"),
         ("x;y;z\n1;2;3\n", "separated by commas"),

@@ -27,7 +27,7 @@ from tumortrack.core.mesh_files import read_mesh, write_mesh
 from tumortrack.core.patient import Patient
 from tumortrack.core.types import CameraLabels, LabelVolume, Mesh, Volume
 from tumortrack.imaging.case import Case, save_case
-from tumortrack.imaging.meshes import read_mesh_folder
+from tumortrack.imaging.meshes import read_meshes
 from tumortrack.imaging.segmentation_files import segments, write_dicom_seg, write_seg_nrrd
 from tumortrack.imaging.surface import surfaces
 from tumortrack.imaging.volume import read_labels
@@ -176,7 +176,7 @@ def test_meshes_state_lps_and_read_as_before(tmp_path: Path, suffix: str) -> Non
     again = read_mesh(path)
     np.testing.assert_allclose(again.box_mm, mesh.box_mm, atol=1e-6)
     assert again.volume_mm3 == pytest.approx(60_000, rel=1e-6)
-    anatomy, notes = read_mesh_folder(tmp_path)
+    anatomy, notes = read_meshes([*tmp_path.iterdir()])
     assert not any("SPACE" in note for note in notes)  # LPS is what it takes anyway
     np.testing.assert_allclose(anatomy.organ.box_mm, mesh.box_mm, atol=1e-3)
 

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
 from jaxtyping import Float64
 from scipy.spatial import cKDTree
 
+from tumortrack.core.case_warning import warnings_in
 from tumortrack.core.errors import ArtifactError, InputError
 from tumortrack.core.estimate import Estimate
 from tumortrack.core.geometry import rigid
@@ -83,6 +85,7 @@ class _Report(msgspec.Struct):
     stamp_ns: int = 0
     structures: tuple[str, ...] = ()
     margin: MarginReport | None = None
+    model: dict[str, Any] = {}
 
 
 def read_run(folder: Path) -> Located:
@@ -92,6 +95,7 @@ def read_run(folder: Path) -> Located:
     path = folder / "occupancy.ply"
     try:
         report = msgspec.convert(stored, _Report)
+        weak = warnings_in(report.model.get("warnings"), str(folder))
         content = path.read_bytes()
         table = parse_ply_properties(content, str(path), ("x", "y", "z", "label", "probability"))
     except (OSError, InputError, msgspec.ValidationError) as error:
@@ -137,4 +141,5 @@ def read_run(folder: Path) -> Located:
         margin=report.margin,
         structures=structures,
         doubt=doubt,
+        weak=weak,
     )

@@ -31,7 +31,7 @@ from tumortrack_resection.files import INVENTED, PlanFolder, check_structures, w
 from tumortrack_resection.located import poor_estimate_notes, read_run, table_under
 from tumortrack_resection.operation import OperationConfig
 from tumortrack_resection.options import PlanOptions
-from tumortrack_resection.values import Located, ResectionConfig, ResectionPlan
+from tumortrack_resection.values import WEAK_CASE, Located, ResectionConfig, ResectionPlan
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,7 +175,8 @@ def plan_cuts(
     moved_mm: float = MOVED_MM,
 ) -> Cuts:
     """Where to cut a run, without the arms."""
-    doubts = poor_estimate_notes(run.doubt, accept_poor)
+    weak = (f"{WEAK_CASE}: {warning}." for warning in run.weak)
+    doubts = (*poor_estimate_notes(run.doubt, accept_poor), *weak)
     located = run.moved(frames.published_from_camera)
     cell = below(located.organ, cell or CellConfig())
 

@@ -14,6 +14,7 @@ import msgspec
 import numpy as np
 from jaxtyping import Float, Float64, UInt8
 
+from tumortrack.core.case_warning import CaseWarning
 from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError, NoPlan
 from tumortrack.core.geometry import transform_points
@@ -29,10 +30,11 @@ ELECTRODE = "electrode"
 POOR_ESTIMATE = "PLANNED ON A POOR ESTIMATE"
 OVER_BUDGET = "PLANNED OVER ITS ERROR BUDGET"
 UNCHECKED = "UNCHECKED"
+WEAK_CASE = "PLANNED ON A WEAK CASE"
 CUTS_TUMOR = "THE INSTRUMENT CUTS INTO"
 NO_ROOM = "NO ROOM TO KEEP"
 UNGUARDED = "Nothing keeps the cuts away from"
-WARNINGS = (POOR_ESTIMATE, CUTS_TUMOR, OVER_BUDGET, NO_ROOM, UNCHECKED, UNGUARDED)
+WARNINGS = (POOR_ESTIMATE, WEAK_CASE, CUTS_TUMOR, OVER_BUDGET, NO_ROOM, UNCHECKED, UNGUARDED)
 
 
 class ResectionConfig(Config, frozen=True, kw_only=True):
@@ -103,6 +105,7 @@ class Located:
         margin: the estimate's margins (``tracking.margins``).
         structures: further surfaces that move with the organ, closed or open.
         doubt: why the estimate is poor; empty: it is good.
+        weak: what weakens the case.
     """
 
     points_mm: Float[np.ndarray, "n 3"]
@@ -114,6 +117,7 @@ class Located:
     margin: MarginReport | None = None
     structures: Mapping[str, Mesh] = field(default_factory=dict)
     doubt: str = ""
+    weak: tuple[CaseWarning, ...] = ()
 
     def moved(self, b_from_a: Float[np.ndarray, "4 4"]) -> Located:
         """The same in another frame."""

@@ -31,8 +31,11 @@ class Prepare(PrepareOptions):
     """Make a case from a CT, a label map or a folder of meshes.
 
     Attributes:
-        input: DICOM folder, CT volume or label map (.nii, .nii.gz, .nrrd), or folder of meshes.
+        input: DICOM folder, CT volume, label map or segmentation (.nii, .nii.gz, .nrrd, .seg.nrrd,
+            DICOM), folder of meshes or of label files with one structure each; or such files one
+            after the other.
         case: folder to write.
+        more: with several files: the paths that follow; the last one is CASE.
         segment: segment the CT by a tool of yours, with weights that you have:
             totalsegmentator, totalsegmentator:TASK (liver_lesions, ...: also tumors),
             nnunet:FOLDER or monai:BUNDLE. Its label map is kept beside CASE (docs/segment.md).
@@ -41,22 +44,28 @@ class Prepare(PrepareOptions):
 
     input: Positional[Path]
     case: Positional[Path]
+    more: Positional[tuple[Path, ...]] = ()
     organ_hu: Annotated[tuple[float, float], arg(aliases=["--kidney-hu"])] = ORGAN_HU
     side: Literal["left", "right"] | None = None
     unit: Literal["mm", "m"] | None = None
+    organ: UseAppendAction[tuple[int, ...]] = ()
+    tumor: UseAppendAction[tuple[int, ...]] = ()
     structure: UseAppendAction[tuple[str, ...]] = ()
     segment: str | None = None
     overwrite: bool = False
 
     def run(self) -> None:
-        with progress_of("the case's model", f"reading {self.input}, making surfaces ...") as made:
+        paths = [self.input, self.case, *self.more]
+        inputs, folder = paths[:-1], paths[-1]
+        words = ", ".join(map(str, inputs))
+        with progress_of("the case's model", f"reading {words}, making surfaces ...") as made:
             from tumortrack import api
 
             case = api.prepare(
-                self.input, self.case, overwrite=self.overwrite, segment=self.segment,
+                inputs, folder, overwrite=self.overwrite, segment=self.segment,
                 progress=made, **options_of(self, PrepareOptions),
             )  # fmt: skip
-        say_notes(case.report.get("notes", []))
+        say_notes([*case.warnings, *case.report.get("notes", [])])
         say(str(case.patient))
         kind = case.anatomy.kind
         if not kind.identified(case.patient):
@@ -64,7 +73,7 @@ class Prepare(PrepareOptions):
             say_notes([f"state {both if kind.in_pairs else '--patient ID: real arms need it'}"])
         for name, part in zip(case.anatomy.names, case.anatomy.parts, strict=True):
             say(f"{name}: {part.volume_ml:.1f} ml")
-        say(f"case written to {self.case}; look at {self.case / 'qc.png'} before you rely on it.")
+        say(f"case written to {folder}; look at {folder / 'qc.png'} before you rely on it.")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 from tyro.conf import Positional, UseAppendAction
 
-from tumortrack.cli.console import console, keep_loaded, model_folder, options_of, say
+from tumortrack.cli.console import console, keep_loaded, model_folder, options_of, say, say_notes
 from tumortrack.tracking.options import TrackOptions
 
 if TYPE_CHECKING:
@@ -68,6 +68,7 @@ def follow(run: Session) -> None:
 
     say("warming up ...")
     run.loop.warm()
+    say_notes(run.tracker.model.warnings)
     screen = _Screen(run)
     with stopping(stop), ExitStack() as ending:
         ending.push(screen.end)

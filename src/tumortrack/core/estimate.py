@@ -80,7 +80,7 @@ class FollowOptions(Config, frozen=True, kw_only=True):
             raise InputError(f"smoothing is {self.smoothing_s:g} s; allowed: 0 (off) to 5 s.")
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Estimate:
     """Organ and tumors located in one sensor cloud, all in the camera frame, in mm.
 
@@ -112,6 +112,18 @@ class Estimate:
     organ: Organ = KIDNEY
     structures: Mapping[str, Mesh] = field(default_factory=dict)
     evidence: tuple[Any, ...] = ()
+
+    def __repr__(self) -> str:
+        """The verdict, and where each part is, in about ten lines."""
+        lines = [verdict_words(self.quality, self.reason)]
+        for name, part in self.report.parts.items():
+            middle = None if part.center_mm is None else [round(n, 1) for n in part.center_mm]
+            miss = "" if part.miss_mm is None else f", miss_mm={part.miss_mm:.1f}"
+            lines.append(
+                f"{name}: center_mm={middle}{miss}" if part.found else f"{name}: not found"
+            )
+        frame = f"{len(self.cloud.points_mm)} points; camera frame: x right, y down, z forward, mm"
+        return "\n".join([f"Estimate: {lines[0]}", *lines[1:], frame])
 
     @property
     def quality(self) -> Quality:

@@ -3,8 +3,6 @@ where there is no tissue. Camera frame, mm."""
 
 from __future__ import annotations
 
-import csv
-import json
 from collections.abc import Sequence
 from copy import copy
 from pathlib import Path
@@ -19,6 +17,7 @@ from tumortrack.core.config import Config, from_builtins
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import Points
 from tumortrack.core.report import Point
+from tumortrack.core.tables import number_in, read_rows, whole_in
 
 _REACH_MM = 2000.0  # of anything that a camera above a patient sees
 _LEAST_MM = 3.0  # no camera has an organ nearer
@@ -153,14 +152,7 @@ def _tuples(places: np.ndarray) -> Any:
 def read_evidence(path: Path) -> tuple[Evidence, ...]:
     """Of a JSON file, see ``EvidenceFile``, or a table (.csv), a row for each place. Raises
     InputError: missing, another frame or unit, a value that is not allowed."""
-    content = store.read_file(path, _LARGEST_FILE)
-    if path.suffix.lower() == ".csv":
-        given = _table(content.decode("utf-8-sig", errors="replace"), path)
-    else:
-        try:
-            given = json.loads(content)
-        except (ValueError, RecursionError) as error:
-            raise InputError(f"{path} is no JSON: {error}.") from error
+    given = _table(path) if path.suffix.lower() == ".csv" else store.read_json(path)
     known = from_builtins(given, EvidenceFile, str(path))
     if (known.frame, known.unit) != ("camera", "mm"):
         raise InputError(
@@ -178,50 +170,55 @@ def read_evidence(path: Path) -> tuple[Evidence, ...]:
 
 _PLACE, _POINT = ("x_mm", "y_mm", "z_mm"), ("x_ct_mm", "y_ct_mm", "z_ct_mm")
 _NUMBERS = {*_PLACE, *_POINT, "std_mm", "shared_std_mm", "tip_mm", "point_std_mm", "stamp_ns"}
-_COLUMNS = {*_NUMBERS, "piece", "frame", "kind", "part", "tool"}
+_NEEDED = ("piece", "frame", "kind", *_PLACE)
+_COLUMNS = {*_NUMBERS, *_NEEDED, "part", "tool"}
 
 
-def _table(text: str, path: Path) -> dict[str, Any]:
+def _table(path: Path) -> dict[str, Any]:
     """The rows of a table as an ``EvidenceFile``; rows of one ``piece`` are places of one."""
-    try:
-        rows = list(csv.DictReader(text.splitlines()))
-    except csv.Error as error:
-        raise InputError(f"{path} is no table: {error}.") from error
-    names = list(rows[0]) if rows else []
+    table = read_rows(store.read_file(path, _LARGEST_FILE), str(path))
+    names = table.columns
     if unknown := [name for name in names if name not in _COLUMNS]:
         raise InputError(
             f"{path}: there is no column {unknown[0]!r}. Allowed: {', '.join(sorted(_COLUMNS))}."
         )
-    if missing := [n for n in ("piece", "frame", "kind", *_PLACE) if n not in names]:
-        raise InputError(f"{path} has no rows, or no column for {', '.join(missing)}.")
+    if missing := [n for n in _NEEDED if n not in names]:
+        raise InputError(f"{path} has no column for {', '.join(missing)}.")
     pieces: dict[str, dict[str, Any]] = {}
-    for row in rows:
-        given: dict[str, Any] = {n: _number(value, n, path) for n, value in row.items() if value}
-        number, place = str(given.pop("piece", "")), [given.pop(n, None) for n in _PLACE]
+    for line, row in table.rows:
+        given = _cells(dict(zip(names, row, strict=True)), f"{path}, line {line}")
+        number, place = given.pop("piece"), [given.pop(n) for n in _PLACE]
         if _POINT[0] in given:
             given["point_ct"] = [given.pop(n, None) for n in _POINT]
         each = pieces.setdefault(number, {**given, "places_mm": []})
         if {**given, "places_mm": each["places_mm"]} != each:
-            raise InputError(f"{path}: piece {number} has several rows that differ.")
+            raise InputError(
+                f"{path}, line {line}: piece {number} differs from its rows before, which only its "
+                "places may. Give another piece another name."
+            )
+        if each["places_mm"] and given["kind"] not in ("outline", "free"):
+            raise InputError(
+                f"{path}, line {line}: piece {number} has a place already, and a {given['kind']} "
+                "has one. Give another piece another name."
+            )
         each["places_mm"].append(place)
-    frames = {each.pop("frame", "") for each in pieces.values()}
+    frames = {each.pop("frame") for each in pieces.values()}
     for each in pieces.values():
-        if each.get("kind") not in ("outline", "free"):
-            each["place_mm"], *more = each.pop("places_mm")
-            if more:
-                raise InputError(
-                    f"{path}: a {each.get('kind')} has one place, not {1 + len(more)}."
-                )
+        if each["kind"] not in ("outline", "free"):
+            (each["place_mm"],) = each.pop("places_mm")
     return {"frame": ", ".join(sorted(frames)), "unit": "mm", "evidence": list(pieces.values())}
 
 
-def _number(text: str, name: str, path: Path) -> str | float:
-    if name not in _NUMBERS:
-        return text
-    try:
-        return int(text) if name == "stamp_ns" else float(text)
-    except ValueError as error:
-        raise InputError(f"{path}: {name} is {text!r}; it must be a number.") from error
+def _cells(row: dict[str, str], where: str) -> dict[str, Any]:
+    """What a row says, by column."""
+    if empty := [name for name in _NEEDED if not row[name]]:
+        raise InputError(f"{where}, column {empty[0]}: it is empty; every row needs it.")
+    read = dict.fromkeys(_NUMBERS, number_in) | {"stamp_ns": whole_in}
+    return {
+        name: read[name](text, f"{where}, column {name}") if name in read else text
+        for name, text in row.items()
+        if text
+    }
 
 
 def touched(

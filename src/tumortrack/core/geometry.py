@@ -30,7 +30,7 @@ DIRECTIONS_LPS: dict[str, Direction] = {
 HERE = np.eye(4)  # both frames are the same
 HERE.flags.writeable = False
 _NOT_RIGID = 1e-3  # deviation of a rotation from orthonormal: files have few digits
-_FARTHEST_MM = 1e6
+_FARTHEST_MM = 5000.0  # beyond any arm, tracker or camera of one room
 
 # NIfTI is RAS+, DICOM is LPS: the first two axes change sign, and nothing else.
 RAS_FROM_LPS = np.diag([-1.0, -1.0, 1.0, 1.0])
@@ -55,7 +55,8 @@ def read_rigid(rows: Sequence[Sequence[float]], unit: Literal["mm", "m"], where:
         raise InputError(f"{where} has {len(rows)} rows; it must have 4 of 4 numbers.")
     rotation, mm_per_unit = b_from_a[:3, :3], 1000.0 if unit == "m" else 1.0
     is_rigid = (
-        np.abs(b_from_a).max() < _FARTHEST_MM / mm_per_unit
+        np.isfinite(b_from_a).all()
+        and np.abs(rotation).max() < 2
         and np.abs(rotation @ rotation.T - np.eye(3)).max() < _NOT_RIGID
         and np.linalg.det(rotation) > 0
         and np.array_equal(b_from_a[3], [0, 0, 0, 1])
@@ -63,9 +64,14 @@ def read_rigid(rows: Sequence[Sequence[float]], unit: Literal["mm", "m"], where:
     if not is_rigid:
         raise InputError(
             f"{where} is no rigid transform: its rotation must be orthonormal and right-handed, "
-            "its last row 0 0 0 1, its shift less than a kilometre."
+            "its last row 0 0 0 1."
         )
     b_from_a[:3, 3] *= mm_per_unit
+    if not (far_mm := np.abs(b_from_a[:3, 3]).max()) <= _FARTHEST_MM:
+        raise InputError(
+            f"{where} shifts by {far_mm / 1000:.4g} m, with the unit {unit!r}; allowed: up to "
+            f"{_FARTHEST_MM / 1000:g} m. Is it in {'mm' if unit == 'm' else 'another unit'}?"
+        )
     return b_from_a
 
 

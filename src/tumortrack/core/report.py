@@ -45,6 +45,9 @@ class _Said(msgspec.Struct, forbid_unknown_fields=True):
 _SAID = read_table("tumortrack.core", "findings.toml", _Said)
 
 
+_NOT_STORED = {"limit_mm": 6.0, "digits": "1"}  # by runs of before
+
+
 class _WithoutNumbers(string.Formatter):
     """Writes # for every number."""
 
@@ -69,12 +72,13 @@ class Finding(msgspec.Struct, frozen=True):
 
     @property
     def words(self) -> str:
-        return self._sentence.format(**self.values)
+        return self._sentence.format(**{**_NOT_STORED, **self.values})
 
     @property
     def words_without_numbers(self) -> str:
         """For counts of what happened often."""
-        return _WithoutNumbers().vformat(self._sentence, (), self.values)
+        values = {**_NOT_STORED, **self.values}
+        return _WithoutNumbers().vformat(self._sentence, (), values)
 
     @property
     def same_as(self) -> tuple[Kind, object]:
@@ -302,14 +306,16 @@ class FitReport(_Value, frozen=True, kw_only=True, omit_defaults=True):
 # Of a poor estimate, or of none.
 Cause = Enum(
     "Cause",
-    "UNIT FRAME MIRRORED SCALE OBJECT BACKGROUND HIDDEN ANOTHER_PATIENT DEFORMED POSES VIEW",
+    "UNIT FRAME MIRRORED SCALE OBJECT BACKGROUND HIDDEN ANOTHER_PATIENT DEFORMED POSES VIEW "
+    "EVIDENCE",
 )
 
 
 @dataclass(frozen=True)
 class Likely:
-    """A likely cause. ``number``: the factor of UNIT and SCALE, the share of BACKGROUND and HIDDEN.
-    ``fit``: cost of the fit without it over the model's usual cost; None: not tried."""
+    """A likely cause. ``number``: the factor of UNIT and SCALE, the share of BACKGROUND and HIDDEN,
+    of EVIDENCE the piece, from 1. ``fit``: cost of the fit without it over the model's usual cost;
+    None: not tried."""
 
     cause: Cause
     number: float | None = None

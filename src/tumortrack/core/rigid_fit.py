@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Float, Float64
+from jaxtyping import Float, Float64, Int
 
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import Affine, Points, rigid, transform_points
 from tumortrack.core.types import Mesh
 
 # Barycentric quadrature points of a tetrahedron, exact for quadratics (Keast 1986, 4 points)
+_ROUNDED_MM = 1e-3  # coordinates of 200 mm in single precision are right to 1e-5
 _NEAR, _FAR = 0.1381966011250105, 0.5854101966249685
 
 
@@ -29,16 +30,25 @@ def matched_vertices(rest: Mesh, moved: Mesh) -> Float64[np.ndarray, "_ 3"]:
     """The place in ``moved`` of each vertex of ``rest``, by triangles: reading a mesh merges and
     reorders vertices but keeps the order of triangles. Raises InputError: it has others."""
     vertex = np.full(len(rest.vertices_mm), -1)
-    same = rest.faces.shape == moved.faces.shape
+    before, after = (_wide_faces(mesh) for mesh in (rest, moved))
+    same = before.shape == after.shape
     if same:
-        vertex[rest.faces.reshape(-1)] = moved.faces.reshape(-1)
-        same = bool((vertex[rest.faces] == moved.faces).all() and (vertex >= 0).all())
+        vertex[before.reshape(-1)] = after.reshape(-1)
+        off_mm = moved.vertices_mm[vertex[before]] - moved.vertices_mm[after]
+        same = bool((vertex >= 0).all() and np.abs(off_mm).max() < _ROUNDED_MM)
     if not same:
         raise InputError(
             "the scene's surfaces must have the same triangles as the case's; compare scenes that "
             "were made from this case."
         )
     return moved.vertices_mm[vertex]
+
+
+def _wide_faces(mesh: Mesh) -> Int[np.ndarray, "m 3"]:
+    """Faces but those so thin that rounding may make them a line, which reading then drops."""
+    corners = mesh.vertices_mm[mesh.faces]
+    edges_mm = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)
+    return mesh.faces[edges_mm.min(1) > _ROUNDED_MM]
 
 
 def fit_over_volume(source: Mesh, target: Mesh) -> tuple[Affine, float]:

@@ -8,6 +8,7 @@ import glob
 import hashlib
 import json
 import os
+import re
 import shutil
 import stat
 import tempfile
@@ -40,6 +41,13 @@ def sha256_of(path: Path) -> str:
         return digest.hexdigest()
     with path.open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def natural(path: Path) -> tuple[Any, ...]:
+    """A key that sorts names as people number them: frame_2 before frame_10."""
+    parts = re.split(r"([0-9]+)", path.name)
+    keys = (("", int(part)) if n % 2 else (part, 0) for n, part in enumerate(parts))
+    return tuple(keys), path
 
 
 def read_file(
@@ -93,15 +101,26 @@ def write_json(path: Path, data: object) -> None:
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """Read a JSON object. Raises ArtifactError: missing, too large, or not one."""
+    """Read a JSON object. Raises ArtifactError: missing, too large, not one, or one with
+    a key twice."""
     try:
-        data = json.loads(read_file(path, _LARGEST_MANIFEST))
+        content = read_file(path, _LARGEST_MANIFEST)
+        data = json.loads(content, object_pairs_hook=_once)
     except InputError as error:
         raise ArtifactError(str(error)) from error
     except (ValueError, RecursionError) as error:
         raise ArtifactError(f"{path} cannot be read as JSON: {error}.") from error
     if not isinstance(data, dict):
         raise ArtifactError(f"{path} must hold a JSON object.")
+    return data
+
+
+def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """A JSON object. Raises ValueError for a key that it has twice: which one is meant?"""
+    data = dict(pairs)
+    if len(data) < len(pairs):
+        names = [name for name, _ in pairs]
+        raise ValueError(f"it has {next(n for n in names if names.count(n) > 1)!r} twice")
     return data
 
 
@@ -126,7 +145,7 @@ def check_place(path: Path, kind: str, overwrite: bool | None) -> None:
     except OSError as error:  # a name that is too long
         raise InputError(f"{path} cannot be written: {error.strerror}.") from error
     if not overwrite:
-        advice = "." if overwrite is None else ", or give --overwrite."
+        advice = "." if overwrite is None else ", or give --overwrite (overwrite=True)."
         raise InputError(f"{path} exists already. Choose another path{advice}")
     if not path.is_dir():
         raise InputError(f"{path} is a file; only a {kind} folder is replaced.")

@@ -9,6 +9,7 @@ from typing import Any, ClassVar, Literal
 import msgspec
 
 from tumortrack.core import store
+from tumortrack.core.case_warning import CaseWarning, warnings_in
 from tumortrack.core.config import to_builtins
 from tumortrack.core.errors import ArtifactError, InputError
 from tumortrack.core.mesh_files import read_anatomy, read_mesh, write_anatomy, write_mesh
@@ -34,6 +35,7 @@ class Case:
         rotations, tilt_degrees: possible poses: any (``full``), or turned about the line of sight
             and tilted by at most so much about each axis across it.
         sensor: the camera that will be used.
+        warnings: what weakens it for good; every answer repeats it.
         folder, sha256: where it was read or written, and the digest of its manifest there.
     """
 
@@ -48,6 +50,7 @@ class Case:
     rotations: Literal["limited", "full"] = "limited"
     tilt_degrees: float = 30.0
     sensor: Literal["d405", "stereo"] = "d405"
+    warnings: tuple[CaseWarning, ...] = ()
     folder: Path | None = None
     sha256: str = ""
 
@@ -64,6 +67,7 @@ class _Manifest(msgspec.Struct):
     tilt_degrees: float
     sensor: Literal["d405", "stereo"]
     report: dict[str, Any]
+    warnings: tuple[dict[str, Any], ...] = ()  # older cases have none
 
 
 def save_case(case: Case, folder: Path) -> None:
@@ -84,6 +88,7 @@ def save_case(case: Case, folder: Path) -> None:
         "rotations": case.rotations,
         "tilt_degrees": case.tilt_degrees,
         "sensor": case.sensor,
+        "warnings": [warning.entry for warning in case.warnings],
         "folders": [case.MODEL],
         "report": case.report,
     }
@@ -106,6 +111,7 @@ def load_case(folder: str | Path) -> Case:
         manifest = msgspec.convert(store.read_manifest(folder, KIND), _Manifest)
         for name in manifest.structures:
             check_name(name, "a structure", "--structure")
+        warnings = warnings_in(manifest.warnings, str(folder))
     except (InputError, msgspec.ValidationError) as error:
         reason = str(error).rstrip(".")
         raise ArtifactError(
@@ -126,6 +132,7 @@ def load_case(folder: str | Path) -> Case:
         manifest.rotations,
         manifest.tilt_degrees,
         manifest.sensor,
+        warnings,
         folder,
         store.sha256_of(folder / store.MANIFEST),
     )

@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import os
 import warnings
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -19,12 +21,16 @@ from tumortrack.core.errors import InputError
 from tumortrack.core.patient import NOBODY, UNKNOWN, Patient, Side
 from tumortrack.core.pydicom_library import load_pydicom
 from tumortrack.imaging.dicom_pixels import read_pixels
-from tumortrack.imaging.grid import GZIP_BEST, RawVolume, check_affine, check_size
+from tumortrack.imaging.grid import GZIP_BEST, RawVolume, check_affine, check_size, check_suffix
 
 MIN_SLICES = 10
 _MAX_FILES = 20_000
-_NO_SLICE, _MULTI_FRAME = "no DICOM slices", "multi-frame DICOM objects"
+_NO_SLICE, _SEGMENTATION = "no DICOM slices", "DICOM segmentations (give one itself)"
+# What may differ from slice to slice, as writers round: components of directions, relative pixel
+# spacing, relative slope, and HU.
+_SAME_DIRECTION, _SAME_SPACING, _SAME_SLOPE, _SAME_HU = 2e-3, 5e-4, 1e-4, 0.1
 _CT = "1.2.840.10008.5.1.4.1.1.2"  # SOP class of CT images
+_SEGMENTATIONS = "1.2.840.10008.5.1.4.1.1.66.4"  # and of binary segmentations
 _UNDEFINED = 0xFFFFFFFF  # length of compressed pixels
 _DEFLATED = "1.2.840.10008.1.2.1.99"  # transfer syntax; pydicom would unpack it unchecked
 _AGAIN = "Export the series again."
@@ -45,6 +51,7 @@ class _Slice:
     pixel_fault: str  # what is wrong with the length of the pixel data; "": nothing
     patient_id: str
     laterality: str  # L, R or something else
+    frame: int  # of its file
 
 
 class NoSeries(InputError):
@@ -53,10 +60,12 @@ class NoSeries(InputError):
 
 @dataclass(frozen=True, eq=False)
 class Series:
-    """The slices of one series, in order along the slice normal. ``shape``: columns, rows, slices;
-    ``lps_from_index``: (column, row, slice) -> LPS mm; ``scale``: slope and intercept to HU."""
+    """The slices of one series, in order along the slice normal: files and frames of them.
+    ``shape``: columns, rows, slices; ``lps_from_index``: (column, row, slice) -> LPS mm; ``scale``:
+    slope and intercept to HU."""
 
     files: tuple[Path, ...]
+    frames: tuple[int, ...]
     shape: tuple[int, int, int]
     lps_from_index: Float[np.ndarray, "4 4"]
     scale: tuple[float, float]
@@ -85,21 +94,22 @@ def find_series(folder: Path, series: str | None = None) -> Series:
     axes = (row * between_columns, column * between_rows, _slice_step(slices, normal))
     lps_from_index[:3] = np.stack([*axes, slices[0].position_mm], axis=1)
     shape = (first.shape[1], first.shape[0], len(slices))
-    stored = sum(s.path.stat().st_size for s in slices)
+    stored = sum(path.stat().st_size for path in {s.path for s in slices})
     check_size(folder, shape, 4, compressed=True, stored=stored)
     check_affine(folder, lps_from_index)
     if others := sum(map(len, groups)) - len(slices):  # perhaps a damaged slice is among them
         notes += (f"{others} images of other series, sizes or orientations left out",)
     if not first.uid:
         notes += ("the slices have no SeriesInstanceUID: taken as one series",)
-    files, patient = tuple(s.path for s in slices), _patient(folder, groups, slices)
-    return Series(files, shape, lps_from_index, first.scale, notes, patient)
+    files, frames = tuple(s.path for s in slices), tuple(s.frame for s in slices)
+    patient = _patient(folder, groups, slices)
+    return Series(files, frames, shape, lps_from_index, first.scale, notes, patient)
 
 
 def read_dicom(folder: Path, series: str | None = None) -> RawVolume:
     """Read one CT series in HU, float32. Raises InputError: as ``find_series``; damaged pixels."""
     chosen = find_series(folder, series)
-    array = read_pixels(chosen.files, chosen.shape, chosen.scale)
+    array = read_pixels(chosen.files, chosen.shape, chosen.scale, chosen.frames)
     return RawVolume(array, chosen.lps_from_index, chosen.notes, chosen.patient)
 
 
@@ -119,7 +129,8 @@ def _patient(folder: Path, groups: list[list[_Slice]], slices: list[_Slice]) -> 
 
 def _check_tags(folder: Path, slices: list[_Slice]) -> None:
     """Refuse slices that cannot be Hounsfield units; positions are checked in ``_slice_step``."""
-    if len({s.scale for s in slices}) > 1:
+    slope, intercept = np.ptp([s.scale for s in slices], axis=0)
+    if slope > _SAME_SLOPE * abs(slices[0].scale[0]) or intercept > _SAME_HU:
         raise InputError(
             f"{folder}: its slices differ in RescaleSlope or RescaleIntercept, so their Hounsfield "
             f"units are uncertain. {_AGAIN}"
@@ -138,29 +149,37 @@ def _check_tags(folder: Path, slices: list[_Slice]) -> None:
 
 def _groups(folder: Path) -> tuple[list[list[_Slice]], tuple[str, ...]]:
     """Slices by series, size and orientation, in a fixed order; and notes on other files."""
-    files = sorted(p for p in folder.iterdir() if p.is_file() and not p.name.startswith("."))
+    inside = folder.iterdir() if folder.is_dir() else [folder]
+    files = sorted(p for p in inside if p.is_file() and not p.name.startswith("."))
     if len(files) > _MAX_FILES:
         raise InputError(f"{folder} holds {len(files)} files; the limit is {_MAX_FILES}.")
     by_key: dict[tuple[Any, ...], list[_Slice]] = {}
-    left_out: dict[str, list[Path]] = {_NO_SLICE: [], _MULTI_FRAME: []}
+    left_out: dict[str, list[Path]] = {_NO_SLICE: [], _SEGMENTATION: []}
+    slices: list[_Slice] = []
     for file in files:
-        tags = _read_tags(file)
-        if isinstance(tags, str):
-            left_out[tags].append(file)
-            continue
+        found = _read_tags(file)
+        if isinstance(found, str):
+            left_out[found].append(file)
+        else:
+            slices += found
+    for tags in slices:
+        file = tags.path
         numbers = (*tags.position_mm, *tags.orientation, *tags.spacing_mm, *tags.scale)
         if not np.isfinite(numbers).all():
             raise InputError(
                 f"{file}: its position, orientation, spacing or rescaling is not finite. {_AGAIN}"
             )
-        orientation = tuple(round(c, 3) for c in tags.orientation)
-        by_key.setdefault((tags.uid, tags.shape, orientation), []).append(tags)
-    if not by_key and (multi_frame := left_out[_MULTI_FRAME]):
-        raise InputError(
-            f"{multi_frame[0]} is a multi-frame DICOM object; export classic slices, one file "
-            "each, or NIfTI."
+        key = tags.uid, tags.shape, tags.orientation
+        same = (
+            known
+            for known in by_key
+            if known[:2] == key[:2]
+            and np.abs(np.subtract(known[2], key[2])).max() < _SAME_DIRECTION
         )
+        by_key.setdefault(next(same, key), []).append(tags)
     if not by_key:
+        for file in left_out[_NO_SLICE]:
+            check_suffix(file)
         raise NoSeries(
             f"{folder} holds no DICOM image with a position. Give the folder that holds the CT's "
             "slices themselves."
@@ -175,8 +194,8 @@ def _groups(folder: Path) -> tuple[list[list[_Slice]], tuple[str, ...]]:
     return groups, notes
 
 
-def _read_tags(path: Path) -> _Slice | str:
-    """The tags of one slice, or why the file is not one (``_NO_SLICE``, ``_MULTI_FRAME``)."""
+def _read_tags(path: Path) -> list[_Slice] | str:
+    """The tags of a file's slices, or why it has none (``_NO_SLICE``, ``_SEGMENTATION``)."""
     load_pydicom()
     import pydicom
     from pydicom.filereader import read_dataset, read_file_meta_info
@@ -185,14 +204,16 @@ def _read_tags(path: Path) -> _Slice | str:
     tags: Any = None
     with warnings.catch_warnings(), path.open("rb") as stream:
         warnings.simplefilter("ignore")  # damage is reported by our own errors
-        is_dicom = stream.read(132)[128:] == b"DICM"
+        head = stream.read(132)
+        is_dicom = head[128:] == b"DICM"
+        bare = head[:2] in (b"\2\0", b"\x08\0")  # old writers leave the preamble out
         stream.seek(0)
         try:
             meta: Any = read_file_meta_info(path) if is_dicom else {}
             if meta.get("TransferSyntaxUID") == _DEFLATED:
                 tags = pydicom.FileDataset(path, {}, file_meta=meta)
                 raise ValueError("deflated as a whole, which is not read")
-            tags = pydicom.dcmread(stream, stop_before_pixels=True)
+            tags = pydicom.dcmread(stream, stop_before_pixels=True, force=bare)
             start = stream.tell()  # of the pixel data; long values from there on are not read
             implicit, little = tags.original_encoding
             rest = read_dataset(stream, implicit, little, defer_size=1024)
@@ -201,35 +222,66 @@ def _read_tags(path: Path) -> _Slice | str:
             types = {str(element.VR) for part in parts for element in part.values()}
             if strange := types - STANDARD_VR - {"None"}:  # GDCM would read gigabyte lengths
                 raise ValueError(f"elements of the type {sorted(strange)[0]!r}")
-            if int(tags.get("NumberOfFrames") or 1) > 1:
-                return _MULTI_FRAME
+            if tags.get("SOPClassUID") == _SEGMENTATIONS:
+                return _SEGMENTATION
             uid, description, modality, patient_id = (
                 "".join(c if c.isprintable() else "?" for c in str(tags.get(tag) or ""))
                 for tag in ("SeriesInstanceUID", "SeriesDescription", "Modality", "PatientID")
             )
-            slope, intercept = tags.get("RescaleSlope"), tags.get("RescaleIntercept")
-            return _Slice(
-                path,
-                uid,
-                description,
-                modality,
-                shape=(int(tags.Rows), int(tags.Columns)),
-                spacing_mm=(float(tags.PixelSpacing[0]), float(tags.PixelSpacing[1])),
-                position_mm=_numbers(tags.ImagePositionPatient, 3),
-                orientation=_numbers(tags.ImageOrientationPatient, 6),
-                scale=(
-                    1.0 if slope is None else float(slope),
-                    0.0 if intercept is None else float(intercept),
-                ),
-                samples=int(tags.get("SamplesPerPixel") or 1),
-                pixel_fault=_pixel_fault(tags, stream),
-                patient_id=patient_id.strip()[:64].strip(),  # as long as the standard allows
-                laterality=str(tags.get("ImageLaterality") or tags.get("Laterality") or ""),
-            )
+            count = int(tags.get("NumberOfFrames") or 1)
+            fault = _pixel_fault(tags, stream, count)
+            slices = []
+            for frame, group in enumerate(frame_groups(tags, count)):
+                plane = group("PixelMeasuresSequence").PixelSpacing
+                position = group("PlanePositionSequence").ImagePositionPatient
+                turn = group("PlaneOrientationSequence").ImageOrientationPatient
+                rescale = group("PixelValueTransformationSequence")
+                slope, intercept = rescale.get("RescaleSlope"), rescale.get("RescaleIntercept")
+                made = _Slice(
+                    path,
+                    uid,
+                    description,
+                    modality,
+                    shape=(int(tags.Rows), int(tags.Columns)),
+                    spacing_mm=(float(plane[0]), float(plane[1])),
+                    position_mm=_numbers(position, 3),
+                    orientation=_numbers(turn, 6),
+                    scale=(
+                        1.0 if slope is None else float(slope),
+                        0.0 if intercept is None else float(intercept),
+                    ),
+                    samples=int(tags.get("SamplesPerPixel") or 1),
+                    pixel_fault=fault,
+                    patient_id=patient_id.strip()[:64].strip(),  # as long as the standard allows
+                    laterality=str(tags.get("ImageLaterality") or tags.get("Laterality") or ""),
+                    frame=frame,
+                )
+                slices.append(made)
+            return slices
         except Exception as error:  # pydicom raises anything on a foreign or damaged file
             if is_dicom and _should_be_slice(tags):
                 raise InputError(f"{path} is cut short or damaged ({error}). {_AGAIN}") from error
             return _NO_SLICE
+
+
+def is_segmentation(path: Path) -> bool:
+    """Raises InputError: a damaged CT slice."""
+    return _read_tags(path) == _SEGMENTATION
+
+
+def frame_groups(tags: Any, count: int) -> Iterator[Callable[[str], Any]]:
+    """For each frame, what returns the item of one of its functional groups (PS3.3 C.7.6.16); of a
+    classic slice, which has none, the tags themselves."""
+    shared = (tags.get("SharedFunctionalGroupsSequence") or [tags])[0]
+    own = tags.get("PerFrameFunctionalGroupsSequence") or [tags] * count
+    if len(own) != count or count > _MAX_FILES:
+        raise ValueError(f"{count} frames, and {len(own)} groups of tags")
+
+    def group(item: Any, name: str) -> Any:
+        return (item.get(name) or shared.get(name) or [tags])[0]
+
+    for item in own:
+        yield partial(group, item)
 
 
 def _numbers(values: Any, count: int) -> tuple[float, ...]:
@@ -247,7 +299,7 @@ def _should_be_slice(tags: Any) -> bool:
         return True
 
 
-def _pixel_fault(tags: Any, stream: BinaryIO) -> str:
+def _pixel_fault(tags: Any, stream: BinaryIO, frames: int) -> str:
     """What is wrong with the length of the pixel data, at which the stream stands: decoders pad
     what is missing and allocate whatever is claimed."""
     start, head = stream.tell(), stream.read(12)
@@ -258,7 +310,7 @@ def _pixel_fault(tags: Any, stream: BinaryIO) -> str:
     length = int.from_bytes(head[size - 4 : size], "little" if little else "big")
     stored = os.fstat(stream.fileno()).st_size - start - size
     bits = int(tags.get("BitsAllocated") or 16) * int(tags.get("SamplesPerPixel") or 1)
-    needed = int(tags.Rows) * int(tags.Columns) * bits // 8
+    needed = int(tags.Rows) * int(tags.Columns) * bits * frames // 8
     possible = stored * GZIP_BEST if length == _UNDEFINED else min(length, stored)
     if possible >= needed:
         return ""
@@ -288,7 +340,8 @@ def _choose(folder: Path, groups: list[list[_Slice]], series: str | None) -> lis
 def _slice_step(slices: list[_Slice], normal: np.ndarray) -> np.ndarray:
     """The vector from one slice to the next, after checking that all slices follow it."""
     folder = slices[0].path.parent
-    if len({s.spacing_mm for s in slices}) > 1:
+    spacings = [s.spacing_mm for s in slices]
+    if np.ptp(spacings, axis=0).max() > _SAME_SPACING * max(spacings[0]):
         raise InputError(f"{folder}: its slices differ in pixel spacing.")
     if len(slices) < 2:
         raise InputError(f"{folder}: one slice is no volume.")

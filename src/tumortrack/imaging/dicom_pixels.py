@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 _TAGS = (  # that decoding needs
     *("SamplesPerPixel", "PhotometricInterpretation", "Rows", "Columns", "BitsAllocated"),
-    *("BitsStored", "HighBit", "PixelRepresentation", "PixelData"),
+    *("NumberOfFrames", "BitsStored", "HighBit", "PixelRepresentation", "PixelData"),
 )
 _DAMAGED = "the compressed picture is cut short, damaged or of another kind"
 _START, _END = b"\xff\xd8", b"\xff\xd9"
@@ -42,20 +42,25 @@ class _Picture(NamedTuple):
 
 
 def read_pixels(
-    files: tuple[Path, ...], shape: tuple[int, int, int], scale: tuple[float, float]
+    files: tuple[Path, ...],
+    shape: tuple[int, int, int],
+    scale: tuple[float, float],
+    frames: tuple[int, ...],
 ) -> Float[np.ndarray, "columns rows slices"]:
-    """The slices' stored numbers times ``scale[0]`` plus ``scale[1]``, float32; tags on padding and
-    display are not applied. ``shape``: columns, rows, slices. Raises InputError: pixels that cannot
-    be decoded, or are not of this shape."""
+    """The stored numbers of the files' ``frames``, one for each slice, times ``scale[0]`` plus
+    ``scale[1]``, float32; tags on padding and display are not applied. ``shape``: columns, rows,
+    slices. Raises InputError: pixels that cannot be decoded, or are not of this shape."""
     columns, rows, _ = shape
     values = np.empty((len(files), rows, columns), np.float32)
     with warnings.catch_warnings():
         # pydicom's warnings are harmless or checked here, but for excess pixels.
         warnings.simplefilter("ignore")
         warnings.filterwarnings("error", "The decoded RLE segment contains")
-        for file, out in zip(files, values, strict=True):
+        tags, last = None, None
+        for file, frame, out in zip(files, frames, values, strict=True):
             try:
-                stored = _stored(file)
+                tags, last = tags if file == last and tags else _tags(file), file
+                stored = _stored(tags, frame)
                 if stored.shape != out.shape:
                     raise ValueError(f"they are {stored.shape}, the other slices' {out.shape}")
             except Exception as error:  # pydicom and its decoders raise anything
@@ -67,14 +72,23 @@ def read_pixels(
     return values.transpose(2, 1, 0)
 
 
-def _stored(file: Path) -> Integer[np.ndarray, "rows columns"]:
-    """The stored numbers of a slice, or any exception."""
+def _tags(file: Path) -> Dataset:
     import pydicom
+
+    tags = pydicom.dcmread(file, specific_tags=list(_TAGS), force=True)
+    if "TransferSyntaxUID" not in tags.file_meta:  # without preamble, and so never compressed
+        implicit = tags.original_encoding[0]
+        uids = pydicom.uid.ImplicitVRLittleEndian, pydicom.uid.ExplicitVRLittleEndian
+        tags.file_meta.TransferSyntaxUID = uids[0] if implicit else uids[1]
+    return tags
+
+
+def _stored(tags: Dataset, index: int) -> Integer[np.ndarray, "rows columns"]:
+    """The stored numbers of a slice, or any exception."""
     from pydicom.encaps import get_frame
     from pydicom.pixels.decoders.base import get_decoder
     from pydicom.uid import JPEG2000TransferSyntaxes, RLELossless
 
-    tags = pydicom.dcmread(file, specific_tags=list(_TAGS))
     tags.setdefault("SamplesPerPixel", 1)
     tags.setdefault("PhotometricInterpretation", "MONOCHROME2")
     photometric = tags.PhotometricInterpretation
@@ -91,10 +105,12 @@ def _stored(file: Path) -> Integer[np.ndarray, "rows columns"]:
     if syntax.is_encapsulated and syntax != RLELossless:
         _silence_gdcm()
         plugin = "gdcm"
-        frame = get_frame(tags.PixelData, 0, number_of_frames=1)
+        frame = get_frame(
+            tags.PixelData, index, number_of_frames=int(tags.get("NumberOfFrames") or 1)
+        )
         is_j2k = syntax in JPEG2000TransferSyntaxes
         _check_picture(_j2k_header(frame) if is_j2k else _jpeg_header(frame, syntax), tags)
-    return get_decoder(syntax).as_array(tags, index=0, raw=True, decoding_plugin=plugin)[0]
+    return get_decoder(syntax).as_array(tags, index=index, raw=True, decoding_plugin=plugin)[0]
 
 
 def _check_picture(picture: _Picture, tags: Dataset) -> None:

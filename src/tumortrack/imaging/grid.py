@@ -5,11 +5,12 @@ from __future__ import annotations
 import gzip
 import math
 import zlib
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from io import BufferedIOBase
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -28,18 +29,39 @@ _SPACING_RANGE_MM = (0.05, 10.0)
 GZIP_BEST = 1100  # deflate cannot compress better than 1032 : 1
 _USUAL_BEST, _MUCH = 100, 2**30  # a better ratio is refused if the volume has so many bytes
 _MOST_BEHIND = 16 * 2**20  # bytes after the voxels
+_SAVE_AS = {  # of formats that no reader here knows
+    (".mha", ".mhd", ".mgz", ".mgh", ".mnc", ".npy", ".npz", ".vti", ".tif"): ".nii.gz or .nrrd",
+    (".vtk", ".vtp", ".vtu", ".glb", ".gltf", ".3mf", ".off"): "STL, OBJ or PLY",
+}
 _CHUNK = 2**16  # labels that are counted at once
+
+
+class Segment(NamedTuple):
+    """A label with a name. Segments may overlap; ``mask`` reads its voxels, bool (i, j, k)."""
+
+    number: int
+    name: str
+    mask: Callable[[], np.ndarray]
 
 
 @dataclass(frozen=True, eq=False)
 class RawVolume:
     """Voxels in the file's own number type; axes (i, j, k); ``lps_from_index``: index -> LPS mm.
-    ``notes``: what else was there and was left out. ``patient``: as the file states."""
+    ``notes``: what else was there and was left out. ``patient``: as the file states. ``segments``:
+    of a file whose labels have names; ``array`` is then a map of them."""
 
     array: np.ndarray
     lps_from_index: Float[np.ndarray, "4 4"]
     notes: tuple[str, ...] = ()
     patient: Patient = NOBODY
+    segments: tuple[Segment, ...] = ()
+
+
+def check_suffix(path: Path) -> None:
+    """Raises InputError, which says what to save instead, for kinds of files that are not read."""
+    for suffixes, wanted in _SAVE_AS.items():
+        if path.name.lower().endswith(suffixes):
+            raise InputError(f"{path}: this kind of file is not read. Save it as {wanted}.")
 
 
 def check_size(

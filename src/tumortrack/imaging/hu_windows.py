@@ -168,8 +168,8 @@ def _find_organ(
         raise InputError(
             f"no free-standing {kind.words} was found in this CT: nothing between the HU limits is "
             f"compact, {grid.organ_ml[0]:g} to {grid.organ_ml[1]:g} ml and apart from its "
-            "surroundings. Thresholds suit a phantom's CT; of a patient's CT segment the organ "
-            "first and give the label map with --labels."
+            "surroundings and from the image's end. Thresholds suit a phantom's CT; of a patient's "
+            "CT segment the organ first and give the label map with --labels."
         )
     return _refine(region, grid.solid & ~region, solid, factors)
 

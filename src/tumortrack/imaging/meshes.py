@@ -3,60 +3,84 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from tumortrack.core.case_warning import CaseWarning
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import RAS_FROM_LPS, transform_points
 from tumortrack.core.mesh_files import SUFFIXES, read_mesh
 from tumortrack.core.organ import KIDNEY, Organ
 from tumortrack.core.types import FIRST_TUMOR, ORGAN, Anatomy, LabelVolume, Mesh, part_names
 from tumortrack.imaging.grid import grid_round
+from tumortrack.imaging.options import MIN_TUMOR_ML
 from tumortrack.imaging.raster import winding_numbers
-from tumortrack.imaging.surface import largest_shell, surfaces
+from tumortrack.imaging.segments import is_tumor
+from tumortrack.imaging.surface import largest_shell, shells, surface_of
 
-_TUMOR_WORDS = ("tumor", "tumour", "lesion", "mass")
+LEAST_DROPPED_ML = 0.05  # that is said of a piece alone
 _ORGAN_MM = (15.0, 600.0)  # plausible longest extent
 _VOXEL_MM = 1.0
 _MOST_TUMORS = 254  # labels 2 to 255
 _LARGEST_HOLE_MM = 10.0  # to close a larger one would invent anatomy
 _LARGEST_REMESH = 1.5  # ratio by which a remesh may change the volume
 _RULE = (
-    "The rule: one file whose name contains {} or organ is the organ; names with tumor, lesion or "
-    "mass are tumors, in order of name."
+    "The rule: one file whose name contains {} or organ is the organ; names with tumor, lesion, "
+    "mass or the like are tumors, in order of name."
 )
 
 
-def read_mesh_folder(
-    folder: Path, unit: str | None = None, kind: Organ = KIDNEY
+def read_meshes(
+    paths: Sequence[Path],
+    unit: str | None = None,
+    kind: Organ = KIDNEY,
+    min_tumor_ml: float = MIN_TUMOR_ML,
 ) -> tuple[Anatomy, list[str]]:
-    """Read one organ and its tumors, LPS mm; and notes on every change.
+    """Read one organ and its tumors, LPS mm, from the meshes among files; and notes on every
+    change.
 
     Files are LPS unless a comment in them states ``SPACE=RAS``. ``unit``: None is mm; metres are
     then recognised and refused. Small holes, doubled faces, inside-out surfaces and
-    self-intersections are repaired. The organ becomes the union of organ and tumors. Raises
-    InputError: unclear names, open or damaged meshes, wrong unit, a tumor apart from the organ.
+    self-intersections are repaired. The organ becomes the union of organ and tumors; each piece of
+    a tumor's file is a tumor. Raises InputError: unclear names, open or damaged meshes, wrong unit,
+    a tumor apart from the organ.
     """
-    if not folder.is_dir():
-        raise InputError(f"{folder} is not a folder of meshes.")
     if unit not in (None, "mm", "m"):
         raise InputError(f"unit {unit!r} is not allowed: mm or m.")
-    organ_file, *tumor_files = files = _files_by_name(folder, kind.name)
+    files = _files_by_name(paths, kind.name)
     notes: list[str] = []
-    organ, *tumors = [read_lps(file, 1000.0 if unit == "m" else 1.0, notes) for file in files]
-    _check_unit(organ_file, organ, unit)
-    # Without the wall of a cavity that was cut out for an inner tumor
-    organ = largest_shell(closed_mesh(organ, organ_file.name, notes))
-    tumors = [closed_mesh(t, f.name, notes) for t, f in zip(tumors, tumor_files, strict=True)]
-    for tumor, file in zip(tumors, tumor_files, strict=True):
-        organ = _union(organ, tumor, file.name)
-    names = part_names(len(files), kind.name)
-    notes += [f"{file.name} is {name}" for file, name in zip(files, names, strict=True)]
-    if not tumors:
-        notes.append("no tumor in this folder")
-    return Anatomy((organ, *tumors), kind), notes
+    meshes = [read_lps(file, 1000.0 if unit == "m" else 1.0, notes) for file in files]
+    _check_unit(files[0], meshes[0], unit)
+    parts: list[Mesh] = []
+    for file, mesh in zip(files, meshes, strict=True):
+        # Without walls of cavities, such as one that was cut out for an inner tumor
+        bodies = [b for b in shells(closed_mesh(mesh, file.name, notes)) if b.volume_mm3 > 0]
+        kept = bodies[:1]
+        kept += [b for b in bodies[1:] if len(parts) and b.volume_ml >= min_tumor_ml]
+        notes += _dropped(file.name, [body.volume_ml for body in bodies[len(kept) :]])
+        first, last = len(parts), len(parts) + len(kept) - 1
+        names = part_names(last + 1, kind.name)
+        notes.append(f"{file.name} is {' to '.join(dict.fromkeys([names[first], names[last]]))}")
+        parts += kept
+    if len(parts) - 1 > _MOST_TUMORS:
+        raise InputError(f"{len(parts) - 1} tumors; up to {_MOST_TUMORS} are read.")
+    for number, tumor in enumerate(parts[1:], 1):
+        parts[0] = _union(parts[0], tumor, f"tumor_{number}")
+    if len(parts) == 1:
+        notes.append("no tumor in these files")
+    return Anatomy(tuple(parts), kind), notes
+
+
+def _dropped(name: str, pieces_ml: list[float]) -> list[str]:
+    large: list[str] = [
+        CaseWarning("dropped", what=name, ml=ml) for ml in pieces_ml if ml >= LEAST_DROPPED_ML
+    ]
+    specks = [ml for ml in pieces_ml if ml < LEAST_DROPPED_ML]
+    words = f"{name}: {len(specks)} specks of together {sum(specks):.3f} ml dropped"
+    return [*large, words] if specks else large
 
 
 def label_meshes(anatomy: Anatomy) -> LabelVolume:
@@ -71,28 +95,22 @@ def label_meshes(anatomy: Anatomy) -> LabelVolume:
     return LabelVolume(labels, lps_from_index)
 
 
-def _files_by_name(folder: Path, organ: str) -> list[Path]:
+def _files_by_name(paths: Sequence[Path], organ: str) -> list[Path]:
     """The organ's file, then the tumors'."""
-    files = sorted(p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES)
-    if not files:
-        raise InputError(f"{folder} holds no meshes ({', '.join(SUFFIXES)}).")
-
-    def named(words: tuple[str, ...]) -> list[Path]:
-        return [f for f in files if any(word in f.stem.lower() for word in words)]
-
-    tumors = named(_TUMOR_WORDS)
-    organs = [f for f in named((organ, "organ")) if f not in tumors]  # not kidney_tumor.stl
+    files = sorted((p for p in paths if p.suffix.lower() in SUFFIXES), key=natural_order)
+    tumors = [f for f in files if is_tumor(f.stem)]  # also kidney_tumor.stl
+    named = [f for f in files if organ in f.stem.lower() or "organ" in f.stem.lower()]
+    organs = [f for f in named if f not in tumors]
     other = [f.name for f in files if f not in organs and f not in tumors]
     if len(organs) != 1 or other:
         problem = f"{len(organs)} name an organ" + (f", {other} name neither" if other else "")
-        raise InputError(f"{folder}: of {[f.name for f in files]} {problem}. {_RULE.format(organ)}")
-    if len(tumors) > _MOST_TUMORS:
-        raise InputError(f"{folder}: {len(tumors)} tumors; up to {_MOST_TUMORS} are read.")
+        raise InputError(f"of {[f.name for f in files]} {problem}. {_RULE.format(organ)}")
+    return [*organs, *tumors]
 
-    def natural_order(path: Path) -> list[Any]:  # tumor_2 before tumor_10
-        return [int(p) if p.isdigit() else p for p in re.split(r"(\d+)", path.stem.lower())]
 
-    return [organs[0], *sorted(tumors, key=natural_order)]
+def natural_order(path: Path) -> list[Any]:
+    """tumor_2 before tumor_10."""
+    return [int(p) if p.isdecimal() else p for p in re.split(r"(\d+)", path.name.lower())]
 
 
 def read_lps(path: Path, scale: float, notes: list[str]) -> Mesh:
@@ -178,12 +196,26 @@ def closed_mesh(mesh: Mesh, name: str, notes: list[str]) -> Mesh:
     if out.volume_mm3 < 0:
         out = Mesh(out.vertices_mm, out.faces[:, ::-1])
         notes.append(f"{name}: it was inside out; faces turned outward")
+    bodies = list(shells(out))
+    for n, body in enumerate(bodies):  # a cavity's wall lies in the box of another body
+        boxes = (other.box_mm - body.box_mm for other in bodies if other is not body)
+        if body.volume_mm3 < 0 and not any((b[0] <= 0).all() and (b[1] >= 0).all() for b in boxes):
+            bodies[n] = Mesh(body.vertices_mm, body.faces[:, ::-1])
+            notes.append(f"{name}: a piece of {bodies[n].volume_ml:.2f} ml was inside out; turned")
+    out = _together(bodies)
     if abs(out.volume_mm3) < 1e-9 * size**3:
         raise InputError(f"{name} encloses no volume; it is no solid.")
     if not is_simple(out, size / 80):
         out = _remesh(out, name, size / 120)
         notes.append(f"{name}: it crossed itself; remeshed at {size / 120:.2g} mm")
     return out
+
+
+def _together(bodies: list[Mesh]) -> Mesh:
+    """Several meshes as one."""
+    starts = np.cumsum([0, *(len(body.vertices_mm) for body in bodies)])
+    faces = [body.faces + start for body, start in zip(bodies, starts[:-1], strict=True)]
+    return Mesh(np.concatenate([b.vertices_mm for b in bodies]), np.concatenate(faces))
 
 
 def _close_holes(mesh: Mesh, name: str, notes: list[str]) -> Mesh:
@@ -226,7 +258,7 @@ def _remesh(mesh: Mesh, name: str, step: float) -> Mesh:
     inside = winding_numbers(mesh, affine, shape) > 0
     if not inside.any():
         raise InputError(f"{name} crosses itself and encloses nothing; repair it first.")
-    out = surfaces(LabelVolume(inside.astype(np.uint8), affine))[0].organ
+    out = surface_of(name, inside, affine, step, keep=lambda whole: whole)
     if not 1 / _LARGEST_REMESH < out.volume_mm3 / mesh.volume_mm3 < _LARGEST_REMESH:
         raise InputError(f"{name} crosses itself too much to be repaired; repair it first.")
     return out

@@ -39,6 +39,7 @@ _HEADER = np.dtype(  # the fields that are written; all others are 0
 _TYPES = {"u1": 2, "i2": 4, "i4": 8, "f4": 16, "f8": 64, "i1": 256, "u2": 512, "u4": 768}
 _MM, _SCANNER = 2, 1
 _EQUAL_STEPS = 0.01  # of sform and qform, relatively
+_SAME_TURN = math.radians(2)  # likewise
 _LONGEST_HEADER = 540  # bytes: NIfTI-2's
 _MAX_OFFSET = 16 * 2**20  # bytes of header and extensions before the voxels
 _NO_GEOMETRY = (
@@ -126,7 +127,8 @@ def _lps_from_index(path: Path, header: Any) -> Float[np.ndarray, "4 4"]:
         with np.errstate(all="ignore"):
             steps = [np.linalg.norm(a[:3, :3], axis=0) for a in (sform, qform)]
             s, q = (a[:3, :3] / step for a, step in zip((sform, qform), steps, strict=True))
-            agree = bool((np.sum(s * q, axis=0) > math.cos(math.radians(2))).all())
+            forms = [s, *_without_shear(s)] if np.isfinite(s).all() else [s]
+            agree = any((np.sum(s * q, axis=0) > math.cos(_SAME_TURN)).all() for s in forms)
             equal = np.allclose(steps[0], steps[1], rtol=_EQUAL_STEPS, atol=0)
             apart_mm = np.linalg.norm(sform[:3, 3] - qform[:3, 3])
         if not agree:
@@ -142,6 +144,14 @@ def _lps_from_index(path: Path, header: Any) -> Float[np.ndarray, "4 4"]:
                 "apart. Export it again from the DICOM series."
             )
     return RAS_FROM_LPS @ np.asarray(sform if sform_code else qform, np.float64)
+
+
+def _without_shear(axes: Float[np.ndarray, "3 3"]) -> tuple[np.ndarray, np.ndarray]:
+    """What a quaternion, which holds no shear, can say of unit axes: the nearest rotation, as
+    nibabel writes it, and that which keeps the first axis and the first two's plane."""
+    u, _, vt = np.linalg.svd(axes)
+    q, r = np.linalg.qr(axes)
+    return u @ vt, q * np.sign(np.diag(r))
 
 
 def write_nifti(

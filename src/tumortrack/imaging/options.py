@@ -30,8 +30,10 @@ class PrepareOptions:
         labels: the input is a label map (mostly recognised by itself).
         side: of organs in pairs, the patient's one to take from a label map (default: the one
             with most tumor); of a CT or meshes, which one it is.
-        organ: label number of the organ.
-        tumor: label number of the tumors; default: every label from 2 up. 0: none.
+        organ: label number of the organ, again for each label that counts as organ too (default:
+            by its name, where labels have names, else 1).
+        tumor: likewise of the tumors; 0: none. Default: by name; in a map without names whose organ
+            is 1, every label from 2 up.
         up: patient direction that faces the camera: anterior, left, ... or "x,y,z" in LPS.
         rotations: how the organ may lie then: turned about the line of sight and tilted by up to
             TILT, or in any way (full). What is excluded here is never the answer.
@@ -47,14 +49,15 @@ class PrepareOptions:
         term: SNOMED CT code and meaning of the organ, where NAME is none of the usual ones.
         structure: NAME=NUMBER (a label) or NAME=PATH (a mesh, closed or open), again for every
             one: vessels and the like, which move with the organ.
+        ct: of a label map or meshes: their CT, on the same grid, to be shown.
     """
 
     organ_hu: tuple[float, float] = ORGAN_HU
     tumor_hu: tuple[float, float] = TUMOR_HU
     labels: bool = False
     side: str | None = None
-    organ: int = 1
-    tumor: int | None = None
+    organ: int | tuple[int, ...] = ()
+    tumor: int | tuple[int, ...] = ()
     up: str = "anterior"
     rotations: Literal["limited", "full"] = "limited"
     tilt: float = 30.0
@@ -66,14 +69,18 @@ class PrepareOptions:
     name: str = "kidney"
     term: tuple[str, str] | None = None
     structure: tuple[str, ...] = ()
+    ct: Path | None = None
 
     def __post_init__(self) -> None:
         from tumortrack.core.geometry import direction_lps
 
         if not (math.isfinite(self.min_tumor_ml) and self.min_tumor_ml >= 0):
             raise InputError(f"min_tumor_ml {self.min_tumor_ml} must be 0 or more (ml).")
-        if not 1 <= self.organ <= 255 or (self.tumor is not None and not 0 <= self.tumor <= 255):
-            raise InputError("label numbers must lie in 1..255 (tumor 0: none).")
+        numbers = *self.organs, *(self.tumors or ())
+        if not all(1 <= n <= 255 for n in numbers):
+            raise InputError("label numbers must lie in 1..255 (tumor 0, and no other: none).")
+        if len(set(numbers)) < len(numbers):
+            raise InputError("--organ and --tumor name a label twice. Give each once.")
         if self.side not in (None, "left", "right"):
             raise InputError(f"side {self.side!r} is not allowed: left or right (the patient's).")
         self.kind.check_side(self.side)
@@ -92,12 +99,26 @@ class PrepareOptions:
             Patient(self.patient)
 
     @property
+    def organs(self) -> tuple[int, ...]:
+        return _labels(self.organ)
+
+    @property
+    def tumors(self) -> tuple[int, ...] | None:
+        """None: not stated."""
+        stated = _labels(self.tumor)
+        return () if stated == (0,) else stated or None
+
+    @property
     def kind(self) -> Organ:
         return Organ(name=self.name, term=self.term)
 
     @property
     def stated_side(self) -> Side:
         return cast(Side, self.side or UNKNOWN)  # it was checked above
+
+
+def _labels(given: int | tuple[int, ...]) -> tuple[int, ...]:
+    return (given,) if isinstance(given, int) else tuple(given or ())
 
 
 def parse_structures(options: tuple[str, ...], organ: str) -> StructureSources:

@@ -2,79 +2,118 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 from scipy import ndimage
 
 from tumortrack.core import store
+from tumortrack.core.case_warning import CaseWarning
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import direction_lps, spacing_mm
 from tumortrack.core.mesh_files import SUFFIXES
+from tumortrack.core.organ import Organ
 from tumortrack.core.patient import UNKNOWN, Patient, Side
 from tumortrack.core.types import FIRST_TUMOR, ORGAN, Anatomy, LabelVolume, Mesh, Volume
 from tumortrack.imaging.case import Case
-from tumortrack.imaging.grid import grown_box, voxel_ml
+from tumortrack.imaging.grid import check_suffix, grown_box, label_counts, voxel_ml
 from tumortrack.imaging.hu_windows import segment_ct
-from tumortrack.imaging.meshes import label_meshes, read_mesh_folder
+from tumortrack.imaging.meshes import LEAST_DROPPED_ML, label_meshes, natural_order, read_meshes
 from tumortrack.imaging.options import PrepareOptions, parse_structures
-from tumortrack.imaging.select import select_labels
+from tumortrack.imaging.segments import Parts, is_tumor, parts_of
+from tumortrack.imaging.select import neighbours, select_labels
 from tumortrack.imaging.structures import extent_report, read_structures, split_structures
 from tumortrack.imaging.surface import surfaces
 from tumortrack.imaging.symmetry import ambiguous, half_turns, warning
-from tumortrack.imaging.volume import is_label_map, labels_of, read_raw, volume_of
+from tumortrack.imaging.volume import (
+    is_label_map,
+    is_volume,
+    label_map,
+    read_raw,
+    read_several,
+    volume_of,
+)
 
 # Options for one kind of input only.
-_OF_CT, OF_LABELS = ("organ_hu", "tumor_hu"), ("labels", "organ", "tumor")
+_OF_CT, OF_LABELS = ("organ_hu", "tumor_hu"), ("labels", "organ", "tumor", "ct")
 _LEAST_ORGAN_OUTSIDE = 0.02  # of the outer surface
 _LARGEST_SHARE = 0.6  # of organ and tumors that one tumor may take without a note
+_OFF_GRID = 0.05  # of a voxel: rounding of affines in files
+_FEW = 8  # voxels on the image's border, as rounding and resampling leave them
+_ENCLOSED = 0.4  # share of a label's surface on the organ that only a tumor or a cyst has
+_USUAL_ML = {"kidney": (40.0, 800.0), "liver": (500.0, 3500.0), "prostate": (10.0, 300.0)}
 _MOST_CHANGE_PERCENT = 1.0  # of a part's volume by smoothing, without a note
 
 
-def prepare(input: Path, options: PrepareOptions | None = None) -> Case:
-    """A case from any supported input; writes nothing. Raises InputError: unusable input."""
+def prepare(input: Path | Sequence[Path], options: PrepareOptions | None = None) -> Case:
+    """A case from any supported input: a folder or file, or several files of meshes or of labels,
+    one structure each. Writes nothing. Raises InputError: unusable input."""
     options = options or PrepareOptions()
+    paths = [input] if isinstance(input, Path) else list(input)
     try:
-        if not input.exists():
-            raise InputError(f"{input} does not exist.")
-        paths = list(input.iterdir()) if input.is_dir() else []
-        if input.is_dir() and not any(path.is_file() for path in paths):
-            raise InputError(f"{input} holds no files. Give a folder of DICOM slices or of meshes.")
-        is_meshes = any(path.suffix.lower() in SUFFIXES for path in paths)
-        case = _from_meshes(input, options) if is_meshes else _from_volume(input, options)
+        if missing := [path for path in paths if not path.exists()]:
+            raise InputError(f"{missing[0]} does not exist.")
+        files = _files_in(paths)
+        if len(files) == 1:
+            paths = files
+        is_meshes = any(path.suffix.lower() in SUFFIXES for path in files)
+        for path in files if is_meshes or len(paths) > 1 else []:
+            check_suffix(path)
+        case = _from_meshes(files, options) if is_meshes else _from_volume(paths, files, options)
         _check_organ_outside(case.labels)
-        case.report["notes"].extend([*_large_tumors(case), *options.kind.doubts()])
-        case = _with_structures(case, options)
-        source_sha256 = store.sha256_of(input)
+        notes = [*case.report["notes"], *_large_tumors(case), *options.kind.doubts()]
+        case = _with_structures(replace(case, report={**case.report, "notes": notes}), options)
+        if options.ct is not None:
+            case = _with_ct(case, options.ct)
+        source_sha256 = " ".join(map(store.sha256_of, paths))
     except OSError as error:
-        raise InputError(f"{input} cannot be read: {error.strerror or error}.") from error
+        where = error.filename or ", ".join(map(str, paths))
+        raise InputError(f"{where} cannot be read: {error.strerror or error}.") from error
     turns, notes = half_turns(case.anatomy), case.report["notes"]
     text = warning(ambiguous(turns))
     report = case.report | {
-        "source": input.name,
+        "source": ", ".join(path.name for path in paths),
         "source_sha256": source_sha256,
-        "options": {k: list(v) if isinstance(v, tuple) else v for k, v in asdict(options).items()},
+        "options": msgspec.to_builtins(asdict(options), enc_hook=str),
         "half_turn": {
             "warning": text,
             "turns": [{k: v for k, v in asdict(t).items() if k != "ct_from_ct"} for t in turns],
         },
-        "notes": [*notes, text] if text else notes,
+        "notes": [n for n in (*notes, text) if n and not isinstance(n, CaseWarning)],
     }
     return replace(
         case,
         report=report,
+        warnings=tuple(note for note in notes if isinstance(note, CaseWarning)),
         rotations=options.rotations,
         tilt_degrees=options.tilt,
         sensor=options.sensor,
     )
 
 
+def _files_in(paths: list[Path]) -> list[Path]:
+    """The files that were given, or those of a folder, but hidden ones."""
+    if len(paths) > 1 and (folders := [path for path in paths if path.is_dir()]):
+        raise InputError(f"{folders[0]} is a folder. Give it alone, or several files.")
+    files = [p for path in paths for p in (path.iterdir() if path.is_dir() else [path])]
+    files = [path for path in files if path.is_file() and not path.name.startswith(".")]
+    if not files and paths[0].is_dir():
+        raise InputError(
+            f"{paths[0]} holds no files. Give a folder of DICOM slices, of meshes, or of label "
+            "files with one structure each."
+        )
+    return sorted(files, key=natural_order)
+
+
 def _with_structures(case: Case, options: PrepareOptions) -> Case:
     """The case with structures from mesh files as well, and a report on all structures."""
     sources = parse_structures(options.structure, options.name)
-    from_files, notes = read_structures(sources, options.unit)
+    others = {k: v for k, v in sources.items() if k not in case.anatomy.structures}
+    from_files, notes = read_structures(others, options.unit)
     structures = {**case.anatomy.structures, **from_files}
     if missing := [name for name in sources if name not in structures]:
         raise InputError(
@@ -120,24 +159,26 @@ def refuse_unused(what: str, options: PrepareOptions, *unused: str) -> None:
         raise InputError(f"{what}, where {names} means nothing. Leave it out.")
 
 
-def _from_volume(path: Path, options: PrepareOptions) -> Case:
+def _from_volume(paths: list[Path], files: list[Path], options: PrepareOptions) -> Case:
+    path = paths[0]
     if not path.is_dir():
         refuse_unused(f"{path} is one file", options, "series")
-    raw = read_raw(path, options.series)
-    as_labels = options.labels or (path.is_file() and is_label_map(raw))
+    several = len(paths) > 1 or (path.is_dir() and all(map(is_volume, files)))
+    raw = read_several(files) if several else read_raw(path, options.series)
+    is_labels = bool(raw.segments) or (path.is_file() and is_label_map(raw))
+    as_labels = options.labels or is_labels
     structures: dict[str, Mesh] = {}
     ct, notes = None, list(raw.notes)
     file_patient, side = raw.patient, options.stated_side
+    shape, affine = raw.array.shape, raw.lps_from_index
     if as_labels:
         refuse_unused(f"{path} is read as a label map", options, *_OF_CT, "unit")
-        if not options.labels:
+        if not (options.labels or raw.segments):
             notes.append("few distinct whole numbers: read as a label map, not as a CT")
-        source = labels_of(raw, path)
+        parts = parts_of(raw, options, str(path))
+        source = label_map(raw, parts, path)
         del raw  # the largest maps are gigabytes: one copy is enough
-        sources = parse_structures(options.structure, options.name)
-        source, structures = split_structures(source, sources, options.organ)
-        selection = (options.organ, options.tumor, options.min_tumor_ml, options.kind)
-        labels, more, side = select_labels(source, side, *selection)
+        labels, structures, more, side = _selected(source, parts, path, options)
     else:
         what = f"{path} is read as a CT (a label map needs --labels)"
         refuse_unused(what, options, *OF_LABELS, "unit")
@@ -147,19 +188,79 @@ def _from_volume(path: Path, options: PrepareOptions) -> Case:
             volume, options.organ_hu, options.tumor_hu, options.min_tumor_ml, options.kind
         )
         ct = crop_ct(volume, labels)
+    notes += [*more, *_cut(options.kind.words, labels, shape, affine)]
     anatomy, surface = surfaces(labels, options.kind)
     anatomy = replace(anatomy, structures=structures)
-    notes += more
     notes += [
-        f"{name}: the surface's volume is {change:+.1f} % off its labels'; it is too thin or hangs "
+        CaseWarning("dropped", what=part, ml=ml)
+        for part, ml in zip(surface["names"], surface["dropped_ml"], strict=True)
+        if ml > LEAST_DROPPED_ML
+    ]
+    notes += [
+        f"{part}: the surface's volume is {change:+.1f} % off its labels'; it is too thin or hangs "
         "together by too little for a smooth surface. Look at qc.png"
-        for name, change in zip(surface["names"], surface["change_percent"], strict=True)
+        for part, change in zip(surface["names"], surface["change_percent"], strict=True)
         if abs(change) > _MOST_CHANGE_PERCENT
     ]
     measured = _measured(labels, anatomy, surface)
+    notes += _unusual(options.kind, measured)
     report = {"kind": "label map" if as_labels else "ct", "notes": notes, **measured}
     patient = patient_of(path, file_patient, options.patient, side)
     return Case(anatomy, labels, direction_lps(options.up), report, ct, patient)
+
+
+def _selected(
+    volume: LabelVolume, parts: Parts, path: Path, options: PrepareOptions
+) -> tuple[LabelVolume, dict[str, Mesh], list[str], Side]:
+    """The organ and its tumors, structures, notes, and the organ's side."""
+    counts, organ, tumors = label_counts(volume.labels), parts.organ[0], parts.tumors
+    if tumors and options.tumors is None:  # tools also write segments that hold nothing
+        tumors = tuple(n for n in tumors if counts[n])
+    if np.count_nonzero(counts[1:]) == 1 and is_tumor(path.name.split(".")[0]):
+        raise InputError(
+            f"{path} is a tumor by its name, and holds nothing else. Give the organ's file as well."
+        )
+    source, structures = split_structures(volume, parts.structures, organ)
+    selection = options.stated_side, organ, tumors, options.min_tumor_ml, options.kind
+    chosen, notes, side = select_labels(source, *selection)
+    used = organ, *(np.arange(FIRST_TUMOR, 256) if tumors is None else tumors)
+    around = _on_grid(source.labels, source.lps_from_index, chosen, 0)
+    shares = neighbours(around, chosen.labels, used)
+    ml = counts * voxel_ml(volume.lps_from_index)
+    enclosed = [n for n, share in shares.items() if share > _ENCLOSED and n not in parts.names]
+    if enclosed and options.tumors is None:
+        raise InputError(
+            f"{path}: the organ encloses label {enclosed[0]} ({ml[enclosed[0]]:.1f} ml), and "
+            f"nothing says what it is. Give --tumor {enclosed[0]}, --organ {enclosed[0]} as well "
+            "if it is part of the organ, or --tumor 0 if there is no tumor."
+        )
+    beside = {n: f" {parts.names[n]}" if n in parts.names else "" for n in shares}
+    notes += [CaseWarning("beside", label=n, name=beside[n], ml=float(ml[n])) for n in shares]
+    return chosen, structures, [parts.note, *notes] if parts.note else notes, side
+
+
+def _cut(
+    name: str, labels: LabelVolume, shape: tuple[int, ...], affine: np.ndarray
+) -> list[CaseWarning]:
+    """A warning if the organ reaches the border of the image of this shape, which has the labels'
+    grid."""
+    voxels, area_mm2 = 0, 0.0
+    start = _start(affine, labels)
+    for axis, (first, n) in enumerate(zip(start, shape, strict=True)):
+        face_mm2 = np.linalg.norm(np.cross(*np.delete(affine[:3, :3], axis, axis=1).T))
+        for index in (-first, n - 1 - first):
+            if 0 <= index < labels.labels.shape[axis]:
+                count = int(np.count_nonzero(labels.labels.take(index, axis)))
+                voxels, area_mm2 = voxels + count, area_mm2 + count * float(face_mm2)
+    warning = CaseWarning("cut", part=name, voxels=voxels, area_cm2=area_mm2 / 100)
+    return [warning] if voxels > _FEW else []
+
+
+def _unusual(kind: Organ, measured: dict[str, Any]) -> list[CaseWarning]:
+    low, high = _USUAL_ML.get(kind.name, (0.0, np.inf))
+    ml = measured["volumes_ml"][kind.name]
+    warning = CaseWarning("size", part=kind.words, ml=ml, low=low, high=high)
+    return [] if low <= ml <= high else [warning]
 
 
 def patient_of(path: Path, in_file: Patient, identifier: str | None, side: Side) -> Patient:
@@ -173,13 +274,14 @@ def patient_of(path: Path, in_file: Patient, identifier: str | None, side: Side)
     return Patient(identifier or in_file.id, in_file.side if side == UNKNOWN else side)
 
 
-def _from_meshes(folder: Path, options: PrepareOptions) -> Case:
-    unused = (*_OF_CT, *OF_LABELS, "series", "min_tumor_ml")
-    refuse_unused(f"{folder} holds meshes", options, *unused)
-    anatomy, notes = read_mesh_folder(folder, options.unit, options.kind)
+def _from_meshes(files: list[Path], options: PrepareOptions) -> Case:
+    unused = (*_OF_CT, *OF_LABELS[:-1], "series")
+    refuse_unused(f"{files[0]} is a mesh", options, *unused)
+    anatomy, notes = read_meshes(files, options.unit, options.kind, options.min_tumor_ml)
     labels = label_meshes(anatomy)
     mesh_ml = [part.volume_ml for part in anatomy.parts]
     measured = _measured(labels, anatomy, {"names": list(anatomy.names), "mesh_ml": mesh_ml})
+    notes += _unusual(options.kind, measured)
     patient = Patient(options.patient or UNKNOWN, options.stated_side)
     report = {"kind": "meshes", "notes": notes, **measured}
     return Case(anatomy, labels, direction_lps(options.up), report, patient=patient)
@@ -199,13 +301,39 @@ def _measured(
     }
 
 
+def _with_ct(case: Case, path: Path) -> Case:
+    """The case with its CT, which must have the labels' grid. Raises InputError."""
+    raw = read_raw(path)
+    volume = volume_of(raw, path)
+    steps = np.linalg.inv(volume.lps_from_index) @ case.labels.lps_from_index
+    if np.abs(steps - np.rint(steps)).max() > _OFF_GRID or not np.allclose(
+        steps[:3, :3], np.eye(3), atol=_OFF_GRID / max(case.labels.labels.shape)
+    ):
+        raise InputError(
+            f"--ct {path}: its voxels are not the labels'. Give the CT that they were drawn on, or "
+            "resample one of the two."
+        )
+    if case.patient.differs(raw.patient):
+        raise InputError(f"--ct {path} is of {raw.patient}, the labels of {case.patient}.")
+    return replace(case, ct=crop_ct(volume, case.labels))
+
+
+def _start(affine: np.ndarray, labels: LabelVolume) -> list[int]:
+    """The index, on a grid with the labels' steps, of the labels' first voxel."""
+    return np.rint((np.linalg.inv(affine) @ labels.lps_from_index)[:3, 3]).astype(int).tolist()
+
+
+def _on_grid(array: np.ndarray, affine: np.ndarray, labels: LabelVolume, fill: float) -> np.ndarray:
+    """An array with the labels' steps on the labels' grid, ``fill`` beyond its edge."""
+    shape, start = labels.labels.shape, _start(affine, labels)
+    inner = grown_box([slice(a, a + n) for a, n in zip(start, shape, strict=True)], array.shape)
+    out = np.full(shape, fill, array.dtype)
+    target = tuple(slice(s.start - a, s.stop - a) for s, a in zip(inner, start, strict=True))
+    out[target] = array[inner]
+    return out
+
+
 def crop_ct(volume: Volume, labels: LabelVolume) -> Volume:
     """The CT on the labels' grid, air beyond the scan's edge."""
-    shape = labels.labels.shape
-    index_from_lps = np.linalg.inv(volume.lps_from_index)
-    start = np.rint((index_from_lps @ labels.lps_from_index)[:3, 3]).astype(int)
-    inner = grown_box([slice(a, a + n) for a, n in zip(start, shape, strict=True)], volume.hu.shape)
-    hu = np.full(shape, -1000.0, np.float32)
-    target = tuple(slice(s.start - a, s.stop - a) for s, a in zip(inner, start, strict=True))
-    hu[target] = volume.hu[inner]
+    hu = _on_grid(volume.hu, volume.lps_from_index, labels, -1000.0)
     return Volume(hu, labels.lps_from_index)

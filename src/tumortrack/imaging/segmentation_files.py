@@ -148,6 +148,8 @@ def write_dicom_seg(
     ct = find_series(folder, series)
     import pydicom
 
+    if max(ct.frames):
+        raise InputError(f"{folder} holds a multi-frame CT. --dicom needs one file for each slice.")
     if patient.differs(ct.patient):
         raise InputError(
             f"{folder} is of {ct.patient}, the labels are of {patient}. Give the CT of that "

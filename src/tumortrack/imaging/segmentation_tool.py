@@ -31,6 +31,7 @@ from tumortrack.imaging.case import Case
 from tumortrack.imaging.nifti import write_nifti, write_volume_nifti
 from tumortrack.imaging.options import PrepareOptions
 from tumortrack.imaging.prepare import OF_LABELS, crop_ct, patient_of, prepare, refuse_unused
+from tumortrack.imaging.segments import is_tumor
 from tumortrack.imaging.volume import read_raw, volume_of
 
 # Datasets of TotalSegmentator's tasks, and the masks in them that count as tumors.
@@ -40,7 +41,6 @@ _LESIONS = {
     "liver_vessels": (8, ("liver_tumor",)),
     "kidney_cysts": (789, ("kidney_cyst_left", "kidney_cyst_right")),
 }
-_TUMOR = re.compile("tumou?r|neoplasm|lesion|cancer|carcinoma|mass")
 _SAME_MM = 0.01  # of the label map's grid
 # Masks of the organ and of its tumors; None: the tool knows no tumors.
 Masks = tuple[Bool[np.ndarray, "i j k"], Bool[np.ndarray, "i j k"] | None]
@@ -250,7 +250,7 @@ def _numbers(labels: dict[str, Any], organ: str, where: Path) -> tuple[list[int]
     except (TypeError, ValueError) as error:
         raise InputError(f"{where}: its labels {str(labels)[:200]} have no numbers.") from error
     names = {organ, f"{organ}_left", f"{organ}_right", f"left_{organ}", f"right_{organ}"}
-    tumors = {n for name in numbers if _TUMOR.search(name) for n in numbers[name]}
+    tumors = {n for name in numbers if is_tumor(name) for n in numbers[name]}
     organs = {n for name in names & numbers.keys() for n in numbers[name]} - tumors
     if not organs:
         raise InputError(

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int32, UInt8
 from scipy import ndimage
 
+from tumortrack.core.case_warning import CaseWarning
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import spacing_mm
 from tumortrack.core.organ import KIDNEY, Organ
@@ -23,6 +24,7 @@ _MIDLINE_MARGIN_MM = 20.0
 _PAIR_APART_MM = 60.0  # between centres, left to right: kidneys have over 100, a split organ less
 _MOST_TUMORS = 254
 _MOST_OF_BORDER = 1 / 3  # of the map's outermost voxels; an organ cut in half covers a quarter
+_SPECK_ML = 0.5  # a larger piece that is dropped weakens the case
 _MOST_RUGGED = 60.0  # area of all labels' borders over volume^(2/3); a voxelised ball has 7
 
 
@@ -64,7 +66,7 @@ def select_labels(
     label_volume: LabelVolume,
     side: Side = UNKNOWN,
     organ: int = ORGAN,
-    tumor: int | None = None,
+    tumors: tuple[int, ...] | None = None,
     min_tumor_ml: float = MIN_TUMOR_ML,
     kind: Organ = KIDNEY,
 ) -> tuple[LabelVolume, list[str], Side]:
@@ -79,7 +81,7 @@ def select_labels(
 
     Args:
         side: the PATIENT's ``left`` or ``right``; unknown: the organ with the most tumor.
-        tumor: the tumor's label; None takes every other label from 2 up, 0 takes none.
+        tumors: their labels; None takes every other label from 2 up.
         kind: which organ it is; only paired organs are chosen by side.
 
     Returns:
@@ -88,19 +90,22 @@ def select_labels(
     """
     labels, affine = label_volume.labels, label_volume.lps_from_index
     present = [int(n) for n in np.flatnonzero(grid.label_counts(labels)) if n > 0]
-    tumors = _tumor_labels(present, organ, tumor)
+    tumors = _tumor_labels(present, organ, tumors)
     middle = affine @ [*(np.array(labels.shape) / 2), 1]
     counted = _among(labels, (organ, *tumors))
     _check_border(counted)
     box = grid.bounding_box(counted, affine, 2.0)
     affine = grid.moved_origin(affine, box)
     numbered, _ = grid.components(counted[box])
-    pieces = _Pieces(labels[box], numbered, affine, organ, tuple(tumors))
+    pieces = _Pieces(labels[box], numbered, affine, organ, tumors)
     organs = _large_pieces(pieces)
     pieces, notes, apart = _attach_tumors(pieces, organs, min_tumor_ml)
     notes += _left_out(pieces, organs, apart, min_tumor_ml)
     chosen, note, side = _choose(pieces, organs, side, float(middle[0]), kind)
     notes += [note] if note else []
+    for n in set(organs) - {chosen}:
+        if not (kind.in_pairs and abs(pieces.x_mm(n) - pieces.x_mm(chosen)) > _PAIR_APART_MM):
+            notes.append(CaseWarning("dropped", what=kind.words, ml=float(pieces.whole_ml[n])))
     if not _MIN_ML <= (ml := pieces.whole_ml[chosen]) <= _MAX_ML:
         raise InputError(
             f"label {organ} and its tumors fill {ml:.1f} ml; an organ has "
@@ -149,23 +154,23 @@ def _check_ruggedness(labels: np.ndarray, affine: np.ndarray) -> None:
         )
 
 
-def _tumor_labels(present: list[int], organ: int, tumor: int | None) -> list[int]:
+def _tumor_labels(
+    present: list[int], organ: int, tumors: tuple[int, ...] | None
+) -> tuple[int, ...]:
     if not present:
         raise InputError("the label map is empty: every voxel is 0.")
     if organ not in present:
         raise InputError(
             f"the label map has no organ label {organ}; it has {present}. Give --organ N."
         )
-    if tumor is None:
-        return [n for n in present if n >= FIRST_TUMOR and n != organ]
-    if tumor == 0:
-        return []
-    if tumor not in present or tumor == organ:
+    if tumors is None:
+        return tuple(n for n in present if n >= FIRST_TUMOR and n != organ)
+    if missing := set(tumors) - set(present) | set(tumors) & {organ}:
         raise InputError(
-            f"the label map has no tumor label {tumor} besides the organ; it has {present}. "
+            f"the label map has no tumor label {min(missing)} besides the organ; it has {present}. "
             "Give --tumor N, or --tumor 0 for none."
         )
-    return [tumor]
+    return tumors
 
 
 def _large_pieces(pieces: _Pieces) -> list[int]:
@@ -250,6 +255,8 @@ def _left_out(
     other."""
     notes: list[str] = []
     specks_ml = np.delete(pieces.whole_ml, [0, *apart, *organs])
+    large_ml, specks_ml = specks_ml[specks_ml >= _SPECK_ML], specks_ml[specks_ml < _SPECK_ML]
+    notes += [CaseWarning("dropped", what="label map", ml=ml) for ml in large_ml.tolist()]
     if count := int((specks_ml > 0).sum()):
         notes.append(f"{count} specks beside the organ dropped ({specks_ml.sum():.2f} ml together)")
     if not apart:
@@ -260,10 +267,9 @@ def _left_out(
             f"the only tumor ({text}) lies more than {_GAP_MM:g} mm from the organ. Check the "
             "labels and --organ, or give --tumor 0 to leave it out."
         )
-    notes.append(
-        f"LEFT OUT: tumor of {text}, more than {_GAP_MM:g} mm from the organ. If it belongs to "
-        "it, close the gap in the label map"
-    )
+    for n in apart:
+        ml = float(pieces.tumor_ml[n])
+        notes.append(CaseWarning("left_out", what="tumor", ml=ml, mm=_GAP_MM))
     return notes
 
 
@@ -308,7 +314,7 @@ def _choose(
 
 
 def _number_tumors(
-    labels: np.ndarray, tumors: list[int], voxel_volume_ml: float, min_tumor_ml: float
+    labels: np.ndarray, tumors: tuple[int, ...], voxel_volume_ml: float, min_tumor_ml: float
 ) -> tuple[np.ndarray, list[str]]:
     """Labels 1, 2, 3, ... without gaps, and notes on what was dropped or renumbered."""
     notes: list[str] = []
@@ -339,3 +345,21 @@ def _number_tumors(
     if number == FIRST_TUMOR:
         notes.append("no tumor in this organ")
     return out, notes
+
+
+def neighbours(
+    labels: UInt8[np.ndarray, "i j k"],
+    chosen: UInt8[np.ndarray, "i j k"],
+    used: tuple[int, ...],
+) -> dict[int, float]:
+    """Labels of a map that touch what was ``chosen`` of it, on the same grid, and are not ``used``:
+    by label, the share of its surface that lies on what is used. A tumor inside has 1."""
+    near = ndimage.binary_dilation(chosen > 0)
+    touching = set(np.unique(labels[near]).tolist()) - {0, *used}
+    beside = ndimage.binary_dilation(_among(labels, used) & (chosen > 0))
+    shares = {}
+    for label in touching:
+        mask = labels == label
+        surface = mask & ~ndimage.binary_erosion(mask, border_value=1)
+        shares[label] = float(np.count_nonzero(surface & beside) / (surface.sum() + 1e-9))
+    return {label: share for label, share in shares.items() if share > 0}

@@ -3,7 +3,7 @@ blurred, resampled mask of each part, at the level where the mesh has the labels
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
@@ -34,6 +34,7 @@ def surfaces(
 ) -> tuple[Anatomy, dict[str, list[Any]]]:
     """The organ's surface (all labels from 1 up) and one per tumor, LPS mm, faces outward; and a
     report: lists with an entry per part, ``names``, ``labels_ml``, ``mesh_ml``, ``change_percent``,
+    ``dropped_ml``: of pieces that hang together by too little to stay joined on a smooth surface,
     and the vertices' distances to the labels' boundary, ``distance_mean_voxels``, ... Raises
     InputError: no organ, a gap in the tumor numbers, or a part too small for a surface."""
     labels, affine = label_volume.labels, label_volume.lps_from_index
@@ -47,11 +48,11 @@ def surfaces(
     area_mm2 = 1.35 * 4.836 * volume_mm3 ** (2 / 3)  # a kidney has 1.35 times a sphere's area
     coarsest = 1.5 * max(1.0, volume_mm3 / _LARGE_MM3)
     step = float(np.clip(np.sqrt(2.2 * area_mm2 / _TRIANGLES), 0.4, coarsest))
-    parts, rows = [], []
+    parts, rows, dropped_mm3 = [], [], list[float]()
     for name, mask in zip(names, masks, strict=True):
         if not mask.any():
             raise InputError(f"the labels have no voxel of {name}; number the tumors without gap.")
-        mesh = surface_of(name, mask, affine, step)
+        mesh = surface_of(name, mask, affine, step, dropped_mm3=dropped_mm3)
         ml, mesh_ml = float(mask.sum()) * voxel_ml(affine), mesh.volume_ml
         distance = _boundary_distance(mesh, mask, affine)
         p95 = np.percentile(distance, 95)
@@ -60,6 +61,7 @@ def surfaces(
     columns = [[round(float(x), 4) for x in column] for column in zip(*rows, strict=True)]
     report: dict[str, list[Any]] = {
         "names": list(names),
+        "dropped_ml": [round(mm3 / 1000, 4) for mm3 in dropped_mm3],
         **dict(zip(_REPORTED, columns, strict=True)),
     }
     return Anatomy(tuple(parts), kind), report
@@ -71,9 +73,11 @@ def surface_of(
     affine: np.ndarray,
     step_mm: float,
     keep: Callable[[Mesh], Mesh] | None = None,
+    dropped_mm3: list[float] | None = None,
 ) -> Mesh:
     """The closed surface of a mask, LPS mm, faces outward, with the mask's volume. ``keep`` selects
-    pieces; None: the largest. Raises InputError: the mask is too small or thin for a surface."""
+    pieces; None: the largest, and what the others have is added to ``dropped_mm3``. Raises
+    InputError: the mask is too small or thin for a surface."""
     spacing = spacing_mm(affine)
     box = tight_box(mask)
     step_mm = min(step_mm, float(extent_mm(box, spacing).min()) / _STEPS_ACROSS)
@@ -91,7 +95,7 @@ def surface_of(
     # A first guess: the level that as many cells exceed as make the volume.
     level = float(-np.partition(-field.ravel(), n := int(wanted_mm3 / cell_mm3))[n])
 
-    def march(level: float) -> tuple[Mesh, float]:
+    def march(level: float) -> tuple[Mesh, float, float]:
         from skimage import measure
 
         if not field.min() < level < field.max():
@@ -99,26 +103,31 @@ def surface_of(
         vertices, faces, _, _ = measure.marching_cubes(field, level, gradient_direction="ascent")
         vertices_mm = transform_points(affine, vertices.astype(np.float64) * scale + offset)
         mesh = Mesh(vertices_mm, faces[:, ::-1] if np.linalg.det(affine[:3, :3]) < 0 else faces)
+        whole_mm3 = abs(mesh.volume_mm3)
         mesh = (keep or largest_shell)(mesh)
         mesh = mesh if mesh.volume_mm3 > 0 else Mesh(mesh.vertices_mm, mesh.faces[:, ::-1])
-        return mesh, mesh.volume_mm3 / wanted_mm3 - 1
+        return mesh, mesh.volume_mm3 / wanted_mm3 - 1, max(0.0, whole_mm3 - mesh.volume_mm3)
 
-    return _keep_volume(march, level, float(field.max()))
+    mesh, lost_mm3 = _keep_volume(march, level, float(field.max()))
+    if dropped_mm3 is not None:
+        dropped_mm3.append(lost_mm3)
+    return mesh
 
 
 def _keep_volume(
-    march: Callable[[float], tuple[Mesh, float]], level: float, highest: float
-) -> Mesh:
-    """The mesh with the smallest error of volume: secant steps on the level, else bisection.
+    march: Callable[[float], tuple[Mesh, float, float]], level: float, highest: float
+) -> tuple[Mesh, float]:
+    """The mesh with the smallest error of volume, and what other pieces have, mm3: secant steps on
+    the level, else bisection.
 
     The volume falls with the level, but may jump where a piece comes off; then no level is exact.
     """
     too_large, too_small = 0.0, highest
     tried: list[tuple[float, float]] = []
     for _ in range(_MOST_MARCHES):
-        mesh, error = march(level)
+        mesh, error, lost_mm3 = march(level)
         if all(abs(error) < abs(other) for _, other in tried):
-            best = mesh
+            best = mesh, lost_mm3
         tried.append((level, error))
         if error > 0:
             too_large = level
@@ -157,13 +166,20 @@ def _boundary_distance(mesh: Mesh, mask: np.ndarray, affine: np.ndarray) -> np.n
 
 def largest_shell(mesh: Mesh) -> Mesh:
     """The connected piece with the largest absolute volume, without shells inside it and specks."""
+    return next(shells(mesh), mesh)
+
+
+def shells(mesh: Mesh) -> Iterator[Mesh]:
+    """Connected pieces, the largest absolute volume first; walls of cavities have negative ones."""
     if len(mesh.faces) == 0:
-        return mesh
+        return
     i, j, k = mesh.faces.T
     n = len(mesh.vertices_mm)
     graph = coo_array((np.ones(2 * len(i), np.int8), (np.r_[i, j], np.r_[j, k])), shape=(n, n))
     piece = connected_components(graph, directed=False)[1][i]
     a, b, c = (mesh.vertices_mm[corner] - mesh.vertices_mm[0] for corner in (i, j, k))
     volumes = np.bincount(piece, np.einsum("ij,ij->i", a, np.cross(b, c)))  # times 6, signed
-    used, compact = np.unique(mesh.faces[piece == np.abs(volumes).argmax()], return_inverse=True)
-    return Mesh(mesh.vertices_mm[used], compact.reshape(-1, 3))
+    for number in np.argsort(-np.abs(volumes)):
+        if volumes[number]:  # vertices without faces have none
+            used, compact = np.unique(mesh.faces[piece == number], return_inverse=True)
+            yield Mesh(mesh.vertices_mm[used], compact.reshape(-1, 3))

@@ -7,20 +7,30 @@ before it is trusted.
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import UInt8
 
 from tumortrack.core.errors import InputError
 from tumortrack.core.tables import read_table
 from tumortrack.core.types import LabelVolume, Volume
 from tumortrack.imaging import grid
 from tumortrack.imaging.dicom import read_dicom
+from tumortrack.imaging.dicom_segmentation import read_segmentation
 from tumortrack.imaging.nifti import read_nifti
+from tumortrack.imaging.segments import Parts, painted
 
-_DETACHED = (".nhdr", ".mhd", ".hdr", ".img")
+_DETACHED = (".nhdr", ".hdr", ".img")
+_VOLUMES = (".nii", ".nii.gz", ".nrrd")
 _MOST_LABELS = 32  # distinct values that still look like a label map
+_SAME_MM = 0.01  # of the grids of several files
+_OFF_WHOLE = 1e-3  # of labels that were stored with a scale, as 1.00000002
 _MAX_HEADER = 2**20
+_MOST_SEGMENTS = 1000
+_SEGMENT = re.compile(r"Segment\d+_")
 _IS_GZIP = {"raw": False, "gzip": True, "gz": True}
 _NAMES = read_table("tumortrack.imaging", "nrrd_types.toml", dict[str, list[str]])
 _TYPES = {name: dtype for dtype, names in _NAMES.items() for name in names}
@@ -42,6 +52,8 @@ def read_raw(path: Path, series: str | None = None) -> grid.RawVolume:
         raise InputError(f"{path} does not exist or is no file (but a pipe or a device).")
     if path.stat().st_size == 0:
         raise InputError(f"{path} is empty (0 bytes).")
+    if name.endswith((".dcm", ".ima")) or _is_dicom(path):
+        return read_segmentation(path) or read_dicom(path, series)
     if name.endswith((".nii", ".nii.gz")):
         return read_nifti(path)
     if name.endswith(".nrrd"):
@@ -51,9 +63,20 @@ def read_raw(path: Path, series: str | None = None) -> grid.RawVolume:
             f"{path} is a header whose voxels lie in another file; detached data are refused. "
             "Export one .nrrd, .nii or .nii.gz file."
         )
+    grid.check_suffix(path)
     raise InputError(
-        f"{path} is no volume. Allowed: a folder of DICOM slices, .nii, .nii.gz, .nrrd."
+        f"{path} is no volume. Allowed: a folder of DICOM slices, .dcm, .nii, .nii.gz, .nrrd."
     )
+
+
+def _is_dicom(path: Path) -> bool:
+    with path.open("rb") as stream:
+        return stream.read(132)[128:] == b"DICM"
+
+
+def is_volume(path: Path) -> bool:
+    """Whether a file's name says that it is one, other than of DICOM."""
+    return path.name.lower().endswith(_VOLUMES)
 
 
 def read_volume(path: Path, series: str | None = None) -> Volume:
@@ -82,24 +105,73 @@ def volume_of(raw: grid.RawVolume, path: Path) -> Volume:
 def labels_of(raw: grid.RawVolume, path: Path) -> LabelVolume:
     """Raw voxels as labels. Raises InputError: not whole numbers in 0..255, of any type."""
     low, high = float(raw.array.min()), float(raw.array.max())
-    if not (low >= 0 and high <= 255):
+    if not (low >= -_OFF_WHOLE and high <= 255 + _OFF_WHOLE):
         raise InputError(
             f"{path} is no label map: values from {low:g} to {high:g}; whole numbers from 0 to "
             "255 are allowed."
         )
-    labels = raw.array.astype(np.uint8)
-    if raw.array.dtype.kind == "f" and not np.array_equal(labels, raw.array):
+    labels = _whole(raw.array)
+    if labels is None:
         raise InputError(f"{path} is no label map: it has fractions. Whole numbers are needed.")
     return LabelVolume(labels, raw.lps_from_index)
 
 
+def _whole(array: np.ndarray) -> UInt8[np.ndarray, "i j k"] | None:
+    """Numbers from 0 to 255 as whole ones, to which they must be as close as rounding leaves them;
+    None: they are not."""
+    if array.dtype.kind != "f":
+        return array.astype(np.uint8)
+    labels = np.rint(array).astype(np.uint8)
+    return labels if np.allclose(labels, array, rtol=0, atol=_OFF_WHOLE) else None
+
+
+def label_map(raw: grid.RawVolume, parts: Parts, path: Path) -> LabelVolume:
+    """One label map, in which all of the organ has one number. Raises InputError: see
+    ``labels_of``, which names ``path``."""
+    if raw.segments:
+        structures = (n for n in parts.structures.values() if isinstance(n, int))
+        used = *structures, *(parts.tumors or ())
+        return LabelVolume(painted(raw.segments, parts.organ, used), raw.lps_from_index)
+    volume, (first, *others) = labels_of(raw, path), parts.organ
+    same = np.arange(256, dtype=np.uint8)
+    same[others] = first
+    return LabelVolume(same[volume.labels], volume.lps_from_index) if others else volume
+
+
+def read_several(files: Sequence[Path]) -> grid.RawVolume:
+    """Label files with one structure each, numbered in their order and named as the files. Raises
+    InputError: several labels in one, different grids."""
+    first = read_raw(files[0])
+
+    def mask(file: Path) -> np.ndarray:
+        volume = labels_of(read_raw(file), file)
+        labels, affine = volume.labels, volume.lps_from_index
+        same = labels.shape == first.array.shape
+        if not same or not np.allclose(affine, first.lps_from_index, atol=_SAME_MM):
+            raise InputError(
+                f"{file} has another grid than {files[0]}. Export all segments on the same one."
+            )
+        if len(found := np.unique(labels)) > 2 or found[0] != 0:
+            raise InputError(
+                f"{file} has labels {found[:9].tolist()}: of several files each holds one structure"
+                " and 0 around it. Give a label map alone."
+            )
+        return labels > 0
+
+    names = [file.name.split(".")[0] for file in files]
+    segments = tuple(
+        grid.Segment(n, name, partial(mask, file))
+        for n, (name, file) in enumerate(zip(names, files, strict=True), 1)
+    )
+    return grid.RawVolume(first.array, first.lps_from_index, segments=segments)
+
+
 def is_label_map(raw: grid.RawVolume) -> bool:
     """Whether there are only whole numbers in 0..255, at most 32 different ones: no CT is so."""
-    if not (raw.array.min() >= 0 and raw.array.max() <= 255):
+    if not (raw.array.min() >= -_OFF_WHOLE and raw.array.max() <= 255 + _OFF_WHOLE):
         return False
-    labels = raw.array.astype(np.uint8)
-    different = np.count_nonzero(grid.label_counts(labels))
-    return bool(different <= _MOST_LABELS and np.array_equal(labels, raw.array))
+    labels = _whole(raw.array)
+    return labels is not None and int((grid.label_counts(labels) > 0).sum()) <= _MOST_LABELS
 
 
 def _read_nrrd(path: Path) -> grid.RawVolume:
@@ -109,16 +181,19 @@ def _read_nrrd(path: Path) -> grid.RawVolume:
     if encoding not in _IS_GZIP:
         raise InputError(f"{path}: encoding {encoding!r} is not read. Export as raw or gzip.")
     try:
-        shape = tuple(int(n) for n in fields["sizes"].split())
+        layers, shape = 1, tuple(int(n) for n in fields["sizes"].split())
+        if len(shape) == 4 and "segment0_id" in fields:  # the first axis holds layers
+            layers, shape = shape[0], shape[1:]
         dtype = np.dtype(_TYPES[fields["type"].lower()])
         lps_from_index = _lps_from_index(path, fields) if len(shape) == 3 else np.eye(4)
     except (KeyError, ValueError, OverflowError) as error:
         raise InputError(
             f"{path}: the NRRD header is damaged or lacks a field ({error}). Export it again."
         ) from error
-    grid.check_size(path, shape, dtype.itemsize, _IS_GZIP[encoding])
+    grid.check_size(path, shape, layers * dtype.itemsize, _IS_GZIP[encoding])
     grid.check_affine(path, lps_from_index)
-    if fields.get("dimension") != "3":
+    whole = (layers, *shape)
+    if fields.get("dimension") != str(len(fields["sizes"].split())):
         raise InputError(f"{path}: dimension {fields.get('dimension')} is not that of its sizes.")
     if dtype.itemsize > 1:
         if fields.get("endian", "").lower() not in ("little", "big"):
@@ -126,8 +201,47 @@ def _read_nrrd(path: Path) -> grid.RawVolume:
         dtype = dtype.newbyteorder("<" if fields["endian"].lower() == "little" else ">")
     compressed = _IS_GZIP[encoding]
     with grid.volume_stream(path, compressed, start) as stream:
-        array = grid.read_voxels(path, stream, shape, dtype, compressed)
-    return grid.RawVolume(array, lps_from_index)
+        array = grid.read_voxels(path, stream, whole, dtype, compressed)
+    segments = _segments(path, fields, array)
+    array = painted(segments) if layers > 1 else array[0]
+    return grid.RawVolume(array, lps_from_index, segments=segments)
+
+
+def _segments(path: Path, fields: dict[str, str], layers: np.ndarray) -> tuple[grid.Segment, ...]:
+    """Of a .seg.nrrd; numbered by their label values, where these differ, else in their order.
+    Raises InputError: two are the same label of the same layer."""
+    found: dict[tuple[int, int], str] = {}
+    for n in range(_MOST_SEGMENTS):
+        if f"segment{n}_id" not in fields:
+            break
+        value, layer, name = (
+            fields.get(f"segment{n}_{key}", default)
+            for key, default in (("labelvalue", "1"), ("layer", str(n)), ("name", ""))
+        )
+        try:
+            place = int(layer) if len(layers) > 1 else 0, int(value)
+            layers[place[0]]
+        except (ValueError, IndexError) as error:
+            raise InputError(
+                f"{path}: its segment {n} is label {value!r} of layer {layer!r}, which the file "
+                "does not have. Export it again."
+            ) from error
+        if place in found:
+            raise InputError(
+                f"{path}: its segments {found[place]!r} and {name!r} are both label {value} of one "
+                "layer. Export it again."
+            )
+        found[place] = name or fields[f"segment{n}_id"]
+    values = [value for _, value in found]
+    own = len(set(values)) == len(values) and all(0 < value < 256 for value in values)
+    return tuple(
+        grid.Segment(place[1] if own else n, name, partial(_equal, layers[place[0]], place[1]))
+        for n, (place, name) in enumerate(found.items(), 1)
+    )
+
+
+def _equal(array: np.ndarray, value: int) -> np.ndarray:
+    return array == value
 
 
 def _header(path: Path) -> tuple[dict[str, str], int]:
@@ -140,9 +254,9 @@ def _header(path: Path) -> tuple[dict[str, str], int]:
     lines = head[: gap.start() if gap else None].decode("latin-1").replace("\r\n", "\n").split("\n")
     fields: dict[str, str] = {}
     for line in lines[1:]:
-        if not line.startswith("#") and ":=" not in line:
+        if not line.startswith("#") and (":=" not in line or _SEGMENT.match(line)):
             name, _, value = line.partition(":")
-            fields[name.strip().lower()] = value.strip()
+            fields[name.strip().lower()] = value.lstrip("=").strip()
     if gap is None or "data file" in fields or "datafile" in fields:
         raise InputError(f"{path}: its voxels lie in another file. Export one attached .nrrd file.")
     if any(fields.get(name, "0") != "0" for name in ("line skip", "byte skip", "lineskip")):
@@ -160,7 +274,8 @@ def _lps_from_index(path: Path, fields: dict[str, str]) -> np.ndarray:
     units = fields.get("space units", "").replace('"', " ").split()
     if any(unit.lower() not in ("mm", "millimeter", "millimetre") for unit in units):
         raise InputError(f"{path} states its units as {units}; millimetres are needed.")
-    columns = [_vector(part) for part in fields["space directions"].split(")") if part.strip()]
+    directions = fields["space directions"].removeprefix("none")  # of the axis of layers
+    columns = [_vector(part) for part in directions.split(")") if part.strip()]
     lps_from_index = np.eye(4)
     lps_from_index[:3, :3] = np.array(columns).T
     lps_from_index[:3, 3] = _vector(fields.get("space origin", "(0,0,0)").rstrip(") "))

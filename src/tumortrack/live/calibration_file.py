@@ -2,20 +2,28 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from tumortrack.core.config import Config, from_builtins
 from tumortrack.core.errors import InputError
-from tumortrack.core.geometry import read_rigid
-from tumortrack.core.store import read_json
+from tumortrack.core.geometry import read_rigid, rigid
+from tumortrack.core.store import read_file, read_json
+from tumortrack.core.tables import number_in, text_of
 from tumortrack.live.values import PublishedFrame
 
 _LARGEST_MM, _LARGEST_DEG = 100.0, 10.0  # with more, it is no calibration
 _NOT_UNIT = 1e-3  # tolerance of a normal's length: files have few digits
 _TOOL = "tool_from_camera"
+
+_YAML = (".yaml", ".yml", ".calib")
+_LARGEST_YAML = 2**16  # bytes
+_PAIR = re.compile(r"(\w+)[ \t]*:[ \t]*([^\s{},#]*)")
+_PLACE, _TURN = ("x", "y", "z"), ("qx", "qy", "qz", "qw")
 
 Rows = tuple[tuple[float, float, float, float], ...]
 
@@ -52,10 +60,13 @@ class CalibrationFile(Config, frozen=True, kw_only=True):
 
 
 def read_frames(path: Path, moves: bool = False) -> PublishedFrame:
-    """The robot's frame from a calibration file (JSON; keys as in ``CalibrationFile``). ``moves``:
-    for a camera on a tool. Raises InputError if it is missing, or has an unknown key, a matrix that
-    is no rigid transform, or not exactly one way of giving the pose."""
-    file = from_builtins(read_json(path), CalibrationFile, str(path))
+    """The robot's frame from a calibration file: JSON with the keys of ``CalibrationFile``, or YAML
+    as easy_handeye (ROS 1 and 2) writes it. ``moves``: for a camera on a tool. Raises InputError if
+    it is missing, or has an unknown key, a matrix that is no rigid transform, or not exactly one
+    way of giving the pose."""
+    of_ros = path.suffix.lower() in _YAML
+    given = _easy_handeye(path) if of_ros else read_json(path)
+    file = from_builtins(given, CalibrationFile, str(path))
     matrices = {
         name: read_rigid(rows, file.unit, f"{path}: {name}")
         for name in file.__struct_fields__
@@ -94,3 +105,29 @@ def read_frames(path: Path, moves: bool = False) -> PublishedFrame:
         raise InputError(f"{path}: table_in_camera is of a camera that stands still.")
     error = file.error_mm, file.error_deg
     return PublishedFrame(file.frame_id, robot_from_camera, True, camera, table, *error, moves)
+
+
+def _easy_handeye(path: Path) -> dict[str, Any]:
+    """The keys of a ``CalibrationFile`` from what easy_handeye writes, which is in metres."""
+    found, within = dict[str, str](), ""
+    for key, value in _PAIR.findall(text_of(read_file(path, _LARGEST_YAML), str(path))):
+        within = key if not value else within
+        name = f"q{key}" if within == "rotation" and key in "xyzw" else key
+        if value and found.setdefault(name, value.strip("\"'")) != value.strip("\"'"):
+            raise InputError(f"{path} has {name!r} twice; easy_handeye writes it once.")
+    on_hand = found.get("eye_on_hand") or found.get("calibration_type")
+    needed = *_PLACE, *_TURN, "robot_base_frame", "tracking_base_frame"
+    if on_hand is None or (missing := [name for name in needed if name not in found]):
+        lack = "eye_on_hand" if on_hand is None else ", ".join(missing)
+        raise InputError(
+            f"{path} lacks {lack}, which easy_handeye writes. Allowed: such a file, or JSON."
+        )
+    metres, turn = (
+        [number_in(found[name], f"{path}: {name}") for name in names] for names in (_PLACE, _TURN)
+    )
+    if not abs(np.linalg.norm(turn) - 1) < _NOT_UNIT:
+        raise InputError(f"{path}: {', '.join(_TURN)} must have length 1.")
+    moves = on_hand.lower() in ("true", "eye_in_hand", "eye_on_hand")
+    pose = rigid(Rotation.from_quat(turn).as_matrix(), np.array(metres)).tolist()
+    frames = {"frame_id": found[needed[-2]], "camera_frame_id": found[needed[-1]]}
+    return {"unit": "m", _TOOL if moves else "robot_from_camera": pose, **frames}

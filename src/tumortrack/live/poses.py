@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 from abc import abstractmethod
 from bisect import bisect_left
+from collections.abc import Callable
 from pathlib import Path
 from typing import ClassVar
 
@@ -16,6 +17,7 @@ from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.geometry import HERE, Affine, rigid
 from tumortrack.core.report import Finding
 from tumortrack.core.store import read_file
+from tumortrack.core.tables import number_in, read_rows, whole_in
 from tumortrack.live.values import Observation
 
 # Between two poses an arm that accelerates by 1 m/s2 deviates from linear interpolation by at most
@@ -120,31 +122,38 @@ class FilePoses(CameraPoses):
     InputError: there is no such table, or it is damaged."""
 
     def __init__(self, path: Path) -> None:
-        head, *lines = read_file(path, _LARGEST_TABLE).decode(errors="replace").split("\n")
-        rows = [line.strip().split(",") for line in lines if line.strip()]
-        columns = 7 + (head.strip() == COLUMNS + CONTACT)
-        try:
-            stamps_ns = np.array([int(row[0]) for row in rows])
-            numbers = np.array([row[2:] for row in rows], float).reshape(len(rows), columns)
-        except (ValueError, OverflowError) as error:
-            raise InputError(f"{path} is not a table of poses ({COLUMNS}): {error}.") from error
-        names, (numbers, touches) = {row[1].strip() for row in rows}, np.hsplit(numbers, [7])
+        table = read_rows(read_file(path, _LARGEST_TABLE), str(path))
+        names, at = COLUMNS.split(","), table.columns
+        names += [CONTACT[1:]] * (CONTACT[1:] in at)
+        if set(names) != at.keys():
+            raise InputError(
+                f"{path} is not a table of poses: its columns are {','.join(table.header)[:120]}; "
+                f"they must be {COLUMNS}, and {CONTACT[1:]} of a tool."
+            )
+
+        def column(name: str, read: Callable[[str, str], float]) -> list[float]:
+            return [
+                read(row[at[name]], f"{path}, line {n}, column {name}") for n, row in table.rows
+            ]
+
+        stamps_ns = np.array(column(names[0], whole_in), np.int64)
+        numbers = np.stack([column(name, number_in) for name in names[2:]], axis=1)
+        frames = {row[at["frame_id"]] for _, row in table.rows}
+        numbers, touches = np.hsplit(numbers, [7])
         lengths = np.linalg.norm(numbers[:, 3:], axis=1)
         faults = {
-            f"its first line must be {COLUMNS}": head.strip() in (COLUMNS, COLUMNS + CONTACT),
             "contact must be 0 or 1": np.isin(touches, (0, 1)).all(),
-            "it has no poses": len(rows) > 0,
             "stamps must rise": (np.diff(stamps_ns) > 0).all(),
-            "frame_id must be one name, in every row": len(names) == 1 and "" not in names,
+            "frame_id must be one name, in every row": len(frames) == 1 and "" not in frames,
             "places must be finite": np.isfinite(numbers).all(),
             "qw, qx, qy, qz must have length 1": (np.abs(lengths - 1) < _NOT_UNIT).all(),
         }
         if wrong := [what for what, met in faults.items() if not met]:
             raise InputError(f"{path} is not a table of poses: {wrong[0]}.")
-        (self.frame_id,), self.poses = names, PoseBuffer()
+        (self.frame_id,), self.poses = frames, PoseBuffer()
         turns = Rotation.from_quat(numbers[:, 3:], scalar_first=True).as_matrix()
         for stamp_ns, turn, shift in zip(stamps_ns.tolist(), turns, numbers[:, :3], strict=True):
-            self.poses.add(stamp_ns, rigid(turn, shift), len(rows))
+            self.poses.add(stamp_ns, rigid(turn, shift), len(stamps_ns))
         said = (touches.ravel() == 1).tolist()  # nothing without that column
         self.touches = list(zip(stamps_ns.tolist(), said, strict=False))
 

@@ -6,6 +6,7 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
+from tumortrack.core.case_warning import CaseWarning, warnings_in
 from tumortrack.core.config import Config
 from tumortrack.core.organ import Organ, organ_in
 from tumortrack.core.patient import Patient, patient_in
@@ -44,6 +45,11 @@ class Model(ABC):
     @property
     def organ(self) -> Organ:
         return organ_in(self.provenance.get("organ"), "provenance")
+
+    @property
+    def warnings(self) -> tuple[CaseWarning, ...]:
+        """What weakens the case that it is made of."""
+        return warnings_in(self.provenance.get("warnings"), "provenance")
 
     @abstractmethod
     def files(self) -> dict[str, bytes]:

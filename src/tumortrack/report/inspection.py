@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from tumortrack.core import store
+from tumortrack.core.case_warning import warnings_in
 from tumortrack.core.errors import InputError
 from tumortrack.core.tables import read_table
 
@@ -89,12 +90,15 @@ def _json(path: Path) -> list[str]:
 def _with_figures(content: Content, folder: Path) -> Content:
     """The entries of a file, and what is computed from them."""
     figures: dict[str, Any] = {}
+    if "up_lps" in content or "familiar" in content:
+        about = content.get("provenance", content)
+        figures["weak"] = list(warnings_in(about.get("warnings"), str(folder)))
     if "up_lps" in content:  # a case
-        figures = {"lies": _poses(content["rotations"], content["tilt_degrees"])}
+        figures["lies"] = _poses(content["rotations"], content["tilt_degrees"])
         figures |= _of_the_cases_model(folder)
     elif "familiar" in content:  # a model
         pose = content["config"]["scene"]["pose"]
-        figures = {"lies": _poses(pose["rotations"], pose["tilt_deg"])}
+        figures["lies"] = _poses(pose["rotations"], pose["tilt_deg"])
         method = "labels" if "network" in content["config"] else "registers"
         figures |= {"does": _TABLE["texts"][method], **_of_model(content, folder)}
         figures["part_names"] = ", ".join(content["parts"])
@@ -234,6 +238,7 @@ def _volume(path: Path) -> Iterable[str]:
     from tumortrack.imaging.volume import is_label_map, read_raw
 
     raw = read_raw(path)
+    names = {segment.number: f" ({segment.name})" for segment in raw.segments}
     spacing_mm = np.linalg.norm(raw.lps_from_index[:3, :3], axis=0)
     size, spacing = " x ".join(map(str, raw.array.shape)), [f"{mm:.3g}" for mm in spacing_mm]
     yield f"a {'label map' if is_label_map(raw) else 'CT'}; `tumortrack prepare` reads it"
@@ -241,7 +246,7 @@ def _volume(path: Path) -> Iterable[str]:
     if is_label_map(raw):
         labels, counts = np.unique(raw.array[raw.array > 0], return_counts=True)
         for label, ml in zip(labels, counts * spacing_mm.prod() / 1000, strict=True):
-            yield f"label {label:g}: {ml:.1f} ml"
+            yield f"label {label:g}{names.get(int(label), '')}: {ml:.1f} ml"
     else:
         yield f"{raw.array.min():g} to {raw.array.max():g} HU"
 

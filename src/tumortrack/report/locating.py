@@ -85,7 +85,7 @@ def locate(given: Path, clouds: Sequence[Path], options: LocateOptions) -> Locat
     model = load_model(folder, options.device)
     tracker = Tracker(model, options.advise)
     about: dict[str, Any] = {
-        "notes": _notes(views, points, tracker.anatomy_ct, options),
+        "notes": [*model.warnings, *_notes(views, points, tracker.anatomy_ct, options)],
         "input": [],
         "model": model.provenance,
         "model_sha256": store.sha256_of(folder / store.MANIFEST),

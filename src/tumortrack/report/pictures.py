@@ -16,7 +16,7 @@ from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from tumortrack.core.colours import name_colour
+from tumortrack.core.colours import name_colour, structure_colour
 from tumortrack.core.estimate import NO_CHECK_FAILED, UNVERIFIED
 from tumortrack.core.geometry import DIRECTIONS_LPS, transform_points
 from tumortrack.core.organ import is_tumor, organ_name
@@ -176,6 +176,7 @@ def qc_picture(
     frame = view.frame_around(anatomy.organ.vertices_mm, 8.0).widened(_ASPECT)
     colors = _part_colors(anatomy)
     tumors = [Body(*tumor) for tumor in zip(anatomy.tumors, colors[1:], strict=True)]
+    tumors += [Body(mesh, color) for _, mesh, color in _structures(anatomy)]
     drawing.show_bodies(axes, view, [*tumors, Body(anatomy.organ, ORGAN, 0.38)], frame)
     drawing.finish_view(axes, frame)
     _write_letters(axes, view, "black")
@@ -188,6 +189,7 @@ def qc_picture(
         Patch(facecolor=color, label=f"{words(name)} {part.volume_ml:.1f} ml")
         for color, name, part in zip(colors, anatomy.names, anatomy.parts, strict=True)
     ]
+    handles += [Patch(facecolor=c, label=words(name)) for name, _, c in _structures(anatomy)]
     drawing.add_words(figure, title, warnings, (), handles)
     drawing.save(figure, path)
 
@@ -207,7 +209,8 @@ def _draw_plane(
     array = shown.hu if isinstance(shown, Volume) else shown.labels
     values = slice_volume(array, shown.lps_from_index, view, frame, through_mm)
     axes.imshow(np.ma.masked_invalid(values), cmap="gray", vmin=low, vmax=high, extent=frame.extent)
-    for color, part in zip(_part_colors(anatomy), anatomy.parts, strict=True):
+    structures = ((color, mesh) for _, mesh, color in _structures(anatomy))
+    for color, part in (*zip(_part_colors(anatomy), anatomy.parts, strict=True), *structures):
         lines = drawing.section(part, view, through_mm)
         drawing.draw_lines(axes, lines, color=color, linewidth=1.7)
     drawing.finish_view(axes, frame, background="black")
@@ -271,6 +274,14 @@ def _write_letters(axes: Axes, view: ParallelView, color: str) -> None:
     style = {**CENTRED, "fontsize": 13, "fontweight": "bold", "color": color}
     for border, letter in border_letters(view).items():
         axes.text(*_NEAR_BORDER[border], letter, transform=axes.transAxes, gid=border, **style)
+
+
+def _structures(anatomy: Anatomy) -> list[tuple[str, Mesh, RGB]]:
+    """Name, surface and colour of each."""
+    return [
+        (name, mesh, rgb(structure_colour(number)))
+        for number, (name, mesh) in enumerate(anatomy.structures.items())
+    ]
 
 
 def _part_colors(anatomy: Anatomy) -> list[RGB]:

@@ -160,7 +160,8 @@ def check_case(model: Model, folders: list[Path]) -> None:
             raise InputError(
                 f"{folder} shows another case than the one that this model is of, so the "
                 "figures would mean nothing. Make scenes of the model's own case with: "
-                "tumortrack simulate CASE DATASET."
+                "tumortrack simulate CASE DATASET. Another reader's case of the same organ may be "
+                "the truth: take case_sha256 out of the scenes' meta.json."
             )
 
 

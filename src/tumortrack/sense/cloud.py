@@ -75,7 +75,9 @@ def seen_points(
     """The points that a camera can have measured, and notes on what was dropped: points without
     return (NaN, infinite, or exactly 0, 0, 0, as in RealSense's and organised clouds), and up to
     1 % beyond 20 m. Raises InputError, which names the cloud, if more lie beyond."""
-    returned = np.isfinite(points_mm).all(axis=1) & (points_mm != 0).any(axis=1)
+    # The largest float: what some cameras write for no return.
+    returned = (np.abs(points_mm) < np.finfo(np.float32).max).all(axis=1)
+    returned &= (points_mm != 0).any(axis=1)
     near = np.abs(points_mm).max(axis=1, initial=0) <= _FARTHEST_MM
     missing, far = len(points_mm) - int(returned.sum()), int((returned & ~near).sum())
     if far > _MOST_FAR * returned.sum():

@@ -25,9 +25,10 @@ from tumortrack.core.types import DepthFrame, Intrinsics, SensorCloud
 from tumortrack.sense.camera import plausible
 from tumortrack.sense.cloud import seen_points
 from tumortrack.sense.ply import parse_ply_properties
+from tumortrack.sense.units import depths_mm
 
-CLOUD_SUFFIXES = (".ply", ".pcd", ".npz")
-DEPTH_SUFFIXES = (".png", ".tif", ".tiff")
+CLOUD_SUFFIXES = (".ply", ".pcd", ".npz", ".npy")
+DEPTH_SUFFIXES = (".png", ".tif", ".tiff", ".npy")  # an array may be either
 DEPTH_UNIT_MM = 0.1  # the D405's default
 LARGEST_FILE = 256 * 2**20  # bytes, also of what a compressed file unpacks to
 _PINHOLE_KEYS = ("width", "height", "fx", "fy", "cx", "cy")
@@ -81,7 +82,7 @@ def read_poses(path: Path, count: int) -> tuple[str, tuple[Affine, ...]]:
 
 
 def read_cloud(path: Path, unit: Literal["mm", "m"] = "mm") -> tuple[SensorCloud, tuple[str, ...]]:
-    """A cloud in the camera frame from .ply, .pcd (all three encodings) or .npz, without what
+    """A cloud in the camera frame from .ply, .pcd (all three encodings), .npz or .npy, without what
     ``cloud.seen_points`` drops, and its notes. Whether it can be an organ in mm is left to
     ``cloud.check_cloud``.
 
@@ -91,11 +92,19 @@ def read_cloud(path: Path, unit: Literal["mm", "m"] = "mm") -> tuple[SensorCloud
     if path.is_dir():
         raise InputError(f"{path} is a folder. Give a cloud in it, such as {path / 'cloud.ply'}.")
     if suffix not in CLOUD_SUFFIXES:
-        raise InputError(f"{path}: unknown cloud type. Allowed: {', '.join(CLOUD_SUFFIXES)}.")
+        raise InputError(
+            f"{path} is of no kind that is read. Allowed: clouds as {', '.join(CLOUD_SUFFIXES)}, "
+            f"depth images as {', '.join(DEPTH_SUFFIXES)}: save an .exr as a TIFF of floats, a "
+            ".vtk as .ply."
+        )
     if unit not in ("mm", "m"):
         raise InputError(f"unit {unit!r} is not understood. Allowed: mm, m.")
-    npz = partial(_npz_points, unit)
-    parse: Any = {".ply": parse_ply_properties, ".pcd": _pcd_points, ".npz": npz}[suffix]
+    parse: Any = {
+        ".ply": parse_ply_properties,
+        ".pcd": _pcd_points,
+        ".npz": partial(_npz_points, unit),
+        ".npy": _npy_points,
+    }[suffix]
     raw = parse(read_file(path, LARGEST_FILE, "Thin it first."), str(path))
     # Beyond float32 becomes infinite, and is dropped like NaN, signalling or not.
     with np.errstate(over="ignore", invalid="ignore"):
@@ -187,15 +196,42 @@ def _check_npz_size(archive: zipfile.ZipFile, name: str) -> None:
     """Check each array's claimed shape against its bytes: numpy allocates what a header claims."""
     if sum(member.file_size for member in archive.infolist()) > LARGEST_FILE:
         raise InputError(f"{name} unpacks to more than 256 MiB; thin the cloud first.")
-    npy = np.lib.format
     for member in archive.infolist():
         with archive.open(member) as stream:
-            version, _ = npy.read_magic(stream)
-            read_header = npy.read_array_header_1_0 if version == 1 else npy.read_array_header_2_0
-            shape, _, dtype = read_header(stream)
-        claimed = math.prod((dtype.itemsize, *shape))
-        if claimed > member.file_size or min(shape, default=0) < 0:
-            raise InputError(f"{name}: {member.filename} claims more than the file holds.")
+            _check_npy_size(stream, member.file_size, f"{name}: {member.filename}")
+
+
+def _check_npy_size(stream: Any, size: int, name: str) -> None:
+    npy = np.lib.format
+    version, _ = npy.read_magic(stream)
+    read_header = npy.read_array_header_1_0 if version == 1 else npy.read_array_header_2_0
+    shape, _, dtype = read_header(stream)
+    if math.prod((dtype.itemsize, *shape)) > size or min(shape, default=0) < 0:
+        raise InputError(f"{name} claims more than the file holds.")
+
+
+def _npy(content: bytes, name: str) -> np.ndarray:
+    """An array of numbers, in this machine's byte order."""
+    try:
+        _check_npy_size(io.BytesIO(content), len(content), name)
+        array = np.load(io.BytesIO(content), allow_pickle=False)
+    except InputError:
+        raise
+    except Exception as error:  # numpy raises anything on a damaged file
+        raise InputError(f"{name} cannot be read as .npy: {error or type(error)}.") from error
+    if array.dtype.kind not in "fiu":
+        raise InputError(f"{name} is an array of {array.dtype}; it must be one of numbers.")
+    return array.astype(array.dtype.newbyteorder("="))
+
+
+def _npy_points(content: bytes, name: str) -> np.ndarray:
+    array = _npy(content, name)
+    if array.shape[1:] != (3,):
+        raise InputError(
+            f"{name} is an array {array.shape}; a cloud is n x 3. If it is a depth image, give "
+            "--intrinsics FILE.json with it."
+        )
+    return array
 
 
 def read_intrinsics(path: Path) -> Intrinsics:
@@ -215,7 +251,13 @@ def read_camera(path: Path | None) -> tuple[Intrinsics | None, DepthCorrection]:
 def _correction(data: dict[str, Any], path: Path) -> DepthCorrection:
     scale = _numbers(data.get("depth_scale", 1.0), "depth_scale", path)[0]
     offset_mm = _numbers(data.get("depth_offset_mm", 0.0), "depth_offset_mm", path)[0]
-    return DepthCorrection(scale=scale, offset_mm=offset_mm)
+    try:
+        return DepthCorrection(scale=scale, offset_mm=offset_mm)
+    except InputError as error:
+        raise InputError(
+            f"{path}: {error} These correct a camera by depth_scale and depth_offset_mm; what one "
+            "step of its image is in mm is depth_unit_mm."
+        ) from error
 
 
 def _camera(path: Path) -> tuple[Intrinsics, dict[str, Any]]:
@@ -265,9 +307,9 @@ def read_depth_png(path: Path, intrinsics_path: Path) -> DepthFrame:
 def read_depth(
     path: Path, intrinsics_path: Path, unit_mm: float | None = None
 ) -> tuple[DepthFrame, float]:
-    """A depth image (16-bit PNG or TIFF, or a TIFF of floats) and its unit, mm per step.
+    """A depth image (16-bit PNG or TIFF, a TIFF of floats, or .npy) and its unit, mm per step.
 
-    0 and numbers that are not finite are no return. The unit is ``unit_mm``, else depth_unit_mm of
+    What ``depths_mm`` says is no return. The unit is ``unit_mm``, else depth_unit_mm of
     the intrinsics file, else 0.1 for whole numbers and 1000 (metres) for floats. The file's depth
     correction is applied. Whether the unit can be right is left to ``cloud.check_depth_unit``.
 
@@ -277,17 +319,16 @@ def read_depth(
     steps, mode = _image(path, (intrinsics.width, intrinsics.height))
     if not mode.startswith(("I", "F")):
         raise InputError(
-            f"{path} has pixels of the kind {mode}; allowed: 16-bit grey, or floats in a TIFF."
+            f"{path} has pixels of the kind {mode}; allowed: 16-bit grey, or floats in a TIFF or "
+            ".npy."
         )
     default = DEPTH_UNIT_MM if mode.startswith("I") else 1000.0
     stated = data.get("depth_unit_mm", default) if unit_mm is None else unit_mm
     unit_mm = _numbers(stated, "depth_unit_mm", intrinsics_path)[0]
     if not 0 < unit_mm <= 1000:
         raise InputError(f"depth_unit_mm is {unit_mm}; it must lie in 0..1000 mm per step.")
-    with np.errstate(over="ignore"):
-        depth_mm = steps.astype(np.float32) * np.float32(unit_mm)
-    depth_mm[~(np.isfinite(depth_mm) & (depth_mm > 0))] = np.nan
-    return DepthFrame(_correction(data, intrinsics_path).corrected(depth_mm), intrinsics), unit_mm
+    depth_mm = _correction(data, intrinsics_path).corrected(depths_mm(steps, unit_mm))
+    return DepthFrame(depth_mm, intrinsics), unit_mm
 
 
 def read_mask(path: Path, size: tuple[int, int]) -> Bool[np.ndarray, "h w"]:
@@ -301,6 +342,14 @@ def _image(path: Path, size: tuple[int, int]) -> tuple[np.ndarray, str]:
     """An image's values without its transparency, and its Pillow mode."""
     from PIL import Image
 
+    if path.suffix.lower() == ".npy":
+        array = _npy(read_file(path, LARGEST_FILE), str(path))
+        if array.shape != (size[1], size[0]):
+            raise InputError(
+                f"{path} is an array {array.shape}; it must be {size[1]} x {size[0]}, rows and "
+                "columns, as the intrinsics say."
+            )
+        return array, "F" if array.dtype.kind == "f" else "I"
     try:
         content = io.BytesIO(read_file(path, LARGEST_FILE))
         image = Image.open(content, formats=["PNG", "TIFF", "BMP"])
@@ -324,9 +373,9 @@ def depth_png(frame: DepthFrame, compress_level: int = 6) -> bytes:
 
     steps = np.rint(frame.depth_mm.astype(np.float64) / DEPTH_UNIT_MM)
     returned = np.isfinite(steps)
-    if not ((steps[returned] >= 1) & (steps[returned] <= 65535)).all():
+    if not ((steps[returned] >= 1) & (steps[returned] < 65535)).all():
         raise InputError(
-            f"a depth lies outside {DEPTH_UNIT_MM:g}..{65535 * DEPTH_UNIT_MM:g} mm, which 16 bits "
+            f"a depth lies outside {DEPTH_UNIT_MM:g}..{65534 * DEPTH_UNIT_MM:g} mm, which 16 bits "
             f"of {DEPTH_UNIT_MM:g} mm hold; crop the frame."
         )
     stream = io.BytesIO()

@@ -1,16 +1,30 @@
-"""Guessing the unit of depths that were read as millimetres."""
+"""Raw depths to millimetres, and guessing the unit of those that were read as such."""
 
 from __future__ import annotations
 
 from enum import Enum
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Float32, Num
 
 from tumortrack.core.types import DepthFrame, SensorCloud
 
+# What cameras and programs write where there is no depth, beside 0, NaN, infinity, numbers below 0,
+# and the largest number of its type: the largest of 16 bits, also as a float, and in metres.
+_NO_DEPTH = np.array([65535.0, 65.535], np.float32)
 _SHARE = 0.1  # of the lengths in range: an organ may be that little of a depth image
 _SAMPLED = 20_000  # lengths at most
+
+
+def depths_mm(steps: Num[np.ndarray, "h w"], unit_mm: float) -> Float32[np.ndarray, "h w"]:
+    """A raw depth image, of which a step is ``unit_mm``, in mm; NaN where it has no depth."""
+    largest = np.iinfo(steps.dtype) if steps.dtype.kind in "iu" else np.finfo(steps.dtype)
+    with np.errstate(over="ignore", invalid="ignore"):
+        raw = steps.astype(np.float32)
+        depth_mm = raw * np.float32(unit_mm)
+        seen = (depth_mm > 0) & np.isfinite(depth_mm)
+        seen &= ~np.isin(raw, _NO_DEPTH) & (raw < np.float32(largest.max))
+    return np.where(seen, depth_mm, np.float32(np.nan))
 
 
 class Unit(Enum):

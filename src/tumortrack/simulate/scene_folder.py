@@ -19,7 +19,7 @@ from tumortrack.core.errors import InputError
 from tumortrack.core.mesh_files import read_anatomy, write_anatomy
 from tumortrack.core.mesh_query import contains, labels_of
 from tumortrack.core.organ import KIDNEY, Organ, is_tumor, organ_entry, organ_in
-from tumortrack.core.store import new_folder, read_json, write_atomically, write_json
+from tumortrack.core.store import natural, new_folder, read_json, write_atomically, write_json
 from tumortrack.core.types import Anatomy, DepthFrame, SensorCloud
 from tumortrack.imaging.meshes import mesh_of, solid_of
 from tumortrack.sense.files import depth_png, intrinsics_json, read_cloud, read_depth_png
@@ -148,7 +148,7 @@ def list_scenes(folder: Path) -> list[Path]:
     if not folder.is_dir():
         raise InputError(f"{folder} does not exist or is not a folder.")
     visible = (path for path in folder.iterdir() if not path.name.startswith("."))
-    scenes = sorted(path for path in visible if any(path.glob("*.ply")))
+    scenes = sorted((path for path in visible if any(path.glob("*.ply"))), key=natural)
     if not scenes:
         raise InputError(
             f"{folder} holds no scenes: none of its folders has a cloud.ply and a surface. "

@@ -15,6 +15,7 @@ from tumortrack.core.types import Look, Mesh
 from tumortrack.registration.advice import Advisor, Reach, part_number
 from tumortrack.registration.motion import ElasticMotion
 
+TOUCH_MORE = "touch more places, all over what can be reached of it"
 _MAX_SAMPLES = 2000  # faces or vertices of the organ that are looked at
 _MIN_COSINE = 0.3  # to the line of sight: surfaces at a flatter angle return little
 _SEEN_WITHIN_MM = 8.0  # of an observed point

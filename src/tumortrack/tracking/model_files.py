@@ -151,6 +151,7 @@ def make_model(
         "case_sha256": case.sha256,
         "patient": to_builtins(case.patient),
         "organ": organ_entry(case.anatomy.kind),
+        "warnings": [warning.entry for warning in case.warnings],
     }
     more = {} if progress is None else {"progress": progress}
     return build_model(case.anatomy, case.up_lps, config, seed, provenance, **more)

@@ -80,8 +80,8 @@ class LocateOptions(RegionOptions):
             else 0.1 (a D405's), of floats 1000 (metres). Many cameras have 1.
         intrinsics: JSON with width, height, fx, fy, cx, cy in pixels: once for all views, or once
             for each, in their order.
-        evidence: JSON with what else is known of where the organ lies: touched points, landmarks,
-            outlines (docs/evidence.md). Needs a model of preset clinic.
+        evidence: JSON or CSV with what else is known of where the organ lies: touched points,
+            landmarks, outlines (docs/evidence.md). Needs a model of preset clinic.
         advise: part for which it says what to learn next (default: the tumor that is least sure).
         map: points of the CT to map to the camera frame (OUT/points.csv): a .csv with columns
             x,y,z (LPS, mm), or 3D Slicer's .mrk.json or .fcsv. Needs a model of preset clinic.

@@ -26,6 +26,7 @@ from jaxtyping import Float, Float64
 from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.estimate import Motion
 from tumortrack.core.store import read_file
+from tumortrack.core.tables import read_rows, text_of
 
 FAR_MM = 100.0  # from the organ's box: hardly a point that the user means
 _NEAR_MM = 20.0  # of the organ's box, where points in other units or axes are looked for
@@ -37,6 +38,7 @@ _NAMINGS: dict[tuple[str, str, str], tuple[int, int, int]] = {
     ("l", "p", "s"): (1, 1, 1),
     ("r", "a", "s"): (-1, -1, 1),
 }
+_DEFINED = "defined"  # a column of 3D Slicer's tables: 0 where a point was never placed
 _ADDED = ("camera_x", "camera_y", "camera_z", "std_mm")
 _Signs = tuple[float, float, float]
 _LPS_FROM: dict[str, _Signs] = {"LPS": (1.0, 1.0, 1.0), "RAS": (-1.0, -1.0, 1.0)}
@@ -72,37 +74,34 @@ def read_points(path: Path) -> PointTable:
 
 
 def _parse_csv(content: bytes, name: str) -> PointTable:
-    reader = csv.reader(io.StringIO(_text_of(content, name), newline=""), strict=True)
-    try:
-        lines = [(reader.line_num, row) for row in reader if any(cell.strip() for cell in row)]
-    except csv.Error as error:
-        raise InputError(f"{name}, line {reader.line_num}: {error}. Export it again.") from error
-    if not lines:
-        raise InputError(f"{name} is empty; it needs a header with x,y,z and a line a point.")
-    header = [cell.strip() for cell in lines[0][1]]
-    lower = [cell.lower() for cell in header]
-    if len(set(lower)) < len(lower):
-        raise InputError(f"{name}: its columns {','.join(header)} must have different names.")
-    naming = next((names for names in _NAMINGS if set(names) <= set(lower)), None)
+    table = read_rows(content, name)
+    columns, header = table.columns, table.header
+    naming = next((names for names in _NAMINGS if set(names) <= columns.keys()), None)
     if naming is None:
         raise InputError(
             f"{name}: its first line is {','.join(header)[:80]!r}; it must name the columns x,y,z "
             "(or ct_x,ct_y,ct_z: LPS, mm), separated by commas."
         )
-    where = [lower.index(axis) for axis in naming]
-    points = np.empty((len(lines) - 1, 3))
-    for number, (line, row) in enumerate(lines[1:]):
-        if len(row) != len(header):
-            raise InputError(f"{name}, line {line}: {len(row)} values in {len(header)} columns.")
-        points[number] = _numbers_of([row[n] for n in where], f"{name}, line {line}")
+    place = columns.get(_DEFINED)
+    rows = [(line, row) for line, row in table.rows if place is None or row[place] != "0"]
+    without = len(table.rows) - len(rows)
+    points = [
+        _numbers_of([row[columns[axis]] for axis in naming], f"{name}, line {line}")
+        for line, row in rows
+    ]
     # The file may be the output for an earlier frame, whose results are replaced.
-    kept = [n for n, column in enumerate(lower) if column not in _ADDED]
+    kept = [n for column, n in columns.items() if column not in _ADDED]
     replaced = ", ".join(column for column in header if column.lower() in _ADDED)
+    notes = {
+        f"{name}: its columns {replaced} give way to the answer's.": replaced,
+        f"{name}: left out {without} of {len(table.rows)} points that have no place yet "
+        f"({_DEFINED} is 0).": without,
+    }
     return PointTable(
-        points * np.array(_NAMINGS[naming], float),
+        np.reshape(points, (-1, 3)) * np.array(_NAMINGS[naming], float),
         tuple(header[n] for n in kept),
-        tuple(tuple(row[n] for n in kept) for _, row in lines[1:]),
-        (f"{name}: its columns {replaced} give way to the answer's.",) if replaced else (),
+        tuple(tuple(row[n] for n in kept) for _, row in rows),
+        tuple(note for note, holds in notes.items() if holds),
     )
 
 
@@ -143,12 +142,12 @@ def _parse_markups(content: bytes, name: str) -> PointTable:
 
 def _parse_fcsv(content: bytes, name: str) -> PointTable:
     """The points of a fiducial list; its header names the columns and the coordinate system."""
-    text = _text_of(content, name)
+    text = text_of(content, name)
     system = re.search(r"^#\s*CoordinateSystem\s*=\s*(\w+)", text, re.MULTILINE)
     columns = re.search(r"^#\s*columns\s*=(.+)$", text, re.MULTILINE)
     signs = _signs(system.group(1) if system else "missing", name)
     names = [n.strip() for n in columns.group(1).split(",")] if columns else []
-    if not {"x", "y", "z"} <= set(names):
+    if not {"x", "y", "z"} <= set(names) or len(set(names)) < len(names):
         raise InputError(f"{name}: its header lacks '# columns = id,x,y,z,...'. Save it again.")
     body = [line for line in text.splitlines() if line.strip() and not line.startswith("#")]
     try:
@@ -186,19 +185,13 @@ def _fiducials(points: list[_Fiducial], name: str) -> PointTable:
         np.array(points_ct).reshape(-1, 3),
         ("label", "description", "ct_x", "ct_y", "ct_z"),
         tuple(rows),
-        (f"{name}: left out what has no place yet: {', '.join(missing)}.",) if missing else (),
+        (f"{name}: left out {len(missing)} that have no place yet: {', '.join(missing)}.",)
+        if missing
+        else (),
     )
 
 
 _PARSERS = {".json": _parse_markups, ".fcsv": _parse_fcsv, ".csv": _parse_csv}
-
-
-def _text_of(content: bytes, name: str) -> str:
-    """UTF-8 text, with or without a byte order mark."""
-    try:
-        return content.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise InputError(f"{name} is no text in UTF-8: {error}. Save it as CSV (UTF-8).") from error
 
 
 def _numbers_of(texts: list[str], where: str) -> tuple[float, float, float]:

@@ -184,8 +184,12 @@ def _doubt(report: FitReport) -> Finding | None:
         return _unsure(report)
     misses_mm = {name: part.miss_mm or 0.0 for name, part in report.tumors.items()}
     name = max(misses_mm, key=misses_mm.__getitem__)
-    far = misses_mm[name] > POOR_MM
-    return Finding("miss", {"part": name, "miss_mm": misses_mm[name]}) if far else None
+    miss_mm = misses_mm[name]
+    # As many decimals as tell it from what is allowed.
+    digits = next((n for n in "123" if round(miss_mm, int(n)) > POOR_MM), "4")
+    values: dict[str, float | str] = {"part": name, "miss_mm": miss_mm, "limit_mm": POOR_MM}
+    values["digits"] = digits
+    return Finding("miss", values) if miss_mm > POOR_MM else None
 
 
 def _contradiction(evidence: Sequence[EvidenceReport]) -> Finding | None:

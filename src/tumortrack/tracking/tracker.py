@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
@@ -29,7 +29,7 @@ from tumortrack.registration.model import RegistrationModel
 from tumortrack.registration.motion import ElasticMotion, seen_from_first
 from tumortrack.sense.cloud import CloudConfig
 from tumortrack.sense.region import RegionConfig
-from tumortrack.tracking.advice import where_to_look
+from tumortrack.tracking.advice import TOUCH_MORE, where_to_look
 from tumortrack.tracking.causes import likely_causes, words
 from tumortrack.tracking.model_files import case_model
 from tumortrack.tracking.quality import doubt_if_hidden, judged, with_margin
@@ -42,6 +42,7 @@ _TURNED_OVER_S = 30.0
 _CAUSES_EVERY_S = 1.0
 # Evidence outlasts a hand before the camera: tissue carries what lies on it, as it is seen again.
 _REMEMBERED_S = 60.0
+_NO_CAUSE = (Likely(Cause.VIEW),)
 _OF_POSES = "none", "poses", "fit", "strays", "seen_through"  # checks that wrong poses fail
 
 
@@ -80,7 +81,7 @@ class Tracker:
         grid: int = 160,
         seed: int = 0,
         seen: DepthFrame | SensorCloud | None = None,
-        evidence: Sequence[Evidence | Look] = (),
+        evidence: Sequence[Evidence | Look] | Evidence | Look = (),
     ) -> Estimate:
         """The full estimate from one cloud; the same cloud and seed give the same result.
 
@@ -156,17 +157,22 @@ class Tracker:
         start = time.perf_counter()
         if estimate.finding is not None and not self._weakness:
             causes = self._causes(looks, how, estimate)
-            advice = words(causes, where_to_look(estimate, looks))
+            alone = isinstance(looks[0].seen, SensorCloud) and not len(looks[0].seen.points_mm)
+            if alone:  # touches hide nothing, and no camera can look elsewhere
+                causes = tuple(c for c in causes if c.cause is not Cause.HIDDEN) or _NO_CAUSE
+            view = TOUCH_MORE if alone else where_to_look(estimate, looks)
+            advice = words(causes, view)
             estimate = replace(estimate, causes=causes, advice=advice)
         return _timed(estimate, "explain", start)
 
     def _causes(
         self, looks: Sequence[Look], how: FollowOptions, estimate: Estimate | None
     ) -> tuple[Likely, ...]:
-        check = _check_of(estimate)
+        check, wrong = _check_of(estimate), _wrong_evidence(estimate)
         if len(looks) > 1 and check in _OF_POSES:
             return (Likely(Cause.POSES),)
-        return how.known.get(check) or likely_causes(self.model, looks[0].cloud, estimate)
+        known = tuple(c for c in how.known.get(check, ()) if c.cause is not Cause.EVIDENCE)
+        return *wrong, *(known or likely_causes(self.model, looks[0].cloud, estimate))
 
     @contextmanager
     def _explaining_errors(
@@ -188,12 +194,28 @@ class Tracker:
 
 
 def _parted(
-    cloud: SensorCloud, seen: DepthFrame | SensorCloud | None, evidence: Sequence[Evidence | Look]
+    cloud: SensorCloud,
+    seen: DepthFrame | SensorCloud | None,
+    evidence: Sequence[Evidence | Look] | Evidence | Look,
 ) -> tuple[tuple[Look, ...], tuple[Evidence, ...]]:
     """All looks, the cloud's first, and the other evidence."""
-    further = [each for each in evidence if isinstance(each, Look)]
-    pieces = tuple(each for each in evidence if not isinstance(each, Look))
+    several = isinstance(evidence, Iterable) and not isinstance(evidence, Mapping | str)
+    given: tuple[Any, ...] = tuple(evidence) if several else (evidence,)  # type: ignore[arg-type]
+    if wrong := [each for each in given if not isinstance(each, Evidence | Look)]:
+        raise InputError(
+            "evidence is of Look, Touch, Landmark, Held, Outline and Free, not "
+            f"{type(wrong[0]).__name__}: evidence=[Touch(place_mm=(x, y, z))]."
+        )
+    further = [each for each in given if isinstance(each, Look)]
+    pieces = tuple(each for each in given if not isinstance(each, Look))
     return (Look(cloud, seen or cloud, HERE), *further), pieces
+
+
+def _wrong_evidence(estimate: Estimate | None) -> tuple[Likely, ...]:
+    """The piece of evidence, by its number, that lies the farthest from where the rest has it."""
+    pieces = () if estimate is None else estimate.report.evidence
+    out = [(each.off_mm, number) for number, each in enumerate(pieces, 1) if each.left_out]
+    return (Likely(Cause.EVIDENCE, max(out)[1]),) if out else ()
 
 
 def _locator(model: Model, advise: str) -> Locator:

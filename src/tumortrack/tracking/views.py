@@ -17,7 +17,14 @@ from tumortrack.core.types import DepthFrame, Look, SensorCloud
 from tumortrack.models.model import Model
 from tumortrack.sense.camera import deproject_pixels
 from tumortrack.sense.cloud import check_cloud, check_depth_unit, crop_cloud
-from tumortrack.sense.files import DEPTH_SUFFIXES, read_cloud, read_depth, read_mask, read_poses
+from tumortrack.sense.files import (
+    CLOUD_SUFFIXES,
+    DEPTH_SUFFIXES,
+    read_cloud,
+    read_depth,
+    read_mask,
+    read_poses,
+)
 from tumortrack.sense.region import Hints, organ_points
 from tumortrack.tracking.options import LocateOptions
 
@@ -120,7 +127,8 @@ def _read_view(path: Path, intrinsics: Path | None, options: LocateOptions) -> V
                 "without a cloud (-) give --evidence FILE with twelve touches or more."
             )
         return View(path, SensorCloud(np.zeros((0, 3), np.float32)))
-    if path.suffix.lower() in DEPTH_SUFFIXES:
+    suffix = path.suffix.lower()
+    if suffix in DEPTH_SUFFIXES and (suffix not in CLOUD_SUFFIXES or intrinsics is not None):
         if intrinsics is None:
             raise InputError(f"{path} is a depth image: give --intrinsics FILE.json with it.")
         if options.unit != "mm":
@@ -136,7 +144,7 @@ def _read_view(path: Path, intrinsics: Path | None, options: LocateOptions) -> V
         else:
             stated_by = "the default"
         return View(path, frame, unit=(unit_mm, stated_by))
-    if intrinsics is not None or options.depth_unit is not None:
+    if suffix in CLOUD_SUFFIXES and (intrinsics is not None or options.depth_unit is not None):
         option = "--intrinsics" if intrinsics is not None else "--depth-unit"
         raise InputError(
             f"{option} is for depth images ({', '.join(DEPTH_SUFFIXES)}); {path} is a cloud."

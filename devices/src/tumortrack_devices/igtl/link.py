@@ -11,7 +11,7 @@ import contextlib
 import socket
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 
 from tumortrack.core.errors import InputError
 from tumortrack_devices.igtl import message as igtl
@@ -20,6 +20,7 @@ from tumortrack_devices.network import Pace
 
 _LARGEST_REQUEST = 2**16  # bytes
 _LARGEST_HEARD = 2**22  # bytes: a surface of 100,000 points
+_LARGEST_SKIPPED = 2**30  # an image or volume beside what is heard
 MOST_RECEIVERS = 16  # further ones are refused: each may hold half a megabyte
 _REQUESTS_PER_S = 100.0
 _HEARD_PER_S = 5000.0  # some tens of tools of a tracker at some hundred Hz
@@ -38,8 +39,9 @@ class Link:
 
     With ``connect`` it is a client of that host's server, and retries until that is there;
     otherwise it is the server on ``host``. ``port``: the server's. ``heard``: gets each message
-    that comes, whole and undamaged, in this link's thread, and may raise ProtocolError;
-    ``faulty``: what was wrong with one, in words. Raises InputError: the port is taken, the host's
+    that comes, whole and undamaged, in this link's thread, and may raise ProtocolError; of a type
+    that is not ``wanted``, a large one comes without its body. ``faulty``: what was wrong with one,
+    in words. Raises InputError: the port is taken, the host's
     name is unknown, or fastcrc is missing."""
 
     def __init__(
@@ -49,9 +51,10 @@ class Link:
         connect: str = "",
         heard: Callable[[Header, bytes], None] | None = None,
         faulty: Callable[[str], None] = lambda _: None,
+        wanted: Collection[str] = (),
     ) -> None:
         igtl.crc64(b"")  # a missing package is reported before anything is opened
-        self._heard, self._faulty = heard, faulty
+        self._heard, self._faulty, self._wanted = heard, faulty, wanted
         self._listener: socket.socket | None = None
         self.port = port
         try:
@@ -149,6 +152,14 @@ class Link:
         while True:
             await asyncio.sleep(pace.wait_s())
             header = igtl.unpack_header(await reader.readexactly(igtl.HEADER_SIZE))
+            if self._heard and largest < header.body_size <= _LARGEST_SKIPPED:
+                for left in range(header.body_size, 0, -_PIECE):
+                    await reader.readexactly(min(left, _PIECE))
+                if header.type in self._wanted:
+                    self._faulty(f"{header.type} of {header.body_size} bytes is too large.")
+                else:
+                    self._heard(header, b"")
+                continue
             if header.body_size > largest:
                 raise ProtocolError(f"a message of {header.body_size} bytes is refused.")
             body = await reader.readexactly(header.body_size)

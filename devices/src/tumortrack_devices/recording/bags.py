@@ -7,6 +7,7 @@ turn into code.
 from __future__ import annotations
 
 import io
+import logging
 import re
 from collections.abc import Iterator
 from contextlib import ExitStack, closing, contextmanager, suppress
@@ -19,13 +20,16 @@ import msgspec
 
 from tumortrack.core.errors import InputError
 from tumortrack.core.evidence import Evidence
+from tumortrack.core.store import natural
 from tumortrack.live.values import Observation
 from tumortrack_devices.recording.folders import RecordedFrame
 from tumortrack_devices.recording.mcap import EVIDENCE, FrameEvidence
 from tumortrack_devices.ros import sensors
 from tumortrack_devices.ros.messages import Messages, stamp_of
 
-_KINDS = (sensors.IMAGE, sensors.CLOUD)
+_LOG = logging.getLogger("tumortrack")
+_KINDS = (sensors.IMAGE, sensors.CLOUD, sensors.COMPRESSED)
+_PACKED = "/compressedDepth"  # image_transport appends it to the image's topic
 SUFFIXES = (".mcap", ".db3", ".bag")
 ESTIMATES = "/tumortrack/"  # topics of our own estimates: no input
 OWN_DEPTH = "/camera/depth/image_rect"  # of the sink ``recording``
@@ -37,10 +41,10 @@ _DATA_END = 0x0F
 
 
 class BagRecording:
-    """An open bag: depth images, each with the latest camera_info and the mask and picture of its
-    stamp, or clouds. An empty topic means the only one; ``rectified`` and ``unit_mm`` as in
-    ``ros.sensors.depth_of``. Raises InputError if it is no bag or damaged, or if there is not
-    exactly one topic to choose."""
+    """An open bag: depth images, raw or packed, each with the latest camera_info and the mask and
+    picture of its stamp, or clouds. An empty topic means the only one; ``rectified`` and
+    ``unit_mm`` as in ``ros.sensors.depth_of``. Raises InputError if it is no bag or damaged, or if
+    there is not exactly one topic to choose."""
 
     def __init__(
         self,
@@ -62,7 +66,7 @@ class BagRecording:
                 opened.callback(self._readers[-1].close)
             self._types = {c.topic: c.msgtype for r in self._readers for c in r.connections}
             self._topic = self._choose_topic(topic)
-            images = self._types[self._topic] == sensors.IMAGE
+            images = self._types[self._topic] != sensors.CLOUD
             self._info_topic = self._choose_info(info_topic) if images else ""
             self._opened = opened.pop_all()
 
@@ -70,15 +74,16 @@ class BagRecording:
         self._opened.close()
 
     def frames(self) -> Iterator[RecordedFrame]:
-        """From first to last; each call starts again. ``load`` of a damaged frame raises."""
+        """From first to last; each call starts again. ``load`` of a damaged frame raises. If the
+        first has no stamp, all have the bag's times."""
         first = self._first(self._info_topic) if self._info_topic else None
         companions: dict[str, Any] = {self._info_topic: first}  # the latest of each topic
-        stamp_ns = 0
+        stamp_ns, unstamped = 0, None
         waiting: Any = None  # an image: its companions may follow it
         topics = {self._topic, self._info_topic, MASK_TOPIC, self._evidence_topic}
         if self._topic == OWN_DEPTH:  # another bag's picture may not be aligned
             topics.add(PICTURE_TOPIC)
-        for topic, message in chain(self._all(topics), [("", None)]):
+        for topic, message, time_ns in chain(self._all(topics), [("", None, 0)]):
             if topic and topic != self._topic:
                 companions[topic] = message
                 continue
@@ -87,6 +92,9 @@ class BagRecording:
                 companions.pop(self._evidence_topic, None)  # it is of one frame
             if message is not None and not isinstance(message, InputError):
                 stamp_ns = stamp_of(message.header)
+                if unstamped is None and (unstamped := stamp_ns == 0):
+                    _LOG.warning("%s: its frames have no stamps; the bag's times count", self._path)
+                stamp_ns = time_ns if unstamped else stamp_ns
             waiting = message
 
     def _observed(self, message: Any, companions: dict[str, Any]) -> Observation:
@@ -97,6 +105,8 @@ class BagRecording:
         if info is None:
             cloud, frame_id = sensors.cloud_of(message), sensors.frame_of(message)
             return Observation(cloud, 0, frame_id=frame_id, evidence=known)
+        if self._types[self._topic] == sensors.COMPRESSED:
+            message = sensors.image_of(message, self._messages)
         frame = sensors.depth_of(message, info, self._rectified, self._unit_mm)
         same_time = image is not None and stamp_of(image.header) == frame.stamp_ns
         mask = sensors.mask_of(image) if same_time else None
@@ -122,9 +132,9 @@ class BagRecording:
             ) from error
         return known.evidence if known.stamp_ns == stamp_ns else ()
 
-    def _all(self, topics: set[str]) -> Iterator[tuple[str, Any]]:
-        """Topic and message in recorded order; an InputError without a topic if a message, or the
-        rest of the bag, is damaged."""
+    def _all(self, topics: set[str]) -> Iterator[tuple[str, Any, int]]:
+        """Topic, message and time (ns) in recorded order; an InputError without a topic if a
+        message, or the rest of the bag, is damaged."""
         for reader in self._readers:
             wanted = [c for c in reader.connections if c.topic in topics]
             raw = reader.messages(wanted) if wanted else iter(())
@@ -136,23 +146,20 @@ class BagRecording:
                         entry = next(raw, None)
                     if entry is not None:
                         topic = entry[0].topic
-                        yield topic, self._messages.from_bytes(entry[2], self._types[topic])
+                        message = self._messages.from_bytes(entry[2], self._types[topic])
+                        yield topic, message, entry[1]
                 except InputError as error:
-                    yield "", error
+                    yield "", error, 0
 
     def _first(self, topic: str) -> Any:
-        for _, message in self._all({topic}):
+        for _, message, _ in self._all({topic}):
             if isinstance(message, InputError):
                 raise message
             return message
         raise InputError(f"{self._path} has no message on {topic}, which was announced in it.")
 
     def _choose_topic(self, wanted: str) -> str:
-        usable = [
-            topic
-            for topic, kind in self._types.items()
-            if kind in _KINDS and not topic.startswith(ESTIMATES)
-        ]
+        usable = [topic for topic, kind in self._types.items() if _is_input(topic, kind)]
         if wanted:
             if self._types.get(wanted) in _KINDS:
                 return wanted
@@ -161,7 +168,9 @@ class BagRecording:
                 f"{', '.join(usable) or 'none'}."
             )
         clouds = [topic for topic in usable if self._types[topic] == sensors.CLOUD]
-        candidates = [topic for topic in usable if self._is_depth(topic)] or clouds
+        depths = [topic for topic in usable if self._is_depth(topic)]
+        raw = [topic for topic in depths if self._types[topic] == sensors.IMAGE]
+        candidates = raw or depths or clouds
         if len(candidates) == 1:
             return candidates[0]
         if any(topic.startswith(_REALSENSE) for topic in self._types):
@@ -180,10 +189,12 @@ class BagRecording:
         )
 
     def _is_depth(self, topic: str) -> bool:
-        if self._types[topic] != sensors.IMAGE:
-            return False
         with suppress(InputError):
-            return self._first(topic).encoding in sensors.DEPTHS
+            match self._types[topic]:
+                case sensors.IMAGE:
+                    return self._first(topic).encoding in sensors.DEPTHS
+                case sensors.COMPRESSED:
+                    return bool(sensors.image_of(self._first(topic), self._messages))
         return False
 
     def _choose_info(self, wanted: str) -> str:
@@ -191,7 +202,7 @@ class BagRecording:
         infos = [topic for topic, kind in self._types.items() if kind == sensors.CAMERA_INFO]
         if wanted and wanted not in infos:
             raise InputError(f"{self._path} has no camera_info topic {wanted!r}.")
-        parent = self._topic.rpartition("/")[0]
+        parent = self._topic.removesuffix(_PACKED).rpartition("/")[0]
         usual = (f"{parent}/camera_info", f"{parent.rpartition('/')[0]}/info/camera_info")
         candidates = [topic for topic in usual if topic in infos] or infos
         if wanted or len(candidates) == 1:
@@ -210,7 +221,7 @@ def bag_files(path: Path) -> list[Path]:
     if not path.is_dir():
         return [path] if path.suffix.lower() in SUFFIXES else []
     inside = (p for p in path.iterdir() if p.suffix.lower() in SUFFIXES and p.is_file())
-    return sorted(inside, key=lambda p: (len(p.name), p.name))
+    return sorted(inside, key=natural)
 
 
 def bag_contents(path: Path) -> tuple[dict[str, int], float]:
@@ -222,12 +233,17 @@ def bag_contents(path: Path) -> tuple[dict[str, int], float]:
         with _guarded(path):
             reader = _opened(file)
             with closing(reader):
-                kinds = [c for c in reader.connections if c.msgtype in _KINDS]
+                kinds = [c for c in reader.connections if _is_input(c.topic, c.msgtype)]
                 for connection, time_ns, _ in reader.messages(kinds) if kinds else ():
                     counts[connection.topic] = counts.get(connection.topic, 0) + 1
                     times_ns.append(time_ns)
-    inputs = {topic: n for topic, n in counts.items() if not topic.startswith(ESTIMATES)}
-    return inputs, (max(times_ns) - min(times_ns)) * 1e-9 if times_ns else 0.0
+    return counts, (max(times_ns) - min(times_ns)) * 1e-9 if times_ns else 0.0
+
+
+def _is_input(topic: str, kind: str) -> bool:
+    """Whether it may hold depth images or clouds: neither estimates nor packed colours do."""
+    packed = kind != sensors.COMPRESSED or topic.endswith(_PACKED)
+    return kind in _KINDS and packed and not topic.startswith(ESTIMATES)
 
 
 def _opened(path: Path) -> Any:
@@ -236,6 +252,11 @@ def _opened(path: Path) -> Any:
     from rosbags.rosbag2.storage_mcap import McapReader
 
     kind = path.suffix.lower() if path.is_file() else ""
+    if kind == ".mcap" and (profile := _profile(path)) not in ("ros2", None):
+        raise InputError(
+            f"{path} is an MCAP of {f'the profile {profile!r}' if profile else 'no profile'}; "
+            "allowed: of ros2. Record with rosbag2, or convert it (ROS 1: give the .bag itself)."
+        )
     end = _end_of_records(path) if kind == ".mcap" else 0
     if not end:
         whole: Any = rosbag1.Reader(path) if kind == ".bag" else rosbag2.Reader(path)
@@ -258,10 +279,22 @@ def _guarded(path: Path) -> Iterator[None]:
     """Errors inside become an InputError that names the bag."""
     try:
         yield
+    except InputError:
+        raise
     except Exception as error:  # rosbags, sqlite and unpackers raise anything on a damaged bag
         raise InputError(
             f"{path} is no bag that can be read, or is damaged from here on: {error}."
         ) from error
+
+
+def _profile(path: Path) -> str | None:
+    """Whose messages an MCAP says that it holds, in its first record; None: it cannot be read."""
+    with path.open("rb") as stream:
+        head = stream.read(len(_MAGIC) + 13 + 64)
+    size = int.from_bytes(head[len(_MAGIC) + 9 :][:4], "little")
+    if not head.startswith(_MAGIC + b"\x01") or size > 64:
+        return None
+    return head[len(_MAGIC) + 13 :][:size].decode(errors="replace")
 
 
 def _end_of_records(path: Path) -> int:

@@ -10,7 +10,7 @@ from typing import Any, Literal, NamedTuple
 
 from tumortrack.core.errors import InputError
 from tumortrack.core.mesh_files import read_anatomy
-from tumortrack.core.store import read_json
+from tumortrack.core.store import natural, read_json
 from tumortrack.core.types import DepthFrame, SensorCloud
 from tumortrack.live.values import Observation
 from tumortrack.sense import files
@@ -29,17 +29,17 @@ class RecordedFrame(NamedTuple):
 
 
 def folder_frames(path: Path, fps: float, unit: Literal["mm", "m"]) -> list[RecordedFrame]:
-    """The frames in a folder, by name; none is read yet.
+    """The frames in a folder, by name and number; none is read yet.
 
-    Scene folders (with depth.png and intrinsics.json, or cloud.ply), depth images (.png) with one
-    intrinsics.json, or clouds (.ply, .pcd, .npz, in ``unit``). Stamps: ``stamp_ns`` of a scene's
+    Scene folders (with depth.png and intrinsics.json, or cloud.ply), depth images with one
+    intrinsics.json, or clouds (in ``unit``). Stamps: ``stamp_ns`` of a scene's
     meta.json, or file names of at least 12 digits, in ns; else ``fps`` frames a second. Raises
     InputError if there are none of these.
     """
     listed = path.iterdir() if path.is_dir() else ()
-    inside = sorted(p for p in listed if not p.name.startswith("."))
+    inside = sorted((p for p in listed if not p.name.startswith(".")), key=natural)
     scenes = [p for p in inside if (p / DEPTH).is_file() or (p / CLOUD).is_file()]
-    images = [p for p in inside if p.suffix.lower() == ".png" and p.is_file()]
+    images = [p for p in inside if p.suffix.lower() in files.DEPTH_SUFFIXES and p.is_file()]
     clouds = [p for p in inside if p.suffix.lower() in files.CLOUD_SUFFIXES and p.is_file()]
     camera, image, cloud = path / INTRINSICS, files.read_depth_png, files.read_cloud
     kinds: list[tuple[list[Path], Callable[[Path], Observation]]] = [
@@ -49,11 +49,16 @@ def folder_frames(path: Path, fps: float, unit: Literal["mm", "m"]) -> list[Reco
     ]
     frame_paths, read = next((kind for kind in kinds if kind[0]), ([], _read_scene))
     if not frame_paths:
-        lack = f"its .png need {INTRINSICS} beside them" if images else "it holds none of these"
+        lack = (
+            f"its depth images need {INTRINSICS} beside them"
+            if images
+            else "it holds none of these"
+        )
         raise InputError(
             f"{path} is no recording: {lack}. Allowed: a folder of clouds "
-            f"({', '.join(files.CLOUD_SUFFIXES)}), of depth images (.png) with {INTRINSICS}, of "
-            "scene folders, a rosbag2 folder, .mcap, .db3 or .bag."
+            f"({', '.join(files.CLOUD_SUFFIXES)}), of depth images "
+            f"({', '.join(files.DEPTH_SUFFIXES)}) with {INTRINSICS}, of scene folders, a rosbag2 "
+            "folder, .mcap, .db3 or .bag."
         )
     named = all(re.fullmatch(r"[0-9]{12,}", p.stem) for p in frame_paths)  # fewer: a number
     period_ns, last_ns, frames = round(1e9 / fps), 0, []

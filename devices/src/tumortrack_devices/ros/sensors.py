@@ -19,6 +19,7 @@ from tumortrack.core.types import DepthFrame, Intrinsics, SensorCloud
 from tumortrack.live.values import Observation
 from tumortrack.sense.camera import plausible
 from tumortrack.sense.cloud import seen_points
+from tumortrack.sense.units import depths_mm
 from tumortrack_devices.ros.messages import MM_PER_M, Messages, Outgoing, stamp_of
 
 CLOUD = "sensor_msgs/msg/PointCloud2"
@@ -54,6 +55,8 @@ def cloud_of(message: Any) -> SensorCloud:
         raise InputError(f"a cloud came with the fields {names}; x, y and z are needed.")
     width, height, row = int(message.width), int(message.height), int(message.row_step)
     data = np.frombuffer(message.data, np.uint8)
+    if step * width * height == data.nbytes:  # some state all bytes as a row's
+        row = step * width
     organised = height > 1
     claimed = row * (height - 1) + step * width if organised else step * width * height
     if claimed > data.nbytes or (organised and row < step * width):
@@ -92,7 +95,7 @@ def depth_of(image: Any, info: Any, rectified: bool = False, unit_mm: float = 1.
     """A depth Image and its CameraInfo as a frame, with the image's stamp.
 
     Args:
-        image: 32FC1 (metres), 16UC1 or mono16 (whole numbers); 0, NaN and infinity are no return.
+        image: 32FC1 (metres), 16UC1 or mono16 (whole numbers); no return: see ``depths_mm``.
         rectified: the image is rectified: its camera is P, and D was removed. Otherwise its camera
             is K, and D must be zero.
         unit_mm: one step of a 16-bit image; in ROS 1 mm (REP 118).
@@ -110,10 +113,7 @@ def depth_of(image: Any, info: Any, rectified: bool = False, unit_mm: float = 1.
             f"a depth image of {values.shape[1]} x {values.shape[0]} came with a camera_info of "
             f"{intrinsics.width} x {intrinsics.height}. Name the camera_info of this very image."
         )
-    depth_mm = values.astype(np.float32)
-    with np.errstate(over="ignore", invalid="ignore"):
-        depth_mm *= np.float32(unit_mm if values.dtype.kind == "u" else 1000)
-    depth_mm[~((depth_mm > 0) & (depth_mm < np.inf))] = np.nan
+    depth_mm = depths_mm(values, unit_mm if values.dtype.kind == "u" else MM_PER_M)
     return DepthFrame(depth_mm, intrinsics, stamp_of(image.header))
 
 
@@ -208,6 +208,8 @@ def _pixels(image: Any, allowed: dict[str, str], what: str) -> np.ndarray:
         )
     width, height, step = int(image.width), int(image.height), int(image.step)
     data, wide = np.frombuffer(image.data, np.uint8), np.dtype(code).itemsize
+    if width * wide * height == data.nbytes:
+        step = width * wide
     fits = 0 < width <= _LONGEST_SIDE and 0 < height <= _LONGEST_SIDE
     if not fits or step < width * wide or step * height > data.nbytes:
         raise InputError(

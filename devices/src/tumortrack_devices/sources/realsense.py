@@ -21,6 +21,7 @@ from tumortrack.core.errors import InputError
 from tumortrack.core.types import DepthFrame, Intrinsics
 from tumortrack.live.values import Observation, SourceConfig, SourceEnded, SourceLost
 from tumortrack.sense.camera import plausible
+from tumortrack.sense.units import depths_mm
 
 _RECORDINGS = (".db3", ".bag")
 _LAST_S = 0.2  # after a recording's end, for its last frame
@@ -145,8 +146,7 @@ class RealSenseSource:
                 )
             return None
         raw = np.asarray(frame.get_data())
-        depth_mm = raw * np.float32(self._unit_mm)
-        depth_mm[raw == 0] = np.nan  # no return
+        depth_mm = depths_mm(raw, self._unit_mm)
         depth = DepthFrame(depth_mm, self._intrinsics, round(frame.get_timestamp() * 1e6))
         picture = np.array(pair[False].get_data()) if False in pair else None
         return Observation(depth, arrived_ns, picture=picture)

@@ -26,7 +26,10 @@ from tumortrack_devices.igtl.message import Header
 from tumortrack_devices.tools.tip import Piece, TipConfig, TipTool
 
 _SETTLED_S = 0.5  # a drawn piece that has not changed for so long is meant
-_SILENT_S = 5.0  # without a connection, before it is said
+_SILENT_S = 5.0  # without a connection, or without the tool's pose, before it is said
+_MOST_DEVICES = 20  # that are named
+# Behind this machine's clock: a sender that is no more has the same time, and its stamps count.
+_LAG_NS, _AHEAD_NS, _OTHER_CLOCK_NS = 100_000_000, 5_000_000, 1_000_000_000
 _MOST_DRAWN = 200  # pieces under way
 _APART_MM, _MOST_PLACES = 3.0, 100  # of an outline: nearer places share their error
 _MEANT = {"1": True, "true": True, "on": True, "0": False, "false": False, "off": False}
@@ -37,10 +40,13 @@ class OpenIgtLinkToolConfig(TipConfig, frozen=True, kw_only=True, tag="openigtli
     the server (3D Slicer connects), where 18944 may be the sink's.
 
     Attributes:
-        name: device of the tool's TRANSFORM; empty: there is no tool, only what is drawn.
+        name: device of the tool's TRANSFORM, of which 20 characters count; empty: there is no tool,
+            only what is drawn.
         contact: device of a STRING that is 1 while the tip touches, else 0.
         space: ras negates x and y, as 3D Slicer has them; lps takes them as they are. Default: ras
             of who connects to us, lps of a server.
+        clock: when a pose or contact was: sender: by its stamp; arrival: as it comes; auto: by its
+            stamp if that of the first is at most 0.1 s old, else the clocks differ: as it comes.
         host: as the server: which of this machine's addresses; 0.0.0.0: all.
     """
 
@@ -50,6 +56,7 @@ class OpenIgtLinkToolConfig(TipConfig, frozen=True, kw_only=True, tag="openigtli
     name: str = ""
     contact: str = "contact"
     space: Literal["", "ras", "lps"] = ""
+    clock: Literal["auto", "sender", "arrival"] = "auto"
     host: str = "127.0.0.1"
 
     def __post_init__(self) -> None:
@@ -75,11 +82,17 @@ class OpenIgtLinkToolConfig(TipConfig, frozen=True, kw_only=True, tag="openigtli
 
 
 class OpenIgtLinkTool(TipTool):
-    """``link``: the connection. Poses and contacts have the time of their arrival."""
+    """``link``: the connection."""
 
     def __init__(self, config: OpenIgtLinkToolConfig, context: SinkContext, name: str) -> None:
         super().__init__(config, context, name, "" if config.name else None)
-        self._device, self._contact_device = config.name, config.contact
+        self._device, self._contact_device = (
+            name[: igtl.LONGEST_DEVICE] for name in (config.name, config.contact)
+        )
+        self._came = dict[tuple[str, str], None]()  # types and devices
+        self._posed, self._absent, self._apart_s = False, "", time.monotonic()
+        self._watched = config.clock == "auto"
+        self._stamped: bool | None = {"sender": True, "arrival": False}.get(config.clock)
         ras = config.space == "ras" or not (config.space or config.server)
         self._axes = RAS_FROM_LPS if ras else np.eye(4)
         self._poses, self._lock = PoseBuffer(), threading.Lock()
@@ -93,7 +106,8 @@ class OpenIgtLinkTool(TipTool):
             "POLYDATA": self._hear_outline,
         }
         self.link = Link(
-            config.host, int(config.port_text), config.server, self._heard, self._faulty
+            *(config.host, int(config.port_text), config.server),
+            *(self._heard, self._faulty, self._readers),
         )
 
     def pose(self, stamp_ns: int) -> Affine:
@@ -102,6 +116,11 @@ class OpenIgtLinkTool(TipTool):
     def refresh(self, stamp_ns: int) -> None:
         fault, self._heard_fault = self._heard_fault, ""
         now_s = time.monotonic()
+        if not self.link.receivers:
+            self._apart_s = now_s
+        elif self._device and not self._posed and now_s - self._apart_s > _SILENT_S:
+            self._absent = self._absent or self._other_words()
+            fault = fault or self._absent
         if not self._server or self.link.receivers:
             self._reached_s = now_s
         elif now_s - self._reached_s > _SILENT_S:
@@ -120,33 +139,67 @@ class OpenIgtLinkTool(TipTool):
     def close(self) -> None:
         self.link.close()
 
+    def _other_words(self) -> str:
+        """What comes, where the tool's pose does not."""
+        others = ", ".join(f"{kind} of {device!r}" for kind, device in [*self._came])
+        return (
+            f"it is connected, but no TRANSFORM of {self._device!r} comes; "
+            f"{f'what comes is {others}' if others else 'nothing comes at all'}. Allowed: name= as "
+            "it is sent, and the type TRANSFORM"
+        )
+
+    def _time_of(self, header: Header) -> int:
+        """When what a message says was so, ns, by this machine's clock or the sender's."""
+        now_ns = time.time_ns()
+        late_ns = now_ns - header.stamp_ns
+        if not header.stamp_ns:
+            return now_ns
+        if self._stamped is None or (self._watched and self._stamped):
+            most_ns = _LAG_NS if self._stamped is None else _OTHER_CLOCK_NS
+            self._stamped = -most_ns * (most_ns > _LAG_NS) - _AHEAD_NS <= late_ns <= most_ns
+            if not self._stamped:
+                self._heard_fault = (
+                    f"its stamps lie {late_ns * 1e-9:.2f} s behind this machine's clock, so they "
+                    "do not count: poses have the time of their arrival. Synchronise both clocks"
+                )
+        return header.stamp_ns if self._stamped else now_ns
+
     def _faulty(self, words: str) -> None:
         self._heard_fault = f"a message was ignored: {words}"
 
     def _heard(self, header: Header, body: bytes) -> None:
         """One message, in the link's thread. Raises ProtocolError."""
+        if len(self._came) < _MOST_DEVICES:
+            self._came[header.type, header.device] = None
         if (reader := self._readers.get(header.type)) is not None:
-            reader(header.device, *igtl.unpack_body(header, body))
+            reader(header, *igtl.unpack_body(header, body))
 
-    def _hear_pose(self, device: str, content: bytes, metadata: Mapping[str, str]) -> None:
-        if device == self._device and metadata.get("TransformStatus", "OK") == "OK":
+    def _hear_pose(self, header: Header, content: bytes, metadata: Mapping[str, str]) -> None:
+        if header.device != self._device:
+            return
+        self._posed, self._absent = True, ""
+        if metadata.get("TransformStatus", "OK") == "OK":
             pose = self._axes @ igtl.unpack_transform(content) @ self._axes
-            self._poses.add(time.time_ns(), pose)
+            self._poses.add(self._time_of(header), pose)
 
-    def _hear_contact(self, device: str, content: bytes, _: Mapping[str, str]) -> None:
-        if device == self._contact_device:
+    def _hear_contact(self, header: Header, content: bytes, _: Mapping[str, str]) -> None:
+        if header.device == self._contact_device:
             text = igtl.unpack_string(content).strip().lower()
             if text not in _MEANT:
-                raise igtl.ProtocolError(f"the STRING {device} is {text!r}; allowed: 1 or 0.")
-            self.contact(time.time_ns(), _MEANT[text])
+                raise igtl.ProtocolError(
+                    f"the STRING {header.device} is {text!r}; allowed: 1 or 0."
+                )
+            self.contact(self._time_of(header), _MEANT[text])
 
-    def _hear_points(self, device: str, content: bytes, _: Mapping[str, str]) -> None:
+    def _hear_points(self, header: Header, content: bytes, _: Mapping[str, str]) -> None:
+        device = header.device
         for number, (label, group, place_mm) in enumerate(igtl.unpack_points(content)):
             part = self._part(label, group, device)
             fields = {"part": part, "tip_mm": self.config.tip_mm}
             self._draw((device, number), Touch, place_mm[None], fields)
 
-    def _hear_outline(self, device: str, content: bytes, _: Mapping[str, str]) -> None:
+    def _hear_outline(self, header: Header, content: bytes, _: Mapping[str, str]) -> None:
+        device = header.device
         places_mm = _thinned(igtl.unpack_polydata_points(content))
         if len(places_mm):
             self._draw((device, -1), Outline, places_mm, {"part": self._part(device)})

@@ -16,7 +16,7 @@ from jaxtyping import UInt8
 from tumortrack.core.config import Config, from_builtins
 from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.geometry import Affine, read_rigid
-from tumortrack.core.store import read_file, read_json
+from tumortrack.core.store import natural, read_file, read_json
 from tumortrack.core.types import DepthFrame, SensorCloud
 from tumortrack.live.poses import FilePoses
 from tumortrack.live.values import Observation
@@ -58,7 +58,8 @@ def read_shots(folder: Path) -> list[Shot]:
     """The pictures in a folder, by name: loose ones; folders with colour.png or infrared.png each
     (and depth.png, intrinsics.json, meta.json); or a recording, whose states are a pose each.
     Raises InputError: there are none, one is damaged, or they differ in size."""
-    inside = sorted(p for p in folder.iterdir() if p.name[0] != ".") if folder.is_dir() else []
+    listed = folder.iterdir() if folder.is_dir() else ()
+    inside = sorted((p for p in listed if p.name[0] != "."), key=natural)
     names = [name + suffix for name in _NAMES for suffix in _SUFFIXES]
     files = [next((p / n for n in names if (p / n).is_file()), None) for p in inside if p.is_dir()]
     if any(p.suffix == ".mcap" for p in inside):

@@ -20,6 +20,7 @@ from jaxtyping import UInt8
 
 from tumortrack.core.errors import InputError, TumortrackError
 from tumortrack.core.geometry import Affine
+from tumortrack.core.store import natural
 from tumortrack.core.types import DepthFrame
 
 STATE, TF, CAMERA = "/state", "/tf", "/camera/"
@@ -90,7 +91,11 @@ def read_recorded(folder: Path) -> Recorded:
     there is none, or it is damaged."""
     from tumortrack_experiment.record.attachments import attachments_of
 
-    files = [folder / WHOLE] if (folder / WHOLE).is_file() else sorted(folder.glob("*.mcap"))
+    files = (
+        [folder / WHOLE]
+        if (folder / WHOLE).is_file()
+        else sorted(folder.glob("*.mcap"), key=natural)
+    )
     takes: dict[str, _Take] = {}
     for file in files:
         began = [(at_ns, message.data) for topic, at_ns, message in messages_in(file, of=STATE)]

@@ -11,6 +11,7 @@ import numpy as np
 from tumortrack.core.config import from_builtins
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import transform_points
+from tumortrack.core.store import natural
 from tumortrack.core.types import DepthFrame
 from tumortrack.sense.files import read_depth_png
 from tumortrack_devices.recording.folders import folder_frames
@@ -34,7 +35,7 @@ def states_in(recording: Path, kit: Kit) -> dict[str, Recorded | Path]:
         recorded = read_recorded(recording)
         check_kit(recorded, kit)
         return dict.fromkeys(recorded.states, recorded)
-    inside = sorted(path for path in recording.iterdir() if path.is_dir())
+    inside = sorted((path for path in recording.iterdir() if path.is_dir()), key=natural)
     states = {path.name: path for path in inside if any(path.rglob("*.png"))}
     if not states:
         raise InputError(

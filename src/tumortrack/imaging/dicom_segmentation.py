@@ -1,0 +1,76 @@
+"""A binary DICOM segmentation (PS3.3 A.51) as segments, by pydicom."""
+
+from __future__ import annotations
+
+import warnings
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tumortrack.core.errors import InputError
+from tumortrack.imaging.dicom import frame_groups, is_segmentation
+from tumortrack.imaging.grid import RawVolume, Segment, check_affine, check_size
+from tumortrack.imaging.segments import painted
+
+_OFF_STEP = 0.05  # of a slice: rounding of positions
+
+
+def read_segmentation(path: Path) -> RawVolume | None:
+    """The segments of a file; None: it is no segmentation. Slices that hold nothing may be left
+    out of it, so the image is taken to end where the segments do. Raises InputError: damaged,
+    fractional, slices without a common step."""
+    if not is_segmentation(path):
+        return None
+    import pydicom
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            return _read(path, pydicom.dcmread(path))
+    except InputError:
+        raise
+    except Exception as error:  # pydicom raises anything on a damaged file
+        raise InputError(f"{path} is cut short or damaged ({error}). Export it again.") from error
+
+
+def _read(path: Path, tags: Any) -> RawVolume:
+    if tags.SegmentationType != "BINARY":
+        raise InputError(f"{path}: its segments are {tags.SegmentationType}; BINARY is read.")
+    groups = list(frame_groups(tags, int(tags.NumberOfFrames)))
+    positions = np.array([g("PlanePositionSequence").ImagePositionPatient for g in groups], float)
+    row, column = np.reshape(
+        np.array(groups[0]("PlaneOrientationSequence").ImageOrientationPatient, float), (2, 3)
+    )
+    measures = groups[0]("PixelMeasuresSequence")
+    normal = np.cross(row, column)
+    along = positions @ normal
+    gaps = np.diff(np.unique(np.round(along, 3)))
+    step = float(gaps.min() if len(gaps) else measures.SliceThickness)
+    slices = (along - along.min()) / step
+    if np.abs(slices - np.rint(slices)).max() > _OFF_STEP:
+        raise InputError(f"{path}: its slices have no common step. Export it again, or as NIfTI.")
+    index = np.rint(slices).astype(int)
+    lps_from_index = np.eye(4)
+    between_rows, between_columns = map(float, measures.PixelSpacing)
+    axes = row * between_columns, column * between_rows, normal * step
+    lps_from_index[:3] = np.stack([*axes, positions[along.argmin()]], axis=1)
+    shape = int(tags.Columns), int(tags.Rows), max(2, int(index.max()) + 1)
+    names = {int(s.SegmentNumber): str(s.SegmentLabel) for s in tags.SegmentSequence}
+    numbers = [int(g("SegmentIdentificationSequence").ReferencedSegmentNumber) for g in groups]
+    if len(names) < len(tags.SegmentSequence) or not set(numbers) <= set(names) <= set(range(256)):
+        raise InputError(f"{path}: its segments' numbers are damaged. Export it again.")
+    check_size(path, shape, 1, True)
+    check_affine(path, lps_from_index)
+    frames = tags.pixel_array.reshape(len(groups), *shape[1::-1])
+
+    def mask(number: int) -> np.ndarray:
+        out = np.zeros(shape, bool)
+        for frame, k, of in zip(frames, index.tolist(), numbers, strict=True):
+            if of == number:
+                out[..., k] |= frame.T > 0
+        return out
+
+    segments = tuple(Segment(n, name, partial(mask, n)) for n, name in names.items())
+    return RawVolume(painted(segments), lps_from_index, segments=segments)

@@ -1,0 +1,458 @@
+"""Laws that hold whatever the file: nothing is dropped or taken for a tumor without a word, an
+organ at the image's border is told, tolerances are stated, segments may overlap, names decide."""
+
+import gzip
+import json
+import os
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from imaging_objects import kidney_labels, write_dicom, write_nifti
+from tumortrack.core import store
+from tumortrack.core.case_warning import warnings_in
+from tumortrack.core.errors import InputError
+from tumortrack.core.types import LabelVolume, Volume
+from tumortrack.imaging.case import load_case, save_case
+from tumortrack.imaging.options import PrepareOptions
+from tumortrack.imaging.prepare import prepare
+from tumortrack.imaging.volume import read_raw
+from tumortrack.phantom.digital import PhantomParameters, phantom_labels
+
+VOXEL_MM = 2.4
+KIDNEY_ML, TUMORS_ML = 185.15, (28.8, 17.1)  # of the labels; in its CT 180.12, 28.79, 17.40
+OTHER_ML = 4 / 3 * np.pi * 11**3 / 1000  # of a ball
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Masks by name, on one grid."""
+
+    masks: dict[str, np.ndarray]
+    affine: np.ndarray
+    numbers: dict[str, int] = field(default_factory=dict)
+
+    def number(self, name: str) -> int:
+        return self.numbers.get(name, list(self.masks).index(name) + 1)
+
+    def map(self) -> np.ndarray:
+        """Later masks win."""
+        out = np.zeros(next(iter(self.masks.values())).shape, np.uint8)
+        for name, mask in self.masks.items():
+            out[mask] = self.number(name)
+        return out
+
+
+@pytest.fixture(scope="module")
+def phantom() -> Scene:
+    volume = phantom_labels(PhantomParameters(), VOXEL_MM)
+    labels = np.pad(volume.labels, 8)
+    affine = volume.lps_from_index.copy()
+    affine[:3, 3] -= 8 * VOXEL_MM
+    masks = {"kidney": labels > 0, "tumor_a": labels == 2, "tumor_b": labels == 3}
+    return Scene(masks, affine)
+
+
+def with_ball(scene: Scene, name: str, out_mm: float, radius_mm: float = 11.0) -> Scene:
+    """A ball beside the kidney's side, whose middle lies ``out_mm`` outside of it, to the right."""
+    kidney = scene.masks["kidney"]
+    index = np.indices(kidney.shape).reshape(3, -1)
+    places = (scene.affine[:3, :3] @ index).T + scene.affine[:3, 3]
+    middle = places[kidney.ravel()].mean(0)
+    row = np.abs(places[:, 1:] - middle[1:]).max(1) < VOXEL_MM / 1.5
+    middle[0] = places[row & kidney.ravel(), 0].min() - out_mm
+    ball = (np.linalg.norm(places - middle, axis=1) < radius_mm).reshape(kidney.shape)
+    return replace(scene, masks={**scene.masks, name: ball & ~kidney})
+
+
+def nifti(scene: Scene, folder: Path) -> Path:
+    write_nifti(folder / "map.nii.gz", scene.map(), scene.affine, "both")
+    return folder / "map.nii.gz"
+
+
+def nrrd_head(scene: Scene, sizes: str, lead: str, segments: str = "") -> bytes:
+    i, j, k, origin = (",".join(map(str, c)) for c in scene.affine[:3].T.tolist())
+    return (
+        f"NRRD0004\ntype: unsigned char\ndimension: {len(sizes.split())}\n"
+        f"space: left-posterior-superior\nsizes: {sizes}\n"
+        f"space directions: {lead}({i}) ({j}) ({k})\nencoding: gzip\n"
+        f"space origin: ({origin})\n{segments}\n"
+    ).encode()
+
+
+def nrrd(scene: Scene, folder: Path) -> Path:
+    labels = scene.map()
+    head = nrrd_head(scene, " ".join(map(str, labels.shape)), "")
+    (folder / "map.nrrd").write_bytes(head + gzip.compress(labels.tobytes(order="F")))
+    return folder / "map.nrrd"
+
+
+def seg_nrrd(scene: Scene, folder: Path, names: tuple[str, ...] = ()) -> Path:
+    """Each segment in a layer of its own, as Slicer writes segments that overlap."""
+    layers = np.stack([*scene.masks.values()]).astype(np.uint8)
+    fields = "".join(
+        f"Segment{n}_ID:=Segment_{n}\nSegment{n}_Name:={name}\nSegment{n}_LabelValue:=1\n"
+        f"Segment{n}_Layer:={n}\n"
+        for n, name in enumerate(names or scene.masks)
+    )
+    head = nrrd_head(scene, " ".join(map(str, layers.shape)), "none ", fields)
+    (folder / "map.seg.nrrd").write_bytes(head + gzip.compress(layers.tobytes(order="F")))
+    return folder / "map.seg.nrrd"
+
+
+def files(scene: Scene, folder: Path) -> Path:
+    """A folder with a file for each, as TotalSegmentator writes it."""
+    (folder / "files").mkdir()
+    for name, mask in scene.masks.items():
+        path = folder / "files" / f"{name}.nii.gz"
+        write_nifti(path, mask.astype(np.uint8), scene.affine, "both")
+    return folder / "files"
+
+
+def meshes(scene: Scene, folder: Path) -> Path:
+    from tumortrack.core.mesh_files import write_mesh
+    from tumortrack.imaging.surface import surface_of
+
+    (folder / "meshes").mkdir()
+    for name, mask in scene.masks.items():
+        mesh = surface_of(name, mask, scene.affine, VOXEL_MM, keep=lambda whole: whole)
+        write_mesh(folder / "meshes" / f"{name}.stl", mesh)
+    return folder / "meshes"
+
+
+NUMBERED, NAMED = {"nifti": nifti, "nrrd": nrrd}, {"seg.nrrd": seg_nrrd, "files": files}
+READERS = {**NUMBERED, **NAMED, "meshes": meshes}
+every = pytest.mark.parametrize("write", READERS.values(), ids=READERS)
+numbered = pytest.mark.parametrize("write", NUMBERED.values(), ids=NUMBERED)
+named = pytest.mark.parametrize("write", NAMED.values(), ids=NAMED)
+
+
+def volumes(case) -> list[float]:
+    return [part.volume_ml for part in case.anatomy.parts]
+
+
+def kinds(case) -> dict[str, dict]:
+    return {warning.kind: warning.values for warning in case.warnings}
+
+
+@pytest.fixture(autouse=True)
+def without_half_turns(monkeypatch):
+    """They take as long as all else and are tested elsewhere."""
+    monkeypatch.setattr("tumortrack.imaging.prepare.half_turns", lambda _: [])
+
+
+@every
+def test_the_phantom_is_the_phantom_by_every_reader_and_nothing_is_warned_of(
+    phantom, tmp_path, write
+):
+    case = prepare(write(phantom, tmp_path))
+    assert volumes(case) == pytest.approx([KIDNEY_ML, *TUMORS_ML], rel=0.015)
+    assert case.warnings == ()
+
+
+@pytest.mark.parametrize("write", [*NUMBERED.values(), *NAMED.values()], ids=[*NUMBERED, *NAMED])
+def test_an_organ_at_the_border_is_told_and_stays_told(phantom, tmp_path, write):
+    middle = phantom.map().shape[2] // 2
+    half = replace(phantom, masks={k: mask[..., :middle] for k, mask in phantom.masks.items()})
+    case = prepare(write(half, tmp_path))
+    cut = kinds(case)["cut"]
+    voxels = int(half.masks["kidney"][..., -1].sum())
+    assert cut["voxels"] == pytest.approx(voxels, abs=2)
+    assert cut["area_cm2"] == pytest.approx(voxels * VOXEL_MM**2 / 100, rel=0.015)
+    with store.new_folder(tmp_path / "case") as aside:
+        save_case(case, aside)
+    again = load_case(tmp_path / "case").warnings
+    assert [(w.kind, w.values) for w in again] == [(w.kind, w.values) for w in case.warnings]
+
+
+def test_a_ct_that_ends_in_the_organ_is_refused(tmp_path):
+    truth = kidney_labels((1.5, 1.5, 1.5))
+    first = int(np.flatnonzero(truth.labels.any((0, 1)))[0]) + 1
+    hu = np.choose(truth.labels[..., first:], [-1000, 40, 570, 570])
+    write_dicom(tmp_path / "ct", hu, truth.lps_from_index)
+    with pytest.raises(InputError, match="the image's end"):
+        prepare(tmp_path / "ct")
+
+
+def test_a_case_of_before_has_no_warnings(phantom, tmp_path):
+    case = prepare(nifti(phantom, tmp_path))
+    with store.new_folder(tmp_path / "case") as aside:
+        save_case(case, aside)
+    path = tmp_path / "case" / store.MANIFEST
+    manifest = json.loads(path.read_text())
+    del manifest["warnings"]
+    path.write_text(json.dumps(manifest))
+    assert load_case(tmp_path / "case").warnings == ()
+    with pytest.raises(InputError):
+        warnings_in([{"kind": "of_another_version", "values": {}}], "x")
+
+
+@every
+def test_a_body_apart_is_dropped_with_its_ml(phantom, tmp_path, write):
+    scene = with_ball(phantom, "apart", 20.0)
+    both = {**phantom.masks, "kidney": scene.masks["kidney"] | scene.masks["apart"]}
+    case = prepare(write(replace(phantom, masks=both), tmp_path))
+    assert volumes(case)[0] == pytest.approx(KIDNEY_ML, rel=0.015)
+    assert kinds(case)["dropped"]["ml"] == pytest.approx(OTHER_ML, rel=0.1)
+
+
+@every
+def test_the_pieces_of_one_tumor_are_tumors(phantom, tmp_path, write):
+    both = phantom.masks["tumor_a"] | phantom.masks["tumor_b"]
+    scene = replace(phantom, masks={"kidney": phantom.masks["kidney"], "tumor": both})
+    case = prepare(write(scene, tmp_path))
+    assert volumes(case) == pytest.approx([KIDNEY_ML, *TUMORS_ML], rel=0.015)
+
+
+@pytest.mark.parametrize("write", [*NUMBERED.values(), *NAMED.values()], ids=[*NUMBERED, *NAMED])
+def test_what_touches_and_nobody_named_is_left_out_with_its_ml_or_counts_if_asked(
+    phantom, tmp_path, write
+):
+    """A cyst on the surface, half outside."""
+    scene = with_ball(phantom, "cyst", 0.0)
+    path, ml = write(scene, tmp_path), float(scene.masks["cyst"].sum()) * VOXEL_MM**3 / 1000
+    number = {name: scene.number(name) for name in scene.masks}
+    if path.is_dir():  # numbered by name
+        number = {name: n for n, name in enumerate(sorted(scene.masks), 1)}
+    stated = PrepareOptions(organ=number["kidney"], tumor=(number["tumor_a"], number["tumor_b"]))
+    case = prepare(path, stated)
+    assert volumes(case) == pytest.approx([KIDNEY_ML, *TUMORS_ML], rel=0.015)
+    beside = kinds(case)["beside"]
+    assert beside["label"] == number["cyst"]
+    assert beside["ml"] == pytest.approx(ml)
+    case = prepare(path, replace(stated, organ=(number["kidney"], number["cyst"])))
+    assert volumes(case) == pytest.approx([KIDNEY_ML + ml, *TUMORS_ML], rel=0.015)
+    assert case.warnings == ()
+
+
+@numbered
+@pytest.mark.parametrize("numbers", [{"kidney": 2, "tumor_a": 1, "tumor_b": 3}])
+def test_a_tumor_that_nobody_named_is_asked_for_and_never_filled(phantom, tmp_path, write, numbers):
+    path = write(replace(phantom, numbers=numbers), tmp_path)
+    with pytest.raises(InputError, match="--tumor 1"):
+        prepare(path, PrepareOptions(organ=2))
+    case = prepare(path, PrepareOptions(organ=2, tumor=(1, 3)))
+    assert volumes(case) == pytest.approx([KIDNEY_ML, *TUMORS_ML[::1]], rel=0.015)
+    assert len(prepare(path, PrepareOptions(organ=2, tumor=0)).anatomy.parts) == 1
+
+
+@numbered
+def test_of_a_map_of_many_organs_only_the_named_one_is_taken(phantom, tmp_path, write):
+    scene = with_ball(phantom, "liver", 20.0, 25.0)
+    masks = {"spleen": np.zeros_like(scene.masks["kidney"]), "kidney": phantom.masks["kidney"]}
+    masks["liver"] = scene.masks["liver"]
+    case = prepare(write(replace(scene, masks=masks), tmp_path), PrepareOptions(organ=2))
+    assert volumes(case) == pytest.approx([KIDNEY_ML], rel=0.015)
+    ml = float(masks["liver"].sum()) * VOXEL_MM**3 / 1000
+    assert kinds(case)["beside"] == pytest.approx({"label": 3, "name": "", "ml": ml})
+
+
+@named
+def test_names_decide_not_the_order(phantom, tmp_path, write):
+    order = {"tumor_b": 0, "liver": 1, "kidney_left": 2, "tumor_a": 3}
+    scene = with_ball(phantom, "liver", 20.0, 15.0)
+    masks = {**scene.masks, "kidney_left": scene.masks["kidney"]}
+    path = write(replace(scene, masks={name: masks[name] for name in order}), tmp_path)
+    case = prepare(path)
+    assert volumes(case)[0] == pytest.approx(KIDNEY_ML, rel=0.015)
+    assert sorted(volumes(case)[1:]) == pytest.approx(sorted(TUMORS_ML), rel=0.015)
+    with pytest.raises(InputError, match="none is a prostate"):
+        prepare(path, PrepareOptions(name="prostate"))
+    carried = prepare(path, PrepareOptions(structure=("hepar=liver",)))
+    assert list(carried.anatomy.structures) == ["hepar"]
+
+
+def test_one_name_twice_is_one_organ_and_one_label_twice_is_refused(phantom, tmp_path):
+    kidney = phantom.masks["kidney"]
+    upper = np.arange(kidney.shape[2]) >= kidney.shape[2] // 2
+    scene = replace(phantom, masks={"a": kidney & upper, "b": kidney & ~upper})
+    path = seg_nrrd(scene, tmp_path, ("Kidney", "Kidney"))
+    assert volumes(prepare(path)) == pytest.approx([KIDNEY_ML], rel=0.015)
+    path.write_bytes(path.read_bytes().replace(b"Segment1_Layer:=1", b"Segment1_Layer:=0"))
+    with pytest.raises(InputError, match="both label 1"):
+        prepare(path)
+
+
+def test_several_files_in_one_call_and_a_tumors_file_alone(phantom, tmp_path):
+    folder = files(phantom, tmp_path)
+    paths = [folder / f"{name}.nii.gz" for name in ("tumor_a", "kidney")]
+    assert volumes(prepare(paths)) == pytest.approx([KIDNEY_ML, TUMORS_ML[0]], rel=0.015)
+    with pytest.raises(InputError, match="a tumor by its name"):
+        prepare(paths[0])
+    other = replace(phantom, affine=phantom.affine + np.eye(4, k=3))
+    write_nifti(paths[0], phantom.masks["tumor_a"].astype(np.uint8), other.affine, "both")
+    with pytest.raises(InputError, match="another grid"):
+        prepare(paths)
+
+
+def test_a_size_that_no_kidney_has_is_told(phantom, tmp_path):
+    large = replace(phantom, affine=phantom.affine * [[2.0], [2.0], [2.0], [1.0]])
+    case = prepare(nifti(large, tmp_path))
+    assert kinds(case)["size"]["ml"] == pytest.approx(8 * KIDNEY_ML, rel=0.015)
+
+
+@pytest.mark.parametrize("off", [2e-8, 5e-4, -5e-4, 2e-3])
+def test_labels_with_a_scale_are_rounded_within_a_thousandth(phantom, tmp_path, off):
+    array = phantom.map() * np.float64(1 + off)
+    write_nifti(tmp_path / "l.nii.gz", array.astype(np.float32), phantom.affine, "both")
+    if 3 * abs(off) > 1e-3:
+        with pytest.raises(InputError):
+            prepare(tmp_path / "l.nii.gz", PrepareOptions(labels=True))
+    else:
+        case = prepare(tmp_path / "l.nii.gz")
+        assert volumes(case) == pytest.approx([KIDNEY_ML, *TUMORS_ML], rel=0.015)
+
+
+def test_a_shear_that_a_quaternion_cannot_hold_is_no_contradiction(phantom, tmp_path):
+    import nibabel
+
+    from tumortrack.core.geometry import RAS_FROM_LPS
+
+    affine = RAS_FROM_LPS @ phantom.affine
+    affine[1, 2] += 0.5  # a gantry tilted by 17 degrees
+    image = nibabel.Nifti1Image(phantom.map(), affine)
+    image.set_sform(affine, code=1)
+    image.set_qform(affine, code=1)  # as nibabel strips it
+    nibabel.save(image, tmp_path / "l.nii.gz")
+    assert not np.allclose(image.get_qform(), affine, atol=0.05)
+    assert np.allclose(read_raw(tmp_path / "l.nii.gz").lps_from_index, RAS_FROM_LPS @ affine)
+    image.set_qform(affine @ np.diag([-1.0, 1, 1, 1]), code=1)
+    nibabel.save(image, tmp_path / "l.nii.gz")
+    with pytest.raises(InputError, match="disagree"):
+        read_raw(tmp_path / "l.nii.gz")
+
+
+@pytest.mark.parametrize("name", ["a.vtk", "a.mha", "a.vtp", "a.mgz", "a.npy"])
+def test_a_format_that_is_not_read_says_what_to_save_instead(tmp_path, name):
+    (tmp_path / name).write_bytes(b"x" * 100)
+    for given in (tmp_path, tmp_path / name):
+        with pytest.raises(InputError, match="Save it as"):
+            prepare(given)
+
+
+def test_a_ct_beside_a_label_map_is_kept_if_it_has_its_grid(phantom, tmp_path):
+    path = nifti(phantom, tmp_path)
+    hu = np.choose(phantom.map(), [-1000, 40, 570, 570]).astype(np.int16)
+    write_nifti(tmp_path / "ct.nii.gz", np.pad(hu, 3), _moved(phantom.affine, -3), "both")
+    case = prepare(path, PrepareOptions(ct=tmp_path / "ct.nii.gz"))
+    assert (case.ct.hu[case.labels.labels == 2] == 570).all()
+    write_nifti(tmp_path / "ct.nii.gz", hu, _moved(phantom.affine, 0.4), "both")
+    with pytest.raises(InputError, match="--ct"):
+        prepare(path, PrepareOptions(ct=tmp_path / "ct.nii.gz"))
+
+
+def _moved(affine: np.ndarray, voxels: float) -> np.ndarray:
+    out = affine.copy()
+    out[:3, 3] += affine[:3, :3] @ ([voxels] * 3)
+    return out
+
+
+def slices(phantom: Scene, folder: Path) -> tuple[list[Path], np.ndarray]:
+    hu = np.choose(phantom.map(), [-1000, 40, 570, 570]).astype(np.int16)
+    return write_dicom(folder, hu, phantom.affine), hu
+
+
+def retagged(paths: list[Path], **change) -> None:
+    import pydicom
+
+    for n, path in enumerate(paths):
+        data = pydicom.dcmread(path)
+        for tag, of in change.items():
+            setattr(data, tag, of(n, getattr(data, tag)))
+        data.save_as(path)
+
+
+def late_decimals(by: float):
+    return lambda n, values: [f"{float(v) + by * (n % 3):.9g}" for v in values]
+
+
+@pytest.mark.parametrize(
+    ("change", "read"),
+    [
+        ({"ImageOrientationPatient": late_decimals(5e-4)}, True),
+        ({"ImageOrientationPatient": late_decimals(5e-3)}, False),
+        ({"PixelSpacing": late_decimals(2e-4)}, True),
+        ({"PixelSpacing": late_decimals(2e-2)}, False),
+        ({"RescaleIntercept": lambda n, _: f"{-1024 + 0.02 * (n % 3)}"}, True),
+        ({"RescaleIntercept": lambda n, _: f"{-1024 + 2 * (n % 3)}"}, False),
+    ],
+)
+def test_slices_may_differ_by_what_rounding_leaves(phantom, tmp_path, change, read):
+    paths, hu = slices(phantom, tmp_path / "ct")
+    retagged(paths, **change)
+    if read:
+        raw = read_raw(tmp_path / "ct")
+        assert raw.notes == ()
+        assert np.abs(raw.array - hu).max() < 0.1
+    else:
+        with pytest.raises(InputError):
+            read_raw(tmp_path / "ct")
+
+
+def test_slices_without_a_preamble_and_with_names_of_no_encoding_are_read(phantom, tmp_path):
+    paths, hu = slices(phantom, tmp_path / "ct")
+    for n, path in enumerate(paths):
+        content = path.read_bytes()[132:]
+        path.unlink()
+        (tmp_path / "ct" / os.fsdecode(b"sch\xf6n%d" % n)).write_bytes(content)
+    raw = read_raw(tmp_path / "ct")
+    assert raw.notes == ()
+    assert np.array_equal(raw.array, hu)
+
+
+def test_a_multi_frame_ct_is_read_from_its_folder_or_itself(phantom, tmp_path):
+    import pydicom
+    from pydicom.dataset import Dataset
+
+    paths, hu = slices(phantom, tmp_path / "classic")
+    data = [pydicom.dcmread(path) for path in paths]
+    whole = pydicom.dcmread(paths[0])
+    whole.SOPClassUID = whole.file_meta.MediaStorageSOPClassUID = "1.2.840.10008.5.1.4.1.1.2.1"
+    whole.NumberOfFrames = len(data)
+    shared, own = Dataset(), []
+    groups = {
+        "PixelMeasuresSequence": ("PixelSpacing",),
+        "PlaneOrientationSequence": ("ImageOrientationPatient",),
+        "PixelValueTransformationSequence": ("RescaleSlope", "RescaleIntercept"),
+    }
+    for name, tags in groups.items():
+        item = Dataset()
+        for tag in tags:
+            setattr(item, tag, getattr(whole, tag))
+            delattr(whole, tag)
+        setattr(shared, name, [item])
+    for slice_ in data[::-1]:
+        item, place = Dataset(), Dataset()
+        place.ImagePositionPatient = slice_.ImagePositionPatient
+        item.PlanePositionSequence = [place]
+        own.append(item)
+    del whole.ImagePositionPatient
+    whole.SharedFunctionalGroupsSequence, whole.PerFrameFunctionalGroupsSequence = [shared], own
+    whole.PixelData = b"".join(slice_.PixelData for slice_ in data[::-1])
+    (tmp_path / "enhanced").mkdir()
+    whole.save_as(tmp_path / "enhanced" / "ct.dcm")
+    for given in (tmp_path / "enhanced", tmp_path / "enhanced" / "ct.dcm"):
+        raw = read_raw(given)
+        assert np.array_equal(raw.array, hu)
+        assert np.allclose(raw.lps_from_index, phantom.affine, atol=1e-4)
+
+
+def test_our_own_dicom_segmentation_is_read_as_it_was_written(phantom, tmp_path):
+    pytest.importorskip("highdicom")
+    from tumortrack.imaging.segmentation_files import segments, write_dicom_seg
+    from tumortrack.phantom.dicom import write_dicom_series
+
+    hu = np.choose(phantom.map(), [-1000, 40, 570, 570]).astype(np.float32)
+    write_dicom_series(Volume(hu, phantom.affine), tmp_path / "ct")
+    labels = LabelVolume(phantom.map(), phantom.affine)
+    path = tmp_path / "segmentation.dcm"
+    write_dicom_seg(path, labels, segments(("kidney", "tumor_1", "tumor_2")), tmp_path / "ct")
+    case = prepare(path)
+    assert volumes(case) == pytest.approx([KIDNEY_ML, *TUMORS_ML], rel=0.015)
+    raw = read_raw(path)
+    first = int(np.flatnonzero(labels.labels.any((0, 1)))[0])
+    stop = first + raw.array.shape[2]
+    assert np.array_equal(raw.array, labels.labels[..., first:stop])
+    assert not labels.labels[..., stop:].any()
