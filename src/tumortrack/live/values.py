@@ -110,6 +110,10 @@ class PublishedFrame:
     error_deg: float = 0.0
     moves: bool = False
 
+    def named(self, frame_id: str) -> PublishedFrame:
+        """By this name, if it is the camera's frame and has none."""
+        return replace(self, frame_id=frame_id) if self.frame_id == "camera" else self
+
     def of_camera(self, published_from_camera: Affine) -> PublishedFrame:
         """The same frame, for a camera at another pose."""
         if np.array_equal(published_from_camera, self.published_from_camera):
