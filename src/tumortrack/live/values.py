@@ -175,8 +175,8 @@ class Workcell:
 
     ``state``: of the procedure: approach, grasp, hold, sweep 1, ... ``halt``: why the arms have
     stopped early; None: they have not. ``joints_rad``: angle by name of the joint. ``left_mm``:
-    what the present errors leave of the instrument's distance to the tumor that is the least safe;
-    None: unknown. ``cutting``: the instrument is on a cut.
+    what the present errors leave of the instrument's distance to the tumor ``left_to``, which is
+    the least safe; None: unknown. ``cutting``: the instrument is on a cut.
     """
 
     state: str
@@ -185,6 +185,7 @@ class Workcell:
     shapes: tuple[RigidShape, ...] = ()
     lines: tuple[Polyline, ...] = ()
     left_mm: float | None = None
+    left_to: str = ""
     cutting: bool = False
 
     @property
@@ -198,7 +199,7 @@ class Workcell:
         if self.left_mm is None:
             return ""
         if self.left_mm < 0:
-            return f"errors exceed the distance to a tumor by {-self.left_mm:.1f} mm"
+            return f"errors exceed the distance to {self.left_to} by {-self.left_mm:.1f} mm"
         return f"{self.left_mm:.1f} mm or more are left of the distance to each tumor"
 
     @property
@@ -353,7 +354,8 @@ class Controls:
     (published frame): track the piece that it is on. ``aborted``: the arms stop for good.
     ``clicks``: colours at clicks in pictures; ``taught``: the classifier learned from them, if they
     can be separated; ``colour``: its state in words. ``touched``: names of tools of which the user
-    says that they touch now, or take, or let go."""
+    says that they touch now, or take, or let go.
+    ``settled``: evidence that contradicts was wrong."""
 
     picked_mm: Float64[np.ndarray, " 3"] | None = None
     aborted: threading.Event = field(default_factory=threading.Event)
@@ -361,6 +363,7 @@ class Controls:
     taught: TissueClassifier | None = None
     colour: str = ""
     touched: deque[str] = field(default_factory=deque)
+    settled: threading.Event = field(default_factory=threading.Event)
 
     def click(self, seen: Observation, place_mm: Float[np.ndarray, " 3"], organ: bool) -> None:
         """The user clicked on this place (camera frame): on the ``organ``, or beside it. Raises
