@@ -169,6 +169,9 @@ class Polyline:
     width_mm: float = 1.0
 
 
+PLANNED = "planned/"  # begins the names of such shapes
+
+
 @dataclass(frozen=True, eq=False)
 class Workcell:
     """What the arms are doing, and what is shown with them; published frame, mm.
@@ -201,6 +204,11 @@ class Workcell:
         if self.left_mm < 0:
             return f"errors exceed the distance to {self.left_to} by {-self.left_mm:.1f} mm"
         return f"{self.left_mm:.1f} mm or more are left of the distance to each tumor"
+
+    @property
+    def planned_shapes(self) -> tuple[RigidShape, ...]:
+        """Organ and tumors as planned on: these neither move nor deform."""
+        return tuple(shape for shape in self.shapes if shape.name.startswith(PLANNED))
 
     @property
     def drawn_lines(self) -> list[Polyline]:
