@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import json
-import sys
+import threading
 import time
 from dataclasses import replace
-from types import ModuleType
 
 import numpy as np
 import pytest
@@ -14,6 +13,7 @@ import pytest
 import needs
 from clock import until
 from live_objects import small_frame
+from rtde_arm import RtdeArm
 from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.live.cameras import camera_setup
 from tumortrack.live.spec import POSES
@@ -81,45 +81,23 @@ def test_tf_of_another_process_places_the_camera_at_the_frames_stamp():
                 one.close()
 
 
-class Arm:
-    """ur_rtde's receiving half; its tool turns at 1 rad/s and shifts by 100 mm/s."""
-
-    def __init__(self, host):
-        if host == "10.0.0.1":
-            raise RuntimeError("Could not connect")
-        self.silent = self.bye = False
-
-    def getTimestamp(self):  # noqa: N802
-        return 7.0 if self.silent else time.time()
-
-    def isConnected(self):  # noqa: N802
-        return True
-
-    def getActualTCPPose(self):  # noqa: N802
-        seconds = time.time() % 100
-        return [0.1 * seconds, 0.2, 0.3, 0.0, seconds % 3, 0.0]
-
-    def disconnect(self):
-        self.bye = True
-
-
 @pytest.fixture
-def _rtde(monkeypatch):
-    module = ModuleType("rtde_receive")
-    module.RTDEReceiveInterface = Arm
-    monkeypatch.setitem(sys.modules, "rtde_receive", module)
+def arm():
+    made = RtdeArm()
+    yield made
+    made.close()
 
 
-@pytest.mark.usefixtures("_rtde")
-def test_an_arms_tool_and_the_hand_eye_calibration_place_the_camera(tmp_path):
+def test_an_arms_tool_and_the_hand_eye_calibration_place_the_camera(tmp_path, arm):
+    arm.say("turn")
     tool = tmp_path / "tool.json"
     way = np.diag([1.0, -1, -1, 1])
     way[:3, 3] = [0.0, 0.05, 0.02]
     rows = {"frame_id": "base", "unit": "m", "tool_from_camera": way.tolist()}
     tool.write_text(json.dumps(rows))
     with pytest.raises(InputError, match="--frame FILE with tool_from_camera"):
-        camera_setup(["realsense"], None, "ur:10.0.0.9", None)
-    setup = camera_setup(["realsense"], None, "ur:10.0.0.9", tool)
+        camera_setup(["realsense"], None, f"ur:{arm.host}", None)
+    setup = camera_setup(["realsense"], None, f"ur:{arm.host}", tool)
     assert setup.published.frame_id == "base"
     poses = setup.poses
     stamps = []
@@ -136,11 +114,19 @@ def test_an_arms_tool_and_the_hand_eye_calibration_place_the_camera(tmp_path):
         return np.abs(origin_mm - [x_mm, 200, 300]).max() < 5
 
     until(placed, "the tool's place")
-    poses._receive.silent = True
-    time.sleep(0.3)
-    with pytest.raises(NoEstimate, match="last pose is older"):
-        poses.at(seen(time.time_ns()))
+    arm.say("silence")
+    kinds = set()
+
+    def named():  # first that its last pose is old, then that the arm is silent
+        with pytest.raises(NoEstimate) as raised:
+            poses.at(seen(time.time_ns() + 50_000_000))
+        kinds.add(raised.value.finding.kind)
+        return "source" in kinds
+
+    until(named, "the arm's silence")
+    assert kinds == {"old_pose", "source"}
     poses.close()
-    until(lambda: poses._receive.bye, "the end")
-    with pytest.raises(InputError, match="an arm that is on"):
-        POSES.parse("ur:10.0.0.1").open()
+    assert "ur poses" not in [thread.name for thread in threading.enumerate()]
+    arm.say("cut")
+    with pytest.raises(InputError):
+        POSES.parse(f"ur:{arm.host}").open()

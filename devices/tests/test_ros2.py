@@ -232,7 +232,7 @@ def test_the_loop_counts_ages_from_the_stamp_once_a_frame_came() -> None:
     ("name", "frame", "topics"),
     [
         ("tumortrack.rviz", "camera", ["cloud", "meshes"]),
-        ("resection.rviz", "table", ["cloud", "meshes", "observed", "workcell"]),
+        ("resection.rviz", "table", ["cloud", "meshes", "observed", "planned", "workcell"]),
     ],
 )
 def test_the_view_for_rviz_shows_what_is_published(
@@ -249,7 +249,7 @@ def test_the_view_for_rviz_shows_what_is_published(
     assert f"Fixed Frame: {frame}" in view
     # A subscriber that wants what was published before does not hear a volatile publisher.
     assert re.findall(r"Transient Local\n.*\n.*\n +Value: (\S+)", view) == (
-        ["/robot_description"] if name == "resection.rviz" else []
+        ["/tumortrack/planned", "/robot_description"] if name == "resection.rviz" else []
     )
 
 

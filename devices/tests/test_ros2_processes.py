@@ -317,7 +317,7 @@ def test_fast_dds_hears_and_is_heard(tmp_path: Path, bus: Bus, messages: Message
     sub: list[object] = ["sub", LISTENS_S, "rt/tumortrack/cloud", CLOUD_DDS, heard]
     for topic, kind in kinds.items():
         sub += [f"rt{topic}", dds_name(kind), tmp_path / f"heard_{topic[1:]}"]
-    frame = PublishedFrame("table", TURNED)
+    frame = PublishedFrame("table", TURNED, calibrated=True)
     setting = replace(small_setting(), published_frame=frame)
     sinks = (
         SinkRos2(namespace="/theatre", camera_tf=True).open(setting),

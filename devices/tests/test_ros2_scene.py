@@ -9,6 +9,7 @@ import sys
 import xml.etree.ElementTree as ET
 from dataclasses import replace
 from pathlib import Path
+from types import ModuleType, SimpleNamespace
 
 import numpy as np
 import pytest
@@ -37,7 +38,7 @@ from tumortrack_devices.sinks.moveit import SCENE, coarser, widened_hull
 
 MESSAGES = Messages()
 QUARTER = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
-PLACED = PublishedFrame("table", rigid(QUARTER, np.array([10.0, 20, 30])))
+PLACED = PublishedFrame("table", rigid(QUARTER, np.array([10.0, 20, 30])), calibrated=True)
 PACKAGE = Path(__file__).parents[2] / "integrations" / "ros2" / "tumortrack_ros"
 
 
@@ -192,6 +193,8 @@ def test_obstacles_arrive_of_good_estimates_and_cameras_are_kept_for_latecomers(
     with own_graph():
         bus = open_bus("dds")
         heard = bus.subscriber("/scene", SCENE)
+        with pytest.raises(InputError):  # whose frame MoveIt does not know
+            SINKS.parse("moveit:/scene").open(replace(setting, published_frame=PublishedFrame()))
         scene = SINKS.parse("moveit:/scene?margin_mm=5&hz=0").open(setting)
         sink = SINKS.parse("ros2:/theatre?camera_tf=true").open(setting)
         try:
@@ -240,7 +243,8 @@ def options(monkeypatch):
     from tumortrack_ros import options
 
     yield options
-    sys.modules.pop("tumortrack_ros.options")
+    for name in [name for name in sys.modules if name.startswith("tumortrack_ros")]:
+        sys.modules.pop(name)
 
 
 def test_parameters_are_options_of_track_and_have_their_defaults(options):
@@ -258,6 +262,98 @@ def test_parameters_are_options_of_track_and_have_their_defaults(options):
             assert (getattr(plain, name) or "") == (option.default or ""), name
     with pytest.raises(ValueError, match="source is not set"):
         options.command({"model": "MODEL"})
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"stale": -5.0}, {"stale": 0.0}, {"stale": float("nan")}, {"give_up": -1.0},
+        {"rescan": 0.0}, {"smoothing": -0.1}, {"seconds": -1.0}, {"device": "abacus"},
+        {"side": "up"}, {"range": "100"}, {"range": "near far"}, {"box": "1 2 3"},
+        {"range": "100 1e99"},
+    ],
+)  # fmt: skip
+def test_a_parameter_out_of_its_limits_is_refused(options, wrong):
+    with pytest.raises(ValueError, match=next(iter(wrong))):
+        options.command({"model": "MODEL", "source": "ros2:/depth"} | wrong)
+
+
+class _Node:
+    """Of rclpy's Node what the node uses."""
+
+    def __init__(self, name):
+        self.values, self.said, self.changed = {}, [], None
+
+    def declare_parameter(self, name, default, about):
+        self.values.setdefault(name, default)
+
+    def get_parameter(self, name):
+        return SimpleNamespace(value=self.values[name])
+
+    def add_on_set_parameters_callback(self, changed):
+        self.changed = changed
+
+    def set_parameters(self, parameters):
+        answer = self.changed(parameters)
+        self.values |= {one.name: one.value for one in parameters if answer.successful}
+        return answer
+
+    def create_timer(self, seconds, call):
+        pass
+
+    def get_logger(self):
+        return SimpleNamespace(info=self.said.append, error=self.said.append)
+
+
+@pytest.fixture
+def node_type(options, monkeypatch, tmp_path):
+    names = "rclpy", "rclpy.node", "rclpy.parameter", "rclpy.executors", "rcl_interfaces.msg"
+    for name in (*names, "rcl_interfaces"):
+        monkeypatch.setitem(sys.modules, name, ModuleType(name))
+    sys.modules["rclpy.node"].Node = _Node
+    sys.modules["rclpy.parameter"].Parameter = lambda name, value: SimpleNamespace(
+        name=name, value=value
+    )
+    sys.modules["rclpy.executors"].ExternalShutdownException = KeyboardInterrupt
+    for name in ("ParameterDescriptor", "SetParametersResult"):
+        setattr(sys.modules["rcl_interfaces.msg"], name, SimpleNamespace)
+    command = tmp_path / "tumortrack"
+    cases = "case $* in *nonsense*) exit 2;; *over*) exit 0;; esac"
+    command.write_text(f"#!/bin/sh\n{cases}\nexec sleep 99\n")
+    command.chmod(0o755)
+    _Node.given = {"executable": str(command), "model": "M", "source": "ros2:/depth"}
+    from tumortrack_ros.track_node import TrackNode
+
+    class Node(TrackNode):
+        def declare_parameter(self, name, default, about):
+            self.values[name] = _Node.given.get(name, default)
+
+    return Node
+
+
+def test_a_parameter_that_tracking_refuses_is_set_back_and_it_goes_on(node_type):
+    node = node_type()
+
+    def put(name, value):
+        return node.set_parameters([SimpleNamespace(name=name, value=value)]).successful
+
+    def runs():
+        node._look()
+        return node._track.poll() is None and node.values["moving"] != "nonsense"
+
+    try:
+        assert not put("stale", -5.0)
+        node._look()
+        assert node.code is None
+        assert put("moving", "nonsense")  # only the command itself knows
+        first = node._track
+        until(lambda: node._look() or node._track is not first, "a new start")
+        until(runs, "the former values")
+        assert (node.code, node.values["moving"], node.values["stale"]) == (None, "", 0.5)
+        assert put("moving", "over")
+        until(lambda: node._look() or node.code == 0, "the end")
+    finally:
+        node.end()
 
 
 def test_the_package_names_this_version():

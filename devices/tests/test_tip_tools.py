@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import socket
-import sys
+import threading
 import time
 from dataclasses import replace
-from types import ModuleType
 
 import numpy as np
 import pytest
@@ -15,6 +14,7 @@ from scipy.spatial.transform import Rotation
 import needs
 from clock import until
 from live_objects import STAMP_NS, small_anatomy, small_estimate, small_frame, small_setting
+from rtde_arm import RtdeArm
 from tumortrack.core.errors import InputError
 from tumortrack.core.estimate import NOT_JUDGED
 from tumortrack.core.evidence import Free, Held, Landmark, Outline, Touch
@@ -445,62 +445,54 @@ def test_a_pointer_needs_the_calibration_that_drawings_do_not():
 # An arm
 
 
-class Arm:
-    """ur_rtde's receiving half: 4 N of weight, and 3 N more while it touches."""
-
-    def __init__(self, host):
-        self.push_n, self.asked = 0.0, 0
-
-    def felt(self):
-        """Wait until the present force has been read a few times."""
-        enough = self.asked + 30
-        until(lambda: self.asked >= enough, "readings of the force")
-
-    def getTimestamp(self):  # noqa: N802
-        return time.time()
-
-    def isConnected(self):  # noqa: N802
-        return True
-
-    def getActualTCPPose(self):  # noqa: N802
-        return [0.4, 0.0, 0.5, 0.0, 0.0, 0.0]
-
-    def getActualTCPForce(self):  # noqa: N802
-        self.asked += 1
-        return [0.0, self.push_n, -4.0, 9.0, 9.0, 9.0]
-
-    def disconnect(self):
-        pass
+@pytest.fixture
+def arm():
+    made = RtdeArm()
+    yield made
+    made.close()
 
 
-def test_an_arm_feels_that_it_touches(monkeypatch):
-    module = ModuleType("rtde_receive")
-    module.RTDEReceiveInterface = Arm
-    monkeypatch.setitem(sys.modules, "rtde_receive", module)
-    tool = UrToolConfig(host="10.0.0.9", tip=(0.0, 0.0, 20.0)).open(setting(), "arm")
+def felt(tool, arm, push_n):
+    """What an arm gives after a third of a second with this force."""
+    arm.say(f"push {push_n}")
+    time.sleep(0.3)
+    now = view(time.time_ns())
+    pieces = tool.evidence(now)
+    tool.located(now, small_estimate())
+    return pieces
+
+
+def touched(tool, arm):  # again, where a busy machine lost poses for over a tenth of a second
+    return [*felt(tool, arm, 0.0), *felt(tool, arm, 4.0)]
+
+
+def test_an_arm_feels_that_it_touches(arm):
+    tool = UrToolConfig(host=arm.host, tip=(0.0, 0.0, 20.0)).open(setting(), "arm")
     try:
-        arm = tool._arm._receive
-
-        def touched():  # again, where a busy machine lost poses for over a tenth of a second
-            for arm.push_n in (0.0, 4.0):
-                arm.felt()
-            now = view(time.time_ns())
-            pieces = tool.evidence(now)
-            tool.located(now, small_estimate())
-            return pieces
-
         until(lambda: tool._rest_n is not None, "a force at rest")
-        arm.push_n = 1.9  # less than the threshold
-        arm.felt()
-        assert tool.evidence(view(time.time_ns())) == []
-        (touch,) = until(touched, "a touch")
+        assert felt(tool, arm, 1.9) == []  # less than the threshold
+        touch = until(lambda: touched(tool, arm), "a touch")[0]
         np.testing.assert_allclose(touch.place_mm, (0, 0, -20), atol=1e-6)  # base z is -z
-        arm.push_n = 0.0
-        arm.felt()
-        assert tool.evidence(view(time.time_ns())) == []
-        assert len(until(touched, "another touch")) == 1
+        assert felt(tool, arm, 0.0) == []
+        assert until(lambda: touched(tool, arm), "another touch")
     finally:
         tool.close()
+
+
+@pytest.mark.parametrize(("ends", "begins"), [("silence", "speak"), ("cut", "mend")])
+def test_an_arm_that_was_lost_is_named_and_touches_again(arm, ends, begins):
+    tool = UrToolConfig(host=arm.host, tip=(0.0, 0.0, 20.0)).open(setting(), "arm")
+    try:
+        until(lambda: touched(tool, arm), "a touch")
+        assert tool.trouble == ""
+        arm.say(ends)
+        until(lambda: not felt(tool, arm, 0.0) and arm.host in tool.trouble, "the trouble")
+        arm.say(begins)
+        until(lambda: touched(tool, arm), "a touch after the pause")
+        assert tool.trouble == ""
+    finally:
+        tool.close()
+    assert "ur poses" not in [thread.name for thread in threading.enumerate()]
 
 
 def test_a_tool_of_tf_touches_as_its_topic_says():

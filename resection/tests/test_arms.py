@@ -3,6 +3,7 @@
 import itertools
 import xml.etree.ElementTree as ET
 from functools import partial
+from pathlib import Path
 
 import msgspec
 import numpy as np
@@ -728,6 +729,26 @@ def test_places_for_the_bases_are_searched(config):
     tip = ArmCell(found).tips(motions.stages[2].joints_rad[0])[HOLDER]
     assert np.abs(tip[:3, 3] - plan.grasp_mm).max() < 0.01
     checked(plan, motions, body.cell_urdf(found), there)
+
+
+@pytest.mark.parametrize("shift_mm", [(0.0, 0.0, 0.0), (-20.0, 15.0, 0.0)])
+def test_the_cell_that_the_page_shows_plans_from_its_bases(shift_mm):
+    page = (Path(__file__).parents[2] / "docs" / "resection.md").read_text(encoding="utf-8")
+    (text,) = [block for block in page.split("```") if '"cutter_base"' in block]
+    shown = msgspec.json.decode(text.removeprefix("json"), type=CellConfig)
+    assert shown.holder_base.position_mm[2] == 0  # on the table
+    there = seen(shift_mm)
+    found, plan, motions, _ = search_bases(there, OURS, shown)
+    assert (found.cutter_base, found.holder_base) == (shown.cutter_base, shown.holder_base)
+    checked(plan, motions, body.cell_urdf(found), there)
+
+
+def test_a_base_out_of_reach_is_blamed_for_that_and_nothing_that_it_would_meet():
+    for z_mm in (0.0, 100.0):
+        far = Base(position_mm=(3000.0, 0.0, z_mm), yaw_deg=0.0)
+        with pytest.raises(NoPlan) as raised:
+            plan_motions(seen(), OURS, CellConfig(cutter_base=far))
+        assert raised.value.__cause__.pair is None
 
 
 def test_bases_stay_where_they_are_if_the_arms_manage_from_there(ours):

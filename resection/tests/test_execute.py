@@ -477,6 +477,11 @@ def test_a_tumor_that_keeps_moving_is_waited_for_and_its_return_is_enough():
     assert cell.halt.kind == "moved"
     assert not world.calls
     assert list(world.operation.halts.values()) == [1]  # one reason, many numbers
+    for n in range(60, 60 + int(11 / FRAME_S)):
+        world.shift = np.array([0.0, 0.0, 6.0 + 3.0 * np.sin(0.6 * n)])
+        cell = world.frame()
+    assert cell.halt.kind == "restless"  # it does not settle: that is said
+    assert cell.halt.values["part"] in LOCATED.meshes
     world.shift = np.zeros(3)
     assert world.frames(2).halt is None
     world.until(DONE)
@@ -548,6 +553,7 @@ def test_a_second_tumor_that_comes_nearer_to_the_electrode_halts_the_arms_as_wel
     assert cell.halt.kind == "over_budget"
     assert (cell.halt.values["part"], cell.halt.values["margin_mm"]) == ("tumor_2", 8.0)
     assert cell.left_mm == pytest.approx(8.0 - 3.8 - INDEPENDENT_MM)
+    assert cell.left_to == "tumor_2"
     assert world.frame(**changes).joints_rad == cell.joints_rad
     world.shifts = {}
     assert world.frames(2, **changes).halt is None

@@ -131,8 +131,8 @@ def test_a_kind_of_ours_that_is_not_installed_is_named_with_its_package(monkeypa
         (SOURCES, "realsense", "tumortrack-devices[realsense]"),
         (SINKS, "viewer", "tumortrack-devices"),
         (SINKS, "ur", "tumortrack-resection[ur]"),
-        (POSES, "ur", "tumortrack-devices[ur]"),
-        (TOOLS, "ur", "tumortrack-devices[ur]"),
+        (POSES, "ur", "tumortrack-devices"),
+        (TOOLS, "ur", "tumortrack-devices"),
         (TOOLS, "openigtlink", "tumortrack-devices"),
     ):
         with pytest.raises(InputError) as refused:

@@ -264,6 +264,23 @@ def test_another_cameras_frame_is_published_nowhere(tracker, stages):
     assert updates[1].transformed is None
 
 
+@pytest.mark.parametrize(
+    ("frames", "name"),
+    [
+        (PublishedFrame(), "camera_depth_optical_frame"),
+        (PublishedFrame("base_link", calibrated=True), "base_link"),
+        (PublishedFrame("table"), "table"),  # of a plan
+    ],
+)
+def test_results_are_in_the_sources_frame_where_no_other_is_given(tracker, stages, frames, name):
+    seen = [
+        Observation(cloud, cloud.stamp_ns, frame_id="camera_depth_optical_frame")
+        for cloud in moving(stages[0], 2)
+    ]
+    results, _ = play(tracker, [seen[0], NoEstimate("none"), seen[1]], published=frames)
+    assert [one.published_frame.frame_id for one in results] == [name] * len(results)
+
+
 def test_garbage_and_defects_are_said_and_survived(tracker, stages, monkeypatch):
     clouds = moving(stages[0], 4)
     empty = DepthFrame(

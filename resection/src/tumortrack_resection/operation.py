@@ -47,6 +47,7 @@ _OTHER_PARTS = 2.0  # they may move so many times as far as the tumor
 _COMPARED = 500  # points of surfaces with different triangles
 _ELECTRODE = f"{CUTTER}/{ELECTRODE}"  # drawn in a colour of its own while it is energised
 _SILENT_S = 0.2  # without an update for longer, the arms halt
+_RESTLESS_S = 10.0  # of waiting for what moved to lie still, before that is said
 
 
 class OperationConfig(Config, frozen=True, kw_only=True):
@@ -161,6 +162,7 @@ class Operation:
         self._last_s: float | None = None
         self._first_s = 0.0
         self._settled: tuple[Mesh, float] | None = None  # the tumor's surface, and since when
+        self._off_s: float | None = None  # since when something lies elsewhere
         self._work: Future[Planned] | None = None
         self._cut = False  # whether the first sweep of any plan has begun
         self.static_shapes: tuple[RigidShape, ...] = ()
@@ -246,9 +248,10 @@ class Operation:
         shapes = (*self.static_shapes, *drawn)
         state = f"{execution.state} ({self._note})" if self._note else execution.state
         now = None if self._budget is None else self._budget.now
-        left_mm = None if now is None else now.left_mm
+        left_mm, left_to = (None, "") if now is None else (now.left_mm, now.part)
         cutting = execution.cutting
-        return Workcell(state, execution.halted, named, shapes, tuple(lines), left_mm, cutting)
+        halt, drawn_lines = execution.halted, tuple(lines)
+        return Workcell(state, halt, named, shapes, drawn_lines, left_mm, left_to, cutting)
 
     @property
     def _note(self) -> str:
@@ -321,7 +324,7 @@ class Operation:
         tumor = located.meshes[name]
         halt, plan_anew = self._reason_to_halt(update, located)
         if halt is None:
-            self._settled = None
+            self._settled = self._off_s = None
             execution.go()
             if self._budget is not None:
                 self._budget.went_on()
@@ -332,14 +335,21 @@ class Operation:
         if self._cut and not config.replan_cut:
             execution.halt(msgspec.structs.replace(halt, cut=True))
             return
-        execution.halt(halt)
+        execution.halt(self._after_a_while(halt, now_s))
         if self._settled is None or apart_mm(tumor, self._settled[0]) > config.settled_mm:
             self._settled = (tumor, now_s)
         elif now_s - self._settled[1] >= config.settled_s and execution.still:
-            self._settled = None
+            self._settled = self._off_s = None
             if self._replan is not None:
                 plan = self.planned.plan
                 self._work = self._replan(update, execution.joints_rad, self.progress, plan)
+
+    def _after_a_while(self, halt: Halt, now_s: float) -> Halt:
+        """Where it moved and does not come to rest, that is why the arms wait on."""
+        self._off_s = now_s if self._off_s is None else self._off_s
+        if halt.kind != "moved" or now_s - self._off_s <= _RESTLESS_S:
+            return halt
+        return Halt("restless", {**halt.values, "seconds": now_s - self._off_s})
 
     def _reason_to_halt(self, update: TrackingResult, located: Located) -> tuple[Halt | None, bool]:
         """Why the arms must halt (None: they need not), and whether a new plan would help."""

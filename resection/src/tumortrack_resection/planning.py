@@ -74,6 +74,7 @@ class Planning:
         from tumortrack_resection.arms.procedure import search_bases
         from tumortrack_resection.arms.trajectory import first_hit
         from tumortrack_resection.checking import checked
+        from tumortrack_resection.motions import ARMS
 
         organ, config = self.located.organ, self.content.config
         cell, drafts = below(organ, self.cell), self.cuts.drafts
@@ -82,7 +83,8 @@ class Planning:
             raise NoPlan(f"the arms can't carry this out: {hit}. Place the organ otherwise.")
         plan = checked(plan, motions, cell_urdf(placed), self.located)
         plan = replace(plan, notes=(*self.cuts.heading, *plan.notes))
-        source = INVENTED if note else self.bases_source
+        as_given = all(placed.base(arm) == cell.base(arm) for arm in ARMS)
+        source = self.bases_source if as_given else INVENTED
         content = replace(self.content, plan=plan, motions=motions, cell=placed, cell_source=source)
         return replace(self, content=content, note=note).checked()
 

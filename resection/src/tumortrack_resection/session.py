@@ -31,6 +31,7 @@ from tumortrack.live.cameras import CameraSetup
 from tumortrack.live.session import Arms, Session, check_report, named_sinks, open_sinks
 from tumortrack.live.spec import SOURCES
 from tumortrack.live.values import (
+    PLANNED,
     Controls,
     RigidShape,
     SinkConfig,
@@ -479,6 +480,6 @@ def _organ_shapes(stored: PlanFolder) -> tuple[RigidShape, ...]:
     meshes[0] = Mesh(meshes[0].vertices_mm, bare_faces(Anatomy(tuple(meshes))))
     opacity, still = [0.35] + [1.0] * len(names), np.eye(4)
     return tuple(
-        RigidShape(f"planned/{name}", mesh, still, part_colour(n + 1), opacity[n])
+        RigidShape(f"{PLANNED}{name}", mesh, still, part_colour(n + 1), opacity[n])
         for n, (name, mesh) in enumerate(zip(names, meshes, strict=True))
     )

@@ -11,7 +11,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from typing import ClassVar, Literal, NamedTuple
 
 import numpy as np
@@ -308,14 +308,19 @@ class UrLink:
                 "ur with execute=true needs the package ur_rtde: "
                 "pip install 'tumortrack-resection[ur]'."
             ) from error
+        self._ends = ExitStack()  # the last first: the program, then both connections
         try:
             self._receive = rtde_receive.RTDEReceiveInterface(host)
+            self._ends.callback(self._receive.disconnect)
             self._control = rtde_control.RTDEControlInterface(host)
         except RuntimeError as error:
+            self._ends.close()
             raise InputError(
                 f"ur: the arm at {host} cannot be controlled ({error}). Is it on, released, in "
                 "remote control, and reachable on port 30004?"
             ) from error
+        self._ends.callback(self._control.disconnect)
+        self._ends.callback(self._control.stopScript)
         self._control.setWatchdog(1 / _WATCHDOG_S)
         self._last_state = (-1.0, 0.0)  # the arm's clock, and when it changed by ours
 
@@ -361,6 +366,4 @@ class UrLink:
         self._control.kickWatchdog()
 
     def close(self) -> None:
-        self._control.stopScript()
-        self._control.disconnect()
-        self._receive.disconnect()
+        self._ends.close()

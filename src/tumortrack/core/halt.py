@@ -12,7 +12,7 @@ from tumortrack.core.tables import read_table
 
 HaltKind = Literal[
     "no_estimate", "poor", "missing", "moved", "over_budget", "no_margin", "planning", "silent",
-    "no_plan", "defect", "interrupted", "aborted", "ended", "stopped", "slipped",
+    "no_plan", "defect", "interrupted", "aborted", "ended", "stopped", "slipped", "restless",
 ]  # fmt: skip
 _SENTENCES = read_table("tumortrack.core", "halts.toml", dict[HaltKind, str])
 CUT_NOTE = "cut: estimates are of the intact organ"

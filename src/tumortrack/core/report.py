@@ -22,7 +22,7 @@ Check = Literal[
 Kind = Literal[
     "not_judged", "poses", "strays", "fit", "size", "upside_down", "tilted", "not_turned", "rival",
     "missing", "unsure", "miss", "improbable", "seen_through", "unseen", "hidden_now",
-    "evidence", "beyond_margins", "model", "frame_in_doubt", "good_again",
+    "evidence", "disputed", "beyond_margins", "model", "frame_in_doubt", "good_again",
     # No estimate: the frame or its source.
     "no_frame", "source", "defect", "stamp_negative", "stamp_back", "stale", "future", "too_late",
     "frozen", "other_frame_id", "frame_id_changed", "intrinsics_changed", "moved", "cameras",

@@ -56,6 +56,7 @@ def camera_setup(
             where.tool_from_camera = published.published_from_camera
         name = published.frame_id if published is not None else where.frame_id
         if not name or where.frame_id not in ("", name):
+            where.close()
             raise InputError(
                 f"--moving {moving}: --frame FILE with tool_from_camera and frame_id must be of "
                 f"the frame of these poses{where.frame_id and f', {where.frame_id!r}'}."

@@ -105,6 +105,7 @@ class Loop:
         self._stop = threading.Event()
         self._sequence = itertools.count()
         self._cameras: Cameras
+        self._published = context.published_frame  # by its source's name, if it has no other
         self._in_a_row = SURE_AFTER  # good estimates since the last doubt
         self._source_intrinsics: Intrinsics | None = None  # of the first frame, if others are given
         self._stamp: tuple[int, int] | None = None  # of the last frame, and when it was handled
@@ -237,7 +238,9 @@ class Loop:
                 finding = Finding("defect", values)
                 reason = finding.words
         self._stamp = (seen.stamp_ns, time.monotonic_ns())
-        published, numbers = self._context.published_frame, [view.number for view, _ in found]
+        if seen.frame_id and not self._published.calibrated:
+            self._published = self._published.named(seen.frame_id)
+        published, numbers = self._published, [view.number for view, _ in found]
         lead = found[0][0] if found else next(iter(views), None)
         return TrackingResult(
             next(self._sequence),
@@ -276,13 +279,12 @@ class Loop:
         if self._stamp is not None:
             last_ns, then_ns = self._stamp
             stamp_ns = last_ns + time.monotonic_ns() - then_ns
-        frame = self._context.published_frame
         finding = _finding_of(reason)
         return TrackingResult(
             next(self._sequence),
             stamp_ns,
             reason=finding.words,
-            published_frame=frame,
+            published_frame=self._published,
             finding=finding,
         )
 

@@ -110,6 +110,10 @@ class PublishedFrame:
     error_deg: float = 0.0
     moves: bool = False
 
+    def named(self, frame_id: str) -> PublishedFrame:
+        """By this name, if it is the camera's frame and has none."""
+        return replace(self, frame_id=frame_id) if self.frame_id == "camera" else self
+
     def of_camera(self, published_from_camera: Affine) -> PublishedFrame:
         """The same frame, for a camera at another pose."""
         if np.array_equal(published_from_camera, self.published_from_camera):
@@ -165,14 +169,17 @@ class Polyline:
     width_mm: float = 1.0
 
 
+PLANNED = "planned/"  # begins the names of such shapes
+
+
 @dataclass(frozen=True, eq=False)
 class Workcell:
     """What the arms are doing, and what is shown with them; published frame, mm.
 
     ``state``: of the procedure: approach, grasp, hold, sweep 1, ... ``halt``: why the arms have
     stopped early; None: they have not. ``joints_rad``: angle by name of the joint. ``left_mm``:
-    what the present errors leave of the instrument's distance to the tumor that is the least safe;
-    None: unknown. ``cutting``: the instrument is on a cut.
+    what the present errors leave of the instrument's distance to the tumor ``left_to``, which is
+    the least safe; None: unknown. ``cutting``: the instrument is on a cut.
     """
 
     state: str
@@ -181,6 +188,7 @@ class Workcell:
     shapes: tuple[RigidShape, ...] = ()
     lines: tuple[Polyline, ...] = ()
     left_mm: float | None = None
+    left_to: str = ""
     cutting: bool = False
 
     @property
@@ -194,8 +202,13 @@ class Workcell:
         if self.left_mm is None:
             return ""
         if self.left_mm < 0:
-            return f"errors exceed the distance to a tumor by {-self.left_mm:.1f} mm"
+            return f"errors exceed the distance to {self.left_to} by {-self.left_mm:.1f} mm"
         return f"{self.left_mm:.1f} mm or more are left of the distance to each tumor"
+
+    @property
+    def planned_shapes(self) -> tuple[RigidShape, ...]:
+        """Organ and tumors as planned on: these neither move nor deform."""
+        return tuple(shape for shape in self.shapes if shape.name.startswith(PLANNED))
 
     @property
     def drawn_lines(self) -> list[Polyline]:
@@ -349,7 +362,8 @@ class Controls:
     (published frame): track the piece that it is on. ``aborted``: the arms stop for good.
     ``clicks``: colours at clicks in pictures; ``taught``: the classifier learned from them, if they
     can be separated; ``colour``: its state in words. ``touched``: names of tools of which the user
-    says that they touch now, or take, or let go."""
+    says that they touch now, or take, or let go.
+    ``settled``: evidence that contradicts was wrong."""
 
     picked_mm: Float64[np.ndarray, " 3"] | None = None
     aborted: threading.Event = field(default_factory=threading.Event)
@@ -357,6 +371,7 @@ class Controls:
     taught: TissueClassifier | None = None
     colour: str = ""
     touched: deque[str] = field(default_factory=deque)
+    settled: threading.Event = field(default_factory=threading.Event)
 
     def click(self, seen: Observation, place_mm: Float[np.ndarray, " 3"], organ: bool) -> None:
         """The user clicked on this place (camera frame): on the ``organ``, or beside it. Raises

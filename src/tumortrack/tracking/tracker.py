@@ -31,6 +31,8 @@ from tumortrack.sense.cloud import CloudConfig
 from tumortrack.sense.region import RegionConfig
 from tumortrack.tracking.advice import TOUCH_MORE, where_to_look
 from tumortrack.tracking.causes import likely_causes, words
+from tumortrack.tracking.disputes import Disputes
+from tumortrack.tracking.margins import stated_margin
 from tumortrack.tracking.model_files import case_model
 from tumortrack.tracking.quality import doubt_if_hidden, judged, with_margin
 
@@ -277,6 +279,7 @@ class Follower:
         self._scanned_ns, self._at_rest = 0, False
         self._known, self._known_ns = tuple[Any, ...](), 0  # evidence of the last estimate
         self._good_ns: int | None = None
+        self.disputes = Disputes()
         self._causes_ns, self._causes = 0, dict[str, tuple[Likely, ...]]()
 
     def warm(self) -> None:
@@ -346,7 +349,19 @@ class Follower:
             self._causes = {**self._causes, _check_of(self._last): causes}
         if self._last.quality == "good":
             self._good_ns = cloud.stamp_ns
-        return self._last
+        return self._disputed(self._last)
+
+    def _disputed(self, estimate: Estimate) -> Estimate:
+        """Poor, if evidence that contradicted one before is not settled; the next frame is still
+        followed as if it were not."""
+        finding = self.disputes.heed(estimate)
+        if finding is None or estimate.finding is not None:
+            return estimate
+        margins = self._tracker.model.margins
+        if estimate.report.margin is not None:
+            margin = stated_margin(estimate.report, margins, False)
+            estimate = estimate.reporting(margin=margin)
+        return replace(estimate, finding=finding)
 
     def _earlier(self, stamp_ns: int, camera_from_last: Affine) -> tuple[Any, ...]:
         """Evidence of before the organ was lost."""

@@ -78,10 +78,11 @@ class Link:
         )
         self._thread.start()
 
-    def send(self, messages: list[Message]) -> None:
-        """Returns at once. Raises ProtocolError, and sends none, if the protocol cannot hold one of
-        them."""
-        self._call(self._offer, {(m.type, m.device): pack(m) for m in messages})
+    def send(self, messages: list[Message], whole: Collection[str] = ()) -> None:
+        """Returns at once. ``whole``: types of which these are all that holds now; no receiver gets
+        an older one from now on. Raises ProtocolError, and sends none, if the protocol cannot hold
+        one of them."""
+        self._call(self._offer, {(m.type, m.device): pack(m) for m in messages}, whole)
 
     def close(self) -> None:
         """Give receivers up to a second to take what waits for them; may be called twice."""
@@ -92,7 +93,10 @@ class Link:
         with contextlib.suppress(RuntimeError):  # closed
             self._loop.call_soon_threadsafe(function, *arguments)
 
-    def _offer(self, packed: dict[Key, bytes]) -> None:
+    def _offer(self, packed: dict[Key, bytes], whole: Collection[str]) -> None:
+        for known in (self._newest, *(receiver.waiting for receiver in self.receivers)):
+            for key in [key for key in known if key[0] in whole and key not in packed]:
+                del known[key]
         self._newest.update(packed)
         for receiver in self.receivers:
             receiver.offer(packed)

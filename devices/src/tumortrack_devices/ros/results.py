@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import time
 from collections import deque
+from collections.abc import Sequence
 from textwrap import fill
 from typing import Any
 
@@ -20,7 +21,13 @@ from tumortrack.core.geometry import transform_points
 from tumortrack.core.organ import is_tumor, organ_name
 from tumortrack.core.patient import Patient
 from tumortrack.core.types import Mesh, SensorCloud
-from tumortrack.live.values import SinkContext, TrackingResult, TransformedEstimate, Workcell
+from tumortrack.live.values import (
+    RigidShape,
+    SinkContext,
+    TrackingResult,
+    TransformedEstimate,
+    Workcell,
+)
 from tumortrack_devices.beside import Beside, NextTouch
 from tumortrack_devices.display import MOST_SEEN, seen_points, thinned, wxyz_of
 from tumortrack_devices.rate import Rate
@@ -32,6 +39,7 @@ MARKERS = "visualization_msgs/msg/MarkerArray"
 DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
 PLACE = "geometry_msgs/msg/PointStamped"
 JOINTS = "sensor_msgs/msg/JointState"
+LATCHED = "planned"  # the topic that is sent when it changes, and kept for who comes later
 
 _STATE = "state"  # the marker namespace of the arms' text
 _DELETE, _DELETE_ALL = 2, 3  # Marker's actions
@@ -85,6 +93,7 @@ class ResultMessages:
         self._beside, self._spots_shown, self._texts_shown = Beside(), set[str](), 0
         self._shown: set[str] = set()
         self._shown_state: tuple[str, bool, bool] | None = None
+        self._planned: tuple[Mesh, ...] | None = None  # sent last
 
     def of(self, result: TrackingResult) -> list[Outgoing]:
         """The messages of one result; docs/ros.md describes each topic. Raises InputError for a
@@ -127,6 +136,8 @@ class ResultMessages:
         send("joint_states", JOINTS, header=header, name=list(joints), position=angles)
         if (markers := self._workcell(result)) is not None:
             send_markers("workcell", markers)
+        if (markers := self._as_planned(result)) is not None:
+            send(LATCHED, MARKERS, markers=[{"header": header} | marker for marker in markers])
         if self._observed and (points := self._points(result)) is not None:
             seen = plain_cloud(SensorCloud(points, result.stamp_ns), header, self._messages)
             out.append(Outgoing("observed", CLOUD, seen))
@@ -192,26 +203,40 @@ class ResultMessages:
         if cell is None:
             self._shown, self._shown_state = set(), None
             return [{"action": _DELETE_ALL}]
-        names = {_STATE, *(s.name for s in cell.shapes), *(line.name for line in cell.drawn_lines)}
+        shapes = [shape for shape in cell.shapes if shape not in cell.planned_shapes]
+        names = {_STATE, *(s.name for s in shapes), *(line.name for line in cell.drawn_lines)}
         gone, self._shown = self._shown - names, names
         state = cell.state, bool(cell.halted), cell.cutting  # the reason changes with each frame
         changed, self._shown_state = gone or state != self._shown_state, state
         if not self._markers_rate.due() and not changed:
             return None
         markers: list[dict[str, Any]] = [{"ns": name, "action": _DELETE} for name in sorted(gone)]
-        turns = [shape.published_from_shape[:3, :3] for shape in cell.shapes]
+        markers += self._shape_markers(shapes)
+        for line in cell.drawn_lines:
+            scale, points = {"x": line.width_mm / MM_PER_M}, PointBlock(line.points_mm / MM_PER_M)
+            markers.append(_marker(line.name, _LINE, line.colour, scale=scale, points=points))
+        return [*markers, _state_text(result, cell)]
+
+    def _shape_markers(self, shapes: Sequence[RigidShape]) -> list[dict[str, Any]]:
+        markers, turns = [], [shape.published_from_shape[:3, :3] for shape in shapes]
         quaternions = wxyz_of(np.array(turns)) if turns else ()  # all at once: 5 times faster
-        for shape, wxyz in zip(cell.shapes, quaternions, strict=True):
+        for shape, wxyz in zip(shapes, quaternions, strict=True):
             marker = _triangles(shape.name, shape.mesh, shape.colour, shape.opacity)
             marker["pose"] = {
                 "position": xyz(shape.published_from_shape[:3, 3] / MM_PER_M),
                 "orientation": dict(zip("wxyz", wxyz.tolist(), strict=True)),
             }
             markers.append(marker)
-        for line in cell.drawn_lines:
-            scale, points = {"x": line.width_mm / MM_PER_M}, PointBlock(line.points_mm / MM_PER_M)
-            markers.append(_marker(line.name, _LINE, line.colour, scale=scale, points=points))
-        return [*markers, _state_text(result, cell)]
+        return markers
+
+    def _as_planned(self, result: TrackingResult) -> list[dict[str, Any]] | None:
+        """What neither moves nor deforms, two thirds of all triangles: only when it changes."""
+        shapes = () if result.workcell is None else result.workcell.planned_shapes
+        meshes = tuple(shape.mesh for shape in shapes)
+        if self._planned is not None and list(map(id, meshes)) == list(map(id, self._planned)):
+            return None
+        self._planned = meshes
+        return [{"action": _DELETE_ALL}, *self._shape_markers(shapes)]
 
     def _points(self, result: TrackingResult) -> Float32[np.ndarray, "n 3"] | None:
         """The observed points, published frame; None: they are not due."""

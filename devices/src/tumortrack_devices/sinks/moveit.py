@@ -8,6 +8,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from tumortrack.core.colours import PICKED, Colour, name_colour
+from tumortrack.core.errors import InputError
 from tumortrack.core.types import Mesh
 from tumortrack.live.values import SinkConfig, SinkContext, TrackingResult
 from tumortrack_devices.rate import Rate
@@ -40,6 +41,11 @@ class MoveItSinkConfig(SinkConfig, frozen=True, kw_only=True, tag="moveit"):
         self.check_between("moveit:", **limits)
 
     def open(self, context: SinkContext) -> MoveItSink:
+        if not context.published_frame.calibrated:
+            raise InputError(
+                "moveit: MoveIt does not know the camera's frame; give --frame FILE: where the "
+                "camera is in the robot's."
+            )
         return MoveItSink(self, context)
 
 

@@ -77,11 +77,11 @@ class OpenIgtLinkSink:
 
     With a motion TRANSFORM ``ct`` is the organ's pose, and vertices of tumors have the scalar
     ``std_mm``: one standard deviation along the least certain axis. Without an estimate STATUS says
-    why, transforms are the identity with ``TransformStatus`` MISSING, and all else is empty.
+    why, no transform is sent, not to a new receiver either, and all else is empty.
 
     With arms also STATUS ``arms`` (OK: its name is their state; not ready: halted, and why; not
     present: unknown), and a TRANSFORM of each tool tip, named as its shape (``cutter/tip``): from
-    the tip's own frame, and MISSING once it is gone.
+    the tip's own frame, while it is known.
     """
 
     def __init__(self, config: OpenIgtLinkSinkConfig, context: SinkContext) -> None:
@@ -89,7 +89,6 @@ class OpenIgtLinkSink:
         self._axes = RAS_FROM_LPS if config.space == "ras" else np.eye(4)
         self.link = Link(config.host, config.port, config.connect)
         self._mesh_rate, self._cloud_rate = Rate(config.mesh_hz), Rate(config.cloud_hz)
-        self._tips: set[str] = set()  # all so far
         self._margins: set[str] = set()  # all so far
         self._beside, self._advised = Beside(), False
         self._next, self._closed = 0, False
@@ -130,7 +129,8 @@ class OpenIgtLinkSink:
             [
                 Message(kind, device, result.stamp_ns, content, about | more)
                 for kind, device, content, more in contents
-            ]
+            ],
+            whole=["TRANSFORM"],
         )
 
     def _statuses(self, result: TrackingResult, code: int) -> Iterator[_Content]:
@@ -157,12 +157,10 @@ class OpenIgtLinkSink:
         cell = result.workcell if self._context.arms else None
         shapes = () if cell is None else cell.shapes
         tips = {s.name: s.published_from_shape for s in shapes if s.name.endswith(_TIP)}
-        self._tips |= tips.keys()
-        poses |= {name: tips.get(name) for name in sorted(self._tips)}
-        for name, pose in poses.items():
-            sent = np.eye(4) if pose is None else self._axes @ pose @ self._axes
-            status = {"TransformStatus": "MISSING" if pose is None else "OK"}
-            yield "TRANSFORM", name, igtl.pack_transform(sent), status
+        for name, pose in (poses | tips).items():
+            if pose is not None:
+                sent = igtl.pack_transform(self._axes @ pose @ self._axes)
+                yield "TRANSFORM", name, sent, {"TransformStatus": "OK"}
 
     def _centres(self, result: TrackingResult) -> Iterator[_Content]:
         report = FitReport() if result.estimate is None else result.estimate.report

@@ -9,7 +9,7 @@ from tumortrack.core.errors import TumortrackError
 from tumortrack.core.geometry import Affine
 from tumortrack.live.values import SinkConfig, SinkContext, TrackingResult
 from tumortrack_devices.ros.bus import Bus, Publisher, check_topic
-from tumortrack_devices.ros.results import ResultMessages
+from tumortrack_devices.ros.results import LATCHED, ResultMessages
 from tumortrack_devices.ros.ros2 import Via, open_bus
 from tumortrack_devices.ros.sensors import CAMERA_FRAME
 from tumortrack_devices.ros.tf import TRANSFORMS, transform_fields
@@ -52,7 +52,9 @@ class RosSink:
             self._static = bus.publisher("/tf_static", TRANSFORMS, latched=True)
         nothing = TrackingResult(sequence=0, stamp_ns=0, published_frame=context.published_frame)
         self._publishers = {
-            out.suffix: bus.publisher(out.topic(config.namespace), out.message_type)
+            out.suffix: bus.publisher(
+                out.topic(config.namespace), out.message_type, out.suffix == LATCHED
+            )
             for out in self._results.of(nothing)
         }
 

@@ -33,7 +33,7 @@ class UrToolConfig(TipConfig, frozen=True, kw_only=True, tag="ur"):
 
 
 class UrTool(TipTool):
-    """Raises InputError: ur_rtde is missing, or the arm cannot be reached."""
+    """Raises InputError: the arm cannot be reached."""
 
     def __init__(self, config: UrToolConfig, context: SinkContext, name: str) -> None:
         super().__init__(config, context, name, "")
@@ -44,6 +44,9 @@ class UrTool(TipTool):
 
     def pose(self, stamp_ns: int) -> Affine:
         return self._arm.poses.at(stamp_ns)
+
+    def refresh(self, stamp_ns: int) -> None:
+        self.trouble = self._arm.trouble or self.trouble
 
     def close(self) -> None:
         self._arm.close()

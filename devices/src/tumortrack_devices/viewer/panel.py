@@ -264,6 +264,12 @@ class Panel:
             }
             self.colour = gui.add_html("")
             self.forget = gui.add_button("Forget", color="gray", visible=False)
+            self.settle = gui.add_button(
+                "The touch was wrong",
+                color="gray",
+                visible=False,
+                hint="What contradicts the answer counts no more",
+            )
         with gui.add_folder("Show"):
             shown |= {
                 "organ": gui.add_slider(label, 0.0, 1.0, 0.05, default.organ),

@@ -10,11 +10,13 @@ import rclpy
 from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 
 from tumortrack_ros.options import OPTIONS, command
 
 _LOOK_S = 0.2  # how often it is seen whether the command has ended, or must be started anew
 _FLUSH_S = 15.0  # for its sinks to say that it is over
+_REFUSED = 2  # the command's exit code where it does not take a value
 
 
 class TrackNode(Node):
@@ -27,6 +29,7 @@ class TrackNode(Node):
             self.declare_parameter(name, option.default, about)
         self.code: int | None = None
         self._stale = False
+        self._before: dict[str, object] = {}  # the values that it ran with before a change
         self._start()
         self.add_on_set_parameters_callback(self._changed)
         self.create_timer(_LOOK_S, self._look)
@@ -54,7 +57,8 @@ class TrackNode(Node):
             command({**self._values(), **ours})
         except ValueError as error:
             return SetParametersResult(successful=False, reason=str(error))
-        self._stale = self._stale or bool(ours)
+        if ours and not self._stale:
+            self._stale, self._before = True, self._values()
         return SetParametersResult(successful=True)
 
     def _look(self) -> None:
@@ -62,7 +66,13 @@ class TrackNode(Node):
             self._stale = False
             self.end()
             self._start()
-        self.code = self._track.poll()
+        code = self._track.poll()
+        if code == _REFUSED and self._before:
+            self.get_logger().error("the new values were refused; the former ones are back")
+            self.set_parameters([Parameter(name, value=old) for name, old in self._before.items()])
+            self._before = {}
+        else:
+            self.code = code
 
 
 def main() -> None:

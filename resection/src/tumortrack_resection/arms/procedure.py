@@ -60,6 +60,7 @@ _HAND = tuple(f"{HOLDER}/{name}" for name in ("cup", "rod", "wrist_3"))
 _ROOM_MM = 4.0  # between the arms beyond their clearance, so that they still manage later on
 _MOST_TRIED = 4  # pairs of places for which motions are planned
 _EDGE_MM = 120.0  # a base's middle is no nearer to the table's edge
+_AWAY_MM = (-100.0, -50.0, 0.0, 50.0, 100.0)  # a tip's home, along each axis, where it is blocked
 
 
 class Start(NamedTuple):
@@ -314,23 +315,44 @@ def search_bases(
     A small fixed grid of places for both bases, on their pedestals and facing as they do: first
     those within reach of every stroke, near to where the arms stand now; then the first for which
     the whole procedure can be planned. Raises as ``plan_motions``: no place will do; the reason is
-    the one for the places where the arms stand now. ``drafts``: as of ``plan_motions``."""
+    the one for the places where the arms stand now. ``drafts``: as of ``plan_motions``. An arm that
+    would meet something at home, as one whose base is on the table, gets a home near it."""
     drafts = drafts or Drafts(located, config, cell.tools)
+    given, cell = cell, _with_free_homes(cell, located)
+    said = "" if cell == given else "an arm is blocked at home_rad; it has another home, nearby"
     plan = drafts.best().plan()
     try:
-        return cell, *plan_motions(located, config, cell, drafts=drafts), ""
+        return cell, *plan_motions(located, config, cell, drafts=drafts), said
     except NoPlan as failure:
         reason = failure
     for moved in itertools.islice(_reachable_cells(plan, cell), _MOST_TRIED):
-        placed = ArmCell(moved, located.organ)
-        if placed.collisions(placed.home_rad) is not None:
-            continue
+        moved = _with_free_homes(moved, located)
         try:
             made = plan_motions(located, config, moved, pieces=_ELSEWHERE)
-            return moved, *made, _note(moved)
+            return moved, *made, f"{reason} {_note(moved)}"
         except NoPlan:
             continue
     raise NoPlan(f"{reason} Other places for the arms round the table were tried in vain.")
+
+
+def _with_free_homes(cell: CellConfig, located: Located) -> CellConfig:
+    home_rad = np.array(cell.home_rad)
+    for arm in ARMS:
+        group = PlanningGroup(ArmCell(cell, located.organ), arm, home_rad)
+        if group.collides(group.current_rad) is None:
+            continue
+        tip, turn = group.cell.tips(home_rad)[arm], cell.base(arm).table_from_base[:3, :3]
+        choices = [
+            own_rad
+            for by in itertools.product(_AWAY_MM, _AWAY_MM, _AWAY_MM)
+            for own_rad in group.inverse_kinematics(rigid(tip[:3, :3], tip[:3, 3] + turn @ by))
+            if group.collides(own_rad, _ROOM_MM) is None
+        ]
+        if choices:
+            home_rad[group.own] = min(
+                choices, key=lambda own: np.abs(own - group.current_rad).max()
+            )
+    return msgspec.structs.replace(cell, home_rad=tuple(home_rad.tolist()))
 
 
 def _reachable_cells(plan: ResectionPlan, config: CellConfig) -> Iterator[CellConfig]:
@@ -386,7 +408,7 @@ def _note(config: CellConfig) -> str:
     for arm in ARMS:
         (x, y, z), yaw_deg = config.base(arm).position_mm, config.base(arm).yaw_deg
         places.append(f"{arm}'s base at ({x:g}, {y:g}, {z:g}) mm, turned by {yaw_deg:g} degrees")
-    return f"the arms do not manage from where they stand; planned with the {', the '.join(places)}"
+    return f"Planned with the {', the '.join(places)}."
 
 
 _setting: list[tuple[ResectionConfig, CellConfig, str]] = []  # of the worker
