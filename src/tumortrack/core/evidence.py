@@ -14,10 +14,10 @@ from jaxtyping import Float64
 
 from tumortrack.core import store
 from tumortrack.core.config import Config, from_builtins
+from tumortrack.core.csv_tables import number_in, read_rows, whole_in
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import Points
 from tumortrack.core.report import Point
-from tumortrack.core.tables import number_in, read_rows, whole_in
 
 _REACH_MM = 2000.0  # of anything that a camera above a patient sees
 _LEAST_MM = 3.0  # no camera has an organ nearer

@@ -13,11 +13,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from tumortrack.core.config import Config
+from tumortrack.core.csv_tables import number_in, read_rows, whole_in
 from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.geometry import HERE, Affine, rigid
 from tumortrack.core.report import Finding
 from tumortrack.core.store import read_file
-from tumortrack.core.tables import number_in, read_rows, whole_in
 from tumortrack.live.values import Observation
 
 # Between two poses an arm that accelerates by 1 m/s2 deviates from linear interpolation by at most

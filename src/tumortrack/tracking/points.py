@@ -23,10 +23,10 @@ import msgspec
 import numpy as np
 from jaxtyping import Float, Float64
 
+from tumortrack.core.csv_tables import read_rows, text_of
 from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.estimate import Motion
 from tumortrack.core.store import read_file
-from tumortrack.core.tables import read_rows, text_of
 
 FAR_MM = 100.0  # from the organ's box: hardly a point that the user means
 _NEAR_MM = 20.0  # of the organ's box, where points in other units or axes are looked for

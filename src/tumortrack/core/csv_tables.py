@@ -1,0 +1,85 @@
+"""Tables that users give, as CSV."""
+
+from __future__ import annotations
+
+import codecs
+import csv
+import io
+from decimal import Decimal, InvalidOperation
+from typing import NamedTuple
+
+from tumortrack.core.errors import InputError
+
+_UTF16 = codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE
+
+
+class Rows(NamedTuple):
+    """A table's header, and each row's line in the file and cells, as many as there are columns."""
+
+    header: tuple[str, ...]
+    rows: tuple[tuple[int, tuple[str, ...]], ...]
+
+    @property
+    def columns(self) -> dict[str, int]:
+        """Places of the columns by name, in lower case."""
+        return {cell.lower(): place for place, cell in enumerate(self.header)}
+
+
+def read_rows(content: bytes, name: str) -> Rows:
+    """A table as spreadsheets write it: UTF-8, or UTF-16 with its mark; spaces round cells, empty
+    rows, and commas at the ends of rows do not count.
+
+    Raises InputError: no text or table, no header, a column twice, a row with more or fewer cells.
+    """
+    text = io.StringIO(text_of(content, name), newline="")
+    reader = csv.reader(text, strict=True, skipinitialspace=True)
+    try:
+        read = [(reader.line_num, [cell.strip() for cell in row]) for row in reader]
+    except csv.Error as error:
+        raise InputError(f"{name}, line {reader.line_num}: {error}. Export it again.") from error
+    lines = [(line, row) for line, row in read if any(row)]
+    if len(lines) < 2:
+        raise InputError(f"{name} has no rows; it needs a header, and a line for each of them.")
+    header = lines[0][1]
+    while not header[-1]:
+        header.pop()
+    lower, kept = [cell.lower() for cell in header], []
+    if doubled := [cell for cell in lower if lower.count(cell) > 1]:
+        raise InputError(
+            f"{name} has the column {doubled[0]!r} twice; its columns {','.join(header)} must have "
+            "different names."
+        )
+    for line, row in lines[1:]:
+        while len(row) > len(header) and not row[-1]:
+            row.pop()
+        if len(row) != len(header):
+            raise InputError(f"{name}, line {line}: {len(row)} values in {len(header)} columns.")
+        kept.append((line, tuple(row)))
+    return Rows(tuple(header), tuple(kept))
+
+
+def text_of(content: bytes, name: str) -> str:
+    """Text in UTF-8, with or without a byte order mark, or in UTF-16 with one."""
+    try:
+        return content.decode("utf-16" if content.startswith(_UTF16) else "utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise InputError(f"{name} is no text in UTF-8: {error}. Save it as CSV (UTF-8).") from error
+
+
+def number_in(text: str, where: str) -> float:
+    """``where``: file, line and column, for the message."""
+    try:
+        return float(text)
+    except ValueError as error:
+        raise InputError(f"{where}: {text[:40]!r} is no number.") from error
+
+
+def whole_in(text: str, where: str) -> int:
+    """To the last digit, also of 1.7e18."""
+    try:
+        number = Decimal(text)
+        if number == number.to_integral_value() and abs(number) < 2**63:
+            return int(number)
+    except InvalidOperation:
+        pass
+    raise InputError(f"{where}: {text[:40]!r} is no whole number, or beyond 63 bits.")
