@@ -330,7 +330,8 @@ def test_other_and_empty_files_are_refused(tmp_path, name):
     (tmp_path / name).write_bytes(b"ObjectType = Image\nElementDataFile = /etc/passwd\n")
     with pytest.raises(InputError):
         read_volume(tmp_path / name)
-    with pytest.raises(InputError, match="no DICOM image"):
+    words = "not read" if name == "v.mhd" else "no DICOM image"
+    with pytest.raises(InputError, match=words):
         read_volume(tmp_path)
 
 
@@ -381,5 +382,5 @@ def test_a_multi_frame_object_beside_a_series_is_left_out_with_a_note(tmp_path):
     assert "frames.dcm" in raw.notes[0]
     for path in paths:
         path.unlink()
-    with pytest.raises(InputError, match="classic slices"):
+    with pytest.raises(InputError, match="0 of them are CT"):  # two frames at one place
         read_raw(tmp_path / "dicom")

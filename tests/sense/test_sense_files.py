@@ -313,8 +313,9 @@ def test_depths_are_corrected_as_the_intrinsics_file_says(tmp_path):
 
 
 def test_depths_that_16_bits_cannot_hold_are_refused(tmp_path):
-    with pytest.raises(InputError, match=r"6553\.5"):
-        write_depth_png(tmp_path / "depth.png", wall(7000.0))
+    for mm in (7000.0, 6553.5):  # the largest number stands for no depth
+        with pytest.raises(InputError, match=r"6553\.4"):
+            write_depth_png(tmp_path / "depth.png", wall(mm))
     with pytest.raises(InputError, match=r"0\.1"):
         write_depth_png(tmp_path / "depth.png", wall(-5.0))
     assert not list(tmp_path.iterdir())

@@ -52,6 +52,7 @@ class _Slice:
     patient_id: str
     laterality: str  # L, R or something else
     frame: int  # of its file
+    classic: bool  # its file has no other frame
 
 
 class NoSeries(InputError):
@@ -81,14 +82,14 @@ def find_series(folder: Path, series: str | None = None) -> Series:
     missing, double or stray slice; images of two patients.
     """
     groups, notes = _groups(folder)
-    slices = _choose(folder, groups, series)
-    first = slices[0]
-    _check_tags(folder, slices)
+    chosen = _choose(folder, groups, series)
+    first = chosen[0]
+    _check_tags(folder, chosen)
     row, column = np.reshape(first.orientation, (2, 3))
     normal = np.cross(row, column)
     if not 0.99 < np.linalg.norm(normal) < 1.01:
         raise InputError(f"{first.path}: ImageOrientationPatient is not two unit directions.")
-    slices = sorted(slices, key=lambda s: float(np.dot(s.position_mm, normal)))
+    slices = sorted(chosen, key=lambda s: float(np.dot(s.position_mm, normal)))
     between_rows, between_columns = first.spacing_mm
     lps_from_index = np.eye(4)  # index i runs along a row
     axes = (row * between_columns, column * between_rows, _slice_step(slices, normal))
@@ -97,13 +98,20 @@ def find_series(folder: Path, series: str | None = None) -> Series:
     stored = sum(path.stat().st_size for path in {s.path for s in slices})
     check_size(folder, shape, 4, compressed=True, stored=stored)
     check_affine(folder, lps_from_index)
-    if others := sum(map(len, groups)) - len(slices):  # perhaps a damaged slice is among them
-        notes += (f"{others} images of other series, sizes or orientations left out",)
+    others = [s.path.name for group in groups if group is not chosen for s in group]
+    if others:  # perhaps a damaged slice is among them
+        kinds = "other series, sizes, orientations or numbers of frames"
+        notes += (f"{len(others)} images of {kinds} left out ({_named(others)})",)
     if not first.uid:
         notes += ("the slices have no SeriesInstanceUID: taken as one series",)
     files, frames = tuple(s.path for s in slices), tuple(s.frame for s in slices)
     patient = _patient(folder, groups, slices)
     return Series(files, frames, shape, lps_from_index, first.scale, notes, patient)
+
+
+def _named(names: list[str]) -> str:
+    different = list(dict.fromkeys(names))
+    return ", ".join(different[:3]) + (", ..." if len(different) > 3 else "")
 
 
 def read_dicom(folder: Path, series: str | None = None) -> RawVolume:
@@ -169,12 +177,12 @@ def _groups(folder: Path) -> tuple[list[list[_Slice]], tuple[str, ...]]:
             raise InputError(
                 f"{file}: its position, orientation, spacing or rescaling is not finite. {_AGAIN}"
             )
-        key = tags.uid, tags.shape, tags.orientation
+        key = tags.uid, tags.shape, tags.classic, tags.orientation
         same = (
             known
             for known in by_key
-            if known[:2] == key[:2]
-            and np.abs(np.subtract(known[2], key[2])).max() < _SAME_DIRECTION
+            if known[:3] == key[:3]
+            and np.abs(np.subtract(known[3], key[3])).max() < _SAME_DIRECTION
         )
         by_key.setdefault(next(same, key), []).append(tags)
     if not by_key:
@@ -186,8 +194,7 @@ def _groups(folder: Path) -> tuple[list[list[_Slice]], tuple[str, ...]]:
         )
     groups = [by_key[key] for key in sorted(by_key, key=lambda key: (-len(by_key[key]), repr(key)))]
     notes = tuple(
-        f"{len(paths)} files are {what}: left out ({', '.join(p.name for p in paths[:3])}"
-        + (", ...)" if len(paths) > 3 else ")")
+        f"{len(paths)} files are {what}: left out ({_named([p.name for p in paths])})"
         for what, paths in left_out.items()
         if paths
     )
@@ -255,6 +262,7 @@ def _read_tags(path: Path) -> list[_Slice] | str:
                     patient_id=patient_id.strip()[:64].strip(),  # as long as the standard allows
                     laterality=str(tags.get("ImageLaterality") or tags.get("Laterality") or ""),
                     frame=frame,
+                    classic=count == 1,
                 )
                 slices.append(made)
             return slices

@@ -55,7 +55,7 @@ def cloud_of(message: Any) -> SensorCloud:
         raise InputError(f"a cloud came with the fields {names}; x, y and z are needed.")
     width, height, row = int(message.width), int(message.height), int(message.row_step)
     data = np.frombuffer(message.data, np.uint8)
-    if step * width * height == data.nbytes:  # some state all bytes as a row's
+    if row in (0, data.nbytes) and step * width * height == data.nbytes:  # as some state it
         row = step * width
     organised = height > 1
     claimed = row * (height - 1) + step * width if organised else step * width * height
@@ -208,7 +208,7 @@ def _pixels(image: Any, allowed: dict[str, str], what: str) -> np.ndarray:
         )
     width, height, step = int(image.width), int(image.height), int(image.step)
     data, wide = np.frombuffer(image.data, np.uint8), np.dtype(code).itemsize
-    if width * wide * height == data.nbytes:
+    if step in (0, data.nbytes) and width * wide * height == data.nbytes:  # as of clouds
         step = width * wide
     fits = 0 < width <= _LONGEST_SIDE and 0 < height <= _LONGEST_SIDE
     if not fits or step < width * wide or step * height > data.nbytes:
