@@ -452,7 +452,25 @@ def test_our_own_dicom_segmentation_is_read_as_it_was_written(phantom, tmp_path)
     case = prepare(path)
     assert volumes(case) == pytest.approx([KIDNEY_ML, *TUMORS_ML], rel=0.015)
     raw = read_raw(path)
-    first = int(np.flatnonzero(labels.labels.any((0, 1)))[0])
+    first = int(np.flatnonzero(labels.labels.any((0, 1)))[0]) - 1  # an empty slice at either end
     stop = first + raw.array.shape[2]
     assert np.array_equal(raw.array, labels.labels[..., first:stop])
     assert not labels.labels[..., stop:].any()
+    assert not case.warnings
+    assert raw.notes[0] in case.report["notes"]  # where the CT ends, the file does not say
+
+
+def test_a_dicom_segmentation_is_cut_where_its_ct_ends(phantom, tmp_path):
+    pytest.importorskip("highdicom")
+    from tumortrack.imaging.segmentation_files import segments, write_dicom_seg
+    from tumortrack.phantom.dicom import write_dicom_series
+
+    half = phantom.map()[..., : phantom.map().shape[2] // 2]
+    hu = np.choose(half, [-1000, 40, 570, 570]).astype(np.float32)
+    write_dicom_series(Volume(hu, phantom.affine), tmp_path / "ct")
+    labels, path = LabelVolume(half, phantom.affine), tmp_path / "segmentation.dcm"
+    parts = ("kidney", "tumor_1", "tumor_2")[: int(half.max())]
+    write_dicom_seg(path, labels, segments(parts), tmp_path / "ct")
+    assert "cut" not in [warning.kind for warning in prepare(path).warnings]
+    case = prepare(path, PrepareOptions(ct=tmp_path / "ct"))
+    assert [warning.kind for warning in case.warnings] == ["cut"]

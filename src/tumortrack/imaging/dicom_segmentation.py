@@ -15,12 +15,15 @@ from tumortrack.imaging.grid import RawVolume, Segment, check_affine, check_size
 from tumortrack.imaging.segments import painted
 
 _OFF_STEP = 0.05  # of a slice: rounding of positions
+_NO_ENDS = (
+    "a DICOM segmentation does not say whether the CT ended at its first and last slice: give --ct"
+)
 
 
 def read_segmentation(path: Path) -> RawVolume | None:
-    """The segments of a file; None: it is no segmentation. Slices that hold nothing may be left
-    out of it, so the image is taken to end where the segments do. Raises InputError: damaged,
-    fractional, slices without a common step."""
+    """The segments of a file, with an empty slice at either end; None: it is no segmentation. Slices
+    that hold nothing are usually left out, so a note says that where the image ended is unknown.
+    Raises InputError: damaged, fractional, slices without a common step."""
     if not is_segmentation(path):
         return None
     import pydicom
@@ -51,12 +54,12 @@ def _read(path: Path, tags: Any) -> RawVolume:
     slices = (along - along.min()) / step
     if np.abs(slices - np.rint(slices)).max() > _OFF_STEP:
         raise InputError(f"{path}: its slices have no common step. Export it again, or as NIfTI.")
-    index = np.rint(slices).astype(int)
+    index = np.rint(slices).astype(int) + 1
     lps_from_index = np.eye(4)
     between_rows, between_columns = map(float, measures.PixelSpacing)
     axes = row * between_columns, column * between_rows, normal * step
-    lps_from_index[:3] = np.stack([*axes, positions[along.argmin()]], axis=1)
-    shape = int(tags.Columns), int(tags.Rows), max(2, int(index.max()) + 1)
+    lps_from_index[:3] = np.stack([*axes, positions[along.argmin()] - normal * step], axis=1)
+    shape = int(tags.Columns), int(tags.Rows), int(index.max()) + 2
     names = {int(s.SegmentNumber): str(s.SegmentLabel) for s in tags.SegmentSequence}
     numbers = [int(g("SegmentIdentificationSequence").ReferencedSegmentNumber) for g in groups]
     if len(names) < len(tags.SegmentSequence) or not set(numbers) <= set(names) <= set(range(256)):
@@ -73,4 +76,4 @@ def _read(path: Path, tags: Any) -> RawVolume:
         return out
 
     segments = tuple(Segment(n, name, partial(mask, n)) for n, name in names.items())
-    return RawVolume(painted(segments), lps_from_index, segments=segments)
+    return RawVolume(painted(segments), lps_from_index, (_NO_ENDS,), segments=segments)

@@ -302,7 +302,8 @@ def _measured(
 
 
 def _with_ct(case: Case, path: Path) -> Case:
-    """The case with its CT, which must have the labels' grid. Raises InputError."""
+    """The case with its CT, which must have the labels' steps, and a warning if the organ reaches
+    its end. Raises InputError."""
     raw = read_raw(path)
     volume = volume_of(raw, path)
     steps = np.linalg.inv(volume.lps_from_index) @ case.labels.lps_from_index
@@ -315,7 +316,11 @@ def _with_ct(case: Case, path: Path) -> Case:
         )
     if case.patient.differs(raw.patient):
         raise InputError(f"--ct {path} is of {raw.patient}, the labels of {case.patient}.")
-    return replace(case, ct=crop_ct(volume, case.labels))
+    notes = case.report["notes"]
+    if not any(isinstance(note, CaseWarning) and note.kind == "cut" for note in notes):
+        words = case.anatomy.kind.words
+        notes = [*notes, *_cut(words, case.labels, volume.hu.shape, volume.lps_from_index)]
+    return replace(case, ct=crop_ct(volume, case.labels), report={**case.report, "notes": notes})
 
 
 def _start(affine: np.ndarray, labels: LabelVolume) -> list[int]:
