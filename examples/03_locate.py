@@ -1,8 +1,8 @@
 """Locate the organ and its tumors in what a depth camera sees. Nothing has to be trained.
 
 Run after 01: python examples/03_locate.py [FOLDER] [STEPS]
-The paper's method is trained for STEPS steps instead, with `pip install tumortrack-occupancy`;
-a few show that it works, and some thousands give a model worth using.
+The paper's method (tumortrack-occupancy: `make setup`) is trained for STEPS steps instead; a few
+show that it works, and some thousands give a model worth using.
 """
 
 import sys

@@ -1,7 +1,7 @@
 """Where to cut a tumor out of an organ that lies on the table.
 
 Run after 01: python examples/07_plan_a_resection.py [FOLDER]
-Needs `pip install tumortrack-resection` (`make setup` has it).
+Needs the package tumortrack-resection (`make setup`).
 From the command line, with the motions of two arms: tumortrack plan RUN PLAN
 """
 

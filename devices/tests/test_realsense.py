@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 import time
 
@@ -11,6 +12,7 @@ import pytest
 from clock import PATIENCE_S, until
 from realsense_objects import HEIGHT, WIDTH, Camera, raw_depth, record
 from tumortrack.core.errors import InputError
+from tumortrack.core.packages import to_install
 from tumortrack.core.types import Intrinsics
 from tumortrack.live.spec import SOURCES
 from tumortrack.live.values import SourceEnded, SourceLost
@@ -168,7 +170,7 @@ def test_what_is_not_there_is_said(tmp_path, monkeypatch):
     with pytest.raises(SourceLost):
         RealSenseSourceConfig(device="000000000000").open()  # no camera has it
     monkeypatch.setitem(sys.modules, "pyrealsense2", None)
-    with pytest.raises(InputError, match=r"pip install 'tumortrack-devices\[realsense\]'"):
+    with pytest.raises(InputError, match=re.escape(to_install("tumortrack-devices[realsense]"))):
         RealSenseSourceConfig().open()
 
 

@@ -13,6 +13,7 @@ import pytest
 
 from clock import Clock
 from fleet_objects import chain, executions, patients, results, user_file
+from tumortrack.core.packages import to_install
 from tumortrack_lab.cli.fleet import progress_words
 from tumortrack_lab.fleet import engine
 from tumortrack_lab.fleet.engine import Outcome, Status, run
@@ -199,7 +200,7 @@ def test_without_the_extra_one_line_says_how_to_get_it():
     code = f"{hide} from tumortrack.cli.main import run; sys.exit(run({['fleet', 'L', 'O']!r}))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.returncode == 2
-    assert done.stderr == "tumortrack: fleet needs ray: pip install 'tumortrack-lab[fleet]'\n"
+    assert done.stderr == f"tumortrack: fleet needs ray: {to_install('tumortrack-lab[fleet]')}.\n"
 
 
 def test_what_another_run_is_doing_is_left_to_it(store, folder, monkeypatch):

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from stories import with_imports
+from tumortrack.core.packages import to_install
 from tumortrack.tracking.model_files import load_model
 from tumortrack_occupancy.config import MlpDecoderConfig, NetworkConfig
 from tumortrack_occupancy.encoders.pointnet2 import PointNet2Config, SetAbstraction
@@ -95,5 +96,5 @@ def test_a_missing_package_is_told_before_pytorch_is_loaded(quick_model, tmp_pat
     without = "import sys; sys.modules['onnx'] = None; from tumortrack.cli.main import main; main()"
     done, imported = with_imports("onnx", quick_model, tmp_path / "out.onnx", run=["-c", without])
     assert done.returncode == 2, done.stderr
-    assert "pip install 'tumortrack-occupancy[onnx]'" in done.stderr
+    assert to_install("tumortrack-occupancy[onnx]") in done.stderr
     assert "torch" not in imported

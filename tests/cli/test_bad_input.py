@@ -16,6 +16,7 @@ from tumortrack.cli.demo import Demo
 from tumortrack.cli.main import run
 from tumortrack.cli.training import Train
 from tumortrack.core.errors import InputError
+from tumortrack.core.packages import to_install
 from tumortrack.imaging.options import PrepareOptions
 from tumortrack.imaging.prepare import prepare
 
@@ -207,7 +208,7 @@ def test_the_papers_method_names_its_package_where_it_is_not_installed(
     assert run([*arguments, *places]) == 2
     said = capsys.readouterr()
     assert said.err.count("\n") == 1
-    assert "pip install tumortrack-occupancy" in said.err
+    assert to_install("tumortrack-occupancy") in said.err
     assert said.out == ""
     assert list(tmp_path.iterdir()) == []
 

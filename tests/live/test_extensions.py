@@ -16,6 +16,7 @@ from live_objects import small_frame, small_setting, small_update
 from stories import COMMAND, environment
 from track_objects import World, ended_when, estimates, start
 from tumortrack.core.errors import InputError, StorageError
+from tumortrack.core.packages import to_install
 from tumortrack.live.session import named_sinks, open_sinks
 from tumortrack.live.spec import POSES, SINKS, SOURCES, TOOLS, extensions
 from tumortrack.live.values import Sink, Source
@@ -137,8 +138,8 @@ def test_a_kind_of_ours_that_is_not_installed_is_named_with_its_package(monkeypa
     ):
         with pytest.raises(InputError) as refused:
             registry.parse(f"{kind}:x")
-        line = f"{registry.what} '{kind}:x': {kind!r} is not installed here: pip install"
-        assert str(refused.value) == f"{line} '{package}' (in a checkout: make setup)."
+        line = f"{registry.what} '{kind}:x': {kind!r} is not installed here:"
+        assert str(refused.value) == f"{line} {to_install(package)}."
     (tmp_path / "a.mcap").touch()
     for path in (tmp_path, tmp_path / "a.mcap"):
         with pytest.raises(InputError, match=r"'recording' is not installed here: pip install"):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+import re
 import sys
 from pathlib import Path
 
@@ -24,6 +25,7 @@ from imaging_objects import (
 from live_objects import small_estimate
 from tumortrack.core.errors import InputError
 from tumortrack.core.mesh_files import read_mesh, write_mesh
+from tumortrack.core.packages import to_install
 from tumortrack.core.patient import Patient
 from tumortrack.core.types import CameraLabels, LabelVolume, Mesh, Volume
 from tumortrack.imaging.case import Case, save_case
@@ -295,7 +297,7 @@ def test_without_highdicom_it_says_what_to_install(
     monkeypatch.setitem(sys.modules, "highdicom", None)
     affine = affine_lps("LPS", (1.0, 1.0, 1.0), np.eye(3))
     ct = ct_series(tmp_path / "ct", affine)
-    with pytest.raises(InputError, match=r"pip install 'tumortrack\[dicom\]'"):
+    with pytest.raises(InputError, match=re.escape(to_install("tumortrack[dicom]"))):
         write_dicom_seg(tmp_path / "seg.dcm", blob_labels(affine), segments(PARTS), ct)
 
 

@@ -19,6 +19,7 @@ from jaxtyping import Float64, UInt8
 from tumortrack.core.config import Config, from_builtins
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import read_rigid
+from tumortrack.core.packages import to_install
 from tumortrack.core.store import read_file
 from tumortrack.core.types import DepthFrame, Intrinsics
 from tumortrack.sense.camera import plausible
@@ -211,6 +212,6 @@ def opencv() -> ModuleType:
         import cv2
     except ImportError as error:
         raise InputError(
-            f"stereo pictures need OpenCV: pip install 'tumortrack-devices[stereo]' ({error})."
+            f"stereo pictures need OpenCV: {to_install('tumortrack-devices[stereo]')} ({error})."
         ) from error
     return cv2

@@ -11,6 +11,7 @@ from tyro.conf import Positional
 from tumortrack.cli.console import say
 from tumortrack.core import store
 from tumortrack.core.errors import InputError
+from tumortrack.core.packages import to_install
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,7 +46,7 @@ class Onnx:
             )
         if find_spec("onnx") is None:  # reported before PyTorch's seconds
             raise InputError(
-                "writing ONNX needs the package onnx: pip install 'tumortrack-occupancy[onnx]'."
+                f"writing ONNX needs the package onnx: {to_install('tumortrack-occupancy[onnx]')}."
             )
 
         from tumortrack.tracking.model_files import load_model

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tumortrack.core.errors import PackageError
+from tumortrack.core.packages import to_install
 from tumortrack.core.types import Anatomy
 from tumortrack.imaging.case import Case
 from tumortrack.models.method import Locator, Preset, TrainingStatus, TrainOptions
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
 if find_spec("torch") is None:
     raise PackageError(
         "tumortrack-occupancy is installed without PyTorch, which it needs: "
-        "pip install tumortrack-occupancy."
+        f"{to_install('tumortrack-occupancy')}."
     )
 
 

@@ -14,6 +14,7 @@ import numpy as np
 from tumortrack.core import store
 from tumortrack.core.config import from_builtins
 from tumortrack.core.errors import InputError, NoPlan
+from tumortrack.core.packages import to_install
 from tumortrack.core.types import Mesh
 from tumortrack.live.calibration_file import read_frames
 from tumortrack.live.values import PublishedFrame
@@ -208,7 +209,7 @@ def check_arms_installed() -> None:
     needed = ("pinocchio", "coal", "toppra")
     if missing := [name for name in needed if find_spec(name) is None]:
         raise InputError(
-            f"arms need {', '.join(missing)}: pip install 'tumortrack-resection[arms]'. toppra "
+            f"arms need {', '.join(missing)}: {to_install('tumortrack-resection[arms]')}. toppra "
             "has packages for x86-64 alone; elsewhere plan the cuts with --no-arms."
         )
 

@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from tumortrack.core.errors import InputError, TumortrackError
+from tumortrack.core.packages import to_install
 from tumortrack.live.values import SinkConfig, SinkContext, TrackingResult
 
 UR_JOINTS = (
@@ -306,7 +307,7 @@ class UrLink:
         except ImportError as error:
             raise InputError(
                 "ur with execute=true needs the package ur_rtde: "
-                "pip install 'tumortrack-resection[ur]'."
+                f"{to_install('tumortrack-resection[ur]')}."
             ) from error
         self._ends = ExitStack()  # the last first: the program, then both connections
         try:

@@ -21,6 +21,7 @@ from tyro.conf import Positional
 
 from tumortrack.cli.console import Device, say
 from tumortrack.core.errors import NoEstimate, TumortrackError
+from tumortrack.core.packages import to_install
 from tumortrack.core.process import available_cores
 from tumortrack.core.tables import read_table
 from tumortrack.models.method import GROUP
@@ -120,7 +121,7 @@ def part(name: str, extra: str, purpose: str) -> Iterator[Status]:
     """Whether everything that a distribution, or one of its extras, needs is there and works. A
     fault of a package that only a part of it needs is a status of its own."""
     what = f"{name}[{extra}]" if extra else name
-    install = f"{sys.executable} -m pip install '{what}'"
+    install = f"{sys.executable} -m {to_install(what)}"
     try:
         needed = list(_needed(name, extra))
     except PackageNotFoundError:

@@ -16,6 +16,7 @@ import tyro
 
 import tumortrack
 from tumortrack.core.errors import EXIT_STATUSES, InputError, PackageError, TumortrackError
+from tumortrack.core.packages import to_install
 
 
 @runtime_checkable
@@ -105,7 +106,7 @@ def command(name: str) -> Callable[..., Command]:
         package = _DISTRIBUTIONS[name]
         raise InputError(
             f"the command {name} belongs to {package}, which is not installed here: "
-            f"pip install {package}"
+            f"{to_install(package)}."
         )
     return commands[name]
 

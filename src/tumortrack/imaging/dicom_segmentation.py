@@ -21,9 +21,9 @@ _NO_ENDS = (
 
 
 def read_segmentation(path: Path) -> RawVolume | None:
-    """The segments of a file, with an empty slice at either end; None: it is no segmentation. Slices
-    that hold nothing are usually left out, so a note says that where the image ended is unknown.
-    Raises InputError: damaged, fractional, slices without a common step."""
+    """The segments of a file, with an empty slice at either end; None: it is no segmentation.
+    Slices that hold nothing are usually left out, so a note says that where the image ended is
+    unknown. Raises InputError: damaged, fractional, slices without a common step."""
     if not is_segmentation(path):
         return None
     import pydicom

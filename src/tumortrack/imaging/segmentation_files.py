@@ -22,6 +22,7 @@ from tumortrack.core.colours import part_colour
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.organ import KIDNEY, Organ
+from tumortrack.core.packages import to_install
 from tumortrack.core.patient import NOBODY, UNKNOWN, Patient, Side
 from tumortrack.core.store import write_atomically, writing
 from tumortrack.core.tables import read_table
@@ -194,7 +195,7 @@ def _segmentation(
         import highdicom as hd
     except ImportError as error:
         raise InputError(
-            "--dicom needs highdicom: pip install 'tumortrack[dicom]' (Python up to 3.13)."
+            f"--dicom needs highdicom (Python up to 3.13): {to_install('tumortrack[dicom]')}."
         ) from error
     from pydicom.uid import generate_uid
 

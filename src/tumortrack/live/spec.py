@@ -18,6 +18,7 @@ import msgspec
 
 from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError
+from tumortrack.core.packages import to_install
 from tumortrack.core.report import Point
 from tumortrack.core.tables import read_table
 from tumortrack.live.poses import PosesConfig
@@ -81,8 +82,7 @@ class Registry(Generic[C]):
             )
         if not matches and kind in self.packages:
             raise InputError(
-                f"{where}: {kind!r} is not installed here: pip install {self.packages[kind]!r} "
-                "(in a checkout: make setup)."
+                f"{where}: {kind!r} is not installed here: {to_install(self.packages[kind])}."
             )
         if not matches:
             installed = {entry.name for entry in entries}

@@ -21,6 +21,7 @@ from typing import Any, Literal, Protocol, runtime_checkable
 from tumortrack.core.errors import InputError, PackageError
 from tumortrack.core.estimate import Estimate, FollowOptions
 from tumortrack.core.evidence import Evidence
+from tumortrack.core.packages import to_install
 from tumortrack.core.types import Anatomy, Look
 from tumortrack.imaging.case import Case
 from tumortrack.models.model import Model, ModelConfig
@@ -150,5 +151,5 @@ def _installed(what: str, belongs_to: Callable[[Method], bool]) -> Method:
         raise InputError(f"{what} is of no method that is installed here ({', '.join(methods)}).")
     raise PackageError(
         "the presets quick and paper need PyTorch, which the default method does not: "
-        "pip install tumortrack-occupancy."
+        f"{to_install('tumortrack-occupancy')}."
     )

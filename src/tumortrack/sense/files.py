@@ -20,6 +20,7 @@ from jaxtyping import Bool, Float32
 from tumortrack.core.config import Config, from_builtins
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import Affine, read_rigid
+from tumortrack.core.packages import to_install
 from tumortrack.core.store import read_file, read_json
 from tumortrack.core.types import DepthFrame, Intrinsics, SensorCloud
 from tumortrack.sense.camera import plausible
@@ -120,7 +121,7 @@ def _pcd_points(content: bytes, name: str) -> np.ndarray:
     try:
         from pypcd4 import PointCloud
     except ImportError as error:
-        raise InputError("a .pcd cloud needs pypcd4: pip install 'tumortrack[pcd]'.") from error
+        raise InputError(f"a .pcd cloud needs pypcd4: {to_install('tumortrack[pcd]')}.") from error
 
     _check_pcd_size(content, name)
     try:

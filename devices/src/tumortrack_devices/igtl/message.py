@@ -18,6 +18,7 @@ from jaxtyping import Float, Int, Num
 
 from tumortrack.core.colours import Colour
 from tumortrack.core.errors import InputError
+from tumortrack.core.packages import to_install
 
 HEADER_SIZE = 58
 LONGEST_DEVICE = 20  # ASCII characters
@@ -188,7 +189,7 @@ def crc64(data: bytes) -> int:
         from fastcrc.crc64 import ecma_182
     except ImportError as error:
         raise InputError(
-            "OpenIGTLink needs the package fastcrc: pip install tumortrack-devices."
+            f"OpenIGTLink needs the package fastcrc: {to_install('tumortrack-devices')}."
         ) from error
     return ecma_182(data)
 

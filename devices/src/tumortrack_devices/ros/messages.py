@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from tumortrack.core.errors import InputError
+from tumortrack.core.packages import to_install
 
 Distro = Literal["noetic", "humble"]
 
@@ -125,7 +126,7 @@ def _store(distro: Distro) -> Any:
         from rosbags.typesys import Stores, get_types_from_msg, get_typestore
     except ImportError as error:
         raise InputError(
-            "ROS messages need the package rosbags: pip install tumortrack-devices."
+            f"ROS messages need the package rosbags: {to_install('tumortrack-devices')}."
         ) from error
     store = get_typestore(Stores.ROS1_NOETIC if distro == "noetic" else Stores.ROS2_HUMBLE)
     if distro != "noetic":

@@ -8,6 +8,7 @@ import threading
 from typing import Any, Literal
 
 from tumortrack.core.errors import InputError, TumortrackError
+from tumortrack.core.packages import to_install
 from tumortrack_devices.ros.bus import Bus, Publisher, Subscriber
 from tumortrack_devices.ros.messages import Messages
 
@@ -24,7 +25,7 @@ def open_bus(via: Via) -> Bus:
         from tumortrack_devices.ros.dds import DdsBus
     except ImportError as error:
         raise InputError(
-            "ROS 2 without ROS needs the package cyclonedds: pip install tumortrack-devices. It "
+            f"ROS 2 without ROS needs cyclonedds: {to_install('tumortrack-devices')}. It "
             "exists for x86-64 and Python up to 3.13; elsewhere use your ROS's own rclpy."
         ) from error
     return DdsBus(messages)

@@ -22,6 +22,7 @@ from tumortrack.core import colours
 from tumortrack.core.errors import InputError
 from tumortrack.core.estimate import Motion
 from tumortrack.core.geometry import transform_points
+from tumortrack.core.packages import to_install
 from tumortrack.core.types import Mesh
 from tumortrack.imaging.case import load_case
 from tumortrack.live.values import SinkConfig, SinkContext, TrackingResult
@@ -397,7 +398,7 @@ def _opened(host: str, port: int) -> tuple[ViserServer, Guard]:
 
         from tumortrack_devices.viewer.guard import Guard
     except ImportError as error:
-        raise InputError("the viewer needs viser: pip install tumortrack-devices.") from error
+        raise InputError(f"the viewer needs viser: {to_install('tumortrack-devices')}.") from error
     taken = (
         f"the viewer cannot listen on port {port} of {host}: another program does, or it may not "
         f"be used. Close that, or choose another port: viewer:{port + 1}."

@@ -18,6 +18,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from tumortrack.core.errors import InputError
+from tumortrack.core.packages import to_install
 from tumortrack.core.types import DepthFrame, Intrinsics
 from tumortrack.live.values import Observation, SourceConfig, SourceEnded, SourceLost
 from tumortrack.sense.camera import plausible
@@ -195,7 +196,7 @@ def _sdk() -> ModuleType:
         import pyrealsense2
     except ImportError as error:
         raise InputError(
-            "a RealSense needs pyrealsense2: pip install 'tumortrack-devices[realsense]', and "
+            f"a RealSense needs pyrealsense2: {to_install('tumortrack-devices[realsense]')}, and "
             f"Debian's libusb-1.0-0 ({error})."
         ) from error
     return pyrealsense2

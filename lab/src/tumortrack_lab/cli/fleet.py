@@ -14,6 +14,7 @@ from tyro.conf import Positional
 
 from tumortrack.cli.console import console, live_line, say
 from tumortrack.core.errors import InputError, TumortrackError
+from tumortrack.core.packages import to_install
 from tumortrack.core.store import check_place
 
 if TYPE_CHECKING:
@@ -113,7 +114,7 @@ class Fleet:
         needed = [name for name in ("fsspec", "pyarrow", "ray") if not self.serial or name != "ray"]
         if lacking := [name for name in needed if find_spec(name) is None]:
             raise InputError(
-                f"fleet needs {' and '.join(lacking)}: pip install 'tumortrack-lab[fleet]'"
+                f"fleet needs {' and '.join(lacking)}: {to_install('tumortrack-lab[fleet]')}."
             )
 
 
