@@ -74,10 +74,11 @@ def moving(stage, n, start_ns=10**15, step_mm=(0.4, -0.2, 0.1)):
 class Script:
     """A source that gives items in order: clouds, errors to raise, things to do first."""
 
-    dropped, on_demand = 0, False
+    dropped = 0
 
-    def __init__(self, items, waits=True, host_clock=False):
+    def __init__(self, items, waits=True, host_clock=False, on_demand=False):
         self._items, self.lossless, self.host_clock = list(items), waits, host_clock
+        self.on_demand = on_demand
 
     def read(self, timeout_s):
         while self._items and callable(self._items[0]):
@@ -339,7 +340,10 @@ def test_stale_frames_are_refused(tracker, stages, clock):
     assert updates[0].latency_ms == pytest.approx(21_000)
 
 
-def test_an_answer_that_comes_too_late_is_none_and_yet_a_start(tracker, stages, clock):
+@pytest.mark.parametrize("on_demand", [False, True])
+def test_an_answer_that_comes_too_late_is_none_and_yet_a_start(tracker, stages, clock, on_demand):
+    """Of a camera: what a simulation waits for is no camera's age."""
+
     class Slow(Tracker):
         def follow(self, cloud, last=None, how=FollowOptions(), seen=None, evidence=()):  # noqa: B008
             helped.append(last is not None)
@@ -354,9 +358,11 @@ def test_an_answer_that_comes_too_late_is_none_and_yet_a_start(tracker, stages, 
     ]
     config = LoopConfig(region=WHOLE, stale_s=20.0)
     items = [clouds[0], lambda: until(lambda: sink.updates), clouds[1]]
-    updates, _ = play(Slow(tracker.model), items, config, sink, waits=False)
-    assert "too late" in updates[0].reason
-    assert updates[0].estimate is None
+    script = {"waits": False, "on_demand": on_demand}
+    updates, _ = play(Slow(tracker.model), items, config, sink, **script)
+    if not on_demand:
+        assert updates[0].finding.kind == "too_late"
+    assert (updates[0].estimate is not None) == on_demand
     assert updates[-1].estimate is not None
     assert helped == [False, True]
 

@@ -43,7 +43,7 @@ SURE_AFTER = 3  # good estimates in a row after doubt: single frames of somethin
 class LoopConfig(Config, frozen=True, kw_only=True):
     """``stale_s``: after this time without a frame, or with one that old, there is 'no estimate'.
     ``give_up_s``: after this time without a frame the loop ends. Neither counts a source's opening,
-    nor the slowness of one whose frames are made ``on_demand``. ``intrinsics``: replace the
+    nor holds for one whose frames are made ``on_demand``. ``intrinsics``: replace the
     source's, ``correction`` of depths included. ``frozen_s``: an image that repeats bit for bit for
     this time is old; 0: it may repeat. ``seconds``: the loop ends this time after the first frame;
     0: never. ``scan``: the first estimate is from several looks."""
@@ -188,13 +188,17 @@ class Loop:
     def _shown(self, seen: Observation, source: Cameras) -> tuple[TrackingResult, float]:
         """The result of a frame, and of what time it is, by ``time.monotonic``."""
         live_clock = source.latency_from != "taking"
-        result = self._answer(seen, source.born_ns(seen), live_clock)
+        # A frame that is made on demand waits for this computer alone, however slow that is.
+        stale_s = math.inf if source.on_demand else self._config.stale_s
+        result = self._answer(seen, source.born_ns(seen), live_clock, stale_s)
         late_ms = result.latency_ms if live_clock and result.estimate is not None else None
         return result, time.monotonic() - (late_ms or 0.0) / 1000
 
-    def _answer(self, seen: Observation, born_ns: int, live_clock: bool) -> TrackingResult:
+    def _answer(
+        self, seen: Observation, born_ns: int, live_clock: bool, stale_s: float
+    ) -> TrackingResult:
         """The result of one frame of the time ``born_ns``. ``live_clock``: time goes on while we
-        work, so an answer can come too late."""
+        work, so an answer can come too late: more than ``stale_s`` after its frame."""
         seconds: dict[str, float] = {}
         organ, estimate, reason, warning = None, None, "", ""
         quality: Quality = "none"
@@ -207,7 +211,7 @@ class Loop:
         try:
             # Simulations have this computer's clock, and so has the arrival.
             other_clock = born_ns == seen.stamp_ns and seen.truth is None
-            check_age(_age_s(born_ns), self._config.stale_s, other_clock)
+            check_age(_age_s(born_ns), stale_s, other_clock)
             timely = True
             if self._stamp is not None and seen.stamp_ns <= self._stamp[0]:  # set back: see workers
                 self.statistics.clock_jumps += 1
@@ -223,7 +227,7 @@ class Loop:
                 estimate = estimate.reporting(cameras=tuple(view.number for view, _ in found))
             finding, warning = self._confirmed(estimate, doubt)
             quality = "good" if finding is None else "poor"
-            if live_clock and _age_s(born_ns) > self._config.stale_s:
+            if live_clock and _age_s(born_ns) > stale_s:
                 raise _TooLate(Finding("too_late", {"seconds": _age_s(born_ns)}))
         except Exception as error:
             estimate, reason, quality, warning = None, str(error), "none", ""

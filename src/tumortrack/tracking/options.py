@@ -138,7 +138,8 @@ class TrackOptions(CameraOptions):
             5 s; tracking starts from all three together.
         smoothing: time constant in s of a mean over past estimates; the lag is in the report.
         rescan: search for the organ as in a first frame after so many s.
-        stale: refuse frames older than so many s; a pause is reported after four fifths of it.
+        stale: refuse a camera's frames that are older than so many s; a pause is reported after
+            four fifths of it.
         frozen: refuse an image that repeats bit for bit for so many s; 0: it may repeat, as from a
             simulated camera without noise.
         give_up: end after so many s without a frame from an open camera.
