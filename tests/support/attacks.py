@@ -23,6 +23,7 @@ from attack import Attack, Room
 from harness import Child, Ending, Work, base_in, command
 
 SECONDS, MEGABYTES = 20.0, 1024
+_LOADED = 10  # times as long: what takes no time of the processor hangs, or waits for its turn
 WITHOUT_BASE = attack_volumes.ATTACKS | attack_series.ATTACKS
 ATTACKS = WITHOUT_BASE | attack_clouds.ATTACKS | attack_artifacts.ATTACKS | attack_evidence.ATTACKS
 
@@ -32,13 +33,13 @@ def run(attack: Attack, room: Room, models: bool) -> tuple[Ending, str]:
     room.folder.mkdir(parents=True)
     arguments = attack.make(room)
     before = _files_below(room.folder)
-    # What may end well does the whole work: it compiles, beside whatever else the machine does.
+    # What may end well does the whole work, and compiles.
     allowed_s = (1 if attack.end == "refused" else 6) * SECONDS
     work = command(*arguments) if models else _without_models(command(*arguments))
-    ending = Child(work, room.folder).end(allowed_s, 4 * MEGABYTES)
+    ending = Child(work, room.folder).end(_LOADED * allowed_s, 4 * MEGABYTES)
     if ending.fault:
         return ending, ending.fault
-    if ending.seconds > allowed_s / 2:
+    if ending.cpu_s > allowed_s / 2:
         return ending, "slow"
     if ending.megabytes > MEGABYTES:
         return ending, "memory"
@@ -83,7 +84,7 @@ def main(folder: Path, names: list[str]) -> int:
             ending, fault = run(ATTACKS[name], Room(Path(work, name), base), models)
             faults += bool(fault)
             print(
-                f"{fault or 'ok':14} {name:40} {ending.code:4} {ending.seconds:6.2f} s "
+                f"{fault or 'ok':14} {name:40} {ending.code:4} {ending.cpu_s:6.2f} s "
                 f"{ending.megabytes:6.0f} MB  {ending.line[:150]}",
                 flush=True,
             )

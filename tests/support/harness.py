@@ -24,11 +24,13 @@ Work = Callable[[], int]  # returns an exit code
 
 @dataclass(frozen=True)
 class Ending:
-    """``code``: -9 where it was killed. ``megabytes``: beyond what the process began with."""
+    """``code``: -9 where it was killed. ``cpu_s``: of all its cores, which no other program's load
+    lengthens by much. ``megabytes``: beyond what the process began with."""
 
     code: int
     output: str
     seconds: float
+    cpu_s: float
     megabytes: float
 
     @property
@@ -88,11 +90,12 @@ class Child:
                 self.kill()
             time.sleep(0.005)
         took_s = time.perf_counter() - self._started
-        _, status = os.waitpid(self._pid, 0)
+        _, status, used = os.wait4(self._pid, 0)
         with self._output as stream:
             stream.seek(0)
             output = stream.read().decode(errors="replace")
-        return Ending(os.waitstatus_to_exitcode(status), output, took_s, most_mb)
+        cpu_s = used.ru_utime + used.ru_stime
+        return Ending(os.waitstatus_to_exitcode(status), output, took_s, cpu_s, most_mb)
 
 
 def _become(work: Work, folder: Path, limits: Mapping[int, int], output: int) -> None:
