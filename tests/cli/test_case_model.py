@@ -14,6 +14,8 @@ from tumortrack.cli.main import run
 from tumortrack.core import store
 from tumortrack.core.errors import StorageError
 from tumortrack.imaging.case import load_case
+from tumortrack.imaging.nifti import write_nifti
+from tumortrack.models.folder import read_model_manifest, weakness_of
 from tumortrack.report.inspection import describe
 from tumortrack.sense.ply import write_cloud_ply
 from tumortrack.tracking import model_files
@@ -205,3 +207,16 @@ def test_what_is_gone_is_an_unknown_option(case, tmp_path):
     assert "--start" in done.stderr
     assert "Traceback" not in done.stderr
     assert ended(tmp_path) == ["case"]
+
+
+@pytest.mark.slow
+def test_prepare_says_that_a_ball_does_not_show_how_it_lies(tmp_path):
+    """As `inspect` and every answer say it: the model was tried on scenes with a known truth."""
+    index = np.stack(np.meshgrid(*[np.arange(56.0)] * 3, indexing="ij"), -1)
+    labels = (np.linalg.norm(index - 28, axis=-1) < 24).astype(np.uint8)
+    labels[np.linalg.norm(index - [40, 28, 28], axis=-1) < 7] = 2
+    write_nifti(tmp_path / "ball.nii.gz", labels, np.diag([1.5, 1.5, 1.5, 1.0]), lps=True)
+    said = tumortrack("prepare", tmp_path / "ball.nii.gz", tmp_path / "case", "--rotations", "full")
+    weakness = weakness_of(read_model_manifest(tmp_path / "case" / "model")["provenance"])
+    assert weakness
+    assert f"note: {weakness}" in succeeded(said).splitlines()
