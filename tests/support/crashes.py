@@ -12,6 +12,7 @@ import json
 import os
 import resource
 import shutil
+import signal
 import subprocess
 import sys
 import time
@@ -25,6 +26,7 @@ import numpy as np
 from clock import PATIENCE_S, until
 from harness import Child, Ending, Work, base_in, command, new_command
 
+_LONG_S = 12.0  # within which commands are interrupted
 _LOST_S = 1.0  # of a recording, and the longest pause between two of its frames: on a busy machine
 Words = tuple[object, ...]  # of a command
 
@@ -183,6 +185,50 @@ def stamps_of(tape: Path) -> list[int]:
     return stamps
 
 
+# Interrupted ----------------------------------------------------------------------------------
+
+
+def interrupting(place: Place) -> str:
+    """Every long command, interrupted (Ctrl-C) at a random moment"""
+    case, out, scenes = place.base / "case", place.folder / "out", place.base / "scenes"
+    world = f"virtual:{case}?breathing=false&instrument=false&camera_motion=false&fps=10"
+    budget = ("--accept-poor", "--accept-budget")
+    commands: tuple[Words, ...] = (
+        ("prepare", case / "labels.nii.gz", out),
+        ("simulate", case, out, "--scenes", 8),
+        ("train", case, out),
+        ("locate", place.base / "model", scenes / "0000" / "cloud.ply", out),
+        ("evaluate", place.base / "model", scenes, out),
+        ("track", case, world, "viewer:0", "openigtlink:0", f"recording:{out}", "--seconds", 8),
+        ("export", case, out),
+        ("plan", place.base / "run", out, *budget),
+        ("resect", place.base / "plan", "--film", f"{out}.gif"),
+        ("resect", place.base / "plan", "--live", case, world, "--speed", 10),
+        ("demo", "--out", out, "--scenes", 1),
+        ("phantom-kit", case, out),
+        ("twin", case, out),
+    )
+    counts = dict[int, int]()
+    for words in commands:
+        for _ in range(place.times):
+            after_s = place.rng.uniform(0.05, _LONG_S)
+            child = Child(new_command(*words), place.folder)
+            time.sleep(after_s)
+            child.interrupt()
+            ending = child.end(60.0)
+            said = f"{words[0]} after {after_s:.2f} s: exit {ending.code}: {ending.output[-600:]}"
+            # A Python that is ending, or has hardly begun, ends by the signal: 130 to a shell.
+            code = 130 if ending.code == -signal.SIGINT else ending.code
+            require(code in (0, 4, 130) and "Traceback" not in ending.output, said)
+            counts[code] = counts.get(code, 0) + 1
+            strays = names_in(place.folder) - {"out", "out.gif", "runs"}
+            require(not strays, f"{said}; left behind: {strays}")
+            shutil.rmtree(place.folder)
+            place.folder.mkdir()
+    stopped = counts.pop(130, 0)
+    return f"{stopped} ended with 130 and no traceback; {sum(counts.values())} had ended before"
+
+
 # Short of something ---------------------------------------------------------------------------
 
 
@@ -325,7 +371,7 @@ def _one_of_two(work: Work, place: Place, expected: str) -> str:
     return require((one.code, other.code) == (0, 2), what)
 
 
-KILLS = {each.__name__: each for each in (training, making, locating, recording)}
+KILLS = {each.__name__: each for each in (training, making, locating, recording, interrupting)}
 CIRCUMSTANCES = KILLS | {
     each.__name__: each
     for each in (

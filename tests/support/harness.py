@@ -69,6 +69,11 @@ class Child:
         with suppress(ProcessLookupError):
             os.killpg(self._pid, signal.SIGKILL)
 
+    def interrupt(self) -> None:
+        """As Ctrl-C does."""
+        with suppress(ProcessLookupError):
+            os.killpg(self._pid, signal.SIGINT)
+
     def running(self) -> bool:
         options = os.WEXITED | os.WNOHANG | os.WNOWAIT
         return os.waitid(os.P_PID, self._pid, options) is None
