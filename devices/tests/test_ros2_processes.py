@@ -26,8 +26,19 @@ from live_objects import (
     small_setting,
     small_update,
 )
-from ros2_objects import DOMAIN, Other, own_graph, peer, process, read_until
-from ros2_peer import frame_numbered, points_mm
+from ros2_objects import (
+    DOMAIN,
+    OURS,
+    RCLPY,
+    THROUGH_RCLPY,
+    Other,
+    own_graph,
+    peer,
+    process,
+    read_until,
+    sending,
+)
+from ros2_peer import MASK, frame_numbered, points_mm
 from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.estimate import Estimate
 from tumortrack.core.geometry import rigid
@@ -38,7 +49,7 @@ from tumortrack_devices.ros import sensors
 from tumortrack_devices.ros.bus import Bus
 from tumortrack_devices.ros.dds import dds_name
 from tumortrack_devices.ros.messages import Messages
-from tumortrack_devices.ros.results import DIAGNOSTICS, ResultMessages
+from tumortrack_devices.ros.results import DIAGNOSTICS, MARKERS, ResultMessages
 from tumortrack_devices.ros.ros2 import open_bus
 from tumortrack_devices.ros.sensors import messages_seen, plain_cloud
 from tumortrack_devices.ros.tf import TRANSFORMS, pose_of, transform_fields
@@ -83,21 +94,23 @@ def large_update(sequence: int, n: int = 40_000) -> TrackingResult:
     return TrackingResult(sequence=sequence, stamp_ns=stamp_ns, estimate=estimate, quality="good")
 
 
-def test_depth_images_from_another_process() -> None:
+@pytest.mark.parametrize("by", [OURS, THROUGH_RCLPY, RCLPY])
+def test_depth_images_from_another_process(by: str) -> None:
     source = SourceRos2(topic="/camera/depth/image_rect", mask="/camera/mask").open()
     assert isinstance(source, Source)
     try:
         assert source.read(0.1) is None  # nobody there is no fault
-        with peer("send", "image", 60, 600):
+        with peer("send", "image", 60, 600, by=by):
             first = complete(lambda: read_until(source))
             assert source.host_clock
             assert first.mask is not None
-            assert np.array_equal(first.mask, np.arange(48 * 64).reshape(48, 64) % 3 == 0)
+            assert np.array_equal(first.mask, MASK)
             assert first.content.intrinsics == CAMERA
             for _ in range(5):
                 seen = read_until(source)
                 number = round(float(seen.content.depth_mm[0, 0]) - 100)
                 expected = frame_numbered(number, 0).depth_mm
+                expected = expected.round() if by == RCLPY else expected  # as drivers send it
                 np.testing.assert_allclose(seen.content.depth_mm, expected, rtol=2e-7)
                 assert seen.stamp_ns > first.stamp_ns
 
@@ -113,11 +126,28 @@ def test_depth_images_from_another_process() -> None:
         while source.read(0.3) is not None:
             pass
         assert source.read(0.3) is None  # the publisher is gone
-        with peer("send", "image", 60, 600):
+        with peer("send", "image", 60, 600, by=by):
             again = complete(lambda: read_until(source))
             assert again.stamp_ns > fresh.stamp_ns
     finally:
         source.close()
+
+
+@pytest.mark.parametrize("by", [OURS, THROUGH_RCLPY])
+def test_a_source_in_another_process(by: str, bus: Bus) -> None:
+    """With a ROS in its environment it takes that, and says the same."""
+    sum_mm = pytest.approx(float(np.nansum(small_frame().depth_mm)), rel=1e-6)
+    text = bus.publisher("/text/depth", "std_msgs/msg/String")
+    with sending("image") as topic, peer("see", topic, by=by) as other:
+        (first,) = other.lines_until(lambda said: "by" in said)
+        assert first["by"] == ("DdsBus" if by == OURS else "RclpyBus")
+        seen = other.lines_until(lambda said: said.get("sum_mm") == sum_mm)
+        newest = other.lines_until(lambda said: said.get("stamp_ns", 0) > seen[-1]["stamp_ns"])
+        assert newest[-1]["sum_mm"] == sum_mm
+    with peer("see", "/text/depth", by=by) as other:
+        said = other.lines_until(lambda said: "refused" in said)[-1]["refused"]
+        assert "/text/depth is published as std_msgs/msg/String" in said
+    assert text
 
 
 def complete(read: Callable[[], Observation]) -> Observation:
@@ -152,7 +182,8 @@ def test_clouds_of_40_000_points_at_30_hz() -> None:
 # --- the sink ------------------------------------------------------------------------------------
 
 
-def test_updates_reach_another_process(messages: Messages) -> None:
+@pytest.mark.parametrize("by", [OURS, RCLPY])
+def test_updates_reach_another_process(by: str, messages: Messages) -> None:
     sink = SinkRos2(mesh_hz=0.0).open(small_setting())
     assert isinstance(sink, Sink)
     update = small_update()
@@ -160,7 +191,7 @@ def test_updates_reach_another_process(messages: Messages) -> None:
         one.suffix: one.message for one in ResultMessages(messages, small_setting()).of(update)
     }
     try:
-        with peer("hear", 600) as other:
+        with peer("hear", 600, by=by) as other:
             other.lines_until(lambda said: "listens" in said)
             by_topic = publish_until(sink, other, update)
             cloud = by_topic["cloud"]
@@ -192,6 +223,20 @@ def test_updates_reach_another_process(messages: Messages) -> None:
     finally:
         sink.close()
         sink.close()
+
+
+def test_what_is_kept_reaches_a_node_that_comes_later(bus: Bus, messages: Messages) -> None:
+    publisher = bus.publisher("/tumortrack/planned", MARKERS, latched=True)
+    out = {
+        one.suffix: one.message
+        for one in ResultMessages(messages, small_setting()).of(small_update())
+    }
+    publisher.publish(messages.to_bytes(out["meshes"]))
+    with peer("hear", 600, by=RCLPY) as other:
+        heard = other.lines_until(lambda said: said.get("topic") == "planned")[-1]
+    assert heard["markers"] == [
+        [one.ns, one.action, len(one.points)] for one in out["meshes"].markers
+    ]
 
 
 def at(last: dict[str, dict], stamp_ns: int) -> bool:

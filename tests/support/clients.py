@@ -28,6 +28,7 @@ def environment(package: str) -> dict[str, str]:
         "AMENT_PREFIX_PATH": str(FOLDER),
         "LD_LIBRARY_PATH": os.pathsep.join(map(str, libraries)),
         "PYTHONPATH": os.pathsep.join(map(str, paths)),
+        "ROS_LOG_DIR": str(FOLDER / "log"),
     }
 
 
