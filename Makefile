@@ -186,7 +186,7 @@ licences: setup  ## list the dependencies' licences in docs/data/dependencies.cs
 
 audit: $(TOOLS)  ## known vulnerabilities of all that is pinned; fails also if PyPI does not answer
 	@.tools/bin/pip-audit --strict --progress-spinner off --disable-pip --require-hashes \
-	$(foreach name,core rest cuda clients ur tools,-r requirements/$(name).txt) || { echo \
+	$(foreach name,core rest cuda ur tools,-r requirements/$(name).txt) || { echo \
 	"audit: not passed: there are vulnerabilities (listed above), or PyPI could not be asked" >&2; exit 1; }
 
 clean:  ## remove .venv and caches (runs/ stays)
