@@ -50,12 +50,15 @@ ALLOWED = {
 SAID = {
     "apache software license": "Apache-2.0",
     "apache 2.0": "Apache-2.0",
+    "apache license 2.0": "Apache-2.0",
+    "apache license, version 2.0": "Apache-2.0",
     "bsd license": "BSD",
     "3-clause bsd license": "BSD-3-Clause",
     "isc license (iscl)": "ISC",
     "mit license": "MIT",
     "mozilla public license 2.0 (mpl 2.0)": "MPL-2.0",
     "python software foundation license": "PSF-2.0",
+    "zlib license": "Zlib",
     "epl-2.0, bsd-3-clause": "EPL-2.0 OR BSD-3-Clause",
     "osi approved": "",
 }
@@ -63,6 +66,8 @@ STATED = {
     "apsw": "Zlib",  # "any-OSI" in its metadata; LICENSE: the zlib licence
     "cmeel-qhull": "Qhull",  # nothing in its metadata; COPYING.txt: free, with attribution
     "embreex": "BSD-2-Clause",  # its metadata holds the licence's text
+    "ros-fastcdr": "Apache-2.0",  # nothing in its metadata; LICENSE
+    "ros-fastrtps": "Apache-2.0",  # the same
 }
 
 
