@@ -42,16 +42,14 @@ from ros2_peer import MASK, frame_numbered, points_mm
 from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.estimate import Estimate
 from tumortrack.core.geometry import rigid
-from tumortrack.core.types import OccupancyCloud, SensorCloud
+from tumortrack.core.types import OccupancyCloud
 from tumortrack.live.spec import POSES
 from tumortrack.live.values import Observation, PublishedFrame, Sink, Source, TrackingResult
-from tumortrack_devices.ros import sensors
 from tumortrack_devices.ros.bus import Bus
 from tumortrack_devices.ros.dds import dds_name
 from tumortrack_devices.ros.messages import Messages
 from tumortrack_devices.ros.results import DIAGNOSTICS, MARKERS, ResultMessages
 from tumortrack_devices.ros.ros2 import open_bus
-from tumortrack_devices.ros.sensors import messages_seen, plain_cloud
 from tumortrack_devices.ros.tf import TRANSFORMS, pose_of, transform_fields
 from tumortrack_devices.sinks.moveit import SCENE, MoveItSinkConfig
 from tumortrack_devices.sinks.ros import Ros2SinkConfig as SinkRos2
@@ -331,14 +329,11 @@ def built(folder: Path) -> Path:
 
 
 @pytest.mark.slow
-def test_fast_dds_hears_and_is_heard(tmp_path: Path, bus: Bus, messages: Messages) -> None:
-    """A cloud of ours arrives there byte for byte, and tf, diagnostics and the planning scene; an
-    image from there here, and where the camera is by tf; noise does no harm."""
+def test_fast_dds_hears_and_is_heard(tmp_path: Path, messages: Messages) -> None:
+    """What rclpy's packages on PyPI have no types for: tf and the planning scene arrive there, and
+    here by tf where the camera is. Noise does no harm."""
     program = built(tmp_path)
     files = []
-    for suffix, kind, message in messages_seen(Observation(small_frame(), 0), messages):
-        (tmp_path / suffix.replace("/", "_")).write_bytes(messages.to_bytes(message))
-        files += [f"rt/fast/{suffix}", dds_name(kind), tmp_path / suffix.replace("/", "_")]
     noise = np.random.default_rng(1).integers(0, 256, 2000, np.uint8).tobytes()
     (tmp_path / "noise").write_bytes(bytes([0, 1, 0, 0]) + noise)
     files += ["rt/fast/noise", CLOUD_DDS, tmp_path / "noise"]
@@ -349,17 +344,11 @@ def test_fast_dds_hears_and_is_heard(tmp_path: Path, bus: Bus, messages: Message
         (tmp_path / topic).write_bytes(said)
         files += [f"rt/{topic}", dds_name(TRANSFORMS), tmp_path / topic]
 
-    header = messages.header(5, "camera")
-    cloud = SensorCloud(points_mm()[:2000])
-    cdr = bytes(messages.to_bytes(plain_cloud(cloud, header, messages)))
-    ours = bus.publisher("/tumortrack/cloud", sensors.CLOUD)
-    image = SourceRos2(topic="/fast/depth/image_rect").open()
     damaged = SourceRos2(topic="/fast/noise").open()
     poses = POSES.parse("ros2:base_link?via=dds").open()
-    heard = tmp_path / "heard"
     kinds = {"/tf": TRANSFORMS, "/tf_static": TRANSFORMS, "/diagnostics": DIAGNOSTICS}
     kinds |= {"/planning_scene": SCENE}
-    sub: list[object] = ["sub", LISTENS_S, "rt/tumortrack/cloud", CLOUD_DDS, heard]
+    sub: list[object] = ["sub", LISTENS_S]
     for topic, kind in kinds.items():
         sub += [f"rt{topic}", dds_name(kind), tmp_path / f"heard_{topic[1:]}"]
     frame = PublishedFrame("table", TURNED, calibrated=True)
@@ -374,36 +363,23 @@ def test_fast_dds_hears_and_is_heard(tmp_path: Path, bus: Bus, messages: Message
             process(program, DOMAIN, *sub) as there,
             process(program, DOMAIN, "pub", 30, 30, *files),
         ):
-            images, sent, end_s = [], 0, time.monotonic() + LISTENS_S
-            while time.monotonic() < end_s or sum(one is not None for one in images) < 20:
+            sent, end_s = 0, time.monotonic() + LISTENS_S
+            while time.monotonic() < end_s or placed is None:
                 assert time.monotonic() < end_s + PATIENCE_S
-                ours.publish(cdr)
                 sent += 1
                 for sink in sinks:
                     sink.publish(small_update(sent, frames=frame))
-                with contextlib.suppress(InputError):  # before the first CameraInfo
-                    images.append(image.read(1 / 30))
-                    if images[-1] is not None and placed is None:
-                        with contextlib.suppress(NoEstimate):
-                            placed = poses.at(replace(images[-1], frame_id="optical"))
+                seen = Observation(small_frame(time.time_ns()), 0, frame_id="optical")
+                with contextlib.suppress(NoEstimate):
+                    placed = poses.at(seen)
                 with contextlib.suppress(InputError):
-                    assert damaged.read(0.0) is None
-            received, *others = map(int, there.line().split())
+                    assert damaged.read(1 / 30) is None
+            assert all(map(int, there.line().split()))
     finally:
-        for one in (image, damaged, poses, *sinks):
+        for one in (damaged, poses, *sinks):
             one.close()
-    seen = [one for one in images if one is not None]
-    np.testing.assert_allclose(seen[-1].content.depth_mm, small_frame().depth_mm, rtol=2e-7)
-    ages_ms = [(one.arrived_ns - one.stamp_ns) * 1e-6 for one in seen]
-    print(
-        f"Fast DDS heard {received} of {sent}; {len(seen)} images, p50 {np.median(ages_ms):.2f} ms"
-    )
-    assert image.host_clock
-    assert received > 0
-    assert heard.read_bytes().rstrip(b"\0") == cdr.rstrip(b"\0")
-    assert placed is not None  # Fast DDS said the camera on the tool before we listened
+    # Fast DDS said the camera on the tool before we listened.
     np.testing.assert_allclose(placed, TURNED @ SHIFTED, atol=1e-9)
-    assert all(others)
     tf, static, status, scene = (
         messages.from_bytes((tmp_path / f"heard_{topic[1:]}").read_bytes(), kind)
         for topic, kind in kinds.items()
