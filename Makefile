@@ -3,6 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 TRACKER := .venv/.tracker
 SETUP := .venv/.installed
+CLIENTS := .clients/.installed
 TOOLS := .tools/.installed
 PIP := pip install --quiet --disable-pip-version-check --no-compile --no-deps
 # Whatever the environment says: without kept bytecode every start compiles what it imports anew.
@@ -11,13 +12,13 @@ unexport PYTHONDONTWRITEBYTECODE
 # uv fetches and unpacks side by side, in a fraction of pip's time. It reads the certificates that the system trusts, but not pip's
 # settings (a mirror): where it fails, pip does the work.
 define INSTALL
-	VIRTUAL_ENV=.venv $(BIN)/uv pip install --quiet --system-certs --no-deps --require-hashes -r $(1) 2>.venv/uv.log || { \
-	echo "uv could not install $(1) (.venv/uv.log says why); pip does, which takes longer"; \
-	$(BIN)/$(PIP) --require-hashes -r $(1); }
+	VIRTUAL_ENV=$(or $(2),.venv) $(BIN)/uv pip install --quiet --system-certs --no-deps --require-hashes -r $(1) 2>$(or $(2),.venv)/uv.log || { \
+	echo "uv could not install $(1) ($(or $(2),.venv)/uv.log says why); pip does, which takes longer"; \
+	$(or $(2),.venv)/bin/$(PIP) --require-hashes -r $(1); }
 endef
 
 .DEFAULT_GOAL := help
-.PHONY: help setup debian kernels demo test test-all quick pythons pytest test-hard check attack fuzz crash replay fingerprint figures bench soak wheel lock licences audit results real world sequences plans pull pulls trust misses evidence rehearsal population site pictures clean
+.PHONY: help setup debian clients kernels demo test test-all quick pythons pytest test-hard check attack fuzz crash replay fingerprint figures bench soak wheel lock licences audit results real world sequences plans pull pulls trust misses evidence rehearsal population site pictures clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 10
@@ -64,13 +65,24 @@ check: setup  ## lint, types, import order, licences, figures in the pages
 debian:  ## install what tests need from Debian (Chromium, Fast DDS)
 	tools/debian.sh
 
+clients: $(TRACKER)  ## install other makers' programs that tests talk to (ROS 2's rclpy, ur_rtde, 3D Slicer's core: 1 GB); they have wheels of Python 3.11 on x86-64
+	@if $(BIN)/python -c 'import platform, sys; sys.exit(sys.version_info[:2] != (3, 11) or platform.machine() != "x86_64")'; \
+	then $(MAKE) --no-print-directory $(CLIENTS); else echo "make clients: not Python 3.11 on x86-64; tests that need them skip"; fi
+
+# An environment of its own, as a ROS is one; its programs run with that of `make setup` behind it.
+$(CLIENTS): requirements/clients.txt requirements/ur.txt
+	$(BIN)/python -m venv --clear .clients
+	@$(call INSTALL,requirements/clients.txt,.clients)
+	@$(call INSTALL,requirements/ur.txt,.clients)
+	@touch $@
+
 kernels: setup  ## compile what the first estimates would wait for, once instead of in each test process
 	$(BIN)/tumortrack compile --device cpu
 
 site: setup  ## the documentation's site, strictly: build/site/index.html (`.venv/bin/mkdocs serve`: while you write)
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
-test: check site kernels  ## check, then the tracker's tests (those of Chromium and Fast DDS after `make debian`)
+test: check site kernels  ## check, then the tracker's tests (those of Chromium and Fast DDS after `make debian`, of others' programs after `make clients`)
 	$(MAKE) pytest ARGS=tests
 
 test-all: check site kernels pytest  ## the same with those of devices, the paper's method, resection, laboratory and experiment, as CI does
@@ -178,4 +190,4 @@ audit: $(TOOLS)  ## known vulnerabilities of all that is pinned; fails also if P
 	"audit: not passed: there are vulnerabilities (listed above), or PyPI could not be asked" >&2; exit 1; }
 
 clean:  ## remove .venv and caches (runs/ stays)
-	rm -rf .venv .tools .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache
+	rm -rf .venv .clients .tools .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache

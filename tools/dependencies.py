@@ -50,12 +50,15 @@ ALLOWED = {
 SAID = {
     "apache software license": "Apache-2.0",
     "apache 2.0": "Apache-2.0",
+    "apache license 2.0": "Apache-2.0",
+    "apache license, version 2.0": "Apache-2.0",
     "bsd license": "BSD",
     "3-clause bsd license": "BSD-3-Clause",
     "isc license (iscl)": "ISC",
     "mit license": "MIT",
     "mozilla public license 2.0 (mpl 2.0)": "MPL-2.0",
     "python software foundation license": "PSF-2.0",
+    "zlib license": "Zlib",
     "epl-2.0, bsd-3-clause": "EPL-2.0 OR BSD-3-Clause",
     "osi approved": "",
 }
@@ -63,6 +66,8 @@ STATED = {
     "apsw": "Zlib",  # "any-OSI" in its metadata; LICENSE: the zlib licence
     "cmeel-qhull": "Qhull",  # nothing in its metadata; COPYING.txt: free, with attribution
     "embreex": "BSD-2-Clause",  # its metadata holds the licence's text
+    "ros-fastcdr": "Apache-2.0",  # nothing in its metadata; LICENSE
+    "ros-fastrtps": "Apache-2.0",  # the same
 }
 
 
@@ -70,12 +75,15 @@ def lock(upgrade: list[str]) -> None:
     """Resolve everything for every platform, and keep what is pinned unless told to upgrade."""
     folders = (ROOT, *(ROOT / name.removeprefix("tumortrack-") for name in OWN[1:]))
     everything = "".join(f"-e {folder}[{_extras(folder)}]\n" for folder in folders)
-    resolved = _resolved(everything, "".join(_locks().values()), upgrade)
-    build = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["build-system"]["requires"]
+    about = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))
+    build, clients = about["build-system"]["requires"], about["dependency-groups"]["clients"]
+    both = _resolved("\n".join([everything, *clients]), "".join(_locks().values()), upgrade)
+    resolved = _resolved(everything, both, [])  # as resolved with the clients
     core = pinned(_resolved("\n".join([f"-e {ROOT}", *build]), resolved, []))  # as resolved
     files: dict[str, list[str]] = {name: [] for name in _ABOUT}
-    for name, text in pinned(resolved).items():
-        rest = "core" if name in core else _APART.get(name, "rest")
+    ours = pinned(resolved)
+    for name, text in {**pinned(both), **ours}.items():
+        rest = "core" if name in core else _APART.get(name, "rest" if name in ours else "clients")
         files["cuda" if re.match(r"nvidia-|cuda-|triton$", name) else rest].append(text)
     for name, texts in files.items():
         head = f"# {_ABOUT[name]} Made by `make lock`; ranges are in pyproject.toml.\n"
@@ -96,7 +104,8 @@ _NEEDS_NO_WHEEL = "crcmod"  # pure Python where there is no compiler
 def without_wheels() -> list[str]:
     """What uv says where a pin has no wheel; nothing is installed, PyPI is asked."""
     wrong = []
-    files = [word for name in _ABOUT if name != "ur" for word in ("-r", str(LOCKS / f"{name}.txt"))]
+    names = [name for name in _ABOUT if name not in ("ur", "clients")]
+    files = [word for name in names for word in ("-r", str(LOCKS / f"{name}.txt"))]
     options = ["--dry-run", "--no-deps", "--only-binary", ":all:", "--no-binary", _NEEDS_NO_WHEEL]
     for python, platform in itertools.product(_PYTHONS, _PLATFORMS):
         where = ["--python-version", python, "--python-platform", platform, "--target", "build"]
@@ -129,6 +138,7 @@ _ABOUT = {
     "core": "The tracker alone, by hash: what `make demo` installs.",
     "rest": "All else that `make setup` installs: PyTorch, extras, laboratory, tests, site.",
     "cuda": "What PyPI's PyTorch for Linux needs besides; its CPU build does not.",
+    "clients": "What `make clients` installs besides: other makers' programs that tests talk to.",
     "ur": "For real arms: pip install --require-hashes --no-deps -r requirements/ur.txt",
 }
 

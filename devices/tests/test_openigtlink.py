@@ -10,8 +10,14 @@ import numpy as np
 import pytest
 
 from clock import PATIENCE_S, until
-from igtl_objects import Heard, hear, hear_all, polydata_by_the_book
-from igtl_reader import IgtlStatus, unpack_polydata, unpack_status, unpack_transform
+from igtl_objects import (
+    Heard,
+    IgtlStatus,
+    hear,
+    hear_all,
+    polydata_by_the_book,
+    status_by_the_book,
+)
 from live_objects import STAMP_NS, empty_update, small_anatomy, small_setting, small_update
 from motions import Wave
 from reports import NOWHERE, reporting
@@ -19,7 +25,12 @@ from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import rigid
 from tumortrack.live.values import PublishedFrame, SinkContext, TrackingResult
 from tumortrack_devices.igtl import link
-from tumortrack_devices.igtl.message import Message, pack
+from tumortrack_devices.igtl.message import (
+    Message,
+    pack,
+    unpack_polydata_points,
+    unpack_transform,
+)
 from tumortrack_devices.sinks.openigtlink import OpenIgtLinkSink, OpenIgtLinkSinkConfig
 
 
@@ -61,7 +72,7 @@ def test_an_update_arrives_where_slicer_has_our_files(opened) -> None:
     sink.publish(small_update(sequence=7))
     heard = hear_all(sock, ALL)
     status = heard["STATUS", "tumortrack"]
-    assert unpack_status(status.content) == IgtlStatus(1, "good", small_update().describe())
+    assert status_by_the_book(status.content) == IgtlStatus(1, "good", small_update().describe())
     assert status.metadata == {
         "frame_id": "camera", "sequence": "7", "quality": "good", "latency_ms": "12.5",
         "patient": "P1", "side": "left",
@@ -132,7 +143,7 @@ def test_no_estimate_is_said_and_leaves_nothing(opened) -> None:
     assert cloud["probability"][2][[0, -1]].tolist() == [0.5, 1.0]
     sink.publish(empty_update(reason="only 12 points lie in range"))
     heard = hear_all(sock, ALL + 1 - 2)
-    assert unpack_status(heard["STATUS", "tumortrack"].content) == IgtlStatus(
+    assert status_by_the_book(heard["STATUS", "tumortrack"].content) == IgtlStatus(
         4, "no estimate", "only 12 points lie in range"
     )
     for (kind, _), one in heard.items():
@@ -209,7 +220,7 @@ def test_the_end_is_said(opened) -> None:
     sink.close()
     sink.close()
     heard = hear_all(sock, ALL - 2)
-    assert unpack_status(heard["STATUS", "tumortrack"].content).code == 19
+    assert status_by_the_book(heard["STATUS", "tumortrack"].content).code == 19
     assert heard["POLYDATA", "kidney"].content == bytes(40)
     with pytest.raises((EOFError, ConnectionError)):
         hear(sock)
@@ -276,7 +287,7 @@ def test_requests_are_answered_and_others_ignored(opened) -> None:
     damaged = bytearray(pack(Message("GET_STATUS", "tumortrack")))
     damaged[-1] ^= 1
     sock.sendall(damaged)
-    assert unpack_status(hear(sock).content).code == 9
+    assert status_by_the_book(hear(sock).content).code == 9
     sock.sendall(pack(Message("GET_STATUS", "")))
     assert hear(sock).device == "tumortrack"
 
@@ -384,7 +395,7 @@ def test_forty_thousand_points_flow(opened) -> None:
         while (one := hear(sock)).device != "occupancy":
             pass
         assert one.metadata["sequence"] == str(n)
-        points = unpack_polydata(one.content).points
+        points = unpack_polydata_points(one.content)
         assert update.transformed is not None
         np.testing.assert_array_equal(
             points, update.transformed.points_mm * np.float32([-1, -1, 1])

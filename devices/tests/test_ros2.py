@@ -1,15 +1,12 @@
-"""ROS 2's topics without ROS: what is announced, asked for and refused; the way through rclpy."""
+"""ROS 2's topics without ROS: what is announced, asked for and refused."""
 
 from __future__ import annotations
 
 import os
 import re
 import secrets
-import sys
 import time
-import types
-from collections.abc import Callable, Iterator
-from importlib.machinery import ModuleSpec
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -20,8 +17,6 @@ from clock import PATIENCE_S, until
 from live_objects import (
     empty_update,
     small_frame,
-    small_setting,
-    small_update,
 )
 from ros2_objects import Frames, own_graph, read_until, sending
 from ros2_peer import points_mm
@@ -340,82 +335,6 @@ def test_a_network_that_cannot_be(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_options_that_cannot_be(options: dict, said: str) -> None:
     with pytest.raises(InputError, match=said):
         SourceRos2(**options)
-
-
-# --- the user's own ROS --------------------------------------------------------------------------
-
-
-def test_the_way_through_rclpy(monkeypatch: pytest.MonkeyPatch, messages: Messages) -> None:
-    """Which calls go to rclpy, in which order. A stand-in: there is no rclpy to run here."""
-    calls: list[tuple] = []
-    callbacks: dict = {}
-    cloud = plain_cloud(SensorCloud(points_mm()[:300]), messages.header(7, "camera"), messages)
-
-    class Recorded:
-        """Notes what is called on it; every call gives another."""
-
-        def __init__(self, name: str) -> None:
-            self.name = name
-
-        def __getattr__(self, name: str) -> Callable:
-            def call(*args: object, **kwargs: object) -> object:
-                calls.append((f"{self.name}.{name}", args, kwargs))
-                if name == "create_subscription":
-                    callbacks[args[1]] = args[2]
-                if name == "spin_once":
-                    for came in list(callbacks.values()):
-                        came(bytes(messages.to_bytes(cloud)))
-                if name == "get_publishers_info_by_topic":
-                    return [types.SimpleNamespace(topic_type=sensors.CLOUD)]
-                return Recorded(name)
-
-            return call
-
-    def module(name: str, **content: object) -> None:
-        made = types.ModuleType(name)
-        vars(made).update(content)
-        made.__spec__ = ModuleSpec(name, None)
-        monkeypatch.setitem(sys.modules, name, made)
-
-    rclpy = Recorded("rclpy")
-    module("rclpy", Context=rclpy.Context, init=rclpy.init, create_node=rclpy.create_node)
-    module("rclpy.executors", SingleThreadedExecutor=rclpy.SingleThreadedExecutor)
-    policy = types.SimpleNamespace
-    module(
-        "rclpy.qos",
-        QoSProfile=dict,
-        ReliabilityPolicy=policy(RELIABLE="reliable", BEST_EFFORT="best effort"),
-        DurabilityPolicy=policy(TRANSIENT_LOCAL="transient local", VOLATILE="volatile"),
-    )
-    module("rclpy.duration", Duration=dict)
-    standard = ("sensor_msgs", "visualization_msgs", "geometry_msgs", "diagnostic_msgs")
-    for package in (*standard, "tf2_msgs"):
-        names = ("PointCloud2", "MarkerArray", "PointStamped", "DiagnosticArray", "TFMessage")
-        module(f"{package}.msg", **{name: name for name in names})
-
-    source = SourceRos2(topic="/points").open()  # auto: rclpy is there now
-    seen = source.read(0.1)
-    assert seen is not None
-    np.testing.assert_allclose(seen.content.points_mm, points_mm()[:300], rtol=2e-7)
-    source.close()
-    source.close()
-    made = [name for name, _, _ in calls]
-    assert made.index("rclpy.init") < made.index("rclpy.create_node")
-    subscribed = next(call for call in calls if call[0].endswith("create_subscription"))
-    assert subscribed[1][:2] == ("PointCloud2", "/points")
-    assert subscribed[1][3]["reliability"] == "best effort"
-    assert subscribed[2] == {"raw": True}
-    assert made.count("create_node.destroy_node") == 1
-
-    calls.clear()
-    sink = SinkRos2(via="rclpy").open(small_setting())
-    sink.publish(small_update())
-    sink.close()
-    topics = {args[1] for name, args, _ in calls if name.endswith("create_publisher")}
-    assert {"/tumortrack/cloud", "/tumortrack/tumor_2/center"} < topics
-    sent = [args[0] for name, args, _ in calls if name == "create_publisher.publish"]
-    assert all(isinstance(one, bytes) and one[:4] == b"\0\1\0\0" for one in sent)
-    assert len(sent) == 2 * len(topics)  # the update, and that it is over
 
 
 def test_without_rclpy_it_says_what_to_do() -> None:

@@ -4,24 +4,26 @@ trajectories, and a package for their workspace."""
 from __future__ import annotations
 
 import io
+import json
+import os
 import struct
 import sys
 import xml.etree.ElementTree as ET
 from dataclasses import replace
 from pathlib import Path
-from types import ModuleType, SimpleNamespace
 
 import numpy as np
 import pytest
 import tyro
 from PIL import Image
 
+import clients
 import needs
 import tumortrack
 from clock import until
 from live_objects import PARTS, ball, empty_update, small_setting, small_update
 from reports import NOWHERE, reporting
-from ros2_objects import own_graph
+from ros2_objects import RCLPY, own_graph, peer, process
 from tumortrack.cli.track import Track
 from tumortrack.core.errors import InputError
 from tumortrack.core.estimate import Estimate
@@ -234,7 +236,7 @@ def test_obstacles_arrive_of_good_estimates_and_cameras_are_kept_for_latecomers(
     np.testing.assert_allclose(pose_of(camera), PLACED.published_from_camera, atol=1e-9)
 
 
-# --- the package for a ROS 2 workspace; its node, launch file and build need ROS, and are not run
+# --- the package for a ROS 2 workspace; its launch file and build need more of ROS, and are not run
 
 
 @pytest.fixture
@@ -278,82 +280,32 @@ def test_a_parameter_out_of_its_limits_is_refused(options, wrong):
         options.command({"model": "MODEL", "source": "ros2:/depth"} | wrong)
 
 
-class _Node:
-    """Of rclpy's Node what the node uses."""
-
-    def __init__(self, name):
-        self.values, self.said, self.changed = {}, [], None
-
-    def declare_parameter(self, name, default, about):
-        self.values.setdefault(name, default)
-
-    def get_parameter(self, name):
-        return SimpleNamespace(value=self.values[name])
-
-    def add_on_set_parameters_callback(self, changed):
-        self.changed = changed
-
-    def set_parameters(self, parameters):
-        answer = self.changed(parameters)
-        self.values |= {one.name: one.value for one in parameters if answer.successful}
-        return answer
-
-    def create_timer(self, seconds, call):
-        pass
-
-    def get_logger(self):
-        return SimpleNamespace(info=self.said.append, error=self.said.append)
-
-
-@pytest.fixture
-def node_type(options, monkeypatch, tmp_path):
-    names = "rclpy", "rclpy.node", "rclpy.parameter", "rclpy.executors", "rcl_interfaces.msg"
-    for name in (*names, "rcl_interfaces"):
-        monkeypatch.setitem(sys.modules, name, ModuleType(name))
-    sys.modules["rclpy.node"].Node = _Node
-    sys.modules["rclpy.parameter"].Parameter = lambda name, value: SimpleNamespace(
-        name=name, value=value
-    )
-    sys.modules["rclpy.executors"].ExternalShutdownException = KeyboardInterrupt
-    for name in ("ParameterDescriptor", "SetParametersResult"):
-        setattr(sys.modules["rcl_interfaces.msg"], name, SimpleNamespace)
-    command = tmp_path / "tumortrack"
-    cases = "case $* in *nonsense*) exit 2;; *over*) exit 0;; esac"
-    command.write_text(f"#!/bin/sh\n{cases}\nexec sleep 99\n")
-    command.chmod(0o755)
-    _Node.given = {"executable": str(command), "model": "M", "source": "ros2:/depth"}
-    from tumortrack_ros.track_node import TrackNode
-
-    class Node(TrackNode):
-        def declare_parameter(self, name, default, about):
-            self.values[name] = _Node.given.get(name, default)
-
-    return Node
-
-
-def test_a_parameter_that_tracking_refuses_is_set_back_and_it_goes_on(node_type):
-    node = node_type()
-
-    def put(name, value):
-        return node.set_parameters([SimpleNamespace(name=name, value=value)]).successful
-
-    def runs():
-        node._look()
-        return node._track.poll() is None and node.values["moving"] != "nonsense"
-
-    try:
-        assert not put("stale", -5.0)
-        node._look()
-        assert node.code is None
-        assert put("moving", "nonsense")  # only the command itself knows
-        first = node._track
-        until(lambda: node._look() or node._track is not first, "a new start")
-        until(runs, "the former values")
-        assert (node.code, node.values["moving"], node.values["stale"]) == (None, "", 0.5)
-        assert put("moving", "over")
-        until(lambda: node._look() or node.code == 0, "the end")
-    finally:
-        node.end()
+def test_a_parameter_that_tracking_refuses_is_set_back_and_it_goes_on(tmp_path):
+    """The node in a real ROS 2, and a program that sets its parameters as `ros2 param` does."""
+    started, program = tmp_path / "started", tmp_path / "tumortrack"
+    cases = "case $* in *nonsense*) exit 2;; *over*) exit 7;; esac"
+    program.write_text(f'#!/bin/sh\necho "$*" >> {started}\n{cases}\nexec sleep 99\n')
+    program.chmod(0o755)
+    begin = "from tumortrack_ros.track_node import main; main()"
+    given = {"executable": program, "model": "M", "source": "ros2:/depth"}
+    options = [word for name, value in given.items() for word in ("-p", f"{name}:={value}")]
+    command = sys.executable, "-c", begin, "--ros-args", *options
+    with own_graph():
+        environment = clients.environment("ros-jazzy-rclpy")
+        environment["PYTHONPATH"] += f"{os.pathsep}{PACKAGE}"
+        with process(*command, environment=environment) as node:
+            with peer("set", "stale=-5.0", "moving=nonsense", by=RCLPY) as other:
+                refused, nonsense, back = (json.loads(other.line()) for _ in range(3))
+            until(lambda: started.read_text().count("\n") == 3, "the former values")
+            with peer("set", "moving=over", by=RCLPY) as other:
+                assert json.loads(other.line())["successful"]
+                assert node.ended() == 7
+    assert not refused["successful"]
+    assert "stale" in refused["reason"]
+    assert nonsense["successful"]  # only the command itself knows
+    assert (back["moving"], back["stale"]) == ("", 0.5)
+    said = [line.partition("--moving ")[2] for line in started.read_text().splitlines()]
+    assert [words.split()[:1] for words in said] == [[], ["nonsense"], [], ["over"]]
 
 
 def test_the_package_names_this_version():

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import socket
+import subprocess
+import sys
 import threading
 import time
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -23,12 +27,13 @@ from tumortrack.live.poses import COLUMNS, CONTACT, pose_row
 from tumortrack.live.tools import Tools
 from tumortrack.live.values import CameraView, Observation, PublishedFrame
 from tumortrack_devices.igtl import message as igtl
-from tumortrack_devices.igtl.message import Message, Polydata, pack
+from tumortrack_devices.igtl.message import Message, pack
 from tumortrack_devices.tools.file import FileToolConfig
 from tumortrack_devices.tools.openigtlink import OpenIgtLinkToolConfig
 from tumortrack_devices.tools.ur import UrToolConfig
 
 MS = 1_000_000
+PEERS = Path(__file__).parent / "support"
 BASE_FROM_CAMERA = rigid(np.diag([1.0, -1, -1]), np.array([400.0, 0, 500]))
 BASE = PublishedFrame("base", BASE_FROM_CAMERA, calibrated=True)
 
@@ -297,51 +302,48 @@ def tracker():
         one.close()
 
 
-def heard(tool):
-    """What it gives in a frame of now, once there is something; and then located."""
+def test_a_tracked_pointer_touches_over_openigtlink():
+    """A server of pyigtl's, of whose tool's name 20 characters travel."""
+    name = "StylusToReferenceOfTheTable"
+    pose = facing((5, 6, 130))
+    with subprocess.Popen(
+        [sys.executable, PEERS / "igtl_peer.py", name, json.dumps(pose.tolist())],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    ) as server:
+        port = int(server.stdout.readline())
 
-    def asked():
-        now = view(time.time_ns())
-        pieces = tool.evidence(now)
-        tool.located(now, small_estimate())
-        return [piece for piece in pieces if piece.name != "free"]
+        def tell(word):
+            server.stdin.write(f"{word}\n")
+            server.stdin.flush()
+            server.stdout.readline()
 
-    return until(asked, "evidence")
+        options = {"name": name, "tip": (0.0, 0.0, 10.0), "tip_mm": 1.0}
+        config = OpenIgtLinkToolConfig(address=f"127.0.0.1:{port}", **options)
+        tool = config.open(setting(), "pointer")
+        try:
+            until(lambda: tool.link.receivers)
 
+            def touched():  # again, where a busy machine lost poses for over a tenth of a second
+                tell("touch")
+                now = view(time.time_ns())
+                pieces = tool.evidence(now)
+                tool.located(now, small_estimate())
+                return pieces
 
-def test_a_tracked_pointer_touches_over_openigtlink(tracker):
-    port, link = tracker
-    options = {"name": "Stylus", "tip": (0.0, 0.0, 10.0), "tip_mm": 1.0}
-    config = OpenIgtLinkToolConfig(address=f"127.0.0.1:{port}", **options)
-    tool = config.open(setting(), "pointer")
-    try:
-        sock = link()
-        pose = facing((5, 6, 130))
-
-        def touched():  # again, where a busy machine lost poses for over a tenth of a second
-            for n in range(40):  # each 10 ms, of two tools; ours touches from the tenth on
-                sent(sock, "TRANSFORM", "Other", igtl.pack_transform(facing((50, 6, 130))))
-                sent(sock, "TRANSFORM", "Stylus", igtl.pack_transform(pose))
-                sent(sock, "STRING", "contact", string("1" if n >= 10 else "0"))
-                time.sleep(0.01)
-            now = view(time.time_ns())
-            pieces = tool.evidence(now)
-            tool.located(now, small_estimate())
-            return pieces
-
-        touch = until(touched, "evidence")[0]
-        assert isinstance(touch, Touch)
-        # The base's z points towards the camera.
-        np.testing.assert_allclose(touch.place_mm, (5, 6, 120), atol=1e-3)
-        assert abs(touch.stamp_ns - time.time_ns()) < 60e9
-        sent(sock, "STRING", "contact", string("0"))
-        missing = igtl.pack_transform(facing((99, 6, 130)))
-        sent(sock, "TRANSFORM", "Stylus", missing, TransformStatus="MISSING")
-        time.sleep(0.2)
-        assert tool.evidence(view(time.time_ns())) == []
-        assert tool.trouble == ""
-    finally:
-        tool.close()
+            touch = until(touched, "evidence")[0]
+            assert isinstance(touch, Touch)
+            # The base's z points towards the camera.
+            np.testing.assert_allclose(touch.place_mm, (5, 6, 120), atol=1e-3)
+            assert abs(touch.stamp_ns - time.time_ns()) < 60e9
+            tell("missing")
+            time.sleep(0.2)
+            assert tool.evidence(view(time.time_ns())) == []
+            assert tool.trouble == ""
+        finally:
+            tool.close()
+            server.kill()
 
 
 def test_damaged_messages_are_named_and_the_next_ones_are_heard(tracker):
@@ -391,10 +393,17 @@ def test_damaged_messages_are_named_and_the_next_ones_are_heard(tracker):
 
 
 def test_what_is_drawn_in_slicer_counts_once_it_rests():
-    """Slicer connects to us; its axes are RAS."""
+    """Slicer, here pyigtl, connects to us; its axes are RAS."""
+    import pyigtl
+
     tool = OpenIgtLinkToolConfig(address="0", std_mm=2.0).open(setting(PublishedFrame()), "slicer")
+    client = pyigtl.OpenIGTLinkClient("127.0.0.1", tool.link.port)
     try:
-        sock = socket.create_connection(("127.0.0.1", tool.link.port))
+        until(lambda: tool.link.receivers)
+
+        def points(places, labels, device):
+            client.send_message(pyigtl.PointMessage(places, labels, device_name=device))
+
         places = np.array([(1.0, 2, 130), (3, 4, 131), (5, 6, 132)])
         labels, ras = ["tumor_1", "spot", "tumor_2"], places * [-1, -1, 1]
         here = np.eye(4)
@@ -406,33 +415,31 @@ def test_what_is_drawn_in_slicer_counts_once_it_rests():
             return pieces
 
         for step in (9.0, 6.0, 3.0, 0.0):  # dragged by the mouse
-            colours = [(255, 0, 0)] * 3
-            content = igtl.pack_points(ras + [step, 0, 0], labels, colours)
-            sent(sock, "POINT", "kidney", content)
+            points(ras + [step, 0, 0], labels, "kidney")
         given = until(drawn, "touches")
         assert [piece.part for piece in given] == ["tumor_1", "kidney", "tumor_2"]
         np.testing.assert_allclose([p.place_mm for p in given], places, atol=1e-5)
         assert {piece.std_mm for piece in given} == {2.0}
-        sent(sock, "POINT", "kidney", content)  # said again: nothing new
+        points(ras, labels, "kidney")  # said again: nothing new
         angles = np.linspace(0, 2 * np.pi, 2000)
         ring = np.stack([20 * np.cos(angles), 20 * np.sin(angles), np.full(2000, 120.0)], axis=1)
-        surface = Polydata(ring * [-1, -1, 1], np.zeros((0, 3), int))
-        sent(sock, "POLYDATA", "tumor_2", igtl.pack_polydata(surface))
+        surface = pyigtl.PolyDataMessage(points=ring * [-1, -1, 1], device_name="tumor_2")
+        client.send_message(surface)
         (outline,) = until(drawn, "an outline")
         assert isinstance(outline, Outline)
         assert outline.part == "tumor_2"
         assert 30 <= len(outline.places_mm) <= 100
         off_mm = np.linalg.norm(np.array(outline.places_mm)[:, :2], axis=1)
         np.testing.assert_allclose(off_mm, 20, atol=1e-4)
-        sent(sock, "POINT", "F", igtl.pack_points(ras[:1] + 5, ["F-1"], [(255, 0, 0)]))
+        points(ras[:1] + 5, ["F-1"], "F")
 
         def said():
             tool.evidence(view(time.time_ns(), here))
             return "'F-1' is drawn, which is no part" in tool.trouble
 
         until(said, "the unknown name")
-        sock.close()
     finally:
+        client.stop()
         tool.close()
 
 

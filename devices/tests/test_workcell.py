@@ -13,12 +13,12 @@ from rosbags.highlevel import AnyReader
 from scipy.spatial.transform import Rotation
 
 from clock import until
-from igtl_objects import hear_all
-from igtl_reader import IgtlStatus, unpack_status, unpack_transform
+from igtl_objects import IgtlStatus, hear_all, status_by_the_book
 from live_objects import small_setting, small_update
 from recording_objects import frame_number
 from tumortrack.core.geometry import rigid, transform_points
 from tumortrack.live.values import Observation, RigidShape, SinkContext, SourceEnded, TrackingResult
+from tumortrack_devices.igtl.message import unpack_transform
 from tumortrack_devices.ros.messages import Messages, stamp_of
 from tumortrack_devices.ros.results import ResultMessages
 from tumortrack_devices.ros.sensors import cloud_of
@@ -252,7 +252,7 @@ def test_tips_and_the_arms_state_go_to_slicer(slicer):
     update = working(4, 0.25)
     sink.publish(update)
     heard = hear_all(receiver, 6 + 3)
-    assert unpack_status(heard["STATUS", "arms"].content) == IgtlStatus(1, "sweep 1", "")
+    assert status_by_the_book(heard["STATUS", "arms"].content) == IgtlStatus(1, "sweep 1", "")
     shapes = {shape.name: shape for shape in update.workcell.shapes}
     for name in ("cutter/tip", "holder/tip"):
         place = unpack_transform(heard["TRANSFORM", name].content)
@@ -261,14 +261,14 @@ def test_tips_and_the_arms_state_go_to_slicer(slicer):
         assert heard["TRANSFORM", name].metadata["frame_id"] == "table"
     sink.publish(less(virtual(5, halted="it is hidden"), "cutter/tip"))
     heard = hear_all(receiver, 4 + 2)
-    assert unpack_status(heard["STATUS", "tumortrack"].content).text == REASON
-    assert unpack_status(heard["STATUS", "arms"].content) == IgtlStatus(
+    assert status_by_the_book(heard["STATUS", "tumortrack"].content).text == REASON
+    assert status_by_the_book(heard["STATUS", "arms"].content) == IgtlStatus(
         13, "sweep 1", "it is hidden"
     )
     assert [device for kind, device in heard if kind == "TRANSFORM"] == ["holder/tip"]
     sink.close()
     heard = hear_all(receiver, 4 + 1)
-    assert unpack_status(heard["STATUS", "arms"].content).code == 16
+    assert status_by_the_book(heard["STATUS", "arms"].content).code == 16
     assert "TRANSFORM" not in {kind for kind, _ in heard}
 
 

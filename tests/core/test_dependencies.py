@@ -4,13 +4,18 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import re
 import tomllib
+from importlib.metadata import distributions
 from pathlib import Path
 from types import ModuleType
+from xml.etree import ElementTree
 
 import pytest
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
+
+import clients
 
 ROOT = Path(__file__).parents[2]
 
@@ -28,10 +33,11 @@ def tool() -> ModuleType:
 def asked_for() -> list[Requirement]:
     lines: list[str] = []
     for folder in (ROOT, ROOT / "devices", ROOT / "occupancy", ROOT / "lab", ROOT / "experiment"):
-        project = tomllib.loads((folder / "pyproject.toml").read_text("utf-8"))["project"]
-        lines += project["dependencies"]
-        for extra in project.get("optional-dependencies", {}).values():
+        about = tomllib.loads((folder / "pyproject.toml").read_text("utf-8"))
+        lines += about["project"]["dependencies"]
+        for extra in about["project"].get("optional-dependencies", {}).values():
             lines += extra
+        lines += about.get("dependency-groups", {}).get("clients", [])
     return [Requirement(line) for line in lines if not line.startswith("tumortrack")]
 
 
@@ -55,6 +61,20 @@ def test_what_is_installed_is_what_is_locked_and_its_licences_are_listed(tool):
     rows, made = (set(text.splitlines()) for text in (tool.TABLE.read_text("utf-8"), tool.table()))
     assert len(made) > 50
     assert made <= rows, "run make licences"  # some are for one Python or machine alone
+
+
+def test_licences_of_other_makers_programs_are_allowed(tool):
+    """ROS's packages say theirs in package.xml alone."""
+    clients.environment("ros-jazzy-rclpy")
+    (site,) = clients.FOLDER.glob("lib/python3*/site-packages")
+    for package in distributions(path=[str(site)]):
+        name = canonicalize_name(package.metadata["Name"])
+        if not (said := tool.licence(package)):
+            folder = re.sub("^ros-(jazzy-)?", "", name).replace("-", "_")
+            about = ElementTree.parse(clients.FOLDER / "share" / folder / "package.xml")
+            stated = [one.text for one in about.iter("license")]
+            said = " AND ".join(tool.SAID.get(text.lower(), text) for text in stated)
+        assert tool.is_allowed(said), f"{name}: {said!r}"
 
 
 @pytest.mark.parametrize(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import socket
 import struct
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -102,3 +103,16 @@ def polydata_by_the_book(content: bytes) -> dict:
         at += size
     assert at == len(content)
     return out
+
+
+class IgtlStatus(NamedTuple):
+    """What a STATUS says: ``code`` 1 is well."""
+
+    code: int
+    name: str
+    text: str
+
+
+def status_by_the_book(content: bytes) -> IgtlStatus:
+    code, _, name = struct.unpack(">Hq20s", content[:30])
+    return IgtlStatus(code, name.rstrip(b"\0").decode(), content[30:].split(b"\0")[0].decode())

@@ -12,10 +12,11 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from unittest import mock
 
+import clients
 from clock import PATIENCE_S, until
 from live_objects import PARTS, small_anatomy, small_frame
 from tumortrack.core.errors import InputError
@@ -102,13 +103,13 @@ def read_until(source: Source) -> Observation:
 class Other:
     """Another process; what it says is read at once, so that it never waits for us."""
 
-    def __init__(self, *command: object) -> None:
+    def __init__(self, *command: object, environment: dict[str, str] | None = None) -> None:
         self._process = subprocess.Popen(
             [str(part) for part in command],
             stdout=subprocess.PIPE,
             text=True,
             cwd=HERE,
-            env={**os.environ, "PYTHONPATH": os.pathsep.join(map(str, PATHS))},
+            env=environment or {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, PATHS))},
             start_new_session=True,
         )
         self._said: queue.Queue[str] = queue.Queue()
@@ -140,25 +141,41 @@ class Other:
         self.lines_until(heard)
         return last
 
+    def ended(self) -> int:
+        """Its exit code."""
+        return self._process.wait(PATIENCE_S)
+
     def signal(self, number: int) -> None:
         os.killpg(self._process.pid, number)
 
     def end(self) -> None:
-        self.signal(signal.SIGKILL)
+        """Asked first: Fast DDS's shared memory outlives who is killed."""
+        with suppress(ProcessLookupError):  # it has ended by itself
+            self.signal(signal.SIGTERM)
+            with suppress(subprocess.TimeoutExpired):
+                self._process.wait(10)
+            self.signal(signal.SIGKILL)
         self._process.wait()
         self._thread.join()
 
 
 @contextmanager
-def process(*command: object) -> Iterator[Other]:
-    other = Other(*command)
+def process(*command: object, environment: dict[str, str] | None = None) -> Iterator[Other]:
+    other = Other(*command, environment=environment)
     try:
         yield other
     finally:
         other.end()
 
 
+# Who is at the other end: our own code over Cyclone DDS, or through a real rclpy, which speaks by
+# Fast DDS; or a node as ROS's users write one.
+OURS, THROUGH_RCLPY, RCLPY = "ours", "ours through rclpy", "rclpy"
+
+
 @contextmanager
-def peer(*arguments: object) -> Iterator[Other]:
-    with process(sys.executable, HERE / "ros2_peer.py", *arguments) as other:
+def peer(*arguments: object, by: str = OURS) -> Iterator[Other]:
+    script = "rclpy_peer.py" if by == RCLPY else "ros2_peer.py"
+    environment = None if by == OURS else clients.environment("ros-jazzy-rclpy")
+    with process(sys.executable, HERE / script, *arguments, environment=environment) as other:
         yield other

@@ -3,11 +3,14 @@
 ros2_peer.py send image|cloud HZ SECONDS
 ros2_peer.py hear SECONDS
 ros2_peer.py tf HZ SECONDS
+ros2_peer.py see TOPIC
+`send` and `see` go through rclpy where the process has it, else over Cyclone DDS.
 """
 
 from __future__ import annotations
 
 import json
+import signal
 import sys
 import time
 from unittest import mock
@@ -17,6 +20,7 @@ from cyclonedds.qos import Policy
 from scipy.spatial.transform import Rotation
 
 from live_objects import empty_update, small_frame, small_setting
+from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import rigid
 from tumortrack.core.types import DepthFrame, SensorCloud
 from tumortrack.live.values import Observation
@@ -25,10 +29,12 @@ from tumortrack_devices.ros.dds import DdsBus
 from tumortrack_devices.ros.messages import stamp_of
 from tumortrack_devices.ros.results import DIAGNOSTICS, MARKERS, ResultMessages
 from tumortrack_devices.ros.ros2 import open_bus
-from tumortrack_devices.ros.sensors import CLOUD, messages_seen, plain_cloud
+from tumortrack_devices.ros.sensors import CAMERA_INFO, CLOUD, messages_seen, plain_cloud
 from tumortrack_devices.ros.tf import TRANSFORMS
+from tumortrack_devices.sources.ros import Ros2SourceConfig
 
 N_POINTS = 40_000
+MASK = np.arange(48 * 64).reshape(48, 64) % 3 == 0
 TOOL_FROM_CAMERA = rigid(np.diag([-1.0, -1, 1]), np.array([0.01, 0.02, 0.06]))  # m
 
 
@@ -45,10 +51,9 @@ def frame_numbered(number: int, stamp_ns: int) -> DepthFrame:
 
 
 def send(kind: str, hz: float, seconds: float) -> None:
-    bus = open_bus("dds")
+    bus = open_bus("auto")
     messages = bus.messages
     points = points_mm()
-    mask = np.arange(48 * 64).reshape(48, 64) % 3 == 0
     publishers: dict = {}
     end_s = time.monotonic() + seconds
     number = 0
@@ -58,11 +63,12 @@ def send(kind: str, hz: float, seconds: float) -> None:
             header = messages.header(start_ns, "camera")
             out = [("points", CLOUD, plain_cloud(SensorCloud(points, start_ns), header, messages))]
         else:
-            observation = Observation(frame_numbered(number, start_ns), start_ns, mask)
+            observation = Observation(frame_numbered(number, start_ns), start_ns, MASK)
             out = list(reversed(messages_seen(observation, messages)))
         for suffix, message_type, message in out:
             if suffix not in publishers:
-                publishers[suffix] = bus.publisher(f"/camera/{suffix}", message_type)
+                kept = message_type == CAMERA_INFO
+                publishers[suffix] = bus.publisher(f"/camera/{suffix}", message_type, kept)
             publishers[suffix].publish(messages.to_bytes(message))
         number += 1
         time.sleep(max(0.0, 1 / hz - (time.time_ns() - start_ns) * 1e-9))
@@ -130,6 +136,22 @@ def hear(seconds: float) -> None:
     bus.close()
 
 
+def see(topic: str) -> None:
+    """What the source sees, and what it says where it sees nothing."""
+    (bus := open_bus("auto")).close()
+    print(json.dumps({"by": type(bus).__name__}), flush=True)
+    source = Ros2SourceConfig(topic=topic).open()
+    while True:
+        try:
+            seen = source.read(0.2)
+        except InputError as error:
+            print(json.dumps({"refused": str(error)}), flush=True)
+            continue
+        if seen is not None:
+            sum_mm = float(np.nansum(seen.content.depth_mm))
+            print(json.dumps({"stamp_ns": seen.stamp_ns, "sum_mm": sum_mm}), flush=True)
+
+
 def reliably(bus: DdsBus) -> object:
     """A second reader of the cloud, whose writer has to wait for its acknowledgements."""
     from cyclonedds.sub import DataReader
@@ -153,9 +175,12 @@ def content_of(message: object, kind: str) -> dict:
 
 
 if __name__ == "__main__":
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit())  # and it leaves the graph
     if sys.argv[1] == "send":
         send(sys.argv[2], float(sys.argv[3]), float(sys.argv[4]))
     elif sys.argv[1] == "tf":
         transforms(float(sys.argv[2]), float(sys.argv[3]))
+    elif sys.argv[1] == "see":
+        see(sys.argv[2])
     else:
         hear(float(sys.argv[2]))

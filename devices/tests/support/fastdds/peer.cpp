@@ -12,6 +12,7 @@
 #include <fstream>
 #include <iostream>
 #include <iterator>
+#include <memory>
 #include <mutex>
 #include <string>
 #include <thread>
@@ -26,6 +27,7 @@
 #include <fastdds/dds/subscriber/SampleInfo.hpp>
 #include <fastdds/dds/subscriber/Subscriber.hpp>
 #include <fastdds/dds/topic/TopicDataType.hpp>
+#include <fastdds/rtps/transport/UDPv4TransportDescriptor.h>
 
 using namespace eprosima::fastdds::dds;
 using Payload = eprosima::fastrtps::rtps::SerializedPayload_t;
@@ -192,8 +194,13 @@ int main(int argc, char** argv)
     {
         return 2;
     }
-    DomainParticipant* member = DomainParticipantFactory::get_instance()->create_participant(
-        std::stoi(argv[1]), PARTICIPANT_QOS_DEFAULT);
+    // Not by shared memory: what another version of Fast DDS left there would crash this one.
+    DomainParticipantQos qos;
+    qos.transport().use_builtin_transports = false;
+    qos.transport().user_transports.push_back(
+        std::make_shared<eprosima::fastdds::rtps::UDPv4TransportDescriptor>());
+    DomainParticipant* member =
+        DomainParticipantFactory::get_instance()->create_participant(std::stoi(argv[1]), qos);
     if (member == nullptr)
     {
         return 1;
