@@ -17,6 +17,8 @@ from clock import PATIENCE_S, until
 from live_objects import (
     empty_update,
     small_frame,
+    small_setting,
+    small_update,
 )
 from ros2_objects import Frames, own_graph, read_until, sending
 from ros2_peer import points_mm
@@ -32,6 +34,7 @@ from tumortrack_devices.ros.messages import Messages
 from tumortrack_devices.ros.results import JOINTS, MARKERS, ResultMessages
 from tumortrack_devices.ros.ros2 import open_bus
 from tumortrack_devices.ros.sensors import messages_seen, plain_cloud
+from tumortrack_devices.sinks.ros import ACKNOWLEDGE
 from tumortrack_devices.sinks.ros import Ros2SinkConfig as SinkRos2
 from tumortrack_devices.sources.ros import Ros2SourceConfig as SourceRos2
 from workcell_objects import with_arms, working
@@ -272,6 +275,27 @@ def test_arms_travel_over_dds(bus: Bus, messages: Messages) -> None:
     for shape in update.workcell.shapes:
         assert len(markers[shape.name].points) == shape.mesh.faces.size
     assert markers["state"].text == "sweep 1"
+
+
+def test_who_has_seen_what_contradicts_says_so_on_a_topic(bus: Bus, messages: Messages) -> None:
+    setting, (topic, kind) = small_setting(), ACKNOWLEDGE
+    seen = bus.publisher(f"/tumortrack/{topic}", kind)
+    sink = SinkRos2().open(setting)
+
+    def heard() -> bool:
+        sink.publish(small_update())
+        return setting.controls.acknowledged.is_set()
+
+    try:
+        assert not heard()
+
+        def said() -> bool:
+            seen.publish(messages.to_bytes(messages.make(kind)))
+            return heard()
+
+        until(said, "it was heard")
+    finally:
+        sink.close()
 
 
 def test_other_types_are_refused(bus: Bus, messages: Messages) -> None:

@@ -9,6 +9,7 @@ import os
 import struct
 import sys
 import xml.etree.ElementTree as ET
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,7 +21,7 @@ from PIL import Image
 import clients
 import needs
 import tumortrack
-from clock import until
+from clock import PATIENCE_S, until
 from live_objects import PARTS, ball, empty_update, small_setting, small_update
 from reports import NOWHERE, reporting
 from ros2_objects import RCLPY, own_graph, peer, process
@@ -37,6 +38,7 @@ from tumortrack_devices.ros.ros2 import open_bus
 from tumortrack_devices.ros.sensors import COMPRESSED, image_of
 from tumortrack_devices.ros.tf import TRANSFORMS, pose_of
 from tumortrack_devices.sinks.moveit import SCENE, coarser, widened_hull
+from tumortrack_devices.sinks.ros import ACKNOWLEDGE
 
 MESSAGES = Messages()
 QUARTER = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
@@ -281,7 +283,8 @@ def test_a_parameter_out_of_its_limits_is_refused(options, wrong):
 
 
 def test_a_parameter_that_tracking_refuses_is_set_back_and_it_goes_on(tmp_path):
-    """The node in a real ROS 2, and a program that sets its parameters as `ros2 param` does."""
+    """The node in a real ROS 2, and programs that call its service, and set its parameters as
+    `ros2 param` does."""
     started, program = tmp_path / "started", tmp_path / "tumortrack"
     cases = "case $* in *nonsense*) exit 2;; *over*) exit 7;; esac"
     program.write_text(f'#!/bin/sh\necho "$*" >> {started}\n{cases}\nexec sleep 99\n')
@@ -293,7 +296,14 @@ def test_a_parameter_that_tracking_refuses_is_set_back_and_it_goes_on(tmp_path):
     with own_graph():
         environment = clients.environment("ros-jazzy-rclpy")
         environment["PYTHONPATH"] += f"{os.pathsep}{PACKAGE}"
-        with process(*command, environment=environment) as node:
+        with process(*command, environment=environment) as node, closing(open_bus("dds")) as bus:
+            topic, kind = ACKNOWLEDGE
+            acknowledged = bus.subscriber(f"/tumortrack/{topic}", kind)
+            with peer("acknowledge", 2, by=RCLPY) as other:  # as the sink would hear it
+                calls = [json.loads(other.line())["successful"] for _ in range(2)]
+                bus.wait(PATIENCE_S)
+            assert calls[-1]
+            assert acknowledged.take()
             with peer("set", "stale=-5.0", "moving=nonsense", by=RCLPY) as other:
                 refused, nonsense, back = (json.loads(other.line()) for _ in range(3))
             until(lambda: started.read_text().count("\n") == 3, "the former values")

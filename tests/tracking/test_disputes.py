@@ -1,4 +1,4 @@
-"""A touch that contradicts an answer speaks against the next ones, until it is settled."""
+"""A touch that contradicts an answer speaks against the next ones, until it is acknowledged."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def kinds(frames, settled_at=-1):
     follower, found = Follower(Scripted(frames), FollowerConfig()), []
     for n in range(len(frames)):
         if n == settled_at:
-            follower.disputes.settle()
+            follower.disputes.acknowledge()
         cloud = SensorCloud(SURFACE_MM.astype(np.float32), stamp_ns=1 + 33_000_000 * n)
         estimate = follower.locate(cloud, small_frame())
         found.append(estimate.finding and estimate.finding.kind)

@@ -2,6 +2,7 @@
 
 rclpy_peer.py send image HZ SECONDS      a depth camera
 rclpy_peer.py hear SECONDS               a line for every message of the sink
+rclpy_peer.py acknowledge COUNT           calls of the node's service
 rclpy_peer.py set NAME=VALUE ...         parameters of the node /tumortrack, one after the other
 """
 
@@ -23,6 +24,7 @@ from rclpy.parameter_client import AsyncParameterClient
 from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
 from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
+from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
 from live_objects import CAMERA, PARTS
@@ -112,6 +114,17 @@ def put(node: Node, words: list[str]) -> None:
             time.sleep(0.05)
 
 
+def acknowledge(node: Node, count: int) -> None:
+    """A line for each answer, half a second apart."""
+    client = node.create_client(Trigger, "/tumortrack/acknowledge")
+    client.wait_for_service()
+    for _ in range(count):
+        future = client.call_async(Trigger.Request())
+        rclpy.spin_until_future_complete(node, future)
+        print(json.dumps({"successful": future.result().success}), flush=True)
+        time.sleep(0.5)
+
+
 def stamp_ns(header: Any) -> int:
     return header.stamp.sec * 10**9 + header.stamp.nanosec
 
@@ -124,5 +137,7 @@ if __name__ == "__main__":
         send(here, *map(float, sys.argv[3:]))
     elif sys.argv[1] == "set":
         put(here, sys.argv[2:])
+    elif sys.argv[1] == "acknowledge":
+        acknowledge(here, int(sys.argv[2]))
     else:
         hear(here, float(sys.argv[2]))

@@ -363,7 +363,7 @@ class Controls:
     ``clicks``: colours at clicks in pictures; ``taught``: the classifier learned from them, if they
     can be separated; ``colour``: its state in words. ``touched``: names of tools of which the user
     says that they touch now, or take, or let go.
-    ``settled``: evidence that contradicts was wrong."""
+    ``acknowledged``: evidence that contradicts was wrong."""
 
     picked_mm: Float64[np.ndarray, " 3"] | None = None
     aborted: threading.Event = field(default_factory=threading.Event)
@@ -371,7 +371,7 @@ class Controls:
     taught: TissueClassifier | None = None
     colour: str = ""
     touched: deque[str] = field(default_factory=deque)
-    settled: threading.Event = field(default_factory=threading.Event)
+    acknowledged: threading.Event = field(default_factory=threading.Event)
 
     def click(self, seen: Observation, place_mm: Float[np.ndarray, " 3"], organ: bool) -> None:
         """The user clicked on this place (camera frame): on the ``organ``, or beside it. Raises

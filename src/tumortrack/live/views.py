@@ -126,9 +126,9 @@ class ViewsLocator:
 
     def _heed_pick(self) -> None:
         controls = self._context.controls
-        if controls.settled.is_set():
-            controls.settled.clear()
-            self._follower.disputes.settle()
+        if controls.acknowledged.is_set():
+            controls.acknowledged.clear()
+            self._follower.disputes.acknowledge()
         if controls.taught is not self._taught:  # what was taken for the organ may be wrong
             self._taught = controls.taught
             self._follower.forget()

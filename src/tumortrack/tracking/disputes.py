@@ -1,4 +1,4 @@
-"""What contradicted an answer speaks against the next ones too, until it is settled."""
+"""What contradicted an answer speaks against the next ones too, until it is acknowledged."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ class Disputes:
     def __init__(self) -> None:
         self._open: list[_Dispute] = []
 
-    def settle(self) -> None:
+    def acknowledge(self) -> None:
         """The user has seen them all."""
         self._open = []
 
-    def heed(self, estimate: Estimate) -> Finding | None:
+    def update(self, estimate: Estimate) -> Finding | None:
         """With the next answer: what still speaks against it."""
         lasting = [e for e in estimate.report.evidence if e.name not in _OF_A_MOMENT]
         new = [each for each in lasting if not each.before]

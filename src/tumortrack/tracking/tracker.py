@@ -352,9 +352,9 @@ class Follower:
         return self._disputed(self._last)
 
     def _disputed(self, estimate: Estimate) -> Estimate:
-        """Poor, if evidence that contradicted one before is not settled; the next frame is still
+        """Poor, while evidence that contradicted one before is not acknowledged; the next frame is
         followed as if it were not."""
-        finding = self.disputes.heed(estimate)
+        finding = self.disputes.update(estimate)
         if finding is None or estimate.finding is not None:
             return estimate
         margins = self._tracker.model.margins

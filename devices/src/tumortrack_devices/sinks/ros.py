@@ -15,6 +15,7 @@ from tumortrack_devices.ros.sensors import CAMERA_FRAME
 from tumortrack_devices.ros.tf import TRANSFORMS, transform_fields
 
 _FLUSH_S = 0.2  # for the last messages to leave
+ACKNOWLEDGE = "acknowledge", "std_msgs/msg/Empty"
 
 
 class Ros2SinkConfig(SinkConfig, frozen=True, kw_only=True, tag="ros2"):
@@ -39,7 +40,8 @@ class Ros2SinkConfig(SinkConfig, frozen=True, kw_only=True, tag="ros2"):
 
 class RosSink:
     """Subscribers get the newest result; slow ones miss some and delay nobody. At the end, and
-    whenever there is no estimate, all topics say so."""
+    whenever there is no estimate, all topics say so. A message on ``ACKNOWLEDGE`` says that the
+    user has seen what contradicts the answer."""
 
     def __init__(self, config: Ros2SinkConfig, context: SinkContext, bus: Bus) -> None:
         self._bus, self.notes = bus, (bus.note,)
@@ -50,6 +52,9 @@ class RosSink:
         self._static: Publisher | None = None
         if config.camera_tf and not context.published_frame.moves:
             self._static = bus.publisher("/tf_static", TRANSFORMS, latched=True)
+        topic, kind = ACKNOWLEDGE
+        self._seen = bus.subscriber(f"{config.namespace}/{topic}", kind)
+        self._acknowledged = context.controls.acknowledged
         nothing = TrackingResult(sequence=0, stamp_ns=0, published_frame=context.published_frame)
         self._publishers = {
             out.suffix: bus.publisher(
@@ -61,6 +66,9 @@ class RosSink:
     def publish(self, result: TrackingResult) -> None:
         """Send it on every topic, also on the others if one fails."""
         self._last = result
+        self._bus.wait(0.0)
+        if self._seen.take():
+            self._acknowledged.set()
         self._publish_cameras(result)
         failed: list[str] = []
         for suffix, _, message in self._results.of(result):

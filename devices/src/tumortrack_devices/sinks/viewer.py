@@ -127,7 +127,7 @@ class ViewerSink:
         panel.clicks[True].on_click(lambda _: self._ask(True))
         panel.clicks[False].on_click(lambda _: self._ask(False))
         panel.forget.on_click(lambda _: self._forget())
-        panel.settle.on_click(lambda _: self._context.controls.settled.set())
+        panel.acknowledge.on_click(lambda _: self._context.controls.acknowledged.set())
         self._guard.on_refused = self._refused
         if self._context.tools:
 
@@ -257,8 +257,8 @@ class ViewerSink:
         self._panel.stage.content = status.stage()
         finding = None if result is None else result.finding
         contradicted = finding is not None and finding.kind in ("evidence", "disputed")
-        if self._panel.settle.visible is not contradicted:
-            self._panel.settle.visible = contradicted
+        if self._panel.acknowledge.visible is not contradicted:
+            self._panel.acknowledge.visible = contradicted
 
     def _keep_watch(self) -> None:
         """Update the age, hide what is too old, renew the slice."""

@@ -264,7 +264,7 @@ class Panel:
             }
             self.colour = gui.add_html("")
             self.forget = gui.add_button("Forget", color="gray", visible=False)
-            self.settle = gui.add_button(
+            self.acknowledge = gui.add_button(
                 "The touch was wrong",
                 color="gray",
                 visible=False,

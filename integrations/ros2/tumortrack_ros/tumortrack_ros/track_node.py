@@ -11,6 +11,8 @@ from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+from std_msgs.msg import Empty
+from std_srvs.srv import Trigger
 
 from tumortrack_ros.options import OPTIONS, command
 
@@ -30,7 +32,9 @@ class TrackNode(Node):
         self.code: int | None = None
         self._stale = False
         self._before: dict[str, object] = {}  # the values that it ran with before a change
+        self._seen = {}
         self._start()
+        self.create_service(Trigger, "~/acknowledge", self._acknowledge)
         self.add_on_set_parameters_callback(self._changed)
         self.create_timer(_LOOK_S, self._look)
 
@@ -47,9 +51,23 @@ class TrackNode(Node):
         return {name: self.get_parameter(name).value for name in OPTIONS}
 
     def _start(self) -> None:
-        line = command(self._values())
+        values = self._values()
+        line = command(values)
+        for sink in values["sinks"]:
+            kind, _, namespace = sink.partition("?")[0].partition(":")
+            topic = f"{namespace or '/tumortrack'}/acknowledge"
+            if kind == "ros2" and topic not in self._seen:
+                self._seen[topic] = self.create_publisher(Empty, topic, 1)
         self.get_logger().info(" ".join(line))
         self._track = subprocess.Popen(line)
+
+    def _acknowledge(self, _: Trigger.Request, answer: Trigger.Response) -> Trigger.Response:
+        """The user has seen what contradicts the answer."""
+        heard = [one for one in self._seen.values() if one.get_subscription_count()]
+        for one in heard:
+            one.publish(Empty())
+        answer.success, answer.message = bool(heard), "" if heard else "no ros2 sink hears of it"
+        return answer
 
     def _changed(self, parameters: list) -> SetParametersResult:
         ours = {one.name: one.value for one in parameters if one.name in OPTIONS}
