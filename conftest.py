@@ -1,4 +1,5 @@
-"""Runs every test with array shapes checked: jaxtyping's annotations are executed by beartype."""
+"""Runs tests with array shapes checked: jaxtyping's annotations are executed by beartype. Those
+marked slow run as users run them: checked, each call costs as much again."""
 
 import fcntl
 import os
@@ -71,6 +72,11 @@ def pytest_collection_modifyitems(items):
             item.add_marker(pytest.mark.slow)
     order = {name: n for n, name in enumerate(SLOWEST)}
     items.sort(key=lambda item: order.get(item.path.name, len(order)))
+
+
+@pytest.hookimpl(tryfirst=True)  # before fixtures are made
+def pytest_runtest_setup(item):
+    jaxtyping.config.jaxtyping_disable = item.get_closest_marker("slow") is not None
 
 
 @pytest.fixture

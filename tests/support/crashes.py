@@ -27,6 +27,7 @@ from clock import PATIENCE_S, until
 from harness import Child, Ending, Work, base_in, command, new_command
 
 _LONG_S = 12.0  # within which commands are interrupted
+_SOME_FRAMES = 6 * 2**20  # bytes, of which one frame has 2 MB at most: then its pauses are known
 _LOST_S = 1.0  # of a recording, and the longest pause between two of its frames: on a busy machine
 Words = tuple[object, ...]  # of a command
 
@@ -152,7 +153,7 @@ def recording(place: Place) -> str:
 
         def on_disk(child: Child = child, tape: Path = tape) -> bool:
             sizes = [path.stat().st_size for path in tape.rglob("*.mcap")]
-            return sum(sizes) > 2**20 or not child.running()
+            return sum(sizes) > _SOME_FRAMES or not child.running()
 
         try:
             until(on_disk, "a tape", 5 * PATIENCE_S)
