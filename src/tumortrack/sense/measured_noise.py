@@ -13,20 +13,18 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
-from scipy.optimize import nnls
-from scipy.spatial import cKDTree
 
 from tumortrack.core.types import DepthFrame, SensorCloud
 
 _WINDOW_MM = 12.0  # a quadratic leaves 0.01 mm of a ball's surface of 25 mm radius
 _SIDES_PX = 9, 31  # of a window, at least and at most
 _LAGS = np.arange(1, 10)
-_LENGTHS_PX = np.array([1.0, 1.5, 2.0, 3.0, 4.0, 5.5, 7.5, 10.0, 14.0])  # tried, up to half a window
+_LENGTHS_PX = np.geomspace(1.0, 15.0, 13)  # that are tried, up to half a window
 _MOST_WINDOWS = 400  # a hundredth of the noise is then known; 10 ms
 _FEWEST = 12
 _ROUGH = 4.0  # times the median variance: an edge, a fold, a window with an outlier
 _NEIGHBOURS, _SPARSE_MM = 40, 3.0
-_STEP_OFF = 0.02  # of a step: rounding of stored numbers
+_STEP_OFF, _LEAST_STEP_MM = 0.02, 1e-3  # of a step, and of one: rounding of stored numbers
 _MOST_VALUES = 20_000  # depths among which the step is looked for
 
 
@@ -49,6 +47,26 @@ class DepthNoise(NamedTuple):
     @property
     def whole_mm(self) -> float:
         return float(np.hypot(self.white_mm, self.correlated_mm))
+
+    @property
+    def words(self) -> str:
+        """As a clause."""
+        at = f"{self.whole_mm:.2g} mm at {self.depth_mm:.0f} mm"
+        if self.bound:
+            return f"noise of at most {at}"
+        if self.correlated_mm < self.white_mm / 3:
+            return f"noise {at}"
+        return f"noise {at}, most of it shared over {self.correlation_px:.0f} pixels"
+
+    @property
+    def entry(self) -> dict[str, float | bool]:
+        """For JSON."""
+        return {"mm": self.whole_mm, **self._asdict()}
+
+
+def noise_of(content: DepthFrame | SensorCloud) -> DepthNoise | None:
+    """``image_noise`` or ``cloud_noise``."""
+    return image_noise(content) if isinstance(content, DepthFrame) else cloud_noise(content)
 
 
 def image_noise(frame: DepthFrame) -> DepthNoise | None:
@@ -77,6 +95,8 @@ def image_noise(frame: DepthFrame) -> DepthNoise | None:
 
 def cloud_noise(cloud: SensorCloud) -> DepthNoise | None:
     """Of a cloud of any density; None: it has too few points."""
+    from scipy.spatial import cKDTree
+
     points = np.asarray(cloud.points_mm, float)
     if len(points) < 2 * _NEIGHBOURS:
         return None
@@ -107,7 +127,8 @@ def depth_step_mm(depth_mm: Float[np.ndarray, "h w"]) -> float:
     for scale, back in ((values, 1.0), (1 / values[::-1], middle**2)):
         apart = np.diff(scale)
         steps = apart / (step := apart.min())
-        if np.abs(steps - np.rint(steps)).max() < _STEP_OFF * len(steps) ** 0.5:
+        whole = np.abs(steps - np.rint(steps)).max() < _STEP_OFF * len(steps) ** 0.5
+        if whole and step * back > _LEAST_STEP_MM:
             return float(step * back)
     return 0.0
 
@@ -132,22 +153,29 @@ def _quadratics(side: int) -> Float[np.ndarray, "pixels 6"]:
 
 
 def _semivariogram(left: Float[np.ndarray, "n side side"]) -> Float[np.ndarray, " lags"]:
-    """Mean over both axes, and variance at last."""
-    lags = _LAGS[_LAGS < left.shape[1] // 2]
+    """Over both axes, and the variance at last; medians over the windows, as folds and edges have
+    more."""
+    lags = _LAGS[: left.shape[1] // 2 - 1]
+    plane = (1, 2)
     along = [
-        np.mean((left[:, h:] - left[:, :-h]) ** 2) + np.mean((left[..., h:] - left[..., :-h]) ** 2)
+        np.mean((left[:, h:] - left[:, :-h]) ** 2, plane)
+        + np.mean((left[..., h:] - left[..., :-h]) ** 2, plane)
         for h in lags
     ]
-    return np.array([*(np.array(along) / 4), np.mean(left**2)])
+    return np.median([*(np.array(along) / 4), np.mean(left**2, plane)], axis=1)
 
 
 def _parts(seen: Float[np.ndarray, " lags"], side: int) -> tuple[float, float, float]:
     """Standard deviation of the white and of the correlated part, and its length, px."""
     fits = []
     for length_px, expected in _expected(side):
-        weight = 1 / seen
-        variances, off = nnls(expected * weight[:, None], seen * weight)
-        fits.append((off, length_px, variances))
+        parts = expected / seen[:, None]
+        for free in ([0, 1], [0], [1]):  # neither variance is below 0
+            found, *_ = np.linalg.lstsq(parts[:, free], np.ones(len(seen)))
+            if (found >= 0).all():
+                variances = np.zeros(2)
+                variances[free] = found
+                fits.append((float(np.sum((parts @ variances - 1) ** 2)), length_px, variances))
     _, length_px, (white, correlated) = min(fits, key=lambda fit: fit[0])
     return float(np.sqrt(white)), float(np.sqrt(correlated)), length_px if correlated else 0.0
 
@@ -157,7 +185,7 @@ def _expected(side: int) -> list[tuple[float, Float[np.ndarray, "lags 2"]]]:
     """For each length that can be told in such a window, the semivariogram that quadratics leave of
     white noise and of correlated noise of variance 1 each."""
     white = _left_of(np.eye(side), side)
-    lengths = _LENGTHS_PX[_LENGTHS_PX <= side / 2]
+    lengths = _LENGTHS_PX[side / 2 >= _LENGTHS_PX]
     gap = np.abs(np.subtract.outer(np.arange(side), np.arange(side)))
     return [
         (float(one), np.stack([white, _left_of(np.exp(-((gap / one) ** 2)), side)], 1))
@@ -169,7 +197,7 @@ def _left_of(along: Float[np.ndarray, "side side"], side: int) -> Float[np.ndarr
     """Of noise whose covariance is ``along`` each axis, and their product in the plane."""
     basis = _quadratics(side)
     grid = basis.reshape(side, side, -1)
-    spread = np.einsum("ij,jkt,kl->ilt", along, grid, along)  # covariance times basis
+    spread = np.einsum("ij,jkt->ikt", along, np.einsum("jkt,kl->jlt", grid, along))
     inner = basis.T @ spread.reshape(side * side, -1)
 
     def covariance(h: int, axis: int) -> Float[np.ndarray, "a b"]:
@@ -184,7 +212,7 @@ def _left_of(along: Float[np.ndarray, "side side"], side: int) -> Float[np.ndarr
         return before - taken + back
 
     own = covariance(0, 0)
-    lags = _LAGS[_LAGS < side // 2]
+    lags = _LAGS[: side // 2 - 1]
     out = []
     for h in lags:
         sides = [
