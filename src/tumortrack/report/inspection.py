@@ -268,10 +268,12 @@ def _points(path: Path) -> list[str]:
 
     camera = path.with_name("intrinsics.json")
     if path.suffix.lower() == ".png" and camera.is_file():
-        depth_mm = read_depth_png(path, camera).depth_mm
+        frame = read_depth_png(path, camera)
+        depth_mm = frame.depth_mm
         near, far = np.nanpercentile(depth_mm, (1, 99))
         size = " x ".join(map(str, depth_mm.shape[::-1]))
-        return [f"a depth image of {size} pixels, nearly all at {near:.0f} to {far:.0f} mm"]
+        words = f"a depth image of {size} pixels, nearly all at {near:.0f} to {far:.0f} mm"
+        return [words, *_noise(frame)]
     if _is_mesh(path):
         mesh = read_mesh(path)
         return [f"a mesh, {_size(mesh.box_mm)}; {mesh.volume_ml:.1f} ml if it is closed"]
@@ -280,7 +282,13 @@ def _points(path: Path) -> list[str]:
     cloud, notes = read_cloud(path)
     points_mm = cloud.points_mm
     box_mm = np.array([points_mm.min(0), points_mm.max(0)])
-    return [f"a cloud of {len(points_mm)} points, {_size(box_mm)}", *notes]
+    return [f"a cloud of {len(points_mm)} points, {_size(box_mm)}", *_noise(cloud), *notes]
+
+
+def _noise(content: Any) -> list[str]:
+    from tumortrack.sense.measured_noise import noise_of
+
+    return [noise.words] if (noise := noise_of(content)) else []
 
 
 def _size(box_mm: Any) -> str:

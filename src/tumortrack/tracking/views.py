@@ -25,6 +25,7 @@ from tumortrack.sense.files import (
     read_mask,
     read_poses,
 )
+from tumortrack.sense.measured_noise import noise_of
 from tumortrack.sense.region import Hints, organ_points
 from tumortrack.tracking.options import LocateOptions
 
@@ -87,7 +88,8 @@ class View:
                            if name not in ("organ", "no return"))  # fmt: skip
         words += f"{counts['organ']} of {returns} pixels with a return were taken for the organ, "
         words += f"by {hint}{f' (others: {others})' if others else ''}."
-        entry |= {"organ": counts["organ"], "of": returns, "pixels": counts, "words": words}
+        entry |= {"organ": counts["organ"], "of": returns, "pixels": counts}
+        entry |= _with_noise(self.content, words)
         return found.cloud, entry, found.taken
 
     def _cropped(
@@ -102,8 +104,15 @@ class View:
         kept = len(cloud.points_mm)
         words = f"{self.path.name}: {kept} of {count} points were taken for the organ"
         words += f", by {hint}." if hint else ": a cloud is taken for the organ alone."
-        entry = {"file": self.path.name, "hint": hint, "organ": kept, "of": count, "words": words}
-        return cloud, entry
+        entry = {"file": self.path.name, "hint": hint, "organ": kept, "of": count}
+        return cloud, {**entry, **_with_noise(cloud, words)}
+
+
+def _with_noise(content: DepthFrame | SensorCloud, words: str) -> dict[str, Any]:
+    """The words, and the noise that was measured, as entries."""
+    if (noise := noise_of(content)) is None:
+        return {"words": words}
+    return {"noise": noise.entry, "words": f"{words.removesuffix('.')}; {noise.words}."}
 
 
 def read_views(paths: Sequence[Path], options: LocateOptions) -> list[View]:

@@ -1,0 +1,108 @@
+"""Noise is measured as it was put in, whatever the shape below it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter
+
+from tumortrack.core.types import DepthFrame, Intrinsics, SensorCloud
+from tumortrack.sense.camera import deproject
+from tumortrack.sense.measured_noise import cloud_noise, depth_step_mm, image_noise
+
+RADII_MM = np.array([50.0, 30.0, 28.0])  # a kidney's, about
+
+
+def seen(width: int, distance_mm: float, behind_mm: float = 40.0) -> DepthFrame:
+    """An ellipsoid before a tilted plane."""
+    camera = Intrinsics(width, width // 2, fx=width / 2, fy=width / 2, cx=width / 2, cy=width / 4)
+    v, u = np.mgrid[: camera.height, :width]
+    rays = np.stack(
+        [(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(u.shape)], -1
+    )
+    middle = np.array([0.0, 0.0, distance_mm + RADII_MM[2]])
+    a, b, c = (np.sum(x * y / RADII_MM**2, -1) for x, y in ((rays, rays), (rays, middle),
+                                                            (middle, middle)))  # fmt: skip
+    inside = b * b - a * (c - 1)
+    depth = np.where(
+        inside > 0,
+        (b - np.sqrt(np.maximum(inside, 0))) / a,
+        distance_mm + behind_mm + 0.1 * (u - camera.cx) * distance_mm / camera.fx,
+    )
+    return DepthFrame(depth.astype(np.float32), camera)  # fmt: skip
+
+
+def noisy(frame, white_mm, correlated_mm=0.0, length_px=1.0, step_mm=0.1, seed=0):
+    rng = np.random.default_rng(seed)
+    shape = frame.depth_mm.shape
+    depth = frame.depth_mm + white_mm * rng.standard_normal(shape)
+    if correlated_mm:  # 1/e at the length
+        field = gaussian_filter(rng.standard_normal(shape), length_px / 2)
+        depth += correlated_mm * field / field.std()
+    if step_mm:
+        depth = np.rint(depth / step_mm) * step_mm
+    depth[rng.random(shape) < 0.002] = np.nan
+    return frame.with_depth(depth.astype(np.float32))
+
+
+@pytest.mark.parametrize(("width", "distance_mm"), [(848, 150), (848, 300), (424, 150), (640, 400)])
+@pytest.mark.parametrize("white_mm", [0.1, 0.5, 1.0, 2.0])
+def test_white_noise_within_a_tenth(width, distance_mm, white_mm):
+    found = image_noise(noisy(seen(width, distance_mm), white_mm))
+    assert found.white_mm == pytest.approx(white_mm, rel=0.1)
+    assert found.correlated_mm < white_mm / 3
+    assert not found.bound
+
+
+@pytest.mark.parametrize(("width", "distance_mm"), [(848, 150), (424, 150), (640, 300)])
+@pytest.mark.parametrize("length_px", [1.5, 3.0, 5.0])
+@pytest.mark.parametrize("white_mm", [0.0, 0.5])
+def test_correlated_noise_is_told_from_white(width, distance_mm, length_px, white_mm):
+    found = image_noise(noisy(seen(width, distance_mm), white_mm, 1.0, length_px))
+    assert found.correlated_mm == pytest.approx(1.0, rel=0.2)
+    assert found.correlation_px == pytest.approx(length_px, rel=0.4)
+    # Over 1.5 pixels it is nearly white.
+    assert found.white_mm == pytest.approx(white_mm, abs=0.25 if length_px < 2 else 0.15)
+
+
+def test_noise_below_half_a_step_is_a_bound():
+    found = image_noise(noisy(seen(848, 150), 0.05, step_mm=1.0))
+    assert found.bound
+    assert (found.step_mm, found.whole_mm) == (pytest.approx(1.0), pytest.approx(0.5))
+
+
+def test_steps_of_depth_and_of_disparity():
+    frame = noisy(seen(424, 200), 0.5, step_mm=0.25)
+    assert depth_step_mm(frame.depth_mm) == pytest.approx(0.25)
+    focal_baseline = 431.0 * 18.0  # of a D405, in px mm; a 32nd of a pixel
+    plain = noisy(seen(424, 200), 0.5, step_mm=0.0).depth_mm
+    stored = focal_baseline / (np.rint(32 * focal_baseline / plain) / 32)
+    middle = float(np.nanmedian(stored))
+    assert depth_step_mm(stored) == pytest.approx(middle**2 / 32 / focal_baseline, rel=0.1)
+    assert depth_step_mm(plain) == 0
+
+
+def test_edges_instruments_and_strays_do_not_count():
+    frame = noisy(seen(848, 150), 0.5)
+    depth = frame.depth_mm.copy()
+    rng = np.random.default_rng(1)
+    depth[150:170] = 90.0 + 0.5 * rng.standard_normal((20, 848))  # a shaft
+    strays = rng.random(depth.shape) < 2e-4
+    depth[strays] += rng.uniform(-20, 20, strays.sum())
+    assert image_noise(frame.with_depth(depth)).white_mm == pytest.approx(0.5, rel=0.2)
+
+
+def test_an_image_without_a_smooth_surface_says_nothing():
+    empty = seen(424, 150)
+    assert image_noise(empty.with_depth(np.full_like(empty.depth_mm, np.nan))) is None
+
+
+@pytest.mark.parametrize("points", [1000, 20_000])
+@pytest.mark.parametrize("noise_mm", [0.5, 1.0, 2.0])
+def test_a_clouds_noise_whatever_its_density(points, noise_mm):
+    places = deproject(noisy(seen(424, 150), noise_mm, step_mm=0.0))
+    drawn = np.random.default_rng(2).choice(len(places), points, replace=False)
+    found = cloud_noise(SensorCloud(places[drawn].astype(np.float32)))
+    assert found.white_mm == pytest.approx(noise_mm, rel=0.25) or found.bound
+    if found.bound:
+        assert found.white_mm >= 0.8 * noise_mm
