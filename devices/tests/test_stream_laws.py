@@ -174,6 +174,17 @@ def test_frames_are_played_as_people_number_them(tmp_path):
         np.testing.assert_allclose(seen.content.depth_mm, frame_number(n).depth_mm, atol=0.051)
 
 
+@pytest.mark.parametrize("unit_ns", [1, 1000, 10**6])
+def test_times_in_names_are_in_ns_us_or_ms_and_other_pictures_are_no_frames(unit_ns, tmp_path):
+    write_intrinsics(tmp_path / "intrinsics.json", CAMERA)
+    stamps = [(STAMP_NS + n * 200_000_000) // unit_ns * unit_ns for n in range(4)]
+    for n, stamp_ns in enumerate(stamps):
+        write_depth_png(tmp_path / f"{stamp_ns // unit_ns}.png", frame_number(n))
+    for name in ("mask.png", "color_1.png", "RGB.png"):
+        write_depth_png(tmp_path / name, frame_number(9))
+    assert [seen.stamp_ns for seen in played(tmp_path)] == stamps
+
+
 @pytest.fixture
 def tool(monkeypatch):
     """Makes tools as a server; each lives by ``clock``."""

@@ -18,7 +18,8 @@ from tumortrack.core.types import LabelVolume, Volume
 from tumortrack.imaging.case import load_case, save_case
 from tumortrack.imaging.options import PrepareOptions
 from tumortrack.imaging.prepare import prepare
-from tumortrack.imaging.volume import read_raw
+from tumortrack.imaging.segments import is_organ, is_tumor
+from tumortrack.imaging.volume import read_raw, read_several
 from tumortrack.phantom.digital import PhantomParameters, phantom_labels
 
 VOXEL_MM = 2.4
@@ -360,7 +361,7 @@ def retagged(paths: list[Path], **change) -> None:
     for n, path in enumerate(paths):
         data = pydicom.dcmread(path)
         for tag, of in change.items():
-            setattr(data, tag, of(n, getattr(data, tag)))
+            setattr(data, tag, of(n, data.get(tag)))
         data.save_as(path)
 
 
@@ -473,4 +474,155 @@ def test_a_dicom_segmentation_is_cut_where_its_ct_ends(phantom, tmp_path):
     write_dicom_seg(path, labels, segments(parts), tmp_path / "ct")
     assert "cut" not in [warning.kind for warning in prepare(path).warnings]
     case = prepare(path, PrepareOptions(ct=tmp_path / "ct"))
-    assert [warning.kind for warning in case.warnings] == ["cut"]
+    assert [warning.kind for warning in case.warnings] == ["flat", "cut"]
+
+
+def test_an_organ_cut_flat_within_its_image_is_told(phantom, tmp_path):
+    """One empty slice behind the cut, or a crop to a box, and the border says nothing."""
+    labels = phantom.map()
+    labels[..., labels.shape[2] // 2 :] = 0
+    half = Scene(
+        {"kidney": labels > 0, "tumor_b": labels == phantom.number("tumor_b")}, phantom.affine
+    )
+    assert kinds(prepare(nifti(half, tmp_path)))["flat"]["area_cm2"] > 10
+    assert "flat" in kinds(prepare(meshes(replace(half, masks={"kidney": labels > 0}), tmp_path)))
+
+
+@numbered
+@pytest.mark.parametrize("every_n", [2, 100])
+def test_an_organ_drawn_in_some_slices_alone_is_refused(phantom, tmp_path, write, every_n):
+    middle = phantom.map().shape[2] // 2
+    masks = {name: mask.copy() for name, mask in phantom.masks.items()}
+    for mask in masks.values():
+        mask[..., middle % every_n :: every_n] = False
+    with pytest.raises(InputError, match="slices"):
+        prepare(write(replace(phantom, masks=masks), tmp_path))
+
+
+def test_a_label_that_no_segment_describes_is_refused_and_none_is_overlooked(phantom, tmp_path):
+    path = seg_nrrd(phantom, tmp_path)
+    text = path.read_bytes()
+    path.write_bytes(text.replace(b"Segment1_", b"Segment7_"))  # numbers need not be whole
+    assert sorted(volumes(prepare(path))) == pytest.approx(
+        sorted([KIDNEY_ML, *TUMORS_ML]), rel=0.03
+    )
+    start = text.index(b"Segment1_")
+    path.write_bytes(text[:start] + text[text.index(b"Segment2_") :])
+    with pytest.raises(InputError, match="label 1"):
+        prepare(path)
+
+
+@named
+def test_what_lies_in_the_organ_under_an_unknown_name_is_asked_for(phantom, tmp_path, write):
+    masks = {"kidney": phantom.masks["kidney"], "thing": phantom.masks["tumor_a"]}
+    path = write(replace(phantom, masks=masks), tmp_path)
+    number = 1 if write is files and "kidney" > "thing" else 2
+    with pytest.raises(InputError, match="thing"):
+        prepare(path)
+    case = prepare(path, PrepareOptions(tumor=number))
+    assert volumes(case)[1] == pytest.approx(TUMORS_ML[0], rel=0.03)
+
+
+@pytest.mark.parametrize(
+    ("name", "organ", "tumor"),
+    [
+        ("kidney", True, False), ("Kidneys", True, False), ("KidneyLeft", True, False),
+        ("kidney_segmentation", True, False), ("case_00001_kidney", True, False),
+        ("kidney tumor", False, True), ("TumorLeft", False, True), ("RCC", False, True),
+        ("GTV2", False, True), ("renal mass", False, True), ("adenocarcinoma", False, True),
+        ("metastasis 3", False, True), ("non-tumor kidney", False, False),
+        ("peritumoral fat", False, False), ("tumor-free rim", False, False),
+        ("biomass", False, False), ("mass effect", False, False), ("adrenal", False, False),
+    ],
+)  # fmt: skip
+def test_what_names_say(name, organ, tumor):
+    assert (is_organ(name, "kidney"), is_tumor(name)) == (organ, tumor)
+
+
+def test_a_solid_within_a_solid_is_refused_and_a_cavity_is_not(tmp_path):
+    import trimesh
+
+    outer, inner = trimesh.creation.icosphere(3, 30.0), trimesh.creation.icosphere(3, 10.0)
+    trimesh.util.concatenate([outer, inner]).export(tmp_path / "kidney.stl")
+    with pytest.raises(InputError, match="within another"):
+        prepare(tmp_path / "kidney.stl")
+    inner.invert()
+    trimesh.util.concatenate([outer, inner]).export(tmp_path / "kidney.stl")
+    assert volumes(prepare(tmp_path / "kidney.stl")) == pytest.approx(
+        [outer.volume / 1000], rel=0.01
+    )
+
+
+def test_meshes_beside_label_files_and_too_many_of_these_are_refused(phantom, tmp_path):
+    folder = files(phantom, tmp_path)
+    (folder / "tumor_b.nii.gz").rename(folder / "tumor_b.nii")
+    (folder / "tumor.stl").write_bytes(b"")
+    with pytest.raises(InputError, match="beside meshes"):
+        prepare(folder)
+    with pytest.raises(InputError, match="255"):
+        read_several([tmp_path / f"{n}.nii" for n in range(256)])
+
+
+def test_a_folder_of_masks_may_hold_other_files(phantom, tmp_path):
+    folder = files(phantom, tmp_path)
+    (folder / "statistics.json").write_text("{}")
+    case = prepare(folder)
+    assert volumes(case) == pytest.approx([KIDNEY_ML, *TUMORS_ML], rel=0.03)
+    assert any("statistics.json" in note for note in case.report["notes"])
+
+
+@named
+def test_a_side_that_the_names_deny_is_refused(phantom, tmp_path, write):
+    masks = {"kidney_right": phantom.masks["kidney"], "tumor": phantom.masks["tumor_a"]}
+    path = write(replace(phantom, masks=masks), tmp_path)
+    with pytest.raises(InputError, match="--side"):
+        prepare(path, PrepareOptions(side="left"))
+
+
+@pytest.mark.parametrize("flipped", [[1], [0, 1], [2]])
+def test_a_ct_stored_turned_to_its_labels_is_theirs(phantom, tmp_path, flipped):
+    labels, turned = phantom.map(), phantom.affine.copy()
+    for axis in flipped:
+        turned[:3, 3] += turned[:3, axis] * (labels.shape[axis] - 1)
+        turned[:3, axis] *= -1
+    write_nifti(tmp_path / "map.nii.gz", np.flip(labels, flipped), turned, "both")
+    hu = np.choose(labels, [-1000, 40, 570, 570]).astype(np.int16)
+    write_nifti(tmp_path / "ct.nii.gz", hu, phantom.affine, "both")
+    case = prepare(tmp_path / "map.nii.gz", PrepareOptions(ct=tmp_path / "ct.nii.gz"))
+    assert (case.ct.hu[case.labels.labels >= 2] == 570).all()
+    assert (case.ct.hu[case.labels.labels == 1] == 40).all()
+
+
+def test_stated_labels_are_of_a_label_map_however_many_it_has(phantom, tmp_path):
+    labels = phantom.map()
+    labels[0, 0, :60] = np.arange(60) + 100
+    many = replace(phantom, masks={"all": labels > 0})
+    write_nifti(tmp_path / "map.nii.gz", labels, many.affine, "both")
+    case = prepare(tmp_path / "map.nii.gz", PrepareOptions(organ=1, tumor=(2, 3)))
+    assert volumes(case) == pytest.approx([KIDNEY_ML, *TUMORS_ML], rel=0.03)
+
+
+def test_a_segmentation_of_a_tilted_gantry_lies_where_its_labels_lie(phantom, tmp_path):
+    pytest.importorskip("highdicom")
+    from tumortrack.imaging.segmentation_files import segments, write_dicom_seg
+
+    affine = phantom.affine.copy()
+    affine[1, 2] += 0.7
+    labels = LabelVolume(phantom.map(), affine)
+    paths = write_dicom(tmp_path / "ct", np.zeros(labels.labels.shape, np.int16), affine)
+    needed = "PatientName", "PatientBirthDate", "PatientSex", "StudyID", "StudyDate", "StudyTime"
+    needed += "AccessionNumber", "ReferringPhysicianName", "PatientID"
+    tags = dict.fromkeys(needed, lambda *_: "")
+    tags |= {"FrameOfReferenceUID": lambda *_: "1.2.7", "InstanceNumber": lambda n, _: n + 1}
+    retagged(paths, **tags, SliceThickness=lambda *_: VOXEL_MM)
+    path = tmp_path / "segmentation.dcm"
+    write_dicom_seg(path, labels, segments(("kidney", "tumor_1", "tumor_2")), tmp_path / "ct")
+    told = prepare(nifti(replace(phantom, affine=affine), tmp_path)).anatomy
+    for part, same in zip(told.parts, prepare(path).anatomy.parts, strict=True):
+        assert np.abs(part.box_mm - same.box_mm).max() < 0.1
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_labels_that_are_no_numbers_are_refused():
+    with pytest.raises(InputError, match="whole numbers"):
+        PrepareOptions(organ="1")

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from depth_files import write_intrinsics
 from tumortrack.core.errors import InputError
@@ -68,6 +69,13 @@ SPELLINGS: dict[str, Callable[[list[str]], bytes]] = {
     "commas at the end": lambda lines: "\n".join(line + ",," for line in lines).encode(),
     "empty rows": lambda lines: "\n\n,,,,\n".join([*lines, ""]).encode(),
     "quotes": lambda lines: "\n".join(f'"{line.replace(",", QUOTED)}"' for line in lines).encode(),
+    "semicolons": lambda lines: "\n".join(line.replace(",", ";") for line in lines).encode(),
+    "decimal commas": lambda lines: "\n".join(
+        line.replace(",", ";").replace(".", ",") for line in lines
+    ).encode(),
+    "tabs": lambda lines: "\n".join(line.replace(",", "\t") for line in lines).encode(),
+    "as Excel says it": lambda lines: "\n".join(["sep=,", *lines]).encode(),
+    "a comment": lambda lines: "\n".join(["# of today", *lines, "# the end"]).encode(),
     "capitals": lambda lines: "\n".join([lines[0].upper(), *lines[1:]]).encode(),
 }
 
@@ -113,6 +121,7 @@ FAULTS: dict[str, Callable[[Reader], list[str]]] = {
     "a cell too many": lambda r: [r.header, r.rows[0], f"{r.rows[1]},7"],
     "a cell too few": lambda r: [r.header, r.rows[0], r.rows[1].rpartition(",")[0]],
     "no number": lambda r: with_cell(r, "far"),
+    "a number of Python's alone": lambda r: with_cell(r, "1_5"),
     "an empty number": lambda r: with_cell(r, ""),
     "no rows": lambda r: [r.header],
     "nothing": lambda r: [],
@@ -157,6 +166,25 @@ def test_points_that_were_never_placed_are_left_out_and_counted(tmp_path):
     path.write_text("label,r,a,s,defined\nB,0,0,0,0\n")
     with pytest.raises(InputError):
         read_points(path)
+
+
+@pytest.mark.parametrize("text", ["0", "0.0", "False", "no"])
+def test_that_a_point_has_no_place_is_said_in_many_ways(text, tmp_path):
+    path = tmp_path / "points.csv"
+    path.write_text(f"label,r,a,s,defined\nA,1,2,3,1\nB,0,0,0,{text}\n")
+    assert len(read_points(path).points_ct) == 1
+
+
+def test_evidence_that_is_none_and_a_tiff_of_several_images_are_refused(tmp_path):
+    path = tmp_path / "e.json"
+    path.write_text('{"frame": "camera", "unit": "mm", "evidence": []}')
+    with pytest.raises(InputError, match="no evidence"):
+        read_evidence(path)
+    images = [Image.fromarray(DEPTHS.astype(np.uint16)) for _ in range(2)]
+    images[0].save(tmp_path / "d.tif", save_all=True, append_images=images[1:])
+    write_intrinsics(tmp_path / "i.json", CAMERA)
+    with pytest.raises(InputError, match="2 images"):
+        read_depth(tmp_path / "d.tif", tmp_path / "i.json")
 
 
 @pytest.mark.parametrize("read", [read_json, read_evidence, read_frames])
@@ -307,9 +335,12 @@ def test_what_easy_handeye_writes_is_read(style, moves, tmp_path):
         "no number": text.replace("0.5", "far"),
         "no quaternion": text.replace("1.0", "1.1").replace("qx: 1,", "qx: 2,"),
         "no z": text.replace("z: 0.9", "").replace("z: 9.0e-1", ""),
+        "a comment": text + "# x: 0.4, y: far\n",
         "two bases": text + "robot_base_frame: other\n",
         "mm": text.replace("0.5", "500"),
     }
+    path.write_text(wrong.pop("a comment"))
+    np.testing.assert_allclose(read_frames(path, moves).published_from_camera, half_turn)
     for name, told in wrong.items():
         path.write_text(told)
         with pytest.raises(InputError):

@@ -164,7 +164,7 @@ def test_an_answer_can_be_asked_again(tmp_path):
         ("x,y,z\n", "has no rows"),
         ("1,2,3\n4,5,6\n", "must name the columns x,y,z"),
         ("x,y\n1,2\n", "must name the columns x,y,z"),
-        ("x;y;z\n1;2;3\n", "separated by commas"),
+        ("x y z\n1 2 3\n", "separated by commas"),
         ("x,y,z,X\n1,2,3,4\n", "different names"),
         ("x,y,z\n1,2,3\n1,2\n", "line 3: 2 values in 3 columns"),
         ("x,y,z\n1,2,3\n1,2,nan\n", "line 3: .* NaN"),

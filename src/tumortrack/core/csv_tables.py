@@ -5,11 +5,14 @@ from __future__ import annotations
 import codecs
 import csv
 import io
+import re
 from decimal import Decimal, InvalidOperation
 from typing import NamedTuple
 
 from tumortrack.core.errors import InputError
 
+_STATED = re.compile(r"sep=.\r?\n")
+_DECIMAL = re.compile(r"^(-?\d*),(\d+)$")
 _UTF16 = codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE
 
 
@@ -26,15 +29,25 @@ class Rows(NamedTuple):
 
 
 def read_rows(content: bytes, name: str) -> Rows:
-    """A table as spreadsheets write it: UTF-8, or UTF-16 with its mark; spaces round cells, empty
-    rows, and commas at the ends of rows do not count.
+    """A table as spreadsheets write it: UTF-8, or UTF-16 with its mark; separated by commas, or by
+    semicolons or tabs, and then perhaps with decimal commas. Spaces round cells, empty rows, rows
+    that begin with #, and separators at the ends of rows do not count.
 
     Raises InputError: no text or table, no header, a column twice, a row with more or fewer cells.
     """
-    text = io.StringIO(text_of(content, name), newline="")
-    reader = csv.reader(text, strict=True, skipinitialspace=True)
+    text = text_of(content, name)
+    if stated := _STATED.match(text):  # as Excel writes it
+        text = f"\n{text[stated.end() :]}"
+    top = next((line for line in text.splitlines() if line.strip() and line[0] != "#"), "")
+    between = max(";\t,", key=top.count) if "," not in top else ","
+    reader = csv.reader(
+        io.StringIO(text, newline=""), strict=True, skipinitialspace=True, delimiter=between
+    )
     try:
         read = [(reader.line_num, [cell.strip() for cell in row]) for row in reader]
+        read = [(line, row) for line, row in read if not "".join(row[:1]).startswith("#")]
+        if between != ",":
+            read = [(line, [_DECIMAL.sub(r"\1.\2", cell) for cell in row]) for line, row in read]
     except csv.Error as error:
         raise InputError(f"{name}, line {reader.line_num}: {error}. Export it again.") from error
     lines = [(line, row) for line, row in read if any(row)]
@@ -69,6 +82,8 @@ def text_of(content: bytes, name: str) -> str:
 def number_in(text: str, where: str) -> float:
     """``where``: file, line and column, for the message."""
     try:
+        if "_" in text:  # which Python alone takes
+            raise ValueError
         return float(text)
     except ValueError as error:
         raise InputError(f"{where}: {text[:40]!r} is no number.") from error

@@ -159,6 +159,8 @@ def read_evidence(path: Path) -> tuple[Evidence, ...]:
             f"{path} is in frame {known.frame!r} and unit {known.unit!r}; allowed: frame "
             "'camera' (x right, y down, z forward) and unit 'mm'. Transform it first."
         )
+    if not known.evidence:
+        raise InputError(f"{path} holds no evidence. Leave it out, or add some.")
     for number, each in enumerate(known.evidence, start=1):
         if 0 < each.stamp_ns < known.still_since_ns:
             raise InputError(

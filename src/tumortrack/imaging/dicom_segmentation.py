@@ -52,13 +52,16 @@ def _read(path: Path, tags: Any) -> RawVolume:
     gaps = np.diff(np.unique(np.round(along, 3)))
     step = float(gaps.min() if len(gaps) else measures.SliceThickness)
     slices = (along - along.min()) / step
-    if np.abs(slices - np.rint(slices)).max() > _OFF_STEP:
+    first, last = positions[along.argmin()], positions[along.argmax()]
+    between = (last - first) / max(round(float(slices.max())), 1) if len(gaps) else normal * step
+    off_line = np.linalg.norm(positions - first - np.outer(np.rint(slices), between), axis=1)
+    if max(np.abs(slices - np.rint(slices)).max(), off_line.max() / step) > _OFF_STEP:
         raise InputError(f"{path}: its slices have no common step. Export it again, or as NIfTI.")
     index = np.rint(slices).astype(int) + 1
     lps_from_index = np.eye(4)
     between_rows, between_columns = map(float, measures.PixelSpacing)
-    axes = row * between_columns, column * between_rows, normal * step
-    lps_from_index[:3] = np.stack([*axes, positions[along.argmin()] - normal * step], axis=1)
+    axes = row * between_columns, column * between_rows, between
+    lps_from_index[:3] = np.stack([*axes, first - between], axis=1)
     shape = int(tags.Columns), int(tags.Rows), int(index.max()) + 2
     names = {int(s.SegmentNumber): str(s.SegmentLabel) for s in tags.SegmentSequence}
     numbers = [int(g("SegmentIdentificationSequence").ReferencedSegmentNumber) for g in groups]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -202,6 +203,7 @@ def closed_mesh(mesh: Mesh, name: str, notes: list[str]) -> Mesh:
         if body.volume_mm3 < 0 and not any((b[0] <= 0).all() and (b[1] >= 0).all() for b in boxes):
             bodies[n] = Mesh(body.vertices_mm, body.faces[:, ::-1])
             notes.append(f"{name}: a piece of {bodies[n].volume_ml:.2f} ml was inside out; turned")
+    _check_nested(bodies, name)
     out = _together(bodies)
     if abs(out.volume_mm3) < 1e-9 * size**3:
         raise InputError(f"{name} encloses no volume; it is no solid.")
@@ -209,6 +211,20 @@ def closed_mesh(mesh: Mesh, name: str, notes: list[str]) -> Mesh:
         out = _remesh(out, name, size / 120)
         notes.append(f"{name}: it crossed itself; remeshed at {size / 120:.2g} mm")
     return out
+
+
+def _check_nested(bodies: list[Mesh], name: str) -> None:
+    """Refuse a solid within another one, as of a tumor in its organ's file: it would be lost."""
+    for outer, inner in itertools.permutations(bodies, 2):
+        boxes = inner.box_mm - outer.box_mm
+        if inner.volume_mm3 <= 0 or not ((boxes[0] >= 0).all() and (boxes[1] <= 0).all()):
+            continue
+        both = solid_of(outer, name) ^ solid_of(inner, name)
+        if both.volume() > 0.9 * inner.volume_mm3:
+            raise InputError(
+                f"{name} holds a body of {inner.volume_ml:.2f} ml within another one. Give each "
+                "part as a file of its own, tumors with tumor in their names."
+            )
 
 
 def _together(bodies: list[Mesh]) -> Mesh:

@@ -118,7 +118,10 @@ class PrepareOptions:
 
 
 def _labels(given: int | tuple[int, ...]) -> tuple[int, ...]:
-    return (given,) if isinstance(given, int) else tuple(given or ())
+    numbers = (given,) if isinstance(given, int | str) else tuple(given or ())
+    if not all(isinstance(number, int) for number in numbers):
+        raise InputError(f"labels are whole numbers, not {numbers}.")
+    return numbers
 
 
 def parse_structures(options: tuple[str, ...], organ: str) -> StructureSources:

@@ -20,7 +20,7 @@ from tumortrack.core.organ import Organ
 from tumortrack.core.patient import UNKNOWN, Patient, Side
 from tumortrack.core.types import FIRST_TUMOR, ORGAN, Anatomy, LabelVolume, Mesh, Volume
 from tumortrack.imaging.case import Case
-from tumortrack.imaging.grid import check_suffix, grown_box, label_counts, voxel_ml
+from tumortrack.imaging.grid import check_suffix, grown_box, label_counts, tight_box, voxel_ml
 from tumortrack.imaging.hu_windows import segment_ct
 from tumortrack.imaging.meshes import LEAST_DROPPED_ML, label_meshes, natural_order, read_meshes
 from tumortrack.imaging.options import PrepareOptions, parse_structures
@@ -30,6 +30,7 @@ from tumortrack.imaging.structures import extent_report, read_structures, split_
 from tumortrack.imaging.surface import surfaces
 from tumortrack.imaging.symmetry import ambiguous, half_turns, warning
 from tumortrack.imaging.volume import (
+    is_dicom,
     is_label_map,
     is_volume,
     label_map,
@@ -43,6 +44,9 @@ _OF_CT, OF_LABELS = ("organ_hu", "tumor_hu"), ("labels", "organ", "tumor", "ct")
 _LEAST_ORGAN_OUTSIDE = 0.02  # of the outer surface
 _LARGEST_SHARE = 0.6  # of organ and tumors that one tumor may take without a note
 _OFF_GRID = 0.05  # of a voxel: rounding of affines in files
+_THICK_MM = 2.0  # the phantom's tumor of 29 ml is 37 ml by slices of 3 mm, 54 by 5 mm
+_SAME_DRAWN = 0.5  # of a slice's labels, that those beyond an empty one also have
+_FLAT = 0.6  # of the largest cross-section; whole organs end with less even where slices are thick
 _FEW = 8  # voxels on the image's border, as rounding and resampling leave them
 _ENCLOSED = 0.4  # share of a label's surface on the organ that only a tumor or a cyst has
 _USUAL_ML = {"kidney": (40.0, 800.0), "liver": (500.0, 3500.0), "prostate": (10.0, 300.0)}
@@ -61,6 +65,11 @@ def prepare(input: Path | Sequence[Path], options: PrepareOptions | None = None)
         if len(files) == 1:
             paths = files
         is_meshes = any(path.suffix.lower() in SUFFIXES for path in files)
+        if is_meshes and (volumes := [path.name for path in files if is_volume(path)]):
+            raise InputError(
+                f"{', '.join(volumes[:3])} lies beside meshes. Give the parts either all as meshes "
+                "or all as label files."
+            )
         for path in files if is_meshes or len(paths) > 1 else []:
             check_suffix(path)
         case = _from_meshes(files, options) if is_meshes else _from_volume(paths, files, options)
@@ -163,17 +172,25 @@ def _from_volume(paths: list[Path], files: list[Path], options: PrepareOptions) 
     path = paths[0]
     if not path.is_dir():
         refuse_unused(f"{path} is one file", options, "series")
-    several = len(paths) > 1 or (path.is_dir() and all(map(is_volume, files)))
-    raw = read_several(files) if several else read_raw(path, options.series)
-    is_labels = bool(raw.segments) or (path.is_file() and is_label_map(raw))
-    as_labels = options.labels or is_labels
+    volumes = [file for file in files if is_volume(file)]
+    others = [file for file in files if not is_volume(file)]
+    several = len(paths) > 1 or (path.is_dir() and volumes and not any(map(is_dicom, others)))
+    raw = (
+        read_several(volumes if path.is_dir() else files)
+        if several
+        else read_raw(path, options.series)
+    )
+    stated = options.labels or bool(options.organs) or options.tumors is not None
+    as_labels = stated or bool(raw.segments) or (path.is_file() and is_label_map(raw))
     structures: dict[str, Mesh] = {}
     ct, notes = None, list(raw.notes)
+    if several and path.is_dir() and others:
+        notes.append(f"no label files, left out: {', '.join(f.name for f in others[:5])}")
     file_patient, side = raw.patient, options.stated_side
     shape, affine = raw.array.shape, raw.lps_from_index
     if as_labels:
         refuse_unused(f"{path} is read as a label map", options, *_OF_CT, "unit")
-        if not (options.labels or raw.segments):
+        if not (stated or raw.segments):
             notes.append("few distinct whole numbers: read as a label map, not as a CT")
         parts = parts_of(raw, options, str(path))
         source = label_map(raw, parts, path)
@@ -188,7 +205,10 @@ def _from_volume(paths: list[Path], files: list[Path], options: PrepareOptions) 
             volume, options.organ_hu, options.tumor_hu, options.min_tumor_ml, options.kind
         )
         ct = crop_ct(volume, labels)
-    notes += [*more, *_cut(options.kind.words, labels, shape, affine)]
+        thickest_mm = float(spacing_mm(affine).max())
+        more += [CaseWarning("thick", mm=thickest_mm)] if thickest_mm > _THICK_MM else []
+    cut = _cut(options.kind.words, labels, shape, affine)
+    notes += [*more, *(cut or _flat(options.kind.words, labels))]
     anatomy, surface = surfaces(labels, options.kind)
     anatomy = replace(anatomy, structures=structures)
     notes += [
@@ -220,6 +240,7 @@ def _selected(
         raise InputError(
             f"{path} is a tumor by its name, and holds nothing else. Give the organ's file as well."
         )
+    _check_every_slice(volume.labels == organ, path)
     source, structures = split_structures(volume, parts.structures, organ)
     selection = options.stated_side, organ, tumors, options.min_tumor_ml, options.kind
     chosen, notes, side = select_labels(source, *selection)
@@ -256,6 +277,42 @@ def _cut(
     return [warning] if voxels > _FEW else []
 
 
+def _check_every_slice(organ: np.ndarray, path: Path) -> None:
+    """Refuse an organ that was drawn in some slices alone: in a gap it has nothing, and the same on
+    either side."""
+    for axis in range(3):
+        slices = np.moveaxis(organ[tight_box(organ)], axis, 0)
+        voxels = slices.sum((1, 2))
+        gaps = [
+            n
+            for n in np.flatnonzero(voxels == 0).tolist()
+            if np.count_nonzero(slices[n - 1] & slices[min(n + 1, len(slices) - 1)])
+            > _SAME_DRAWN * max(voxels[n - 1], 1)
+        ]
+        if gaps:
+            first = tight_box(organ)[axis].start + gaps[0]
+            raise InputError(
+                f"{path}: {len(gaps)} slices between drawn ones are empty (index {first}, the first"
+                ' of them). Fill between slices (3D Slicer: Segment Editor, "Fill between slices").'
+            )
+
+
+def _flat(name: str, labels: LabelVolume) -> list[CaseWarning]:
+    """A warning where the organ ends in a plane of the grid, with hardly less than its middle."""
+    solid, worst_mm2 = labels.labels > 0, 0.0
+    affine = labels.lps_from_index
+    for axis in range(3):
+        face_mm2 = float(np.linalg.norm(np.cross(*np.delete(affine[:3, :3], axis, axis=1).T)))
+        voxels = np.moveaxis(solid, axis, 0).sum((1, 2))
+        drawn = voxels[voxels > 0]
+        worst_mm2 = max(
+            [worst_mm2]
+            + [face_mm2 * float(end) for end in drawn[[0, -1]] if end > _FLAT * drawn.max()]
+        )
+    warning = CaseWarning("flat", part=name, area_cm2=worst_mm2 / 100)
+    return [warning] if worst_mm2 else []
+
+
 def _unusual(kind: Organ, measured: dict[str, Any]) -> list[CaseWarning]:
     low, high = _USUAL_ML.get(kind.name, (0.0, np.inf))
     ml = measured["volumes_ml"][kind.name]
@@ -281,7 +338,7 @@ def _from_meshes(files: list[Path], options: PrepareOptions) -> Case:
     labels = label_meshes(anatomy)
     mesh_ml = [part.volume_ml for part in anatomy.parts]
     measured = _measured(labels, anatomy, {"names": list(anatomy.names), "mesh_ml": mesh_ml})
-    notes += _unusual(options.kind, measured)
+    notes += [*_flat(options.kind.words, labels), *_unusual(options.kind, measured)]
     patient = Patient(options.patient or UNKNOWN, options.stated_side)
     report = {"kind": "meshes", "notes": notes, **measured}
     return Case(anatomy, labels, direction_lps(options.up), report, patient=patient)
@@ -306,6 +363,7 @@ def _with_ct(case: Case, path: Path) -> Case:
     its end. Raises InputError."""
     raw = read_raw(path)
     volume = volume_of(raw, path)
+    volume = turned_as(volume, case.labels.lps_from_index)
     steps = np.linalg.inv(volume.lps_from_index) @ case.labels.lps_from_index
     if np.abs(steps - np.rint(steps)).max() > _OFF_GRID or not np.allclose(
         steps[:3, :3], np.eye(3), atol=_OFF_GRID / max(case.labels.labels.shape)
@@ -321,6 +379,16 @@ def _with_ct(case: Case, path: Path) -> Case:
         words = case.anatomy.kind.words
         notes = [*notes, *_cut(words, case.labels, volume.hu.shape, volume.lps_from_index)]
     return replace(case, ct=crop_ct(volume, case.labels), report={**case.report, "notes": notes})
+
+
+def turned_as(volume: Volume, affine: np.ndarray) -> Volume:
+    """The volume with its axes in the order and direction of those of ``affine``, where they are
+    parallel: programs store a CT and its labels turned to either side."""
+    from nibabel.orientations import apply_orientation, inv_ornt_aff, io_orientation
+
+    turn = io_orientation(np.linalg.inv(affine) @ volume.lps_from_index)
+    back = inv_ornt_aff(turn, volume.hu.shape)
+    return Volume(apply_orientation(volume.hu, turn), volume.lps_from_index @ back)
 
 
 def _start(affine: np.ndarray, labels: LabelVolume) -> list[int]:

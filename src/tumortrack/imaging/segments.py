@@ -3,31 +3,59 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import UInt8
 
 from tumortrack.core.errors import InputError
+from tumortrack.core.patient import UNKNOWN, Side
 from tumortrack.core.types import ORGAN
 from tumortrack.imaging.grid import RawVolume, Segment
 from tumortrack.imaging.options import PrepareOptions, StructureSources, parse_structures
 
-_TUMOR = re.compile("tumou?r|neoplasm|lesion|cancer|carcinoma|metasta|mass")
-_ALSO = {"left", "right", "l", "r", "organ", "whole", "parenchyma", "mask", "seg", "label"}
+_TUMOR = re.compile(
+    r"(tumou?r|lesion|cancer|mass|nodule|rcc|aml|gtv|\w*(carcinoma|adenoma|oncocytoma|angiomyolipoma|"
+    r"lipoma))s?|neoplas\w+|metasta\w+"
+)
+_NO_TUMOR = {"no", "non", "not", "without", "free", "peri", "bed", "rim", "margin", "effect"}
+_SIDES: dict[str, Side] = {"left": "left", "l": "left", "right": "right", "r": "right"}
+_ALSO = {*_SIDES, "organ", "whole", "parenchyma", "mask", "seg", "segment", "segmentation", "label"}
+_ALSO |= {"case", "patient", "copy", "final", "manual", "volume", "model"}
+
+
+def words_of(name: str) -> set[str]:
+    """The words of a name such as kidney_left_2 or TumorLeft, in lower case."""
+    apart = re.sub(r"(?<=[a-z])(?=[A-Z])", " ", name)
+    return set(filter(None, re.split(r"[^a-z]+", apart.lower())))
 
 
 def is_tumor(name: str) -> bool:
-    return bool(_TUMOR.search(name.lower()))
+    words = words_of(name)
+    return any(map(_TUMOR.fullmatch, words)) and not words & _NO_TUMOR
 
 
 def is_organ(name: str, organ: str) -> bool:
     """Whether a label's name says ``organ`` and, but for the side, nothing else."""
-    words = set(filter(None, re.split(r"[^a-z]+", name.lower())))
+    words = {word.removesuffix("s") if word[:-1] in organ else word for word in words_of(name)}
     wanted = set(organ.split("_"))
     said = wanted if wanted <= words else {"organ"} & words
     return bool(said) and words - said <= _ALSO and not is_tumor(name)
+
+
+def check_side(names: Iterable[str], side: Side) -> None:
+    """Raises InputError: the organ's names say the other side than was stated."""
+    for name in names:
+        said = {_SIDES[word] for word in words_of(name) if word in _SIDES}
+        if side != UNKNOWN and said and side not in said:
+            raise InputError(
+                f"{name!r} is the {said.pop()} one by its name; --side says {side}. Correct one."
+            )
+
+
+_INSIDE = 0.4  # of a segment: what only overlaps the organ's border has less
 
 
 class Parts(NamedTuple):
@@ -61,11 +89,30 @@ def parts_of(raw: RawVolume, options: PrepareOptions, where: str) -> Parts:
             f"{where} holds {listing}: none is a {options.kind.words} by name. Say which is: "
             "--organ NUMBER, or --name of another organ."
         )
+    check_side((names[n] for n in organ if n in names), options.stated_side)
     if tumors is None:
         tumors = tuple(n for n in names if is_tumor(names[n]) and n not in organ)
+        _check_inside(raw, organ, {*tumors, *structures.values()}, where)
     taken = [" and ".join(names.get(n, f"{n}") for n in of) or "none" for of in (organ, tumors)]
     note = f"organ: {taken[0]}; tumors: {taken[1]}; of {listing}"
     return Parts(organ, tumors, structures, names, note)
+
+
+def _check_inside(
+    raw: RawVolume, organ: tuple[int, ...], used: set[int | Path], where: str
+) -> None:
+    """Refuse a segment that lies in the organ, where it would be lost, and that nobody named."""
+    inside = painted([s for s in raw.segments if s.number in organ], organ) > 0
+    for segment in raw.segments:
+        if segment.number in used or segment.number in organ:
+            continue
+        mask = segment.mask()
+        if int(np.count_nonzero(mask & inside)) > _INSIDE * max(int(np.count_nonzero(mask)), 1):
+            raise InputError(
+                f"{where}: {segment.number} {segment.name} lies in the organ, and its name does "
+                f"not say what it is. Give --tumor {segment.number} with the other tumors, --organ "
+                f"{segment.number} as well if it is part of the organ, or --tumor 0."
+            )
 
 
 def painted(

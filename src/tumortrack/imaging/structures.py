@@ -26,6 +26,7 @@ TRUSTED_MM = 5.0  # outside the organ; farther out the motion is a guess
 _APART_MM = 50.0  # from the organ; farther away it must be in another frame or unit
 _BAY_MM = 5.0  # half the width of a structure that runs into the organ and counts as organ there
 _STEP_MM = 1.0
+_LEAST_MM = 1.0  # of a structure's extent
 _MOST_FACES = 200_000
 
 
@@ -64,6 +65,11 @@ def read_structures(
     for name, path in sources.items():
         if isinstance(path, Path):
             meshes[name] = read_lps(path, 1000.0 if unit == "m" else 1.0, notes)
+            if meshes[name].longest_mm < _LEAST_MM:
+                raise InputError(
+                    f"{path} is {meshes[name].longest_mm:.3g} mm long: it looks like metres. Give "
+                    "--unit m, with all meshes in metres."
+                )
             if len(meshes[name].faces) > _MOST_FACES:
                 raise InputError(f"{path} has over {_MOST_FACES} triangles. Reduce it first.")
     return meshes, notes

@@ -29,8 +29,7 @@ _MOST_LABELS = 32  # distinct values that still look like a label map
 _SAME_MM = 0.01  # of the grids of several files
 _OFF_WHOLE = 1e-3  # of labels that were stored with a scale, as 1.00000002
 _MAX_HEADER = 2**20
-_MOST_SEGMENTS = 1000
-_SEGMENT = re.compile(r"Segment\d+_")
+_SEGMENT = re.compile(r"segment(\d+)_(id)?", re.IGNORECASE)
 _IS_GZIP = {"raw": False, "gzip": True, "gz": True}
 _NAMES = read_table("tumortrack.imaging", "nrrd_types.toml", dict[str, list[str]])
 _TYPES = {name: dtype for dtype, names in _NAMES.items() for name in names}
@@ -52,7 +51,7 @@ def read_raw(path: Path, series: str | None = None) -> grid.RawVolume:
         raise InputError(f"{path} does not exist or is no file (but a pipe or a device).")
     if path.stat().st_size == 0:
         raise InputError(f"{path} is empty (0 bytes).")
-    if name.endswith((".dcm", ".ima")) or _is_dicom(path):
+    if name.endswith((".dcm", ".ima")) or is_dicom(path):
         return read_segmentation(path) or read_dicom(path, series)
     if name.endswith((".nii", ".nii.gz")):
         return read_nifti(path)
@@ -69,9 +68,14 @@ def read_raw(path: Path, series: str | None = None) -> grid.RawVolume:
     )
 
 
-def _is_dicom(path: Path) -> bool:
+def is_dicom(path: Path) -> bool:
     with path.open("rb") as stream:
         return stream.read(132)[128:] == b"DICM"
+
+
+def stem(path: Path) -> str:
+    """A volume's name without its suffixes."""
+    return re.sub(r"(\.seg)?\.(nii|nii\.gz|nrrd)$", "", path.name, flags=re.IGNORECASE)
 
 
 def is_volume(path: Path) -> bool:
@@ -141,6 +145,8 @@ def label_map(raw: grid.RawVolume, parts: Parts, path: Path) -> LabelVolume:
 def read_several(files: Sequence[Path]) -> grid.RawVolume:
     """Label files with one structure each, numbered in their order and named as the files. Raises
     InputError: several labels in one, different grids."""
+    if len(files) > 255:
+        raise InputError(f"{len(files)} label files were given; at most 255 are read at once.")
     first = read_raw(files[0])
 
     def mask(file: Path) -> np.ndarray:
@@ -158,7 +164,7 @@ def read_several(files: Sequence[Path]) -> grid.RawVolume:
             )
         return labels > 0
 
-    names = [file.name.split(".")[0] for file in files]
+    names = [stem(file) for file in files]
     segments = tuple(
         grid.Segment(n, name, partial(mask, file))
         for n, (name, file) in enumerate(zip(names, files, strict=True), 1)
@@ -209,11 +215,10 @@ def _read_nrrd(path: Path) -> grid.RawVolume:
 
 def _segments(path: Path, fields: dict[str, str], layers: np.ndarray) -> tuple[grid.Segment, ...]:
     """Of a .seg.nrrd; numbered by their label values, where these differ, else in their order.
-    Raises InputError: two are the same label of the same layer."""
+    Raises InputError: two are the same label of the same layer, or a label is no segment's."""
     found: dict[tuple[int, int], str] = {}
-    for n in range(_MOST_SEGMENTS):
-        if f"segment{n}_id" not in fields:
-            break
+    matches = (_SEGMENT.fullmatch(field) for field in fields)
+    for n in sorted(int(match[1]) for match in matches if match):
         value, layer, name = (
             fields.get(f"segment{n}_{key}", default)
             for key, default in (("labelvalue", "1"), ("layer", str(n)), ("name", ""))
@@ -232,7 +237,16 @@ def _segments(path: Path, fields: dict[str, str], layers: np.ndarray) -> tuple[g
                 "layer. Export it again."
             )
         found[place] = name or fields[f"segment{n}_id"]
+    for at, array in enumerate(layers if found else ()):
+        known = [0, *(number for own_layer, number in found if own_layer == at)]
+        if others := np.setdiff1d(array, known).tolist():
+            raise InputError(
+                f"{path}: none of its segments is label {others[0]:g}, which its voxels have. "
+                "Export it again with all segments."
+            )
     values = [value for _, value in found]
+    if len(found) > 255:
+        raise InputError(f"{path} has {len(found)} segments; at most 255 are read.")
     own = len(set(values)) == len(values) and all(0 < value < 256 for value in values)
     return tuple(
         grid.Segment(place[1] if own else n, name, partial(_equal, layers[place[0]], place[1]))
@@ -274,7 +288,7 @@ def _lps_from_index(path: Path, fields: dict[str, str]) -> np.ndarray:
     units = fields.get("space units", "").replace('"', " ").split()
     if any(unit.lower() not in ("mm", "millimeter", "millimetre") for unit in units):
         raise InputError(f"{path} states its units as {units}; millimetres are needed.")
-    directions = fields["space directions"].removeprefix("none")  # of the axis of layers
+    directions = fields["space directions"].replace("none", "")  # of the axis of layers
     columns = [_vector(part) for part in directions.split(")") if part.strip()]
     lps_from_index = np.eye(4)
     lps_from_index[:3, :3] = np.array(columns).T

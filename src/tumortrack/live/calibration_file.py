@@ -110,7 +110,8 @@ def read_frames(path: Path, moves: bool = False) -> PublishedFrame:
 def _easy_handeye(path: Path) -> dict[str, Any]:
     """The keys of a ``CalibrationFile`` from what easy_handeye writes, which is in metres."""
     found, within = dict[str, str](), ""
-    for key, value in _PAIR.findall(text_of(read_file(path, _LARGEST_YAML), str(path))):
+    text = re.sub(r"(?m)(^|\s)#.*$", "", text_of(read_file(path, _LARGEST_YAML), str(path)))
+    for key, value in _PAIR.findall(text):
         within = key if not value else within
         name = f"q{key}" if within == "rotation" and key in "xyzw" else key
         if value and found.setdefault(name, value.strip("\"'")) != value.strip("\"'"):

@@ -354,6 +354,8 @@ def _image(path: Path, size: tuple[int, int]) -> tuple[np.ndarray, str]:
     try:
         content = io.BytesIO(read_file(path, LARGEST_FILE))
         image = Image.open(content, formats=["PNG", "TIFF", "BMP"])
+        if (count := getattr(image, "n_frames", 1)) > 1:
+            raise InputError(f"{path} holds {count} images. Save the one that is meant.")
         if image.size == size:  # known from the header, before anything is decoded
             opaque = image.convert("RGB") if image.mode in ("RGBA", "LA", "PA") else image
             return np.asarray(opaque), image.mode

@@ -23,7 +23,7 @@ import msgspec
 import numpy as np
 from jaxtyping import Float, Float64
 
-from tumortrack.core.csv_tables import read_rows, text_of
+from tumortrack.core.csv_tables import number_in, read_rows, text_of
 from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.estimate import Motion
 from tumortrack.core.store import read_file
@@ -38,6 +38,7 @@ _NAMINGS: dict[tuple[str, str, str], tuple[int, int, int]] = {
     ("l", "p", "s"): (1, 1, 1),
     ("r", "a", "s"): (-1, -1, 1),
 }
+_NOT_PLACED = "0", "0.0", "false", "no"  # as programs write it in that column
 _DEFINED = "defined"  # a column of 3D Slicer's tables: 0 where a point was never placed
 _ADDED = ("camera_x", "camera_y", "camera_z", "std_mm")
 _Signs = tuple[float, float, float]
@@ -83,7 +84,7 @@ def _parse_csv(content: bytes, name: str) -> PointTable:
             "(or ct_x,ct_y,ct_z: LPS, mm), separated by commas."
         )
     place = columns.get(_DEFINED)
-    rows = [(line, row) for line, row in table.rows if place is None or row[place] != "0"]
+    rows = [row for row in table.rows if place is None or row[1][place].lower() not in _NOT_PLACED]
     without = len(table.rows) - len(rows)
     points = [
         _numbers_of([row[columns[axis]] for axis in naming], f"{name}, line {line}")
@@ -198,8 +199,8 @@ def _numbers_of(texts: list[str], where: str) -> tuple[float, float, float]:
     """Three finite numbers; ``where``: in the file, for messages."""
     shown = ", ".join(texts)[:80]
     try:
-        x, y, z = (float(text) for text in texts)
-    except ValueError as error:
+        x, y, z = (number_in(text, where) for text in texts)
+    except (InputError, ValueError) as error:
         raise InputError(f"{where}: {shown!r} is no point: it takes x, y, z as numbers.") from error
     if not np.abs([x, y, z]).max() < _LARGEST_MM:  # also false for NaN
         raise InputError(

@@ -8,6 +8,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
+import numpy as np
+
 from tumortrack.core.errors import InputError
 from tumortrack.core.mesh_files import read_anatomy
 from tumortrack.core.store import natural, read_json
@@ -18,6 +20,9 @@ from tumortrack.simulate.scene_folder import organ_of_folder
 
 INTRINSICS, DEPTH, CLOUD, META = "intrinsics.json", "depth.png", "cloud.ply", "meta.json"
 ABOUT = "recording.json"  # of the sink ``recording``
+
+
+_OTHER_IMAGE = re.compile(r"(colou?r|rgb|mask|infra(red)?|ir)(?![a-z])", re.IGNORECASE)
 
 
 class RecordedFrame(NamedTuple):
@@ -33,13 +38,14 @@ def folder_frames(path: Path, fps: float, unit: Literal["mm", "m"]) -> list[Reco
 
     Scene folders (with depth.png and intrinsics.json, or cloud.ply), depth images with one
     intrinsics.json, or clouds (in ``unit``). Stamps: ``stamp_ns`` of a scene's
-    meta.json, or file names of at least 12 digits, in ns; else ``fps`` frames a second. Raises
-    InputError if there are none of these.
+    meta.json, or file names of at least 12 digits, in ns, us or ms, as their distance tells; else
+    ``fps`` frames a second. Raises InputError if there are none of these.
     """
     listed = path.iterdir() if path.is_dir() else ()
     inside = sorted((p for p in listed if not p.name.startswith(".")), key=natural)
     scenes = [p for p in inside if (p / DEPTH).is_file() or (p / CLOUD).is_file()]
     images = [p for p in inside if p.suffix.lower() in files.DEPTH_SUFFIXES and p.is_file()]
+    images = [p for p in images if not _OTHER_IMAGE.match(p.stem)]
     clouds = [p for p in inside if p.suffix.lower() in files.CLOUD_SUFFIXES and p.is_file()]
     camera, image, cloud = path / INTRINSICS, files.read_depth_png, files.read_cloud
     kinds: list[tuple[list[Path], Callable[[Path], Observation]]] = [
@@ -61,12 +67,24 @@ def folder_frames(path: Path, fps: float, unit: Literal["mm", "m"]) -> list[Reco
             "folder, .mcap, .db3 or .bag."
         )
     named = all(re.fullmatch(r"[0-9]{12,}", p.stem) for p in frame_paths)  # fewer: a number
+    apart = np.median(np.diff([int(p.stem) for p in frame_paths])) if named else 0
+    unit_ns = (
+        1 if apart >= 1e6 else 1000 if apart >= 1000 else 10**6
+    )  # frames are 1 ms to 1 s apart
+    if len(frame_paths) < 2:
+        unit_ns = 1
     period_ns, last_ns, frames = round(1e9 / fps), 0, []
     for file in frame_paths:
-        known_ns = _scene_stamp(file) if scenes else int(file.stem) if named else None
+        known_ns = _scene_stamp(file) if scenes else unit_ns * int(file.stem) if named else None
         last_ns = last_ns + period_ns if known_ns is None else known_ns
         frames.append(RecordedFrame(last_ns, partial(read, file)))
     return frames
+
+
+def _unit_ns(stamps: list[int]) -> int:
+    """Of stamps in ns, us or ms, of frames that are 1 ms to 1 s apart."""
+    apart = float(np.median(np.diff(stamps))) if len(stamps) > 1 else 1e6
+    return 1 if apart >= 1e6 else 1000 if apart >= 1000 else 10**6
 
 
 def _scene_stamp(folder: Path) -> int | None:
