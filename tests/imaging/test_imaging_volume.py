@@ -1,7 +1,6 @@
 """Readers: the same object lands at the same LPS points, whatever file it came in."""
 
 import gzip
-import shutil
 
 import numpy as np
 import pytest
@@ -100,6 +99,8 @@ def test_sheared_slices_of_a_tilted_gantry_keep_their_place(tmp_path):
 
 
 def test_dicom_gaps_doubles_and_strays_are_refused_with_their_place(tmp_path):
+    import pydicom
+
     affine = GRIDS["LPS"]
     array = blob_array(affine, SHAPE)
     files = write_dicom(tmp_path / "gap", array, affine)
@@ -108,7 +109,9 @@ def test_dicom_gaps_doubles_and_strays_are_refused_with_their_place(tmp_path):
     with pytest.raises(InputError, match=f"missing after position {at:.2f} mm"):
         read_volume(tmp_path / "gap")
     write_dicom(tmp_path / "twice", array, affine)
-    shutil.copy(next((tmp_path / "twice").iterdir()), tmp_path / "twice" / "copy")
+    copy = pydicom.dcmread(next((tmp_path / "twice").iterdir()))
+    copy.SOPInstanceUID = "1.2.9"  # another image at the same place
+    copy.save_as(tmp_path / "twice" / "copy")
     with pytest.raises(InputError, match="two slices lie at position"):
         read_volume(tmp_path / "twice")
 

@@ -626,3 +626,27 @@ def test_a_segmentation_of_a_tilted_gantry_lies_where_its_labels_lie(phantom, tm
 def test_labels_that_are_no_numbers_are_refused():
     with pytest.raises(InputError, match="whole numbers"):
         PrepareOptions(organ="1")
+
+
+def test_a_slice_that_is_there_twice_is_read_once(phantom, tmp_path):
+    paths, hu = slices(phantom, tmp_path / "ct")
+    (tmp_path / "ct" / "copy").write_bytes(paths[5].read_bytes())
+    raw = read_raw(tmp_path / "ct")
+    assert np.array_equal(raw.array, hu)
+    assert any("twice" in note for note in raw.notes)
+
+
+def test_another_organ_by_its_files_name_is_asked_for(phantom, tmp_path):
+    path = nifti(phantom, tmp_path).rename(tmp_path / "liver.nii.gz")
+    with pytest.raises(InputError, match="--name liver"):
+        prepare(path)
+    assert prepare(path, PrepareOptions(name="liver")).anatomy.names[0] == "liver"
+    path.rename(tmp_path / "kidney_beside_liver.nii.gz")
+    assert len(volumes(prepare(tmp_path / "kidney_beside_liver.nii.gz"))) == 3
+
+
+def test_thick_slices_of_a_ct_are_told(tmp_path):
+    volume = phantom_labels(PhantomParameters(), VOXEL_MM)
+    hu = np.choose(np.pad(volume.labels, 8), [-1000, 40, 570, 570]).astype(np.int16)
+    write_nifti(tmp_path / "ct.nii.gz", hu, volume.lps_from_index, "both")
+    assert kinds(prepare(tmp_path / "ct.nii.gz"))["thick"]["mm"] == pytest.approx(VOXEL_MM)

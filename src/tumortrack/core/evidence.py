@@ -152,7 +152,8 @@ def _tuples(places: np.ndarray) -> Any:
 def read_evidence(path: Path) -> tuple[Evidence, ...]:
     """Of a JSON file, see ``EvidenceFile``, or a table (.csv), a row for each place. Raises
     InputError: missing, another frame or unit, a value that is not allowed."""
-    given = _table(path) if path.suffix.lower() == ".csv" else store.read_json(path)
+    is_table = path.suffix.lower() in (".csv", ".tsv", ".txt")
+    given = _table(path) if is_table else store.read_json(path)
     known = from_builtins(given, EvidenceFile, str(path))
     if (known.frame, known.unit) != ("camera", "mm"):
         raise InputError(

@@ -20,6 +20,7 @@ _TAKEN = (  # names of files, topics and report entries that are not parts
     *("points", "quality", "state", "status", "strokes", "targets", "workcell"),
 )
 _TERMS = read_table("tumortrack.core", "organs.toml", dict[str, tuple[str, str]])
+KNOWN = frozenset(_TERMS)  # names
 _UNNAMED = ("113343008", "Organ")
 _IN_PAIRS = ("adrenal_gland", "breast", "kidney", "lung", "ovary", "testis")
 

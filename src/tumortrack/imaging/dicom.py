@@ -52,6 +52,7 @@ class _Slice:
     patient_id: str
     laterality: str  # L, R or something else
     frame: int  # of its file
+    instance: str  # SOPInstanceUID
     classic: bool  # its file has no other frame
 
 
@@ -83,13 +84,16 @@ def find_series(folder: Path, series: str | None = None) -> Series:
     """
     groups, notes = _groups(folder)
     chosen = _choose(folder, groups, series)
-    first = chosen[0]
-    _check_tags(folder, chosen)
+    different = [*{(s.instance, s.frame): s for s in chosen}.values()]
+    if copies := len(chosen) - len(different):
+        notes += (f"{copies} slices are there twice (SOPInstanceUID): one of each is read",)
+    first = different[0]
+    _check_tags(folder, different)
     row, column = np.reshape(first.orientation, (2, 3))
     normal = np.cross(row, column)
     if not 0.99 < np.linalg.norm(normal) < 1.01:
         raise InputError(f"{first.path}: ImageOrientationPatient is not two unit directions.")
-    slices = sorted(chosen, key=lambda s: float(np.dot(s.position_mm, normal)))
+    slices = sorted(different, key=lambda s: float(np.dot(s.position_mm, normal)))
     between_rows, between_columns = first.spacing_mm
     lps_from_index = np.eye(4)  # index i runs along a row
     axes = (row * between_columns, column * between_rows, _slice_step(slices, normal))
@@ -262,6 +266,7 @@ def _read_tags(path: Path) -> list[_Slice] | str:
                     patient_id=patient_id.strip()[:64].strip(),  # as long as the standard allows
                     laterality=str(tags.get("ImageLaterality") or tags.get("Laterality") or ""),
                     frame=frame,
+                    instance=str(tags.get("SOPInstanceUID") or path),
                     classic=count == 1,
                 )
                 slices.append(made)

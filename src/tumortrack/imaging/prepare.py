@@ -24,7 +24,7 @@ from tumortrack.imaging.grid import check_suffix, grown_box, label_counts, tight
 from tumortrack.imaging.hu_windows import segment_ct
 from tumortrack.imaging.meshes import LEAST_DROPPED_ML, label_meshes, natural_order, read_meshes
 from tumortrack.imaging.options import PrepareOptions, parse_structures
-from tumortrack.imaging.segments import Parts, is_tumor, parts_of
+from tumortrack.imaging.segments import Parts, is_tumor, other_organ, parts_of
 from tumortrack.imaging.select import neighbours, select_labels
 from tumortrack.imaging.structures import extent_report, read_structures, split_structures
 from tumortrack.imaging.surface import surfaces
@@ -64,6 +64,11 @@ def prepare(input: Path | Sequence[Path], options: PrepareOptions | None = None)
         files = _files_in(paths)
         if len(files) == 1:
             paths = files
+        if len(files) == 1 and (other := other_organ(files[0].stem, options.name)):
+            raise InputError(
+                f"{files[0]} is of a {other} by its name, and this of a {options.name}. Give "
+                f"--name {other}, or another file."
+            )
         is_meshes = any(path.suffix.lower() in SUFFIXES for path in files)
         if is_meshes and (volumes := [path.name for path in files if is_volume(path)]):
             raise InputError(

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from tumortrack.core.errors import InputError
+from tumortrack.core.organ import KNOWN
 from tumortrack.core.patient import UNKNOWN, Side
 from tumortrack.core.types import ORGAN
 from tumortrack.imaging.grid import RawVolume, Segment
@@ -43,6 +44,13 @@ def is_organ(name: str, organ: str) -> bool:
     wanted = set(organ.split("_"))
     said = wanted if wanted <= words else {"organ"} & words
     return bool(said) and words - said <= _ALSO and not is_tumor(name)
+
+
+def other_organ(name: str, organ: str) -> str:
+    """Which organ a file's name says, where it says another one alone; else empty."""
+    words = words_of(name)
+    others = sorted(KNOWN & words)
+    return others[0] if len(others) == 1 and not set(organ.split("_")) & words else ""
 
 
 def check_side(names: Iterable[str], side: Side) -> None:

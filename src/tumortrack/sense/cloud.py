@@ -24,6 +24,9 @@ _LONGEST_M = 0.6  # longest organ in metres; in inches no organ's side is shorte
 _THINNEST_MM, _THINNEST = 1.0, 0.1
 
 
+_LEAST_FAR_MM = 5.0  # no camera sees so near
+
+
 class CloudConfig(Config, frozen=True, kw_only=True):
     """Depths strictly between near and far (mm) become the cloud. The defaults are the paper's."""
 
@@ -175,6 +178,10 @@ def _check_range(near_mm: float, far_mm: float) -> None:
     if not 0 <= near_mm < far_mm < np.inf:
         raise InputError(
             f"the depth range {near_mm:g}..{far_mm:g} mm is empty; allowed: 0 <= near < far."
+        )
+    if far_mm < _LEAST_FAR_MM:
+        raise InputError(
+            f"the depth range {near_mm:g}..{far_mm:g} mm looks like metres; give it in mm."
         )
 
 

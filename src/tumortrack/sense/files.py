@@ -341,7 +341,7 @@ def read_mask(path: Path, size: tuple[int, int]) -> Bool[np.ndarray, "h w"]:
 
 def _image(path: Path, size: tuple[int, int]) -> tuple[np.ndarray, str]:
     """An image's values without its transparency, and its Pillow mode."""
-    from PIL import Image
+    from PIL import Image, UnidentifiedImageError
 
     if path.suffix.lower() == ".npy":
         array = _npy(read_file(path, LARGEST_FILE), str(path))
@@ -361,6 +361,11 @@ def _image(path: Path, size: tuple[int, int]) -> tuple[np.ndarray, str]:
             return np.asarray(opaque), image.mode
     except InputError:
         raise
+    except UnidentifiedImageError as error:
+        raise InputError(
+            f"{path} is no PNG or TIFF image that is read. Save it with 16-bit numbers, or as a "
+            "TIFF of 32-bit floats."
+        ) from error
     except Exception as error:  # Pillow raises anything on a damaged file
         raise InputError(f"{path} cannot be read as a PNG or TIFF image: {error}.") from error
     raise InputError(

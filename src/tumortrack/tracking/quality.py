@@ -163,7 +163,8 @@ def _misfit(report: FitReport, surroundings_seen: bool) -> Finding | None:
         return Finding("strays", {"percent": 100 * cost.strays})
     now, factor = (cost.without_strays, FIT_FACTOR) if surroundings_seen else (cost.now, 1.0)
     if now > factor * cost.usual:
-        return Finding("fit", {"times": now / cost.usual})
+        times = now / cost.usual
+        return Finding("fit", {"times": times, "digits": _telling(times, factor)})
     return None
 
 
@@ -185,8 +186,7 @@ def _doubt(report: FitReport) -> Finding | None:
     misses_mm = {name: part.miss_mm or 0.0 for name, part in report.tumors.items()}
     name = max(misses_mm, key=misses_mm.__getitem__)
     miss_mm = misses_mm[name]
-    # As many decimals as tell it from what is allowed.
-    digits = next((n for n in "123" if round(miss_mm, int(n)) > POOR_MM), "4")
+    digits = _telling(miss_mm, POOR_MM)
     values: dict[str, float | str] = {"part": name, "miss_mm": miss_mm, "limit_mm": POOR_MM}
     values["digits"] = digits
     return Finding("miss", values) if miss_mm > POOR_MM else None
@@ -200,11 +200,20 @@ def _contradiction(evidence: Sequence[EvidenceReport]) -> Finding | None:
     agree = len(evidence) - len(old) - sum(out)
     outvoted = agree >= max(_MANY, _FOR_EACH * sum(out))
     most_old = len(old) >= _FEW and sum(old) > len(old) / 2
-    for number, each in enumerate(evidence, start=1):
-        decides = most_old if each.before else not outvoted or each.name == "held"
-        if each.left_out and decides:
-            return Finding("evidence", {"name": each.name, "number": number, "off_mm": each.off_mm})
-    return None
+    wrong = [
+        (each.off_mm, number, each.name)
+        for number, each in enumerate(evidence, start=1)
+        if each.left_out and (most_old if each.before else not outvoted or each.name == "held")
+    ]
+    if not wrong:
+        return None
+    off_mm, number, name = max(wrong)  # as causes.py names it
+    return Finding("evidence", {"name": name, "number": number, "off_mm": off_mm})
+
+
+def _telling(value: float, limit: float) -> str:
+    """As many decimals as tell a value from the limit that it exceeds."""
+    return next((n for n in "123" if round(value, int(n)) > limit), "4")
 
 
 def _misses_known(report: FitReport) -> bool:
