@@ -60,13 +60,15 @@ class Prepare(PrepareOptions):
         words = ", ".join(map(str, inputs))
         with progress_of("the case's model", f"reading {words}, making surfaces ...") as made:
             from tumortrack import api
-            from tumortrack.models.folder import read_model_manifest, weakness_of
+            from tumortrack.models.folder import is_finished, read_model_manifest, weakness_of
 
             case = api.prepare(
                 inputs, folder, overwrite=self.overwrite, segment=self.segment,
                 progress=made, **options_of(self, PrepareOptions),
             )  # fmt: skip
-        weakness = weakness_of(read_model_manifest(folder / case.MODEL)["provenance"])
+        model, weakness = folder / case.MODEL, ""
+        if is_finished(model):
+            weakness = weakness_of(read_model_manifest(model)["provenance"])
         say_notes(filter(None, [*case.warnings, weakness, *case.report.get("notes", [])]))
         say(str(case.patient))
         kind = case.anatomy.kind

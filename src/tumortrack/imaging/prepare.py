@@ -285,7 +285,7 @@ def _cut(
 def _check_every_slice(organ: np.ndarray, path: Path) -> None:
     """Refuse an organ that was drawn in some slices alone: in a gap it has nothing, and the same on
     either side."""
-    for axis in range(3):
+    for axis in range(3) if organ.any() else ():
         slices = np.moveaxis(organ[tight_box(organ)], axis, 0)
         voxels = slices.sum((1, 2))
         gaps = [
