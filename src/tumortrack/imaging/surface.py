@@ -179,6 +179,9 @@ def shells(mesh: Mesh) -> Iterator[Mesh]:
     piece = connected_components(graph, directed=False)[1][i]
     a, b, c = (mesh.vertices_mm[corner] - mesh.vertices_mm[0] for corner in (i, j, k))
     volumes = np.bincount(piece, np.einsum("ij,ij->i", a, np.cross(b, c)))  # times 6, signed
+    if np.count_nonzero(volumes) == 1 and np.bincount(mesh.faces.ravel(), minlength=n).all():
+        yield mesh  # all of it
+        return
     for number in np.argsort(-np.abs(volumes)):
         if volumes[number]:  # vertices without faces have none
             used, compact = np.unique(mesh.faces[piece == number], return_inverse=True)
