@@ -490,13 +490,11 @@ def test_an_arm_feels_that_it_touches(arm):
 def test_an_arm_that_was_lost_is_named_and_touches_again(arm, ends, begins):
     tool = UrToolConfig(host=arm.host, tip=(0.0, 0.0, 20.0)).open(setting(), "arm")
     try:
-        until(lambda: touched(tool, arm), "a touch")
-        assert tool.trouble == ""
+        until(lambda: touched(tool, arm) and not tool.trouble, "a touch")
         arm.say(ends)
         until(lambda: not felt(tool, arm, 0.0) and arm.host in tool.trouble, "the trouble")
         arm.say(begins)
-        until(lambda: touched(tool, arm), "a touch after the pause")
-        assert tool.trouble == ""
+        until(lambda: touched(tool, arm) and not tool.trouble, "a touch after the pause")
     finally:
         tool.close()
     assert "ur poses" not in [thread.name for thread in threading.enumerate()]

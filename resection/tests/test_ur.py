@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 import time
 from collections.abc import Iterator
@@ -14,6 +15,7 @@ import pytest
 from clock import PATIENCE_S, Clock, until
 from live_objects import small_setting, small_update
 from tumortrack.core.errors import InputError, TumortrackError
+from tumortrack.core.packages import to_install
 from tumortrack.live.spec import SINKS
 from tumortrack.live.workers import SinkWorker
 from tumortrack_resection.ur_sink import SILENT_S, UR_JOINTS, UrSink, UrSinkConfig
@@ -392,6 +394,6 @@ def test_what_cannot_work_is_refused(arm, monkeypatch):
     with pytest.raises(InputError, match=r"arm at 10\.0\.0\.9 cannot be controlled"):
         UrSinkConfig(host="10.0.0.9", execute=True).open(with_arms())
     monkeypatch.setitem(sys.modules, "rtde_control", None)
-    with pytest.raises(InputError, match=r"tumortrack-resection"):
+    with pytest.raises(InputError, match=re.escape(to_install("tumortrack-resection[ur]"))):
         UrSinkConfig(host="10.0.0.9", execute=True).open(with_arms())
     assert arm.calls == []

@@ -30,6 +30,7 @@ from tumortrack.imaging.structures import extent_report, read_structures, split_
 from tumortrack.imaging.surface import surfaces
 from tumortrack.imaging.symmetry import ambiguous, half_turns, warning
 from tumortrack.imaging.volume import (
+    MOST_LABELS,
     is_dicom,
     is_label_map,
     is_volume,
@@ -185,8 +186,10 @@ def _from_volume(paths: list[Path], files: list[Path], options: PrepareOptions) 
         if several
         else read_raw(path, options.series)
     )
-    stated = options.labels or bool(options.organs) or options.tumors is not None
-    as_labels = stated or bool(raw.segments) or (path.is_file() and is_label_map(raw))
+    stated = bool(options.organs) or options.tumors is not None
+    most = 256 if stated else MOST_LABELS  # kinds of voxels
+    is_labels = bool(raw.segments) or (path.is_file() and is_label_map(raw, most))
+    as_labels = options.labels or is_labels
     structures: dict[str, Mesh] = {}
     ct, notes = None, list(raw.notes)
     if several and path.is_dir() and others:
@@ -195,7 +198,7 @@ def _from_volume(paths: list[Path], files: list[Path], options: PrepareOptions) 
     shape, affine = raw.array.shape, raw.lps_from_index
     if as_labels:
         refuse_unused(f"{path} is read as a label map", options, *_OF_CT, "unit")
-        if not (stated or raw.segments):
+        if not (options.labels or stated or raw.segments):
             notes.append("few distinct whole numbers: read as a label map, not as a CT")
         parts = parts_of(raw, options, str(path))
         source = label_map(raw, parts, path)

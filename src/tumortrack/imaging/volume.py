@@ -25,7 +25,7 @@ from tumortrack.imaging.segments import Parts, painted
 
 _DETACHED = (".nhdr", ".hdr", ".img")
 _VOLUMES = (".nii", ".nii.gz", ".nrrd")
-_MOST_LABELS = 32  # distinct values that still look like a label map
+MOST_LABELS = 32  # distinct values that still look like a label map
 _SAME_MM = 0.01  # of the grids of several files
 _OFF_WHOLE = 1e-3  # of labels that were stored with a scale, as 1.00000002
 _MAX_HEADER = 2**20
@@ -172,12 +172,13 @@ def read_several(files: Sequence[Path]) -> grid.RawVolume:
     return grid.RawVolume(first.array, first.lps_from_index, segments=segments)
 
 
-def is_label_map(raw: grid.RawVolume) -> bool:
-    """Whether there are only whole numbers in 0..255, at most 32 different ones: no CT is so."""
+def is_label_map(raw: grid.RawVolume, most: int = MOST_LABELS) -> bool:
+    """Whether there are only whole numbers in 0..255, at most so many different ones: few CTs have
+    256, none 32."""
     if not (raw.array.min() >= -_OFF_WHOLE and raw.array.max() <= 255 + _OFF_WHOLE):
         return False
     labels = _whole(raw.array)
-    return labels is not None and int((grid.label_counts(labels) > 0).sum()) <= _MOST_LABELS
+    return labels is not None and int((grid.label_counts(labels) > 0).sum()) <= most
 
 
 def _read_nrrd(path: Path) -> grid.RawVolume:
