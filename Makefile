@@ -102,7 +102,7 @@ attack: setup  ## hostile files and calls: each must end in one clear line (3 mi
 fuzz: setup  ## a million damaged inputs over all readers (20 minutes; ARGS="--inputs 60000 --target NAME")
 	$(BIN)/python tests/support/fuzz.py --artifacts $(ARGS)
 
-crash: setup  ## kill -9 at random moments, shortages, two at once (ARGS="--times 20 --only NAME ...")
+crash: setup  ## kill -9 and Ctrl-C at random moments, shortages, two at once (ARGS="--times 20 --only NAME ...")
 	$(BIN)/python tests/support/crashes.py runs/crashes $(ARGS)
 
 replay: setup  ## has any of 500 answers changed since runs/replay.json, by how many mm? Without that file: record them

@@ -489,14 +489,21 @@ def test_an_organ_cut_flat_within_its_image_is_told(phantom, tmp_path):
 
 
 @numbered
-@pytest.mark.parametrize("every_n", [2, 100])
-def test_an_organ_drawn_in_some_slices_alone_is_refused(phantom, tmp_path, write, every_n):
-    middle = phantom.map().shape[2] // 2
+@pytest.mark.parametrize("kept", [(1, 0), (1, 0, 0), (1,) * 30 + (0,)])
+def test_an_organ_drawn_in_some_slices_alone_is_refused(phantom, tmp_path, write, kept):
     masks = {name: mask.copy() for name, mask in phantom.masks.items()}
     for mask in masks.values():
-        mask[..., middle % every_n :: every_n] = False
+        mask &= np.resize(kept, mask.shape[2]).astype(bool)
     with pytest.raises(InputError, match="slices"):
         prepare(write(replace(phantom, masks=masks), tmp_path))
+
+
+def test_a_slice_that_is_all_tumor_is_no_empty_one(phantom, tmp_path):
+    kidney = phantom.masks["kidney"]
+    tumor = np.zeros_like(kidney)
+    tumor[..., kidney.shape[2] // 2] = kidney[..., kidney.shape[2] // 2]
+    case = prepare(nifti(replace(phantom, masks={"kidney": kidney, "tumor": tumor}), tmp_path))
+    assert volumes(case)[0] == pytest.approx(KIDNEY_ML, rel=0.03)
 
 
 def test_a_label_that_no_segment_describes_is_refused_and_none_is_overlooked(phantom, tmp_path):
@@ -510,6 +517,16 @@ def test_a_label_that_no_segment_describes_is_refused_and_none_is_overlooked(pha
     path.write_bytes(text[:start] + text[text.index(b"Segment2_") :])
     with pytest.raises(InputError, match="label 1"):
         prepare(path)
+
+
+@named
+def test_what_lies_in_something_else_that_nobody_uses_is_not_asked_for(phantom, tmp_path, write):
+    body = np.ones_like(phantom.masks["kidney"])
+    other = np.zeros_like(body)
+    other[:3, :3, :3] = True
+    masks = {"body": body & ~phantom.masks["kidney"], **phantom.masks, "other": other}
+    case = prepare(write(replace(phantom, masks=masks), tmp_path))
+    assert volumes(case) == pytest.approx([KIDNEY_ML, *TUMORS_ML], rel=0.03)
 
 
 @named
@@ -634,6 +651,9 @@ def test_a_slice_that_is_there_twice_is_read_once(phantom, tmp_path):
     raw = read_raw(tmp_path / "ct")
     assert np.array_equal(raw.array, hu)
     assert any("twice" in note for note in raw.notes)
+    paths, hu = slices(phantom, tmp_path / "anonymous")
+    retagged(paths, SOPInstanceUID=lambda *_: "1.2.3")  # of all
+    assert np.array_equal(read_raw(tmp_path / "anonymous").array, hu)
 
 
 def test_another_organ_by_its_files_name_is_asked_for(phantom, tmp_path):

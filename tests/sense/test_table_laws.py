@@ -75,7 +75,7 @@ SPELLINGS: dict[str, Callable[[list[str]], bytes]] = {
     ).encode(),
     "tabs": lambda lines: "\n".join(line.replace(",", "\t") for line in lines).encode(),
     "as Excel says it": lambda lines: "\n".join(["sep=,", *lines]).encode(),
-    "a comment": lambda lines: "\n".join(["# of today", *lines, "# the end"]).encode(),
+    "a comment": lambda lines: "\n".join(["# of today", "", "# more", *lines]).encode(),
     "capitals": lambda lines: "\n".join([lines[0].upper(), *lines[1:]]).encode(),
 }
 
@@ -118,6 +118,7 @@ FAULTS: dict[str, Callable[[Reader], list[str]]] = {
         f"{r.header},{r.number.upper()}",
         *(f"{row},7" for row in r.rows),
     ],
+    "a comment below": lambda r: [r.header, *r.rows, "# the end"],
     "a cell too many": lambda r: [r.header, r.rows[0], f"{r.rows[1]},7"],
     "a cell too few": lambda r: [r.header, r.rows[0], r.rows[1].rpartition(",")[0]],
     "no number": lambda r: with_cell(r, "far"),

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 from tumortrack.core.errors import InputError
 
-_STATED = re.compile(r"sep=.\r?\n")
+_ABOVE = re.compile(r"((#.*|sep=.)?\r?\n)*")  # Excel states its separator so
 _DECIMAL = re.compile(r"^(-?\d*),(\d+)$")
 _UTF16 = codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE
 
@@ -30,22 +30,21 @@ class Rows(NamedTuple):
 
 def read_rows(content: bytes, name: str) -> Rows:
     """A table as spreadsheets write it: UTF-8, or UTF-16 with its mark; separated by commas, or by
-    semicolons or tabs, and then perhaps with decimal commas. Spaces round cells, empty rows, rows
-    that begin with #, and separators at the ends of rows do not count.
+    semicolons or tabs, and then perhaps with decimal commas. Spaces round cells, empty rows,
+    separators at the ends of rows, and lines above the header that begin with # do not count.
 
     Raises InputError: no text or table, no header, a column twice, a row with more or fewer cells.
     """
     text = text_of(content, name)
-    if stated := _STATED.match(text):  # as Excel writes it
-        text = f"\n{text[stated.end() :]}"
-    top = next((line for line in text.splitlines() if line.strip() and line[0] != "#"), "")
+    above = _ABOVE.match(text).end()  # type: ignore[union-attr]  # it matches what is empty, too
+    top = text[above:].partition("\n")[0]
     between = max(";\t,", key=top.count) if "," not in top else ","
+    text = "\n" * text.count("\n", 0, above) + text[above:]  # lines keep their numbers
     reader = csv.reader(
         io.StringIO(text, newline=""), strict=True, skipinitialspace=True, delimiter=between
     )
     try:
         read = [(reader.line_num, [cell.strip() for cell in row]) for row in reader]
-        read = [(line, row) for line, row in read if not "".join(row[:1]).startswith("#")]
         if between != ",":
             read = [(line, [_DECIMAL.sub(r"\1.\2", cell) for cell in row]) for line, row in read]
     except csv.Error as error:

@@ -84,7 +84,8 @@ def find_series(folder: Path, series: str | None = None) -> Series:
     """
     groups, notes = _groups(folder)
     chosen = _choose(folder, groups, series)
-    different = [*{(s.instance, s.frame): s for s in chosen}.values()]
+    # With their places, as some anonymisers give all slices one UID.
+    different = [*{(s.instance, s.frame, s.position_mm): s for s in chosen}.values()]
     if copies := len(chosen) - len(different):
         notes += (f"{copies} slices are there twice (SOPInstanceUID): one of each is read",)
     first = different[0]

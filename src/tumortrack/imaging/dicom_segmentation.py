@@ -79,4 +79,4 @@ def _read(path: Path, tags: Any) -> RawVolume:
         return out
 
     segments = tuple(Segment(n, name, partial(mask, n)) for n, name in names.items())
-    return RawVolume(painted(segments), lps_from_index, (_NO_ENDS,), segments=segments)
+    return RawVolume(painted(shape, segments)[0], lps_from_index, (_NO_ENDS,), segments=segments)

@@ -15,6 +15,7 @@ from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import RAS_FROM_LPS, transform_points
 from tumortrack.core.mesh_files import SUFFIXES, read_mesh
 from tumortrack.core.organ import KIDNEY, Organ
+from tumortrack.core.store import natural
 from tumortrack.core.types import FIRST_TUMOR, ORGAN, Anatomy, LabelVolume, Mesh, part_names
 from tumortrack.imaging.grid import grid_round
 from tumortrack.imaging.options import MIN_TUMOR_ML
@@ -98,7 +99,7 @@ def label_meshes(anatomy: Anatomy) -> LabelVolume:
 
 def _files_by_name(paths: Sequence[Path], organ: str) -> list[Path]:
     """The organ's file, then the tumors'."""
-    files = sorted((p for p in paths if p.suffix.lower() in SUFFIXES), key=natural_order)
+    files = sorted((p for p in paths if p.suffix.lower() in SUFFIXES), key=natural)
     tumors = [f for f in files if is_tumor(f.stem)]  # also kidney_tumor.stl
     named = [f for f in files if organ in f.stem.lower() or "organ" in f.stem.lower()]
     organs = [f for f in named if f not in tumors]
@@ -107,11 +108,6 @@ def _files_by_name(paths: Sequence[Path], organ: str) -> list[Path]:
         problem = f"{len(organs)} name an organ" + (f", {other} name neither" if other else "")
         raise InputError(f"of {[f.name for f in files]} {problem}. {_RULE.format(organ)}")
     return [*organs, *tumors]
-
-
-def natural_order(path: Path) -> list[Any]:
-    """tumor_2 before tumor_10."""
-    return [int(p) if p.isdecimal() else p for p in re.split(r"(\d+)", path.name.lower())]
 
 
 def read_lps(path: Path, scale: float, notes: list[str]) -> Mesh:

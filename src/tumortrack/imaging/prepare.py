@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -20,9 +21,9 @@ from tumortrack.core.organ import Organ
 from tumortrack.core.patient import UNKNOWN, Patient, Side
 from tumortrack.core.types import FIRST_TUMOR, ORGAN, Anatomy, LabelVolume, Mesh, Volume
 from tumortrack.imaging.case import Case
-from tumortrack.imaging.grid import check_suffix, grown_box, label_counts, tight_box, voxel_ml
+from tumortrack.imaging.grid import check_suffix, grown_box, label_counts, voxel_ml
 from tumortrack.imaging.hu_windows import segment_ct
-from tumortrack.imaging.meshes import LEAST_DROPPED_ML, label_meshes, natural_order, read_meshes
+from tumortrack.imaging.meshes import LEAST_DROPPED_ML, label_meshes, read_meshes
 from tumortrack.imaging.options import PrepareOptions, parse_structures
 from tumortrack.imaging.segments import Parts, is_tumor, other_organ, parts_of
 from tumortrack.imaging.select import neighbours, select_labels
@@ -46,7 +47,8 @@ _LEAST_ORGAN_OUTSIDE = 0.02  # of the outer surface
 _LARGEST_SHARE = 0.6  # of organ and tumors that one tumor may take without a note
 _OFF_GRID = 0.05  # of a voxel: rounding of affines in files
 _THICK_MM = 2.0  # the phantom's tumor of 29 ml is 37 ml by slices of 3 mm, 54 by 5 mm
-_SAME_DRAWN = 0.5  # of a slice's labels, that those beyond an empty one also have
+_SAME_DRAWN = 0.5  # of a slice's labels, that those beyond empty ones also have
+_GAP_MM = 15.0  # of empty slices: the organs of a pair lie farther apart
 _FLAT = 0.6  # of the largest cross-section; whole organs end with less even where slices are thick
 _FEW = 8  # voxels on the image's border, as rounding and resampling leave them
 _ENCLOSED = 0.4  # share of a label's surface on the organ that only a tumor or a cyst has
@@ -65,11 +67,6 @@ def prepare(input: Path | Sequence[Path], options: PrepareOptions | None = None)
         files = _files_in(paths)
         if len(files) == 1:
             paths = files
-        if len(files) == 1 and (other := other_organ(files[0].stem, options.name)):
-            raise InputError(
-                f"{files[0]} is of a {other} by its name, and this of a {options.name}. Give "
-                f"--name {other}, or another file."
-            )
         is_meshes = any(path.suffix.lower() in SUFFIXES for path in files)
         if is_meshes and (volumes := [path.name for path in files if is_volume(path)]):
             raise InputError(
@@ -121,7 +118,7 @@ def _files_in(paths: list[Path]) -> list[Path]:
             f"{paths[0]} holds no files. Give a folder of DICOM slices, of meshes, or of label "
             "files with one structure each."
         )
-    return sorted(files, key=natural_order)
+    return sorted(files, key=store.natural)
 
 
 def _with_structures(case: Case, options: PrepareOptions) -> Case:
@@ -181,11 +178,10 @@ def _from_volume(paths: list[Path], files: list[Path], options: PrepareOptions) 
     volumes = [file for file in files if is_volume(file)]
     others = [file for file in files if not is_volume(file)]
     several = len(paths) > 1 or (path.is_dir() and volumes and not any(map(is_dicom, others)))
-    raw = (
-        read_several(volumes if path.is_dir() else files)
-        if several
-        else read_raw(path, options.series)
-    )
+    if several:
+        raw = read_several(volumes if path.is_dir() else files)
+    else:
+        raw = read_raw(path, options.series)
     stated = bool(options.organs) or options.tumors is not None
     most = 256 if stated else MOST_LABELS  # kinds of voxels
     is_labels = bool(raw.segments) or (path.is_file() and is_label_map(raw, most))
@@ -248,11 +244,16 @@ def _selected(
         raise InputError(
             f"{path} is a tumor by its name, and holds nothing else. Give the organ's file as well."
         )
-    _check_every_slice(volume.labels == organ, path)
+    if not (parts.names or options.organs) and (other := other_organ(path.name, options.name)):
+        raise InputError(
+            f"{path} is of a {other} by its name, and no label says what it is. Give --name "
+            f"{other}, or --organ NUMBER of the {options.kind.words}."
+        )
+    used = organ, *(np.arange(FIRST_TUMOR, 256) if tumors is None else tumors)
+    _check_every_slice(np.isin(volume.labels, used), volume.lps_from_index, path)
     source, structures = split_structures(volume, parts.structures, organ)
     selection = options.stated_side, organ, tumors, options.min_tumor_ml, options.kind
     chosen, notes, side = select_labels(source, *selection)
-    used = organ, *(np.arange(FIRST_TUMOR, 256) if tumors is None else tumors)
     around = _on_grid(source.labels, source.lps_from_index, chosen, 0)
     shares = neighbours(around, chosen.labels, used)
     ml = counts * voxel_ml(volume.lps_from_index)
@@ -285,24 +286,21 @@ def _cut(
     return [warning] if voxels > _FEW else []
 
 
-def _check_every_slice(organ: np.ndarray, path: Path) -> None:
-    """Refuse an organ that was drawn in some slices alone: in a gap it has nothing, and the same on
-    either side."""
-    for axis in range(3) if organ.any() else ():
-        slices = np.moveaxis(organ[tight_box(organ)], axis, 0)
-        voxels = slices.sum((1, 2))
-        gaps = [
-            n
-            for n in np.flatnonzero(voxels == 0).tolist()
-            if np.count_nonzero(slices[n - 1] & slices[min(n + 1, len(slices) - 1)])
-            > _SAME_DRAWN * max(voxels[n - 1], 1)
-        ]
-        if gaps:
-            first = tight_box(organ)[axis].start + gaps[0]
-            raise InputError(
-                f"{path}: {len(gaps)} slices between drawn ones are empty (index {first}, the first"
-                ' of them). Fill between slices (3D Slicer: Segment Editor, "Fill between slices").'
-            )
+def _check_every_slice(solid: np.ndarray, affine: np.ndarray, path: Path) -> None:
+    """Refuse an organ with its tumors that was drawn in some slices alone: those between have
+    nothing, and those on either side of them the same."""
+    for axis, step_mm in enumerate(spacing_mm(affine).tolist()):
+        slices = np.moveaxis(solid, axis, 0)
+        drawn = np.flatnonzero(slices.any((1, 2))).tolist()
+        for last, following in itertools.pairwise(drawn):
+            if not 0 < (following - last - 1) * step_mm < _GAP_MM:
+                continue
+            same = np.count_nonzero(slices[last] & slices[following])
+            if same > _SAME_DRAWN * np.count_nonzero(slices[last]):
+                raise InputError(
+                    f"{path}: slices between drawn ones are empty (index {last + 1}, the first of "
+                    'them). Fill them (3D Slicer: Segment Editor, "Fill between slices").'
+                )
 
 
 def _flat(name: str, labels: LabelVolume) -> list[CaseWarning]:
@@ -312,11 +310,9 @@ def _flat(name: str, labels: LabelVolume) -> list[CaseWarning]:
     for axis in range(3):
         face_mm2 = float(np.linalg.norm(np.cross(*np.delete(affine[:3, :3], axis, axis=1).T)))
         voxels = np.moveaxis(solid, axis, 0).sum((1, 2))
-        drawn = voxels[voxels > 0]
-        worst_mm2 = max(
-            [worst_mm2]
-            + [face_mm2 * float(end) for end in drawn[[0, -1]] if end > _FLAT * drawn.max()]
-        )
+        end = voxels[np.flatnonzero(voxels)[[0, -1]]].max()
+        if end > _FLAT * voxels.max():
+            worst_mm2 = max(worst_mm2, face_mm2 * float(end))
     warning = CaseWarning("flat", part=name, area_cm2=worst_mm2 / 100)
     return [warning] if worst_mm2 else []
 
@@ -370,8 +366,7 @@ def _with_ct(case: Case, path: Path) -> Case:
     """The case with its CT, which must have the labels' steps, and a warning if the organ reaches
     its end. Raises InputError."""
     raw = read_raw(path)
-    volume = volume_of(raw, path)
-    volume = turned_as(volume, case.labels.lps_from_index)
+    volume = _turned_as(volume_of(raw, path), case.labels.lps_from_index)
     steps = np.linalg.inv(volume.lps_from_index) @ case.labels.lps_from_index
     if np.abs(steps - np.rint(steps)).max() > _OFF_GRID or not np.allclose(
         steps[:3, :3], np.eye(3), atol=_OFF_GRID / max(case.labels.labels.shape)
@@ -389,7 +384,7 @@ def _with_ct(case: Case, path: Path) -> Case:
     return replace(case, ct=crop_ct(volume, case.labels), report={**case.report, "notes": notes})
 
 
-def turned_as(volume: Volume, affine: np.ndarray) -> Volume:
+def _turned_as(volume: Volume, affine: np.ndarray) -> Volume:
     """The volume with its axes in the order and direction of those of ``affine``, where they are
     parallel: programs store a CT and its labels turned to either side."""
     from nibabel.orientations import apply_orientation, inv_ornt_aff, io_orientation

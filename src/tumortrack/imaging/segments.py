@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Sequence
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -21,10 +20,11 @@ _TUMOR = re.compile(
     r"(tumou?r|lesion|cancer|mass|nodule|rcc|aml|gtv|\w*(carcinoma|adenoma|oncocytoma|angiomyolipoma|"
     r"lipoma))s?|neoplas\w+|metasta\w+"
 )
-_NO_TUMOR = {"no", "non", "not", "without", "free", "peri", "bed", "rim", "margin", "effect"}
+_NO_TUMOR = {"non", "not", "without", "free", "peri", "bed", "rim", "margin", "effect"}
 _SIDES: dict[str, Side] = {"left": "left", "l": "left", "right": "right", "r": "right"}
 _ALSO = {*_SIDES, "organ", "whole", "parenchyma", "mask", "seg", "segment", "segmentation", "label"}
 _ALSO |= {"case", "patient", "copy", "final", "manual", "volume", "model"}
+_LOST = 0.4  # of a segment, below others: what only overlaps their border has less
 
 
 def words_of(name: str) -> set[str]:
@@ -40,8 +40,8 @@ def is_tumor(name: str) -> bool:
 
 def is_organ(name: str, organ: str) -> bool:
     """Whether a label's name says ``organ`` and, but for the side, nothing else."""
-    words = {word.removesuffix("s") if word[:-1] in organ else word for word in words_of(name)}
     wanted = set(organ.split("_"))
+    words = {word.removesuffix("s") if word[:-1] in wanted else word for word in words_of(name)}
     said = wanted if wanted <= words else {"organ"} & words
     return bool(said) and words - said <= _ALSO and not is_tumor(name)
 
@@ -63,9 +63,6 @@ def check_side(names: Iterable[str], side: Side) -> None:
             )
 
 
-_INSIDE = 0.4  # of a segment: what only overlaps the organ's border has less
-
-
 class Parts(NamedTuple):
     """What is what in a label map: numbers of the organ (several count as its first), of tumors
     (None: all from 2 up) and of structures, which may be meshes too; ``names`` of all labels, none
@@ -75,6 +72,7 @@ class Parts(NamedTuple):
     tumors: tuple[int, ...] | None
     structures: StructureSources
     names: dict[int, str]
+    stated: bool  # the tumors, by options
     note: str = ""
 
 
@@ -90,7 +88,7 @@ def parts_of(raw: RawVolume, options: PrepareOptions, where: str) -> Parts:
     if not names:
         stated = tumors if tumors is not None or options.organs in ((), (ORGAN,)) else ()
         note = "tumors by their numbers alone: every label from 2 up" if stated is None else ""
-        return Parts(organ or (ORGAN,), stated, structures, {}, note)
+        return Parts(organ or (ORGAN,), stated, structures, {}, tumors is not None, note)
     listing = ", ".join(f"{n} {name}" for n, name in names.items())
     if not organ:
         raise InputError(
@@ -100,44 +98,31 @@ def parts_of(raw: RawVolume, options: PrepareOptions, where: str) -> Parts:
     check_side((names[n] for n in organ if n in names), options.stated_side)
     if tumors is None:
         tumors = tuple(n for n in names if is_tumor(names[n]) and n not in organ)
-        _check_inside(raw, organ, {*tumors, *structures.values()}, where)
     taken = [" and ".join(names.get(n, f"{n}") for n in of) or "none" for of in (organ, tumors)]
     note = f"organ: {taken[0]}; tumors: {taken[1]}; of {listing}"
-    return Parts(organ, tumors, structures, names, note)
-
-
-def _check_inside(
-    raw: RawVolume, organ: tuple[int, ...], used: set[int | Path], where: str
-) -> None:
-    """Refuse a segment that lies in the organ, where it would be lost, and that nobody named."""
-    inside = painted([s for s in raw.segments if s.number in organ], organ) > 0
-    for segment in raw.segments:
-        if segment.number in used or segment.number in organ:
-            continue
-        mask = segment.mask()
-        if int(np.count_nonzero(mask & inside)) > _INSIDE * max(int(np.count_nonzero(mask)), 1):
-            raise InputError(
-                f"{where}: {segment.number} {segment.name} lies in the organ, and its name does "
-                f"not say what it is. Give --tumor {segment.number} with the other tumors, --organ "
-                f"{segment.number} as well if it is part of the organ, or --tumor 0."
-            )
+    return Parts(organ, tumors, structures, names, options.tumors is not None, note)
 
 
 def painted(
-    segments: Sequence[Segment], organ: tuple[int, ...] = (), others: tuple[int, ...] = ()
-) -> UInt8[np.ndarray, "i j k"]:
-    """One map of segments that may overlap: ``others`` in their order over the ``organ`` (all of it
-    with its first number) over the rest, tumors first."""
+    shape: tuple[int, ...],
+    segments: Sequence[Segment],
+    organ: tuple[int, ...] = (),
+    others: tuple[int, ...] = (),
+) -> tuple[UInt8[np.ndarray, "i j k"], list[int]]:
+    """One map of segments that may overlap: the ``organ``, all of it with its first number; over it
+    ``others`` in their order; below both what else there is, tumors first. And what else there is
+    that lies mostly below them, where it is lost."""
     used = [*organ, *others]
-
-    def rank(segment: Segment) -> tuple[int, bool]:
-        number, name = segment.number, segment.name
-        return used.index(number) if number in used else -1, not is_tumor(name)
-
-    out = np.zeros((), np.uint8)
-    for segment in sorted(segments, key=rank):
+    above = [segment for segment in segments if segment.number in used]
+    below = [segment for segment in segments if segment.number not in used]
+    out = np.zeros(shape, np.uint8)
+    for segment in sorted(above, key=lambda s: used.index(s.number)):
+        out[segment.mask()] = organ[0] if segment.number in organ else segment.number
+    free, lost = out == 0, list[int]()
+    for segment in sorted(below, key=lambda s: not is_tumor(s.name)):
         mask = segment.mask()
-        out = out if out.ndim else np.zeros(mask.shape, np.uint8)
-        mask = mask if segment.number in used else mask & (out == 0)
-        out[mask] = organ[0] if segment.number in organ else segment.number
-    return out
+        size = int(np.count_nonzero(mask))
+        if size - int(np.count_nonzero(mask & free)) > _LOST * size:
+            lost.append(segment.number)
+        out[mask & (out == 0)] = segment.number
+    return out, lost

@@ -131,11 +131,19 @@ def _whole(array: np.ndarray) -> UInt8[np.ndarray, "i j k"] | None:
 
 def label_map(raw: grid.RawVolume, parts: Parts, path: Path) -> LabelVolume:
     """One label map, in which all of the organ has one number. Raises InputError: see
-    ``labels_of``, which names ``path``."""
+    ``labels_of``, which names ``path``; a segment is lost in the organ, and nobody named it."""
     if raw.segments:
         structures = (n for n in parts.structures.values() if isinstance(n, int))
         used = *structures, *(parts.tumors or ())
-        return LabelVolume(painted(raw.segments, parts.organ, used), raw.lps_from_index)
+        labels, lost = painted(raw.array.shape, raw.segments, parts.organ, used)
+        if lost and not parts.stated:
+            n, name = lost[0], parts.names[lost[0]]
+            raise InputError(
+                f"{path}: {n} {name} lies in the organ, and its name does not say what it is. Give "
+                f"--tumor {n} with the other tumors, --organ {n} as well if it is part of the "
+                "organ, or --tumor 0."
+            )
+        return LabelVolume(labels, raw.lps_from_index)
     volume, (first, *others) = labels_of(raw, path), parts.organ
     same = np.arange(256, dtype=np.uint8)
     same[others] = first
@@ -210,7 +218,7 @@ def _read_nrrd(path: Path) -> grid.RawVolume:
     with grid.volume_stream(path, compressed, start) as stream:
         array = grid.read_voxels(path, stream, whole, dtype, compressed)
     segments = _segments(path, fields, array)
-    array = painted(segments) if layers > 1 else array[0]
+    array = painted(shape, segments)[0] if layers > 1 else array[0]
     return grid.RawVolume(array, lps_from_index, segments=segments)
 
 

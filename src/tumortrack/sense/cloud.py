@@ -22,8 +22,6 @@ _LONGEST_M = 0.6  # longest organ in metres; in inches no organ's side is shorte
 # Least standard deviation along the second axis: in mm, and over that along the first. An organ has
 # over 10 mm and half of the first.
 _THINNEST_MM, _THINNEST = 1.0, 0.1
-
-
 _LEAST_FAR_MM = 5.0  # no camera sees so near
 
 

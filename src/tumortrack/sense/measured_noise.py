@@ -25,6 +25,7 @@ _FEWEST = 12
 _ROUGH = 4.0  # times the median variance: an edge, a fold, a window with an outlier
 _NEIGHBOURS, _SPARSE_MM = 40, 3.0
 _STEP_OFF, _LEAST_STEP_MM = 0.02, 1e-3  # of a step, and of one: rounding of stored numbers
+_MOST_POINTS = 50_000  # of a cloud: more are no more certain
 _MOST_VALUES = 20_000  # depths among which the step is looked for
 
 
@@ -100,6 +101,7 @@ def cloud_noise(cloud: SensorCloud) -> DepthNoise | None:
     points = np.asarray(cloud.points_mm, float)
     if len(points) < 2 * _NEIGHBOURS:
         return None
+    points = points[:: len(points) // _MOST_POINTS + 1]
     tree = cKDTree(points)
     middles = points[:: max(1, len(points) // _MOST_WINDOWS)]
     _, near = tree.query(middles, _NEIGHBOURS)

@@ -20,8 +20,6 @@ from tumortrack.simulate.scene_folder import organ_of_folder
 
 INTRINSICS, DEPTH, CLOUD, META = "intrinsics.json", "depth.png", "cloud.ply", "meta.json"
 ABOUT = "recording.json"  # of the sink ``recording``
-
-
 _OTHER_IMAGE = re.compile(r"(colou?r|rgb|mask|infra(red)?|ir)(?![a-z])", re.IGNORECASE)
 
 
@@ -37,9 +35,9 @@ def folder_frames(path: Path, fps: float, unit: Literal["mm", "m"]) -> list[Reco
     """The frames in a folder, by name and number; none is read yet.
 
     Scene folders (with depth.png and intrinsics.json, or cloud.ply), depth images with one
-    intrinsics.json, or clouds (in ``unit``). Stamps: ``stamp_ns`` of a scene's
-    meta.json, or file names of at least 12 digits, in ns, us or ms, as their distance tells; else
-    ``fps`` frames a second. Raises InputError if there are none of these.
+    intrinsics.json, or clouds (in ``unit``). Stamps: ``stamp_ns`` of a scene's meta.json, or file
+    names of at least 12 digits, in ns, us or ms, as their distance tells; else ``fps`` frames a
+    second. Raises InputError if there are none of these.
     """
     listed = path.iterdir() if path.is_dir() else ()
     inside = sorted((p for p in listed if not p.name.startswith(".")), key=natural)
@@ -67,12 +65,7 @@ def folder_frames(path: Path, fps: float, unit: Literal["mm", "m"]) -> list[Reco
             "folder, .mcap, .db3 or .bag."
         )
     named = all(re.fullmatch(r"[0-9]{12,}", p.stem) for p in frame_paths)  # fewer: a number
-    apart = np.median(np.diff([int(p.stem) for p in frame_paths])) if named else 0
-    unit_ns = (
-        1 if apart >= 1e6 else 1000 if apart >= 1000 else 10**6
-    )  # frames are 1 ms to 1 s apart
-    if len(frame_paths) < 2:
-        unit_ns = 1
+    unit_ns = _unit_ns([int(p.stem) for p in frame_paths]) if named else 1
     period_ns, last_ns, frames = round(1e9 / fps), 0, []
     for file in frame_paths:
         known_ns = _scene_stamp(file) if scenes else unit_ns * int(file.stem) if named else None

@@ -32,7 +32,7 @@ class TrackNode(Node):
         self.code: int | None = None
         self._stale = False
         self._before: dict[str, object] = {}  # the values that it ran with before a change
-        self._seen = {}
+        self._acknowledging = {}  # publishers, by topic
         self._start()
         self.create_service(Trigger, "~/acknowledge", self._acknowledge)
         self.add_on_set_parameters_callback(self._changed)
@@ -56,14 +56,14 @@ class TrackNode(Node):
         for sink in values["sinks"]:
             kind, _, namespace = sink.partition("?")[0].partition(":")
             topic = f"{namespace or '/tumortrack'}/acknowledge"
-            if kind == "ros2" and topic not in self._seen:
-                self._seen[topic] = self.create_publisher(Empty, topic, 1)
+            if kind == "ros2" and topic not in self._acknowledging:
+                self._acknowledging[topic] = self.create_publisher(Empty, topic, 1)
         self.get_logger().info(" ".join(line))
         self._track = subprocess.Popen(line)
 
     def _acknowledge(self, _: Trigger.Request, answer: Trigger.Response) -> Trigger.Response:
         """The user has seen what contradicts the answer."""
-        heard = [one for one in self._seen.values() if one.get_subscription_count()]
+        heard = [one for one in self._acknowledging.values() if one.get_subscription_count()]
         for one in heard:
             one.publish(Empty())
         answer.success, answer.message = bool(heard), "" if heard else "no ros2 sink hears of it"
