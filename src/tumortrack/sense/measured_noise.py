@@ -25,7 +25,7 @@ _FEWEST = 12
 _ROUGH = 4.0  # times the median variance: an edge, a fold, a window with an outlier
 _NEIGHBOURS, _SPARSE_MM = 40, 3.0
 _STEP_OFF, _LEAST_STEP_MM = 0.02, 1e-3  # of a step, and of one: rounding of stored numbers
-_MOST_POINTS = 50_000  # of a cloud: more are no more certain
+_MOST_POINTS, _MOST_MIDDLES = 10_000, 200  # of a cloud: more are hardly more certain
 _MOST_VALUES = 20_000  # depths among which the step is looked for
 
 
@@ -96,15 +96,14 @@ def image_noise(frame: DepthFrame) -> DepthNoise | None:
 
 def cloud_noise(cloud: SensorCloud) -> DepthNoise | None:
     """Of a cloud of any density; None: it has too few points."""
-    from scipy.spatial import cKDTree
-
     points = np.asarray(cloud.points_mm, float)
     if len(points) < 2 * _NEIGHBOURS:
         return None
     points = points[:: len(points) // _MOST_POINTS + 1]
-    tree = cKDTree(points)
-    middles = points[:: max(1, len(points) // _MOST_WINDOWS)]
-    _, near = tree.query(middles, _NEIGHBOURS)
+    middles = points[:: len(points) // _MOST_MIDDLES + 1]
+    # Not by scipy's tree, whose import takes longer.
+    apart_mm2 = np.sum((middles[:, None] - points) ** 2, axis=2)
+    near = np.argpartition(apart_mm2, _NEIGHBOURS, axis=1)[:, :_NEIGHBOURS]
     local = points[near] - middles[:, None]
     _, _, axes = np.linalg.svd(local - local.mean(1, keepdims=True), full_matrices=False)
     u, v, height = np.einsum("nki,nji->jnk", local, axes)
@@ -113,7 +112,7 @@ def cloud_noise(cloud: SensorCloud) -> DepthNoise | None:
     left = height - np.einsum("nkt,nt->nk", basis, np.einsum("nkt,nk->nt", basis, height))
     variances = np.sum(left**2, axis=1) / (_NEIGHBOURS - terms.shape[-1])
     smooth = variances <= _ROUGH * np.median(variances)
-    apart_mm = float(np.median(tree.query(middles, 2)[0][:, 1]))
+    apart_mm = float(np.sqrt(np.median(np.partition(apart_mm2, 1, axis=1)[:, 1])))
     white_mm = float(np.sqrt(variances[smooth].mean()))
     at_mm = float(np.median(points[:, 2]))
     return DepthNoise(white_mm, 0.0, 0.0, 0.0, at_mm, apart_mm > _SPARSE_MM)
