@@ -192,6 +192,18 @@ def test_no_word_of_a_warning_is_cut(tmp_path):
     assert "&lt;b&gt; @TABLE@" in page
 
 
+def test_structures_are_drawn_and_named(tmp_path):
+    vein, colour = ball((0.0, 0.0, 100.0), 8.0), colours.structure_colour(0)
+    found = small_estimate()
+    for estimate in (found, replace(found, structures={"vein": vein})):
+        write_run_page(tmp_path, {}, estimate, Seen())
+        with Image.open(tmp_path / PICTURE) as image:
+            reds = (np.asarray(image.convert("RGB")).astype(int) - colour).astype(int)
+        drawn = int((np.abs(reds).max(2) < 40).sum())
+        named = f"{colours.css(colour)}" in (tmp_path / PAGE).read_text()
+        assert (drawn > 100, named) == (estimate is not found,) * 2
+
+
 @pytest.mark.parametrize("placed", [True, False])
 def test_the_page_shows_evidence_and_what_to_learn_next_where_the_organ_surely_lies(
     tmp_path, placed

@@ -26,7 +26,7 @@ from tumortrack.core.patient import patient_in
 from tumortrack.core.process import parallel_map
 from tumortrack.core.report import Point
 from tumortrack.core.store import write_atomically
-from tumortrack.core.types import DepthFrame, SensorCloud
+from tumortrack.core.types import DepthFrame, Mesh, SensorCloud
 from tumortrack.report.renderer import Body, ParallelView, corner_normals, render, rgb
 from tumortrack.report.seen import PAGE, Seen, next_evidence, next_lines, part_rows, row_words
 from tumortrack.report.wrapping import wrapped
@@ -73,7 +73,7 @@ def write_run_page(
         "@VERDICT@": _TITLES[verdict],
         "@WORDS@": html.escape(_sentence(words.partition(": ")[2])),
         "@LINES@": "".join(f"<p>{html.escape(line)}</p>" for line in lines),
-        "@TABLE@": _table(rows) if rows else "",
+        "@TABLE@": (_table(rows) if rows else "") + _legend(estimate),
         "@EVIDENCE@": f"<section>{_table(known)}</section>" if known else "",
         "@PANELS@": _figures(views) + _figures(slices),
     }
@@ -136,6 +136,19 @@ def _table(rows: list[dict[str, str]]) -> str:
     return f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
 
 
+def _structures(estimate: Estimate | None) -> list[tuple[str, Mesh, colours.Colour]]:
+    """Name, surface and colour of each."""
+    known = () if estimate is None else estimate.structures.items()
+    return [(name, mesh, colours.structure_colour(n)) for n, (name, mesh) in enumerate(known)]
+
+
+def _legend(estimate: Estimate | None) -> str:
+    return "".join(
+        f'<p><i style="background:{colours.css(colour)}"></i>{html.escape(name)}</p>'
+        for name, _, colour in _structures(estimate)
+    )
+
+
 def _views(estimate: Estimate | None, seen: Seen) -> Iterator[Panel]:
     if isinstance(seen.content, DepthFrame):
         taken = "; tinted: taken for the organ" if seen.taken is not None else ""
@@ -147,7 +160,8 @@ def _views(estimate: Estimate | None, seen: Seen) -> Iterator[Panel]:
     points_mm = _thinned(seen.cloud if estimate and seen.cloud else seen.content)
     if estimate is None and not len(points_mm):
         return
-    for mesh in () if estimate is None else estimate.meshes.values():
+    parts = () if estimate is None else estimate.meshes.values()
+    for mesh in (*parts, *(mesh for _, mesh, _ in _structures(estimate))):
         corner_normals(mesh)  # kept, for all views
     views = [ParallelView(name, *axes) for name, axes in ORIENTATIONS.items()]  # type: ignore[arg-type]
     images = parallel_map(lambda view: _view(view, estimate, points_mm), views)
@@ -190,6 +204,7 @@ def _view(
         Body(mesh, rgb(colours.name_colour(name)), 1.0 if is_tumor(name) else 0.36)
         for name, mesh in meshes.items()
     ]
+    bodies += [Body(mesh, rgb(colour)) for _, mesh, colour in _structures(estimate)]
     width, height = frame.size(pixel_mm)
     picture = np.full((height, width, 3), 255, np.uint8)
     if bodies:
@@ -235,6 +250,7 @@ def _slice(estimate: Estimate, seen: Seen, part: str, orientation: str) -> Image
     else:
         picture = _labelled(estimate, places_mm)
     lines = [(mesh, colours.name_colour(name), 3) for name, mesh in estimate.meshes.items()]
+    lines += [(mesh, colour, 2) for _, mesh, colour in _structures(estimate)]
     image = outlined(picture.reshape(half, half, 3), plane, lines, _SLICE).copy()
     if seen.cloud is not None:
         away = seen.cloud.points_mm.astype(float) - plane.centre_mm
