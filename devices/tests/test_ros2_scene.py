@@ -285,8 +285,10 @@ def test_a_parameter_out_of_its_limits_is_refused(options, wrong):
 def test_a_parameter_that_tracking_refuses_is_set_back_and_it_goes_on(tmp_path):
     """The node in a real ROS 2, and programs that call its service, and set its parameters as
     `ros2 param` does."""
-    started, program = tmp_path / "started", tmp_path / "tumortrack"
-    cases = "case $* in *nonsense*) exit 2;; *over*) exit 7;; esac"
+    started, end = tmp_path / "started", tmp_path / "end"
+    program = tmp_path / "tumortrack"
+    over = f"while [ ! -e {end} ]; do sleep 0.1; done; exit 7"  # the node ends with it, so not yet
+    cases = f"case $* in *nonsense*) exit 2;; *over*) {over};; esac"
     program.write_text(f'#!/bin/sh\necho "$*" >> {started}\n{cases}\nexec sleep 99\n')
     program.chmod(0o755)
     begin = "from tumortrack_ros.track_node import main; main()"
@@ -309,7 +311,8 @@ def test_a_parameter_that_tracking_refuses_is_set_back_and_it_goes_on(tmp_path):
             until(lambda: started.read_text().count("\n") == 3, "the former values")
             with peer("set", "moving=over", by=RCLPY) as other:
                 assert json.loads(other.line())["successful"]
-                assert node.ended() == 7
+            end.touch()
+            assert node.ended() == 7
     assert not refused["successful"]
     assert "stale" in refused["reason"]
     assert nonsense["successful"]  # only the command itself knows
