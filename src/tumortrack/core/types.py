@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, fields
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -219,15 +220,30 @@ class DepthFrame:
         return DepthFrame(depth_mm, self.intrinsics, self.stamp_ns)
 
 
+class PointNoise(NamedTuple):
+    """Standard deviations, mm, along the line of sight: of a point; and of the mean of all points
+    of a look, as what neighbours share does not average out."""
+
+    point_mm: float
+    mean_mm: float
+
+
 @dataclass(frozen=True, eq=False)
 class SensorCloud:
-    """Points seen by the sensor, camera frame, mm, float32, all finite."""
+    """Points seen by the sensor, camera frame, mm, float32, all finite. ``noise``: of the points,
+    as measured; None: not yet. ``candidates_mm``: points beside them that may be the organ's too,
+    as dense as they are."""
 
     points_mm: Float32[np.ndarray, "n 3"]
     stamp_ns: int = 0
+    noise: PointNoise | None = None
+    candidates_mm: Float32[np.ndarray, "c 3"] = field(
+        default_factory=lambda: np.zeros((0, 3), np.float32)
+    )
 
     def __post_init__(self) -> None:
         _freeze(self, "points_mm", np.float32, (None, 3))
+        _freeze(self, "candidates_mm", np.float32, (None, 3))
         if not np.isfinite(self.points_mm).all():
             raise InputError(
                 "the cloud has NaN or infinite points; remove them first (no return is no point)."

@@ -114,7 +114,7 @@ class _Groups:
         points_mm, body = fit.looks.points_mm[::_EVERY], fit.motion.shape.body
         means, counts = _means_of_groups(start.residual_rows(points_mm), start.back(points_mm))
         weights = _EVERY * fit.looks.weight(config) * counts
-        width_mm = np.full(len(counts), config.last_mm)
+        width_mm = np.full(len(counts), fit.looks.width_mm(config))
         if terms is not None:
             means = np.concatenate([means, np.column_stack([terms.by_motion, terms.residuals_mm])])
             weights = np.append(weights, terms.std_mm**-2.0)

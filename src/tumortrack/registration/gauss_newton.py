@@ -112,7 +112,7 @@ class GaussNewton:
     ) -> None:
         body, count = rest.body, len(looks.points_mm)
         precision = prior_precision(rest, config) if precision is None else precision
-        self._rest, self._looks = rest, looks
+        self._rest, self._looks, last_mm = rest, looks, looks.width_mm(config)
         # Copies in C's order, and floats, whatever was given: the kernel is compiled for that, and
         # would be once more for points that can't be written, or a whole number.
         self._problem = kernels.Problem(
@@ -123,8 +123,8 @@ class GaussNewton:
             mean=body.mean,
             points=np.array(looks.points_mm, np.float32, order="C"),
             weight=looks.weight(config),
-            first_mm=float(config.first_mm),
-            last_mm=float(config.last_mm),
+            first_mm=max(float(config.first_mm), last_mm),
+            last_mm=last_mm,
             narrowing=float(config.narrowing),
             enough_mm=float(config.enough_mm),
         )

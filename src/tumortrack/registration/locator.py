@@ -15,7 +15,15 @@ from jaxtyping import Float, Float32, Int32, Int64, UInt8
 from tumortrack.core.estimate import Estimate, FollowOptions
 from tumortrack.core.evidence import FEWEST_TOUCHES, Evidence
 from tumortrack.core.report import EvidenceReport, FitReport, SizeFit, SmoothingReport
-from tumortrack.core.types import Anatomy, CameraLabels, Look, Mesh, OccupancyCloud, SensorCloud
+from tumortrack.core.types import (
+    Anatomy,
+    CameraLabels,
+    Look,
+    Mesh,
+    OccupancyCloud,
+    PointNoise,
+    SensorCloud,
+)
 from tumortrack.imaging.raster import label_grid
 from tumortrack.models.report import Frame, describe_parts, grid_over
 from tumortrack.registration import kernels
@@ -31,6 +39,7 @@ from tumortrack.registration.motion import ElasticMotion, blend
 from tumortrack.registration.search import PosePrior, apart_mm
 from tumortrack.registration.uncertainty import apparent_size, held_by_prior_mm
 from tumortrack.sense.cloud import FEWEST_POINTS
+from tumortrack.sense.measured_noise import cloud_noise
 
 QUERIES = 40_000  # as many as the paper asks
 CARRIED = 20_000  # points of the undeformed organ that live estimates carry along
@@ -93,6 +102,14 @@ class _Placed:
         variances = np.trace(self.sample_mm2, axis1=1, axis2=2) / 3
         per_std = 1 / np.sqrt(variances + _FIELD_MM**2)
         return kernels.probabilities(mine.margin_mm, per_std, mine.sample)
+
+
+def _noise(look: Look) -> PointNoise:
+    """As it was measured with the organ's points, else now."""
+    if look.cloud.noise is not None:
+        return look.cloud.noise
+    measured = cloud_noise(look.cloud)
+    return PointNoise(0.0, 0.0) if measured is None else measured.of_points(len(look.cloud.points_mm))
 
 
 class _Found(NamedTuple):
@@ -242,6 +259,7 @@ class RegistrationLocator:
             looks = replace(looks, evidence=EvidenceTerms.of(pieces, self._touchable))
             fits = [fit.beside(looks.evidence) for fit in fits]
         fit, usual = likeliest(fits, method.prior), self._calibration.usual_cost * looks.count
+        usual += looks.noise_cost(method.config)
         doubtful = fit.points_cost > usual or apart_mm(fit.motion, start) > _JUMP_MM
         # From one frame to the next nobody turns an organ over.
         if not doubtful and not self._registration.prior.excludes(fit.motion.rotation):
@@ -281,7 +299,9 @@ class RegistrationLocator:
         """What the fit takes of all looks; ``frame`` is the first one's."""
         more = [Frame(self._model, look.cloud, frame.seed, frame.rng) for look in looks[1:]]
         points_mm = [each.points_mm[::every] for each in (frame, *more)]
-        return Looks.of(points_mm, [look.camera_from_look for look in looks[1:]], evidence)
+        poses = [look.camera_from_look for look in looks[1:]]
+        candidates_mm = looks[0].cloud.candidates_mm
+        return Looks.of(points_mm, poses, evidence, map(_noise, looks), candidates_mm)
 
     def warm(self) -> None:
         """See ``tracking.tracker.Tracker.warm``."""
@@ -354,12 +374,12 @@ class RegistrationLocator:
                 self._model.parts, held_mm, placed.middle_mm2, surfaces_mm2, strict=True
             )
         }
-        usual_cost, last_mm = self._calibration.usual_cost, self._registration.config.last_mm
+        usual_cost, config = self._calibration.usual_cost, self._registration.config
         report = frame.report(
             np.abs(bent.distances_mm),
             describe_parts(self._model.parts, placed.meshes, inside, deviations),
             structures=tuple(placed.structures),
-            fit_cost=entries.cost_entry(fit, prior, usual_cost, last_mm),
+            fit_cost=entries.cost_entry(fit, prior, usual_cost, config),
             poses=entries.poses_entry(prior),
             motion=entries.motion_entry(placed.motion, fit, bent),
             looks=fit.looks.described() if len(looks) > 1 else None,

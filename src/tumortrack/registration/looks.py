@@ -7,7 +7,7 @@ organ's motion, and what remains uncertain widens the motion's covariance.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,11 +15,20 @@ from jaxtyping import Float, Float64, Int64
 
 from tumortrack.core.geometry import Affine, Points, rigid, transform_points
 from tumortrack.core.report import LooksReport
+from tumortrack.core.types import PointNoise
 from tumortrack.registration.config import GaussNewtonConfig
 from tumortrack.registration.evidence import EvidenceTerms
 from tumortrack.registration.kernels import POSE
 from tumortrack.registration.motion import ElasticMotion
 from tumortrack.sense.noise import CAMERA_STD
+
+_CONTAINED_MM = 0.4  # of noise, in ``GaussNewtonConfig.sigma_mm``: a D405's at 150 mm, doubled
+_FACING = 0.15  # cosine to the line of sight: what is steeper is not told from what it stands on
+_WIDTHS = 2.5  # standard deviations of noise: the robust kernel then loses 5 % of its efficiency
+_ACROSS = 0.85  # of noise along the line of sight, across a surface that is seen at 0 to 60 degrees
+_NODES, _SHARES = np.polynomial.hermite_e.hermegauss(8)  # of a normal distribution
+_SHARES = _SHARES / _SHARES.sum()
+_NONE = PointNoise(0.0, 0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,6 +69,9 @@ class Looks:
         shifts: by how much the organ was found to lie elsewhere before each camera (mm, rad; its
             axes, about its centre): the camera's error, which points and places are rid of.
         evidence: what is known beside the points.
+        noise: of the points, where looks differ that of the worst, beyond what ``sigma_mm``
+            contains.
+        candidates_mm: points of a single look that may be the organ's too.
     """
 
     points_mm: Points
@@ -67,6 +79,8 @@ class Looks:
     camera_from_look: tuple[Affine, ...]
     shifts: Float64[np.ndarray, "k 6"]
     evidence: EvidenceTerms | None = None
+    noise: PointNoise = _NONE
+    candidates_mm: Points | None = None
 
     @classmethod
     def of(
@@ -74,13 +88,19 @@ class Looks:
         points_mm: Sequence[Float[np.ndarray, "_ 3"]],
         camera_from_look: Sequence[Affine] = (),
         evidence: EvidenceTerms | None = None,
+        noises: Iterable[PointNoise] = (),
+        candidates_mm: Points | None = None,
     ) -> Looks:
         """Points of each look in its own camera's frame; further ones with where it is."""
         moved = [*points_mm[:1], *map(_moved, camera_from_look, points_mm[1:])]
         numbers = np.repeat(np.arange(len(moved)), [len(points) for points in moved])
         together = moved[0] if len(moved) == 1 else np.concatenate(moved)
         poses, shifts = (np.eye(4), *camera_from_look), np.zeros((len(moved), POSE))
-        return cls(together, numbers, poses, shifts, evidence)
+        worst = [max(values) for values in zip(*noises, strict=True)]
+        noise = _NONE
+        if worst and worst[0] > _CONTAINED_MM:
+            noise = PointNoise(float(np.sqrt(worst[0] ** 2 - _CONTAINED_MM**2)), worst[1])
+        return cls(together, numbers, poses, shifts, evidence, noise, candidates_mm)
 
     @property
     def count(self) -> int:
@@ -106,10 +126,32 @@ class Looks:
             turn_degrees=np.rad2deg(np.linalg.norm(self.shifts[:, 3:], axis=1)).tolist(),
         )
 
+    def with_points_on(self, motion: ElasticMotion, within_mm: float) -> Looks:
+        """With those candidates that lie near the organ's surface where it faces the camera."""
+        if self.candidates_mm is None or not len(self.candidates_mm):
+            return self
+        rows = motion.residual_rows(self.candidates_mm)
+        towards = (rows[:, :3] * (self.candidates_mm @ motion.rotation)).sum(1)
+        facing = towards > _FACING * np.linalg.norm(self.candidates_mm, axis=1)
+        on = self.candidates_mm[facing & (np.abs(rows[:, -1]) < within_mm)]
+        numbers = np.append(self.look, np.zeros(len(on), int))
+        return replace(self, points_mm=np.concatenate([self.points_mm, on]), look=numbers)
+
     def weight(self, config: GaussNewtonConfig) -> float:
         """Of a point's squared distance in the cost. Each look tells as much as a single one."""
-        n_effective = self.count * config.n_effective
-        return min(n_effective / len(self.points_mm), 1.0) / config.sigma_mm**2
+        points = len(self.points_mm) / self.count
+        model_mm2 = config.sigma_mm**2 / min(config.n_effective, points)
+        return 1 / (points * (model_mm2 + self.noise.mean_mm**2))
+
+    def width_mm(self, config: GaussNewtonConfig) -> float:
+        """Of the robust kernel in the last steps: so wide that noise makes no outliers."""
+        return float(np.hypot(config.last_mm, _WIDTHS * self.noise.point_mm))
+
+    def noise_cost(self, config: GaussNewtonConfig) -> float:
+        """What the points' noise adds to the cost of a right fit."""
+        squares = (_ACROSS * self.noise.point_mm * _NODES) ** 2
+        robust_mm2 = squares / (1 + squares / self.width_mm(config) ** 2)
+        return float(len(self.points_mm) * self.weight(config) * (_SHARES @ robust_mm2))
 
     def residuals(self, motion: ElasticMotion, config: GaussNewtonConfig) -> Residuals:
         """At a motion. A camera's error does what the organ's motion before it alone would do."""
@@ -117,7 +159,7 @@ class Looks:
         by_motion, distances_mm = rows[:, :-1], rows[:, -1]
         each = [by_motion[:, :POSE] * (self.look == n)[:, None] for n in range(1, self.count)]
         by_cameras = np.concatenate([by_motion[:, :0], *each], axis=1)
-        weights = self.weight(config) / (1 + (distances_mm / config.last_mm) ** 2) ** 2
+        weights = self.weight(config) / (1 + (distances_mm / self.width_mm(config)) ** 2) ** 2
         return Residuals(distances_mm, by_motion, by_cameras, weights)
 
     def corrected(self, motion: ElasticMotion, config: GaussNewtonConfig) -> Looks:

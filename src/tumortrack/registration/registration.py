@@ -38,7 +38,12 @@ from tumortrack.models.in_distribution import (
 from tumortrack.registration.bend import BentFit, bend
 from tumortrack.registration.choose import cost_with_prior, likeliest
 from tumortrack.registration.config import GaussNewtonConfig
-from tumortrack.registration.gauss_newton import GaussNewton, RegistrationResult, refine
+from tumortrack.registration.gauss_newton import (
+    FARTHEST,
+    GaussNewton,
+    RegistrationResult,
+    refine,
+)
 from tumortrack.registration.looks import Looks
 from tumortrack.registration.motion import ElasticMotion
 from tumortrack.registration.rest_shape import RestShape
@@ -54,6 +59,9 @@ Timer = Callable[[str], AbstractContextManager[object]]
 _TRIAL_STEPS = 6
 _MAX_COST_RATIO = 3.0  # to the least cost: starts above are given up
 _TURNED_SHARE = 2 / 3  # of that, for turned starts, which compete with a finished fit
+
+_ROUNDS = 4  # of choosing points and fitting: what lies on the organ is known after two or three
+_SAME_POINTS = 0.01  # share of the points: the fit no longer moves by them
 
 _CORRECTIONS = 3  # of cameras and motion in turns: more move nothing by a tenth of a millimetre
 
@@ -90,9 +98,29 @@ class Registration:
         with timed("refine"):
             best = self.best_fit(looks, starts, known)
             if looks.count == 1:
-                return best
+                return self.with_all_points(best, looks)
             fits = [self._correct_cameras(looks, fit) for fit in (best, *best.others)]
             return likeliest(fits if known is None else [known, *fits], self.prior)
+
+    def with_all_points(
+        self, fit: RegistrationResult, looks: Looks, rounds: int = _ROUNDS
+    ) -> RegistrationResult:
+        """The fit, and its rivals', to all points that lie on the organ: those of ``looks`` and the
+        candidates that the fit shows to be the organ's, too; until they stay the same."""
+        near = msgspec.structs.replace(self.config, first_mm=self.config.last_mm)
+        count = len(fit.looks.points_mm)
+        for _ in range(rounds):
+            more = looks.with_points_on(fit.motion, FARTHEST * looks.width_mm(self.config))
+            if abs(len(more.points_mm) - count) <= _SAME_POINTS * count:
+                break
+            count = len(more.points_mm)
+            fits = [
+                GaussNewton(self.rest, more, each.motion, near, each.moved)
+                for each in (fit, *fit.others)
+            ]
+            parallel_map(lambda descent: descent.run(near.steps), fits)
+            fit = likeliest([descent.result() for descent in fits], self.prior)
+        return fit
 
     def follow(
         self, looks: Looks, start: ElasticMotion, config: GaussNewtonConfig

@@ -9,19 +9,20 @@ from jaxtyping import Float
 
 from tumortrack.core.report import AllowedPoses, ExcludedFit, FitCost, MotionReport, RivalFit
 from tumortrack.registration.bend import BentFit
+from tumortrack.registration.config import GaussNewtonConfig
 from tumortrack.registration.gauss_newton import FARTHEST, RegistrationResult
 from tumortrack.registration.motion import ElasticMotion
 from tumortrack.registration.search import PosePrior
 
 
 def cost_entry(
-    fit: RegistrationResult, prior: PosePrior, usual_cost: float, last_mm: float
+    fit: RegistrationResult, prior: PosePrior, usual_cost: float, config: GaussNewtonConfig
 ) -> FitCost:
-    """``usual_cost``: of one look; ``last_mm``: the robust kernel's last width. Of several looks
-    the one with most strays counts."""
+    """``usual_cost``: of one look, without its noise. Of several looks the one with most strays
+    counts."""
     looks, strays, now = fit.looks, fit.strays, fit.points_cost
     if looks.count > 1:
-        far = np.abs(fit.distances_mm) > FARTHEST * last_mm
+        far = np.abs(fit.distances_mm) > FARTHEST * looks.width_mm(config)
         strays = max(float(far[looks.look == n].mean()) for n in range(looks.count))
     rivals = [
         RivalFit(more=rival.cost - fit.cost, apart_mm=_middles_apart_mm(fit.motion, rival.motion))
@@ -30,7 +31,7 @@ def cost_entry(
     return FitCost(
         now=now,
         without_strays=fit.cost_without_strays - (fit.cost - now),
-        usual=usual_cost * looks.count,
+        usual=usual_cost * looks.count + looks.noise_cost(config),
         strays=strays,
         others=tuple(rivals),
         beyond=_excluded(fit, prior),

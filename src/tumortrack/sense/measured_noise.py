@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from tumortrack.core.types import DepthFrame, SensorCloud
+from tumortrack.core.types import DepthFrame, PointNoise, SensorCloud
 
 _WINDOW_MM = 12.0  # a quadratic leaves 0.01 mm of a ball's surface of 25 mm radius
 _SIDES_PX = 9, 31  # of a window, at least and at most
@@ -48,6 +48,17 @@ class DepthNoise(NamedTuple):
     @property
     def whole_mm(self) -> float:
         return float(np.hypot(self.white_mm, self.correlated_mm))
+
+    def of_points(self, count: int, window_px: int = 0) -> PointNoise:
+        """Of points of ``count`` pixels, each averaged over a window of so many pixels to either
+        side. Correlated noise is as that of so many patches of its length are independent."""
+        white = self.white_mm / (2 * window_px + 1)
+        patch_px = max(np.pi * self.correlation_px**2, 1.0)
+        mean_mm2 = (self.white_mm**2 + patch_px * self.correlated_mm**2) / max(count, 1)
+        return PointNoise(
+            float(np.hypot(white, self.correlated_mm)),
+            float(np.sqrt(min(mean_mm2, self.whole_mm**2))),
+        )
 
     @property
     def words(self) -> str:

@@ -8,12 +8,15 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass
 
+import msgspec
 import numpy as np
 
 from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.report import Finding
 from tumortrack.core.types import DepthFrame, SensorCloud
 from tumortrack.sense.cloud import FEWEST_POINTS
+from tumortrack.sense.measured_noise import DepthNoise, image_noise
+from tumortrack.sense.noise import REFERENCE_MM
 from tumortrack.sense.region.choose import choose_pieces
 from tumortrack.sense.region.hints import Hints
 from tumortrack.sense.region.pieces import remove_flying
@@ -34,6 +37,8 @@ from tumortrack.sense.units import unit_advice
 
 __all__ = ["Hints", "Region", "RegionConfig", "organ_points"]
 
+_MOST_CANDIDATES = 3000  # points beside the organ's: an organ of which a quarter was found
+
 
 @dataclass(frozen=True, eq=False)
 class Region:
@@ -48,6 +53,7 @@ class Region:
         seconds: run time.
         doubt: why the colours learnt from clicks were not used, so that depth alone decided; or
             empty.
+        noise: of the depth image, as measured, if it shows a surface.
     """
 
     cloud: SensorCloud
@@ -55,6 +61,7 @@ class Region:
     taken: np.ndarray
     seconds: float
     doubt: str = ""
+    noise: DepthNoise | None = None
 
 
 def organ_points(
@@ -72,8 +79,12 @@ def organ_points(
         InputError: mask or picture is not of the image's size, or a mask was given with a cloud.
     """
     start = time.perf_counter()
+    noise = None
     if isinstance(content, DepthFrame):
-        image = image_of_frame(content, hints.mask)
+        noise = hints.noise or image_noise(content)
+        image = image_of_frame(content, hints.mask, noise)
+        if noise is not None:
+            config = _as_noisy(config, noise, image.window_px)
     elif hints.mask is None:
         image = image_of_cloud(content)
     else:
@@ -90,6 +101,7 @@ def organ_points(
         remove_plane(image, config, rng)
     if config.flying:
         remove_flying(image, config)
+    possible = image.remaining(image.taken)
     if config.pieces:
         window, part = image.cropped()
         choose_pieces(part, config, hints)
@@ -111,8 +123,23 @@ def organ_points(
         }
         raise NoEstimate(Finding("few_points", values))
     drawn = rng.choice(remaining, min(len(remaining), config.crop.n_points), replace=False)
-    cloud = SensorCloud(image.points(drawn), content.stamp_ns)
-    return Region(cloud, counts, image.taken, time.perf_counter() - start, doubt)
+    beside = np.setdiff1d(possible, remaining, assume_unique=True)
+    most = min(round(len(beside) * len(drawn) / len(remaining)), _MOST_CANDIDATES)
+    beside = rng.choice(beside, most, replace=False)
+    pixels = counts["organ"] * image.step_px**2
+    cloud = SensorCloud(
+        image.points(drawn),
+        content.stamp_ns,
+        None if noise is None else noise.of_points(pixels, image.window_px),
+        image.points(beside),
+    )
+    return Region(cloud, counts, image.taken, time.perf_counter() - start, doubt, noise)
+
+
+def _as_noisy(config: RegionConfig, noise: DepthNoise, window_px: int) -> RegionConfig:
+    """With the noise that is left, if it is more than was presumed."""
+    left_mm = noise.of_points(1, window_px).point_mm * (REFERENCE_MM / noise.depth_mm) ** 2
+    return msgspec.structs.replace(config, noise_mm=max(config.noise_mm, min(left_mm, 10.0)))
 
 
 def _remove_other_tissue(

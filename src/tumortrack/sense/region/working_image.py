@@ -14,6 +14,8 @@ from tumortrack.core.errors import InputError
 from tumortrack.core.types import DepthFrame, SensorCloud
 from tumortrack.sense.camera import Pinhole, deproject_pixels
 from tumortrack.sense.cloud import CloudConfig
+from tumortrack.sense.measured_noise import DepthNoise
+from tumortrack.sense.smoothing import smoothed, window_px
 
 MOST_PIXELS = 110_000  # 424 x 240 as it is, of 848 x 480 every second pixel
 _POINTS_PER_PIXEL = 2
@@ -98,7 +100,8 @@ class WorkingImage:
     """A depth image at working size, and the state of its pixels.
 
     ``depth_mm`` (h, w) is float32, NaN without a return; ``taken`` (h, w), uint8, holds the states
-    above, which the steps write. ``remaining(taken)``: indices (n,) of the frame's or cloud's
+    above, which the steps write. Each of its pixels is one of ``step_px`` by ``step_px`` of the
+    frame's, averaged over ``window_px`` to either side. ``remaining(taken)``: indices (n,) of the frame's or cloud's
     points that are still ORGAN; ``points(indices)``: these (n, 3), camera frame, mm.
     """
 
@@ -107,6 +110,8 @@ class WorkingImage:
     pinhole: Pinhole
     remaining: Callable[[np.ndarray], np.ndarray]
     points: Callable[[np.ndarray], np.ndarray]
+    step_px: int = 1
+    window_px: int = 0
 
     @property
     def footprint(self) -> float:
@@ -150,17 +155,21 @@ def sampled_pixels(frame: DepthFrame) -> tuple[slice, slice]:
     return slice(step // 2, None, step), slice(step // 2, None, step)
 
 
-def image_of_frame(frame: DepthFrame, mask: np.ndarray | None) -> WorkingImage:
-    """A frame's ``sampled_pixels``, without those outside a mask. InputError: of another size."""
+def image_of_frame(
+    frame: DepthFrame, mask: np.ndarray | None, noise: DepthNoise | None = None
+) -> WorkingImage:
+    """A frame's ``sampled_pixels``, rid of white noise, without those outside a mask. InputError:
+    of another size."""
     camera, sampled = frame.intrinsics, sampled_pixels(frame)
     step = sampled[0].step
-    depth_mm = frame.depth_mm[sampled].copy()
+    reach = 0 if noise is None else window_px(frame, noise)
+    depth_mm = smoothed(frame, sampled, noise, reach) if reach else frame.depth_mm[sampled].copy()
     taken = np.isnan(depth_mm).view(np.uint8) * np.uint8(NO_RETURN)
 
     def points(pixel: np.ndarray) -> np.ndarray:
+        z_mm = depth_mm.ravel()[pixel].astype(np.float64)
         row, column = np.divmod(pixel, depth_mm.shape[1])
         row, column = step // 2 + row * step, step // 2 + column * step
-        z_mm = frame.depth_mm[row, column].astype(np.float64)
         return deproject_pixels(row * camera.width + column, z_mm, camera)
 
     cx, cy = (camera.cx - step // 2) / step, (camera.cy - step // 2) / step
@@ -169,7 +178,7 @@ def image_of_frame(frame: DepthFrame, mask: np.ndarray | None) -> WorkingImage:
     def remaining(taken: np.ndarray) -> np.ndarray:
         return np.flatnonzero(taken == ORGAN)
 
-    image = WorkingImage(depth_mm, taken, pinhole, remaining, points)
+    image = WorkingImage(depth_mm, taken, pinhole, remaining, points, step, reach)
     if mask is not None:
         if mask.shape != frame.depth_mm.shape:
             raise InputError(
