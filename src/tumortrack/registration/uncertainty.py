@@ -43,7 +43,9 @@ def apparent_size(
     fit them scaled about their cameras by that; to second order, as in Rao's score test."""
     assert motion.covariance is not None
     near = looks.residuals(motion, config)
+    # To the surface, not to the points: their noise would make the organ larger.
     by_scale = -(near.by_motion[:, :3] * (looks.rays_mm @ motion.rotation)).sum(1)
+    by_scale -= near.distances_mm
     weighted = by_scale * near.weights
     cross = near.by_motion.T @ weighted
     slope = weighted @ near.distances_mm
