@@ -21,7 +21,6 @@ from tumortrack.core.types import (
     Look,
     Mesh,
     OccupancyCloud,
-    PointNoise,
     SensorCloud,
 )
 from tumortrack.imaging.raster import label_grid
@@ -39,7 +38,6 @@ from tumortrack.registration.motion import ElasticMotion, blend
 from tumortrack.registration.search import PosePrior, apart_mm
 from tumortrack.registration.uncertainty import apparent_size, held_by_prior_mm
 from tumortrack.sense.cloud import FEWEST_POINTS
-from tumortrack.sense.measured_noise import cloud_noise
 
 QUERIES = 40_000  # as many as the paper asks
 CARRIED = 20_000  # points of the undeformed organ that live estimates carry along
@@ -102,14 +100,6 @@ class _Placed:
         variances = np.trace(self.sample_mm2, axis1=1, axis2=2) / 3
         per_std = 1 / np.sqrt(variances + _FIELD_MM**2)
         return kernels.probabilities(mine.margin_mm, per_std, mine.sample)
-
-
-def _noise(look: Look) -> PointNoise:
-    """As it was measured with the organ's points, else now."""
-    if look.cloud.noise is not None:
-        return look.cloud.noise
-    measured = cloud_noise(look.cloud)
-    return PointNoise(0.0, 0.0) if measured is None else measured.of_points(len(look.cloud.points_mm))
 
 
 class _Found(NamedTuple):
@@ -301,7 +291,8 @@ class RegistrationLocator:
         points_mm = [each.points_mm[::every] for each in (frame, *more)]
         poses = [look.camera_from_look for look in looks[1:]]
         candidates_mm = looks[0].cloud.candidates_mm
-        return Looks.of(points_mm, poses, evidence, map(_noise, looks), candidates_mm)
+        noises = [look.cloud.noise for look in looks if look.cloud.noise is not None]
+        return Looks.of(points_mm, poses, evidence, noises, candidates_mm)
 
     def warm(self) -> None:
         """See ``tracking.tracker.Tracker.warm``."""

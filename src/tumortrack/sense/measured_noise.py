@@ -25,7 +25,9 @@ _FEWEST = 12
 _ROUGH = 4.0  # times the median variance: an edge, a fold, a window with an outlier
 _NEIGHBOURS, _SPARSE_MM = 40, 3.0
 _STEP_OFF, _LEAST_STEP_MM = 0.02, 1e-3  # of a step, and of one: rounding of stored numbers
-_MOST_POINTS, _MOST_MIDDLES = 10_000, 200  # of a cloud: more are hardly more certain
+_MOST_POINTS, _MOST_MIDDLES = 5000, 200  # of a cloud: more are hardly more certain
+TERMS = 6  # of a quadratic
+CROWD, LONELY = 8, 2.0  # a stray's so many neighbours reach more than so many times the usual
 _MOST_VALUES = 20_000  # depths among which the step is looked for
 
 
@@ -107,26 +109,52 @@ def image_noise(frame: DepthFrame) -> DepthNoise | None:
 
 def cloud_noise(cloud: SensorCloud) -> DepthNoise | None:
     """Of a cloud of any density; None: it has too few points."""
-    points = np.asarray(cloud.points_mm, float)
-    if len(points) < 2 * _NEIGHBOURS:
+    if len(cloud.points_mm) < 2 * _NEIGHBOURS:
         return None
-    points = points[:: len(points) // _MOST_POINTS + 1]
-    middles = points[:: len(points) // _MOST_MIDDLES + 1]
-    # Not by scipy's tree, whose import takes longer.
-    apart_mm2 = np.sum((middles[:, None] - points) ** 2, axis=2)
+    points, middles, apart_mm2 = _around(cloud)
     near = np.argpartition(apart_mm2, _NEIGHBOURS, axis=1)[:, :_NEIGHBOURS]
-    local = points[near] - middles[:, None]
-    _, _, axes = np.linalg.svd(local - local.mean(1, keepdims=True), full_matrices=False)
-    u, v, height = np.einsum("nki,nji->jnk", local, axes)
-    terms = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], -1)
-    basis, _ = np.linalg.qr(terms)
-    left = height - np.einsum("nkt,nt->nk", basis, np.einsum("nkt,nk->nt", basis, height))
-    variances = np.sum(left**2, axis=1) / (_NEIGHBOURS - terms.shape[-1])
+    _, left = local_quadratics(points[near] - middles[:, None])
+    variances = np.sum(left**2, axis=1) / (_NEIGHBOURS - TERMS)
     smooth = variances <= _ROUGH * np.median(variances)
     apart_mm = float(np.sqrt(np.median(np.partition(apart_mm2, 1, axis=1)[:, 1])))
     white_mm = float(np.sqrt(variances[smooth].mean()))
     at_mm = float(np.median(points[:, 2]))
     return DepthNoise(white_mm, 0.0, 0.0, 0.0, at_mm, apart_mm > _SPARSE_MM)
+
+
+def local_quadratics(
+    local: Float[np.ndarray, "n k 3"],
+) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n k"]]:
+    """Through neighbours of points, relative to these: by how much the surface there lies off each
+    point, along the normal; and how far the neighbours lie from it."""
+    middle = local.mean(1, keepdims=True)
+    _, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", local - middle, local - middle))
+    height, u, v = np.einsum("nki,nij->jnk", local, axes)
+    terms = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], -1)
+    normal = np.einsum("nkt,nks->nts", terms, terms)
+    normal += 1e-9 * np.trace(normal, axis1=1, axis2=2)[:, None, None] * np.eye(TERMS)
+    found = np.linalg.solve(normal, np.einsum("nkt,nk->nt", terms, height)[..., None])[..., 0]
+    left = height - np.einsum("nkt,nt->nk", terms, found)
+    return found[:, :1] * axes[:, :, 0], left
+
+
+def scattered_share(cloud: SensorCloud) -> float:
+    """The share of the points that have few neighbours: about that of strays."""
+    if len(cloud.points_mm) < 2 * _NEIGHBOURS:
+        return 0.0
+    _, _, apart_mm2 = _around(cloud)
+    reach_mm2 = np.partition(apart_mm2, CROWD, axis=1)[:, CROWD]
+    return float(np.mean(reach_mm2 > (LONELY**2) * np.median(reach_mm2)))
+
+
+def _around(cloud: SensorCloud) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Points of a cloud, some of these, and the squares of the distances between them. Not by
+    scipy's tree, whose import takes longer."""
+    points = np.asarray(cloud.points_mm, float)
+    points = points[:: len(points) // _MOST_POINTS + 1]
+    middles = points[:: len(points) // _MOST_MIDDLES + 1]
+    half = (points**2).sum(1) - 2 * middles @ points.T
+    return points, middles, np.maximum(half + (middles**2).sum(1)[:, None], 0.0)
 
 
 def depth_step_mm(depth_mm: Float[np.ndarray, "h w"]) -> float:

@@ -1,8 +1,9 @@
-"""White noise, averaged away: a local plane at each pixel that is looked at.
+"""White noise, averaged away: a local surface at each pixel or point that is looked at.
 
 A tissue's surface is nearly flat over a few millimetres, so neighbours tell a pixel's depth better
 than its own noise. Depths that lie apart by more than noise and slope explain, across an edge or a
-fold, do not take part (Tomasi and Manduchi 1998, doi 10.1109/ICCV.1998.710815).
+fold, do not take part (Tomasi and Manduchi 1998, doi 10.1109/ICCV.1998.710815). Of a cloud, points
+with few neighbours are dropped first (Rusu et al. 2008, doi 10.1016/j.robot.2008.08.005).
 """
 
 from __future__ import annotations
@@ -12,8 +13,17 @@ from jaxtyping import Float32
 
 from tumortrack.core.compiled import njit
 from tumortrack.core.process import parallel_for
-from tumortrack.core.types import DepthFrame
-from tumortrack.sense.measured_noise import DepthNoise
+from tumortrack.core.types import DepthFrame, PointNoise, SensorCloud
+from tumortrack.sense.cloud import thin_cloud
+from tumortrack.sense.measured_noise import (
+    CROWD,
+    LONELY,
+    TERMS,
+    DepthNoise,
+    cloud_noise,
+    local_quadratics,
+    scattered_share,
+)
 
 # What is left is less than what the fit's own ``sigma_mm`` contains, and flat patches of this
 # radius leave 0.1 mm of a ball of 25 mm.
@@ -22,6 +32,11 @@ _STEEPEST = 2.0  # slope up to which neighbours are of one surface
 _WITHIN = 3.0  # standard deviations
 _FEWEST = 0.3  # of the window; else there is no surface round the pixel
 _AT_ONCE = 20  # rows
+_FEW_SCATTERED = 0.12  # share of a cloud's points: up to 0.08 lie alone where it is seen aslant
+_MOST_POINTS = 4000  # of a cloud that is cleaned
+_SMOOTHED = 1000  # of these: as many as a fit takes
+_NEIGHBOURS, _RADIUS_MM = (24, 120), 6.0  # a quadratic leaves 0.1 mm of a ball of 25 mm
+_NOISY_MM = 0.4  # less is what cameras have that nothing need be done for
 
 
 def window_px(frame: DepthFrame, noise: DepthNoise) -> int:
@@ -49,6 +64,49 @@ def smoothed(
         _AT_ONCE,
     )
     return out
+
+
+def clean_cloud(cloud: SensorCloud) -> SensorCloud:
+    """The cloud with its noise, as measured; without scattered points, if it has many; its white
+    noise averaged away, if it is more than a camera near by has."""
+    if cloud.noise is not None:
+        return cloud
+    if (share := scattered_share(cloud)) > _FEW_SCATTERED:
+        cloud = _without_scattered(cloud, share)
+    if (noise := cloud_noise(cloud)) is None:
+        return cloud
+    kept = noise.of_points(len(cloud.points_mm))
+    if noise.white_mm > _NOISY_MM and not noise.bound:
+        cloud, kept = _smoothed(cloud, noise)
+    return SensorCloud(cloud.points_mm, cloud.stamp_ns, kept)
+
+
+def _without_scattered(cloud: SensorCloud, share: float) -> SensorCloud:
+    from scipy.spatial import cKDTree
+
+    points_mm = thin_cloud(cloud, _MOST_POINTS, np.random.default_rng(0)).points_mm
+    for _ in range(2):  # a stray's neighbours may be strays
+        reach_mm = cKDTree(points_mm).query(points_mm, CROWD + 1)[0][:, -1]
+        points_mm = points_mm[reach_mm < LONELY * np.quantile(reach_mm, 0.5 * (1 - share))]
+    return SensorCloud(points_mm, cloud.stamp_ns)
+
+
+def _smoothed(cloud: SensorCloud, noise: DepthNoise) -> tuple[SensorCloud, PointNoise]:
+    from scipy.spatial import cKDTree
+
+    rng = np.random.default_rng(0)
+    points_mm = thin_cloud(cloud, _MOST_POINTS, rng).points_mm.astype(float)
+    tree, drawn = cKDTree(points_mm), points_mm[: _SMOOTHED]
+    wanted = int(np.clip(TERMS / 2 * (noise.white_mm / _LEFT_MM) ** 2, *_NEIGHBOURS))
+    apart_mm, near = tree.query(drawn, min(wanted, len(points_mm)))
+    count = int(np.median((apart_mm < _RADIUS_MM).sum(1)))
+    if count < 2 * TERMS:
+        return cloud, noise.of_points(len(cloud.points_mm))
+    off_mm, _ = local_quadratics(points_mm[near[:, :count]] - drawn[:, None])
+    off_mm[apart_mm[:, count - 1] > 2 * _RADIUS_MM] = 0.0  # too sparse there
+    white_mm = noise.white_mm * np.sqrt(TERMS / 2 / count)
+    left = PointNoise(float(white_mm), float(noise.white_mm / np.sqrt(len(points_mm))))
+    return SensorCloud((drawn + off_mm).astype(np.float32), cloud.stamp_ns), left
 
 
 @njit(nogil=True)

@@ -29,6 +29,7 @@ from tumortrack.registration.model import RegistrationModel
 from tumortrack.registration.motion import ElasticMotion, seen_from_first
 from tumortrack.sense.cloud import CloudConfig
 from tumortrack.sense.region import RegionConfig
+from tumortrack.sense.smoothing import clean_cloud
 from tumortrack.tracking.advice import TOUCH_MORE, where_to_look
 from tumortrack.tracking.causes import likely_causes, words
 from tumortrack.tracking.disputes import Disputes
@@ -208,9 +209,15 @@ def _parted(
             "evidence is of Look, Touch, Landmark, Held, Outline and Free, not "
             f"{type(wrong[0]).__name__}: evidence=[Touch(place_mm=(x, y, z))]."
         )
-    further = [each for each in given if isinstance(each, Look)]
+    looks = Look(cloud, seen or cloud, HERE), *(each for each in given if isinstance(each, Look))
     pieces = tuple(each for each in given if not isinstance(each, Look))
-    return (Look(cloud, seen or cloud, HERE), *further), pieces
+    return tuple(map(_cleaned, looks)), pieces
+
+
+def _cleaned(look: Look) -> Look:
+    """What was seen is cleaned with the organ's points where it is no more than these."""
+    cloud = clean_cloud(look.cloud)
+    return replace(look, cloud=cloud, seen=cloud if look.seen is look.cloud else look.seen)
 
 
 def _wrong_evidence(estimate: Estimate | None) -> tuple[Likely, ...]:
