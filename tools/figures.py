@@ -10,9 +10,41 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
+import pandas as pd
+
+from tumortrack.core import store
 from tumortrack.core.errors import InputError
+from tumortrack.sense.sensors import FIGURES, simulated
 from tumortrack.tracking.fingerprint import fingerprint
 from tumortrack_lab.study.document import MeasuredTable, rendered
+
+
+def sensors() -> str:
+    """sensors.toml as CSV: every figure with its grade, and what follows at some distances."""
+    rows = []
+    for name, known in FIGURES.items():
+        camera = simulated(name)
+        for part, of in enumerate(("temporal", "frozen")):
+            law = " / ".join(
+                f"{camera.noise_mm(z)[part]:.2f}" if z >= camera.nearest_mm else "–"
+                for z in (150.0, 300.0, 500.0)
+            )
+            key = f"{of}_px" if f"{of}_px" in known else f"{of}_mm"
+            at = f"{of} noise at 150 / 300 / 500, mm"
+            rows.append((name, at, law, known[key][1], f"from {key}"))
+        for key, (value, grade, source) in known.items():
+            shown = ", ".join(map(str, value)) if isinstance(value, list) else value
+            rows.append((name, key, shown, grade, source))
+    columns = ["sensor", "figure", "value", "grade", "source"]
+    return pd.DataFrame(rows, columns=columns).to_csv(index=False, lineterminator="\n")
+
+
+def differs(table: Path, check: bool) -> list[str]:
+    """Whether the table of sensors is not what sensors.toml says; without ``check`` it is made."""
+    if not check:
+        store.write_atomically(table, sensors().encode())
+    same = table.is_file() and table.read_text(encoding="utf-8") == sensors()
+    return [] if same else [f"{table.name} differs from sensors.toml: make figures"]
 
 
 def faults(root: Path, check: bool) -> list[str]:
@@ -44,6 +76,7 @@ def faults(root: Path, check: bool) -> list[str]:
 
 
 if __name__ == "__main__":
-    wrong = faults(Path(__file__).parents[1], "--check" in sys.argv[1:])
+    root, check = Path(__file__).parents[1], "--check" in sys.argv[1:]
+    wrong = differs(root / "docs/data/sensors.csv", check) + faults(root, check)
     print(*wrong, sep="\n", file=sys.stderr)
     sys.exit(bool(wrong))

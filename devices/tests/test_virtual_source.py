@@ -20,6 +20,7 @@ from tumortrack.core.types import LabelVolume, Mesh
 from tumortrack.imaging.case import Case, save_case
 from tumortrack.live.spec import SOURCES
 from tumortrack.sense.noise import CLEAN
+from tumortrack.sense.sensors import simulated
 from tumortrack.simulate.elastic.body import BodyConfig
 from tumortrack_devices.player import SHAFT_MM, ScenePlayer, ScenePlayerConfig, rod
 from tumortrack_devices.sources.virtual import VirtualSource, VirtualSourceConfig
@@ -242,6 +243,24 @@ def test_truth_is_of_the_frames_own_instant():
     np.testing.assert_array_equal(seen.truth.organ.vertices_mm, again.organ.vertices_mm)
 
 
+def test_another_camera_looks_from_farther_and_keeps_its_frozen_noise():
+    camera = simulated("l515", unit=1)
+    room = small_theatre(table=False, push_mm=0.0, noise=camera, **STILL)
+    exact = small_theatre(table=False, push_mm=0.0, distance_mm=265.0, noise=CLEAN, **STILL)
+    errors = []
+    for t_s in (1.0, 2.0):
+        instant, exactly = room.state_at(t_s), exact.state_at(t_s)
+        truth = room.truth(instant)
+        assert truth.organ.vertices_mm[:, 2].min() > camera.nearest_mm + 10
+        clean = exact.frame(exactly, exact.truth(exactly), 0)
+        errors.append(room.frame(instant, truth, 0).depth_mm - clean.depth_mm)
+    temporal, frozen = camera.noise_mm(280.0)
+    both = (np.abs(errors) < 4 * np.hypot(temporal, frozen)).all(0)  # no mixed pixels of edges
+    shared = np.mean(errors[0][both] * errors[1][both])
+    assert frozen**2 > 4 * temporal**2
+    assert shared == pytest.approx(frozen**2, rel=0.2)
+
+
 def test_the_command_lines_text_opens_a_case(tmp_path):
     labels = LabelVolume(np.zeros((2, 2, 2), np.uint8), np.eye(4))
     save_case(Case(organ(), labels, UP), tmp_path)
@@ -258,6 +277,8 @@ def test_the_command_lines_text_opens_a_case(tmp_path):
         seen.truth.organ.vertices_mm[:, 2].min(),
         atol=0.5,
     )
+    other = SOURCES.parse(f"virtual:{tmp_path}?sensor=azure-kinect&tissue=true&seed=2").player()
+    assert other.config.noise == simulated("azure-kinect", tissue=True, unit=2)
     for wrong in ({"fps": 0.0}, {"seed": -1}):
         with pytest.raises(InputError):
             VirtualSourceConfig(case=tmp_path, **wrong)

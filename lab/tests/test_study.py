@@ -284,6 +284,18 @@ def test_a_table_of_another_method_or_a_page_that_differs_is_found(tmp_path):
     assert faults(True) == []
 
 
+def test_the_table_of_sensors_is_that_of_the_data_file(tmp_path):
+    differs = runpy.run_path(str(ROOT / "tools" / "figures.py"))["differs"]
+    table = tmp_path / "sensors.csv"
+    assert len(differs(table, True)) == 1
+    assert differs(table, False) == []
+    rows = MeasuredTable.read(table)
+    assert rows.cell("l515,step_mm", "value") == "0.25"
+    assert rows.cell("l515,step_mm", "grade") == "second-hand"
+    table.write_text(table.read_text().replace("0.25", "0.2"))
+    assert len(differs(table, True)) == 1
+
+
 def test_a_population_shows_rigid_fits_or_says_that_a_run_lacks_them(tmp_path):
     script = runpy.run_path(str(ROOT / "lab" / "scripts" / "population.py"))
     people = {"patient": ["a"], "state": ["done"], "slice_mm": [1.0], "scenes": [1], "lost": [0]}

@@ -171,7 +171,8 @@ def write_scenes(
         folder: where to write scene folders PREFIX0000, PREFIX0001, ...
         progress: called after each scene.
         options: as on the command line: ``scenes``, ``seed``, ``configuration``, ``falloff``,
-            ``rotations``, ``squeeze``, ``noise``, ``sensor``, ``elastic``.
+            ``rotations``, ``squeeze``, ``noise``, ``sensor``, ``uncalibrated``, ``tissue``,
+            ``elastic``.
 
     Raises:
         InputError: an option is not allowed, or a scene that is there was made otherwise.

@@ -42,6 +42,7 @@ SHAFT_MM = 4.0  # an instrument's radius
 _SHAFT_LENGTH_MM = 200.0
 _BREATH_S, _PUSH_S = 4.0, 6.0  # periods
 _KIDNEY_MM = 118.0  # from the camera to a kidney
+_CLEAR_MM = 15.0  # from the nearest depth that a camera sees to the organ, motions included
 _AWAY_MM = 160.0  # an instrument withdrawn this far along its shaft is out of view
 _STEPS = 3  # of integration: for these states within 0.02 mm of the exact position
 _SWAY_S = (17.0, 23.0, 29.0, 19.0, 13.0, 31.0)  # periods of the camera's rotations and shifts
@@ -131,6 +132,7 @@ class ScenePlayer:
         distance_mm = config.distance_mm
         if distance_mm is None:
             distance_mm = min(_KIDNEY_MM * max(1.0, length_over_kidney(anatomy_ct)), 400.0)
+            distance_mm = max(distance_mm, config.noise.nearest_mm + _CLEAR_MM)
         nearest_mm = (distance_mm, distance_mm)
         self._camera_from_ct = sample_pose(pose, anatomy_ct.organ, up_lps, nearest_mm, rng)
         organ = self._organ = reduced_organ(anatomy_ct, up, config.body, rng)

@@ -102,7 +102,7 @@ class NoiseConfig(Config, frozen=True, kw_only=True):
     shadow_px_mm: float = 0.0
 
     def __post_init__(self) -> None:
-        for name in self.__struct_fields__:
+        for name in NoiseConfig.__struct_fields__:
             value = getattr(self, name)
             if not 0 <= value < np.inf:
                 raise InputError(f"noise {name} is {value}; it must be 0 (off) or positive.")
@@ -112,6 +112,15 @@ class NoiseConfig(Config, frozen=True, kw_only=True):
                 raise InputError(f"noise {name} is {value}; at least 1 pixel is needed.")
         if not self.grazing_degrees < 90:
             raise InputError(f"noise grazing_degrees is {self.grazing_degrees}; it must be < 90.")
+
+    @property
+    def nearest_mm(self) -> float:
+        """Nothing nearer is seen."""
+        return 0.0
+
+    def measured(self, frame: DepthFrame, seed: int) -> DepthFrame:
+        """The frame with these errors; each part hashes its own stream from the seed."""
+        return _measured(frame, self, seed)
 
 
 CLEAN = NoiseConfig()
@@ -159,6 +168,10 @@ def add_noise(frame: DepthFrame, config: NoiseConfig, rng: np.random.Generator) 
     seed = int(rng.integers(2**62))
     if config == CLEAN:
         return frame
+    return config.measured(frame, seed)
+
+
+def _measured(frame: DepthFrame, config: NoiseConfig, seed: int) -> DepthFrame:
     from tumortrack.sense.kernels import seen_pixels
 
     if config.fatten_px or config.shadow_px_mm:

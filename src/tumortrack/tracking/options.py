@@ -18,6 +18,12 @@ if TYPE_CHECKING:
     from tumortrack.simulate.scene import SceneConfig
 
 Device = Literal["auto", "cpu", "cuda"]
+# ``sense.noise.SENSORS``, and the cameras of sense/sensors.toml.
+SimulatedSensor = Literal[
+    "d405", "stereo", "d405-measured", "d435", "zed", "azure-kinect", "l515", "flexx2",
+    "structured-light", "endoscope",
+]  # fmt: skip
+_CLEAR_MM = 10.0  # from the nearest depth that a camera sees to the organ
 _Options = TypeVar("_Options")  # a dataclass
 
 
@@ -199,7 +205,12 @@ class SimulateOptions:
         rotations: poses, as in `train`.
         squeeze: also squeeze and bend the organ as a whole.
         noise: with the depth sensor's noise.
-        sensor: whose, as in `train`.
+        sensor: whose. d405 and stereo are as in `train`; all others have the noise that is
+            published of them, of which much is assumed (docs/method.md). A camera that cannot see
+            so near has the organ farther off.
+        uncalibrated: the camera errs as its kind does without calibration, by what SEED draws.
+        tissue: it sees tissue: wet for stereo (twice the noise, 12 % lost), too deep for time of
+            flight (8 to 15 mm). Not of d405 and stereo, nor is uncalibrated.
         elastic: deform the organ as an elastic body in its bed does (plates, instruments, pulls,
             weight, swelling), instead of by the paper's table.
     """
@@ -211,7 +222,9 @@ class SimulateOptions:
     rotations: Literal["limited", "full"] = "limited"
     squeeze: bool = False
     noise: bool = True
-    sensor: Literal["d405", "stereo"] = "d405"
+    sensor: SimulatedSensor = "d405"
+    uncalibrated: bool = False
+    tissue: bool = False
     elastic: bool = False
 
     def __post_init__(self) -> None:
@@ -219,7 +232,9 @@ class SimulateOptions:
             raise InputError(f"--scenes {self.scenes} must be at least 1.")
 
     def scene_config(self) -> SceneConfig:
-        from tumortrack.sense.noise import CLEAN, SENSORS
+        from tumortrack.sense.cloud import CloudConfig
+        from tumortrack.sense.noise import CLEAN
+        from tumortrack.sense.sensors import simulated
         from tumortrack.simulate import deform
         from tumortrack.simulate.deform.drag import CONFIGURATIONS
         from tumortrack.simulate.scene import PoseConfig, SceneConfig
@@ -228,13 +243,21 @@ class SimulateOptions:
         if not self.elastic:
             table = (CONFIGURATIONS[number] for number in self.configuration)
             models = [deform.DragConfig(steps=steps, falloff=self.falloff) for steps in table]
+        noise = simulated(
+            self.sensor, unit=self.seed, uncalibrated=self.uncalibrated, tissue=self.tissue
+        )
+        cloud, (low_mm, high_mm) = CloudConfig(), PoseConfig().nearest_mm
+        farther_mm = max(0.0, noise.nearest_mm + _CLEAR_MM - low_mm)
         chains = [deform.ChainConfig(links=(model, deform.StretchConfig())) for model in models]
         return SceneConfig(
             width=848,
             height=480,
-            pose=PoseConfig(rotations=self.rotations),
+            pose=PoseConfig(
+                rotations=self.rotations, nearest_mm=(low_mm + farther_mm, high_mm + farther_mm)
+            ),
             deform=tuple(chains if self.squeeze else models),
-            noise=SENSORS[self.sensor] if self.noise else CLEAN,
+            noise=noise if self.noise else CLEAN,
+            cloud=CloudConfig(near_mm=cloud.near_mm + farther_mm, far_mm=cloud.far_mm + farther_mm),
         )
 
 

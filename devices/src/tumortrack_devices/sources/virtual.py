@@ -13,7 +13,7 @@ from tumortrack.core.config import check_seed
 from tumortrack.core.errors import InputError
 from tumortrack.core.patient import Patient, patient_in
 from tumortrack.live.values import Observation, SourceConfig, SourceLost
-from tumortrack.sense.noise import Sensor
+from tumortrack.tracking.options import SimulatedSensor
 
 if TYPE_CHECKING:
     from tumortrack_devices.player import ScenePlayer
@@ -30,7 +30,7 @@ class VirtualSourceConfig(SourceConfig, frozen=True, kw_only=True, tag="virtual"
         seed: of pose, pushed places, tissue and noise.
         table, drape: around the organ.
         instrument: a shaft that comes and pushes; else nothing pushes.
-        sensor: of the noise.
+        sensor, uncalibrated, tissue: of the noise, as in `simulate`; the unit is the seed's.
         pulled: states of the organ under the pull of `resect`'s holder (``make pull``).
     """
 
@@ -48,7 +48,9 @@ class VirtualSourceConfig(SourceConfig, frozen=True, kw_only=True, tag="virtual"
     breathing: bool = True
     camera_motion: bool = True
     noise: bool = True
-    sensor: Sensor = "d405"
+    sensor: SimulatedSensor = "d405"
+    uncalibrated: bool = False
+    tissue: bool = False
     pulled: Path | None = None
 
     def __post_init__(self) -> None:
@@ -62,7 +64,8 @@ class VirtualSourceConfig(SourceConfig, frozen=True, kw_only=True, tag="virtual"
         """The simulated room; building it takes some seconds. Raises ArtifactError if there is no
         case, or no states of it, InputError if case or options make no scene."""
         from tumortrack.imaging.case import load_case
-        from tumortrack.sense.noise import CLEAN, SENSORS
+        from tumortrack.sense.noise import CLEAN
+        from tumortrack.sense.sensors import simulated
         from tumortrack_devices.player import ScenePlayer, ScenePlayerConfig
         from tumortrack_devices.pulled import PulledStates
 
@@ -73,8 +76,10 @@ class VirtualSourceConfig(SourceConfig, frozen=True, kw_only=True, tag="virtual"
         ]
         copied = ("width", "height", "distance_mm", "table", "drape")
         options = {name: getattr(self, name) for name in copied} | dict.fromkeys(off, 0.0)
-        noise = SENSORS[self.sensor] if self.noise else CLEAN
-        config = ScenePlayerConfig(noise=noise, **options)
+        noise = simulated(
+            self.sensor, unit=self.seed, uncalibrated=self.uncalibrated, tissue=self.tissue
+        )
+        config = ScenePlayerConfig(noise=noise if self.noise else CLEAN, **options)
         case, pulled = load_case(self.case), None
         if self.pulled is not None:
             pulled = PulledStates.read(self.pulled)
