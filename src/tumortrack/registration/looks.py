@@ -28,7 +28,6 @@ _WIDTHS = 2.5  # standard deviations of noise: the robust kernel then loses 5 % 
 _ACROSS = 0.85  # of noise along the line of sight, across a surface that is seen at 0 to 60 degrees
 _NODES, _SHARES = np.polynomial.hermite_e.hermegauss(8)  # of a normal distribution
 _SHARES = _SHARES / _SHARES.sum()
-_NONE = PointNoise(0.0, 0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,8 +68,7 @@ class Looks:
         shifts: by how much the organ was found to lie elsewhere before each camera (mm, rad; its
             axes, about its centre): the camera's error, which points and places are rid of.
         evidence: what is known beside the points.
-        noise: of the points, where looks differ that of the worst, beyond what ``sigma_mm``
-            contains.
+        noise: of the points; where looks differ, that of the worst.
         candidates_mm: points of a single look that may be the organ's too.
     """
 
@@ -79,7 +77,7 @@ class Looks:
     camera_from_look: tuple[Affine, ...]
     shifts: Float64[np.ndarray, "k 6"]
     evidence: EvidenceTerms | None = None
-    noise: PointNoise = _NONE
+    noise: PointNoise = PointNoise()  # noqa: RUF009 (an immutable tuple)
     candidates_mm: Points | None = None
 
     @classmethod
@@ -97,9 +95,9 @@ class Looks:
         together = moved[0] if len(moved) == 1 else np.concatenate(moved)
         poses, shifts = (np.eye(4), *camera_from_look), np.zeros((len(moved), POSE))
         worst = [max(values) for values in zip(*noises, strict=True)]
-        noise = _NONE
-        if worst and worst[0] > _CONTAINED_MM:
-            noise = PointNoise(float(np.sqrt(worst[0] ** 2 - _CONTAINED_MM**2)), worst[1])
+        noise = PointNoise()
+        if worst:
+            noise = PointNoise(*worst)
         return cls(together, numbers, poses, shifts, evidence, noise, candidates_mm)
 
     @property
@@ -143,13 +141,18 @@ class Looks:
         model_mm2 = config.sigma_mm**2 / min(config.n_effective, points)
         return 1 / (points * (model_mm2 + self.noise.mean_mm**2))
 
+    @property
+    def more_noise_mm(self) -> float:
+        """Of a point, beyond what ``GaussNewtonConfig.sigma_mm`` contains."""
+        return float(np.sqrt(max(self.noise.point_mm**2 - _CONTAINED_MM**2, 0.0)))
+
     def width_mm(self, config: GaussNewtonConfig) -> float:
         """Of the robust kernel in the last steps: so wide that noise makes no outliers."""
-        return float(np.hypot(config.last_mm, _WIDTHS * self.noise.point_mm))
+        return float(np.hypot(config.last_mm, _WIDTHS * self.more_noise_mm))
 
     def noise_cost(self, config: GaussNewtonConfig) -> float:
         """What the points' noise adds to the cost of a right fit."""
-        squares = (_ACROSS * self.noise.point_mm * _NODES) ** 2
+        squares = (_ACROSS * self.more_noise_mm * _NODES) ** 2
         robust_mm2 = squares / (1 + squares / self.width_mm(config) ** 2)
         return float(len(self.points_mm) * self.weight(config) * (_SHARES @ robust_mm2))
 

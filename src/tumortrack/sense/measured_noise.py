@@ -58,6 +58,7 @@ class DepthNoise(NamedTuple):
         patch_px = max(np.pi * self.correlation_px**2, 1.0)
         mean_mm2 = (self.white_mm**2 + patch_px * self.correlated_mm**2) / max(count, 1)
         return PointNoise(
+            self.whole_mm,
             float(np.hypot(white, self.correlated_mm)),
             float(np.sqrt(min(mean_mm2, self.whole_mm**2))),
         )

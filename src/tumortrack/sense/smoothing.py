@@ -105,7 +105,8 @@ def _smoothed(cloud: SensorCloud, noise: DepthNoise) -> tuple[SensorCloud, Point
     off_mm, _ = local_quadratics(points_mm[near[:, :count]] - drawn[:, None])
     off_mm[apart_mm[:, count - 1] > 2 * _RADIUS_MM] = 0.0  # too sparse there
     white_mm = noise.white_mm * np.sqrt(TERMS / 2 / count)
-    left = PointNoise(float(white_mm), float(noise.white_mm / np.sqrt(len(points_mm))))
+    mean_mm = noise.white_mm / np.sqrt(len(points_mm))
+    left = PointNoise(noise.white_mm, float(white_mm), float(mean_mm))
     return SensorCloud((drawn + off_mm).astype(np.float32), cloud.stamp_ns), left
 
 

@@ -33,7 +33,8 @@ _WIDTH = 212  # pixels of the depth image in which the organ is compared
 # The doubt about an earlier estimate stays if less than this share of what was in sight then is in
 # sight now, unless the organ moved by more than this from one frame to the next.
 _AS_MUCH, _MOVED_MM = 0.9, 10.0
-_THROUGH_MM = 6.0  # points so far behind the estimated surface are behind the organ
+_THROUGH_MM = 6.0  # points so far behind the estimated surface are behind the organ, or, of a
+_NOISES = 3.0  # noisy camera, so many standard deviations of it
 # If the camera sees the surroundings in more than this share of a rim so many pixels (some 3 mm)
 # wide round the organ, most wrong places are seen through. The fit is then judged without strays
 # and may cost ``FIT_FACTOR`` times the usual cost: in a wider world than training's (make world)
@@ -71,8 +72,9 @@ def judged(estimate: Estimate, looks: Sequence[Look], strictly: bool = False) ->
         strictly: the fit must be no worse than usual, whatever the camera sees round the organ.
     """
     views = _organ_before_cameras(estimate, looks)
-    images = [seen_through(organ, view) for organ, view in views if isinstance(view, DepthFrame)]
-    clouds = [cloud_shares(organ, view) for organ, view in views if isinstance(view, SensorCloud)]
+    behind = [(*view, _behind_mm(look)) for view, look in zip(views, looks, strict=False)]
+    images = [seen_through(*view) for view in behind if isinstance(view[1], DepthFrame)]
+    clouds = [cloud_shares(*view) for view in behind if isinstance(view[1], SensorCloud)]
     unseen = max((share for _, share in clouds), default=0.0)
     rim_share = min((share for _, share, _ in images), default=0.0) if not clouds else 0.0
     by_depth = max((share for share, _, _ in images), default=0.0)
@@ -242,7 +244,15 @@ def _tilt_finding(tilt_degrees: float) -> Kind:
     return "tilted" if tilt_degrees > _FAR_TILTED else "not_turned"
 
 
-def seen_through(organ: Mesh, frame: DepthFrame) -> tuple[float, float, float]:
+def _behind_mm(look: Look) -> float:
+    """What lies so far behind the estimated surface is behind the organ, and no noise of it."""
+    measured_mm = 0.0 if look.cloud.noise is None else look.cloud.noise.measured_mm
+    return float(np.hypot(_THROUGH_MM, _NOISES * measured_mm))
+
+
+def seen_through(
+    organ: Mesh, frame: DepthFrame, behind_mm: float = _THROUGH_MM
+) -> tuple[float, float, float]:
     """Three shares of the estimated organ's image, all 0 if no pixel has a return there.
 
     1. Where the camera sees something behind the surface, such as a table, which the organ would
@@ -261,14 +271,16 @@ def seen_through(organ: Mesh, frame: DepthFrame) -> tuple[float, float, float]:
     both = image & np.isfinite(seen_mm)
     if not both.any():
         return 0.0, 0.0, 0.0
-    in_sight = (seen_mm[both] > organ_mm[both] - _THROUGH_MM).sum() / image.sum()
+    in_sight = (seen_mm[both] > organ_mm[both] - behind_mm).sum() / image.sum()
     rim = _within(_RIM, image) & ~image
     rim_share = (seen_mm[rim] > organ_mm[image].min()).sum() / max(rim.sum(), 1)
-    through = (seen_mm[both] > organ_mm[both] + _THROUGH_MM).mean()
+    through = (seen_mm[both] > organ_mm[both] + behind_mm).mean()
     return float(through), float(rim_share), float(in_sight)
 
 
-def cloud_shares(organ: Mesh, cloud: SensorCloud) -> tuple[float, float]:
+def cloud_shares(
+    organ: Mesh, cloud: SensorCloud, behind_mm: float = _THROUGH_MM
+) -> tuple[float, float]:
     """Of a cloud, whose camera is at its origin: the share of the points in the organ's image that
     lie behind its surface, and the share of the image without points."""
     nearest_mm = organ.vertices_mm[:, 2].min()
@@ -291,7 +303,7 @@ def cloud_shares(organ: Mesh, cloud: SensorCloud) -> tuple[float, float]:
     on = np.isfinite(surface_mm)
     if not on.any():
         return 0.0, 1.0
-    through = float((z_mm[on] > surface_mm[on] + _THROUGH_MM).mean())
+    through = float((z_mm[on] > surface_mm[on] + behind_mm).mean())
     filled = np.zeros(organ_mm.shape, bool)
     filled[row, column] = True
     image = np.isfinite(organ_mm)

@@ -46,6 +46,7 @@ _CAUSES_EVERY_S = 1.0
 # Evidence outlasts a hand before the camera: tissue carries what lies on it, as it is seen again.
 _REMEMBERED_S = 60.0
 _NO_CAUSE = (Likely(Cause.VIEW),)
+_FARTHEST_MM = 700.0  # of an organ before a camera on a stand
 _OF_POSES = "none", "poses", "fit", "strays", "seen_through"  # checks that wrong poses fail
 
 
@@ -421,6 +422,8 @@ def region_for(
     if scene.free_range > 0:
         nearest, farthest = scene.free_nearest_mm
         near, far = min(near, nearest - 5), max(far, farthest + far - near)
+    if isinstance(model, RegistrationModel):  # what it fits does not depend on the distance
+        far = max(far, _FARTHEST_MM)
     near, far = range_mm or (near, far)
     crop = CloudConfig(near_mm=near, far_mm=far, n_points=scene.cloud.n_points)
     if whole:
