@@ -49,8 +49,10 @@ def to_builtins(config: msgspec.Struct) -> dict[str, Any]:
 
 def from_builtins(data: object, kind: type[C], where: str) -> C:
     """The inverse. Raises InputError, which names ``where`` the data came from: an unknown key, a
-    wrong type or a missing value."""
+    wrong type, a missing value, or one that is not allowed."""
     try:
         return msgspec.convert(data, kind)
     except msgspec.ValidationError as error:
         raise InputError(f"{where}: not a valid {kind.__name__}: {error}.") from error
+    except InputError as error:  # of its own checks
+        raise InputError(f"{where}: {error}") from error
