@@ -11,14 +11,13 @@ import numpy as np
 from jaxtyping import Float64
 from scipy.spatial import cKDTree
 
-from tumortrack.core.case_warning import warnings_in
 from tumortrack.core.errors import ArtifactError, InputError
 from tumortrack.core.estimate import Estimate
 from tumortrack.core.geometry import rigid
 from tumortrack.core.mesh_files import read_mesh
 from tumortrack.core.organ import KIDNEY, is_tumor, organ_first, organ_name
 from tumortrack.core.patient import NOBODY, Patient
-from tumortrack.core.report import MarginReport
+from tumortrack.core.report import MarginReport, findings_in
 from tumortrack.core.store import MANIFEST, read_json
 from tumortrack.core.types import ORGAN, Mesh, OccupancyCloud
 from tumortrack.sense.ply import parse_ply_properties
@@ -95,7 +94,7 @@ def read_run(folder: Path) -> Located:
     path = folder / "occupancy.ply"
     try:
         report = msgspec.convert(stored, _Report)
-        weak = warnings_in(report.model.get("warnings"), str(folder))
+        weak = findings_in(report.model.get("warnings"), str(folder))
         content = path.read_bytes()
         table = parse_ply_properties(content, str(path), ("x", "y", "z", "label", "probability"))
     except (OSError, InputError, msgspec.ValidationError) as error:

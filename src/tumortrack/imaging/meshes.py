@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from tumortrack.core.case_warning import CaseWarning
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import RAS_FROM_LPS, transform_points
 from tumortrack.core.mesh_files import SUFFIXES, read_mesh
 from tumortrack.core.organ import KIDNEY, Organ
+from tumortrack.core.report import Finding, Note
 from tumortrack.core.store import natural
 from tumortrack.core.types import FIRST_TUMOR, ORGAN, Anatomy, LabelVolume, Mesh, part_names
 from tumortrack.imaging.grid import grid_round
@@ -40,7 +40,7 @@ def read_meshes(
     unit: str | None = None,
     kind: Organ = KIDNEY,
     min_tumor_ml: float = MIN_TUMOR_ML,
-) -> tuple[Anatomy, list[str]]:
+) -> tuple[Anatomy, list[Note]]:
     """Read one organ and its tumors, LPS mm, from the meshes among files; and notes on every
     change.
 
@@ -53,7 +53,7 @@ def read_meshes(
     if unit not in (None, "mm", "m"):
         raise InputError(f"unit {unit!r} is not allowed: mm or m.")
     files = _files_by_name(paths, kind.name)
-    notes: list[str] = []
+    notes: list[Note] = []
     meshes = [read_lps(file, 1000.0 if unit == "m" else 1.0, notes) for file in files]
     _check_unit(files[0], meshes[0], unit)
     parts: list[Mesh] = []
@@ -76,13 +76,12 @@ def read_meshes(
     return Anatomy(tuple(parts), kind), notes
 
 
-def _dropped(name: str, pieces_ml: list[float]) -> list[str]:
-    large: list[str] = [
-        CaseWarning("dropped", what=name, ml=ml) for ml in pieces_ml if ml >= LEAST_DROPPED_ML
-    ]
+def _dropped(name: str, pieces_ml: list[float]) -> list[Note]:
+    large = [ml for ml in pieces_ml if ml >= LEAST_DROPPED_ML]
+    notes: list[Note] = [Finding("dropped", {"what": name, "ml": ml}) for ml in large]
     specks = [ml for ml in pieces_ml if ml < LEAST_DROPPED_ML]
     words = f"{name}: {len(specks)} specks of together {sum(specks):.3f} ml dropped"
-    return [*large, words] if specks else large
+    return [*notes, words] if specks else notes
 
 
 def label_meshes(anatomy: Anatomy) -> LabelVolume:
@@ -110,7 +109,7 @@ def _files_by_name(paths: Sequence[Path], organ: str) -> list[Path]:
     return [*organs, *tumors]
 
 
-def read_lps(path: Path, scale: float, notes: list[str]) -> Mesh:
+def read_lps(path: Path, scale: float, notes: list[Note]) -> Mesh:
     """A mesh file in LPS, its vertices times ``scale``; a conversion from RAS is noted. Raises
     InputError: not a mesh, or an unknown frame."""
     mesh = read_mesh(path)
@@ -166,7 +165,7 @@ def _union(organ: Mesh, tumor: Mesh, name: str) -> Mesh:
     return largest_shell(mesh_of(outer[0]))
 
 
-def closed_mesh(mesh: Mesh, name: str, notes: list[str]) -> Mesh:
+def closed_mesh(mesh: Mesh, name: str, notes: list[Note]) -> Mesh:
     """Repair a mesh and note each change: doubled faces are removed, holes up to 10 mm closed and
     faces turned outward; a mesh that crosses itself is remeshed from its winding numbers. Raises
     InputError: still open, or not a surface."""
@@ -230,7 +229,7 @@ def _together(bodies: list[Mesh]) -> Mesh:
     return Mesh(np.concatenate([b.vertices_mm for b in bodies]), np.concatenate(faces))
 
 
-def _close_holes(mesh: Mesh, name: str, notes: list[str]) -> Mesh:
+def _close_holes(mesh: Mesh, name: str, notes: list[Note]) -> Mesh:
     """Close every boundary loop by a fan about its centre, if all are small."""
     edges = np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]], mesh.faces[:, [2, 0]]])
     n = len(mesh.vertices_mm)

@@ -132,7 +132,7 @@ def _parse_markups(content: bytes, name: str) -> PointTable:
             raise InputError(f"{name}: the unit is {markup.coordinate_units!r}; it must be mm.")
         signs = _signs(markup.coordinate_system, name)
         points += [
-            _Fiducial(p.label, p.description, p.position * signs, p.position_status == "defined")
+            _Fiducial(p.label, p.description, signs * p.position, p.position_status == "defined")
             for p in markup.control_points
         ]
     return _fiducials(points, name)
@@ -155,7 +155,7 @@ def _parse_fcsv(content: bytes, name: str) -> PointTable:
         label, is_placed = cells.get("label", ""), len(row) <= _STATUS or row[_STATUS] == _PLACED
         where = f"{name}, point {label!r}"
         place = [number_in(cells.get(axis, ""), where) for axis in "xyz" if is_placed] or [0.0] * 3
-        points.append(_Fiducial(label, cells.get("desc", ""), place * signs, is_placed))
+        points.append(_Fiducial(label, cells.get("desc", ""), signs * place, is_placed))
     return _fiducials(points, name)
 
 
