@@ -42,7 +42,9 @@ class Rows(NamedTuple):
 
     def numbers(self, names: Sequence[str]) -> Float64[np.ndarray, "rows columns"]:
         """Of several columns. Raises InputError."""
-        return np.reshape([self.column(name, number_in) for name in names], (len(names), -1)).T
+        return np.reshape(
+            [self.column(name, number_in) for name in names], (len(names), len(self.rows))
+        ).T
 
 
 def read_rows(

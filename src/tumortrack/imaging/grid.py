@@ -74,8 +74,12 @@ def check_size(
     """Check, before anything is allocated, that a shape is a 3-D volume within the limits and that
     the file (``stored`` bytes; None: its size) is long enough for it; InputError where not."""
     dims = " x ".join(str(n) for n in shape)
-    if len(shape) != 3 or min(shape) < 2:
-        raise InputError(f"{path} is {dims} voxels. Export one 3-D volume, one phase or channel.")
+    if len(shape) != 3:
+        raise InputError(
+            f"{path} has {len(shape)} axes ({dims}). Export a single phase or channel."
+        )
+    if min(shape) < 2:
+        raise InputError(f"{path} is {dims} voxels: a flat image. Give a whole 3-D volume.")
     voxels = math.prod(int(n) for n in shape)
     needed = voxels * bytes_per_voxel
     if voxels > _MAX_VOXELS or needed > _MAX_BYTES:
@@ -130,7 +134,7 @@ def check_affine(path: Path, lps_from_index: Float[np.ndarray, "4 4"]) -> None:
         raise InputError(f"{path}: the affine puts voxels kilometres away. Export it again.")
     steps = spacing_mm(lps_from_index)
     if min(steps) <= 0 or abs(np.linalg.det(linear / np.where(steps > 0, steps, 1))) < 0.1:
-        raise InputError(f"{path}: the affine's axes do not span space. Export it again.")
+        raise InputError(f"{path}: the affine is singular. Export it again.")
     low, high = _SPACING_RANGE_MM
     if min(steps) < low or max(steps) > high:
         text = " x ".join(f"{s:.6g}" for s in steps)

@@ -143,12 +143,9 @@ def _check_unit(path: Path, organ: Mesh, unit: str | None) -> None:
     if low <= extent <= high:
         return
     if unit != "m" and low <= 1000 * extent <= high:
-        raise InputError(
-            f"{path} is {extent:.3g} mm long: it looks like metres. Give --unit m to convert."
-        )
+        raise InputError(f"{path} is {extent:.3g} mm long: it looks like metres. Give --unit m.")
     raise InputError(
-        f"{path} is {extent:.4g} mm long; an organ has {low:g} to {high:g} mm. Check its unit"
-        + (" (--unit m multiplied it by 1000)." if unit == "m" else ".")
+        f"{path} is {extent:.4g} mm long; an organ has {low:g} to {high:g} mm. Check its unit."
     )
 
 
@@ -159,8 +156,7 @@ def _union(organ: Mesh, tumor: Mesh, name: str) -> Mesh:
     outer.sort(key=lambda shell: -shell.volume())
     if not outer or (len(outer) > 1 and outer[1].volume() > 0.01 * tumor.volume_mm3):
         raise InputError(
-            f"{name} lies apart from the organ: a tumor must lie in it or touch it. Check that "
-            "all meshes share one frame and unit."
+            f"{name} lies apart from the organ. Check that all meshes share one frame and unit."
         )
     return largest_shell(mesh_of(outer[0]))
 
@@ -187,7 +183,7 @@ def closed_mesh(mesh: Mesh, name: str, notes: list[Note]) -> Mesh:
     if not trimesh.Trimesh(out.vertices_mm, out.faces, process=False).is_watertight:
         raise InputError(
             f"{name} is not a closed surface (edges with one or more than two faces). Repair it, "
-            "for instance with Blender's 3D-Print toolbox, or give a label map."
+            "or give a label map."
         )
     if out.volume_mm3 < 0:
         out = Mesh(out.vertices_mm, out.faces[:, ::-1])
@@ -199,7 +195,9 @@ def closed_mesh(mesh: Mesh, name: str, notes: list[Note]) -> Mesh:
             bodies[n] = Mesh(body.vertices_mm, body.faces[:, ::-1])
             notes.append(f"{name}: a piece of {bodies[n].volume_ml:.2f} ml was inside out; turned")
     _check_nested(bodies, name)
-    out = _together(bodies)
+    starts = np.cumsum([0, *(len(body.vertices_mm) for body in bodies)])
+    faces = [body.faces + start for body, start in zip(bodies, starts, strict=False)]
+    out = Mesh(np.concatenate([b.vertices_mm for b in bodies]), np.concatenate(faces))
     if abs(out.volume_mm3) < 1e-9 * size**3:
         raise InputError(f"{name} encloses no volume; it is no solid.")
     if not is_simple(out, size / 80):
@@ -218,15 +216,8 @@ def _check_nested(bodies: list[Mesh], name: str) -> None:
         if both.volume() > 0.9 * inner.volume_mm3:
             raise InputError(
                 f"{name} holds a body of {inner.volume_ml:.2f} ml within another one. Give each "
-                "part as a file of its own, tumors with tumor in their names."
+                "part a file of its own."
             )
-
-
-def _together(bodies: list[Mesh]) -> Mesh:
-    """Several meshes as one."""
-    starts = np.cumsum([0, *(len(body.vertices_mm) for body in bodies)])
-    faces = [body.faces + start for body, start in zip(bodies, starts[:-1], strict=True)]
-    return Mesh(np.concatenate([b.vertices_mm for b in bodies]), np.concatenate(faces))
 
 
 def _close_holes(mesh: Mesh, name: str, notes: list[Note]) -> Mesh:
@@ -257,7 +248,7 @@ def _close_holes(mesh: Mesh, name: str, notes: list[Note]) -> Mesh:
     if widest > _LARGEST_HOLE_MM:
         raise InputError(
             f"{name} is open: {len(centres)} holes, the widest {widest:.1f} mm (up to "
-            f"{_LARGEST_HOLE_MM:g} mm are closed). Close the mesh, or give a label map."
+            f"{_LARGEST_HOLE_MM:g} mm are closed). Close them, or give a label map."
         )
     notes.append(f"{name}: {len(centres)} holes closed, the widest {widest:.1f} mm")
     return Mesh(np.concatenate([mesh.vertices_mm, centres]), np.concatenate(faces))
@@ -295,10 +286,8 @@ def solid_of(mesh: Mesh, name: str) -> Any:
     raw = manifold3d.Mesh64(mesh.vertices_mm.copy(), mesh.faces.astype(np.uint64))
     solid = manifold3d.Manifold(raw)
     if solid.status() != manifold3d.Error.NoError or solid.volume() <= 0:
-        raise InputError(
-            f"{name} is not a closed surface with faces turned outward "
-            f"({solid.status().name}). Repair the mesh and try again."
-        )
+        status = solid.status().name
+        raise InputError(f"{name} is no closed surface with faces outward ({status}). Repair it.")
     return solid
 
 

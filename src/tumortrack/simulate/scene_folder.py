@@ -109,8 +109,7 @@ def read_scene(folder: Path) -> Scene:
         if not (folder / name).is_file():
             raise InputError(
                 f"{folder} is not a scene: it lacks {name}. A scene holds cloud.ply, kidney.ply "
-                "(or of another organ's name) and tumor_1.ply, tumor_2.ply, ... in the camera "
-                "frame, in mm."
+                "(or another organ's name), tumor_1.ply, ... in the camera frame, in mm."
             )
     reference = read_anatomy(folder, kind)
     _check_parts(folder, reference)
@@ -151,10 +150,7 @@ def list_scenes(folder: Path) -> list[Path]:
     visible = (path for path in folder.iterdir() if not path.name.startswith("."))
     scenes = sorted((path for path in visible if any(path.glob("*.ply"))), key=store.natural)
     if not scenes:
-        raise InputError(
-            f"{folder} holds no scenes: none of its folders has a cloud.ply and a surface. "
-            "Make some with: tumortrack simulate CASE DATASET."
-        )
+        raise InputError(f"{folder} holds no scenes. Make some: tumortrack simulate CASE DATASET.")
     return scenes
 
 
@@ -162,17 +158,16 @@ def _check_parts(folder: Path, anatomy: Anatomy) -> None:
     last = f"tumor_{len(anatomy.tumors)}"
     strays = {path.stem for path in folder.glob("tumor_*.ply")} - set(anatomy.names)
     if strays:
+        stray = sorted(strays)[0]
         raise InputError(
-            f"{folder}: {sorted(strays)[0]}.ply does not follow {last}.ply. Number the tumors "
-            "1, 2, 3, ... without a gap."
+            f"{folder}: {stray}.ply is not next to {last}.ply. Number them without a gap."
         )
     low, high = _ORGAN_SIZE_MM
     size_mm = anatomy.organ.longest_mm
     if not low <= size_mm <= high:
-        raise InputError(
-            f"{folder / anatomy.kind.name}.ply is {size_mm:.3g} wide; an organ has {low:g} to "
-            f"{high:g} mm. Scale the meshes and the cloud to mm."
-        )
+        path = folder / f"{anatomy.kind.name}.ply"
+        allowed = f"{low:g} to {high:g} mm"
+        raise InputError(f"{path} is {size_mm:.3g} wide; an organ has {allowed}. Scale all to mm.")
 
 
 def _united(folder: Path, anatomy: Anatomy) -> Anatomy:

@@ -122,8 +122,8 @@ def read_views(paths: Sequence[Path], options: LocateOptions) -> list[View]:
     count = len(paths)
     if len(cameras) not in (1, count):
         raise InputError(
-            f"--intrinsics is given {len(cameras)} times for {count} view{'s' * (count > 1)}: "
-            "give it once for all of them, or once for each, in their order."
+            f"--intrinsics is given {len(cameras)} times for {count} view{'s' * (count > 1)}: give "
+            "it once, or once for each."
         )
     cameras = cameras if len(cameras) == count else cameras * count
     return [_read_view(*pair, options) for pair in zip(paths, cameras, strict=True)]
@@ -168,10 +168,7 @@ def read_places(poses: Path | None, views: int) -> tuple[str, tuple[Affine, ...]
     if poses is None and views == 1:
         return "", ()
     if poses is None or views == 1:
-        raise InputError(
-            f"{views} view{'s' * (views > 1)} with{'out' * (poses is None)} --poses: give "
-            "--poses FILE with several views (locate MODEL CLOUD CLOUD ... OUT), and only then."
-        )
+        raise InputError("give --poses FILE with several views, and only with several.")
     return read_poses(poses, views)
 
 
@@ -190,10 +187,8 @@ def _picked_mm(frame: DepthFrame, column: int, row: int) -> Float[np.ndarray, " 
     pixel, or no return near it."""
     camera = frame.intrinsics
     if not (0 <= column < camera.width and 0 <= row < camera.height):
-        raise InputError(
-            f"--at {column} {row} is outside the depth image; COLUMN is 0 to {camera.width - 1}, "
-            f"ROW 0 to {camera.height - 1}."
-        )
+        size = f"{camera.width} x {camera.height}"
+        raise InputError(f"--at {column} {row} is outside the depth image of {size} pixels.")
     pixels = [(column + x, row + y) for x in _NEAR for y in _NEAR]
     pixels.sort(key=lambda pixel: (pixel[0] - column) ** 2 + (pixel[1] - row) ** 2)
     index = np.array([y * camera.width + x for x, y in pixels
@@ -201,7 +196,5 @@ def _picked_mm(frame: DepthFrame, column: int, row: int) -> Float[np.ndarray, " 
     depth_mm = frame.depth_mm.ravel()[index].astype(float)
     index, depth_mm = index[np.isfinite(depth_mm)], depth_mm[np.isfinite(depth_mm)]
     if not len(index):
-        raise InputError(
-            f"--at {column} {row}: the depth image has no return there. Give another pixel."
-        )
+        raise InputError(f"--at {column} {row} has no return. Give another pixel.")
     return deproject_pixels(index[:1], depth_mm[:1], camera)[0].astype(float)

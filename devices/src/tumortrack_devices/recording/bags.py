@@ -18,6 +18,7 @@ from typing import Any
 
 import msgspec
 
+from tumortrack.core.config import from_builtins
 from tumortrack.core.errors import InputError, readable
 from tumortrack.core.evidence import Evidence
 from tumortrack.core.store import natural
@@ -125,8 +126,10 @@ class BagRecording:
         """What became known with the frame of this stamp."""
         if message is None:
             return ()
-        with readable(f"{self._path}: its {self._evidence_topic}", "is damaged"):
-            known = msgspec.json.decode(message.data, type=FrameEvidence)
+        where, fault = f"{self._path}: its {self._evidence_topic}", "is damaged"
+        with readable(where, fault):
+            given = msgspec.json.decode(message.data)
+            known = from_builtins(given, FrameEvidence, f"{where} {fault}")
         return known.evidence if known.stamp_ns == stamp_ns else ()
 
     def _all(self, topics: set[str]) -> Iterator[tuple[str, Any, int]]:
