@@ -56,14 +56,10 @@ class _Evidence(Config, frozen=True, kw_only=True, tag_field="kind"):
             if not (np.abs(places) <= _REACH_MM).all():
                 raise InputError(
                     f"{self.name}: {field} reaches {np.abs(places).max():g}; allowed: up to "
-                    f"{_REACH_MM:g}. Places are in the camera's frame, points of the CT in LPS; "
-                    "both in mm."
+                    f"{_REACH_MM:g} mm, places in the camera's frame, points of the CT in LPS."
                 )
             if field != "point_ct" and np.abs(places).max() < _LEAST_MM:
-                raise InputError(
-                    f"{self.name}: {field} lies within {_LEAST_MM:g} mm of the camera: is it in "
-                    "metres? Allowed: mm."
-                )
+                raise InputError(f"{self.name}: {field} lies at the camera: is it in metres?")
             msgspec.structs.force_setattr(self, field, _tuples(places))
 
     @property

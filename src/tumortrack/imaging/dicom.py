@@ -96,11 +96,9 @@ class Series:
 
 def find_series(folder: Path, series: str | None = None) -> Series:
     """Find one CT series in a folder (sub-folders not searched) without reading its pixels.
-
     ``series``: its UID, or its number in the error's list; None: the only one with modality CT and
     at least 10 slices of one size and orientation. Raises InputError: no series, several, a
-    missing, double or stray slice; images of two patients.
-    """
+    missing, double or stray slice; images of two patients."""
     groups, notes = _groups(folder)
     chosen = _choose(folder, groups, series)
     # With their places, as some anonymisers give all slices one UID.

@@ -181,10 +181,7 @@ def closed_mesh(mesh: Mesh, name: str, notes: list[Note]) -> Mesh:
         out = Mesh(out.vertices_mm, np.asarray(work.faces))
     out = _close_holes(out, name, notes)
     if not trimesh.Trimesh(out.vertices_mm, out.faces, process=False).is_watertight:
-        raise InputError(
-            f"{name} is not a closed surface (edges with one or more than two faces). Repair it, "
-            "or give a label map."
-        )
+        raise InputError(f"{name} is not a closed surface. Repair it, or give a label map.")
     if out.volume_mm3 < 0:
         out = Mesh(out.vertices_mm, out.faces[:, ::-1])
         notes.append(f"{name}: it was inside out; faces turned outward")
@@ -214,10 +211,8 @@ def _check_nested(bodies: list[Mesh], name: str) -> None:
             continue
         both = solid_of(outer, name) ^ solid_of(inner, name)
         if both.volume() > 0.9 * inner.volume_mm3:
-            raise InputError(
-                f"{name} holds a body of {inner.volume_ml:.2f} ml within another one. Give each "
-                "part a file of its own."
-            )
+            ml = f"{inner.volume_ml:.2f} ml"
+            raise InputError(f"{name} holds {ml} within another body. Give each part its own file.")
 
 
 def _close_holes(mesh: Mesh, name: str, notes: list[Note]) -> Mesh:

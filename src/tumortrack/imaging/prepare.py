@@ -38,12 +38,11 @@ from tumortrack.imaging.surface import surfaces
 from tumortrack.imaging.symmetry import ambiguous, half_turns, warning
 from tumortrack.imaging.volume import (
     MOST_LABELS,
-    is_dicom,
     is_label_map,
     is_volume,
     label_map,
+    read_files,
     read_raw,
-    read_several,
     volume_of,
 )
 
@@ -131,10 +130,7 @@ def _with_structures(case: Case, options: PrepareOptions) -> Case:
     from_files, notes = read_structures(others, options.unit)
     structures = {**case.anatomy.structures, **from_files}
     if missing := [name for name in sources if name not in structures]:
-        raise InputError(
-            f"--structure {missing[0]}={sources[missing[0]]}: a number is a label of a label map, "
-            "and this is none. Give a mesh."
-        )
+        raise InputError(f"--structure {missing[0]}: without a label map it takes a mesh's file.")
     extents, more = extent_report(structures, case.anatomy, case.labels)
     report = {**case.report, "notes": [*case.report["notes"], *notes, *more]}
     anatomy = replace(case.anatomy, structures=structures)
@@ -148,8 +144,8 @@ def _check_organ_outside(labels: LabelVolume) -> None:
     share = np.count_nonzero(outermost == ORGAN) / max(len(outermost), 1)
     if share < _LEAST_ORGAN_OUTSIDE:
         raise InputError(
-            f"tumors make up {1 - share:.0%} of the outer surface: they enclose the organ. Check "
-            "which part is which, and that all have one frame and unit."
+            f"tumors make up {1 - share:.0%} of the outer surface. Check which part is the organ, "
+            "and that all have one frame and unit."
         )
 
 
@@ -177,21 +173,13 @@ def _from_volume(paths: list[Path], files: list[Path], options: PrepareOptions) 
     path, kind = paths[0], options.kind
     if not path.is_dir():
         refuse_unused(f"{path} is one file", options, "series")
-    volumes = [file for file in files if is_volume(file)]
-    others = [file for file in files if not is_volume(file)]
-    several = len(paths) > 1 or (path.is_dir() and volumes and not any(map(is_dicom, others)))
-    if several:
-        raw = read_several(volumes if path.is_dir() else files)
-    else:
-        raw = read_raw(path, options.series)
+    raw = read_files(paths, files, options.series)
     stated = bool(options.organs) or options.tumors is not None
     most = 256 if stated else MOST_LABELS  # kinds of voxels
     is_labels = bool(raw.segments) or (path.is_file() and is_label_map(raw, most))
     as_labels = options.labels or is_labels
     structures: dict[str, Mesh] = {}
     ct, notes = None, list[Note](raw.notes)
-    if several and path.is_dir() and others:
-        notes.append(f"no label files, left out: {', '.join(f.name for f in others[:5])}")
     file_patient, side = raw.patient, options.stated_side
     shape, affine = raw.array.shape, raw.lps_from_index
     if as_labels:
@@ -294,8 +282,8 @@ def _check_every_slice(solid: np.ndarray, affine: np.ndarray, path: Path) -> Non
             same = np.count_nonzero(slices[last] & slices[following])
             if same > _SAME_DRAWN * np.count_nonzero(slices[last]):
                 raise InputError(
-                    f"{path}: slices between drawn ones are empty (index {last + 1}, the first of "
-                    'them). Fill them (3D Slicer: Segment Editor, "Fill between slices").'
+                    f"{path}: from index {last + 1} on, slices between drawn ones are empty. Fill "
+                    'them (3D Slicer: Segment Editor, "Fill between slices").'
                 )
 
 

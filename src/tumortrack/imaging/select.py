@@ -74,19 +74,13 @@ def select_labels(
 
     An organ is a large connected piece of organ and tumor voxels. A tumor within 3 mm of an organ
     belongs to it; one farther away is left out with a note; other pieces are dropped as specks.
-    A tumor is a piece of one tumor label inside that organ; those below ``min_tumor_ml`` become
-    organ. Tumor labels keep their order; pieces of one label are ordered by size. Raises
-    InputError: no organ, no such tumor label, two organs of a pair without tumor and no ``side``,
-    the only tumor lies apart from every organ.
+    A tumor is a piece of one label of ``tumors`` (None: all others from 2 up) inside that organ;
+    those below ``min_tumor_ml`` become organ. Tumor labels keep their order; pieces of one label
+    are ordered by size. Of a pair the patient's ``side`` is taken; unknown: with the most tumor.
 
-    Args:
-        side: the PATIENT's ``left`` or ``right``; unknown: the organ with the most tumor.
-        tumors: their labels; None takes every other label from 2 up.
-        kind: which organ it is; only paired organs are chosen by side.
-
-    Returns:
-        The selected labels, notes on what was dropped or renumbered, and the organ's side: measured
-        in a map with both organs of a pair, else as given.
+    Returns the labels, notes on what was dropped or renumbered, and the organ's side: measured in a
+    map with both organs of a pair, else as given. Raises InputError: no organ, no such tumor label,
+    two organs of a pair without tumor and no ``side``, the only tumor lies apart from every organ.
     """
     labels, affine = label_volume.labels, label_volume.lps_from_index
     present = [int(n) for n in np.flatnonzero(grid.label_counts(labels)) if n > 0]
@@ -133,10 +127,7 @@ def _check_border(counted: np.ndarray) -> None:
     inner = counted[1:-1, 1:-1, 1:-1]
     share = (counted.sum() - inner.sum()) / max(counted.size - inner.size, 1)
     if share > _MOST_OF_BORDER:
-        raise InputError(
-            f"organ and tumors cover {share:.0%} of the label map's border. Give a map that holds "
-            "the whole organ, with a margin about it."
-        )
+        raise InputError(f"{share:.0%} of the map's border is labelled. Give it a wider margin.")
 
 
 def _check_ruggedness(labels: np.ndarray, affine: np.ndarray) -> None:
@@ -184,9 +175,7 @@ def _attach_tumors(
     pieces: _Pieces, organs: list[int], min_tumor_ml: float
 ) -> tuple[_Pieces, list[Note], list[int]]:
     """Join each piece with a tumor of at least ``min_tumor_ml`` to an organ within 3 mm (or one
-    voxel where voxels are larger), so that they have one surface. The gap is filled with organ
-    where the two face each other.
-
+    voxel where voxels are larger): the gap is filled with organ where the two face each other.
     Returns the pieces, joined ones numbered as their organ; notes; numbers of pieces farther away.
     """
     notes, apart = list[Note](), list[int]()
@@ -284,10 +273,8 @@ def _choose(
         middle_x_mm = (right_mm + left_mm) / 2
     if side == UNKNOWN:
         if pieces.tumor_ml[best] == 0:
-            raise InputError(
-                f"the label map holds {len(organs)} {kind.words}s and no tumor. Give --side left "
-                "or --side right (the patient's)."
-            )
+            what = f"{len(organs)} {kind.words}s and no tumor"
+            raise InputError(f"the label map holds {what}. Give --side left or --side right.")
         side = "left" if x_mm[best] > middle_x_mm else "right"
         note = f"the patient's {side} {kind.words} was chosen: it bears most tumor"
         return best, note, side if left_mm - right_mm > _PAIR_APART_MM else UNKNOWN
@@ -296,10 +283,7 @@ def _choose(
     slack = _MIDLINE_MARGIN_MM if alone else 0.0
     fitting = [n for n in organs if sign * (x_mm[n] - middle_x_mm) > -slack]
     if not fitting:
-        raise InputError(
-            f"the {kind.words} of this label map lies on the patient's other side than {side}. "
-            "Leave out --side, or check the map's orientation."
-        )
+        raise InputError(f"the {kind.words} lies on the patient's other side. Check --side.")
     note = f"only one {kind.words} in the map; its side was checked against the image's middle only"
     return max(fitting, key=tumor_then_size), note if alone else "", side
 

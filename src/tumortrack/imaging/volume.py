@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -100,10 +101,8 @@ def labels_of(raw: grid.RawVolume, path: Path) -> LabelVolume:
     """Raw voxels as labels. Raises InputError: not whole numbers in 0..255, of any type."""
     if (labels := _whole(raw.array)) is None:
         low, high = raw.array.min(), raw.array.max()
-        raise InputError(
-            f"{path} is no label map: values from {low:g} to {high:g}, or fractions; whole numbers "
-            "from 0 to 255 are allowed."
-        )
+        fault = f"values from {low:g} to {high:g}, or fractions"
+        raise InputError(f"{path} is no label map ({fault}): whole numbers of 0..255 are needed.")
     return LabelVolume(labels, raw.lps_from_index)
 
 
@@ -138,6 +137,18 @@ def label_map(raw: grid.RawVolume, parts: Parts, path: Path) -> LabelVolume:
     return LabelVolume(same[volume.labels], volume.lps_from_index) if others else volume
 
 
+def read_files(paths: list[Path], files: list[Path], series: str | None) -> grid.RawVolume:
+    """One volume, or several label files, of ``paths`` that hold the ``files``. Raises InputError:
+    see ``read_raw`` and ``read_several``."""
+    if len(paths) > 1:
+        return read_several(files)
+    volumes, others = [f for f in files if is_volume(f)], [f for f in files if not is_volume(f)]
+    if not (paths[0].is_dir() and volumes) or any(map(is_dicom, others)):
+        return read_raw(paths[0], series)
+    raw, names = read_several(volumes), ", ".join(file.name for file in others[:5])
+    return replace(raw, notes=(f"no label files, left out: {names}",)) if others else raw
+
+
 def read_several(files: Sequence[Path]) -> grid.RawVolume:
     """Label files with one structure each, numbered in their order and named as the files. Raises
     InputError: several labels in one, different grids."""
@@ -152,10 +163,7 @@ def read_several(files: Sequence[Path]) -> grid.RawVolume:
         if not same or not np.allclose(affine, first.lps_from_index, atol=_SAME_MM):
             raise InputError(f"{file} has another grid than {files[0]}. Export both on the same.")
         if len(found := np.unique(labels)) > 2 or found[0] != 0:
-            raise InputError(
-                f"{file} has labels {found[:9].tolist()}: of several files each holds 0 and one "
-                "structure. Give a label map alone."
-            )
+            raise InputError(f"{file} has labels {found[:9].tolist()}. Give a label map alone.")
         return labels > 0
 
     names = [stem(file) for file in files]

@@ -81,10 +81,8 @@ def read_poses(path: Path, count: int) -> tuple[str, tuple[Affine, ...]]:
 def read_cloud(path: Path, unit: Literal["mm", "m"] = "mm") -> tuple[SensorCloud, tuple[str, ...]]:
     """A cloud in the camera frame from .ply, .pcd (all three encodings), .npz or .npy, without what
     ``cloud.seen_points`` drops, and its notes. Whether it can be an organ in mm is left to
-    ``cloud.check_cloud``.
-
-    Raises InputError: missing, too large, damaged, of another kind, or without any point.
-    """
+    ``cloud.check_cloud``. Raises InputError: missing, too large, damaged, of another kind, or
+    without any point."""
     suffix = path.suffix.lower()
     if path.is_dir():
         raise InputError(f"{path} is a folder. Give a cloud in it, such as {path / 'cloud.ply'}.")
@@ -295,14 +293,11 @@ def read_depth_png(path: Path, intrinsics_path: Path) -> DepthFrame:
 def read_depth(
     path: Path, intrinsics_path: Path, unit_mm: float | None = None
 ) -> tuple[DepthFrame, float]:
-    """A depth image (16-bit PNG or TIFF, a TIFF of floats, or .npy) and its unit, mm per step.
-
-    What ``depths_mm`` says is no return. The unit is ``unit_mm``, else depth_unit_mm of
-    the intrinsics file, else 0.1 for whole numbers and 1000 (metres) for floats. The file's depth
-    correction is applied. Whether the unit can be right is left to ``cloud.check_depth_unit``.
-
-    Raises InputError: no such image, of another size than the intrinsics, or no valid unit.
-    """
+    """A depth image (16-bit PNG or TIFF, a TIFF of floats, or .npy) and its unit, mm per step:
+    ``unit_mm``, else depth_unit_mm of the intrinsics file, else 0.1 for whole numbers and 1000
+    (metres) for floats. The file's depth correction is applied. Whether the unit can be right is
+    left to ``cloud.check_depth_unit``. Raises InputError: no such image, of another size than the
+    intrinsics, or no valid unit."""
     intrinsics, data = _camera(intrinsics_path)
     steps, mode = _image(path, (intrinsics.width, intrinsics.height))
     if not mode.startswith(("I", "F")):

@@ -158,10 +158,8 @@ def _check_parts(folder: Path, anatomy: Anatomy) -> None:
     last = f"tumor_{len(anatomy.tumors)}"
     strays = {path.stem for path in folder.glob("tumor_*.ply")} - set(anatomy.names)
     if strays:
-        stray = sorted(strays)[0]
-        raise InputError(
-            f"{folder}: {stray}.ply is not next to {last}.ply. Number them without a gap."
-        )
+        stray = folder / f"{sorted(strays)[0]}.ply"
+        raise InputError(f"{stray} does not follow {last}.ply. Number them without a gap.")
     low, high = _ORGAN_SIZE_MM
     size_mm = anatomy.organ.longest_mm
     if not low <= size_mm <= high:

@@ -162,10 +162,7 @@ def _parse_fcsv(content: bytes, name: str) -> PointTable:
 def _signs(system: str, name: str) -> np.ndarray:
     known = _OLD_NUMBERS.get(system, system)
     if known not in _LPS_FROM:
-        raise InputError(
-            f"{name}: its coordinate system is {system}; it must be LPS or RAS. Save it in 3D "
-            "Slicer again."
-        )
+        raise InputError(f"{name}: its coordinate system is {system}; it must be LPS or RAS.")
     return np.array(_LPS_FROM[known], float)
 
 
@@ -219,10 +216,7 @@ def check_near_organ(
     far = distance() > FAR_MM
     away = f"more than {FAR_MM:g} mm away from {box}"
     if far.all():
-        raise InputError(
-            f"{name}: every point lies {away}. Points must be in the frame of the CT that the case "
-            "was made from, LPS, mm."
-        )
+        raise InputError(f"{name}: every point lies {away}. Give them in the CT's frame.")
     if not far.any():
         return ()
     count = f"{far.sum()} of {len(far)} points"

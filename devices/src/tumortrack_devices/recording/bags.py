@@ -178,10 +178,7 @@ class BagRecording:
                 f"{self._path} is of the RealSense SDK. Give the source realsense:{self._path}."
             )
         if not usable:
-            raise InputError(
-                f"{self._path} holds no depth images and no clouds (topics of "
-                f"{' or '.join(_KINDS)}; those under {ESTIMATES} are estimates)."
-            )
+            raise InputError(f"{self._path} holds no depth images and no clouds, as cameras send.")
         raise InputError(
             f"{self._path}: which topic holds the depth images or clouds? Say topic=NAME; "
             f"candidates: {', '.join(candidates or usable)}."

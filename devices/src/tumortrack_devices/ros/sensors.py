@@ -177,10 +177,7 @@ def _intrinsics_of(info: Any, rectified: bool) -> Intrinsics:
     if rectified and (matrix[:, 3] != 0).any():
         raise InputError("a camera_info came whose P has a shift. Give the left camera's depth.")
     if not rectified and (np.asarray(lens["d"], float) != 0).any():
-        raise InputError(
-            "a camera_info came that states lens distortion (D). Give the rectified depth image, "
-            "and say that it is (rectified=true)."
-        )
+        raise InputError("a camera_info has distortion (D); give rectified depth (rectified=true).")
     if matrix[0, 1] != 0:
         raise InputError("a camera_info came whose pixels are skewed, which is not supported.")
     fx, cx, fy, cy = matrix[0, 0], matrix[0, 2], matrix[1, 1], matrix[1, 2]
