@@ -12,8 +12,8 @@ import pytest
 
 from imaging_objects import kidney_labels, write_dicom, write_nifti
 from tumortrack.core import store
+from tumortrack.core.config import findings_in
 from tumortrack.core.errors import InputError
-from tumortrack.core.report import findings_in
 from tumortrack.core.types import LabelVolume, Volume
 from tumortrack.imaging.case import load_case, save_case
 from tumortrack.imaging.options import PrepareOptions

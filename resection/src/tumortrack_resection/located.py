@@ -11,13 +11,14 @@ import numpy as np
 from jaxtyping import Float64
 from scipy.spatial import cKDTree
 
+from tumortrack.core.config import findings_in
 from tumortrack.core.errors import ArtifactError, InputError
 from tumortrack.core.estimate import Estimate
 from tumortrack.core.geometry import rigid
 from tumortrack.core.mesh_files import read_mesh
 from tumortrack.core.organ import KIDNEY, is_tumor, organ_first, organ_name
 from tumortrack.core.patient import NOBODY, Patient
-from tumortrack.core.report import MarginReport, findings_in
+from tumortrack.core.report import MarginReport
 from tumortrack.core.store import MANIFEST, read_json
 from tumortrack.core.types import ORGAN, Mesh, OccupancyCloud
 from tumortrack.sense.ply import parse_ply_properties

@@ -11,7 +11,6 @@ from typing import Any, Literal
 
 import msgspec
 
-from tumortrack.core.errors import readable
 from tumortrack.core.tables import read_table
 
 Point = tuple[float, float, float]
@@ -93,14 +92,6 @@ class Finding(msgspec.Struct, frozen=True):
 
 
 Note = str | Finding  # of how a case was made: in passing, or a weakness
-
-
-def findings_in(entries: object, where: str) -> tuple[Finding, ...]:
-    """From JSON; none: of a version that knew none. Raises InputError."""
-    with readable(where, "has findings that are none of this version"):
-        found = msgspec.convert(entries or (), tuple[Finding, ...])
-        _ = [finding.words for finding in found]  # their values are there
-    return found
 
 
 class _Value(msgspec.Struct, frozen=True, kw_only=True):

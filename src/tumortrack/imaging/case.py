@@ -9,12 +9,12 @@ from typing import Any, ClassVar, Literal
 import msgspec
 
 from tumortrack.core import store
-from tumortrack.core.config import to_builtins
+from tumortrack.core.config import findings_in, to_builtins
 from tumortrack.core.errors import ArtifactError, InputError
 from tumortrack.core.mesh_files import read_anatomy, read_mesh, write_anatomy, write_mesh
 from tumortrack.core.organ import Organ, check_name, organ_entry
 from tumortrack.core.patient import NOBODY, Patient
-from tumortrack.core.report import Finding, findings_in
+from tumortrack.core.report import Finding
 from tumortrack.core.types import Anatomy, LabelVolume, Volume
 from tumortrack.imaging.nifti import write_nifti, write_volume_nifti
 from tumortrack.imaging.volume import read_labels, read_volume

@@ -6,10 +6,10 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from tumortrack.core.config import Config
+from tumortrack.core.config import Config, findings_in
 from tumortrack.core.organ import Organ, organ_in
 from tumortrack.core.patient import Patient, patient_in
-from tumortrack.core.report import Finding, findings_in
+from tumortrack.core.report import Finding
 from tumortrack.models.in_distribution import InDistributionRange
 
 if TYPE_CHECKING:

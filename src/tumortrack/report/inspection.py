@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from tumortrack.core import store
+from tumortrack.core.config import findings_in
 from tumortrack.core.errors import InputError
-from tumortrack.core.report import findings_in
 from tumortrack.core.tables import read_table
 
 Content = Mapping[str, Any]  # of a JSON file
